@@ -59,7 +59,7 @@ def meshes_built_once() -> Iterator[None]:
 @pytest.fixture
 def little_built(monkeypatch: pytest.MonkeyPatch) -> None:
     """`check` measures the loads of small meshes alone: it builds those of up to 60,000 cells."""
-    monkeypatch.setattr(check, "MAX_CHECK_CELLS", 3000)
+    monkeypatch.setattr(check, "LIMITS", replace(check.LIMITS, max_built_cells=3000))
 
 
 # The longest first, so that no worker is left alone with one of them at the end.

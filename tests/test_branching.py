@@ -26,7 +26,7 @@ from fracsim.fracture.energy.tip_criterion import DISC
 from fracsim.mesh.domain import distribute
 from fracsim.scene import Scene, build_scene, scene_on
 from fracsim.study.check import check_study
-from fracsim.study.energy_checks import RADIUS
+from fracsim.study.check_limits import LIMITS
 from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import DIRECT, each_step, make_scene, make_study, march
 from support.squares import square
@@ -317,7 +317,7 @@ def test_a_state_is_advanced_twice_alike() -> None:
 
 def test_check_tells_when_tips_branch() -> None:
     """And that none does in steps longer than R / c_R; c_R within 1 % of the root of Rayleigh's equation."""
-    assert DISC[2] == RADIUS
+    assert DISC[2] == LIMITS.tip_radius
     nu, h = 0.3, 0.05
     ratio = (1 - 2 * nu) / (2 - 2 * nu)
     root = brentq(lambda x: (2 - x**2) ** 2 - 4 * np.sqrt((1 - x**2) * (1 - ratio * x**2)), 0.5, 0.99)

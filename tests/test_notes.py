@@ -16,11 +16,12 @@ from cases import BAR, STRIP, changed, study
 from fracsim.errors import InputError
 from fracsim.scene import build_scene
 from fracsim.study.check import build_checked_mesh, check_study
+from fracsim.study.check_limits import LIMITS
 from fracsim.study.material_library import MATERIALS
 from fracsim.study.mesh_source import build_mesh
 from fracsim.study.overlap_checks import containment_depth
 from fracsim.study.reader import load_study, validate
-from fracsim.study.step_checks import QUADRATIC, estimated_explicit_step
+from fracsim.study.step_checks import estimated_explicit_step
 from fracsim.study.unit_checks import unit_questions
 
 HELD = [{"on": {"point": [0.0, 0.0], "normal": [1.0, 0.0]}, "fix": "xy"}]
@@ -206,7 +207,7 @@ def test_the_step_that_check_tells_is_the_one_that_is_taken(base: dict[str, Any]
 def test_quadratic_cells_have_the_bound_of_the_stepper() -> None:
     from fracsim.timestepping.stable_time_step import quadratic_gain
 
-    assert {dim: quadratic_gain(dim) for dim in (2, 3)} == pytest.approx(QUADRATIC, rel=1e-3)
+    assert {dim: quadratic_gain(dim) for dim in (2, 3)} == pytest.approx(LIMITS.quadratic_frequency_factor, rel=1e-3)
 
 
 def test_check_counts_the_steps_that_are_stable() -> None:

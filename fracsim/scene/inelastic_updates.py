@@ -12,7 +12,7 @@ from ..mechanics.stress import Stress
 from ..mesh.domain import Domain
 from ..study import BrittleSettings, Study
 from ..study.conditions import fibre_direction, initial_cracks
-from ..study.energy_checks import check_branching_dimension
+from ..study.length_checks import check_branching_dimension
 from ..timestepping.protocols import NoPlasticFlow, PlasticFlowProtocol
 from .material_model import per_cell
 

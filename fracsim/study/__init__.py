@@ -1,25 +1,33 @@
-"""The study file: its tables, their defaults, units and limits (SI throughout). No DOLFINx here.
+"""Schema of the study file and checks without DOLFINx. SI units throughout.
 
-body                 [mesh], [material], [damping]
-fracture             [fracture], [plasticity], [brittle]
-boundary_conditions  [[boundary]], [load], [initial]
-contact              [[obstacle]], [contact]
-rigid_bodies         [[body]], and what rigid studies may say
-time_and_output      [time], [[probe]], [output]
-solver_options       [solver]
-study                a study, and what its tables ask of one another
-values               what a key may hold
-reader               a study read by path or name, overridden, and written with every default
-error_messages       what is wrong, in one sentence
-check                `fracsim check`
-overlap_checks       whether the body and obstacles overlap at the start
-length_checks        whether strength, energy, mesh and body fit together
-unit_checks          questions about figures that look like those of other units
-step_checks          how many time steps there are, and how long stable ones are
-load_resultants      areas and resultants of loads
-mesh_source          from [mesh] to arrays
-catalogue            `fracsim list`
-material_library     materials by name, and where their values come from
+=====================  ====================================================================
+body                   schema of [mesh], [material], [damping]
+fracture               schema of [fracture], [[crack]], [plasticity], [brittle]
+boundary_conditions    schema of [[boundary]], [load], [initial], and selectors
+contact                schema of [[obstacle]], [contact]
+rigid_bodies           schema of [[body]], and the limits of rigid studies
+time_and_output        schema of [time], [[probe]], [output]
+solver_options         schema of [solver]
+study                  schema of a whole study, and conditions between its tables
+values                 types of values, and the documentation of a key
+material_library       named materials with their sources
+documentation          docs/study-file.md, written from the schema
+reader                 read a study by path or name, override values, write all defaults
+error_messages         errors of validation as sentences
+conditions             boundary conditions, loads, obstacles and cracks for a dimension
+mesh_source            from [mesh] to arrays
+quadratic_checks       limits of quadratic displacement, and its curved cells
+check                  validation of a study against its mesh
+mesh_summary           size, extent and groups of a mesh, before it is built if possible
+check_report           lines of `fracsim check`
+check_limits           thresholds of its notes and questions
+length_checks          strength, fracture energy, cell size and body against each other
+unit_checks            values that look like those of another unit
+step_checks            number and stability of time steps
+load_resultants        areas and resultants of loads
+overlap_checks         overlap of body and obstacles at the start
+catalogue              contents of `fracsim list`
+=====================  ====================================================================
 """
 
 from .body import DampingSettings, ElasticSettings, MaterialSettings, MeshSettings, RegionSettings

@@ -14,8 +14,11 @@ SOURCES = ("builder", "file", "surface", "outline", "shell")
 
 
 class MeshSettings(BaseModel):
-    """The mesh, from exactly one source: a builder, a mesh file, a closed surface or a plane outline that is filled
-    with cells, or a shell. Parameters of a builder are keys of this table, too."""
+    """The mesh, from exactly one source.
+
+    Sources are a builder, a mesh file, a closed surface or a plane outline that is filled with cells, and a shell.
+    Parameters of a builder are keys of this table, too.
+    """
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -47,9 +50,9 @@ class MeshSettings(BaseModel):
 
     @model_validator(mode="after")
     def _one_source(self) -> MeshSettings:
-        given = [name for name in SOURCES if getattr(self, name) is not None]
-        if len(given) != 1:
-            listed = " and ".join(given) or "none of them"
+        present = [name for name in SOURCES if getattr(self, name) is not None]
+        if len(present) != 1:
+            listed = " and ".join(present) or "none of them"
             raise ValueError(f"give exactly one of {', '.join(SOURCES)}; found {listed}")
         return self
 
@@ -200,6 +203,11 @@ class MaterialSettings(ElasticSettings):
                     f'has not: "{name}"'
                 )
         return regions
+
+    def elastic_constants(self, region: RegionSettings) -> tuple[float, float, float]:
+        """Returns Young's modulus (Pa), Poisson's ratio and density (kg/m^3) in a region."""
+        poisson = self.poisson if region.poisson is None else region.poisson
+        return region.young or self.young, poisson, region.density or self.density
 
     @model_validator(mode="after")
     def _plane_stress_has_an_energy(self) -> MaterialSettings:

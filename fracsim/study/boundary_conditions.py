@@ -52,8 +52,11 @@ Selector = Annotated[
 
 
 class BoundarySettings(StudyTable):
-    """A boundary condition on a facet group, a box or a plane. Give exactly one of fix, displacement, velocity,
-    traction, force and pressure. Conditions that contradict each other at the same place are refused."""
+    """A boundary condition on a facet group, a box or a plane.
+
+    Give exactly one of fix, displacement, velocity, traction, force and pressure. Conditions that contradict each other
+    at the same place are refused.
+    """
 
     on: Selector = key("Name of a facet group, or a table that selects a box or a plane.", example="left")
     fix: Annotated[str, Field(pattern="^[xyz]+$")] | None = key(
@@ -78,18 +81,18 @@ class BoundarySettings(StudyTable):
 
     @model_validator(mode="after")
     def _one_condition(self) -> BoundarySettings:
-        if len(given := self._given()) != 1:
+        if len(present := self._present()) != 1:
             kinds = ", ".join(CONDITIONS)
-            raise ValueError(f"give exactly one of {kinds}; found {' and '.join(given) or 'none'}")
+            raise ValueError(f"give exactly one of {kinds}; found {' and '.join(present) or 'none'}")
         return self
 
-    def _given(self) -> list[str]:
+    def _present(self) -> list[str]:
         return [name for name in CONDITIONS if getattr(self, name) is not None]
 
     @property
     def kind(self) -> str:
         """Name of the condition, one of `CONDITIONS`."""
-        return self._given()[0]
+        return self._present()[0]
 
 
 CONDITIONS = ("fix", "displacement", "velocity", "traction", "force", "pressure")

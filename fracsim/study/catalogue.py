@@ -1,4 +1,4 @@
-"""What `fracsim list` shows."""
+"""Contents of `fracsim list`: studies, builders, energies, schemes, obstacles and materials."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ OBSTACLES = {
 
 
 def material_table() -> list[str]:
-    """Lines for `fracsim list materials`."""
-    head = f"{'':27}{'E, Pa':>9} {'nu':>5} {'rho':>6} {'f_t, Pa':>9} {'G_c, J/m^2':>10} {'l_ch, m':>8}  source"
-    lines = ["materials: [material] like = NAME; l_ch = E' G_c / f_t^2", head]
-    for name, each in MATERIALS.items():
-        energy, length = ("-" if value is None else f"{value:.3g}" for value in (each.energy, each.length))
-        flow = f"; yields at {each.yield_stress:.3g} Pa" if each.yield_stress is not None else ""
-        figures = (
-            f"{each.young:9.3g} {each.poisson:5.3g} {each.density:6.4g} {each.strength:9.3g} {energy:>10} {length:>8}"
+    """Returns the lines of `fracsim list materials`."""
+    header = f"{'':27}{'E, Pa':>9} {'nu':>5} {'rho':>6} {'f_t, Pa':>9} {'G_c, J/m^2':>10} {'l_ch, m':>8}  source"
+    lines = ["materials: [material] like = NAME; l_ch = E' G_c / f_t^2", header]
+    for name, material in MATERIALS.items():
+        energy, length = ("-" if value is None else f"{value:.3g}" for value in (material.energy, material.length))
+        plastic = f"; yields at {material.yield_stress:.3g} Pa" if material.yield_stress is not None else ""
+        elastic = f"{material.young:9.3g} {material.poisson:5.3g} {material.density:6.4g}"
+        lines.append(
+            f"  {name:25}{elastic} {material.strength:9.3g} {energy:>10} {length:>8}  {material.source}{plastic}"
         )
-        lines.append(f"  {name:25}{figures}  {each.source}{flow}")
     return lines
 
 
 def catalogue() -> dict[str, dict[str, str]]:
-    """Heading -> name -> words."""
+    """Returns heading -> name -> description."""
     studies = {path.stem: tomllib.loads(path.read_text())["title"] for path in sorted(folder().glob("*.toml"))}
     builders = {name: (kind.__doc__ or "").strip().splitlines()[0] for name, kind in BUILDERS.items()}
-    chosen = TimeSettings.model_fields["scheme"].default
-    schemes = {name: kind.summary + " (default)" * (name == chosen) for name, kind in SCHEMES.items()}
+    default = TimeSettings.model_fields["scheme"].default
+    schemes = {name: kind.summary + " (default)" * (name == default) for name, kind in SCHEMES.items()}
     return {"studies": studies, "builders": builders, "energies": ENERGIES, "schemes": schemes, "obstacles": OBSTACLES}

@@ -1,7 +1,7 @@
-"""What the tables of a study say of a body with d dimensions: places, and functions of time. No DOLFINx here.
+"""Boundary conditions, loads, obstacles and cracks of a study as selectors and functions of time, for a dimension d.
 
-The one interpretation of [[boundary]], [load], [initial] and a fibre: `fracsim check` asks here whether they fit the
-mesh, the scene builds its terms from what comes out, reports plot it.
+`fracsim check` uses them to compare a study with its mesh, the scene to build terms, and reports to plot them. No
+DOLFINx here.
 """
 
 from __future__ import annotations
@@ -41,10 +41,12 @@ class BoundaryCondition:
     """An entry of [[boundary]].
 
     Attributes:
-        key: where the study has it.    kind: fix, displacement, velocity, traction, force or pressure.
-        function: of time: displacement (d,) in m of the three motions, traction (d,) or pressure (1,) in Pa, force (d,)
-            in N, in 2D per metre of thickness.
-        components: (d,) which components a motion prescribes; none of a load.
+        key: path in the study, such as `boundary.0`.
+        kind: fix, displacement, velocity, traction, force or pressure.
+        place: selector of nodes or facets.
+        function: of time: displacement (d,) in m for the three motions, traction (d,) or pressure (1,) in Pa, force
+            (d,) in N, in 2D per metre of thickness.
+        components: (d,) components that a motion prescribes; none for a load.
     """
 
     key: str
@@ -55,7 +57,7 @@ class BoundaryCondition:
 
     @property
     def prescribes_motion(self) -> bool:
-        """Whether it prescribes a motion."""
+        """True for the kinds fix, displacement and velocity."""
         return self.kind in MOTIONS
 
 
@@ -64,7 +66,13 @@ class ObstaclePlacement:
     """An entry of [[obstacle]].
 
     Attributes:
-        geometry: arguments of its shape.    at: (d,) its reference point at t = 0, m.    moved: (d,) m of time.
+        name, shape: as in the study.
+        geometry: arguments of the shape.
+        reference_point: (d,) at t = 0, m.
+        displacement: function of time, (d,) in m; None for a fixed or free obstacle.
+        friction: Coulomb's coefficient.
+        free_motion: of a free obstacle.
+        spin: (3,) angular velocity of a fixed or driven obstacle from a file, rad/s.
     """
 
     name: str
@@ -74,17 +82,19 @@ class ObstaclePlacement:
     displacement: TimeFunction | None
     friction: float
     free_motion: FreeObstacleMotion | None = None
-    spin: Values | None = None  # rad/s, at which a driven one turns
+    spin: Values | None = None
 
 
 @dataclass(frozen=True)
 class FreeObstacleMotion:
-    """What an entry of [[obstacle]] says of one that is free; d = 2 or 3, r = 1 or 3, p = d + r.
+    """Mass, constraints and initial motion of a free obstacle; d = 2 or 3, r = 1 or 3, p = d + r.
 
     Attributes:
-        mass: kg (2D: per metre of thickness), or density: kg/m^3.
-        hinge: (d,) the point that it turns about, m; None: its centre moves.
-        ways: (p, k) what it may do: increments of its pose.    rate: (k,) how fast at the start, m/s and rad/s.
+        mass: kg (2D: per metre of thickness); None with a density.
+        density: kg/m^3; None with a mass.
+        hinge: (d,) point of rotation, m; None if the centre moves.
+        pose_basis: (p, k) basis of the admissible increments of the pose.
+        initial_rate: (k,) rates of these at the start, m/s and rad/s.
         gravity: (d,) m/s^2.
     """
 
@@ -97,36 +107,44 @@ class FreeObstacleMotion:
 
 
 def boundary_conditions(study: Study, dim: int) -> list[BoundaryCondition]:
-    """All entries of [[boundary]]. InputError where one does not fit the dimension, or two do not agree."""
+    """Returns all entries of [[boundary]].
+
+    Raises:
+        InputError: if an entry does not fit the dimension, or two contradict each other.
+    """
     entries = [_condition(entry, dim, f"boundary.{i}", study.thickness) for i, entry in enumerate(study.boundary)]
     check_conflicts(entries, dim)
     return entries
 
 
 def check_conflicts(entries: Sequence[BoundaryCondition], dim: int) -> None:
-    """InputError where two entries prescribe the same component of the same place, or a load acts along one that is
-    prescribed there and so does nothing."""
-    for one, other in permutations(entries, 2):
-        if one.place != other.place or not one.prescribes_motion:
+    """Check that entries on the same selector do not contradict each other.
+
+    Raises:
+        InputError: if two motions prescribe the same component, or a load acts along a prescribed component, where it
+            has no effect.
+    """
+    for motion, second in permutations(entries, 2):
+        if motion.place != second.place or not motion.prescribes_motion:
             continue
-        both = one.components & (other.components if other.prescribes_motion else _acts(other, dim))
-        if not both.any():
+        common = motion.components & (second.components if second.prescribes_motion else _loaded(second, dim))
+        if not common.any():
             continue
-        axis = AXES[int(np.argmax(both))]
-        if not other.prescribes_motion:
+        axis = AXES[int(np.argmax(common))]
+        if not second.prescribes_motion:
             raise InputError(
-                f"{other.key}.{other.kind} acts along {axis} on {other.place}, where {one.key} prescribes {axis}: it "
-                f"would do nothing; set its {axis} to 0, or leave {axis} free"
+                f"{second.key}.{second.kind} acts along {axis} on {second.place}, where {motion.key} prescribes {axis}:"
+                f" it would do nothing; set its {axis} to 0, or leave {axis} free"
             )
-        if {one.kind, other.kind} != {"fix"}:
+        if {motion.kind, second.kind} != {"fix"}:
             raise InputError(
-                f"{one.key} and {other.key} both prescribe {axis} of {one.place}: remove one of them, or give "
+                f"{motion.key} and {second.key} both prescribe {axis} of {motion.place}: remove one of them, or give "
                 f'"free" for {axis}'
             )
 
 
-def _acts(load: BoundaryCondition, dim: int) -> Flags:
-    """(d,) components along which a traction or a force ever acts; a pressure has none of its own."""
+def _loaded(load: BoundaryCondition, dim: int) -> Flags:
+    """Components (d,) along which a traction or force acts at any time; none for a pressure."""
     if load.kind == "pressure":
         return np.zeros(dim, bool)
     assert isinstance(load.function, TabulatedFunction)
@@ -151,14 +169,18 @@ def _condition(entry: BoundarySettings, dim: int, key: str, thickness: float) ->
 
 
 def _named(axes: str, dim: int, key: str, word: str = "fix") -> Flags:
-    """(d,) the components that `fix` names."""
-    if beyond := set(axes) - set(AXES[:dim]):
-        raise InputError(f'{key}.{word} = "{axes}": a {dim}D mesh has no {min(beyond)}')
+    """Returns which components the letters of `fix` or `guide` name, (d,)."""
+    if missing := set(axes) - set(AXES[:dim]):
+        raise InputError(f'{key}.{word} = "{axes}": a {dim}D mesh has no {min(missing)}')
     return np.array([axis in axes for axis in AXES[:dim]])
 
 
 def find_selector(where: str | BoxSelector | PlaneSelector, dim: int, key: str) -> Selector:
-    """A place of the study. InputError where its vectors do not fit the dimension, or a normal is zero."""
+    """Returns the group, box or plane that a study selects.
+
+    Raises:
+        InputError: if a vector does not fit the dimension, or a normal is zero.
+    """
     if isinstance(where, str):
         return Group(where)
     if isinstance(where, BoxSelector):
@@ -176,74 +198,81 @@ def _vector(values: Sequence[float], dim: int, key: str) -> tuple[float, ...]:
 
 
 def volume_loads(study: Study, dim: int) -> dict[str, TimeFunction]:
-    """gravity (d,) in m/s^2 and body_force (d,) in N/m^3, as far as [load] has them."""
-    given = {} if study.load is None else {key: getattr(study.load, key) for key in ("gravity", "body_force")}
-    return {key: time_function(value, f"load.{key}", dim) for key, value in given.items() if value is not None}
+    """Returns functions of time by name: gravity (d,) in m/s^2 and body_force (d,) in N/m^3, if [load] has them."""
+    values = {} if study.load is None else {name: getattr(study.load, name) for name in ("gravity", "body_force")}
+    return {name: time_function(value, f"load.{name}", dim) for name, value in values.items() if value is not None}
 
 
 def obstacle_placements(study: Study, dim: int) -> list[ObstaclePlacement]:
-    """All entries of [[obstacle]]. InputError where one does not fit the dimension."""
+    """Returns all entries of [[obstacle]].
+
+    Raises:
+        InputError: if an entry does not fit the dimension.
+    """
     load = volume_loads(study, dim)
     gravity = load["gravity"](0.0) if "gravity" in load else np.zeros(dim)
     entries = enumerate(study.obstacle)
-    return [_placing(entry, dim, f"obstacle.{i}", gravity, study.thickness) for i, entry in entries]
+    return [_placement(entry, dim, f"obstacle.{i}", gravity, study.thickness) for i, entry in entries]
 
 
-def _placing(entry: ObstacleSettings, dim: int, key: str, gravity: Values, thickness: float) -> ObstaclePlacement:
-    given = entry.geometry
-    for name in {"normal", "axis", "size"} & set(given):
-        given[name] = _vector(given[name], dim, f"{key}.{name}")
-    if "normal" in given:
-        given["direction"] = given.pop("normal")
+def _placement(entry: ObstacleSettings, dim: int, key: str, gravity: Values, thickness: float) -> ObstaclePlacement:
+    geometry = entry.geometry
+    for name in {"normal", "axis", "size"} & set(geometry):
+        geometry[name] = _vector(geometry[name], dim, f"{key}.{name}")
+    if "normal" in geometry:
+        geometry["direction"] = geometry.pop("normal")
     if entry.shape == "plane":
-        given.pop("hollow", None)
+        geometry.pop("hollow", None)
     elif entry.shape == "sphere":
-        given["dim"] = dim
+        geometry["dim"] = dim
     elif entry.shape == "cylinder" and dim == 2:
         raise InputError(f'{key}.shape = "cylinder": a 2D mesh has none; choose "sphere", which is a disk there')
     elif entry.shape == "mesh":
         _check_file(entry, dim, key)
-    moved: TimeFunction | None = None
+    displacement: TimeFunction | None = None
     if entry.displacement is not None:
-        moved = time_function(entry.displacement, f"{key}.displacement", dim)
+        displacement = time_function(entry.displacement, f"{key}.displacement", dim)
     elif entry.velocity is not None and not entry.is_free:
-        moved = time_function(entry.velocity, f"{key}.velocity", dim).integral
-    loose = _loose(entry, dim, key, gravity, thickness) if entry.is_free else None
-    at, turns = check_size(entry.at, dim, f"{key}.at"), entry.spin is not None and not entry.is_free
-    spin = check_size(entry.spin, 3, f"{key}.spin") if turns and entry.spin is not None else None
-    return ObstaclePlacement(entry.name, entry.shape, given, at, moved, entry.friction, loose, spin)
+        displacement = time_function(entry.velocity, f"{key}.velocity", dim).integral
+    free_motion = _free_motion(entry, dim, key, gravity, thickness) if entry.is_free else None
+    point = check_size(entry.at, dim, f"{key}.at")
+    spin = None if entry.spin is None or entry.is_free else check_size(entry.spin, 3, f"{key}.spin")
+    return ObstaclePlacement(entry.name, entry.shape, geometry, point, displacement, entry.friction, free_motion, spin)
 
 
 def _check_file(entry: ObstacleSettings, dim: int, key: str) -> None:
     if dim == 2:
         raise InputError(f'{key}.shape = "mesh": a 2D mesh has none; choose "box", "sphere", "capsule" or "plane"')
-    assert entry.file is not None  # the schema sees to it
+    # the schema requires a file for this shape
+    assert entry.file is not None
     check_file(entry.file, f"{key}.file")
 
 
-def _loose(entry: ObstacleSettings, dim: int, key: str, gravity: Values, thickness: float) -> FreeObstacleMotion:
-    """What is free of an entry, and how it starts."""
-    turns = 1 if dim == 2 else 3
-    velocity = np.zeros(dim) if entry.velocity is None else check_size(entry.velocity, dim, f"{key}.velocity")  # type: ignore[arg-type]
-    ways, hinge = np.eye(dim + turns), None
-    spin = [0.0] * (turns if entry.hinge is None else 1) if entry.spin is None else entry.spin
+def _free_motion(entry: ObstacleSettings, dim: int, key: str, gravity: Values, thickness: float) -> FreeObstacleMotion:
+    """Mass, admissible motions and initial rates of a free obstacle."""
+    rotations = 1 if dim == 2 else 3
+    velocity: Values = np.zeros(dim)
+    if isinstance(entry.velocity, list):
+        velocity = check_size(entry.velocity, dim, f"{key}.velocity")
+    basis, hinge = np.eye(dim + rotations), None
+    spin = [0.0] * (rotations if entry.hinge is None else 1) if entry.spin is None else entry.spin
     if entry.hinge is not None:
         hinge = check_size(entry.hinge.point, dim, f"{key}.hinge.point")
-        ways, turns = _about(entry.hinge, dim, f"{key}.hinge.axis"), 1
-    rate = np.concatenate([velocity, check_size(spin, turns, f"{key}.spin")])
+        basis, rotations = _hinge_basis(entry.hinge, dim, f"{key}.hinge.axis"), 1
+    rate = np.concatenate([velocity, check_size(spin, rotations, f"{key}.spin")])
     if entry.hinge is not None:
         rate = rate[dim:]
     elif entry.guide is not None:
         along = _named(entry.guide, dim, key, "guide")
         if np.any(velocity[~along]):
             raise InputError(f"{key}.velocity = {velocity.tolist()}: it moves along {entry.guide} alone")
-        ways, rate = ways[:, :dim][:, along], velocity[along]
+        basis, rate = basis[:, :dim][:, along], velocity[along]
     mass = None if entry.mass is None else entry.mass / thickness
-    return FreeObstacleMotion(mass, entry.density, hinge, ways, rate, gravity)
+    return FreeObstacleMotion(mass, entry.density, hinge, basis, rate, gravity)
 
 
-def _about(hinge: HingeSettings, dim: int, key: str) -> Values:
-    """(p, 1) increment of the pose about a hinge."""
+def _hinge_basis(hinge: HingeSettings, dim: int, key: str) -> Values:
+    """Increment of the pose in a rotation about a hinge, (p, 1)."""
     if dim == 2:
         if hinge.axis is not None:
             raise InputError(f"{key} = {hinge.axis}: in 2D bodies turn in the plane; remove axis")
@@ -258,7 +287,7 @@ def _about(hinge: HingeSettings, dim: int, key: str) -> Values:
 
 
 def initial_motion(study: Study, dim: int) -> tuple[Values | None, Values | None] | None:
-    """Velocity (d,) in m/s and spin in rad/s (one number in 2D) of [initial]; None without the table."""
+    """Returns velocity (d,) in m/s and spin in rad/s (one number in 2D) of [initial]; None without the table."""
     initial = study.initial
     if initial is None:
         return None
@@ -268,7 +297,11 @@ def initial_motion(study: Study, dim: int) -> tuple[Values | None, Values | None
 
 
 def initial_cracks(study: Study, dim: int) -> list[CrackPlane]:
-    """[[crack]] of a body with d dimensions. InputError where they are of another, or have no extent."""
+    """Returns all entries of [[crack]].
+
+    Raises:
+        InputError: if an entry does not fit the dimension or has no extent.
+    """
     return [_crack(entry, f"crack.{i}", dim) for i, entry in enumerate(study.crack)]
 
 
@@ -287,18 +320,18 @@ def _crack(entry: CrackSettings, key: str, dim: int) -> CrackPlane:
 
 
 def fibre_direction(study: Study, dim: int) -> Values | None:
-    """(d,) of [fracture.fibre]; None without the table."""
+    """Returns the direction of [fracture.fibre], (d,); None without the table."""
     fibre = study.fracture.fibre if study.fracture is not None else None
     return None if fibre is None else check_size(fibre.direction, dim, "fracture.fibre.direction")
 
 
 def step_size_function(timing: TimeSettings) -> TabulatedFunction | None:
-    """The longest step, s, at a time; None where it is the same all the time."""
+    """Returns the longest step in s as a function of time; None if it is constant."""
     return time_function(timing.step, "time.step", 1) if isinstance(timing.step, TimeTable) else None
 
 
 def time_function(value: Any, key: str, size: int) -> TabulatedFunction:
-    """A constant or a table as a function of time that returns `size` numbers; "free" becomes nan."""
+    """Returns a constant or a table as a function of time with `size` components; "free" becomes nan."""
     table = value if isinstance(value, TimeTable) else TimeTable(time=[0.0], value=[value])
     rows = np.array([check_size(row if isinstance(row, list) else [row], size, key) for row in table.value])
     if np.any(np.isnan(rows) != np.isnan(rows[0])):
@@ -307,7 +340,11 @@ def time_function(value: Any, key: str, size: int) -> TabulatedFunction:
 
 
 def check_size(values: Sequence[Any], size: int, key: str) -> Values:
-    """A constant vector; InputError where it does not fit the dimension of the mesh. "free" becomes nan."""
+    """Returns a vector of a study as an array (size,); "free" becomes nan.
+
+    Raises:
+        InputError: if its length does not fit the dimension of the mesh.
+    """
     if len(values) != size:
         raise InputError(f"{key} = {values}: this mesh needs {size} number{'s'[: size != 1]}")
     return np.array([np.nan if value == "free" else float(value) for value in values])

@@ -30,8 +30,10 @@ class HingeSettings(StudyTable):
 
 
 class ObstacleSettings(StudyTable):
-    """A rigid obstacle that the body cannot penetrate: fixed, driven by a displacement or velocity, or free with a
-    mass."""
+    """A rigid obstacle that the body cannot penetrate.
+
+    It is fixed, driven by a displacement or velocity, or free with a mass.
+    """
 
     name: Name = key(
         "Name in the columns of history.csv: contact_NAME_x (force on it), gap_NAME, work_NAME, ...", example="hammer"
@@ -94,10 +96,10 @@ class ObstacleSettings(StudyTable):
     @model_validator(mode="after")
     def _has_the_keys_of_its_shape(self) -> ObstacleSettings:
         needed, allowed = SHAPE_KEYS[self.shape]
-        given = [name for name in GEOMETRY if getattr(self, name) not in (None, False)]
-        if missing := [name for name in needed if name not in given]:
+        present = [name for name in GEOMETRY if getattr(self, name) not in (None, False)]
+        if missing := [name for name in needed if name not in present]:
             raise ValueError(f'shape = "{self.shape}" needs {" and ".join(missing)}')
-        if excess := [name for name in given if name not in (*needed, *allowed)]:
+        if excess := [name for name in present if name not in (*needed, *allowed)]:
             raise ValueError(f'shape = "{self.shape}" has no {excess[0]}; remove it')
         if self.displacement is not None and self.velocity is not None:
             raise ValueError("give displacement or velocity, not both")
@@ -106,9 +108,11 @@ class ObstacleSettings(StudyTable):
     @model_validator(mode="after")
     def _keys_of_free_obstacles(self) -> ObstacleSettings:
         if not self.is_free:
-            given = [name for name in FREE if getattr(self, name) is not None]
-            if given and not (self.shape == "mesh" and given == ["spin"]):
-                raise ValueError(f"{given[0]} is for an obstacle that moves freely: give mass or density, or remove it")
+            present = [name for name in FREE if getattr(self, name) is not None]
+            if present and not (self.shape == "mesh" and present == ["spin"]):
+                raise ValueError(
+                    f"{present[0]} is for an obstacle that moves freely: give mass or density, or remove it"
+                )
             return self
         if self.mass is not None and self.density is not None:
             raise ValueError("give mass or density, not both")
@@ -144,8 +148,10 @@ class ObstacleSettings(StudyTable):
 
 
 class ContactSettings(StudyTable):
-    """Contact of the body with itself and of its fragments with each other, and parameters of the contact of
-    obstacles."""
+    """Contact of the body with itself and of its fragments with each other.
+
+    The table also has the parameters of contact with obstacles and of rigid bodies.
+    """
 
     itself: Flag | Literal["pieces"] = key(
         'true: the body with itself. "pieces": fragments with each other, without cracks inside a fragment and nodes '

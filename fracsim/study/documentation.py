@@ -21,6 +21,7 @@ from pydantic.fields import FieldInfo
 
 from . import BoxSelector, ColourSettings, PlaneSelector, Study, TimeTable
 from .body import SOURCE_KEYS, SourceKey
+from .error_messages import models_in
 from .values import OverTime
 
 INTRODUCTION = """# Study file
@@ -128,13 +129,13 @@ def _tables() -> Iterator[_Table]:
     """All tables of a study, in the order of the schema."""
     yield _Table("Top level", "", [_key("title", Study.model_fields["title"])])
     for name, field in Study.model_fields.items():
-        models = _models_in(field.annotation)
+        models = models_in(field.annotation)
         heading = f"[[{name}]]" if "list" in str(field.annotation) else f"[{name}]"
         if models:
             keys = list(_keys_of(models[0], f"{name}."))
             if name == "mesh":
                 keys += _source_keys()
-            yield _Table(heading, _first_paragraph(models[0]), keys)
+            yield _Table(heading, _description(models[0]), keys)
         elif name != "title":
             yield _Table(heading, SOLVER, [_key(name, field)])
 
@@ -151,7 +152,7 @@ def _sections() -> Iterator[str]:
 def _keys_of(model: type[BaseModel], path: str) -> Iterator[Key]:
     """The keys of a table, and of the tables inside it."""
     for name, field in model.model_fields.items():
-        inner = [kind for kind in _models_in(field.annotation) if not issubclass(kind, TimeTable)]
+        inner = [kind for kind in models_in(field.annotation) if not issubclass(kind, TimeTable)]
         key = f"{path}NAME" if name == "regions" else f"{path}{name}"
         if not inner or _has_plain_value(inner):
             yield _key(key, field)
@@ -257,20 +258,20 @@ def _range(bounds: Iterable[Any]) -> str:
 
 def _list(item: str, bounds: Iterable[Any]) -> str:
     """Words for a list whose length is limited."""
-    least = most = None
+    shortest = longest = None
     for bound in bounds:
         if isinstance(bound, Len | MinLen):
-            least = bound.min_length
+            shortest = bound.min_length
         if isinstance(bound, Len | MaxLen):
-            most = bound.max_length
+            longest = bound.max_length
     plural = f"entries ({item})"
     if item[0].isdigit():
         plural = "points"
     elif "number" in item:
         plural = item.replace("number", "numbers", 1)
-    if most is not None:
-        return f"{most} {plural}" if least == most else f"{least} to {most} {plural}"
-    return f"{least} or more {plural}" if least else f"list of {plural}"
+    if longest is not None:
+        return f"{longest} {plural}" if shortest == longest else f"{shortest} to {longest} {plural}"
+    return f"{shortest} or more {plural}" if shortest else f"list of {plural}"
 
 
 def _commented(study: dict[str, Any]) -> Iterator[str]:
@@ -306,16 +307,9 @@ def _comment(path: str, documented: dict[str, Key]) -> Iterator[str]:
     yield line
 
 
-def _first_paragraph(model: type[BaseModel]) -> str:
-    return " ".join((model.__doc__ or "").split("\n\n")[0].split())
-
-
-def _models_in(annotation: Any) -> list[type[BaseModel]]:
-    """Tables that a value of this type may be."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    inner = [model for part in get_args(annotation) for model in _models_in(part)]
-    return inner or (_models_in(annotation.__value__) if hasattr(annotation, "__value__") else [])
+def _description(model: type[BaseModel]) -> str:
+    """Docstring of a table as one paragraph."""
+    return " ".join((model.__doc__ or "").split())
 
 
 if __name__ == "__main__":

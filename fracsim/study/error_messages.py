@@ -1,4 +1,4 @@
-"""What is wrong with a table of the study file, in one sentence: the key, the value, what is allowed."""
+"""Errors of validation as one sentence: the key, its value, and what is allowed."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from pydantic import BaseModel
 
 from . import Study
 
-# sentences for pydantic's types of errors; the others keep its own words
-_WORDS = {
+# sentences for the error types of pydantic; other types keep its text
+_SENTENCES = {
     "bool_type": "must be true or false",
     "dataclass_type": "must be a table",
     "dict_type": "must be a table",
@@ -36,8 +36,15 @@ _PATTERNS = {
 
 
 def validation_message(errors: Sequence[Any], table: str = "") -> str:
-    """The error to mend first as a sentence. An unknown key goes before a missing one: it is mostly the same key."""
-    error = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
+    """Returns the first error as a sentence.
+
+    An unknown key precedes a missing one, since it is usually the missing key with a typing error.
+
+    Args:
+        errors: of a pydantic ValidationError.
+        table: path of the table that was validated, if it is not the whole study.
+    """
+    error = next((error for error in errors if error["type"] == "extra_forbidden"), errors[0])
     location = _location(error["loc"])
     where = ".".join(map(str, [table, *location] if table else location))
     if error["type"] == "extra_forbidden":
@@ -50,7 +57,7 @@ def validation_message(errors: Sequence[Any], table: str = "") -> str:
 
 
 def unknown_key_message(where: str, known: Iterable[str]) -> str:
-    """`where` is not a key; the nearest one, or all that are known at its place."""
+    """Returns a sentence on an unknown key, with the nearest known key, or all known keys of its table."""
     known = sorted(known)
     near = difflib.get_close_matches(where.rpartition(".")[2], known, n=1, cutoff=0.5)
     hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
@@ -58,7 +65,7 @@ def unknown_key_message(where: str, known: Iterable[str]) -> str:
 
 
 def _location(parts: Sequence[Any]) -> list[Any]:
-    """Keys of the file: without the tags of unions, and without the field that collects the regions."""
+    """Path of an error in the file: without the tags of unions and the field of the regions."""
     keys = [part for part in parts if not str(part).startswith("<")]
     return [keys[0], *keys[2:]] if keys[:2] == ["material", "regions"] else keys
 
@@ -69,8 +76,8 @@ def _owner(location: list[Any]) -> str:
 
 def _sentence(error: Any) -> str:
     kind, context = error["type"], error.get("ctx", {})
-    if kind in _WORDS:
-        return _WORDS[kind].format(**context)
+    if kind in _SENTENCES:
+        return _SENTENCES[kind].format(**context)
     if kind == "string_pattern_mismatch":
         return _PATTERNS[context["pattern"]]
     if context.get("expected") == "'free'":
@@ -89,20 +96,20 @@ def _show(value: Any) -> str:
 
 
 def _known_keys(location: list[Any]) -> list[str]:
-    """The keys allowed at a place of the study file, found by walking the schema."""
+    """Known keys of the table at a path of the study file."""
     models: list[type[BaseModel]] = [Study]
     for part in location:
         fields = [model.model_fields for model in models]
-        inner = [m for field in fields for m in _models_in(field.get(part, field.get("regions")))]
-        models = inner or models  # an index of a list stands for its entries
+        selected = [field.get(part, field.get("regions")) for field in fields]
+        inner = [model for field in selected if field is not None for model in models_in(field.annotation)]
+        # an index of a list keeps the table of its entries
+        models = inner or models
     return [key for model in models for key in model.model_fields if key != "regions"]
 
 
-def _models_in(field: Any) -> list[type[BaseModel]]:
-    def walk(annotation: Any) -> list[type[BaseModel]]:
-        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-            return [annotation]
-        inner = [found for argument in get_args(annotation) for found in walk(argument)]
-        return inner or walk(annotation.__value__) if hasattr(annotation, "__value__") else inner
-
-    return walk(field.annotation) if field is not None else []
+def models_in(annotation: Any) -> list[type[BaseModel]]:
+    """Returns the tables that a value of a type may be."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    inner = [model for argument in get_args(annotation) for model in models_in(argument)]
+    return inner or (models_in(annotation.__value__) if hasattr(annotation, "__value__") else [])

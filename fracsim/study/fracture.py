@@ -33,8 +33,11 @@ class FibreSettings(StudyTable):
 
 
 class FractureSettings(StudyTable):
-    """Fracture. Without `energy` an edge breaks when its averaged normal stress reaches `strength`; with it, cracks
-    advance when they release the fracture energy."""
+    """Criterion of fracture and degradation.
+
+    Without `energy` an edge breaks when its averaged normal stress reaches `strength`; with it, cracks advance when
+    they release the fracture energy.
+    """
 
     strength: Strength = key("Normal stress at which an edge breaks; inf: it never breaks.", "Pa", example=3e4)
     energy: Positive | None = key(
@@ -123,15 +126,18 @@ class CrackSettings(StudyTable):
 
     @model_validator(mode="after")
     def _one_shape(self) -> CrackSettings:
-        given = [name for name in ("segment", "polygon", "plane") if getattr(self, name) is not None]
-        if len(given) != 1:
-            raise ValueError(f"give exactly one of segment, polygon, plane; found {' and '.join(given) or 'none'}")
+        present = [name for name in ("segment", "polygon", "plane") if getattr(self, name) is not None]
+        if len(present) != 1:
+            raise ValueError(f"give exactly one of segment, polygon, plane; found {' and '.join(present) or 'none'}")
         return self
 
 
 class PlasticitySettings(StudyTable):
-    """Plastic flow where the stress exceeds the yield stress, F = F_e F_p with det F_p = 1. Not with the energy linear,
-    plane stress or approach edge. Rigid bodies are dented: they have yield_stress and hardening only."""
+    """Plastic flow where the stress exceeds the yield stress, F = F_e F_p with det F_p = 1.
+
+    Not with the energy linear, plane stress or approach edge. Rigid bodies are dented: they have yield_stress and
+    hardening only.
+    """
 
     yield_stress: Strength = key("Yield stress (Cauchy); inf: never yields.", "Pa", example=2e4)
     measure: Literal["von-mises", "frobenius"] = key(
@@ -154,8 +160,10 @@ class PlasticitySettings(StudyTable):
 
 
 class GrainSettings(StudyTable):
-    """Grains: regions of nodes nearest to seeded points by weighted distance. They do not depend on the number of
-    ranks."""
+    """Grains: regions of nodes nearest to seeded points by weighted distance.
+
+    They do not depend on the number of ranks.
+    """
 
     count: Annotated[int, Field(ge=2, le=1_000_000, strict=True)] = key("Number of grains.", example=50)
     seed: Seed = key("Seed of the points.", default=0, example=1)
@@ -170,8 +178,10 @@ class GrainSettings(StudyTable):
 
 
 class BrittleSettings(StudyTable):
-    """Crack surfaces instead of single edges. They start in the cells of highest averaged principal stress and use
-    strength, radius and kernel of [fracture]."""
+    """Crack surfaces instead of single edges.
+
+    They start in the cells of highest averaged principal stress and use strength, radius and kernel of [fracture].
+    """
 
     surfaces: Annotated[int, Field(ge=1, strict=True)] = key(
         "Maximum number of surfaces in the run; of each body with rigid bodies.", example=20

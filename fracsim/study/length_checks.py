@@ -1,14 +1,9 @@
-"""Whether strength, mesh and body fit together: what `fracsim check` says of them beside cracks that take an energy
-(energy_checks).
+"""Checks of strength, fracture energy, cell size and body against each other, for `fracsim check`.
 
-How far pieces that come off may turn until the end of a study, roughly: with a linear energy they swell by 1/cos.
-
-A piece leaves at the speed that breaking gives it, f_t / sqrt(Y rho), at that of what drives or strikes the body, or at
-what gravity has given it by the end, whichever is most; as large as the body's least side L it turns by
-
-    theta = v T / L.
-
-Stiff bodies in short studies hardly turn: a disk of granite by a tenth of a degree before it has split.
+The length that decides is Irwin's, l_ch = E' G_c / f_t^2 (docs/theory.md#fracture-energy). The rotation of fragments is
+estimated by theta = v T / L, with the duration T and the least side L of the body. Its speed v is the largest of the
+speed that fracture gives a fragment, f_t / sqrt(Y rho), the speed of prescribed motions and obstacles, and that of free
+fall.
 """
 
 from __future__ import annotations
@@ -17,86 +12,185 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from . import Study
+from ..errors import InputError
+from ..forms.waves import rayleigh_speed
+from . import FractureSettings, Study
 from .body import RegionSettings
+from .check_limits import LIMITS
 from .conditions import boundary_conditions, initial_motion, obstacle_placements, volume_loads
-from .energy_checks import plane_modulus
 from .material_library import MATERIALS
 
-TIP_CLEARANCE = 6.0  # h that a tip needs around it
-MAX_ENERGY_RATIO = 3.0  # times that an energy may be off without a word
-MAX_SMALL_STRAIN = 0.005  # strain at the strength, below which stretches do not matter
-MAX_LINEAR_ROTATION = 0.1  # rad: half a percent larger
 
+def length_scale_notes(study: Study, h: float, min_side: float) -> Iterator[str]:
+    """Yield notes on strength, energy and cell size that do not fit together.
 
-def length_scale_notes(study: Study, h: float, least: float) -> Iterator[str]:
-    """Notes on what does not fit together; `h`: size of the cells, infinite where it is not known, and `least`: the
-    body's least side, m."""
+    Args:
+        study: with any table.
+        h: cell size, m; infinite if it is not known.
+        min_side: least side of the body, m.
+    """
     table = study.fracture
     if table is None or study.brittle is not None:
         return
-    if table.strength > 0.1 * study.material.young and table.strength < float("inf"):
+    if table.strength > LIMITS.max_strength_share * study.material.young and table.strength < float("inf"):
         yield f"note: strength is {table.strength / study.material.young:.2g} of young: only rubber is that strong"
     if table.energy is None:
-        yield from _spent(study, plane_modulus(study, RegionSettings()), table.radius or h)
+        yield from _edge_energy_notes(study, plane_modulus(study, RegionSettings()), table.radius or h)
         return
-    if table.law == "griffith" and least < 2 * TIP_CLEARANCE * h < float("inf"):
-        most = least / 2 / TIP_CLEARANCE
+    clearance = LIMITS.tip_clearance
+    if table.law == "griffith" and min_side < 2 * clearance * h < float("inf"):
         yield (
-            f"note: tips need {TIP_CLEARANCE:g} h on every side, the body is {least / h:.3g} h across: "
-            f"h below {most:.2g} m"
+            f"note: tips need {clearance:g} h on every side, the body is {min_side / h:.3g} h across: "
+            f"h below {min_side / 2 / clearance:.2g} m"
+        )
+
+
+def _edge_energy_notes(study: Study, modulus: float, h: float) -> Iterator[str]:
+    """Yield the energy of a crack by single edges, f_t^2 h / 2 E' for each area, beside that of the material.
+
+    It is the elastic energy of a row of cells at the strength, whatever the fracture energy is.
+    """
+    table, like = study.fracture, study.material.like
+    assert table is not None
+    if not (h < float("inf") and table.strength < float("inf")):
+        return
+    energy = table.strength**2 * h / (2 * modulus)
+    material_energy = MATERIALS[like].energy if like is not None else None
+    word = "radius" if table.radius else "h"
+    yield f"edges break one by one: a crack takes some f_t^2 {word} / 2 E' = {energy:.2g} J/m^2, as much as h has it"
+    ratio = LIMITS.max_energy_ratio
+    if material_energy is not None and not material_energy / ratio < energy < material_energy * ratio:
+        yield (
+            f"note: {like} takes {material_energy:g} J/m^2: give fracture.energy = true (2D), or {word} = "
+            f"{2 * modulus * material_energy / table.strength**2:.2g} m"
         )
 
 
 def small_strain_notes(study: Study) -> Iterator[str]:
-    """A note where slow steps pay for large strains that a brittle material does not reach."""
+    """Yield a note if a slow energy of large strains is chosen for a brittle material."""
     material, table, like = study.material, study.fracture, study.material.like
     strength = table.strength if table is not None else MATERIALS[like].strength if like is not None else None
     if material.energy == "linear" or study.time.scheme != "quasi-static" or strength is None or study.plasticity:
         return
-    share = strength / material.young
-    if share < MAX_SMALL_STRAIN and not any(each.young or each.strength for each in material.regions.values()):
-        yield f"note: strains stay below strength / young = {100 * share:.2g} %, and energy = {material.energy} is one"
+    strain = strength / material.young
+    uniform = not any(region.young or region.strength for region in material.regions.values())
+    if strain < LIMITS.max_small_strain and uniform:
+        yield f"note: strains stay below strength / young = {100 * strain:.2g} %, and energy = {material.energy} is one"
         yield 'of large strains: energy = "linear" gives the same loads in less time, unless thin parts bend far'
 
 
-def _spent(study: Study, stiff: float, cell: float) -> Iterator[str]:
-    """What single edges take: the energy of a row of cells at their strength, f_t^2 h / 2 E', whatever G_c is."""
-    table, like = study.fracture, study.material.like
+def energy_criterion_notes(study: Study, h: float, max_side: float) -> Iterator[str]:
+    """Yield fracture energy, strength and Irwin's length of each region, with notes on what does not fit.
+
+    Args:
+        study: with `fracture.energy`.
+        h: size of the finest cells, m.
+        max_side: longest side of the body, m.
+    """
+    table = study.fracture
     assert table is not None
-    if not (cell < float("inf") and table.strength < float("inf")):
-        return
-    spent = table.strength**2 * cell / (2 * stiff)
-    of = MATERIALS[like].energy if like is not None else None
-    word = "radius" if table.radius else "h"
-    yield f"edges break one by one: a crack takes some f_t^2 {word} / 2 E' = {spent:.2g} J/m^2, as much as h has it"
-    if of is not None and not of / MAX_ENERGY_RATIO < spent < of * MAX_ENERGY_RATIO:
-        yield (
-            f"note: {like} takes {of:g} J/m^2: give fracture.energy = true (2D), or {word} = "
-            f"{2 * stiff * of / table.strength**2:.2g} m"
-        )
+    for name, region in _fracture_regions(study):
+        energy, strength = region.fracture_energy or table.energy, region.strength or table.strength
+        assert energy is not None
+        length = plane_modulus(study, region) * energy / strength**2
+        prefix = f"in {name}: " if name else ""
+        yield f"{prefix}cracks that take {energy:g} J/m^2, and begin at {strength:g} Pa; law {table.law}"
+        yield f"{prefix}l_ch = E' G_c / f_t^2 = {length:.3g} m = {length / h:.3g} h"
+        if table.law == "cohesive":
+            yield from _cohesive_notes(length, h)
+            continue
+        yield from _process_zone_notes(length, strength, h, max_side)
+        if length >= LIMITS.min_zone_cells * h and study.time.scheme == "quasi-static":
+            yield 'cells resolve that: with law = "cohesive" cracks hold on while they open, as concrete does'
+    if table.branching:
+        yield from _branching_notes(study, h)
 
 
-def estimated_rotation(study: Study, dim: int, least: float) -> float:
-    """rad; `least`: the body's least side, m. 0 where nothing breaks or there is no inertia."""
-    if study.fracture is None or not study.time.scheme_class.inertia or not study.fracture.strength < np.inf:
+def _fracture_regions(study: Study) -> list[tuple[str, RegionSettings]]:
+    """The body without regions, named "", and the regions with elastic constants, strength or energy of their own."""
+    keys = ("young", "poisson", "strength", "fracture_energy")
+    regions = study.material.regions.items()
+    differing = [entry for entry in regions if any(getattr(entry[1], name) is not None for name in keys)]
+    return [("", RegionSettings()), *differing]
+
+
+def check_branching_dimension(study: Study, dim: int) -> None:
+    """Raises InputError if cracks are to branch in 3D."""
+    if dim == 3 and study.fracture is not None and study.fracture.branching:
+        raise InputError("fracture.branching: cracks branch in the plane only; remove it, or take a 2D mesh")
+
+
+def _branching_notes(study: Study, h: float) -> Iterator[str]:
+    """Yield whether steps are short enough for the branching of tips."""
+    yield "cracks run at up to half of the Rayleigh speed; tips branch to which 2 G_c flows"
+    material, step = study.material, study.time.breaking_step or study.time.max_step
+    shear = (material.young / (2 * (1 + material.poisson) * material.density)) ** 0.5
+    wave = LIMITS.tip_radius * h / rayleigh_speed(shear, material.poisson)
+    if step > wave:
+        yield f"note: in steps of {step:.2g} s none does: a Rayleigh wave leaves the disc of a tip in {wave:.2g} s;"
+        yield f"breaking_step = {wave / 2:.1g} s would do"
+
+
+def plane_modulus(study: Study, region: RegionSettings) -> float:
+    """Returns E' = E / (1 - nu^2) of a region in Pa; E in plane stress."""
+    young, poisson, _ = study.material.elastic_constants(region)
+    return young / (1 - poisson**2 if study.material.plane == "strain" else 1.0)
+
+
+def _cohesive_notes(length: float, h: float) -> Iterator[str]:
+    """Yield a note if cells of size h do not resolve a process zone of that length, both in m."""
+    cells = LIMITS.min_zone_cells
+    if length < cells * h:
+        yield f'note: that is less than {cells:g} h: cells are too coarse for law = "cohesive";'
+        yield f'h = {length / cells:.2g} m would do, or law = "griffith"'
+
+
+def _process_zone_notes(length: float, strength: float, h: float, max_side: float) -> Iterator[str]:
+    """Yield a note if Irwin's length is below a cell or above a fifth of the body; lengths in m."""
+    if 0 < length < h:
+        yield f"note: that is less than h = {h:.3g} m: in smooth places cracks begin late and take more than G_c;"
+        yield f"h = {length:.2g} m would do, or a strength of {strength * (length / h) ** 0.5:.2g} Pa"
+    elif length * LIMITS.min_zone_share > max_side:
+        yield "note: that is over a fifth of the body: a crack's process zone has no room, and loads are too high"
+
+
+def estimated_rotation(study: Study, dim: int, min_side: float) -> float:
+    """Returns an upper estimate of the rotation of fragments until the end of the study, in rad.
+
+    It is 0 if nothing breaks or there is no inertia. With the energy linear a rotated fragment swells by 1/cos.
+
+    Args:
+        study: with any table.
+        dim: dimension of the mesh.
+        min_side: least side of the body, m.
+    """
+    fracture = study.fracture
+    if fracture is None or not study.time.scheme_class.inertia or not fracture.strength < np.inf:
         return 0.0
+    distance = max(_travel_distances(study, dim, fracture))
+    _, spin = initial_motion(study, dim) or (None, None)
+    return max(distance / min_side, float(np.linalg.norm(spin)) * study.time.end if spin is not None else 0.0)
+
+
+def _travel_distances(study: Study, dim: int, fracture: FractureSettings) -> Iterator[float]:
+    """Distances in m that fragments may travel until the end, by each cause of motion."""
     end, material = study.time.end, study.material
-    ways = [study.fracture.strength / np.sqrt(material.young * material.density) * end]
-    ways += [_way(each.function, end) for each in boundary_conditions(study, dim) if each.prescribes_motion]
-    for each in obstacle_placements(study, dim):
-        if each.displacement is not None:
-            ways.append(_way(each.displacement, end))
-        if each.free_motion is not None:
-            ways.append(float(np.abs(each.free_motion.initial_rate).max(initial=0.0)) * end)
+    yield fracture.strength / np.sqrt(material.young * material.density) * end
+    for condition in boundary_conditions(study, dim):
+        if condition.prescribes_motion:
+            yield _max_distance(condition.function, end)
+    for obstacle in obstacle_placements(study, dim):
+        if obstacle.displacement is not None:
+            yield _max_distance(obstacle.displacement, end)
+        if obstacle.free_motion is not None:
+            yield float(np.abs(obstacle.free_motion.initial_rate).max(initial=0.0)) * end
     if (load := volume_loads(study, dim)) and "gravity" in load:
-        ways.append(float(np.linalg.norm(load["gravity"](end))) * end**2 / 2)
-    velocity, spin = initial_motion(study, dim) or (None, None)
-    ways.append(float(np.linalg.norm(velocity)) * end if velocity is not None else 0.0)
-    return max(max(ways) / least, float(np.linalg.norm(spin)) * end if spin is not None else 0.0)
+        yield float(np.linalg.norm(load["gravity"](end))) * end**2 / 2
+    velocity, _ = initial_motion(study, dim) or (None, None)
+    yield float(np.linalg.norm(velocity)) * end if velocity is not None else 0.0
 
 
-def _way(function: object, end: float) -> float:
-    """m, the greatest distance of a motion from its start, at 20 times until `end`; what is free does not count."""
+def _max_distance(function: object, end: float) -> float:
+    """Greatest distance in m of a motion from its start, at 20 times until `end`; free components are ignored."""
     assert callable(function)
     return max(float(np.linalg.norm(np.nan_to_num(function(t)))) for t in np.linspace(0.0, end, 20))

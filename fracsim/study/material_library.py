@@ -1,9 +1,9 @@
-"""Materials by name: `[material] like = "soda-lime glass"`, each value of which a study may override.
+"""Materials by name: `material.like = "soda-lime glass"`; a study may override each value.
 
-Typical values at room temperature, in SI units, as the sources named are known for (not looked up again in print), or
-as they follow from K_c by G_c = K_c^2 / E' (plane strain). Strength and fracture energy scatter by tens of per cent
-from piece to piece, and strength with size: where a figure matters, measure it. nu of what hardly changes its volume
-is 0.45 here, since linear cells lock near 0.5.
+Typical values at room temperature in SI units. Values are those for which the sources are known, and were not verified
+in print again. Fracture energies follow from K_c by G_c = K_c^2 / E' (plane strain). Strength and fracture energy
+scatter by tens of per cent between specimens, and strength depends on size: important values should be measured.
+Poisson's ratio of nearly incompressible materials is 0.45 here, since linear cells lock near 0.5.
 """
 
 from __future__ import annotations
@@ -15,11 +15,15 @@ from typing import Any
 
 @dataclass(frozen=True)
 class NamedMaterial:
-    """What is known of a material.
+    """Values of a material.
 
     Attributes:
-        young, strength: Pa.    density: kg/m^3.    energy: G_c, J/m^2; None: no source gives one.
-        yield_stress: Pa, of what flows before it breaks.    source: of which value; M22: Mandal et al. (2022), table 2.
+        young, strength: Pa.
+        poisson: Poisson's ratio.
+        density: kg/m^3.
+        energy: G_c in J/m^2; None if no source gives one.
+        source: of which value; M22 is Mandal et al. (2022), table 2.
+        yield_stress: Pa, if the material yields before it breaks.
     """
 
     young: float
@@ -32,46 +36,49 @@ class NamedMaterial:
 
     @property
     def length(self) -> float | None:
-        """Irwin's length l_ch = E' G_c / f_t^2 in plane strain, m: what lies far below a body's size breaks by G_c."""
+        """Irwin's length l_ch = E' G_c / f_t^2 in plane strain, m; None without a fracture energy.
+
+        Bodies that are much larger break by G_c rather than by strength.
+        """
         if self.energy is None:
             return None
         return self.young / (1 - self.poisson**2) * self.energy / self.strength**2
 
 
-def _toughness(k: float, young: float, poisson: float) -> float:
-    """G_c in J/m^2 of K_c in Pa m^(1/2), to two digits."""
+def _fracture_energy(k: float, young: float, poisson: float) -> float:
+    """G_c in J/m^2 from K_c in Pa m^(1/2), to two digits."""
     return float(f"{k**2 * (1 - poisson**2) / young:.2g}")
 
 
-# M22 gives E, nu, rho, strength and yield stress of what it names; no fracture energies
+# M22 gives E, nu, rho, strength and yield stress of its materials, and no fracture energies
 MATERIALS: dict[str, NamedMaterial] = {
     "soda-lime glass": NamedMaterial(
-        7.0e10, 0.22, 2500.0, 4.5e7, _toughness(7.5e5, 7.0e10, 0.22),
+        7.0e10, 0.22, 2500.0, 4.5e7, _fracture_energy(7.5e5, 7.0e10, 0.22),
         "E, nu, rho, f_t (annealed float, characteristic): EN 572-1; K_c 0.75 MPa m^1/2: Lawn (1993)",
     ),
     "borosilicate glass": NamedMaterial(
-        6.4e10, 0.20, 2230.0, 2.5e7, _toughness(7.7e5, 6.4e10, 0.20),
+        6.4e10, 0.20, 2230.0, 2.5e7, _fracture_energy(7.7e5, 6.4e10, 0.20),
         "E, nu, rho: ISO 3585; f_t as ground: DIN EN 1595; K_c 0.77 MPa m^1/2: Wiederhorn (1969)",
     ),
     "fused silica": NamedMaterial(
-        7.25e10, 0.17, 2203.0, 5.0e7, _toughness(7.5e5, 7.25e10, 0.17),
+        7.25e10, 0.17, 2203.0, 5.0e7, _fracture_energy(7.5e5, 7.25e10, 0.17),
         "E, nu, rho, f_t: Heraeus data sheet; K_c 0.75 MPa m^1/2: Wiederhorn (1969)",
     ),
     "porcelain": NamedMaterial(
-        7.0e10, 0.22, 2400.0, 3.5e7, _toughness(1.1e6, 7.0e10, 0.22),
+        7.0e10, 0.22, 2400.0, 3.5e7, _fracture_energy(1.1e6, 7.0e10, 0.22),
         "quartz porcelain C 110: IEC 60672-3 (f_t unglazed, tension); K_c about 1.1 MPa m^1/2: Ashby & Jones. "
         "M22 has E = 1e10, rho = 1000, 5e7",
     ),
     "alumina": NamedMaterial(
-        4.16e11, 0.231, 3984.0, 2.67e8, _toughness(3.5e6, 4.16e11, 0.231),
+        4.16e11, 0.231, 3984.0, 2.67e8, _fracture_energy(3.5e6, 4.16e11, 0.231),
         "sintered, 99.5 %: Munro, J. Am. Ceram. Soc. 80 (1997)",
     ),
     "granite": NamedMaterial(
-        4.5e10, 0.33, 2750.0, 9.56e6, _toughness(1.6e6, 4.5e10, 0.33),
+        4.5e10, 0.33, 2750.0, 9.56e6, _fracture_energy(1.6e6, 4.5e10, 0.33),
         "E, nu, rho, f_t: M22 after Ghouli et al. (2021); K_c 1.6 MPa m^1/2: Westerly, Atkinson & Meredith (1987)",
     ),
     "marble": NamedMaterial(
-        4.9e10, 0.23, 2710.0, 6.9e6, _toughness(8.5e5, 4.9e10, 0.23),
+        4.9e10, 0.23, 2710.0, 6.9e6, _fracture_energy(8.5e5, 4.9e10, 0.23),
         "Carrara: f_t (Brazilian) and K_c 0.85 MPa m^1/2: Atkinson & Meredith (1987); E: Wong & Einstein (2009)",
     ),
     "concrete": NamedMaterial(
@@ -79,22 +86,22 @@ MATERIALS: dict[str, NamedMaterial] = {
         "C30/37: EN 1992-1-1 (E, f_ctm); G_F = 73 f_cm^0.18 N/m: fib Model Code 2010",
     ),
     "ice": NamedMaterial(
-        9.3e9, 0.33, 917.0, 1.5e6, _toughness(1.0e5, 9.3e9, 0.33),
+        9.3e9, 0.33, 917.0, 1.5e6, _fracture_energy(1.0e5, 9.3e9, 0.33),
         "freshwater, -10 C: Petrovic, J. Mater. Sci. 38 (2003): f_t 0.7 to 3.1 MPa, K_c 0.05 to 0.15 MPa m^1/2",
     ),
     "steel A516 Gr.70 at -40 C": NamedMaterial(
-        2.2e11, 0.28, 7700.0, 6.55e8, _toughness(4.0e7, 2.2e11, 0.28),
+        2.2e11, 0.28, 7700.0, 6.55e8, _fracture_energy(4.0e7, 2.2e11, 0.28),
         "E, nu, rho, f_t: M22 after Tronskar et al. (2002); K_c 40 MPa m^1/2: ferritic steel on its lower shelf, "
         "ASTM E1921 (20 to 60)",
     ),
     "steel NVE 36 at 23 C": NamedMaterial(
-        1.9e11, 0.28, 7700.0, 5.4e8, _toughness(2.0e8, 1.9e11, 0.28),
+        1.9e11, 0.28, 7700.0, 5.4e8, _fracture_energy(2.0e8, 1.9e11, 0.28),
         "E, nu, rho, f_t, yield: M22 after Tronskar et al. (2002) (it is sold with a yield stress of 3.55e8); "
         "K_Jc 200 MPa m^1/2: ship plate on its upper shelf",
         yield_stress=8.3e7,
     ),
     "steel S355": NamedMaterial(
-        2.1e11, 0.30, 7850.0, 5.1e8, _toughness(1.7e8, 2.1e11, 0.30),
+        2.1e11, 0.30, 7850.0, 5.1e8, _fracture_energy(1.7e8, 2.1e11, 0.30),
         "f_t, yield: EN 10025-2; K_Jc 170 MPa m^1/2: mild steel, Ashby & Jones (100 kJ/m^2 and more)",
         yield_stress=3.55e8,
     ),
@@ -104,16 +111,16 @@ MATERIALS: dict[str, NamedMaterial] = {
         yield_stress=1.72e9,
     ),
     "aluminium 7075-T6": NamedMaterial(
-        7.17e10, 0.33, 2810.0, 5.72e8, _toughness(2.9e7, 7.17e10, 0.33),
+        7.17e10, 0.33, 2810.0, 5.72e8, _fracture_energy(2.9e7, 7.17e10, 0.33),
         "ASM; K_c 29 MPa m^1/2 (L-T)",
         yield_stress=5.03e8,
     ),
     "grey cast iron": NamedMaterial(
-        1.1e11, 0.26, 7150.0, 2.0e8, _toughness(1.5e7, 1.1e11, 0.26),
+        1.1e11, 0.26, 7150.0, 2.0e8, _fracture_energy(1.5e7, 1.1e11, 0.26),
         "EN-GJL-200: EN 1561 (f_t); K_c 15 MPa m^1/2: Ashby & Jones (6 to 20)",
     ),
     "PMMA": NamedMaterial(
-        3.0e9, 0.36, 1190.0, 7.0e7, _toughness(1.05e6, 3.0e9, 0.36),
+        3.0e9, 0.36, 1190.0, 7.0e7, _fracture_energy(1.05e6, 3.0e9, 0.36),
         "ISO 7823-1 sheet (E, f_t); K_c 1.05 MPa m^1/2: Ashby & Jones (300 to 400 J/m^2)",
     ),
     "epoxy": NamedMaterial(
@@ -125,7 +132,7 @@ MATERIALS: dict[str, NamedMaterial] = {
         "unfilled, f_t of the section at rest: Treloar; G_c: tearing, Rivlin & Thomas (1953), 3 to 30 kJ/m^2",
     ),
     "bone": NamedMaterial(
-        1.7e10, 0.30, 1900.0, 1.33e8, _toughness(5.0e6, 1.7e10, 0.30),
+        1.7e10, 0.30, 1900.0, 1.33e8, _fracture_energy(5.0e6, 1.7e10, 0.30),
         "cortical, human, along the shaft: Reilly & Burstein (1975); K_c 5 MPa m^1/2 across the osteons: "
         "Koester, Ager & Ritchie (2008), where cracks are short",
     ),
@@ -146,11 +153,15 @@ MATERIALS: dict[str, NamedMaterial] = {
     ),
 }  # fmt: skip
 
-_OF_MATERIAL = ("young", "poisson", "density")
+_ELASTIC_KEYS = ("young", "poisson", "density")
 
 
 def find_material(name: str, key: str) -> NamedMaterial:
-    """A material by its name. ValueError with the nearest one; `key`: where the study names it."""
+    """Returns a material by its name; `key` is the path of the name in the study.
+
+    Raises:
+        ValueError: if there is no such material, with the nearest name.
+    """
     if name not in MATERIALS:
         near = difflib.get_close_matches(name, MATERIALS, n=1, cutoff=0.5)
         hint = f"did you mean {near[0]}?" if near else "`fracsim list materials` shows them"
@@ -159,55 +170,60 @@ def find_material(name: str, key: str) -> NamedMaterial:
 
 
 def fill_from_library(data: dict[str, Any]) -> dict[str, Any]:
-    """The tables of a study with what `like` says of keys that they leave out; `fracture.energy = true` asks for G_c.
-    ValueError where a name is not known, or nothing says what is asked for."""
+    """Returns the tables of a study with the values of named materials for keys that are left out.
+
+    `fracture.energy = true` takes the fracture energy of the material.
+
+    Raises:
+        ValueError: if a name is unknown, or a requested fracture energy is not known.
+    """
     material, fracture = data.get("material"), data.get("fracture")
     if not isinstance(material, dict):
         return data
-    data = data | {"material": _of_body(data, material)}
+    data = data | {"material": _fill_material(data, material)}
     like = material.get("like")
-    found = find_material(like, "material.like") if isinstance(like, str) else None
+    named = find_material(like, "material.like") if isinstance(like, str) else None
     if isinstance(fracture, dict):
-        data["fracture"] = _of_fracture(fracture, found)
+        data["fracture"] = _fill_fracture(fracture, named)
     plasticity = data.get("plasticity")
-    if found is not None and isinstance(plasticity, dict) and found.yield_stress is not None:
-        data["plasticity"] = {"yield_stress": found.yield_stress} | plasticity
+    if named is not None and isinstance(plasticity, dict) and named.yield_stress is not None:
+        data["plasticity"] = {"yield_stress": named.yield_stress} | plasticity
     return data
 
 
-def _of_body(data: dict[str, Any], material: dict[str, Any]) -> dict[str, Any]:
-    """[material] and its regions."""
+def _fill_material(data: dict[str, Any], material: dict[str, Any]) -> dict[str, Any]:
+    """[material] and its regions with the values of named materials."""
     result = dict(material)
     regions = result.get("regions") if isinstance(result.get("regions"), dict) else None
     inner = result if regions is None else dict(regions)
     for name, region in list(inner.items()):
         if isinstance(region, dict) and isinstance(region.get("like"), str) and name != "regions":
-            of = find_material(region["like"], f"material.{name}.like")
-            given = {key: getattr(of, key) for key in _OF_MATERIAL}
+            named = find_material(region["like"], f"material.{name}.like")
+            values = {key: getattr(named, key) for key in _ELASTIC_KEYS}
             if "fracture" in data:
-                given["strength"] = of.strength
-            if "plasticity" in data and of.yield_stress is not None:
-                given["yield_stress"] = of.yield_stress
-            inner[name] = given | region
+                values["strength"] = named.strength
+            if "plasticity" in data and named.yield_stress is not None:
+                values["yield_stress"] = named.yield_stress
+            inner[name] = values | region
     if regions is not None:
         result["regions"] = inner
     if isinstance(result.get("like"), str):
-        of = find_material(result["like"], "material.like")
-        result = {key: getattr(of, key) for key in _OF_MATERIAL} | result
+        named = find_material(result["like"], "material.like")
+        result = {key: getattr(named, key) for key in _ELASTIC_KEYS} | result
     return result
 
 
-def _of_fracture(table: dict[str, Any], found: NamedMaterial | None) -> dict[str, Any]:
-    """[fracture]."""
+def _fill_fracture(table: dict[str, Any], named: NamedMaterial | None) -> dict[str, Any]:
+    """[fracture] with strength and fracture energy of a named material."""
     result = dict(table)
-    if found is not None:
-        result = {"strength": found.strength} | result
+    if named is not None:
+        result = {"strength": named.strength} | result
     if result.get("energy") is True:
-        if found is None or found.energy is None:
-            why = "material.like says which" if found is None else "nothing is known of that of material.like"
+        if named is None or named.energy is None:
+            why = "material.like says which" if named is None else "nothing is known of that of material.like"
             raise ValueError(f"fracture.energy = true takes the fracture energy of a material by name, and {why}: "
                              "give G_c in J/m^2")  # fmt: skip
-        result["energy"] = found.energy
+        result["energy"] = named.energy
     elif result.get("energy") is False:
         del result["energy"]
     return result

@@ -1,4 +1,4 @@
-"""From the [mesh] table to a checked mesh in arrays. No DOLFINx here."""
+"""Meshes of a study as arrays: built, read or filled, checked and saved. No DOLFINx here."""
 
 from __future__ import annotations
 
@@ -28,7 +28,11 @@ if TYPE_CHECKING:
 
 
 def find_builder(mesh: MeshSettings) -> Any:
-    """The builder of a [mesh] table with its parameters checked, None for a file or surface. No mesh is built."""
+    """Returns the builder of a [mesh] table with its parameters; None for a file or surface. No mesh is built.
+
+    Raises:
+        InputError: if there is no such builder, or a parameter or file is invalid.
+    """
     if mesh.builder is None:
         _check_source(mesh)
         return None
@@ -40,25 +44,27 @@ def find_builder(mesh: MeshSettings) -> Any:
 
 
 def _with_parameters(kind: Any, parameters: dict[str, Any]) -> Any:
+    """A builder of a class with the parameters of a study. InputError for an unknown or invalid parameter."""
     known = [field.name for field in dataclasses.fields(kind)]
     for key in parameters:
         if key not in known:
             raise InputError(unknown_key_message(f"mesh.{key}", known))
     try:
-        # through JSON: strict about numbers, and yet a list becomes a tuple
+        # JSON keeps numbers strict, and converts a list to a tuple
         return _reader(kind).validate_json(json.dumps(parameters, default=str), strict=True)
     except ValidationError as error:
         raise InputError(validation_message(error.errors(), "mesh")) from None
-    except ArithmeticError:  # the count of its cells overflows, or there are none
-        given = ", ".join(f"{key} = {value}" for key, value in parameters.items())
+    except ArithmeticError:
+        # the number of cells overflows, or is zero
+        listed = ", ".join(f"{key} = {value}" for key, value in parameters.items())
         raise InputError(
-            f"mesh: {kind.name} with {given}: numbers do not reach that far; take a larger h (lengths are in metres)"
+            f"mesh: {kind.name} with {listed}: numbers do not reach that far; take a larger h (lengths are in metres)"
         ) from None
 
 
 @cache
 def _reader(kind: type) -> TypeAdapter[Any]:
-    """What reads the parameters of a builder: pydantic takes longer to make one than to read with it."""
+    """Reader of the parameters of a builder, cached since pydantic takes longer to make it than to use it."""
     return TypeAdapter(kind)
 
 
@@ -83,46 +89,56 @@ def _check_source(mesh: MeshSettings) -> None:
 
 
 def check_file(path: Path, key: str) -> None:
-    """InputError where a study names what is no plain file; `key`: under which."""
+    """Raises InputError if a path of a study is not a plain file; `key` is its path in the study."""
     if wrong := wrong_with(path):
         raise InputError(f'{key} = "{path}"{": there is no such file" if wrong == MISSING else f" {wrong}"}')
 
 
-REPAIR = "Or set [mesh] repair = true: it fills holes, makes parts that cross one body, and says what it changed."
+REPAIR_HINT = "Or set [mesh] repair = true: it fills holes, makes parts that cross one body, and says what it changed."
 
 
 def open_surface(mesh: MeshSettings) -> ClosedSurface | None:
-    """The closed surface of a [mesh] table in metres, checked but not filled; None where it names none. InputError."""
+    """Returns the closed surface of a [mesh] table in metres, checked but not filled; None if it has none.
+
+    Raises:
+        InputError: if the file is invalid, or the surface is open or intersects itself.
+    """
     if mesh.surface is None:
         return None
     from ..meshes.surfaces.closed import Repairable
     from ..meshes.surfaces.repair import read_body
 
     _check_source(mesh)
-    given = mesh.parameters
-    repair = bool(given.get("repair"))
-    with _told():
+    parameters = mesh.parameters
+    repair, scale = bool(parameters.get("repair")), float(parameters.get("scale", 1.0))
+    with _mesh_errors():
         try:
-            return read_body(
-                mesh.surface, float(given.get("scale", 1.0)), repair=repair, time_limit=given.get("time_limit")
-            )
+            return read_body(mesh.surface, scale, repair=repair, time_limit=parameters.get("time_limit"))
         except Repairable as error:
-            raise MeshError(str(error) if repair else f"{error} {REPAIR}") from None
+            raise MeshError(str(error) if repair else f"{error} {REPAIR_HINT}") from None
 
 
 def open_outline(mesh: MeshSettings) -> Drawn | None:
-    """The outline of a [mesh] table in metres, not filled; None where it names none. InputError."""
+    """Returns the outline of a [mesh] table in metres, not filled; None if it has none.
+
+    Raises:
+        InputError: if the file is invalid.
+    """
     if mesh.outline is None:
         return None
     from ..meshes.random_points.outline_file import read_outline
 
     _check_source(mesh)
-    with _told():
+    with _mesh_errors():
         return read_outline(mesh.outline, float(mesh.parameters.get("scale", 1.0)))
 
 
 def read_obstacle_surface(file: Path, scale: float, key: str) -> ClosedSurface:
-    """The closed surface of an obstacle in metres. InputError; `key`: of its table."""
+    """Returns the closed surface of an obstacle in metres; `key` is the path of its table in the study.
+
+    Raises:
+        InputError: if the file is invalid.
+    """
     from ..meshes.surfaces.closed import read_surface
 
     try:
@@ -132,34 +148,46 @@ def read_obstacle_surface(file: Path, scale: float, key: str) -> ClosedSurface:
 
 
 def estimate_filled_cells(mesh: MeshSettings, surface: ClosedSurface) -> int:
-    """About how many cells will fill the surface. InputError where they are too many, or larger than it."""
+    """Returns an estimate of the number of cells that fill a surface.
+
+    Raises:
+        InputError: if it is too large, or a cell is larger than the body.
+    """
     from ..meshes.surfaces.fill import expected_cells
 
-    with _told():
+    with _mesh_errors():
         return expected_cells(surface, float(mesh.parameters["h"]))
 
 
 def build_mesh(mesh: MeshSettings, surface: ClosedSurface | None = None) -> MeshData:
-    """Build, read or fill, then check (rank 0); `surface`: that of the table, where it is open. InputError."""
+    """Returns the mesh of a [mesh] table, built, read or filled, and checked. Called on rank 0.
+
+    Args:
+        mesh: the table.
+        surface: of the table, if it is open already.
+
+    Raises:
+        InputError: if the mesh is invalid.
+    """
     from ..meshes.check import check_mesh
     from ..meshes.read import read_mesh
 
     builder = find_builder(mesh)
     surface = surface or open_surface(mesh)
-    with _told():
+    with _mesh_errors():
         if builder is not None:
             data = builder.build()
         elif surface is not None:
             data = _filled(mesh, surface)
-        elif (drawn := open_outline(mesh)) is not None:
+        elif (outline := open_outline(mesh)) is not None:
             from ..meshes.random_points.outline_file import fill_outline
 
-            data = fill_outline(drawn, float(mesh.parameters["h"]), int(mesh.parameters.get("seed", 1)))
+            data = fill_outline(outline, float(mesh.parameters["h"]), int(mesh.parameters.get("seed", 1)))
         elif mesh.shell is not None:
             from ..meshes.shell import read_shell
 
-            given = mesh.parameters
-            data = read_shell(mesh.shell, float(given["thickness"]), float(given.get("scale", 1.0)))
+            parameters = mesh.parameters
+            data = read_shell(mesh.shell, float(parameters["thickness"]), float(parameters.get("scale", 1.0)))
         else:
             assert mesh.file is not None
             data = read_mesh(mesh.file)
@@ -168,7 +196,7 @@ def build_mesh(mesh: MeshSettings, surface: ClosedSurface | None = None) -> Mesh
 
 
 def _scaled(data: MeshData, mesh: MeshSettings) -> MeshData:
-    """A mesh from file in metres: after its check, which tells coordinates of single precision by their bits."""
+    """A mesh from a file in metres. It is scaled after its check, which recognises single precision by its bits."""
     scale = float(mesh.parameters.get("scale", 1)) if mesh.file is not None else 1.0
     if scale == 1:
         return data
@@ -179,13 +207,13 @@ def _scaled(data: MeshData, mesh: MeshSettings) -> MeshData:
 def _filled(mesh: MeshSettings, surface: ClosedSurface) -> MeshData:
     from ..meshes.surfaces.fill import fill_closed
 
-    given = mesh.parameters
-    return fill_closed(surface, float(given["h"]), f"Surface file '{mesh.surface}'", given.get("time_limit"))
+    parameters = mesh.parameters
+    return fill_closed(surface, float(parameters["h"]), f"Surface file '{mesh.surface}'", parameters.get("time_limit"))
 
 
 @contextmanager
-def _told() -> Iterator[None]:
-    """What is wrong with a mesh is the user's to mend."""
+def _mesh_errors() -> Iterator[None]:
+    """Convert errors of meshes into errors of the user's input."""
     try:
         yield
     except MeshError as error:
@@ -193,7 +221,11 @@ def _told() -> Iterator[None]:
 
 
 def save_mesh(data: MeshData, path: Path) -> None:
-    """Save with groups, in the format that the ending of the path names. InputError where that cannot be done."""
+    """Save a mesh with its groups, in the format of the ending of the path.
+
+    Raises:
+        InputError: if the format is unknown or the file cannot be written.
+    """
     from ..meshes.write import write_mesh
 
     try:

@@ -1,7 +1,7 @@
-"""Whether the body and the obstacles of a study overlap at the start. No DOLFINx here.
+"""Overlap of the body and the obstacles of a study at the start. No DOLFINx here.
 
-A body lies in an obstacle where a node of its mesh has a negative distance to it. An obstacle lies in the body where a
-point of its outline is in a cell of the mesh, even if all nodes are outside the obstacle.
+The body overlaps an obstacle if a node of its mesh has a negative distance to it. An obstacle inside the body is found
+by a point of its outline in a cell of the mesh, also if all nodes are outside the obstacle.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from ..errors import InputError
 from ..meshes.data import MeshData
 from ..meshes.text import format_point
 from ..meshes.topology import boundary_facets, edges_of
+from .check_limits import LIMITS
 from .conditions import ObstaclePlacement, obstacle_placements
 from .mesh_source import read_obstacle_surface
 
@@ -28,14 +29,13 @@ if TYPE_CHECKING:
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-ROUND_OFF = 1e-9  # of the body's size: what overlaps an obstacle by less touches it, and may
-WITHIN = 1e-6  # least barycentric coordinate of what lies in a cell: bodies may touch
-DEEP = 0.05  # of the mean edge: rigid bodies may lie in an obstacle by so much, as convex parts of them may in a run
-PAIRS = 1 << 21  # of cells and points that are compared at a time
-
 
 def build_shape(entry: ObstaclePlacement, number: int) -> Shape:
-    """The shape of an entry of [[obstacle]] that is not read from a file. InputError where there is no such shape."""
+    """Returns the analytic shape of an obstacle.
+
+    Raises:
+        InputError: if its geometry is invalid.
+    """
     try:
         return SHAPES[entry.shape](**entry.geometry)
     except InputError as error:
@@ -43,82 +43,90 @@ def build_shape(entry: ObstaclePlacement, number: int) -> Shape:
 
 
 def body_placements(study: Study) -> list[Place]:
-    """All copies of all entries of [[body]]; one body where the mesh has it without any."""
+    """Returns position, rotation vector, velocity and spin of all copies of all entries of [[body]].
+
+    Without an entry there is one body at the position of the mesh.
+    """
     from ..rigid.instance_placement import Place
 
     if not study.body:
         return [Place(*np.zeros((4, 3)))]
-    places = []
+    placements = []
     for entry in study.body:
         grid = np.indices(entry.copies).reshape(3, -1).T * np.array(entry.spacing or [0.0, 0.0, 0.0])
-        others = [np.array(each) for each in (entry.rotation, entry.velocity, entry.spin)]
-        places += [Place(np.array(entry.position) + shift, *others) for shift in grid]
-    return places
+        motion = [np.array(vector) for vector in (entry.rotation, entry.velocity, entry.spin)]
+        placements += [Place(np.array(entry.position) + shift, *motion) for shift in grid]
+    return placements
 
 
 def find_near_obstacles(study: Study, lower: Values, upper: Values) -> list[str]:
-    """Names of obstacles that may overlap a body in the box between two corners (d,), m, at the start.
+    """Returns names of obstacles that may overlap a body in the box between two corners (d,), m, at the start.
 
-    InputError where an entry is no shape, or a free obstacle overlaps another one.
+    Raises:
+        InputError: if a shape is invalid, or a free obstacle overlaps another obstacle.
     """
     corners = _corners(lower, upper)
     entries = obstacle_placements(study, len(lower))
-    placed = [None if each.shape == "mesh" else _placed(each, number) for number, each in enumerate(entries)]
+    shapes = [None if entry.shape == "mesh" else _placed(entry, number) for number, entry in enumerate(entries)]
     if study.time.scheme == "rigid":
-        bodies = _of_copies(study, corners)
+        bodies = _copies_in_space(study, corners)
     else:
-        _check_free(entries, placed)
+        _check_free_obstacles(entries, shapes)
         bodies = corners[None]
-    every = zip(entries, placed, strict=True)
-    return [each.name for each, at in every if at is None or any(at.distance_bound(body) <= 0 for body in bodies)]
+    return [
+        entry.name
+        for entry, shape in zip(entries, shapes, strict=True)
+        if shape is None or any(shape.distance_bound(body) <= 0 for body in bodies)
+    ]
 
 
 def check_initial_overlap(study: Study, mesh: MeshData) -> None:
-    """InputError where the body lies in an obstacle at the start, or an obstacle in the body."""
+    """Raises InputError if the body and an obstacle overlap at the start."""
     entries = obstacle_placements(study, mesh.dim)
     if not entries:
         return
     if study.time.scheme == "rigid":
-        _check_rigid(study, mesh, entries)
+        _check_rigid_bodies(study, mesh, entries)
         return
     for number, entry in enumerate(entries):
         if entry.shape == "mesh":
-            _check_solid(entry, number, mesh)
+            _check_mesh_obstacle(entry, number, mesh)
         else:
             _check_shape(entry, number, mesh)
 
 
 def _placed(entry: ObstaclePlacement, number: int) -> PosedShape:
-    """An obstacle where it is at the start."""
+    """The shape of an obstacle at its pose at the start."""
     return PosedShape(build_shape(entry, number), Pose.at_point(_reference(entry)))
 
 
 def _reference(entry: ObstaclePlacement) -> Values:
-    """(d,) the reference point at the start, m."""
-    return (
-        entry.reference_point
-        if entry.displacement is None
-        else np.asarray(entry.reference_point + entry.displacement(0.0))
-    )
+    """The reference point of an obstacle at the start, (d,) in m."""
+    if entry.displacement is None:
+        return entry.reference_point
+    return np.asarray(entry.reference_point + entry.displacement(0.0))
 
 
 def _corners(lower: Values, upper: Values) -> Values:
-    """(2^d, d) corners of a box."""
-    ends = np.stack([lower, upper])
+    """The corners of a box, (2^d, d)."""
+    bounds = np.stack([lower, upper])
     choice = np.indices((2,) * len(lower)).reshape(len(lower), -1).T
-    return np.asarray(np.take_along_axis(ends, choice, axis=0), float)
+    return np.asarray(np.take_along_axis(bounds, choice, axis=0), float)
 
 
-def _check_free(entries: list[ObstaclePlacement], placed: list[PosedShape | None]) -> None:
-    """InputError where an obstacle that moves freely overlaps another one; those from files are left to the run."""
-    shapes = [(number, each, at) for number, (each, at) in enumerate(zip(entries, placed, strict=True)) if at]
-    every = free_pairs([_Named(each.name, each.free_motion is not None) for _, each, _ in shapes])  # type: ignore[misc]
-    boxes = {a: _corners(*_box(shapes[a][2])) for a, _ in every}
-    among = [(a, b) for a, b in every if not shapes[b][2].distance_bound(boxes[a]) > 0]
-    for a, b, deep in find_overlaps([at for _, _, at in shapes], among):
+def _check_free_obstacles(entries: list[ObstaclePlacement], placed: list[PosedShape | None]) -> None:
+    """Raises InputError if a free obstacle overlaps another one. The run checks those from files."""
+    shapes = [
+        (number, entry, shape) for number, (entry, shape) in enumerate(zip(entries, placed, strict=True)) if shape
+    ]
+    named = [_NamedObstacle(entry.name, entry.free_motion is not None) for _, entry, _ in shapes]
+    candidates = free_pairs(named)  # type: ignore[arg-type]
+    boxes = {a: _corners(*_box(shapes[a][2])) for a, _ in candidates}
+    near = [(a, b) for a, b in candidates if not shapes[b][2].distance_bound(boxes[a]) > 0]
+    for a, b, depth in find_overlaps([shape for _, _, shape in shapes], near):
         raise InputError(
             f"obstacle.{shapes[a][0]}: {shapes[a][1].name} moves freely and overlaps {shapes[b][1].name} at the start, "
-            f"by {max(0.0, deep):.4g} m; move it away or make it smaller"
+            f"by {max(0.0, depth):.4g} m; move it away or make it smaller"
         )
 
 
@@ -128,27 +136,29 @@ def _box(placed: PosedShape) -> tuple[Values, Values]:
     return points.min(axis=0), points.max(axis=0)
 
 
-class _Named:
-    """What `pairs` asks of an obstacle."""
+class _NamedObstacle:
+    """Name and freedom of an obstacle, for `free_pairs`."""
 
     def __init__(self, name: str, free: bool) -> None:
         self.name, self.free = name, free
 
 
 def _check_shape(entry: ObstaclePlacement, number: int, mesh: MeshData) -> None:
+    """Raises InputError if an analytic obstacle overlaps the body."""
     placed = _placed(entry, number)
     if placed.distance_bound(mesh.points) > 0:
         return
     least = float(placed.distance(mesh.points).min())
-    if least < -ROUND_OFF * float(np.linalg.norm(np.ptp(mesh.points, axis=0))):
+    if least < -LIMITS.overlap_round_off * float(np.linalg.norm(np.ptp(mesh.points, axis=0))):
         raise InputError(
             f"obstacle.{number}: {entry.name} overlaps the body at the start, by {-least:.4g} m; "
             "move it away or make it smaller"
         )
     if not placed.shape.convex or not np.isfinite(placed.shape.volume):
-        return  # all corners of the body are in a convex room, so the body is
+        # all corners of the body are inside a convex space, and so is the body
+        return
     points = placed.pose.points_to_space(placed.shape.tessellate()[0])
-    inside = containment_depth(np.concatenate([points, placed.pose.centre[None]]), mesh) > WITHIN
+    inside = containment_depth(np.concatenate([points, placed.pose.centre[None]]), mesh) > LIMITS.min_inside_coordinate
     if inside.any():
         where = format_point(np.concatenate([points, placed.pose.centre[None]])[np.flatnonzero(inside)[0]])
         raise InputError(
@@ -158,9 +168,9 @@ def _check_shape(entry: ObstaclePlacement, number: int, mesh: MeshData) -> None:
 
 
 def containment_depth(x: Values, mesh: MeshData) -> Values:
-    """(n,) of points x (n, d): the greatest, over cells around a point, of its least barycentric coordinate.
+    """Returns the least barycentric coordinate of points x (n, d) in their cell, (n,); -1 outside the mesh.
 
-    Not below 0 where a point lies in the mesh; -1 where it does not.
+    If several cells contain a point, the greatest value counts. Points in the mesh have values of 0 or more.
     """
     result = np.full(len(x), -1.0)
     order = np.argsort(x[:, 0], kind="stable")
@@ -170,64 +180,70 @@ def containment_depth(x: Values, mesh: MeshData) -> Values:
     cells = np.flatnonzero(((lower <= x.max(axis=0)) & (upper >= x.min(axis=0))).all(axis=1))
     first = np.searchsorted(x[:, 0], lower[cells, 0], "left")
     count = np.searchsorted(x[:, 0], upper[cells, 0], "right") - first
-    for part in np.array_split(np.arange(len(cells)), 1 + int(count.sum()) // PAIRS):
+    # cells and points of overlapping ranges in x are compared, a limited number of pairs at a time
+    for part in np.array_split(np.arange(len(cells)), 1 + int(count.sum()) // LIMITS.max_overlap_pairs):
         n = count[part]
         cell = np.repeat(cells[part], n)
         point = np.arange(n.sum()) - np.repeat(np.cumsum(n) - n, n) + np.repeat(first[part], n)
         close = ((x[point] >= lower[cell]) & (x[point] <= upper[cell])).all(axis=1)
-        point, at = point[close], corners[cell[close]]
-        basis = (at[:, 1:] - at[:, :1]).transpose(0, 2, 1)
-        inner = np.linalg.solve(basis, (x[point] - at[:, 0])[:, :, None])[:, :, 0]
+        point, x_corners = point[close], corners[cell[close]]
+        basis = (x_corners[:, 1:] - x_corners[:, :1]).transpose(0, 2, 1)
+        inner = np.linalg.solve(basis, (x[point] - x_corners[:, 0])[:, :, None])[:, :, 0]
         np.maximum.at(result, order[point], np.minimum(inner.min(axis=1, initial=1.0), 1 - inner.sum(axis=1)))
     return np.maximum(result, -1.0)
 
 
-def _check_solid(entry: ObstaclePlacement, number: int, mesh: MeshData) -> None:
-    """The same of an obstacle that is read from a file."""
+def _check_mesh_obstacle(entry: ObstaclePlacement, number: int, mesh: MeshData) -> None:
+    """Raises InputError if an obstacle from a file overlaps the body."""
     from ..contact.triangle_mesh_shape import penetration_depth, surfaces_intersect
 
-    given: dict[str, Any] = entry.geometry
-    solid = read_obstacle_surface(given["file"], given.get("scale", 1.0), f"obstacle.{number}")
-    points = solid.points + _reference(entry)
+    geometry: dict[str, Any] = entry.geometry
+    surface = read_obstacle_surface(geometry["file"], geometry.get("scale", 1.0), f"obstacle.{number}")
+    points = surface.points + _reference(entry)
     if np.any(points.min(axis=0) > mesh.points.max(axis=0)) or np.any(points.max(axis=0) < mesh.points.min(axis=0)):
         return
-    body, other = (mesh.points, boundary_facets(mesh.cells)), (points, np.asarray(solid.triangles, np.int64))
-    cut = surfaces_intersect(body, other)
-    deep = penetration_depth(body, other, cut=cut)
-    if cut or deep is not None:
-        how = "cuts" if deep is None else "overlaps"
-        by = "" if deep is None else f", by {deep:.4g} m"
+    body = mesh.points, boundary_facets(mesh.cells)
+    obstacle = points, np.asarray(surface.triangles, np.int64)
+    intersects = surfaces_intersect(body, obstacle)
+    overlap = penetration_depth(body, obstacle, cut=intersects)
+    if intersects or overlap is not None:
+        verb = "cuts" if overlap is None else "overlaps"
+        amount = "" if overlap is None else f", by {overlap:.4g} m"
         raise InputError(
-            f"obstacle.{number}: {entry.name} {how} the body at the start{by}; move it away or make it smaller"
+            f"obstacle.{number}: {entry.name} {verb} the body at the start{amount}; move it away or make it smaller"
         )
 
 
-def _of_copies(study: Study, x: Values) -> Values:
-    """(copies, n, 3) points x (n, 3) of the mesh where copies have them at the start, m."""
+def _copies_in_space(study: Study, x: Values) -> Values:
+    """Points x (n, 3) of the mesh at their positions in all copies at the start, (copies, n, 3) in m."""
     from ..rigid.instance_placement import Poses
 
     poses = Poses.of(body_placements(study))
     return np.asarray(np.einsum("kij,nj->kni", poses.turn, x) + poses.place[:, None])
 
 
-def _check_rigid(study: Study, mesh: MeshData, entries: list[ObstaclePlacement]) -> None:
-    """The same of all copies of the mesh; obstacles from files, and bodies among themselves, are left to the run."""
+def _check_rigid_bodies(study: Study, mesh: MeshData, entries: list[ObstaclePlacement]) -> None:
+    """Raises InputError if a copy of the mesh overlaps an obstacle.
+
+    The run checks obstacles from files, and rigid bodies against each other.
+    """
     from ..rigid.instance_placement import Poses
 
-    places = body_placements(study)
-    poses, edge = Poses.of(places), edges_of(mesh.cells)
-    deep = DEEP * float(np.linalg.norm(np.diff(mesh.points[edge], axis=1)[:, 0], axis=1).mean())
-    middle = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
-    reach = float(np.linalg.norm(mesh.points - middle, axis=1).max())
-    centres = poses.place + poses.turn @ middle
+    poses, edges = Poses.of(body_placements(study)), edges_of(mesh.cells)
+    mean_edge = float(np.linalg.norm(np.diff(mesh.points[edges], axis=1)[:, 0], axis=1).mean())
+    max_depth = LIMITS.max_rigid_overlap * mean_edge
+    centre = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+    radius = float(np.linalg.norm(mesh.points - centre, axis=1).max())
+    centres = poses.place + poses.turn @ centre
     for number, entry in enumerate(entries):
-        if entry.shape == "mesh" or entry.geometry.get("hollow"):  # the run refuses hollow ones
+        # the run refuses hollow obstacles
+        if entry.shape == "mesh" or entry.geometry.get("hollow"):
             continue
         placed = _placed(entry, number)
-        for copy in np.flatnonzero(placed.distance(centres) < reach):
+        for copy in np.flatnonzero(placed.distance(centres) < radius):
             x = mesh.points @ poses.turn[copy].T + poses.place[copy]
             least = float(placed.distance(x).min())
-            if least < -deep:
+            if least < -max_depth:
                 raise InputError(
                     f"body {copy} around {format_point(centres[copy])} lies in obstacle {entry.name} at the start, by "
                     f"{-least:.3g} m: move them apart (body.N.position, spacing, or `at` of the obstacle)"

@@ -1,4 +1,4 @@
-"""What quadratic displacement ([mesh] order = 2) goes with: everything else is refused, not answered wrongly."""
+"""Limits of quadratic displacement (`mesh.order = 2`), and its curved cells."""
 
 from __future__ import annotations
 
@@ -10,20 +10,24 @@ from ..meshes.data import MeshData
 if TYPE_CHECKING:
     from .study import Study
 
-ORDER = "mesh.order = 2 (quadratic displacement)"
+_ORDER = "mesh.order = 2 (quadratic displacement)"
 
 
 def check_displacement_order(study: Study) -> None:
-    """ValueError where a table of the study takes linear displacement."""
+    """Check that no key of the study needs linear displacement.
+
+    Raises:
+        ValueError: with the first such key.
+    """
     if study.mesh.order == 1:
         return
-    for key, given, why in _refused(study):
-        if given:
-            raise ValueError(f"{ORDER} does not go with {key}: {why}; choose order = 1, or leave that out")
+    for key, present, why in _unsupported_keys(study):
+        if present:
+            raise ValueError(f"{_ORDER} does not go with {key}: {why}; choose order = 1, or leave that out")
 
 
-def _refused(study: Study) -> list[tuple[str, bool, str]]:
-    """(key, whether it is given, why not) of all that needs linear displacement."""
+def _unsupported_keys(study: Study) -> list[tuple[str, bool, str]]:
+    """Key, whether the study has it, and the reason, for all keys that need linear displacement."""
     fracture = study.fracture
     return [
         (
@@ -46,15 +50,17 @@ def _refused(study: Study) -> list[tuple[str, bool, str]]:
 
 
 def has_curved_cells(study: Study, builder: Any) -> bool:
-    """Whether cells of the study are bent; `builder`: of its mesh, None of a file."""
+    """Returns whether boundary cells of the study are curved; `builder` is that of its mesh, None for a file."""
     straight = study.mesh.order == 1 or study.fracture is not None or study.plasticity is not None
     return not straight and bool(getattr(builder, "rounds", ()))
 
 
 def with_curved_boundary(study: Study, mesh: MeshData, builder: Any) -> MeshData:
-    """The mesh with the middles of edges on the round faces that its builder knows of, where cells are to have nodes
-    there: straight sides would cost what quadratic displacement gains. What breaks or flows stays straight: energies of
-    cells are sums over their volume."""
+    """Returns the mesh with midside nodes on the curved faces of its builder.
+
+    Straight sides would lose the accuracy of quadratic displacement. Bodies that break or yield keep straight sides,
+    since energies of their cells are sums over the volume. `builder` is that of the mesh, None for a file.
+    """
     if not has_curved_cells(study, builder):
         return mesh
     from ..meshes.curved_boundaries import middles_on

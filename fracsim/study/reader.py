@@ -1,4 +1,4 @@
-"""Reading a study file into a `Study`, with messages a user can act on; writing it back with every default."""
+"""Read a study file into a `Study`, override values, and write it back with all defaults."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from . import MeshSettings, ObstacleSettings, Study
 from .error_messages import validation_message
 from .mesh_source import find_builder
 
-_PATHS: dict[type[BaseModel], list[str]] = {
+_PATH_KEYS: dict[type[BaseModel], list[str]] = {
     kind: [key for key, field in kind.model_fields.items() if field.annotation == Path | None]
     for kind in (MeshSettings, ObstacleSettings)
 }
@@ -27,40 +27,52 @@ _TOO_DEEP = "lists or tables are nested too deeply; a study needs five levels or
 
 
 def find_study(name: str) -> Path:
-    """A path as it is, or the file of the packaged study of that name."""
+    """Returns the path of a study: a path is returned unchanged, a name becomes that of the packaged study."""
     path = Path(name)
     packaged = packaged_studies() / (name if name.endswith(".toml") else f"{name}.toml")
-    # os.path.isfile, unlike Path.is_file, does not mind a name that is too long; `-o bar-2d` makes a folder bar-2d
-    named = os.path.isfile(path) or path.parent != Path() or not os.path.isfile(packaged)
-    return path if named else packaged
+    # os.path.isfile, unlike Path.is_file, accepts a name that is too long; `-o bar-2d` makes a folder bar-2d
+    is_path = os.path.isfile(path) or path.parent != Path() or not os.path.isfile(packaged)
+    return path if is_path else packaged
 
 
 def load_study(study: str | Path, overrides: Sequence[str] = ()) -> Study:
-    """Read a study file, or the packaged study of that name, override (`key.path=value`) and validate.
+    """Returns a validated study.
 
-    Raises InputError with one message.
+    Args:
+        study: path of a study file, or name of a packaged study.
+        overrides: `key.path=value` with values in TOML.
+
+    Raises:
+        InputError: with one message on the first error.
     """
     path = find_study(study) if isinstance(study, str) else study
     data = _parse(path)
-    _anchor(data, path.parent)
+    _resolve_paths(data, path.parent)
     for override in overrides:
-        _apply(data, override)
-    _anchor(data, Path())
+        _apply_override(data, override)
+    _resolve_paths(data, Path())
     _check_whole_numbers(data)
     return validate(data, str(path))
 
 
 def validate(data: dict[str, Any], name: str) -> Study:
-    """Build the Study; the first thing that is wrong becomes the message."""
+    """Returns the study of a table.
+
+    Args:
+        data: the tables of a study file; paths are relative to the working folder.
+        name: of the study, for the message.
+
+    Raises:
+        InputError: with a message on the first error.
+    """
     try:
-        study = Study.model_validate(data)
+        return Study.model_validate(data)
     except ValidationError as error:
         raise InputError(f"{name}: {validation_message(error.errors())}") from None
-    return study
 
 
 def study_text(study: Study, comments: Iterable[str] = ()) -> str:
-    """The study as TOML with every default written out, `comments` first."""
+    """Returns the study as TOML with all defaults, after lines of comments."""
     import tomli_w
 
     data = study.model_dump(mode="json", exclude_none=True)
@@ -70,8 +82,10 @@ def study_text(study: Study, comments: Iterable[str] = ()) -> str:
 
 
 def add_missing_defaults(values: dict[str, Any]) -> dict[str, Any]:
-    """What `study_text` of an earlier version wrote, with the defaults of keys that it did not know; as it is, where it
-    is no study of this one."""
+    """Returns the tables of an earlier version with the defaults of keys that this version has added.
+
+    Tables that are not a valid study are returned unchanged.
+    """
     try:
         return tomllib.loads(study_text(validate(deepcopy(values), "")))
     except InputError:
@@ -94,39 +108,40 @@ def _parse(path: Path) -> dict[str, Any]:
         raise InputError(f"cannot read the study file {path}: {error}") from None
     try:
         return tomllib.loads(text)
-    except ValueError as error:  # also of a number with thousands of digits
+    except ValueError as error:
+        # also for a number with thousands of digits
         raise InputError(f"{path} is not TOML: {error}") from None
     except RecursionError:
         raise InputError(f"{path}: {_TOO_DEEP}") from None
 
 
 def _check_whole_numbers(value: Any, key: str = "") -> None:
-    """InputError for one beyond TOML's 64 bits: in hexadecimal they may have more digits than Python prints."""
-    inner = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    for part, each in inner:
-        _check_whole_numbers(each, f"{key}.{part}" if key else str(part))
+    """Raises InputError for a whole number beyond TOML's 64 bits; in hexadecimal it may be too long for Python."""
+    items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
+    for part, item in items:
+        _check_whole_numbers(item, f"{key}.{part}" if key else str(part))
     if isinstance(value, int) and value.bit_length() > 63:
         raise InputError(
             f"{key} is a whole number of {value.bit_length()} bits; TOML has 64: write 1e30 for 10 to the 30"
         )
 
 
-def _anchor(data: dict[str, Any], folder: Path) -> None:
-    """Files of the body and of obstacles are looked for beside the study file (those given with --set: in the working
-    folder)."""
+def _resolve_paths(data: dict[str, Any], folder: Path) -> None:
+    """Make the paths of mesh and obstacles absolute: relative to the study file, with --set to the working folder."""
     obstacles = data.get("obstacle")
     entries = obstacles if isinstance(obstacles, list) else []
     tables: list[tuple[str, type[BaseModel], Any]] = [("mesh", MeshSettings, data.get("mesh"))]
-    tables += [(f"obstacle.{i}", ObstacleSettings, each) for i, each in enumerate(entries)]
+    tables += [(f"obstacle.{i}", ObstacleSettings, entry) for i, entry in enumerate(entries)]
     for name, kind, table in tables:
-        for key in _PATHS[kind]:
+        for key in _PATH_KEYS[kind]:
             if isinstance(table, dict) and isinstance(table.get(key), str):
                 if not table[key].isprintable():
                     raise InputError(f"{name}.{key} = {table[key]!a}: a path has no control characters")
                 table[key] = str((folder / table[key]).resolve())
 
 
-def _apply(data: dict[str, Any], override: str) -> None:
+def _apply_override(data: dict[str, Any], override: str) -> None:
+    """Set a value `key.path=value` in the tables of a study. InputError if the path is invalid."""
     key, equals, text = override.partition("=")
     if not equals or not all(key.strip().split(".")):
         raise InputError(f"--set {override}: write key.path=value, for example --set time.step=1e-3")
@@ -137,23 +152,27 @@ def _apply(data: dict[str, Any], override: str) -> None:
     except RecursionError:
         raise InputError(f"--set {key.strip()}: {_TOO_DEEP}") from None
     *path, last = key.strip().split(".")
-    place: Any = data
+    container: Any = data
     for part in path:
-        place = _descend(place, part, override)
-    if isinstance(place, list):
-        place[_index(place, last, override)] = value
+        container = _descend(container, part, override)
+    if isinstance(container, list):
+        container[_index(container, last, override)] = value
     else:
-        place[last] = value
+        container[last] = value
 
 
-def _descend(place: Any, part: str, override: str) -> Any:
-    inner = place[_index(place, part, override)] if isinstance(place, list) else place.setdefault(part, {})
+def _descend(container: Any, part: str, override: str) -> Any:
+    """The table or list inside another one; a missing table is added."""
+    inner = (
+        container[_index(container, part, override)] if isinstance(container, list) else container.setdefault(part, {})
+    )
     if not isinstance(inner, dict | list):
         raise InputError(f"--set {override}: {part} is a value, not a table")
     return inner
 
 
-def _index(place: list[Any], part: str, override: str) -> int:
-    if part not in map(str, range(len(place))):
-        raise InputError(f"--set {override}: {part} is not an entry; there are {len(place)}, counted from 0")
+def _index(entries: list[Any], part: str, override: str) -> int:
+    """Index of an entry of a list. InputError if there is none."""
+    if part not in map(str, range(len(entries))):
+        raise InputError(f"--set {override}: {part} is not an entry; there are {len(entries)}, counted from 0")
     return int(part)

@@ -23,8 +23,10 @@ def _zeros() -> list[float]:
 
 
 class BodySettings(StudyTable):
-    """A rigid body, or copies of it on a grid: x = position + R X for a point X of the mesh. Only with
-    `time.scheme = "rigid"`; without any [[body]] there is one body at the position of the mesh."""
+    """A rigid body, or copies of it on a grid: x = position + R X for a point X of the mesh.
+
+    Only with `time.scheme = "rigid"`; without any [[body]] there is one body at the position of the mesh.
+    """
 
     position: Vector3 = key("Displacement of the origin.", "m", factory=_zeros, example=[0.0, 0.0, 0.3])
     rotation: Vector3 = key("Rotation vector of R.", "rad", factory=_zeros, example=[0.0, 0.2, 0.0])

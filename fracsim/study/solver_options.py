@@ -1,8 +1,9 @@
-"""[solver]: PETSc options that are data. A study never runs code or touches a file other than its own.
+"""Schema of [solver]: PETSc options that are data. A study cannot run code or open files of its own choice.
 
-PETSc takes classes of Python, shared libraries and files from the values of some options, at any prefix of an inner
-solver, and by the mere presence of some others. A list of what is forbidden has to follow PETSc; the shape of key and
-value needs not: a value is a number or plain words, so that no path, no address and no viewer with a target fits.
+PETSc loads Python classes, shared libraries and files by the values of some options, with any prefix of an inner
+solver, and by the presence of others. A list of forbidden options would have to follow PETSc. Therefore the form of
+keys and values is limited: a value is a number or plain words, which excludes paths, addresses and viewers with a
+target.
 """
 
 from __future__ import annotations
@@ -17,18 +18,19 @@ Options = dict[str, bool | int | float | str]
 
 _KEY = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,99}")
 _VALUE = re.compile(r"[A-Za-z0-9_.,+-]{0,200}")
-# words of keys whose mere presence names, writes or reads a file, or loads code: pc_mg_dump_binary, pc_bddc_save, ...
+# words of keys whose presence names, writes or reads a file, or loads code: pc_mg_dump_binary, pc_bddc_save, ...
 _KEY_WORDS = {
     "python", "dll", "library", "exec", "script", "file", "filename", "files", "dir", "dirname", "directory", "tmpdir",
     "path", "template", "dump", "load", "save", "history", "options", "machine", "port", "ports", "server",
 }  # fmt: skip
-# ends of values, as PETSc compares them: code, and viewers that write to a file of a name of their own or to a socket
+# endings of values, as PETSc compares them: code, and viewers that write to a file or socket of their own
 _CODE = ("python", "shell")
 _TARGETS = (
     "adios", "binary", "cgns", "draw", "exodusii", "glvis", "hdf5", "mathematica", "matlab", "pyvista", "saws",
     "socket", "string", "vtk", "vtu",
 )  # fmt: skip
-_SPEAKS = {"view", "monitor", "reason"}  # words of keys that print
+# words of keys that print
+_PRINT_WORDS = {"view", "monitor", "reason"}
 
 
 def _is_setting(value: Any) -> Any:
@@ -41,29 +43,33 @@ OptionValue = Annotated[bool | int | float | str, BeforeValidator(_is_setting)]
 
 
 def check_options(options: Options) -> None:
-    """ValueError that names the first option which would load code or name a file."""
+    """Check that options are data.
+
+    Raises:
+        ValueError: with the first option that would load code or name a file, or that is invalid.
+    """
     for key, value in options.items():
         if (
-            wrong := _wrong_key(key)
-            or _wrong_value(str(value))
-            or _wrong_kind(key, str(value))
-            or _wrong_share(key, value)
+            wrong := _key_error(key)
+            or _value_error(str(value))
+            or _preconditioner_error(key, str(value))
+            or _tolerance_error(key, value)
         ):
             raise ValueError(f"solver.{_short(key)} = {_short(json.dumps(value))}: {wrong}")
 
 
 def expand_print_options(options: Options) -> Options:
-    """The options as PETSc reads them: `ksp_monitor = true` is a bare `-ksp_monitor`, and with false there is none."""
-    printing = {key for key in options if _SPEAKS & set(key.split("_"))}
-    kept = {key: value for key, value in options.items() if key not in printing or value is not False}
-    return {key: "" if key in printing and value is True else value for key, value in kept.items()}
+    """Returns the options as PETSc reads them: `ksp_monitor = true` becomes a bare `-ksp_monitor`, false removes it."""
+    printing = {key for key in options if _PRINT_WORDS & set(key.split("_"))}
+    active = {key: value for key, value in options.items() if key not in printing or value is not False}
+    return {key: "" if key in printing and value is True else value for key, value in active.items()}
 
 
 def _short(text: str) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _wrong_key(key: str) -> str:
+def _key_error(key: str) -> str:
     if not _KEY.fullmatch(key):
         return "a PETSc option is named by letters, digits and _ (no - before it), a letter first"
     if _KEY_WORDS & set(key.lower().split("_")):
@@ -71,16 +77,16 @@ def _wrong_key(key: str) -> str:
     return ""
 
 
-def _wrong_kind(key: str, text: str) -> str:
-    """Of a preconditioner in which PETSc crashes where nothing is known of its fields."""
+def _preconditioner_error(key: str, text: str) -> str:
+    """Error text for a preconditioner with which PETSc crashes, since it has no fields; empty if valid."""
     wrong = key.endswith("pc_type") and text == "fieldsplit"
     return (
         "fieldsplit needs fields, and there is one; choose another, for example gamg, hypre, ilu or lu" if wrong else ""
     )
 
 
-def _wrong_share(key: str, value: bool | int | float | str) -> str:
-    """Of a tolerance that a Krylov method is to reach: none gets to 0."""
+def _tolerance_error(key: str, value: bool | int | float | str) -> str:
+    """Error text for a relative tolerance that no Krylov method reaches; empty if valid."""
     try:
         inside = isinstance(value, bool) or 0 < float(value) < 1
     except ValueError:
@@ -88,7 +94,7 @@ def _wrong_share(key: str, value: bool | int | float | str) -> str:
     return "" if key != "ksp_rtol" or inside else "a share of the residual, above 0 and below 1, for example 1e-6"
 
 
-def _wrong_value(text: str) -> str:
+def _value_error(text: str) -> str:
     ends = [part.lower() for part in text.split(",")]
     if any(end.endswith(_CODE) for end in ends):
         return "options of [solver] load no code, as types python and shell do; choose one of PETSc's own"

@@ -6,7 +6,7 @@ from typing import Any
 
 from pydantic import ValidationInfo, field_validator, model_validator
 
-from .body import DampingSettings, MaterialSettings, MeshSettings
+from .body import DampingSettings, MaterialSettings, MeshSettings, RegionSettings
 from .boundary_conditions import BoundarySettings, InitialSettings, LoadSettings
 from .contact import ContactSettings, ObstacleSettings
 from .fracture import BrittleSettings, CrackSettings, FractureSettings, PlasticitySettings
@@ -16,13 +16,6 @@ from .rigid_bodies import MAX_ROTATION_PER_STEP, BodySettings, check_rigid, with
 from .solver_options import Options, OptionValue, check_options, expand_print_options
 from .time_and_output import FRACTURE_FIELDS, OutputSettings, ProbeSettings, TimeSettings, frame_interval, frame_notes
 from .values import Deferred, StudyTable, key
-
-
-def _moduli(material: MaterialSettings) -> list[tuple[float, float]]:
-    """Young's modulus (Pa) and Poisson's ratio of the material and of every region."""
-    regions = [(each.young or material.young, each.poisson) for each in material.regions.values()]
-    regions = [(young, material.poisson if poisson is None else poisson) for young, poisson in regions]
-    return [(material.young, material.poisson), *regions]  # type: ignore[list-item]
 
 
 class Study(StudyTable):
@@ -60,8 +53,8 @@ class Study(StudyTable):
         cls, entries: list[Entry], info: ValidationInfo
     ) -> list[Entry]:
         names = [entry.name for entry in entries]
-        if twice := sorted({name for name in names if names.count(name) > 1}):
-            raise ValueError(f"two {info.field_name}s have the name {twice[0]}")
+        if duplicates := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two {info.field_name}s have the name {duplicates[0]}")
         return entries
 
     @field_validator("solver")
@@ -120,7 +113,8 @@ class Study(StudyTable):
                 'fracture.approach = "edge" projects strain on the edges at rest, which plastic flow leaves behind; '
                 'choose approach = "chi" with [plasticity]'
             )
-        for young, poisson in _moduli(material):
+        for region in (RegionSettings(), *material.regions.values()):
+            young, poisson, _ = material.elastic_constants(region)
             if table.hardening <= (limit := -1.5 * young / (1 + poisson)):
                 raise ValueError(
                     f"plasticity.hardening = {table.hardening:g}: must be greater than -3 mu = {limit:.4g} Pa; a body "
@@ -159,7 +153,7 @@ class Study(StudyTable):
             self._check_cohesive(table)
         if table is None or table.energy is None:
             return self
-        others = {
+        conflicts = {
             "fracture.approach": (table.approach != "chi", 'cells that a crack cuts fade: choose approach = "chi"'),
             "fracture.radius": (table.radius > 0, "stress is averaged over 3 h, and tips go by energy: remove radius"),
             "fracture.kernel": (table.kernel != "linear", "stress is averaged over 3 h: remove kernel"),
@@ -168,15 +162,15 @@ class Study(StudyTable):
             "[brittle]": (self.brittle is not None, "surfaces take no energy: remove [brittle], or fracture.energy"),
             "[plasticity]": (self.plasticity is not None, "the force on a tip is that of an elastic body: remove it"),
         }
-        for name, (given, why) in others.items():
-            if given:
+        for name, (present, why) in conflicts.items():
+            if present:
                 raise ValueError(f"fracture.energy does not go with {name}: {why}")
         return self
 
     def _check_cohesive(self, table: FractureSettings) -> None:
         if table.energy is None:
             raise ValueError('fracture.law = "cohesive" needs fracture.energy: what a crack takes as it opens')
-        others = {
+        conflicts = {
             f'time.scheme = "{self.time.scheme}"': (
                 self.time.scheme != "quasi-static", 'cohesive cracks are slow ones: choose "quasi-static"'
             ),
@@ -185,8 +179,8 @@ class Study(StudyTable):
             ),
             "fracture.crumbs = false": (not table.crumbs, "no node is held while cells are half open: remove crumbs"),
         }  # fmt: skip
-        for name, (given, why) in others.items():
-            if given:
+        for name, (present, why) in conflicts.items():
+            if present:
                 raise ValueError(f'fracture.law = "cohesive" does not go with {name}: {why}')
 
     @model_validator(mode="after")
@@ -267,10 +261,10 @@ class Study(StudyTable):
     def _check_stop_criterion(self) -> Study:
         if self.time.until is None:
             return self
-        names, of = self._load_names(), self.time.until.of
-        if (len(names) == 1 and of is None) or of in names:
+        names, name = self._load_names(), self.time.until.of
+        if (len(names) == 1 and name is None) or name in names:
             return self
-        which = f"of = {of!r} is none of them" if of is not None else "say which, of = NAME"
+        which = f"of = {name!r} is none of them" if name is not None else "say which, of = NAME"
         there = ", ".join(names) or "none: add a [[probe]] with on = the group that is driven"
         raise ValueError(f"time.until watches the force on a probed group or an obstacle: {which}; there are: {there}")
 

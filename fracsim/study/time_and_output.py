@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import MISSING, fields
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from pydantic import Discriminator, Field, Tag, create_model, field_validator, model_validator
 
@@ -45,31 +45,31 @@ class BaseTimeSettings(StudyTable):
 
     @property
     def scheme_class(self) -> type[Scheme]:
-        """The class of the scheme."""
+        """Class of the scheme."""
         return SCHEMES[self.scheme]
 
     @property
     def max_step(self) -> float:
-        """The longest step, s."""
+        """Longest step, s."""
         return max(self.step.value) if isinstance(self.step, TimeTable) else self.step
 
     @property
     def min_step(self) -> float:
-        """The shortest step that a study asks for, s."""
+        """Shortest step of the study, s."""
         return min(self.step.value) if isinstance(self.step, TimeTable) else self.step
 
     @property
     def has_constant_steps(self) -> bool:
-        """Whether all steps are equal, but for those that fail or break edges; explicit ones are as the body allows."""
+        """True if all steps are equal, except those that fail or break edges. Explicit steps depend on the body."""
         return not isinstance(self.step, TimeTable) and (self.scheme_class.implicit or self.scheme == "rigid")
 
     @property
     def scheme_parameters(self) -> dict[str, float]:
-        """What the scheme takes: the table has the parameters of all schemes, whichever it is."""
-        return {each.name: getattr(self, each.name) for each in fields(self.scheme_class)}
+        """Parameters of the scheme; the table has those of all schemes."""
+        return {field.name: getattr(self, field.name) for field in fields(self.scheme_class)}
 
     @model_validator(mode="after")
-    def _order(self) -> BaseTimeSettings:
+    def _check_steps(self) -> BaseTimeSettings:
         if self.max_step > self.end:
             raise ValueError(f"step = {self.max_step:g} s is longer than the run: end = {self.end:g} s")
         if self.smallest is not None and self.smallest > self.min_step:
@@ -94,17 +94,21 @@ class BaseTimeSettings(StudyTable):
 
 
 def _keys_of_schemes() -> dict[str, Any]:
-    """Key -> (type with its limits, default) of the parameters of all schemes. TypeError where two disagree."""
+    """Returns key -> (type with its limits, default) for the parameters of all schemes.
+
+    Raises:
+        TypeError: if a parameter has no default, or two schemes give it different limits.
+    """
     keys: dict[str, Any] = {}
     limits: dict[str, Any] = dict.fromkeys(BaseTimeSettings.model_fields)
-    for kind in SCHEMES.values():
-        for each in fields(kind):
-            own = each.default, each.metadata
-            if each.default is MISSING:
-                raise TypeError(f"{kind.__name__}.{each.name} needs a default: [time] has it whichever the scheme is")
-            if limits.setdefault(each.name, own) != own:
-                raise TypeError(f"{kind.__name__}.{each.name}: [time] has this key already, with other limits")
-            keys[each.name] = Annotated[Finite, Field(**each.metadata)], each.default
+    for scheme in SCHEMES.values():
+        for parameter in fields(scheme):
+            name, limit = parameter.name, (parameter.default, parameter.metadata)
+            if parameter.default is MISSING:
+                raise TypeError(f"{scheme.__name__}.{name} needs a default: [time] has it whichever the scheme is")
+            if limits.setdefault(name, limit) != limit:
+                raise TypeError(f"{scheme.__name__}.{name}: [time] has this key already, with other limits")
+            keys[name] = Annotated[Finite, Field(**parameter.metadata)], parameter.default
     return keys
 
 
@@ -139,7 +143,7 @@ class ProbeSettings(StudyTable):
     )
 
     @model_validator(mode="after")
-    def _place(self) -> ProbeSettings:
+    def _one_place(self) -> ProbeSettings:
         if (self.point is None) == (self.on is None):
             raise ValueError("give either point or on")
         if self.point is not None and self.record == "reaction":
@@ -148,33 +152,45 @@ class ProbeSettings(StudyTable):
 
     @property
     def quantity(self) -> Literal["displacement", "reaction"]:
-        """What is recorded."""
+        """The recorded quantity, with its default."""
         return self.record or ("displacement" if self.point is not None else "reaction")
 
 
-FRAMES = 50  # of a run whose study says neither every nor interval
-FEWEST_FRAMES, MOST_FRAMES = 34, 75  # where steps are constant, so that the last one comes in time if it can
+class FrameCount(NamedTuple):
+    """Number of frames of a study without `output.every` and `output.interval`.
+
+    Attributes:
+        target: frames that are aimed at.
+        least, most: range in which a number of steps per frame divides the number of constant steps, if there is one.
+    """
+
+    target: int = 50
+    least: int = 34
+    most: int = 75
+
+
+FRAMES = FrameCount()
 
 
 def frame_interval(timing: BaseTimeSettings, output: OutputSettings) -> float:
-    """Simulated time between two frames, s; 0 where they are counted in steps (output.every).
+    """Returns the simulated time between two frames, s; 0 if `output.every` counts steps.
 
-    A whole number of steps where these are constant: frames are evenly spaced, and a film of them does not stutter. An
-    interval shorter than a step is left as it is, for steps that are shortened.
+    With constant steps it is a whole number of them, so that frames are evenly spaced and films run smoothly. An
+    interval shorter than a step is kept, and steps are shortened.
     """
     if output.every is not None:
         return 0.0
-    wanted = output.interval or timing.end / FRAMES
+    interval = output.interval or timing.end / FRAMES.target
     step = timing.max_step
     if not timing.has_constant_steps:
-        return wanted
+        return interval
     if output.interval is None:
-        return _steps_between(math.ceil(timing.end / step * (1 - 1e-9))) * step
-    return round(wanted / step) * step if wanted > step else wanted
+        return _steps_per_frame(math.ceil(timing.end / step * (1 - 1e-9))) * step
+    return round(interval / step) * step if interval > step else interval
 
 
 def frame_notes(timing: BaseTimeSettings, output: OutputSettings) -> list[str]:
-    """What is to be said where frames are not as far apart as the study asks."""
+    """Returns a note if frames are not as far apart as the study asks."""
     interval = frame_interval(timing, output)
     if output.interval is None or abs(interval - output.interval) <= 1e-6 * interval:
         return []
@@ -185,12 +201,13 @@ def frame_notes(timing: BaseTimeSettings, output: OutputSettings) -> list[str]:
     ]
 
 
-def _steps_between(steps: int) -> int:
-    """Steps between two of about FRAMES frames of so many steps; a divisor of them, if there is one."""
-    if steps > 100 * FRAMES:  # what the last frame is early by cannot be seen
-        return round(steps / FRAMES)
-    candidates = range(math.ceil(steps / MOST_FRAMES), max(1, steps // FEWEST_FRAMES) + 1)
-    return min(candidates, key=lambda count: (steps % count > 0, abs(math.log(steps / count / FRAMES))))
+def _steps_per_frame(steps: int) -> int:
+    """Steps per frame for a number of constant steps: a divisor if there is one, near the target number of frames."""
+    # with many steps the last frame is too little early to be seen
+    if steps > 100 * FRAMES.target:
+        return round(steps / FRAMES.target)
+    candidates = range(math.ceil(steps / FRAMES.most), max(1, steps // FRAMES.least) + 1)
+    return min(candidates, key=lambda count: (steps % count > 0, abs(math.log(steps / count / FRAMES.target))))
 
 
 FIELDS = (
@@ -258,13 +275,13 @@ class OutputSettings(StudyTable):
 
     @field_validator("fields")
     @classmethod
-    def _each_once(cls, fields: list[str] | None) -> list[str] | None:
-        if twice := [name for name in fields or [] if (fields or []).count(name) > 1]:
-            raise ValueError(f'"{twice[0]}" is given twice; name each field once')
+    def _no_duplicates(cls, fields: list[str] | None) -> list[str] | None:
+        if duplicates := [name for name in fields or [] if (fields or []).count(name) > 1]:
+            raise ValueError(f'"{duplicates[0]}" is given twice; name each field once')
         return fields
 
     @model_validator(mode="after")
-    def _one_clock(self) -> OutputSettings:
+    def _one_interval(self) -> OutputSettings:
         if self.every is not None and self.interval is not None:
             raise ValueError("give every (in steps) or interval (in s), not both")
         return self

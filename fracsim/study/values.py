@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-# A look for plugins in all installed packages, and a check of schemas that pydantic has just made: a tenth of a second.
+# The search for plugins in all packages and the check of schemas by pydantic take a tenth of a second.
 os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 os.environ.setdefault("PYDANTIC_SKIP_VALIDATING_CORE_SCHEMAS", "1")
 
@@ -26,13 +26,15 @@ from pydantic import (
 )
 from pydantic_core.core_schema import no_info_plain_validator_function
 
-# Strict: "3" is not taken for 3, nor true for 1. Tags of unions are in <>: they name no key of the file.
-# No Field() in here: it is shared by all keys of the type, and the default of one would become that of the others.
-LARGEST, SMALLEST = 1e50, 1e-50  # of what is given, whatever its unit: products of a few stay within double precision
+# Strict: "3" is not accepted for 3, nor true for 1. Tags of unions are in <>: they name no key of the file.
+# No Field() in types: it would be shared by all keys of a type, and the default of one would become that of all.
+# Bounds of given numbers in any unit: products of a few of them stay within double precision.
+LARGEST, SMALLEST = 1e50, 1e-50
 
 
 def _not_too_large(value: float) -> float:
-    if abs(value) > LARGEST and not math.isinf(value):  # inf: where it is allowed
+    # types that do not accept inf refuse it themselves
+    if abs(value) > LARGEST and not math.isinf(value):
         raise ValueError(f"{value:g} is out of reach; allowed are {-LARGEST:g} to {LARGEST:g}")
     return value
 
@@ -46,21 +48,22 @@ def _not_too_small(value: float) -> float:
 Finite = Annotated[float, Strict(), AllowInfNan(False), AfterValidator(_not_too_large)]
 Positive = Annotated[Finite, Gt(0), AfterValidator(_not_too_small)]
 NonNegative = Annotated[Finite, Ge(0)]
-# inf, too: never breaks, never flows, flows at once
+# may be inf: never breaks, never yields, yields at once
 Unbounded = Annotated[float, Strict(), Gt(0), AfterValidator(_not_too_small), AfterValidator(_not_too_large)]
 Strength = Unbounded  # Pa
 Poisson = Annotated[Finite, Gt(-1), Lt(0.5)]
 Seed = Annotated[int, Strict(), Ge(0)]
 Flag = Annotated[bool, Strict()]
 Vector = Annotated[list[Finite], Len(2, 3)]
-MAX_NAME = 64  # letters: names of files have 255, with what stands around a name
-# of obstacles and probes: part of names of files, columns and arrays
+# Letters of the name of an obstacle or probe, which is part of names of files (255 letters), columns and arrays.
+MAX_NAME = 64
 Name = Annotated[str, StringConstraints(pattern="^[A-Za-z][A-Za-z0-9-]*$", max_length=MAX_NAME)]
-MAX_REGION_NAME = 100  # letters of the name of a region, which programs that make meshes choose
+# Letters of the name of a region, which mesh generators choose.
+MAX_REGION_NAME = 100
 
 
 def _within_reach(time: float) -> float:
-    """What is divided by its square in double precision."""
+    """Check that divisions by the square of a time stay within double precision."""
     if not 1e-30 <= time <= 1e30:
         raise ValueError(f"{time:g} s is out of reach; allowed are 1e-30 to 1e30 s")
     return time
@@ -117,8 +120,10 @@ def key(
 
 
 class _DeferredSchema:
-    """Marks a table whose validator is built when a study has the table: building all takes as long as reading a
-    study."""
+    """Marks a table whose validator is built when a study has the table.
+
+    Building the validators of all tables takes as long as reading a study.
+    """
 
     def __get_pydantic_core_schema__(self, source: type[BaseModel], handler: Any) -> Any:
         return no_info_plain_validator_function(source.model_validate)

@@ -1,0 +1,289 @@
+"""Lines of `fracsim check`: what the scene of a study will build, with notes and questions. No DOLFINx here."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from . import BrittleSettings, ContactSettings, FractureSettings, ObstacleSettings, Study
+from .check_limits import LIMITS
+from .length_checks import (
+    check_branching_dimension,
+    energy_criterion_notes,
+    estimated_rotation,
+    length_scale_notes,
+    small_strain_notes,
+)
+from .load_resultants import resultant_lines
+from .mesh_source import find_builder, read_obstacle_surface
+from .mesh_summary import MeshSummary
+from .quadratic_checks import has_curved_cells
+from .step_checks import time_step_lines
+from .unit_checks import unit_questions
+
+# nodes of a mesh with quadratic displacement over those with linear displacement: edges have nodes, too
+_NODE_RATIO = {2: "4 times", 3: "7 to 8 times"}
+# Measured with boxes of 25,000 and 207,000 tetrahedra without contact, with two obstacles and with the body alone.
+_AS_CRACKS_OPEN = "and of cracks as they open"
+_OBSTACLE_COST = "nothing is gathered; some 2 % of a step until they touch"
+_MESH_OBSTACLE_COST = "gathered and detected on one rank, from two edges' length on"
+_CONTACT_COST = {
+    implicit: f"gathered and detected on one rank: some {share} until something touches, on n ranks n times that share"
+    for implicit, share in ((True, "tenth of a step"), (False, "two fifths of an explicit step (12,000 cells)"))
+}
+_INDENT = " " * 12
+
+
+def report_lines(study: Study, summary: MeshSummary, near: list[str]) -> Iterator[str]:
+    """Yield the lines of `fracsim check`.
+
+    Args:
+        study: a valid study.
+        summary: of its mesh.
+        near: names of obstacles that may overlap the body.
+
+    Raises:
+        InputError: if a file of an obstacle, or a load, turns out to be invalid.
+    """
+    if study.time.scheme == "rigid":
+        yield from _rigid_lines(study, summary)
+        return
+    yield from _mesh_lines(study, summary)
+    yield from _fracture_lines(study, summary)
+    yield f"plasticity  {_plasticity(study)}"
+    if study.brittle is not None:
+        yield f"brittle     {_brittle(study.brittle)}"
+    if study.crack:
+        yield f"cracks      {len(study.crack)}, broken before the start"
+    yield f"damping     {_damping(study)}"
+    yield from _load_lines(study, summary)
+    yield from _contact_lines(study, summary)
+    yield from _time_lines(study, summary)
+    if near and summary.mesh is None:
+        yield f"{_INDENT}whether the body lies in {' or '.join(near)} is not looked at in meshes of more than"
+        yield f"{_INDENT}{LIMITS.max_built_cells:,} cells that are not built yet; the run does"
+    options = ", ".join(f"{name}={value}" for name, value in study.solver.items())
+    yield f"solver      {options or 'defaults (Newton with line search, CG, algebraic multigrid)'}"
+    yield f"probes      {', '.join(f'{probe.name} ({probe.quantity})' for probe in study.probe) or 'none'}"
+
+
+def _mesh_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
+    """Mesh, size, questions on units, and material."""
+    groups = ", ".join(summary.groups) or "none"
+    yield f"mesh        {study.mesh.source}: {summary.dim}D, {summary.size_text}; groups {groups}"
+    if study.mesh.order == 2:
+        nodes, ratio = 6 if summary.dim == 2 else 10, _NODE_RATIO[summary.dim]
+        sides = ", round sides" if has_curved_cells(study, find_builder(study.mesh)) else ""
+        yield f"{_INDENT}quadratic displacement: cells of {nodes} nodes{sides}, {ratio} as many nodes"
+    yield f"size        {_size(summary)}"
+    for note in summary.notes:
+        yield f"{_INDENT}note: {note}"
+    for line in unit_questions(study, summary.max_side):
+        yield f"{_INDENT}{line}"
+    plane = f", plane {study.material.plane}{_thickness(study)}" if summary.dim == 2 else ""
+    regions = f"; regions {', '.join(study.material.regions)}" if study.material.regions else ""
+    like = f"; like {study.material.like}" if study.material.like else ""
+    yield f"material    {study.material.energy}{plane}{regions}{like}"
+
+
+def _fracture_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
+    """Criterion of fracture, and notes on lengths and directions of the mesh."""
+    table = study.fracture
+    if table is not None and table.energy is not None:
+        check_branching_dimension(study, summary.dim)
+        first, *following = energy_criterion_notes(study, summary.h, summary.max_side)
+        yield f"fracture    {first}"
+        yield from (f"{_INDENT}{line}" for line in following)
+    else:
+        yield f"fracture    {_fracture(study)}"
+        if table is not None and not table.crumbs and not table.retains_nodes(study.material.energy):
+            yield f'{_INDENT}note: crumbs = false holds no node with approach = "edge" and the corotated energy;'
+            yield f'{_INDENT}energy = "linear" or approach = "chi" keeps them'
+    notes = length_scale_notes(study, summary.h, summary.min_side)
+    for line in (*notes, *small_strain_notes(study), *_direction_notes(study, summary)):
+        yield f"{_INDENT}{line}"
+
+
+def _load_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
+    """Boundary conditions, and loads with their resultants."""
+    kinds = [entry.kind for entry in study.boundary]
+    yield f"boundary    {', '.join(kinds) if kinds else 'none: the body is free'}"
+    yield f"load        {', '.join(study.load.model_dump(exclude_none=True)) if study.load else 'none'}"
+    for line in resultant_lines(study, summary.dim, summary.mesh):
+        yield f"{_INDENT}{line}"
+
+
+def _contact_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
+    """Obstacles and self-contact, with what they cost."""
+    if study.obstacle:
+        yield f"obstacles   {_obstacle_list(study)}"
+        shapes = [obstacle.shape for obstacle in study.obstacle]
+        any_free = any(obstacle.is_free for obstacle in study.obstacle)
+        if any(shape != "mesh" for shape in shapes):
+            surface = summary.surface_text()
+            yield f"{_INDENT}touched by the points of {surface}, {_AS_CRACKS_OPEN}; {_OBSTACLE_COST}"
+        for i, obstacle in enumerate(study.obstacle):
+            if obstacle.file is not None:
+                text = _mesh_obstacle(obstacle.file, obstacle.scale or 1.0, f"obstacle.{i}")
+                yield f"{_INDENT}{obstacle.name}: {text}"
+        if len(study.obstacle) > 1 and any_free and not study.time.scheme_class.implicit:
+            yield f"{_INDENT}note: in explicit steps obstacles do not feel, and pass through each other"
+        if any_free and "mesh" in shapes:
+            yield f"{_INDENT}note: obstacles that move freely do not feel those from files; free ones from files feel"
+            yield f"{_INDENT}shapes that are held or driven, with their points"
+    if study.contact is not None and study.contact.itself:
+        between_fragments = study.contact.itself == "pieces"
+        partners = "of pieces alone with one another" if between_fragments else "of the body with itself"
+        cost = _CONTACT_COST[study.time.scheme_class.implicit]
+        yield f"contact     {partners}, friction {study.contact.friction:g}; {cost}"
+        yield f"{_INDENT}its surface has {summary.surface_text()}, {_AS_CRACKS_OPEN}"
+
+
+def _time_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
+    """Steps, frames and the end of the run."""
+    yield from time_step_lines(study, summary.dim, summary.h, summary.mesh)
+    yield from _frame_lines(study)
+    if (until := study.time.until) is not None:
+        yield f"{_INDENT}ends where the force on {study.monitored_load} has fallen by {until.drop:.0%} from its peak"
+    linear = study.material.energy == "linear"
+    if linear and estimated_rotation(study, summary.dim, summary.min_side) > LIMITS.max_linear_rotation:
+        yield f'{_INDENT}note: with energy = "linear" pieces that come off and turn swell by 1/cos of their angle;'
+        yield f'{_INDENT}"corotated" costs little more, and turns them as they are'
+
+
+def _rigid_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
+    """Lines on a study of rigid bodies."""
+    source = study.mesh.source
+    yield f"mesh        {source}: {summary.dim}D, {summary.size_text}"
+    yield f"size        {_size(summary)}"
+    for line in unit_questions(study, summary.max_side):
+        yield f"{_INDENT}{line}"
+    copies = sum(int(np.prod(body.copies)) for body in study.body) or 1
+    yield f"bodies      {copies} times the mesh; motion on one rank, no fields.xdmf"
+    if study.brittle is not None and study.fracture is not None:
+        yield f"fracture    strength {study.fracture.strength:g} Pa, {_average(study.fracture)}"
+        yield f"brittle     {'of each body, ' if copies > 1 else ''}{_brittle(study.brittle)}"
+    elif study.plasticity is not None:
+        table = study.plasticity
+        limits = f"{table.yield_stress:g} Pa, hardening {table.hardening:g} Pa"
+        yield f"plasticity  what is struck keeps a dent where von Mises stress exceeds {limits}"
+    else:
+        yield "fracture    off: nothing is analysed"
+    yield f"obstacles   {_obstacle_list(study) or 'none'}"
+    contact = study.contact or ContactSettings()
+    duration = "Hertz's time" if contact.contact_time is None else f"{contact.contact_time:g} s"
+    restitution = contact.restitution or 0.0
+    yield f"contact     friction {contact.friction:g}, restitution {restitution:g}, a blow lasts {duration}"
+    yield f"time        rigid, {study.time.end / study.time.max_step:.0f} steps of {study.time.max_step:g} s"
+    yield from _frame_lines(study)
+
+
+def _frame_lines(study: Study) -> Iterator[str]:
+    """Time between frames, in steps and s."""
+    every, interval = study.output.every, study.frame_interval
+    if every is not None:
+        yield f"{_INDENT}a frame every {f'{every} steps' if every > 1 else 'step'}"
+        return
+    steps = round(interval / study.time.max_step) if study.time.has_constant_steps else 0
+    yield f"{_INDENT}a frame every {interval:g} s" + (f", {steps} step{'s'[: steps != 1]}" if steps else "")
+    for note in study.frame_notes:
+        yield f"{_INDENT}note: {note}"
+
+
+def _obstacle_list(study: Study) -> str:
+    return ", ".join(f"{obstacle.name} ({_motion(obstacle)} {obstacle.shape})" for obstacle in study.obstacle)
+
+
+def _motion(obstacle: ObstacleSettings) -> str:
+    """Kind of motion of an obstacle: fixed, driven, or free with its mass and constraint."""
+    if obstacle.is_free:
+        mass = f"{obstacle.mass:g} kg" if obstacle.mass is not None else f"{obstacle.density:g} kg/m^3"
+        guide = f" along {obstacle.guide}" if obstacle.guide else ""
+        constraint = " on a hinge" if obstacle.hinge is not None else guide
+        return f"free{constraint}, {mass},"
+    return "fixed" if obstacle.displacement is None and obstacle.velocity is None else "driven"
+
+
+def _mesh_obstacle(file: Path, scale: float, key: str) -> str:
+    """Size of an obstacle from a file. InputError if the file is invalid."""
+    surface = read_obstacle_surface(file, scale, key)
+    return f"{len(surface.triangles):,} triangles, {surface.extent}, {surface.volume:.4g} m^3; {_MESH_OBSTACLE_COST}"
+
+
+def _thickness(study: Study) -> str:
+    return "" if study.material.thickness is None else f", {study.material.thickness:g} m thick"
+
+
+def _direction_notes(study: Study, summary: MeshSummary) -> Iterator[str]:
+    """Notes on preferred directions of the edges of a mesh that was read or built: cracks run along edges."""
+    if study.fracture is None or study.brittle is not None or summary.mesh is None:
+        return
+    from ..meshes.directions import preferred
+
+    mesh = summary.mesh
+    if len(mesh.points) < LIMITS.min_direction_nodes[summary.dim]:
+        return
+    ratio, limit = max(preferred(mesh, LIMITS.max_sampled_cells).values()), LIMITS.max_edge_direction_ratio
+    if ratio > limit and study.fracture.energy is None:
+        yield f"note: the mesh has {ratio:.2g} times as many edges along its commonest directions as one without any,"
+        yield "and cracks run along edges: take random points (builders, surface, outline), or fracture.energy"
+    elif ratio > limit:
+        yield f"the mesh has {ratio:.2g} times as many edges along its commonest directions as one without any; cracks"
+        yield "that take an energy go through cells, and cross edges in any direction"
+
+
+def _size(summary: MeshSummary) -> str:
+    """Side lengths and extent of the body, and its volume or area if it is known."""
+    sides = " x ".join(f"{side:.4g}" for side in np.subtract(summary.upper, summary.lower))
+    names = {2: "area", 3: "volume"}
+    measure = f"; {names[summary.dim]} {summary.volume:.4g} m^{summary.dim}" if summary.volume is not None else ""
+    return f"{sides} m, from {summary.extent}{measure}"
+
+
+def _fracture(study: Study) -> str:
+    if study.fracture is None:
+        return "off: no damage field, no graph, no average"
+    fracture = study.fracture
+    approach = "degraded energy (chi)" if fracture.approach == "chi" else "strain projected on intact edges (edge)"
+    closure = ", cracks close" if fracture.unilateral else ""
+    return f"{approach}, strength {fracture.strength:g} Pa, {_average(fracture)}{closure}"
+
+
+def _average(fracture: FractureSettings) -> str:
+    if fracture.kernel == "neighbours":
+        return "average over neighbouring cells"
+    return f"average over {fracture.radius:g} m ({fracture.kernel})" if fracture.radius else "local, no average"
+
+
+def _plasticity(study: Study) -> str:
+    if study.plasticity is None:
+        return "off: no plastic strain, no flow"
+    table = study.plasticity
+    rate = "independent of the rate" if np.isinf(table.flow_rate) else f"flow rate {table.flow_rate:g} 1/s"
+    return (
+        f"{table.measure} stress above {table.yield_stress:g} Pa, {rate}, "
+        f"hardening {table.hardening:g} Pa, {table.update}"
+    )
+
+
+def _brittle(brittle: BrittleSettings) -> str:
+    count = f"{brittle.surfaces} surfaces" if brittle.surfaces > 1 else "1 surface"
+    spacing = f"starts {brittle.spacing:g} m apart" if brittle.spacing else "starts two mesh edges apart"
+    per_pass = f", {brittle.per_pass} a pass" if brittle.per_pass else ""
+    return f"up to {count}{per_pass}, {_surface_kind(brittle)}, {spacing}; edges do not break by themselves"
+
+
+def _surface_kind(brittle: BrittleSettings) -> str:
+    grains = brittle.grains
+    if grains is None:
+        return brittle.shape
+    relation = "each frees one of" if grains.mode == "replace" else f"{brittle.shape} along the boundaries of"
+    return f"{relation} {grains.count} grains (seed {grains.seed}, spread {grains.spread:g})"
+
+
+def _damping(study: Study) -> str:
+    if study.damping is None:
+        return "off"
+    return f"Rayleigh, {study.damping.mass:g} M + {study.damping.stiffness:g} K"
