@@ -256,7 +256,7 @@ import sys
 from mpi4py import MPI
 from fracsim.mesh import parallel
 from fracsim.solvers.nonlinear_solver import Solver
-ranks.PATIENCE = 1.0
+ranks.FAILURE_WAIT = 1.0
 solve = Solver.solve
 def faulty(self, guess):
     if MPI.COMM_WORLD.rank == 1:

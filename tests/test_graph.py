@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import combinations
-from unittest.mock import patch
 
 import numpy as np
 import numpy.typing as npt
@@ -13,11 +12,7 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from fracsim.mesh import incremental_fragments
-from fracsim.mesh.edge_graph import EdgeGraph
-from fracsim.mesh.fragments import find_fragments
-from fracsim.mesh.incidence import Incidence
-from fracsim.mesh.incremental_fragments import IncrementalFragments
+from fracsim.mesh.edge_graph import EdgeGraph, Incidence
 from fracsim.mesh.simplices import is_split, local_edges, node_groups
 from fracsim.meshes.components import components
 from support.ranks import OnRanks
@@ -128,56 +123,15 @@ def test_keys_name_edges(graph: EdgeGraph) -> None:
     assert np.all(keys[:, 0] < keys[:, 1])
 
 
-@pytest.mark.parametrize("dim", DIMS)
-def test_pieces_are_followed(dim: int) -> None:
-    """Single edges break in random order until all are dust, and are whole again at the end: always the pieces of a
-    search of all nodes, which is seldom needed."""
-    scene, _ = make_scene(mesh={"builder": "box", "size": [1] * dim, "h": 0.34}, fracture={"strength": 1.0})
-    graph = scene.fracture.graph
-    follow, counts = IncrementalFragments(graph), []
-    with patch.object(incremental_fragments, "find_fragments", wraps=find_fragments) as searched:
-        for edge in np.random.default_rng(6).permutation(len(graph.broken)):
-            graph.break_edges(np.arange(len(graph.broken)) == edge)
-            pieces, expected = follow.update(), find_fragments(graph)
-            assert np.array_equal(pieces.node_fragment, expected.node_fragment) and np.array_equal(
-                pieces.lowest_node, expected.lowest_node
-            )
-            counts.append(pieces.count)
-        assert searched.call_count == 0 and counts[0] == 1 and counts[-1] == 4**dim
-        graph.set_integrity(np.ones(len(graph.broken)))
-        assert follow.update().count == 1 and searched.called
-
-
-def test_breaks_far_from_one_another_are_looked_at_by_themselves() -> None:
-    """Edges that break at once in two corners of a body: nothing has come off, and no search of all nodes
-    says so; then a node of one corner does, with all its edges."""
-    scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.05}, fracture={"strength": 1.0})
-    graph = scene.fracture.graph
-    follow, middle = IncrementalFragments(graph), graph.domain.nodes[graph.edge_nodes].mean(axis=1)
-    near = [np.argsort(np.linalg.norm(middle - corner, axis=1))[:3] for corner in ([0.2, 0.2], [0.8, 0.8])]
-    with (
-        patch.object(incremental_fragments, "FAR", 3),
-        patch.object(incremental_fragments, "find_fragments") as searched,
-    ):
-        graph.break_edges(np.isin(np.arange(len(middle)), np.concatenate(near)))
-        assert follow.update().count == 1
-        alone = graph.edge_nodes[near[0][0], 0]
-        graph.break_edges((graph.edge_nodes == alone).any(axis=1) | (np.arange(len(middle)) == near[1][0]))
-        pieces = follow.update()
-    assert not searched.called
-    assert pieces.count == 2 and np.array_equal(pieces.node_fragment, find_fragments(graph).node_fragment)
-
-
 @pytest.mark.ranks
 @pytest.mark.parametrize("ranks", (1, 2, 3))
 @pytest.mark.parametrize("case", ("2d", "3d", "quadratic"))
 def test_pieces_are_those_of_scipy(on_ranks: OnRanks, case: str, ranks: int) -> None:
     """Some edges at a time, blocks first and at last all dust: SciPy's components of the input mesh each time, their
-    numbers alike on any number of ranks, with a search of all nodes now and then."""
-    same, count, searched = on_ranks(ranks)[0][f"parting-{case}"].T
+    numbers alike on any number of ranks."""
+    same, count = on_ranks(ranks)[0][f"parting-{case}"].T
     assert same.all() and count[0] < 5 and count[-1] > 100
     assert np.array_equal(count, on_ranks(1)[0][f"parting-{case}"][:, 1])
-    assert 0 < searched.sum() < 0.9 * len(searched)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -187,7 +141,6 @@ def test_rows_are_found_by_what_is_in_them(seed: int) -> None:
     table, wanted = random.integers(0, 30, (40, 3)), random.choice(30, random.integers(0, 5), replace=False)
     incidence = Incidence(table, 30)
     assert np.array_equal(incidence(wanted), np.flatnonzero(np.isin(table, wanted).any(axis=1)))
-    assert len(incidence.entities_of(wanted)) == np.isin(table, wanted).sum()
 
 
 def test_components_are_numbered_by_their_lowest_node() -> None:

@@ -14,8 +14,8 @@ from scipy.sparse.csgraph import connected_components
 from fracsim.fracture.node_retention import Joining
 from fracsim.mechanics.node_ties import NodeTies
 from fracsim.mesh.edge_graph import EdgeGraph
-from fracsim.mesh.facet_components import node_components
 from fracsim.mesh.fragments import find_fragments
+from fracsim.mesh.node_cells import node_components
 from fracsim.scene import Scene
 from fracsim.solvers.deflation import create_deflation
 from fracsim.solvers.multigrid import block_operator
@@ -268,7 +268,11 @@ def test_tied_nodes_go_with_the_body_and_nothing_is_gained() -> None:
 
         before, reports = figures(), march(scene, state)
         energy = np.array([each.kinetic + each.elastic for each in reports])
-        return float(np.linalg.norm(tethers._elongations(), axis=1).max()), figures() / before - 1, energy / energy[0] - 1
+        return (
+            float(np.linalg.norm(tethers._elongations(), axis=1).max()),
+            figures() / before - 1,
+            energy / energy[0] - 1,
+        )
 
     apart, change, gained = turned(1.0)
     assert np.abs(change[:2]).max() < 1e-9 and abs(change[2]) < 1e-2 and gained.max() < 1e-2  # Newmark's own errors

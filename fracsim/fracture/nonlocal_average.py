@@ -24,8 +24,7 @@ from scipy.spatial import cKDTree
 
 from ..mesh.c_library import Float64, Int32, load_library, struct_pointer
 from ..mesh.domain import Domain
-from ..mesh.halo import RankHalo
-from ..mesh.parallel import max_over_ranks
+from ..mesh.parallel import RankHalo, max_over_ranks
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -1,4 +1,4 @@
-"""The bodies of a mesh, and the rigid motions that its supports leave free. No DOLFINx here."""
+"""Connected bodies of a mesh, and the rigid motions that supports leave free. DOLFINx is not imported here."""
 
 from __future__ import annotations
 
@@ -13,16 +13,18 @@ Values = npt.NDArray[np.float64]
 
 
 def bodies_of(mesh: MeshData) -> tuple[int, npt.NDArray[np.int64]]:
-    """How many bodies share no node, and the body of each node."""
+    """The number of bodies that share no node, and (N,) the body of each node."""
     first = np.repeat(mesh.cells[:, 0], mesh.cells.shape[1] - 1)
     return components(np.stack([first, mesh.cells[:, 1:].reshape(-1)], axis=1), len(mesh.points))
 
 
 def free_motion(points: Values, held: npt.NDArray[np.bool_]) -> str:
-    """A rigid motion in words that the held components ((n, d) flags) do not stop; empty where there is none.
+    """A rigid motion, in words, that the prescribed components leave free; empty if there is none.
 
-    Rows of A are the values of the rigid modes at held components, lengths scaled by the body's size; a motion c is
-    free where A c = 0, that is where A^T A has a zero eigenvalue.
+    The rows of A are the values of the rigid modes at the prescribed components, with lengths scaled by the size of the
+    body. A motion c is free if A c = 0, that is, if A^T A has a zero eigenvalue.
+
+    `points`: (n, d), m.    `held`: (n, d) flags of the prescribed components.
     """
     d = points.shape[1]
     X = points - points.mean(axis=0)
@@ -35,7 +37,7 @@ def free_motion(points: Values, held: npt.NDArray[np.bool_]) -> str:
         modes.append(turn)
         names.append(f"turning about {name}")
     A = np.stack([mode[held] for mode in modes], axis=1)
-    # translations by themselves first: turning about a line far from the middle moves the middle as well
+    # translations first, since a rotation about a distant axis also moves the centre
     for first, count in ((0, d), (d, len(modes))):
         values, vectors = np.linalg.eigh(A[:, :count].T @ A[:, :count])
         if values[0] <= 1e-10 * max(values[-1], 1.0):
@@ -44,7 +46,7 @@ def free_motion(points: Values, held: npt.NDArray[np.bool_]) -> str:
 
 
 def not_held(which: str, motion: str) -> str:
-    """The message for a body that nothing holds."""
+    """The message for a body that no support holds against a rigid motion."""
     return (
         f"boundary: nothing holds {which} against {motion}; a quasi-static study needs every body held: "
         'add a [[boundary]] with fix or displacement, or choose a scheme with inertia (time.scheme = "newmark")'

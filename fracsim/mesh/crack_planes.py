@@ -1,4 +1,4 @@
-"""Flat cracks in a body, and which points of their planes belong to them. No DOLFINx here."""
+"""Planar initial cracks, and which points of their planes lie on them. DOLFINx is not imported here."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from ..errors import InputError
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-FLAT = 1e-6  # of a polygon's size: how far its corners may lie off their plane
+MAX_CORNER_OFFSET = 1e-6  # of the size of a polygon: distance of a corner from the plane of the polygon
 
 
 @dataclass(frozen=True)
 class CrackPlane:
-    """A flat crack.
+    """A planar crack.
 
     Attributes:
-        name: how messages call it.
-        point, normal: (d,) of its plane (2D: line), m and unit.
-        corners: (k, d) of the segment (k = 2, in 2D) or polygon (k > 2, in 3D), m; None: all of the plane.
+        name: name of the crack in messages.
+        point, normal: (d,) a point (m) and the unit normal of the plane (2D: line).
+        corners: (k, d) of the segment (2D: k = 2) or polygon (3D: k > 2), m; None: the crack covers the whole plane.
     """
 
     name: str
@@ -31,7 +31,7 @@ class CrackPlane:
     corners: Values | None = None
 
     def intersects_box(self, lower: Values, upper: Values) -> bool:
-        """Whether it may reach into a bounding box: no face of the box, nor the crack's own plane, keeps them apart."""
+        """Whether no face of a bounding box, nor the plane of the crack, separates the crack from the box."""
         corners = np.array(np.meshgrid(*zip(lower, upper, strict=True))).reshape(len(lower), -1).T
         heights = (corners - self.point) @ self.normal
         if heights.min() > 0 or heights.max() < 0:
@@ -41,26 +41,26 @@ class CrackPlane:
         )
 
     def contains(self, points: Values, slack: float) -> Flags:
-        """Whether points (n, d) of its plane lie within its corners, or no farther than `slack` (m) outside."""
+        """(n,) whether points (n, d) of the plane lie within the corners, or at most `slack` (m) outside."""
         if self.corners is None:
             return np.ones(len(points), bool)
         if len(self.corners) == 2:
             along = self.corners[1] - self.corners[0]
             length = float(np.linalg.norm(along))
-            place = (points - self.corners[0]) @ along / length
-            return np.asarray((place >= -slack) & (place <= length + slack))
+            coordinate = (points - self.corners[0]) @ along / length
+            return np.asarray((coordinate >= -slack) & (coordinate <= length + slack))
         return _in_polygon(self.corners, self.normal, points, slack)
 
 
 def plane(name: str, point: Values, normal: Values) -> CrackPlane:
-    """A crack over all of the body's section with a plane (2D: a line). InputError where the normal is zero."""
+    """A crack over the whole section of the body with a plane (2D: a line). InputError if the normal is zero."""
     if not (length := float(np.linalg.norm(normal))):
         raise InputError(f"{name}.plane: the normal must not be zero")
     return CrackPlane(name, point, np.asarray(normal / length))
 
 
 def segment(name: str, corners: Values) -> CrackPlane:
-    """A crack along the segment between two points (2, 2) of a 2D body. InputError where they are one."""
+    """A crack along the segment between two points (2, 2), m, of a 2D body. InputError if the points coincide."""
     along = corners[1] - corners[0]
     if not (length := float(np.linalg.norm(along))):
         raise InputError(f"{name}.segment: both ends are {corners[0].tolist()}; give two different points (m)")
@@ -68,16 +68,16 @@ def segment(name: str, corners: Values) -> CrackPlane:
 
 
 def polygon(name: str, corners: Values) -> CrackPlane:
-    """A crack over a flat polygon (k, 3). InputError where its corners do not lie in one plane."""
+    """A crack over a planar polygon (k, 3), m. InputError if the corners do not lie in one plane."""
     centre = corners.mean(axis=0)
     _, sizes, axes = np.linalg.svd(corners - centre)
-    if sizes[1] <= FLAT * sizes[0] or sizes[2] > FLAT * sizes[0]:
+    if sizes[1] <= MAX_CORNER_OFFSET * sizes[0] or sizes[2] > MAX_CORNER_OFFSET * sizes[0]:
         raise InputError(f"{name}.polygon: its {len(corners)} corners do not span a plane; give a flat polygon (m)")
     return CrackPlane(name, centre, axes[2], corners)
 
 
 def _in_polygon(corners: Values, normal: Values, points: Values, slack: float) -> Flags:
-    """By the number of sides that a ray in the plane crosses, or by the distance to the nearest side."""
+    """(n,) whether points of the plane lie in the polygon (crossing number), or within `slack` (m) of a side."""
     first = corners[1] - corners[0]
     first = first / np.linalg.norm(first)
     axes = np.stack([first, np.cross(normal, first)], axis=1)

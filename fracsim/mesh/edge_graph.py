@@ -1,6 +1,6 @@
-"""The graph of a mesh: nodes joined by the edges of simplices, some of them broken.
+"""Edge damage of a distributed mesh: the graph of its nodes and edges, with the integrity of each edge.
 
-What the pattern of a cell's broken edges means is looked up in `simplices`.
+The broken edges of a cell are one integer, its pattern; `simplices` has tables of what each pattern means.
 
 Equations: docs/theory.md#edge-damage.
 """
@@ -15,24 +15,48 @@ from dolfinx import la
 from dolfinx.common import IndexMap
 
 from .domain import Domain, Ints
-from .incidence import Incidence
 from .parallel import allgather, gather, sum_over_ranks
 from .simplices import intact_edges, is_split, local_edges
 
 
+class Incidence:
+    """Rows of a table (n, k) of numbers, looked up by the numbers in them: for instance the cells at an edge.
+
+    Numbers lie between 0 and `count` - 1. A lookup costs time in proportion to the rows that it returns.
+    """
+
+    def __init__(self, table: npt.NDArray[np.integer], count: int) -> None:
+        numbers = table.ravel()
+        # rows sorted by the number in them; _end[i]: one past the last row of number i
+        self._rows = np.argsort(numbers, kind="stable") // table.shape[1]
+        # the last entry is the start of number 0, which _end[i - 1] reads for i = 0
+        self._end = np.append(np.cumsum(np.bincount(numbers, minlength=count)), 0)
+
+    def __call__(self, numbers: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
+        """(m,) rows that contain any of the numbers (n,), ascending, without repetition."""
+        end = self._end[numbers]
+        counts = end - self._end[numbers - 1]
+        last = np.cumsum(counts)
+        # positions in `_rows`: consecutive ones for each number
+        positions = np.repeat(end - last, counts)
+        positions += np.arange(len(positions))
+        return np.unique(self._rows[positions])
+
+
 class EdgeGraph:
-    """Damage of the edges of a distributed mesh, and the patterns of its cells.
+    """Integrity of the edges of a distributed mesh, and the patterns of broken edges of its cells.
 
     Attributes:
-        cell_edges: (cells, k) local edge index of each cell's local edges, k = 3 or 6.
-        cell_nodes: (cells, d + 1) local node index.
-        integrity: (edges,) of owned and ghost edges, from 1 (whole) to 0 (broken), never rising; the same on every rank
-            that has the edge.
-        broken: (edges,) bool, integrity is 0.
-        pattern: (cells,) uint8, bit k set where local edge k is broken.
-        damaged: (cells,) bool, whether any edge is less than whole.
-        split: (cells,) bool, whether the cell has come apart; another array once any has.
-        kept: (edges,) bool, those that join their ends though all their cells have come apart; None: there are none.
+        cell_edges: (cells, k) local edge numbers of each cell, k = 3 (2D) or 6 (3D).
+        cell_nodes: (cells, d + 1) local node numbers of each cell.
+        integrity: (edges,) of owned and ghost edges, from 1 (intact) to 0 (broken). Integrity never increases, and is
+            the same on every rank that has the edge.
+        broken: (edges,) whether integrity is 0.
+        pattern: (cells,) uint8, bit k is set where local edge k is broken.
+        damaged: (cells,) whether integrity of any edge is below 1.
+        split: (cells,) whether the intact edges no longer connect all nodes of the cell. A new array is made at each
+            change, so that a reference to an old one keeps the old state.
+        retained: (edges,) edges that join their ends although all their cells are split; None: there are none.
     """
 
     retained: npt.NDArray[np.bool_] | None = None
@@ -53,7 +77,7 @@ class EdgeGraph:
         self.pattern = np.zeros(domain.cell_count, np.uint8)
         self.damaged = np.zeros(domain.cell_count, bool)
         self.split = np.zeros(domain.cell_count, bool)
-        self._idle_looked_for = self.split  # among the edges of these cells
+        self._searched_split = self.split  # state of `split` at the last call of break_unloaded_edges
         self._shared = la.vector(self.index_map, 1, np.int32)
 
     @cached_property
@@ -65,16 +89,11 @@ class EdgeGraph:
 
     @cached_property
     def edge_cells(self) -> Incidence:
-        """Cells that have any of some edges."""
+        """Lookup of the cells that contain given edges."""
         return Incidence(self.cell_edges, len(self.broken))
 
-    @cached_property
-    def node_edges(self) -> Incidence:
-        """Edges, owned and ghost, that have any of some nodes as an end."""
-        return Incidence(self.edge_nodes, len(self.domain.nodes))
-
     def any_over_ranks(self, flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-        """(edges,) flags raised on any rank that has the edge (collective)."""
+        """(edges,) flags that are set on any rank that has the edge (collective)."""
         if self.domain.comm.size == 1:
             return flags
         self._shared.array[:] = flags
@@ -83,7 +102,10 @@ class EdgeGraph:
         return self._shared.array > 0
 
     def break_edges(self, flags: npt.NDArray[np.bool_]) -> int:
-        """Break the intact edges flagged on any rank; returns how many broke in all (collective)."""
+        """Set the integrity of the edges flagged on any rank to 0.
+
+        Returns the number of edges that were intact before, over all ranks (collective).
+        """
         new = self.any_over_ranks(flags) & ~self.broken
         count = int(sum_over_ranks(self.domain.comm, np.count_nonzero(new[: self.edge_count]))[0])
         if count:
@@ -92,13 +114,13 @@ class EdgeGraph:
         return count
 
     def weaken(self, integrity: npt.NDArray[np.float64]) -> tuple[int, int]:
-        """Lower integrity to the least (edges,) that any rank gives an edge (collective).
+        """Reduce integrity to the minimum over ranks of `integrity` (edges,), where that is less (collective).
 
-        Returns how many edges broke, and how many lost anything.
+        Returns the number of edges that broke, and of edges whose integrity decreased, over all ranks.
         """
-        least = np.minimum(self.integrity, self.min_over_ranks(integrity))
-        less, new = least < self.integrity, (least == 0) & ~self.broken
-        self.integrity[:] = least
+        reduced = np.minimum(self.integrity, self.min_over_ranks(integrity))
+        less, new = reduced < self.integrity, (reduced == 0) & ~self.broken
+        self.integrity[:] = reduced
         self._note_broken(new)
         self.damaged |= less[self.cell_edges].any(axis=1)
         counts = [np.count_nonzero(flags[: self.edge_count]) for flags in (new, less)]
@@ -106,56 +128,59 @@ class EdgeGraph:
         return int(broken), int(weakened)
 
     def set_integrity(self, integrity: npt.NDArray[np.float64]) -> None:
-        """Be as an earlier time left it: (edges,), owned and ghost."""
+        """Replace the integrity (edges,) of owned and ghost edges, as a rejected step or a checkpoint requires."""
         self.integrity[:] = integrity
         self.broken[:], self.pattern[:] = False, 0
-        self.split = self._idle_looked_for = np.zeros(len(self.pattern), bool)
+        self.split = self._searched_split = np.zeros(len(self.pattern), bool)
         self._note_broken(self.integrity == 0)
         self.damaged[:] = (self.integrity[self.cell_edges] < 1).any(axis=1)
 
     def _note_broken(self, new: npt.NDArray[np.bool_]) -> None:
-        """Edges (edges,) are broken from here on."""
+        """Mark the flagged edges (edges,) as broken and update the patterns of their cells."""
         self.broken |= new
         touched = self.edge_cells(np.flatnonzero(new))
         bits = 1 << np.arange(self.cell_edges.shape[1])
         self.pattern[touched] = self.broken[self.cell_edges[touched]] @ bits
         self.damaged[touched] = True
-        self.split = self.split.copy()  # whoever has asked for it has what was
+        # a copy, since others compare with the array of the state before
+        self.split = self.split.copy()
         self.split[touched] = is_split(self.domain.dim)[self.pattern[touched]]
 
-    def min_over_ranks(self, values: npt.NDArray[np.float64], of: IndexMap | None = None) -> npt.NDArray[np.float64]:
-        """(n,) the least value that any rank gives an edge, or an entity of another index map (collective)."""
+    def min_over_ranks(
+        self, values: npt.NDArray[np.float64], index_map: IndexMap | None = None
+    ) -> npt.NDArray[np.float64]:
+        """(n,) minimum over ranks of the values of edges, or of entities of another index map (collective)."""
         if self.domain.comm.size == 1:
             return values
-        of = of or self.index_map
-        every, first = allgather(self.domain.comm, values[of.size_local :]), of.local_range[0]
-        result = la.vector(of, 1, np.float64)
+        index_map = index_map or self.index_map
+        ghost_rows, first = allgather(self.domain.comm, values[index_map.size_local :]), index_map.local_range[0]
+        result = la.vector(index_map, 1, np.float64)
         result.array[:] = values
-        for ghosts, ghost_values in zip(allgather(self.domain.comm, of.ghosts), every, strict=True):
-            own = (ghosts >= first) & (ghosts < first + of.size_local)
-            np.minimum.at(result.array, ghosts[own] - first, ghost_values[own])
+        for ghosts, ghost_values in zip(allgather(self.domain.comm, index_map.ghosts), ghost_rows, strict=True):
+            owned = (ghosts >= first) & (ghosts < first + index_map.size_local)
+            np.minimum.at(result.array, ghosts[owned] - first, ghost_values[owned])
         result.scatter_forward()
         return np.asarray(result.array)
 
     def break_unloaded_edges(self) -> int:
-        """Break the edges all of whose cells, on all ranks, have come apart; returns how many (collective).
+        """Break the edges all of whose cells, on all ranks, are split, except retained ones (collective).
 
-        Such an edge carries no force and could never break, yet would join its ends in the graph however far they drift
-        apart. Mechanics do not change: chi of its cells is 0 and they enter no average. What is `kept` is not broken.
+        Returns the number of edges. Such an edge carries no force, so that no criterion would break it, yet it would
+        connect its ends in the graph. The mechanics do not change: chi of its cells is 0 and no average contains them.
         """
-        looked_for = self._idle_looked_for if self.retained is None else np.zeros(len(self.split), bool)
-        self._idle_looked_for = self.split
-        apart = np.zeros(len(self.broken), bool)
-        apart[self.cell_edges[self.split & ~looked_for]] = True
-        may = self.any_over_ranks(apart & ~self.broken)
+        searched = self._searched_split if self.retained is None else np.zeros(len(self.split), bool)
+        self._searched_split = self.split
+        in_split_cell = np.zeros(len(self.broken), bool)
+        in_split_cell[self.cell_edges[self.split & ~searched]] = True
+        candidates = self.any_over_ranks(in_split_cell & ~self.broken)
         carried = np.zeros(len(self.broken), bool) if self.retained is None else self.retained.copy()
-        cells = self.edge_cells(np.flatnonzero(may))
+        cells = self.edge_cells(np.flatnonzero(candidates))
         carried[self.cell_edges[cells[~self.split[cells]]]] = True
-        return self.break_edges(may & ~self.any_over_ranks(carried))
+        return self.break_edges(candidates & ~self.any_over_ranks(carried))
 
     @property
     def broken_count(self) -> int:
-        """Broken edges that this rank owns."""
+        """Number of broken edges that this rank owns."""
         return int(np.count_nonzero(self.broken[: self.edge_count]))
 
     def intact(self, cells: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
@@ -167,13 +192,13 @@ class EdgeGraph:
         return self.integrity[self.cell_edges[cells]]
 
     def edge_keys(self, edges: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """(n, 2) input-mesh nodes of local edges, the lower first: a name of the edge that no partition changes."""
+        """(n, 2) input-mesh nodes of local edges, the lower first: a key that does not depend on the partition."""
         return np.sort(self.domain.node_input[self.edge_nodes[edges]], axis=1)
 
     def gather_broken(
         self, values: npt.NDArray[np.float64] | None = None
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
-        """(n, 2) sorted keys of all broken edges on rank 0 and, of (edges, m) values of local ones, their (n, m) rows.
+        """(n, 2) sorted keys of all broken edges, and the (n, m) rows of their `values` (edges, m), on rank 0.
 
         None on the other ranks (collective).
         """
@@ -182,25 +207,30 @@ class EdgeGraph:
     def gather_weakened(
         self, values: npt.NDArray[np.float64] | None = None
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
-        """(n, 2) sorted keys of all edges that are not whole on rank 0, and of (edges, m) values of local ones their
-        rows, or their (n, 1) integrity; None on the other ranks (collective)."""
+        """(n, 2) sorted keys of all edges with integrity below 1, and the (n, m) rows of their `values`, on rank 0.
+
+        `values`: (edges, m), by default the integrity (edges, 1). None on the other ranks (collective).
+        """
         return self._gather(self.integrity < 1, self.integrity[:, None] if values is None else values)
 
     def restore_integrity(self, keys: npt.NDArray[np.int64], integrity: npt.NDArray[np.float64]) -> None:
-        """Be as `gather_weakened` said, given on every rank."""
+        """Set the integrity (n, 1) of the edges with `keys` (n, 2), and 1 elsewhere: the inverse of `gather_weakened`.
+
+        Both arrays are given on every rank.
+        """
         values = np.ones(len(self.integrity))
-        local, place = self.find_keys(keys)
-        values[local] = integrity[place, 0]
+        local, rows = self.find_keys(keys)
+        values[local] = integrity[rows, 0]
         self.set_integrity(values)
 
     def _gather(
         self, flags: npt.NDArray[np.bool_], values: npt.NDArray[np.float64]
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
-        own = np.flatnonzero(flags[: self.edge_count])
-        parts = gather(self.domain.comm, (self.edge_keys(own), values[own]))
+        owned = np.flatnonzero(flags[: self.edge_count])
+        parts = gather(self.domain.comm, (self.edge_keys(owned), values[owned]))
         if parts is None:
             return None
-        keys, rows = (np.concatenate(each) for each in zip(*parts, strict=True))
+        keys, rows = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         order = np.lexsort(keys.T[::-1])
         return keys[order], rows[order]
 
@@ -210,29 +240,31 @@ class EdgeGraph:
         return None if gathered is None else gathered[0]
 
     def find_keys(self, keys: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Local edges whose keys are among the (n, 2) sorted ones, and the row of each of them there."""
-        known, order = self._by_key
+        """Local edges whose keys are among `keys` (n, 2), sorted, and the row of each in `keys`."""
+        local_keys, order = self._by_key
         wanted = _one_number(keys)
-        at = np.minimum(np.searchsorted(known, wanted), max(len(known) - 1, 0))
-        place = np.flatnonzero(known[at] == wanted) if len(known) else np.empty(0, np.int64)
-        local = order[at[place]]
-        rising = np.argsort(local)
-        return local[rising], place[rising]
+        if not len(local_keys):
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        position = np.minimum(np.searchsorted(local_keys, wanted), len(local_keys) - 1)
+        rows = np.flatnonzero(local_keys[position] == wanted)
+        local = order[position[rows]]
+        ascending = np.argsort(local)
+        return local[ascending], rows[ascending]
 
     @cached_property
     def _by_key(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """(edges,) keys of owned and ghost edges as one number each, rising, and the local edges."""
+        """(edges,) keys of owned and ghost edges as one number each, ascending, and the local edges in that order."""
         keys = _one_number(self.edge_keys(np.arange(len(self.broken))))
         order = np.argsort(keys)
         return keys[order], order
 
     def flags_of_keys(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """(edges,) flags of the local edges whose keys are among those given, in any order."""
+        """(edges,) flags of the local edges whose keys are among `keys` (n, 2), in any order."""
         flags = np.zeros(len(self.broken), bool)
         flags[self.find_keys(keys[np.lexsort(keys.T[::-1])])[0]] = True
         return flags
 
 
 def _one_number(keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """(n,) keys (n, 2) as one number each, in the same order."""
+    """(n,) keys (n, 2) as one 64-bit number each, which sort as the keys do."""
     return np.asarray((keys[:, 0] << 32) + keys[:, 1], np.int64)

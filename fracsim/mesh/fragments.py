@@ -1,4 +1,4 @@
-"""Pieces: connected components of the nodes under intact edges, the same at any rank count."""
+"""Fragments: connected components of the nodes under intact edges, numbered alike at any rank count."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from .parallel import allgather, offset
 
 @dataclass(frozen=True)
 class Fragments:
-    """Bodies of a graph.
+    """Fragments of a body, in the order of their lowest nodes in the input mesh.
 
     Attributes:
-        count: how many there are, numbered from 0 by their lowest node in the input mesh.
-        of_node: (nodes,) piece of every owned and ghost node.
-        lowest: (count,) the input node that each is numbered by.
+        count: number of fragments.
+        node_fragment: (nodes,) fragment of every owned and ghost node.
+        lowest_node: (count,) lowest node of each fragment in the input mesh.
     """
 
     count: int
@@ -30,35 +30,41 @@ class Fragments:
 
 
 def find_fragments(graph: EdgeGraph) -> Fragments:
-    """Components within each rank, joined where ranks share nodes: one exchange, however they wind (collective)."""
+    """The fragments of a graph (collective).
+
+    Components are found within each rank, then joined over the nodes that ranks share, in one exchange.
+    """
     domain = graph.domain
-    local_count, local = components(_joined(graph), len(domain.nodes))
+    local_count, local = components(_links(graph), len(domain.nodes))
     first = offset(domain.comm, local_count)
     label = local + first
     ghosts = slice(domain.node_count, None)
     links = np.stack([label[ghosts], _owners_label(domain, label)[ghosts]], axis=1)
-    every = np.concatenate(allgather(domain.comm, np.unique(links, axis=0)))
+    all_links = np.concatenate(allgather(domain.comm, np.unique(links, axis=0)))
     lowest = np.full(local_count, np.iinfo(np.int64).max)
     np.minimum.at(lowest, local, domain.node_input)
     lowest = np.concatenate(allgather(domain.comm, lowest))
-    count, joined = components(every, len(lowest))
-    least = np.full(count, np.iinfo(np.int64).max)
-    np.minimum.at(least, joined, lowest)
-    order = np.argsort(least)
-    rank = np.empty(count, np.int64)
-    rank[order] = np.arange(count)
-    return Fragments(count, rank[joined][label], least[order])
+    count, joined = components(all_links, len(lowest))
+    lowest_joined = np.full(count, np.iinfo(np.int64).max)
+    np.minimum.at(lowest_joined, joined, lowest)
+    order = np.argsort(lowest_joined)
+    number = np.empty(count, np.int64)
+    number[order] = np.arange(count)
+    return Fragments(count, number[joined][label], lowest_joined[order])
 
 
 def midside_parents(domain: Domain) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """(m,) middles of edges and (m,) the ends that they go with, those that come first in the input mesh: where an edge
-    is broken its middle is anywhere between its ends, and a piece is known by its corners."""
+    """(m,) midside nodes and (m,) the end of the edge of each whose fragment it belongs to.
+
+    That is the end which comes first in the input mesh. The edge may be broken, so that the midside node alone does not
+    tell the fragment.
+    """
     between, ends = domain.midside_edges
     return between, ends[np.arange(len(ends)), np.argmin(domain.node_input[ends], axis=1)]
 
 
-def _joined(graph: EdgeGraph) -> npt.NDArray[np.int32]:
-    """(n, 2) nodes of intact edges, and middles with what they follow."""
+def _links(graph: EdgeGraph) -> npt.NDArray[np.int32]:
+    """(n, 2) nodes of intact edges, and midside nodes with the ends that they belong to."""
     edges = graph.edge_nodes[~graph.broken]
     return (
         edges if graph.domain.order == 1 else np.concatenate([edges, np.stack(midside_parents(graph.domain), axis=1)])
@@ -66,7 +72,7 @@ def _joined(graph: EdgeGraph) -> npt.NDArray[np.int32]:
 
 
 def _owners_label(domain: Domain, label: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """The label that the owner of each node gives it."""
+    """(nodes,) the label of each node on the rank that owns the node (collective)."""
     vector = la.vector(domain.space.dofmap.index_map, 1, np.int64)
     vector.array[:] = label
     vector.scatter_forward()

@@ -1,4 +1,4 @@
-"""Cells and edges of the input mesh, numbered once, on the rank that has the mesh."""
+"""Edges of the input mesh and their numbers, on the rank that holds the mesh."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _NUMBERED: WeakKeyDictionary[MeshData, tuple[Indices, Indices]] = WeakKeyDiction
 
 
 class MeshTopology:
-    """A mesh of N nodes and C cells with its E edges; all that are made of one mesh share their numbers.
+    """A mesh of N nodes and C cells with its E edges; numbers are computed once for each mesh.
 
     Attributes:
         dim: 2 or 3.
@@ -32,19 +32,19 @@ class MeshTopology:
         self.edges, self.cell_edges = _NUMBERED[mesh]
 
     def find_edges(self, keys: Indices) -> Indices:
-        """(n,) numbers of the edges named by pairs of nodes (n, 2) in either order; all of them exist."""
+        """(n,) numbers of the edges between pairs of nodes `keys` (n, 2), in either order; all edges exist."""
         factor = np.array([len(self.points), 1])
         return np.searchsorted(self.edges @ factor, np.sort(keys, axis=1) @ factor)
 
     def edge_flags(self, keys: Indices) -> npt.NDArray[np.bool_]:
-        """(E,) flags of the edges named by pairs of nodes (n, 2)."""
+        """(E,) flags of the edges between pairs of nodes `keys` (n, 2)."""
         flags = np.zeros(len(self.edges), bool)
         flags[self.find_edges(keys)] = True
         return flags
 
 
 def _numbered(mesh: MeshData) -> tuple[Indices, Indices]:
-    """Distinct edges, and those of each cell."""
+    """(E, 2) distinct edges, and (C, k) the edges of each cell."""
     pairs = np.sort(mesh.cells[:, local_edges(mesh.dim)], axis=2).reshape(-1, 2)
     edges, _, inverse = distinct_rows(pairs)
     return edges, inverse.reshape(len(mesh.cells), -1)

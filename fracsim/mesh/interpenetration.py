@@ -1,7 +1,7 @@
-"""Whether pieces of a body overlap: whether a node of one lies inside a whole cell of another.
+"""Interpenetration of fragments: a node of one fragment lies inside an intact cell of another.
 
-A crack runs half an edge from the nodes beside it, so the faces of one that closes, or presses on itself a little, are
-not found: what is has gone an edge or so into the other.
+Crack faces lie half an edge from the nodes beside them. Therefore crack faces that touch, or overlap slightly, are not
+reported: a reported node lies about one edge length inside the other fragment.
 """
 
 from __future__ import annotations
@@ -13,15 +13,15 @@ from scipy.spatial import cKDTree
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-INSIDE = 0.05  # least barycentric coordinate: bodies that touch are not inside each other
-LONG = 4.0  # a cell of so many times the median radius is torn or crushed, and holds nothing
-ROWS = 1 << 22  # of a table of boxes that are compared at a time
+MIN_BARYCENTRIC = 0.05  # of a node that counts as inside a cell: touching bodies do not interpenetrate
+MAX_RADIUS_RATIO = 4.0  # of a cell to the median: larger cells are torn or crushed, and are left out
+MAX_BOX_PAIRS = 1 << 22  # compared at a time, which bounds memory
 
 
 def find_interpenetration(x: Values, cells: Ints, piece: Ints) -> tuple[int, int] | None:
-    """The node that is deepest inside a cell of another piece, and that cell; None where there is none.
+    """The node that lies deepest inside a cell of another fragment, and that cell; None if there is none.
 
-    `x`: (N, d) places, m.    `cells`: (C, d + 1) the whole cells.    `piece`: (N,) of each node.
+    `x`: (N, d) current positions, m.    `cells`: (C, d + 1) the intact cells.    `piece`: (N,) fragment of each node.
     """
     of_cell = piece[cells[:, 0]]
     nodes = np.argsort(piece, kind="stable")
@@ -35,21 +35,21 @@ def find_interpenetration(x: Values, cells: Ints, piece: Ints) -> tuple[int, int
     near = _inside_boxes(x[nodes], start, count, small, lower[large], upper[large])
     holds = np.zeros(piece.max() + 1, bool)
     holds[names[large]] = True
-    held = np.flatnonzero(holds[of_cell])
-    node, cell = _candidates(x, nodes[near], cells[held])
-    other = piece[node] != of_cell[held[cell]]
-    node, cell = node[other], held[cell[other]]
+    searched = np.flatnonzero(holds[of_cell])
+    node, cell = _candidates(x, nodes[near], cells[searched])
+    foreign = piece[node] != of_cell[searched[cell]]
+    node, cell = node[foreign], searched[cell[foreign]]
     depth = _depth(x, node, cells[cell])
-    if not len(depth) or depth.max() <= INSIDE:
+    if not len(depth) or depth.max() <= MIN_BARYCENTRIC:
         return None
     deepest = np.argmax(depth)
     return int(node[deepest]), int(cell[deepest])
 
 
 def _meeting(lower: Values, upper: Values, count: Ints) -> tuple[Ints, Ints]:
-    """Pairs of pieces whose boxes overlap, that of fewer nodes first."""
+    """(k,), (k,) pairs of fragments whose bounding boxes overlap, the one with fewer nodes first."""
     pairs = []
-    rows = max(1, ROWS // len(lower))
+    rows = max(1, MAX_BOX_PAIRS // len(lower))
     for first in range(0, len(lower), rows):
         some = slice(first, first + rows)
         meets = ((lower[some, None] < upper) & (lower < upper[some, None])).all(axis=2)
@@ -61,32 +61,33 @@ def _meeting(lower: Values, upper: Values, count: Ints) -> tuple[Ints, Ints]:
 
 
 def _inside_boxes(x: Values, start: Ints, count: Ints, small: Ints, lower: Values, upper: Values) -> Ints:
-    """Numbers of the points x of the pieces `small` that lie in the box of the pair."""
-    many = count[small]
-    pair = np.repeat(np.arange(len(small)), many)
-    point = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many) + np.repeat(start[small], many)
-    at = x[point]
-    return np.unique(point[((at > lower[pair]) & (at < upper[pair])).all(axis=1)])
+    """Points of the fragments `small` (k,) that lie in the boxes `lower`, `upper` (k, d) of their pairs."""
+    counts = count[small]
+    pair = np.repeat(np.arange(len(small)), counts)
+    point = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + np.repeat(start[small], counts)
+    position = x[point]
+    return np.unique(point[((position > lower[pair]) & (position < upper[pair])).all(axis=1)])
 
 
 def _candidates(x: Values, nodes: Ints, cells: Ints) -> tuple[Ints, Ints]:
-    """Pairs (node, number of a cell) no farther apart than the cell's corners are from its centre."""
+    """Pairs (node, index in `cells`) in which the node lies in the smallest ball about the cell's centre."""
     if not len(cells):
         return np.empty(0, np.int64), np.empty(0, np.int64)
     corners = x[cells]
     centre = corners.mean(axis=1)
     radius = np.sqrt(((corners - centre[:, None]) ** 2).sum(axis=2).max(axis=1))
-    usual = np.flatnonzero(radius < LONG * np.median(radius))
+    usual = np.flatnonzero(radius < MAX_RADIUS_RATIO * np.median(radius))
     if not len(nodes) or not len(usual):
         return np.empty(0, np.int64), np.empty(0, np.int64)
-    found = cKDTree(x[nodes]).sparse_distance_matrix(cKDTree(centre[usual]), radius[usual].max(), output_type="ndarray")
-    cell = usual[found["j"]]
-    close = found["v"] < radius[cell]
-    return nodes[found["i"][close]], cell[close]
+    centres = cKDTree(centre[usual])
+    pairs = cKDTree(x[nodes]).sparse_distance_matrix(centres, radius[usual].max(), output_type="ndarray")
+    cell = usual[pairs["j"]]
+    close = pairs["v"] < radius[cell]
+    return nodes[pairs["i"][close]], cell[close]
 
 
 def _depth(x: Values, node: Ints, cells: Ints) -> Values:
-    """(n,) least barycentric coordinate of each node in its cell; -1 in a flat one."""
+    """(n,) minimum barycentric coordinate of each node in its cell; -1 in a cell without volume."""
     corners = x[cells]
     edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
     real = np.flatnonzero(np.linalg.det(edges) != 0)

@@ -1,4 +1,4 @@
-"""How many cells of a kind nodes have around them, whichever ranks own these."""
+"""Cells around nodes: how many there are, and the facet-connected components that they belong to."""
 
 from __future__ import annotations
 
@@ -6,23 +6,96 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import la
 
+from ..meshes.components import components
 from .domain import Domain
+from .parallel import allgather, offset
 
 Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 
 class NodeCellCount:
-    """Counts the cells around each node."""
+    """Counts the flagged cells around each node, over the cells of all ranks."""
 
     def __init__(self, domain: Domain) -> None:
         self._cell_nodes = domain.cell_nodes
         self._sum = la.vector(domain.space.dofmap.index_map, 1, np.float64)
 
-    def __call__(self, flags: npt.NDArray[np.bool_]) -> Values:
-        """(nodes,) how many of the flagged ones among the cells (cells,) of all ranks a node has, ghosts too
-        (collective)."""
+    def __call__(self, flags: Flags) -> Values:
+        """(nodes,) number of flagged cells around each owned and ghost node; `flags` (cells,) (collective)."""
         self._sum.array[:] = 0.0
         np.add.at(self._sum.array, self._cell_nodes[flags], 1.0)
         self._sum.scatter_reverse(la.InsertMode.add)
         self._sum.scatter_forward()
         return np.asarray(self._sum.array.copy())
+
+
+def node_components(domain: Domain, flags: Flags) -> tuple[int, Ints]:
+    """The number of facet-connected components of the flagged cells, and (owned nodes,) that of each node (collective).
+
+    Cells that share only a node or an edge are not connected: they rotate freely about it. A node of several components
+    has the largest, a node of none has -1. Components are numbered from the largest, equally large ones by their lowest
+    cell in the input mesh. `flags`: (owned cells,).
+    """
+    cells = np.flatnonzero(flags)
+    count, component = _local_components(domain, cells)
+    lowest: Ints = np.full(count, np.iinfo(np.int64).max)
+    size: Ints = np.bincount(component, minlength=count)
+    np.minimum.at(lowest, component, domain.cell_input[cells])
+    joined, size, lowest = _join_over_ranks(domain, cells, component, count, size, lowest)
+    number = np.empty(len(size), np.int64)
+    number[np.lexsort((lowest, -size))] = np.arange(len(size))
+    return len(size), _lowest_number(domain, cells, number[joined[component]])
+
+
+def _local_components(domain: Domain, cells: Ints) -> tuple[int, Ints]:
+    """The number of components on this rank, and (n,) that of each of the cells (n,)."""
+    index = np.full(domain.cell_count, -1)
+    index[cells] = np.arange(len(cells))
+    links = index[domain.facet_neighbours]
+    return components(links[(links >= 0).all(axis=1)], len(cells))
+
+
+def _join_over_ranks(
+    domain: Domain, cells: Ints, component: Ints, count: int, size: Ints, lowest: Ints
+) -> tuple[Ints, Ints, Ints]:
+    """Components joined over the facets that ranks share (collective).
+
+    Returns (count,) the joined component of each component of this rank, and the sizes and lowest cells of all joined
+    components.
+    """
+    comm = domain.comm
+    if comm.size == 1:
+        return np.arange(count), size, lowest
+    first, facets = offset(comm, count), domain.mesh.topology.index_map(domain.dim - 1)
+    label = la.vector(facets, 1, np.int64)
+    label.array[:] = -1
+    label.array[domain.cell_facets[cells]] = (first + component)[:, None]
+    local = label.array[facets.size_local :].copy()
+    label.scatter_forward()
+    links = np.stack([local, label.array[facets.size_local :]], axis=1)
+    links = np.concatenate(allgather(comm, links[(links >= 0).all(axis=1)]))
+    sizes, lowest_cells = (np.concatenate(allgather(comm, values)) for values in (size, lowest))
+    total, joined = components(links, len(sizes))
+    joined_lowest = np.full(total, np.iinfo(np.int64).max)
+    np.minimum.at(joined_lowest, joined, lowest_cells)
+    joined_size = np.bincount(joined, weights=sizes, minlength=total).astype(np.int64)
+    return joined[first : first + count], joined_size, joined_lowest
+
+
+def _lowest_number(domain: Domain, cells: Ints, number: Ints) -> Ints:
+    """(owned nodes,) lowest number among the cells (n,) around each node, -1 if there is none (collective)."""
+    none, owned = np.iinfo(np.int64).max, domain.node_count
+    lowest = np.full(len(domain.nodes), none)
+    nodes = domain.all_cell_nodes[cells]
+    np.minimum.at(lowest, nodes.reshape(-1), np.repeat(number, nodes.shape[1]))
+    if domain.comm.size > 1:
+        index_map = domain.space.dofmap.index_map
+        ghosts, numbers = (
+            np.concatenate(allgather(domain.comm, values)) for values in (index_map.ghosts, lowest[owned:])
+        )
+        local = ghosts - index_map.local_range[0]
+        is_owned = (local >= 0) & (local < owned)
+        np.minimum.at(lowest, local[is_owned], numbers[is_owned])
+    return np.where(lowest[:owned] == none, -1, lowest[:owned])

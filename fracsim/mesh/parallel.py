@@ -1,4 +1,4 @@
-"""Small collective operations: errors that reach every rank, sums, and gathering in the order of the input mesh."""
+"""Collective operations: errors that reach every rank, sums, gathering in input order, and halos of cells."""
 
 from __future__ import annotations
 
@@ -13,13 +13,16 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-PATIENCE = 5.0  # s that a rank which failed waits for the others to say that they failed as well
-LAUNCHERS = ("prte", "orte", "mpirun", "mpiexec", "hydra", "slurmstepd")  # how names of their processes begin
-_FAILED = 7919  # tag of that message
+FAILURE_WAIT = 5.0  # s, that a rank which failed waits for the failure messages of other ranks
+# first letters of the names of processes that start ranks
+LAUNCHERS = ("prte", "orte", "mpirun", "mpiexec", "hydra", "slurmstepd")
+Values = npt.NDArray[np.float64]
+
+_FAILED = 7919  # tag of the message that a rank has failed
 
 
 def on_root[T](comm: MPI.Comm, work: Callable[[], T]) -> T | None:
-    """Run `work` on rank 0 and return its result there, None elsewhere; what it raises is raised on every rank."""
+    """The result of `work` on rank 0, None elsewhere; an exception of `work` is raised on every rank."""
     result, failure = None, None
     if comm.rank == 0:
         try:
@@ -35,13 +38,13 @@ def on_root[T](comm: MPI.Comm, work: Callable[[], T]) -> T | None:
 
 
 def from_root[T](comm: MPI.Comm, work: Callable[[], T]) -> T:
-    """Run `work` on rank 0 and give its result to every rank; what it raises is raised on every rank."""
+    """The result of `work`, called on rank 0, on every rank; an exception of `work` is raised on every rank."""
     result: T = bcast(comm, on_root(comm, work))
     return result
 
 
 def _sendable(failure: BaseException | None) -> BaseException | None:
-    """The exception, or where it cannot be pickled one that says the same."""
+    """The exception, or a RuntimeError with the same message if the exception cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(failure))
     except Exception:
@@ -50,8 +53,8 @@ def _sendable(failure: BaseException | None) -> BaseException | None:
 
 
 def raise_together(comm: MPI.Comm, failure: Exception | None) -> None:
-    """Raise on every rank where one has failed: its own exception, or that of the lowest rank (collective)."""
-    failures = [each for each in comm.allgather(_sendable(failure)) if each is not None]
+    """Raise on every rank if any rank has failed: its own exception, or that of the lowest rank (collective)."""
+    failures = [error for error in comm.allgather(_sendable(failure)) if error is not None]
     if failure is not None:
         raise failure
     if failures:
@@ -59,10 +62,10 @@ def raise_together(comm: MPI.Comm, failure: Exception | None) -> None:
 
 
 def who_failed(comm: MPI.Intracomm, patience: float) -> set[int]:
-    """The ranks that have failed within `patience` seconds, this one among them: each calls this.
+    """The ranks that have failed within `patience` seconds, this rank included.
 
-    Called where something was raised, perhaps here alone: all others may be waiting in a collective operation, so that
-    none can be used, but messages from rank to rank pass beside it.
+    Each rank that fails calls this function. Other ranks may be waiting in a collective operation. Therefore only
+    messages between two ranks are used.
     """
     others = [rank for rank in range(comm.size) if rank != comm.rank]
     sent = [comm.isend(None, rank, _FAILED) for rank in others]
@@ -79,26 +82,26 @@ def who_failed(comm: MPI.Intracomm, patience: float) -> set[int]:
 
 
 def end_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, late: bool = False) -> None:
-    """Return where every rank has failed; otherwise print the message once and end all ranks with the exit code.
+    """Return if every rank has failed; otherwise print the message once and end all ranks with the exit code.
 
-    `late`: what rank 0 does before it fails may take a while, such as drawing a picture.
+    `late`: other ranks are given more time, since rank 0 may be drawing a picture before it fails.
     """
-    failed = who_failed(comm, 12 * PATIENCE if late else PATIENCE)
+    failed = who_failed(comm, 12 * FAILURE_WAIT if late else FAILURE_WAIT)
     if len(failed) == comm.size:
         return
     if comm.rank > min(failed):
-        time.sleep(PATIENCE)  # a lower rank says why, and ends this one
+        time.sleep(FAILURE_WAIT)  # a lower rank prints its message and ends all ranks
     print(message or f"fracsim: rank {comm.rank} ended alone", file=sys.stderr, flush=True)
     comm.Abort(code or 1)
 
 
 def starts_ranks(process: int) -> bool:
-    """Whether a process is one that starts the ranks of a job; False where the system does not tell."""
+    """Whether a process starts the ranks of a job; False if the system gives no information on it."""
     return _name_and_parent(process)[0].startswith(LAUNCHERS)
 
 
 def launcher(process: int) -> int | None:
-    """The process that starts the ranks of a job, among a process and its ancestors; None: there is none."""
+    """The process that starts the ranks of a job, among a process and its ancestors; None if there is none."""
     while process > 1:
         name, parent = _name_and_parent(process)
         if name.startswith(LAUNCHERS):
@@ -108,7 +111,7 @@ def launcher(process: int) -> int | None:
 
 
 def _name_and_parent(process: int) -> tuple[str, int]:
-    """The name of a process and its parent's number; "" and 0 where the system does not tell."""
+    """The name of a process and the number of its parent; "" and 0 if the system gives no information on it."""
     try:
         with open(f"/proc/{process}/stat", encoding="utf-8", errors="replace") as file:
             before, _, after = file.read().rpartition(")")
@@ -128,13 +131,13 @@ def sum_over_ranks(comm: MPI.Comm, values: npt.ArrayLike) -> npt.NDArray[Any]:
 
 
 def max_over_ranks[Number: (int, float)](comm: MPI.Intracomm, value: Number) -> Number:
-    """The greatest over the ranks."""
+    """Maximum over the ranks."""
     result: Number = value if comm.size == 1 else comm.allreduce(value, op=MPI.MAX)
     return result
 
 
 def concatenate_over_ranks(comm: MPI.Intracomm, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """Rows of all ranks, those of the lowest first."""
+    """The rows of all ranks, in the order of the ranks (collective)."""
     return rows if comm.size == 1 else np.concatenate(allgather(comm, rows))
 
 
@@ -144,17 +147,17 @@ def offset(comm: MPI.Intracomm, count: int) -> int:
     return int(before or 0)
 
 
-# --- of any size ----------------------------------------------------------------------------------------------------
+# --- messages of any size -------------------------------------------------------------------------------------------
 #
-# MPI before version 4 counts elements and places in 32 bits, mpi4py's own functions for Python objects in bytes. Rows
-# of an array, or blocks of what is pickled, are counted here instead, by a type of MPI for each size of them.
+# MPI before version 4 has 32-bit counts and displacements, and mpi4py counts pickled objects in bytes. The functions
+# below count rows of an array, or blocks of a pickled object, by an MPI datatype of the size of a row or block.
 
-BLOCK = 256  # bytes: pickled objects of 550 GB on all ranks together
+BLOCK = 256  # bytes; the limit is 550 GB of pickled objects on all ranks together
 
 
 @cache
 def _bytes(count: int) -> MPI.Datatype:
-    """MPI's type of so many bytes side by side."""
+    """MPI datatype of `count` contiguous bytes."""
     return MPI.BYTE.Create_contiguous(count).Commit()
 
 
@@ -167,12 +170,12 @@ def _flat(rows: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
 
 
 def _sent(rows: npt.NDArray[Any]) -> Any:
-    """Contiguous rows as a message."""
+    """Contiguous rows as a message of mpi4py."""
     return _flat(rows), len(rows) if rows.size else 0, _bytes(_width(rows))
 
 
 def _received(rows: npt.NDArray[Any], counts: Sequence[int] | npt.NDArray[np.int64]) -> Any:
-    """Contiguous rows as messages of, or to, all ranks, so many (ranks,) for each."""
+    """Contiguous rows as messages from, or to, all ranks; `counts` (ranks,) of rows."""
     return _flat(rows), (list(counts) if rows.size else [0] * len(counts), None), _bytes(_width(rows))
 
 
@@ -182,14 +185,17 @@ def exchange_rows(
     sent: Sequence[int] | npt.NDArray[np.int64],
     received: Sequence[int] | npt.NDArray[np.int64],
 ) -> npt.NDArray[Any]:
-    """(n, ...) contiguous rows, so many (ranks,) `sent` to each rank in turn -> the rows `received` (collective)."""
+    """The rows that other ranks send to this rank, in the order of the ranks (collective).
+
+    `rows` (n, ...) are contiguous: `sent` (ranks,) of them go to each rank in turn, and `received` (ranks,) arrive.
+    """
     arrived = np.empty((int(sum(received)), *rows.shape[1:]), rows.dtype)
     comm.Alltoallv(_received(rows, sent), _received(arrived, received))
     return arrived
 
 
 def _packed(value: object) -> npt.NDArray[np.uint8]:
-    """(blocks, BLOCK)."""
+    """(blocks, BLOCK) bytes of the pickled object."""
     data = pickle.dumps(value, protocol=pickle.HIGHEST_PROTOCOL)
     blocks: npt.NDArray[np.uint8] = np.zeros((-(-len(data) // BLOCK), BLOCK), np.uint8)
     blocks.reshape(-1)[: len(data)] = np.frombuffer(data, np.uint8)
@@ -197,14 +203,14 @@ def _packed(value: object) -> npt.NDArray[np.uint8]:
 
 
 def _unpacked(blocks: npt.NDArray[np.uint8], counts: Sequence[int] | npt.NDArray[np.int64]) -> list[Any]:
-    """Of each rank."""
+    """The object of each rank, of blocks (n, BLOCK) and their `counts` (ranks,)."""
     return [pickle.loads(part.reshape(-1).data) for part in np.split(blocks, np.cumsum(counts)[:-1])]
 
 
 def _counts(comm: MPI.Comm, count: int) -> npt.NDArray[np.int64]:
-    every = np.empty(comm.size, np.int64)
-    comm.Allgather(np.array([count], np.int64), every)
-    return every
+    counts = np.empty(comm.size, np.int64)
+    comm.Allgather(np.array([count], np.int64), counts)
+    return counts
 
 
 def allgather[T](comm: MPI.Comm, value: T) -> list[T]:
@@ -233,11 +239,11 @@ def gather[T](comm: MPI.Comm, value: T) -> list[T] | None:
 
 
 def alltoall[T](comm: MPI.Comm, values: Sequence[T]) -> list[T]:
-    """An object for each rank -> one from each (collective)."""
+    """The objects that the ranks have for this rank, of `values` (ranks,) for each rank (collective)."""
     if comm.size == 1:
         return list(values)
-    packed = [_packed(each) for each in values]
-    sent, received = np.array([len(each) for each in packed], np.int64), np.empty(comm.size, np.int64)
+    packed = [_packed(value) for value in values]
+    sent, received = np.array([len(blocks) for blocks in packed], np.int64), np.empty(comm.size, np.int64)
     comm.Alltoall(sent, received)
     return _unpacked(exchange_rows(comm, np.concatenate(packed), sent, received), received)
 
@@ -260,14 +266,14 @@ def bcast(comm: MPI.Comm, value: Any) -> Any:
 
 
 class Gather:
-    """Rows of owned entities brought to rank 0 in the order of the input mesh, whatever the partition.
+    """Gathers rows of owned entities on rank 0 in the order of the input mesh, at any partition.
 
-    Output is written by rank 0 alone: files are the same at any rank count, and no parallel HDF5 is needed. The price,
-    one copy of a field on rank 0, is small beside the tangent matrix.
+    Rank 0 alone writes output, so that files are the same at any rank count, and parallel HDF5 is not needed. One copy
+    of a field on rank 0 is small beside the tangent matrix.
     """
 
     def __init__(self, comm: MPI.Comm, input_index: npt.NDArray[np.int64]) -> None:
-        """`input_index`: (n,) index in the input mesh of each entity this rank owns."""
+        """`input_index`: (n,) index in the input mesh of each entity that this rank owns."""
         self.comm = comm
         self.count = len(input_index)
         pieces = gather(comm, np.ascontiguousarray(input_index))
@@ -275,7 +281,7 @@ class Gather:
         self._order = np.concatenate(pieces) if pieces is not None else None
 
     def __call__(self, values: npt.NDArray[Any]) -> npt.NDArray[Any] | None:
-        """(n, ...) owned rows -> (N, ...) rows in input order on rank 0, None elsewhere."""
+        """(N, ...) rows of all ranks in input order on rank 0, None elsewhere; `values` (n, ...) of owned entities."""
         rows = np.ascontiguousarray(values[: self.count])
         if self.comm.size == 1:
             result = np.empty_like(rows)
@@ -295,7 +301,7 @@ class Gather:
         return result
 
     def scatter(self, values: npt.NDArray[Any] | None) -> npt.NDArray[Any]:
-        """(N, ...) rows in input order on rank 0 -> the (n, ...) rows this rank owns."""
+        """(n, ...) rows that this rank owns, of `values` (N, ...) in input order on rank 0."""
         if self.comm.size == 1:
             assert values is not None and self._order is not None
             return np.asarray(values[self._order])
@@ -310,18 +316,50 @@ class Gather:
 
 
 class GatherSubset(Gather):
-    """The same of some rows: those left out are 0 when scattered."""
+    """Gathers a subset of the owned rows; the other rows are 0 when scattered."""
 
     def __init__(self, comm: MPI.Comm, input_index: npt.NDArray[np.int64], which: npt.NDArray[np.bool_]) -> None:
-        """`which`: (n,) of the entities this rank owns, with `input_index` (n,) from 0 on for these."""
+        """`which`: (n,) flags of the subset; `input_index`: (n,) of all owned entities, from 0 in the subset."""
         super().__init__(comm, input_index[which])
         self._which = which
 
     def __call__(self, values: npt.NDArray[Any]) -> npt.NDArray[Any] | None:
+        """(N, ...) rows of the subset over all ranks in input order on rank 0, None elsewhere."""
         return super().__call__(values[: len(self._which)][self._which])
 
     def scatter(self, values: npt.NDArray[Any] | None) -> npt.NDArray[Any]:
-        some = super().scatter(values)
-        result = np.zeros((len(self._which), *some.shape[1:]), some.dtype)
-        result[self._which] = some
+        """(n, ...) rows of the owned entities, 0 outside the subset, of `values` (N, ...) on rank 0."""
+        rows = super().scatter(values)
+        result = np.zeros((len(self._which), *rows.shape[1:]), rows.dtype)
+        result[self._which] = rows
         return result
+
+
+class RankHalo:
+    """Exchanges rows of the cells of other ranks that lie within a distance of the cells of this rank."""
+
+    def __init__(self, comm: MPI.Comm, centroids: Values, distance: float) -> None:
+        self.comm = comm
+        self._send: list[npt.NDArray[np.int64]] = [np.empty(0, np.int64)] * comm.size
+        if comm.size == 1:
+            return
+        d = centroids.shape[1]
+        empty = np.full((2, d), np.inf) * [[1], [-1]]
+        box = np.array([centroids.min(axis=0), centroids.max(axis=0)]) if len(centroids) else empty
+        boxes = allgather(comm, box)
+        for rank, (low, high) in enumerate(boxes):
+            if rank != comm.rank:
+                close = np.all((centroids >= low - distance) & (centroids <= high + distance), axis=1)
+                self._send[rank] = np.flatnonzero(close).astype(np.int64)
+        sent = np.array([len(part) for part in self._send], np.int64)
+        received = np.empty_like(sent)
+        comm.Alltoall(sent, received)
+        self._sent, self._received = sent, received
+        self._rows = np.concatenate(self._send)
+
+    def __call__(self, values: Values) -> Values:
+        """(cells + halo, n) rows of `values` (cells, n): those of this rank first (collective)."""
+        if self.comm.size == 1:
+            return values
+        send = np.ascontiguousarray(values[self._rows], float)
+        return np.concatenate([values, exchange_rows(self.comm, send, self._sent, self._received)])

@@ -1,7 +1,4 @@
-"""Places of a body: a group of facets, a box or a plane, and which points belong to them. No DOLFINx here.
-
-Named groups and regions of a mesh, as a study calls them. No DOLFINx here.
-"""
+"""Selectors of nodes and facets: a named group, a box or a plane. DOLFINx is not imported here."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from ..errors import InputError
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-RELATIVE_TOLERANCE = 1e-9  # of the body's size: faces that coincide are meant
+RELATIVE_TOLERANCE = 1e-9  # of the size of the body: round-off of coordinates
 
 
 @dataclass(frozen=True)
@@ -39,21 +36,21 @@ class PointsInBox:
         return f"box {list(self.lower)} to {list(self.upper)}"
 
     def selects(self, points: Values, size: float) -> Flags:
-        """(n,) which of the points (n, d) in m lie in it; `size`: of the body, m."""
+        """(n,) whether the points (n, d), m, lie in the box; `size` of the body, m."""
         slack = RELATIVE_TOLERANCE * size
         return np.all((points >= np.array(self.lower) - slack) & (points <= np.array(self.upper) + slack), axis=1)
 
     def intersects_box(self, lower: Values, upper: Values) -> bool:
-        """Whether it reaches into a bounding box."""
+        """Whether the box intersects a bounding box, m."""
         slack = RELATIVE_TOLERANCE * float(np.linalg.norm(upper - lower))
         return bool(np.all(self.lower <= upper + slack) and np.all(self.upper >= lower - slack))
 
 
 @dataclass(frozen=True)
 class PointsOnPlane:
-    """A plane through a point (m), and what lies within `within` of it (m; default 1e-6 of the body's size).
+    """A plane through a point (m), with all points closer than `within` (m; default: 1e-6 of the size of the body).
 
-    Raises InputError where the normal is zero.
+    Raises InputError if the normal is zero.
     """
 
     point: tuple[float, ...]
@@ -61,20 +58,20 @@ class PointsOnPlane:
     within: float | None = None
 
     def __post_init__(self) -> None:
-        if not np.linalg.norm(self.normal) > 0:  # squares of less than 1e-154 are nothing
+        if not np.linalg.norm(self.normal) > 0:  # components below 1e-154 underflow in the norm
             raise InputError(f"normal = {list(self.normal)}: a normal must not be zero")
 
     def __str__(self) -> str:
         return f"plane through {list(self.point)} with normal {list(self.normal)}"
 
     def selects(self, points: Values, size: float) -> Flags:
-        """(n,) which of the points (n, d) in m lie on it; `size`: of the body, m."""
+        """(n,) whether the points (n, d), m, lie on the plane; `size` of the body, m."""
         normal = np.array(self.normal)
         distance = np.abs((points - np.array(self.point)) @ normal) / np.linalg.norm(normal)
         return np.asarray(distance <= (self.within or 1e-6 * size))
 
     def intersects_box(self, lower: Values, upper: Values) -> bool:
-        """Whether it passes through a bounding box, whose corners may be infinite."""
+        """Whether the plane passes through a bounding box, whose corners may be infinite."""
         normal = np.array(self.normal)
         ends = np.sort(normal * (np.array([lower, upper]) - np.array(self.point)), axis=0)
         slack = (self.within or 0.0) * np.linalg.norm(normal) + RELATIVE_TOLERANCE * np.abs(
@@ -87,14 +84,14 @@ type Selector = Group | PointsInBox | PointsOnPlane
 
 
 def check_group(name: str, known: Iterable[str], key: str) -> None:
-    """InputError where the mesh has no facet group of that name; `key`: where the study has it."""
+    """Raise InputError if the mesh has no facet group of that name; `key` of the study that names the group."""
     known = sorted(known)
     if name not in known:
         raise InputError(f'{key} = "{name}": the mesh has no such facet group; it has: {", ".join(known) or "none"}')
 
 
 def check_regions(names: Iterable[str], known: Sequence[str]) -> None:
-    """InputError for a [material.NAME] that the mesh does not have."""
+    """Raise InputError if the mesh lacks a region that a [material.NAME] names."""
     for name in names:
         if name not in known:
             regions = ", ".join(known) or "none"

@@ -1,7 +1,7 @@
-"""Edges of a triangle or tetrahedron, and what every pattern of broken ones means.
+"""Edges of a triangle or tetrahedron, and tables of all patterns of broken edges.
 
-A cell's broken edges are one small integer, its *pattern*: bit k is set where local edge k is broken, 64 patterns for a
-tetrahedron and 8 for a triangle. What a pattern means is worked out once for all of them and looked up with arrays.
+The pattern of a cell is an integer whose bit k is set if local edge k is broken: 64 patterns for a tetrahedron, 8 for a
+triangle. Properties of patterns are tabulated once and looked up with arrays.
 """
 
 from __future__ import annotations
@@ -23,14 +23,14 @@ def local_edges(dim: int) -> npt.NDArray[np.int64]:
 
 @cache
 def intact_edges(dim: int) -> npt.NDArray[np.bool_]:
-    """(patterns, edges per cell): for each pattern, which edges are intact."""
+    """(patterns, edges per cell) whether each edge is intact, for each pattern."""
     edges = len(local_edges(dim))
     return (np.arange(1 << edges)[:, None] >> np.arange(edges)) & 1 == 0
 
 
 @cache
 def node_groups(dim: int) -> npt.NDArray[np.int8]:
-    """(patterns, d + 1): for each pattern, the lowest local node that each local node is joined to by intact edges."""
+    """(patterns, d + 1) the lowest local node that intact edges connect each local node to, for each pattern."""
     edges, intact = local_edges(dim), intact_edges(dim)
     label = np.tile(np.arange(dim + 1, dtype=np.int8), (len(intact), 1))
     for _ in range(dim):  # a path through d + 1 nodes has at most d edges
@@ -44,5 +44,5 @@ def node_groups(dim: int) -> npt.NDArray[np.int8]:
 
 @cache
 def is_split(dim: int) -> npt.NDArray[np.bool_]:
-    """(patterns,): whether the intact edges no longer connect all nodes of the cell."""
+    """(patterns,) whether the intact edges no longer connect all nodes of the cell."""
     return np.any(node_groups(dim) != 0, axis=1)

@@ -1,4 +1,7 @@
-"""Arrays of 2 x 2 and 3 x 3 matrices, those of simplices, all at once: a LAPACK call each costs more than the sums."""
+"""Arrays of 2 x 2 and 3 x 3 matrices: cofactors, inverse transposes, gradients of simplices, polar rotations.
+
+Closed formulas over the whole array are faster than one LAPACK call for each small matrix.
+"""
 
 from __future__ import annotations
 
@@ -33,17 +36,17 @@ def inverse_transpose(A: Matrices) -> Matrices:
 def barycentric_gradients(corners: Matrices) -> Matrices:
     """(n, d + 1, d) gradients g_i of the barycentric coordinates of (n, d + 1, d) corners, 1/m."""
     basis = corners[:, 1:] - corners[:, :1]
-    others = inverse_transpose(basis)
-    return np.concatenate([-others.sum(axis=1, keepdims=True), others], axis=1)
+    gradients = inverse_transpose(basis)
+    return np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)
 
 
 def polar_rotation(F: Matrices, iterations: int = 20) -> Matrices:
-    """(n, d, d) rotations closest to F: Newton's iteration R <- (R + R^-T) / 2, which converges quadratically.
+    """(n, d, d) rotations R of the polar decomposition F = R U, by Newton's iteration R <- (R + R^-T) / 2.
 
-    About four times faster on arrays than a batched SVD, which serves only the cells that are inverted or nearly flat,
-    where the iteration would find a reflection or stall (Higham 1986).
+    Convergence is quadratic. For inverted or nearly flat cells the iteration would converge to a reflection or stall;
+    an SVD is used there. Source: Higham (1986), Computing the polar decomposition.
     """
-    with np.errstate(invalid="ignore", over="ignore"):  # cells of a diverging iterate fail the comparison
+    with np.errstate(invalid="ignore", over="ignore"):  # cells of a diverging iterate are not finite
         regular = np.linalg.det(F) > 1e-6 * np.einsum("nij,nij->n", F, F) ** (F.shape[1] / 2)
     if not regular.all():
         result = np.empty_like(F)
@@ -54,13 +57,13 @@ def polar_rotation(F: Matrices, iterations: int = 20) -> Matrices:
     for _ in range(iterations):
         change = inverse_transpose(R) - R
         R += change / 2
-        if np.max(np.abs(change), initial=0.0) < 1e-8:  # quadratic: the next one would be at round-off
+        if np.max(np.abs(change), initial=0.0) < 1e-8:  # quadratic convergence: the next change is at round-off
             break
     return R
 
 
 def _rotation_by_svd(F: Matrices) -> Matrices:
-    """U diag(1, .., det(U V^T)) V^T: the rotation, not the reflection, closest to F. Identity where F is not finite."""
+    """(n, d, d) U diag(1, .., det(U V^T)) V^T, the rotation closest to F; the identity where F is not finite."""
     finite = np.isfinite(F.sum(axis=(1, 2)))
     safe = np.where(finite[:, None, None], F, np.eye(F.shape[1]))
     U, _, Vt = np.linalg.svd(safe)

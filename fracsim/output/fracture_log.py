@@ -41,14 +41,15 @@ class FractureLog:
         self.record: EdgeRecord | None = None
         self.surfaces: BrittleSurfaces | None = None
         self.fragments: Fragments | None = None
+        # (edges,) state of the broken edges that `fragments` belongs to
+        self._broken: npt.NDArray[np.bool_] | None = None
         self.counts = (0, 0, _count_bodies(self._domain))
         self._cut_by_criterion: npt.NDArray[np.float64] | None = None
         self._carried: npt.NDArray[np.float64] | None = None
         if breaking is not None:
             from ..fracture.edge_history import EdgeRecord
-            from ..mesh.incremental_fragments import IncrementalFragments
 
-            self.record, self._fragment_search = EdgeRecord(breaking.graph), IncrementalFragments(breaking.graph)
+            self.record = EdgeRecord(breaking.graph)
             # not isinstance: that would import the brittle room, which other studies do not need
             if hasattr(breaking.criterion, "starts"):
                 self.surfaces = cast("BrittleSurfaces", breaking.criterion)
@@ -88,8 +89,13 @@ class FractureLog:
         if self.record is None:
             return
         graph = self.record.graph
-        broken, split = sum_over_ranks(self._domain.comm, np.array([graph.broken_count, np.count_nonzero(graph.split)]))
-        self.fragments = self._fragment_search.update()
+        changed = self._broken is None or not np.array_equal(self._broken, graph.broken)
+        counts = np.array([graph.broken_count, np.count_nonzero(graph.split), changed])
+        broken, split, changed_ranks = sum_over_ranks(self._domain.comm, counts)
+        if self.fragments is None or changed_ranks:
+            from ..mesh.fragments import find_fragments
+
+            self.fragments, self._broken = find_fragments(graph), graph.broken.copy()
         self.counts = int(broken), int(split), self.fragments.count
 
     def count_single_nodes(self, mass: npt.NDArray[np.float64]) -> tuple[int, float]:

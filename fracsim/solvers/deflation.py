@@ -27,7 +27,7 @@ from scipy.sparse.linalg import splu
 from ..mechanics.balance import Balance
 from ..mechanics.term_protocols import TieTerm
 from ..mesh.domain import Domain
-from ..mesh.facet_components import node_components
+from ..mesh.node_cells import node_components
 from ..mesh.parallel import allgather, sum_over_ranks
 from .weak_callbacks import ApplyContext
 

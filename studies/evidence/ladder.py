@@ -39,7 +39,7 @@ EXACT: dict[str, Any] = {"solver": {"snes_type": "newtonls", "ksp_rtol": 1e-5}}
 FLOW: dict[str, Any] = {"solver": None, "plasticity": {"yield_stress": 2e3, "hardening": 1e5}}
 FRACTURE_MODULES = (
     "fracture.fracture_pass", "fracture.degradation", "fracture.strength", "fracture.edge_stress",
-    "fracture.edge_history", "mesh.edge_graph", "mesh.incidence", "mesh.incremental_fragments", "mesh.fragments",
+    "fracture.edge_history", "mesh.edge_graph", "mesh.fragments",
 )  # fmt: skip
 PLASTIC_MODULES = (
     "mechanics.plasticity", "mechanics.plasticity", "mechanics.return_mapping", "mechanics.tensor_functions",

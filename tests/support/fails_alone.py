@@ -19,7 +19,7 @@ FAILURES: dict[str, BaseException] = {
 }
 
 rank, kind, *arguments = sys.argv[1:]
-parallel.PATIENCE = 1.0  # as long as the other rank would need to fail in the same place
+parallel.FAILURE_WAIT = 1.0  # as long as the other rank would need to fail in the same place
 calls = 0
 advance = stepper_module.BalanceStepper.advance
 

@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from fracsim.mesh.halo import RankHalo
-from fracsim.mesh.parallel import Gather, GatherSubset, allgather, alltoall, bcast, gather
+from fracsim.mesh.parallel import Gather, GatherSubset, RankHalo, allgather, alltoall, bcast, gather
 
 END = 1500  # elements
 UNIT = 2**31 // 1024

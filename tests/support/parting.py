@@ -2,48 +2,42 @@
 
 from __future__ import annotations
 
-from unittest.mock import patch
-
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from fracsim.mesh import incremental_fragments
 from fracsim.mesh.edge_graph import EdgeGraph
+from fracsim.mesh.fragments import find_fragments
 
 from .scenes import make_scene
 
 CASES = {"2d": (2, 0.06, 1), "3d": (3, 0.2, 1), "quadratic": (2, 0.1, 2)}  # dim, h and order
 AT_ONCE = 12
-NEAR = 3  # edges that one goes: bodies are small
 
 
 def compared() -> dict[str, npt.NDArray[np.generic]]:
-    """For each case whether pieces were those of SciPy each time, how many there were, and at how many looks the whole
-    body was searched."""
+    """For each case (searches, 2): whether fragments were those of SciPy, and their count."""
     return {f"parting-{name}": broken_bit_by_bit(*case) for name, case in CASES.items()}
 
 
 def broken_bit_by_bit(dim: int, h: float, order: int) -> npt.NDArray[np.int64]:
-    """(looks, 3) on rank 0: whether pieces are SciPy's, their count, and whether all was searched."""
+    """(searches, 2) on rank 0: whether fragments are SciPy's, and their count."""
     scene, _ = make_scene(
         mesh={"builder": "box", "size": [1] * dim, "h": h, "pattern": "unstructured", "order": order},
         fracture={"strength": 1.0},
     )
     graph, rows = scene.fracture.graph, []
-    follow, turn = incremental_fragments.IncrementalFragments(graph), _turns(graph)
+    turn = _turns(graph)
     for last in np.arange(0, turn[-1] + AT_ONCE, AT_ONCE):
         graph.break_edges(turn[:-1] <= last)
-        everywhere = patch.object(incremental_fragments, "find_fragments", wraps=incremental_fragments.find_fragments)
-        with patch.object(incremental_fragments, "FAR", NEAR), everywhere as searched:
-            pieces = follow.update()
+        pieces = find_fragments(graph)
         of_node = graph.domain.gather_nodes(pieces.node_fragment[: graph.domain.node_count])
         keys = graph.broken_keys()
         if keys is not None:
             assert of_node is not None
             same = np.array_equal(of_node[: len(graph.domain.source.points)], _by_scipy(graph, keys))
-            rows.append((same, pieces.count, searched.called))
+            rows.append((same, pieces.count))
     return np.array(rows)
 
 

@@ -18,8 +18,8 @@ from fracsim.fracture.nonlocal_average import NonlocalAverage
 from fracsim.fracture.strength import hashed
 from fracsim.mesh.domain import Domain
 from fracsim.mesh.edge_graph import EdgeGraph
-from fracsim.mesh.facet_components import node_components
 from fracsim.mesh.fragments import find_fragments
+from fracsim.mesh.node_cells import node_components
 from fracsim.mesh.parallel import sum_over_ranks
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers.deflation import create_deflation

@@ -15,8 +15,7 @@ from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from ...mesh.domain import Domain
-from ...mesh.halo import RankHalo
-from ...mesh.parallel import alltoall
+from ...mesh.parallel import RankHalo, alltoall
 from ...mesh.small_matrices import barycentric_gradients
 
 Ints = npt.NDArray[np.int64]
