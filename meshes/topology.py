@@ -55,19 +55,39 @@ def edges_of(cells: Indices) -> Indices:
 
 
 def distinct_rows(rows: Indices) -> tuple[Indices, Indices, Indices]:
-    """Distinct rows (k, w), the number of times each occurs (k,), and for each given row the place of its like (n,).
+    """Distinct rows (k, w) in rising order, their numbers of occurrences (k,), and the distinct row of each row (n,).
 
     Rows are compared as they stand: sort each row first where the order of its nodes does not matter.
     """
     if len(rows) == 0:
         return rows, np.zeros(0, np.int64), np.zeros(0, np.int64)
-    order = np.lexsort(rows.T[::-1])
-    ranked = rows[order]
-    starts = np.flatnonzero(np.concatenate([[True], np.any(ranked[1:] != ranked[:-1], axis=1)]))
-    counts = np.diff(np.append(starts, len(rows)))
+    keys = _row_keys(rows)
+    order = np.argsort(keys[0]) if len(keys) == 1 else np.lexsort(keys[::-1])
+    first = np.zeros(len(rows), bool)
+    first[0] = True
+    for key in keys:
+        ranked = key[order]
+        first[1:] |= ranked[1:] != ranked[:-1]
+    starts = np.flatnonzero(first)
     inverse = np.empty(len(rows), np.int64)
-    inverse[order] = np.repeat(np.arange(len(starts)), counts)
-    return ranked[starts], counts, inverse
+    inverse[order] = np.cumsum(first) - 1
+    return rows[order[starts]], np.diff(np.append(starts, len(rows))), inverse
+
+
+def _row_keys(rows: Indices) -> list[Indices]:
+    """Integers (n,) that compare as the rows (n, w) do, the most significant first: one sort takes several columns."""
+    lowest = int(rows.min())
+    bits = (int(rows.max()) - lowest).bit_length()
+    # a signed integer of 64 bits holds so many columns
+    per_key = max(1, 63 // max(bits, 1))
+    keys = []
+    for begin in range(0, rows.shape[1], per_key):
+        columns = rows[:, begin : begin + per_key]
+        key = columns[:, 0] - lowest if bits < 64 else columns[:, 0]
+        for column in columns.T[1:]:
+            key = (key << bits) | (column - lowest)
+        keys.append(key)
+    return keys
 
 
 def boundary_facets(cells: Indices) -> Indices:

@@ -381,3 +381,29 @@ def test_a_search_that_is_not_ended_is_no_sound_surface(monkeypatch: pytest.Monk
     monkeypatch.setattr(self_intersection, "MAX_PAIRS_EACH", 1)
     with pytest.raises(MeshError, match="200 triangles was not searched to the end"):
         crossing_triangles(points, np.arange(600).reshape(-1, 3))
+
+
+def test_a_face_folded_over_its_edge_is_found() -> None:
+    corners = np.array([[x, y, z] for z in (0, 1) for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))], float)
+    points = np.concatenate([corners, [[0.5, 1.3, 1.0]]])  # the middle of the upper face, beyond its edge 6-7
+    sides = [[0, 2, 1], [0, 3, 2], [0, 1, 5], [0, 5, 4], [1, 2, 6], [1, 6, 5], [2, 3, 7], [2, 7, 6]]
+    sides += [[3, 0, 4], [3, 4, 7]]
+    lid = [[4, 5, 8], [5, 6, 8], [6, 7, 8], [7, 4, 8]]
+    assert 13 in crossing_triangles(points, np.array(sides + lid), closed=True)
+
+
+def test_neighbours_are_left_out_of_the_exact_test(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A ball of a million triangles is searched in the time in which it is read."""
+    tested = 0
+    exact = self_intersection._crossed
+
+    def counted(points: Points, triangles: Indices, pairs: Indices, *rest: float) -> object:
+        nonlocal tested
+        tested += len(pairs)
+        return exact(points, triangles, pairs, *rest)
+
+    monkeypatch.setattr(self_intersection, "_crossed", counted)
+    points, triangles = sphere(5)
+    assert len(crossing_triangles(points, triangles)) == 0
+    assert tested < 0.5 * len(triangles)
+    assert len(crossing_triangles(*pushed_through(2.2))) > 0

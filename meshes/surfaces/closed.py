@@ -12,9 +12,9 @@ from ..data import Indices, MeshError, Points
 from ..mesh_conversion import Block
 from ..parameters import LONGEST, SHORTEST
 from ..text import middle_of
-from ..topology import Floats, Mask, distinct_rows
+from ..topology import Floats, Mask
 from .enclosed import enclosed_volumes, windings
-from .mending import areas, directed_edges, flat_triangles, mended, mended_sheet
+from .mending import EdgeTable, areas, flat_triangles, mended, mended_sheet
 from .polygons import triangles_of_faces
 
 PROBES = 300  # points of a part that are looked up in another part
@@ -84,10 +84,12 @@ def read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indic
     MeshError as of read_surface, beginning with `source`; an edge of more than two triangles."""
     points, triangles = triangles_as_given(path, scale, source)
     check_points(points, triangles, source)
-    points, triangles, notes = mended_sheet(points, triangles)
-    check_areas(points, triangles, source)
-    check_edges(points, triangles, source, (2,))
-    triangles, _, turned = turned_alike(triangles, source)
+    points, triangles, notes, _, may_be_flat = mended_sheet(points, triangles)
+    if may_be_flat:
+        check_areas(points, triangles, source)
+    table = EdgeTable(triangles)
+    check_edges(points, table, source, (2,))
+    triangles, _, turned = turned_alike(triangles, table, source)
     if turned:
         notes = (*notes, f"{turned} of {len(triangles)} triangles of the shell faced the other way; turned.")
     return points, triangles, notes
@@ -136,10 +138,12 @@ def closed_surface(points: Points, triangles: Indices, source: str) -> ClosedSur
         MeshError: see read_surface; `source` begins the message.
     """
     check_points(points, triangles, source)
-    points, triangles, mends = mended(points, triangles)
-    check_areas(points, triangles, source)
-    _check_closed(points, triangles, source)
-    triangles, shell, turned = turned_alike(triangles, source)
+    points, triangles, mends, _, may_be_flat = mended(points, triangles)
+    if may_be_flat:
+        check_areas(points, triangles, source)
+    table = EdgeTable(triangles)
+    check_edges(points, table, source, (1, 2))
+    triangles, shell, turned = turned_alike(triangles, table, source)
     triangles, bodies, inside_out = _outwards(points, triangles, shell, source)
     notes = list(mends)
     if turned:
@@ -157,14 +161,16 @@ def closed_surface(points: Points, triangles: Indices, source: str) -> ClosedSur
 def check_points(points: Points, triangles: Indices, source: str) -> None:
     if triangles.min() < 0 or triangles.max() >= len(points):
         raise MeshError(f"{source} names points that do not exist (there are {len(points)}); it is damaged.")
-    used = np.unique(triangles)
-    wrong = used[~(np.abs(points[used]) <= LONGEST).all(axis=1)]
-    if len(wrong):
+    is_used = np.zeros(len(points), bool)
+    is_used[triangles] = True
+    named = points if is_used.all() else points[is_used]
+    if not np.abs(named).max() <= LONGEST:
+        wrong = np.flatnonzero(is_used & ~(np.abs(points) <= LONGEST).all(axis=1))
         raise MeshError(
             f"{source} has {len(wrong)} points that are not finite numbers of at most {LONGEST:g} m, the first is "
             f"point {wrong[0]}."
         )
-    if (size := float(np.ptp(points[used], axis=0).max())) < SHORTEST:
+    if (size := float(np.ptp(named, axis=0).max())) < SHORTEST:
         raise MeshError(f"{source} is {size:g} m large, and {SHORTEST:g} m or more is needed.")
 
 
@@ -179,16 +185,11 @@ def check_areas(points: Points, triangles: Indices, source: str) -> None:
         )
 
 
-def _check_closed(points: Points, triangles: Indices, source: str) -> None:
-    check_edges(points, triangles, source, (1, 2))
-
-
-def check_edges(points: Points, triangles: Indices, source: str, which: tuple[int, ...]) -> None:
+def check_edges(points: Points, table: EdgeTable, source: str, which: tuple[int, ...]) -> None:
     """MeshError where edges belong to one triangle only (1) or to more than two (2)."""
-    edges, counts, _ = distinct_rows(np.sort(directed_edges(triangles), axis=1))
     found = {
-        1: (edges[counts == 1], "is open: {} edges belong to one triangle only"),
-        2: (edges[counts > 2], "is not the surface of a body: {} edges belong to more than two triangles"),
+        1: (table.edges[table.counts == 1], "is open: {} edges belong to one triangle only"),
+        2: (table.edges[table.counts > 2], "is not the surface of a body: {} edges belong to more than two triangles"),
     }
     for kind in which:
         wrong, what = found[kind]
@@ -201,20 +202,21 @@ def check_edges(points: Points, triangles: Indices, source: str, which: tuple[in
             )
 
 
-def turned_alike(triangles: Indices, source: str) -> tuple[Indices, Indices, int]:
+def turned_alike(triangles: Indices, table: EdgeTable, source: str) -> tuple[Indices, Indices, int]:
     """Triangles turned so that neighbours face the same side; the connected part of each; how many were turned.
 
     Each triangle t has two states, as given (t) and turned (t + k). States of neighbours that agree are linked; the
     links fall into two mirrored halves for each part, or into one where the part has one side only (Moebius).
     """
     count = len(triangles)
-    directed = directed_edges(triangles)
-    _, counts, edge = distinct_rows(np.sort(directed, axis=1))
+    directed, counts, edge = table.directed, table.counts, table.place
     order = np.argsort(edge, kind="stable")
     order = order[counts[edge[order]] == 2]  # an open one has edges of one triangle
     first, second = order[0::2], order[1::2]
     disagree = directed[first, 0] == directed[second, 0]
     a, b = first // 3, second // 3
+    if not disagree.any():
+        return triangles, components(np.stack([a, b], axis=1), count)[1], 0
     links = np.concatenate([np.stack([a, b + count * disagree], 1), np.stack([a + count, b + count * ~disagree], 1)])
     _, state = components(links, 2 * count)
     as_given, turned = state[:count], state[count:]
@@ -251,6 +253,8 @@ def _holders(points: Points, triangles: Indices, shell: Indices, source: str) ->
     """Whether shell i lies inside shell j: (s, s). Where only some of its points do, the two cut each other."""
     count = int(shell.max()) + 1
     inside = np.zeros((count, count), bool)
+    if count == 1:
+        return inside
     corners = [points[triangles[shell == j]] for j in range(count)]
     for i, j in _near(corners):
         probes = np.unique(corners[i].reshape(-1, 3), axis=0)

@@ -30,7 +30,7 @@ from .closed import (
     turned_alike,
 )
 from .enclosed import enclosed_volumes, windings
-from .mending import JOINED, areas, directed_edges, mended, open_edges
+from .mending import JOINED, EdgeTable, areas, directed_edges, mended, open_edges
 from .self_intersection import crossing_triangles
 
 MAX_CHANGE = 0.1  # of the volume of a part, or of a side of its bounding box over the longest side
@@ -100,7 +100,7 @@ def repaired(points: Points, triangles: Indices, source: str) -> tuple[Points, I
             manifold3d is not installed.
     """
     points, triangles, mends = _mended(points, triangles, source)
-    triangles, shell, _ = turned_alike(triangles, source)
+    triangles, shell, _ = turned_alike(triangles, EdgeTable(triangles), source)
     crossings = crossing_triangles(points, triangles, closed=True)
     own = np.unique(crossings[shell[crossings[:, 0]] == shell[crossings[:, 1]]])
     opened = np.unique(open_edges(triangles) // 3)
@@ -132,26 +132,26 @@ def _mended(points: Points, triangles: Indices, source: str) -> tuple[Points, In
     Parts that cross or touch may have points at the same place, as two boxes with a common face.
     """
     whole, given = mended(points, triangles), (points, triangles)
-    points, triangles, notes = whole
+    points, triangles, notes = whole[:3]
     if _crowded(triangles):
         _, part = components(np.concatenate([given[1][:, :2], given[1][:, 1:]]), len(given[0]))
         of_triangle = part[given[1][:, 0]]
         numbers = np.unique(of_triangle)
         if 1 < len(numbers) <= MAX_PARTS:
             parts = [mended(*_part(given[0], given[1][of_triangle == number])) for number in numbers]
-            apart = _together([(own_points, own) for own_points, own, _ in parts])
+            apart = _together([(own_points, own) for own_points, own, *_ in parts])
             # STL does not say which triangles are connected: each would be a part, and open
             if not _crowded(apart[1]) and len(open_edges(apart[1])) <= len(open_edges(triangles)):
                 points, triangles = apart
-                notes = tuple(note for _, _, own_notes in parts for note in own_notes)
+                notes = tuple(note for _, _, own_notes, *_ in parts for note in own_notes)
     check_areas(points, triangles, source)
-    check_edges(points, triangles, source, (2,))
+    check_edges(points, EdgeTable(triangles), source, (2,))
     return points, triangles, notes
 
 
 def _crowded(triangles: Indices) -> bool:
     """Whether an edge belongs to more than two triangles."""
-    return bool((distinct_rows(np.sort(directed_edges(triangles), axis=1))[1] > 2).any())
+    return bool((EdgeTable(triangles).counts > 2).any())
 
 
 Part = tuple[Points, Indices]
