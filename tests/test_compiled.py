@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fracsim.errors import InputError
+from fracsim.errors import CannotWrite, InputError
 from fracsim.mesh import c_library, library_cache
 from support.damaged import DAMAGES, damage
 
@@ -166,6 +166,61 @@ def test_a_cache_that_cannot_be_written_is_somewhere_else(
     library_cache._usable.cache_clear()
 
 
+def test_a_folder_that_becomes_unusable_is_a_message(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The file system is read-only all of a sudden: no traceback, and the folder is named."""
+
+    def refuse(**_: object) -> None:
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr(c_library.tempfile, "TemporaryDirectory", refuse)
+    source = tmp_path / "twice.c"
+    source.write_text(TWICE)
+    with pytest.raises(CannotWrite, match=f"{folder} cannot be used: .*Read-only file system; name another one"):
+        c_library.load_library(source)
+
+
+COMPILERS = [compiler for compiler in ("gcc", "clang") if shutil.which(compiler)]
+PACKAGE = Path(c_library.__file__).parents[1]
+SOURCES = sorted(PACKAGE.rglob("*.c"))
+# sizes that sources are compiled for; simd_kernels.c needs a kernel of FFCx, and is compiled in test_lanes
+MACROS = {
+    "block_matrix": ["-DD=3"], "psd_projection": ["-DN=9", "-DLANES=4"], "bcsr": ["-DR=3", "-DLANES=8"],
+    "prolongation": ["-DR=3", "-DC=6"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+def test_compilers_take_every_source(folder: Path, monkeypatch: pytest.MonkeyPatch, compiler: str) -> None:
+    """GCC and Clang, as far as they are installed, compile all C files, and their functions are declared."""
+    monkeypatch.setenv("CC", compiler)
+    sources = [source for source in SOURCES if source.stem != "simd_kernels"]
+    assert len(sources) > 10
+    for source in sources:
+        flags = c_library.FAST_FLAGS + MACROS.get(source.stem, [])
+        code, text = c_library.compile_library(source.stem, source.read_text(), flags), source.read_text()
+        names = [name for _, name, _ in c_library._FUNCTION.findall(text) if hasattr(code, name)]
+        assert names and all(getattr(code, name).argtypes for name in names), source
+
+
+@pytest.mark.ranks
+def test_ranks_compile_once(tmp_path: Path) -> None:
+    """Three ranks of a job that ask at once start the compiler once."""
+    log, source = tmp_path / "log", tmp_path / "twice.c"
+    source.write_text(TWICE)
+    compiler = _compiler(tmp_path / "slow", f"echo started >>{log}\nsleep 1")
+    code = (
+        "from fracsim.mesh.c_library import compile_on_all_ranks; from mpi4py import MPI; from pathlib import Path; "
+        f"code = compile_on_all_ranks(MPI.COMM_WORLD, 'twice', Path({str(source)!r}).read_text(), []); "
+        "assert code.twice(21) == 42"
+    )
+    environment = os.environ | {"CC": compiler, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    command = ["mpirun", "--oversubscribe", "-n", "3", sys.executable, "-c", code]
+    subprocess.run(command, env=environment, check=True, timeout=100)
+    assert log.read_text().split() == ["started"]
+
+
 def _compiler(at: Path, lines: str) -> str:
     """A compiler that does something before."""
     at.write_text(f'#!/bin/sh\n{lines}\nexec cc "$@"\n')
@@ -217,25 +272,48 @@ class _Weights(Structure):
 
 
 def test_arrays_are_checked(folder: Path, tmp_path: Path) -> None:
-    """Contiguous ones of the right numbers are taken, also what may not be written to and what is empty; no other."""
+    """Contiguous arrays of the declared type are taken, read-only ones where nothing is written; no others."""
     source = tmp_path / "sum.c"
     source.write_text(SUM)
     function, done = c_library.load_library(source).sum, np.zeros(1, bool)
     values, weights = np.arange(4.0), np.full(4, 2.0)
     values.flags.writeable = False
     given = ctypes.byref(_Weights(c_library.struct_pointer(weights)))
-    assert function(given, c_int64(4), c_library.array_pointer(values), c_library.array_pointer(done)) == 12.0
+    assert function(given, 4, values, done) == 12.0
     assert done[0]
-    assert function(given, 0, c_library.array_pointer(np.empty(0)), c_library.array_pointer(done)) == 0.0
-    for wrong in (np.arange(8.0)[::2], np.zeros((4, 4)).T[1:], np.zeros(4, complex), np.arange(4.0).astype(">f8")):
-        for hand_over in (c_library.array_pointer, c_library.struct_pointer):
+    assert function(given, 0, np.empty(0), done) == 0.0
+    assert function(given, c_int64(4), c_library.array_pointer(values), c_library.array_pointer(done)) == 12.0
+    strided, swapped = np.arange(8.0)[::2], np.arange(4.0).astype(">f8")
+    for wrong in (strided, np.zeros((4, 4)).T[1:], swapped, np.zeros(4, complex)):
+        for pointer_to in (c_library.array_pointer, c_library.struct_pointer):
             with pytest.raises(ValueError, match="cannot be handed to C"):
-                hand_over(wrong)
+                pointer_to(wrong)
+    message = r"argument 3: ValueError: sum\(values\) takes a contiguous array of float64, and not one of "
+    for wrong, kind in (
+        (strided, r"float64, shape \(4,\), strides \(16,\)"), (swapped, ">f8"), (np.arange(4), "int64"),
+        (np.zeros(4, np.float32), "float32"),
+    ):  # fmt: skip
+        with pytest.raises(ctypes.ArgumentError, match=message + kind):
+            function(given, 4, wrong, done)
     for wrong in (np.arange(4), np.zeros(4, np.float32)):
         with pytest.raises(ctypes.ArgumentError, match="argument 3"):
-            function(given, c_int64(4), c_library.array_pointer(wrong), c_library.array_pointer(done))
+            function(given, c_int64(4), c_library.array_pointer(wrong), done)
         with pytest.raises(TypeError):
             _Weights(c_library.struct_pointer(wrong))
+
+
+def test_read_only_arrays_are_not_written_to(folder: Path, tmp_path: Path) -> None:
+    """An array that the function writes to has to be writable."""
+    source = tmp_path / "sum.c"
+    source.write_text(SUM)
+    function, done, weights = c_library.load_library(source).sum, np.zeros(1, bool), np.full(4, 2.0)
+    done.flags.writeable = False
+    given = ctypes.byref(_Weights(c_library.struct_pointer(weights)))
+    with pytest.raises(
+        ctypes.ArgumentError, match=r"sum\(done\) takes a contiguous writable array of uint8.*read-only"
+    ):
+        function(given, 4, weights, done)
+    assert not done[0]
 
 
 def test_prepared_arguments_are_checked_once(folder: Path, tmp_path: Path) -> None:
@@ -252,10 +330,8 @@ def test_prepared_arguments_are_checked_once(folder: Path, tmp_path: Path) -> No
 
 def test_every_function_in_c_is_declared() -> None:
     """What a library of the package gives to others is known with its arguments: none is called unchecked."""
-    package = Path(c_library.__file__).parents[1]
-    sources = sorted(package.rglob("*.c"))
-    assert len(sources) > 10
-    for source in sources:
+    assert len(SOURCES) > 10
+    for source in SOURCES:
         text = source.read_text()
         named = {name for _, name, _ in c_library._FUNCTION.findall(text)}
         opened = {

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import shutil
+from functools import partial
+
 import numpy as np
 import pytest
 from dolfinx import fem
 
-from fracsim.mechanics import jit, simd_kernels
+from fracsim.mechanics import matrix_assembly, simd_kernels
 from fracsim.mechanics.jit import jit_options
+from fracsim.mechanics.kernel_selection import KernelSelection
 from fracsim.mechanics.matrix_assembly import TangentAssembler
 from fracsim.mechanics.simd_kernels import (
     SimdBilinearForm,
@@ -109,7 +113,7 @@ def test_expressions_as_one_by_one(energy: str, dim: int) -> None:
     lanes = SimdExpression.for_expression(
         compiled_one, expression.mesh, source_of(compiled_one, expression.mesh, jit_options())
     )
-    assert lanes is not None and expression._lanes is None
+    assert lanes is not None and expression._kernel is None
     rng = np.random.default_rng(5)
     for _ in range(2):
         balance.set_displacement(rng.uniform(-0.02, 0.02, balance.owned_dof_count))
@@ -125,12 +129,12 @@ def test_large_bodies_that_break_are_looked_at_several_cells_at_a_time(monkeypat
     """The same where the size of a body decides, and crushed cells are counted as before."""
     found = []
     for many in (1, 10**9):
-        monkeypatch.setattr(jit, "MANY_CELLS", many)
+        monkeypatch.setattr(matrix_assembly, "KernelSelection", partial(KernelSelection, min_cells=many))
         scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 0.7], "h": 0.2}, fracture={"strength": 1.0})
         u = np.random.default_rng(5).uniform(-0.02, 0.02, scene.balance.owned_dof_count)
         u[3] = np.nan
         scene.balance.set_displacement(u)
-        assert (scene.fracture._undamaged._evaluate._lanes is None) == (many > 1)
+        assert (scene.fracture._undamaged._evaluate._kernel is None) == (many > 1)
         found.append((*map(np.copy, scene.fracture.evaluate()), scene.fracture.nonfinite_cells))
     (ours, energy, crushed), (theirs, expected, count) = found
     np.testing.assert_array_equal(ours, theirs)
@@ -195,6 +199,14 @@ def test_what_lanes_cannot_do(line: str) -> None:
     assert vectorise_kernel("double s = fabs(a);") is vectorise_kernel("\nvoid tabulate_tensor_x(double* A);\n") is None
 
 
+@pytest.mark.parametrize("compiler", [name for name in ("gcc", "clang") if shutil.which(name)])
+def test_compilers(monkeypatch: pytest.MonkeyPatch, compiler: str) -> None:
+    """Kernels of several cells by GCC and Clang, as far as they are installed."""
+    monkeypatch.setenv("CC", compiler)
+    balance = damaged("damped", 3, boundary=SIDE)[0].balance
+    assert_as_one_by_one(balance.tangent.form, balance.motion.bcs)
+
+
 def test_no_compiler_is_said_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Kernels of FFCx may be there from before: nobody else misses it. What nobody expects is not kept quiet."""
     balance = damaged("damped", 3, boundary=SIDE)[0].balance
@@ -207,3 +219,26 @@ def test_no_compiler_is_said_once(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     monkeypatch.setattr(simd_kernels, "SOURCE", None)
     with pytest.raises(AttributeError):
         compile_simd_form(balance._work)
+
+
+def test_plain_selection_agrees(monkeypatch: pytest.MonkeyPatch) -> None:
+    """DOLFINx alone gives the same forces, released forces, energy, tangent and positive moduli, to round-off."""
+    results = []
+    for plain in (False, True):
+        selection = partial(KernelSelection, plain=plain, min_dofs=1, min_cells=1)
+        monkeypatch.setattr(matrix_assembly, "KernelSelection", selection)
+        balance = damaged("damped", 3, boundary=SIDE)[0].balance
+        balance.set_displacement(np.random.default_rng(6).uniform(-0.2, 0.2, balance.owned_dof_count))
+        stress = balance.stress
+        before = [field.x.array.copy() for field in stress.damage_fields]
+        for field in stress.damage_fields:
+            field.x.array[::3] = 0.0
+        balance.damage_changed()
+        assert (balance.tangent.switch_to_blocks() is None) == plain
+        balance.tangent.assemble(psd_tolerance=0.1)
+        K = balance.tangent.matrix.convert("dense").getDenseArray().copy()
+        released, energy = stress.assemble_released_forces(before), np.array([stress.stored_energy()])
+        results.append((balance.update_forces().copy(), released, energy, K))
+    for kernels, dolfinx in zip(*results, strict=True):
+        assert np.abs(dolfinx).max() > 0
+        np.testing.assert_allclose(kernels, dolfinx, rtol=0, atol=1e-11 * np.abs(dolfinx).max())

@@ -104,7 +104,7 @@ class EdgeEnergy:
         self._graph, self._volumes = graph, domain.volumes
         self._integrity = stress.integrity.x.array.reshape(-1, graph.cell_edges.shape[1])
         density = stress.energy.psi(deformation_gradient(stress.u), stress.rotation_field)
-        self._density = CellExpression(domain.comm, domain.mesh, density, domain.cell_count, every_step=True)
+        self._density = CellExpression(domain.comm, domain.mesh, density, domain.cell_count, kernels=stress.kernels)
 
     def energy(self) -> float:
         """Elastic energy on this rank, J."""

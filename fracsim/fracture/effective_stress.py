@@ -26,7 +26,8 @@ class Undamaged:
         energy, F, domain = stress.material.energy, deformation_gradient(stress.u), stress.domain
         tensor = symmetric_components(cauchy_stress(energy, F, stress.rotation_field))
         both = ufl.as_vector([*tensor, energy.psi(F, stress.rotation_field)])  # one kernel: F is worked out once
-        self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count, every_step=often)
+        kernels = stress.kernels if often else None
+        self._evaluate = CellExpression(domain.comm, domain.mesh, both, domain.cell_count, kernels=kernels)
         self.not_finite = 0
 
     def __call__(self) -> tuple[Values, Values]:

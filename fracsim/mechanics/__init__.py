@@ -18,10 +18,10 @@ cell_energy                 energy, forces and stiffness of single cells
 psd_projection              positive semi-definite moduli
 stability_limit             stable step from frequencies of single cells
 jit                         compiled forms and expressions
+kernel_selection            choice between DOLFINx and kernels in C: the one place
 matrix_assembly             assembly of vectors and of the tangent
 cell_subset_assembly        linear forms over some of their cells
 simd_kernels                forms of several cells at a time (C)
 block_matrix                tangent in blocks of a node's dofs (C)
 extra_couplings             stiffness between nodes that share no cell
-rotation                    polar rotation of each cell
 """

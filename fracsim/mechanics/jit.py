@@ -1,4 +1,4 @@
-"""Compiling forms: one place for the compiler's flags."""
+"""Compiled forms and expressions, with the compiler's flags in one place, and fields at integration points."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ from ..mesh.library_cache import library_folder, no_room, not_for_others
 from ..mesh.parallel import raise_together
 
 if TYPE_CHECKING:
+    from .kernel_selection import KernelSelection
     from .simd_kernels import SimdExpression
 
 keep_kernels()
@@ -38,35 +39,12 @@ _CENTRE = {2: np.array([[1 / 3, 1 / 3]]), 3: np.array([[0.25, 0.25, 0.25]])}
 
 @cache
 def jit_options() -> dict[str, list[str] | int | Path]:
-    """Of FFCx, which caches kernels by source and flags."""
+    """Options of FFCx, which caches kernels by source and flags."""
     return {"cffi_extra_compile_args": machine_flags(), "timeout": PATIENCE, "cache_dir": library_folder()}
 
 
-PATIENCE = 60  # s that a process waits for a kernel that another one compiles; FFCx's 10 are too few on a busy machine
-
-
-MANY = 10_000  # dofs from which on it pays to compile a form once more, for 1 to 2 s, for several cells at a time
-MANY_CELLS = 5_000  # from which on it does for what is asked in every step: half a second, and a third of the time
-
-
-class SimdKernelCache[Lanes]:
-    """What takes several cells of a form at a time (mechanics.simd_kernels), made where it is first asked for."""
-
-    def __init__(self, make: Callable[[fem.Form], Lanes | None]) -> None:
-        """`make`: None where it cannot be done."""
-        self._make = make
-        self._made: dict[fem.Form, Lanes | None] = {}
-
-    def __call__(self, form: fem.Form) -> Lanes | None:
-        """That of a form; None where it does not pay, or cannot be done (collective the first time)."""
-        if form not in self._made:
-            self._made[form] = self._make(form) if _is_large(form) else None
-        return self._made[form]
-
-
-def _is_large(form: fem.Form) -> bool:
-    spaces = form.function_spaces or [field.function_space for field in form._cpp_object.coefficients]
-    return any(each.dofmap.index_map.size_global * each.dofmap.index_map_bs >= MANY for each in spaces)
+# seconds that a process waits for a kernel that another one compiles; FFCx's 10 are too few on a busy machine
+PATIENCE = 60
 
 
 def compile_form(form: ufl.Form) -> fem.Form:
@@ -75,28 +53,30 @@ def compile_form(form: ufl.Form) -> fem.Form:
 
 
 class CellForm(fem.Form):
-    """A form over `cells_measure`, cells of which may be left out later: its kernels stay, and so do its facets. They
-    are bound to the cells that are left when DOLFINx asks for them next; vectors are summed over `left` without that.
+    """Form over `cell_measure` from which cells can be excluded later, with the same compiled kernels.
 
-    fem.create_form would bind kernels to other cells as well, but in DOLFINx 0.9 it mixes up the coefficients of a form
-    whose derivatives let one of them vanish.
+    Kernels are bound to the remaining cells when DOLFINx asks for the form next. Vectors are assembled over
+    `remaining_cells` without that.
     """
 
+    # fem.create_form would bind kernels to other cells as well, but in DOLFINx 0.9 it mixes up the coefficients of a
+    # form whose derivatives let one of them vanish
+
     def __init__(self, form: ufl.Form) -> None:
-        whole = compile_form(form)
-        self._whole: Any = whole._cpp_object
-        self._dead: npt.NDArray[np.bool_] | None = None  # that are not left out yet
-        self._out: npt.NDArray[np.bool_] | None = None  # that are
-        self._left: npt.NDArray[np.int64] | None = None
-        super().__init__(whole._cpp_object, whole.ufcx_form, whole.code, whole.module)
+        compiled = compile_form(form)
+        self._all_cells: Any = compiled._cpp_object
+        self._pending: npt.NDArray[np.bool_] | None = None  # excluded cells to which kernels are not bound yet
+        self._excluded: npt.NDArray[np.bool_] | None = None
+        self._remaining: npt.NDArray[np.int64] | None = None
+        super().__init__(compiled._cpp_object, compiled.ufcx_form, compiled.code, compiled.module)
         self._constants = [constant._cpp_object for constant in form.constants()]
 
     @property
     def _cpp_object(self) -> Any:
-        """What DOLFINx asks a form for."""
-        if self._dead is not None:
-            dead, self._dead = self._dead, None  # binding asks for it, too
-            self._bound = self._over(~dead)
+        """C++ form that DOLFINx uses, over the remaining cells."""
+        if self._pending is not None:
+            excluded, self._pending = self._pending, None  # first, since binding asks for the C++ form, too
+            self._bound = self._over(~excluded)
         return self._bound
 
     @_cpp_object.setter
@@ -105,42 +85,41 @@ class CellForm(fem.Form):
 
     @property
     def all_cells_form(self) -> Any:
-        """C++ form over all cells of the measure, as it was compiled: to ask it for anything binds nothing anew."""
-        return self._whole
+        """C++ form over all cells of the measure, as it was compiled; to use it binds no kernel again."""
+        return self._all_cells
 
     @property
     def remaining_cells(self) -> npt.NDArray[np.int64] | None:
-        """The cells that it is integrated over, once any have been left out; None before, and where it has other
-        integrals."""
-        if self._left is None and self._out is not None and (cells := self._cells) is not None:
-            self._left = cells[~self._out[cells]]
-        return self._left
+        """Cells of the integral once any have been excluded; None before, and for forms with other integrals."""
+        if self._remaining is None and self._excluded is not None and (cells := self._cells) is not None:
+            self._remaining = cells[~self._excluded[cells]]
+        return self._remaining
 
     @cached_property
     def _cells(self) -> npt.NDArray[np.int64] | None:
-        """Those of the measure; None of a form with other integrals."""
-        return only_cells(self._whole)
+        """Cells of the measure; None for a form with other integrals."""
+        return only_cells(self._all_cells)
 
     def exclude_cells(self, dead: npt.NDArray[np.bool_]) -> None:
-        """Integrate from here on over those cells of the measure that are not flagged (not collective)."""
-        self._dead = self._out = dead
-        self._left = None
+        """Integrate from now on over the cells of the measure that are not flagged (cells,) (not collective)."""
+        self._pending = self._excluded = dead
+        self._remaining = None
 
     def _over(self, chosen: npt.NDArray[np.bool_]) -> Any:
-        return bind_to_cells(self, self._whole, self._constants, lambda cells: cells[chosen[cells]])
+        return bind_to_cells(self, self._all_cells, self._constants, lambda cells: cells[chosen[cells]])
 
 
 def cell_measure(domain: Domain, cells: npt.NDArray[np.int32] | None = None) -> ufl.Measure:
-    """Measure of the given owned cells; None: of all of them."""
-    every = np.arange(domain.cell_count, dtype=np.int32) if cells is None else cells
-    return ufl.Measure("dx", domain=domain.mesh, subdomain_data=[(1, every)])(1)
+    """Measure of owned cells (n,); None: of all of them."""
+    entities = np.arange(domain.cell_count, dtype=np.int32) if cells is None else cells
+    return ufl.Measure("dx", domain=domain.mesh, subdomain_data=[(1, entities)])(1)
 
 
 def compile_collectively[Kernel](comm: MPI.Comm, compile_kernel: Callable[[], Kernel]) -> Kernel:
-    """Compile; where an earlier process was killed while it compiled the same kernel, clear that away and do it again.
+    """Compile a kernel on all ranks; a failure on one rank is raised on all (collective).
 
-    FFCx takes what such a process left for a compilation that is still under way. A failure on one rank is raised on
-    all (collective).
+    Files of an earlier process that was killed while it compiled the same kernel are removed: FFCx takes them for a
+    compilation that is still running.
     """
     kernel, failure = _attempt(compile_kernel)
     timed_out = comm.allreduce("JIT compilation timed out" in str(failure), op=MPI.LOR)
@@ -160,7 +139,7 @@ def _attempt[Kernel](compile_kernel: Callable[[], Kernel]) -> tuple[Kernel | Non
 
 
 def _explained(error: Exception) -> Exception:
-    """What a user can mend of a compiler's failure, which comes as an error of setuptools', cffi's or DOLFINx's."""
+    """Error with a message for users of a compiler's failure, which setuptools, cffi or DOLFINx raised."""
     kind, folder = type(error).__module__.split(".")[0], library_folder()
     if kind not in ("cffi", "distutils", "setuptools") and "Compile" not in str(error) and "Link" not in str(error):
         return error
@@ -170,7 +149,7 @@ def _explained(error: Exception) -> Exception:
 
 
 def _clear_abandoned() -> bool:
-    """Remove kernels that have been compiling for longer than anyone waits; whether there were any."""
+    """Remove kernels that have been compiling for longer than `PATIENCE`; returns whether there were any."""
     folder = library_folder()
     abandoned = [
         path for path in folder.glob("libffcx_*.c")
@@ -182,40 +161,48 @@ def _clear_abandoned() -> bool:
 
 
 def renumber_labels(expression: Expr) -> Expr:
-    """An expression whose labels (of ufl.variable) are numbered from 0, in the order in which they are met: they do not
-    tell how many there have been before it.
+    """The same expression with the labels of ufl.variable numbered from 0, in the order of traversal.
 
-    FFCx knows a kernel again by its signature. UFL 2024.2 puts the number of a label into that of an expression: each
-    scene of a process would compile its own.
+    FFCx recognises a kernel by its signature, which with UFL 2024.2 has the numbers of labels. Each scene of a process
+    would otherwise compile its own kernels.
     """
-    anew: dict[Expr, Expr] = {}
-    given = 0
+    renumbered: dict[Expr, Expr] = {}
+    count = 0
     for part in unique_post_traversal(expression):
         if isinstance(part, Label):
-            anew[part], given = Label(given), given + 1
+            renumbered[part], count = Label(count), count + 1
             continue
-        operands = [anew[each] for each in part.ufl_operands]
+        operands = [renumbered[operand] for operand in part.ufl_operands]
         same = all(new is old for new, old in zip(operands, part.ufl_operands, strict=True))
-        anew[part] = part if same else part._ufl_expr_reconstruct_(*operands)
-    return anew[expression]
+        renumbered[part] = part if same else part._ufl_expr_reconstruct_(*operands)
+    return renumbered[expression]
 
 
 class CellExpression:
-    """A UFL expression as its mean over each cell, evaluated by a compiled kernel into an array that is kept.
+    """UFL expression that a compiled kernel evaluates in each cell.
 
-    What depends on F alone is constant in a cell with linear displacement, and asked for at its centre; with quadratic
-    displacement at the points where stress is integrated, which have equal weights.
+    A function of F is constant in a cell with linear displacement, and is evaluated at its centre. With quadratic
+    displacement it is evaluated at the points where stress is integrated, which have equal weights.
 
     Attributes:
+        mesh: the mesh.
         width: components of the expression.    count: points of a cell.
     """
 
     def __init__(
         self, comm: MPI.Comm, mesh: Mesh, expression: Expr, cells: int, points: npt.NDArray[np.float64] | None = None,
-        *, every_step: bool = False,
+        *, kernels: KernelSelection | None = None,
     ) -> None:  # fmt: skip
-        """`points`: (count, d) of the reference cell; None: by the fields that the expression is made of. `often`: it
-        is asked for in every step, so that compiling it once more may pay (collective)."""
+        """Compile an expression (collective).
+
+        Args:
+            comm: of the mesh.
+            mesh: the mesh.
+            expression: a scalar, vector or tensor.
+            cells: number of cells of this rank.
+            points: (count, d) points of the reference cell; None: those that the fields of the expression need.
+            kernels: selection of kernels, for an expression of every step; None: DOLFINx evaluates it.
+        """
         shape = expression.ufl_shape
         self.mesh = mesh
         self.width = int(np.prod(shape, dtype=int))
@@ -226,19 +213,22 @@ class CellExpression:
             lambda: fem.Expression(renumber_labels(expression), points, comm=comm, jit_options=jit_options()),
         )
         self._all = np.arange(cells, dtype=np.int32)
-        pays = every_step and self.points_per_cell == 1 and comm.allreduce(cells) >= MANY_CELLS
-        self._lanes = self._in_lanes() if pays else None
+        self._kernel: SimdExpression | None = None
+        if kernels is not None and self.points_per_cell == 1:
+            self._kernel = kernels.expression(
+                self._compiled, mesh, cells, lambda: source_of(self._compiled, mesh, jit_options())
+            )
         self._values: npt.NDArray[np.float64] | None = None
 
     def __call__(self, cells: npt.NDArray[np.int32] | None = None) -> npt.NDArray[np.float64]:
-        """(cells, width) values on all owned cells (an array that the next such call overwrites) or on those given."""
+        """(cells, width) mean values in all owned cells (an array that the next such call overwrites) or in `cells`."""
         values = self.evaluate_at_points(cells)
         return (
             values if self.points_per_cell == 1 else values.reshape(-1, self.points_per_cell, self.width).mean(axis=1)
         )
 
     def evaluate_at_points(self, cells: npt.NDArray[np.int32] | None = None) -> npt.NDArray[np.float64]:
-        """(cells, count width) the same at each of the points."""
+        """(cells, points_per_cell width) values at each of the points."""
         if cells is None:
             if self._values is None:
                 self._values = np.empty((len(self._all), self.points_per_cell * self.width))
@@ -246,57 +236,57 @@ class CellExpression:
         return self._into(np.empty((len(cells), self.points_per_cell * self.width)), cells)
 
     def _into(self, values: npt.NDArray[np.float64], cells: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:
-        if self._lanes is None:
+        if self._kernel is None:
             return evaluate(self._compiled, self.mesh, cells, values)
-        self._lanes(cells, values)
+        self._kernel(cells, values)
         return values
 
-    def _in_lanes(self) -> SimdExpression | None:
-        from .simd_kernels import SimdExpression
 
-        source = source_of(self._compiled, self.mesh, jit_options())
-        return SimdExpression.for_expression(self._compiled, self.mesh, source)
-
-
-def point_expression(domain: Domain, expression: Expr, *, every_step: bool = False) -> CellExpression:
-    """An expression whose `at_points` are those of a `point_field`."""
+def point_expression(domain: Domain, expression: Expr, *, kernels: KernelSelection | None = None) -> CellExpression:
+    """Expression at the points of a `point_field`; `kernels`: as for CellExpression (collective)."""
     points = stress_points(domain.mesh) if domain.order == 2 else _CENTRE[domain.dim]
-    return CellExpression(domain.comm, domain.mesh, expression, domain.cell_count, points, every_step=every_step)
+    return CellExpression(domain.comm, domain.mesh, expression, domain.cell_count, points, kernels=kernels)
 
 
 def _points_of(mesh: Mesh, expression: Expr) -> npt.NDArray[np.float64]:
-    """(count, d) points of the reference cell that do for an expression."""
+    """(count, d) points of the reference cell at which an expression is evaluated."""
     fields = [field.ufl_element() for field in extract_coefficients(expression)]
     quadratic = any(element.embedded_superdegree > 1 for element in fields)
     return stress_points(mesh) if quadratic else _CENTRE[mesh.topology.dim]
 
 
 def stress_points(mesh: Mesh) -> npt.NDArray[np.float64]:
-    """(3 or 4, d) points of the reference cell where stress is integrated with quadratic displacement
-    (forms.balance.points_of_stress)."""
+    """(3 or 4, d) points of the reference cell where stress is integrated, with quadratic displacement.
+
+    The same as in forms.balance.points_of_stress.
+    """
     points: npt.NDArray[np.float64] = np.asarray(basix.make_quadrature(mesh.basix_cell(), STRESS_DEGREE)[0])
     return points
 
 
 def quadratic_shape_functions(mesh: Mesh) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """(count, k) functions of the nodes of a cell with quadratic displacement at these points, and (count, k, d) their
-    derivatives by the barycentric coordinates of the corners but the first."""
+    """Shape functions (count, k) of the nodes of a quadratic cell at `stress_points`, and derivatives (count, k, d).
+
+    Derivatives are by the barycentric coordinates of all corners but the first.
+    """
     element = basix.create_element(basix.ElementFamily.P, mesh.basix_cell(), 2, basix.LagrangeVariant.gll_warped)
     table: npt.NDArray[np.float64] = np.asarray(element.tabulate(1, stress_points(mesh)))[..., 0]
     return table[0], np.moveaxis(table[1:], 0, -1)
 
 
-STRESS_DEGREE = 2  # of the quadrature of a stress where displacement is quadratic
+STRESS_DEGREE = 2  # degree of the quadrature of stress with quadratic displacement
 
 
 def points_per_cell(domain: Domain) -> int:
-    """How many points `point_field` has in a cell."""
+    """Number of points of a `point_field` in a cell."""
     return 1 if domain.order == 1 else domain.dim + 1
 
 
 def point_field(domain: Domain, shape: tuple[int, ...], name: str) -> fem.Function:
-    """A field of scalars or tensors with a value at each point where stress is integrated, those of a cell one after
-    the other in `x.array`; DG0 with linear displacement."""
+    """Field of scalars or tensors at the points where stress is integrated; DG0 with linear displacement.
+
+    The values of a cell's points come one after the other in `x.array`.
+    """
     if domain.order == 1:
         return fem.Function(fem.functionspace(domain.mesh, ("DG", 0, shape)), name=name)
     element = basix.ufl.quadrature_element(domain.mesh.basix_cell(), shape, degree=STRESS_DEGREE)

@@ -1,16 +1,13 @@
-"""Assembling the tangent: element matrices are summed in DOLFINx's own sparse matrix and handed to PETSc row by row.
+"""Assembly of linear forms into vectors, and of the tangent into a matrix.
 
-PETSc's MatSetValuesLocal, which fem.petsc.assemble_matrix calls for every cell, takes twice as long as the kernels and
-DOLFINx's insertion together: 44 ms against 25 for 24,000 tetrahedra. The price is a second copy of the values. Larger
-bodies have several cells assembled at a time (simd_kernels).
+Cell matrices are summed in DOLFINx's sparse matrix and given to PETSc by rows. PETSc's MatSetValuesLocal, which
+fem.petsc.assemble_matrix calls for every cell, takes twice as long as the kernels and DOLFINx's insertion together: 44
+ms instead of 25 for 24,000 tetrahedra. The price is a second copy of the values. Large bodies have several cells
+assembled at a time (kernel_selection).
 
-It can be summed in blocks of the d dofs of a node instead. Products are made with those where they are (block_matrix);
-PETSc's matrix of single entries, which multigrid is set up from, follows where it is asked for.
-
-Where a body falls apart, the entries of its dead cells are zeros that every product with the matrix still reads. They
-are given up from time to time: the matrix shrinks, the unknowns stay.
-
-Assembled vectors: forms summed into PETSc vectors over all ranks.
+The matrix can be summed in blocks of the d dofs of a node. Products use the blocks (block_matrix). PETSc's matrix of
+single entries, from which multigrid is set up, is updated on demand. Where a body falls apart, entries of dead cells
+are zeros that every product still reads; they are dropped from time to time. The unknowns stay.
 """
 
 from __future__ import annotations
@@ -26,7 +23,8 @@ from petsc4py import PETSc
 from ..mesh.dolfinx_compat import assemble_into, block_csr, create_matrix, create_vector, expanded_csr, pattern_of
 from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
-from .jit import CellForm, SimdKernelCache
+from .jit import CellForm
+from .kernel_selection import KernelCache, KernelSelection
 
 if TYPE_CHECKING:
     from ctypes import CDLL
@@ -34,142 +32,154 @@ if TYPE_CHECKING:
     from .block_matrix import BlockMatrix
     from .cell_subset_assembly import CellSubsetAssembler
     from .inertia import MassBlocks
-    from .simd_kernels import SimdBilinearForm, SimdLinearForm
 
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
 
 
 class TangentAssembler:
-    """A bilinear form and the matrix that it is assembled into.
+    """Bilinear form, and the matrix into which it is assembled.
 
     Attributes:
-        form: the compiled form.    matrix: PETSc's, kept until `fit` makes a smaller one.
-        blocks: products with what is assembled into blocks, where it is; kept as long.
-        on_diagonal: (owned nodes,) those blocks of owned rows that are on the diagonal, where there are blocks.
-        is_behind: whether the blocks have been assembled since the matrix.
+        form: compiled form.
+        matrix: PETSc's matrix of single entries, until `shrink` replaces it.
+        blocks: matrix in blocks, if the form is assembled into blocks; until `shrink` replaces it.
+        diagonal_blocks: (owned nodes,) indices of the blocks on the diagonal, if there are blocks.
+        entries_outdated: whether the blocks are newer than `matrix`.
     """
 
     matrix: PETSc.Mat
 
-    def __init__(self, form: CellForm) -> None:
+    def __init__(self, form: CellForm, kernels: KernelSelection | None = None) -> None:
+        """`kernels`: selection of kernels; None: the default one."""
         self.form = form
+        self.kernels = kernels or KernelSelection()
         self.blocks: BlockMatrix | None = None
         self.entries_outdated = False
         self._dead: Flags | None = None
-        self._make()
+        self._create()
 
     def switch_to_blocks(self, *, with_dead_cells: bool = False) -> BlockMatrix | None:
-        """Assemble into blocks from here on; products with them, None where there is no compiler. `dead_too`: with room
-        for cells that the form has left out (collective)."""
-        if self.blocks is None:
-            from .block_matrix import compile_block_product
+        """Assemble into blocks from now on; returns the matrix in blocks, None if there is no kernel (collective).
 
-            size = self.matrix.getBlockSize()
-            if (code := compile_block_product(self.form.mesh.comm, size)) is None:
+        Args:
+            with_dead_cells: whether cells that the form excludes have blocks.
+        """
+        if self.blocks is None:
+            code = self.kernels.block_product(self.form.mesh.comm, self.matrix.getBlockSize())
+            if code is None:
                 return None
             self.matrix.destroy()
-            self._make(code, with_dead_cells)
+            self._create(code, with_dead_cells)
         return self.blocks
 
-    def _make(self, by_blocks: CDLL | None = None, dead_too: bool = False) -> None:
-        """Matrices with the pattern of the cells that the form is integrated over (`dead_too`: and of those left out),
-        and a full diagonal; `by_blocks`: what makes products with blocks."""
-        pattern = pattern_of(self.form.all_cells_form if dead_too else self.form._cpp_object)
+    def _create(self, block_code: CDLL | None = None, with_dead_cells: bool = False) -> None:
+        """Create matrices with the pattern of the form's cells and a full diagonal.
+
+        Args:
+            block_code: library of products with blocks; None: single entries.
+            with_dead_cells: whether cells that the form excludes are in the pattern.
+        """
+        pattern = pattern_of(self.form.all_cells_form if with_dead_cells else self.form._cpp_object)
         owned = self.form.function_spaces[0].dofmap.index_map.size_local
         pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
         pattern.finalize()
         self.matrix = create_matrix(self.form.mesh.comm, pattern)
-        self._lanes = SimdKernelCache(self._in_lanes)
-        self._sum = expanded_csr(pattern) if by_blocks is None else block_csr(pattern)
+        self._sum = expanded_csr(pattern) if block_code is None else block_csr(pattern)
+        self._kernel_of = KernelCache(lambda form: self.kernels.bilinear_form(form, self._sum))
         rows, columns = (self._sum.index_map(axis) for axis in (0, 1))
         starts = self._sum.indptr[: rows.size_local + 1]
-        self._own = slice(int(starts[-1]))  # entries or blocks of owned rows; those of ghosts come after
-        names = np.concatenate([np.arange(*columns.local_range), columns.ghosts])
+        # entries or blocks of owned rows; those of ghosts come after them
+        self._owned = slice(int(starts[-1]))
+        global_columns = np.concatenate([np.arange(*columns.local_range), columns.ghosts])
         self._starts = starts.astype(PETSc.IntType)
-        self._columns = names[self._sum.indices[self._own]].astype(PETSc.IntType)
-        self._by_blocks = by_blocks
-        if by_blocks is not None:
+        self._columns = global_columns[self._sum.indices[self._owned]].astype(PETSc.IntType)
+        self._block_code = block_code
+        if block_code is not None:
             from .block_matrix import BlockMatrix
 
-            self.blocks = BlockMatrix(self._sum, by_blocks)
-            rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
-            self.diagonal_blocks = np.flatnonzero(self._sum.indices[self._own] == rows)
+            self.blocks = BlockMatrix(self._sum, block_code)
+            row_of_block = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+            self.diagonal_blocks = np.flatnonzero(self._sum.indices[self._owned] == row_of_block)
 
     def shrink(self, dead: Flags, share: float) -> bool:
-        """Give up the entries of cells that the form has left out, where at most `share` of the cells that there is
-        room for are alive, and make room for cells that are back; whether the matrix is a new one (collective).
+        """Replace the matrices by smaller ones, or by larger ones for cells that are alive again (collective).
 
-        `dead`: (owned cells,) flags of what is left out now.
+        Args:
+            dead: (owned cells,) cells that the form excludes now.
+            share: largest share of living cells among those in the pattern at which the matrices are replaced.
+
+        Returns:
+            Whether they were.
         """
-        had = np.zeros_like(dead) if self._dead is None else self._dead
-        alive, room, back = sum_over_ranks(
-            self.form.mesh.comm, np.array([np.sum(~dead), np.sum(~had), np.sum(had & ~dead)])
-        )
-        if not back and (alive == room or alive > share * room):
+        was_dead = np.zeros_like(dead) if self._dead is None else self._dead
+        counts = np.array([np.sum(~dead), np.sum(~was_dead), np.sum(was_dead & ~dead)])
+        alive, in_pattern, revived = sum_over_ranks(self.form.mesh.comm, counts)
+        if not revived and (alive == in_pattern or alive > share * in_pattern):
             return False
         self._dead = dead.copy()
         self.destroy()
-        self._make(self._by_blocks)
+        self._create(self._block_code)
         return True
 
     def __call__(
         self, bcs: list[fem.DirichletBC], extra_form: fem.Form | None = None, mass: MassBlocks | None = None
     ) -> None:
-        """Assemble, with another form of the same pattern; rows and columns of prescribed dofs become the identity's.
-        `mass` is added to blocks, which `bring` makes the matrix of (collective)."""
+        """Assemble the form; rows and columns of prescribed dofs become those of the identity (collective).
+
+        Args:
+            bcs: conditions on prescribed dofs.
+            extra_form: form of the same pattern to be added.
+            mass: blocks to be added, if there are blocks.
+        """
         self._sum.data[:] = 0.0
         for form in (self.form, extra_form) if extra_form is not None else (self.form,):
             self._add(form, bcs)
         self._sum.scatter_reverse()
         if self.blocks is None:
-            self.matrix.setValuesIJV(self._starts, self._columns, self._sum.data[self._own])
+            self.matrix.setValuesIJV(self._starts, self._columns, self._sum.data[self._owned])
             self.matrix.assemble()
             return
         if mass is not None:
-            self._diagonals[mass.blocks] += mass.values
+            self._block_diagonals[mass.blocks] += mass.values
         self.entries_outdated = True
 
     def assemble_block_diagonals(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> Values:
-        """(blocks of owned rows, d) what a form of the same pattern adds to the diagonal of each; nothing in rows and
-        columns of prescribed dofs. It is summed in the tangent's place, which has to be assembled after it
-        (collective)."""
+        """(blocks of owned rows, d) diagonals of the blocks of a form of the same pattern (collective).
+
+        Rows and columns of prescribed dofs are zero. The blocks of the tangent are overwritten: it has to be assembled
+        after this.
+        """
         self._sum.data[:] = 0.0
         fem.assemble_matrix(self._sum, form, bcs, 0.0)  # type: ignore[arg-type]
         self._sum.scatter_reverse()
-        return self._diagonals.copy()
+        return self._block_diagonals.copy()
 
     @property
-    def _diagonals(self) -> Values:
-        """The same of the sum, as part of it."""
+    def _block_diagonals(self) -> Values:
+        """(blocks of owned rows, d) view of the diagonals of the blocks."""
         d = self.matrix.getBlockSize()
-        return np.einsum("bii->bi", self._sum.data[: d * d * self._own.stop].reshape(-1, d, d))
+        return np.einsum("bii->bi", self._sum.data[: d * d * self._owned.stop].reshape(-1, d, d))
 
     def _add(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
         """Add a form to the sum (collective the first time)."""
-        if (lanes := self._lanes(form)) is None:
+        if (kernel := self._kernel_of(form)) is None:
             fem.assemble_matrix(self._sum, form, bcs)  # type: ignore[arg-type]
         else:
-            lanes.add_to(self._sum, bcs)
-
-    def _in_lanes(self, form: fem.Form) -> SimdBilinearForm | None:
-        from .simd_kernels import SimdBilinearForm
-
-        return SimdBilinearForm.for_form(form, self._sum)
+            kernel.add_to(self._sum, bcs)
 
     def update_entries(self) -> bool:
-        """Bring the matrix to where the blocks are, if there are any that it is behind of; whether there were
-        (collective)."""
-        if was_behind := self.entries_outdated:
+        """Update `matrix` from newer blocks; returns whether there were any (collective)."""
+        if outdated := self.entries_outdated:
             d = self.matrix.getBlockSize()
-            values = self._sum.data[: d * d * self._own.stop]
+            values = self._sum.data[: d * d * self._owned.stop]
             self.matrix.setValuesBlockedIJV(self._starts, self._columns, values)
             self.matrix.assemble()
             self.entries_outdated = False
-        return was_behind
+        return outdated
 
     def destroy(self) -> None:
-        """Give the memory of PETSc's matrices back."""
+        """Free PETSc's matrices."""
         self.matrix.destroy()
         if self.blocks is not None:
             self.blocks.destroy()
@@ -177,72 +187,70 @@ class TangentAssembler:
 
 
 class VectorAssembler:
-    """Assembles linear forms over a domain's displacement space, with one vector that is kept.
+    """Assembler of linear forms over the displacement space of a domain.
 
     Attributes:
-        domain: the mesh.    owned: dofs of this rank.
+        domain: the mesh.
+        owned_dof_count: number of dofs of this rank.
+        kernels: selection of kernels, of all that a scene assembles.
     """
 
-    def __init__(self, domain: Domain) -> None:
+    def __init__(self, domain: Domain, kernels: KernelSelection | None = None) -> None:
+        """`kernels`: selection of kernels; None: the default one."""
         self.domain = domain
+        self.kernels = kernels or KernelSelection()
         self.owned_dof_count = domain.node_count * domain.dim
-        self._kept = self.create_vector()
-        self._lanes = SimdKernelCache(_in_lanes)
-        self._few: dict[CellForm, CellSubsetAssembler] = {}
+        self._work = self.create_vector()
+        self._kernel_of = KernelCache(self.kernels.linear_form)
+        self._subset_of: dict[CellForm, CellSubsetAssembler | None] = {}
 
     def create_vector(self) -> PETSc.Vec:
-        """A new vector over the dofs, ghosts included."""
+        """New vector over the dofs, ghosts included."""
         return create_vector(self.domain.space)
 
     def __call__(self, form: fem.Form) -> Values:
         """(owned dofs,) copy of an assembled form (collective)."""
-        return self.assemble_into(self._kept, form).array_r.copy()
+        return self.assemble_into(self._work, form).array_r.copy()
 
     def sum_contributions(self, add: Callable[[Values], None]) -> Values:
-        """(owned dofs,) sums of what `add` adds to the dofs of each rank, ghosts included (collective)."""
-        with self._kept.localForm() as local:
+        """(owned dofs,) sums over ranks of what `add` adds to an array of their dofs, ghosts included (collective)."""
+        with self._work.localForm() as local:
             local.set(0.0)
             add(local.array_w)
-        return self.sum_over_ranks(self._kept).array_r.copy()
+        return self.sum_over_ranks(self._work).array_r.copy()
 
     def assemble_into(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
-        """Assemble into b, which loses what it held (collective)."""
+        """b, overwritten with an assembled form (collective)."""
         return self.sum_over_ranks(self.assemble_local_part(b, form))
 
     def assemble_local_part(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
-        """This rank's part alone into b; returns b (collective the first time)."""
+        """b, overwritten with this rank's part of a form, ghosts included (collective the first time)."""
         with b.localForm() as local:
             local.set(0.0)
-            added = self._added_to(local.array_w, form)
-        if not added:
+            done = self._add_by_kernel(local.array_w, form)
+        if not done:
             assemble_into(b, form)
         return b
 
-    def _added_to(self, values: Values, form: fem.Form) -> bool:
-        """Add this rank's part to the values of dofs, ghosts included, where DOLFINx need not do it."""
-        if (lanes := self._lanes(form)) is not None:
-            lanes.add_to(values)
-        elif isinstance(form, CellForm) and (left := form.remaining_cells) is not None:
-            if form not in self._few:
-                from .cell_subset_assembly import CellSubsetAssembler
-
-                self._few[form] = CellSubsetAssembler(form)
-            self._few[form].add_cells(left, values)
-        else:
+    def _add_by_kernel(self, values: Values, form: fem.Form) -> bool:
+        """Add this rank's part of a form to the values of dofs, if there is a kernel for it; returns whether."""
+        if (kernel := self._kernel_of(form)) is not None:
+            kernel.add_to(values)
+            return True
+        if not isinstance(form, CellForm) or (cells := form.remaining_cells) is None:
             return False
+        if form not in self._subset_of:
+            self._subset_of[form] = self.kernels.cell_subset(form)
+        if (subset := self._subset_of[form]) is None:
+            return False
+        subset.add_cells(cells, values)
         return True
 
     def sum_over_ranks(self, b: PETSc.Vec) -> PETSc.Vec:
-        """b with the parts that other ranks have assembled for its owned dofs (collective)."""
+        """b, with the parts of other ranks added to its owned dofs (collective)."""
         b.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
         return b
 
     def destroy(self) -> None:
-        """Give the memory back."""
-        self._kept.destroy()
-
-
-def _in_lanes(form: fem.Form) -> SimdLinearForm | None:
-    from .simd_kernels import SimdLinearForm
-
-    return SimdLinearForm.for_form(form)
+        """Free PETSc's vector."""
+        self._work.destroy()

@@ -45,9 +45,9 @@ class PsdProjection:
         domain, d = stress.domain, stress.domain.dim
         F = ufl.variable(deformation_gradient(stress.u))
         P = stress.energy_factor * ufl.diff(stress.energy.psi(F, stress.rotation_field), F)
-        self._moduli = point_expression(domain, ufl.diff(P, F), every_step=True)
+        self._moduli = point_expression(domain, ufl.diff(P, F), kernels=stress.kernels)
         self._field = point_field(domain, (d * d, d * d), "correction of moduli")
-        self._size, self._cells = d * d, domain.cell_count
+        self._size, self._cells, self._plain = d * d, domain.cell_count, stress.kernels.plain
         self._nonzero = np.zeros(len(self._field.x.array) // d**4, np.uint8)
         v, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
         components = [(i, j) for i in range(d) for j in range(d)]
@@ -68,7 +68,18 @@ class PsdProjection:
             cells = np.arange(first, min(first + BLOCK, self._cells), dtype=np.int32)
             block = slice(points * first, points * (first + len(cells)))
             moduli = self._moduli.evaluate_at_points(cells).reshape(-1, n, n)
-            psd_correction(moduli, tolerance, C[block], self._nonzero[block])
+            if self._plain:
+                C[block] = plain_psd_correction(moduli, tolerance)
+            else:
+                psd_correction(moduli, tolerance, C[block], self._nonzero[block])
+
+
+def plain_psd_correction(A: Values, tolerance: float) -> Values:
+    """(k, n, n) corrections of symmetric matrices A (k, n, n) by LAPACK; see psd_correction."""
+    eigenvalues, vectors = np.linalg.eigh(A)
+    corrected = eigenvalues[:, 0] < -tolerance * eigenvalues.mean(axis=1)
+    negative = np.where(corrected[:, None], np.minimum(eigenvalues, 0.0), 0.0)
+    return np.asarray(-(vectors * negative[:, None]) @ vectors.transpose(0, 2, 1))
 
 
 def psd_correction(A: Values, tolerance: float, C: Values, nonzero: npt.NDArray[np.uint8]) -> None:

@@ -55,7 +55,7 @@ class ReturnMapping:
         self._stress, self._flowed = stress, True
         trial = Trial(plastic.energy, stress.u, stress.rotation_field)
         asked = trial.state(), trial.measures()
-        self._state, self._measures = (point_expression(domain, each, every_step=True) for each in asked)
+        self._state, self._measures = (point_expression(domain, each, kernels=stress.kernels) for each in asked)
 
     def begin_step(self, dt: float) -> None:
         """The flow to come is that of a step of dt."""

@@ -95,7 +95,7 @@ class Tangent:
         self._last: tuple[object, list[Values]] | None = None  # rates and damage of the last linear tangent
         v, w, dx = ufl.TrialFunction(self.domain.space), ufl.TestFunction(self.domain.space), cell_measure(self.domain)
         self.form = CellForm(sum_of_forms([term.tangent_form(v, w, dx) for term in terms]))
-        self._assembler = TangentAssembler(self.form)
+        self._assembler = TangentAssembler(self.form, stress.kernels)
 
     # --- matrices ---
 
