@@ -1,1 +1,1 @@
-"""The mathematics in UFL: kinematics, energies, time discretisation. Needs UFL and the standard library only."""
+"""The mathematics in UFL: kinematics, energies, virtual work, damage, plasticity, time schemes; it needs UFL alone."""

@@ -1,8 +1,9 @@
 """Virtual work of a body: the integrands from which residual and tangent are derived.
 
-Quadrature is chosen here and nowhere else: with P1 displacement F is constant in a cell, so one point integrates every
-energy exactly. With P2 F is linear, and the rule of degree 2 (three points in a triangle, four in a tetrahedron) is
-exact for linear energies, leaves no mode of a cell without stiffness, and costs no order for any energy. Inertia is not
+The quadrature is chosen here. With P1 displacement F is constant in a cell, so that one point integrates every energy
+exactly. With P2 F is linear: the rule of degree 2 (three points in a triangle, four in a tetrahedron) is exact for
+linear energies, leaves no mode of a cell without stiffness, and keeps the order of convergence for every energy.
+Inertia is not
 here: with a lumped or constant mass matrix it is linear algebra (solvers.newton).
 
 Equations: docs/theory.md#elastic-energies.
@@ -19,50 +20,63 @@ from .energies import Energy, elastic_stress, first_piola_kirchhoff
 from .kinematics import deformation_gradient
 
 
-def points_of_stress(field: Expr) -> dict[str, int]:
-    """Metadata of the quadrature of a stress, by the order of a displacement (a sum of fields) or its test function:
-    2 (order - 1)."""
-    return {"quadrature_degree": 2 * (max(each.embedded_superdegree for each in extract_elements(field)) - 1)}
+def stress_quadrature(field: Expr) -> dict[str, int]:
+    """Return the quadrature metadata of a stress, of degree 2 (order - 1).
+
+    The order is that of `field`, a displacement (a sum of fields) or its test function.
+    """
+    order = max(element.embedded_superdegree for element in extract_elements(field))
+    return {"quadrature_degree": 2 * (order - 1)}
 
 
 def internal_work(
     energy: Energy, u: Expr, w: Expr, dx: ufl.Measure, *, chi: Expr | float = 1.0, rotation: Expr | None = None
 ) -> Form:
-    """Virtual work of the stress, int chi P : grad w dX in N m; chi is the degradation of the cell (M22 eq. 27)."""
+    """Return the virtual work of the stress, int chi P : grad w dX, N m; chi degrades the cell (M22, eq. 27)."""
     P = first_piola_kirchhoff(energy, deformation_gradient(u), rotation)
-    return chi * ufl.inner(P, ufl.grad(w)) * dx(metadata=points_of_stress(w))
+    return chi * ufl.inner(P, ufl.grad(w)) * dx(metadata=stress_quadrature(w))
 
 
 def elastic_energy(
     energy: Energy, u: Expr, dx: ufl.Measure, *, chi: Expr | float = 1.0, rotation: Expr | None = None
 ) -> Form:
-    """Stored energy int chi psi dX in J."""
-    return chi * energy.psi(deformation_gradient(u), rotation) * dx(metadata=points_of_stress(u))
+    """Return the stored energy int chi psi dX, J."""
+    return chi * energy.psi(deformation_gradient(u), rotation) * dx(metadata=stress_quadrature(u))
 
 
 def viscous_work(
     energy: Energy, v: Expr, u_n: Expr, w: Expr, dx: ufl.Measure, *, b: Expr | float, chi: Expr | float = 1.0
 ) -> Form:
-    """Stiffness-proportional damping, int chi b (C : Edot) : sym(F_n^T grad w) dX with Edot = sym(F_n^T grad v).
+    """Return the stiffness-proportional damping, int chi b (C : Edot) : sym(F_n^T grad w) dX, Edot = sym(F_n^T grad v).
 
-    At small strain this is Rayleigh's b K v (b in s). K of the deformed body would be neither positive nor blind to a
-    rotating stressed body; this form always dissipates, int b Edot : C : Edot. F_n is that of the start of the step,
-    which keeps the term linear in v; a rigid spin w then has a strain rate of about w^2 dt, which vanishes with dt.
+    At small strain this is Rayleigh's b K v. K of the deformed body would be neither positive nor independent of the
+    rotation of a stressed body, while this form always dissipates int b Edot : C : Edot. F_n is that of the start of
+        the step, which keeps the form linear in v. A rigid spin w then has a strain rate of about w^2 dt, which
+        vanishes with dt.
+
+    Args:
+        energy: elastic energy.
+        v: velocity, m/s.
+        u_n: displacement at the start of the step, m.
+        w: test function.
+        dx: measure of the body.
+        b: damping coefficient, s.
+        chi: degradation.
     """
     F_n = ufl.Identity(u_n.ufl_shape[0]) if energy.linear else deformation_gradient(u_n)
     rate, virtual = (ufl.sym(F_n.T * ufl.grad(field)) for field in (v, w))
-    return chi * b * ufl.inner(elastic_stress(energy, rate), virtual) * dx(metadata=points_of_stress(w))
+    return chi * b * ufl.inner(elastic_stress(energy, rate), virtual) * dx(metadata=stress_quadrature(w))
 
 
 def traction_work(traction: Expr, w: Expr, ds: ufl.Measure) -> Form:
-    """Virtual work of a dead load, int t . w dA, t in Pa of the reference area."""
+    """Return the virtual work of a dead load, int t . w dA, t in Pa of the reference area."""
     return ufl.inner(traction, w) * ds
 
 
 def pressure_work(pressure: Expr, u: Expr, w: Expr, normal: Expr, ds: ufl.Measure, *, linear: bool) -> Form:
-    """Virtual work of a pressure that follows the surface, -int p J F^-T N . w dA (p in Pa, > 0 pushes).
+    """Return the virtual work of a pressure that follows the surface, -int p J F^-T N . w dA.
 
-    `linear`: on the reference surface instead, as befits the linear energy.
+    p is in Pa, positive in compression. `linear`: on the reference surface, for the linear energy.
     """
     if linear:
         return -pressure * ufl.inner(normal, w) * ds

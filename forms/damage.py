@@ -1,8 +1,8 @@
-"""What broken edges do to the strain of a simplex: the edge-projected energy (M22 sections 3.5.2 and 3.6.1).
+"""Edge-projected energy: the strain of a simplex without its broken edges (M22, sections 3.5.2 and 3.6.1).
 
 A strain is a sum over the edges ij of the reference cell, eps = - sum (d_ij . eps . d_ij) sym(g_i x g_j), with
-d_ij = X_j - X_i and barycentric gradients g_i (see fracture.edge_stress for the identity): T_strain^-1 without a matrix
-inverse. Broken edges are left out of the sum.
+d_ij = X_j - X_i and barycentric gradients g_i: T_strain^-1 of M22 without a matrix inverse (see fracture.edge_stress).
+Broken edges are left out of the sum.
 
 Equations: docs/theory.md#edge-projected-strain.
 """
@@ -15,39 +15,41 @@ from typing import Any, Protocol
 import ufl
 from ufl.core.expr import Expr
 
-from .energies import Around, Energy, hooke
+from .energies import Energy, WrappedEnergy, hooke
 from .kinematics import embed
 
 
-class Strained(Energy, Protocol):
-    """An energy that is Hooke's law of some strain: linear or corotated."""
+class StrainEnergy(Energy, Protocol):
+    """Interface of an energy that is Hooke's law of a strain: linear or corotated."""
 
-    def strain(self, F: Expr, rotation: Expr | None = None) -> Expr: ...
+    def strain(self, F: Expr, rotation: Expr | None = None) -> Expr:
+        """Return the strain (d x d)."""
 
 
 def edge_dyads(cell: Expr, edges: Any) -> list[tuple[Expr, Expr]]:
-    """(d_ij, -sym(g_i x g_j)) of the edges of the cell that `cell`, a coefficient, lives on."""
+    """Return (d_ij, -sym(g_i x g_j)) of the edges of the cells on which the coefficient `cell` is defined."""
     mesh = ufl.domain.extract_unique_domain(cell)
     K = ufl.JacobianInverse(mesh)
     d = K.ufl_shape[0]
-    others = [ufl.as_vector([K[k, i] for i in range(d)]) for k in range(d)]
-    gradients = [-sum(others[1:], others[0]), *others]
+    # The first gradient follows from the others: barycentric coordinates sum to 1.
+    following = [ufl.as_vector([K[k, i] for i in range(d)]) for k in range(d)]
+    gradients = [-sum(following[1:], following[0]), *following]
     dyads = [-ufl.sym(ufl.outer(gradients[i], gradients[j])) for i, j in edges]
     return list(zip(edge_vectors(cell, edges), dyads, strict=True))
 
 
 def edge_vectors(cell: Expr, edges: Any) -> list[Expr]:
-    """d_ij = X_j - X_i of the edges of the cell, m."""
+    """Return d_ij = X_j - X_i, m, of the edges of the cells on which the coefficient `cell` is defined."""
     J = ufl.Jacobian(ufl.domain.extract_unique_domain(cell))
     d = J.ufl_shape[0]
     corners = [ufl.as_vector([0] * d), *(ufl.as_vector([J[i, k] for i in range(d)]) for k in range(d))]  # X_i - X_0
     return [corners[j] - corners[i] for i, j in edges]
 
 
-def edge_projected(strain: Expr, integrity: Expr, edges: Any) -> Expr:
-    """D eps: the part of the strain along edges with `integrity` 1 (0: broken), in the order of `edges`.
+def project_on_edges(strain: Expr, integrity: Expr, edges: Any) -> Expr:
+    """Return D eps: the part of the strain along edges with integrity 1 (0: broken), in the order of `edges`.
 
-    `edges`: (k, 2) local nodes.
+    `edges` (k, 2) are local nodes.
     """
     parts = [
         integrity[number] * ufl.dot(edge, strain * edge) * dyad
@@ -56,30 +58,34 @@ def edge_projected(strain: Expr, integrity: Expr, edges: Any) -> Expr:
     return sum(parts[1:], parts[0])
 
 
-def in_plane(tensor: Expr, edges: Any) -> Expr:
-    """The block of a tensor that a cell with these edges lies in: 2 x 2 of the 3 x 3 embedding of a triangle."""
+def in_plane_block(tensor: Expr, edges: Any) -> Expr:
+    """Return the block of a tensor in the space of a cell with these edges: 2 x 2 of 3 x 3 for a triangle."""
     if len(edges) != 3 or tensor.ufl_shape[0] == 2:
         return tensor
     return ufl.as_tensor([[tensor[i, j] for j in range(2)] for i in range(2)])
 
 
 @dataclass(frozen=True)
-class EdgeProjected(Around):
-    """psi = 1/2 (D eps) : C : (D eps) + r psi_0: force and tangent of M22 eqs. 21-22, symmetric and positive.
+class EdgeProjectedEnergy(WrappedEnergy):
+    """psi = 1/2 (D eps) : C : (D eps) + r psi_0: force and tangent of M22, eqs. 21-22, symmetric and positive.
 
-    r is the share of the whole cell's stiffness that is left however damaged (0 but in quasi-static studies).
+    Attributes:
+        base: energy of the undamaged material.
+        integrity: (k,) integrity of the edges of a cell.
+        edges: (k, 2) local nodes of the edges.
+        residual: r, share of the stiffness that remains in any damage; 0 except in quasi-static studies.
     """
 
-    whole: Strained
+    base: StrainEnergy
     integrity: Any
     edges: Any
     residual: float = 0.0
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
-        """Energy density in J/m^3."""
-        strain = self.whole.strain(F, rotation)
-        plane = in_plane(strain, self.edges)
-        kept = edge_projected(plane, self.integrity, self.edges)
+        """Return the energy density, J/m^3."""
+        strain = self.base.strain(F, rotation)
+        plane = in_plane_block(strain, self.edges)
+        projected = project_on_edges(plane, self.integrity, self.edges)
         if plane is not strain:
-            kept = embed(kept, strain[2, 2])
-        return hooke(self, kept) + self.residual * hooke(self, strain)
+            projected = embed(projected, strain[2, 2])
+        return hooke(self, projected) + self.residual * hooke(self, strain)

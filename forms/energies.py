@@ -1,8 +1,8 @@
-"""Elastic energy densities psi(F) in J/m^3 of the reference volume, and the stresses derived from them.
+"""Elastic energy densities psi(F), J/m^3 of the reference volume, and the stresses derived from them.
 
-Every energy is a frozen dataclass with Lame's parameters mu and lmbda in Pa (numbers, or UFL coefficients for
-fields) and a method `psi`. It is written on the d x d block of F, so that the same lines serve 3D and plane strain
-(F33 = 1); plane stress is the same again with the reduced lambda* of `plane_stress_lambda`, for energies that allow it.
+Every energy is a frozen dataclass with Lame's parameters mu and lmbda in Pa (numbers, or UFL coefficients for fields)
+and a method `psi`. It is written for the d x d block of F, so that the same code serves 3D and plane strain (F33 = 1).
+Plane stress uses the reduced lambda* of `plane_stress_lambda`, for energies that allow it.
 
 Equations: docs/theory.md#elastic-energies.
 """
@@ -18,168 +18,182 @@ from ufl.core.expr import Expr
 
 from .kinematics import embed, green_strain, identity, small_strain
 
-Scalar = Any  # a float, or a UFL coefficient that stands for a field
+Scalar = Any  # a float, or a UFL coefficient for a field
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
-    """Lame's mu = Y / (2 (1 + nu)) and lambda = Y nu / ((1 + nu)(1 - 2 nu)), in the unit of Y (M22 eq. 24)."""
+    """Return mu = Y / (2 (1 + nu)) and lambda = Y nu / ((1 + nu)(1 - 2 nu)), in the unit of Y (M22, eq. 24)."""
     return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
 def plane_stress_lambda(mu: float, lmbda: float) -> float:
-    """lambda* = 2 lambda mu / (lambda + 2 mu), for which sigma_33 = 0 is built into the 2D energy."""
+    """Return lambda* = 2 lambda mu / (lambda + 2 mu), with which the 2D energy implies sigma_33 = 0."""
     return 2 * lmbda * mu / (lmbda + 2 * mu)
 
 
 def hooke(moduli: Any, strain: Expr) -> Expr:
-    """mu strain:strain + lambda/2 tr(strain)^2 in J/m^3, whichever measure of strain it is given."""
+    """Return mu strain:strain + lambda/2 tr(strain)^2, J/m^3, for any measure of strain."""
     return moduli.mu * ufl.inner(strain, strain) + moduli.lmbda / 2 * ufl.tr(strain) ** 2
 
 
 class Energy(Protocol):
-    """What the solver needs of an energy."""
+    """Interface of an elastic energy."""
 
     @property
-    def mu(self) -> Scalar: ...
+    def mu(self) -> Scalar:
+        """Lame's mu, Pa."""
 
     @property
-    def lmbda(self) -> Scalar: ...
+    def lmbda(self) -> Scalar:
+        """Lame's lambda, Pa."""
 
     @property
-    def reduced(self) -> bool:
+    def plane_stress(self) -> bool:
         """Whether lmbda is lambda* of plane stress."""
 
     @property
     def needs_rotation(self) -> bool:
-        """Whether psi takes the polar rotation of F, lagged per iterate."""
+        """Whether psi takes the polar rotation of F, lagged by one iterate."""
 
     @property
     def linear(self) -> bool:
-        """Whether the stress is linear in u: reference and current configuration are not told apart."""
+        """Whether the stress is linear in u: reference and present configuration are the same."""
 
-    def psi(self, F: Expr, rotation: Expr | None = None) -> Expr: ...
+    def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
+        """Return the energy density, J/m^3, at the deformation gradient F (d x d) and its rotation (d x d)."""
 
-    def thickness_stretch(self, F: Expr) -> Expr | float: ...
+    def thickness_stretch(self, F: Expr) -> Expr | float:
+        """Return F33, dimensionless."""
 
 
-class Around:
-    """An energy made of another one, `whole`, with its moduli and its kind."""
+class WrappedEnergy:
+    """Base of an energy made of another one: it has the moduli and the kind of `base`.
 
-    whole: Any
+    Attributes:
+        base: energy of the undamaged, elastic material.
+    """
+
+    base: Any
 
     @property
     def mu(self) -> Scalar:
-        """Lame's mu of the whole material, Pa."""
-        return self.whole.mu
+        """Lame's mu of the base material, Pa."""
+        return self.base.mu
 
     @property
     def lmbda(self) -> Scalar:
-        """Lame's lambda of the whole material, Pa."""
-        return self.whole.lmbda
+        """Lame's lambda of the base material, Pa."""
+        return self.base.lmbda
 
     @property
-    def reduced(self) -> bool:
+    def plane_stress(self) -> bool:
         """Whether lmbda is lambda* of plane stress."""
-        return bool(self.whole.reduced)
+        return bool(self.base.plane_stress)
 
     @property
     def needs_rotation(self) -> bool:
         """Whether psi takes a polar rotation."""
-        return bool(self.whole.needs_rotation)
+        return bool(self.base.needs_rotation)
 
     @property
     def linear(self) -> bool:
         """Whether the stress is linear in u."""
-        return bool(self.whole.linear)
+        return bool(self.base.linear)
 
     def thickness_stretch(self, F: Expr) -> Expr | float:
-        """F33, dimensionless."""
-        stretch: Expr | float = self.whole.thickness_stretch(F)
+        """Return F33, dimensionless."""
+        stretch: Expr | float = self.base.thickness_stretch(F)
         return stretch
 
 
 @dataclass(frozen=True)
 class _PlaneStrain:
-    """F33 = 1: the out-of-plane stretch of an energy without a plane-stress form."""
+    """Base of energies without a plane-stress form of the out-of-plane stretch: F33 = 1.
+
+    Attributes:
+        mu: Lame's mu, Pa.
+        lmbda: Lame's lambda, Pa; lambda* in plane stress.
+        plane_stress: whether lmbda is lambda*.
+    """
 
     mu: Scalar
     lmbda: Scalar
-    reduced: bool = False
+    plane_stress: bool = False
     needs_rotation: ClassVar[bool] = False
     linear: ClassVar[bool] = False
 
     def thickness_stretch(self, F: Expr) -> Expr | float:
-        """F33, dimensionless."""
+        """Return F33 = 1."""
         return 1.0
 
 
 @dataclass(frozen=True)
-class Linear(_PlaneStrain):
-    """Hooke's law: psi = mu eps:eps + lambda/2 tr(eps)^2. Small strains and rotations only."""
+class LinearElastic(_PlaneStrain):
+    """Hooke's law for small strains and rotations: psi = mu eps:eps + lambda/2 tr(eps)^2."""
 
     linear: ClassVar[bool] = True
 
     def strain(self, F: Expr, rotation: Expr | None = None) -> Expr:
-        """eps = sym(F) - I."""
+        """Return eps = sym(F) - I."""
         return small_strain(F)
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
-        """Energy density in J/m^3."""
+        """Return the energy density, J/m^3."""
         return hooke(self, self.strain(F))
 
 
 @dataclass(frozen=True)
 class Corotated(_PlaneStrain):
-    """Hooke's law in a frame that turns with the cell: eps = sym(R^T F) - I, R the polar rotation of F.
+    """Hooke's law in a frame that rotates with the cell: eps = sym(R^T F) - I, R the polar rotation of F.
 
-    R is a field lagged per iterate. Where R is the polar rotation of F the first Piola-Kirchhoff stress
-    R (2 mu eps + lambda tr(eps) I) is exact, since R's own variation does no work on a stress that commutes with
-    the stretch; the tangent leaves that variation out and stays symmetric and positive.
+    R is a field lagged by one iterate. At the polar rotation the first Piola-Kirchhoff stress R (2 mu eps + lambda
+    tr(eps) I) is exact, since the variation of R does no work on a stress that commutes with the stretch. The tangent
+    leaves that variation out, and is symmetric and positive.
     """
 
     needs_rotation: ClassVar[bool] = True
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
-        """Energy density in J/m^3; `rotation` is R (d x d)."""
+        """Return the energy density, J/m^3; `rotation` is R (d x d)."""
         return hooke(self, self.strain(F, rotation))
 
     def strain(self, F: Expr, rotation: Expr | None = None) -> Expr:
-        """eps = sym(R^T F) - I."""
+        """Return eps = sym(R^T F) - I."""
         if rotation is None:
             raise ValueError("the corotated energy needs the polar rotation of F")
         return small_strain(rotation.T * F)
 
 
 @dataclass(frozen=True)
-class StVK(_PlaneStrain):
+class SaintVenantKirchhoff(_PlaneStrain):
     """Saint Venant-Kirchhoff: psi = mu E:E + lambda/2 tr(E)^2, P = F (2 mu E + lambda tr(E) I).
 
-    Large rotations, moderate strains: softens in compression and has no resistance to inversion.
-    Source: M22 eq. 26; M22s eq. 29 prints P without the leading F.
+    For large rotations and moderate strains: it softens in compression and does not resist inversion. Source: M22, eq.
+        26; M22s, eq. 29 prints P without the leading F.
     """
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
-        """Energy density in J/m^3."""
+        """Return the energy density, J/m^3."""
         return hooke(self, green_strain(F))
 
     def thickness_stretch(self, F: Expr) -> Expr | float:
-        """F33 = sqrt(1 + 2 E33), E33 = -lambda*/(2 mu) tr(E) in plane stress; 1 in plane strain."""
-        if not self.reduced:
+        """Return F33 = sqrt(1 + 2 E33), E33 = -lambda*/(2 mu) tr(E), in plane stress; 1 in plane strain."""
+        if not self.plane_stress:
             return 1.0
         return ufl.sqrt(1 - self.lmbda / self.mu * ufl.tr(green_strain(F)))
 
 
 @dataclass(frozen=True)
 class NeoHookean(_PlaneStrain):
-    """Stable neo-Hookean of Smith, de Goes and Kim 2018 (M22 eq. 25), shifted so that psi(I) = 0.
+    """Stable neo-Hookean energy of Smith, de Goes and Kim (2018; M22, eq. 25), shifted so that psi(I) = 0.
 
     psi = m/2 (I_C - 3) + l/2 (J - alpha)^2 - m/2 log(I_C + 1) - psi_0, with m = 4/3 mu, l = lambda + 5/6 mu and
-    alpha = 1 + m/l - m/(4 l). Finite and smooth for every F, inverted ones included. Without the shift a degraded
-    body at rest would seem to hold energy.
+    alpha = 1 + m/l - m/(4 l). It is finite and smooth for every F, inverted ones included. Without the shift a degraded
+    body at rest would seem to store energy.
     """
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
-        """Energy density in J/m^3."""
+        """Return the energy density, J/m^3."""
         m = 4 / 3 * self.mu
         volumetric = self.lmbda + 5 / 6 * self.mu
         alpha = 1 + 3 / 4 * m / volumetric
@@ -189,19 +203,24 @@ class NeoHookean(_PlaneStrain):
         return distortion + volumetric / 2 * (ufl.det(F) - alpha) ** 2 - at_rest
 
 
-ENERGIES: dict[str, type] = {"linear": Linear, "corotated": Corotated, "stvk": StVK, "neo-hookean": NeoHookean}
+ENERGIES: dict[str, type] = {
+    "linear": LinearElastic,
+    "corotated": Corotated,
+    "stvk": SaintVenantKirchhoff,
+    "neo-hookean": NeoHookean,
+}
 
 
 def first_piola_kirchhoff(energy: Energy, F: Expr, rotation: Expr | None = None) -> Expr:
-    """P = d psi / d F in Pa (d x d)."""
+    """Return P = d psi / d F, Pa (d x d)."""
     variable = ufl.variable(F)
     return ufl.diff(energy.psi(variable, rotation), variable)
 
 
 def cauchy_stress(energy: Energy, F: Expr, rotation: Expr | None = None) -> Expr:
-    """Cauchy stress J^-1 P F^T in Pa (d x d, symmetric); for the linear energy, sigma = P.
+    """Return the Cauchy stress J^-1 P F^T, Pa (d x d, symmetric); for the linear energy sigma = P.
 
-    J counts the out-of-plane stretch, so that the plane-stress value is the force per current area.
+    J includes the out-of-plane stretch, so that the plane-stress value is the force per present area.
     """
     P = first_piola_kirchhoff(energy, F, rotation)
     if energy.linear:
@@ -210,18 +229,18 @@ def cauchy_stress(energy: Energy, F: Expr, rotation: Expr | None = None) -> Expr
 
 
 def elastic_stress(energy: Energy, strain: Expr) -> Expr:
-    """2 mu strain + lambda tr(strain) I in Pa: Hooke's law, to which every energy tends at small strain."""
+    """Return 2 mu strain + lambda tr(strain) I, Pa: Hooke's law, the limit of every energy at small strain."""
     return 2 * energy.mu * strain + energy.lmbda * ufl.tr(strain) * identity(strain)
 
 
 def full_cauchy_stress(energy: Energy, F: Expr, rotation: Expr | None = None) -> Expr:
-    """3 x 3 Cauchy stress in Pa of a 2D or 3D body; in 2D with the stress out of the plane."""
-    if F.ufl_shape[0] == 3 or energy.reduced:
+    """Return the 3 x 3 Cauchy stress, Pa, of a 2D or 3D body; in 2D with the stress out of the plane."""
+    if F.ufl_shape[0] == 3 or energy.plane_stress:
         return embed(cauchy_stress(energy, F, rotation), 0.0)
     return cauchy_stress(energy, embed(F, 1.0), embed(rotation, 1.0) if rotation is not None else None)
 
 
 def von_mises(stress: Expr) -> Expr:
-    """sqrt(3/2 s:s), s the deviator of a 3 x 3 stress, Pa."""
+    """Return sqrt(3/2 s:s), Pa, s the deviator of a 3 x 3 stress."""
     deviator = ufl.dev(stress)
     return ufl.sqrt(1.5 * ufl.inner(deviator, deviator))

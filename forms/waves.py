@@ -1,13 +1,16 @@
-"""Speeds of waves."""
+"""Wave speeds. It imports nothing, so that a study is read without UFL."""
 
 from __future__ import annotations
 
 
-def rayleigh_speed[Numbers](shear: Numbers, poisson: Numbers) -> Numbers:
-    """c_R, m/s, of waves along a free surface, which no crack that opens outruns, from the speed of shear waves c_s,
-    m/s, and Poisson's ratio in plane strain.
+def rayleigh_wave_speed[Numbers](shear: Numbers, poisson: Numbers) -> Numbers:
+    """Return c_R, m/s, of waves along a free surface, which bounds the speed of an opening crack.
 
-    c_R = c_s (0.862 + 1.14 nu) / (1 + nu), within 0.7 % of the root of Rayleigh's equation from nu = 0.1 on, 1.4 % at 0
-    (Freund 1990).
+    c_R = c_s (0.862 + 1.14 nu) / (1 + nu) (Freund 1990), within 0.7 % of the root of Rayleigh's equation for nu >= 0.1,
+    and 1.4 % at nu = 0.
+
+    Args:
+        shear: speed of shear waves c_s, m/s.
+        poisson: Poisson's ratio nu; in plane stress that of the equivalent plane strain.
     """
     return shear * (0.862 + 1.14 * poisson) / (1 + poisson)  # type: ignore[operator]

@@ -95,8 +95,8 @@ def break_now(run: Any, flags: Any) -> None:
     fracture = run.scene.fracture
     fracture.graph.break_edges(flags)
     fracture.graph.break_unloaded_edges()
-    fracture.degradation(True, *fracture.evaluate())
-    fracture.changed()
+    fracture.degradation(True, *fracture.evaluate_undamaged_stress())
+    fracture.mark_changed()
     run.state = run.scene.stepper.with_current_history(run.state)
     run.note_breaks()
     run.scene.balance.damage_changed()

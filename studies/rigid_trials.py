@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..fracture.brittle.principal_stress import tensors
+from ..fracture.principal_stress import symmetric_tensors
 from ..rigid.breakage import Breakable
 from ..rigid.pinned_analysis import pinned
 from ..scene.rigid_scene import build_rigid_scene
@@ -77,7 +77,9 @@ def stresses() -> tuple[Values, Values, Values]:
     relieved = body._stiffness.tensor(free(force), share)
     held = body._stiffness.tensor(pinned(free.matrix, domain.nodes, force), share)  # type: ignore[attr-defined]
     x = domain.nodes[domain.cell_nodes].mean(axis=1)[:, 0]
-    return x, *(np.asarray(np.abs(np.linalg.eigvalsh(tensors(each, 3))).max(axis=1)) for each in (relieved, held))
+    return x, *(
+        np.asarray(np.abs(np.linalg.eigvalsh(symmetric_tensors(each, 3))).max(axis=1)) for each in (relieved, held)
+    )
 
 
 def turned() -> tuple[Values, Values]:

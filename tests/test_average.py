@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
@@ -111,13 +113,18 @@ def test_a_large_constant_kernel_is_the_mean_over_the_body(body: Body) -> None:
     np.testing.assert_allclose(body.average(10.0, "constant")(values), mean, atol=len(values) * EPS)
 
 
+def limit_weights(monkeypatch: pytest.MonkeyPatch, count: float) -> None:
+    """Let a rank compute no more than `count` weights before stress needs them."""
+    monkeypatch.setattr(average_module, "LIMITS", replace(average_module.LIMITS, max_initial_weights=count))
+
+
 @pytest.mark.parametrize("at_once", (0, 5e7), ids=("rows made as needed", "all rows"))
 def test_cells_that_may_reach_a_bound_are_found_with_their_averages(
     monkeypatch: pytest.MonkeyPatch, at_once: float
 ) -> None:
     """None is missed: every cell whose average is as large as the bound is among them, with the same average, whichever
     cells have come apart since the last time, or are whole again."""
-    monkeypatch.setattr(average_module, "AT_ONCE", at_once)
+    limit_weights(monkeypatch, at_once)
     scene, _ = make_scene(
         mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.1, "pattern": "unstructured"},
         fracture={"strength": 1.0, "radius": 0.25},
@@ -131,26 +138,26 @@ def test_cells_that_may_reach_a_bound_are_found_with_their_averages(
         size = frobenius_norm(values, 2)
         whole = other(values, active)
         bound = float(np.quantile(frobenius_norm(whole, 2), 0.8))
-        cells, found = average.reaching(values, size, bound, active)
+        cells, found = average.find_averages_above(values, size, bound, active)
         np.testing.assert_allclose(found, whole[cells], rtol=1e-12, atol=1e-14)
         assert set(np.flatnonzero(frobenius_norm(whole, 2) >= bound)) <= set(cells)
-        assert len(average.reaching(values, size, 1.01 * size.max(), active)[0]) == 0
+        assert len(average.find_averages_above(values, size, 1.01 * size.max(), active)[0]) == 0
 
 
 def test_weights_are_those_of_now_where_few_rows_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
     """A cell that has no row itself, beyond R of the hot one, comes apart: averages between the two leave it out."""
     body = Body(MESHES["2d-unstructured"])
     count, radius = len(body.volumes), 2.7 * H
-    monkeypatch.setattr(average_module, "AT_ONCE", 0)
+    limit_weights(monkeypatch, 0)
     few = body.average(radius, "linear")
     size = np.random.default_rng(3).uniform(0.1, 0.3, count)
     size[17] = 5.0
     far = np.linalg.norm(body.centroids - body.centroids[17], axis=1)
     for active in (np.ones(count, bool), ~((far > radius) & (far < 1.5 * radius))):
         values = np.where(active, size, 0.0)[:, None]
-        cells, found = few.reaching(values, values[:, 0], 0.3, active)
+        cells, found = few.find_averages_above(values, values[:, 0], 0.3, active)
         np.testing.assert_allclose(found, brute_force(body, radius, "linear", values, active)[cells], rtol=1e-12)
-    assert len(cells) > 5 and not np.isin(np.flatnonzero(~active), few._rows.made[0].cells).any()
+    assert len(cells) > 5 and not np.isin(np.flatnonzero(~active), few._weights.blocks[0].cells).any()
 
 
 def test_rows_are_made_where_stress_is_high(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,17 +165,17 @@ def test_rows_are_made_where_stress_is_high(monkeypatch: pytest.MonkeyPatch) -> 
     body = Body(MESHES["2d-unstructured"])
     size = np.zeros(len(body.volumes))
     whole = body.average(2.7 * H, "linear")
-    monkeypatch.setattr(average_module, "AT_ONCE", 0)
+    limit_weights(monkeypatch, 0)
     few = body.average(2.7 * H, "linear")
     made = []
     for hot in (17, 17, 90):
         size[:] = np.random.default_rng(hot).uniform(0.1, 0.3, len(size))
         size[hot] = 5.0
-        cells, found = few.reaching(size[:, None], size, 0.35)
-        expected, averages = whole.reaching(size[:, None], size, 0.35)
+        cells, found = few.find_averages_above(size[:, None], size, 0.35)
+        expected, averages = whole.find_averages_above(size[:, None], size, 0.35)
         assert len(cells) and np.array_equal(cells, expected) and np.array_equal(found, averages)
-        made.append(sum(len(rows.cells) for rows in few._rows.made))
+        made.append(sum(len(rows.cells) for rows in few._weights.blocks))
     near = np.linalg.norm(body.centroids - body.centroids[[17, 90], None], axis=2) <= 2.7 * H
     assert made == [near[0].sum(), near[0].sum(), near.any(axis=0).sum()] and made[0] < len(size) / 3
     assert np.array_equal(few(size[:, None]), whole(size[:, None])), "all rows, in the order of the cells"
-    assert np.array_equal(few.reaching(size[:, None], size, 0.35)[1], averages)
+    assert np.array_equal(few.find_averages_above(size[:, None], size, 0.35)[1], averages)

@@ -21,11 +21,11 @@ def test_a_particle_that_is_struck(scheme: Scheme) -> None:
     """m = 2 kg at v = 3, a = 5 is struck by f = 7 N over a step of 0.1 s: beside what a does, v changes by dt f / m and
     u by theta dt^2 f / m (theta = 1, or beta / gamma), and what is carried on is as if nothing had struck it."""
     dt, m, f = 0.1, 2.0, 7.0
-    c_a, _ = scheme.rates(dt)
+    c_a, _ = scheme.rate_coefficients(dt)
     start = np.zeros(1), np.full(1, 3.0), np.full(1, 5.0)
-    x, _ = scheme.references(dt, *start)
+    x, _ = scheme.reference_displacements(dt, *start)
     moved = np.full(1, ContactTimeWeights.for_scheme(scheme).factor * (1 - scheme.alpha_f) * f / m / c_a)
-    (u, v, a), (u_f, v_f, a_f) = scheme.finish(dt, x, *start), scheme.finish(dt, x + moved, *start)
+    (u, v, a), (u_f, v_f, a_f) = scheme.complete_step(dt, x, *start), scheme.complete_step(dt, x + moved, *start)
     newmark = getattr(scheme, "newmark", scheme)
     theta = 1.0 if isinstance(scheme, BackwardEuler) else newmark.beta / newmark.gamma
     assert [v_f - v, u_f - u] == pytest.approx([dt * f / m, theta * dt**2 * f / m], rel=1e-9)

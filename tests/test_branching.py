@@ -17,12 +17,12 @@ from mpi4py import MPI
 from scipy.optimize import brentq
 
 from fracsim.errors import InputError
-from fracsim.fracture.energy.branching import ANGLE, each, parted, rotated
-from fracsim.fracture.energy.crack_speed import RunningTips, slower
-from fracsim.fracture.energy.cut_plane import fork, leave
-from fracsim.fracture.energy.mixed_mode import gain
-from fracsim.fracture.energy.neighbour_search import Pairs
-from fracsim.fracture.energy.tip_criterion import DISC
+from fracsim.fracture.energy.branching import branch_directions, release_rate, rotate
+from fracsim.fracture.energy.crack_speed import RateDependentTipCriterion, relax_slowness
+from fracsim.fracture.energy.cut_plane import branching_cuts, exit_cuts
+from fracsim.fracture.energy.mixed_mode import kink_gain
+from fracsim.fracture.energy.neighbour_search import NeighbourPairs
+from fracsim.fracture.energy.tip_parameters import TIP
 from fracsim.mesh.domain import distribute
 from fracsim.scene import Scene, build_scene, scene_on
 from fracsim.study.check import check_study
@@ -44,25 +44,25 @@ YOUNG, POISSON = 1.0, 0.3
 
 def test_what_each_tip_of_a_disc_takes_up() -> None:
     """g = G (t_1 + q t_2) of tips that go apart; one that comes towards the tip is left out."""
-    t = rotated(np.array([[1.0, 0.0], [1.0, 0.0]]), np.array([0.4, -0.4]))
+    t = rotate(np.array([[1.0, 0.0], [1.0, 0.0]]), np.array([0.4, -0.4]))
     advance = t[:1] + 0.7 * t[1:]
-    np.testing.assert_allclose(each(3 * advance, advance, t[:1]), 3.0)
+    np.testing.assert_allclose(release_rate(3 * advance, advance, t[:1]), 3.0)
     towards = t[:1] - 0.6 * t[:1]
-    np.testing.assert_allclose(each(2 * t[:1], towards, t[:1]), 2.0)
+    np.testing.assert_allclose(release_rate(2 * t[:1], towards, t[:1]), 2.0)
 
 
 def test_tips_abreast_go_apart() -> None:
     """Each at ANGLE to the way of both, from the other, and the one that is ahead by over h = R / 5 waits; not those
     behind one another, nor those that meet, nor any that have left each other's discs."""
-    ways = rotated(np.repeat([[1.0, 0.0]], 2, axis=0), np.array([0.2, -0.2]))
+    ways = rotate(np.repeat([[1.0, 0.0]], 2, axis=0), np.array([0.2, -0.2]))
 
     def pair(apart: list[float], own: Values, other: Values) -> tuple[Values, bool]:
         vector, none = np.array([apart]), np.zeros(1, np.int64)
-        both = Pairs(none, none, vector, np.linalg.norm(vector, axis=1), 1)
-        way, waits = parted(both, own[None], other[None], np.array([2.0]))
+        both = NeighbourPairs(none, none, vector, np.linalg.norm(vector, axis=1), 1)
+        way, waits = branch_directions(both, own[None], other[None], np.array([2.0]))
         return way[0], bool(waits[0])
 
-    c, s = np.cos(ANGLE), np.sin(ANGLE)
+    c, s = np.cos(TIP.branching_angle), np.sin(TIP.branching_angle)
     np.testing.assert_allclose(pair([0.1, -1.0], ways[0], ways[1])[0], [c, s])
     np.testing.assert_allclose(pair([0.1, 1.0], ways[1], ways[0])[0], [c, -s])
     assert [pair([lead, 1.0], ways[1], ways[0])[1] for lead in (0.5, -0.39, -0.41)] == [False, False, True]
@@ -77,18 +77,18 @@ def test_a_cell_is_cut_in_three_where_both_ways_out_are_free() -> None:
     it goes; one that makes for the middle of a side goes on as one."""
     corners = np.repeat([[[0.0, -1.0], [0.0, 1.0], [1.0, 0.0]]], 2, axis=0)
     entry, point = np.array([2, 2]), np.zeros((2, 2))  # local edges: opposite to 0, 1 and 2
-    ahead = rotated(np.repeat([[1.0, 0.0]], 2, axis=0), np.array([0.1, 0.8]))
+    ahead = rotate(np.repeat([[1.0, 0.0]], 2, axis=0), np.array([0.1, 0.8]))
     torn, yes = np.zeros((2, 3), bool), np.ones(2, bool)
-    one = leave(corners, entry, point, rotated(ahead, np.pi / 2), ahead, torn)
-    cuts = fork(corners, entry, point, rotated(ahead, np.pi / 2), ahead, torn, yes)
+    one = exit_cuts(corners, entry, point, rotate(ahead, np.pi / 2), ahead, torn)
+    cuts = branching_cuts(corners, entry, point, rotate(ahead, np.pi / 2), ahead, torn, yes)
     assert sorted(cuts.row) == [0, 0, 1] and len(set(cuts.edge[cuts.row == 0])) == 2
     assert cuts.share[cuts.row == 1] == one.share[1] and cuts.edge[cuts.row == 1] == one.edge[1]
     ends = {0: (1, 2), 1: (0, 2)}
     for edge, share in zip(cuts.edge[cuts.row == 0], cuts.share[cuts.row == 0], strict=True):
         first, second = (corners[0, k] for k in ends[int(edge)])
         place = first + share * (second - first)
-        assert abs(abs(np.arctan2(place[1], place[0]) - 0.1) - ANGLE) < 1e-9
-    whole = fork(corners, entry, point, rotated(ahead, np.pi / 2), ahead, torn, ~yes)
+        assert abs(abs(np.arctan2(place[1], place[0]) - 0.1) - TIP.branching_angle) < 1e-9
+    whole = branching_cuts(corners, entry, point, rotate(ahead, np.pi / 2), ahead, torn, ~yes)
     np.testing.assert_array_equal(whole.edge, one.edge)
 
 
@@ -100,7 +100,7 @@ def test_how_fast_a_crack_gets(rest: float) -> None:
     for count in (3000, 6000):
         slow = np.ones(1)
         for _ in range(count):
-            slow = slower(slow, rest * slow, np.full(1, 30 / count))
+            slow = relax_slowness(slow, rest * slow, np.full(1, 30 / count))
         ends.append(1 - float(slow[0]))
     assert ends == pytest.approx([float(np.clip(1 - 1 / rest, 0.0, 0.5))] * 2, abs=1e-6)
 
@@ -111,7 +111,7 @@ def test_how_fast_a_crack_gets(rest: float) -> None:
 def forked(upper: float, lower: float, n: int = 40) -> Scene:
     """A plate of 1 m, pulled by 1 mm, cracked to its middle, with two branches of these lengths, m, at ANGLE."""
     at = np.array([0.5, 0.503])
-    ends = at + rotated(np.array([[upper, 0.0], [lower, 0.0]]), np.array([ANGLE, -ANGLE]))
+    ends = at + rotate(np.array([[upper, 0.0], [lower, 0.0]]), np.array([TIP.branching_angle, -TIP.branching_angle]))
     study = make_study(
         material={"energy": "linear", "young": YOUNG, "poisson": POISSON, "density": 1.0},
         fracture={"strength": 1e9, "energy": 1e9},
@@ -134,8 +134,8 @@ def test_two_tips_in_a_disc_share_its_force() -> None:
         assert len(reached) == 2
         along = now.tips.point - now.tips.behind
         tangent = along / np.linalg.norm(along, axis=1)[:, None]
-        force = now.forces()
-        released = each(force, now.tips.ahead, tangent)
+        force = now.evaluate_forces()
+        released = release_rate(force, now.tips.ahead, tangent)
         size = np.linalg.norm(reached - [0.5, 0.503], axis=1).sum()
         books.append(
             (scene.balance.stress.stored_energy(), size, released.mean(), np.linalg.norm(force, axis=1).mean())
@@ -151,15 +151,17 @@ def test_a_tip_that_is_ahead_waits_unless_there_is_enough_for_both() -> None:
     scene = forked(0.05, 0.09)
     stress, graph, held = scene.balance.stress, scene.fracture.graph, criterion_of(scene)
     for share, goes in ((1.9, False), (2.1, True)):
-        criterion = RunningTips(stress, graph, held.strength, 1.0, held.cut.copy())
-        found = criterion.tips()
-        now = criterion.sight.look(*scene.fracture.evaluate())
+        criterion = RateDependentTipCriterion(stress, graph, held.strength, 1.0, held.cut_positions.copy())
+        found = criterion.find_tips()
+        now = criterion.field_evaluator.evaluate_fields(*scene.fracture.evaluate_undamaged_stress())
         tangent = (found.point - found.behind) / np.linalg.norm(found.point - found.behind, axis=1)[:, None]
         ahead = int(np.argmax(found.point[:, 0]))
         assert found.waits[ahead] and found.waits.sum() == 1
-        released = each(now.forces(), found.ahead, tangent) * gain(now.phases() * ~np.any(found.parts, axis=1))
+        released = release_rate(now.evaluate_forces(), found.ahead, tangent) * kink_gain(
+            now.phase_angles() * ~np.any(found.parts, axis=1)
+        )
         criterion.toughness = released[ahead] / share
-        criterion(*scene.fracture.evaluate())
+        criterion(*scene.fracture.evaluate_undamaged_stress())
         assert (found.cell[ahead] in criterion.cells) == goes
 
 
@@ -230,9 +232,9 @@ def branch(angle: float, length: float = 0.02, finest: float = 5e-5) -> tuple[fl
 
 def test_short_branches_open_and_do_not_slide() -> None:
     """K_II is 0 at ANGLE, to 2 degrees, where each branch releases 0.52 of what the crack straight on does."""
-    angles = ANGLE + np.radians([-6, 6])
+    angles = TIP.branching_angle + np.radians([-6, 6])
     (opening, low), (_, high) = map(branch, angles)
-    assert np.interp(0.0, [low, high], angles) == pytest.approx(ANGLE, abs=np.radians(2))
+    assert np.interp(0.0, [low, high], angles) == pytest.approx(TIP.branching_angle, abs=np.radians(2))
     assert opening**2 == pytest.approx(0.52, abs=0.015)
 
 
@@ -279,15 +281,15 @@ def test_what_is_kept_of_tips_that_branch_is_what_is_found_anew() -> None:
     scene, state = make_scene(**RUNS["forked"])
     criterion, graph, most = criterion_of(scene), scene.fracture.graph, 0
     for _ in each_step(scene, state):
-        parts = scene.balance.stress, graph, criterion.strength, criterion.toughness, criterion.cut
-        kept, found = criterion.tips(), RunningTips(*parts).tips()
+        parts = scene.balance.stress, graph, criterion.strength, criterion.toughness, criterion.cut_positions
+        kept, found = criterion.find_tips(), RateDependentTipCriterion(*parts).find_tips()
         most = max(most, len(kept))
         for name in ("cell", "mature", "waits", "alone"):
             np.testing.assert_array_equal(getattr(kept, name), getattr(found, name))
         for name in ("behind", "course", "ahead", "parts"):
             np.testing.assert_allclose(getattr(kept, name), getattr(found, name), atol=1e-12)
         if most > 1:
-            criterion.toughness = np.where(criterion.sight.centres[:, 1] > 0.52, np.inf, 0.02)
+            criterion.toughness = np.where(criterion.field_evaluator.centres[:, 1] > 0.52, np.inf, 0.02)
     assert most > 1
 
 
@@ -298,7 +300,7 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
     assert 1 < broken < going.breaks.counts[0]
     assert np.any(going.scene.fracture.graph.pattern == 7)
     assert_alike(again, going, 1e-9)
-    carried = [each.scene.fracture.criterion.carried for each in (going, again)]
+    carried = [each.scene.fracture.criterion.tip_states for each in (going, again)]
     np.testing.assert_allclose(carried[1], carried[0], rtol=1e-9, atol=1e-12)
 
 
@@ -307,9 +309,9 @@ def test_a_state_is_advanced_twice_alike() -> None:
     scene, state = make_scene(**RUNS["forked"])
     march(scene, state, 12)
     first = [scene.stepper.advance(state.state)[0]]
-    carried = [criterion_of(scene).carried.copy()]
+    carried = [criterion_of(scene).tip_states.copy()]
     first.append(scene.stepper.advance(state.state)[0])
-    carried.append(criterion_of(scene).carried.copy())
+    carried.append(criterion_of(scene).tip_states.copy())
     assert not np.array_equal(first[0].u, state.u)
     np.testing.assert_array_equal(carried[0], carried[1])
     assert np.any(carried[0][:, 0] < 1)
@@ -317,7 +319,7 @@ def test_a_state_is_advanced_twice_alike() -> None:
 
 def test_check_tells_when_tips_branch() -> None:
     """And that none does in steps longer than R / c_R; c_R within 1 % of the root of Rayleigh's equation."""
-    assert DISC[2] == LIMITS.tip_radius
+    assert TIP.disc_radius[2] == LIMITS.tip_radius
     nu, h = 0.3, 0.05
     ratio = (1 - 2 * nu) / (2 - 2 * nu)
     root = brentq(lambda x: (2 - x**2) ** 2 - 4 * np.sqrt((1 - x**2) * (1 - ratio * x**2)), 0.5, 0.99)

@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 from scipy.spatial.transform import Rotation
 
-from fracsim.fracture.brittle.grains import GrainRules, SurfaceRules
+from fracsim.fracture.brittle.grains import GrainParameters, SurfaceParameters
 from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.breakage import Breakable
 from fracsim.rigid.surface_loads import point_loads
@@ -19,7 +19,7 @@ Values = npt.NDArray[np.float64]
 
 def bent(strength: float, **rules: object) -> tuple[Breakable, int]:
     """A bar of 3 x 1 x 1 m, struck from above in its middle over two supports, and how many edges broke."""
-    body = breakable(lattice(12, 4, 4, size=0.25), strength, SurfaceRules(**({"surfaces": 1} | rules)))  # type: ignore[arg-type]
+    body = breakable(lattice(12, 4, 4, size=0.25), strength, SurfaceParameters(**({"surfaces": 1} | rules)))  # type: ignore[arg-type]
     points = np.array([[1.5, 0.5, 1.0], [0.1, 0.5, 0.0], [2.9, 0.5, 0.0]])
     force = 1e5 * np.array([[0.0, 0.0, -2.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
     return body, body.strike(0, body.loads(0, points, force))
@@ -48,7 +48,7 @@ def test_pieces_keep_momentum_spin_and_energy() -> None:
     though each piece is weighed by itself; places of points at rest do not move."""
     body, _ = bent(3e5, surfaces=8)
     assert body.pieces.count > 2
-    whole = moments_of(breakable(lattice(12, 4, 4, size=0.25), 1.0, SurfaceRules(1)))
+    whole = moments_of(breakable(lattice(12, 4, 4, size=0.25), 1.0, SurfaceParameters(1)))
     start = Bodies.at_rest(density_of(whole), whole)
     turn = Rotation.from_rotvec([[0.3, -1.2, 0.5]]).as_matrix()
     motion = np.array([[3.0, -2.0, 9.0]]), np.array([[4.0, 5.0, -6.0]])
@@ -67,7 +67,7 @@ def test_pieces_keep_momentum_spin_and_energy() -> None:
 def test_a_piece_breaks_alone() -> None:
     """Two bars in one mesh: the one that is struck breaks, and the other is left as it was, whatever its grains."""
     mesh = copies(lattice(6, 2, 2, size=0.25), 2)
-    body = breakable(mesh, 1e3, SurfaceRules(6, grains=GrainRules(6, seed=2)))
+    body = breakable(mesh, 1e3, SurfaceParameters(6, grains=GrainParameters(6, seed=2)))
     assert body.pieces.count == 2
     points = np.array([[0.75, 0.25, 0.5], [0.1, 0.25, 0.0], [1.4, 0.25, 0.0]])
     force = 1e5 * np.array([[0.0, 0.0, -2.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
@@ -79,7 +79,7 @@ def test_a_piece_breaks_alone() -> None:
 
 def test_crumbs_break_no_more() -> None:
     """A piece without a whole cell is a rigid body: no blow is analysed on it."""
-    body = breakable(lattice(2, 2, 2), 1.0, SurfaceRules(5))
+    body = breakable(lattice(2, 2, 2), 1.0, SurfaceParameters(5))
     domain = body.graph.domain
     body.graph.break_edges((body.graph.edge_nodes == domain.cell_nodes[0, 0]).any(axis=1))
     body = Breakable(body._stiffness, body.graph, body._criterion, body._within)
@@ -106,7 +106,7 @@ def test_a_crack_that_ends_in_a_body_is_open_and_solved() -> None:
     """Half of the middle section is cut: one piece still, solved for by CG, and bent further at the crack's tip."""
     found = []
     for cut in (False, True):
-        body = breakable(lattice(8, 4, 4, size=0.25), 1e9, SurfaceRules(1))
+        body = breakable(lattice(8, 4, 4, size=0.25), 1e9, SurfaceParameters(1))
         X = body.graph.domain.nodes[body.graph.edge_nodes]
         across = (X[:, :, 0] > 1.1).any(axis=1) & (X[:, :, 0] < 1.1).any(axis=1) & (X[:, :, 2] < 0.6).all(axis=1)
         body.graph.break_edges(across & cut)

@@ -15,9 +15,20 @@ from scipy.spatial.distance import cdist
 from cases import fracsim, write_study
 from fracsim.errors import Stopped
 from fracsim.fracture.brittle.crack_level_set import DirectionField
-from fracsim.fracture.brittle.principal_stress import SAME, directions, largest, material_normals, upper_bound
-from fracsim.fracture.brittle.surface_cut import NEAREST, Body, settled, sides_of
-from fracsim.fracture.brittle.surface_pass import Starts
+from fracsim.fracture.brittle.surface_cut import (
+    CUT,
+    SurfaceCutMesh,
+    reassign_isolated_nodes,
+    sides_of_level_set,
+)
+from fracsim.fracture.brittle.surface_pass import StartCandidates
+from fracsim.fracture.principal_stress import (
+    EQUAL_STRESS_TOLERANCE,
+    first_principal_directions,
+    first_principal_stress,
+    material_normals,
+    principal_stress_bound,
+)
 from fracsim.meshes.data import MeshData
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
@@ -55,7 +66,7 @@ def strained(dim: int, F: Any, energy: str = "linear", **tables: Any) -> Scene:
 
 def cuts(scene: Scene) -> tuple[Any, Any]:
     """(n, 2) sorted keys of the edges that surfaces cut, and where."""
-    cut = scene.fracture.criterion.cut
+    cut = scene.fracture.criterion.cut_positions
     own = np.flatnonzero(~np.isnan(cut))
     keys = scene.fracture.graph.edge_keys(own)
     order = np.lexsort(keys.T[::-1])
@@ -121,7 +132,7 @@ def test_a_planar_cut_is_flat(dim: int, approach: str) -> None:
     keys, cut = cuts(scene)
     normal = np.array([1.0, 0.3, 0.2][:dim]) / np.linalg.norm([1.0, 0.3, 0.2][:dim])
     height = (cut_points(mesh_of(scene).points, keys, cut) - scene.fracture.criterion.starts[0]) @ normal
-    at_node = np.minimum(cut, 1 - cut) <= 2 * NEAREST
+    at_node = np.minimum(cut, 1 - cut) <= 2 * CUT.min_share
     assert np.abs(height[~at_node]).max() < 1e-9
     assert at_node.mean() <= (0.1 if approach == "chi" else 0.0)
     assert scene_surface(scene).fragment_count == 2
@@ -206,10 +217,10 @@ def test_starts_are_those_of_a_greedy_search(seed: int) -> None:
         others = np.concatenate([taken, places[kept]])
         if cdist(places[candidate][None], others).min() >= 0.25:
             kept.append(candidate)
-    starts, found = Starts(places, load, 0.25, taken), []
-    while (chosen := starts.next()) is not None:
+    starts, found = StartCandidates(places, load, 0.25, taken), []
+    while (chosen := starts.pop_most_loaded()) is not None:
         found.append(chosen)
-        starts.leave_out(places[chosen])
+        starts.exclude_near(places[chosen])
     assert found == kept and 5 < len(kept) < 60
 
 
@@ -249,23 +260,25 @@ def test_principal_stress_by_its_definition() -> None:
     random = np.random.default_rng(1)
     s = random.normal(size=(50, 3, 3))
     s = s + np.swapaxes(s, 1, 2)
-    n = directions(s, random.random((50, 3)), 0)
+    n = first_principal_directions(s, random.random((50, 3)), 0)
     top = np.einsum("ni,nij,nj->n", n, s, n)
     tries = random.normal(size=(2000, 3))
     tries /= np.linalg.norm(tries, axis=1)[:, None]
     assert np.all(np.einsum("ki,nij,kj->nk", tries, s, tries).max(axis=1) <= top + 1e-12)
-    np.testing.assert_allclose(largest(s), top, atol=1e-12)
-    assert np.all(upper_bound(s) >= top - 1e-12)
+    np.testing.assert_allclose(first_principal_stress(s), top, atol=1e-12)
+    assert np.all(principal_stress_bound(s) >= top - 1e-12)
 
 
 def test_equal_principal_stresses_give_a_drawn_direction() -> None:
     """Biaxial tension with noise: a direction in its plane that the noise does not change, but the seed does."""
     place, noise = np.array([[0.1, 0.2, 0.3]]), np.random.default_rng(0).normal(size=(3, 3)) * 1e-9
     s = np.diag([1.0, 1.0, 0.2])
-    plain = directions(s[None], place, 0)[0]
-    noisy = directions((s + noise + noise.T)[None], place, 0)[0]
-    other = directions(s[None], place, 1)[0]
-    assert abs(plain[2]) < 1e-12 and 1 - abs(plain @ noisy) < 1e-8 / SAME and abs(plain @ other) < 0.999
+    plain = first_principal_directions(s[None], place, 0)[0]
+    noisy = first_principal_directions((s + noise + noise.T)[None], place, 0)[0]
+    other = first_principal_directions(s[None], place, 1)[0]
+    assert (
+        abs(plain[2]) < 1e-12 and 1 - abs(plain @ noisy) < 1e-8 / EQUAL_STRESS_TOLERANCE and abs(plain @ other) < 0.999
+    )
     np.testing.assert_allclose(abs(plain @ noisy), 1.0, atol=1e-6)
 
 
@@ -325,11 +338,11 @@ def test_without_tension_a_curved_surface_goes_straight_on() -> None:
 
 def test_weights_are_a_share_of_the_strength() -> None:
     """Uniaxial stress of half the strength: weight 1/2 along it; equal principal stresses: direction without weight."""
-    from fracsim.fracture.brittle.surface_cut import Body
+    from fracsim.fracture.brittle.surface_cut import SurfaceCutMesh
 
-    body = Body(box(2, 0.25))
+    body = SurfaceCutMesh(box(2, 0.25))
     rest = np.broadcast_to(np.eye(2), (len(body.cells), 2, 2))
-    field = DirectionField.of(body, rest * np.array([[1.0, 0.0], [0.0, 0.0]]), rest, np.full(len(rest), 2.0))
+    field = DirectionField.from_cells(body, rest * np.array([[1.0, 0.0], [0.0, 0.0]]), rest, np.full(len(rest), 2.0))
     np.testing.assert_allclose(field.weight, 0.5, rtol=1e-12)
     np.testing.assert_allclose(np.abs(field.direction[:, 0]), 1.0, rtol=1e-12)
 
@@ -428,7 +441,7 @@ def test_a_restart_remembers_its_surfaces(tmp_path: Path) -> None:
     np.testing.assert_allclose(again.scene.fracture.criterion.starts, whole.scene.fracture.criterion.starts, rtol=1e-14)
     assert again.breaks.record is not None and whole.breaks.record is not None
     assert np.array_equal(again.breaks.record.graph.broken, whole.breaks.record.graph.broken)
-    np.testing.assert_allclose(again.breaks.record.cut, whole.breaks.record.cut, atol=1e-8)
+    np.testing.assert_allclose(again.breaks.record.cut_positions, whole.breaks.record.cut_positions, atol=1e-8)
 
 
 def test_several_passes_open_surfaces_one_after_the_other() -> None:
@@ -481,21 +494,21 @@ def test_check_tells_and_a_typing_error_is_named(tmp_path: Path) -> None:
 
 def test_no_node_of_a_thin_plate_is_left_without_a_whole_cell() -> None:
     """Planes at any angle through a plate about one cell thick, which as they are would leave two nodes each, or so."""
-    body = Body(
+    body = SurfaceCutMesh(
         build_mesh(MeshSettings.model_validate({"builder": "box", "size": [1.0, 0.8, 0.07], "h": 0.06} | UNSTRUCTURED))
     )
     draw, every = np.random.default_rng(0), np.ones(len(body.cells), bool)
     left = np.zeros((100, 2), int)
     for trial in left:
         origin, normal = draw.uniform(0.2, 0.8, 3) * [1.0, 0.8, 0.07], draw.normal(size=3) * [1.0, 1.0, 0.3]
-        plane = sides_of((body.points - origin) @ (normal / np.linalg.norm(normal)), body.tolerance)
-        moved = settled(body, plane, every)
+        plane = sides_of_level_set((body.points - origin) @ (normal / np.linalg.norm(normal)), body.tolerance)
+        moved = reassign_isolated_nodes(body, plane, every)
         assert moved.any() and not moved.all()
         trial[:] = [without_a_cell(body, plane), without_a_cell(body, moved)]
     assert left[:, 0].sum() > 100 and left[:, 1].sum() == 0
 
 
-def without_a_cell(body: Body, sides: Any) -> int:
+def without_a_cell(body: SurfaceCutMesh, sides: Any) -> int:
     """Nodes none of whose cells lie on their side as a whole."""
     whole = np.ptp(np.asarray(sides, int)[body.cells], axis=1) == 0
     return len(body.points) - len(np.unique(body.cells[whole]))

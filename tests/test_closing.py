@@ -31,7 +31,7 @@ def cut(scene: Scene, at: float) -> None:
     graph.break_edges(side[:, 0] != side[:, 1])
     if scene.balance.stress.chi is not None:
         scene.balance.stress.chi.x.array[: scene.domain.cell_count][graph.split] = 0.0
-    scene.fracture.degradation.restore()
+    scene.fracture.degradation.update_from_graph()
 
 
 def bar(approach: str, energy: str, *, unilateral: bool = True, **tables: Any) -> tuple[Scene, State]:
@@ -324,7 +324,7 @@ def test_explicit_steps_stay_stable_with_damage(approach: str, unilateral: bool,
     if scene.balance.stress.chi is not None:
         scene.balance.stress.chi.x.array[: scene.domain.cell_count][graph.damaged] = 0.5
         scene.balance.stress.chi.x.array[: scene.domain.cell_count][graph.split] = 0.0
-    scene.fracture.degradation.restore()
+    scene.fracture.degradation.update_from_graph()
     state.v[:] = rng.uniform(-1e-3, 1e-3, len(state.v))
     state.settle()
     energies = [report.kinetic + report.elastic for report in march(scene, state, 500)]

@@ -11,9 +11,13 @@ import numpy.typing as npt
 import pytest
 from scipy.integrate import quad
 
-from fracsim.fracture.cohesive.cohesive_pass import CohesiveBreaking
-from fracsim.fracture.cohesive.cohesive_tips import without
-from fracsim.fracture.cohesive.softening import carried, decay, widths
+from fracsim.fracture.cohesive_cracks import (
+    CohesiveFracturePass,
+    opening_widths,
+    remove_normal_stress,
+    softening_parameter,
+    stress_ratio,
+)
 from fracsim.scene import Scene
 from fracsim.studies import folder as packaged
 from fracsim.study.check import check_study
@@ -34,10 +38,10 @@ LENGTH, SECTION = 0.4, 0.5  # m: shorter than l_ch, so that the bar does not sna
 def test_a_cell_takes_the_fracture_energy(width: float) -> None:
     """int psi (-dchi) = G_c / l by quadrature, chi = carried / r, psi = psi_0 r^2, for cells of any width."""
     start = STRENGTH**2 / (2 * YOUNG)
-    b = decay(np.array([ENERGY]), np.array([width]), np.array([start]))
+    b = softening_parameter(np.array([ENERGY]), np.array([width]), np.array([start]))
 
     def fall(r: float) -> float:
-        above, below = (carried(np.array([x]), b)[0] / x for x in (r * (1 - 1e-5), r * (1 + 1e-5)))
+        above, below = (stress_ratio(np.array([x]), b)[0] / x for x in (r * (1 - 1e-5), r * (1 + 1e-5)))
         return float((above - below) / (2e-5 * r))
 
     taken, _ = quad(lambda r: start * r**2 * fall(r), 1, 1 + 40 * float(b[0]), limit=200)
@@ -53,7 +57,7 @@ def test_the_width_of_a_cell_is_how_its_sides_part(d: int) -> None:
     # the cut half way between the first corner and the others: edges (0, k) in a plane of this normal
     corners[:, 0, 0], corners[:, 1:, 0] = 1.0, 0.0
     points = (corners[:, :1] + corners[:, 1:]) / 2
-    found = widths(corners, np.tile(first, (40, 1)), points, np.ones((40, d), bool))
+    found = opening_widths(corners, np.tile(first, (40, 1)), points, np.ones((40, d), bool))
     slopes = np.linalg.inv(np.concatenate([np.ones((40, d + 1, 1)), corners], axis=2))[:, 1:, 0] @ normal
     np.testing.assert_allclose(found, 1 / np.abs(slopes))
     np.testing.assert_allclose(found, 1.0)
@@ -66,11 +70,13 @@ def test_where_a_crack_goes() -> None:
     pull = np.column_stack([-np.sin(angles), np.cos(angles)])  # normal of the crack as it ought to go
     stress = np.einsum("ni,nj->nij", pull, pull)
     behind, along = np.tile([3.0, 0.0], (9, 1)), np.diag([5.0, 0.0])
-    found = np.linalg.eigh(without(stress, behind))[1][:, :, -1]
+    found = np.linalg.eigh(remove_normal_stress(stress, behind))[1][:, :, -1]
     found *= np.sign(found[:, 1])[:, None]
     np.testing.assert_allclose(np.arctan2(-found[:, 0], found[:, 1]), angles, atol=np.abs(angles).max() ** 3)
-    np.testing.assert_allclose(without(stress + along, behind), without(stress, behind), atol=1e-12)
-    np.testing.assert_array_equal(without(stress, 0 * behind), stress)
+    np.testing.assert_allclose(
+        remove_normal_stress(stress + along, behind), remove_normal_stress(stress, behind), atol=1e-12
+    )
+    np.testing.assert_array_equal(remove_normal_stress(stress, 0 * behind), stress)
 
 
 # --- a bar -----------------------------------------------------------------------------------------------------------
@@ -119,9 +125,9 @@ def test_a_bar_in_tension(kind: str, n: int) -> None:
     assert lost == pytest.approx(ENERGY * SECTION, rel=0.01)
     np.testing.assert_allclose(stress, np.interp(way, *closed_form(1 / n)), atol=0.04 * STRENGTH)
     breaking = scene.fracture
-    assert isinstance(breaking, CohesiveBreaking)
-    cells = np.flatnonzero(breaking.cuts.split)
-    area = (scene.domain.volumes[cells] / breaking.softening.widths(cells)).sum()
+    assert isinstance(breaking, CohesiveFracturePass)
+    cells = np.flatnonzero(breaking.cut_graph.split)
+    area = (scene.domain.volumes[cells] / breaking.softening.opening_widths(cells)).sum()
     assert area == pytest.approx(SECTION, rel=1e-3)
     assert breaking.graph.split[cells].all() and stress[-1] < 1e-3 * STRENGTH
 
@@ -137,17 +143,17 @@ def test_edges_hold_until_they_carry_nothing() -> None:
     """At half of its strength the bar is cut through, and in one piece."""
     scene, state = make_scene(**RUNS["cohesive"] | {"crack": []})
     breaking = scene.fracture
-    assert isinstance(breaking, CohesiveBreaking)
+    assert isinstance(breaking, CohesiveFracturePass)
     cut, broken = [], []
     while not scene.ended(state.state):
         state.advance()
-        cut.append(int(breaking.cuts.split.sum()))
+        cut.append(int(breaking.cut_graph.split.sum()))
         broken.append(breaking.graph.broken_count)
     assert cut[broken.index(max(broken))] > 0
     assert any(c > 4 and not b for c, b in zip(cut, broken, strict=True))
     chi = scene.balance.stress.chi.x.array[: scene.domain.cell_count]
     assert not np.any(breaking.graph.split & (chi > 0))
-    assert not np.any(breaking.cuts.broken & (breaking.graph.integrity == 1))
+    assert not np.any(breaking.cut_graph.broken & (breaking.graph.integrity == 1))
 
 
 def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
@@ -155,8 +161,10 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
     tables = RUNS["cohesive"] | {"output": {"picture": False, "interval": 100.0}, "solver": DIRECT}
     going, _, again = going_stopped_resumed(tables, tmp_path, 8, 5)
     assert_alike(again, going, 1e-9)
-    np.testing.assert_allclose(again.scene.fracture.criterion.cut, going.scene.fracture.criterion.cut, atol=1e-9)
-    assert np.count_nonzero(~np.isnan(going.scene.fracture.criterion.cut)) > going.breaks.counts[0]
+    np.testing.assert_allclose(
+        again.scene.fracture.criterion.cut_positions, going.scene.fracture.criterion.cut_positions, atol=1e-9
+    )
+    assert np.count_nonzero(~np.isnan(going.scene.fracture.criterion.cut_positions)) > going.breaks.counts[0]
 
 
 def test_a_panel_of_concrete_is_as_stiff_as_by_another_program() -> None:

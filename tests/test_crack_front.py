@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial import Delaunay
 
-from fracsim.fracture.edge_history import EdgeRecord
+from fracsim.fracture.edge_history import EdgeHistory
 from fracsim.output.crack_length import CrackExtent
 from fracsim.study.conditions import initial_cracks as given
 from support.scenes import make_scene
@@ -21,16 +21,16 @@ def test_what_changes_is_enough(dim: int) -> None:
     """Edges break a few at a time, anywhere. The size is that of a front that has just been made. The tip lies on an
     edge that broke last, of a cell that holds together where there is one, found cell by cell."""
     scene, _ = make_scene(mesh={"builder": "box", "size": [1] * dim, "h": 0.25}, fracture={"strength": 1.0})
-    graph, record = scene.fracture.graph, EdgeRecord(scene.fracture.graph)
+    graph, record = scene.fracture.graph, EdgeHistory(scene.fracture.graph)
     front, sizes, led = CrackExtent(record), [], 0
     order = np.random.default_rng(2).permutation(len(graph.broken))
     for t, edges in enumerate(np.array_split(order, 40)):
         graph.break_edges(np.isin(np.arange(len(order)), edges))
-        record.note(float(t))
+        record.record_breaks(float(t))
         front.update()
         sizes.append(front.values[0])
         np.testing.assert_allclose(front.values[0], CrackExtent(record).values[0], rtol=1e-12)
-        last = set(np.flatnonzero(record.at == np.nanmax(record.at)).tolist())
+        last = set(np.flatnonzero(record.break_times == np.nanmax(record.break_times)).tolist())
         whole = [
             set(cell) & last for cell, split in zip(graph.cell_edges.tolist(), graph.split, strict=True) if not split
         ]
@@ -51,8 +51,8 @@ def test_a_tip_that_has_left_stays_where_it_was(ahead: int) -> None:
         mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.05, "pattern": "unstructured"}, crack=cracks,
         fracture={"strength": 1.0},
     )  # fmt: skip
-    graph, record = scene.fracture.graph, EdgeRecord(scene.fracture.graph)
-    record.note(0.0, scene.fracture.opened)
+    graph, record = scene.fracture.graph, EdgeHistory(scene.fracture.graph)
+    record.record_breaks(0.0, scene.fracture.initial_cuts)
     front = CrackExtent(record, given(scene.study, 2))
     ends = graph.domain.nodes[graph.edge_nodes]
     crossed = np.flatnonzero((ends[:, :, 1].min(axis=1) < 0.507) & (ends[:, :, 1].max(axis=1) > 0.507) & ~graph.broken)
@@ -60,7 +60,7 @@ def test_a_tip_that_has_left_stays_where_it_was(ahead: int) -> None:
     seen, lengths = [], [front.values[0]]
     for t, k in enumerate(range(0, len(crossed), ahead)):
         graph.break_edges(np.isin(np.arange(len(graph.broken)), crossed[k : k + ahead]))
-        record.note(t + 1.0)
+        record.record_breaks(t + 1.0)
         front.update()
         seen.append(front.values[1:].copy())
         lengths.append(front.values[0])
@@ -95,8 +95,8 @@ def test_cracks_are_as_long_as_asked_for(mesh: str, order: int, tmp_path: Path) 
             mesh=square(mesh, h, tmp_path) | {"order": order}, crack=[{"segment": line} for line in lines],
             fracture={"strength": 1.0},
         )  # fmt: skip
-        record = EdgeRecord(scene.fracture.graph)
-        record.note(0.0, scene.fracture.opened)
+        record = EdgeHistory(scene.fracture.graph)
+        record.record_breaks(0.0, scene.fracture.initial_cuts)
         length, *tip = CrackExtent(record, given(scene.study, 2)).values
         inside = [np.clip(line, 0.0, 1.0) if line is LINES[4] else cut_off(np.array(line)) for line in lines]
         assert length == pytest.approx(sum(np.linalg.norm(b - a) for a, b in inside), abs=0.08 * h * len(lines))
@@ -148,7 +148,7 @@ def test_polygons_are_as_large_as_asked_for() -> None:
         for seed in (1, 2, 3):
             box = {"builder": "box", "size": [1.0] * 3, "h": 0.08, "pattern": "unstructured", "seed": seed}
             scene, _ = make_scene(mesh=box, crack=[crack], fracture={"strength": 1.0})
-            record = EdgeRecord(scene.fracture.graph)
-            record.note(0.0, scene.fracture.opened)
+            record = EdgeHistory(scene.fracture.graph)
+            record.record_breaks(0.0, scene.fracture.initial_cuts)
             errors.append(CrackExtent(record, given(scene.study, 3)).values[0] / exact - 1)
         assert np.abs(errors).max() < each and abs(np.mean(errors)) < mean

@@ -34,12 +34,12 @@ def cracked(crack: list[dict[str, Any]], dim: int = 2, h: float = 0.1, **tables:
 def cut_points(scene: Scene) -> np.ndarray:
     """(n, d) places where edges were cut before the start."""
     breaking = scene.fracture
-    assert breaking is not None and breaking.opened is not None
+    assert breaking is not None and breaking.initial_cuts is not None
     broken = np.flatnonzero(breaking.graph.broken)
     ends = breaking.graph.edge_nodes[broken]
     nodes, number = scene.domain.nodes, scene.domain.node_input[ends]
     ends = np.where((number[:, 0] > number[:, 1])[:, None], ends[:, ::-1], ends)
-    share = breaking.opened[broken, None]
+    share = breaking.initial_cuts[broken, None]
     return np.asarray(nodes[ends[:, 0]] + share * (nodes[ends[:, 1]] - nodes[ends[:, 0]]))
 
 

@@ -232,7 +232,7 @@ def test_dust_falls(scheme: str, solver: dict[str, Any]) -> None:
     )
     graph = scene.fracture.graph
     graph.break_edges(np.ones(len(graph.broken), bool))
-    scene.fracture.degradation(True, *scene.fracture.evaluate())
+    scene.fracture.degradation(True, *scene.fracture.evaluate_undamaged_stress())
     scene.balance.damage_changed()
     assert len(integrated_cells(scene)) == 0
     march(scene, state)
@@ -246,7 +246,7 @@ def test_a_restart_leaves_the_same_cells_out(tmp_path: Path) -> None:
     going = Run(build_scene(MPI.COMM_SELF, data), tmp_path)
     graph = going.scene.fracture.graph
     graph.break_edges(np.random.default_rng(3).uniform(size=len(graph.broken)) < 0.6)
-    going.scene.fracture.degradation(True, *going.scene.fracture.evaluate())
+    going.scene.fracture.degradation(True, *going.scene.fracture.evaluate_undamaged_stress())
     going.scene.balance.damage_changed()
     going.note_breaks()
     going.checkpoint()

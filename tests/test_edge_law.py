@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from fracsim.fracture.edge_law import Brittle
-from fracsim.fracture.fracture_pass import Breaking
+from fracsim.fracture.fracture_pass import BrittleEdgeLaw, FracturePass
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from support.ranks import OnRanks
@@ -39,7 +38,7 @@ PULL = {
 
 def test_brittle_is_all_or_nothing() -> None:
     """Whole below the strength, gone at it."""
-    np.testing.assert_array_equal(Brittle()(np.array([0.0, 0.999, 1.0, 7.0])), [1, 1, 0, 0])
+    np.testing.assert_array_equal(BrittleEdgeLaw()(np.array([0.0, 0.999, 1.0, 7.0])), [1, 1, 0, 0])
 
 
 def test_a_law_that_softens_weakens_cells_by_degrees() -> None:
@@ -47,7 +46,7 @@ def test_a_law_that_softens_weakens_cells_by_degrees() -> None:
     is (3/4 + 1/2) / (1 + 1/2) = 5/6, as the diagonals carry half of the stress along the load (test_fracture)."""
     scene, state = make_scene(**PULL)
     part = scene.fracture
-    scene.stepper.breaking = Breaking(part.stress, part.graph, part.criterion, Softening(), max_passes=1)
+    scene.stepper.breaking = FracturePass(part.stress, part.graph, part.criterion, Softening(), max_passes=1)
     march(scene, state, 5)
     graph = part.graph
     aligned = np.ptp(scene.domain.nodes[graph.edge_nodes][:, :, 1], axis=1) < 1e-9

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fracsim.forms.kinematics import SYMMETRIC_COMPONENTS
-from fracsim.fracture.edge_stress import Simplices, frobenius_norm, greatest_pull
+from fracsim.fracture.edge_stress import EdgeStressOperator, frobenius_norm, normal_stress_bound
 from fracsim.mesh.simplices import local_edges
 from fracsim.mesh.small_matrices import barycentric_gradients
 from support.laws import T_stress, Tensor, rotation
@@ -55,14 +55,14 @@ def carried_by(components: Tensor, corners: Tensor, intact: Tensor) -> Tensor:
         cell_edges=edges, integrity=intact.ravel().astype(float), pattern=pattern, damaged=np.ones(n, bool),
         split=np.zeros(n, bool),
     )  # fmt: skip
-    return simplices(corners).carried(components, damage)
+    return simplices(corners).intact_edge_stress(components, damage)
 
 
-def simplices(corners: Tensor) -> Simplices:
+def simplices(corners: Tensor) -> EdgeStressOperator:
     """Those of (n, d + 1, d) corners, half of the way to which they have moved."""
     nodes = np.arange(corners.size // corners.shape[2], dtype=np.int32).reshape(corners.shape[:2])
     rest = np.ascontiguousarray(corners.reshape(-1, corners.shape[2]) / 2)
-    return Simplices(nodes, rest, rest.copy())
+    return EdgeStressOperator(nodes, rest, rest.copy())
 
 
 def flags_of(patterns: Tensor, edges: int) -> Tensor:
@@ -132,16 +132,16 @@ def test_no_direction_is_pulled_harder(dim: int) -> None:
     """Against the eigenvalues: a bound of the largest, which it is in 2D and where a stress has one direction, below
     the norm; that of an average is at most the average of theirs."""
     stress = np.array([stress_components(dim, seed) for seed in range(200)])
-    pull, largest = greatest_pull(stress, dim), np.linalg.eigvalsh([as_matrix(each) for each in stress])[:, -1]
+    pull, largest = normal_stress_bound(stress, dim), np.linalg.eigvalsh([as_matrix(each) for each in stress])[:, -1]
     assert np.all(pull >= largest - 8 * EPS) and np.all(pull >= 0)
     assert np.all(pull <= frobenius_norm(stress, dim) * (1 + 8 * EPS))
     if dim == 2:
         np.testing.assert_allclose(pull, np.maximum(largest, 0), rtol=0, atol=8 * EPS)
     n = rotation(dim, 3)[0]
     single = [3.0 * n[i] * n[j] for i, j in SYMMETRIC_COMPONENTS[dim]]
-    np.testing.assert_allclose(greatest_pull(np.array([single]), dim), 3.0, rtol=8 * EPS)
+    np.testing.assert_allclose(normal_stress_bound(np.array([single]), dim), 3.0, rtol=8 * EPS)
     shares = np.random.default_rng(5).dirichlet(np.ones(len(stress)), 50)
-    assert np.all(greatest_pull(shares @ stress, dim) <= shares @ pull + 8 * EPS)
+    assert np.all(normal_stress_bound(shares @ stress, dim) <= shares @ pull + 8 * EPS)
 
 
 def test_flat_cells_carry_nothing() -> None:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import polar
 
-from fracsim.forms.energies import ENERGIES, Energy, StVK, lame, plane_stress_lambda
+from fracsim.forms.energies import ENERGIES, Energy, SaintVenantKirchhoff, lame, plane_stress_lambda
 from support.laws import Law, Tensor, law_of, rotation
 
 YOUNG, POISSON = 3.0, 0.3
@@ -228,7 +228,7 @@ def test_stvk_cauchy_stress_is_the_push_forward() -> None:
     F = near_identity(np.random.default_rng(7).uniform(-1, 1, (3, 3)))
     S = hooke(LAMBDA, (F.T @ F - np.eye(3)) / 2)
     expected = F @ S @ F.T / np.linalg.det(F)
-    np.testing.assert_allclose(law_of(StVK(MU, LAMBDA), 3).cauchy(F), expected, atol=200 * EPS * YOUNG)
+    np.testing.assert_allclose(law_of(SaintVenantKirchhoff(MU, LAMBDA), 3).cauchy(F), expected, atol=200 * EPS * YOUNG)
 
 
 def test_forms_need_no_dolfinx() -> None:

@@ -14,12 +14,19 @@ from mpi4py import MPI
 from scipy.integrate import quad
 from scipy.optimize import brentq
 
-from fracsim.fracture.energy.configurational_force import eshelby, first_piola, plateau, plateau_gradient, springs
-from fracsim.fracture.energy.cut_plane import leave, line_cuts, points_at, through_centre
-from fracsim.fracture.energy.gradient_operators import Patch
-from fracsim.fracture.energy.mixed_mode import Around, gain, kink, shares
-from fracsim.fracture.energy.tip_criterion import DISC, NEAR_TIP, CrackTips
-from fracsim.fracture.energy.tip_fields import Seen
+from fracsim.fracture.energy.configurational_force import (
+    closure_spring_stress,
+    eshelby_stress,
+    first_piola_stress,
+    plateau,
+    plateau_gradient,
+)
+from fracsim.fracture.energy.cut_plane import centroid_cuts, exit_cuts, plane_crossings, points_on_edges
+from fracsim.fracture.energy.gradient_operators import GradientOperators
+from fracsim.fracture.energy.mixed_mode import TipDiscFields, intensity_contributions, kink_angle, kink_gain
+from fracsim.fracture.energy.tip_criterion import TipCriterion, kinked_release
+from fracsim.fracture.energy.tip_fields import TipFields
+from fracsim.fracture.energy.tip_parameters import TIP
 from fracsim.mesh.domain import distribute
 from fracsim.mesh.small_matrices import barycentric_gradients
 from fracsim.scene import build_scene, scene_on
@@ -55,11 +62,11 @@ def test_a_patch_has_the_gradient_and_the_middles_of_a_field(d: int) -> None:
     chance = np.random.default_rng(d)
     points, A, b = chance.random((20, d)), chance.random((d, d)), chance.random(d)
     cells = np.array([chance.permutation(20)[: d + 1] for _ in range(30)])
-    patch = Patch(cells, barycentric_gradients(points[cells])[:, None], np.full((1, d + 1), 1 / (d + 1)))
+    patch = GradientOperators(cells, barycentric_gradients(points[cells])[:, None], np.full((1, d + 1), 1 / (d + 1)))
     field = (points @ A.T + b).ravel()
-    corners = patch.at_nodes(field)
-    np.testing.assert_allclose(patch.gradients(corners), np.tile(A, (30, 1, 1)), rtol=1e-7, atol=1e-9)
-    np.testing.assert_allclose(patch.values(corners), points[cells].mean(axis=1) @ A.T + b, rtol=1e-12)
+    corners = patch.gather_nodal_values(field)
+    np.testing.assert_allclose(patch.evaluate_gradients(corners), np.tile(A, (30, 1, 1)), rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(patch.evaluate_values(corners), points[cells].mean(axis=1) @ A.T + b, rtol=1e-12)
 
 
 def test_eshelbys_stress_is_what_moving_the_material_costs() -> None:
@@ -75,12 +82,12 @@ def test_eshelbys_stress_is_what_moving_the_material_costs() -> None:
     J, step = float(np.linalg.det(F)), 1e-6
     P = F - np.linalg.inv(F).T + 2 * (J - 1) * J * np.linalg.inv(F).T
     cost = [np.linalg.det(D) * psi(F @ np.linalg.inv(D)) for D in (np.eye(2) + step * B, np.eye(2) - step * B)]
-    sigma = eshelby(np.array([psi(F)]), F[None], P[None])[0]
+    sigma = eshelby_stress(np.array([psi(F)]), F[None], P[None])[0]
     assert float(np.sum(sigma * B)) == pytest.approx((cost[0] - cost[1]) / (2 * step), rel=1e-7)
     H = F - np.eye(2)
-    np.testing.assert_allclose(eshelby(np.array([psi(F)]), H[None], P[None])[0] - sigma, P, rtol=1e-12)
+    np.testing.assert_allclose(eshelby_stress(np.array([psi(F)]), H[None], P[None])[0] - sigma, P, rtol=1e-12)
     cauchy = P @ F.T / J
-    np.testing.assert_allclose(first_piola(cauchy[None], H[None], linear=False)[0], P, rtol=1e-12)
+    np.testing.assert_allclose(first_piola_stress(cauchy[None], H[None], linear=False)[0], P, rtol=1e-12)
 
 
 @pytest.mark.parametrize("linear", (True, False))
@@ -89,17 +96,17 @@ def test_the_springs_of_closed_edges(linear: bool) -> None:
     rng = np.random.default_rng(4)
     vectors, modulus = rng.standard_normal((5, 3, 2)), rng.uniform(0, 2, (5, 3)) * (rng.uniform(0, 1, (5, 3)) > 0.3)
     H, B, step = 0.3 * rng.standard_normal((5, 2, 2)), rng.standard_normal((5, 2, 2)), 1e-6
-    _, P = springs(vectors, modulus, H, linear=linear)
-    up, down = (springs(vectors, modulus, H + s * step * B, linear=linear)[0] for s in (1, -1))
+    _, P = closure_spring_stress(vectors, modulus, H, linear=linear)
+    up, down = (closure_spring_stress(vectors, modulus, H + s * step * B, linear=linear)[0] for s in (1, -1))
     np.testing.assert_allclose(np.sum(P * B, axis=(1, 2)), (up - down) / (2 * step), atol=1e-8)
-    longer, _ = springs(vectors, modulus, np.tile(0.1 * np.eye(2), (5, 1, 1)), linear=linear)
+    longer, _ = closure_spring_stress(vectors, modulus, np.tile(0.1 * np.eye(2), (5, 1, 1)), linear=linear)
     np.testing.assert_array_equal(longer, 0.0)
 
 
 def test_the_mean_square_near_a_tip() -> None:
     """0.334: sigma_1 = cos(t/2) (1 + |sin(t/2)|) K / sqrt(2 pi r), its square averaged over a disc, by quadrature."""
     around, _ = quad(lambda t: (np.cos(t / 2) * (1 + abs(np.sin(t / 2)))) ** 2, -np.pi, np.pi, points=[0.0])
-    assert around / (2 * np.pi * np.pi) == pytest.approx(NEAR_TIP[2], rel=1e-3)
+    assert around / (2 * np.pi * np.pi) == pytest.approx(TIP.near_tip_factor[2], rel=1e-3)
 
 
 def test_a_line_cuts_a_triangle_where_it_crosses() -> None:
@@ -108,10 +115,10 @@ def test_a_line_cuts_a_triangle_where_it_crosses() -> None:
     corners = rng.uniform(0, 1, (50, 3, 2))
     angle = rng.uniform(0, np.pi, 50)
     normal = np.column_stack([np.cos(angle), np.sin(angle)])
-    cuts = through_centre(corners, normal)
+    cuts = centroid_cuts(corners, normal)
     assert np.array_equal(np.bincount(cuts.row), np.full(50, 2))
-    _, share = line_cuts(corners, corners.mean(axis=1), normal)
-    places = points_at(corners, share)[cuts.row, cuts.edge]
+    _, share = plane_crossings(corners, corners.mean(axis=1), normal)
+    places = points_on_edges(corners, share)[cuts.row, cuts.edge]
     off = np.einsum("ni,ni->n", places - corners.mean(axis=1)[cuts.row], normal[cuts.row])
     inner = (cuts.share > 0.021) & (cuts.share < 0.979)
     assert inner.sum() > 80 and np.abs(off[inner]).max() < 1e-15
@@ -123,26 +130,26 @@ def test_a_crack_does_not_turn_back() -> None:
     corners = np.array([[[0.0, 0.0], [1.0, 0.0], [0.5, 1.0]]])  # DOLFINx's edge 0 is (1, 2), 1 (0, 2), 2 (0, 1)
     entry, point, normal = np.array([2]), np.array([[0.4, 0.0]]), np.array([[1.0, 0.2]]) / np.hypot(1, 0.2)
     whole, up = np.zeros((1, 3), bool), np.array([[0.0, 1.0]])
-    straight = leave(corners, entry, point, normal, up, whole)
+    straight = exit_cuts(corners, entry, point, normal, up, whole)
     assert straight.edge.tolist() == [1]
-    assert leave(corners, entry, point, normal, up, np.array([[False, True, False]])).edge.tolist() == [0]
-    assert leave(corners, entry, point, normal, np.array([[1.0, 0.0]]), whole).edge.tolist() == [0]
+    assert exit_cuts(corners, entry, point, normal, up, np.array([[False, True, False]])).edge.tolist() == [0]
+    assert exit_cuts(corners, entry, point, normal, np.array([[1.0, 0.0]]), whole).edge.tolist() == [0]
     both = np.array([[True, True, False]])
-    assert leave(corners, entry, point, normal, up, both).edge.tolist() == [1]
+    assert exit_cuts(corners, entry, point, normal, up, both).edge.tolist() == [1]
     steep = np.array([[-0.94, -0.33]])  # out by where it came in: along that edge, by the end that lies ahead
-    turned = leave(corners, entry, point, np.array([[0.33, -0.94]]), steep, whole)
-    assert turned.edge.tolist() == [1] and points_at(corners, np.full((1, 3), turned.share[0]))[0, 1, 0] < 0.02
+    turned = exit_cuts(corners, entry, point, np.array([[0.33, -0.94]]), steep, whole)
+    assert turned.edge.tolist() == [1] and points_on_edges(corners, np.full((1, 3), turned.share[0]))[0, 1, 0] < 0.02
 
 
 def test_a_cell_is_let_go_in_the_time_of_a_rayleigh_wave() -> None:
     """c_R from the secular equation of a half space, to 0.5 % (Viktorov's fit)."""
     scene = build_scene(MPI.COMM_SELF, make_study(**plate_tables(), mesh={"builder": "box", "size": [1, 1], "h": 0.1}))
     criterion = scene.fracture.criterion
-    assert isinstance(criterion, CrackTips)
+    assert isinstance(criterion, TipCriterion)
     shear = np.sqrt(YOUNG / 2 / (1 + POISSON) / 7800.0)
     ratio = (1 - 2 * POISSON) / (2 * (1 - POISSON))  # (c_s / c_p)^2
     c = shear * brentq(lambda x: (2 - x**2) ** 2 - 4 * np.sqrt((1 - x**2) * (1 - ratio * x**2)), 0.5, 0.99)
-    np.testing.assert_allclose(criterion.release_rate(), c / (DISC[2] * 0.1), rtol=5e-3)
+    np.testing.assert_allclose(criterion.release_rate(), c / (TIP.disc_radius[2] * 0.1), rtol=5e-3)
 
 
 # --- the force on a tip ----------------------------------------------------------------------------------------------
@@ -158,7 +165,7 @@ def test_the_force_of_a_known_field(kind: str, order: int) -> None:
     for first, second in ((1.0, 0.0), (0.0, 1.0), (1.0, 0.4)):
         u = near_tip(scene.domain.nodes - [point[0, 0] + 0.5 / 30, 0.507], first, second)
         scene.balance.set_displacement(u.ravel())
-        force = seen(scene).forces()[0] * STIFF
+        force = seen(scene).evaluate_forces()[0] * STIFF
         expected = np.array([first**2 + second**2, -2 * first * second])
         np.testing.assert_allclose(force, expected, atol=0.1 * expected[0])
 
@@ -170,8 +177,8 @@ def test_a_uniform_body_pulls_at_no_tip(kind: str, end: float, least: float) -> 
     a tip feels otherwise as an energy that it takes to get on."""
     look = seen(plate(kind, 30, crack=[{"segment": [[0.0, 0.507], [end, 0.507]]}]))
     density, none = np.tile(np.eye(2), (len(look.sigma), 1, 1)), np.zeros((len(look.sigma), 2))
-    assert look.tips.surface[0, 0] > least * look.disc[0]
-    assert np.linalg.norm(look.around.forces(density, none)[0]) < 0.1 * look.disc[0]
+    assert look.tips.surface[0, 0] > least * look.disc_radius[0]
+    assert np.linalg.norm(look.neighbourhoods.evaluate_forces(density, none)[0]) < 0.1 * look.disc_radius[0]
 
 
 @pytest.mark.parametrize("order", (1, 2))
@@ -188,26 +195,26 @@ def test_no_force_of_waves_that_pass(kind: str, order: int) -> None:
     flags = np.zeros(len(graph.broken), bool)
     flags[np.argmin(np.linalg.norm(nodes[graph.edge_nodes].mean(axis=1) - 0.5, axis=1))] = True
     graph.break_edges(flags)
-    criterion.cut[flags] = 0.5
+    criterion.cut_positions[flags] = 0.5
     (point, *_) = tips(scene)
     shape, push = waves(nodes)
     scene.balance.set_displacement(shape.ravel())
-    still = float(np.linalg.norm(seen(scene).forces(), axis=1).min())
-    criterion.moving(np.zeros(shape.size), push.ravel(), 0.0, 1e-9)
-    assert np.linalg.norm(seen(scene).forces(), axis=1).max() < 0.15 * still
+    still = float(np.linalg.norm(seen(scene).evaluate_forces(), axis=1).min())
+    criterion.set_motion(np.zeros(shape.size), push.ravel(), 0.0, 1e-9)
+    assert np.linalg.norm(seen(scene).evaluate_forces(), axis=1).max() < 0.15 * still
 
-    r = DISC[2] / 24 * (np.arange(40) + 0.5) / 40
+    r = TIP.disc_radius[2] / 24 * (np.arange(40) + 0.5) / 40
     t = 2 * np.pi * np.arange(80) / 80
     apart = (r[:, None, None] * np.column_stack([np.cos(t), np.sin(t)])).reshape(-1, 2)
-    area = np.repeat(r, len(t)) * (DISC[2] / 24 / 40) * (2 * np.pi / 80)
+    area = np.repeat(r, len(t)) * (TIP.disc_radius[2] / 24 / 40) * (2 * np.pi / 80)
     velocity = np.sqrt(YOUNG / 7800.0) * 3.0
     kinetic = 7800.0 / 2 * velocity**2 * np.sum(waves(point + apart)[0] ** 2, axis=1)
-    slope = plateau_gradient(apart, np.full(len(apart), DISC[2] / 24))
+    slope = plateau_gradient(apart, np.full(len(apart), TIP.disc_radius[2] / 24))
     carried = float(np.linalg.norm((area * kinetic) @ slope))
     assert carried > 0.3 * still
     scene.balance.set_displacement(np.zeros(shape.size))
-    criterion.moving(velocity * shape.ravel(), np.zeros(shape.size), 0.0, 1e-9)
-    assert np.linalg.norm(seen(scene).forces(), axis=1).max() < 0.15 * carried
+    criterion.set_motion(velocity * shape.ravel(), np.zeros(shape.size), 0.0, 1e-9)
+    assert np.linalg.norm(seen(scene).evaluate_forces(), axis=1).max() < 0.15 * carried
 
 
 def waves(places: Values) -> tuple[Values, Values]:
@@ -229,10 +236,10 @@ def test_where_a_crack_turns_in_closed_form() -> None:
         hoop = np.cos(t / 2) * (max(np.cos(each), 0) * np.cos(t / 2) ** 2 - 1.5 * np.sin(each) * np.sin(t))
         best = np.argmax(hoop)
         if each:
-            assert kink(np.array([each]))[0] == pytest.approx(t[best], abs=1e-4)
-        assert gain(np.array([each]))[0] == pytest.approx(hoop[best] ** 2, rel=1e-6)
-    assert np.degrees(kink(np.array([np.pi / 2]))[0]) == pytest.approx(-70.53, abs=0.01)
-    assert gain(np.array([np.pi / 2]))[0] == pytest.approx(4 / 3)
+            assert kink_angle(np.array([each]))[0] == pytest.approx(t[best], abs=1e-4)
+        assert kink_gain(np.array([each]))[0] == pytest.approx(hoop[best] ** 2, rel=1e-6)
+    assert np.degrees(kink_angle(np.array([np.pi / 2]))[0]) == pytest.approx(-70.53, abs=0.01)
+    assert kink_gain(np.array([np.pi / 2]))[0] == pytest.approx(4 / 3)
 
 
 def test_intensities_in_closed_form() -> None:
@@ -261,9 +268,11 @@ def test_intensities_in_closed_form() -> None:
     slope = area[:, None] * plateau_gradient(apart, discs[0]) @ Q.T
     inside = area * plateau(np.linalg.norm(apart, axis=1), discs[0])
     push = discs[2]
-    around = Around(apart @ Q.T, discs[1], slope, inside, Q @ stress @ Q.T, Q @ H @ Q.T, push, mu * many, kappa * many)
-    np.testing.assert_allclose(shares(around).sum(axis=0), [0.8, 0.5], atol=2e-3)
-    still = shares(replace(around, push=0 * push)).sum(axis=0)
+    around = TipDiscFields(
+        apart @ Q.T, discs[1], slope, inside, Q @ stress @ Q.T, Q @ H @ Q.T, push, mu * many, kappa * many
+    )
+    np.testing.assert_allclose(intensity_contributions(around).sum(axis=0), [0.8, 0.5], atol=2e-3)
+    still = intensity_contributions(replace(around, inertia_force=0 * push)).sum(axis=0)
     assert abs(still[1] - 0.5) > 0.1  # it is the acceleration's part that makes it so
 
 
@@ -293,7 +302,7 @@ def test_both_tips_of_a_tilted_crack_are_told(kind: str) -> None:
         scene.balance.set_displacement(
             tilted(scene.domain.nodes - [ends[:, 0].mean(), 0.507], first, second, half).ravel()
         )
-        off = np.degrees(seen(scene).phases() - (np.pi / 2 - angle))
+        off = np.degrees(seen(scene).phase_angles() - (np.pi / 2 - angle))
         assert np.abs(off).max() < 2.5
 
 
@@ -306,7 +315,7 @@ def test_who_turns_with_a_tip_sees_no_turn() -> None:
     c, s = np.cos(1.2), np.sin(1.2)
     for Q in (np.eye(2), np.array([[c, -s], [s, c]])):
         scene.balance.set_displacement(((nodes + u) @ Q.T - nodes).ravel())
-        phases.append(seen(scene).phases()[0])
+        phases.append(seen(scene).phase_angles()[0])
     assert phases[0] == pytest.approx(np.arctan2(0.5, 1), abs=0.03)
     assert phases[1] == pytest.approx(phases[0], abs=1e-6)
 
@@ -317,16 +326,16 @@ def test_a_crack_turns_as_the_field_around_it_asks(kind: str) -> None:
     that turns releases to a tenth, as near as a field is that no mesh made; the first principal stress of the mean is
     30 degrees off."""
     scene = plate(kind, 30, crack=[{"segment": [[0.0, 0.507], [0.5, 0.507]]}])
-    criterion, point = criterion_of(scene), tips(scene)
+    point = tips(scene)
     for first, second in ((1.0, 0.5), (1.0, 1.0), (0.0, 1.0)):
         u = near_tip(scene.domain.nodes - [point[0, 0] + 0.5 / 30, 0.507], first, second)
         scene.balance.set_displacement(u.ravel())
         now = seen(scene)
-        released, ahead = criterion._turned(now.phases(), now.tips, now.forces())
+        released, ahead = kinked_release(now.phase_angles(), now.tips, now.evaluate_forces())
         psi = np.arctan2([second], [first])
         angle = np.arctan2(ahead[0, 1], ahead[0, 0])
-        assert np.degrees(angle - kink(psi)[0]) == pytest.approx(0, abs=3)
-        expected = (first**2 + second**2) * gain(psi)[0]
+        assert np.degrees(angle - kink_angle(psi)[0]) == pytest.approx(0, abs=3)
+        expected = (first**2 + second**2) * kink_gain(psi)[0]
         assert released[0] * STIFF == pytest.approx(expected, rel=0.1)
 
 
@@ -346,13 +355,13 @@ def test_a_notched_plate_breaks_at_griffiths_load(
     of the crack, and some more: each h has places that hold it until the load is up to 3 % higher, whence it jumps.
     Work, stored and lost are three sums that share nothing. While it grows by h the plate is solved for twice at most.
     """
-    peak, books, solved, look = 0.0, [], [0], CrackTips.__call__
+    peak, books, solved, look = 0.0, [], [0], TipCriterion.__call__
 
     def counted(*given: Any) -> Any:
         solved[-1] += 1
         return look(*given)
 
-    monkeypatch.setattr(CrackTips, "__call__", counted)
+    monkeypatch.setattr(TipCriterion, "__call__", counted)
     for reaction, tip, state in torn(notched(kind, n, order=order)):
         peak = max(peak, reaction)
         books.append((tip, state.dissipated, state.work - state.elastic))
@@ -378,14 +387,14 @@ def test_event_by_event_the_crack_takes_its_energy(
     unit load tells all: load^2 = G_c / |g|."""
     scene = notched(kind, n, end=200.0, order=order)
     criterion, state, rows = scene.fracture.criterion, scene.start(), []
-    criterion.toughness, scene.fracture.max_passes, forces = 1e-30, 1, Seen.forces
+    criterion.toughness, scene.fracture.max_passes, forces = 1e-30, 1, TipFields.evaluate_forces
 
-    def watched(seen: Seen) -> Values:
+    def watched(seen: TipFields) -> Values:
         found = forces(seen)
         rows.append([scene.balance.stress.stored_energy(), *seen.tips.point[0], np.linalg.norm(found[0])])
         return np.asarray(found)
 
-    monkeypatch.setattr(Seen, "forces", watched)
+    monkeypatch.setattr(TipFields, "evaluate_forces", watched)
     state, _ = scene.stepper.advance(state)
     scene.balance.motion.displacements_at = lambda t, held=scene.balance.motion.displacements_at: held(1.0)
     while rows[-1][1] < 0.75e-3:
@@ -496,7 +505,9 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
     going, broken, again = going_stopped_resumed(tables, tmp_path, 1, 4)
     assert 0 < broken < going.breaks.counts[0]
     assert_alike(again, going, 1e-9)
-    np.testing.assert_allclose(again.scene.fracture.criterion.cut, going.scene.fracture.criterion.cut, atol=1e-9)
+    np.testing.assert_allclose(
+        again.scene.fracture.criterion.cut_positions, going.scene.fracture.criterion.cut_positions, atol=1e-9
+    )
 
 
 def test_a_state_is_advanced_twice_alike() -> None:

@@ -211,7 +211,7 @@ def test_what_breaks_in_touch_gains_nothing() -> None:
     assert before > 0
     pushed = contact.nodal_forces()
     graph.break_edges(np.random.default_rng(2).random(len(graph.broken)) < 0.4)
-    scene.fracture.changed()
+    scene.fracture.mark_changed()
     scene.balance.edges_broke(graph.pattern)
     springs = contact._step_end.springs[0]
     assert len(springs.points) == len(held.points)

@@ -164,7 +164,7 @@ def test_what_breaks_in_touch_gains_nothing(tmp_path: Path) -> None:
         np.flatnonzero(surface.pairs.contact_facets[:, 0] >= 0),
     )
     graph.break_edges(np.random.default_rng(2).random(len(graph.broken)) < 0.5)
-    scene.fracture.changed()
+    scene.fracture.mark_changed()
     scene.balance.edges_broke(graph.pattern)
     _, again = contact_of(scene)
     assert again is not surface and len(again.split.points) > len(surface.split.points)

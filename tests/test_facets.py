@@ -316,7 +316,7 @@ def test_what_breaks_under_a_ball_gains_nothing() -> None:
     before, graph = contact.stored_energy(), scene.fracture.graph
     assert before > 0
     graph.break_edges(np.random.default_rng(3).random(len(graph.broken)) < 0.5)
-    scene.fracture.changed()
+    scene.fracture.mark_changed()
     scene.balance.edges_broke(graph.pattern)
     assert contact.stored_energy() <= before * (1 + 1e-6)
     skin, placed = contact.surface, contact._kinematics.posed[0]

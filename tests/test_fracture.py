@@ -18,10 +18,10 @@ from scipy.stats import kstest, pearsonr
 from fracsim.forms.energies import cauchy_stress
 from fracsim.forms.kinematics import deformation_gradient, symmetric_components
 from fracsim.fracture.criterion import OverloadedEdges
-from fracsim.fracture.edge_stress import Simplices
-from fracsim.fracture.fracture_pass import Breaking
+from fracsim.fracture.edge_stress import EdgeStressOperator
+from fracsim.fracture.fracture_pass import FracturePass
 from fracsim.fracture.nonlocal_average import NonlocalAverage
-from fracsim.fracture.strength import Strength, hashed
+from fracsim.fracture.strength import EdgeStrength, hash_points
 from fracsim.mechanics.jit import CellExpression
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.simplices import is_split, local_edges
@@ -309,14 +309,14 @@ def stressed_block(dim: int, energy: str) -> Scene:
     )[0]
 
 
-def make_pass(scene: Scene, strength: float, radius: float) -> Breaking:
+def make_pass(scene: Scene, strength: float, radius: float) -> FracturePass:
     """A pass of its own on the same body."""
     stress, graph = scene.balance.stress, EdgeGraph(scene.domain)
     average = NonlocalAverage(scene.domain, radius, "linear") if radius else None
-    return Breaking(stress, graph, OverloadedEdges(stress, graph, Strength(graph, strength), average))
+    return FracturePass(stress, graph, OverloadedEdges(stress, graph, EdgeStrength(graph, strength), average))
 
 
-def broken_by(fracture: Breaking) -> npt.NDArray[np.bool_]:
+def broken_by(fracture: FracturePass) -> npt.NDArray[np.bool_]:
     """(edges,) what one pass breaks of the undamaged body, which is undamaged again afterwards."""
     graph = fracture.graph
     fracture()
@@ -327,7 +327,7 @@ def broken_by(fracture: Breaking) -> npt.NDArray[np.bool_]:
 
 def along_edges(scene: Scene, stress: Values) -> Values:
     """(cells, k) normal stress along the edges of the deformed cells."""
-    return Simplices.of(scene.balance.stress).normal_stress(np.arange(len(stress)), stress)
+    return EdgeStressOperator.from_stress(scene.balance.stress).normal_stress(np.arange(len(stress)), stress)
 
 
 def strain_field(scene: Scene, dim: int) -> Values:
@@ -512,14 +512,14 @@ def test_linear_bodies_conserve_reference_moment_through_fracture() -> None:
 def test_noise_is_uniform_and_belongs_to_the_place() -> None:
     """Uniform on [-1, 1), the same in any order and for -0 as for 0, unlike between neighbours of a lattice."""
     points = np.stack(np.meshgrid(*[np.linspace(0, 1, 21)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    noise = hashed(points)
+    noise = hash_points(points)
     assert -1 <= noise.min() < -0.999
     assert 0.999 < noise.max() < 1
     assert kstest(noise, "uniform", args=(-1, 2)).pvalue > 0.01  # fixed points: the outcome is fixed too
     assert len(np.unique(noise)) == len(noise)
     order = np.random.default_rng(0).permutation(len(points))
-    assert np.array_equal(hashed(points[order]), noise[order])
-    assert np.array_equal(hashed(-points * 0.0), hashed(points * 0.0))
+    assert np.array_equal(hash_points(points[order]), noise[order])
+    assert np.array_equal(hash_points(-points * 0.0), hash_points(points * 0.0))
     grid = noise.reshape(21, 21, 21)
     for axis in range(3):
         a, b = np.delete(grid, -1, axis).ravel(), np.delete(grid, 0, axis).ravel()
@@ -530,11 +530,11 @@ def test_strength_scatters_by_the_edge_not_by_the_cell() -> None:
     """The perturbation of an edge is one number, whichever cell looks at it and from whichever end."""
     scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.5}, fracture={"strength": 1.0})
     edges = scene.fracture.graph.cell_edges
-    noise = scene.fracture.criterion.strength.noise(edges)
+    noise = scene.fracture.criterion.strength.tie_break_noise(edges)
     values: dict[int, set[float]] = {}
     for edge, value in zip(edges.ravel().tolist(), noise.ravel().tolist(), strict=True):
         values.setdefault(edge, set()).add(value)
     assert Counter(len(found) for found in values.values()) == {1: len(values)}
     middles = scene.domain.nodes[scene.fracture.graph.edge_nodes].sum(axis=1)
-    assert {edge: next(iter(found)) for edge, found in values.items()} == dict(enumerate(hashed(middles).tolist()))
+    assert {edge: next(iter(found)) for edge, found in values.items()} == dict(enumerate(hash_points(middles).tolist()))
     assert edges.shape[1] == len(local_edges(3))

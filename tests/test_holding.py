@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 from fracsim.cli import _dust
 from fracsim.fracture.criterion import OverloadedEdges
-from fracsim.fracture.node_retention import LIMIT, Holding
+from fracsim.fracture.node_retention import RETENTION, CellRetention
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
@@ -40,7 +40,7 @@ def kept(scene: Scene, own: Values) -> tuple[EdgeGraph, int, npt.NDArray[np.int6
     node = inner_node(graph)
     failing = Failing(np.flatnonzero((graph.edge_nodes == node).any(axis=1)))
     stress = np.stack([own, own, 0 * own], axis=1)
-    holding = Holding(cast(OverloadedEdges, failing), scene.balance.stress, graph)
+    holding = CellRetention(cast(OverloadedEdges, failing), scene.balance.stress, graph)
     edges, _ = holding(stress, own)
     flags = np.zeros(len(graph.broken), bool)
     flags[edges] = True
@@ -62,10 +62,10 @@ def test_the_cell_that_is_loaded_least_stays(scene: Scene) -> None:
 def test_what_feels_too_much_itself_does_not_hold(scene: Scene) -> None:
     """Beyond the limit none is spared; where one cell is below it, that one, however many hold the node less."""
     count = scene.domain.cell_count
-    assert not len(kept(scene, np.full(count, 1.01 * LIMIT))[2])
+    assert not len(kept(scene, np.full(count, 1.01 * RETENTION.max_cell_load))[2])
     graph = EdgeGraph(scene.domain)
     one = np.flatnonzero((graph.cell_nodes == inner_node(graph)).any(axis=1))[2]
-    assert kept(scene, np.where(np.arange(count) == one, 0.99, 1.01) * LIMIT)[2].tolist() == [one]
+    assert kept(scene, np.where(np.arange(count) == one, 0.99, 1.01) * RETENTION.max_cell_load)[2].tolist() == [one]
 
 
 def test_what_leaves_every_node_a_cell_is_not_touched(scene: Scene) -> None:
@@ -78,7 +78,7 @@ def test_what_leaves_every_node_a_cell_is_not_touched(scene: Scene) -> None:
     around[graph.cell_nodes[flags]] = True
     crossing = crossing[around[graph.edge_nodes[crossing]].all(axis=1)]
     load = np.ones(scene.domain.cell_count)
-    holding = Holding(cast(OverloadedEdges, Failing(crossing)), scene.balance.stress, graph)
+    holding = CellRetention(cast(OverloadedEdges, Failing(crossing)), scene.balance.stress, graph)
     assert len(crossing) and np.array_equal(holding(np.stack([load] * 3, axis=1), load)[0], crossing)
 
 

@@ -11,7 +11,7 @@ from petsc4py import PETSc
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from fracsim.fracture.node_retention import Joining
+from fracsim.fracture.node_retention import NodeAttachment
 from fracsim.mechanics.node_ties import NodeTies
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.fragments import find_fragments
@@ -46,7 +46,7 @@ def one_pass(scene: Scene, graph: EdgeGraph, failing: Flags, own: Values, held: 
     stress = np.concatenate([np.tile(own[:, None], d), np.zeros((len(own), d * (d - 1) // 2))], axis=1)
     held = np.zeros(len(scene.domain.nodes), bool) if held is None else held
     edges = np.flatnonzero(failing)
-    fail = Joining(scene.balance.stress, graph, strength, held)(edges, stress)  # type: ignore[arg-type]
+    fail = NodeAttachment(scene.balance.stress, graph, strength, held)(edges, stress)  # type: ignore[arg-type]
     flags = np.zeros(len(graph.broken), bool)
     flags[edges[fail]] = True
     graph.break_edges(flags)
@@ -113,7 +113,7 @@ def test_cracks_that_take_an_energy_cut_no_node_off(dim: int) -> None:
         graph = scene.fracture.graph
         crumbs.append(np.count_nonzero(np.bincount(find_fragments(graph).node_fragment) == 1))
         split.append(np.count_nonzero(graph.split))
-        assert np.isnan(scene.fracture.criterion.cut[~graph.broken]).all()  # what was spared is not cut
+        assert np.isnan(scene.fracture.criterion.cut_positions[~graph.broken]).all()  # what was spared is not cut
     assert crumbs[0] > 10 and crumbs[1] == 0 and split[1] == pytest.approx(split[0], rel=0.5)
     other = burst(dim, False, forgetful=True)
     np.testing.assert_array_equal(other.fracture.graph.broken, scene.fracture.graph.broken)
@@ -133,7 +133,7 @@ def burst(dim: int, crumbs: bool, forgetful: bool = False) -> Scene:
     state.settle()
     for _ in each_step(scene, state):
         if forgetful:
-            scene.fracture.criterion._tips.barred[:] = False
+            scene.fracture.criterion._tips.clear_bars()
     return scene
 
 

@@ -9,7 +9,7 @@ import pytest
 from mpi4py import MPI
 
 from fracsim.fracture.edge_stress import frobenius_norm
-from fracsim.fracture.neighbour_average import NeighbourAverage
+from fracsim.fracture.nonlocal_average import NeighbourAverage
 from fracsim.mesh.domain import distribute
 from support.scenes import make_scene
 from support.solids import copies, lattice
@@ -36,13 +36,13 @@ def test_each_neighbour_counts_with_its_volume_for_every_node_it_shares(numbers:
     average = NeighbourAverage(domain)
     assert np.allclose(average(values, active), expected, atol=1e-13)
     bound = 0.5 * float(frobenius_norm(expected, 2).max())
-    cells, found = average.reaching(values, frobenius_norm(values, 2), bound, active)
+    cells, found = average.find_averages_above(values, frobenius_norm(values, 2), bound, active)
     assert np.allclose(found, expected[cells], atol=1e-13)
     assert set(np.flatnonzero(frobenius_norm(expected, 2) >= bound)) <= set(cells.tolist())
     some = np.flatnonzero(rng.random(domain.cell_count) < 0.6)
     active &= np.isin(np.arange(domain.cell_count), some)
-    cells, found = average.reaching_among(some, values, frobenius_norm(values, 2), bound, active)
-    whole = average.reaching(values, frobenius_norm(values, 2), bound, active)
+    cells, found = average.find_averages_above_in(some, values, frobenius_norm(values, 2), bound, active)
+    whole = average.find_averages_above(values, frobenius_norm(values, 2), bound, active)
     assert np.array_equal(cells, np.intersect1d(whole[0], some)) and len(cells)
     assert np.allclose(found, average(values, active)[cells], atol=1e-13)
 

@@ -328,7 +328,7 @@ def test_a_cracked_body_touches_with_its_walls() -> None:
     graph, domain = scene.fracture.graph, scene.domain
     y = domain.nodes[graph.edge_nodes][:, :, 1]
     graph.break_edges((y.min(axis=1) < 0.25) & (y.max(axis=1) > 0.25))
-    scene.fracture.changed()
+    scene.fracture.mark_changed()
     scene.balance.edges_broke(graph.pattern)
     (contact,) = [term for term in scene.balance.terms if isinstance(term, ObstacleTerm)]
     X = contact.surface.rest_positions

@@ -143,8 +143,8 @@ def test_a_restart_takes_the_explicit_step_of_its_damage(tmp_path: Path, unilate
     fracture, report = going.scene.fracture, going.step()
     assert fracture is not None
     fracture.graph.break_edges(np.random.default_rng(3).uniform(size=len(fracture.graph.broken)) < 0.4)
-    fracture.degradation.restore()
-    fracture.changed()
+    fracture.degradation.update_from_graph()
+    fracture.mark_changed()
     going.state = state = going.scene.stepper.with_forces(going.state)
     going.note_breaks()
     going.checkpoint()

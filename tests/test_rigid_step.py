@@ -71,7 +71,7 @@ def test_gradient_and_hessian_of_the_incremental_potential(scheme: Scheme, hinge
     at_start = PosedShape(body.shape, start.pose)
     held = lag_contact(x, at_start.distance(x), area, at_start, barrier)
     assert len(held.points) > 5
-    c_a, _ = scheme.rates(dt)
+    c_a, _ = scheme.rate_coefficients(dt)
     step = RigidStep(body, start, scheme, dt, c_a, 1 - scheme.alpha_f, ContactTimeWeights.for_scheme(scheme).factor)
 
     z = np.array([0.02]) if hinged else np.array([0.02, -0.01, 0.015, 0.3, -0.25, 0.3])[: len(body.motion_basis)]
@@ -110,7 +110,7 @@ def test_a_body_that_tumbles_keeps_its_angular_momentum(scheme: Scheme) -> None:
     flight, dt = body.start_motion(), 0.02
     first, energies = flight, []
     for _ in range(200):
-        step = RigidStep(body, flight, scheme, dt, scheme.rates(dt)[0], 1 - scheme.alpha_f, 1.0)
+        step = RigidStep(body, flight, scheme, dt, scheme.rate_coefficients(dt)[0], 1 - scheme.alpha_f, 1.0)
         none = PoseDerivatives(0.0, np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6)))
         z, _ = step.minimise(np.zeros(6), lambda _, none=none: none, lambda *_: 1.0)
         flight = step.end_motion(z, np.zeros(6))

@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from cases import fracsim_here
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
-from fracsim.fracture.brittle.grains import SurfaceRules
+from fracsim.fracture.brittle.grains import SurfaceParameters
 from fracsim.mesh.input_topology import MeshTopology
 from fracsim.rigid.instance_placement import Place, Poses
 from fracsim.rigid.instances import Copies
@@ -280,7 +280,7 @@ def test_ranks_share_analyses_and_give_the_same_run(ranks: int, tmp_path: Path) 
 def test_a_blow_on_a_copy_opens_what_it_opens_on_the_body_itself() -> None:
     """Turned, carried away, and struck as the body would be: the same edges and cuts, none in the other copies, whose
     analyses share its factors; what a checkpoint keeps of them is as before."""
-    mesh, rules = lattice(6, 2, 2, size=0.25), SurfaceRules(6)
+    mesh, rules = lattice(6, 2, 2, size=0.25), SurfaceParameters(6)
     points = np.array([[0.05, 0.25, 0.05], [1.45, 0.25, 0.05], [0.75, 0.25, 0.45]])
     force = 2e4 * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -2.0]])
     alone = Copies.of(breakable(mesh, 2e4, rules))
@@ -304,7 +304,7 @@ def test_a_blow_on_a_copy_opens_what_it_opens_on_the_body_itself() -> None:
 def test_a_copy_breaks_as_it_would_alone() -> None:
     """With as many surfaces, whether others are struck before it, with it or after it: a bar that falls on what broke
     others does not stay whole since they took them all."""
-    mesh, rules = lattice(6, 2, 2, size=0.25), SurfaceRules(2)
+    mesh, rules = lattice(6, 2, 2, size=0.25), SurfaceParameters(2)
     points = np.array([[0.05, 0.25, 0.05], [1.45, 0.25, 0.05], [0.75, 0.25, 0.45]])
     force = 3e4 * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -2.0]])
     alone = Copies.of(breakable(mesh, 2e4, rules))
@@ -346,7 +346,7 @@ def test_strikes_on_several_ranks_open_what_they_open_on_one(monkeypatch: pytest
     numbers of analyses; what one rank opens the other knows when it is asked again."""
     mesh = copies(lattice(6, 2, 2, size=0.25), 3)
     length = len(mesh.points) // 3
-    alone, first, second = (Copies.of(breakable(mesh, 2e4, SurfaceRules(5))) for _ in range(3))
+    alone, first, second = (Copies.of(breakable(mesh, 2e4, SurfaceParameters(5))) for _ in range(3))
     points = np.array([[0.05, 0.25, 0.05], [1.45, 0.25, 0.05], [0.75, 0.25, 0.45]])
     comm = OtherRank(second)
     monkeypatch.setattr("fracsim.rigid.parallel_analyses.gather", lambda comm, value: comm.gather(value))

@@ -81,11 +81,11 @@ def test_newmark_is_refused_from_where_long_steps_grow(gamma: float) -> None:
         scheme = Newmark(beta, gamma)
         E = energy(run(scheme, W, 100.0, 60, START))
         if stable:
-            scheme.check()
+            scheme.check_parameters()
             assert E[30:].max() < 1.01 * E[:30].max()
         else:
             with pytest.raises(ValueError, match="beta >= gamma / 2"):
-                scheme.check()
+                scheme.check_parameters()
             assert E[-1] > 1e2 * E[0]
 
 
@@ -103,8 +103,8 @@ def test_newmark_follows_constant_acceleration(scheme: Newmark) -> None:
     dt, v0, a = 0.5, 2.0, -9.81
     u, v = 0.0, v0
     for step in range(1, 5):
-        c_a, c_v = scheme.rates(dt)
-        u_a, u_v = scheme.references(dt, u, v, a)
+        c_a, c_v = scheme.rate_coefficients(dt)
+        u_a, u_v = scheme.reference_displacements(dt, u, v, a)
         u = u_a + a / c_a
         v = c_v * (u - u_v)
         assert u == pytest.approx(v0 * step * dt + a * (step * dt) ** 2 / 2, rel=100 * EPS)
@@ -115,8 +115,8 @@ def test_quasi_static_has_no_inertia() -> None:
     """The solution is the static one at once; the velocity is the mean of the step."""
     scheme = QuasiStatic()
     assert not scheme.inertia
-    c_a, c_v = scheme.rates(0.25)
-    _, u_v = scheme.references(0.25, 3.0, 9.0, 9.0)
+    c_a, c_v = scheme.rate_coefficients(0.25)
+    _, u_v = scheme.reference_displacements(0.25, 3.0, 9.0, 9.0)
     assert c_a == 0.0
     assert c_v * (4.0 - u_v) == pytest.approx(4.0)
 
@@ -126,8 +126,8 @@ def test_small_steps_keep_their_digits(scheme: Scheme) -> None:
     """A body far from the origin in slow motion: with u / dt^2 summed instead of differences, eps u / dt^2 would swamp
     a."""
     dt, u, v = 1e-7, 1.0, 1e-3
-    c_a, c_v = scheme.rates(dt)
-    u_a, u_v = scheme.references(dt, u, v, 0.0)
+    c_a, c_v = scheme.rate_coefficients(dt)
+    u_a, u_v = scheme.reference_displacements(dt, u, v, 0.0)
     new = u + dt * v
     assert c_v * (new - u_v) == pytest.approx(v, abs=4 * EPS * c_v)
     assert c_a * (new - u_a) == pytest.approx(0.0, abs=4 * EPS * c_a)

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-from fracsim.fracture.brittle.grains import SurfaceRules
+from fracsim.fracture.brittle.grains import SurfaceParameters
 from fracsim.mesh.input_topology import MeshTopology
 from fracsim.meshes.builders.ornament import Ornament
 from fracsim.rigid.fragment_geometry import Geometry
@@ -63,7 +63,7 @@ class Scene:
         assert mesh.shell is not None
         poses = Poses.of([Place(at, *np.zeros((3, 3))) for at in places])
         sizes = len(mesh.points), len(mesh.cells), len(MeshTopology(mesh).edges)
-        made = Copies(lambda *_: breakable(mesh, 1e6, SurfaceRules(surfaces)), poses, sizes)
+        made = Copies(lambda *_: breakable(mesh, 1e6, SurfaceParameters(surfaces)), poses, sizes)
         rules = Rules(step, np.zeros(3), 0.3)
         stepper = RigidStepper(made, Geometry(mesh, poses), DENSITY, [], rules, Hertz(1e9, 0.2))
         middle, first = mesh.shell.middle + np.array(places)[:, None], len(mesh.points) * np.arange(len(places))

@@ -11,8 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from fracsim.errors import InputError
-from fracsim.fracture.brittle.grains import GrainRules, SurfaceRules
-from fracsim.fracture.brittle.principal_stress import tensors
+from fracsim.fracture.brittle.grains import GrainParameters, SurfaceParameters
+from fracsim.fracture.principal_stress import symmetric_tensors
 from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
 from fracsim.meshes.shell import read_shell, thickened
@@ -164,19 +164,19 @@ def test_stress_of_a_shell_does_not_depend_on_the_frame() -> None:
         force = np.zeros((len(mesh.points), 3))
         force[[3, 40, 77]] = [[1.0, -2.0, 0.5], [0.3, 0.1, 2.0], [0.0, 1.0, 1.0]]
         u = body((force @ R.T)[domain.node_input])
-        found.append((R.T @ tensors(stiffness.tensor(u, body.share), 3) @ R)[np.argsort(domain.cell_input)])
+        found.append((R.T @ symmetric_tensors(stiffness.tensor(u, body.share), 3) @ R)[np.argsort(domain.cell_input)])
     assert np.allclose(*found, atol=1e-6 * np.abs(found[0]).max())
 
 
 # --- fracture ---
 
 
-@pytest.mark.parametrize("grains", [None, GrainRules(12, seed=3)])
-def test_cracks_go_through_the_whole_thickness(grains: GrainRules | None) -> None:
+@pytest.mark.parametrize("grains", [None, GrainParameters(12, seed=3)])
+def test_cracks_go_through_the_whole_thickness(grains: GrainParameters | None) -> None:
     """A pane pushed in its middle, held at its corners: both nodes of a place stay in one piece, the pieces weigh what
     the pane weighs, and some broke across its bending."""
     mesh = strip(12)
-    body = breakable(mesh, 2e4, SurfaceRules(8, grains=grains))
+    body = breakable(mesh, 2e4, SurfaceParameters(8, grains=grains))
     points = np.array([[0.5, 0.1, H / 2], [0.0, 0.1, -H / 2], [1.0, 0.1, -H / 2]])
     force = np.array([[0.0, 0.0, -2.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
     assert body.strike(0, body.loads(0, points, force, np.full(3, 0.01))) > 0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fracsim.fracture.strength import Fibre, Scatter, Strength, along_fibre, weibull
+from fracsim.fracture.strength import EdgeStrength, FibreAnisotropy, WeibullScatter, fibre_factors, weibull_factors
 from support.scenes import make_scene, march
 
 
@@ -16,7 +16,7 @@ from support.scenes import make_scene, march
 def test_scatter_is_weibull_with_mean_one(modulus: float) -> None:
     """P(w < x) = 1 - exp(-(x/s)^m), s = 1 / Gamma(1 + 1/m): Kolmogorov-Smirnov, and the mean within 4 errors."""
     points = np.random.default_rng(1).uniform(-1, 1, (20_000, 3))
-    sample = weibull(points, Scatter(modulus=modulus, seed=3))
+    sample = weibull_factors(points, WeibullScatter(modulus=modulus, seed=3))
     law = stats.weibull_min(modulus, scale=1 / stats.weibull_min(modulus).mean())
     assert stats.kstest(sample, law.cdf).pvalue > 1e-3
     assert abs(sample.mean() - 1) < 4 * law.std() / np.sqrt(len(sample))
@@ -26,17 +26,17 @@ def test_the_seed_decides() -> None:
     """The same seed gives the same numbers in any order of the places, another seed other and uncorrelated ones."""
     points = np.random.default_rng(2).uniform(-1, 1, (5_000, 2))
     order = np.random.default_rng(3).permutation(len(points))
-    first, again, other = (weibull(points, Scatter(modulus=5.0, seed=seed)) for seed in (7, 7, 8))
+    first, again, other = (weibull_factors(points, WeibullScatter(modulus=5.0, seed=seed)) for seed in (7, 7, 8))
     assert np.array_equal(first, again)
-    assert np.array_equal(weibull(points[order], Scatter(modulus=5.0, seed=7)), first[order])
+    assert np.array_equal(weibull_factors(points[order], WeibullScatter(modulus=5.0, seed=7)), first[order])
     assert abs(np.corrcoef(first, other)[0, 1]) < 4 / np.sqrt(len(points))
 
 
 def test_direction() -> None:
     """ratio along the fibre, 1 across, in between by the square of the cosine, whatever the lengths."""
-    fibre = Fibre(direction=[3.0, 0.0, 4.0], ratio=2.5)
+    fibre = FibreAnisotropy(direction=[3.0, 0.0, 4.0], ratio=2.5)
     vectors = np.array([[6.0, 0.0, 8.0], [0.0, 5.0, 0.0], [-4.0, 0.0, 3.0], [1.0, 0.0, 0.0]])
-    assert along_fibre(vectors, fibre) == pytest.approx([2.5, 1.0, 1.0, 1 + 1.5 * 0.36], rel=1e-14)
+    assert fibre_factors(vectors, fibre) == pytest.approx([2.5, 1.0, 1.0, 1 + 1.5 * 0.36], rel=1e-14)
 
 
 def test_no_edge_of_a_cell_is_weaker_than_is_said_of_it() -> None:
@@ -45,12 +45,12 @@ def test_no_edge_of_a_cell_is_weaker_than_is_said_of_it() -> None:
     graph = make_scene(mesh=mesh, fracture={"strength": 1.0})[0].fracture.graph
     cells = np.arange(len(graph.cell_edges))
     of_cell = np.where(cells % 2, 1.0, 3.0)
-    how = {"scatter": Scatter(5.0, 2), "fibre": Fibre([1.0, 0.0, 1.0], 2.0)}
-    strength = Strength(graph, of_cell, tie_break=1e-3, **how)
+    how = {"scatter": WeibullScatter(5.0, 2), "fibre": FibreAnisotropy([1.0, 0.0, 1.0], 2.0)}
+    strength = EdgeStrength(graph, of_cell, tie_break=1e-3, **how)
     least = strength(cells, graph.cell_edges).min(axis=1)
-    said = strength.weakest_of(cells)
+    said = strength.minimum_in(cells)
     assert np.all(said <= least) and np.all(said >= (1 - 2.1e-3) * least)
-    assert Strength(graph, 2.0, tie_break=0.1).weakest_of(cells) == pytest.approx(1.8)
+    assert EdgeStrength(graph, 2.0, tie_break=0.1).minimum_in(cells) == pytest.approx(1.8)
 
 
 def pulled(**fracture: Any) -> int:
@@ -79,7 +79,9 @@ def test_a_fibre_along_the_load_strengthens() -> None:
 def test_ratio_one_is_isotropic() -> None:
     """A fibre of ratio 1 changes nothing."""
     directions = np.random.default_rng(5).normal(size=(100, 3))
-    assert np.array_equal(along_fibre(directions, Fibre(direction=[1.0, 2.0, 3.0], ratio=1.0)), np.ones(100))
+    assert np.array_equal(
+        fibre_factors(directions, FibreAnisotropy(direction=[1.0, 2.0, 3.0], ratio=1.0)), np.ones(100)
+    )
 
 
 def test_scatter_breaks_the_weakest_first() -> None:

@@ -12,7 +12,7 @@ import pytest
 import pyvista
 
 from fracsim.errors import NotConverged
-from fracsim.fracture.edge_history import cut_by_forces
+from fracsim.fracture.edge_history import cut_positions_from_forces
 from fracsim.meshes.data import MeshData
 from fracsim.output.fields_file import Field
 from fracsim.output.surface.body_surface import MAX_COORDINATE, BodySurface, SurfaceFrame
@@ -247,6 +247,6 @@ def spun(omega: Values, r: Values) -> Values:
 def test_cut_by_forces() -> None:
     """M22 fig. 12: sections in inverse proportion to the forces at their ends; equal or no forces: the middle."""
     force = np.array([[3.0, 0.0], [0.0, 1.0], [0.0, 0.0], [0.0, 0.0]])
-    cut = cut_by_forces(force, np.array([[0, 1], [1, 0], [0, 0], [2, 3]]))
+    cut = cut_positions_from_forces(force, np.array([[0, 1], [1, 0], [0, 0], [2, 3]]))
     assert np.allclose(cut, [0.25, 0.75, 0.5, 0.5])
     assert np.all((cut >= 0.1) & (cut <= 0.9))

@@ -76,8 +76,8 @@ def test_cuts_by_forces_move_the_crack_only(torn: Run, tmp_path: Path) -> None:
     other = run(changed(TEARING, output={"cut": "forces"}), tmp_path)
     assert other.breaks.record is not None and torn.breaks.record is not None
     assert np.array_equal(other.breaks.record.graph.broken, torn.breaks.record.graph.broken)
-    cut = other.breaks.record.cut[other.breaks.record.graph.broken]
-    assert np.isnan(torn.breaks.record.cut).all()
+    cut = other.breaks.record.cut_positions[other.breaks.record.graph.broken]
+    assert np.isnan(torn.breaks.record.cut_positions).all()
     assert np.all((cut >= 0.1) & (cut <= 0.9)) and np.ptp(cut) > 0.05
     for made in (other, torn):
         grid = last(made.folder)

@@ -22,11 +22,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from fracsim.forms.schemes.scheme import Array, AtTheEnd
+from fracsim.forms.schemes.scheme import Array, EndOfStepScheme
 
 
 @dataclass(frozen=True)
-class Theta(AtTheEnd):
+class Theta(EndOfStepScheme):
     """u = u_n + dt ((1 - theta) v_n + theta v), v = v_n + dt ((1 - theta) a_n + theta a)."""
 
     theta: float = field(default=0.5, metadata={"gt": 0, "le": 1})
@@ -34,10 +34,10 @@ class Theta(AtTheEnd):
     inertia: ClassVar[bool] = True
     carries_acceleration: ClassVar[bool] = True
 
-    def rates(self, dt: float) -> tuple[float, float]:
+    def rate_coefficients(self, dt: float) -> tuple[float, float]:
         return 1 / (self.theta * dt) ** 2, 1 / (self.theta * dt)
 
-    def references(self, dt: float, u: Array, v: Array, a: Array) -> tuple[Array, Array]:
+    def reference_displacements(self, dt: float, u: Array, v: Array, a: Array) -> tuple[Array, Array]:
         rest = u + dt * (1 - self.theta) * v
         return rest + self.theta * dt * (v + (1 - self.theta) * dt * a), rest
 '''

@@ -1,14 +1,10 @@
-"""Time schemes by the name that studies call them by: `time.scheme`, its keys and `fracsim list` follow from here."""
+"""Time schemes by the names of `time.scheme`; their keys and `fracsim list` follow from these classes."""
 
 from __future__ import annotations
 
-from .backward_euler import BackwardEuler
-from .central_difference import CentralDifference
-from .generalized_alpha import GeneralizedAlpha
-from .newmark import Newmark
-from .quasi_static import QuasiStatic
-from .rigid import Rigid
-from .scheme import Scheme
+from .backward_euler import BackwardEuler, QuasiStatic
+from .newmark import CentralDifference, GeneralizedAlpha, Newmark
+from .scheme import Rigid, Scheme
 
 SCHEMES: dict[str, type[Scheme]] = {
     "backward-euler": BackwardEuler,

@@ -1,6 +1,9 @@
-"""Newmark's method.
+"""Newmark's family: Newmark's method, generalized-alpha, and explicit central differences.
 
-N. M. Newmark: A method of computation for structural dynamics. J. Eng. Mech. Div. (ASCE) 85 (1959) 67-94.
+N. M. Newmark (1959), A method of computation for structural dynamics, J. Eng. Mech. Div. (ASCE) 85, 67-94. J. Chung, G.
+M. Hulbert (1993), A time integration algorithm for structural dynamics with improved numerical dissipation: the
+generalized-alpha method, J. Appl. Mech. 60, 371-375. L. Verlet (1967), Computer "experiments" on classical fluids,
+Phys. Rev. 159, 98-103.
 """
 
 from __future__ import annotations
@@ -8,16 +11,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from .scheme import Array, AtTheEnd, driven
+from .scheme import Array, EndOfStepScheme, prescribed_rates
+
+# Rounding error of beta and gamma when they are compared with the limit of stability.
+STABILITY_ROUND_OFF = 1e-12
 
 
 @dataclass(frozen=True)
-class Newmark(AtTheEnd):
+class Newmark(EndOfStepScheme):
     """u = u_n + dt v_n + dt^2 ((1/2 - beta) a_n + beta a), v = v_n + dt ((1 - gamma) a_n + gamma a).
 
-    beta = 1/4, gamma = 1/2 is the trapezoidal rule: second order, conserves the energy of a linear body.
-    gamma > 1/2 dissipates and is of first order. Stable for every step where 2 beta >= gamma >= 1/2 (Hughes, The Finite
-    Element Method, 1987, sec. 9.1).
+    beta = 1/4, gamma = 1/2 is the trapezoidal rule: second order, it conserves the energy of a linear body. gamma > 1/2
+    dissipates and is of first order. Every step is stable if 2 beta >= gamma >= 1/2 (Hughes 1987, The Finite Element
+    Method, section 9.1).
     """
 
     beta: float = field(
@@ -36,20 +42,115 @@ class Newmark(AtTheEnd):
     inertia: ClassVar[bool] = True
     carries_acceleration: ClassVar[bool] = True
 
-    def check(self) -> None:
-        """ValueError where only short steps are stable."""
-        if 2 * self.beta < self.gamma - 1e-12:
+    def check_parameters(self) -> None:
+        """Check that every step is stable.
+
+        Raises:
+            ValueError: beta < gamma / 2, for which only short steps are stable.
+        """
+        if 2 * self.beta < self.gamma - STABILITY_ROUND_OFF:
             raise ValueError("newmark is stable for every step where beta >= gamma / 2; raise beta")
 
-    def rates(self, dt: float) -> tuple[float, float]:
-        """(1 / (beta dt^2), gamma / (beta dt))."""
+    def rate_coefficients(self, dt: float) -> tuple[float, float]:
+        """Return 1 / (beta dt^2) and gamma / (beta dt)."""
         return 1 / (self.beta * dt**2), self.gamma / (self.beta * dt)
 
-    def references(self, dt: float, u: Array, v: Array, a: Array) -> tuple[Array, Array]:
-        """u_a = u_n + dt v_n + dt^2 (1/2 - beta) a_n;  u_v = u_a - beta dt / gamma (v_n + dt (1 - gamma) a_n)."""
+    def reference_displacements(self, dt: float, u: Array, v: Array, a: Array) -> tuple[Array, Array]:
+        """Return u_a and u_v, m.
+
+        u_a = u_n + dt v_n + dt^2 (1/2 - beta) a_n and u_v = u_a - beta dt / gamma (v_n + dt (1 - gamma) a_n).
+        """
         u_a = u + dt * v + (0.5 - self.beta) * dt**2 * a
         return u_a, u_a - (self.beta * dt / self.gamma) * (v + (1 - self.gamma) * dt * a)
 
-    def prescribed(self, dt: float, u: Array, start: Array, v: Array) -> tuple[Array, Array] | None:
-        """By their own law."""
-        return driven(dt, u, start, v)
+    def prescribed_dof_rates(self, dt: float, u: Array, start: Array, v: Array) -> tuple[Array, Array] | None:
+        """Return the mean velocity over the step, and its change over dt."""
+        return prescribed_rates(dt, u, start, v)
+
+
+@dataclass(frozen=True)
+class GeneralizedAlpha:
+    """Second order, with a dissipation of high frequencies set by rho, 0 to 1.
+
+    It has Newmark's formulae, and balances forces within the step: M a_{n+1-am} + f(u_{n+1-af}) = f_ext(t_{n+1-af})
+    with am = (2 rho - 1)/(rho + 1), af = rho/(rho + 1), gamma = 1/2 - am + af, beta = (1 - am + af)^2 / 4. The
+    amplitude of a mode far above 1/dt decreases by rho in a step; rho = 1 is the trapezoidal rule at the mid-point.
+    """
+
+    rho: float = field(
+        default=0.8,
+        metadata={
+            "ge": 0,
+            "le": 1,
+            "description": "Of `generalized-alpha`: amplitude of the fastest vibrations after a step.",
+        },
+    )
+    summary: ClassVar[str] = "second order; rho sets how much of the fastest modes is left after a step"
+    inertia: ClassVar[bool] = True
+    carries_acceleration: ClassVar[bool] = True
+    implicit: ClassVar[bool] = True
+
+    def check_parameters(self) -> None:
+        """Accept all parameters: every step is stable for every rho."""
+
+    @property
+    def alpha_m(self) -> float:
+        """Weight am of the start of the step in the acceleration."""
+        return (2 * self.rho - 1) / (self.rho + 1)
+
+    @property
+    def alpha_f(self) -> float:
+        """Weight af of the start of the step in the forces."""
+        return self.rho / (self.rho + 1)
+
+    @property
+    def newmark(self) -> Newmark:
+        """Newmark's formulae for u, v and a at the ends of the step."""
+        shift = self.alpha_f - self.alpha_m
+        return Newmark((1 + shift) ** 2 / 4, 0.5 + shift)
+
+    def rate_coefficients(self, dt: float) -> tuple[float, float]:
+        """Return (1 - am) / ((1 - af) beta dt^2), of a at the level am, and gamma / (beta dt), of v at the level af."""
+        c_a, c_v = self.newmark.rate_coefficients(dt)
+        return c_a * (1 - self.alpha_m) / (1 - self.alpha_f), c_v
+
+    def reference_displacements(self, dt: float, u: Array, v: Array, a: Array) -> tuple[Array, Array]:
+        """Return x for which a_{n+1-am} vanishes, and x for which v_{n+1-af} vanishes."""
+        (c_a, c_v), (u_a, u_v) = self.newmark.rate_coefficients(dt), self.newmark.reference_displacements(dt, u, v, a)
+        without_acceleration = u_a - self.alpha_m / (1 - self.alpha_m) / c_a * a
+        at_rest = u_v - self.alpha_f / (1 - self.alpha_f) / c_v * v
+        return self._at_force_level(without_acceleration, u), self._at_force_level(at_rest, u)
+
+    def complete_step(self, dt: float, x: Array, u: Array, v: Array, a: Array) -> tuple[Array, Array, Array]:
+        """Return u_{n+1} = (x - af u_n) / (1 - af), with Newmark's v and a."""
+        return self.newmark.complete_step(dt, (x - self.alpha_f * u) / (1 - self.alpha_f), u, v, a)
+
+    def prescribed_dof_rates(self, dt: float, u: Array, start: Array, v: Array) -> tuple[Array, Array] | None:
+        """Return the mean velocity over the step, and its change over dt."""
+        return prescribed_rates(dt, u, start, v)
+
+    def _at_force_level(self, end: Array, start: Array) -> Array:
+        """Return (1 - af) end + af start."""
+        return (1 - self.alpha_f) * end + self.alpha_f * start
+
+
+@dataclass(frozen=True)
+class CentralDifference(EndOfStepScheme):
+    """Explicit central differences in velocity Verlet form: Newmark's formulae with beta = 0 and gamma = 1/2.
+
+    u = u_n + dt v_n + dt^2/2 a_n,  M a = f_ext - f_int(u) - C v_{n+1/2},  v = v_n + dt/2 (a_n + a). Second order,
+    stable for dt < 2 / omega_max, without a system to solve. `rate_coefficients` are used by damping alone.
+    """
+
+    summary: ClassVar[str] = "central differences, no system to solve; the step is cut to what the fastest cell allows"
+    inertia: ClassVar[bool] = True
+    implicit: ClassVar[bool] = False
+    carries_acceleration: ClassVar[bool] = True
+
+    def rate_coefficients(self, dt: float) -> tuple[float, float]:
+        """Return 0 and 1/dt: inertia is not part of the assembled forces."""
+        return 0.0, 1 / dt
+
+    def reference_displacements(self, dt: float, u: Array, v: Array, a: Array) -> tuple[Array, Array]:
+        """Return u_n and u_n."""
+        return u, u

@@ -363,7 +363,7 @@ class RigidStep:
     @cached_property
     def z_a(self) -> Values:
         """(k,) level of s z without acceleration."""
-        return np.asarray(self.scheme.references(self.dt, np.zeros(len(self.M)), *self._motion)[0])
+        return np.asarray(self.scheme.reference_displacements(self.dt, np.zeros(len(self.M)), *self._motion)[0])
 
     @cached_property
     def weight_load(self) -> Values:
@@ -452,7 +452,7 @@ class RigidStep:
         weight = self.body.motion_basis.T @ -self.body.gravity_potential(pose)[1]
         struck = self.share * self.factor * _over(self.M, self.body.motion_basis.T @ force) / self.c_a
         reached = self.z_a + _over(self.M, self.share * weight + self.weight_load) / self.c_a + struck
-        _, rate, change = self.scheme.finish(self.dt, reached, np.zeros(len(z)), *self._motion)
+        _, rate, change = self.scheme.complete_step(self.dt, reached, np.zeros(len(z)), *self._motion)
         carried = change - acceleration_change(self.scheme, self.dt, struck)
         return RigidMotion(pose, self.M @ rate, self.M @ carried, self._turned(pose, z))
 

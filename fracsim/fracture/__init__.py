@@ -1,13 +1,17 @@
-"""What breaks, and what that takes out of the stress.
+"""Fracture: which edges of the mesh break, and how broken edges degrade the energy of their cells.
 
-fracture_pass     a pass: a criterion, a law of the edge and a degradation, one after the other
-criterion         which edges fail
-node_retention    which of them are spared, for a node would be left without a whole cell
-edge_law          what is left of an edge under a load
-degradation       what broken edges take out of the elastic energy
-edge_stress       normal stress along edges, and what the intact ones carry
-nonlocal_average  average of the stress over a radius
-strength          of every edge in every cell: regions, scatter, a fibre, ties
-edge_history      when and where edges broke
-brittle           surfaces in place of single edges: another criterion
+fracture_pass     pass at the end of a step: criterion, law of the edge, degradation
+criterion         criterion: normal stress of edges over their strength
+node_retention    edges that are spared so that no node becomes a fragment
+degradation       energy that broken edges take out of their cells
+edge_stress       normal stress along edges, stress that intact edges carry
+effective_stress  stress and energy density without damage
+principal_stress  principal stress and its direction
+nonlocal_average  averages over a radius or over neighbouring cells
+strength          strength of edges: regions, scatter, fibre, tie-break
+initial_cracks    cracks that are there before the start
+edge_history      times and positions of breaks
+brittle           criterion of brittle surfaces
+energy            criterion of cracks with a fracture energy
+cohesive_cracks   pass, criterion and softening of cohesive cracks
 """

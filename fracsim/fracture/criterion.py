@@ -1,4 +1,7 @@
-"""Which edges fail: those whose averaged normal stress reaches their strength (docs/theory.md#edge-criterion)."""
+"""Fracture criterion: edges fail where their averaged normal stress reaches their strength.
+
+Equations: docs/theory.md#edge-criterion.
+"""
 
 from __future__ import annotations
 
@@ -11,142 +14,169 @@ import numpy.typing as npt
 from ..mechanics.stress import Stress
 from ..mesh.edge_graph import EdgeGraph
 from ..mesh.parallel import allgather, sum_over_ranks
-from .edge_stress import Simplices, greatest_pull
-from .strength import Strength
+from .edge_stress import EdgeStressOperator, normal_stress_bound
+from .strength import EdgeStrength
 
 Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 Edges = npt.NDArray[np.integer]
-ROUND_OFF = 1e-12  # of a stress, by which a bound of it may be too low
+
+# Relative margin of a computed upper bound: rounding may make the bound that much too low.
+BOUND_ROUND_OFF = 1e-12
 
 
-class Criterion(Protocol):
-    """Finds the edges that fail."""
-
-    @property
-    def cut(self) -> Values | None:
-        """(edges,) where local edges are cut, from the end that comes first in the input mesh, NaN: nowhere yet; the
-        same array for ever. None: it does not say."""
+class FractureCriterion(Protocol):
+    """Interface of a criterion: it finds the edges that fail in a fracture pass."""
 
     @property
-    def carried(self) -> Values | None:
-        """(edges, n) of tips that run, the same array for ever; None: there are none."""
+    def cut_positions(self) -> Values | None:
+        """Positions of the cuts of local edges, (edges,), dimensionless.
 
-    def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
-        """(n,) local edges and their load over strength, 1 or more.
-
-        `stress` (cells, 3 or 6) in Pa and `psi` (cells,) in J/m^3 are those of the undamaged material. The same edges
-        on all ranks once what each has found is joined (collective).
+        0 is the end that comes first in the input mesh, 1 the other end, NaN an edge that is not cut. It is the same
+        array object during the whole run. None: the criterion does not determine positions.
         """
 
-    def moving(self, v: Values, a: Values, now: float, dt: float) -> None:
-        """The body moves so: (owned dofs,) in m/s and m/s^2, at the end of a step of dt, s."""
+    @property
+    def tip_states(self) -> Values | None:
+        """States of moving crack tips, (edges, n), the same array object during the run; None without such tips."""
 
-    def memory(self) -> object:
-        """What it remembers of earlier passes, never to be written to again."""
+    def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
+        """Find the edges that fail (collective).
 
-    def recall(self, memory: object) -> None:
-        """Remember no more than that."""
+        Args:
+            stress: (cells, 3 or 6) Cauchy stress of the undamaged material, Pa.
+            psi: (cells,) elastic energy density of the undamaged material, J/m^3.
+
+        Returns:
+            Local edges (n,) and their load over strength (n,), 1 or more. The union over all ranks does not depend on
+            the number of ranks.
+        """
+
+    def set_motion(self, v: Values, a: Values, now: float, dt: float) -> None:
+        """Store velocity (owned dofs,) in m/s and acceleration in m/s^2 at the end `now` of a step of `dt`, s."""
+
+    def snapshot(self) -> object:
+        """Return a copy of the history variables, never written to afterwards."""
+
+    def restore(self, memory: object) -> None:
+        """Restore the history variables that `snapshot` returned."""
 
 
-class Average(Protocol):
-    """A non-local average (fracture.nonlocal_average)."""
+class CellAverage(Protocol):
+    """Interface of a non-local average over cells (fracture.nonlocal_average)."""
 
     def __call__(self, values: Values, active: Flags | None = None) -> Values:
-        """Averages (cells, n) of cell values (cells, n); cells not `active` enter none."""
+        """Average cell values (cells, n) at all cells; inactive cells are left out of the averages."""
 
-    def reaching(
-        self, values: Values, size: Values, bound: float, active: Flags | None = None
-    ) -> tuple[npt.NDArray[np.int64], Values]:
-        """Cells (m,) whose average may reach a bound, and those averages (m, n)."""
+    def find_averages_above(
+        self, values: Values, norms: Values, bound: float, active: Flags | None = None
+    ) -> tuple[Ints, Values]:
+        """Find the cells (m,) whose average may reach `bound`, and their averages (m, n)."""
 
 
-class CarriedStress:
-    """The stress that the intact edges of the cells carry, averaged where there is a radius."""
+class IntactEdgeStress:
+    """The stress that intact edges carry, averaged over cells if an average is given."""
 
-    def __init__(self, stress: Stress, graph: EdgeGraph, average: Average | None, *, whole_tensor: bool) -> None:
-        """`whole_tensor`: more is asked of it than the normal stress along intact edges."""
-        self._cells, self._graph, self._average, self._comm = Simplices.of(stress), graph, average, stress.domain.comm
-        # by edges and locally there is no need: an intact edge has the same normal stress in the whole tensor
-        self._leaves_out = whole_tensor or average is not None
+    def __init__(self, stress: Stress, graph: EdgeGraph, average: CellAverage | None, *, whole_tensor: bool) -> None:
+        """Prepare the reduction of the stress by broken edges.
+
+        Args:
+            stress: stress of the body; its configuration is that of the edges.
+            graph: edges and their damage.
+            average: non-local average, None for the local stress.
+            whole_tensor: the caller needs more of the tensor than the normal stress along intact edges.
+        """
+        self._edge_stress = EdgeStressOperator.from_stress(stress)
+        self._graph, self._average, self._comm = graph, average, stress.domain.comm
+        # The local normal stress along an intact edge is the same with and without the broken edges.
+        self._removes_broken_edges = whole_tensor or average is not None
 
     def __call__(self, stress: Values) -> tuple[Values, Flags | None]:
-        """What intact edges carry, and which cells enter an average (None: all): split cells carry nothing."""
+        """Return the stress (cells, 3 or 6) that intact edges carry, and the cells that enter averages (None: all)."""
         graph = self._graph
         if not sum_over_ranks(self._comm, int(graph.damaged.any()))[0]:
             return stress, None
-        if self._leaves_out:
-            return self._cells.carried(stress, graph), ~graph.split
+        if self._removes_broken_edges:
+            return self._edge_stress.intact_edge_stress(stress, graph), ~graph.split
         carried = stress.copy()
         carried[graph.split] = 0.0
         return carried, ~graph.split
 
-    def reaching(self, carried: Values, active: Flags | None, bound: float) -> tuple[npt.NDArray[np.int64], Values]:
-        """Cells whose averaged stress may reach a bound in Pa along some direction, and that stress (collective).
+    def find_averages_above(self, carried: Values, active: Flags | None, bound: float) -> tuple[Ints, Values]:
+        """Find the cells whose averaged stress may reach `bound` (Pa) in some direction, and that stress (collective).
 
-        No average pulls harder than the average of the pulls: most cells are passed over after one product.
+        The largest normal stress of an average is at most the average of the largest normal stresses. So a scalar
+        average excludes most cells.
         """
-        size, bound = greatest_pull(carried, self._cells.dim), bound * (1 - ROUND_OFF)
+        norms, bound = normal_stress_bound(carried, self._edge_stress.dim), bound * (1 - BOUND_ROUND_OFF)
         if self._average is not None:
-            return self._average.reaching(carried, size, bound, active)
-        cells = np.flatnonzero(size >= bound)
+            return self._average.find_averages_above(carried, norms, bound, active)
+        cells = np.flatnonzero(norms >= bound)
         return cells, carried[cells]
 
-    def everywhere(self, carried: Values, active: Flags | None) -> Values:
-        """(cells, 3 or 6) the averaged stress of all cells (collective)."""
+    def average_all(self, carried: Values, active: Flags | None) -> Values:
+        """Return the averaged stress (cells, 3 or 6) of all cells (collective)."""
         return carried if self._average is None else self._average(carried, active)
 
 
 class OverloadedEdges:
-    """Edges whose normal stress in one of their cells reaches the strength.
+    """Criterion: an edge fails if its normal stress in one of its cells reaches the strength (M22, section 3.4).
 
     Attributes:
-        strength: of each edge in each cell.
+        strength: strength of each edge in each cell, Pa.
     """
 
-    cut = carried = None
+    cut_positions = tip_states = None
 
     def __init__(
-        self, stress: Stress, graph: EdgeGraph, strength: Strength, average: Average | None, cap: float | None = None
+        self,
+        stress: Stress,
+        graph: EdgeGraph,
+        strength: EdgeStrength,
+        average: CellAverage | None,
+        cap: float | None = None,
     ) -> None:
-        """`cap`: share of all edges that may fail in one pass, those loaded most first."""
-        self.strength, self._cells, self._graph = strength, Simplices.of(stress), graph
-        self._carried = CarriedStress(stress, graph, average, whole_tensor=False)
-        self._most = None if cap is None else math.ceil(cap * graph.index_map.size_global)
+        """Build the criterion; `cap` is the largest share of all edges that fails in one pass, most loaded first."""
+        self.strength, self._graph = strength, graph
+        self._edge_stress = EdgeStressOperator.from_stress(stress)
+        self._carried = IntactEdgeStress(stress, graph, average, whole_tensor=False)
+        self._max_edges = None if cap is None else math.ceil(cap * graph.index_map.size_global)
 
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
-        """(n,) local edges over their strength and their loads, at most `cap` of all edges in one pass (collective)."""
+        """Find the local edges (n,) that fail, and their load over strength (n,) (collective)."""
         carried, active = self._carried(stress)
-        edges, load = self.overloaded(*self._carried.reaching(carried, active, self.strength.weakest))
-        return (edges, load) if self._most is None else self._strongest(edges, load, self._most)
+        edges, load = self.find_overloaded(*self._carried.find_averages_above(carried, active, self.strength.minimum))
+        return (edges, load) if self._max_edges is None else self._select_most_loaded(edges, load, self._max_edges)
 
-    def overloaded(self, cells: npt.NDArray[np.int64], averaged: Values) -> tuple[Edges, Values]:
-        """Intact local edges of some cells whose normal stress in their stress (n, 3 or 6) reaches the strength."""
-        size = greatest_pull(averaged, self._cells.dim)  # most cells are passed over
-        may = size >= self.strength.weakest_of(cells) * (1 - ROUND_OFF)
-        cells, averaged = cells[may], averaged[may]
+    def find_overloaded(self, cells: Ints, averaged: Values) -> tuple[Edges, Values]:
+        """Find the intact edges of cells (n,) whose normal stress under `averaged` (n, 3 or 6) reaches the strength."""
+        # One scalar a cell excludes most cells before the normal stress of their edges is computed.
+        norms = normal_stress_bound(averaged, self._edge_stress.dim)
+        candidate = norms >= self.strength.minimum_in(cells) * (1 - BOUND_ROUND_OFF)
+        cells, averaged = cells[candidate], averaged[candidate]
         edges = self._graph.cell_edges[cells]
-        along = self._cells.normal_stress(cells, averaged)
+        normal_stress = self._edge_stress.normal_stress(cells, averaged)
         strength = self.strength(cells, edges)
-        over = (along >= strength) & ~self._graph.broken[edges]
-        return edges[over], along[over] / strength[over]
+        fails = (normal_stress >= strength) & ~self._graph.broken[edges]
+        return edges[fails], normal_stress[fails] / strength[fails]
 
-    def _strongest(self, edges: Edges, load: Values, most: int) -> tuple[Edges, Values]:
-        """Those of the candidates of all ranks that are loaded most; equal ones by their input nodes (collective)."""
+    def _select_most_loaded(self, edges: Edges, load: Values, count: int) -> tuple[Edges, Values]:
+        """Select the `count` most loaded edges of all ranks; ties are ordered by input nodes (collective)."""
         keys = self._graph.edge_keys(edges.astype(np.int64))
-        every = np.concatenate(allgather(self._graph.domain.comm, np.column_stack([keys, -load])))
-        order = np.lexsort((every[:, 1], every[:, 0], every[:, 2]))  # the highest ratio first
-        _, first = np.unique(every[order, :2], axis=0, return_index=True)
-        chosen = every[order][np.sort(first)[:most], :2].astype(np.int64)
-        wanted = self._graph.flags_of_keys(chosen) if len(chosen) else np.zeros(len(self._graph.broken), bool)
-        return edges[wanted[edges]], load[wanted[edges]]
+        rows = np.concatenate(allgather(self._graph.domain.comm, np.column_stack([keys, -load])))
+        order = np.lexsort((rows[:, 1], rows[:, 0], rows[:, 2]))  # the highest ratio first
+        _, first = np.unique(rows[order, :2], axis=0, return_index=True)
+        chosen = rows[order][np.sort(first)[:count], :2].astype(np.int64)
+        selected = self._graph.flags_of_keys(chosen) if len(chosen) else np.zeros(len(self._graph.broken), bool)
+        return edges[selected[edges]], load[selected[edges]]
 
-    def moving(self, v: Values, a: Values, now: float, dt: float) -> None:
-        """Stress is all that counts."""
+    def set_motion(self, v: Values, a: Values, now: float, dt: float) -> None:
+        """Do nothing: the criterion depends on the stress alone."""
 
-    def memory(self) -> object:
-        """Nothing."""
+    def snapshot(self) -> object:
+        """Return None: the criterion has no history."""
         return None
 
-    def recall(self, memory: object) -> None:
-        """Nothing."""
+    def restore(self, memory: object) -> None:
+        """Do nothing: the criterion has no history."""

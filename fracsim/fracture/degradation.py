@@ -1,10 +1,12 @@
-"""What broken edges take out of the elastic energy: two approaches (docs/theory.md#degraded-energy,
-docs/theory.md#edge-projected-strain).
+"""Degradation: the elastic energy that broken edges take out of their cells.
 
-chi     psi_frac = chi psi, chi the share of the edges' stress that intact ones carry (M22 eq. 28), never rising
-edge    psi_frac = 1/2 (D eps) : C : (D eps), D the projection on intact edges (M22 eqs. 21-22, forms.damage)
+- `ChiDegradation`: psi_frac = chi psi, chi the share of the edge stress that intact edges carry (M22, eq. 28).
+- `EdgeProjectionDegradation`: psi_frac = 1/2 (D eps) : C : (D eps), D the projection on intact edges (M22, eqs. 21-22).
+- `SplitCellDegradation`: chi = 1 until a cell is split, then 0, at once or over a time.
+- `CrackClosureDegradation`: one of them, with the springs of broken edges added where cracks close (`unilateral`).
 
-Where cracks close (`unilateral`) the springs of broken edges are added to either (forms.crack_closure).
+Equations: docs/theory.md#degraded-energy, docs/theory.md#edge-projected-strain, docs/theory.md#crack-closure,
+docs/theory.md#release-with-inertia.
 """
 
 from __future__ import annotations
@@ -19,84 +21,91 @@ from ..forms.kinematics import deformation_gradient
 from ..mechanics.jit import CellExpression
 from ..mechanics.stress import Stress
 from ..mesh.edge_graph import EdgeGraph
-from .edge_stress import Simplices
+from .edge_stress import EdgeStressOperator
 
 Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Lost:
-    """What cells of this rank lost in a pass.
+class EnergyRelease:
+    """Energy that the cells of this rank lost in a fracture pass.
 
     Attributes:
-        released, elastic: elastic energy that went, and that is left, J.
-        loss: most that chi of a cell fell.    died: whether cells lost the last of their stress.
+        released: elastic energy lost, J.
+        elastic: elastic energy left, J.
+        chi_drop: largest decrease of chi in a cell, dimensionless.
+        exhausted: whether chi fell to 0 in some cell.
     """
 
     released: float
     elastic: float
-    loss: float = 0.0
-    died: bool = False
+    chi_drop: float = 0.0
+    exhausted: bool = False
 
 
 class Degradation(Protocol):
-    """One way to weaken damaged cells."""
+    """Interface of a degradation."""
 
-    idle: bool  # an edge whose cells have all come apart carries nothing
+    # An edge all of whose cells are split carries no stress, so that it may break as well.
+    breaks_idle_edges: bool
 
-    def __call__(self, broke: bool, stress: Values, psi: Values) -> Lost:
-        """After a pass that weakened edges (`broke`) or did not.
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> EnergyRelease:
+        """Degrade the cells after a pass.
 
-        `stress` (cells, 3 or 6) in Pa and `psi` (cells,) in J/m^3 are those of the undamaged material.
+        Args:
+            broke: whether the pass weakened any edge.
+            stress: (cells, 3 or 6) Cauchy stress of the undamaged material, Pa.
+            psi: (cells,) energy density of the undamaged material, J/m^3.
         """
 
-    def restore(self) -> None:
-        """Take up the damage of a graph that was read from a checkpoint."""
+    def update_from_graph(self) -> None:
+        """Recompute the fields that follow from the edges, which were read from a checkpoint."""
 
-    def opened(self) -> None:
-        """Take up the damage of a graph with cracks, before anything is loaded."""
+    def apply_initial_cracks(self) -> None:
+        """Degrade the cells that cracks split before the body is loaded."""
 
-    def begin(self, t: float, dt: float) -> None:
-        """A step of dt (s) from t on is solved, for the first time or once more."""
+    def begin_step(self, t: float, dt: float) -> None:
+        """Prepare a step of `dt` (s) from `t`, which may be a repeated step."""
 
 
-class Chi:
-    """chi of the damaged cells, from the normal stress along their edges."""
+class ChiDegradation:
+    """chi of damaged cells from the normal stress along their edges (M22, eq. 28); it never increases."""
 
-    idle = True
+    breaks_idle_edges = True
 
     def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
         assert stress.chi is not None
-        self._cells, self._graph = Simplices.of(stress), graph
+        self._edge_stress, self._graph = EdgeStressOperator.from_stress(stress), graph
         self._chi: Values = stress.chi.x.array
         self._volumes = stress.domain.volumes
 
-    def __call__(self, broke: bool, stress: Values, psi: Values) -> Lost:
-        """Released and left: sums of V psi times what chi lost and what it is."""
-        released, loss, died = self._lower(stress, psi)
-        return Lost(released, float(np.sum(self._volumes * self._chi[: len(psi)] * psi)), loss, died)
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> EnergyRelease:
+        """Lower chi; the energies are sums of V psi times the decrease of chi, and times chi."""
+        released, chi_drop, exhausted = self._lower_chi(stress, psi)
+        elastic = float(np.sum(self._volumes * self._chi[: len(psi)] * psi))
+        return EnergyRelease(released, elastic, chi_drop, exhausted)
 
-    def _lower(self, stress: Values, psi: Values) -> tuple[float, float, bool]:
-        """Energy released on this rank in J, most that chi of a cell fell, and whether it fell to 0 in any."""
-        cells, lost = self._cells.lower(self._chi, stress, self._graph)
+    def _lower_chi(self, stress: Values, psi: Values) -> tuple[float, float, bool]:
+        """Lower chi; return the energy released (J), the largest decrease, and whether any chi is 0 now."""
+        cells, drop = self._edge_stress.lower_chi(self._chi, stress, self._graph)
         if not len(cells):
             return 0.0, 0.0, False
-        released = float(np.sum(self._volumes[cells] * lost * psi[cells]))
-        return released, float(np.max(lost)), not self._chi[cells].all()
+        released = float(np.sum(self._volumes[cells] * drop * psi[cells]))
+        return released, float(np.max(drop)), not self._chi[cells].all()
 
-    def restore(self) -> None:
-        """chi itself is in the checkpoint."""
+    def update_from_graph(self) -> None:
+        """Do nothing: chi itself is in the checkpoint."""
 
-    def opened(self) -> None:
-        """Cells that have come apart carry nothing; what others lose is seen once they are loaded."""
+    def apply_initial_cracks(self) -> None:
+        """Set chi of split cells to 0; that of other damaged cells follows once they are loaded."""
         self._chi[np.flatnonzero(self._graph.split)] = 0.0
 
-    def begin(self, t: float, dt: float) -> None:
-        """What goes goes at once."""
+    def begin_step(self, t: float, dt: float) -> None:
+        """Do nothing: energy is released at once."""
 
 
-class EdgeEnergy:
-    """Integrity of each edge of each cell, and the energy that depends on it."""
+class EdgeIntegrityFields:
+    """Integrity of the edges as a field on cells, and the elastic energy that depends on it."""
 
     def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
         assert stress.integrity is not None
@@ -106,72 +115,124 @@ class EdgeEnergy:
         density = stress.energy.psi(deformation_gradient(stress.u), stress.rotation_field)
         self._density = CellExpression(domain.comm, domain.mesh, density, domain.cell_count, kernels=stress.kernels)
 
-    def energy(self) -> float:
-        """Elastic energy on this rank, J."""
+    def elastic_energy(self) -> float:
+        """Return the elastic energy of this rank, J."""
         return float(self._volumes @ self._density()[:, 0])
 
-    def update(self) -> None:
-        """Integrity of the edges as cells see it."""
+    def update_integrity(self) -> None:
+        """Copy the integrity of the graph's edges to the field."""
         self._integrity[: len(self._volumes)] = self._graph.cell_integrity(np.arange(len(self._volumes)))
 
 
-class Projection:
-    """The energy follows from the integrity of the edges; split cells keep the forces of intact ones."""
+class EdgeProjectionDegradation:
+    """Energy of the strain projected on intact edges; split cells keep the forces of their intact edges."""
 
-    idle = False
+    breaks_idle_edges = False
 
     def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
-        self._edges = EdgeEnergy(stress, graph)
+        self._edges = EdgeIntegrityFields(stress, graph)
 
-    def __call__(self, broke: bool, stress: Values, psi: Values) -> Lost:
-        """Released: what the projected energy lost at this displacement as edges broke."""
-        before = self._edges.energy()
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> EnergyRelease:
+        """Update the integrity; the energy released is the difference at the present displacement."""
+        before = self._edges.elastic_energy()
         if not broke:
-            return Lost(0.0, before)
-        self.restore()
-        after = self._edges.energy()
-        return Lost(before - after, after)
+            return EnergyRelease(0.0, before)
+        self._edges.update_integrity()
+        after = self._edges.elastic_energy()
+        return EnergyRelease(before - after, after)
 
-    def restore(self) -> None:
-        """Integrity follows from that of the edges."""
-        self._edges.update()
+    def update_from_graph(self) -> None:
+        """Update the integrity."""
+        self._edges.update_integrity()
 
-    def opened(self) -> None:
-        """Integrity follows from that of the edges."""
-        self._edges.update()
+    def apply_initial_cracks(self) -> None:
+        """Update the integrity."""
+        self._edges.update_integrity()
 
-    def begin(self, t: float, dt: float) -> None:
-        """What goes goes at once."""
+    def begin_step(self, t: float, dt: float) -> None:
+        """Do nothing: energy is released at once."""
 
 
-class ClosingChi(Chi):
-    """chi beside the springs of broken edges (forms.crack_closure)."""
+class SplitCellDegradation:
+    """chi of the energy criterion: 1 in unsplit cells; in split cells it falls to 0, at once or at a given rate.
 
-    def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
-        super().__init__(stress, graph)
-        self._edges = EdgeEnergy(stress, graph)
+    With inertia chi falls during the time that a Rayleigh wave takes through the disc of a tip
+    (docs/theory.md#release-with-inertia).
+    """
 
-    def __call__(self, broke: bool, stress: Values, psi: Values) -> Lost:
-        """Released: what the energy lost at this displacement as chi fell and edges broke."""
-        before = self._edges.energy()
-        _, loss, died = self._lower(stress, psi)
+    breaks_idle_edges = True
+
+    def __init__(self, stress: Stress, graph: EdgeGraph, release_rate: Values | None = None) -> None:
+        """Build the degradation; `release_rate`: (cells,) decrease of chi in 1/s, None for a release at once."""
+        assert stress.chi is not None
+        self._graph, self._chi, self._volumes = graph, stress.chi.x.array, stress.domain.volumes
+        self._release_rate, self._step_start = release_rate, -np.inf
+        self._chi_at_start: Values = np.ones(0)
+        self._min_chi: Values = np.zeros(0)
+
+    def begin_step(self, t: float, dt: float) -> None:
+        """Limit the release in the step from `t` of `dt`, s; a repeated step starts from the same chi."""
+        if self._release_rate is None:
+            return
+        if t != self._step_start:
+            self._step_start, self._chi_at_start = t, self._chi[: len(self._volumes)].copy()
+        self._min_chi = np.maximum(self._chi_at_start - self._release_rate * dt, 0.0)
+
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> EnergyRelease:
+        """Lower chi of split cells; the energies are sums of V psi times the decrease of chi, and times chi."""
+        chi = self._chi[: len(psi)]
+        cells = np.flatnonzero(self._graph.split & (chi > 0))
+        target = 0.0 if self._release_rate is None else np.minimum(self._min_chi[cells], chi[cells])
+        drop = chi[cells] - target
+        chi[cells] = target
+        released = float(np.sum(self._volumes[cells] * drop * psi[cells]))
+        elastic = float(np.sum(self._volumes * chi * psi))
+        exhausted = bool(len(cells)) and not chi[cells].all()
+        return EnergyRelease(released, elastic, float(np.max(drop, initial=0.0)), exhausted)
+
+    def update_from_graph(self) -> None:
+        """Do nothing: chi itself is in the checkpoint."""
+
+    def apply_initial_cracks(self) -> None:
+        """Set chi of split cells to 0."""
+        self._chi[np.flatnonzero(self._graph.split)] = 0.0
+
+
+class CrackClosureDegradation:
+    """A degradation of chi together with the springs of broken edges (forms.crack_closure)."""
+
+    def __init__(self, degradation: Degradation, stress: Stress, graph: EdgeGraph) -> None:
+        """Build the combination; `degradation` sets chi, and the springs carry pressure in broken edges."""
+        self._degradation, self.breaks_idle_edges = degradation, degradation.breaks_idle_edges
+        self._edges = EdgeIntegrityFields(stress, graph)
+
+    def __call__(self, broke: bool, stress: Values, psi: Values) -> EnergyRelease:
+        """Degrade cells and edges; the energy released is the difference at the present displacement."""
+        before = self._edges.elastic_energy()
+        release = self._degradation(broke, stress, psi)
         if broke:
-            self._edges.update()
-        after = self._edges.energy()
-        return Lost(before - after, after, loss, died)
+            self._edges.update_integrity()
+        after = self._edges.elastic_energy()
+        return EnergyRelease(before - after, after, release.chi_drop, release.exhausted)
 
-    def restore(self) -> None:
-        """chi itself is in the checkpoint."""
-        self._edges.update()
+    def update_from_graph(self) -> None:
+        """Update chi and the integrity of the edges."""
+        self._degradation.update_from_graph()
+        self._edges.update_integrity()
 
-    def opened(self) -> None:
-        """As without springs, and these are there where edges are broken."""
-        super().opened()
-        self._edges.update()
+    def apply_initial_cracks(self) -> None:
+        """Degrade split cells, and let the broken edges act as springs."""
+        self._degradation.apply_initial_cracks()
+        self._edges.update_integrity()
+
+    def begin_step(self, t: float, dt: float) -> None:
+        """Prepare a step of `dt` (s) from `t`."""
+        self._degradation.begin_step(t, dt)
 
 
 def make_degradation(stress: Stress, graph: EdgeGraph) -> Degradation:
-    """The approach that the stress has fields for: chi alone, integrity alone, or both where cracks close."""
+    """Return the degradation for the fields that the stress has: chi, edge integrity, or both where cracks close."""
     if stress.chi is None:
-        return Projection(stress, graph)
-    return Chi(stress, graph) if stress.integrity is None else ClosingChi(stress, graph)
+        return EdgeProjectionDegradation(stress, graph)
+    chi = ChiDegradation(stress, graph)
+    return chi if stress.integrity is None else CrackClosureDegradation(chi, stress, graph)

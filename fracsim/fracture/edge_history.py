@@ -1,4 +1,4 @@
-"""What is remembered of every broken edge: when it broke, and where it was cut."""
+"""History of broken edges: the time of each break, and the position of each cut."""
 
 from __future__ import annotations
 
@@ -10,66 +10,81 @@ from ..mesh.edge_graph import EdgeGraph
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
+# Cut positions derived from nodal forces are kept this share of an edge away from its ends, against sliver triangles.
+MIN_FORCE_CUT_SHARE = 0.1
 
-class EdgeRecord:
-    """Time and place of the breaks of the edges that a rank has, owned and ghost.
+
+class EdgeHistory:
+    """Break times and cut positions of the edges of a rank, owned and ghost.
 
     Attributes:
         graph: the edges and their damage.
-        at: (edges,) s at which each broke, NaN while it is whole.
-        cut: (edges,) where, from the end that comes first in the input mesh (0) to the other (1); NaN: in the middle.
-        carried: (edges, n) of tips that run, the time of the last look in the end; None where none do.
+        break_times: (edges,) time at which each edge broke, s; NaN for intact edges.
+        cut_positions: (edges,) position of each cut, from 0 at the end that comes first in the input mesh to 1 at the
+            other; NaN stands for the middle.
+        tip_states: (edges, n) states of moving crack tips, the time of the last update in the last column; None
+            without such tips.
     """
 
     def __init__(self, graph: EdgeGraph) -> None:
         self.graph = graph
-        self.at = np.full(len(graph.broken), np.nan)
-        self.cut = np.full(len(graph.broken), np.nan)
-        self.carried: Values | None = None
+        self.break_times = np.full(len(graph.broken), np.nan)
+        self.cut_positions = np.full(len(graph.broken), np.nan)
+        self.tip_states: Values | None = None
 
-    def note(self, t: float, cut: Values | None = None) -> None:
-        """Edges that broke since the last call did so at t (s), at `cut` (edges,) where it is given."""
-        new = self.graph.broken & np.isnan(self.at)
-        self.at[new] = t
+    def record_breaks(self, t: float, cut: Values | None = None) -> None:
+        """Record that edges which broke since the last call broke at `t` (s), cut at `cut` (edges,) if given."""
+        new = self.graph.broken & np.isnan(self.break_times)
+        self.break_times[new] = t
         if cut is not None:
-            self.cut[new] = cut[new]
+            self.cut_positions[new] = cut[new]
 
-    def remember(self, cut: Values, carried: Values | None) -> None:
-        """Edges that are weakened and not broken are cut at `cut` (edges,); tips carry what is said by the rank that
-        looked at them last, which has them (collective)."""
-        held = (self.graph.integrity < 1) & ~self.graph.broken
-        self.cut[held] = cut[held]
-        if carried is not None:
-            ago = -np.nan_to_num(carried[:, -1], nan=-np.inf)
-            newest = ago <= self.graph.min_over_ranks(ago)
-            columns = [self.graph.min_over_ranks(np.where(newest, each, np.inf)) for each in carried.T]
-            self.carried = np.column_stack(columns)
+    def record_weakened(self, cut: Values, tip_states: Values | None) -> None:
+        """Record the cuts (edges,) of weakened, unbroken edges, and the states of tips (edges, n) (collective).
 
-    def gathered(self) -> tuple[Ints, Values] | None:
-        """(n, 2) sorted keys of all broken edges and (n, 2) their `at` and `cut`, on rank 0 (collective)."""
-        return self.graph.gather_broken(np.column_stack([self.at, self.cut]))
+        Of the states that several ranks have for one edge, those with the latest time are recorded.
+        """
+        weakened = (self.graph.integrity < 1) & ~self.graph.broken
+        self.cut_positions[weakened] = cut[weakened]
+        if tip_states is not None:
+            negative_time = -np.nan_to_num(tip_states[:, -1], nan=-np.inf)
+            latest = negative_time <= self.graph.min_over_ranks(negative_time)
+            columns = [self.graph.min_over_ranks(np.where(latest, column, np.inf)) for column in tip_states.T]
+            self.tip_states = np.column_stack(columns)
 
-    def saved(self) -> tuple[Ints, Values] | None:
-        """The same of all edges that are not whole (collective)."""
-        carried = [] if self.carried is None else [self.carried]
-        return self.graph.gather_weakened(np.column_stack([self.at, self.cut, *carried]))
+    def gather_broken(self) -> tuple[Ints, Values] | None:
+        """Gather all broken edges on rank 0 (collective).
 
-    def restore(self, keys: Ints, values: Values) -> None:
-        """Take up what `saved` gave, (n, 2) keys and (n, 2 and more) values, on every rank."""
-        local, place = self.graph.find_keys(keys)
-        self.at[local], self.cut[local] = values[place, :2].T
+        Returns:
+            Sorted keys (n, 2), and break times and cut positions (n, 2); None on other ranks.
+        """
+        return self.graph.gather_broken(np.column_stack([self.break_times, self.cut_positions]))
+
+    def to_checkpoint(self) -> tuple[Ints, Values] | None:
+        """Gather all weakened edges on rank 0: keys (n, 2), and times, cuts and tip states (n, 2 or more)."""
+        states = [] if self.tip_states is None else [self.tip_states]
+        return self.graph.gather_weakened(np.column_stack([self.break_times, self.cut_positions, *states]))
+
+    def from_checkpoint(self, keys: Ints, values: Values) -> None:
+        """Restore what `to_checkpoint` returned, on every rank: keys (n, 2) and values (n, 2 or more)."""
+        local, row = self.graph.find_keys(keys)
+        self.break_times[local], self.cut_positions[local] = values[row, :2].T
         if values.shape[1] > 2:
-            self.carried = np.full((len(self.at), values.shape[1] - 2), np.nan)
-            self.carried[local] = values[place, 2:]
+            self.tip_states = np.full((len(self.break_times), values.shape[1] - 2), np.nan)
+            self.tip_states[local] = values[row, 2:]
 
 
-def cut_by_forces(force: Values, ends: npt.NDArray[np.integer]) -> Values:
-    """(edges,) cuts whose sections are in inverse proportion to the nodal forces (M22 section 4.1, fig. 12).
+def cut_positions_from_forces(force: Values, ends: npt.NDArray[np.integer]) -> Values:
+    """Return cut positions (edges,) that divide each edge in inverse proportion to its nodal forces.
 
-    length_i / length_j = |f_j| / |f_i|, so the cut is at |f_j| / (|f_i| + |f_j|) from i, the middle where both are 0.
-    `force`: (nodes, d) N; `ends`: (edges, 2) from the lower input node. Held within 0.1 to 0.9: no needles.
+    length_i / length_j = |f_j| / |f_i|, so that the cut is at |f_j| / (|f_i| + |f_j|) from node i (M22, section 4.1,
+    fig. 12). It is in the middle where both forces are 0, and within 0.1 to 0.9.
+
+    Args:
+        force: (nodes, d) nodal forces, N.
+        ends: (edges, 2) nodes of the edges, the lower input node first.
     """
     size = np.linalg.norm(force, axis=1)[ends]
-    both = size.sum(axis=1)
-    share = np.divide(size[:, 1], both, out=np.full(len(both), 0.5), where=both > 0)
-    return np.clip(share, 0.1, 0.9)
+    total = size.sum(axis=1)
+    share = np.divide(size[:, 1], total, out=np.full(len(total), 0.5), where=total > 0)
+    return np.clip(share, MIN_FORCE_CUT_SHARE, 1 - MIN_FORCE_CUT_SHARE)

@@ -1,18 +1,14 @@
-"""Normal stress along the edges of a simplex, and the stress that is left when some edges carry none.
+"""Normal stress along the edges of simplices, and the stress that remains when some edges carry none.
 
 With barycentric gradients g_i the tensors -sym(g_i x g_j), i < j, are dual to the dyads d_ij x d_ij of the edge vectors
-d_ij = x_j - x_i, because d_kl . g_i = delta_il - delta_ik. Hence for every symmetric tensor
+d_ij = x_j - x_i, because d_kl . g_i = delta_il - delta_ik. Hence every symmetric tensor is
 
-    s = - sum_{i<j} (d_ij . s . d_ij) sym(g_i x g_j),
+    s = - sum_{i<j} (d_ij . s . d_ij) sym(g_i x g_j).
 
-which is M22's T^-1 in closed form: no 6 x 6 matrix is inverted, and triangles and tetrahedra share the line. Leaving
-broken edges out of the sum is T^-1 diag(integrity) T of M22 eqs. 16-18, with the factor 2 on shear terms that M22
-eq. 12 lacks.
+This is T^-1 of M22 in closed form, in 2D and 3D. Without the broken edges in the sum it is T^-1 diag(integrity) T of
+M22, eqs. 16-18, with the factor 2 of shear terms that M22, eq. 12, lacks.
 
-These are dozens of small sums for each of a few hundred cells in every step: in edge_stress.c, which is compiled where
-it is needed first, they take a tenth of the time of arrays.
-
-Equations: docs/theory.md#edge-criterion.
+The sums are computed in edge_stress.c. Equations: docs/theory.md#edge-criterion.
 """
 
 from __future__ import annotations
@@ -36,114 +32,135 @@ SOURCE = Path(__file__).with_suffix(".c")
 
 
 def edge_vectors(corners: Values) -> Values:
-    """(n, k, d) vectors d_ij = x_j - x_i of the local edges of simplices with (n, d + 1, d) corners."""
+    """Return the vectors d_ij = x_j - x_i (n, k, d) of the local edges of simplices with corners (n, d + 1, d)."""
     i, j = local_edges(corners.shape[2]).T
     return corners[:, j] - corners[:, i]
 
 
 def frobenius_norm(components: Values, dim: int) -> Values:
-    """(n,) sqrt(s : s) of symmetric tensors given by their components; no normal stress is larger."""
+    """Return sqrt(s : s) (n,) of symmetric tensors given by components (n, 3 or 6); no normal stress is larger."""
     normal, shear = components[:, :dim], components[:, dim:]
     square = np.einsum("ni,ni->n", normal, normal) + 2 * np.einsum("ni,ni->n", shear, shear)
     return np.asarray(np.sqrt(square))
 
 
-def greatest_pull(components: Values, dim: int) -> Values:
-    """(n,) tr s / d + sqrt(1 - 1/d) |dev s|, or 0: no normal stress is larger, and in 2D one is as large.
+def normal_stress_bound(components: Values, dim: int) -> Values:
+    """Return max(0, tr s / d + sqrt(1 - 1/d) |dev s|) (n,), an upper bound of the normal stress in any direction.
 
-    A convex function of s that grows in proportion to it: that of an average is at most the average of it.
+    In 2D it is the first principal stress. It is convex in s and homogeneous of degree one, so that the bound of an
+    average is at most the average of the bounds.
     """
-    found = np.empty(len(components))
-    _code().pull(c_int64(dim), c_int64(len(components)), np.ascontiguousarray(components), found)
-    return found
+    result = np.empty(len(components))
+    _code().pull(c_int64(dim), c_int64(len(components)), np.ascontiguousarray(components), result)
+    return result
 
 
-class _Given(Structure):
-    """As edge_stress.c has it."""
+class _SimplexArrays(Structure):
+    """Arrays of simplices, in the layout of edge_stress.c."""
 
     _fields_ = (("count", c_int64), ("nodes", Int32), ("rest", Float64), ("moved", Float64))
 
 
-class _Damage(Structure):
-    """The same."""
+class _DamageArrays(Structure):
+    """Arrays of damaged edges, in the layout of edge_stress.c."""
 
     _fields_ = (("edges", Int32), ("integrity", Float64), *((name, Uint8) for name in ("pattern", "damaged", "split")))
 
 
-class Damage(Protocol):
-    """Edges of cells and their damage (mesh.edge_graph)."""
+class EdgeDamage(Protocol):
+    """Interface of edges of cells and their damage (mesh.edge_graph)."""
 
     @property
-    def cell_edges(self) -> npt.NDArray[np.int32]: ...
+    def cell_edges(self) -> npt.NDArray[np.int32]:
+        """(cells, k) local edges of cells."""
+
     @property
-    def integrity(self) -> Values: ...
+    def integrity(self) -> Values:
+        """(edges,) 1 intact to 0 broken."""
+
     @property
-    def pattern(self) -> npt.NDArray[np.uint8]: ...
+    def pattern(self) -> npt.NDArray[np.uint8]:
+        """(cells,) broken edges, one bit each."""
+
     @property
-    def damaged(self) -> Flags: ...
+    def damaged(self) -> Flags:
+        """(cells,) cells with a weakened edge."""
+
     @property
-    def split(self) -> Flags: ...
+    def split(self) -> Flags:
+        """(cells,) cells whose intact edges do not connect their corners."""
 
 
-class Simplices:
-    """Cells whose edges feel a stress, as they lie when they are asked.
+class EdgeStressOperator:
+    """Maps the stress of simplices to normal stress along their edges, in the present configuration.
 
     Attributes:
         dim: 2 or 3.
     """
 
     def __init__(self, nodes: npt.NDArray[np.int32], rest: Values, moved: Values | None = None) -> None:
-        """(cells, d + 1) `nodes` at `rest` (nodes, d), m, and by how much these have `moved` from there."""
+        """Store the cells.
+
+        Args:
+            nodes: (cells, d + 1) nodes of the cells.
+            rest: (nodes, d) reference positions, m.
+            moved: displacement of the nodes, m, read at every call; None for the reference configuration.
+        """
         self.dim, self._count = rest.shape[1], len(nodes)
-        self._kept = struct_pointer(nodes), struct_pointer(rest), None if moved is None else struct_pointer(moved)
-        self._all = byref(_Given(len(nodes), *self._kept))
+        # The C structure has addresses only: these references keep the arrays alive.
+        self._arrays = struct_pointer(nodes), struct_pointer(rest), None if moved is None else struct_pointer(moved)
+        self._cells = byref(_SimplexArrays(len(nodes), *self._arrays))
 
     @classmethod
-    def of(cls, stress: Stress) -> Simplices:
-        """Cells in the configuration that a stress belongs to."""
+    def from_stress(cls, stress: Stress) -> EdgeStressOperator:
+        """Build the operator for the cells and the configuration of `stress`."""
         domain = stress.domain
         return cls(domain.cell_nodes, domain.nodes, None if stress.energy.linear else stress.u.x.array)
 
     def normal_stress(self, cells: Ints, components: Values) -> Values:
-        """(n, k) normal stress n . s . n along the edges of cells (n,) under s (n, 3 or 6), in its unit; n is the unit
-        vector of an edge."""
-        found = np.empty(components.shape)
-        given = np.ascontiguousarray(cells), self._all, np.ascontiguousarray(components), found
-        _code().normal(c_int64(self.dim), c_int64(len(cells)), *given)
-        return found
+        """Return n . s . n (n, k) along the edges of cells (n,) under stress (n, 3 or 6), n the unit edge vector."""
+        result = np.empty(components.shape)
+        arguments = np.ascontiguousarray(cells), self._cells, np.ascontiguousarray(components), result
+        _code().normal(c_int64(self.dim), c_int64(len(cells)), *arguments)
+        return result
 
-    def carried(self, components: Values, damage: Damage) -> Values:
-        """(cells, 3 or 6) the part of s (cells, 3 or 6) that the intact edges of cells carry; zero in those that have
-        come apart and in flat ones."""
-        found = np.empty(components.shape)
-        _code().carried(c_int64(self.dim), self._all, _damage(damage), *_rows(components), found)
-        return found
+    def intact_edge_stress(self, components: Values, damage: EdgeDamage) -> Values:
+        """Return the part of the stress (cells, 3 or 6) that intact edges carry; 0 in split and in flat cells."""
+        result = np.empty(components.shape)
+        _code().carried(c_int64(self.dim), self._cells, _damage_arrays(damage), *_row_layout(components), result)
+        return result
 
-    def lower(self, chi: Values, components: Values, damage: Damage) -> tuple[Ints, Values]:
-        """Lower chi (cells,) of damaged cells to the sum of integrity |n . s . n| over their edges, as a share of that
-        of whole ones (M22 eq. 28), 1 where nothing is loaded; of those that have come apart to 0.
+    def lower_chi(self, chi: Values, components: Values, damage: EdgeDamage) -> tuple[Ints, Values]:
+        """Lower chi (cells,) in place to the share of the edge stress that intact edges carry (M22, eq. 28).
 
-        Returns (n,) cells that lost anything, and how much.
+        chi = sum of integrity |n . s . n| over sum of |n . s . n|, over the edges of a damaged cell. It is 1 in an
+        unloaded cell and 0 in a split one, and never increases.
+
+        Returns:
+            Cells (n,) whose chi decreased, and by how much (n,).
         """
-        cells, lost = np.empty(self._count, np.int64), np.empty(self._count)
-        given = *_rows(components), chi, cells, lost
-        many = _code().lower(c_int64(self.dim), self._all, _damage(damage), *given)
-        return cells[:many], lost[:many]
+        cells, drop = np.empty(self._count, np.int64), np.empty(self._count)
+        arguments = *_row_layout(components), chi, cells, drop
+        count = _code().lower(c_int64(self.dim), self._cells, _damage_arrays(damage), *arguments)
+        return cells[:count], drop[:count]
 
 
-def _rows(values: Values) -> tuple[c_int64, Any]:
-    """How far rows are apart that may be the first columns of a table, and where they begin."""
+def _row_layout(values: Values) -> tuple[c_int64, Any]:
+    """Return stride and address of rows, which may be the first columns of a wider table."""
     if values.strides[1] != values.itemsize:
         values = np.ascontiguousarray(values)
     return c_int64(values.strides[0] // values.itemsize), values[0] if len(values) else values
 
 
-def _damage(of: Damage) -> Any:
-    """Damage as C has it: its arrays live as long as they do in Python."""
-    arrays: tuple[npt.NDArray[Any], ...] = of.cell_edges, of.integrity, of.pattern, of.damaged, of.split
-    return byref(_Damage(*map(struct_pointer, arrays)))
+def _damage_arrays(damage: EdgeDamage) -> Any:
+    """Return the C structure of `damage`, valid as long as its arrays live."""
+    arrays: tuple[npt.NDArray[Any], ...] = (
+        damage.cell_edges, damage.integrity, damage.pattern, damage.damaged, damage.split,
+    )  # fmt: skip
+    return byref(_DamageArrays(*map(struct_pointer, arrays)))
 
 
 @cache
 def _code() -> CDLL:
+    """Return the compiled functions of edge_stress.c."""
     return load_library(SOURCE, separate_rounding=True)

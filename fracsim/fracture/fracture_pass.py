@@ -1,34 +1,59 @@
-"""A pass of fracture at the end of a step: which edges fail, and what that leaves of the energy of their cells."""
+"""Fracture pass at the end of a step: edges fail, and their cells lose stiffness."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.stress import Stress
 from ..mesh.edge_graph import EdgeGraph
-from .criterion import Criterion
+from .criterion import FractureCriterion
 from .degradation import Degradation, make_degradation
-from .edge_law import Brittle, EdgeLaw
-from .effective_stress import Undamaged
-from .node_retention import Joining
+from .effective_stress import UndamagedStress
+from .node_retention import NodeAttachment
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class PassResult:
-    """What one pass did.
+class EdgeLaw(Protocol):
+    """Interface of the law of an edge: integrity, from 1 (intact) to 0 (broken), as a function of the load.
 
     Attributes:
-        broken: edges that broke, on all ranks.    loss: most that chi of a cell of this rank lost.
-        released: elastic energy that went with them on this rank, J.    elastic: what is left of it, J.
-        died: whether cells of this rank lost the last of their stress.
-        before: copies of the fields of damage before the pass, where edges broke.
+        all_or_nothing: integrity is 1 or 0, so that ranks need not agree on values in between.
+    """
+
+    all_or_nothing: bool
+
+    def __call__(self, load: Values) -> Values:
+        """Return the integrity (n,) under loads (n,), normal stress over strength; an edge keeps its least value."""
+
+
+class BrittleEdgeLaw:
+    """Brittle law: integrity is 1 below the strength and 0 from there on."""
+
+    all_or_nothing = True
+
+    def __call__(self, load: Values) -> Values:
+        """Return the integrity (n,), 0 or 1, under loads (n,) over the strength."""
+        return np.where(load >= 1, 0.0, 1.0)
+
+
+@dataclass(frozen=True)
+class FracturePassResult:
+    """Result of one fracture pass.
+
+    Attributes:
+        broken_edges: number of edges that broke, on all ranks.
+        largest_chi_loss: largest decrease of chi in a cell of this rank, dimensionless.
+        released_energy: elastic energy released on this rank, J.
+        elastic_energy: elastic energy left on this rank, J.
+        cells_died: whether chi of some cell of this rank fell to 0.
+        previous_damage: copies of the damage fields before the pass, if edges broke.
     """
 
     broken_edges: int
@@ -40,22 +65,31 @@ class PassResult:
 
 
 @dataclass(frozen=True)
-class Damage:
-    """What is damaged at a time: integrity of local edges, the fields of damage, and what the criterion remembers."""
+class DamageSnapshot:
+    """Damage at one time.
+
+    Attributes:
+        integrity: (edges,) of the local edges.
+        fields: values of the damage fields of the stress.
+        criterion: history variables of the criterion.
+    """
 
     integrity: Values
     fields: list[Values]
     criterion: object
 
 
-class Breaking:
-    """Weakens the edges that a criterion finds overloaded, and their cells: a part of timestepping.protocols.
+class FracturePass:
+    """Weakens the edges that a criterion finds, and degrades their cells (timestepping.protocols).
 
     Attributes:
-        graph: edges and their integrity.    criterion: which edges fail.    law: what is left of an edge that does.
-        degradation: what broken edges take out of the energy.
-        max_passes: most passes in a step; None: until nothing changes.
-        opened: (edges,) where edges that were broken before the start are cut, NaN elsewhere; None: there are none.
+        stress: stress of the body, with its damage fields.
+        graph: edges and their integrity.
+        criterion: finds the edges that fail.
+        law: integrity of an edge that fails.
+        degradation: energy that broken edges take out of their cells.
+        max_passes: largest number of passes in a step; None: until nothing changes.
+        initial_cuts: (edges,) cut positions of edges broken before the start, NaN elsewhere; None without such edges.
     """
 
     phase = "fracture"
@@ -64,113 +98,122 @@ class Breaking:
         self,
         stress: Stress,
         graph: EdgeGraph,
-        criterion: Criterion,
+        criterion: FractureCriterion,
         law: EdgeLaw | None = None,
         *,
         max_passes: int | None = 1,
-        opened: Values | None = None,
+        initial_cuts: Values | None = None,
         degradation: Degradation | None = None,
-        pace: float | None = None,
-        joining: Joining | None = None,
+        passes_per_second: float | None = None,
+        node_attachment: NodeAttachment | None = None,
     ) -> None:
-        """`pace`: passes a second, in place of `passes`: in short steps not one in each; `joining`: which of the edges
-        that fail hold nodes that would be crumbs (collective)."""
+        """Assemble a pass from its parts (collective).
+
+        Args:
+            stress: stress of the body.
+            graph: edges of the body.
+            criterion: finds the edges that fail.
+            law: law of the edges, brittle by default.
+            max_passes: largest number of passes in a step; None: until nothing changes.
+            initial_cuts: (edges,) cut positions of initial cracks.
+            degradation: by default that of the fields of `stress`.
+            passes_per_second: rate of passes, instead of `max_passes`: short steps may have none.
+            node_attachment: spares edges that attach nodes without an unsplit cell.
+        """
         self.stress, self.graph, self.criterion, self.max_passes = stress, graph, criterion, max_passes
-        self.law: EdgeLaw = law or Brittle()
+        self.law: EdgeLaw = law or BrittleEdgeLaw()
         self.degradation: Degradation = degradation or make_degradation(stress, graph)
-        self.opened, self._pace, self._joining = opened, pace, joining
-        self._due, self._now, self._dt = True, 0.0, math.inf
-        self._restless = criterion.carried is not None  # remembers more than what broke
-        if opened is not None:
-            self.degradation.opened()
-        self._undamaged = Undamaged(stress, often=True)
-        self._memory: Damage | None = None
+        self.initial_cuts, self._passes_per_second = initial_cuts, passes_per_second
+        self._node_attachment = node_attachment
+        self._is_due, self._now, self._dt = True, 0.0, math.inf
+        # Moving tips change their states in every pass, also where no edge breaks.
+        self._has_tip_states = criterion.tip_states is not None
+        if initial_cuts is not None:
+            self.degradation.apply_initial_cracks()
+        self._undamaged = UndamagedStress(stress, every_step=True)
+        self._snapshot: DamageSnapshot | None = None
 
     @property
     def broken_edge_patterns(self) -> npt.NDArray[np.uint8]:
-        """(cells,) broken edges of each cell."""
+        """(cells,) broken edges of each cell, one bit each."""
         return self.graph.pattern
 
     @property
     def nonfinite_cells(self) -> int:
-        """Cells of this rank whose stress was no number (crushed flat), over all passes."""
+        """Number of evaluations, on this rank, of cells so crushed that their stress is not finite."""
         return self._undamaged.not_finite
 
-    def evaluate(self) -> tuple[Values, Values]:
-        """Cauchy stress (cells, 3 or 6) in Pa and energy density (cells,) in J/m^3 of the undamaged material."""
+    def evaluate_undamaged_stress(self) -> tuple[Values, Values]:
+        """Return Cauchy stress (cells, 3 or 6), Pa, and energy density (cells,), J/m^3, without damage."""
         return self._undamaged()
 
     def begin_step(self, t: float, dt: float) -> None:
-        """A step of dt (s) from t on is solved: no more passes than cracks have time for, nor more let go."""
-        self.degradation.begin(t, dt)
+        """Prepare a step of `dt` (s) from `t`: its number of passes, and the energy that may be released in it."""
+        self.degradation.begin_step(t, dt)
         self._now, self._dt = t + dt, dt
-        if self._pace is not None:
-            self.max_passes = max(1, math.ceil(self._pace * dt))
-            self._due = math.floor(self._pace * (t + dt)) > math.floor(self._pace * t)
+        if self._passes_per_second is not None:
+            self.max_passes = max(1, math.ceil(self._passes_per_second * dt))
+            # Passes are due at multiples of the period: a step without such a time has none.
+            self._is_due = math.floor(self._passes_per_second * (t + dt)) > math.floor(self._passes_per_second * t)
 
     def set_rates(self, v: Values, a: Values) -> None:
-        """The body that the next pass looks at moves so: (owned dofs,) in m/s and m/s^2."""
-        self.criterion.moving(v, a, self._now, self._dt)
+        """Store velocity (owned dofs,) in m/s and acceleration in m/s^2 for the next pass."""
+        self.criterion.set_motion(v, a, self._now, self._dt)
 
-    def __call__(self) -> PassResult:
-        """One pass on the current displacement (collective)."""
-        stress, psi = self.evaluate()
-        broken, weakened = self._broken(stress, psi) if self._due else (0, 0)
-        if broken and self.degradation.idle:
+    def __call__(self) -> FracturePassResult:
+        """Carry out one pass at the present displacement (collective)."""
+        stress, psi = self.evaluate_undamaged_stress()
+        broken, weakened = self._weaken_failing_edges(stress, psi) if self._is_due else (0, 0)
+        if broken and self.degradation.breaks_idle_edges:
             broken += self.graph.break_unloaded_edges()
-        before = [each.x.array.copy() for each in self.stress.damage_fields] if broken else []
-        lost = self.degradation(weakened > 0, stress, psi)
-        if weakened or lost.loss or self._restless:
-            self.changed()
-        return PassResult(broken, lost.loss, lost.released, lost.elastic, lost.died, before)
+        before = [damage.x.array.copy() for damage in self.stress.damage_fields] if broken else []
+        release = self.degradation(weakened > 0, stress, psi)
+        if weakened or release.chi_drop or self._has_tip_states:
+            self.mark_changed()
+        return FracturePassResult(
+            broken, release.chi_drop, release.released, release.elastic, release.exhausted, before
+        )
 
-    def _broken(self, stress: Values, psi: Values) -> tuple[int, int]:
-        """Weaken what fails: how many edges broke, and how many lost anything (collective)."""
+    def _weaken_failing_edges(self, stress: Values, psi: Values) -> tuple[int, int]:
+        """Weaken the edges that fail; return the numbers of broken and of weakened edges (collective)."""
         edges, load = self.criterion(stress, psi)
-        if self._joining is not None:
-            fail = self._joining(edges, stress)
-            edges, load = edges[fail], load[fail]
-        return self._weaken(edges, load)
-
-    def _weaken(self, edges: npt.NDArray[np.integer], load: Values) -> tuple[int, int]:
-        """Give edges (n,) under a load (n,), in units of their strength, what the law leaves them.
-
-        Returns how many broke, and how many lost anything (collective).
-        """
-        kept = self.law(load)
+        if self._node_attachment is not None:
+            fails = self._node_attachment(edges, stress)
+            edges, load = edges[fails], load[fails]
+        integrity = self.law(load)
         if self.law.all_or_nothing:
             flags = np.zeros(len(self.graph.broken), bool)
-            flags[edges[kept == 0]] = True
+            flags[edges[integrity == 0]] = True
             return (self.graph.break_edges(flags),) * 2
-        left = np.ones(len(self.graph.broken))
-        np.minimum.at(left, edges, kept)
-        return self.graph.weaken(left)
+        lowered = np.ones(len(self.graph.broken))
+        np.minimum.at(lowered, edges, integrity)
+        return self.graph.weaken(lowered)
 
-    # --- what it remembers ---
+    # --- history variables ---
 
-    def changed(self) -> None:
-        """Damage is not what `memory` gave last: edges were weakened from elsewhere."""
-        self._memory = None
+    def mark_changed(self) -> None:
+        """Mark damage as different from the last snapshot."""
+        self._snapshot = None
 
     def damage_restored(self) -> None:
-        """Edges and chi were read from a checkpoint: bring the other fields of damage to them."""
-        self.degradation.restore()
-        self.changed()
+        """Recompute the damage fields from edges and chi that were read from a checkpoint."""
+        self.degradation.update_from_graph()
+        self.mark_changed()
 
-    def snapshot(self) -> Damage:
-        """Copies of the damage of now, on this rank; the same object until something changes."""
-        if self._memory is None:
-            fields = [each.x.array.copy() for each in self.stress.damage_fields]
-            self._memory = Damage(self.graph.integrity.copy(), fields, self.criterion.memory())
-        return self._memory
+    def snapshot(self) -> DamageSnapshot:
+        """Return copies of the damage of this rank; the same object until something changes."""
+        if self._snapshot is None:
+            fields = [damage.x.array.copy() for damage in self.stress.damage_fields]
+            self._snapshot = DamageSnapshot(self.graph.integrity.copy(), fields, self.criterion.snapshot())
+        return self._snapshot
 
     def restore(self, saved: object) -> bool:
-        """Be damaged as `memory` says; whether that is anything else than now."""
-        assert isinstance(saved, Damage)
-        if saved is self._memory:
+        """Restore the damage that `snapshot` returned; returns True if it changed."""
+        assert isinstance(saved, DamageSnapshot)
+        if saved is self._snapshot:
             return False
         self.graph.set_integrity(saved.integrity)
         self.stress.exchange_damage(saved.fields)
-        self.criterion.recall(saved.criterion)
-        self._memory = saved
+        self.criterion.restore(saved.criterion)
+        self._snapshot = saved
         return True

@@ -1,4 +1,4 @@
-"""Cracks that are there before the start: which edges they cut, and where."""
+"""Initial cracks: the edges that `[[crack]]` cuts before the start, and the positions of the cuts."""
 
 from __future__ import annotations
 
@@ -17,73 +17,80 @@ Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.integer]
 Values = npt.NDArray[np.float64]
 
-CLOSEST = 0.02  # share of an edge that is left at either end of a cut: no slivers of surface
-ON = 1e-9  # of the body's size: nodes as near as this to a crack lie on one side of it
+# Least share of an edge between a cut and its ends, against sliver triangles of the split surface.
+MIN_CUT_SHARE = 0.02
+# Nodes nearer to the plane of a crack than this share of the body's size count as nodes on one side of it.
+ON_PLANE_TOLERANCE = 1e-9
 
 
 def cut_edges(graph: EdgeGraph, crack: CrackPlane) -> Values:
-    """(edges,) where the crack cuts local edges, from the end that comes first in the input mesh; NaN elsewhere
-    (collective).
+    """Return the cut positions (edges,) of local edges, NaN where the crack does not cut (collective).
 
-    In the plane edges that it crosses: it ends where it enters the cell in which its end lies. In space by cells, since
-    one whose edges it crosses in part only does not come apart, and a crack would be some 0.4 h short all around.
+    A position is 0 at the end that comes first in the input mesh and 1 at the other. In 2D the crack cuts the edges
+    that it crosses, so that it ends where it enters its last cell. In 3D it cuts whole cells: a cell with some of its
+    crossed edges cut would not be split, and the crack would be about 0.4 h short along its front.
     """
-    domain, slack = graph.domain, ON * graph.domain.size
-    corners = domain.nodes[ends_in_order(graph)]
-    height = (corners - crack.point) @ crack.normal
-    height[np.abs(height) <= slack] = 0.0
+    domain, tolerance = graph.domain, ON_PLANE_TOLERANCE * graph.domain.size
+    ends = domain.nodes[edge_ends_in_input_order(graph)]
+    height = (ends - crack.point) @ crack.normal
+    height[np.abs(height) <= tolerance] = 0.0
     crossed = (height[:, 0] >= 0) != (height[:, 1] >= 0)
     share = np.divide(height[:, 0], height[:, 0] - height[:, 1], out=np.zeros(len(height)), where=crossed)
-    places = corners[:, 0] + share[:, None] * (corners[:, 1] - corners[:, 0])
+    points = ends[:, 0] + share[:, None] * (ends[:, 1] - ends[:, 0])
     if domain.dim == 2:
-        crossed[crossed] = crack.contains(places[crossed], slack)
+        crossed[crossed] = crack.contains(points[crossed], tolerance)
     else:
-        crossed = graph.any_over_ranks(_through(graph.cell_edges, crossed, places, crack, slack))
-    return np.where(crossed, np.clip(share, CLOSEST, 1 - CLOSEST), np.nan)
+        crossed = graph.any_over_ranks(_edges_of_cut_cells(graph.cell_edges, crossed, points, crack, tolerance))
+    return np.where(crossed, np.clip(share, MIN_CUT_SHARE, 1 - MIN_CUT_SHARE), np.nan)
 
 
-def _through(cell_edges: Ints, crossed: Flags, places: Values, crack: CrackPlane, slack: float) -> Flags:
-    """(edges,) those of `crossed`, at `places` (edges, 3), of the cells that a crack cuts through: those in which the
-    middle of what its plane cuts belongs to it."""
+def _edges_of_cut_cells(cell_edges: Ints, crossed: Flags, points: Values, crack: CrackPlane, tolerance: float) -> Flags:
+    """Flag the crossed edges (edges,) of the cells that a crack cuts.
+
+    It cuts a cell if the mean of the points (edges, 3) at which its plane crosses the cell's edges lies in the crack.
+    """
     edges = cell_edges[crossed[cell_edges].any(axis=1)]
-    through = crossed[edges]
-    middle = np.einsum("nk,nki->ni", through, places[edges]) / through.sum(axis=1, keepdims=True)
-    cut = through & crack.contains(middle, slack)[:, None]
+    crossed_here = crossed[edges]
+    middle = np.einsum("nk,nki->ni", crossed_here, points[edges]) / crossed_here.sum(axis=1, keepdims=True)
+    cut = crossed_here & crack.contains(middle, tolerance)[:, None]
     flags = np.zeros_like(crossed)
     flags[edges[cut]] = True
     return flags
 
 
-def ends_in_order(graph: EdgeGraph) -> npt.NDArray[np.int32]:
-    """(edges, 2) local nodes of owned and ghost edges, the one that comes first in the input mesh first."""
+def edge_ends_in_input_order(graph: EdgeGraph) -> npt.NDArray[np.int32]:
+    """Return the nodes (edges, 2) of owned and ghost edges, the lower node of the input mesh first."""
     ends = graph.edge_nodes
     swap = graph.domain.node_input[ends[:, 0]] > graph.domain.node_input[ends[:, 1]]
     return np.where(swap[:, None], ends[:, ::-1], ends)
 
 
-def open_cracks(graph: EdgeGraph, cracks: Sequence[CrackPlane], *, in_one: bool) -> Values:
-    """Break the edges that cracks cut; returns where, as `cut_edges` (collective).
+def open_initial_cracks(graph: EdgeGraph, cracks: Sequence[CrackPlane], *, keep_connected: bool) -> Values:
+    """Break the edges that cracks cut; return the cut positions (edges,), NaN elsewhere (collective).
 
-    `in_one`: the body must stay in as many pieces as it is, as one without inertia has to.
+    Args:
+        graph: edges of the body; they are broken in place.
+        cracks: the cracks, in the order of the study.
+        keep_connected: refuse cracks that cut off a fragment, which has no equilibrium without inertia.
 
     Raises:
-        InputError: a crack cuts no edge, or cuts the body in two where it must not.
+        InputError: a crack cuts no edge, or cuts the body in two although `keep_connected`.
     """
-    domain, cut = graph.domain, np.full(len(graph.broken), np.nan)
+    domain, positions = graph.domain, np.full(len(graph.broken), np.nan)
     for crack in cracks:
-        before = find_fragments(graph).count if in_one else 0
-        own = cut_edges(graph, crack)
-        if not sum_over_ranks(domain.comm, np.count_nonzero(~np.isnan(own)))[0]:
+        fragments_before = find_fragments(graph).count if keep_connected else 0
+        crack_positions = cut_edges(graph, crack)
+        if not sum_over_ranks(domain.comm, np.count_nonzero(~np.isnan(crack_positions)))[0]:
             raise InputError(
                 f"{crack.name} cuts no edge of the mesh: it lies outside the body, which spans {domain.extent()}, or "
                 "is shorter than the cells there"
             )
-        new = np.isnan(cut) & ~np.isnan(own)
-        cut[new] = own[new]
-        graph.break_edges(~np.isnan(own))
-        if in_one and find_fragments(graph).count > before:
+        new = np.isnan(positions) & ~np.isnan(crack_positions)
+        positions[new] = crack_positions[new]
+        graph.break_edges(~np.isnan(crack_positions))
+        if keep_connected and find_fragments(graph).count > fragments_before:
             raise InputError(
                 f"{crack.name} cuts the body in two, and quasi-static loads have no answer for a piece that comes off; "
                 "make it shorter, or choose a time.scheme with inertia"
             )
-    return cut
+    return positions

@@ -1,31 +1,17 @@
-"""Nodes that a pass would leave without a whole cell stay with the neighbours that hold them best.
+"""Node retention: no node becomes a single-node fragment because all of its cells were split.
 
-A node all of whose cells have come apart carries nothing and is a crumb of its own, on any mesh: no debris, but an
-artefact of it. So of the edges that fail those of one cell are spared for each such node: of the cell
+A node all of whose cells are split carries nothing and would be a fragment of its own on any mesh. It is no debris but
+an artefact of the mesh. Two rules avoid it:
 
-    with the fewest failing edges that the node is no end of, so that the others are of one side,
-    and of those the one that is loaded least,
-
-as a surface that would leave a node without a whole cell passes on its other side (docs/theory.md#node-retention).
-What holds nodes of both sides is pulled apart by them and feels so itself, whatever the average says: beyond `limit`
-times its strength a cell holds no longer, and what it held may be a crumb all the same.
-
-Nodes that a pass leaves without a whole cell stay joined to the neighbour that holds them best: none is a crumb.
-
-A node all of whose cells have come apart carries nothing: on its own it would be a piece, on any mesh, and no debris.
-Of the edges that still held it before the pass one does not break: the one that is loaded least, by what its cells feel
-themselves. Where nodes hang on one another each group of them keeps the least loaded edge that leads out of it, until
-it hangs on a node with a whole cell, and on no more than one: what a crack parts is not joined by it (Boruvka's rule
-for a spanning forest). So cells that have come apart stay so, and mechanics follow from what a joined node hangs on
-(mechanics.node_ties).
-
-Nodes whose motion is prescribed are held by it, and by one another where no edge between them fails: a group of two and
-more of them, what is left on a grip that something has snapped off, may be a piece of its own.
+- `CellRetention` spares the failing edges of one cell for each such node, so that the node keeps an unsplit cell.
+- `NodeAttachment` spares one edge, so that the node stays attached to its best loaded neighbour (mechanics.node_ties).
 
 Equations: docs/theory.md#node-retention.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -37,177 +23,237 @@ from ..mesh.parallel import allgather, sum_over_ranks
 from ..mesh.simplices import is_split, local_edges
 from ..meshes.components import components
 from .criterion import OverloadedEdges
-from .edge_stress import Simplices
-from .strength import Strength
+from .edge_stress import EdgeStressOperator
+from .strength import EdgeStrength
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-LIMIT = 5.0  # of the strength, by what a cell feels itself
-DIGITS = 9  # of loads that are told apart: equal ones go by the numbers of the input, whatever the ranks
-ROUNDS = 2  # nodes beside a crack, then those that only what was spared for them holds
-HELD = -np.inf  # the load of an edge that joins already, or both ends of which move as they are told
 
 
-class Holding:
-    """A criterion without the edges that keep a node from being a crumb.
+@dataclass(frozen=True)
+class RetentionParameters:
+    """Parameters of cell retention.
 
     Attributes:
-        strength: of each edge in each cell.
+        max_cell_load: load over strength, by the local stress of a cell, beyond which the cell is split all the same:
+            its nodes are pulled apart by both sides of the crack, whatever the average says.
+        load_digits: decimal digits of loads that are compared. Equal loads are ordered by the numbers of the input
+            mesh, so that rounding does not decide in a uniform field.
+        rounds: first the nodes beside a crack are retained, then those that depend on cells spared for them.
     """
 
-    cut = carried = None
+    max_cell_load: float = 5.0
+    load_digits: int = 9
+    rounds: int = 2
 
-    def __init__(self, failing: OverloadedEdges, stress: Stress, graph: EdgeGraph, limit: float = LIMIT) -> None:
-        self._failing, self._cells, self._graph, self._limit = failing, Simplices.of(stress), graph, limit
+
+RETENTION = RetentionParameters()
+# Load of an edge that attaches already, or both ends of which are prescribed: it comes first in every comparison.
+ATTACHED = -np.inf
+
+
+def _flag_unsplit_after(graph: EdgeGraph, fails: Flags) -> Flags:
+    """Flag the cells (cells,) that are not split once the edges in `fails` (edges,) break as well."""
+    bits = 1 << np.arange(graph.cell_edges.shape[1])
+    return ~is_split(graph.domain.dim)[graph.pattern | (fails[graph.cell_edges] @ bits).astype(np.uint8)]
+
+
+class CellRetention:
+    """A criterion without the failing edges of cells that nodes need to keep an unsplit cell.
+
+    Of the cells of such a node that one is spared which has the fewest failing edges that do not end in the node, and
+    of equal ones the least loaded. So the crack passes on the other side of the node.
+
+    Attributes:
+        strength: strength of each edge in each cell, Pa.
+    """
+
+    cut_positions = tip_states = None
+
+    def __init__(
+        self,
+        failing: OverloadedEdges,
+        stress: Stress,
+        graph: EdgeGraph,
+        max_cell_load: float = RETENTION.max_cell_load,
+    ) -> None:
+        """Restrict the criterion `failing`; `max_cell_load` as in `RetentionParameters` (collective)."""
+        self._failing, self._graph, self._max_cell_load = failing, graph, max_cell_load
+        self._edge_stress = EdgeStressOperator.from_stress(stress)
         self.strength = failing.strength
         domain = graph.domain
-        self._map = domain.space.dofmap.index_map
-        self._around = NodeCellCount(domain)
+        self._node_map = domain.space.dofmap.index_map
+        self._cells_around = NodeCellCount(domain)
         pairs = local_edges(domain.dim)
-        self._of_node = np.array([(pairs == node).any(axis=1) for node in range(domain.dim + 1)])  # (d + 1, edges)
+        # (d + 1, edges) local edges that end in each local node
+        self._node_edges = np.array([(pairs == node).any(axis=1) for node in range(domain.dim + 1)])
 
     def __call__(self, stress: Values, psi: Values) -> tuple[Ints, Values]:
-        """(n,) local edges that fail and are not spared, and their loads (collective)."""
+        """Find the local edges (n,) that fail and are not spared, and their loads (n,) (collective)."""
         graph = self._graph
         edges, load = self._failing(stress, psi)
         fails = np.zeros(len(graph.broken), bool)
         fails[edges] = True
         fails = graph.any_over_ranks(fails) & ~graph.broken
         if graph.domain.comm.allreduce(int(fails.any())):
-            for _ in range(ROUNDS):
-                fails &= ~self._spared(fails, stress)
-        kept = fails[edges]
-        return edges[kept], load[kept]
+            for _ in range(RETENTION.rounds):
+                fails &= ~self._spared_edges(fails, stress)
+        still_fails = fails[edges]
+        return edges[still_fails], load[still_fails]
 
-    def moving(self, v: Values, a: Values, now: float, dt: float) -> None:
-        """Stress is all that counts."""
+    def set_motion(self, v: Values, a: Values, now: float, dt: float) -> None:
+        """Do nothing: the criterion depends on the stress alone."""
 
-    def memory(self) -> object:
-        """Nothing."""
+    def snapshot(self) -> object:
+        """Return None: the criterion has no history."""
         return None
 
-    def recall(self, memory: object) -> None:
-        """Nothing."""
+    def restore(self, memory: object) -> None:
+        """Do nothing: the criterion has no history."""
 
-    def _spared(self, fails: Flags, stress: Values) -> Flags:
-        """(edges,) those of the cells that keep a node, of the edges that are to fail (edges,) (collective)."""
+    def _spared_edges(self, fails: Flags, stress: Values) -> Flags:
+        """Flag the edges (edges,) of the cells that retain a node, given the failing edges (collective)."""
         graph = self._graph
-        of_cell = fails[graph.cell_edges]
+        cell_fails = fails[graph.cell_edges]
         before = ~graph.split
-        bits = 1 << np.arange(graph.cell_edges.shape[1])
-        after = before & ~is_split(graph.domain.dim)[graph.pattern | (of_cell @ bits).astype(np.uint8)]
-        endangered = (self._around(before) > 0) & (self._around(after) == 0)
+        after = before & _flag_unsplit_after(graph, fails)
+        endangered = (self._cells_around(before) > 0) & (self._cells_around(after) == 0)
         cells = np.flatnonzero(before & endangered[graph.cell_nodes].any(axis=1))
-        own = self._own_load(cells, stress, of_cell[cells])
-        cells, own = cells[own < self._limit], own[own < self._limit]
+        load = self._cell_load(cells, stress, cell_fails[cells])
+        cells, load = cells[load < self._max_cell_load], load[load < self._max_cell_load]
         spared = np.zeros(len(fails), bool)
-        spared[graph.cell_edges[self._chosen(cells, own, of_cell[cells], endangered)]] = True
+        spared[graph.cell_edges[self._choose_cells(cells, load, cell_fails[cells], endangered)]] = True
         return graph.any_over_ranks(spared)
 
-    def _own_load(self, cells: Ints, stress: Values, fails: Flags) -> Values:
-        """(n,) the greatest load over strength of the failing edges (n, edges) of cells, by what these feel
-        themselves."""
-        along = self._cells.normal_stress(cells, stress[cells])
+    def _cell_load(self, cells: Ints, stress: Values, fails: Flags) -> Values:
+        """Return the largest load over strength (n,) of the failing edges (n, edges) of cells, by local stress."""
+        normal_stress = self._edge_stress.normal_stress(cells, stress[cells])
         strength = self.strength(cells, self._graph.cell_edges[cells])
-        return np.asarray(np.where(fails, along / strength, 0.0).max(axis=1, initial=0.0))
+        return np.asarray(np.where(fails, normal_stress / strength, 0.0).max(axis=1, initial=0.0))
 
-    def _chosen(self, cells: Ints, own: Values, fails: Flags, endangered: Flags) -> Ints:
-        """Of cells (n,) under their own loads (n,) those that keep a node: one for each that there is one for."""
+    def _choose_cells(self, cells: Ints, load: Values, fails: Flags, endangered: Flags) -> Ints:
+        """Choose, of cells (n,) under loads (n,), one for each endangered node that has any."""
         nodes = self._graph.cell_nodes[cells].astype(np.int64)
-        across = (fails[:, None] & ~self._of_node).sum(axis=2)  # (n, d + 1): failing edges beside the node's own
-        share = np.round(own / self._limit, DIGITS)  # in a uniform field cells are equal but for round-off
+        # (n, d + 1) failing edges of the cell that do not end in the node: they are of the crack's other side
+        across = (fails[:, None] & ~self._node_edges).sum(axis=2)
+        share = np.round(load / self._max_cell_load, RETENTION.load_digits)
         key = np.where(endangered[nodes], across + 0.5 * share[:, None], np.inf)
-        at = np.isfinite(key) & (key == self._least(nodes, key)[nodes])
-        first = np.where(at, self._graph.domain.cell_input[cells][:, None].astype(float), np.inf)  # of equals one
-        return np.asarray(cells[(at & (first == self._least(nodes, first)[nodes])).any(axis=1)])
+        is_best = np.isfinite(key) & (key == self._least_at_nodes(nodes, key)[nodes])
+        # Of cells with equal keys the first of the input mesh is chosen.
+        number = np.where(is_best, self._graph.domain.cell_input[cells][:, None].astype(float), np.inf)
+        is_first = number == self._least_at_nodes(nodes, number)[nodes]
+        return np.asarray(cells[(is_best & is_first).any(axis=1)])
 
-    def _least(self, nodes: Ints, values: Values) -> Values:
-        """(nodes,) the least of `values` (n, d + 1) at `nodes` on all ranks."""
-        result = np.full(self._map.size_local + self._map.num_ghosts, np.inf)
+    def _least_at_nodes(self, nodes: Ints, values: Values) -> Values:
+        """Return the least (nodes,) of `values` (n, d + 1) at `nodes` (n, d + 1) over all ranks."""
+        result = np.full(self._node_map.size_local + self._node_map.num_ghosts, np.inf)
         np.minimum.at(result, nodes, values)
-        return self._graph.min_over_ranks(result, self._map)
+        return self._graph.min_over_ranks(result, self._node_map)
 
 
-class Joining:
-    """Spares, of edges that fail, those that nodes without a whole cell stay joined by."""
+class NodeAttachment:
+    """Spares one failing edge for each node without an unsplit cell, by which the node stays attached.
+
+    It is the least loaded edge, by the local stress of its cells, of those that attached the node before the pass.
+    Nodes that are attached to one another form a group. Each group keeps the least loaded edge that leads out of it,
+    until it is attached to a node with an unsplit cell, and no more than one, so that no edge joins the two sides of a
+    crack (Boruvka's rule for a spanning forest). Nodes with prescribed motion are attached by it, and by one another
+    where no edge between them fails; two or more of them may be a fragment of their own.
+    """
 
     def __init__(
-        self, stress: Stress, graph: EdgeGraph, strength: Strength, held: Flags, *, cracks: bool = False
+        self, stress: Stress, graph: EdgeGraph, strength: EdgeStrength, prescribed: Flags, *, cracks: bool = False
     ) -> None:
-        """`held`: (nodes,) whose motion is prescribed, ghosts too; `cracks` cut what fails: it joins last."""
-        self._cells, self._graph, self._strength, self._held = Simplices.of(stress), graph, strength, held
-        self._cracks = cracks
-        self._both: Flags = np.asarray(held[graph.edge_nodes].all(axis=1))
-        self._around = NodeCellCount(graph.domain)
+        """Build the rule.
+
+        Args:
+            stress: stress of the body.
+            graph: edges of the body; the spared ones are stored in it.
+            strength: strength of edges.
+            prescribed: (nodes,) nodes whose motion is prescribed, with ghosts.
+            cracks: failing edges are cut by cracks, so that other edges are spared first.
+        """
+        self._edge_stress, self._graph = EdgeStressOperator.from_stress(stress), graph
+        self._strength, self._prescribed, self._cracks = strength, prescribed, cracks
+        self._is_prescribed_edge: Flags = np.asarray(prescribed[graph.edge_nodes].all(axis=1))
+        self._cells_around = NodeCellCount(graph.domain)
 
     def __call__(self, edges: npt.NDArray[np.integer], stress: Values) -> Flags:
-        """(n,) which of the edges (n,) that fail do so, and which idle ones the graph keeps, under the stress (cells,
-        3 or 6) that cells feel themselves, Pa (collective)."""
+        """Flag, of the edges (n,) that fail, those that break; store the spared ones in the graph (collective).
+
+        `stress` is the local stress (cells, 3 or 6), Pa.
+        """
         graph = self._graph
         fails = np.zeros(len(graph.broken), bool)
         fails[edges] = True
         fails = graph.any_over_ranks(fails) & ~graph.broken
         if sum_over_ranks(graph.domain.comm, np.count_nonzero(fails))[0]:
-            whole = np.zeros(len(fails), bool)
-            whole[graph.cell_edges[~graph.split]] = True
-            joined = ~graph.broken & ~graph.any_over_ranks(whole)
-            kept = (self._both & ~fails) | joined | self._found(fails, joined, stress)
-            graph.retained, fails = kept, fails & ~kept
+            in_unsplit_cell = np.zeros(len(fails), bool)
+            in_unsplit_cell[graph.cell_edges[~graph.split]] = True
+            attaching = ~graph.broken & ~graph.any_over_ranks(in_unsplit_cell)
+            spared = self._attaching_edges(fails, attaching, stress)
+            retained = (self._is_prescribed_edge & ~fails) | attaching | spared
+            graph.retained, fails = retained, fails & ~retained
         return np.asarray(fails[edges])
 
-    def _found(self, fails: Flags, joined: Flags, stress: Values) -> Flags:
-        """(edges,) that nodes are to be joined by once edges (edges,) break; `joined`: by which some are."""
+    def _attaching_edges(self, fails: Flags, attaching: Flags, stress: Values) -> Flags:
+        """Flag the edges (edges,) that attach nodes once `fails` (edges,) break; `attaching` do so already."""
         graph = self._graph
-        bits = 1 << np.arange(graph.cell_edges.shape[1])
-        after = ~is_split(graph.domain.dim)[graph.pattern | (fails[graph.cell_edges] @ bits).astype(np.uint8)]
-        without = self._around(after) == 0
-        if not sum_over_ranks(graph.domain.comm, np.count_nonzero(without & (self._around(~graph.split) > 0)))[0]:
+        without_cell = self._cells_around(_flag_unsplit_after(graph, fails)) == 0
+        has_cell = self._cells_around(~graph.split) > 0
+        if not sum_over_ranks(graph.domain.comm, np.count_nonzero(without_cell & has_cell))[0]:
             return np.zeros(len(fails), bool)
-        at = np.flatnonzero(~graph.broken & without[graph.edge_nodes].any(axis=1))
-        load = self._loads(at, without, stress)
+        candidates = np.flatnonzero(~graph.broken & without_cell[graph.edge_nodes].any(axis=1))
+        load = self._edge_loads(candidates, without_cell, stress)
         if self._cracks:
-            load[fails[at]] = np.finfo(float).max
-        load[joined[at] | (self._both & ~fails)[at]] = HELD
-        keys, ends = graph.edge_keys(at), graph.edge_nodes[at]
+            load[fails[candidates]] = np.finfo(float).max
+        load[attaching[candidates] | (self._is_prescribed_edge & ~fails)[candidates]] = ATTACHED
+        keys, ends = graph.edge_keys(candidates), graph.edge_nodes[candidates]
         swapped = graph.domain.node_input[ends[:, 0]] != keys[:, 0]
         ends[swapped] = ends[swapped, ::-1]
-        parts = allgather(graph.domain.comm, (keys, load, without[ends], self._held[ends]))
-        return graph.flags_of_keys(_forest(*(np.concatenate(each) for each in zip(*parts, strict=True))))
+        parts = allgather(graph.domain.comm, (keys, load, without_cell[ends], self._prescribed[ends]))
+        return graph.flags_of_keys(_spanning_forest(*(np.concatenate(column) for column in zip(*parts, strict=True))))
 
-    def _loads(self, edges: Ints, without: Flags, stress: Values) -> Values:
-        """(n,) the greatest load over strength of edges (n,) in cells of this rank that have been whole, by what these
-        feel themselves; -max where there is none."""
+    def _edge_loads(self, edges: Ints, without_cell: Flags, stress: Values) -> Values:
+        """Return the largest load over strength (n,) of edges in unsplit cells of this rank; -max without any."""
         graph = self._graph
-        cells = np.flatnonzero(~graph.split & without[graph.cell_nodes].any(axis=1))
-        along = self._cells.normal_stress(cells, stress[cells])
+        cells = np.flatnonzero(~graph.split & without_cell[graph.cell_nodes].any(axis=1))
+        normal_stress = self._edge_stress.normal_stress(cells, stress[cells])
         result = np.full(len(graph.broken), -np.finfo(float).max)
-        np.maximum.at(result, graph.cell_edges[cells], along / self._strength(cells, graph.cell_edges[cells]))
+        np.maximum.at(result, graph.cell_edges[cells], normal_stress / self._strength(cells, graph.cell_edges[cells]))
         return np.asarray(result[edges])
 
 
-def _forest(keys: Ints, load: Values, without: Flags, held: Flags) -> Ints:
-    """(m, 2) keys of the edges that join, of edges with keys (n, 2), some of them more than once, and of their ends
-    (n, 2) which are `without` a whole cell and whose motion is prescribed."""
-    order = np.lexsort((-load, keys[:, 1], keys[:, 0]))  # of one edge the greatest load that a rank has for it
+def _spanning_forest(keys: Ints, load: Values, without_cell: Flags, prescribed: Flags) -> Ints:
+    """Return the keys (m, 2) of the least loaded edges that attach all nodes (Boruvka's algorithm).
+
+    Args:
+        keys: (n, 2) end nodes of candidate edges, which several ranks may give.
+        load: (n,) their loads.
+        without_cell: (n, 2) which ends have no unsplit cell.
+        prescribed: (n, 2) which ends have a prescribed motion.
+    """
+    # Of the rows of one edge the largest load counts.
+    order = np.lexsort((-load, keys[:, 1], keys[:, 0]))
     keys, first = np.unique(keys[order], axis=0, return_index=True)
-    load, without, held = load[order][first], without[order][first], held[order][first]
+    load, without_cell, prescribed = load[order][first], without_cell[order][first], prescribed[order][first]
     nodes, ends = np.unique(keys, return_inverse=True)
     ends = ends.reshape(-1, 2)
-    whole, moved = np.ones(len(nodes), bool), np.zeros(len(nodes), bool)
-    whole[ends], moved[ends] = ~without, held
-    chosen = load == HELD
+    has_cell, is_prescribed = np.ones(len(nodes), bool), np.zeros(len(nodes), bool)
+    has_cell[ends], is_prescribed[ends] = ~without_cell, prescribed
+    chosen = load == ATTACHED
     rank = np.empty(len(load), np.int64)
     rank[np.argsort(load, kind="stable")] = np.arange(len(load))
     while True:
-        count, part = components(ends[chosen], len(nodes))
-        size, prescribed = np.bincount(part, minlength=count), np.bincount(part, moved, count) > 0
-        hangs = (np.bincount(part, whole, count) == 0) & ~(prescribed & (size > 1))
-        way = part[ends]
-        out = (way[:, 0] != way[:, 1])[:, None] & hangs[way]
+        count, group = components(ends[chosen], len(nodes))
+        size, has_prescribed = np.bincount(group, minlength=count), np.bincount(group, is_prescribed, count) > 0
+        unattached = (np.bincount(group, has_cell, count) == 0) & ~(has_prescribed & (size > 1))
+        groups = group[ends]
+        leads_out = (groups[:, 0] != groups[:, 1])[:, None] & unattached[groups]
         best = np.full(count, len(load))
-        np.minimum.at(best, way[out], np.broadcast_to(rank[:, None], way.shape)[out])
-        new = ((best[way] == rank[:, None]) & out).any(axis=1)
+        np.minimum.at(best, groups[leads_out], np.broadcast_to(rank[:, None], groups.shape)[leads_out])
+        new = ((best[groups] == rank[:, None]) & leads_out).any(axis=1)
         if not new.any():
             return np.asarray(keys[chosen])
         chosen |= new

@@ -1,24 +1,29 @@
-"""Non-local average over cells: a sparse matrix with one row per owned cell, exact across rank boundaries.
+"""Averages of cell values over neighbouring cells: within a radius, or over the cells that share a node.
 
-    <s>_c = sum_k w_ck s_k / sum_k w_ck,   w_ck = V_k g(|X_k - X_c| / R),   |X_k - X_c| <= R
+`NonlocalAverage` (M22, eq. 13) is a sparse matrix with one row per owned cell,
 
-with reference centroids X and volumes V (M22 eq. 13). Built once; a rank holds copies of the cells of other ranks
-within R of its own. Where all rows would take gigabytes (fine meshes: the weights of a radius grow as h^-6), a row is
-made when a stress near it first reaches the strength. In a pass few cells pull as hard as the bound that is asked for,
-and fewer have come apart since the last one: only rows near these are looked at.
+    <s>_c = sum_k w_ck s_k / sum_k w_ck,   w_ck = V_k g(|X_k - X_c| / R),   |X_k - X_c| <= R,
 
-Equations: docs/theory.md#edge-criterion.
+with reference centroids X, volumes V and a kernel g. `NeighbourAverage` is B07's average (section 7.1),
+
+    <s>_c = sum over nodes n of c of sum over cells k around n of V_k s_k / the same sum of V_k,
+
+so that a neighbour counts once for each node that it shares with the cell, and the cell itself d + 1 times.
+
+Both are the same on any number of ranks. Equations: docs/theory.md#edge-criterion.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from ctypes import CDLL, Structure, byref, c_double, c_int64
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from dolfinx import la
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
@@ -34,199 +39,314 @@ SOURCE = Path(__file__).with_suffix(".c")
 KERNELS: dict[str, Callable[[Values], Values]] = {
     "linear": lambda q: 1 - q,
     "constant": np.ones_like,
-    # three standard deviations fit in the radius; what lies outside (1 %) is cut off
+    # The radius is three standard deviations; the 1 % of the weight outside is cut off.
     "gaussian": lambda q: np.exp(-4.5 * q**2),
 }
 
-AT_ONCE = 5e7  # weights that a rank makes before the first step: 0.6 GB
-CHUNK = 20_000  # rows made at a time: on the way a distance takes thrice the memory of a weight
-SAMPLED = 1_000  # rows that are counted for that
+
+@dataclass(frozen=True)
+class AverageLimits:
+    """Memory limits and tolerances of the averages.
+
+    Attributes:
+        max_initial_weights: weights that a rank computes before the first step (0.6 GB). Beyond it a row is computed
+            when the stress near it first reaches the strength, since the number of weights grows as h^-6.
+        rows_per_block: rows computed at once. A distance takes three times the memory of a weight meanwhile.
+        sampled_rows: rows that are counted to estimate the number of weights.
+        bound_round_off: relative rounding error of an average that is compared with a bound.
+        near_bound_round_off: the same of cell values that decide which rows are needed.
+        radius_round_off: relative rounding error of distances that are compared with the radius.
+    """
+
+    max_initial_weights: float = 5e7
+    rows_per_block: int = 20_000
+    sampled_rows: int = 1_000
+    bound_round_off: float = 1e-12
+    near_bound_round_off: float = 1e-9
+    radius_round_off: float = 1e-9
+
+
+LIMITS = AverageLimits()
 
 
 class NonlocalAverage:
-    """The averaging matrix of a mesh for one radius (m) and kernel."""
+    """Average over the cells within a radius (m), weighted by volume and kernel.
+
+    A rank has copies of the cells of other ranks within the radius of its own.
+    """
 
     def __init__(self, domain: Domain, radius: float, kernel: str) -> None:
+        """Exchange the neighbouring cells of other ranks, and compute weights up to the memory limit (collective)."""
         self._comm = domain.comm
         centroids = domain.nodes[domain.cell_nodes].mean(axis=1)
         self._exchange = RankHalo(domain.comm, centroids, radius)
         near = self._exchange(centroids)
         volumes = self._exchange(domain.volumes[:, None])[:, 0]
+        # Sums in the order of the input mesh are the same to the last bit on any number of ranks.
         order = np.argsort(self._exchange(domain.cell_input[:, None].astype(float))[:, 0], kind="stable")
-        self._rows = _AllRows(centroids, near[order], volumes[order], order, radius, kernel)
+        self._weights = _WeightMatrix(centroids, near[order], volumes[order], order, radius, kernel)
 
     def __call__(self, values: Values, active: Flags | None = None) -> Values:
-        """Averages (cells, n) of cell values (cells, n); cells not `active` enter none. 0 where none is left."""
-        self._rows.make_all()
+        """Average cell values (cells, n); inactive cells do not enter; 0 where no active cell is near (collective)."""
+        self._weights.compute_all()
         n = values.shape[1]
         if active is not None:
             values = np.column_stack([np.where(active[:, None], values, 0.0), active])
         near = self._exchange(values)
         averages = np.zeros((len(values), n))
-        for rows in self._rows.made:
-            sums = rows.times(near)
-            weight = rows.full[:, None] if active is None else sums[:, -1:]
-            averages[rows.cells] = np.divide(sums[:, :n], weight, out=np.zeros((len(sums), n)), where=weight > 0)
+        for block in self._weights.blocks:
+            sums = block.multiply(near)
+            weight = block.row_sums[:, None] if active is None else sums[:, -1:]
+            averages[block.cells] = np.divide(sums[:, :n], weight, out=np.zeros((len(sums), n)), where=weight > 0)
         return averages
 
-    def reaching(self, values: Values, size: Values, bound: float, active: Flags | None = None) -> tuple[Ints, Values]:
-        """(m,) cells whose average may reach `bound` in size, and those averages (m, n) (collective).
+    def find_averages_above(
+        self, values: Values, norms: Values, bound: float, active: Flags | None = None
+    ) -> tuple[Ints, Values]:
+        """Find the cells (m,) whose average may reach `bound` in norm, and their averages (m, n) (collective).
 
-        `size` (cells,) is a norm of `values`: the norm of an average is at most the average of norms, which takes one
-        column where the values have six. `values` and `size` are 0 on cells that are not active.
+        The norm of an average is at most the average of the norms, which needs one column instead of six.
+
+        Args:
+            values: (cells, n), 0 on inactive cells.
+            norms: (cells,) norms of `values`, in any norm.
+            bound: value that the norm of an average is compared with.
+            active: (cells,) cells that enter averages; None: all.
         """
         n = values.shape[1]
-        if max_over_ranks(self._comm, float(np.max(size, initial=0.0))) < bound:
+        if max_over_ranks(self._comm, float(np.max(norms, initial=0.0))) < bound:
             return np.empty(0, np.int64), np.empty((0, n))
-        near, pull = self._exchange(values), self._exchange(size[:, None])[:, 0]
-        hot = pull >= bound * (1 - 1e-9)  # hairs below the bound: the sums are rounded
-        self._rows.make(hot)
-        may = self._rows.around(hot)
-        weighing = self._rows.sums(None if active is None else self._exchange(active[:, None].astype(float)))
-        blocks = [
-            rows.reaching(may, pull, weight, bound * (1 - 1e-12), near)
-            for rows, weight in zip(self._rows.made, weighing, strict=True)
+        near, near_norms = self._exchange(values), self._exchange(norms[:, None])[:, 0]
+        # The sums are rounded, so that cells slightly below the bound count as well.
+        over_bound = near_norms >= bound * (1 - LIMITS.near_bound_round_off)
+        self._weights.compute_near(over_bound)
+        candidates = self._weights.flag_centres_near(over_bound)
+        near_active = None if active is None else self._exchange(active[:, None].astype(float))
+        parts = [
+            block.find_averages_above(candidates, near_norms, sums, bound * (1 - LIMITS.bound_round_off), near)
+            for block, sums in zip(self._weights.blocks, self._weights.active_sums(near_active), strict=True)
         ]
-        found = np.concatenate([np.empty(0, np.int64), *(cells for cells, _ in blocks)])
-        averages = np.concatenate([np.empty((0, n)), *(averages for _, averages in blocks)])
-        order = np.argsort(found)
-        return found[order], averages[order]
+        cells = np.concatenate([np.empty(0, np.int64), *(cells for cells, _ in parts)])
+        averages = np.concatenate([np.empty((0, n)), *(averages for _, averages in parts)])
+        order = np.argsort(cells)
+        return cells[order], averages[order]
 
 
-class _Given(Structure):
-    """As nonlocal_average.c has it."""
+class _WeightArrays(Structure):
+    """Arrays of a sparse matrix, in the layout of nonlocal_average.c."""
 
     _fields_ = (("start", Int32), ("place", Int32), ("weight", Float64))
 
 
 @cache
 def _code() -> CDLL:
+    """Return the compiled functions of nonlocal_average.c."""
     return load_library(SOURCE, separate_rounding=True)
 
 
-class _Rows:
-    """Rows of the weights of near cells around some cells.
+class _WeightBlock:
+    """Rows of the weight matrix of some centres.
 
     Attributes:
-        cells: (n,) they.    full: (n,) sums of their weights.
+        cells: (n,) centres of the rows.
+        row_sums: (n,) sums of their weights, m^d.
     """
 
     def __init__(self, cells: Ints, weights: csr_matrix) -> None:
-        """`weights`: (n, near)."""
-        self.cells, self.full = cells, np.asarray(weights.sum(axis=1))[:, 0]
-        self._kept = np.asarray(weights.indptr, np.int32), np.asarray(weights.indices, np.int32), weights.data
-        self._given = _Given(*map(struct_pointer, self._kept))
-        self._all = np.arange(len(cells))
+        """Store the rows `weights` (n, near) of the centres `cells` (n,)."""
+        self.cells, self.row_sums = cells, np.asarray(weights.sum(axis=1))[:, 0]
+        # The C structure has addresses only: these references keep the arrays alive.
+        self._arrays = np.asarray(weights.indptr, np.int32), np.asarray(weights.indices, np.int32), weights.data
+        self._matrix = _WeightArrays(*map(struct_pointer, self._arrays))
+        self._all_rows = np.arange(len(cells))
 
-    def reaching(self, may: Flags, pull: Values, weight: Values, bound: float, values: Values) -> tuple[Ints, Values]:
-        """(m,) cells, of those that `may` (own cells,), whose average of `pull` (near,) reaches a bound, and their
-        averages (m, k) of values (near, k); `weight`: (n,) sums of weights."""
+    def find_averages_above(
+        self, candidates: Flags, norms: Values, sums: Values, bound: float, values: Values
+    ) -> tuple[Ints, Values]:
+        """Find the candidate cells (m,) whose average of `norms` reaches `bound`, and their averages (m, k).
+
+        Args:
+            candidates: (own cells,) cells that may reach the bound.
+            norms: (near,) norms of values.
+            sums: (n,) sums of the weights of active cells.
+            bound: value to reach.
+            values: (near, k) values to average.
+        """
         width, count = values.shape[1], len(self.cells)
-        found, averages = np.empty(count, np.int64), np.empty((count, width))
-        given = self.cells, may, np.ascontiguousarray(pull), weight, c_double(bound)
-        told = c_int64(width), np.ascontiguousarray(values), found, averages
-        many = _code().reaching(byref(self._given), c_int64(count), *given, *told)
-        return found[:many], averages[:many]
+        cells, averages = np.empty(count, np.int64), np.empty((count, width))
+        inputs = self.cells, candidates, np.ascontiguousarray(norms), sums, c_double(bound)
+        outputs = c_int64(width), np.ascontiguousarray(values), cells, averages
+        count = _code().reaching(byref(self._matrix), c_int64(count), *inputs, *outputs)
+        return cells[:count], averages[:count]
 
-    def mark(self, places: Flags, marks: Flags) -> None:
-        """Mark those near (near,) the own cells that are among some `places` (near,)."""
+    def mark_neighbours(self, near_flags: Flags, marks: Flags) -> None:
+        """Set `marks` (near,) of the cells that are near the flagged own cells (near,) of this block."""
         sizes = c_int64(len(self.cells)), self.cells
-        _code().mark(byref(self._given), *sizes, places, marks)
+        _code().mark(byref(self._matrix), *sizes, near_flags, marks)
 
-    def times(self, values: Values, some: Ints | None = None) -> Values:
-        """(n, k) sums over the weights of near values (near, k), of all rows or of some of them."""
-        some = self._all if some is None else some
-        found, values = np.empty((len(some), values.shape[1])), np.ascontiguousarray(values)
-        sizes = c_int64(len(some)), some, c_int64(values.shape[1])
-        _code().times(byref(self._given), *sizes, values, found)
-        return found
+    def multiply(self, values: Values, rows: Ints | None = None) -> Values:
+        """Return the weighted sums (n, k) of near values (near, k), of all rows or of `rows`."""
+        rows = self._all_rows if rows is None else rows
+        result, values = np.empty((len(rows), values.shape[1])), np.ascontiguousarray(values)
+        sizes = c_int64(len(rows)), rows, c_int64(values.shape[1])
+        _code().times(byref(self._matrix), *sizes, values, result)
+        return result
 
 
-class _AllRows:
-    """Weights of near cells around `centres`: all of them at once, or row by row where they would be too many.
-
-    Each row has its weights in the order of the input mesh: the same order of summation at any rank count.
+class _WeightMatrix:
+    """Weights of near cells around centres, computed at once or row by row if they are too many.
 
     Attributes:
-        made: one block after the other. They are never joined: that would take their memory once more.
+        blocks: blocks of rows. They are never joined, which would need their memory once more.
     """
 
     def __init__(
-        self, centres: Values, near: Values, volumes: Values, places: Ints, radius: float, kernel: str
+        self, centres: Values, near: Values, volumes: Values, positions: Ints, radius: float, kernel: str
     ) -> None:
-        """`near`, `volumes`: centroids and volumes of near cells in that order, `places` (near,) where values have
-        them, the centres first."""
-        self._places = places
-        self._centres, self._near, self._volumes, self._radius, self._kernel = centres, near, volumes, radius, kernel
+        """Build the matrix.
+
+        Args:
+            centres: (centres, d) centroids of the cells of this rank, m.
+            near: (near, d) centroids of these and of near cells, in the order of the input mesh, m.
+            volumes: (near,) their volumes, m^d.
+            positions: (near,) their positions in exchanged values, where the cells of this rank come first.
+            radius: radius of the average, m.
+            kernel: name of the kernel.
+        """
+        self._positions, self._centres, self._near, self._volumes = positions, centres, near, volumes
+        self._radius, self._kernel = radius, kernel
         self._tree = cKDTree(near)
         self._missing = np.ones(len(centres), bool)
-        self._border = np.zeros(len(centres), bool)  # with cells of other ranks within the radius
-        self.made: list[_Rows] = []
+        # Centres with cells of other ranks within the radius.
+        self._near_other_rank = np.zeros(len(centres), bool)
+        self.blocks: list[_WeightBlock] = []
         self._active: Values = np.ones((len(near), 1))
-        self._sums: list[Values] = []
-        if self._expected() <= AT_ONCE:
-            self.make_all()
+        self._active_sums: list[Values] = []
+        if self._estimate_weights() <= LIMITS.max_initial_weights:
+            self.compute_all()
 
-    def _expected(self) -> float:
-        """About how many weights there are."""
-        every = max(len(self._centres) // SAMPLED, 1)
-        counts = self._tree.query_ball_point(self._centres[::every], self._radius, return_length=True)
-        return float(np.sum(counts)) * every
+    def _estimate_weights(self) -> float:
+        """Estimate the number of weights from a sample of rows."""
+        stride = max(len(self._centres) // LIMITS.sampled_rows, 1)
+        counts = self._tree.query_ball_point(self._centres[::stride], self._radius, return_length=True)
+        return float(np.sum(counts)) * stride
 
-    def around(self, places: Flags) -> Flags:
-        """(centres,) which of those that have rows may have any of some near cells (near,) within the radius: what is
-        near one of them it is near to. Own cells among these are to have rows.
+    def flag_centres_near(self, near_flags: Flags) -> Flags:
+        """Flag the centres (centres,) with rows that may have a flagged near cell (near,) within the radius.
 
-        Two cells that are R apart to the last digit may be near for one of them alone, which counts where the kernel
-        does not end at 0 there.
+        Own cells among the flagged ones must have rows: nearness is symmetric, so that their rows tell the centres.
         """
-        count, marks = len(self._centres), np.zeros(len(places), bool)
+        count, marks = len(self._centres), np.zeros(len(near_flags), bool)
+        # Of two cells exactly R apart only one may count as near, which matters if the kernel is not 0 at R.
         if KERNELS[self._kernel](np.ones(1))[0]:
             return ~marks[:count]
-        for rows in self.made:
-            rows.mark(places, marks)
-        return marks[:count] | self._border if places[count:].any() else marks[:count]
+        for block in self.blocks:
+            block.mark_neighbours(near_flags, marks)
+        return marks[:count] | self._near_other_rank if near_flags[count:].any() else marks[:count]
 
-    def make(self, hot: Flags) -> None:
-        """See that there are rows of all centres with a `hot` near cell within the radius."""
-        if not self._missing.any() or not hot.any():
+    def compute_near(self, near_flags: Flags) -> None:
+        """Compute the rows of all centres with a flagged near cell (near,) within the radius."""
+        if not self._missing.any() or not near_flags.any():
             return
-        centres, points, reach = self._centres, self._near[hot[self._places]], self._radius * (1 + 1e-9)
-        close = np.all((centres >= points.min(axis=0) - reach) & (centres <= points.max(axis=0) + reach), axis=1)
-        cells = np.flatnonzero(self._missing & close)
+        centres, points = self._centres, self._near[near_flags[self._positions]]
+        reach = self._radius * (1 + LIMITS.radius_round_off)
+        in_box = np.all((centres >= points.min(axis=0) - reach) & (centres <= points.max(axis=0) + reach), axis=1)
+        cells = np.flatnonzero(self._missing & in_box)
         distance, _ = cKDTree(points).query(centres[cells], distance_upper_bound=reach)
-        self._add(cells[np.isfinite(distance)])
+        self._add_rows(cells[np.isfinite(distance)])
 
-    def make_all(self) -> None:
-        """See that there are rows of all centres."""
-        self._add(np.flatnonzero(self._missing))
+    def compute_all(self) -> None:
+        """Compute the rows of all centres."""
+        self._add_rows(np.flatnonzero(self._missing))
 
-    def sums(self, active: Values | None) -> list[Values]:
-        """Sums of the weights of near cells with 1 in `active` (near, 1), of each block `made`; None: of all."""
+    def active_sums(self, active: Values | None) -> list[Values]:
+        """Return, for each block, the sums of the weights of near cells with 1 in `active` (near, 1); None: of all.
+
+        Only rows near cells that became active or inactive since the last call are summed again.
+        """
         if active is None:
-            return [rows.full for rows in self.made]
+            return [block.row_sums for block in self.blocks]
         changed, self._active = (active != self._active)[:, 0], active
-        if changed.any() and self._missing.any():  # what has changed may be near rows and have none itself
-            self._sums = []
+        if changed.any() and self._missing.any():
+            # A changed cell without a row of its own may be near rows that exist: sum all again.
+            self._active_sums = []
         elif changed.any():
-            near = self.around(changed)
-            for rows, sums in zip(self.made, self._sums, strict=False):
-                some = np.flatnonzero(near[rows.cells])
-                sums[some] = rows.times(active, some)[:, 0]
-        self._sums += [rows.times(active)[:, 0] for rows in self.made[len(self._sums) :]]
-        return self._sums
+            near = self.flag_centres_near(changed)
+            for block, sums in zip(self.blocks, self._active_sums, strict=False):
+                rows = np.flatnonzero(near[block.cells])
+                sums[rows] = block.multiply(active, rows)[:, 0]
+        self._active_sums += [block.multiply(active)[:, 0] for block in self.blocks[len(self._active_sums) :]]
+        return self._active_sums
 
-    def _add(self, cells: Ints) -> None:
-        for start in range(0, len(cells), CHUNK):
-            part = cells[start : start + CHUNK]
+    def _add_rows(self, cells: Ints) -> None:
+        """Compute the rows of centres (n,), in blocks."""
+        for start in range(0, len(cells), LIMITS.rows_per_block):
+            part = cells[start : start + LIMITS.rows_per_block]
             pairs = cKDTree(self._centres[part]).sparse_distance_matrix(
                 self._tree, self._radius, output_type="coo_matrix"
             )
             weights = self._volumes[pairs.col] * KERNELS[self._kernel](pairs.data / self._radius)
-            self._border[part[pairs.row[self._places[pairs.col] >= len(self._centres)]]] = True
+            self._near_other_rank[part[pairs.row[self._positions[pairs.col] >= len(self._centres)]]] = True
             rows = csr_matrix((weights, (pairs.row, pairs.col)), shape=(len(part), len(self._near)))
             rows.sort_indices()
-            rows.indices = self._places[rows.indices].astype(rows.indices.dtype)
+            # Columns become positions in exchanged values, and keep the order of the input mesh.
+            rows.indices = self._positions[rows.indices].astype(rows.indices.dtype)
             rows.has_sorted_indices = False
-            self.made.append(_Rows(part, rows))
+            self.blocks.append(_WeightBlock(part, rows))
         self._missing[cells] = False
+
+
+class NeighbourAverage:
+    """Average over the cells that share a node with a cell (B07, section 7.1); it stores nothing but the mesh."""
+
+    def __init__(self, domain: Domain) -> None:
+        self._domain = domain
+
+    def __call__(self, values: Values, active: Flags | None = None) -> Values:
+        """Average cell values (cells, n); inactive cells do not enter; 0 where no active cell is near (collective)."""
+        volume = self._domain.volumes if active is None else np.where(active, self._domain.volumes, 0.0)
+        sums = self._sum_over_neighbours(np.column_stack([volume[:, None] * values, volume]))
+        return np.asarray(sums[:, :-1] / np.where(sums[:, -1:] > 0, sums[:, -1:], 1.0))
+
+    def find_averages_above(
+        self, values: Values, norms: Values, bound: float, active: Flags | None = None
+    ) -> tuple[Ints, Values]:
+        """Find the cells (m,) whose average may reach `bound` in norm, and their averages (m, n) (collective)."""
+        cells = np.flatnonzero(self(norms[:, None], active)[:, 0] >= bound * (1 - LIMITS.bound_round_off))
+        return cells, self(values, active)[cells]
+
+    def find_averages_above_in(
+        self, cells: Ints, values: Values, norms: Values, bound: float, active: Flags
+    ) -> tuple[Ints, Values]:
+        """Find averages above `bound` in a subset `cells` (k,) on one rank, at the cost of the subset.
+
+        Of the subset the cells that are `active` (cells,) enter the averages, and no other cell does.
+        """
+        if not len(cells):
+            return cells, values[cells]
+        corners = np.unique(self._domain.cell_nodes[cells], return_inverse=True)[1].reshape(len(cells), -1)
+        volume = np.where(active[cells], self._domain.volumes[cells], 0.0)
+
+        def sum_over_neighbours(column: Values) -> Values:
+            nodal = np.bincount(corners.ravel(), np.repeat(volume * column, corners.shape[1]))
+            return np.asarray(sum(nodal[corner] for corner in corners.T))
+
+        weight = sum_over_neighbours(np.ones(len(cells)))
+        weight[weight <= 0] = 1.0
+        limit = bound * (1 - LIMITS.bound_round_off)
+        near = np.flatnonzero(sum_over_neighbours(norms[cells]) / weight >= limit)
+        if not len(near):
+            return cells[near], values[cells[near]]
+        means = np.stack([sum_over_neighbours(column)[near] for column in values[cells].T], axis=1)
+        return cells[near], means / weight[near, None]
+
+    def _sum_over_neighbours(self, values: Values) -> Values:
+        """Return the sums (cells, n) over the nodes of each cell of the sums over the cells around the node."""
+        nodes, n = self._domain.cell_nodes, values.shape[1]
+        nodal = la.vector(self._domain.space.dofmap.index_map, n, np.float64)
+        table = nodal.array.reshape(-1, n)
+        for total, column in zip(table.T, values.T, strict=True):
+            total += np.bincount(nodes.ravel(), np.repeat(column, nodes.shape[1]), minlength=len(table))
+        nodal.scatter_reverse(la.InsertMode.add)
+        nodal.scatter_forward()
+        return np.asarray(table[nodes].sum(axis=1))

@@ -1,11 +1,12 @@
-"""Strength of an edge in a cell: by region, with a hashed tie-break, and scatter and a fibre where the study asks.
+"""Strength of an edge in a cell: by region, with a hashed tie-break, Weibull scatter and a fibre direction.
 
     s_e = strength(cell) (1 + tie_break h_e) w_e f_e
 
-h_e in [-1, 1) is hashed from the edge's reference mid-point; w_e is a Weibull number of mean 1 drawn from the same
-place and a seed, w = (-ln(1 - U))^(1/m) / Gamma(1 + 1/m); f_e = 1 + (ratio - 1) (n . a)^2 for the edge's reference
-direction n and the fibre a. All of them belong to the place of the edge, so that no partition changes them.
+- h_e in [-1, 1) is hashed from the reference mid-point of the edge.
+- w_e = (-ln(1 - U))^(1/m) / Gamma(1 + 1/m) is a Weibull number of mean 1, drawn from the mid-point and a seed.
+- f_e = 1 + (ratio - 1) (n . a)^2, with the reference direction n of the edge and the fibre a.
 
+All depend on the position of the edge, so that they are the same in any partition of the mesh.
 Equations: docs/theory.md#edge-criterion.
 """
 
@@ -27,109 +28,137 @@ Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Scatter:
-    """Weibull's modulus m (5 scatters like stone, 50 hardly at all), and the seed of the draw."""
+class WeibullScatter:
+    """Scatter of the strength.
+
+    Attributes:
+        modulus: Weibull modulus m: 5 for stone, 50 for nearly uniform strength.
+        seed: seed of the draw.
+    """
 
     modulus: float
     seed: int = 0
 
 
 @dataclass(frozen=True)
-class Fibre:
-    """A direction (d,) of any length, along which the strength is `ratio` times that across it."""
+class FibreAnisotropy:
+    """Dependence of the strength on the direction of the edge.
+
+    Attributes:
+        direction: (d,) fibre direction, of any length.
+        ratio: strength along the fibre over that across it.
+    """
 
     direction: Sequence[float] | Values
     ratio: float = 1.0
 
 
-class Strength:
-    """Pa, for edges of cells of a distributed mesh."""
+class EdgeStrength:
+    """Strength (Pa) of the edges of cells of a distributed mesh.
+
+    Attributes:
+        minimum: lower bound of the strength of all edges of the body, Pa.
+    """
 
     def __init__(
         self,
         graph: EdgeGraph,
-        of_cell: PerCell,
+        cell_strength: PerCell,
         *,
         tie_break: float = 0.0,
-        scatter: Scatter | None = None,
-        fibre: Fibre | None = None,
+        scatter: WeibullScatter | None = None,
+        fibre: FibreAnisotropy | None = None,
     ) -> None:
-        """`of_cell`: Pa, a number or (cells,); `tie_break`: relative perturbation from edge to edge (collective)."""
-        self._graph, self._of_cell, self._tie_break = graph, of_cell, tie_break
-        self._factor = self._edge_factors(scatter, fibre)
-        smallest = float(np.min(self._factor, initial=np.inf)) if self._factor is not None else 1.0
-        weakest = float(np.min(self._of_cell, initial=np.inf)) * smallest * (1 - tie_break)
-        self.weakest = graph.domain.comm.allreduce(weakest, op=MPI.MIN)  # no edge of the body is weaker
+        """Compute the factors of edges (collective).
+
+        Args:
+            graph: edges of the body.
+            cell_strength: strength of the material, Pa, one number or (cells,).
+            tie_break: relative amplitude of the hashed perturbation.
+            scatter: Weibull scatter.
+            fibre: fibre direction.
+        """
+        self._graph, self._cell_strength, self._tie_break = graph, cell_strength, tie_break
+        self._factors = self._edge_factors(scatter, fibre)
+        smallest = float(np.min(self._factors, initial=np.inf)) if self._factors is not None else 1.0
+        minimum = float(np.min(self._cell_strength, initial=np.inf)) * smallest * (1 - tie_break)
+        self.minimum = graph.domain.comm.allreduce(minimum, op=MPI.MIN)
 
     def __call__(self, cells: npt.NDArray[np.int64], edges: npt.NDArray[np.int32]) -> Values:
-        """(n, k) strengths of the (n, k) local edges of n cells."""
-        base = self._of_cell[cells, None] if isinstance(self._of_cell, np.ndarray) else self._of_cell
-        factor = 1.0 if self._factor is None else self._factor[edges]
-        return np.asarray(base * factor * (1 + self._tie_break * self.noise(edges)))
+        """Return the strengths (n, k), Pa, of the local edges (n, k) of cells (n,)."""
+        base = self._cell_strength[cells, None] if isinstance(self._cell_strength, np.ndarray) else self._cell_strength
+        factor = 1.0 if self._factors is None else self._factors[edges]
+        return np.asarray(base * factor * (1 + self._tie_break * self.tie_break_noise(edges)))
 
-    def weakest_of(self, cells: npt.NDArray[np.int64]) -> Values | float:
-        """(n,) Pa, what no edge of each cell is weaker than; one number where that is the same for all of them."""
-        return self._of_cells[cells] if isinstance(self._of_cells, np.ndarray) else self._of_cells
+    def minimum_in(self, cells: npt.NDArray[np.int64]) -> Values | float:
+        """Return a lower bound (n,) of the strength in each cell, Pa, or one number that holds for all."""
+        return self._cell_minimum[cells] if isinstance(self._cell_minimum, np.ndarray) else self._cell_minimum
 
     @cached_property
-    def _of_cells(self) -> Values | float:
-        """`weakest_of` all cells."""
-        least = self._of_cell * (1 - self._tie_break)
-        return least if self._factor is None else least * self._factor[self._graph.cell_edges].min(axis=1)
+    def _cell_minimum(self) -> Values | float:
+        """Lower bound of the strength in each cell (cells,) or in all, Pa."""
+        minimum = self._cell_strength * (1 - self._tie_break)
+        return minimum if self._factors is None else minimum * self._factors[self._graph.cell_edges].min(axis=1)
 
-    def noise(self, edges: npt.NDArray[np.int32]) -> Values:
-        """Numbers in [-1, 1) hashed from the mid-points of local edges; worked out for those asked for, once."""
+    def tie_break_noise(self, edges: npt.NDArray[np.int32]) -> Values:
+        """Return numbers in [-1, 1) hashed from the mid-points of local edges; each is computed once."""
         if not self._tie_break:
             return np.zeros(edges.shape)
         result = self._noise[edges]
         if len(unknown := edges[np.isnan(result)]):
-            self._noise[unknown] = hashed(self._twice_middle(unknown))
+            self._noise[unknown] = hash_points(self._twice_midpoints(unknown))
             result = self._noise[edges]
         return result
 
     @cached_property
     def _noise(self) -> Values:
-        """(edges,) those that have been worked out; NaN elsewhere."""
+        """(edges,) numbers computed so far; NaN elsewhere."""
         return np.full(len(self._graph.broken), np.nan)
 
-    def _twice_middle(self, edges: npt.NDArray[np.integer]) -> Values:
+    def _twice_midpoints(self, edges: npt.NDArray[np.integer]) -> Values:
+        """Return the sum (n, d) of the ends of edges, which has the same bits whichever end is first."""
         ends = self._graph.domain.nodes[self._graph.edge_nodes[edges]]
         return ends[:, 0] + ends[:, 1]
 
-    def _edge_factors(self, scatter: Scatter | None, fibre: Fibre | None) -> Values | None:
-        """w_e f_e of every local edge; None where all of them are 1."""
+    def _edge_factors(self, scatter: WeibullScatter | None, fibre: FibreAnisotropy | None) -> Values | None:
+        """Return w_e f_e (edges,) of local edges; None if all are 1."""
         if scatter is None and fibre is None:
             return None
         factor = np.ones(len(self._graph.broken))
         if scatter is not None:
-            factor *= weibull(self._twice_middle(np.arange(len(factor))), scatter)
+            factor *= weibull_factors(self._twice_midpoints(np.arange(len(factor))), scatter)
         if fibre is not None:
-            factor *= along_fibre(self._directions(), fibre)
+            factor *= fibre_factors(self._edge_vectors(), fibre)
         return factor
 
-    def _directions(self) -> Values:
+    def _edge_vectors(self) -> Values:
+        """Return the reference vectors (edges, d) of local edges, m."""
         ends = self._graph.domain.nodes[self._graph.edge_nodes]
         return ends[:, 1] - ends[:, 0]
 
 
-def weibull(points: Values, scatter: Scatter) -> Values:
-    """Weibull numbers of mean 1 and the given modulus, one a place."""
+def weibull_factors(points: Values, scatter: WeibullScatter) -> Values:
+    """Return Weibull numbers (n,) of mean 1, drawn from points (n, d) and a seed."""
     m = scatter.modulus
-    survival = (1 - hashed(points, scatter.seed)) / 2  # 1 - U, in (0, 1]
+    survival = (1 - hash_points(points, scatter.seed)) / 2  # 1 - U, in (0, 1]
     return np.asarray((-np.log(survival)) ** (1 / m) / math.gamma(1 + 1 / m), np.float64)
 
 
-def along_fibre(vectors: Values, fibre: Fibre) -> Values:
-    """1 + (ratio - 1) cos^2 of the angle between edges ((n, d) vectors) and the fibre: `ratio` along it, 1 across."""
+def fibre_factors(vectors: Values, fibre: FibreAnisotropy) -> Values:
+    """Return 1 + (ratio - 1) cos^2 (n,) of the angle between edge vectors (n, d) and the fibre."""
     a = np.asarray(fibre.direction, float)
     cosine2 = (vectors @ a) ** 2 / (np.einsum("ni,ni->n", vectors, vectors) * (a @ a))
     return np.asarray(1 + (fibre.ratio - 1) * cosine2)
 
 
-def hashed(points: Values, seed: int = 0) -> Values:
-    """Numbers in [-1, 1), one a point, from a seed and the bits of its coordinates (splitmix64's finaliser)."""
-    places = np.ascontiguousarray(points + 0.0, float)  # + 0.0: -0 and 0 are one place
-    bits: npt.NDArray[np.uint64] = places.view(np.uint64)
+def hash_points(points: Values, seed: int = 0) -> Values:
+    """Return numbers (n,) in [-1, 1) hashed from a seed and the bits of coordinates (n, k).
+
+    The hash is the finaliser of splitmix64 (G. L. Steele, D. Lea, C. H. Flood, 2014, Fast splittable pseudorandom
+    number generators).
+    """
+    positions = np.ascontiguousarray(points + 0.0, float)  # + 0.0: -0 and 0 have the same bits then
+    bits: npt.NDArray[np.uint64] = positions.view(np.uint64)
     state: npt.NDArray[np.uint64] = np.full(len(points), seed, np.uint64)
     for column in bits.T:
         state = _mix(state ^ column)
@@ -137,6 +166,7 @@ def hashed(points: Values, seed: int = 0) -> Values:
 
 
 def _mix(x: npt.NDArray[np.uint64]) -> npt.NDArray[np.uint64]:
+    """Return splitmix64's mix of 64-bit integers (n,)."""
     x = x + np.uint64(0x9E3779B97F4A7C15)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

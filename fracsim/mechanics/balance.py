@@ -92,7 +92,7 @@ class Balance:
         self.contact, self.histories = ContactTerms(domain.comm, terms), TermHistories(terms)
         self.linear = all(term.linear for term in terms)
         self.symmetric = all(term.symmetric for term in terms)
-        self.c_a, self.c_v = scheme.rates(step)
+        self.c_a, self.c_v = scheme.rate_coefficients(step)
         self._assembler = assembler
         self.displacement_version = 0
         self.work_vector, self._force_vector = assembler.create_vector(), assembler.create_vector()
@@ -120,11 +120,11 @@ class Balance:
         """Begin a step of dt to t at the owned state u, v, a (collective)."""
         scheme, motion = self.scheme, self.motion
         late = scheme.alpha_f
-        self.c_a, self.c_v = scheme.rates(dt)
+        self.c_a, self.c_v = scheme.rate_coefficients(dt)
         prescribed = (1 - late) * motion.displacements_at(t) + late * motion.displacements_at(t - dt)
-        u_a, u_v = scheme.references(dt, u, v, a)
+        u_a, u_v = scheme.reference_displacements(dt, u, v, a)
         own, end = motion.owned_dofs, prescribed[: len(motion.owned_dofs)]
-        if not late and (rates := scheme.prescribed(dt, end, u[own], v[own])) is not None:
+        if not late and (rates := scheme.prescribed_dof_rates(dt, end, u[own], v[own])) is not None:
             u_a[own], u_v[own] = end - rates[1] / self.c_a, end - rates[0] / self.c_v
         level = TimeLevel(t - late * dt, dt, u, v, self.c_a, self.c_v, u_a, u_v, 1 - late, self.contact_weights)
         self._set_level(level, prescribed)
@@ -139,7 +139,7 @@ class Balance:
             dt: size of the step whose rates are used, s; None: that of the last step.
         """
         if dt is not None:
-            self.c_a, self.c_v = self.scheme.rates(dt)
+            self.c_a, self.c_v = self.scheme.rate_coefficients(dt)
         self.set_displacement(u)
         u_a = u - a / self.c_a if a is not None and self.c_a else u
         weights = self.contact_weights

@@ -39,7 +39,7 @@ class ContactTimeWeights:
         """Weights of a time integration scheme; all 1 for explicit schemes and without inertia."""
         if not (scheme.inertia and scheme.implicit):
             return cls()
-        c_a, c_v = scheme.rates(1.0)  # k does not depend on dt
+        c_a, c_v = scheme.rate_coefficients(1.0)  # k does not depend on dt
         return cls(c_a / c_v, 1.0, scheme.carries_acceleration)
 
 
@@ -57,4 +57,4 @@ def acceleration_change(scheme: Scheme, dt: float, displacement_change: Any) -> 
         displacement_change: change of the unknown, m; a number or an array.
     """
     zero = 0.0 * displacement_change
-    return scheme.finish(dt, displacement_change, zero, zero, zero)[2]
+    return scheme.complete_step(dt, displacement_change, zero, zero, zero)[2]

@@ -53,7 +53,7 @@ def material_fields(
     options = {}
     if domain.dim == 2 and plane_stress:
         lmbda = plane_stress_lambda(mu, lmbda)
-        options = {"reduced": True}
+        options = {"plane_stress": True}
     psi = ENERGIES[energy](coefficient(domain, mu), coefficient(domain, lmbda), **options)
     return MaterialFields(psi, density, young, mu, lmbda)
 

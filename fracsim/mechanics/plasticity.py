@@ -24,7 +24,7 @@ import numpy.typing as npt
 import ufl
 from dolfinx import fem
 
-from ..forms.plasticity import ImplicitFlow, Plastic
+from ..forms.plasticity import ElastoplasticEnergy, ImplicitFlow
 from ..mesh.domain import Domain
 from .jit import point_field, points_per_cell
 from .material_fields import MaterialFields, PerCell
@@ -71,7 +71,7 @@ class FlowPrediction(Protocol):
 class ImplicitPlasticFlow:
     """Flow that follows from the unknown displacement of the step."""
 
-    def __init__(self, domain: Domain, energy: Plastic, frobenius: bool) -> None:
+    def __init__(self, domain: Domain, energy: ElastoplasticEnergy, frobenius: bool) -> None:
         self._flow_stress, self._compliance = (point_field(domain, (), name) for name in ("resistance", "softness"))
         self._fraction = fem.Constant(domain.mesh, np.float64(0.0))
         self.form = ImplicitFlow(energy, self._flow_stress, self._compliance, self._fraction, frobenius)
@@ -186,7 +186,7 @@ class PlasticHistory:
         self.inverse = point_field(domain, (3, 3), "inverse plastic part")
         self.inverse_rows: Values = self.inverse.x.array.reshape(-1, 9)[: len(self.accumulated_strain)]
         self.inverse.x.array.reshape(-1, 9)[:] = np.eye(3).reshape(-1)
-        self.energy = Plastic(material.energy, _block(self.inverse, domain.dim))
+        self.energy = ElastoplasticEnergy(material.energy, _block(self.inverse, domain.dim))
         # with u known before the stress nothing needs to be extrapolated
         u_known = law.update == "extrapolated" and not implicit
         self.prediction = self._prediction(domain, "implicit" if u_known else law.update)

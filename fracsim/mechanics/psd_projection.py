@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 
-from ..forms.balance import points_of_stress
+from ..forms.balance import stress_quadrature
 from ..forms.kinematics import deformation_gradient
 from ..mesh.c_library import FAST_FLAGS, compile_library
 from .jit import CellForm, cell_measure, point_expression, point_field
@@ -52,7 +52,7 @@ class PsdProjection:
         v, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
         components = [(i, j) for i in range(d) for j in range(d)]
         row, column = (ufl.as_vector([ufl.grad(field)[i, j] for i, j in components]) for field in (w, v))
-        form = ufl.dot(row, self._field * column) * cell_measure(domain)(metadata=points_of_stress(w))
+        form = ufl.dot(row, self._field * column) * cell_measure(domain)(metadata=stress_quadrature(w))
         self.form = CellForm(form)
 
     def update(self, tolerance: float) -> None:

@@ -24,7 +24,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from ..forms.plasticity import Trial
+from ..forms.plasticity import TrialStress
 from .jit import point_expression
 from .plasticity import PlasticHistory
 from .stress import Stress
@@ -53,7 +53,7 @@ class ReturnMapping:
         assert plastic is not None
         self.plastic: PlasticHistory = plastic
         self._stress, self._flowed = stress, True
-        trial = Trial(plastic.energy, stress.u, stress.rotation_field)
+        trial = TrialStress(plastic.energy, stress.u, stress.rotation_field)
         asked = trial.state(), trial.measures()
         self._state, self._measures = (point_expression(domain, each, kernels=stress.kernels) for each in asked)
 

@@ -142,16 +142,16 @@ class Stress(Term):
         edges: list[list[int]] = np.asarray(local_edges(self.domain.dim)).tolist()  # type: ignore[assignment]
         self.integrity = self._undamaged_field("integrity", len(edges))
         if model.approach == "edge":
-            from ..forms.damage import EdgeProjected, Strained
+            from ..forms.damage import EdgeProjectedEnergy, StrainEnergy
 
-            energy = EdgeProjected(cast(Strained, energy), self.integrity, edges, self._floor)
+            energy = EdgeProjectedEnergy(cast(StrainEnergy, energy), self.integrity, edges, self._floor)
         if not model.cracks_close:
             return energy
-        from ..forms.crack_closure import Closing, bends_of
+        from ..forms.crack_closure import CrackClosureEnergy, midpoint_corrections
 
         share = 1.0 if self.chi is None else 1 - self.chi
-        bends = bends_of(self.u, self._reference_coordinates(), edges) if self.domain.order == 2 else None
-        return Closing(energy, self._floored(self.chi), share, self.integrity, edges, bends)
+        bends = midpoint_corrections(self.u, self._reference_coordinates(), edges) if self.domain.order == 2 else None
+        return CrackClosureEnergy(energy, self._floored(self.chi), share, self.integrity, edges, bends)
 
     def _reference_coordinates(self) -> fem.Function:
         """Field of the (d,) coordinates in the reference cell."""

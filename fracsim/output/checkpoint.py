@@ -37,7 +37,7 @@ from .checkpoint_file import (
 
 if TYPE_CHECKING:
     from ..fracture.brittle.surface_criterion import BrittleSurfaces
-    from ..fracture.edge_history import EdgeRecord
+    from ..fracture.edge_history import EdgeHistory
 
 _CLOCK = ("t", "step", "dt", "dissipated", "work", "easy")
 _NODAL = ("u", "v", "a", "forces")
@@ -54,7 +54,7 @@ def write_checkpoint(
     state: State,
     balance: Balance,
     notes: CheckpointNotes,
-    record: EdgeRecord | None = None,
+    record: EdgeHistory | None = None,
     surfaces: BrittleSurfaces | None = None,
 ) -> Path:
     """Write folder/checkpoint/state.h5 and return its path (collective). The old file stays until the new one is whole.
@@ -97,7 +97,7 @@ def write_checkpoint(
     arrays |= {name: domain.gather_cells(values) for name, values in cells.items()}
     if record is not None:
         arrays["weakened"], arrays["integrity"] = record.graph.gather_weakened() or (None, None)
-        arrays["broken"], arrays["breaks"] = record.saved() or (None, None)
+        arrays["broken"], arrays["breaks"] = record.to_checkpoint() or (None, None)
     if surfaces is not None:
         arrays["starts"] = surfaces.starts
     path = checkpoint_path(folder)
@@ -129,7 +129,7 @@ def read_checkpoint(
     domain: Domain,
     state: State,
     balance: Balance,
-    record: EdgeRecord | None = None,
+    record: EdgeHistory | None = None,
     surfaces: BrittleSurfaces | None = None,
 ) -> State:
     """State of a checkpoint (collective). The degradation chi, plastic strain and `record` are set from it as well.
@@ -184,7 +184,7 @@ def read_checkpoint(
     if record is not None and replicated["weakened"] is not None:
         _check_edges(comm, record, replicated["weakened"], checkpoint_path(folder))
         record.graph.restore_integrity(replicated["weakened"], replicated["integrity"])
-        record.restore(replicated["broken"], replicated["breaks"])
+        record.from_checkpoint(replicated["broken"], replicated["breaks"])
     if surfaces is not None and replicated["starts"] is not None:
         surfaces.starts = replicated["starts"]
     if stress.chi is not None and "chi" in names:
@@ -315,7 +315,7 @@ def _read_checked(folder: Path, domain: Domain, checks: _ContentChecks) -> Store
     return stored
 
 
-def _check_edges(comm: MPI.Comm, record: EdgeRecord, keys: npt.NDArray[np.int64], path: Path) -> None:
+def _check_edges(comm: MPI.Comm, record: EdgeHistory, keys: npt.NDArray[np.int64], path: Path) -> None:
     """Raise InputError if pairs of input nodes (n, 2), in rising order, are not edges of the mesh (collective)."""
     graph = record.graph
     local, _ = graph.find_keys(keys)

@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..fracture.edge_history import EdgeRecord
-from ..fracture.initial_cracks import ends_in_order
+from ..fracture.edge_history import EdgeHistory
+from ..fracture.initial_cracks import edge_ends_in_input_order
 from ..mesh.crack_planes import CrackPlane
 from ..mesh.parallel import concatenate_over_ranks, sum_over_ranks
 from ..meshes.text import AXES
@@ -35,7 +35,7 @@ class CrackExtent:
         values: (1 + d,) length or area and tip, as of the last update; NaN while there is no tip.
     """
 
-    def __init__(self, record: EdgeRecord, cracks: Sequence[CrackPlane] = ()) -> None:
+    def __init__(self, record: EdgeHistory, cracks: Sequence[CrackPlane] = ()) -> None:
         """Measure the initial cracks (collective).
 
         Args:
@@ -46,7 +46,7 @@ class CrackExtent:
         self._record, self._graph, self._domain = record, graph, graph.domain
         d = self._domain.dim
         self.columns = ["crack_length" if d == 2 else "crack_area", *(f"tip_{axis}" for axis in AXES[:d])]
-        self._edge_ends = ends_in_order(graph)
+        self._edge_ends = edge_ends_in_input_order(graph)
         self.values = np.array([0.0] + d * [np.nan])
         self._pattern = np.zeros_like(graph.pattern)  # broken edges of each cell at the last update
         self._cut_size = np.zeros(len(self._pattern))  # length or area of the cut through each cell
@@ -83,7 +83,7 @@ class CrackExtent:
         Args:
             segment_ends: local cell that is not split -> end point of a segment of the study in it, (d,) in m.
         """
-        comm, graph, broken_at = self._domain.comm, self._graph, self._record.at
+        comm, graph, broken_at = self._domain.comm, self._graph, self._record.break_times
         latest = comm.allreduce(float(np.fmax.reduce(broken_at, initial=-np.inf)), MPI.MAX)
         newest = np.flatnonzero(broken_at == latest)
         cells = graph.edge_cells(newest)
@@ -112,7 +112,7 @@ class CrackExtent:
     def _locate_segment_end(self, end: Values) -> None:
         """Find the cell, not split, in which a segment of the study ends at the point `end` (d,) in m (collective)."""
         graph = self._graph
-        initially_open = self._record.at == 0
+        initially_open = self._record.break_times == 0
         cells = np.flatnonzero(initially_open[graph.cell_edges].sum(axis=1) == 1)
         corners = self._domain.nodes[graph.cell_nodes[cells]]
         sides = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
@@ -130,11 +130,11 @@ class CrackExtent:
     def _segment_entry(self, cell: int) -> Values:
         """Point (d,) at which a segment of the study enters a cell, m."""
         edges = self._graph.cell_edges[cell]
-        return self._cut_points(edges[self._record.at[edges] == 0])[0]
+        return self._cut_points(edges[self._record.break_times[edges] == 0])[0]
 
     def _cut_points(self, edges: Ints) -> Values:
         """Positions (n, d) of the cuts of broken edges, m; the middle if the position is unknown."""
-        cut = self._record.cut[edges]
+        cut = self._record.cut_positions[edges]
         share = np.where(np.isnan(cut), 0.5, cut)[:, None]
         ends = self._domain.nodes[self._edge_ends[edges]]
         return np.asarray(ends[:, 0] + share * (ends[:, 1] - ends[:, 0]))

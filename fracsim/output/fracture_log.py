@@ -14,8 +14,8 @@ from ..mesh.parallel import sum_over_ranks
 
 if TYPE_CHECKING:
     from ..fracture.brittle.surface_criterion import BrittleSurfaces
-    from ..fracture.edge_history import EdgeRecord
-    from ..fracture.fracture_pass import Breaking
+    from ..fracture.edge_history import EdgeHistory
+    from ..fracture.fracture_pass import FracturePass
     from ..mesh.fragments import Fragments
 
 
@@ -29,7 +29,7 @@ class FractureLog:
         counts: numbers of broken edges, split cells and fragments over all ranks.
     """
 
-    def __init__(self, stress: Stress, breaking: Breaking | None, *, cut_by_forces: bool = False) -> None:
+    def __init__(self, stress: Stress, breaking: FracturePass | None, *, cut_by_forces: bool = False) -> None:
         """Record the initially open edges (collective).
 
         Args:
@@ -38,7 +38,7 @@ class FractureLog:
             cut_by_forces: cut edges at a position that the nodal forces determine, not in the middle.
         """
         self._stress, self._domain, self._by_forces = stress, stress.domain, cut_by_forces
-        self.record: EdgeRecord | None = None
+        self.record: EdgeHistory | None = None
         self.surfaces: BrittleSurfaces | None = None
         self.fragments: Fragments | None = None
         # (edges,) state of the broken edges that `fragments` belongs to
@@ -47,16 +47,16 @@ class FractureLog:
         self._cut_by_criterion: npt.NDArray[np.float64] | None = None
         self._carried: npt.NDArray[np.float64] | None = None
         if breaking is not None:
-            from ..fracture.edge_history import EdgeRecord
+            from ..fracture.edge_history import EdgeHistory
 
-            self.record = EdgeRecord(breaking.graph)
+            self.record = EdgeHistory(breaking.graph)
             # not isinstance: that would import the brittle room, which other studies do not need
             if hasattr(breaking.criterion, "starts"):
                 self.surfaces = cast("BrittleSurfaces", breaking.criterion)
-            self._cut_by_criterion = breaking.criterion.cut
-            self._carried = breaking.criterion.carried
-            if breaking.opened is not None:
-                self.record.note(0.0, breaking.opened)
+            self._cut_by_criterion = breaking.criterion.cut_positions
+            self._carried = breaking.criterion.tip_states
+            if breaking.initial_cuts is not None:
+                self.record.record_breaks(0.0, breaking.initial_cuts)
             self.update_counts()
 
     def record_breaks(self, t: float) -> None:
@@ -65,23 +65,23 @@ class FractureLog:
             return
         if self._cut_by_criterion is not None:
             # surfaces and cracks define the position of the cut themselves
-            self.record.note(t, self._cut_by_criterion)
+            self.record.record_breaks(t, self._cut_by_criterion)
         else:
-            self.record.note(t, self._cuts_by_forces() if self._by_forces else None)
+            self.record.record_breaks(t, self._cuts_by_forces() if self._by_forces else None)
         self.update_counts()
 
     def prepare_checkpoint(self) -> None:
         """Add to the record the cuts of edges that are not broken yet, and the state of crack tips (collective)."""
         if self.record is not None and self._cut_by_criterion is not None:
-            self.record.remember(self._cut_by_criterion, self._carried)
+            self.record.record_weakened(self._cut_by_criterion, self._carried)
 
     def apply_checkpoint(self) -> None:
         """Set cuts and crack tips of the criterion from the record, which was read from a checkpoint (collective)."""
         if self.record is not None and self._cut_by_criterion is not None:
-            self._cut_by_criterion[:] = self.record.cut
-            if self._carried is not None and self.record.carried is not None:
-                defined = ~np.isnan(self.record.carried[:, 0])
-                self._carried[defined] = self.record.carried[defined]
+            self._cut_by_criterion[:] = self.record.cut_positions
+            if self._carried is not None and self.record.tip_states is not None:
+                defined = ~np.isnan(self.record.tip_states[:, 0])
+                self._carried[defined] = self.record.tip_states[defined]
         self.update_counts()
 
     def update_counts(self) -> None:
@@ -115,14 +115,14 @@ class FractureLog:
 
     def _cuts_by_forces(self) -> npt.NDArray[np.float64]:
         """Cuts (edges,) in inverse proportion to the nodal forces (Mandal et al. 2022, figure 12)."""
-        from ..fracture.edge_history import cut_by_forces
+        from ..fracture.edge_history import cut_positions_from_forces
 
         assert self.record is not None
         domain, ends = self._domain, self.record.graph.edge_nodes
         force = domain.with_ghosts(self._stress.assemble_forces()).reshape(-1, domain.dim)
         # ends in the order of the input mesh, so that a cut does not depend on the partition
         swap = domain.node_input[ends[:, 0]] > domain.node_input[ends[:, 1]]
-        return cut_by_forces(force, np.where(swap[:, None], ends[:, ::-1], ends))
+        return cut_positions_from_forces(force, np.where(swap[:, None], ends[:, ::-1], ends))
 
 
 def _count_bodies(domain: Domain) -> int:

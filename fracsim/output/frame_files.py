@@ -23,7 +23,7 @@ from .fields_file import TENSOR_COMPONENTS, Field, FieldsFile
 from .fracture_log import FractureLog
 
 if TYPE_CHECKING:
-    from ..fracture.fracture_pass import Breaking
+    from ..fracture.fracture_pass import FracturePass
     from ..mesh.fragments import Fragments
     from .result_checks import InterpenetrationMonitor
     from .surface.surface_output import SurfaceOutput
@@ -35,7 +35,7 @@ _TENSOR_INDICES = [("xyz".index(name[0]), "xyz".index(name[1])) for name in TENS
 class FieldEvaluator:
     """Values of the fields of a frame, gathered on rank 0. Expressions are compiled at the first frame."""
 
-    def __init__(self, stress: Stress, names: list[str], fracture: Breaking | None = None) -> None:
+    def __init__(self, stress: Stress, names: list[str], fracture: FracturePass | None = None) -> None:
         """Choose the fields.
 
         Args:
@@ -154,7 +154,7 @@ class FrameFiles:
         self,
         folder: Path,
         balance: Balance,
-        breaking: Breaking | None,
+        breaking: FracturePass | None,
         breaks: FractureLog,
         *,
         fields: list[str],

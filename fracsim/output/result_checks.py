@@ -20,7 +20,7 @@ from ..timestepping.state import State
 from ..timestepping.stepper import StepReport
 
 if TYPE_CHECKING:
-    from ..fracture.fracture_pass import Breaking
+    from ..fracture.fracture_pass import FracturePass
     from .surface.body_surface import BodySurface
 
 Values = npt.NDArray[np.float64]
@@ -142,7 +142,7 @@ class InvertedCellMonitor:
         first_time: time of the first frame with an inverted cell, s.
     """
 
-    def __init__(self, stress: Stress, fracture: Breaking | None = None) -> None:
+    def __init__(self, stress: Stress, fracture: FracturePass | None = None) -> None:
         """Start at rest; `fracture` has the damaged cells."""
         self._stress, self._domain = stress, stress.domain
         self._graph = fracture.graph if fracture is not None else None

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..fracture.brittle.surface_criterion import BrittleSurfaces
-from ..fracture.criterion import Average
+from ..fracture.criterion import CellAverage
 from ..fracture.edge_stress import frobenius_norm
-from ..fracture.neighbour_average import NeighbourAverage
+from ..fracture.nonlocal_average import NeighbourAverage
 from ..mechanics.stress import Stress
 from ..mesh.edge_graph import EdgeGraph
 from ..mesh.fragments import Fragments, find_fragments
@@ -39,7 +39,7 @@ CRACKED = 1e-3
 class Within:
     """An average over the cells of one piece: `cells` (cells,) flags say of which. It wraps another, or none."""
 
-    def __init__(self, average: Average | None, count: int) -> None:
+    def __init__(self, average: CellAverage | None, count: int) -> None:
         self._average = average
         self.cells: Flags = np.ones(count, bool)
 
@@ -48,17 +48,17 @@ class Within:
         values = np.where(self.cells[:, None], values, 0.0)
         return values if self._average is None else self._average(values, self._both(active))
 
-    def reaching(
-        self, values: Values, size: Values, bound: float, active: Flags | None = None
+    def find_averages_above(
+        self, values: Values, norms: Values, bound: float, active: Flags | None = None
     ) -> tuple[npt.NDArray[np.int64], Values]:
         """Cells (m,) of the piece whose average may reach a bound, and those averages (m, n)."""
         if self._average is None:
-            cells = np.flatnonzero((size >= bound) & self.cells)
+            cells = np.flatnonzero((norms >= bound) & self.cells)
             return cells, values[cells]
         if isinstance(self._average, NeighbourAverage):
             cells = np.flatnonzero(self.cells)
-            return self._average.reaching_among(cells, values, size, bound, self._both(active))
-        cells, found = self._average.reaching(values, size, bound, self._both(active))
+            return self._average.find_averages_above_in(cells, values, norms, bound, self._both(active))
+        cells, found = self._average.find_averages_above(values, norms, bound, self._both(active))
         mine = self.cells[cells]
         return cells[mine], found[mine]
 
@@ -152,14 +152,14 @@ class Breakable:
         edges = np.arange(len(self.graph.broken))
         cut = np.full(len(edges), np.nan)
         if self._criterion is not None:
-            cut[MeshTopology(source).find_edges(self.graph.edge_keys(edges))] = self._criterion.cut
+            cut[MeshTopology(source).find_edges(self.graph.edge_keys(edges))] = self._criterion.cut_positions
         return pattern, cut
 
     def saved(self) -> dict[str, npt.NDArray[Any]]:
         """What a checkpoint keeps: keys (n, 2) of broken edges, where they are cut, and where surfaces started."""
         if self._criterion is None:
             return {}
-        keys, cut = self.graph.gather_broken(self._criterion.cut[:, None])  # type: ignore[misc]
+        keys, cut = self.graph.gather_broken(self._criterion.cut_positions[:, None])  # type: ignore[misc]
         return {"broken": keys, "cut": cut, "starts": self._criterion.starts}
 
     def restore(self, saved: dict[str, npt.NDArray[Any]]) -> None:
@@ -168,7 +168,7 @@ class Breakable:
             return
         self.graph.break_edges(self.graph.flags_of_keys(saved["broken"]))
         local, place = self.graph.find_keys(saved["broken"])
-        self._criterion.cut[local], self._criterion.starts = saved["cut"][place, 0], saved["starts"]
+        self._criterion.cut_positions[local], self._criterion.starts = saved["cut"][place, 0], saved["starts"]
         self._find_pieces()
 
     def piece_of(self, name: int) -> int:
@@ -183,7 +183,7 @@ class Breakable:
         if self._length is None:
             self._length = self._lengths()
         h = self._stiffness.finest
-        weakest = self._flow.weakest if self._criterion is None else self._criterion.strength.weakest  # type: ignore[union-attr]
+        weakest = self._flow.weakest if self._criterion is None else self._criterion.strength.minimum  # type: ignore[union-attr]
         return bool(2 * force * max(float(self._length[piece]), h) / h**3 >= weakest)
 
     def _lengths(self) -> Values:
@@ -238,12 +238,12 @@ class Breakable:
     @property
     def left(self) -> int:
         """Surfaces that may still open; 1 of what flows, for one blow after the other does."""
-        return int(self._flow is not None) if self._criterion is None else self._criterion.left
+        return int(self._flow is not None) if self._criterion is None else self._criterion.remaining
 
     @property
     def breaks(self) -> bool:
         """Whether a surface may still open."""
-        return self._criterion is not None and self._criterion.left > 0
+        return self._criterion is not None and self._criterion.remaining > 0
 
     def opened(self, name: int, loads: PointLoads, share: int, energy: float = np.inf) -> Opened:
         """What a strike opens that may start `share` surfaces, or what shape it leaves with an energy to spend, J;
@@ -252,15 +252,15 @@ class Breakable:
         if criterion is None:
             return self._dented(name, loads, energy)
         before, starts, passes, iterations = self.graph.broken.copy(), criterion.starts, self.passes, self.iterations
-        criterion.kept_back = criterion.left - share
+        criterion.reserved = criterion.remaining - share
         try:
             self.strike(self.piece_of(name), loads)
         finally:
-            more, criterion.starts, criterion.kept_back = criterion.starts[len(starts) :], starts, 0
+            more, criterion.starts, criterion.reserved = criterion.starts[len(starts) :], starts, 0
         edges = np.flatnonzero(self.graph.broken & ~before)
         done = self.passes - passes, self.iterations - iterations
         self.passes, self.iterations = passes, iterations
-        return Opened(name, self.graph.edge_keys(edges), criterion.cut[edges], more, *done)
+        return Opened(name, self.graph.edge_keys(edges), criterion.cut_positions[edges], more, *done)
 
     def _dented(self, name: int, loads: PointLoads, energy: float) -> Opened:
         """What shape a strike leaves. Raises NotConverged."""
@@ -293,7 +293,7 @@ class Breakable:
             pieces = np.unique(self.pieces.node_fragment[self.graph.edge_nodes[local[new]]])
             for piece in pieces:
                 self._forget(int(np.flatnonzero(self.pieces.node_fragment == piece)[0]))
-            criterion.cut[local] = cut[order][place]
+            criterion.cut_positions[local] = cut[order][place]
             flags = np.zeros(len(self.graph.broken), bool)
             flags[local] = True
             self.graph.break_edges(flags)
@@ -351,7 +351,7 @@ class Breakable:
         assert self._criterion is not None
         cells = np.flatnonzero(self._within.cells & ~self.graph.split)
         size = frobenius_norm(stress[cells], self._domain.dim)
-        enough = float(size.max(initial=0.0)) < self._criterion.strength.weakest * (1 - 1e-9)
+        enough = float(size.max(initial=0.0)) < self._criterion.strength.minimum * (1 - 1e-9)
         return enough and not self.graph.damaged[cells].any()
 
     def _lowest(self, mine: Flags) -> list[int]:

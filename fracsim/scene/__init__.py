@@ -44,7 +44,7 @@ from .material_model import material_of  # noqa: E402
 from .terms import TERMS, Parts, balance_of  # noqa: E402
 
 if TYPE_CHECKING:
-    from ..fracture.fracture_pass import Breaking as EdgeBreaking
+    from ..fracture.fracture_pass import FracturePass as EdgeBreaking
 
 __all__ = ["TERMS", "Parts", "Scene", "build_scene", "make_scheme", "make_stepper", "material_of", "scene_on"]
 

@@ -19,14 +19,13 @@ from .material_model import per_cell
 Values = npt.NDArray[np.float64]
 
 if TYPE_CHECKING:
-    from ..fracture.brittle.grains import SurfaceRules
+    from ..fracture.brittle.grains import SurfaceParameters
     from ..fracture.brittle.surface_criterion import BrittleSurfaces
-    from ..fracture.criterion import Average, OverloadedEdges
-    from ..fracture.energy.tip_constraints import JoinedTips
-    from ..fracture.energy.tip_criterion import CrackTips
-    from ..fracture.fracture_pass import Breaking
-    from ..fracture.node_retention import Holding, Joining
-    from ..fracture.strength import Strength
+    from ..fracture.criterion import CellAverage, OverloadedEdges
+    from ..fracture.energy.tip_criterion import AttachedTipCriterion, TipCriterion
+    from ..fracture.fracture_pass import FracturePass
+    from ..fracture.node_retention import CellRetention, NodeAttachment
+    from ..fracture.strength import EdgeStrength
     from ..mesh.edge_graph import EdgeGraph
 
 
@@ -39,11 +38,11 @@ def flow_of(study: Study, balance: Balance) -> PlasticFlowProtocol:
     return ReturnMapping(balance.stress)
 
 
-def breaking_of(study: Study, balance: Balance) -> Breaking | None:
+def breaking_of(study: Study, balance: Balance) -> FracturePass | None:
     """What breaks; None without [fracture]."""
     if study.fracture is None:
         return None
-    from ..fracture.fracture_pass import Breaking
+    from ..fracture.fracture_pass import FracturePass
     from ..mesh.edge_graph import EdgeGraph
 
     graph = EdgeGraph(balance.domain)
@@ -56,8 +55,10 @@ def breaking_of(study: Study, balance: Balance) -> Breaking | None:
     else:
         criterion = _criterion(study, balance.stress, graph)
         joining = _joining(study, balance, graph, criterion.strength)
-        breaking = Breaking(balance.stress, graph, criterion, max_passes=passes, opened=opened, joining=joining)
-    if (cut := breaking.criterion.cut) is not None:  # of a surface, or of a crack
+        breaking = FracturePass(
+            balance.stress, graph, criterion, max_passes=passes, initial_cuts=opened, node_attachment=joining
+        )
+    if (cut := breaking.criterion.cut_positions) is not None:  # of a surface, or of a crack
         balance.contact.set_cuts(lambda: graph.gather_broken(cut[:, None]))
     if opened is not None:
         balance.edges_broke(graph.pattern)
@@ -65,12 +66,14 @@ def breaking_of(study: Study, balance: Balance) -> Breaking | None:
     return breaking
 
 
-def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, opened: Values | None) -> Breaking:
+def _tearing(
+    study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, opened: Values | None
+) -> FracturePass:
     """What breaks where cracks take an energy."""
-    from ..fracture.energy.cell_degradation import ClosingSplitting, Splitting
-    from ..fracture.energy.front_advance import RowTips
-    from ..fracture.energy.tip_criterion import CrackTips
-    from ..fracture.fracture_pass import Breaking
+    from ..fracture.degradation import CrackClosureDegradation, Degradation, SplitCellDegradation
+    from ..fracture.energy.front_advance import FrontTipCriterion
+    from ..fracture.energy.tip_criterion import TipCriterion
+    from ..fracture.fracture_pass import FracturePass
 
     assert study.fracture is not None and study.fracture.energy is not None
     check_branching_dimension(study, balance.domain.dim)
@@ -80,49 +83,54 @@ def _tearing(study: Study, balance: Balance, graph: EdgeGraph, passes: int | Non
     toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
     given, moves = study.fracture.passes is not None, balance.scheme.inertia
     rows = balance.domain.dim == 3 and not moves
-    criterion_type: type[CrackTips] = RowTips if rows else CrackTips
+    criterion_type: type[TipCriterion] = FrontTipCriterion if rows else TipCriterion
     if study.fracture.branching:
-        from ..fracture.energy.crack_speed import RunningTips
+        from ..fracture.energy.crack_speed import RateDependentTipCriterion
 
-        criterion_type = RunningTips
+        criterion_type = RateDependentTipCriterion
     tips = criterion_type(stress, graph, strength, toughness, opened)
-    pace = tips.pace() if moves and not given else None
-    kind = ClosingSplitting if stress.cracks_close else Splitting
-    splitting = kind(stress, graph, tips.release_rate() if moves else None)
-    criterion: CrackTips | JoinedTips = tips
+    pace = tips.passes_per_second() if moves and not given else None
+    splitting: Degradation = SplitCellDegradation(stress, graph, tips.release_rate() if moves else None)
+    if stress.cracks_close:
+        splitting = CrackClosureDegradation(splitting, stress, graph)
+    criterion: TipCriterion | AttachedTipCriterion = tips
     if (joining := _joining(study, balance, graph, strength)) is not None:
-        from ..fracture.energy.tip_constraints import JoinedTips
+        from ..fracture.energy.tip_criterion import AttachedTipCriterion
 
-        criterion = JoinedTips(tips, graph, joining)
-    return Breaking(stress, graph, criterion, max_passes=passes, opened=opened, degradation=splitting, pace=pace)
+        criterion = AttachedTipCriterion(tips, graph, joining)
+    return FracturePass(
+        stress, graph, criterion, max_passes=passes, initial_cuts=opened, degradation=splitting, passes_per_second=pace
+    )
 
 
-def _cohesive(study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, opened: Values | None) -> Breaking:
+def _cohesive(
+    study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, opened: Values | None
+) -> FracturePass:
     """What breaks where cracks hold on while they open."""
-    from ..fracture.cohesive.cohesive_pass import CohesiveBreaking
-    from ..fracture.cohesive.cohesive_tips import CohesiveTips
-    from ..fracture.cohesive.softening import Softening
+    from ..fracture.cohesive_cracks import CohesiveFracturePass, CohesiveSoftening, CohesiveTipCriterion
     from ..mesh.edge_graph import EdgeGraph
 
     assert study.fracture is not None
     stress, cuts = balance.stress, EdgeGraph(balance.domain)
     strength = strength_of(study, balance.domain, cuts)
     toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
-    tips = CohesiveTips(stress, cuts, strength, toughness, opened)
-    softening = Softening(stress, cuts, strength, toughness, tips.cut)
-    return CohesiveBreaking(stress, graph, cuts, tips, softening, max_passes=passes, opened=opened)
+    tips = CohesiveTipCriterion(stress, cuts, strength, toughness, opened)
+    softening = CohesiveSoftening(stress, cuts, strength, toughness, tips.cut_positions)
+    return CohesiveFracturePass(stress, graph, cuts, tips, softening, max_passes=passes, initial_cuts=opened)
 
 
 def _opened(study: Study, balance: Balance, graph: EdgeGraph) -> Values | None:
     """[[crack]]: break its edges; where they are cut, None without any."""
     if not study.crack:
         return None
-    from ..fracture.initial_cracks import open_cracks
+    from ..fracture.initial_cracks import open_initial_cracks
 
-    return open_cracks(graph, initial_cracks(study, balance.domain.dim), in_one=not balance.scheme.inertia)
+    return open_initial_cracks(
+        graph, initial_cracks(study, balance.domain.dim), keep_connected=not balance.scheme.inertia
+    )
 
 
-def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> OverloadedEdges | Holding | BrittleSurfaces:
+def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> OverloadedEdges | CellRetention | BrittleSurfaces:
     """Which edges fail."""
     from ..fracture.criterion import OverloadedEdges
 
@@ -132,32 +140,34 @@ def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> OverloadedEdge
         failing = OverloadedEdges(stress, graph, strength, average, study.fracture.cap)
         if study.fracture.crumbs:
             return failing
-        from ..fracture.node_retention import Holding
+        from ..fracture.node_retention import CellRetention
 
-        return Holding(failing, stress, graph)
+        return CellRetention(failing, stress, graph)
     from ..fracture.brittle.surface_criterion import BrittleSurfaces
 
     return BrittleSurfaces(stress, graph, strength, average, surface_rules(study.brittle))
 
 
-def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: Strength) -> Joining | None:
+def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: EdgeStrength) -> NodeAttachment | None:
     """What nodes without a whole cell stay joined by."""
     table = study.fracture
     assert table is not None
     if not table.retains_nodes(study.material.energy):
         return None
-    from ..fracture.node_retention import Joining
+    from ..fracture.node_retention import NodeAttachment
 
-    return Joining(balance.stress, graph, strength, balance.motion.prescribed_nodes, cracks=table.energy is not None)
+    return NodeAttachment(
+        balance.stress, graph, strength, balance.motion.prescribed_nodes, cracks=table.energy is not None
+    )
 
 
-def average_of(study: Study, domain: Domain) -> Average | None:
+def average_of(study: Study, domain: Domain) -> CellAverage | None:
     """The average that a study takes of its stress; None: it takes the stress as it is."""
     table = study.fracture
     if table is None:
         return None
     if table.kernel == "neighbours":
-        from ..fracture.neighbour_average import NeighbourAverage
+        from ..fracture.nonlocal_average import NeighbourAverage
 
         return NeighbourAverage(domain)
     if not table.radius:
@@ -167,24 +177,24 @@ def average_of(study: Study, domain: Domain) -> Average | None:
     return NonlocalAverage(domain, table.radius, table.kernel)
 
 
-def strength_of(study: Study, domain: Domain, graph: EdgeGraph, copy: int = 0) -> Strength:
+def strength_of(study: Study, domain: Domain, graph: EdgeGraph, copy: int = 0) -> EdgeStrength:
     """Strength of edges by region, with scatter, another one in each `copy` of a mesh, and a fibre."""
-    from ..fracture.strength import Fibre, Scatter, Strength
+    from ..fracture.strength import EdgeStrength, FibreAnisotropy, WeibullScatter
 
     table = study.fracture
     assert table is not None
-    scatter = None if (given := table.heterogeneity) is None else Scatter(given.modulus, given.seed + copy)
+    scatter = None if (given := table.heterogeneity) is None else WeibullScatter(given.modulus, given.seed + copy)
     direction = fibre_direction(study, domain.dim)
-    fibre = Fibre(direction, table.fibre.ratio) if direction is not None and table.fibre is not None else None
+    fibre = FibreAnisotropy(direction, table.fibre.ratio) if direction is not None and table.fibre is not None else None
     of_cell = per_cell(study, domain, table, "strength")
-    return Strength(graph, of_cell, tie_break=table.tie_break, scatter=scatter, fibre=fibre)
+    return EdgeStrength(graph, of_cell, tie_break=table.tie_break, scatter=scatter, fibre=fibre)
 
 
-def surface_rules(table: BrittleSettings, copy: int = 0) -> SurfaceRules:
+def surface_rules(table: BrittleSettings, copy: int = 0) -> SurfaceParameters:
     """[brittle] as numbers; seeds differ from `copy` to copy of a mesh."""
-    from ..fracture.brittle.grains import GrainRules, SurfaceRules
+    from ..fracture.brittle.grains import GrainParameters, SurfaceParameters
 
     given = table.grains
-    grains = None if given is None else GrainRules(given.count, given.seed + copy, given.spread, given.mode)
+    grains = None if given is None else GrainParameters(given.count, given.seed + copy, given.spread, given.mode)
     curved = table.shape == "curved"
-    return SurfaceRules(table.surfaces, table.spacing, curved, table.seed + copy, table.per_pass, grains)
+    return SurfaceParameters(table.surfaces, table.spacing, curved, table.seed + copy, table.per_pass, grains)

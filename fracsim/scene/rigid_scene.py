@@ -45,7 +45,7 @@ except ImportError:
     ) from None
 
 if TYPE_CHECKING:
-    from ..fracture.criterion import Average
+    from ..fracture.criterion import CellAverage
     from ..rigid.denting import Shape
 
 Values = npt.NDArray[np.float64]
@@ -152,7 +152,7 @@ def _flowing(study: Study, stiffness: Stiffness, shape: Shape | None, heed: Call
 
 
 def _breakable(
-    study: Study, stiffness: Operator, average: Average | None, number: int, heed: Callable[[], None] | None
+    study: Study, stiffness: Operator, average: CellAverage | None, number: int, heed: Callable[[], None] | None
 ) -> Breakable:
     """A copy of the mesh, with what breaks of it. Chance differs from copy to copy."""
     domain = stiffness.stress.domain

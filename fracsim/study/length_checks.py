@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..errors import InputError
-from ..forms.waves import rayleigh_speed
+from ..forms.waves import rayleigh_wave_speed
 from . import FractureSettings, Study
 from .body import RegionSettings
 from .check_limits import LIMITS
@@ -125,7 +125,7 @@ def _branching_notes(study: Study, h: float) -> Iterator[str]:
     yield "cracks run at up to half of the Rayleigh speed; tips branch to which 2 G_c flows"
     material, step = study.material, study.time.breaking_step or study.time.max_step
     shear = (material.young / (2 * (1 + material.poisson) * material.density)) ** 0.5
-    wave = LIMITS.tip_radius * h / rayleigh_speed(shear, material.poisson)
+    wave = LIMITS.tip_radius * h / rayleigh_wave_speed(shear, material.poisson)
     if step > wave:
         yield f"note: in steps of {step:.2g} s none does: a Rayleigh wave leaves the disc of a tip in {wave:.2g} s;"
         yield f"breaking_step = {wave / 2:.1g} s would do"

@@ -78,7 +78,7 @@ class BaseTimeSettings(StudyTable):
             raise ValueError('step of scheme = "rigid" is one number: bodies move by one step from start to end')
         if self.breaking_step is not None:
             self._check_breaking_step(self.breaking_step)
-        self.scheme_class(**self.scheme_parameters).check()
+        self.scheme_class(**self.scheme_parameters).check_parameters()
         if not self.scheme_class.implicit and self.mass == "consistent":
             raise ValueError('mass = "consistent" is for implicit schemes; explicit steps need mass = "lumped"')
         return self

@@ -32,7 +32,7 @@ REFRESH = 20  # steps between two looks at the shape of the cells
 
 
 class ExplicitStepper(BalanceStepper):
-    """Central differences (forms.schemes.central_difference); the study's step is an upper bound."""
+    """Central differences (forms.schemes.newmark); the study's step is an upper bound."""
 
     _arrival: tuple[Values, Values, Values]
 

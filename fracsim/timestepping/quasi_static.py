@@ -114,7 +114,7 @@ class QuasiStaticStepper(ImplicitStepper):
 
     def _arrived(self, state: State, dt: float, path: _Path) -> State:
         """The end of the step."""
-        _, v, a = self.balance.scheme.finish(dt, path.u, state.u, state.v, state.a)
+        _, v, a = self.balance.scheme.complete_step(dt, path.u, state.u, state.v, state.a)
         return replace(
             state, u=path.u, v=v, a=a, t=state.t + dt, step=state.step + 1, forces=path.forces, drag=path.drag,
             previous_increment=(state.u, dt), out_of_balance=path.out_of_balance,

@@ -368,10 +368,10 @@ class BalanceStepper:
         balance, scheme, own = self.balance, self.balance.scheme, self.balance.motion.owned_dofs
         balance.accept_step()
         x = balance.u.x.array[: balance.owned_dof_count].copy()
-        u, v, a = scheme.finish(dt, x, state.u, state.v, state.a)
+        u, v, a = scheme.complete_step(dt, x, state.u, state.v, state.a)
         if scheme.carries_acceleration:
             a = balance.carried_acceleration(dt, a)
-        if (led := scheme.prescribed(dt, u[own], state.u[own], state.v[own])) is not None:
+        if (led := scheme.prescribed_dof_rates(dt, u[own], state.u[own], state.v[own])) is not None:
             v[own], a[own] = led
         if scheme.alpha_f:
             self.flow.begin_step(dt)

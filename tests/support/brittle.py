@@ -10,9 +10,9 @@ import numpy.typing as npt
 import pyvista
 
 from fracsim.fracture.brittle.crack_level_set import DirectionField
-from fracsim.fracture.brittle.grains import SurfaceRules
-from fracsim.fracture.brittle.surface_cut import Body
-from fracsim.fracture.brittle.surface_pass import Load, Opened, Pattern
+from fracsim.fracture.brittle.grains import SurfaceParameters
+from fracsim.fracture.brittle.surface_cut import SurfaceCutMesh
+from fracsim.fracture.brittle.surface_pass import OpenedSurfaces, OverloadedCells, SurfacePass
 from fracsim.mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
 from fracsim.meshes.data import MeshData
@@ -27,7 +27,7 @@ Ints = npt.NDArray[np.int64]
 class Broken:
     """A body after a pass."""
 
-    opened: Opened
+    opened: OpenedSurfaces
     places: Values  # (n, d) where edges are cut, m
     surface: SplitSurface
     volumes: Values  # (pieces,) m^d enclosed
@@ -38,7 +38,7 @@ def pulled_along(normals: Values) -> Values:
     return np.einsum("ni,nj->nij", normals, normals)
 
 
-def near(body: Body, place: list[float]) -> int:
+def near(body: SurfaceCutMesh, place: list[float]) -> int:
     """The cell whose centroid is nearest to a place."""
     return int(np.argmin(np.linalg.norm(body.centroids - place, axis=1)))
 
@@ -55,29 +55,29 @@ def open_at(
 
     `field`: a function from places (C, d) to directions of tension in the whole body.
     """
-    pattern = Pattern(mesh, SurfaceRules(surfaces=len(places), **table), 1e-6, settle)
-    body, dim = pattern.body, mesh.dim
+    pattern = SurfacePass(mesh, SurfaceParameters(surfaces=len(places), **table), 1e-6, settle)
+    body, dim = pattern.mesh, mesh.dim
     cells = np.array([near(body, place) for place in places])
     direction = np.array(normals, float) / np.linalg.norm(normals, axis=1)[:, None]
     order = np.argsort(cells)
     rest = np.broadcast_to(np.eye(dim), (len(body.cells), dim, dim))
     loads = 2.0 - np.arange(len(cells)) / 100
-    load = Load(cells[order], loads[order], pulled_along(direction[order]), rest[: len(cells)])
+    load = OverloadedCells(cells[order], loads[order], pulled_along(direction[order]), rest[: len(cells)])
     whole = None
     if field is not None:
-        whole = DirectionField.of(body, pulled_along(field(body.centroids)), rest, np.ones(len(rest)))
-    opened = pattern.open(load, np.empty((0, 2), np.int64), np.empty((0, dim)), len(places), whole)
+        whole = DirectionField.from_cells(body, pulled_along(field(body.centroids)), rest, np.ones(len(rest)))
+    opened = pattern.open_surfaces(load, np.empty((0, 2), np.int64), np.empty((0, dim)), len(places), whole)
     return after(mesh, opened)
 
 
-def after(mesh: MeshData, opened: Opened) -> Broken:
+def after(mesh: MeshData, opened: OpenedSurfaces) -> Broken:
     """The body with what a pass opened."""
     skeleton = EntityNumbering(mesh)
-    cut = skeleton.of_edges(opened.keys, opened.cut)
+    cut = skeleton.of_edges(opened.keys, opened.cut_positions)
     broken = ~np.isnan(cut)
     bits = 1 << np.arange(skeleton.cell_edges.shape[1])
     made = build_split_surface(skeleton, broken[skeleton.cell_edges] @ bits, cut)
-    return Broken(opened, cut_points(mesh.points, opened.keys, opened.cut), made, enclosed(made))
+    return Broken(opened, cut_points(mesh.points, opened.keys, opened.cut_positions), made, enclosed(made))
 
 
 def cut_points(points: Values, keys: Ints, cut: Values) -> Values:
@@ -96,7 +96,7 @@ def scene_surface(scene: Scene) -> SplitSurface:
     assert scene.domain.source is not None
     skeleton, graph = EntityNumbering(scene.domain.source), scene.fracture.graph
     own = np.flatnonzero(graph.broken)
-    cut = skeleton.of_edges(graph.edge_keys(own), scene.fracture.criterion.cut[own])
+    cut = skeleton.of_edges(graph.edge_keys(own), scene.fracture.criterion.cut_positions[own])
     pattern = scene.domain.gather_cells(graph.pattern)
     assert pattern is not None
     return build_split_surface(skeleton, pattern, cut)

@@ -7,7 +7,7 @@ import numpy.typing as npt
 
 from fracsim.contact.obstacle import RigidObstacle
 from fracsim.contact.shapes import HalfSpace
-from fracsim.fracture.brittle.grains import SurfaceRules
+from fracsim.fracture.brittle.grains import SurfaceParameters
 from fracsim.mechanics.time_functions import TimeFunction
 from fracsim.meshes.data import MeshData
 from fracsim.rigid.bodies import Bodies
@@ -53,7 +53,7 @@ def stepper_of(
     moved: TimeFunction | None = None,
 ) -> RigidStepper:
     """Bodies of a mesh, by default over a floor at z = 0."""
-    body = breakable(mesh, strength, SurfaceRules(surfaces))
+    body = breakable(mesh, strength, SurfaceParameters(surfaces))
     stand = (
         [RigidObstacle("floor", HalfSpace((0.0, 0.0, 1.0)), np.zeros(3), moved, 0.5)]
         if obstacles is None

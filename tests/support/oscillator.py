@@ -18,11 +18,11 @@ def run(
     u, v = start
     drag = a + b * w**2
     rows = [(u, v, -(w**2) * u - drag * v)]
-    c_a, c_v = scheme.rates(dt)
+    c_a, c_v = scheme.rate_coefficients(dt)
     for _ in range(steps):
-        u_a, u_v = scheme.references(dt, *rows[-1])
+        u_a, u_v = scheme.reference_displacements(dt, *rows[-1])
         x = (c_a * u_a + drag * c_v * u_v) / (c_a + drag * c_v + w**2)
-        rows.append(scheme.finish(dt, x, *rows[-1]))
+        rows.append(scheme.complete_step(dt, x, *rows[-1]))
     return np.array(rows)
 
 

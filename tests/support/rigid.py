@@ -7,10 +7,10 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
-from fracsim.fracture.brittle.grains import SurfaceRules
+from fracsim.fracture.brittle.grains import SurfaceParameters
 from fracsim.fracture.brittle.surface_criterion import BrittleSurfaces
-from fracsim.fracture.neighbour_average import NeighbourAverage
-from fracsim.fracture.strength import Strength
+from fracsim.fracture.nonlocal_average import NeighbourAverage
+from fracsim.fracture.strength import EdgeStrength
 from fracsim.mechanics.material_fields import material_fields
 from fracsim.mechanics.matrix_assembly import VectorAssembler
 from fracsim.mechanics.stress import DegradationModel, Stress
@@ -57,12 +57,12 @@ def section_mean(domain: Domain, values: Values, axis: int, low: float, high: fl
     return float(np.average(values[inside], weights=domain.volumes[inside]))
 
 
-def breakable(mesh: MeshData, strength: float, rules: SurfaceRules, poisson: float = 0.2) -> Breakable:
+def breakable(mesh: MeshData, strength: float, rules: SurfaceParameters, poisson: float = 0.2) -> Breakable:
     """A mesh that breaks along surfaces where its stress, averaged over neighbours, reaches a strength in Pa."""
     stiffness: Operator = stiffness_of(mesh, poisson=poisson) if mesh.shell is None else shell_of(mesh, poisson=poisson)
     domain = stiffness.stress.domain
     graph, within = EdgeGraph(domain), Within(NeighbourAverage(domain), domain.cell_count)
-    criterion = BrittleSurfaces(stiffness.stress, graph, Strength(graph, strength, tie_break=1e-6), within, rules)
+    criterion = BrittleSurfaces(stiffness.stress, graph, EdgeStrength(graph, strength, tie_break=1e-6), within, rules)
     return Breakable(stiffness, graph, criterion, within)
 
 

@@ -60,7 +60,7 @@ class Walk:
     def remember(self) -> None:
         """The body was damaged by hand: go on from there."""
         scene = vars(self)["scene"]
-        scene.fracture.changed()
+        scene.fracture.mark_changed()
         self.state = scene.stepper.with_current_history(self.state)
 
     def settle(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from fracsim.fracture.edge_history import EdgeRecord
+from fracsim.fracture.edge_history import EdgeHistory
 from fracsim.scene import Scene
 
 from .scenes import make_scene, march
@@ -75,9 +75,9 @@ def surfaces_of(name: str, scene: Scene) -> Found:
 
 def cuts_of(name: str, scene: Scene) -> Found:
     """Where edges are cut, by sorted keys."""
-    record = EdgeRecord(scene.fracture.graph)
-    record.note(0.0, scene.fracture.criterion.cut)
-    gathered = record.gathered()
+    record = EdgeHistory(scene.fracture.graph)
+    record.record_breaks(0.0, scene.fracture.criterion.cut_positions)
+    gathered = record.gather_broken()
     return {} if gathered is None else {f"{name}-cut": gathered[1][:, 1]}
 
 

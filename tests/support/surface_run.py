@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from fracsim.fracture.edge_history import EdgeRecord
+from fracsim.fracture.edge_history import EdgeHistory
 from fracsim.mesh.fragments import find_fragments
 from fracsim.output.surface.surface_output import SurfaceOutput
 from fracsim.scene import Scene
@@ -20,7 +20,7 @@ class WrittenSurface:
 
     def __init__(self, scene: Scene, state: State, folder: Path) -> None:
         self._scene, self._steps = scene, 0
-        self._record = EdgeRecord(scene.fracture.graph)
+        self._record = EdgeHistory(scene.fracture.graph)
         self._output = SurfaceOutput(folder, scene.domain, scene.balance.stress.material.density, self._record)
         self._output.write_frame(state, [])
 
@@ -28,7 +28,7 @@ class WrittenSurface:
         """After each step (collective)."""
         self._steps += 1
         if broken:
-            self._record.note(state.t)
+            self._record.record_breaks(state.t)
         if self._steps % 4 == 0:
             self._output.write_frame(state, [])
 

@@ -5,29 +5,29 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from fracsim.fracture.energy.tip_criterion import CrackTips
-from fracsim.fracture.energy.tip_fields import Seen
+from fracsim.fracture.energy.tip_criterion import TipCriterion
+from fracsim.fracture.energy.tip_fields import TipFields
 from fracsim.scene import Scene
 
 Values = npt.NDArray[np.float64]
 
 
-def criterion_of(scene: Scene) -> CrackTips:
+def criterion_of(scene: Scene) -> TipCriterion:
     criterion = scene.fracture.criterion
-    assert isinstance(criterion, CrackTips)
+    assert isinstance(criterion, TipCriterion)
     return criterion
 
 
 def tips(scene: Scene) -> Values:
     """(n, d) m."""
-    return criterion_of(scene).tips().point
+    return criterion_of(scene).find_tips().point
 
 
-def seen(scene: Scene) -> Seen:
+def seen(scene: Scene) -> TipFields:
     """The body around the tips of now, which there are."""
     criterion = criterion_of(scene)
-    criterion.tips()
-    return criterion.sight.look(*scene.fracture.evaluate())
+    criterion.find_tips()
+    return criterion.field_evaluator.evaluate_fields(*scene.fracture.evaluate_undamaged_stress())
 
 
 def run_when_ready(scene: Scene, ready: float) -> tuple[Values, list[Values]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,9 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from fracsim.fracture import nonlocal_average as average_module
-from fracsim.fracture.node_retention import Holding
+from fracsim.fracture.node_retention import CellRetention
 from fracsim.fracture.nonlocal_average import NonlocalAverage
-from fracsim.fracture.strength import hashed
+from fracsim.fracture.strength import hash_points
 from fracsim.mesh.domain import Domain
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.fragments import find_fragments
@@ -124,7 +125,7 @@ def edges(domain: Domain) -> Found:
     count = graph.break_edges(flags)
     ends = domain.nodes[graph.edge_nodes[: graph.edge_count]]
     keys = graph.edge_keys(np.arange(graph.edge_count))
-    every = domain.comm.gather((keys, hashed(ends[:, 0] + ends[:, 1])))
+    every = domain.comm.gather((keys, hash_points(ends[:, 0] + ends[:, 1])))
     found = {
         "edges-broken": graph.broken_keys(),
         "edges-count": np.array([count, sum_over_ranks(domain.comm, graph.broken_count)[0]]),
@@ -145,7 +146,7 @@ def held(scene: Scene) -> Found:
     own = 3.0 + 2.5 * cell_field(domain.nodes[domain.cell_nodes].mean(axis=1))[:, :1]
     stress = own * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
     flags = np.zeros(len(graph.broken), bool)
-    flags[Holding(failing, scene.balance.stress, graph)(stress, own)[0]] = True  # type: ignore[arg-type]
+    flags[CellRetention(failing, scene.balance.stress, graph)(stress, own)[0]] = True  # type: ignore[arg-type]
     graph.break_edges(flags)
     return {"held-broken": graph.broken_keys()}
 
@@ -415,9 +416,9 @@ def squeezed() -> Found:
 
 def by_rows() -> Found:
     """Edges that the block breaks where its average makes no row before stress asks for it."""
-    at_once, average_module.AT_ONCE = average_module.AT_ONCE, 0
+    limits, average_module.LIMITS = average_module.LIMITS, replace(average_module.LIMITS, max_initial_weights=0)
     found = run("block")
-    average_module.AT_ONCE = at_once
+    average_module.LIMITS = limits
     return {"broken-by-rows": found["block-broken"], "u-by-rows": found["block-u"]}
 
 

@@ -1,13 +1,13 @@
-"""The surface through a start as a level set phi (m) on the nodes of the input mesh: planar, or curving.
+"""Level set phi (m) of a crack surface on the nodes of the input mesh: planar or curved.
 
-Planar: phi = N . (X - X_0). Curved: phi grows along its own surface. A node j that completes a cell behind a facet that
-the surface crosses gets
+Planar: phi = N . (X - X_0). Curved: phi is extended along its own surface. A node j that completes a cell behind a
+facet which the surface crosses gets
 
-    N_j   = unit(w_j D_j + (1 - w_j) N),       N the mean normal of the facet's nodes, D_j in the sense of N,
-    phi_j = mean over i of phi_i + (N_i + N_j) / 2 . (X_j - X_i)     (the trapezoidal rule),
+    N_j   = unit(w_j D_j + (1 - w_j) N),       N the mean normal of the facet's nodes, D_j oriented like N,
+    phi_j = mean over i of phi_i + (N_i + N_j) / 2 . (X_j - X_i)     (trapezoidal rule),
 
-with D_j the principal direction around the node and w_j how far it can be relied on: 1 where the stress has the
-strength and one principal stress stands out, 0 where there is no tension, so that the surface goes straight on there.
+with the principal direction D_j around the node and its reliability w_j: 1 where the stress reaches the strength and
+one principal stress stands out, 0 without tension, so that the surface goes straight on there.
 
 Equations: docs/theory.md#brittle-surfaces.
 """
@@ -20,111 +20,130 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from .principal_stress import directions, largest, material_normals, unit
-from .surface_cut import Body, sides_of
+from ..principal_stress import (
+    first_principal_directions,
+    first_principal_stress,
+    material_normals,
+    unit_or_first_axis,
+)
+from .surface_cut import SurfaceCutMesh, sides_of_level_set
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
 
+# Cosine below which a direction is turned round: directions at right angles, but for rounding, keep their sign.
+MIN_COSINE = -1e-9
 
-def planar(points: Values, origin: Values, normal: Values) -> Values:
-    """(N,) signed distances of points (N, d) from a plane."""
+
+def plane_distance(points: Values, origin: Values, normal: Values) -> Values:
+    """Return the signed distances (nodes,) of points (nodes, d) from a plane, m."""
     return np.asarray((points - origin) @ normal)
 
 
 @dataclass(frozen=True)
 class DirectionField:
-    """Principal directions around the nodes.
+    """First principal directions around the nodes.
 
     Attributes:
-        direction: (N, d) unit vectors in the reference configuration, without a sense.
-        weight: (N,) 0 to 1, how far they can be relied on.
+        direction: (nodes, d) unit vectors in the reference configuration, of arbitrary sign.
+        weight: (nodes,) reliability of the directions, 0 to 1.
     """
 
     direction: Values
     weight: Values
 
     @classmethod
-    def of(cls, body: Body, stress: Values, gradient: Values, strength: Values) -> DirectionField:
-        """From stress and F (C, d, d) and strength (C,) of the cells.
+    def from_cells(cls, mesh: SurfaceCutMesh, stress: Values, gradient: Values, strength: Values) -> DirectionField:
+        """Average the directions of cells at nodes.
 
-        Q = sum V w N x N / sum V over the cells around a node; its largest eigenvector is the direction, and what that
-        eigenvalue is ahead of the next is the weight.
+        Q = sum V w N x N / sum V over the cells around a node. Its eigenvector of the largest eigenvalue is the
+        direction, and the distance to the next eigenvalue is the weight.
+
+        Args:
+            mesh: the input mesh.
+            stress: (cells, d, d) Pa.
+            gradient: (cells, d, d) deformation gradient F.
+            strength: (cells,) Pa.
         """
-        share = np.clip(largest(stress) / strength, 0.0, 1.0) * body.volumes
-        normal = material_normals(directions(stress, body.centroids, 0), gradient)
+        share = np.clip(first_principal_stress(stress) / strength, 0.0, 1.0) * mesh.volumes
+        normal = material_normals(first_principal_directions(stress, mesh.centroids, 0), gradient)
         dyads = (share[:, None, None] * normal[:, :, None] * normal[:, None, :]).reshape(len(stress), -1)
-        sums = (body.around @ dyads) / (body.around @ body.volumes)[:, None]
-        values, vectors = np.linalg.eigh(sums.reshape(-1, body.dim, body.dim))
+        sums = (mesh.node_cells @ dyads) / (mesh.node_cells @ mesh.volumes)[:, None]
+        values, vectors = np.linalg.eigh(sums.reshape(-1, mesh.dim, mesh.dim))
         return cls(vectors[:, :, -1], np.clip(values[:, -1] - values[:, -2], 0.0, 1.0))
 
 
-class Curved:
-    """phi grown from one start.
+class CurvedLevelSet:
+    """Level set that is extended cell by cell from one start.
 
     Attributes:
-        phi: (N,) m, NaN where the surface does not come.
+        phi: (nodes,) m, NaN where the surface does not come.
     """
 
-    def __init__(self, body: Body, field: DirectionField, broken: Flags) -> None:
-        self._body, self._field, self._broken = body, field, broken
-        self.phi = np.full(len(body.points), np.nan)
-        self._normal = np.zeros(body.points.shape)
+    def __init__(self, mesh: SurfaceCutMesh, field: DirectionField, broken: Flags) -> None:
+        """Prepare the extension over intact edges; `broken`: (edges,)."""
+        self._mesh, self._field, self._broken = mesh, field, broken
+        self.phi = np.full(len(mesh.points), np.nan)
+        self._normal = np.zeros(mesh.points.shape)
 
     def __call__(self, cell: int, origin: Values, normal: Values) -> Values:
-        """Grow from a cell until nothing is left to complete; returns phi."""
-        new = self._body.cells[cell]
-        self.phi[new] = planar(self._body.points[new], origin, normal)
+        """Extend phi from a cell until no cell can be completed; return it."""
+        new = self._mesh.cells[cell]
+        self.phi[new] = plane_distance(self._mesh.points[new], origin, normal)
         self._normal[new] = normal
         while len(new):
-            new = self._layer(new)
+            new = self._extend_by_layer(new)
         return self.phi
 
-    def extended(self, wanted: Flags) -> Values:
-        """(N,) phi; on nodes that are wanted (N,) and where the surface does not come, that of the nearest plane."""
+    def extrapolate_to(self, wanted: Flags) -> Values:
+        """Return phi (nodes,), on wanted nodes without a value that of the tangent plane at the nearest node."""
         unknown = np.isnan(self.phi) & wanted
-        known = np.flatnonzero(~np.isnan(self.phi))
-        points, phi = self._body.points, self.phi.copy()
-        near = known[cKDTree(points[known]).query(points[unknown])[1]]
+        defined = np.flatnonzero(~np.isnan(self.phi))
+        points, phi = self._mesh.points, self.phi.copy()
+        near = defined[cKDTree(points[defined]).query(points[unknown])[1]]
         phi[unknown] = phi[near] + np.einsum("ni,ni->n", self._normal[near], points[unknown] - points[near])
         return phi
 
-    def _layer(self, new: Ints) -> Ints:
-        """Complete the cells around new nodes that lack one node; returns those nodes."""
-        cells, missing, known = self._to_complete(new)
-        node = self._body.cells[cells][missing]
-        others = self._body.cells[cells][~missing].reshape(len(cells), self._body.dim)[known]
-        node = node[known]
+    def _extend_by_layer(self, new: Ints) -> Ints:
+        """Complete the cells around new nodes that lack one node; return the nodes that got a value."""
+        cells, missing, enters = self._cells_to_complete(new)
+        node = self._mesh.cells[cells][missing]
+        facet = self._mesh.cells[cells][~missing].reshape(len(cells), self._mesh.dim)[enters]
+        node = node[enters]
         if not len(node):
             return node
-        normal, phi = self._beyond(node, others)
-        target, place, count = np.unique(node, return_inverse=True, return_counts=True)
-        self.phi[target] = np.bincount(place, phi) / count
-        for axis in range(self._body.dim):
-            self._normal[target, axis] = np.bincount(place, normal[:, axis])
-        self._normal[target] = unit(self._normal[target])
+        normal, phi = self._extend_behind_facets(node, facet)
+        target, row, count = np.unique(node, return_inverse=True, return_counts=True)
+        self.phi[target] = np.bincount(row, phi) / count
+        for axis in range(self._mesh.dim):
+            self._normal[target, axis] = np.bincount(row, normal[:, axis])
+        self._normal[target] = unit_or_first_axis(self._normal[target])
         return target
 
-    def _to_complete(self, new: Ints) -> tuple[Ints, Flags, Flags]:
-        """Cells around new nodes that lack one node, (n, d + 1) flags of that node, and which of the cells the surface
-        enters through the facet opposite, over intact edges."""
-        body = self._body
-        cells = np.unique(body.around[new].indices).astype(np.int64)
-        missing = np.isnan(self.phi[body.cells[cells]])
-        lacking = np.count_nonzero(missing, axis=1) == 1
-        cells, missing = cells[lacking], missing[lacking]
-        ends = self.phi[body.edges[body.cell_edges[cells]]]
-        side = sides_of(ends, body.tolerance)
-        crossed = (side[:, :, 0] != side[:, :, 1]) & ~np.isnan(ends).any(axis=2)
-        return cells, missing, crossed.any(axis=1) & ~(crossed & self._broken[body.cell_edges[cells]]).any(axis=1)
+    def _cells_to_complete(self, new: Ints) -> tuple[Ints, Flags, Flags]:
+        """Find the cells around new nodes that lack one value.
 
-    def _beyond(self, node: Ints, others: Ints) -> tuple[Values, Values]:
-        """(n, d) normals and (n,) phi at nodes from those of the facets (n, d nodes) opposite."""
-        ahead = unit(self._normal[others].sum(axis=1))
-        found, weight = self._field.direction[node], self._field.weight[node][:, None]
-        sense = np.where(np.einsum("ni,ni->n", found, ahead) >= -1e-9, 1.0, -1.0)[:, None]
-        normal = unit(weight * sense * found + (1 - weight) * ahead)
-        step = self._body.points[node][:, None] - self._body.points[others]
-        mean = (self._normal[others] + normal[:, None]) / 2
-        return normal, (self.phi[others] + np.einsum("nki,nki->nk", mean, step)).mean(axis=1)
+        Returns:
+            Cells (n,), flags (n, d + 1) of the lacking node, and flags (n,) of the cells that the surface enters
+            through the facet opposite to it, over intact edges.
+        """
+        mesh = self._mesh
+        cells = np.unique(mesh.node_cells[new].indices).astype(np.int64)
+        missing = np.isnan(self.phi[mesh.cells[cells]])
+        lacks_one = np.count_nonzero(missing, axis=1) == 1
+        cells, missing = cells[lacks_one], missing[lacks_one]
+        ends = self.phi[mesh.edges[mesh.cell_edges[cells]]]
+        side = sides_of_level_set(ends, mesh.tolerance)
+        crossed = (side[:, :, 0] != side[:, :, 1]) & ~np.isnan(ends).any(axis=2)
+        return cells, missing, crossed.any(axis=1) & ~(crossed & self._broken[mesh.cell_edges[cells]]).any(axis=1)
+
+    def _extend_behind_facets(self, node: Ints, facet: Ints) -> tuple[Values, Values]:
+        """Return normals (n, d) and phi (n,) at nodes (n,) behind facets (n, d nodes)."""
+        ahead = unit_or_first_axis(self._normal[facet].sum(axis=1))
+        direction, weight = self._field.direction[node], self._field.weight[node][:, None]
+        sign = np.where(np.einsum("ni,ni->n", direction, ahead) >= MIN_COSINE, 1.0, -1.0)[:, None]
+        normal = unit_or_first_axis(weight * sign * direction + (1 - weight) * ahead)
+        step = self._mesh.points[node][:, None] - self._mesh.points[facet]
+        mean = (self._normal[facet] + normal[:, None]) / 2
+        return normal, (self.phi[facet] + np.einsum("nki,nki->nk", mean, step)).mean(axis=1)

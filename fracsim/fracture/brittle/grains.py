@@ -1,11 +1,9 @@
-"""Grain boundaries (B07 section 7.1): nodes belong to the seeded point p_i with the least energy k_i |x - p_i|.
+"""Grain boundaries (B07, section 7.1): nodes belong to the seed p_i with the least energy k_i |x - p_i|.
 
-B07 cuts at the zero of (E_i - E_j) / 2, linear between nodes. The difference of the squares has the same zero, and is
-linear along an edge where the weights are equal: then the boundaries are planes exactly.
+B07 cuts edges at the zero of (E_i - E_j) / 2, linear between nodes. The difference of the squares has the same zero and
+is linear along an edge if the weights are equal, so that the boundaries are exact planes then.
 
 Equations: docs/theory.md#brittle-surfaces.
-
-What decides where brittle surfaces start and run: plain numbers.
 """
 
 from __future__ import annotations
@@ -17,21 +15,25 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.distance import cdist
 
-from .surface_cut import NEAREST, ROUNDS, Body, one_by_one
+from .surface_cut import CUT, SurfaceCutMesh, relabel_isolated_nodes
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
-CHUNK = 1 << 22  # distances held at a time
+
+# Distances between points and seeds held at once: 32 MiB.
+DISTANCES_AT_ONCE = 1 << 22
 
 
 @dataclass(frozen=True)
-class GrainRules:
-    """Grain boundaries: regions of `count` seeded points p_i by least k_i |x - p_i|.
+class GrainParameters:
+    """Parameters of grains.
 
     Attributes:
-        seed: of the points.    spread: k_i are drawn from 1 - spread to 1 + spread; 0: all grains alike.
-        mode: "replace": a surface frees a grain; "bias": it runs along the boundaries nearest to it.
+        count: number of seeds.
+        seed: seed of the random points.
+        spread: the weights k_i are drawn from 1 - spread to 1 + spread; 0 for equal weights.
+        mode: "replace": a surface cuts out a grain; "bias": it follows the nearest grain boundaries.
     """
 
     count: int
@@ -41,14 +43,16 @@ class GrainRules:
 
 
 @dataclass(frozen=True)
-class SurfaceRules:
-    """Surfaces in place of single edges.
+class SurfaceParameters:
+    """Parameters of brittle surfaces.
 
     Attributes:
-        surfaces: most of the run.    per_pass: most that start in one pass; None: no limit.
-        spacing: m between places where surfaces start; None: about two mesh edges.
-        curved: whether surfaces turn with the principal direction; else they are planes.
-        seed: of the direction where several principal stresses are equal.
+        surfaces: largest number of surfaces in the run.
+        spacing: least distance between starts of surfaces, m; None: about two mesh edges.
+        curved: surfaces turn with the principal direction; otherwise they are planes.
+        seed: seed of the direction where several principal stresses are equal.
+        per_pass: largest number of surfaces that start in one pass; None: no limit.
+        grains: grains; None for surfaces by a level set.
     """
 
     surfaces: int
@@ -56,126 +60,140 @@ class SurfaceRules:
     curved: bool = False
     seed: int = 0
     per_pass: int | None = None
-    grains: GrainRules | None = None
+    grains: GrainParameters | None = None
 
 
-class Grains:
-    """Grains of a body.
+class GrainBoundaries:
+    """Grains of a mesh, and the edges between them.
 
     Attributes:
-        seeds: (n, d) m, uniform in the body.    weights: (n,) k_i.
-        mode: see GrainRules.
-        of_node: (N,) grain of each node.    of_cell: (C,) grain of each centroid.
-        edges: (k,) edges between grains.    cut: (k,) where their boundaries cut them, from the lower node.
+        mode: see `GrainParameters`.
+        seeds: (n, d) points, m, uniform in the body.
+        weights: (n,) k_i.
+        node_grain: (nodes,) grain of each node.
+        cell_grain: (cells,) grain of each centroid.
+        edges: (k,) edges between grains.
+        cut_positions: (k,) positions of the boundary on these edges, from the lower node.
     """
 
-    def __init__(self, body: Body, rules: GrainRules, settle: bool) -> None:
-        """`settle`: no node without a cell in its own grain, as far as its cells allow."""
-        self.mode = rules.mode
-        self.seeds, self.weights = sow(body, rules)
-        self.of_node, _ = least(body.points, self.seeds, self.weights)
-        self.of_cell, _ = least(body.centroids, self.seeds, self.weights)
-        if settle:
-            half = len(self.of_node) // 2
-            self.of_node = (_settled(body.cells, self.of_node) if body.layer is None
-                            else np.tile(_settled(body.layer.cells, self.of_node[:half]), 2))  # fmt: skip
-        both = self.of_node[body.edges]
-        self.edges: Ints = np.flatnonzero(both[:, 0] != both[:, 1])
-        self._ends = both[self.edges]
-        self.cut = self._cuts(body.points[body.edges[self.edges]], self._ends)
+    def __init__(self, mesh: SurfaceCutMesh, parameters: GrainParameters, retain_nodes: bool) -> None:
+        """Draw seeds and assign nodes; `retain_nodes`: every node gets a cell within its own grain where possible."""
+        self.mode = parameters.mode
+        self.seeds, self.weights = draw_seeds(mesh, parameters)
+        self.node_grain, _ = assign_to_seeds(mesh.points, self.seeds, self.weights)
+        self.cell_grain, _ = assign_to_seeds(mesh.centroids, self.seeds, self.weights)
+        if retain_nodes and mesh.layer is None:
+            self.node_grain = _reassign_isolated_nodes(mesh.cells, self.node_grain)
+        elif retain_nodes and mesh.layer is not None:
+            # The nodes of a shell are there twice: both faces belong to the same grains.
+            half = len(self.node_grain) // 2
+            self.node_grain = np.tile(_reassign_isolated_nodes(mesh.layer.cells, self.node_grain[:half]), 2)
+        end_grains = self.node_grain[mesh.edges]
+        self.edges: Ints = np.flatnonzero(end_grains[:, 0] != end_grains[:, 1])
+        self._end_grains = end_grains[self.edges]
+        self.cut_positions = self._boundary_positions(mesh.points[mesh.edges[self.edges]], self._end_grains)
 
-    def cut_of(self, edges: Ints) -> Values:
-        """(n,) where edges between grains are cut."""
-        return self.cut[np.searchsorted(self.edges, edges)]
+    def cut_positions_of(self, edges: Ints) -> Values:
+        """Return the cut positions (n,) of edges (n,) between grains."""
+        return self.cut_positions[np.searchsorted(self.edges, edges)]
 
     def edges_of(self, grain: int) -> Ints:
-        """The edges that leave a grain."""
-        return self.edges[(self._ends == grain).any(axis=1)]
+        """Return the edges that leave a grain."""
+        return self.edges[(self._end_grains == grain).any(axis=1)]
 
-    def mean(self, phi: Values) -> Values:
-        """(n,) mean of nodal values over each grain."""
+    def average_by_grain(self, phi: Values) -> Values:
+        """Return the mean (n,) of nodal values (nodes,) over each grain."""
         count = len(self.weights)
-        nodes = np.bincount(self.of_node, minlength=count)
-        return np.asarray(np.bincount(self.of_node, phi, minlength=count) / np.maximum(nodes, 1))
+        nodes = np.bincount(self.node_grain, minlength=count)
+        return np.asarray(np.bincount(self.node_grain, phi, minlength=count) / np.maximum(nodes, 1))
 
-    def _cuts(self, ends: Values, grain: Ints) -> Values:
-        """(k,) zeros of E_j^2 - E_i^2 on edges whose ends (k, 2, d) belong to grains (k, 2) i and j."""
-        lead = [self._energy2(ends[:, a], grain[:, 1 - a]) - self._energy2(ends[:, a], grain[:, a]) for a in (0, 1)]
-        first, second = (np.maximum(each, 0.0) for each in lead)  # below 0: a node that was moved over
-        both = first + second
-        return np.clip(np.divide(first, both, out=np.full(len(both), 0.5), where=both > 0), NEAREST, 1 - NEAREST)
+    def _boundary_positions(self, ends: Values, grain: Ints) -> Values:
+        """Return the zeros (k,) of E_j^2 - E_i^2 on edges with ends (k, 2, d) in grains i and j (k, 2)."""
+        difference = [
+            self._squared_energy(ends[:, a], grain[:, 1 - a]) - self._squared_energy(ends[:, a], grain[:, a])
+            for a in (0, 1)
+        ]
+        # A node that was moved to another grain has a negative difference: the cut is at that node then.
+        first, second = (np.maximum(end, 0.0) for end in difference)
+        total = first + second
+        position = np.divide(first, total, out=np.full(len(total), 0.5), where=total > 0)
+        return np.clip(position, CUT.min_share, 1 - CUT.min_share)
 
-    def _energy2(self, points: Values, grain: Ints) -> Values:
+    def _squared_energy(self, points: Values, grain: Ints) -> Values:
+        """Return k_i^2 |x - p_i|^2 (n,) of points (n, d) and grains i (n,)."""
         return np.asarray(self.weights[grain] ** 2 * np.sum((points - self.seeds[grain]) ** 2, axis=1))
 
 
-def sow(body: Body, rules: GrainRules) -> tuple[Values, Values]:
-    """Points drawn uniformly from the body, (n, d) in m, and weights (n,) drawn from 1 - spread to 1 + spread."""
-    random = np.random.Generator(np.random.PCG64(rules.seed))
-    share = np.cumsum(body.volumes)
-    cell = np.searchsorted(share / share[-1], random.random(rules.count), side="right")
-    inside = random.dirichlet(np.ones(body.dim + 1), rules.count)
-    seeds = np.einsum("nk,nki->ni", inside, body.points[body.cells[np.minimum(cell, len(body.cells) - 1)]])
-    return seeds, random.uniform(1 - rules.spread, 1 + rules.spread, rules.count)
+def draw_seeds(mesh: SurfaceCutMesh, parameters: GrainParameters) -> tuple[Values, Values]:
+    """Draw points (n, d), m, uniformly from the body, and weights (n,) from 1 - spread to 1 + spread."""
+    random = np.random.Generator(np.random.PCG64(parameters.seed))
+    share = np.cumsum(mesh.volumes)
+    cell = np.searchsorted(share / share[-1], random.random(parameters.count), side="right")
+    barycentric = random.dirichlet(np.ones(mesh.dim + 1), parameters.count)
+    seeds = np.einsum("nk,nki->ni", barycentric, mesh.points[mesh.cells[np.minimum(cell, len(mesh.cells) - 1)]])
+    return seeds, random.uniform(1 - parameters.spread, 1 + parameters.spread, parameters.count)
 
 
-def least(points: Values, seeds: Values, weights: Values) -> tuple[Ints, Values]:
-    """For each point the seed of least energy k_i |x - p_i|, the first where several are, and that energy (k m)."""
+def assign_to_seeds(points: Values, seeds: Values, weights: Values) -> tuple[Ints, Values]:
+    """Return for each point (N, d) the seed of least energy k_i |x - p_i|, the first of equal ones, and the energy."""
     label, energy = np.empty(len(points), np.int64), np.empty(len(points))
-    rows = max(CHUNK // len(seeds), 1)
+    rows = max(DISTANCES_AT_ONCE // len(seeds), 1)
     for first in range(0, len(points), rows):
         part = slice(first, first + rows)
-        every = cdist(points[part], seeds) * weights
-        label[part] = every.argmin(axis=1)
-        energy[part] = every.min(axis=1)
+        energies = cdist(points[part], seeds) * weights
+        label[part] = energies.argmin(axis=1)
+        energy[part] = energies.min(axis=1)
     return label, energy
 
 
-def _settled(cells: Ints, grain: Ints) -> Ints:
-    """Grains (N,) with the nodes moved over that have no cell within their own grain: into one where they have, alone
-    or, where there is none, with the other corners of the cell that most of are of one grain."""
+def _reassign_isolated_nodes(cells: Ints, grain: Ints) -> Ints:
+    """Return the grains (nodes,) with isolated nodes moved to a grain in which they have a cell.
+
+    An isolated node has no cell with all corners in its own grain. It moves alone, or with the other corners of the
+    cell that has most corners in one grain.
+    """
     grain = grain.copy()
-    lost = _lost(cells, grain)
-    for attempt in range(2 * ROUNDS):
-        if not lost.any():
+    isolated = _flag_isolated(cells, grain)
+    for attempt in range(2 * CUT.reassign_rounds):
+        if not isolated.any():
             break
-        moved = _moved_alone(cells, grain, lost) if attempt < ROUNDS else grain
+        moved = _move_alone(cells, grain, isolated) if attempt < CUT.reassign_rounds else grain
         if np.array_equal(moved, grain):
-            moved = _moved_with_cells(cells, grain, lost)
-            if np.count_nonzero(_lost(cells, moved)) >= np.count_nonzero(lost):
+            moved = _move_with_cell(cells, grain, isolated)
+            if np.count_nonzero(_flag_isolated(cells, moved)) >= np.count_nonzero(isolated):
                 break
-        grain, lost = moved, _lost(cells, moved)
-    return one_by_one(cells, grain, np.ones(len(grain), bool)) if lost.any() else grain
+        grain, isolated = moved, _flag_isolated(cells, moved)
+    return relabel_isolated_nodes(cells, grain, np.ones(len(grain), bool)) if isolated.any() else grain
 
 
-def _lost(cells: Ints, grain: Ints) -> Flags:
-    """(N,) nodes without a cell within their own grain."""
-    of = grain[cells]
-    lost = np.ones(len(grain), bool)
-    lost[cells[np.all(of == of[:, :1], axis=1)]] = False
-    return lost
+def _flag_isolated(cells: Ints, grain: Ints) -> Flags:
+    """Flag the nodes (nodes,) without a cell within their own grain."""
+    corner_grain = grain[cells]
+    isolated = np.ones(len(grain), bool)
+    isolated[cells[np.all(corner_grain == corner_grain[:, :1], axis=1)]] = False
+    return isolated
 
 
-def _moved_alone(cells: Ints, grain: Ints, lost: Flags) -> Ints:
-    """Lost nodes in the grain that all other corners of a cell of theirs are of."""
-    of, moved = grain[cells], grain.copy()
+def _move_alone(cells: Ints, grain: Ints, isolated: Flags) -> Ints:
+    """Return the grains with isolated nodes moved to the common grain of all other corners of one of their cells."""
+    corner_grain, moved = grain[cells], grain.copy()
     for corner in range(cells.shape[1]):
-        rest = np.delete(of, corner, axis=1)
-        one = np.all(rest == rest[:, :1], axis=1) & lost[cells[:, corner]]
-        moved[cells[one, corner]] = rest[one, 0]
+        remaining = np.delete(corner_grain, corner, axis=1)
+        common = np.all(remaining == remaining[:, :1], axis=1) & isolated[cells[:, corner]]
+        moved[cells[common, corner]] = remaining[common, 0]
     return moved
 
 
-def _moved_with_cells(cells: Ints, grain: Ints, lost: Flags) -> Ints:
-    """All corners of one cell of each lost node in the grain that most of the cell's corners are of."""
-    near = cells[lost[cells].any(axis=1)]
-    of = grain[near]
-    like = (of[:, :, None] == of[:, None, :]).sum(axis=2)
-    most = of[np.arange(len(near)), like.argmax(axis=1)]
-    row, corner = np.nonzero(lost[near])
-    order = np.lexsort((row, -like.max(axis=1)[row], near[row, corner]))
+def _move_with_cell(cells: Ints, grain: Ints, isolated: Flags) -> Ints:
+    """Return the grains with one cell of each isolated node moved, all corners, to the most frequent grain in it."""
+    near = cells[isolated[cells].any(axis=1)]
+    corner_grain = grain[near]
+    frequency = (corner_grain[:, :, None] == corner_grain[:, None, :]).sum(axis=2)
+    frequent = corner_grain[np.arange(len(near)), frequency.argmax(axis=1)]
+    row, corner = np.nonzero(isolated[near])
+    order = np.lexsort((row, -frequency.max(axis=1)[row], near[row, corner]))
     _, first = np.unique(near[row, corner][order], return_index=True)
     chosen = row[order][first]
     moved = grain.copy()
-    moved[near[chosen]] = most[chosen, None]
+    moved[near[chosen]] = frequent[chosen, None]
     return moved

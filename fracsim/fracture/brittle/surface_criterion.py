@@ -1,4 +1,8 @@
-"""The part of the fracture pass that starts surfaces and breaks the edges that they cut."""
+"""Criterion of brittle surfaces: surfaces start where stress reaches the strength, and break the edges that they cut.
+
+Geometry is computed on rank 0 in the input mesh, and only in passes in which a surface starts, so that the pattern is
+the same on any number of ranks. Equations: docs/theory.md#brittle-surfaces.
+"""
 
 from __future__ import annotations
 
@@ -11,136 +15,159 @@ from ...mechanics.stress import Stress
 from ...mesh.edge_graph import EdgeGraph
 from ...mesh.parallel import from_root, gather, sum_over_ranks
 from ...mesh.simplices import local_edges
-from ..criterion import Average, CarriedStress, Edges
-from ..strength import Strength
+from ..criterion import CellAverage, Edges, IntactEdgeStress
+from ..principal_stress import first_principal_stress, principal_stress_bound, symmetric_tensors
+from ..strength import EdgeStrength
 from .crack_level_set import DirectionField
-from .grains import SurfaceRules
-from .principal_stress import largest, tensors, upper_bound
-from .surface_pass import Load, Opened, Pattern
+from .grains import SurfaceParameters
+from .surface_pass import OpenedSurfaces, OverloadedCells, SurfacePass
 
 Cells = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-SPACING = 4.0  # default distance of starts, in sides of a mean cell's cube: about two mesh edges
+# Default distance between starts over the side of a cube of the mean cell's volume: about two mesh edges.
+DEFAULT_SPACING = 4.0
 
 
 class BrittleSurfaces:
-    """Surfaces where the averaged principal stress of cells reaches their strength, the mean over their edges.
+    """Criterion: a surface starts where the averaged first principal stress of a cell reaches its strength.
+
+    The strength of a cell is the mean over its edges.
 
     Attributes:
-        starts: (n, d) where the surfaces so far have started, m; the same on every rank.
-        cut: (edges,) where surfaces cut local edges, from the end that comes first in the input mesh; NaN elsewhere.
-        spacing: least distance of starts, m.
+        strength: strength of each edge in each cell, Pa.
+        spacing: least distance between starts, m.
+        starts: (n, d) points where the surfaces started so far, m; the same on every rank.
+        cut_positions: (edges,) cuts of local edges, 0 at the end that comes first in the input mesh to 1 at the other;
+            NaN elsewhere.
+        reserved: number of surfaces that may not start at present.
     """
 
-    carried = None
+    tip_states = None
 
     def __init__(
-        self, stress: Stress, graph: EdgeGraph, strength: Strength, average: Average | None, rules: SurfaceRules
+        self,
+        stress: Stress,
+        graph: EdgeGraph,
+        strength: EdgeStrength,
+        average: CellAverage | None,
+        parameters: SurfaceParameters,
     ) -> None:
-        self._stress, self._graph, self.strength, self._rules = stress, graph, strength, rules
+        self._stress, self._graph, self.strength, self._parameters = stress, graph, strength, parameters
         self._domain = stress.domain
-        self._carried = CarriedStress(stress, graph, average, whole_tensor=True)
-        self.spacing = rules.spacing if rules.spacing is not None else SPACING * self._domain.mean_edge_length
+        self._carried = IntactEdgeStress(stress, graph, average, whole_tensor=True)
+        spacing = parameters.spacing
+        self.spacing = spacing if spacing is not None else DEFAULT_SPACING * self._domain.mean_edge_length
         self.starts: Values = np.empty((0, self._domain.dim))
-        self.cut: Values = np.full(len(graph.broken), np.nan)
-        self.kept_back = 0  # surfaces that may not start now
-        self._pattern: Pattern | None = None
+        self.cut_positions: Values = np.full(len(graph.broken), np.nan)
+        self.reserved = 0
+        self._surface_pass: SurfacePass | None = None
 
     @property
-    def left(self) -> int:
-        """Surfaces that may still start."""
-        return self._rules.surfaces - len(self.starts) - self.kept_back
+    def remaining(self) -> int:
+        """Number of surfaces that may still start."""
+        return self._parameters.surfaces - len(self.starts) - self.reserved
 
     def __call__(self, stress: Values, psi: Values | None = None) -> tuple[Edges, Values]:
-        """The edges that new surfaces cut; once all surfaces are used up nothing breaks."""
+        """Find the local edges (n,) that new surfaces cut, with loads of 1 (collective).
+
+        Args:
+            stress: (cells, 3 or 6) Cauchy stress of the undamaged material, Pa.
+            psi: not used.
+        """
         none = np.empty(0, np.int64), np.empty(0)
-        if not self.left:
+        if not self.remaining:
             return none
         carried, active = self._carried(stress)
-        load = self._overloaded(*self._carried.reaching(carried, active, self.strength.weakest))
+        cells, averaged = self._carried.find_averages_above(carried, active, self.strength.minimum)
+        load = self._find_overloaded(cells, averaged)
         if not sum_over_ranks(self._domain.comm, len(load.cell))[0]:
             return none
         parts = gather(self._domain.comm, load)
-        field = self._field(self._carried.everywhere(carried, active)) if self._rules.curved else None
+        field = self._cell_fields(self._carried.average_all(carried, active)) if self._parameters.curved else None
         broken = self._graph.broken_keys()
-        opened: Opened = from_root(self._domain.comm, lambda: self._open(parts, broken, field))
+        opened: OpenedSurfaces = from_root(self._domain.comm, lambda: self._open_on_root(parts, broken, field))
         self.starts = np.concatenate([self.starts, opened.starts])
-        edges = self._cut_edges(opened)
+        edges = self._store_cuts(opened)
         return edges, np.ones(len(edges))
 
-    def moving(self, v: Values, a: Values, now: float, dt: float) -> None:
-        """Stress is all that counts."""
+    def set_motion(self, v: Values, a: Values, now: float, dt: float) -> None:
+        """Do nothing: the criterion depends on the stress alone."""
 
-    def memory(self) -> tuple[Values, Values]:
-        """Where surfaces have started, and where they cut."""
-        return self.starts, self.cut.copy()
+    def snapshot(self) -> tuple[Values, Values]:
+        """Return the starts (n, d) and the cut positions (edges,)."""
+        return self.starts, self.cut_positions.copy()
 
-    def recall(self, memory: object) -> None:
-        """No more surfaces than that."""
+    def restore(self, memory: object) -> None:
+        """Restore the starts and cut positions that `snapshot` returned."""
         assert isinstance(memory, tuple)
-        self.starts, self.cut[:] = memory
+        self.starts, self.cut_positions[:] = memory
 
-    def _overloaded(self, cells: Cells, averaged: Values) -> Load:
-        """Those of the cells whose largest principal stress reaches their strength."""
+    def _find_overloaded(self, cells: Cells, averaged: Values) -> OverloadedCells:
+        """Find those of cells (n,) whose first principal stress reaches their strength."""
         dim = self._domain.dim
-        stress = tensors(averaged, dim)
-        may = np.flatnonzero(upper_bound(stress) >= self.strength.weakest)
-        cells, stress = cells[may], stress[may]
-        load = largest(stress) / self._strength_of(cells)
-        over = np.flatnonzero(load >= 1)
-        cells = cells[over]
-        return Load(self._domain.cell_input[cells], load[over], stress[over], self._gradients(cells))
+        stress = symmetric_tensors(averaged, dim)
+        candidates = np.flatnonzero(principal_stress_bound(stress) >= self.strength.minimum)
+        cells, stress = cells[candidates], stress[candidates]
+        load = first_principal_stress(stress) / self._cell_strength(cells)
+        overloaded = np.flatnonzero(load >= 1)
+        cells = cells[overloaded]
+        return OverloadedCells(
+            self._domain.cell_input[cells], load[overloaded], stress[overloaded], self._gradients(cells)
+        )
 
-    def _strength_of(self, cells: Cells) -> Values:
-        """(n,) Pa: the mean over the edges of each cell."""
+    def _cell_strength(self, cells: Cells) -> Values:
+        """Return the mean strength (n,) over the edges of cells, Pa."""
         return np.asarray(self.strength(cells, self._graph.cell_edges[cells]).mean(axis=1))
 
     def _gradients(self, cells: Cells) -> Values:
-        """(n, d, d) F of the configuration that the stress belongs to: x_k - x_0 = F (X_k - X_0). Of quadratic cells
-        the mean, as stress is: that of linear cells with `_mean_corners`."""
-        rest, now = self._domain.nodes[self._domain.cell_nodes[cells]], self._stress.cell_corners(cells)
+        """Return F (n, d, d) of the configuration of the stress, x_k - x_0 = F (X_k - X_0).
+
+        For quadratic cells it is the mean, as the stress is: that of the linear cells with `_mean_corners`.
+        """
+        reference, present = self._domain.nodes[self._domain.cell_nodes[cells]], self._stress.cell_corners(cells)
         if self._domain.order == 2 and not self._stress.energy.linear:
-            now = self._mean_corners(cells)
-        span, moved = (corners[:, 1:] - corners[:, :1] for corners in (rest, now))
-        return np.swapaxes(np.linalg.solve(span, moved), 1, 2)
+            present = self._mean_corners(cells)
+        reference_edges, present_edges = (corners[:, 1:] - corners[:, :1] for corners in (reference, present))
+        return np.swapaxes(np.linalg.solve(reference_edges, present_edges), 1, 2)
 
     def _mean_corners(self, cells: Cells) -> Values:
-        """(n, d + 1, d) corners of the straight cells with the mean gradient of quadratic ones, but for a shift, m.
+        """Return corners (n, d + 1, d), m, of straight cells with the mean gradient of quadratic ones, but for a shift.
 
-        It is the gradient at the centroid, where the shape functions l_i (2 l_i - 1) of corners have the slope
-        (4 / (d + 1) - 1) grad l_i and 4 l_i l_j of middles 4 / (d + 1) (grad l_i + grad l_j).
+        The mean gradient is that at the centroid, where the shape functions l_i (2 l_i - 1) of corners have the
+        gradient (4 / (d + 1) - 1) grad l_i, and 4 l_i l_j of midside nodes 4 / (d + 1) (grad l_i + grad l_j).
         """
         domain, d = self._domain, self._domain.dim
         x = domain.nodes + self._stress.u.x.array.reshape(-1, d)
-        middles, share = x[domain.cell_midside_nodes[cells]], 4 / (d + 1)
+        midside, share = x[domain.cell_midside_nodes[cells]], 4 / (d + 1)
         result: Values = (share - 1) * x[domain.cell_nodes[cells]]
         for number, ends in enumerate(local_edges(d)):
-            result[:, ends] += share * middles[:, number, None]
+            result[:, ends] += share * midside[:, number, None]
         return result
 
-    def _field(self, averaged: Values) -> tuple[Any, ...]:
-        """Stress, F and strength of all cells in input order, on rank 0 (collective)."""
-        every = np.arange(self._domain.cell_count)
-        stress = tensors(averaged, self._domain.dim)
-        parts = stress, self._gradients(every), self._strength_of(every)
-        return tuple(self._domain.gather_cells(part) for part in parts)
+    def _cell_fields(self, averaged: Values) -> tuple[Any, ...]:
+        """Gather stress, F and strength of all cells in input order on rank 0 (collective)."""
+        cells = np.arange(self._domain.cell_count)
+        stress = symmetric_tensors(averaged, self._domain.dim)
+        fields = stress, self._gradients(cells), self._cell_strength(cells)
+        return tuple(self._domain.gather_cells(values) for values in fields)
 
-    def _open(self, parts: Any, broken: Any, field: tuple[Any, ...] | None) -> Opened:
-        """What the pass opens, on rank 0."""
-        if self._pattern is None:
+    def _open_on_root(self, parts: Any, broken: Any, field: tuple[Any, ...] | None) -> OpenedSurfaces:
+        """Open the surfaces of the pass, on rank 0, from the overloaded cells of all ranks."""
+        if self._surface_pass is None:
             assert self._domain.source is not None
-            settle = self._stress.chi is not None
-            self._pattern = Pattern(self._domain.source, self._rules, self.spacing, settle)
-        load = Load(*(np.concatenate([getattr(part, name) for part in parts]) for name in Load.__annotations__))
+            retain_nodes = self._stress.chi is not None
+            self._surface_pass = SurfacePass(self._domain.source, self._parameters, self.spacing, retain_nodes)
+        names = OverloadedCells.__annotations__
+        load = OverloadedCells(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
         order = np.argsort(load.cell)
-        load = Load(*(getattr(load, name)[order] for name in Load.__annotations__))
-        most = min(self.left, self._rules.per_pass or self.left)
-        along = DirectionField.of(self._pattern.body, *field) if field is not None else None
-        return self._pattern.open(load, broken, self.starts, most, along)
+        load = OverloadedCells(*(getattr(load, name)[order] for name in names))
+        count = min(self.remaining, self._parameters.per_pass or self.remaining)
+        directions = DirectionField.from_cells(self._surface_pass.mesh, *field) if field is not None else None
+        return self._surface_pass.open_surfaces(load, broken, self.starts, count, directions)
 
-    def _cut_edges(self, opened: Opened) -> Edges:
-        """(n,) local edges that are cut; where is kept."""
-        local, place = self._graph.find_keys(opened.keys)
-        self.cut[local] = opened.cut[place]
+    def _store_cuts(self, opened: OpenedSurfaces) -> Edges:
+        """Store the cut positions; return the local edges (n,) that are cut."""
+        local, row = self._graph.find_keys(opened.keys)
+        self.cut_positions[local] = opened.cut_positions[row]
         return local

@@ -1,6 +1,7 @@
-"""A pass on rank 0: surfaces opened one after the other on the arrays of the input mesh.
+"""Pass of brittle surfaces on rank 0: surfaces open one after the other in the arrays of the input mesh.
 
-Where surfaces start: the highest load first, all that is near a start left out (non-maximum suppression).
+Surfaces start at the most loaded cells first, and no start is nearer than a spacing to another (non-maximum
+suppression). Equations: docs/theory.md#brittle-surfaces.
 """
 
 from __future__ import annotations
@@ -11,56 +12,67 @@ import numpy as np
 import numpy.typing as npt
 
 from ...meshes.data import MeshData
-from .crack_level_set import Curved, DirectionField, planar
-from .grains import Grains, SurfaceRules
-from .principal_stress import directions, material_normals
-from .surface_cut import Body, Crossing, cut_places, settled, sides_of
+from ..principal_stress import first_principal_directions, material_normals
+from .crack_level_set import CurvedLevelSet, DirectionField, plane_distance
+from .grains import GrainBoundaries, SurfaceParameters
+from .surface_cut import (
+    CrossedCells,
+    SurfaceCutMesh,
+    level_set_cut_positions,
+    reassign_isolated_nodes,
+    sides_of_level_set,
+)
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
+# Share of the spacing within which no surface starts again after one that could not cut anything.
+FAILED_START_SPACING = 0.5
 
-class Starts:
-    """Candidates of one pass, handed out one by one.
+
+class StartCandidates:
+    """Cells at which a surface of one pass may start.
 
     Attributes:
-        places: (n, d) of the candidates, m.
-        spacing: m; no start is closer than this to another, or to one of the starts `taken` before.
+        points: (n, d) centroids of the candidates, m.
+        spacing: least distance between starts, also to those of earlier passes, m.
     """
 
-    def __init__(self, places: Values, load: Values, spacing: float, taken: Values) -> None:
-        """`load` (n,): the highest goes first, the earlier candidate where loads are equal."""
-        self.places, self.spacing = places, spacing
-        self._left: Ints = np.argsort(-load, kind="stable")
-        for place in taken:
-            self.leave_out(place)
+    def __init__(self, points: Values, load: Values, spacing: float, earlier_starts: Values) -> None:
+        """Order the candidates by load (n,), the highest first; equal loads keep their order."""
+        self.points, self.spacing = points, spacing
+        self._remaining: Ints = np.argsort(-load, kind="stable")
+        for point in earlier_starts:
+            self.exclude_near(point)
 
-    def next(self) -> int | None:
-        """The candidate loaded most of those left, which does not come again. None: none is left."""
-        if not len(self._left):
+    def pop_most_loaded(self) -> int | None:
+        """Remove and return the most loaded candidate; None if none is left."""
+        if not len(self._remaining):
             return None
-        chosen = int(self._left[0])
-        self._left = self._left[1:]
+        chosen = int(self._remaining[0])
+        self._remaining = self._remaining[1:]
         return chosen
 
-    def leave_out(self, place: Values, share: float = 1.0) -> None:
-        """Take out the candidates closer than the spacing, or a share of it, to a place (d,)."""
-        arm = self.places[self._left] - place
-        self._left = self._left[np.einsum("ni,ni->n", arm, arm) >= (share * self.spacing) ** 2]
+    def exclude_near(self, point: Values, share: float = 1.0) -> None:
+        """Remove the candidates nearer to a point (d,) than a share of the spacing."""
+        arm = self.points[self._remaining] - point
+        self._remaining = self._remaining[np.einsum("ni,ni->n", arm, arm) >= (share * self.spacing) ** 2]
 
-    def drop(self, candidates: npt.NDArray[np.bool_]) -> None:
-        """Take out those flagged (n,)."""
-        self._left = self._left[~candidates[self._left]]
+    def discard(self, candidates: npt.NDArray[np.bool_]) -> None:
+        """Remove the flagged candidates (n,)."""
+        self._remaining = self._remaining[~candidates[self._remaining]]
 
 
 @dataclass(frozen=True)
-class Load:
-    """Cells under load, by rows.
+class OverloadedCells:
+    """Cells whose first principal stress reaches the strength.
 
     Attributes:
-        cell: (n,) in the input mesh.    load: (n,) largest principal stress over strength.
-        stress: (n, d, d) Pa, in the present configuration.    gradient: (n, d, d) F.
+        cell: (n,) numbers in the input mesh.
+        load: (n,) first principal stress over strength.
+        stress: (n, d, d) Cauchy stress, Pa.
+        gradient: (n, d, d) deformation gradient F.
     """
 
     cell: Ints
@@ -70,129 +82,158 @@ class Load:
 
 
 @dataclass(frozen=True)
-class Opened:
+class OpenedSurfaces:
     """Surfaces opened in a pass.
 
     Attributes:
-        starts: (s, d) where they started, m.
-        keys: (n, 2) nodes of the edges that they cut, the lower first.    cut: (n,) where, from the lower node.
+        starts: (s, d) points where they start, m.
+        keys: (n, 2) nodes of the edges that they cut, the lower first.
+        cut_positions: (n,) positions of the cuts from the lower node.
     """
 
     starts: Values
     keys: Ints
-    cut: Values
+    cut_positions: Values
 
 
-class Pattern:
-    """Opens surfaces in a mesh, on the rank that has it; made when the first surface starts."""
+class SurfacePass:
+    """Opens surfaces in a mesh, on the rank that has the input mesh.
 
-    def __init__(self, mesh: MeshData, rules: SurfaceRules, spacing: float, settle: bool) -> None:
-        """`settle`: nodes that a surface leaves without a whole cell go over to its other side."""
-        self.body, self.rules = Body(mesh), rules
-        self._spacing, self._settle = spacing, settle
-        self.grains = Grains(self.body, rules.grains, settle) if rules.grains is not None else None
+    Attributes:
+        mesh: the input mesh.
+        parameters: parameters of the surfaces.
+        grains: grain boundaries, None without grains.
+    """
 
-    def open(
-        self, load: Load, broken_keys: Ints, taken: Values, most: int, field: DirectionField | None = None
-    ) -> Opened:
-        """Up to `most` surfaces from the cells loaded most, none nearer than the spacing to another or to those `taken`
-        (n, d) before. A cell that a surface of this pass has touched is relieved: none starts there."""
-        body, places = self.body, self.body.centroids[load.cell]
-        normals = material_normals(directions(load.stress, places, self.rules.seed), load.gradient)
-        state, starts = _State(body, broken_keys), Starts(places, load.load, self._spacing, taken)
-        at: list[Values] = []
-        while len(at) < most and (start := starts.next()) is not None:
+    def __init__(self, mesh: MeshData, parameters: SurfaceParameters, spacing: float, retain_nodes: bool) -> None:
+        """Prepare the mesh; `retain_nodes`: nodes left without an unsplit cell move to the surface's other side."""
+        self.mesh, self.parameters = SurfaceCutMesh(mesh), parameters
+        self._spacing, self._retain_nodes = spacing, retain_nodes
+        grains = parameters.grains
+        self.grains = GrainBoundaries(self.mesh, grains, retain_nodes) if grains is not None else None
+
+    def open_surfaces(
+        self, load: OverloadedCells, broken_keys: Ints, earlier_starts: Values, count: int,
+        field: DirectionField | None = None,
+    ) -> OpenedSurfaces:  # fmt: skip
+        """Open up to `count` surfaces, from the most loaded cells.
+
+        A cell that a surface of this pass cuts is relieved: no other surface starts there.
+
+        Args:
+            load: candidates.
+            broken_keys: (n, 2) nodes of broken edges.
+            earlier_starts: (n, d) starts of earlier passes, m.
+            count: largest number of surfaces.
+            field: principal directions for curved surfaces; None for planes.
+        """
+        mesh, points = self.mesh, self.mesh.centroids[load.cell]
+        directions = first_principal_directions(load.stress, points, self.parameters.seed)
+        normals = material_normals(directions, load.gradient)
+        damage = _PassDamage(mesh, broken_keys)
+        candidates = StartCandidates(points, load.load, self._spacing, earlier_starts)
+        starts: list[Values] = []
+        while len(starts) < count and (start := candidates.pop_most_loaded()) is not None:
             cell = int(load.cell[start])
-            if self._surface(state, cell, normals[start], field):
-                at.append(places[start])
-                starts.leave_out(places[start])
-                starts.drop(state.touched[load.cell])
-            elif self.grains is None:  # no room for two sides with whole cells
-                starts.leave_out(places[start], 0.5)
-            else:  # nothing to open around this grain
-                starts.drop(self.grains.of_cell[load.cell] == self.grains.of_cell[cell])
-        new = np.flatnonzero(~np.isnan(state.cut))
-        return Opened(np.array(at).reshape(-1, body.dim), body.edges[new], state.cut[new])
+            if self._open_surface(damage, cell, normals[start], field):
+                starts.append(points[start])
+                candidates.exclude_near(points[start])
+                candidates.discard(damage.touched[load.cell])
+            elif self.grains is None:
+                # There is no room for two sides with unsplit cells.
+                candidates.exclude_near(points[start], FAILED_START_SPACING)
+            else:
+                # All edges around this grain are broken.
+                candidates.discard(self.grains.cell_grain[load.cell] == self.grains.cell_grain[cell])
+        new = np.flatnonzero(~np.isnan(damage.cut_positions))
+        return OpenedSurfaces(np.array(starts).reshape(-1, mesh.dim), mesh.edges[new], damage.cut_positions[new])
 
-    def _surface(self, state: _State, cell: int, normal: Values, field: DirectionField | None) -> bool:
-        """Open the surface through a cell; returns whether it cuts anything."""
+    def _open_surface(self, damage: _PassDamage, cell: int, normal: Values, field: DirectionField | None) -> bool:
+        """Open the surface through a cell; return whether it cuts anything."""
         grains = self.grains
         if grains is None:
-            return self._by_level_set(state, cell, *self._level_set(state, cell, normal, field))
-        own = int(grains.of_cell[cell])
+            return self._cut_level_set(damage, cell, *self._level_set(damage, cell, normal, field))
+        grain = int(grains.cell_grain[cell])
         if grains.mode == "replace":
-            sides = grains.of_node == own
-            return self._along(grains, state, Crossing.of(self.body, sides, state.broken), None)
-        phi = self._level_set(state, cell, normal, field)[1]
-        sides = sides_of(grains.mean(phi), self.body.tolerance)[grains.of_node]
-        return self._along(grains, state, Crossing.of(self.body, sides, state.broken), grains.edges_of(own))
+            sides = grains.node_grain == grain
+            crossed = CrossedCells.from_sides(self.mesh, sides, damage.broken)
+            return self._cut_grain_boundaries(grains, damage, crossed, None)
+        phi = self._level_set(damage, cell, normal, field)[1]
+        sides = sides_of_level_set(grains.average_by_grain(phi), self.mesh.tolerance)[grains.node_grain]
+        crossed = CrossedCells.from_sides(self.mesh, sides, damage.broken)
+        return self._cut_grain_boundaries(grains, damage, crossed, grains.edges_of(grain))
 
     def _level_set(
-        self, state: _State, cell: int, normal: Values, field: DirectionField | None
+        self, damage: _PassDamage, cell: int, normal: Values, field: DirectionField | None
     ) -> tuple[Flags | None, Values]:
-        """(N,) where phi is known (None: everywhere), and phi."""
-        body, origin, known = self.body, self.body.centroids[cell], None
+        """Return the nodes (nodes,) where phi is defined (None: everywhere), and phi (nodes,), m."""
+        mesh, origin, defined = self.mesh, self.mesh.centroids[cell], None
         if field is None:
-            phi = planar(body.points, origin, normal)
+            phi = plane_distance(mesh.points, origin, normal)
         else:
-            curved = Curved(body, field, state.broken)
+            curved = CurvedLevelSet(mesh, field, damage.broken)
             phi = curved(cell, origin, normal)
-            known = ~np.isnan(phi)
-            # the nodes around tell whether those of the surface have a cell on their own side
-            phi = curved.extended(self._around(known) if self.grains is None else np.ones_like(known))
-        return known, phi * self._sense(phi, cell)
+            defined = ~np.isnan(phi)
+            # Whether a node of the surface has a cell on its own side depends on the nodes around it.
+            wanted = self._flag_neighbours(defined) if self.grains is None else np.ones_like(defined)
+            phi = curved.extrapolate_to(wanted)
+        return defined, phi * self._sign(phi, cell)
 
-    def _around(self, nodes: Flags) -> Flags:
-        """(N,) nodes of the cells around nodes (N,)."""
+    def _flag_neighbours(self, nodes: Flags) -> Flags:
+        """Flag the nodes (nodes,) of all cells around flagged nodes."""
         result = nodes.copy()
-        result[self.body.cells[self.body.touching(nodes)]] = True
+        result[self.mesh.cells[self.mesh.flag_with_nodes(nodes)]] = True
         return result
 
-    def _sense(self, phi: Values, cell: int) -> float:
-        """1 or -1: the lowest node of the cell that is not on the surface is on the positive side.
+    def _sign(self, phi: Values, cell: int) -> float:
+        """Return 1 or -1, so that the lowest node of the cell that is not on the surface is on the positive side.
 
-        Nodes on the surface go to that side, and a direction has no sense of its own.
+        Nodes on the surface belong to the positive side, and a principal direction has no sign of its own.
         """
-        nodes = np.sort(self.body.cells[cell])
-        off = np.flatnonzero(np.abs(phi[nodes]) > self.body.tolerance)
-        return 1.0 if not len(off) or phi[nodes[off[0]]] > 0 else -1.0
+        nodes = np.sort(self.mesh.cells[cell])
+        off_surface = np.flatnonzero(np.abs(phi[nodes]) > self.mesh.tolerance)
+        return 1.0 if not len(off_surface) or phi[nodes[off_surface[0]]] > 0 else -1.0
 
-    def _by_level_set(self, state: _State, cell: int, known: Flags | None, phi: Values) -> bool:
-        """Cut where phi changes its sign, as far as the surface through the cell goes."""
-        body, sides = self.body, sides_of(phi, self.body.tolerance)
-        complete = None if known is None else ~body.touching(~known)
-        if self._settle:
-            usable = state.whole if known is None else state.whole & body.touching(known)
-            sides = settled(body, sides, usable, known)
-        crossing = Crossing.of(body, sides, state.broken, complete)
-        edges = crossing.connected(body.dim, body.cell_edges[cell])
-        return state.note(crossing, edges, cut_places(phi, sides, body.edges[edges]))
+    def _cut_level_set(self, damage: _PassDamage, cell: int, defined: Flags | None, phi: Values) -> bool:
+        """Cut the edges where phi changes its sign, as far as the surface through the cell reaches."""
+        mesh, sides = self.mesh, sides_of_level_set(phi, self.mesh.tolerance)
+        complete = None if defined is None else ~mesh.flag_with_nodes(~defined)
+        if self._retain_nodes:
+            usable = damage.unsplit if defined is None else damage.unsplit & mesh.flag_with_nodes(defined)
+            sides = reassign_isolated_nodes(mesh, sides, usable, defined)
+        crossed = CrossedCells.from_sides(mesh, sides, damage.broken, complete)
+        edges = crossed.connected_open_edges(mesh.dim, mesh.cell_edges[cell])
+        return damage.record_cuts(crossed, edges, level_set_cut_positions(phi, sides, mesh.edges[edges]))
 
-    def _along(self, grains: Grains, state: _State, crossing: Crossing, seeds: Ints | None) -> bool:
-        """Cut grain boundaries: all that are crossed, or those that are linked to the seeds (edges)."""
-        edges = crossing.all() if seeds is None else crossing.connected(self.body.dim, seeds)
-        return state.note(crossing, edges, grains.cut_of(edges))
+    def _cut_grain_boundaries(
+        self, grains: GrainBoundaries, damage: _PassDamage, crossed: CrossedCells, seeds: Ints | None
+    ) -> bool:
+        """Cut the grain boundaries that are crossed, or of these the ones that are linked to seed edges."""
+        edges = crossed.all_open_edges() if seeds is None else crossed.connected_open_edges(self.mesh.dim, seeds)
+        return damage.record_cuts(crossed, edges, grains.cut_positions_of(edges))
 
 
-class _State:
+class _PassDamage:
     """Damage during a pass.
 
     Attributes:
-        broken: (E,).    cut: (E,) where edges are cut in this pass, NaN for all others.
-        whole: (C,) cells that have not come apart.    touched: (C,) cells with an edge cut in this pass.
+        broken: (edges,) broken edges.
+        cut_positions: (edges,) positions of the cuts of this pass, NaN elsewhere.
+        unsplit: (cells,) cells that are not split.
+        touched: (cells,) cells with an edge cut in this pass.
     """
 
-    def __init__(self, body: Body, broken_keys: Ints) -> None:
-        self._body = body
-        self.broken = body.edge_flags(broken_keys)
-        self.cut: Values = np.full(len(self.broken), np.nan)
-        self.whole = body.whole(np.arange(len(body.cells)), self.broken)
-        self.touched = np.zeros(len(body.cells), bool)
+    def __init__(self, mesh: SurfaceCutMesh, broken_keys: Ints) -> None:
+        self._mesh = mesh
+        self.broken = mesh.edge_flags(broken_keys)
+        self.cut_positions: Values = np.full(len(self.broken), np.nan)
+        self.unsplit = mesh.flag_unsplit(np.arange(len(mesh.cells)), self.broken)
+        self.touched = np.zeros(len(mesh.cells), bool)
 
-    def note(self, crossing: Crossing, edges: Ints, cut: Values) -> bool:
-        """Break edges; returns whether there are any."""
-        self.broken[edges], self.cut[edges] = True, cut
-        cells = crossing.touched(edges, len(self.broken))
+    def record_cuts(self, crossed: CrossedCells, edges: Ints, cut_positions: Values) -> bool:
+        """Break edges (n,) of crossed cells; return whether there are any."""
+        self.broken[edges], self.cut_positions[edges] = True, cut_positions
+        cells = crossed.cells_with_edges(edges, len(self.broken))
         self.touched[cells] = True
-        self.whole[cells] = self._body.whole(cells, self.broken)
+        self.unsplit[cells] = self._mesh.flag_unsplit(cells, self.broken)
         return len(edges) > 0

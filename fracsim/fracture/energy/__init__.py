@@ -1,25 +1,23 @@
-"""Cracks that take an energy: their tips advance where the configurational force reaches the fracture energy.
+"""Cracks with a fracture energy: tips advance where the configurational force reaches G_c (Griffith).
 
     g = - sum_j V_j Sigma_j grad q(x_j),   Sigma = chi psi I - H^T (chi P),   H = grad u
 
-configurational_force  g, the energy that a tip's advance releases for each area of crack
-neighbour_search       what lies around a place, on any rank; values of cells of other ranks
-cut_cells              the cells that cracks cut, known on every rank
-tip_neighbourhoods     what lies around the tips, kept until cracks change
-gradient_operators     gradients of fields around tips, by matrices that are kept
-crack_front            in space: the crack that an advance makes, by which g is divided; in space: G of tips by
-                       themselves, or of the front nearby
-tip_fields             the body as tips see it
-mixed_mode             where a crack in tension and sliding turns, and what that releases
-crack_speed            how fast cracks run that may branch, and where they do
-branching              tips that share a disc
+tip_criterion          criterion: which tips advance, and which cells would detach a node
+crack_initiation       criterion: where cracks start, and which cells are cut in one pass
+front_advance          3D without inertia: a stretch of a front advances at once
+crack_speed            2D with inertia: speed of tips, and where they branch
+branching              2D: several tips in one disc
+tip_fields             stress, Eshelby stress and inertia around tips
+tip_neighbourhoods     cells around tips, and weighted sums over them
+configurational_force  Eshelby stress, weight function, springs of closed cracks
+crack_front            3D: area that an advance makes, energy release rate along a front
+mixed_mode             2D: stress intensities, kink angle, energy release of a kink
 cut_plane              the line or plane that cuts a cell
-tip_criterion          which tips advance, and where cracks begin: the criterion
-release_rate_bound     in space, with inertia: how long tips need not be looked at
-front_advance          in space, without inertia: all of a front gets on at once
-tip_constraints        the same, without those that would cut a node off
-cell_degradation       what is left of a cell that has come apart
+cut_cells              cut positions, cut polygons, and the cut cells of all ranks
+gradient_operators     gradients of fields around tips, as matrices
+neighbour_search       cells near points, and values of cells of other ranks
+tip_parameters         lengths and thresholds
 
-docs/theory.md#fracture-energy has the equations, docs/theory.md#rejected-alternatives what was tried. A tip cell is
-whole and has a broken edge; a split cell has come apart.
+Equations: docs/theory.md#fracture-energy; what was tried: docs/theory.md#rejected-alternatives. A tip is a cell that is
+cut and not split.
 """

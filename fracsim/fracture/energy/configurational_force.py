@@ -1,4 +1,4 @@
-"""The configurational force on a crack tip: what its advance releases for each area of crack, J/m^2.
+"""Configurational force on a crack tip: the energy that its advance releases per area of crack, J/m^2.
 
 Equations: docs/theory.md#configurational-force.
 """
@@ -13,9 +13,11 @@ from ...mesh.small_matrices import cofactors
 Values = npt.NDArray[np.float64]
 
 
-def across(H: Values, vectors: Values) -> Values:
-    """(n, d) H^T v of matrices (n, d, d) and vectors (n, d): component by component, which is quick where these lie one
-    after the other in memory."""
+def transposed_product(H: Values, vectors: Values) -> Values:
+    """Return H^T v (n, d) of matrices (n, d, d) and vectors (n, d).
+
+    It works component by component, which is fast where each component is contiguous in memory.
+    """
     result = np.empty_like(vectors)
     for k in range(vectors.shape[1]):
         result[:, k] = H[:, 0, k] * vectors[:, 0]
@@ -24,10 +26,13 @@ def across(H: Values, vectors: Values) -> Values:
     return result
 
 
-def eshelby(psi: Values, H: Values, P: Values) -> Values:
-    """(n, d, d) psi I - H^T P in Pa, of energy densities (n,) in J/m^3, gradients H = grad u and P (n, d, d) in Pa.
+def eshelby_stress(psi: Values, H: Values, P: Values) -> Values:
+    """Return Eshelby's stress psi I - H^T P (n, d, d), Pa (Eshelby, 1951).
 
-    Eshelby (1951); psi and P as the cell has them, chi included.
+    Args:
+        psi: (n,) energy density with damage, J/m^3.
+        H: (n, d, d) displacement gradient.
+        P: (n, d, d) first Piola-Kirchhoff stress with damage, Pa.
     """
     result = np.empty_like(P)
     for i in range(P.shape[1]):
@@ -40,24 +45,28 @@ def eshelby(psi: Values, H: Values, P: Values) -> Values:
 
 
 def plateau(distance: Values, radius: Values) -> Values:
-    """(n,) q at distances (n,) from a tip: 1 up to R / 2, falling linearly to 0 at R (n,)."""
+    """Return q (n,) at distances (n,) from a tip: 1 up to R / 2, then linear to 0 at R (n,)."""
     return np.clip(2 * (1 - distance / radius), 0.0, 1.0)
 
 
 def plateau_gradient(apart: Values, radius: Values) -> Values:
-    """(n, d) grad q in 1/m at places (n, d) from a tip: q is 1 up to R / 2 and falls linearly to 0 at R (n,)."""
+    """Return grad q (n, d), 1/m, at positions (n, d) relative to a tip, for radii R (n,)."""
     r = np.linalg.norm(apart, axis=1)
     ring = (r > radius / 2) & (r < radius)
     slope = np.where(ring, -2 / (radius * np.where(ring, r, 1.0)), 0.0)
     return slope[:, None] * apart
 
 
-def springs(vectors: Values, modulus: Values, H: Values, *, linear: bool) -> tuple[Values, Values]:
-    """(n,) psi in J/m^3 and (n, d, d) P in Pa of springs along edges that are shorter than at rest
-    (forms.crack_closure).
+def closure_spring_stress(vectors: Values, modulus: Values, H: Values, *, linear: bool) -> tuple[Values, Values]:
+    """Return psi (n,), J/m^3, and P (n, d, d), Pa, of the springs along shortened edges (forms.crack_closure).
 
-    psi = k/2 sum min(s, 0)^2, s = (|F d|^2 / |d|^2 - 1) / 2, or d . H d / |d|^2 where strains are taken for small.
-    `vectors`: (n, edges, d) m. `modulus`: (n, edges) k in Pa, 0 of edges without one.
+    psi = k/2 sum min(s, 0)^2 with s = (|F d|^2 / |d|^2 - 1) / 2, or d . H d / |d|^2 for small strains.
+
+    Args:
+        vectors: (n, edges, d) edge vectors d, m.
+        modulus: (n, edges) k, Pa, 0 for intact edges.
+        H: (n, d, d) displacement gradient.
+        linear: strains are small.
     """
     square = np.einsum("nei,nei->ne", vectors, vectors)
     moved = np.einsum("nij,nej->nei", H, vectors)
@@ -65,17 +74,17 @@ def springs(vectors: Values, modulus: Values, H: Values, *, linear: bool) -> tup
     if not linear:
         strain += np.einsum("nei,nei->ne", moved, moved) / (2 * square)
         moved += vectors
-    shorter = np.minimum(strain, 0.0)
-    pulled = vectors if linear else moved
-    P = np.einsum("ne,nei,nej->nij", modulus * shorter / square, pulled, vectors)
-    return np.einsum("ne,ne->n", modulus, shorter**2) / 2, P
+    shortening = np.minimum(strain, 0.0)
+    present = vectors if linear else moved
+    P = np.einsum("ne,nei,nej->nij", modulus * shortening / square, present, vectors)
+    return np.einsum("ne,ne->n", modulus, shortening**2) / 2, P
 
 
-def first_piola(cauchy: Values, H: Values, *, linear: bool) -> Values:
-    """(n, d, d) P = J sigma F^-T in Pa, F = I + H; sigma itself where strains are taken for small."""
+def first_piola_stress(cauchy: Values, H: Values, *, linear: bool) -> Values:
+    """Return P = J sigma F^-T (n, d, d), Pa, with F = I + H; sigma itself for small strains."""
     if linear:
         return cauchy
     cofactor, result = cofactors(H + np.eye(H.shape[1])), np.empty_like(cauchy)
     for i in range(cauchy.shape[1]):
-        result[:, i] = across(cofactor, cauchy[:, i])
+        result[:, i] = transposed_product(cofactor, cauchy[:, i])
     return result

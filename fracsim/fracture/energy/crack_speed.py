@@ -1,20 +1,18 @@
-"""Cracks that carry their speed, and branch where it does not take up what flows to them (in the plane, with inertia).
+"""Crack tips with a speed, which branch where the speed does not take up the energy that flows to them (2D, inertia).
 
-    v = c_R (1 - G_c / G*),   G* = G / (1 - v / c_R)     up to c_R / 2, taken up over R / c_R
+    v = c_R (1 - G_c / G*),   G* = G / (1 - v / c_R)     up to c_R / 2, with a relaxation time of R / c_R
     mean of G over R / c_R >= 2 G_c                      the crack branches
 
-G* is what would flow to the tip if it stood (Freund 1972); R / c_R is the time of a Rayleigh wave through its disc.
-Where G is G_c, G* grows with the speed, and is that of two cracks at half of c_R. From there on the crack could become
-two that set off from rest (Eshelby 1970), and in glass and PMMA it sheds short side branches, which take up what flows,
-instead of getting faster (Sharon and Fineberg 1999). So here it goes no faster, and G grows over G_c. Where that is
-2 G_c, two cracks that run at half of c_R take it up: the crack becomes these, and they keep its speed. In a strip that
-stores less than 2 G_c a metre so much does not flow; at single looks, between the cuts of two cells, G is up to a
-quarter over what flows.
+G* is the energy that would flow to the tip at rest (Freund 1972), and R / c_R the time of a Rayleigh wave through its
+disc. Where G = G_c, G* grows with the speed, and at c_R / 2 it is that of two cracks: from there on the crack could
+become two that start from rest (Eshelby 1970). In glass and PMMA it sheds short side branches instead of running faster
+(Sharon and Fineberg 1999). So the speed is limited here, and G grows beyond G_c. At 2 G_c two cracks at c_R / 2 take
+the energy
+up: the crack becomes these, and they keep its speed.
 
-A tip cuts a cell as it comes to it. By G >= G_c at each look it ran on at c_R and stood in turn, since what it has cut
-is let go over R / c_R: G went from 0.4 to 2.2 G_c, and at which look a crack branched was chance. Only where no other
-tip's disc lies over its own, and in steps in which a wave stays in the disc: in longer ones a crack gets on by more
-than that, and goes by G >= G_c, as one.
+A tip cuts a cell when it has travelled through it. Cutting by G >= G_c alone would let it run at c_R and stop in turn,
+since the energy of a cut cell is released over R / c_R. The speed is used where no other tip's disc overlaps, and in
+steps in which a wave stays in the disc. In longer steps a tip goes by G >= G_c, as one.
 
 Equations: docs/theory.md#crack-speed-and-branching.
 """
@@ -22,6 +20,7 @@ Equations: docs/theory.md#crack-speed-and-branching.
 from __future__ import annotations
 
 from enum import IntEnum
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -29,110 +28,122 @@ import numpy.typing as npt
 
 from ...mesh.simplices import local_edges
 from ..criterion import Edges
-from .branching import TIPS
-from .cut_plane import Cuts
-from .tip_criterion import CrackTips, Proposal
-from .tip_fields import Seen
-from .tip_neighbourhoods import Tips
+from .crack_initiation import CutProposal
+from .cut_plane import EdgeCuts
+from .tip_criterion import TipCriterion, reference_corners
+from .tip_fields import TipFields
+from .tip_neighbourhoods import CrackTips
+from .tip_parameters import TIP
 
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
 
-FASTEST = 1 / TIPS  # 1 - v / c_R where G* is that of two cracks, and G that of one
+# Slowness 1 - v / c_R at the largest speed: G* is that of two cracks there, and G that of one.
+MIN_SLOWNESS = 1 / TIP.branching_ratio
 
 
-class Carried(IntEnum):
-    """What is kept of a tip, at the edge by which it came in."""
+class TipState(IntEnum):
+    """Columns of the state of a tip, stored at the edge by which it came in."""
 
-    SLOW = 0  # 1 - v / c_R
-    LEFT = 1  # m to go before it is there
-    FLOW = 2  # mean of G / G_c, of late
-    AT = 3  # s, when that was so; NaN: nobody has looked
-
-
-STANDS = 1.0, 0.0, 0.0, np.nan
+    SLOWNESS = 0  # 1 - v / c_R
+    REMAINING = 1  # distance to the point at which the tip leaves its cell, m
+    FLOW = 2  # recent mean of G / G_c
+    TIME = 3  # time of the last update, s; NaN: never updated
 
 
-def slower(slow: Values, flow: Values, time: Values) -> Values:
-    """(n,) 1 - v / c_R of tips at which it was `slow`, after a `time`, R / c_R, in which G is `flow`, G_c.
+AT_REST = 1.0, 0.0, 0.0, np.nan
 
-    G_c / G* = slow / flow is what it is to be, and between that of a crack that stands and FASTEST.
+
+def relax_slowness(slowness: Values, flow: Values, time: Values) -> Values:
+    """Return 1 - v / c_R (n,) after a time (n,), in R / c_R, in which G is `flow` (n,), in G_c.
+
+    The target is G_c / G* = slowness / flow, between that of a crack at rest and MIN_SLOWNESS.
     """
-    wanted = slow / np.maximum(flow, slow)
-    return np.maximum(later(slow, wanted, time), FASTEST)
+    target = slowness / np.maximum(flow, slowness)
+    return np.maximum(relax(slowness, target, time), MIN_SLOWNESS)
 
 
-def later(before: Values, wanted: Values, time: Values) -> Values:
-    """(n,) what was `before` goes to what is `wanted`, over 1 of `time`."""
-    return np.asarray(wanted + (before - wanted) * np.exp(-time))
+def relax(before: Values, target: Values, time: Values) -> Values:
+    """Return values (n,) that relax exponentially towards a target (n,), after a time (n,) in relaxation times."""
+    return np.asarray(target + (before - target) * np.exp(-time))
 
 
-class RunningTips(CrackTips):
-    """Cells that running cracks, which may branch, cut next. In steps that see no waves they go as `CrackTips` do.
+class RateDependentTipCriterion(TipCriterion):
+    """Tip criterion with crack speed and branching; in steps too long for waves it is `TipCriterion`.
 
     Attributes:
-        carried: (edges, 4) of the tip that came in by each local edge (`Carried`).
+        tip_states: (edges, 4) state of the tip that came in by each local edge (`TipState`).
     """
 
     forks = True
-    carried: Values
+    tip_states: Values
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Build the criterion with tips at rest; arguments are those of `TipCriterion` (collective)."""
         super().__init__(*args, **kwargs)
-        self.carried = np.tile(STANDS, (len(self._graph.broken), 1))
-        self._due: Flags = np.empty(0, bool)
+        self.tip_states = np.tile(AT_REST, (len(self._graph.broken), 1))
+        self._arrived: Flags = np.empty(0, bool)
 
-    def memory(self) -> object:
-        """Where cracks cut, and how they run."""
-        return super().memory(), self.carried.copy()
+    def snapshot(self) -> object:
+        """Return copies of the cut positions and of the states of tips."""
+        return super().snapshot(), self.tip_states.copy()
 
-    def recall(self, memory: object) -> None:
-        """As then."""
+    def restore(self, memory: object) -> None:
+        """Restore the cut positions and states that `snapshot` returned."""
         assert isinstance(memory, tuple)
-        cut, self.carried[:] = memory
-        super().recall(cut)
+        cut_positions, self.tip_states[:] = memory
+        super().restore(cut_positions)
 
-    def _ready(self, size: Values, toughness: Values, tips: Tips) -> tuple[Flags, Flags]:
-        """(n,) which tips have come to the end of what they cut last, in long steps reach G_c; and which go on as
-        two."""
-        entry, rate = self._graph.cell_edges[tips.cell, self._entry(tips.cell)], self._rate[tips.cell]
-        slow, left, flow, at = self.carried[entry].T
-        time = np.where(np.isnan(at), 0.0, self._now - at)
-        slow = np.where(tips.mature & (size > 0), slower(slow, size / toughness, rate * time), 1.0)
-        flow = later(flow, size / toughness, rate * time)
-        left = left - (1 - slow) * rate * self.disc * self._h[tips.cell] * time
-        self.carried[entry] = np.column_stack([slow, left, flow, np.full(len(at), self._now)])
-        self._due = (slow < 1) & (left <= 0)
-        sees = self._sees_waves(tips)
-        return np.where(sees, self._due, size >= toughness), tips.alone & (flow >= TIPS) & sees
+    @cached_property
+    def _rate(self) -> Values:
+        """c_R / R (cells,), 1/s."""
+        return self.release_rate()
 
-    def _sees_waves(self, tips: Tips) -> Flags:
-        """(n,) whether a Rayleigh wave stays in the disc of a tip within a step."""
+    def _find_critical_tips(self, size: Values, toughness: Values, tips: CrackTips) -> tuple[Flags, Flags]:
+        """Return which tips (n,) have arrived at the end of their cell (in long steps: reach G_c), and which branch."""
+        entry, rate = self._graph.cell_edges[tips.cell, self._entry_edges(tips.cell)], self._rate[tips.cell]
+        slowness, remaining, flow, updated = self.tip_states[entry].T
+        time = np.where(np.isnan(updated), 0.0, self._now - updated)
+        relaxed = relax_slowness(slowness, size / toughness, rate * time)
+        slowness = np.where(tips.mature & (size > 0), relaxed, 1.0)
+        flow = relax(flow, size / toughness, rate * time)
+        # v = (1 - slowness) c_R, and c_R = rate R.
+        wave_speed = rate * self.disc_radius_ratio * self._h[tips.cell]
+        remaining = remaining - (1 - slowness) * wave_speed * time
+        times = np.full(len(updated), self._now)
+        self.tip_states[entry] = np.column_stack([slowness, remaining, flow, times])
+        self._arrived = (slowness < 1) & (remaining <= 0)
+        resolved = self._resolves_waves(tips)
+        critical = np.where(resolved, self._arrived, size >= toughness)
+        return critical, tips.alone & (flow >= TIP.branching_ratio) & resolved
+
+    def _resolves_waves(self, tips: CrackTips) -> Flags:
+        """Return whether a Rayleigh wave stays in the disc of a tip (n,) within a step."""
         return np.asarray(self._rate[tips.cell] * self._dt <= 1)
 
-    def _grown(self, seen: Seen) -> Proposal:
-        """Tips that advance; those that have come to the end of a cell and may not go on stand."""
-        self._due = np.zeros(len(seen.tips), bool)
-        grown = super()._grown(seen)
-        cell = seen.tips.cell[self._due]
-        cell = cell[~np.isin(cell, grown.cells)]
-        held = self._graph.cell_edges[cell, self._entry(cell)]
-        self.carried[held, Carried.SLOW], self.carried[held, Carried.LEFT] = STANDS[:2]
-        return grown
+    def _propose_advances(self, fields: TipFields) -> CutProposal:
+        """Propose the cells of tips that advance; tips at the end of a cell that may not advance come to rest."""
+        self._arrived = np.zeros(len(fields.tips), bool)
+        advances = super()._propose_advances(fields)
+        cell = fields.tips.cell[self._arrived]
+        cell = cell[~np.isin(cell, advances.cells)]
+        stopped = self._graph.cell_edges[cell, self._entry_edges(cell)]
+        self.tip_states[stopped, TipState.SLOWNESS], self.tip_states[stopped, TipState.REMAINING] = AT_REST[:2]
+        return advances
 
-    def _rows(self, cracks: Proposal, cuts: Cuts) -> Values:
-        """With what tips carry to where they leave their cells; branches are as fast as the crack."""
-        rows, cells = super()._rows(cracks, cuts), cracks.cells[cuts.row]
-        if cracks.entry is None:
-            return np.column_stack([rows, np.tile(STANDS, (len(rows), 1))])
-        carried = self.carried[self._graph.cell_edges[cells, cracks.entry[cuts.row]]]
-        ends = self._corners(cells)[np.arange(len(cells))[:, None], local_edges(2)[cuts.edge]]
-        place = ends[:, 0] + cuts.share[:, None] * (ends[:, 1] - ends[:, 0])
-        carried[:, Carried.LEFT] += np.linalg.norm(place - cracks.place[cuts.row], axis=1)
-        return np.column_stack([rows, carried])
+    def _cut_rows(self, proposal: CutProposal, cuts: EdgeCuts) -> Values:
+        """Return rows with the states of tips appended (n, 4); branches keep the speed of the crack."""
+        rows, cells = super()._cut_rows(proposal, cuts), proposal.cells[cuts.row]
+        if proposal.entry is None:
+            return np.column_stack([rows, np.tile(AT_REST, (len(rows), 1))])
+        states = self.tip_states[self._graph.cell_edges[cells, proposal.entry[cuts.row]]]
+        ends = reference_corners(self._domain, cells)[np.arange(len(cells))[:, None], local_edges(2)[cuts.edge]]
+        exit_point = ends[:, 0] + cuts.share[:, None] * (ends[:, 1] - ends[:, 0])
+        states[:, TipState.REMAINING] += np.linalg.norm(exit_point - proposal.point[cuts.row], axis=1)
+        return np.column_stack([rows, states])
 
-    def _remembered(self, rows: Values) -> tuple[Edges, Values]:
-        """As others, and what tips carry there (collective)."""
-        edges, rest = super()._remembered(rows)
-        self.carried[edges] = rest[:, self.course :]
-        return edges, rest[:, : self.course]
+    def _store_cuts(self, rows: Values) -> tuple[Edges, Values]:
+        """Store cuts and the states of the tips there; return new edges (n,) and courses (n, 2) (collective)."""
+        edges, columns = super()._store_cuts(rows)
+        self.tip_states[edges] = columns[:, self.course_width :]
+        return edges, columns[:, : self.course_width]

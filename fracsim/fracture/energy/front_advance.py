@@ -1,11 +1,10 @@
-"""Fronts in space where nothing moves by itself: all of a front that is about to advance gets on, before the body is
-solved for again.
+"""Advance of fronts in 3D without inertia: a whole stretch of a front advances before the body is solved for again.
 
-A ball of 4 h cannot tell tips apart by less than some per cent (crack_front). So where a tip reaches G_c, those in its
-ball that lack 3 % go with it, and each leads on: cells that its cut enters are cut by its plane, as far as 0.65 h from
-it, one by one, no nearer than half of h to one another, in rounds without a solve: neighbours cut at once would not
-meet. A tip that was looked at and has less stays, wherever the others go. A front gets on by h in 1.3 to 1.9 solves,
-where it took five. Tips that are not mature go by stress, which a cell changes, and do not lead.
+A ball of 4 h cannot distinguish the release rates of neighbouring tips to better than some per cent (crack_front). So
+when a tip reaches G_c, tips in its ball that lack at most 3 % advance with it. Each of them leads a plane: cells that
+its cut enters are cut by the plane up to 0.65 h away, one by one, no nearer than h / 2 to one another, in rounds
+without a solve, since cells cut at once would not match. A tip that was evaluated and has less stays. Young tips go by
+stress, which one cell changes, and lead no plane.
 
 Equations: docs/theory.md#tip-criterion.
 """
@@ -21,100 +20,112 @@ from scipy.spatial import cKDTree
 from ...mesh.parallel import allgather
 from ...mesh.simplices import is_split
 from ..criterion import Edges
-from .cut_plane import Cuts, cleave
-from .tip_criterion import APART, CrackTips, Proposal
-from .tip_fields import Seen
-from .tip_neighbourhoods import Tips
+from .crack_initiation import TIP_ADVANCE, CutProposal, empty_proposal, rank_rows, select_proposals
+from .cut_plane import EdgeCuts, plane_cuts
+from .tip_criterion import TipCriterion, input_numbers, reference_corners
+from .tip_fields import TipFields
+from .tip_neighbourhoods import CrackTips
+from .tip_parameters import TIP
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-ABOUT = 0.03  # of G_c: what a tip may lack that goes with another
-FAR = 0.65  # h: how far a tip leads on
 
+class FrontTipCriterion(TipCriterion):
+    """Tip criterion that cuts rows of cells along a front in 3D.
 
-class RowTips(CrackTips):
-    """Cells that cracks in space cut next, a row of them."""
+    The course of a crack is the plane of its leading tip: point (3), m, normal (3), and sigma_1, Pa.
+    """
 
     shares = True
-    course = 7  # a plane: the place of the tip that leads, m, the normal, and sigma_1 in Pa
+    course_width = 7
 
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
-        """The edges that cracks cut now, as loaded as they may be (collective)."""
-        self._leading = self._none(0)
+        """Find the local edges (n,) that cracks cut, with loads of 1 (collective)."""
+        self._leading = empty_proposal(3, self.course_width)
         return super().__call__(stress, psi)
 
-    def _ready(self, size: Values, toughness: Values, tips: Tips) -> tuple[Flags, Flags]:
-        """(n,) which tips reach G_c, or lack little of it in the ball of one that does; none goes on as two
-        (collective)."""
-        reach = size >= toughness
-        first = tips.point[reach & tips.mature & ~self.barred[tips.cell]]
-        every = np.concatenate(allgather(self._domain.comm, first))
-        if not len(every):
-            return reach, np.zeros(len(tips), bool)
-        near = cKDTree(every).query(tips.point)[0] < self.disc * self._h[tips.cell]
-        return reach | (near & (size >= (1 - ABOUT) * toughness)), np.zeros(len(tips), bool)
+    def _find_critical_tips(self, size: Values, toughness: Values, tips: CrackTips) -> tuple[Flags, Flags]:
+        """Return which tips (n,) reach G_c, or lack little in the ball of one that does; none branches (collective)."""
+        critical = size >= toughness
+        leaders = tips.point[critical & tips.mature & ~self._barred[tips.cell]]
+        leaders = np.concatenate(allgather(self._domain.comm, leaders))
+        if not len(leaders):
+            return critical, np.zeros(len(tips), bool)
+        near = cKDTree(leaders).query(tips.point)[0] < self.disc_radius_ratio * self._h[tips.cell]
+        return critical | (near & (size >= (1 - TIP.front_lag) * toughness)), np.zeros(len(tips), bool)
 
-    def _grown(self, seen: Seen) -> Proposal:
-        """Tips that advance, each on its plane; those that go by G lead on."""
-        grown = super()._grown(seen)
-        normals = self._normals(grown.stress, grown.cells)
-        mature = seen.tips.mature[np.searchsorted(seen.tips.cell, grown.cells)]
-        grown = replace(grown, ahead=np.column_stack([grown.place, normals, -grown.rank[:, 1]]), turns=mature)
-        self._leading = grown.taken(mature)
-        return grown
+    def _propose_advances(self, fields: TipFields) -> CutProposal:
+        """Propose the cells of tips that advance, each on its plane; mature tips lead their planes."""
+        advances = super()._propose_advances(fields)
+        normals = self._normals(advances.stress, advances.cells)
+        mature = fields.tips.mature[np.searchsorted(fields.tips.cell, advances.cells)]
+        planes = np.column_stack([advances.point, normals, -advances.rank[:, 1]])
+        advances = replace(advances, ahead=planes, turns=mature)
+        self._leading = advances.select(mature)
+        return advances
 
-    def _none(self, kind: int) -> Proposal:
-        """Nothing of a kind."""
-        return replace(super()._none(kind), ahead=np.empty((0, self.course)))
+    def _exit_cuts(self, advances: CutProposal) -> EdgeCuts:
+        """Return the cuts of cells by their planes."""
+        assert advances.ahead is not None
+        cells = advances.cells
+        return plane_cuts(
+            reference_corners(self._domain, cells), self._flag_cut_edges(cells), advances.point, advances.ahead[:, 3:6]
+        )
 
-    def _way_out(self, grown: Proposal) -> Cuts:
-        """Where planes cut their cells."""
-        assert grown.ahead is not None
-        return cleave(self._corners(grown.cells), self._cut_by_now(grown.cells), grown.place, grown.ahead[:, 3:6])
+    def _extend_cuts(self, edges: Edges, courses: Values) -> Edges:
+        """Return the cut edges (n,) with those of the rows of cells that follow (collective).
 
-    def _beyond(self, edges: Edges, courses: Values) -> Edges:
-        """All that is cut, edges (n,) being so already, on planes (n, 7); 0: of nobody who leads (collective)."""
-        found, cells, planes = [edges], self._leading.cells, np.zeros((len(self._h), self.course))
-        own = np.zeros(len(self._h), bool)
-        own[cells], planes[cells] = True, self._leading.ahead
-        led = np.zeros((len(self._graph.broken), self.course))
+        `courses` (n, 7) are the planes of the edges, 0 where no tip leads.
+        """
+        all_edges, cells = [edges], self._leading.cells
+        # Planes of cells, and of the edges that were cut in this pass.
+        cell_planes = np.zeros((len(self._h), self.course_width))
+        edge_planes = np.zeros((len(self.cut_positions), self.course_width))
+        leads_itself = np.zeros(len(self._h), bool)
+        leads_itself[cells], cell_planes[cells] = True, self._leading.ahead
         while True:
-            led[edges] = courses
-            self._take_over(planes, led, own)
-            (onwards,) = self._chosen(self._next(planes))
-            if self._idle:
+            edge_planes[edges] = courses
+            self._inherit_planes(cell_planes, edge_planes, leads_itself)
+            (following,), any_selected = select_proposals(self._domain, self._propose_following(cell_planes))
+            if not any_selected:
                 break
-            self.cells = np.concatenate([self.cells, onwards.cells])
-            edges, courses = self._remembered(self._rows(onwards, self._way_out(onwards)))
-            found.append(edges)
-        self._idle = False
-        return np.concatenate(found)
+            self.cells = np.concatenate([self.cells, following.cells])
+            edges, courses = self._store_cuts(self._cut_rows(following, self._exit_cuts(following)))
+            all_edges.append(edges)
+        return np.concatenate(all_edges)
 
-    def _take_over(self, planes: Values, led: Values, own: Flags) -> None:
-        """Whole cells go on with the planes (cells, 7) of the edges (edges, 7) by which they were entered, that of the
-        most loaded tip; but those that lead themselves have their `own`."""
+    def _inherit_planes(self, cell_planes: Values, edge_planes: Values, leads_itself: Flags) -> None:
+        """Give intact cells the plane of the edge by which they were entered, that with the largest sigma_1.
+
+        Args:
+            cell_planes: (cells, 7) planes, updated in place.
+            edge_planes: (edges, 7) planes of cut edges.
+            leads_itself: (cells,) cells of tips with a plane of their own.
+        """
         graph = self._graph
-        entered = np.any(led[:, 3:6], axis=1)[graph.cell_edges].any(axis=1)
-        cells = np.flatnonzero(entered & ~(graph.damaged | own))
-        first = np.argmax(led[graph.cell_edges[cells], 6], axis=1)
-        planes[cells] = led[graph.cell_edges[cells, first]]
+        entered = np.any(edge_planes[:, 3:6], axis=1)[graph.cell_edges].any(axis=1)
+        cells = np.flatnonzero(entered & ~(graph.damaged | leads_itself))
+        first = np.argmax(edge_planes[graph.cell_edges[cells], 6], axis=1)
+        cell_planes[cells] = edge_planes[graph.cell_edges[cells, first]]
 
-    def _next(self, planes: Values) -> Proposal:
-        """Cells that have not come apart by now, nearer to the tips whose planes they have than FAR."""
-        cells = np.flatnonzero(np.any(planes[:, 3:6], axis=1) & ~(self._graph.split | self.barred)).astype(np.int64)
-        cut = self._cut_by_now(cells)
-        whole = ~is_split(3)[cut @ (1 << np.arange(6))]
-        cells, cut = cells[whole], cut[whole]
-        places = self.sight.places(self._graph.cell_edges[cells], self.cut)
-        middle = np.einsum("nk,nki->ni", cut, places) / cut.sum(axis=1, keepdims=True)
-        near = np.linalg.norm(middle - planes[cells, :3], axis=1) <= FAR * self._h[cells]
+    def _propose_following(self, planes: Values) -> CutProposal:
+        """Propose unsplit cells on planes (cells, 7), near enough to the tips that lead these."""
+        has_plane = np.any(planes[:, 3:6], axis=1)
+        cells = np.flatnonzero(has_plane & ~(self._graph.split | self._barred)).astype(np.int64)
+        cut = self._flag_cut_edges(cells)
+        unsplit = ~is_split(3)[cut @ (1 << np.arange(6))]
+        cells, cut = cells[unsplit], cut[unsplit]
+        points = self.field_evaluator.cut_points(self._graph.cell_edges[cells], self.cut_positions)
+        middle = np.einsum("nk,nki->ni", cut, points) / cut.sum(axis=1, keepdims=True)
+        near = np.linalg.norm(middle - planes[cells, :3], axis=1) <= TIP.lead_distance * self._h[cells]
         cells, middle = cells[near], middle[near]
-        rank = self._ranked(0, planes[cells, 6], self._numbers(cells), middle, APART[3] * self._h[cells])
-        none, all_ = np.empty((len(cells), 3, 3)), np.ones(len(cells), bool)
-        return Proposal(rank, cells, none, np.zeros(len(cells), np.int64), planes[cells], all_, ~all_)
+        exclusion = TIP.exclusion_radius[3] * self._h[cells]
+        rank = rank_rows(TIP_ADVANCE, planes[cells, 6], input_numbers(self._domain, cells), middle, exclusion)
+        stress, turns = np.empty((len(cells), 3, 3)), np.ones(len(cells), bool)
+        return CutProposal(rank, cells, stress, np.zeros(len(cells), np.int64), planes[cells], turns, ~turns)
 
-    def _cut_by_now(self, cells: Ints) -> Flags:
-        """(n, 6) edges of cells (n,) that are broken, or cut in this pass."""
-        return ~self._graph.intact(cells) | ~np.isnan(self.cut[self._graph.cell_edges[cells]])
+    def _flag_cut_edges(self, cells: Ints) -> Flags:
+        """Flag the edges (n, 6) of cells (n,) that are broken, or cut in this pass."""
+        return ~self._graph.intact(cells) | ~np.isnan(self.cut_positions[self._graph.cell_edges[cells]])

@@ -1,7 +1,7 @@
-"""Gradients and values of fields at points of some cells: matrices that are kept, a product a component.
+"""Gradients and values of nodal fields at points of some cells, as sparse matrices that are kept.
 
-A cell has one point, its middle, and with quadratic displacement those where stress is integrated, of equal weights
-(mechanics.jit): what is made of fields is made there, and a cell has the mean of it.
+A linear cell has one point, its centroid. A quadratic cell has the points of the stress quadrature, of equal weights
+(mechanics.jit): products of fields are evaluated at points, and a cell gets their mean.
 """
 
 from __future__ import annotations
@@ -19,60 +19,62 @@ Ints = npt.NDArray[np.integer]
 Values = npt.NDArray[np.float64]
 
 
-class Patch:
-    """The points of some cells, those of a cell one after the other: m = n `count` of them. What comes out has its
-    components one after the other in memory, each of them in one piece.
+class GradientOperators:
+    """Operators at the m = n `count` points of n cells, cell by cell; results have each component contiguous.
 
     Attributes:
-        count: points of a cell.    steepness: (m,) sum |grad N_k| over the functions N_k of nodes, 1/m.
-        most: max sum |N_k| over all points: no value there is more than that many times as large as those of nodes.
+        count: number of points of a cell.
     """
 
     @classmethod
-    def of(cls, domain: Domain, cells: Ints, slopes: Values) -> Self:
-        """Of cells (n,); `slopes`: (n, d + 1, d) of their barycentric coordinates, 1/m."""
+    def of_cells(cls, domain: Domain, cells: Ints, slopes: Values) -> Self:
+        """Build the operators of cells (n,) from the gradients (n, d + 1, d) of barycentric coordinates, 1/m."""
         if domain.order == 1:
             corners = domain.dim + 1
             return cls(domain.cell_nodes[cells], slopes[:, None], np.full((1, corners), 1 / corners))
         values, by_coordinate = quadratic_shape_functions(domain.mesh)
-        each = np.einsum("pka,nai->npki", by_coordinate, slopes[:, 1:])
-        return cls(domain.all_cell_nodes[cells], each, values)
+        gradients = np.einsum("pka,nai->npki", by_coordinate, slopes[:, 1:])
+        return cls(domain.all_cell_nodes[cells], gradients, values)
 
-    def __init__(self, nodes: Ints, slopes: Values, shares: Values) -> None:
-        """`nodes`: (n, k) of cells.    `slopes`: (n, count, k, d) of the functions of nodes, 1/m.    `shares`: (count,
-        k) these themselves."""
-        cells, self.count, width, self._d = slopes.shape
+    def __init__(self, nodes: Ints, gradients: Values, values: Values) -> None:
+        """Assemble the matrices.
+
+        Args:
+            nodes: (n, k) nodes of cells.
+            gradients: (n, count, k, d) gradients of the shape functions, 1/m.
+            values: (count, k) shape functions.
+        """
+        cells, self.count, width, self._d = gradients.shape
         rows = cells * self.count
-        found, index = np.unique(nodes, return_inverse=True)
-        index, size = np.repeat(index.reshape(cells, 1, width), self.count, axis=1).reshape(-1), len(found)
-        self._dofs = np.arange(self._d)[:, None] + self._d * found
-        axes = slopes.transpose(3, 0, 1, 2).ravel()  # a block of rows an axis
-        self._slopes = csr_matrix(
-            (axes, np.tile(index, self._d), width * np.arange(self._d * rows + 1)), (self._d * rows, size)
+        unique_nodes, index = np.unique(nodes, return_inverse=True)
+        index, size = np.repeat(index.reshape(cells, 1, width), self.count, axis=1).reshape(-1), len(unique_nodes)
+        self._dofs = np.arange(self._d)[:, None] + self._d * unique_nodes
+        # One block of rows for each axis.
+        by_axis = gradients.transpose(3, 0, 1, 2).ravel()
+        self._gradients = csr_matrix(
+            (by_axis, np.tile(index, self._d), width * np.arange(self._d * rows + 1)), (self._d * rows, size)
         )
-        self.steepness: Values = np.sqrt(np.einsum("npki,npki->npk", slopes, slopes)).sum(axis=2).ravel()
-        self.most = float(np.abs(shares).sum(axis=1).max())
-        self._shares = csr_matrix((np.tile(shares.ravel(), cells), index, width * np.arange(rows + 1)), (rows, size))
+        self._values = csr_matrix((np.tile(values.ravel(), cells), index, width * np.arange(rows + 1)), (rows, size))
 
-    def at_nodes(self, field: Values) -> Values:
-        """(d, nodes) of a field of nodes (all * d,), at those of the cells."""
+    def gather_nodal_values(self, field: Values) -> Values:
+        """Return the values (d, nodes of the cells) of a nodal field (all nodes * d,)."""
         return field[self._dofs]
 
-    def gradients(self, nodes: Values) -> Values:
-        """(m, d, d) of a field, H_ij = du_i / dX_j of the displacement."""
-        rows = np.array([self._slopes @ each for each in nodes])
+    def evaluate_gradients(self, nodal: Values) -> Values:
+        """Return the gradients (m, d, d) of a field, H_ij = du_i / dX_j of a displacement."""
+        rows = np.array([self._gradients @ component for component in nodal])
         return rows.reshape(self._d, self._d, -1).transpose(2, 0, 1)
 
-    def values(self, nodes: Values) -> Values:
-        """(m, d) of a field."""
-        return np.array([self._shares @ each for each in nodes]).T
+    def evaluate_values(self, nodal: Values) -> Values:
+        """Return the values (m, d) of a field."""
+        return np.array([self._values @ component for component in nodal]).T
 
-    def everywhere(self, cells: Values) -> Values:
-        """(m,) of values of cells (n,)."""
-        return cells if self.count == 1 else np.repeat(cells, self.count)
+    def repeat_at_points(self, cell_values: Values) -> Values:
+        """Return the values (m,) of cells (n,) at their points."""
+        return cell_values if self.count == 1 else np.repeat(cell_values, self.count)
 
-    def means(self, points: Values) -> Values:
-        """(n, ...) over each cell of values at points (m, ...)."""
+    def average_over_points(self, point_values: Values) -> Values:
+        """Return the means (n, ...) over each cell of values at points (m, ...)."""
         if self.count == 1:
-            return points
-        return np.asarray(points.reshape(-1, self.count, *points.shape[1:]).mean(axis=1))
+            return point_values
+        return np.asarray(point_values.reshape(-1, self.count, *point_values.shape[1:]).mean(axis=1))

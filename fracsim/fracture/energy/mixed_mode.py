@@ -1,19 +1,18 @@
-"""A tip in tension and sliding: where the crack turns, and what that releases beside going straight on (in the plane).
+"""Mixed-mode crack tips in 2D: stress intensity factors, the kink angle, and the energy that the kink releases.
 
     K_k = E'/2 (- int t . Sigma_k grad q dA + int q rho a . (grad u_k) t dA)
     Sigma_k = (sigma : grad u_k) I - H^T sigma_k - (grad u_k)^T sigma
 
-u_k, sigma_k: around the tip of a crack along t with K_k = 1 (Williams 1957); H = grad u (Stern, Becker and Dunham 1976;
-with inertia Rethore et al. 2005). What does not belong to the tip, as the stress along the crack's sides or what loads
-and ends at some distance make, drops out at any size of the disc. Mean stress around the tip, taken here before, says
-K_II / K_I with the disc's size in it, and three times the scatter: 62 degrees of a crack that goes by 67 (kalthoff).
+u_k, sigma_k is the field around the tip of a crack along t with K_k = 1 (Williams 1957), and H = grad u (Stern, Becker
+and Dunham 1976; with inertia Rethore et al. 2005). Fields that do not belong to the tip, such as the stress along the
+crack faces, drop out at any size of the disc.
 
     psi = atan2(K_II, K_I)
-    tan(t/2) = - 2 K_II / (K_I + (K_I^2 + 8 K_II^2)^1/2)        the greatest hoop stress (Erdogan and Sih 1963)
-    K = cos(t/2) (K_I cos^2(t/2) - 3/2 K_II sin t)              of the crack that turns by t
+    tan(t/2) = - 2 K_II / (K_I + (K_I^2 + 8 K_II^2)^1/2)        the largest hoop stress (Erdogan and Sih 1963)
+    K = cos(t/2) (K_I cos^2(t/2) - 3/2 K_II sin t)              of the crack that kinks by t
 
-The force along the crack, (K_I^2 + K_II^2) / E', is of growing straight on. In pure sliding the crack that turns
-releases a third more. Where K_I < 0 the sides press on each other, and it has no part.
+The force along the crack, (K_I^2 + K_II^2) / E', is that of straight growth. In pure sliding a kinked crack releases a
+third more. Where K_I < 0 the crack faces press on each other, and K_I counts as 0.
 
 Equations: docs/theory.md#tension-and-sliding.
 """
@@ -29,14 +28,19 @@ Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Around:
-    """What lies in discs: (pairs, ...) of a tip and a cell.
+class TipDiscFields:
+    """Fields in the discs of tips, one row for each pair of a tip and a cell.
 
     Attributes:
-        apart: (pairs, 2) from the tip to the cell, m.    tangent: (pairs, 2) t of the tip, of length 1.
-        slope: (pairs, 2) V grad q, m.    inside: (pairs,) V q, m^2.
-        stress: (pairs, 2, 2) Pa.    H: (pairs, 2, 2) grad u.    push: (pairs, 2) rho a, N/m^3.
-        mu, kappa: (pairs,) shear modulus in Pa, and (lambda + 3 mu) / (lambda + mu).
+        apart: (pairs, 2) from the tip to the cell, m.
+        tangent: (pairs, 2) unit tangent t of the crack at the tip.
+        slope: (pairs, 2) V grad q, m.
+        inside: (pairs,) V q, m^2.
+        stress: (pairs, 2, 2) Cauchy stress, Pa.
+        H: (pairs, 2, 2) displacement gradient.
+        inertia_force: (pairs, 2) rho a, N/m^3.
+        mu: (pairs,) shear modulus, Pa.
+        kappa: (pairs,) (lambda + 3 mu) / (lambda + mu).
     """
 
     apart: Values
@@ -45,65 +49,70 @@ class Around:
     inside: Values
     stress: Values
     H: Values
-    push: Values
+    inertia_force: Values
     mu: Values
     kappa: Values
 
 
-def near_tip(places: Values, mu: Values, kappa: Values) -> Values:
-    """(n, 2, 2, 2) grad u at places (n, 2) in m from the tip of a crack along - x, of K_I = 1 and of K_II = 1.
+def auxiliary_gradients(positions: Values, mu: Values, kappa: Values) -> Values:
+    """Return grad u (n, 2, 2, 2) of the fields with K_I = 1 and with K_II = 1, at positions (n, 2), m, from the tip.
 
-    2 mu (u_x + i u_y) = kappa phi - z conj(phi') - conj(psi), phi' = (K_I - i K_II) / 2 (2 pi z)^1/2 (Muskhelishvili).
+    The crack lies along -x. 2 mu (u_x + i u_y) = kappa phi - z conj(phi') - conj(psi) with
+    phi' = (K_I - i K_II) / 2 (2 pi z)^1/2 (Muskhelishvili). Units: 1 / (Pa sqrt(m)).
     """
-    z = places[:, 0] + 1j * places[:, 1]
-    elsewhere = z != 0  # a tip in the very middle of a cell: what is infinite there is left out
-    z = np.where(elsewhere, z, 1.0)
+    z = positions[:, 0] + 1j * positions[:, 1]
+    # A tip may be the very centroid of a cell, where the field is infinite: that cell is left out.
+    is_finite = z != 0
+    z = np.where(is_finite, z, 1.0)
     root = 1 / (2 * np.sqrt(2 * np.pi * z))
-    both = []
+    modes = []
     for K in (1.0, -1.0j):
         first, mirrored = K * root, np.conj(K) * root
         second = -first / (2 * z)
         by_z = kappa * first - np.conj(first)
         by_conj = -z * np.conj(second) - np.conj(mirrored - first - z * second)
         by_x, by_y = by_z + by_conj, 1j * (by_z - by_conj)
-        both.append(np.stack([by_x.real, by_y.real, by_x.imag, by_y.imag], axis=1).reshape(-1, 2, 2))
-    return np.asarray(np.stack(both, axis=1) * (elsewhere / (2 * mu))[:, None, None, None])
+        modes.append(np.stack([by_x.real, by_y.real, by_x.imag, by_y.imag], axis=1).reshape(-1, 2, 2))
+    return np.asarray(np.stack(modes, axis=1) * (is_finite / (2 * mu))[:, None, None, None])
 
 
-def shares(around: Around) -> Values:
-    """(pairs, 2) what each cell adds to K_I and K_II of its tip, Pa sqrt(m)."""
-    t = around.tangent
+def intensity_contributions(fields: TipDiscFields) -> Values:
+    """Return the contributions (pairs, 2) of cells to K_I and K_II of their tips, Pa sqrt(m)."""
+    t = fields.tangent
+    # Rotation to axes along and across the crack.
     Q = np.stack([t, np.column_stack([-t[:, 1], t[:, 0]])], axis=1)
-    slope, push, places = (np.einsum("pai,pi->pa", Q, x) for x in (around.slope, around.push, around.apart))
-    stress, H = (Q @ x @ Q.transpose(0, 2, 1) for x in (around.stress, around.H))
-    mu, kappa = around.mu, around.kappa
-    field = near_tip(places, mu, kappa)
-    strain = (field + field.transpose(0, 1, 3, 2)) / 2
-    dilation = mu * (3 - kappa) / (kappa - 1) * np.einsum("pkii->kp", field)
+    slope, inertia_force, positions = (
+        np.einsum("pai,pi->pa", Q, vectors) for vectors in (fields.slope, fields.inertia_force, fields.apart)
+    )
+    stress, H = (Q @ tensors @ Q.transpose(0, 2, 1) for tensors in (fields.stress, fields.H))
+    mu, kappa = fields.mu, fields.kappa
+    gradient = auxiliary_gradients(positions, mu, kappa)
+    strain = (gradient + gradient.transpose(0, 1, 3, 2)) / 2
+    dilation = mu * (3 - kappa) / (kappa - 1) * np.einsum("pkii->kp", gradient)
     sigma = 2 * mu[:, None, None, None] * strain + dilation.T[..., None, None] * np.eye(2)
-    energy = np.einsum("pij,pkij->pk", stress, field) * slope[:, :1]
+    energy = np.einsum("pij,pkij->pk", stress, gradient) * slope[:, :1]
     energy -= np.einsum("pi,pkij,pj->pk", H[:, :, 0], sigma, slope)
-    energy -= np.einsum("pki,pij,pj->pk", field[..., 0], stress, slope)
-    energy -= around.inside[:, None] * np.einsum("pi,pki->pk", push, field[..., 0])
+    energy -= np.einsum("pki,pij,pj->pk", gradient[..., 0], stress, slope)
+    energy -= fields.inside[:, None] * np.einsum("pi,pki->pk", inertia_force, gradient[..., 0])
     return np.asarray(-4 * (mu / (kappa + 1))[:, None] * energy)  # E' = 8 mu / (kappa + 1)
 
 
-def turned_back(angle: Values, stress: Values, F: Values, push: Values) -> tuple[Values, Values, Values]:
-    """Stress, grad u and rho a, (n, ...), where all has turned by angles (n,), as without that."""
+def rotate_back(angle: Values, stress: Values, F: Values, inertia_force: Values) -> tuple[Values, Values, Values]:
+    """Return stress, grad u and rho a (n, ...) without the rotation by angles (n,), rad."""
     c, s = np.cos(angle), np.sin(angle)
     Q = np.stack([c, s, -s, c], axis=1).reshape(-1, 2, 2)
-    return Q @ stress @ Q.transpose(0, 2, 1), Q @ F - np.eye(2), np.einsum("nij,nj->ni", Q, push)
+    return Q @ stress @ Q.transpose(0, 2, 1), Q @ F - np.eye(2), np.einsum("nij,nj->ni", Q, inertia_force)
 
 
-def kink(psi: Values) -> Values:
-    """(n,) the angle by which a crack turns, from its tangent, anti-clockwise."""
+def kink_angle(psi: Values) -> Values:
+    """Return the kink angle (n,), rad, anti-clockwise from the tangent, at phase angles psi (n,)."""
     first, second = np.maximum(np.cos(psi), 0.0), np.sin(psi)
-    whole = first + np.sqrt(first**2 + 8 * second**2)
-    return np.asarray(-2 * np.arctan2(2 * second, whole))
+    root = first + np.sqrt(first**2 + 8 * second**2)
+    return np.asarray(-2 * np.arctan2(2 * second, root))
 
 
-def gain(psi: Values) -> Values:
-    """(n,) what the crack that turns releases, over that of growing straight on."""
-    t = kink(psi)
+def kink_gain(psi: Values) -> Values:
+    """Return the energy release of the kinked crack over that of straight growth (n,), at phase angles psi (n,)."""
+    t = kink_angle(psi)
     turned = np.cos(t / 2) * (np.maximum(np.cos(psi), 0.0) * np.cos(t / 2) ** 2 - 1.5 * np.sin(psi) * np.sin(t))
     return np.asarray(turned**2)

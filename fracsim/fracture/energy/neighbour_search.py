@@ -1,7 +1,4 @@
-"""What lies around a place: the cells within a distance, the same at any number of ranks.
-
-Values of a few cells, on whatever rank they are: the ranks that own them work them out.
-"""
+"""Cells and points near points, and values of cells of other ranks; the same results on any number of ranks."""
 
 from __future__ import annotations
 
@@ -22,70 +19,79 @@ Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
 
-class Asked:
-    """Cells that this rank asks for, and those that others ask of it.
+class RemoteCellValues:
+    """Exchange of the values of some cells, evaluated by the ranks that own them.
 
     Attributes:
-        own: (m,) cells of this rank that any rank asks for; on one rank in the order in which they are.
+        owned_cells: (m,) cells of this rank that any rank requests; on one rank in the order of the request.
     """
 
     def __init__(self, comm: MPI.Comm, rank: Ints, index: Ints) -> None:
-        """`rank`, `index`: (n,) who owns each of the cells that are asked for, and its number there (collective)."""
+        """Request cells (collective); `rank`, `index`: (n,) owner of each cell, and its local number there."""
         self._comm = comm
         if comm.size == 1:
-            self.own: Ints = index
+            self.owned_cells: Ints = index
             return
         self._order = np.argsort(rank, kind="stable")
-        here = [index[rank == each] for each in range(comm.size)]
-        there = alltoall(comm, here)
-        self.own = np.unique(np.concatenate(there))
-        self._send = [np.searchsorted(self.own, each) for each in there]
+        requested = alltoall(comm, [index[rank == owner] for owner in range(comm.size)])
+        self.owned_cells = np.unique(np.concatenate(requested))
+        self._send = [np.searchsorted(self.owned_cells, cells) for cells in requested]
 
     def __call__(self, *fields: Values) -> list[Values]:
-        """(n, ...) values of the cells asked for, from those (m, ...) of `own`; from other ranks they come with one
-        component after the other in memory (collective)."""
+        """Return the values (n, ...) of the requested cells, from those (m, ...) of `owned_cells` (collective).
+
+        Values from other ranks have each component contiguous in memory.
+        """
         if self._comm.size == 1:
             return list(fields)
-        tails = [each.shape[1:] for each in fields]
-        rows = np.concatenate([each.reshape(len(each), prod(tail)).T for each, tail in zip(fields, tails, strict=True)])
-        arrived = np.concatenate(alltoall(self._comm, [rows[:, each] for each in self._send]), axis=1)
-        result = np.empty_like(arrived)
-        result[:, self._order] = arrived
+        tails = [field.shape[1:] for field in fields]
+        rows = np.concatenate(
+            [field.reshape(len(field), prod(tail)).T for field, tail in zip(fields, tails, strict=True)]
+        )
+        received = np.concatenate(alltoall(self._comm, [rows[:, columns] for columns in self._send]), axis=1)
+        result = np.empty_like(received)
+        result[:, self._order] = received
         parts = np.split(result, np.cumsum([prod(tail) for tail in tails])[:-1])
         shaped = [part.reshape(*tail, result.shape[1]) for part, tail in zip(parts, tails, strict=True)]
-        return [np.moveaxis(each, -1, 0) for each in shaped]
+        return [np.moveaxis(part, -1, 0) for part in shaped]
 
 
-def local_size(domain: Domain) -> Values:
-    """(cells,) h = (d! V)^(1/d) in m, V the mean volume of the cells around the nodes of each cell (collective)."""
+def local_mesh_size(domain: Domain) -> Values:
+    """Return h = (d! V)^(1/d) (cells,), m, V the mean volume of the cells around the corners (collective)."""
     volumes, nodes = domain.volumes, domain.cell_nodes
     sums = la.vector(domain.space.dofmap.index_map, 2, np.float64)
     rows = sums.array.reshape(-1, 2)
     np.add.at(rows, nodes.ravel(), np.repeat(np.column_stack([volumes, np.ones(len(volumes))]), nodes.shape[1], axis=0))
     sums.scatter_reverse(la.InsertMode.add)
     sums.scatter_forward()
-    around = rows[nodes]  # of corners: no cell has brought anything to the middle of an edge
-    return np.asarray((factorial(domain.dim) * (around[..., 0] / around[..., 1]).mean(axis=1)) ** (1 / domain.dim))
+    at_corners = rows[nodes]
+    mean = (at_corners[..., 0] / at_corners[..., 1]).mean(axis=1)
+    return np.asarray((factorial(domain.dim) * mean) ** (1 / domain.dim))
 
 
-def surface_of(domain: Domain) -> tuple[Values, Values]:
-    """(cells, d) int n dA over the facets that cells of this rank have in the body's surface, outwards, and (cells, d)
-    the mean of the middles of these facets, m."""
+def surface_vectors(domain: Domain) -> tuple[Values, Values]:
+    """Return int n dA (cells, d), m^(d-1), over the facets of cells in the body's surface, and their middle (cells, d).
+
+    n is the outward normal; the middle is the mean of the centroids of these facets, m.
+    """
     corners, outside = domain.nodes[domain.cell_nodes], domain.boundary_sides
     areas = -domain.dim * domain.volumes[:, None, None] * barycentric_gradients(corners)
-    middles = (corners.sum(axis=1, keepdims=True) - corners) / domain.dim
+    facet_centroids = (corners.sum(axis=1, keepdims=True) - corners) / domain.dim
     count = np.maximum(outside.sum(axis=1), 1)[:, None]
-    vector, place = (np.einsum("nk,nki->ni", outside, each) for each in (areas, middles))
-    return vector, place / count
+    area, middle = (np.einsum("nk,nki->ni", outside, vectors) for vectors in (areas, facet_centroids))
+    return area, middle / count
 
 
 @dataclass(frozen=True)
-class Pairs:
-    """Things near places: pair k is of place `place[k]` and thing `other[k]`, by places, then in order of the things.
+class NeighbourPairs:
+    """Pairs of points and things near them, ordered by points, then by things.
 
     Attributes:
-        apart: (pairs, d) from the place to the thing, m.    distance: (pairs,) its length, m.
-        count: number of places.
+        place: (pairs,) number of the point.
+        other: (pairs,) number of the thing.
+        apart: (pairs, d) from the point to the thing, m.
+        distance: (pairs,) their distance, m.
+        count: number of points.
     """
 
     place: Ints
@@ -95,73 +101,79 @@ class Pairs:
     count: int
 
     def sum(self, values: Values) -> Values:
-        """(places, ...) sums of (pairs, ...) values, one after the other."""
+        """Return the sums (points, ...) of values (pairs, ...), added in order."""
         flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
         sums = [np.bincount(self.place, weights=column, minlength=self.count) for column in flat.T]
-        return np.asarray(sums, float).T.reshape(self.count, *values.shape[1:])  # float: those of nothing are not
+        # Sums of no pair are integers: convert.
+        return np.asarray(sums, float).T.reshape(self.count, *values.shape[1:])
 
     def any(self, flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-        """(places,) whether any pair (pairs,) is flagged."""
+        """Return whether a point (points,) has any flagged pair (pairs,)."""
         return np.bincount(self.place[flags], minlength=self.count) > 0
 
 
-def pairs_within(tree: cKDTree, places: Values, radius: Values) -> Pairs:
-    """Points of a tree nearer than `radius` (n,) to places (n, d).
+def find_pairs(tree: cKDTree, points: Values, radius: Values) -> NeighbourPairs:
+    """Return the pairs of points (n, d) and tree points nearer to them than radius (n,), m.
 
-    Places are taken together by the size of their radius to a quarter: one search has one radius, and what it finds
-    stays in arrays, which takes a tenth of the time of one list a place.
+    Points are grouped by the size of their radius, in steps of a quarter of an octave: one search has one radius, and
+        its result stays in arrays, which takes a tenth of the time of one list for each point.
     """
-    points = np.asarray(tree.data)
-    if not len(places) or not len(points):
+    tree_points = np.asarray(tree.data)
+    if not len(points) or not len(tree_points):
         none = np.empty(0, np.int64)
-        return Pairs(none, none, np.empty((0, points.shape[1])), np.empty(0), len(places))
+        return NeighbourPairs(none, none, np.empty((0, tree_points.shape[1])), np.empty(0), len(points))
     size = np.ceil(4 * np.log2(radius)).astype(np.int64)
-    found = []
-    for each in np.unique(size):
-        rows = np.flatnonzero(size == each)
-        near = cKDTree(places[rows]).sparse_distance_matrix(tree, radius[rows].max(), output_type="ndarray")
-        place = rows[near["i"]]
-        inside = near["v"] < radius[place]
-        found.append(place[inside] * len(points) + near["j"][inside])
-    place, other = np.divmod(np.sort(np.concatenate(found)), len(points))
-    apart = points[other] - places[place]
-    return Pairs(place, other, apart, np.sqrt(np.einsum("ni,ni->n", apart, apart)), len(places))
+    keys = []
+    for group in np.unique(size):
+        rows = np.flatnonzero(size == group)
+        near = cKDTree(points[rows]).sparse_distance_matrix(tree, radius[rows].max(), output_type="ndarray")
+        point_number = rows[near["i"]]
+        inside = near["v"] < radius[point_number]
+        keys.append(point_number[inside] * len(tree_points) + near["j"][inside])
+    point_number, thing = np.divmod(np.sort(np.concatenate(keys)), len(tree_points))
+    apart = tree_points[thing] - points[point_number]
+    return NeighbourPairs(point_number, thing, apart, np.sqrt(np.einsum("ni,ni->n", apart, apart)), len(points))
 
 
-def over(sums: Values, weight: Values) -> Values:
-    """Sums over their weights; 0 where there is none."""
+def weighted_mean(sums: Values, weight: Values) -> Values:
+    """Return weighted sums divided by the sums of their weights; 0 without weight."""
     return np.divide(sums, weight, out=np.zeros_like(sums), where=weight > 0)
 
 
-class Around:
-    """The cells of this rank and those of others that are near them, in the order of the input mesh.
+class NearbyCells:
+    """Cells of this rank and of others within a distance of them, in the order of the input mesh.
 
     Attributes:
-        number: (near,) of cells in the input mesh, rising.    volumes: (near,) m^d.    centres: (near, d) m.
-        outside: (near, d) int n dA over what cells have of the body's surface, m^(d-1).    there: (near, d) its middle.
+        number: (near,) numbers in the input mesh, ascending.
+        volumes: (near,) m^d.
+        centres: (near, d) centroids, m.
+        surface_vectors: (near, d) int n dA over the facets in the body's surface, m^(d-1).
+        surface_points: (near, d) middle of these facets, m.
     """
 
     def __init__(self, domain: Domain, reach: float) -> None:
-        """`reach`: farthest that anybody will look, m (collective)."""
-        own = domain.nodes[domain.cell_nodes].mean(axis=1)
-        halo, self._comm = RankHalo(domain.comm, own, reach), domain.comm
-        rank, index = np.full(len(own), float(domain.comm.rank)), np.arange(float(len(own)))
-        known = halo(np.column_stack([domain.cell_input, rank, index, domain.volumes, own, *surface_of(domain)]))
-        known = known[np.argsort(known[:, 0], kind="stable")]
-        self.number, self._rank, self._index = known[:, :3].T.astype(np.int64)
-        self.volumes = known[:, 3].copy()
-        self.centres, self.outside, self.there = (each.copy() for each in np.split(known[:, 4:], 3, axis=1))
+        """Exchange cells (collective); `reach`: largest distance of any later search, m."""
+        centroids = domain.nodes[domain.cell_nodes].mean(axis=1)
+        halo, self._comm = RankHalo(domain.comm, centroids, reach), domain.comm
+        rank, index = np.full(len(centroids), float(domain.comm.rank)), np.arange(float(len(centroids)))
+        columns = [domain.cell_input, rank, index, domain.volumes, centroids, *surface_vectors(domain)]
+        rows = halo(np.column_stack(columns))
+        rows = rows[np.argsort(rows[:, 0], kind="stable")]
+        self.number, self._rank, self._index = rows[:, :3].T.astype(np.int64)
+        self.volumes = rows[:, 3].copy()
+        self.centres, self.surface_vectors, self.surface_points = (part.copy() for part in np.split(rows[:, 4:], 3, 1))
         self._tree = cKDTree(self.centres)
 
-    def pairs(self, places: Values, radius: Values) -> Pairs:
-        """Cells, by their place among those near, whose centres are nearer than `radius` (n,) to places (n, d)."""
-        return pairs_within(self._tree, places, radius)
+    def find_pairs(self, points: Values, radius: Values) -> NeighbourPairs:
+        """Return the pairs of points (n, d) and near cells whose centroids are nearer than radius (n,), m."""
+        return find_pairs(self._tree, points, radius)
 
-    def asked(self, cells: Ints) -> Asked:
-        """A way to the values of cells (n,), by their place among those near (collective)."""
-        return Asked(self._comm, self._rank[cells], self._index[cells])
+    def request_values(self, cells: Ints) -> RemoteCellValues:
+        """Return an exchange of the values of near cells (n,) (collective)."""
+        return RemoteCellValues(self._comm, self._rank[cells], self._index[cells])
 
-    def those_of(self, number: Ints) -> tuple[Ints, npt.NDArray[np.bool_]]:
-        """Where cells (n,) of the input mesh are among those near, and (n,) whether they are."""
-        place = np.minimum(np.searchsorted(self.number, number), max(len(self.number) - 1, 0))
-        return place, self.number[place] == number if len(self.number) else np.zeros(len(number), bool)
+    def find_cells(self, number: Ints) -> tuple[Ints, npt.NDArray[np.bool_]]:
+        """Return the positions (n,) of cells of the input mesh among the near ones, and whether they are there."""
+        position = np.minimum(np.searchsorted(self.number, number), max(len(self.number) - 1, 0))
+        is_near = self.number[position] == number if len(self.number) else np.zeros(len(number), bool)
+        return position, is_near

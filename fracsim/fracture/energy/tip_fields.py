@@ -1,4 +1,4 @@
-"""The body as crack tips see it: stress, and the force on them; at any number of ranks."""
+"""Fields around crack tips: stress, Eshelby stress and inertia, and the forces on tips; on any number of ranks."""
 
 from __future__ import annotations
 
@@ -13,202 +13,239 @@ from ...mechanics.stress import Stress
 from ...mesh.edge_graph import EdgeGraph
 from ...mesh.simplices import local_edges
 from ...mesh.small_matrices import barycentric_gradients
-from ..brittle.principal_stress import tensors
-from ..effective_stress import Undamaged
-from .configurational_force import across, eshelby, first_piola, springs
-from .crack_front import Front
-from .cut_cells import Crack
-from .gradient_operators import Patch
-from .neighbour_search import Around, Asked, over
-from .tip_neighbourhoods import Neighbourhoods, Reach, Tips
+from ..effective_stress import UndamagedStress
+from ..principal_stress import symmetric_tensors
+from .configurational_force import closure_spring_stress, eshelby_stress, first_piola_stress, transposed_product
+from .cut_cells import CutCells, CutGeometry
+from .gradient_operators import GradientOperators
+from .neighbour_search import NearbyCells, RemoteCellValues, weighted_mean
+from .tip_neighbourhoods import CrackTips, TipNeighbourhoods, TipRadii
 
 Cells = npt.NDArray[np.integer]
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-ROUND_OFF = 1e-9  # of the bound of a force: of sums of some thousand cells
-
 
 @dataclass(frozen=True)
-class Seen:
-    """The body as it is, of the cells around tips (`Neighbourhoods.asked`).
+class TipFields:
+    """Fields in the cells around tips, which `TipNeighbourhoods.remote_values` requests.
 
     Attributes:
-        around: the tips and their sums.    disc: (tips,) R in m.
-        stress: (asked, 3 or 6) Cauchy stress of the undamaged material, Pa.
-        sigma: (asked, d, d) Eshelby's stress of the body as it is, Pa.
-        inertia: (asked, d) rho (H^T a - (grad v)^T v), N/m^3; 0 where nothing has a mass.
-        H, push: (asked, 2, 2) grad u and (asked, 2) rho a in N/m^3; of nothing in space.
-        elastic: (tips,) mu in Pa and (lambda + 3 mu) / (lambda + mu).    turns: whether turning strains nothing.
+        neighbourhoods: tips and sums around them.
+        disc_radius: (tips,) R, m.
+        stress: (requested, 3 or 6) Cauchy stress of the undamaged material, Pa.
+        sigma: (requested, d, d) Eshelby stress of the damaged body, Pa.
+        inertia: (requested, d) rho (H^T a - (grad v)^T v), N/m^3; 0 without inertia.
+        H: (requested, 2, 2) displacement gradient; empty in 3D.
+        inertia_force: (requested, 2) rho a, N/m^3; empty in 3D.
+        elastic: (tips,) mu, Pa, and (tips,) (lambda + 3 mu) / (lambda + mu).
+        rotates: a rotation causes no strain (the energy is not linear).
     """
 
-    around: Neighbourhoods
-    disc: Values
+    neighbourhoods: TipNeighbourhoods
+    disc_radius: Values
     stress: Values
     sigma: Values
     inertia: Values
     H: Values
-    push: Values
+    inertia_force: Values
     elastic: tuple[Values, Values]
-    turns: bool
+    rotates: bool
 
     @property
-    def tips(self) -> Tips:
-        """Of this rank."""
-        return self.around.tips
+    def tips(self) -> CrackTips:
+        """Tips of this rank."""
+        return self.neighbourhoods.tips
 
-    def forces(self) -> Values:
-        """(tips, d) configurational force, J/m^2.
+    def evaluate_forces(self) -> Values:
+        """Return the configurational forces (tips, d), J/m^2 (collective).
 
         g = - sum V Sigma grad q + int q Sigma n dA + sum V q rho (H^T a - (grad v)^T v)
 
-        The surface is the body's, where a crack goes for it: it does not move with the crack.
-        In space that along the advance of a crack, over the area it makes (crack_front) (collective).
+        The surface integral is over the body's surface, for cracks that advance towards it: it does not move with the
+        crack. In 3D the result is G along the advance of the crack (crack_front).
         """
-        force = self.around.forces(self.sigma, self.inertia)
-        return force if force.shape[1] == 2 else self.around.along(force)
+        force = self.neighbourhoods.evaluate_forces(self.sigma, self.inertia)
+        return force if force.shape[1] == 2 else self.neighbourhoods.front_release_rate(force)
 
-    def most(self) -> Values:
-        """(tips,) no less than the force on tips by themselves, J/m^2: a bound that takes a third of the time, at rest
-        twice the force, where strong waves pass far more; in the plane none."""
-        if self.sigma.shape[1] == 2:
-            return np.full(len(self.tips), np.inf)
-        return self.around.along.most(self.around.most(self.sigma, self.inertia)) * (1 + ROUND_OFF)
+    def mean_stress(self, rows: Ints) -> Values:
+        """Return the mean stress (m, d, d) around tips `rows` (m,), Pa."""
+        return self.neighbourhoods.mean_stress(rows, self.stress)
 
-    def means(self, rows: Ints) -> Values:
-        """(m, d, d) mean stress around tips `rows` (m,), Pa."""
-        return self.around.means(rows, self.stress)
+    def mean_square_stress(self, rows: Ints) -> Values:
+        """Return the mean square (m,) of the positive first principal stress around tips `rows` (m,), Pa^2."""
+        return self.neighbourhoods.mean_square_stress(rows, self.stress)
 
-    def phases(self) -> Values:
-        """(tips,) atan2(K_II, K_I) of tips in the plane (mixed_mode)."""
-        fields = self.stress, self.H, self.push
-        K = self.around.intensities(fields, self.elastic, turns=self.turns)
+    def phase_angles(self) -> Values:
+        """Return atan2(K_II, K_I) (tips,) of tips in 2D, rad."""
+        fields = self.stress, self.H, self.inertia_force
+        K = self.neighbourhoods.stress_intensities(fields, self.elastic, rotates=self.rotates)
         return np.asarray(np.arctan2(K[:, 1], K[:, 0]))
 
-    def squares(self, rows: Ints) -> Values:
-        """(m,) mean square of the positive first principal stress around tips `rows`, Pa^2."""
-        return self.around.squares(rows, self.stress)
 
-
-class Sight:
-    """What makes a `Seen` of the body.
+class TipFieldEvaluator:
+    """Evaluates `TipFields` at the present displacement.
 
     Attributes:
-        centres: (cells, d) of the cells of this rank, m.    crack: all cells that are cut.
-        around: the tips of this rank, and what lies around them.
-        motion: (owned dofs,) velocity in m/s and acceleration in m/s^2; None where nothing moves.
+        centres: (cells, d) centroids of the cells of this rank, m.
+        cut_cells: cut cells of all ranks.
+        neighbourhoods: tips of this rank, and sums around them.
     """
 
     def __init__(
-        self, stress: Stress, graph: EdgeGraph, reach: Reach, *, forks: bool = False, shares: bool = False
+        self, stress: Stress, graph: EdgeGraph, radii: TipRadii, *, forks: bool = False, shares: bool = False
     ) -> None:
-        """`forks`: whether cracks branch; `shares`: whether the force on a tip in space is that on the front nearby
-        (collective)."""
-        self._stress, self._graph, self._reach = stress, graph, reach
+        """Find the near cells of other ranks (collective).
+
+        Args:
+            stress: stress of the body.
+            graph: edges and their damage.
+            radii: radii of neighbourhoods.
+            forks: cracks may branch (2D).
+            shares: tips of a front share their force (3D).
+        """
+        self._stress, self._graph, self._radii = stress, graph, radii
         domain = self._domain = stress.domain
         self.centres: Values = domain.nodes[domain.cell_nodes].mean(axis=1)
-        self.motion: tuple[Values, Values] | None = None
-        farthest = domain.comm.allreduce(float(np.max(reach.disc, initial=0.0)), op=MPI.MAX)
-        self._near, self._front = Around(domain, farthest), Front(domain, graph)
-        self.crack = Crack(graph, self._front, self.centres)
-        self.around = Neighbourhoods(self._near, self.crack, graph, self._front, reach, forks=forks, shares=shares)
-        # of the coordinates of cells, NaN until somebody looks there
-        self._slopes = np.full((domain.cell_count, domain.dim + 1, domain.dim), np.nan)
-        self._patch: tuple[Asked, Patch] | None = None
-        self._undamaged = Undamaged(stress) if domain.order == 2 else None  # of points
-        mu, lmbda = np.asarray(stress.material.mu), np.asarray(stress.material.lmbda)
-        every = (domain.cell_count,)
-        self._elastic = np.broadcast_to(mu, every), np.broadcast_to((lmbda + 3 * mu) / (lmbda + mu), every)
-        self._density = np.broadcast_to(np.asarray(stress.material.density), (domain.cell_count,))
-
-    def follow(self, cut: Values) -> Tips:
-        """The tips of this rank; `cut`: (edges,) where cracks cut local edges (collective)."""
-        if self.crack.changed():
-            self.around.update(cut)
-        return self.around.tips
-
-    def look(self, stress: Values, psi: Values) -> Seen:
-        """What is around the tips (collective)."""
-        asked, tips, (mu, kappa) = self.around.asked, self.around.tips, self._elastic
-        cells, patch = asked.own, self.patch
-        H = patch.gradients(patch.at_nodes(self._stress.u.x.array))
-        own = np.array([column[cells] for column in stress.T]).T  # in half the time of rows
-        assert self._stress.chi is not None
-        chi = self._stress.chi.x.array[cells]
-        there, stored = (own, psi[cells]) if self._undamaged is None else self._undamaged.at_points(cells)
-        sigma = self._eshelby(patch.everywhere(chi), there, stored, H)
-        inertia, push = np.zeros((2, len(H), self._domain.dim))
-        if self.motion is not None:
-            density = np.where(self._stress.cracks_close | (chi > 0), self._density[cells], 0.0)
-            v, a = map(self._domain.with_ghosts, self.motion)
-            kinetic, inertia, push = self._moved(patch.everywhere(density), H, patch, v, a)
-            for axis in range(self._domain.dim):
-                sigma[:, axis, axis] += kinetic
-        sigma, inertia, H, push = map(patch.means, (sigma, inertia, H, push))
-        if self._stress.cracks_close:
-            sigma += self._pressed(cells, 1 - chi)
-        flat = (H, push) if self._domain.dim == 2 else (np.empty((len(cells), 0)),) * 2
-        seen, sigma, inertia, H, push = asked(own, sigma, inertia, *flat)
-        elastic, turns = (mu[tips.cell], kappa[tips.cell]), not self._stress.energy.linear
-        return Seen(self.around, self._reach.disc[tips.cell], seen, sigma, inertia, H, push, elastic, turns)
+        self._motion: tuple[Values, Values] | None = None
+        largest_radius = domain.comm.allreduce(float(np.max(radii.disc, initial=0.0)), op=MPI.MAX)
+        self._nearby, self._geometry = NearbyCells(domain, largest_radius), CutGeometry(domain, graph)
+        self.cut_cells = CutCells(graph, self._geometry, self.centres)
+        self.neighbourhoods = TipNeighbourhoods(
+            self._nearby, self.cut_cells, graph, self._geometry, radii, forks=forks, shares=shares
+        )
+        # Gradients of barycentric coordinates, NaN until they are needed.
+        self._barycentric_gradients = np.full((domain.cell_count, domain.dim + 1, domain.dim), np.nan)
+        self._operators: tuple[RemoteCellValues, GradientOperators] | None = None
+        # Quadratic cells need the stress at points, not means.
+        self._undamaged = UndamagedStress(stress) if domain.order == 2 else None
+        material, count = stress.material, (domain.cell_count,)
+        mu, lmbda = np.asarray(material.mu), np.asarray(material.lmbda)
+        self._elastic = np.broadcast_to(mu, count), np.broadcast_to((lmbda + 3 * mu) / (lmbda + mu), count)
+        self._density = np.broadcast_to(np.asarray(material.density), count)
 
     @property
-    def patch(self) -> Patch:
-        """Of the cells of this rank that anybody asks for: as long as they are the same."""
-        asked = self.around.asked
-        if self._patch is None or self._patch[0] is not asked:
-            self._patch = asked, Patch.of(self._domain, asked.own, self._slopes_of(asked.own))
-        return self._patch[1]
+    def has_motion(self) -> bool:
+        """Whether the body moves with inertia."""
+        return self._motion is not None
 
-    def places(self, edges: npt.NDArray[np.integer], cut: Values) -> Values:
-        """(n, d) where local edges are cut, m."""
-        return self._front.places(edges, cut)
+    def set_motion(self, v: Values, a: Values) -> None:
+        """Store velocity (owned dofs,) in m/s and acceleration in m/s^2."""
+        self._motion = v, a
 
-    def means_at(self, cells: Ints, stress: Values) -> Values:
-        """(n, d, d) mean stress around the centres of cells (n,) of this rank that are far from cracks, Pa, of all
-        cells' (cells, 3 or 6) (collective)."""
-        average = self._reach.average[cells]
-        pairs = self._near.pairs(self.centres[cells], average)
+    def update_tips(self, cut: Values) -> CrackTips:
+        """Return the tips of this rank; `cut`: (edges,) cut positions (collective)."""
+        if self.cut_cells.has_changed():
+            self.neighbourhoods.update(cut)
+        return self.neighbourhoods.tips
+
+    def evaluate_fields(self, stress: Values, psi: Values) -> TipFields:
+        """Evaluate the fields around tips (collective).
+
+        Args:
+            stress: (cells, 3 or 6) Cauchy stress of the undamaged material, Pa.
+            psi: (cells,) energy density of the undamaged material, J/m^3.
+        """
+        exchange, tips, (mu, kappa) = self.neighbourhoods.remote_values, self.neighbourhoods.tips, self._elastic
+        cells, operators = exchange.owned_cells, self.operators
+        H = operators.evaluate_gradients(operators.gather_nodal_values(self._stress.u.x.array))
+        # Column by column, which takes half the time of rows.
+        cell_stress = np.array([column[cells] for column in stress.T]).T
+        assert self._stress.chi is not None
+        chi = self._stress.chi.x.array[cells]
+        if self._undamaged is None:
+            point_stress, point_psi = cell_stress, psi[cells]
+        else:
+            point_stress, point_psi = self._undamaged.evaluate_at_points(cells)
+        sigma = self._eshelby_stress(operators.repeat_at_points(chi), point_stress, point_psi, H)
+        inertia, inertia_force = np.zeros((2, len(H), self._domain.dim))
+        if self._motion is not None:
+            # Cells without stiffness carry no inertia either, unless they carry pressure.
+            density = np.where(self._stress.cracks_close | (chi > 0), self._density[cells], 0.0)
+            v, a = map(self._domain.with_ghosts, self._motion)
+            density = operators.repeat_at_points(density)
+            kinetic, inertia, inertia_force = self._inertia_terms(density, H, operators, v, a)
+            for axis in range(self._domain.dim):
+                sigma[:, axis, axis] += kinetic
+        sigma, inertia, H, inertia_force = map(operators.average_over_points, (sigma, inertia, H, inertia_force))
+        if self._stress.cracks_close:
+            sigma += self._closure_stress(cells, 1 - chi)
+        in_plane = (H, inertia_force) if self._domain.dim == 2 else (np.empty((len(cells), 0)),) * 2
+        remote_stress, sigma, inertia, H, inertia_force = exchange(cell_stress, sigma, inertia, *in_plane)
+        elastic, rotates = (mu[tips.cell], kappa[tips.cell]), not self._stress.energy.linear
+        radius = self._radii.disc[tips.cell]
+        return TipFields(self.neighbourhoods, radius, remote_stress, sigma, inertia, H, inertia_force, elastic, rotates)
+
+    @property
+    def operators(self) -> GradientOperators:
+        """Operators of the cells of this rank that any rank requests, kept as long as these are the same."""
+        exchange = self.neighbourhoods.remote_values
+        if self._operators is None or self._operators[0] is not exchange:
+            cells = exchange.owned_cells
+            built = GradientOperators.of_cells(self._domain, cells, self._gradients_of_coordinates(cells))
+            self._operators = exchange, built
+        return self._operators[1]
+
+    def cut_points(self, edges: npt.NDArray[np.integer], cut: Values) -> Values:
+        """Return the points (n, d) at which local edges (n,) are cut, m."""
+        return self._geometry.cut_points(edges, cut)
+
+    def mean_stress_at(self, cells: Ints, stress: Values) -> Values:
+        """Return the mean stress (n, d, d), Pa, around the centroids of cells (n,) far from cracks (collective).
+
+        `stress` is that of all cells (cells, 3 or 6), Pa.
+        """
+        average = self._radii.average[cells]
+        pairs = self._nearby.find_pairs(self.centres[cells], average)
         needed, index = np.unique(pairs.other, return_inverse=True)
-        asked = self._near.asked(needed)
-        (near,) = asked(stress[asked.own])
-        weight = self._near.volumes[pairs.other] * (1 - pairs.distance / average[pairs.place])
-        return tensors(over(pairs.sum(weight[:, None] * near[index]), pairs.sum(weight)[:, None]), self._domain.dim)
+        exchange = self._nearby.request_values(needed)
+        (near,) = exchange(stress[exchange.owned_cells])
+        weight = self._nearby.volumes[pairs.other] * (1 - pairs.distance / average[pairs.place])
+        mean = weighted_mean(pairs.sum(weight[:, None] * near[index]), pairs.sum(weight)[:, None])
+        return symmetric_tensors(mean, self._domain.dim)
 
-    def _eshelby(self, chi: Values, stress: Values, psi: Values, H: Values) -> Values:
-        """(m, d, d) Pa of the stress (m, 3 or 6)."""
-        P = first_piola(tensors((chi * stress.T).T, self._domain.dim), H, linear=self._stress.energy.linear)
-        return eshelby(chi * psi, H, P)
+    def mean_gradients(self, cells: Ints, field: Values) -> Values:
+        """Return the mean gradients (n, d, d) of a nodal field (nodes * d,) in cells (n,)."""
+        operators = GradientOperators.of_cells(self._domain, cells, self._gradients_of_coordinates(cells))
+        return operators.average_over_points(operators.evaluate_gradients(operators.gather_nodal_values(field)))
 
-    def _pressed(self, cells: Ints, share: Values) -> Values:
-        """(n, d, d) Pa of the broken edges of cells, with `share` of their springs: of what corners make alone."""
+    def _eshelby_stress(self, chi: Values, stress: Values, psi: Values, H: Values) -> Values:
+        """Return Eshelby's stress (m, d, d), Pa, of undamaged stress (m, 3 or 6) and energy density (m,)."""
+        cauchy = symmetric_tensors((chi * stress.T).T, self._domain.dim)
+        P = first_piola_stress(cauchy, H, linear=self._stress.energy.linear)
+        return eshelby_stress(chi * psi, H, P)
+
+    def _closure_stress(self, cells: Ints, share: Values) -> Values:
+        """Return Eshelby's stress (n, d, d), Pa, of the springs of broken edges, of which cells have `share` (n,).
+
+        It depends on the displacement of the corners alone.
+        """
         graph, material, corners = self._graph, self._stress.material, self._domain.cell_nodes[cells]
         nodes, moved = self._domain.nodes[corners], self._stress.u.x.array.reshape(-1, self._domain.dim)[corners]
-        H = np.einsum("nki,nkj->nij", moved, self._slopes_of(cells))
+        H = np.einsum("nki,nkj->nij", moved, self._gradients_of_coordinates(cells))
         first, second = local_edges(self._domain.dim).T
         stiff = np.broadcast_to(spring_modulus(material, self._domain.dim, len(first)), (len(self.centres),))[cells]
         modulus = (share * stiff)[:, None] * ~graph.intact(cells)
-        psi, P = springs(nodes[:, second] - nodes[:, first], modulus, H, linear=self._stress.energy.linear)
-        return eshelby(psi, H, P)
+        vectors = nodes[:, second] - nodes[:, first]
+        psi, P = closure_spring_stress(vectors, modulus, H, linear=self._stress.energy.linear)
+        return eshelby_stress(psi, H, P)
 
     @staticmethod
-    def _moved(density: Values, H: Values, patch: Patch, v: Values, a: Values) -> tuple[Values, Values, Values]:
-        """(m,) rho v^2 / 2 in J/m^3, and (m, d) rho (H^T a - (grad v)^T v) and rho a in N/m^3, at points of a density
-        (m,), 0 of those that carry nothing."""
-        moves = patch.at_nodes(v)
-        speed, push = patch.values(moves), density[:, None] * patch.values(patch.at_nodes(a))
-        momentum = density[:, None] * speed
-        carried = across(H, push) - across(patch.gradients(moves), momentum)
-        return np.einsum("ni,ni->n", speed, momentum) / 2, carried, push
+    def _inertia_terms(
+        density: Values, H: Values, operators: GradientOperators, v: Values, a: Values
+    ) -> tuple[Values, Values, Values]:
+        """Return rho v^2 / 2 (m,), J/m^3, rho (H^T a - (grad v)^T v) (m, d) and rho a (m, d), N/m^3, at points."""
+        nodal_v = operators.gather_nodal_values(v)
+        velocity = operators.evaluate_values(nodal_v)
+        inertia_force = density[:, None] * operators.evaluate_values(operators.gather_nodal_values(a))
+        momentum = density[:, None] * velocity
+        gradient_v = operators.evaluate_gradients(nodal_v)
+        inertia = transposed_product(H, inertia_force) - transposed_product(gradient_v, momentum)
+        return np.einsum("ni,ni->n", velocity, momentum) / 2, inertia, inertia_force
 
-    def gradients(self, cells: Ints, field: Values) -> Values:
-        """(n, d, d) mean gradients of a field of nodes (nodes * d,), H_ij = du_i / dX_j of the displacement."""
-        patch = Patch.of(self._domain, cells, self._slopes_of(cells))
-        return patch.means(patch.gradients(patch.at_nodes(field)))
-
-    def _slopes_of(self, cells: Ints) -> Values:
-        """(n, d + 1, d) of the barycentric coordinates of cells, 1/m."""
-        new = cells[np.isnan(self._slopes[cells, 0, 0])]
+    def _gradients_of_coordinates(self, cells: Ints) -> Values:
+        """Return the gradients (n, d + 1, d) of the barycentric coordinates of cells (n,), 1/m."""
+        new = cells[np.isnan(self._barycentric_gradients[cells, 0, 0])]
         if len(new):
-            self._slopes[new] = barycentric_gradients(self._domain.nodes[self._domain.cell_nodes[new]])
-        return self._slopes[cells]
+            self._barycentric_gradients[new] = barycentric_gradients(self._domain.nodes[self._domain.cell_nodes[new]])
+        return self._barycentric_gradients[cells]

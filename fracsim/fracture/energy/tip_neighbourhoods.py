@@ -1,7 +1,7 @@
-"""What lies around the tips: looked for only where cracks have changed, and kept until they do.
+"""Neighbourhoods of crack tips: the cells around each tip and their weights, updated only where cracks have changed.
 
-A tip is a cell that is cut and has not come apart, at the mean of the places where its edges are cut. The cells around
-it, and their weights in its sums, are kept as long as it stays; the crack behind it as long as none of it changes.
+A tip is a cell that is cut and not split, at the mean of the points at which its edges are cut. The cells around a tip
+and their weights are kept as long as the tip stays, and the crack behind it as long as no part of that changes.
 """
 
 from __future__ import annotations
@@ -15,25 +15,28 @@ from scipy.sparse import csc_matrix, csr_matrix, hstack
 from scipy.spatial import cKDTree
 
 from ...mesh.edge_graph import EdgeGraph
-from ..brittle.principal_stress import largest, tensors
+from ..principal_stress import first_principal_stress, symmetric_tensors
 from . import branching, mixed_mode
 from .configurational_force import plateau, plateau_gradient
-from .crack_front import Alone, Along, Front, advance
-from .cut_cells import Crack
-from .neighbour_search import Around, Pairs, over, pairs_within
+from .crack_front import FrontReleaseRate, advance_vectors, project_on_surface
+from .cut_cells import CutCells, CutGeometry
+from .neighbour_search import NearbyCells, NeighbourPairs, find_pairs, weighted_mean
+from .tip_parameters import TIP
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-LEAST_DISC = 3.0  # R over h is more: polygons reach as far as a cell beyond their cell's centre
-FACED = 0.1  # of R^2: area of the body's surface within a disc from which on it is there
-
 
 @dataclass(frozen=True)
-class Reach:
-    """(cells,) how far a tip in a cell looks, m: the `disc` of its force, where stress is averaged (`average`, no more
-    than that), and how far `beyond` the disc there is a crack once it is mature."""
+class TipRadii:
+    """Radii of the neighbourhood of a tip in each cell (cells,), m.
+
+    Attributes:
+        disc: R of the configurational force.
+        average: radius within which stress is averaged, at most R.
+        beyond: a tip is mature if a split cell lies between R and R plus this length.
+    """
 
     disc: Values
     average: Values
@@ -41,17 +44,21 @@ class Reach:
 
 
 @dataclass(frozen=True)
-class Tips:
-    """Tips of this rank.
+class CrackTips:
+    """Crack tips of this rank.
 
     Attributes:
-        cell: (n,) local, rising.    pattern: (n,) of its cut edges.    point: (n, d) m.
-        behind: (n, d) the middle of the crack nearer than R, m.    mature: (n,) whether there is any beyond R.
-        ahead: (n, d) the crack that an advance makes: in space m, in the plane in tips (branching).
-        course: (n, d) from the middle of the crack nearer than 2 R to the tip, m; only where cracks branch.
-        parts: (n, d) whither it goes abreast of another in its disc; 0 where there is none, and in space.
-        waits: (n,) whether it lets that other go first.    alone: (n,) whether no other tip's disc lies over its own.
-        surface: (n, d) int q n dA of the body's own surface in the disc, m^(d-1).
+        cell: (n,) local cells, ascending.
+        pattern: (n,) broken edges of the cells, one bit each.
+        point: (n, d) positions, m.
+        behind: (n, d) mean of the cuts of the crack nearer than R, m.
+        mature: (n,) whether the crack is longer than R.
+        ahead: (n, d) advance that the force is divided by: in 3D the crack area it makes, m; in 2D see `branching`.
+        course: (n, d) from the mean of the crack nearer than 2 R to the tip, m; 0 unless cracks may branch.
+        parts: (n, d) direction of a tip that advances side by side with another; 0 without one, and in 3D.
+        waits: (n,) whether the tip lets the other one advance first.
+        alone: (n,) whether no disc of another tip overlaps that of the tip.
+        surface: (n, d) int q n dA over the surface of the body in the disc, m^(d-1).
     """
 
     cell: Ints
@@ -67,263 +74,295 @@ class Tips:
     surface: Values
 
     def __len__(self) -> int:
+        """Return the number of tips."""
         return len(self.cell)
 
 
-class _Sum(IntEnum):
-    """Weights of a cell in the sums around a tip, behind its V grad q; all but the first are 0 of split cells."""
+class _Weight(IntEnum):
+    """Columns of the weights of a cell after V grad q; all but the first are 0 for split cells."""
 
     INSIDE = 0  # V q
     MEAN = 1  # V (1 - r / radius of the average)
-    ALIKE = 2  # V
+    UNIFORM = 2  # V
 
 
-class Neighbourhoods:
-    """The tips of this rank, and sums over the cells around them.
+class TipNeighbourhoods:
+    """Tips of this rank, and weighted sums over the cells around them.
 
     Attributes:
-        tips: as they were when `update` was called last.    asked: the cells around them.
-        along: in space, what G their fronts have there.
+        tips: tips at the last update.
+        remote_values: exchange of the values of the cells around them.
+        front_release_rate: in 3D, the energy release rate from the forces on tips.
     """
 
     def __init__(
-        self, around: Around, crack: Crack, graph: EdgeGraph, front: Front, reach: Reach, *, forks: bool, shares: bool
+        self,
+        nearby: NearbyCells,
+        cut_cells: CutCells,
+        graph: EdgeGraph,
+        geometry: CutGeometry,
+        radii: TipRadii,
+        *,
+        forks: bool,
+        shares: bool,
     ) -> None:
-        """`forks`: whether cracks branch; `shares`: whether tips of a front take their shares of a force
-        (crack_front)."""
-        self._around, self._crack, self._graph, self._front, self._reach = around, crack, graph, front, reach
-        self._forks, self.along = forks, (Along if shares else Alone)(graph.domain.comm)
+        """Start without tips.
+
+        Args:
+            nearby: cells within the largest radius.
+            cut_cells: cut cells of all ranks.
+            graph: edges and their damage.
+            geometry: positions of the cuts.
+            radii: radii of neighbourhoods.
+            forks: cracks may branch (2D).
+            shares: tips of a front share their force (3D).
+        """
+        self._nearby, self._cut_cells, self._graph, self._geometry = nearby, cut_cells, graph, geometry
+        self._radii, self._forks = radii, forks
+        self.front_release_rate = FrontReleaseRate(graph.domain.comm, averaged=shares)
         none, nowhere, no = np.empty(0, np.int64), np.empty((0, graph.domain.dim)), np.empty(0, bool)
-        self.tips = Tips(none, none.astype(np.uint8), nowhere, nowhere, no, nowhere, nowhere, nowhere, no, no, nowhere)
-        self._split = np.zeros(len(around.number), bool)
-        # the tip and the cell (among those near) of each pair, and the cell's weights in the sums of `_Sum`
-        self._place: Ints = none
-        self._cell: Ints = none
-        self._weights: Values = np.empty((0, graph.domain.dim + len(_Sum)))
-        self._crossed: Values = nowhere  # and int q n dA over what it has of the body's surface
+        self.tips = CrackTips(
+            none, none.astype(np.uint8), nowhere, nowhere, no, nowhere, nowhere, nowhere, no, no, nowhere
+        )
+        self._split = np.zeros(len(nearby.number), bool)
+        # Pairs of a tip and a cell (among the near ones), and the weights of the cell in sums around the tip.
+        self._pair_tip: Ints = none
+        self._pair_cell: Ints = none
+        self._weights: Values = np.empty((0, graph.domain.dim + len(_Weight)))
+        # int q n dA over the surface of the body that the cell of a pair has.
+        self._surface_weights: Values = nowhere
         self._matrices: dict[int, csr_matrix] = {}
-        self._products: tuple[csc_matrix, csc_matrix, csc_matrix] | None = None
+        self._force_matrices: tuple[csc_matrix, csc_matrix] | None = None
 
     def update(self, cut: Values) -> None:
-        """Cracks have changed: look anew where they have (collective)."""
-        number, centre = self._crack.update(cut)
-        for cells, split in ((number, False), (self._crack.number[self._crack.split], True)):
-            place, near = self._around.those_of(cells)
-            self._split[place[near]] = split
-        fresh = self._look(cut)
-        self._look_back(np.flatnonzero(fresh | self._near(centre)))
+        """Update the neighbourhoods near changed cells; `cut`: (edges,) cut positions (collective)."""
+        number, centre = self._cut_cells.update_cells(cut)
+        for cells, split in ((number, False), (self._cut_cells.number[self._cut_cells.split], True)):
+            position, is_near = self._nearby.find_cells(cells)
+            self._split[position[is_near]] = split
+        new = self._find_tips(cut)
+        self._update_cracks_behind(np.flatnonzero(new | self._flag_near(centre)))
         needed = np.zeros(len(self._split), bool)
-        needed[self._cell] = True
+        needed[self._pair_cell] = True
         cells = np.flatnonzero(needed)
-        self.asked = self._around.asked(cells)
+        self.remote_values = self._nearby.request_values(cells)
         index = np.cumsum(needed) - 1
-        ends = np.concatenate([[0], np.cumsum(np.bincount(self._place, minlength=len(self.tips)))])
-        self._shape, self._index, self._ends = (len(self.tips), len(cells)), index[self._cell], ends
+        ends = np.concatenate([[0], np.cumsum(np.bincount(self._pair_tip, minlength=len(self.tips)))])
+        self._shape, self._index, self._ends = (len(self.tips), len(cells)), index[self._pair_cell], ends
         self._matrices.clear()
-        self._products = None
+        self._force_matrices = None
         if self.tips.point.shape[1] == 3:
             cell, domain = self.tips.cell, self._graph.domain
-            self.along.update(domain.cell_input[cell], self.tips.point, self.tips.ahead, self._reach.disc[cell])
+            number, radius = domain.cell_input[cell], self._radii.disc[cell]
+            self.front_release_rate.update(number, self.tips.point, self.tips.ahead, radius)
 
-    # --- sums ---
+    # --- sums around tips; `requested` counts the cells of `remote_values` ---
 
-    def forces(self, sigma: Values, push: Values) -> Values:
-        """(n, d) - sum V Sigma grad q + sum V q f over the discs of tips: Sigma (asked, d, d) in Pa and f (asked, d) in
-        N/m^3."""
+    def evaluate_forces(self, sigma: Values, inertia: Values) -> Values:
+        """Return configurational forces (n, d): - sum V Sigma grad q + sum V q f + surface integral.
+
+        Args:
+            sigma: (requested, d, d) Eshelby stress, Pa.
+            inertia: (requested, d) f, N/m^3.
+        """
         d = sigma.shape[1]
-        slopes, inside, _ = self._force
+        slopes, inside = self._force_operators
         rows = np.moveaxis(sigma, 0, -1).reshape(d, -1)
-        return np.column_stack([inside @ push[:, i] - slopes @ rows[i] for i in range(d)])
-
-    def most(self, sigma: Values, push: Values) -> Values:
-        """(n,) no less than the size of those forces: sum V |Sigma| |grad q| + sum V q |f|."""
-        size, pushed = np.einsum("nij,nij->n", sigma, sigma), np.einsum("ni,ni->n", push, push)
-        return self.most_of(np.sqrt(size)[:, None], np.sqrt(pushed)[:, None]).sum(axis=1)
-
-    def most_of(self, sizes: Values, pushed: Values) -> Values:
-        """(n, k + m) sum V |grad q| of `sizes` (asked, k), and sum V q of `pushed` (asked, m)."""
-        _, inside, steep = self._force
-        return np.column_stack([steep @ sizes, inside @ pushed])
+        return np.column_stack([inside @ inertia[:, i] - slopes @ rows[i] for i in range(d)])
 
     @property
-    def _force(self) -> tuple[csc_matrix, csc_matrix, csc_matrix]:
-        """(tips, d asked) V grad q less int q n dA, one axis after the other, (tips, asked) V q and the size of these;
-        by columns, which takes two thirds of the time: in rows each sum waits for the one before."""
-        if self._products is None:
-            slopes = self._weights[:, : self.tips.point.shape[1]] - self._crossed_ahead()
-            axes = [self._sparse(each) for each in slopes.T]
-            steep = sum(each.multiply(each) for each in axes).sqrt()
-            matrices = hstack(axes), self._matrix(len(axes) + _Sum.INSIDE), steep
-            self._products = tuple(each.tocsc() for each in matrices)
-        return self._products
+    def _force_operators(self) -> tuple[csc_matrix, csc_matrix]:
+        """V grad q less int q n dA (tips, d requested), one axis after the other, and V q (tips, requested).
 
-    def _crossed_ahead(self) -> Values:
-        """(pairs, d) int q n dA over the body's surface around tips that go for it."""
-        tips = self.tips
-        onwards, size = (np.linalg.norm(each, axis=1) for each in (tips.ahead, tips.surface))
-        faces = np.einsum("ni,ni->n", tips.ahead, tips.surface) ** 2 > (onwards * size) ** 2 / 2
-        return faces[self._place, None] * self._crossed
-
-    def means(self, rows: Ints, stress: Values) -> Values:
-        """(m, d, d) mean stress in Pa around tips `rows` (m,), that of cells (asked, 3 or 6) which have not come apart,
-        weighted by 1 - r over the radius of the average."""
-        d = self._graph.domain.dim
-        weights = self._matrix(d + _Sum.MEAN)[rows]
-        sums = np.column_stack([weights @ column for column in stress.T])
-        return tensors(over(sums, np.asarray(weights.sum(axis=1))), d)
-
-    def intensities(
-        self, fields: tuple[Values, Values, Values], elastic: tuple[Values, Values], *, turns: bool
-    ) -> Values:
-        """(n, 2) K_I and K_II in Pa sqrt(m) of tips in the plane, along the crack behind them (mixed_mode).
-
-        `fields`: stress (asked, 3) in Pa, grad u (asked, 2, 2), rho a (asked, 2) in N/m^3, of cells that have not
-        come apart. `elastic`: (n,) mu in Pa and kappa. `turns`: as seen by somebody who turns with what is in the disc.
+        They are stored by columns, which takes two thirds of the time: in rows each sum waits for the one before.
         """
-        rows, tips, count = np.flatnonzero(~self._split[self._cell]), self.tips, len(self.tips)
-        place, index, inside = self._place[rows], self._index[rows], self._weights[rows, 2 + _Sum.INSIDE]
-        stress, H, push = (np.ascontiguousarray(each)[index] for each in (tensors(fields[0], 2), *fields[1:]))
-        if turns:
-            F = H + np.eye(2)
-            sines, cosines = (np.bincount(place, inside * each, count)
-                              for each in (F[:, 1, 0] - F[:, 0, 1], F[:, 0, 0] + F[:, 1, 1]))  # fmt: skip
-            stress, H, push = mixed_mode.turned_back(np.arctan2(sines, cosines)[place], stress, F, push)
-        apart = self._around.centres[self._cell[rows]] - tips.point[place]
-        tangent = branching.unit(tips.point - tips.behind)[place]
-        mu, kappa = (each[place] for each in elastic)
-        around = mixed_mode.Around(apart, tangent, self._weights[rows, :2], inside, stress, H, push, mu, kappa)
-        return np.column_stack([np.bincount(place, each, count) for each in mixed_mode.shares(around).T])
+        if self._force_matrices is None:
+            slopes = self._weights[:, : self.tips.point.shape[1]] - self._surface_weights_ahead()
+            axes = [self._sparse_matrix(component) for component in slopes.T]
+            inside = self._weight_matrix(len(axes) + _Weight.INSIDE)
+            self._force_matrices = hstack(axes).tocsc(), inside.tocsc()
+        return self._force_matrices
 
-    def squares(self, rows: Ints, stress: Values) -> Values:
-        """(m,) mean square of the positive first principal stress around tips, of stress (asked, 3 or 6), all cells
-        alike, Pa^2."""
+    def _surface_weights_ahead(self) -> Values:
+        """Return int q n dA (pairs, d) for tips that advance towards the body's surface, 0 for the others."""
+        tips = self.tips
+        advance, size = (np.linalg.norm(vectors, axis=1) for vectors in (tips.ahead, tips.surface))
+        faces_surface = np.einsum("ni,ni->n", tips.ahead, tips.surface) ** 2 > (advance * size) ** 2 / 2
+        return faces_surface[self._pair_tip, None] * self._surface_weights
+
+    def mean_stress(self, rows: Ints, stress: Values) -> Values:
+        """Return the mean stress (m, d, d), Pa, around tips `rows` (m,), over cells that are not split.
+
+        The weight is 1 - r over the radius of the average; `stress` is (requested, 3 or 6), Pa.
+        """
         d = self._graph.domain.dim
-        weights = self._matrix(d + _Sum.ALIKE)[rows]
+        weights = self._weight_matrix(d + _Weight.MEAN)[rows]
+        sums = np.column_stack([weights @ column for column in stress.T])
+        return symmetric_tensors(weighted_mean(sums, np.asarray(weights.sum(axis=1))), d)
+
+    def mean_square_stress(self, rows: Ints, stress: Values) -> Values:
+        """Return the mean square (m,), Pa^2, of the positive first principal stress around tips `rows` (m,).
+
+        It is over the disc of the average, with uniform weight; `stress` is (requested, 3 or 6), Pa.
+        """
+        d = self._graph.domain.dim
+        weights = self._weight_matrix(d + _Weight.UNIFORM)[rows]
         cells = np.unique(weights.indices)
         squares = np.zeros(len(stress))
-        squares[cells] = np.maximum(largest(tensors(stress[cells], d)), 0.0) ** 2
-        return over(weights @ squares, np.asarray(weights.sum(axis=1)).ravel())
+        squares[cells] = np.maximum(first_principal_stress(symmetric_tensors(stress[cells], d)), 0.0) ** 2
+        return weighted_mean(weights @ squares, np.asarray(weights.sum(axis=1)).ravel())
 
-    def _matrix(self, column: int) -> csr_matrix:
-        """(tips, asked) weights, kept until cracks change."""
+    def stress_intensities(
+        self, fields: tuple[Values, Values, Values], elastic: tuple[Values, Values], *, rotates: bool
+    ) -> Values:
+        """Return K_I and K_II (n, 2), Pa sqrt(m), of tips in 2D along the crack behind them (mixed_mode).
+
+        Args:
+            fields: stress (requested, 3), Pa, grad u (requested, 2, 2), and rho a (requested, 2), N/m^3.
+            elastic: (n,) mu, Pa, and (n,) kappa.
+            rotates: the mean rotation of the disc is removed first (large rotations).
+        """
+        rows, tips, count = np.flatnonzero(~self._split[self._pair_cell]), self.tips, len(self.tips)
+        tip, index, inside = self._pair_tip[rows], self._index[rows], self._weights[rows, 2 + _Weight.INSIDE]
+        stress, H, inertia_force = (
+            np.ascontiguousarray(values)[index] for values in (symmetric_tensors(fields[0], 2), *fields[1:])
+        )
+        if rotates:
+            F = H + np.eye(2)
+            sines, cosines = (
+                np.bincount(tip, inside * component, count)
+                for component in (F[:, 1, 0] - F[:, 0, 1], F[:, 0, 0] + F[:, 1, 1])
+            )
+            angle = np.arctan2(sines, cosines)[tip]
+            stress, H, inertia_force = mixed_mode.rotate_back(angle, stress, F, inertia_force)
+        apart = self._nearby.centres[self._pair_cell[rows]] - tips.point[tip]
+        tangent = branching.unit_or_zero(tips.point - tips.behind)[tip]
+        mu, kappa = (values[tip] for values in elastic)
+        slope = self._weights[rows, :2]
+        disc = mixed_mode.TipDiscFields(apart, tangent, slope, inside, stress, H, inertia_force, mu, kappa)
+        contributions = mixed_mode.intensity_contributions(disc)
+        return np.column_stack([np.bincount(tip, column, count) for column in contributions.T])
+
+    def _weight_matrix(self, column: int) -> csr_matrix:
+        """Return a column of the weights as a matrix (tips, requested), kept until the next update."""
         if column not in self._matrices:
             data = self._weights[:, column]
             if column > self._graph.domain.dim:
-                data = np.where(self._split[self._cell], 0.0, data)
-            self._matrices[column] = self._sparse(data)
+                data = np.where(self._split[self._pair_cell], 0.0, data)
+            self._matrices[column] = self._sparse_matrix(data)
         return self._matrices[column]
 
-    def _sparse(self, data: Values) -> csr_matrix:
-        """(tips, asked) of what pairs have."""
+    def _sparse_matrix(self, data: Values) -> csr_matrix:
+        """Return values of pairs (pairs,) as a matrix (tips, requested)."""
+        # The copy protects the weights: zeros are eliminated in place.
         matrix = csr_matrix((data, self._index, self._ends), shape=self._shape, copy=True)
-        matrix.eliminate_zeros()  # in place
+        matrix.eliminate_zeros()
         return matrix
 
-    # --- what lies around ---
+    # --- update of tips, and of the cracks behind them ---
 
-    def _look(self, cut: Values) -> Flags:
-        """Find the tips, and the cells around those that are new: (n,) flags of these."""
+    def _find_tips(self, cut: Values) -> Flags:
+        """Find the tips, and the cells around new ones; return flags (n,) of the new ones."""
         graph, old = self._graph, self.tips
         cell = np.flatnonzero(graph.damaged & ~graph.split).astype(np.int64)
-        before = np.full(graph.domain.cell_count, -1)
-        before[old.cell] = np.arange(len(old))
-        row = before[cell]
-        kept = row >= 0
-        kept[kept] = old.pattern[row[kept]] == graph.pattern[cell[kept]]
-        new = np.flatnonzero(~kept)
-        point = self._front.middles(cell, cut)
-        place, cells, weights, crossed = self._surroundings(cell[new], point[new])
-        after = np.full(len(old), -1)
-        after[row[kept]] = np.flatnonzero(kept)
-        stays = np.flatnonzero(after[self._place] >= 0)
-        every = np.concatenate([after[self._place[stays]], new[place]])
-        order = np.argsort(every, kind="stable")
-        self._place, self._cell = every[order], np.concatenate([self._cell[stays], cells])[order]
-        self._weights = np.concatenate([self._weights[stays], weights])[order]
-        self._crossed = np.concatenate([self._crossed[stays], crossed])[order]
+        # A tip stays if its cell is cut as before.
+        old_row = np.full(graph.domain.cell_count, -1)
+        old_row[old.cell] = np.arange(len(old))
+        row = old_row[cell]
+        stays = row >= 0
+        stays[stays] = old.pattern[row[stays]] == graph.pattern[cell[stays]]
+        new = np.flatnonzero(~stays)
+        point = self._geometry.mean_cut_points(cell, cut)
+        pair_tip, pair_cell, weights, surface_weights = self._find_surroundings(cell[new], point[new])
+        # Merge the pairs of old and new tips, ordered by tips.
+        new_row = np.full(len(old), -1)
+        new_row[row[stays]] = np.flatnonzero(stays)
+        old_pairs = np.flatnonzero(new_row[self._pair_tip] >= 0)
+        all_tips = np.concatenate([new_row[self._pair_tip[old_pairs]], new[pair_tip]])
+        order = np.argsort(all_tips, kind="stable")
+        self._pair_tip = all_tips[order]
+        self._pair_cell = np.concatenate([self._pair_cell[old_pairs], pair_cell])[order]
+        self._weights = np.concatenate([self._weights[old_pairs], weights])[order]
+        self._surface_weights = np.concatenate([self._surface_weights[old_pairs], surface_weights])[order]
         behind, ahead, course, parts, surfaces = np.zeros((5, *point.shape))
         mature, waits, alone = np.zeros((3, len(cell)), bool)
         size, slope = len(new), weights[:, : point.shape[1]]
-        surfaces[new] = np.column_stack([np.bincount(place, each, size) for each in slope.T])
-        self.tips = Tips(cell, graph.pattern[cell], point, behind, mature, ahead, course, parts, waits, alone, surfaces)
-        for each in ("behind", "mature", "ahead", "course", "parts", "waits", "alone", "surface"):
-            getattr(self.tips, each)[kept] = getattr(old, each)[row[kept]]
-        return ~kept
+        # The integral of grad q over the body is that of q n over its surface.
+        surfaces[new] = np.column_stack([np.bincount(pair_tip, component, size) for component in slope.T])
+        self.tips = CrackTips(
+            cell, graph.pattern[cell], point, behind, mature, ahead, course, parts, waits, alone, surfaces
+        )
+        for name in ("behind", "mature", "ahead", "course", "parts", "waits", "alone", "surface"):
+            getattr(self.tips, name)[stays] = getattr(old, name)[row[stays]]
+        return ~stays
 
-    def _surroundings(self, cell: Ints, point: Values) -> tuple[Ints, Ints, Values, Values]:
-        """Of tips: the tip and the cell of each pair, its (pairs, d + 3) weights and (pairs, d) int q n dA of it."""
-        disc, average = self._reach.disc[cell], self._reach.average[cell]
-        pairs = self._around.pairs(point, disc)
-        volume, r, R = self._around.volumes[pairs.other], pairs.distance, disc[pairs.place]
+    def _find_surroundings(self, cell: Ints, point: Values) -> tuple[Ints, Ints, Values, Values]:
+        """Find the pairs of tips and cells around them.
+
+        Returns:
+            Tip (pairs,) and cell (pairs,), the weights (pairs, d + 3), and int q n dA (pairs, d) of the cell's surface.
+        """
+        disc, average = self._radii.disc[cell], self._radii.average[cell]
+        pairs = self._nearby.find_pairs(point, disc)
+        volume, r, R = self._nearby.volumes[pairs.other], pairs.distance, disc[pairs.place]
         slope = volume[:, None] * plateau_gradient(pairs.apart, R)
         share = 1 - r / average[pairs.place]
         columns = [plateau(r, R), np.maximum(share, 0.0), share > 0]
-        weights = np.column_stack([slope, *(volume * each for each in columns)])
-        apart = np.linalg.norm(self._around.there[pairs.other] - point[pairs.place], axis=1)
-        return pairs.place, pairs.other, weights, plateau(apart, R)[:, None] * self._around.outside[pairs.other]
+        weights = np.column_stack([slope, *(volume * column for column in columns)])
+        distance = np.linalg.norm(self._nearby.surface_points[pairs.other] - point[pairs.place], axis=1)
+        surface_weights = plateau(distance, R)[:, None] * self._nearby.surface_vectors[pairs.other]
+        return pairs.place, pairs.other, weights, surface_weights
 
-    def _near(self, changed: Values) -> Flags:
-        """(n,) whether a tip sees any of the cells with these centres (m, d)."""
+    def _flag_near(self, changed: Values) -> Flags:
+        """Return whether tips (n,) depend on any of the changed cells with centroids (m, d)."""
         if not len(changed):
             return np.zeros(len(self.tips), bool)
-        disc, beyond = self._reach.disc[self.tips.cell], self._reach.beyond[self.tips.cell]
-        apart = cKDTree(changed).query(self.tips.point)[0]
-        farthest = (
-            disc * (1 + 1 / LEAST_DISC) if changed.shape[1] == 3 else 2 * (1 + self._forks) * disc
-        )  # others' tips, and what they see
-        return np.asarray(apart <= np.maximum(disc + beyond, farthest))
+        disc, beyond = self._radii.disc[self.tips.cell], self._radii.beyond[self.tips.cell]
+        distance = cKDTree(changed).query(self.tips.point)[0]
+        # In 2D a tip depends on other tips around it, and on what these depend on.
+        reach = disc * (1 + 1 / TIP.min_disc_radius) if changed.shape[1] == 3 else 2 * (1 + self._forks) * disc
+        return np.asarray(distance <= np.maximum(disc + beyond, reach))
 
-    def _look_back(self, rows: Ints) -> None:
-        """Find the crack behind tips."""
-        tips, crack = self.tips, self._crack
-        point, disc = tips.point[rows], self._reach.disc[tips.cell[rows]]
-        full, split = disc + self._reach.beyond[tips.cell[rows]], np.flatnonzero(crack.split)
-        pairs = pairs_within(cKDTree(crack.centre[split]), point, np.maximum(full, disc * (1 + 1 / LEAST_DISC)))
+    def _update_cracks_behind(self, rows: Ints) -> None:
+        """Update the cracks behind tips `rows` (m,)."""
+        tips, cut_cells = self.tips, self._cut_cells
+        point, disc = tips.point[rows], self._radii.disc[tips.cell[rows]]
+        mature_radius, split = disc + self._radii.beyond[tips.cell[rows]], np.flatnonzero(cut_cells.split)
+        reach = np.maximum(mature_radius, disc * (1 + 1 / TIP.min_disc_radius))
+        pairs = find_pairs(cKDTree(cut_cells.centre[split]), point, reach)
         cells, r = split[pairs.other], disc[pairs.place]
-        tips.behind[rows] = self._behind(pairs, cells, point, disc)
-        tips.mature[rows] = pairs.any((pairs.distance >= r) & (pairs.distance < full[pairs.place]))
+        tips.behind[rows] = self._mean_cut_point_behind(pairs, cells, point, disc)
+        tips.mature[rows] = pairs.any((pairs.distance >= r) & (pairs.distance < mature_radius[pairs.place]))
         if point.shape[1] == 3:
-            near = np.flatnonzero(pairs.distance < r * (1 + 1 / LEAST_DISC))
-            sides = advance(crack.polygon, (pairs.place[near], cells[near]), point, disc)
-            tips.ahead[rows] = along_the_surface(sides, tips.surface[rows], disc)
+            near = np.flatnonzero(pairs.distance < r * (1 + 1 / TIP.min_disc_radius))
+            advance = advance_vectors(cut_cells.polygon, (pairs.place[near], cells[near]), point, disc)
+            tips.ahead[rows] = project_on_surface(advance, tips.surface[rows], disc)
         else:
-            self._look_aside(rows, disc)
+            self._update_shared_advance(rows, disc)
 
-    def _behind(self, pairs: Pairs, cells: Ints, point: Values, disc: Values) -> Values:
-        """(n, d) mean of the cuts of split cells (pairs,) of the crack nearer than `disc` to points, m."""
+    def _mean_cut_point_behind(self, pairs: NeighbourPairs, cells: Ints, point: Values, disc: Values) -> Values:
+        """Return the mean (n, d), m, of the cuts of split cells (pairs,) nearer than `disc` to points (n, d)."""
         within = (pairs.distance < disc[pairs.place]).astype(float)
-        back = within[:, None] * (self._crack.middle[cells] - point[pairs.place])
-        return point + over(pairs.sum(back), pairs.sum(within)[:, None])
+        back = within[:, None] * (self._cut_cells.cut_point[cells] - point[pairs.place])
+        return point + weighted_mean(pairs.sum(back), pairs.sum(within)[:, None])
 
-    def _look_aside(self, rows: Ints, disc: Values) -> None:
-        """Find the tips whose discs lie over those of tips, in the plane."""
-        tips, crack = self.tips, self._crack
-        every = np.flatnonzero(~crack.split)
-        pairs = pairs_within(cKDTree(crack.middle[every]), tips.point[rows], (1 + self._forks) * disc)
-        other = crack.middle[every[pairs.other]]
-        along = self._way(other, disc[pairs.place])
-        tips.ahead[rows] = branching.advance(pairs, along, disc)
+    def _update_shared_advance(self, rows: Ints, disc: Values) -> None:
+        """Update what tips `rows` (m,) in 2D have from tips whose discs overlap theirs."""
+        tips, cut_cells = self.tips, self._cut_cells
+        all_tips = np.flatnonzero(~cut_cells.split)
+        pairs = find_pairs(cKDTree(cut_cells.cut_point[all_tips]), tips.point[rows], (1 + self._forks) * disc)
+        other_points = cut_cells.cut_point[all_tips[pairs.other]]
+        directions = self._direction_from_crack(other_points, disc[pairs.place])
+        tips.ahead[rows] = branching.shared_advance(pairs, directions, disc)
         if self._forks:
             tips.alone[rows] = np.bincount(pairs.place, minlength=len(rows)) == 1
-            tips.course[rows] = course = self._way(tips.point[rows], 2 * disc)
-            theirs = self._way(other, 2 * disc[pairs.place])
-            tips.parts[rows], tips.waits[rows] = branching.parted(pairs, course[pairs.place], theirs, disc)
+            tips.course[rows] = course = self._direction_from_crack(tips.point[rows], 2 * disc)
+            other_course = self._direction_from_crack(other_points, 2 * disc[pairs.place])
+            parts, waits = branching.branch_directions(pairs, course[pairs.place], other_course, disc)
+            tips.parts[rows], tips.waits[rows] = parts, waits
 
-    def _way(self, point: Values, radius: Values) -> Values:
-        """(n, d) from the middle of the crack nearer than `radius` to points, m."""
-        split = np.flatnonzero(self._crack.split)
-        pairs = pairs_within(cKDTree(self._crack.centre[split]), point, radius)
-        return point - self._behind(pairs, split[pairs.other], point, radius)
-
-
-def along_the_surface(ahead: Values, surface: Values, radius: Values) -> Values:
-    """(n, 3) the crack that an advance of tips makes, m; along the body's `surface` where it ends there.
-
-    `surface`: (n, 3) int q n dA of the body, m^2: an advance across it would move the body's own surface. A front that
-    has the surface ahead goes for it.
-    """
-    size = np.linalg.norm(surface, axis=1)[:, None]
-    normal = np.divide(surface, size, out=np.zeros_like(surface), where=size > FACED * radius[:, None] ** 2)
-    along = ahead - np.einsum("nk,nk->n", ahead, normal)[:, None] * normal
-    turned = np.einsum("nk,nk->n", along, along) >= np.einsum("nk,nk->n", ahead, ahead) / 2
-    return np.where(turned[:, None], along, ahead)
+    def _direction_from_crack(self, point: Values, radius: Values) -> Values:
+        """Return vectors (n, d), m, from the mean of the crack nearer than radius (n,) to points (n, d)."""
+        split = np.flatnonzero(self._cut_cells.split)
+        pairs = find_pairs(cKDTree(self._cut_cells.centre[split]), point, radius)
+        return point - self._mean_cut_point_behind(pairs, split[pairs.other], point, radius)

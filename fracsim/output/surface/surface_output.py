@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...fracture.edge_history import EdgeRecord
+from ...fracture.edge_history import EdgeHistory
 from ...mechanics.material_fields import PerCell
 from ...mechanics.term_protocols import OutputSurfaces
 from ...mesh.domain import Domain
@@ -37,7 +37,7 @@ class SurfaceOutput:
         folder: Path,
         domain: Domain,
         density: PerCell,
-        record: EdgeRecord | None,
+        record: EdgeHistory | None,
         *,
         apart: Sequence[PointCorrection] = (),
         beside: Sequence[OutputSurfaces] = (),
@@ -64,7 +64,7 @@ class SurfaceOutput:
         self._domain, self.record, self._corrections = domain, record, apart
         self._obstacle_terms, self._interpenetration = beside, passing
         cell_density = domain.gather_cells(np.broadcast_to(np.asarray(density, float), domain.cell_count))
-        broken = self.record.gathered() if self.record is not None else None
+        broken = self.record.gather_broken() if self.record is not None else None
 
         def open_files() -> tuple[BodySurface, SurfaceFiles]:
             assert domain.source is not None and cell_density is not None
@@ -91,7 +91,7 @@ class SurfaceOutput:
         domain, d = self._domain, self._domain.dim
         gathered: list[Any] = [domain.gather_nodes(values.reshape(-1, d)) for values in (state.u, state.v)]
         pattern = domain.gather_cells(self.record.graph.pattern) if self.record is not None else None
-        broken = self.record.gathered() if self.record is not None else None
+        broken = self.record.gather_broken() if self.record is not None else None
 
         def write() -> None:
             assert self.surface_and_files is not None

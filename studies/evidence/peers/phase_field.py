@@ -116,7 +116,7 @@ def beside(n: int, pull: str) -> dict[str, Any]:
 def _ours(n: int, pull: Pull) -> dict[str, float]:
     from mpi4py import MPI
 
-    from ....fracture.energy.tip_criterion import CrackTips
+    from ....fracture.energy.tip_criterion import TipCriterion
     from ....run import Run
     from ....scene import build_scene
     from ....study.reader import validate
@@ -131,10 +131,10 @@ def _ours(n: int, pull: Pull) -> dict[str, float]:
         seconds = time.process_time() - began
         assert run.scene.fracture is not None
         criterion = run.scene.fracture.criterion
-        assert isinstance(criterion, CrackTips)
-        criterion.tips()
+        assert isinstance(criterion, TipCriterion)
+        criterion.find_tips()
         notch = np.array([SIDE / 2, SIDE * (0.5 + 0.5 / n)])
-        crack = criterion.sight.crack.middle - notch
+        crack = criterion.field_evaluator.cut_cells.cut_point - notch
     return _figures(np.array(load), pull.course, crack, seconds, solves)
 
 

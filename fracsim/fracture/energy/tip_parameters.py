@@ -1,0 +1,62 @@
+"""Parameters of crack tips in the criterion by fracture energy (docs/theory.md#fracture-energy)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from math import pi, radians
+
+
+def _by_dimension(in_plane: float, in_space: float) -> Mapping[int, float]:
+    """Return a field that is read by the dimension of the body, 2 or 3."""
+    values: Mapping[int, float] = field(default_factory=lambda: {2: in_plane, 3: in_space})
+    return values
+
+
+@dataclass(frozen=True)
+class TipParameters:
+    """Lengths and thresholds of crack tips; mappings have the keys 2 and 3, for 2D and 3D.
+
+    Lengths are in units of the local mesh size h unless a unit is given.
+
+    Attributes:
+        disc_radius: radius R of the disc, in 3D ball, over which the force on a tip is summed.
+        average_radius: radius within which stress is averaged.
+        mature_length: a tip is mature once a split cell lies between R and R plus this length.
+        passes_per_size: fracture passes in which a crack advances by h.
+        exclusion_radius: distance between tips that advance in one pass.
+        near_tip_factor: mean square of the first principal stress over a disc of radius rho around a tip, in units of
+            E' G / rho. With sigma_1 = K / sqrt(2 pi r) cos(t/2) (1 + |sin(t/2)|) it is
+            (1 / 2 pi^2) int cos^2 (1 + |sin|)^2 dt = 0.334, and 3 pi / 8 of that over a ball.
+        branching_ratio: mean of G over G_c from which on a crack branches: there is energy for two.
+        branching_angle: angle between a branch and the crack it comes from, rad. At 27 degrees short branches open
+            without sliding.
+        side_by_side: largest lead of a branch, in R, at which two branches advance side by side.
+        max_lead: lead in R from which on the branch ahead waits for the other.
+        min_front_advance: least length of an advance, in R, that belongs to a crack front.
+        min_surface_area: area of the body's surface in a ball, in R^2, from which on a front follows the surface.
+        min_disc_radius: lower bound of R: cut polygons reach as far as a cell beyond their cell's centre.
+        front_lag: relative lack of G below G_c with which tips of a front advance with their neighbours.
+        lead_distance: distance up to which a tip of a front leads its plane.
+        force_round_off: relative rounding error of a sum over some thousand cells.
+    """
+
+    disc_radius: Mapping[int, float] = _by_dimension(5.0, 4.0)
+    average_radius: float = 3.0
+    mature_length: float = 1.5
+    passes_per_size: Mapping[int, float] = _by_dimension(2.5, 5.0)
+    exclusion_radius: Mapping[int, float] = _by_dimension(5.0, 0.5)
+    near_tip_factor: Mapping[int, float] = _by_dimension(0.334, 0.334 * 3 * pi / 8)
+    branching_ratio: float = 2.0
+    branching_angle: float = radians(27.0)
+    side_by_side: float = 0.5
+    max_lead: float = 0.2
+    min_front_advance: float = 0.05
+    min_surface_area: float = 0.1
+    min_disc_radius: float = 3.0
+    front_lag: float = 0.03
+    lead_distance: float = 0.65
+    force_round_off: float = 1e-9
+
+
+TIP = TipParameters()

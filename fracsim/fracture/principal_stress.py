@@ -1,0 +1,69 @@
+"""Principal stress: its largest value, its direction, and the material plane normal to that direction."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from ..forms.kinematics import SYMMETRIC_COMPONENTS
+from .strength import hash_points
+
+Values = npt.NDArray[np.float64]
+
+# Principal stresses that differ by less than this share of the largest one count as equal: the difference of their
+# directions is noise of the solver.
+EQUAL_STRESS_TOLERANCE = 1e-3
+
+
+def symmetric_tensors(components: Values, dim: int) -> Values:
+    """Return symmetric tensors (n, d, d) from components (n, 3 or 6); in memory one component follows the other."""
+    result = np.empty((dim, dim, len(components))).transpose(2, 0, 1)
+    for column, (i, j) in enumerate(SYMMETRIC_COMPONENTS[dim]):
+        result[:, i, j] = result[:, j, i] = components[:, column]
+    return result
+
+
+def principal_stress_bound(stress: Values) -> Values:
+    """Return an upper bound (n,) of the largest eigenvalue of tensors (n, d, d), by Gershgorin's discs."""
+    diagonal = np.einsum("nii->ni", stress)
+    radius = np.abs(stress).sum(axis=2) - np.abs(diagonal)
+    return np.asarray((diagonal + radius).max(axis=1))
+
+
+def first_principal_stress(stress: Values) -> Values:
+    """Return the largest principal stress (n,) of tensors (n, d, d)."""
+    return np.asarray(np.linalg.eigvalsh(stress)[:, -1])
+
+
+def first_principal_directions(stress: Values, points: Values, seed: int) -> Values:
+    """Return unit directions (n, d) of the largest principal stress; their sign is arbitrary.
+
+    If several principal stresses are equal to the largest one, a direction of their eigenspace is drawn from the seed
+    and the bits of the points (n, d). So it is the same on any number of ranks.
+    """
+    values, vectors = np.linalg.eigh(stress)
+    size = np.abs(values).max(axis=1, keepdims=True)
+    is_largest = values >= values[:, -1:] - EQUAL_STRESS_TOLERANCE * size
+    result = vectors[:, :, -1].copy()
+    multiple = np.flatnonzero(is_largest.sum(axis=1) > 1)
+    if len(multiple):
+        d = stress.shape[1]
+        draw = np.column_stack([hash_points(points[multiple], d * seed + axis) for axis in range(d)])
+        shares = np.einsum("nij,ni->nj", vectors[multiple], draw) * is_largest[multiple]
+        result[multiple] = np.einsum("nij,nj->ni", vectors[multiple], shares)
+    return unit_or_first_axis(result)
+
+
+def material_normals(direction: Values, gradient: Values) -> Values:
+    """Return unit reference normals N ~ F^T n (n, d) of material planes with present normals n (n, d).
+
+    A tangent t = F T of the plane has n . F T = (F^T n) . T = 0. `gradient` is F (n, d, d).
+    """
+    return unit_or_first_axis(np.einsum("nji,nj->ni", gradient, direction))
+
+
+def unit_or_first_axis(vectors: Values) -> Values:
+    """Return vectors (..., d) of length 1; vectors of no length become the first axis."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    first = np.eye(vectors.shape[-1])[0]
+    return np.where(length > 0, vectors / np.where(length > 0, length, 1.0), first)
