@@ -15,18 +15,18 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 from .errors import Exit, FracsimError, InputError, NotConverged, Stopped, one_line
 from .process import (
     INTERRUPTED,
-    begin_process,
-    begin_run,
-    begin_work,
+    exit_process,
+    import_blocked,
     import_dolfinx,
     import_outside,
     is_first_rank,
-    kept_out,
-    leave,
+    start_process,
+    start_run,
+    start_work,
 )
 
 # typer imports rich where it is there, though `rich_markup_mode` is None: two thirds of what this module takes.
-with kept_out("rich"):
+with import_blocked("rich"):
     import typer
 
 if TYPE_CHECKING:
@@ -72,8 +72,8 @@ def run(
     import_dolfinx()
     from .run import run_study
 
-    begin_work()
-    begin_run()
+    start_work()
+    start_run()
     how = {"restart": restart, "overwrite": overwrite}
     summary = run_study(comm, loaded, folder, **how, wall_limit=wall_limit, source=path)
     if comm.rank == 0:
@@ -163,7 +163,7 @@ def render(
     from .report.pictures.picture import render
     from .report.pictures.picture_options import PictureOptions, parse_limits, parse_size
 
-    begin_work()
+    start_work()
     _tell_of_runs(outs)
     how = PictureOptions(
         colour, explode, view, zoom, material=look, size=parse_size(size),
@@ -209,7 +209,7 @@ def report(
     import_outside("matplotlib")
     from .report.html_report import make_report
 
-    begin_work()
+    start_work()
     _tell_of_runs(outs)
     print(f"saved {make_report(outs, html, references=reference, quantity=quantity, exact=exact)}")
 
@@ -231,7 +231,7 @@ def sweep(
     from .report.sweep import run_sweep
     from .study.reader import find_study
 
-    begin_work()
+    start_work()
     path = find_study(study)
     folder = out or Path("out") / f"{path.stem}-sweep"
     run_sweep(study, path, set_, folder, ranks=ranks, only_list=list_, overwrite=overwrite)
@@ -303,9 +303,9 @@ def program() -> NoReturn:
     """Entry point of the console script: main(), in a process of its own."""
     gc.disable()  # what imports make stays; to look through it for garbage takes a tenth of a small run
     try:
-        main(begin_process)
+        main(start_process)
     except SystemExit as end:
-        leave(end.code)
+        exit_process(end.code)
 
 
 def main(begin: Callable[[], None] | None = None) -> NoReturn:

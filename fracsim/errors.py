@@ -5,13 +5,15 @@ from __future__ import annotations
 import signal
 from enum import IntEnum
 
-LONGEST = 1000  # characters of a message
+MAX_MESSAGE_LENGTH = 1000  # characters of a message
 
 # What ends a run with a checkpoint. SIGHUP: its terminal was closed; SIGXCPU: its limit of processor time is reached.
 STOP_SIGNALS = (
     signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP, signal.SIGQUIT, signal.SIGXCPU,
 )  # fmt: skip
-SAME_REQUEST = 1.0  # s after such a signal in which another one is no second request: some senders send it twice
+REPEATED_SIGNAL_INTERVAL = (
+    1.0  # s after such a signal in which another one is no second request: some senders send it twice
+)
 
 
 class Exit(IntEnum):
@@ -29,7 +31,11 @@ def one_line(text: str) -> str:
     """A text of a user's file as a terminal may have it: one line of at most LONGEST characters, without control
     characters."""
     line = text if text.isprintable() else "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
-    return line if len(line) <= LONGEST else f"{line[: LONGEST // 2]} ... {line[-LONGEST // 2 :]}"
+    return (
+        line
+        if len(line) <= MAX_MESSAGE_LENGTH
+        else f"{line[: MAX_MESSAGE_LENGTH // 2]} ... {line[-MAX_MESSAGE_LENGTH // 2 :]}"
+    )
 
 
 class FracsimError(Exception):

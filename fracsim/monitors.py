@@ -36,13 +36,13 @@ class Monitor(Protocol):
 
 
 # What every checkpoint of a deformable body says of the run so far.
-WATCHED = {
+CHECKPOINT_MONITORS = {
     *("smallest_J", "inverted_cells", "inverted_since", "energy_rise", "energy_scale", "energy_least"),
     *("peak_reactions", "trouble", "wall", "cpu", "memory", "seconds"),
 }
 
 
-class Watched:
+class RunMonitors:
     """What is watched.
 
     Attributes:
@@ -58,42 +58,42 @@ class Watched:
         self._study, self.history, self.meter = study, history, meter
         self.inverted = InvertedCellMonitor(stress, scene.fracture)
         floor = negligible_energy(stress)
-        self.gained = EnergyGainMonitor(at_rest=study.starts_at_rest, floor=floor, thickness=study.thickness)
-        self.meetings, self.overlapping = _of_obstacles(scene)
-        self.passing, self.drop = _passing(study), _load_drop(study)
-        those = (self.meetings, self.overlapping, self.passing, self.drop)
+        self.energy_gain = EnergyGainMonitor(at_rest=study.starts_at_rest, floor=floor, thickness=study.thickness)
+        self.contact_monitor, self.obstacle_overlap = _of_obstacles(scene)
+        self.interpenetration, self.load_drop = _passing(study), _load_drop(study)
+        those = (self.contact_monitor, self.obstacle_overlap, self.interpenetration, self.load_drop)
         self._others: list[Monitor] = [each for each in those if each is not None]
 
     @property
-    def dropped(self) -> bool:
+    def load_dropped(self) -> bool:
         """Whether the load has fallen as far as ends the run."""
-        return self.drop is not None and self.drop.has_dropped
+        return self.load_drop is not None and self.load_drop.has_dropped
 
-    def look(self, state: State, report: StepReport, figures: dict[str, float], broken: int) -> None:
+    def record_step(self, state: State, report: StepReport, figures: dict[str, float], broken: int) -> None:
         """Note a step; `figures`: what was probed in it; `broken`: edges so far (collective)."""
-        if self.meetings is not None:
-            self.meetings.record_step(state, report.dt, figures)
-        if self.drop is not None:
-            self.drop.record_step(state.t, figures, broken)
-        self.gained.record_step(report, state)
+        if self.contact_monitor is not None:
+            self.contact_monitor.record_step(state, report.dt, figures)
+        if self.load_drop is not None:
+            self.load_drop.record_step(state.t, figures, broken)
+        self.energy_gain.record_step(report, state)
 
-    def look_at_frame(self, t: float) -> None:
+    def record_frame(self, t: float) -> None:
         """Note what is looked at in frames alone (collective)."""
         self.inverted.record_frame(t)
-        if self.overlapping is not None:
-            self.overlapping.record_frame(t)
+        if self.obstacle_overlap is not None:
+            self.obstacle_overlap.record_frame(t)
 
-    def saved(self) -> dict[str, Any]:
+    def to_checkpoint(self) -> dict[str, Any]:
         """For a checkpoint (collective)."""
-        watched: dict[str, Any] = self.inverted.to_checkpoint() | self.gained.to_checkpoint()
+        watched: dict[str, Any] = self.inverted.to_checkpoint() | self.energy_gain.to_checkpoint()
         watched |= {"peak_reactions": self.history.reaction_peaks, "worked": self.history.obstacle_work}
         for monitor in self._others:
             watched |= monitor.to_checkpoint()
         return watched | self.meter.read_totals()
 
-    def restore(self, saved: dict[str, Any]) -> None:
+    def from_checkpoint(self, saved: dict[str, Any]) -> None:
         """Go on from those of a checkpoint."""
-        watched: list[Any] = [self.inverted, self.gained, self.meter, *self._others]
+        watched: list[Any] = [self.inverted, self.energy_gain, self.meter, *self._others]
         for each in watched:
             each.from_checkpoint(saved)
         self.history.reaction_peaks |= saved["peak_reactions"]
@@ -115,13 +115,13 @@ class Watched:
         """Sentences on what makes the result doubtful; `done`: the run came to its end (collective)."""
         energy, time = self._study.material.energy, self._study.time
         trouble = describe_trouble(self.meter.read_totals()["trouble"])
-        notes = [note for note in (trouble, self.inverted.note(energy), self.gained.note(time.scheme)) if note]
-        if self.meetings is not None:
-            notes += self.meetings.notes(done=done)
-        if self.overlapping is not None:
-            notes += self.overlapping.notes()
-        if self.passing is not None:
-            notes += self.passing.notes(implicit=time.scheme_class.implicit)
+        notes = [note for note in (trouble, self.inverted.note(energy), self.energy_gain.note(time.scheme)) if note]
+        if self.contact_monitor is not None:
+            notes += self.contact_monitor.notes(done=done)
+        if self.obstacle_overlap is not None:
+            notes += self.obstacle_overlap.notes()
+        if self.interpenetration is not None:
+            notes += self.interpenetration.notes(implicit=time.scheme_class.implicit)
         return notes
 
 

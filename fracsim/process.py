@@ -36,7 +36,7 @@ _FIRST_RANK_SPEAKS = 0.3  # s that other ranks wait before they end: the launche
 # --- its start ---
 
 
-def begin_process() -> None:
+def start_process() -> None:
     """Prepare the process of a command line: streams, home folder, signals. Raises InputError."""
     global _own
     _own = True
@@ -158,7 +158,7 @@ def _is_rank() -> bool:
     return any(name in os.environ for name in _RANK)
 
 
-def begin_run() -> None:
+def start_run() -> None:
     """The run takes over: it heeds signals itself, and a crash ends the process at once, telling where."""
     global _run_begun
     if not _own:
@@ -184,7 +184,7 @@ def begin_run() -> None:
 
 
 @contextmanager
-def kept_out(name: str, stand_in: ModuleType | None = None) -> Iterator[None]:
+def import_blocked(name: str, stand_in: ModuleType | None = None) -> Iterator[None]:
     """While it lasts, importing a module finds nothing (or the stand-in), unless it is there already."""
     absent = name not in sys.modules
     if absent:
@@ -231,7 +231,7 @@ def import_dolfinx(*, whole: bool = False) -> None:
     if "dolfinx" in sys.modules:
         return
     name = "dolfinx.utils"
-    with outside_working_folder(), nullcontext() if whole else kept_out(name, ModuleType(name)):
+    with outside_working_folder(), nullcontext() if whole else import_blocked(name, ModuleType(name)):
         if _own:  # PETSc's handlers would end what SIGHUP and SIGQUIT meet from here on by MPI_Abort
             importlib.import_module("petsc4py").init([sys.argv[0], "-no_signal_handler"])
         dolfinx = importlib.import_module("dolfinx")
@@ -267,14 +267,14 @@ def _check_dolfinx(version: str) -> None:
         )
 
 
-def begin_work() -> None:
+def start_work() -> None:
     """Look for garbage from here on where it has not been, but not in what imports made: it stays."""
     if not gc.isenabled():
         gc.freeze()
         gc.enable()
 
 
-def leave(code: Any) -> NoReturn:
+def exit_process(code: Any) -> NoReturn:
     """End the process as sys.exit does, but for taking apart all modules and objects, which frees their memory bit by
     bit (0.04 s of a small job)."""
     if not isinstance(code, int) or threading.active_count() > 1:

@@ -44,7 +44,7 @@ from .timestepping.stepper import StepAborted
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from .rigid.instances import Copies
+    from .rigid.instances import Instances
 
 ALONE = MPI.COMM_SELF
 CLOCK = ("t", "step", "work", "start")
@@ -72,14 +72,14 @@ class RigidRun:
         """`text`: study.toml, without its head; `progress`: one that tells already."""
         self._progress = progress or ProgressReporter(first=True, end=scene.study.time.end)
         self.scene, self.folder, self._interrupt, self.text = scene, folder, interrupt, text
-        self.state, self._began, self._cpu = scene.first, time.perf_counter(), time.process_time()
+        self.state, self._began, self._cpu = scene.initial_state, time.perf_counter(), time.process_time()
         self.broken = self.blows = self.loads = 0
-        self._start = scene.first.bodies.kinetic
+        self._start = scene.initial_state.bodies.kinetic_energy
         arrays = self._resume() if restart else None
         step, t = (self.state.step, self.state.t) if arrays is not None else (None, None)
         self._saved_at = t  # s, of the last checkpoint
         names = [f"contact_{each.name}_{axis}" for each in scene.obstacles for axis in "xyz"]
-        names += [f"work_{each.name}" for each in scene.obstacles] + scene.stepper.others.columns()
+        names += [f"work_{each.name}" for each in scene.obstacles] + scene.stepper.obstacles.columns()
         if step is not None:
             read_earlier_rows(folder / "history.csv", history_columns(names), step)
             check_text_files(folder)
@@ -88,7 +88,9 @@ class RigidRun:
         self.history = History(ALONE, folder / "history.csv", names, step)
         density = float(scene.study.material.density)
         where = folder / "surface.pvd"
-        self.frames = self._writing(where, lambda: RigidFrames(folder, *scene.made_of, density, scene.obstacles, t))
+        self.frames = self._writing(
+            where, lambda: RigidFrames(folder, scene.instance_mesh, scene.poses, density, scene.obstacles, t)
+        )
         if arrays is not None:
             self.frames.resume(arrays["broken_at"])
             self.broken = int(np.count_nonzero(np.isfinite(arrays["broken_at"])))
@@ -112,10 +114,12 @@ class RigidRun:
         stored, stepper = read_checkpoint_file(self.folder), self.scene.stepper
         check_mesh(stored, self.scene.mesh)
         arrays, clock, earlier = stored.arrays, stored.clock, stored.notes.monitors
-        _check_stored(stored, stepper.saved(self.state), len(self.scene.obstacles), stepper.copies)
+        _check_stored(stored, stepper.to_checkpoint(self.state), len(self.scene.obstacles), stepper.instances)
         self._start = float(clock["start"])
-        self.state = stepper.restore(arrays, float(clock["t"]), int(clock["step"]), float(clock["work"]))
-        if len(self.state.bodies) != len(stepper.names) or len(arrays["broken_at"]) != len(stepper.copies.damage()[1]):
+        self.state = stepper.from_checkpoint(arrays, float(clock["t"]), int(clock["step"]), float(clock["work"]))
+        if len(self.state.bodies) != len(stepper.body_names) or len(arrays["broken_at"]) != len(
+            stepper.instances.damage()[1]
+        ):
             raise restart_error(stored.path, "its bodies are not those that its broken edges leave")
         self.blows, self.loads, self._had = earlier["blows"], earlier["loads"], earlier["frames"]
         return arrays
@@ -128,32 +132,33 @@ class RigidRun:
         self._interrupt.begin_step()
         self.state, report = stepper.advance(self.state)
         if report.broken:
-            self.frames.record_breaks(stepper.copies.damage()[0], self.state.t)
+            self.frames.record_breaks(stepper.instances.damage()[0], self.state.t)
         self.broken, self.blows, self.loads = (
             self.broken + report.broken, self.blows + report.blows, self.loads + report.loads
         )  # fmt: skip
-        state, split = self.state, stepper.copies.split_cells
-        lost = self._start + state.work - report.kinetic
+        state, split = self.state, stepper.instances.split_cell_count
+        lost = self._start + state.work - report.kinetic_energy
         self.history.append_row([
-            state.step, state.t, self.scene.study.time.max_step, report.kinetic, 0.0, lost, state.work, self.broken,
-            split, stepper.count, report.blows + report.loads, report.krylov, report.seconds,
-            *map(float, report.pushed.flat), *map(float, report.worked),
-            *map(float, stepper.others.readings(state.bodies)),
+            state.step, state.t, self.scene.study.time.max_step, report.kinetic_energy, 0.0, lost, state.work,
+            self.broken, split, stepper.fragment_count, report.blows + report.loads, report.cg_iterations,
+            report.seconds,
+            *map(float, report.obstacle_forces.flat), *map(float, report.obstacle_work),
+            *map(float, stepper.obstacles.readings(state.bodies)),
         ])  # fmt: skip
         return report
 
     def write_frame(self) -> None:
         """The bodies as they are now. Raises CannotWrite."""
-        state, copies = self.state, self.scene.stepper.copies
-        damage, dented = copies.damage(), {number: each.points for number, each in copies.shapes.items()}
-        path, placed = self.folder / "surface.pvd", self.scene.stepper.others.placed(state.t, state.bodies)
+        state, copies = self.state, self.scene.stepper.instances
+        damage, dented = copies.damage(), {number: each.points for number, each in copies.dented_shapes.items()}
+        path, placed = self.folder / "surface.pvd", self.scene.stepper.obstacles.placed_shapes(state.t, state.bodies)
         write_on_root(ALONE, path, lambda: self.frames.write_frame(state.t, state.bodies, *damage, dented, placed))
         self._clock.record_frame(state.t)
 
     def checkpoint(self) -> Path:
         """Write one of now: all states that a step ends with are finite; returns its path. Raises CannotWrite."""
         state, path = self.state, checkpoint_path(self.folder)
-        arrays = self.scene.stepper.saved(state) | {"broken_at": self.frames.broken_at}
+        arrays = self.scene.stepper.to_checkpoint(state) | {"broken_at": self.frames.broken_at}
         arrays["worked"] = np.array([*self.history.obstacle_work.values()])
         clock = {"t": state.t, "step": state.step, "work": state.work, "start": self._start}
         counts = {"blows": self.blows, "loads": self.loads, "frames": self.frames.files.frame_counts}
@@ -227,7 +232,7 @@ class RigidRun:
                 raise self._stopped()
 
     def _tell(self, report: RigidReport) -> None:
-        state, pieces, dt = self.state, self.scene.stepper.count, self.scene.study.time.max_step
+        state, pieces, dt = self.state, self.scene.stepper.fragment_count, self.scene.study.time.max_step
         more = f"analyses {report.blows + report.loads}  {report.seconds:.2g} s/step"
         self._progress.update(ProgressState(state.t, dt, state.step, self.broken, pieces, more))
 
@@ -238,13 +243,14 @@ class RigidRun:
 
     def _finish(self, outcome: str) -> dict[str, Any]:
         state, scene = self.state, self.scene
-        kinetic = state.bodies.kinetic
+        kinetic = state.bodies.kinetic_energy
         summary = {
             "title": scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
             "nodes": len(scene.mesh.points), "cells": len(scene.mesh.cells), "broken_edges": self.broken,
-            "split_cells": scene.stepper.copies.split_cells, "pieces": scene.stepper.count, **self._dust(),
+            "split_cells": scene.stepper.instances.split_cell_count, "pieces": scene.stepper.fragment_count,
+            **self._dust(),
             "external_work": state.work, "dissipated": self._start + state.work - kinetic,
-            "blows": self.blows, "loads": self.loads, "analyses": scene.stepper.copies.passes,
+            "blows": self.blows, "loads": self.loads, "analyses": scene.stepper.instances.analyses,
             "seconds": {name: round(each, 4) for name, each in scene.stepper.phases.seconds.items()},
             "wall": round(time.perf_counter() - self._began, 3), "cpu": round(time.process_time() - self._cpu, 4),
             "ranks": MPI.COMM_WORLD.size, "versions": software_versions(MPI.COMM_WORLD),
@@ -254,17 +260,19 @@ class RigidRun:
 
     def _dust(self) -> dict[str, float]:
         """How many pieces are single nodes, and their mass, kg."""
-        nodes = np.bincount(self.scene.stepper.shapes.piece_of_node, minlength=self.scene.stepper.count)
+        nodes = np.bincount(self.scene.stepper.shapes.node_fragment, minlength=self.scene.stepper.fragment_count)
         single = np.flatnonzero(nodes == 1)
         return {"dust": len(single), "dust_mass": float(self.state.bodies.mass[single].sum())}
 
 
-def notes_of(scene: RigidScene) -> None:
+def print_mesh_notes(scene: RigidScene) -> None:
     """Tell what was mended of the mesh while it was read."""
     print_notes(ALONE, list(scene.mesh.notes))
 
 
-def _check_stored(stored: StoredCheckpoint, fresh: dict[str, npt.NDArray[Any]], obstacles: int, copies: Copies) -> None:
+def _check_stored(
+    stored: StoredCheckpoint, fresh: dict[str, npt.NDArray[Any]], obstacles: int, copies: Instances
+) -> None:
     """InputError where a checkpoint lacks something that a run goes on from, or has it in another shape, or not finite.
 
     `fresh`: what the run would write at its start; `obstacles`: how many there are.
@@ -291,7 +299,7 @@ def _check_stored(stored: StoredCheckpoint, fresh: dict[str, npt.NDArray[Any]], 
     for group in (("broken", "cut"), ("starts", "starts_of"), ("shape_of", "shape_points", "shape_yields")):
         if len({len(arrays.get(name, ())) for name in group}) > 1:
             raise restart_error(path, f"{' and '.join(group)} do not belong together")
-    most = {"broken": len(copies) * copies.nodes, "starts_of": len(copies), "shape_of": len(copies)}
+    most = {"broken": len(copies) * copies.node_count, "starts_of": len(copies), "shape_of": len(copies)}
     for name, count in most.items():
         numbers = arrays.get(name, np.empty(0, np.int64))
         if numbers.dtype.kind != "i" or np.any((numbers < 0) | (numbers >= count)):

@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from .errors import CannotWrite, NotConverged, Stopped, one_line
 from .mesh.parallel import end_unless_all_failed, from_root, on_root, sum_over_ranks
-from .monitors import WATCHED, Watched, wants_surface
+from .monitors import CHECKPOINT_MONITORS, RunMonitors, wants_surface
 from .output.atomic_write import write_on_root
 from .output.checkpoint import read_checkpoint, write_checkpoint
 from .output.checkpoint_file import (
@@ -105,7 +105,7 @@ class Run:
     def _resume(self) -> CheckpointNotes:
         """Take up the state of the checkpoint, and what it says beside it."""
         scene, breaks, notes = self.scene, self.breaks, from_root(self.comm, lambda: read_notes(self.folder))
-        if missing := sorted(WATCHED - notes.monitors.keys()):
+        if missing := sorted(CHECKPOINT_MONITORS - notes.monitors.keys()):
             raise restart_error(checkpoint_path(self.folder), f"notes/monitors has no {missing[0]}")
         state = read_checkpoint(self.folder, scene.domain, self.state, scene.balance, breaks.record, breaks.surfaces)
         breaks.apply_checkpoint()
@@ -129,15 +129,15 @@ class Run:
         on_root(self.comm, lambda: make_output_folder(folder, self._text, restart=restart))
         self._saved_at = t  # s, of the last checkpoint
         self.history = History(self.comm, folder / "history.csv", names, step, study.thickness)
-        self.watched = Watched(self.scene, self.history, self._meter)
+        self.monitors = RunMonitors(self.scene, self.history, self._meter)
         if notes is not None:
-            self.watched.restore(notes.monitors)
+            self.monitors.from_checkpoint(notes.monitors)
             if self.front is not None:
                 self.front.from_checkpoint(notes.monitors)
         self.frames = FrameFiles(
             folder, self.scene.balance, self.scene.fracture, self.breaks,
             fields=wanted_fields(study), surface=wants_surface(study), smooth=wants_smooth(study),
-            passing=self.watched.passing, resume_at=t, thickness=study.thickness,
+            passing=self.monitors.interpenetration, resume_at=t, thickness=study.thickness,
         )  # fmt: skip
         if notes is not None:
             had = notes.monitors["frames"]
@@ -161,7 +161,7 @@ class Run:
     @property
     def ended(self) -> bool:
         """Whether the run is at its end: that of the study, or that of `time.until`."""
-        return self.scene.ended(self.state) or self.watched.dropped
+        return self.scene.ended(self.state) or self.monitors.load_dropped
 
     # --- one step, one frame, one checkpoint ---
 
@@ -174,15 +174,15 @@ class Run:
         self.interrupt.begin_step()
         self.state, report = self.scene.stepper.advance(self.state)
         if report.broken:
-            self.note_breaks()
+            self.record_breaks()
         probes = self.scene.probes()
         front = self.front.values if self.front is not None else ()
         self.history.append(self.state, report, self.breaks.counts, np.array([*probes, *front]))
         figures = {name: float(value) for name, value in zip(self.scene.probes.columns, probes, strict=True)}
-        self.watched.look(self.state, report, figures, self.breaks.counts[0])
+        self.monitors.record_step(self.state, report, figures, self.breaks.counts[0])
         return report
 
-    def note_breaks(self) -> None:
+    def record_breaks(self) -> None:
         """Edges have broken since the last step, in it or by hand: when, where, and into how many pieces
         (collective)."""
         self.breaks.record_breaks(self.state.t)
@@ -192,7 +192,7 @@ class Run:
     def write_frame(self) -> None:
         """Write the body as it is now, and look at its cells. Raises CannotWrite (collective)."""
         began = time.perf_counter()
-        self.watched.look_at_frame(self.state.t)
+        self.monitors.record_frame(self.state.t)
         self.frames.write_frame(self.state)
         self._clock.record_frame(self.state.t)
         self._frame_of = self.state.step
@@ -204,7 +204,9 @@ class Run:
         began = time.perf_counter()
         domain, balance, breaks = self.scene.domain, self.scene.balance, self.breaks
         front = self.front.to_checkpoint() if self.front is not None else {}
-        notes = CheckpointNotes(self._text, self.watched.saved() | front | {"frames": self.frames.frame_counts})
+        notes = CheckpointNotes(
+            self._text, self.monitors.to_checkpoint() | front | {"frames": self.frames.frame_counts}
+        )
         breaks.prepare_checkpoint()
         path = write_checkpoint(self.folder, domain, self.state, balance, notes, breaks.record, breaks.surfaces)
         self._saved_at, self._forgets = self.state.t, True
@@ -286,7 +288,7 @@ class Run:
         """summary.json; only on ways out that all ranks take, since it sums over them."""
         summary = self._summary(outcome)
         write_summary(self.comm, self.folder, summary)
-        print_notes(self.comm, self.watched.notes(done=outcome == "done"))
+        print_notes(self.comm, self.monitors.notes(done=outcome == "done"))
         return summary
 
     def _summary(self, outcome: str) -> dict[str, Any]:
@@ -300,7 +302,7 @@ class Run:
             "title": self.scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
             "nodes": int(sizes[0]), "cells": int(sizes[1]),
             "broken_edges": broken, "split_cells": split, "pieces": pieces, "dust": dust, "dust_mass": dust_mass,
-            "external_work": state.work * thick, "dissipated": state.dissipated * thick, **self.watched.summary(),
+            "external_work": state.work * thick, "dissipated": state.dissipated * thick, **self.monitors.summary(),
         }  # fmt: skip
 
     # --- where to go on from ---
@@ -389,20 +391,20 @@ def _run_rigid(
     source: Path | None,
 ) -> dict[str, Any]:
     """Rigid bodies move on rank 0, and are the same on any number of ranks, which analyse them (collective)."""
-    from .rigid.worker_ranks import tell
-    from .scene.rigid_scene import build_rigid_scene, help_rigid
+    from .rigid.parallel_analyses import send_to_workers
+    from .scene.rigid_scene import build_rigid_scene, serve_rigid_analyses
 
     def work() -> dict[str, Any]:
         check = partial(_check, folder, study, study_text(study), source, restart=restart, overwrite=overwrite)
         lock_checked_folder(lock, check)
-        from .rigid_run import RigidRun, notes_of
+        from .rigid_run import RigidRun, print_mesh_notes
 
         progress.set_stage("building the bodies")
         scene = build_rigid_scene(study, comm, heed)
         interrupt.check_setup_signals()
         lock_checked_folder(lock, check, make=True)
         progress.end_line()
-        notes_of(scene)
+        print_mesh_notes(scene)
         text = study_text(study, [f"{key}: {value}" for key, value in software_versions(comm).items()])
         summary = RigidRun(scene, folder, text, interrupt, restart=restart, progress=progress)()
         if study.output.picture:
@@ -415,7 +417,7 @@ def _run_rigid(
             return work()
         finally:
             if comm.size > 1:
-                tell(comm, None)
+                send_to_workers(comm, None)
 
     def heed() -> None:
         if interrupt.must_abandon_step():
@@ -424,7 +426,7 @@ def _run_rigid(
     alone, progress = comm.size == 1, ProgressReporter(first=comm.rank == 0, end=study.time.end)
     with InterruptHandler(MPI.COMM_SELF, wall_limit, alone=alone) as interrupt, FolderLock(folder) as lock, progress:
         if comm.rank:
-            help_rigid(comm, heed)
+            serve_rigid_analyses(comm, heed)
         return from_root(comm, first)
 
 

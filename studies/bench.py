@@ -98,7 +98,7 @@ def break_now(run: Any, flags: Any) -> None:
     fracture.degradation(True, *fracture.evaluate_undamaged_stress())
     fracture.mark_changed()
     run.state = run.scene.stepper.with_current_history(run.state)
-    run.note_breaks()
+    run.record_breaks()
     run.scene.balance.damage_changed()
     run.scene.solver.damage_changed()
 

@@ -16,10 +16,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
+from petsc4py import PETSc
+from scipy.sparse import bmat, csr_matrix
+from scipy.sparse.linalg import spsolve
 
 from ..fracture.principal_stress import symmetric_tensors
-from ..rigid.breakage import Breakable
-from ..rigid.pinned_analysis import pinned
+from ..rigid.breakage import BreakableBody
 from ..scene.rigid_scene import build_rigid_scene
 from ..study import Study
 
@@ -40,16 +42,16 @@ TABLES = {
 }
 
 
-def bar() -> Breakable:
+def bar() -> BreakableBody:
     """Whole, as the scheme has it."""
     scene = build_rigid_scene(Study.model_validate(TABLES), MPI.COMM_SELF)
-    return scene.stepper.copies.copy(0)
+    return scene.stepper.instances.get(0)
 
 
 def crack(force: float) -> npt.NDArray[np.bool_]:
     """(edges,) which break under a push (N) upwards at the corner."""
     body = bar()
-    body.strike(0, body.loads(0, CORNER, np.array([[0.0, 0.0, force]])))
+    body.break_fragments(0, body.distribute_forces(0, CORNER, np.array([[0.0, 0.0, force]])))
     return body.graph.broken.copy()
 
 
@@ -70,16 +72,50 @@ def stresses() -> tuple[Values, Values, Values]:
     """Places x (cells,) along the bar, m, and the largest principal stress (cells,) with inertia relief and with
     pins, Pa."""
     body = bar()
-    loads = body.loads(0, np.array([[0.0, 0.1, 0.1]]), np.array([[PUSH, 0.0, 0.0]]))
-    domain, free = body.graph.domain, body._stiffness.whole()
-    force = loads.nodal(len(domain.nodes))
+    loads = body.distribute_forces(0, np.array([[0.0, 0.1, 0.1]]), np.array([[PUSH, 0.0, 0.0]]))
+    domain, free = body.graph.domain, body._stiffness.whole_body()
+    force = loads.nodal_forces(len(domain.nodes))
     share = np.ones(domain.cell_count)
-    relieved = body._stiffness.tensor(free(force), share)
-    held = body._stiffness.tensor(pinned(free.matrix, domain.nodes, force), share)  # type: ignore[attr-defined]
+    relieved = body._stiffness.cell_stress(free(force), share)
+    held = body._stiffness.cell_stress(solve_pinned(free.matrix, domain.nodes, force), share)  # type: ignore[attr-defined]
     x = domain.nodes[domain.cell_nodes].mean(axis=1)[:, 0]
     return x, *(
         np.asarray(np.abs(np.linalg.eigvalsh(symmetric_tensors(each, 3))).max(axis=1)) for each in (relieved, held)
     )
+
+
+def pin_constraints(nodes: Values) -> Values:
+    """Return rows (k, n d), one a pin, of the components that three pinned nodes hold: k = 3 in 2D, 6 in 3D.
+
+    Of the nodes (n, d), node a is the farthest from the centre, b the farthest from a, c the farthest from the line
+    ab. Node a is held in all directions, b across ab, c out of the plane abc (B07, section 5).
+    """
+    n, d = nodes.shape
+    a = int(np.argmax(np.linalg.norm(nodes - nodes.mean(axis=0), axis=1)))
+    b = int(np.argmax(np.linalg.norm(nodes - nodes[a], axis=1)))
+    along = (nodes[b] - nodes[a]) / np.linalg.norm(nodes[b] - nodes[a])
+    arm = nodes - nodes[a]
+    across = arm - np.outer(arm @ along, along)
+    c = int(np.argmax(np.linalg.norm(across, axis=1)))
+    first = across[c] / np.linalg.norm(across[c])
+    held = [(a, axis) for axis in np.eye(d)] + [(b, first)]
+    if d == 3:
+        normal = np.cross(along, first)
+        held += [(b, normal), (c, normal)]
+    rows = np.zeros((len(held), n, d))
+    for row, (node, direction) in zip(rows, held, strict=True):
+        row[node] = direction
+    return rows.reshape(len(held), -1)
+
+
+def solve_pinned(matrix: PETSc.Mat, nodes: Values, force: Values) -> Values:
+    """Return displacements (n, d) of nodes (n, d) with K u = f and three nodes pinned, by factors (one rank)."""
+    constraints = pin_constraints(nodes)
+    start, columns, entries = matrix.getValuesCSR()
+    K, C = csr_matrix((entries, columns, start), shape=matrix.size), csr_matrix(constraints)
+    saddle = bmat([[K, C.T], [C, None]], format="csc")
+    u = spsolve(saddle, np.concatenate([force.reshape(-1), np.zeros(len(constraints))]))[: force.size]
+    return np.asarray(u).reshape(nodes.shape)
 
 
 def turned() -> tuple[Values, Values]:

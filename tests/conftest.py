@@ -103,4 +103,7 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 def solver(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """Few contacts of rigid bodies, and as many as if they were a crowd."""
     if request.param == "projections":
-        monkeypatch.setattr("fracsim.rigid.contact_solver.CROWD", 0)
+        from fracsim.rigid import contact_solver
+
+        settings = replace(contact_solver.SETTINGS, max_newton_contacts=0)
+        monkeypatch.setattr(contact_solver, "SETTINGS", settings)

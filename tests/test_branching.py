@@ -24,7 +24,7 @@ from fracsim.fracture.energy.mixed_mode import kink_gain
 from fracsim.fracture.energy.neighbour_search import NeighbourPairs
 from fracsim.fracture.energy.tip_parameters import TIP
 from fracsim.mesh.domain import distribute
-from fracsim.scene import Scene, build_scene, scene_on
+from fracsim.scene import Scene, build_scene, build_scene_on
 from fracsim.study.check import check_study
 from fracsim.study.check_limits import LIMITS
 from support.resumed import assert_alike, going_stopped_resumed
@@ -119,7 +119,7 @@ def forked(upper: float, lower: float, n: int = 40) -> Scene:
         boundary=[{"on": "bottom", "fix": "xy"}, {"on": "top", "displacement": [0.0, 1e-3]}],
         time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
     )  # fmt: skip
-    scene = scene_on(distribute(MPI.COMM_SELF, square("unstructured", n)), study)
+    scene = build_scene_on(distribute(MPI.COMM_SELF, square("unstructured", n)), study)
     scene.stepper.advance(scene.start())
     return scene
 
@@ -258,7 +258,7 @@ def test_a_crack_that_is_loaded_slowly_does_not_branch() -> None:
     """A step four times as long as starts the crack, without inertia, tears the plate along one line."""
     tables = RUNS["notched"] | {"time": {"scheme": "quasi-static", "step": 6.0, "end": 12.0}}
     study = make_study(**{key: value for key, value in tables.items() if key != "mesh"})
-    scene = scene_on(distribute(MPI.COMM_SELF, square("unstructured", 16)), study)
+    scene = build_scene_on(distribute(MPI.COMM_SELF, square("unstructured", 16)), study)
     state = scene.start()
     while not scene.ended(state):
         state, _ = scene.stepper.advance(state)

@@ -94,7 +94,11 @@ def test_rigid_bodies_go_on_the_same(tmp_path: Path, name: str) -> None:
         return RigidRun(scene, tmp_path / where, text, interrupt, restart=restart)
 
     def numbers(run: RigidRun) -> dict[str, Any]:
-        kept = {key: np.array(values) for key, values in run.scene.stepper.saved(run.state).items() if np.size(values)}
+        kept = {
+            key: np.array(values)
+            for key, values in run.scene.stepper.to_checkpoint(run.state).items()
+            if np.size(values)
+        }
         return kept | {"work": np.array(run.state.work), "t": np.array(run.state.t)}
 
     going, writing, states = begun("going"), begun("writing"), {}

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.rigid.bodies import Bodies
-from fracsim.rigid.core_contact import LEAST, MOST, REACH, Core, Cores
+from fracsim.rigid.core_contact import SETTINGS, CoreContact, CoreGeometry
 from fracsim.rigid.rigid_stepper import RigidState, RigidStepper
 from fracsim.scene.rigid_scene import build_rigid_scene
 from fracsim.study.reader import load_study
@@ -52,15 +52,15 @@ def shot() -> tuple[RigidStepper, RigidState]:
     """A slab that lies elsewhere than its mesh and is turned, in pieces."""
     body = "body=[{position=[0.4,0.0,0.3],rotation=[0.0,0.0,1.5707963]}]"
     scene = build_rigid_scene(load_study("rigid-slab", [body, "time.end=2e-3"]))
-    state, _ = scene.stepper.advance(scene.first)
-    count = scene.stepper.count
+    state, _ = scene.stepper.advance(scene.initial_state)
+    count = scene.stepper.fragment_count
     assert count > 7
-    return scene.stepper, replace(state, bodies=state.bodies.part(slice(count)))
+    return scene.stepper, replace(state, bodies=state.bodies.select(slice(count)))
 
 
-def fresh(stepper: RigidStepper) -> Cores:
+def fresh(stepper: RigidStepper) -> CoreContact:
     """As pieces broke, nothing being known of where they have been."""
-    made = stepper._geometry._cores(stepper.shapes.turn)
+    made = stepper._geometry._make_core_contact(stepper.shapes.rotation)
     assert made is not None
     return made
 
@@ -75,12 +75,12 @@ def shaken(stepper: RigidStepper, bodies: Bodies, much: float, seed: int) -> Bod
     random, rest = np.random.default_rng(seed), np.tile(np.eye(3), (len(bodies), 1, 1))
     way = much * stepper._geometry.mean_edge
     turn = Rotation.from_rotvec(random.uniform(-0.1, 0.1, (len(bodies), 3)) * much).as_matrix()
-    return replace(bodies, place=bodies.centre + random.uniform(-way, way, (len(bodies), 3)), turn=turn @ rest)
+    return replace(bodies, position=bodies.centre + random.uniform(-way, way, (len(bodies), 3)), rotation=turn @ rest)
 
 
-def told(cores: Cores, stepper: RigidStepper, bodies: Bodies) -> Found:
+def told(cores: CoreContact, stepper: RigidStepper, bodies: Bodies) -> Found:
     """Depths of nodes in cores, the deepest first, of pairs (whose core, whose nodes), m."""
-    things, _, depth, _ = cores.deepest(pairs(stepper), bodies)
+    things, _, depth, _ = cores.find_deepest(pairs(stepper), bodies)
     found = Found()
     for (first, second), each in zip(things, depth, strict=True):
         key = int(first), int(second)
@@ -91,17 +91,17 @@ def told(cores: Cores, stepper: RigidStepper, bodies: Bodies) -> Found:
 def looked_at(stepper: RigidStepper, bodies: Bodies) -> Found:
     """The same by other means: nodes that are in whole cells, and how far from the faces that these share with torn
     ones."""
-    body = stepper.copies.copy(0)
-    domain, of_node, found = body.graph.domain, body.pieces.node_fragment, Found()
+    body = stepper.instances.get(0)
+    domain, of_node, found = body.graph.domain, body.fragments.node_fragment, Found()
     nodes = as_placed(stepper, domain.nodes)
-    of_cell, x = of_node[domain.cell_nodes], bodies.to_space(nodes, of_node)
+    of_cell, x = of_node[domain.cell_nodes], bodies.to_current(nodes, of_node)
     whole = np.all(of_cell == of_cell[:, :1], axis=1)
     sides = np.sort(domain.cell_nodes[:, [0, 1, 2, 0, 1, 3, 0, 2, 3, 1, 2, 3]].reshape(-1, 3))
     _, facet, count = np.unique(sides, axis=0, return_inverse=True, return_counts=True)
     facet = facet.reshape(-1, 4)
     beside = (count == 2) & (np.bincount(facet[whole].ravel(), minlength=len(count)) == 1)
-    skeleton = stepper._geometry.skeleton
-    torn = np.unique(skeleton.edges[skeleton.broken_edges(body.damage()[0])])
+    skeleton = stepper._geometry.numbering
+    torn = np.unique(skeleton.edges[skeleton.broken_edges(body.input_damage()[0])])
     torn = cKDTree(domain.nodes).query(skeleton.points[torn])[1]  # as the domain numbers them
     for piece in range(len(bodies)):
         mine = np.flatnonzero(whole & (of_cell[:, 0] == piece))
@@ -109,7 +109,7 @@ def looked_at(stepper: RigidStepper, bodies: Bodies) -> Found:
         if not len(faces):
             continue
         rows = torn[of_node[torn] != piece]
-        X = bodies.to_rest(x[rows], piece)
+        X = bodies.to_reference(x[rows], piece)
         inside = in_cells(X, nodes[domain.cell_nodes[mine]])
         if not inside.any():
             continue
@@ -118,7 +118,8 @@ def looked_at(stepper: RigidStepper, bodies: Bodies) -> Found:
         for other in np.unique(of_node[rows[inside]]):
             each = np.sort(depth[of_node[rows[inside]] == other])[::-1]
             edge = stepper._geometry.mean_edge
-            each = each[(each > LEAST * edge) & (each < REACH * edge)][:MOST]
+            low, high = SETTINGS.tolerance * edge, SETTINGS.search_radius * edge
+            each = each[(each > low) & (each < high)][: SETTINGS.max_nodes]
             if len(each):
                 found[piece, int(other)] = each
     return found
@@ -158,10 +159,10 @@ def test_what_has_moved_step_by_step_is_found_as_what_is_looked_at_once() -> Non
     stepper, state = broken()
     followed, some = fresh(stepper), 0
     ways = [shaken(stepper, state.bodies, 0.6, seed) for seed in range(3)]
-    places = [state.bodies.centre, *(each.place for each in ways)]
+    places = [state.bodies.centre, *(each.position for each in ways)]
     for start, end in pairwise(places):
         for share in np.linspace(0.0, 1.0, 15):
-            bodies = replace(ways[0], place=(1 - share) * start + share * end)
+            bodies = replace(ways[0], position=(1 - share) * start + share * end)
             found = told(followed, stepper, bodies)
             same(found, told(fresh(stepper), stepper, bodies))
             some += len(found)
@@ -171,21 +172,21 @@ def test_what_has_moved_step_by_step_is_found_as_what_is_looked_at_once() -> Non
 def test_as_pieces_break_no_node_is_in_a_core() -> None:
     """And one that does not move is not looked at."""
     stepper, state = broken()
-    rest = replace(state.bodies, place=state.bodies.centre, turn=np.tile(np.eye(3), (len(state.bodies), 1, 1)))
+    rest = replace(state.bodies, position=state.bodies.centre, rotation=np.tile(np.eye(3), (len(state.bodies), 1, 1)))
     assert not told(fresh(stepper), stepper, rest) and not looked_at(stepper, rest)
 
 
 def test_a_node_that_would_come_into_a_core_touches_it() -> None:
-    """At the distance that is left, along the way out: with that gap closed it is no deeper than LEAST."""
+    """At the distance that is left, along the way out: with that gap closed it is no deeper than the tolerance."""
     stepper, state = broken()
-    least = LEAST * stepper._geometry.mean_edge
+    least = SETTINGS.tolerance * stepper._geometry.mean_edge
     before = shaken(stepper, state.bodies, 0.0, 0)
     later = shaken(stepper, state.bodies, 0.5, 1)
-    speed = (later.place - before.place) / STEP
+    speed = (later.position - before.position) / STEP
     moving = replace(before, velocity=speed, spin=np.zeros_like(speed))
-    later = replace(before, place=later.place)
+    later = replace(before, position=later.position)
     things, x, axes, gap = fresh(stepper)(pairs(stepper), moving, later, STEP)
-    _, _, depth, _ = fresh(stepper).deepest(pairs(stepper), later)
+    _, _, depth, _ = fresh(stepper).find_deepest(pairs(stepper), later)
     assert len(gap) and np.allclose(axes @ np.swapaxes(axes, 1, 2), np.eye(3), atol=1e-12)
     assert np.allclose(np.linalg.det(axes), 1.0)
     closing = np.einsum("ki,ki->k", axes[:, 0], speed[things[:, 0]] - speed[things[:, 1]])
@@ -197,4 +198,4 @@ def test_a_node_that_would_come_into_a_core_touches_it() -> None:
 def test_shells_and_what_is_whole_have_no_cores() -> None:
     """Nothing is looked for among them."""
     stepper = stepper_of(bar(0.0), 1e9, STEP)
-    assert stepper.shapes.cores is None and not len(Core.none().faces)
+    assert stepper.shapes.core_contact is None and not len(CoreGeometry.empty().faces)

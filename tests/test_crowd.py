@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +12,9 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.contact_points import Contacts
-from fracsim.rigid.contact_solver import Crowd, projected
+from fracsim.rigid.contact_solver import ProjectedGradientSolver, project_on_cones
 from fracsim.rigid.engine import Engine
-from fracsim.rigid.mujoco_model import Rules
-from fracsim.rigid.worker_ranks import Helper
+from fracsim.rigid.mujoco_model import ContactParameters
 from support.falling import CUBE, DOWN, MASS, cubes
 
 Values = npt.NDArray[np.float64]
@@ -25,7 +23,7 @@ Values = npt.NDArray[np.float64]
 def test_the_nearest_of_a_cone_is_where_what_is_left_is_at_right_angles() -> None:
     """Moreau: p = a + b with a in the cone |a_t| <= mu a_n, b in its polar cone, mu |b_t| <= -b_n, and a . b = 0."""
     p, mu = np.random.default_rng(0).normal(size=(3, 500)), np.linspace(0.0, 2.0, 500)
-    near = projected(p.T, mu).T
+    near = project_on_cones(p.T, mu).T
     left = p - near
     assert np.all(np.hypot(near[1], near[2]) <= mu * near[0] + 1e-12)
     assert np.all(mu * np.hypot(left[1], left[2]) <= -left[0] + 1e-12)
@@ -45,12 +43,12 @@ def pile(friction: float) -> tuple[Contacts, Bodies]:
     second = np.repeat(np.arange(36), 4)
     first = np.where(at[second, 2] > 0, second - 1, 36)
     corners = np.array([[x, y, -0.5] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
-    point = bodies.place[second] + np.tile(corners, (36, 1))
+    point = bodies.position[second] + np.tile(corners, (36, 1))
     axes = np.tile(np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]]), (len(point), 1, 1))
     things = np.stack([first, second], axis=1)
-    places = np.concatenate([bodies.place, np.zeros((1, 3))])
+    places = np.concatenate([bodies.position, np.zeros((1, 3))])
     mu = np.full(len(point), friction)
-    return Contacts.found(things, things, point, axes, np.zeros(len(point)), mu, places), bodies
+    return Contacts.with_arms(things, things, point, axes, np.zeros(len(point)), mu, places), bodies
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3, 0.8])
@@ -60,19 +58,19 @@ def test_every_contact_of_a_crowd_keeps_coulombs_law(friction: float) -> None:
     contacts, bodies = pile(friction)
     aim = np.random.default_rng(4).uniform(0.0, 0.3, len(contacts))
     still = np.zeros((1, 3))
-    free = contacts.parting(np.concatenate([bodies.velocity, still]), np.concatenate([bodies.spin, still]))
-    crowd = Crowd.of(contacts, free, aim, bodies.mass, np.linalg.inv(bodies.inertia))
-    p = crowd.impulses(1e-7, 5000, np.zeros_like(free))
+    free = contacts.relative_velocities(np.concatenate([bodies.velocity, still]), np.concatenate([bodies.spin, still]))
+    crowd = ProjectedGradientSolver.assemble(contacts, free, aim, bodies.mass, np.linalg.inv(bodies.inertia))
+    p = crowd.solve(1e-7, 5000, np.zeros_like(free))
     velocity, spin = np.concatenate([bodies.velocity, still]), np.concatenate([bodies.spin, still])
-    for (first, second), at, axes, each in zip(contacts.things, contacts.point, contacts.axes, p, strict=True):
+    for (first, second), at, axes, each in zip(contacts.pairs, contacts.point, contacts.axes, p, strict=True):
         for body, sign in ((first, -1.0), (second, 1.0)):
             if body < 36:
                 velocity[body] += sign * each @ axes / bodies.mass[body]
-                arm = np.cross(at - bodies.place[body], sign * each @ axes)
+                arm = np.cross(at - bodies.position[body], sign * each @ axes)
                 spin[body] += np.linalg.solve(bodies.inertia[body], arm)
-    after = np.concatenate([bodies.velocity, bodies.spin], axis=1) + crowd.gained(p)
+    after = np.concatenate([bodies.velocity, bodies.spin], axis=1) + crowd.velocity_changes(p)
     assert np.allclose(after, np.concatenate([velocity, spin], axis=1)[:36], atol=1e-10)
-    u = contacts.parting(velocity, spin)
+    u = contacts.relative_velocities(velocity, spin)
     spare, slip, along = u[:, 0] + aim, np.linalg.norm(u[:, 1:], axis=1), np.linalg.norm(p[:, 1:], axis=1)
     pressed, sliding = p[:, 0] > 1e-3, slip > 1e-3
     assert spare.min() > -1e-5 and np.all(along <= friction * p[:, 0] * (1 + 1e-9))
@@ -83,29 +81,16 @@ def test_every_contact_of_a_crowd_keeps_coulombs_law(friction: float) -> None:
         assert np.count_nonzero(both) > 10 and np.count_nonzero(pressed & ~sliding) > 10
 
 
-def test_two_threads_come_to_the_same_digits(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of a crowd, in as many iterations; whatever each of them was busy with."""
-    monkeypatch.setattr("fracsim.rigid.contact_solver.FEW", 10)
-    contacts, bodies = pile(0.3)
-    still = np.zeros((1, 3))
-    free = contacts.parting(np.concatenate([bodies.velocity, still]), np.concatenate([bodies.spin, still]))
-    crowd = Crowd.of(contacts, free, np.zeros(len(contacts)), bodies.mass, np.linalg.inv(bodies.inertia))
-    with Helper(os.sched_getaffinity(0)) as helper:
-        for most in (1, 17, 150, 150, 1000):
-            alone, two = (crowd.impulses(1e-7, most, np.zeros_like(free), each) for each in (None, helper))
-            assert alone.max() > 0 and np.array_equal(alone, two)
-
-
 def test_a_heap_keeps_its_momentum_and_loses_energy() -> None:
     """A thousand contacts of blocks that fly together, without weight or a floor: as a crowd, m v and m x x v + I w."""
     grid = 1.01 * np.indices((7, 7, 7)).reshape(3, -1).T
     bodies = cubes(grid.tolist())
     inwards = -2.0 * (grid - grid.mean(axis=0))
     bodies = replace(bodies, velocity=inwards, spin=np.random.default_rng(1).normal(size=(343, 3)))
-    engine = Engine(bodies, [[CUBE]] * 343, [], Rules(5e-3, 0 * DOWN, 0.4))
+    engine = Engine(bodies, [[CUBE]] * 343, [], ContactParameters(5e-3, 0 * DOWN, 0.4))
     after, touches = engine.advance(bodies)
     size = MASS * np.abs(bodies.velocity).sum()
-    assert len(touches) > 1000 and after.kinetic < 0.9 * bodies.kinetic
+    assert len(touches) > 1000 and after.kinetic_energy < 0.9 * bodies.kinetic_energy
     assert np.allclose(after.momentum, bodies.momentum, atol=1e-9 * size)
     assert np.allclose(after.angular_momentum, bodies.angular_momentum, atol=1e-8 * size)
 
@@ -115,15 +100,17 @@ def test_no_step_of_a_crowd_is_too_long() -> None:
     many times too large as bodies have contacts."""
     contacts, bodies = pile(0.3)
     k = len(contacts)
-    crowd = Crowd.of(contacts, np.zeros((k, 3)), np.zeros(k), bodies.mass, np.linalg.inv(bodies.inertia))
+    crowd = ProjectedGradientSolver.assemble(
+        contacts, np.zeros((k, 3)), np.zeros(k), bodies.mass, np.linalg.inv(bodies.inertia)
+    )
     across = np.zeros((3, k, 36, 6))
-    for number, (things, at, axes) in enumerate(zip(contacts.things, contacts.point, contacts.axes, strict=True)):
+    for number, (things, at, axes) in enumerate(zip(contacts.pairs, contacts.point, contacts.axes, strict=True)):
         for body, sign in zip(things, (-1.0, 1.0), strict=True):
             if body < 36:
-                turning = np.cross(at - bodies.place[body], axes)
+                turning = np.cross(at - bodies.position[body], axes)
                 across[:, number, body] = sign * np.concatenate([axes, turning], axis=1)
     weight = np.concatenate([np.tile(1 / bodies.mass, (3, 1)), np.tile(1 / bodies.inertia[:, 0, 0], (3, 1))]).T
-    scaled = (across * np.sqrt(weight)).reshape(3, k, -1) / np.sqrt(crowd.bound())[:, None]
+    scaled = (across * np.sqrt(weight)).reshape(3, k, -1) / np.sqrt(crowd.diagonal_bounds())[:, None]
     most = np.linalg.svd(scaled.reshape(3 * k, -1), compute_uv=False)[0] ** 2
     assert 0.4 < most <= 1 + 1e-12
-    assert np.bincount(contacts.things.ravel())[:36].max() == 8
+    assert np.bincount(contacts.pairs.ravel())[:36].max() == 8

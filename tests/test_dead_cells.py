@@ -248,7 +248,7 @@ def test_a_restart_leaves_the_same_cells_out(tmp_path: Path) -> None:
     graph.break_edges(np.random.default_rng(3).uniform(size=len(graph.broken)) < 0.6)
     going.scene.fracture.degradation(True, *going.scene.fracture.evaluate_undamaged_stress())
     going.scene.balance.damage_changed()
-    going.note_breaks()
+    going.record_breaks()
     going.checkpoint()
     again = Run(build_scene(MPI.COMM_SELF, data), tmp_path, restart=True)
     living = integrated_cells(again.scene)

@@ -29,7 +29,7 @@ from fracsim.fracture.energy.tip_fields import TipFields
 from fracsim.fracture.energy.tip_parameters import TIP
 from fracsim.mesh.domain import distribute
 from fracsim.mesh.small_matrices import barycentric_gradients
-from fracsim.scene import build_scene, scene_on
+from fracsim.scene import build_scene, build_scene_on
 from fracsim.study.check import check_study
 from support.notched import POISSON, STIFF, YOUNG, near_tip, notched, plate, plate_tables, torn
 from support.resumed import assert_alike, going_stopped_resumed
@@ -421,7 +421,7 @@ def test_a_tougher_region_takes_its_own_energy() -> None:
                       {"on": "top", "displacement": {"time": [0, 1], "value": [[0, 0], [0, 5e-6]]}}],
             time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
         )  # fmt: skip
-        scene = scene_on(distribute(MPI.COMM_SELF, replace(mesh, regions={"tough": tough, "rest": rest})), study)
+        scene = build_scene_on(distribute(MPI.COMM_SELF, replace(mesh, regions={"tough": tough, "rest": rest})), study)
         *_, (_, tip, _) = torn(scene)
         reached.append(tip)
     assert not reached[0] < 0.8e-3

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import replace
 
 import numpy as np
@@ -12,13 +11,11 @@ from scipy.spatial.transform import Rotation
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-from fracsim.contact.shapes import RoundedBox, Sphere
-from fracsim.rigid.collision_detection import Finder
+from fracsim.contact.shapes import Sphere
+from fracsim.rigid.collision_detection import CollisionDetector, MotionBounds
 from fracsim.rigid.contact_points import Contacts
-from fracsim.rigid.mujoco_model import Rules, Stand, model_of
-from fracsim.rigid.obstacle_shapes import primitive
-from fracsim.rigid.swept_bounds import Course
-from fracsim.rigid.worker_ranks import Helper
+from fracsim.rigid.mujoco_model import ContactParameters, PrescribedObstacle, build_model
+from fracsim.rigid.obstacles import obstacle_primitive
 from support.falling import CUBE, DOWN, cubes, floor
 
 Values = npt.NDArray[np.float64]
@@ -26,7 +23,7 @@ Values = npt.NDArray[np.float64]
 
 def told(contacts: Contacts) -> Values:
     """(k, 12) things, places, normals, gaps and friction, in an order of their own."""
-    rows = np.column_stack([contacts.things, contacts.geoms, contacts.point, contacts.axes[:, 0], contacts.gap,
+    rows = np.column_stack([contacts.pairs, contacts.geoms, contacts.point, contacts.axes[:, 0], contacts.gap,
                             contacts.friction])  # fmt: skip
     return np.asarray(rows[np.lexsort(rows.T[::-1])])
 
@@ -35,38 +32,20 @@ def test_some_bodies_meet_what_they_meet_among_all() -> None:
     """Sixty-four blocks askew over a floor and a driven ball: contacts of a third of them, and none of the others."""
     rng = np.random.default_rng(5)
     bodies = cubes((1.1 * np.indices((4, 4, 4)).reshape(3, -1).T + 0.6).tolist())
-    bodies = replace(bodies, turn=Rotation.random(64, rng=rng).as_matrix(), velocity=rng.normal(size=(64, 3)))
-    ball = Stand(primitive(Sphere(1.0, 3), "ball"), np.array([1.0, 1.0, -0.2]), 0.3, driven=True)
-    model = model_of(bodies, [[CUBE]] * 64, [floor(0.5), ball], Rules(5e-3, DOWN, 0.4))
-    find, looked = Finder(model), model.planes.looked()
+    bodies = replace(bodies, rotation=Rotation.random(64, rng=rng).as_matrix(), velocity=rng.normal(size=(64, 3)))
+    ball = PrescribedObstacle(obstacle_primitive(Sphere(1.0, 3), "ball"), np.array([1.0, 1.0, -0.2]), 0.3, driven=True)
+    model = build_model(bodies, [[CUBE]] * 64, [floor(0.5), ball], ContactParameters(5e-3, DOWN, 0.4))
+    find, looked = CollisionDetector(model), model.planes.begin_step()
     rates: Values = np.tile([200.0, 0.0, 0.0], (2, 1))  # 1 m a step
-    course = Course(rates, np.zeros(3), [*rng.uniform(0.01, 0.3, (2, 64))])
+    course = MotionBounds(rates, np.zeros(3), [*rng.uniform(0.01, 0.3, (2, 64))])
     ways: Values = np.array([[0.0, 0, 0], [1.0, 1.0, -0.2]])
     some = np.append([True], rng.uniform(size=63) < 0.3)
     every, chosen = (find(bodies, ways, course, 5e-3, looked, only) for only in (None, some))
-    met = np.append(some, [False, False])[every.things].any(axis=1)
-    assert {64, 65} <= set(every.things[met].ravel()) and 50 < np.count_nonzero(met) < len(every) - 50
-    assert np.array_equal(told(chosen), told(every.chosen(np.flatnonzero(met))))
+    met = np.append(some, [False, False])[every.pairs].any(axis=1)
+    assert {64, 65} <= set(every.pairs[met].ravel()) and 50 < np.count_nonzero(met) < len(every) - 50
+    assert np.array_equal(told(chosen), told(every.select(np.flatnonzero(met))))
     again = find(bodies, ways, course, 5e-3, looked)
     assert np.array_equal(told(again), told(every)), "and all are looked for afterwards"
-
-
-def test_two_threads_find_what_one_does() -> None:
-    """In the same order: of 216 blocks askew over a floor, a block that stands and a driven ball, all and some."""
-    rng = np.random.default_rng(6)
-    bodies = cubes((1.05 * np.indices((6, 6, 6)).reshape(3, -1).T + 0.6).tolist())
-    bodies = replace(bodies, turn=Rotation.random(216, rng=rng).as_matrix())
-    block = Stand(primitive(RoundedBox((2.0, 2.0, 1.0)), "block"), np.array([3.0, 3.0, 0.1]), 0.3)
-    ball = Stand(primitive(Sphere(1.0, 3), "ball"), np.array([1.0, 1.0, -0.2]), 0.3, driven=True)
-    model = model_of(bodies, [[CUBE]] * 216, [floor(0.5), block, ball], Rules(5e-3, DOWN, 0.4))
-    course = Course(np.full((3, 3), 100.0), np.zeros(3), [*rng.uniform(0.01, 0.3, (2, 216))])
-    ways, looked = np.array([[0.0, 0, 0], [3.0, 3.0, 0.1], [1.0, 1.0, -0.2]]), model.planes.looked()
-    with Helper(os.sched_getaffinity(0)) as helper:
-        alone, two = Finder(model), Finder(model, helper)
-        for only in (None, rng.uniform(size=216) < 0.7):
-            one, other = (find(bodies, ways, course, 5e-3, looked, only) for find in (alone, two))
-            assert len(one) > 1000 and {216, 217, 218} <= set(one.things.ravel())
-            assert all(np.array_equal(a, b) for a, b in zip(vars(one).values(), vars(other).values(), strict=True))
 
 
 def test_things_come_together_as_fast_as_their_points_do() -> None:
@@ -76,7 +55,7 @@ def test_things_come_together_as_fast_as_their_points_do() -> None:
     things = np.array([[a, b] for a in range(7) for b in range(7) if a != b])
     point, k = rng.normal(size=(len(things), 3)), len(things)
     axes = Rotation.random(k, rng=rng).as_matrix()
-    contacts = Contacts.found(things, things, point, axes, np.zeros(k), np.zeros(k), places)
+    contacts = Contacts.with_arms(things, things, point, axes, np.zeros(k), np.zeros(k), places)
     gone: Values = np.zeros((2, k, 3))  # where the point is, of the first and of the second thing
     for dt in (-1e-5, 1e-5):
         turn = Rotation.from_rotvec(dt * spin).as_matrix()
@@ -85,6 +64,6 @@ def test_things_come_together_as_fast_as_their_points_do() -> None:
         ]
         gone += np.array(at) / (2 * dt)
     apart = np.einsum("kij,kj->ki", axes, gone[1] - gone[0])
-    assert np.allclose(contacts.parting(velocity, spin), apart, atol=1e-8)
-    assert np.allclose(contacts.closing(velocity, spin), -apart[:, 0], atol=1e-8)
-    assert np.array_equal(contacts.of_both(np.arange(7) < 4), (things < 4).all(axis=1))
+    assert np.allclose(contacts.relative_velocities(velocity, spin), apart, atol=1e-8)
+    assert np.allclose(contacts.approach_speeds(velocity, spin), -apart[:, 0], atol=1e-8)
+    assert np.array_equal(contacts.both_flagged(np.arange(7) < 4), (things < 4).all(axis=1))

@@ -91,7 +91,7 @@ def test_dust_is_counted_with_its_mass(tmp_path: Any) -> None:
     corner = int(np.argmin(domain.nodes.sum(axis=1)))
     graph = run.scene.fracture.graph  # type: ignore[union-attr]
     graph.break_edges((graph.edge_nodes == corner).any(axis=1))
-    run.note_breaks()
+    run.record_breaks()
     wanted = domain.volumes[(graph.cell_nodes == corner).any(axis=1)].sum() / 3
     count, mass = run.breaks.count_single_nodes(domain.volumes)
     assert count == 1 and mass == pytest.approx(wanted, rel=1e-12)

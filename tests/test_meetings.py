@@ -193,10 +193,10 @@ def test_one_piece_is_not_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
     monkeypatch.setattr("fracsim.mesh.interpenetration.find_interpenetration", never)
     one = begun(STRIP, tmp_path)
-    assert one.watched.passing is not None
+    assert one.monitors.interpenetration is not None
     one()
 
 
 @pytest.mark.parametrize("more", [{"output": PAIR["output"] | {"surface": False}}, {"contact": {}}])
 def test_nothing_is_looked_for_where_it_is_not_wanted(more: Tables, tmp_path: Path) -> None:
-    assert begun(two_bodies(tmp_path) | more, tmp_path / "out").watched.passing is None
+    assert begun(two_bodies(tmp_path) | more, tmp_path / "out").monitors.interpenetration is None

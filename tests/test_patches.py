@@ -7,9 +7,8 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.meshes.data import MeshData
-from fracsim.rigid.hertz import Hertz
-from fracsim.rigid.impact_detection import _radius
-from fracsim.rigid.surface_loads import patches, point_loads
+from fracsim.rigid.impact_detection import _circle_radii
+from fracsim.rigid.surface_loads import HertzContact, distribute_on_circles, locate_forces
 from support.rigid import stiffness_of
 from support.solids import lattice
 
@@ -20,7 +19,7 @@ def test_a_patch_keeps_force_and_moment_and_has_hertzs_pressure() -> None:
     """What acts within r is F (1 - (1 - r^2/a^2)^(3/2)), the integral of the pressure; in the plane across the force;
     what is much smaller than a cell stays a point."""
     points, force = np.array([[0.3, 0.1, 2.0], [1.0, 0.0, 0.0]]), np.array([[1.0, -2.0, 2.0], [0.0, 3.0, 0.0]])
-    at, share = patches(points, force, np.array([0.5, 1e-4]), 0.1)
+    at, share = distribute_on_circles(points, force, np.array([0.5, 1e-4]), 0.1)
     assert np.array_equal(at[0], points[1]) and np.array_equal(share[0], force[1])
     arm = at[1:] - points[0]
     assert np.allclose(share.sum(axis=0), force.sum(axis=0))
@@ -33,10 +32,10 @@ def test_a_patch_keeps_force_and_moment_and_has_hertzs_pressure() -> None:
 
 def test_the_circle_is_hertzs() -> None:
     """a^3 = 3 F R / (4 E*), by the approach of two spheres d = a^2 / R, F = 4/3 E* sqrt(R) d^(3/2)."""
-    hertz, R = Hertz(2e9, 0.3), np.array([0.2])
+    hertz, R = HertzContact(2e9, 0.3), np.array([0.2])
     for both, E in ((True, 1e9), (False, 2e9)):
         force = np.array([[0.0, 300.0, 400.0]])
-        (a,) = _radius(hertz.spread(R, np.array([both])), force)
+        (a,) = _circle_radii(hertz.radius_cubed_per_force(R, np.array([both])), force)
         assert 4 / 3 * E / (1 - 0.3**2) * np.sqrt(R) * (a**2 / R) ** 1.5 == pytest.approx(500.0)
 
 
@@ -50,10 +49,10 @@ def graded(count: int) -> MeshData:
 def stress_below(count: int, radius: float) -> tuple[Values, Values, Values]:
     """Volumes (n,) and middles (n, 3) of cells, m, and their stress (n, 6), Pa, under 1 N on a circle at the origin."""
     stiffness = stiffness_of(graded(count))
-    body, domain = stiffness.whole(), stiffness.stress.domain
-    at, force = patches(np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]), np.array([radius]), 0.02)
-    loads = point_loads(domain.nodes, domain.cell_nodes.astype(np.int64), at, force)
-    sigma = stiffness.tensor(body(loads.nodal(len(domain.nodes))), body.share)
+    body, domain = stiffness.whole_body(), stiffness.stress.domain
+    at, force = distribute_on_circles(np.zeros((1, 3)), np.array([[0.0, 0.0, -1.0]]), np.array([radius]), 0.02)
+    loads = locate_forces(domain.nodes, domain.cell_nodes.astype(np.int64), at, force)
+    sigma = stiffness.cell_stress(body(loads.nodal_forces(len(domain.nodes))), body.cell_fractions)
     return domain.volumes, domain.nodes[domain.cell_nodes].mean(axis=1), sigma
 
 

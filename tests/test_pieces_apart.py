@@ -31,21 +31,24 @@ CORE = 0.04  # of the mean edge
 def as_placed(stepper: RigidStepper, points: Values) -> Values:
     """(k, 3) where points of the mesh (k, 3) are of the one body that is at rest where its study puts it, m."""
     poses = stepper._geometry.poses
-    return np.asarray(points @ poses.turn[0].T + poses.place[0])
+    return np.asarray(points @ poses.rotation[0].T + poses.position[0])
 
 
 def in_others(stepper: RigidStepper, state: RigidState) -> Depths:
     """Of pairs of pieces, how far corners of the drawn surface of one, crack faces as well, that are in a whole cell of
     the other are from its surface, m: they come free of one another by no shorter way."""
-    body, bodies, found = stepper.copies.copy(0), state.bodies, dict[tuple[int, int], float]()
-    domain, of_node = body.graph.domain, body.pieces.node_fragment
-    made, nodes = build_split_surface(stepper._geometry.skeleton, *body.damage()), as_placed(stepper, domain.nodes)
+    body, bodies, found = stepper.instances.get(0), state.bodies, dict[tuple[int, int], float]()
+    domain, of_node = body.graph.domain, body.fragments.node_fragment
+    made, nodes = (
+        build_split_surface(stepper._geometry.numbering, *body.input_damage()),
+        as_placed(stepper, domain.nodes),
+    )
     own, owner = made.point_fragment, made.elements[:, 0]
-    x = bodies.to_space(as_placed(stepper, made.points), own)
+    x = bodies.to_current(as_placed(stepper, made.points), own)
     of_cell = of_node[domain.cell_nodes]
     whole = np.all(of_cell == of_cell[:, :1], axis=1)
     for piece in range(len(bodies)):
-        corners, X = nodes[domain.cell_nodes[whole & (of_cell[:, 0] == piece)]], bodies.to_rest(x, piece)
+        corners, X = nodes[domain.cell_nodes[whole & (of_cell[:, 0] == piece)]], bodies.to_reference(x, piece)
         if not len(corners):
             continue
         near = np.flatnonzero(np.all((corners.min(axis=(0, 1)) < X) & (corners.max(axis=(0, 1)) > X), axis=1))
@@ -64,16 +67,16 @@ def in_others(stepper: RigidStepper, state: RigidState) -> Depths:
 def in_cores(stepper: RigidStepper, state: RigidState) -> Depths:
     """Of pairs of pieces, how far nodes of one are in the cells that are wholly of the other, m: no crack goes through
     these, so that its roughness does not explain it."""
-    body, bodies = stepper.copies.copy(0), state.bodies
-    domain, of_node, found = body.graph.domain, body.pieces.node_fragment, dict[tuple[int, int], float]()
+    body, bodies = stepper.instances.get(0), state.bodies
+    domain, of_node, found = body.graph.domain, body.fragments.node_fragment, dict[tuple[int, int], float]()
     nodes = as_placed(stepper, domain.nodes)
-    of_cell, x = of_node[domain.cell_nodes], bodies.to_space(nodes, of_node)
+    of_cell, x = of_node[domain.cell_nodes], bodies.to_current(nodes, of_node)
     whole = np.all(of_cell == of_cell[:, :1], axis=1)
     for piece in range(len(bodies)):
         cells = domain.cell_nodes[whole & (of_cell[:, 0] == piece)]
         if not len(cells):
             continue
-        corners, X = nodes[cells], bodies.to_rest(x, piece)
+        corners, X = nodes[cells], bodies.to_reference(x, piece)
         near = np.all((corners.min(axis=(0, 1)) < X) & (corners.max(axis=(0, 1)) > X), axis=1)
         rows = np.flatnonzero(near & (of_node != piece))
         rows = rows[in_cells(X[rows], corners)] if len(rows) else rows
@@ -103,7 +106,7 @@ def in_cells(X: Values, corners: Values) -> npt.NDArray[np.bool_]:
 
 def from_birth(stepper: RigidStepper) -> Depths:
     """Of pairs of pieces, how far their hulls may lie in one another, as they do from birth, m."""
-    overlaps, found = stepper.overlaps, dict[tuple[int, int], float]()
+    overlaps, found = stepper.initial_overlaps, dict[tuple[int, int], float]()
     for pair, depth in zip(np.searchsorted(stepper.shapes.names, overlaps.names), overlaps.depth, strict=True):
         key = int(pair[0]), int(pair[1])
         found[key] = max(found.get(key, 0.0), float(depth))
@@ -123,12 +126,12 @@ def test_pieces_do_not_pass_through_one_another_at_twenty_metres_a_second() -> N
     for _ in range(STEPS):
         state, _ = stepper.advance(state)
         assert max(in_cores(stepper, state).values(), default=0.0) < CORE * stepper._geometry.mean_edge
-        allowed, told = from_birth(stepper), {pair[:2]: pair[2] for pair in stepper.depths(state)}
+        allowed, told = from_birth(stepper), {pair[:2]: pair[2] for pair in stepper.find_penetrations(state)}
         assert max(told.values(), default=0.0) < SPEED * STEP / 5
         for pair, depth in in_others(stepper, state).items():
             assert depth < allowed.get(pair, 0.0) + told.get(pair, 0.0) + NONE
     assert len(state.bodies) > 10
-    moved = replace(state.bodies, place=0.5 * state.bodies.place)
+    moved = replace(state.bodies, position=0.5 * state.bodies.position)
     assert max(in_others(stepper, replace(state, bodies=moved)).values()) > 0.1, "it would be seen"
     assert max(in_cores(stepper, replace(state, bodies=moved)).values()) > 0.1, "and so would this"
 
@@ -138,7 +141,7 @@ def test_grains_of_a_wall_do_not_pass_through_one_another() -> None:
     """Of a wall that a ball is driven through no node comes into cells that are wholly of another piece, by more than a
     little, at any step in which they fall: 0.14 of the mean edge where only convex parts met."""
     scene = build_rigid_scene(load_study("rigid-wall", ["time.end=0.26", "brittle.grains.seed=4"]))
-    stepper, state, seen = scene.stepper, scene.first, 0
+    stepper, state, seen = scene.stepper, scene.initial_state, 0
     while not scene.ended(state):
         state, _ = stepper.advance(state)
         if len(state.bodies) > 1:

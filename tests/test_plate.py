@@ -9,7 +9,7 @@ from scipy.sparse import coo_matrix, csc_matrix
 from scipy.sparse.linalg import spsolve
 from scipy.spatial.transform import Rotation
 
-from fracsim.rigid.shell_triangles import Plates
+from fracsim.rigid.shell_analysis import ShellTriangles
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -31,7 +31,7 @@ def pane(count: int, seed: int = 0) -> tuple[Values, Ints]:
 
 def matrix_of(points: Values, triangles: Ints) -> csc_matrix:
     """K of all nodes."""
-    K = Plates.of(points[triangles]).stiffness(YOUNG, POISSON, H)
+    K = ShellTriangles.from_corners(points[triangles]).stiffness(YOUNG, POISSON, H)
     dofs = (6 * triangles[:, :, None] + np.arange(6)).reshape(-1, 18)
     rows, columns = np.repeat(dofs, 18, axis=1).ravel(), np.tile(dofs, 18).ravel()
     return coo_matrix((K.ravel(), (rows, columns)), shape=(6 * len(points),) * 2).tocsc()
@@ -54,7 +54,7 @@ def test_a_clamped_pane_bends_as_kirchhoff_says() -> None:
     of an edge, where the parabola through three rows of triangles leads to; under P in the
     middle, w = 0.0056 P a^2 / D."""
     points, triangles = pane(16)
-    plates = Plates.of(points[triangles])
+    plates = ShellTriangles.from_corners(points[triangles])
     area = np.bincount(triangles.ravel(), np.repeat(plates.area / 3, 3))
     u = clamped(points, triangles, area)
     assert np.abs(u[:, 2]).max() == pytest.approx(0.00126 / D, rel=0.02)
@@ -70,7 +70,7 @@ def test_a_clamped_pane_bends_as_kirchhoff_says() -> None:
     assert np.abs(clamped(points, triangles, middle)[:, 2]).max() == pytest.approx(0.0056 / D, rel=0.05)
 
 
-def normal_along_x(plates: Plates, stress: Values) -> Values:
+def normal_along_x(plates: ShellTriangles, stress: Values) -> Values:
     """(n,) sigma_xx in space of stresses (n, 3) in the axes of the triangles."""
     x, y = plates.axes[:, 0, 0], plates.axes[:, 1, 0]
     return np.asarray(stress[:, 0] * x**2 + stress[:, 1] * y**2 + 2 * stress[:, 2] * x * y)
@@ -86,9 +86,9 @@ def test_constant_curvature_and_strain_are_exact() -> None:
     there = u.reshape(-1, 2, 3) @ Q.T
     turned = points @ Q.T
     E = YOUNG / (1 - POISSON**2)
-    plates = Plates.of(turned[triangles])
+    plates = ShellTriangles.from_corners(turned[triangles])
     low, high = np.moveaxis(plates.stress(there.reshape(-1, 6)[triangles], YOUNG, POISSON, H), 1, 0)
-    own = Plates.of(points[triangles])
+    own = ShellTriangles.from_corners(points[triangles])
     assert np.allclose(normal_along_x(own, (low + high) / 2), E * (1 + 3 * POISSON))
     assert np.allclose(normal_along_x(own, (high - low) / 2), -E * H / 2)
     force = (matrix_of(turned, triangles) @ there.ravel()).reshape(-1, 6)

@@ -42,7 +42,7 @@ def test_a_process_is_left_as_by_sys_exit(thread: bool) -> None:
 import atexit, threading, time
 from petsc4py import PETSc
 from mpi4py import MPI
-from fracsim.process import leave
+from fracsim.process import exit_process
 atexit.register(lambda: print('end'))
 kept = PETSc.Vec().createSeq(3)
 class Attribute: pass
@@ -50,7 +50,7 @@ def told(*_): print('finalised', flush=True); return None
 MPI.COMM_SELF.Set_attr(MPI.Comm.Create_keyval(delete_fn=told), Attribute())
 {begin}
 print('said')
-leave(3)
+exit_process(3)
 """)
     assert result.returncode == 3, result.stderr
     said = result.stdout.split()
@@ -130,7 +130,7 @@ def test_a_crash_ends_the_process(number: signal.Signals) -> None:
 import os
 from fracsim import process
 process._own = True
-process.begin_run()
+process.start_run()
 os.kill(os.getpid(), {int(number)})
 """)
     assert done.returncode == -number
@@ -146,7 +146,7 @@ import os, signal, sys, time
 signal.signal({int(number)}, signal.SIG_DFL)  # a shell may have had it ignored, in the background
 sys.argv = ["fracsim", "run"]
 from fracsim import process
-process.begin_process()
+process.start_process()
 process.import_dolfinx()
 os.kill(os.getpid(), {int(number)})
 time.sleep(5)

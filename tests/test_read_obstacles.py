@@ -446,7 +446,7 @@ def test_it_is_drawn_and_told(tmp_path: Path) -> None:
     scene = build_scene(MPI.COMM_SELF, study)
     run = Run(scene, tmp_path / "out")
     run()
-    (note,) = run.watched.meetings.notes(done=True)
+    (note,) = run.monitors.contact_monitor.notes(done=True)
     assert note.startswith("the obstacle block never met the body: it came no nearer than 0.0")
     points = points_of(sorted(tmp_path.glob("out/surface/obstacle_block_*.vtu"))[-1])
     np.testing.assert_allclose(points[:, 2].min(), 1.6 - 0.5 - 0.05, atol=1e-6)

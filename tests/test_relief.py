@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from fracsim.fracture.principal_stress import symmetric_tensors
 from fracsim.mesh.domain import Domain
 from fracsim.meshes.data import MeshData
-from fracsim.rigid.free_body_analysis import FreeBody
-from fracsim.rigid.pinned_analysis import pinned, pins
+from fracsim.rigid.free_body_analysis import SolidBody
+from fracsim.studies.rigid_trials import pin_constraints, solve_pinned
 from support.rigid import DENSITY, section_mean, stiffness_of, whole_body
 from support.scenes import make_scene, march
 from support.solids import lattice
@@ -41,13 +41,13 @@ def test_forces_and_accelerations_balance_everywhere(numbers: tuple[int, ...]) -
     """K u = f - M a at every node, and a is Newton's: sum f = m a, sum r x f = sum r x m a."""
     _, body, domain = whole_body(lattice(*numbers, size=0.5))
     force = some_load(domain)
-    left = body.relief(force)
+    left = body.inertia_relief(force)
     residual = body.matrix.createVecLeft()
     u = body.matrix.createVecRight()
     u.array_w[:] = body(force).reshape(-1)
     body.matrix.mult(u, residual)
     assert np.abs(residual.array_r.reshape(left.shape) - left).max() < 1e-10 * np.abs(left).max()
-    a = (force - left) / body.relief.mass[:, None]
+    a = (force - left) / body.inertia_relief.mass[:, None]
     assert np.allclose(a, rigid(domain.nodes, a), atol=1e-12 * np.abs(a).max())
     assert np.allclose(left.sum(axis=0), 0.0, atol=1e-13)
     assert np.allclose(moment(domain.nodes, left), 0.0, atol=1e-13)
@@ -81,7 +81,7 @@ def test_stress_does_not_depend_on_the_frame(numbers: tuple[int, ...]) -> None:
     for each, R in ((mesh, np.eye(mesh.dim)), (there, Q)):
         stiffness, body, domain = whole_body(each)
         u = body(some_load(domain) @ R.T)
-        sigma = symmetric_tensors(stiffness.tensor(u, body.share), mesh.dim)
+        sigma = symmetric_tensors(stiffness.cell_stress(u, body.cell_fractions), mesh.dim)
         found.append((R.T @ sigma @ R)[np.argsort(domain.cell_input)])
     assert np.allclose(*found, atol=1e-9 * np.abs(found[0]).max())
 
@@ -95,8 +95,8 @@ def test_a_block_at_rest_carries_its_weight(numbers: tuple[int, ...]) -> None:
     force, foot = np.zeros_like(domain.nodes), domain.nodes[:, -1] == 0
     area = np.bincount(domain.cell_nodes.ravel(), np.repeat(domain.volumes, domain.dim + 1))
     force[foot, axis] = area[foot]  # as a floor under each cell of the first layer shares it out
-    force *= G * body.relief.mass.sum() / force.sum()
-    sigma = stiffness.tensor(body(force), body.share)[:, axis]
+    force *= G * body.inertia_relief.mass.sum() / force.sum()
+    sigma = stiffness.cell_stress(body(force), body.cell_fractions)[:, axis]
     for layer in range(numbers[-1]):
         low, high = layer * size, (layer + 1) * size
         expected = -DENSITY * G * (height - (low + high) / 2)
@@ -109,9 +109,10 @@ def test_pins_strain_a_body_where_they_hold_it_and_relief_does_not() -> None:
     stiffness, body, domain = whole_body(lattice(3, 3, 3, size=0.5))
     force = np.zeros_like(domain.nodes)
     force[domain.nodes[:, 2] == 0, 2] = 1.0
-    relieved = pinned(body.matrix, domain.nodes, body.relief(force))
+    relieved = solve_pinned(body.matrix, domain.nodes, body.inertia_relief(force))
     free, same, held = (
-        stiffness.tensor(u, body.share) for u in (body(force), relieved, pinned(body.matrix, domain.nodes, force))
+        stiffness.cell_stress(u, body.cell_fractions)
+        for u in (body(force), relieved, solve_pinned(body.matrix, domain.nodes, force))
     )
     assert np.allclose(free, same, atol=1e-8 * np.abs(free).max())
     assert np.abs(held).max() > 2 * np.abs(free).max()
@@ -125,7 +126,7 @@ def test_pins_hold_all_that_is_rigid(dim: int) -> None:
     modes[:dim] = np.eye(dim)[:, None]
     for row, (i, j) in enumerate([(0, 1), (1, 2), (2, 0)][: len(modes) - dim], dim):
         modes[row, :, i], modes[row, :, j] = -places[:, j], places[:, i]
-    held = pins(places)
+    held = pin_constraints(places)
     assert held.shape == (len(modes), places.size)
     assert np.linalg.cond(held @ modes.reshape(len(modes), -1).T) < 100
 
@@ -146,10 +147,10 @@ def test_a_slow_push_gives_the_mean_stress_of_the_motion() -> None:
     stiffness = stiffness_of(scene.domain.source, young=1.0)  # type: ignore[arg-type]
     for _ in range(120):
         march(scene, state, 1)
-        rows.append(stiffness.tensor(state.u.reshape(-1, 2), np.ones(domain.cell_count)))
+        rows.append(stiffness.cell_stress(state.u.reshape(-1, 2), np.ones(domain.cell_count)))
         loads.append(load.applied_forces().reshape(-1, 2).copy())  # type: ignore[union-attr]
-    body = FreeBody(stiffness, np.ones(domain.cell_count))
-    expected = stiffness.tensor(body(np.mean(loads, axis=0)), body.share)
+    body = SolidBody(stiffness, np.ones(domain.cell_count))
+    expected = stiffness.cell_stress(body(np.mean(loads, axis=0)), body.cell_fractions)
     assert np.linalg.norm(np.mean(rows, axis=0) - expected) < 0.05 * np.linalg.norm(expected)
 
 
@@ -160,13 +161,13 @@ def test_a_piece_is_solved_for_alone() -> None:
     domain = stiffness.stress.domain
     mine = domain.nodes[:, 2] < 1.3
     share = mine[domain.cell_nodes].mean(axis=1)
-    body = FreeBody(stiffness, share, {"ksp_rtol": 1e-12})
+    body = SolidBody(stiffness, share, {"ksp_rtol": 1e-12})
     force = np.zeros_like(domain.nodes)
     force[domain.nodes[:, 2] == 0, 2] = 1.0
     u = body(force)
-    assert body.relief.mass.sum() == pytest.approx(DENSITY * 1.25)
+    assert body.inertia_relief.mass.sum() == pytest.approx(DENSITY * 1.25)
     assert not u[domain.nodes[:, 2] > 1.6].any()
     assert u[(domain.nodes[:, 2] > 1.4) & (domain.nodes[:, 2] < 1.6)].any(axis=1).all()
-    sigma = stiffness.tensor(u, share)[:, 2]
+    sigma = stiffness.cell_stress(u, share)[:, 2]
     # a = F / m: 9 N lift 2500 kg; what is above z = 1 m, without the half of the layer that is cut, is a tenth of it
     assert section_mean(domain, sigma, 2, 0.5, 1.0) == pytest.approx(-9.0 * (1 - 0.75 / 1.25), rel=0.05)

@@ -146,7 +146,7 @@ def test_a_restart_takes_the_explicit_step_of_its_damage(tmp_path: Path, unilate
     fracture.degradation.update_from_graph()
     fracture.mark_changed()
     going.state = state = going.scene.stepper.with_forces(going.state)
-    going.note_breaks()
+    going.record_breaks()
     going.checkpoint()
     again = Run(build_scene(MPI.COMM_SELF, study(data)), tmp_path, restart=True)
     assert again.state.step == state.step > 0
@@ -517,7 +517,7 @@ def test_monitors_go_on_with_a_restart(tmp_path: Path) -> None:
 def test_a_gain_of_energy_is_told_after_a_restart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Seen before the checkpoint alone."""
     first = Run(build_scene(MPI.COMM_SELF, study(BAR)), tmp_path, wall_limit=0.0)
-    first.watched.gained.rise, first.watched.gained.scale = 3.0, 4.0
+    first.monitors.energy_gain.rise, first.monitors.energy_gain.scale = 3.0, 4.0
     with pytest.raises(Stopped):
         first()
     capsys.readouterr()

@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from fracsim.rigid.parallel_analyses import serve
-from fracsim.rigid.worker_ranks import LENT
+from fracsim.rigid.parallel_analyses import serve_analyses
 
 
 class Script:
@@ -17,9 +16,6 @@ class Script:
 
     def __init__(self, *said: object) -> None:
         self.said, self.answers, self.looked = list(said), list[Any](), 0
-
-    def send(self, offer: object, dest: int, tag: int) -> None:
-        assert dest == 0 and tag == LENT and offer
 
     def iprobe(self, source: int, tag: int) -> bool:
         """Only every other time that it looks."""
@@ -37,7 +33,7 @@ class Script:
 class Message:
     """What every analysis begins with."""
 
-    saved, news, strikes = None, (), ()
+    state, outcomes, loads = None, (), ()
 
 
 @pytest.mark.parametrize("begin", [None, "mesh"])
@@ -50,6 +46,6 @@ def test_a_rank_that_cannot_make_its_mesh_tells(monkeypatch: pytest.MonkeyPatch,
     said = [Message, Message, None] if begin else []
     comm: Any = Script(begin, *said)
     monkeypatch.setattr("fracsim.rigid.parallel_analyses.gather", lambda comm, value: comm.gather(value))
-    serve(comm, make)
+    serve_analyses(comm, make)
     assert [str(answer) for answer in comm.answers] == ["no mesh here"] * (2 if begin else 0)
     assert not comm.said

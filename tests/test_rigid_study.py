@@ -19,9 +19,9 @@ from cases import fracsim_here
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
 from fracsim.fracture.brittle.grains import SurfaceParameters
 from fracsim.mesh.input_topology import MeshTopology
-from fracsim.rigid.instance_placement import Place, Poses
-from fracsim.rigid.instances import Copies
-from fracsim.rigid.parallel_analyses import Analyses, Strike, opened_by
+from fracsim.rigid.instance_placement import InstancePlacement, InstancePoses
+from fracsim.rigid.instances import Instances
+from fracsim.rigid.parallel_analyses import ImpactLoads, ParallelAnalyses, analyse_impact
 from fracsim.run import run_study
 from fracsim.studies import folder
 from fracsim.study import Study
@@ -283,22 +283,27 @@ def test_a_blow_on_a_copy_opens_what_it_opens_on_the_body_itself() -> None:
     mesh, rules = lattice(6, 2, 2, size=0.25), SurfaceParameters(6)
     points = np.array([[0.05, 0.25, 0.05], [1.45, 0.25, 0.05], [0.75, 0.25, 0.45]])
     force = 2e4 * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -2.0]])
-    alone = Copies.of(breakable(mesh, 2e4, rules))
-    Analyses(alone)([Strike(0, points, force, np.zeros(3))])
-    poses = Poses.of([Place(np.array([k, 5.0, -k]), np.array([0.3, k, -0.7]), *np.zeros((2, 3))) for k in range(4)])
+    alone = Instances.of_body(breakable(mesh, 2e4, rules))
+    ParallelAnalyses(alone)([ImpactLoads(0, points, force, np.zeros(3))])
+    poses = InstancePoses.from_placements(
+        [InstancePlacement(np.array([k, 5.0, -k]), np.array([0.3, k, -0.7]), *np.zeros((2, 3))) for k in range(4)]
+    )
     sizes = len(mesh.points), len(mesh.cells), len(MeshTopology(mesh).edges)
-    several, again = (Copies(lambda *_: breakable(mesh, 2e4, rules), poses, sizes) for _ in range(2))
-    turn, place = poses.turn[2], poses.place[2]
+    several, again = (Instances(lambda *_: breakable(mesh, 2e4, rules), poses, sizes) for _ in range(2))
+    turn, place = poses.rotation[2], poses.position[2]
     name = 2 * len(mesh.points)
-    broken = Analyses(several)([Strike(name, points @ turn.T + place, force @ turn.T, np.zeros(3))])
-    assert broken[name] == alone.copy(0).graph.broken.sum() > 0 and several.left(name) == (2, alone.left(0)[1])
-    assert alone.left(0)[1] < 6
-    again.restore(several.saved())
+    broken = ParallelAnalyses(several)([ImpactLoads(name, points @ turn.T + place, force @ turn.T, np.zeros(3))])
+    assert broken[name] == alone.get(0).graph.broken.sum() > 0 and several.surfaces_left(name) == (
+        2,
+        alone.surfaces_left(0)[1],
+    )
+    assert alone.surfaces_left(0)[1] < 6
+    again.from_checkpoint(several.to_checkpoint())
     for each in (several, again):
         pattern, cut = (values.reshape(4, -1) for values in each.damage())
         assert np.array_equal(pattern[2], alone.damage()[0]) and not pattern[[0, 1, 3]].any()
         assert np.allclose(cut[2], alone.damage()[1], atol=1e-6, equal_nan=True)
-        assert each.left(name) == several.left(name) and [*each.damaged] == [2]
+        assert each.surfaces_left(name) == several.surfaces_left(name) and [*each.damaged] == [2]
 
 
 def test_a_copy_breaks_as_it_would_alone() -> None:
@@ -307,17 +312,17 @@ def test_a_copy_breaks_as_it_would_alone() -> None:
     mesh, rules = lattice(6, 2, 2, size=0.25), SurfaceParameters(2)
     points = np.array([[0.05, 0.25, 0.05], [1.45, 0.25, 0.05], [0.75, 0.25, 0.45]])
     force = 3e4 * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -2.0]])
-    alone = Copies.of(breakable(mesh, 2e4, rules))
-    Analyses(alone)([Strike(0, points, force, np.zeros(3))])
+    alone = Instances.of_body(breakable(mesh, 2e4, rules))
+    ParallelAnalyses(alone)([ImpactLoads(0, points, force, np.zeros(3))])
     places = np.array([[0.0, 5.0 * k, 0.0] for k in range(4)])
     sizes = len(mesh.points), len(mesh.cells), len(MeshTopology(mesh).edges)
-    poses = Poses.of([Place(each, *np.zeros((3, 3))) for each in places])
-    several = Copies(lambda *_: breakable(mesh, 2e4, rules), poses, sizes)
-    analyses = Analyses(several)
+    poses = InstancePoses.from_placements([InstancePlacement(each, *np.zeros((3, 3))) for each in places])
+    several = Instances(lambda *_: breakable(mesh, 2e4, rules), poses, sizes)
+    analyses = ParallelAnalyses(several)
     for together in ([2], [0, 3], [2, 1]):
-        analyses([Strike(k * len(mesh.points), points + places[k], force, np.zeros(3)) for k in together])
+        analyses([ImpactLoads(k * len(mesh.points), points + places[k], force, np.zeros(3)) for k in together])
     pattern = several.damage()[0].reshape(4, -1)
-    assert pattern[0].any() and alone.left(0) == (0, 0)
+    assert pattern[0].any() and alone.surfaces_left(0) == (0, 0)
     assert np.array_equal(pattern, np.tile(alone.damage()[0], (4, 1)))
 
 
@@ -326,19 +331,19 @@ class OtherRank:
 
     size, rank = 2, 0
 
-    def __init__(self, other: Copies) -> None:
+    def __init__(self, other: Instances) -> None:
         self.other, self.asked = other, 0
-        self._strikes: list[Strike] = []
+        self._loads: list[ImpactLoads] = []
 
     def isend(self, message: object, rank: int, tag: int) -> SimpleNamespace:
         if not isinstance(message, str):
-            self.other.take(message.news)  # type: ignore[attr-defined]
-            self._strikes = message.strikes  # type: ignore[attr-defined]
+            self.other.apply_outcomes(message.outcomes)  # type: ignore[attr-defined]
+            self._loads = message.loads  # type: ignore[attr-defined]
         return SimpleNamespace(wait=lambda: None)
 
     def gather(self, mine: object) -> list[object]:
-        self.asked += len(self._strikes[1::2])
-        return [mine, [opened_by(self.other, each) for each in self._strikes[1::2]]]
+        self.asked += len(self._loads[1::2])
+        return [mine, [analyse_impact(self.other, each) for each in self._loads[1::2]]]
 
 
 def test_strikes_on_several_ranks_open_what_they_open_on_one(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -346,23 +351,23 @@ def test_strikes_on_several_ranks_open_what_they_open_on_one(monkeypatch: pytest
     numbers of analyses; what one rank opens the other knows when it is asked again."""
     mesh = copies(lattice(6, 2, 2, size=0.25), 3)
     length = len(mesh.points) // 3
-    alone, first, second = (Copies.of(breakable(mesh, 2e4, SurfaceParameters(5))) for _ in range(3))
+    alone, first, second = (Instances.of_body(breakable(mesh, 2e4, SurfaceParameters(5))) for _ in range(3))
     points = np.array([[0.05, 0.25, 0.05], [1.45, 0.25, 0.05], [0.75, 0.25, 0.45]])
     comm = OtherRank(second)
     monkeypatch.setattr("fracsim.rigid.parallel_analyses.gather", lambda comm, value: comm.gather(value))
-    serial, spread = Analyses(alone), Analyses(first, comm, "begin")  # type: ignore[arg-type]
+    serial, spread = ParallelAnalyses(alone), ParallelAnalyses(first, comm, "begin")  # type: ignore[arg-type]
     for size in (1e4, 3e4):
         force = size * np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.0], [0.0, 0.0, -2.0]])
         there = [points + mesh.points[k * length] - mesh.points[0] for k in range(3)]
-        strikes = [Strike(k * length, each, force, np.zeros(3)) for k, each in enumerate(there)]
+        strikes = [ImpactLoads(k * length, each, force, np.zeros(3)) for k, each in enumerate(there)]
         broken = serial(strikes)
         assert spread(strikes) == broken
-    assert comm.asked and alone.left(0) == (0, 0) and alone.copy(0).pieces.count > 3
-    assert np.array_equal(alone.copy(0).graph.broken, first.copy(0).graph.broken)
+    assert comm.asked and alone.surfaces_left(0) == (0, 0) and alone.get(0).fragments.count > 3
+    assert np.array_equal(alone.get(0).graph.broken, first.get(0).graph.broken)
     (pattern, cut), (others, cuts) = alone.damage(), first.damage()
     assert np.array_equal(pattern, others) and np.allclose(cut, cuts, atol=1e-6, equal_nan=True)
-    assert (alone.passes, alone.iterations) == (first.passes, first.iterations)
-    assert np.allclose(alone.saved()["starts"], first.saved()["starts"])
+    assert (alone.analyses, alone.cg_iterations) == (first.analyses, first.cg_iterations)
+    assert np.allclose(alone.to_checkpoint()["starts"], first.to_checkpoint()["starts"])
 
 
 @pytest.mark.parametrize("shape", ["curved", "planar"])

@@ -12,22 +12,28 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.engine import Engine
-from fracsim.rigid.fragment_overlap import Overlaps
-from fracsim.rigid.mujoco_model import Rules
+from fracsim.rigid.fragment_overlap import InitialOverlaps
+from fracsim.rigid.mujoco_model import ContactParameters
 from support.falling import CUBE, DOWN, cubes
 
 Values = npt.NDArray[np.float64]
 STEP, SPEED = 0.02, 5.0
 
 
-def struck(monkeypatch: pytest.MonkeyPatch, farther: float) -> tuple[Bodies, Overlaps]:
+def struck(monkeypatch: pytest.MonkeyPatch, farther: float) -> tuple[Bodies, InitialOverlaps]:
     """Two pieces that lie in one another by 0.3 m from birth and fly on together; a third block strikes the one ahead
-    half-way through the step. `farther`: times what was thought, see rigid.swept_bounds."""
-    monkeypatch.setattr("fracsim.rigid.swept_bounds.FARTHER", farther)
+    half-way through the step. `farther`: times what was thought, see rigid.collision_detection."""
+    monkeypatch.setattr("fracsim.rigid.collision_detection.EXCESS_REACH_RATIO", farther)
     bodies = cubes([[0.0, 0.0, 0.0], [0.7, 0.05, 0.0], [1.8, 0.0, 0.05]])
     velocity: Values = np.array([[SPEED, 0, 0], [SPEED, 0, 0], [-SPEED, 0, 0]])
-    engine = Engine(bodies, [[CUBE]] * 3, [], Rules(STEP, 0 * DOWN), Overlaps.new(np.array([[0, 1]])))
-    return engine.advance(replace(bodies, velocity=velocity))[0], engine.overlaps
+    engine = Engine(
+        bodies,
+        [[CUBE]] * 3,
+        [],
+        ContactParameters(STEP, 0 * DOWN),
+        InitialOverlaps.between_new_fragments(np.array([[0, 1]])),
+    )
+    return engine.advance(replace(bodies, velocity=velocity))[0], engine.initial_overlaps
 
 
 def test_a_round_does_not_go_on_from_how_overlaps_stood_after_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -35,4 +41,6 @@ def test_a_round_does_not_go_on_from_how_overlaps_stood_after_the_one_before(mon
     and in the next round they were pushed apart by what they are more."""
     (once, stands), (again, stands_again) = (struck(monkeypatch, farther) for farther in (1e9, 0.0))
     assert np.allclose(stands.depth, stands_again.depth, atol=1e-12)
-    assert np.allclose(once.velocity, again.velocity, atol=1e-9) and np.allclose(once.place, again.place, atol=1e-11)
+    assert np.allclose(once.velocity, again.velocity, atol=1e-9) and np.allclose(
+        once.position, again.position, atol=1e-11
+    )

@@ -13,12 +13,12 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 from fracsim.fracture.brittle.grains import SurfaceParameters
 from fracsim.mesh.input_topology import MeshTopology
 from fracsim.meshes.builders.ornament import Ornament
-from fracsim.rigid.fragment_geometry import Geometry
-from fracsim.rigid.hertz import Hertz
-from fracsim.rigid.instance_placement import Place, Poses
-from fracsim.rigid.instances import Copies
-from fracsim.rigid.mujoco_model import Rules
+from fracsim.rigid.fragment_geometry import FragmentGeometry
+from fracsim.rigid.instance_placement import InstancePlacement, InstancePoses
+from fracsim.rigid.instances import Instances
+from fracsim.rigid.mujoco_model import ContactParameters
 from fracsim.rigid.rigid_stepper import RigidState, RigidStepper
+from fracsim.rigid.surface_loads import HertzContact
 from support.rigid import DENSITY, breakable
 
 Ints = npt.NDArray[np.int64]
@@ -61,21 +61,21 @@ class Scene:
         """At some places, without weight."""
         mesh = Ornament(radius=RADIUS, neck=0.0, thickness=THICKNESS, h=0.012).build()
         assert mesh.shell is not None
-        poses = Poses.of([Place(at, *np.zeros((3, 3))) for at in places])
+        poses = InstancePoses.from_placements([InstancePlacement(at, *np.zeros((3, 3))) for at in places])
         sizes = len(mesh.points), len(mesh.cells), len(MeshTopology(mesh).edges)
-        made = Copies(lambda *_: breakable(mesh, 1e6, SurfaceParameters(surfaces)), poses, sizes)
-        rules = Rules(step, np.zeros(3), 0.3)
-        stepper = RigidStepper(made, Geometry(mesh, poses), DENSITY, [], rules, Hertz(1e9, 0.2))
+        made = Instances(lambda *_: breakable(mesh, 1e6, SurfaceParameters(surfaces)), poses, sizes)
+        rules = ContactParameters(step, np.zeros(3), 0.3)
+        stepper = RigidStepper(made, FragmentGeometry(mesh, poses), DENSITY, [], rules, HertzContact(1e9, 0.2))
         middle, first = mesh.shell.middle + np.array(places)[:, None], len(mesh.points) * np.arange(len(places))
         triangles = mesh.shell.triangles + first[:, None, None]
         return cls(stepper, middle.reshape(-1, 3), triangles.reshape(-1, 3).astype(np.int64))
 
     def piercings(self, state: RigidState) -> list[tuple[int, int, float]]:
         """Of the middle surfaces of all pieces, without the triangles that cracks run through."""
-        of_node = self.stepper.shapes.piece_of_node
+        of_node = self.stepper.shapes.node_fragment
         of = of_node[self.triangles]
         whole = (of == of[:, :1]).all(axis=1)
-        return pierced(state.bodies.to_space(self.middle, of_node), self.triangles[whole], of[whole, 0])
+        return pierced(state.bodies.to_current(self.middle, of_node), self.triangles[whole], of[whole, 0])
 
 
 def test_piercing_is_seen() -> None:
@@ -100,7 +100,7 @@ def test_shards_do_not_pass_through_one_another_at_twenty_metres_a_second() -> N
         state, _ = stepper.advance(state)
         found = scene.piercings(state)
         deepest = max(deepest, *(depth for *_, depth in found), 0.0)
-    longest = max(float(np.linalg.norm(np.ptp(each, axis=0))) for each in stepper.shapes.outer)
+    longest = max(float(np.linalg.norm(np.ptp(each, axis=0))) for each in stepper.shapes.hull_points)
     assert len(state.bodies) > 20 and not found and deepest < 2 * 0.02 * longest
-    squeezed = replace(state, bodies=replace(state.bodies, place=0.5 * state.bodies.place))
+    squeezed = replace(state, bodies=replace(state.bodies, position=0.5 * state.bodies.position))
     assert len(scene.piercings(squeezed)) > 10, "it would be seen"

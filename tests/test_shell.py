@@ -17,8 +17,8 @@ from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
 from fracsim.meshes.shell import read_shell, thickened
 from fracsim.meshes.topology import signed_measures
-from fracsim.rigid.convex_decomposition import Solid
-from fracsim.rigid.fragment_geometry import Geometry
+from fracsim.rigid.convex_decomposition import Polyhedron
+from fracsim.rigid.fragment_geometry import FragmentGeometry
 from fracsim.study.check import check_study
 from support.rigid import DENSITY, breakable, moments_of, shell_of
 from test_plate import pane
@@ -122,13 +122,13 @@ def test_a_shell_is_for_rigid_bodies(tmp_path: Path) -> None:
 def bent(force: list[float], at: list[float]) -> tuple[Values, Values]:
     """sigma_x (triangles,) on the face in tension, and x of their middles, of the strip under forces at places."""
     stiffness = shell_of(strip(20))
-    domain, body = stiffness.stress.domain, stiffness.whole()
-    assert body.relief.mass[:, 0].sum() == pytest.approx(DENSITY * 0.2 * H)
+    domain, body = stiffness.stress.domain, stiffness.whole_body()
+    assert body.inertia_relief.mass[:, 0].sum() == pytest.approx(DENSITY * 0.2 * H)
     nodal = np.zeros_like(domain.nodes)
     for each, x in zip(force, at, strict=True):
         on = np.abs(domain.nodes[:, 0] - x) < 1e-9
         nodal[on, 2] = each / on.sum()
-    sigma = stiffness.tensor(body(nodal), body.share)[:, 0]
+    sigma = stiffness.cell_stress(body(nodal), body.cell_fractions)[:, 0]
     return sigma, domain.nodes[domain.cell_nodes].mean(axis=1)[:, 0]
 
 
@@ -160,11 +160,15 @@ def test_stress_of_a_shell_does_not_depend_on_the_frame() -> None:
     found = []
     for each, R in ((mesh, np.eye(3)), (turned, Q)):
         stiffness = shell_of(each)
-        domain, body = stiffness.stress.domain, stiffness.whole()
+        domain, body = stiffness.stress.domain, stiffness.whole_body()
         force = np.zeros((len(mesh.points), 3))
         force[[3, 40, 77]] = [[1.0, -2.0, 0.5], [0.3, 0.1, 2.0], [0.0, 1.0, 1.0]]
         u = body((force @ R.T)[domain.node_input])
-        found.append((R.T @ symmetric_tensors(stiffness.tensor(u, body.share), 3) @ R)[np.argsort(domain.cell_input)])
+        found.append(
+            (R.T @ symmetric_tensors(stiffness.cell_stress(u, body.cell_fractions), 3) @ R)[
+                np.argsort(domain.cell_input)
+            ]
+        )
     assert np.allclose(*found, atol=1e-6 * np.abs(found[0]).max())
 
 
@@ -179,11 +183,11 @@ def test_cracks_go_through_the_whole_thickness(grains: GrainParameters | None) -
     body = breakable(mesh, 2e4, SurfaceParameters(8, grains=grains))
     points = np.array([[0.5, 0.1, H / 2], [0.0, 0.1, -H / 2], [1.0, 0.1, -H / 2]])
     force = np.array([[0.0, 0.0, -2.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
-    assert body.strike(0, body.loads(0, points, force, np.full(3, 0.01))) > 0
+    assert body.break_fragments(0, body.distribute_forces(0, points, force, np.full(3, 0.01))) > 0
     of_input = np.empty(len(mesh.points), int)
-    of_input[body.graph.domain.node_input] = body.pieces.node_fragment
+    of_input[body.graph.domain.node_input] = body.fragments.node_fragment
     below, above = np.split(of_input, 2)
-    assert body.pieces.count > 2 and np.array_equal(below, above)
+    assert body.fragments.count > 2 and np.array_equal(below, above)
     assert moments_of(body).volume.sum() == pytest.approx(0.2 * H, rel=1e-9)
     assert moments_of(body).volume.min() > 0
 
@@ -191,9 +195,9 @@ def test_cracks_go_through_the_whole_thickness(grains: GrainParameters | None) -
 def test_a_closed_shell_collides_as_what_it_encloses() -> None:
     """One convex part: nothing is ever inside."""
     mesh = BUILDERS["ornament"](neck=0.0, h=0.012).build()  # type: ignore[call-arg]
-    (parts,) = Geometry(mesh).shapes({}).parts
+    (parts,) = FragmentGeometry(mesh).update_shapes({}).convex_parts
     assert len(parts) == 1
     outer = np.linalg.norm(np.concatenate(parts), axis=1)
     assert outer.min() > 0.04
-    box = Solid(np.eye(3), np.array([[0, 1, 2], [0, 2, 1]]))
-    assert box.filled is box
+    box = Polyhedron(np.eye(3), np.array([[0, 1, 2], [0, 2, 1]]))
+    assert box.without_cavities is box

@@ -9,7 +9,7 @@ import pytest
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
 from fracsim.output.rigid_frames import InstanceSurface
 from fracsim.output.surface.body_surface import BodySurface
-from fracsim.rigid.instance_placement import Place, Poses, placed
+from fracsim.rigid.instance_placement import InstancePlacement, InstancePoses, place_mesh
 from support.solids import lattice, patterns, separated
 
 Values = npt.NDArray[np.float64]
@@ -19,8 +19,8 @@ DENSITY = 3.0
 def test_it_is_that_of_the_mesh_of_all_copies() -> None:
     """One of three breaks, then another: names, masses, volumes, triangles, and the cells and edges behind them."""
     mesh, still = lattice(3, 2, 2), np.zeros(3)
-    places = [Place(np.array([5.0 * k, 0, 0]), np.array([0.1 * k, 0.2, 0]), still, still) for k in range(3)]
-    whole, copies = placed(mesh, places), InstanceSurface(mesh, Poses.of(places), DENSITY)
+    places = [InstancePlacement(np.array([5.0 * k, 0, 0]), np.array([0.1 * k, 0.2, 0]), still, still) for k in range(3)]
+    whole, copies = place_mesh(mesh, places), InstanceSurface(mesh, InstancePoses.from_placements(places), DENSITY)
     expected, skeleton = BodySurface(whole, DENSITY), EntityNumbering(whole)
     assert copies.edge_count == len(skeleton.edges)
     label = np.zeros(len(whole.points), int)
@@ -53,9 +53,9 @@ def rows_of(surface: BodySurface) -> list[Values]:
 def test_pieces_of_earlier_frames_have_their_names_again() -> None:
     """After a restart: the same names as a run that saw them break."""
     mesh, still = lattice(3, 1, 1), np.zeros(3)
-    places = [Place(np.array([5.0 * k, 0, 0]), still, still, still) for k in range(2)]
-    seen, again = (InstanceSurface(mesh, Poses.of(places), DENSITY) for _ in range(2))
-    skeleton = EntityNumbering(placed(mesh, places))
+    places = [InstancePlacement(np.array([5.0 * k, 0, 0]), still, still, still) for k in range(2)]
+    seen, again = (InstanceSurface(mesh, InstancePoses.from_placements(places), DENSITY) for _ in range(2))
+    skeleton = EntityNumbering(place_mesh(mesh, places))
     x = np.tile(mesh.points[:, 0], 2)
     first, second = ((x > 1.5) & (np.arange(len(x)) >= len(x) // 2)), x > 0.5
     early = separated(skeleton, first.astype(int))

@@ -66,7 +66,7 @@ from unittest import mock
 from fracsim import cli, process
 sys.argv = ["fracsim", "check", "x"]
 with mock.patch("fracsim.study.reader.load_study", side_effect=RuntimeError({EVIL!r})):
-    cli.main(process.begin_process)
+    cli.main(process.start_process)
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=60, check=False, cwd=tmp_path)
     said = done.stderr.decode()

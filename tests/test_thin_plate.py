@@ -13,10 +13,10 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.mesh.split_surface.closed_surface import build_split_surface
 from fracsim.rigid.bodies import Bodies
-from fracsim.rigid.contact_records import Touches
-from fracsim.rigid.contact_solver import HARD
+from fracsim.rigid.contact_points import ContactImpulses
+from fracsim.rigid.contact_solver import SETTINGS as SOLVER_SETTINGS
 from fracsim.rigid.engine import Engine
-from fracsim.rigid.mujoco_model import SLOW
+from fracsim.rigid.mujoco_model import SETTINGS as MODEL_SETTINGS
 from fracsim.rigid.rigid_stepper import RigidState, RigidStepper
 from fracsim.scene.rigid_scene import RigidScene, build_rigid_scene
 from test_rigid_study import study
@@ -47,17 +47,17 @@ def scene_of(thick: float, speed: float, step: float) -> RigidScene:
 
 def surfaces(stepper: RigidStepper, bodies: Bodies) -> Values:
     """(m, 3, 3) triangles of the split surface of the pieces, where they are."""
-    copy, skeleton = stepper.copies.copy(0), stepper._geometry.skeleton
-    made = build_split_surface(skeleton, *copy.damage())
-    at_rest = made.points + stepper._geometry.poses.place[0]
-    return bodies.to_space(at_rest, made.point_fragment)[made.elements]
+    copy, skeleton = stepper.instances.get(0), stepper._geometry.numbering
+    made = build_split_surface(skeleton, *copy.input_damage())
+    at_rest = made.points + stepper._geometry.poses.position[0]
+    return bodies.to_current(at_rest, made.point_fragment)[made.elements]
 
 
 class Watch:
     """What touched in a step, as it was taken in the end."""
 
     def __init__(self) -> None:
-        self.touches = Touches.none()
+        self.touches = ContactImpulses.empty()
 
 
 @pytest.fixture
@@ -65,7 +65,7 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
     """Of the steps of an engine."""
     found, advance = Watch(), Engine.advance
 
-    def watched(self: Engine, *how: Any) -> tuple[Bodies, Touches]:
+    def watched(self: Engine, *how: Any) -> tuple[Bodies, ContactImpulses]:
         moved, found.touches = advance(self, *how)
         return moved, found.touches
 
@@ -76,22 +76,22 @@ def watch(monkeypatch: pytest.MonkeyPatch) -> Watch:
 def depths(stepper: RigidStepper, bodies: Bodies) -> Values:
     """m that anything is in the anvil by, and a piece in the ball."""
     triangles = surfaces(stepper, bodies)
-    centre = np.tile(bodies.place[-1], (len(triangles), 1))
+    centre = np.tile(bodies.position[-1], (len(triangles), 1))
     nearest = np.linalg.norm(trimesh.triangles.closest_point(triangles, centre) - centre, axis=1).min()
-    low = min(triangles[:, :, 2].min(), bodies.place[-1, 2] - RADIUS)
+    low = min(triangles[:, :, 2].min(), bodies.position[-1, 2] - RADIUS)
     return np.maximum([-low, RADIUS - nearest], 0.0)
 
 
-def assert_step(before: RigidState, after: RigidState, touches: Touches, speed: float) -> None:
+def assert_step(before: RigidState, after: RigidState, touches: ContactImpulses, speed: float) -> None:
     """No energy is gained; both momenta change by what the anvil gave. Momentum is a sum of some thousand products,
     round-off 1e-16 each; of the angular momentum that is lost which is set back by c_0 dt with what rests
-    (rigid.impact_step); contacts give way by a share 1 - HARD of what they take."""
+    (rigid.engine); contacts give way by a share 1 - impedance of what they take."""
     one, two, anvil = before.bodies, after.bodies, len(after.bodies)
-    points, given = touches.on(anvil)
+    points, given = touches.received_by(anvil)
     size = float(one.mass[-1]) * speed
-    assert two.kinetic < one.kinetic + (1 - HARD) * size * speed
+    assert two.kinetic_energy < one.kinetic_energy + (1 - SOLVER_SETTINGS.impedance) * size * speed
     assert two.momentum - one.momentum == pytest.approx(-given.sum(axis=0), abs=1e-12 * size)
-    turned, lifted = np.cross(points, -given).sum(axis=0), SLOW * (after.t - before.t) * size
+    turned, lifted = np.cross(points, -given).sum(axis=0), MODEL_SETTINGS.min_impact_speed * (after.t - before.t) * size
     assert two.angular_momentum - one.angular_momentum == pytest.approx(turned, abs=lifted)
 
 
@@ -107,15 +107,15 @@ def test_what_is_behind_a_plate_does_not_stop_what_flies_at_it(
     come out on the other side."""
     step = SPEEDS[speed] / finer
     scene = scene_of(thick, speed, step)
-    stepper, state, given = scene.stepper, scene.first, 0.0
+    stepper, state, given = scene.stepper, scene.initial_state, 0.0
     while state.t < 1.5 * (OVER + BELOW) / speed + 2 * SPEEDS[speed]:
         before = state
         state, report = stepper.advance(state)
         assert_step(before, state, watch.touches, speed)
         assert np.all(depths(stepper, state.bodies) < thick / 2)
-        given -= float(report.pushed[0, 2]) * step
+        given -= float(report.obstacle_forces[0, 2]) * step
     mass = float(state.bodies.mass[-1])
-    assert stepper.count > 2 and given > 0.3 * mass * speed
+    assert stepper.fragment_count > 2 and given > 0.3 * mass * speed
 
 
 @pytest.mark.parametrize("at", [1, 2])
@@ -124,11 +124,11 @@ def test_it_goes_on_from_a_checkpoint_to_the_last_digit(at: int) -> None:
     ends = []
     for stops in (False, True):
         scene = scene_of(0.002, 50.0, SPEEDS[50.0] / 2)
-        stepper, state = scene.stepper, scene.first
+        stepper, state = scene.stepper, scene.initial_state
         for step in range(4):
             if stops and step == at:
-                saved, stepper = stepper.saved(state), scene_of(0.002, 50.0, SPEEDS[50.0] / 2).stepper
-                state = stepper.restore(saved, state.t, state.step, state.work)
+                saved, stepper = stepper.to_checkpoint(state), scene_of(0.002, 50.0, SPEEDS[50.0] / 2).stepper
+                state = stepper.from_checkpoint(saved, state.t, state.step, state.work)
             state, _ = stepper.advance(state)
         ends.append(state.bodies)
     assert len(ends[0]) > 3

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -10,7 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from fracsim.rigid.bodies import PART, driven, orientation, rotated, tumbled
+from fracsim.rigid.bodies import LIMITS, accelerate, apply_tensor, quaternions, rotate_freely
 
 Values = npt.NDArray[np.float64]
 TOP = np.diag([1.0, 2.0, 3.0])[None]  # kg m^2
@@ -21,9 +22,9 @@ def tops(steps: int, turns: float) -> tuple[Values, Values, Values]:
     """Rotations (1, 3, 3), spins (1, 3) and energies (steps,) of an asymmetric top that nothing acts on."""
     turn, spin, energy = np.eye(3)[None], NEARLY, []
     for _ in range(steps):
-        momentum, inverse = rotated(turn, TOP, spin), np.linalg.inv(TOP)
-        turn = tumbled(turn, inverse, momentum, np.array([turns / steps]))
-        spin = rotated(turn, inverse, momentum)
+        momentum, inverse = apply_tensor(turn, TOP, spin), np.linalg.inv(TOP)
+        turn = rotate_freely(turn, inverse, momentum, np.array([turns / steps]))
+        spin = apply_tensor(turn, inverse, momentum)
         energy.append(float(np.einsum("ni,nij,nj->", spin, turn @ TOP @ np.swapaxes(turn, 1, 2), spin)) / 2)
     return turn, spin, np.array(energy)
 
@@ -43,9 +44,9 @@ def test_a_top_keeps_its_angular_momentum_to_round_off_and_its_energy() -> None:
 
 
 def test_what_turns_by_a_radian_a_step_keeps_its_energy_as_in_short_steps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of second order: as many parts as PART fits in, squared, better than in one, within a tenth."""
-    in_parts, parts = kept(4, 6), math.ceil(2 * np.pi / 6 / PART)
-    monkeypatch.setattr("fracsim.rigid.bodies.PART", np.inf)
+    """Of second order: as many substeps as fit in, squared, better than in one, within a tenth."""
+    in_parts, parts = kept(4, 6), math.ceil(2 * np.pi / 6 / LIMITS.substep_angle)
+    monkeypatch.setattr("fracsim.rigid.bodies.LIMITS", replace(LIMITS, substep_angle=np.inf))
     assert in_parts * parts**2 == pytest.approx(kept(4, 6), rel=0.1)
 
 
@@ -60,9 +61,9 @@ def test_what_whirls_beside_others_does_not_change_how_they_turn() -> None:
     rng = np.random.default_rng(2)
     turn, size = Rotation.random(20, random_state=1).as_matrix(), rng.uniform(1.0, 3.0, (20, 3))
     inverse, momentum = size[:, :, None] * np.eye(3), np.geomspace(1e-3, 1e3, 20)[:, None] * rng.normal(size=(20, 3))
-    together = tumbled(turn, inverse, momentum, np.full(20, 0.01))
+    together = rotate_freely(turn, inverse, momentum, np.full(20, 0.01))
     for k in range(20):
-        alone = tumbled(turn[[k]], inverse[[k]], momentum[[k]], np.full(1, 0.01))
+        alone = rotate_freely(turn[[k]], inverse[[k]], momentum[[k]], np.full(1, 0.01))
         assert np.allclose(alone[0], together[k], rtol=0.0, atol=1e-14)
 
 
@@ -83,7 +84,7 @@ def test_a_rotation_is_its_quaternion() -> None:
     axes = np.concatenate([np.eye(3), -np.eye(3), rng.normal(size=(40, 3))])
     axes /= np.linalg.norm(axes, axis=1)[:, None]
     turns = np.concatenate([angle * axes for angle in (0.0, 1e-9, 0.3, 2.0, np.pi - 1e-9, np.pi, 4.0)])
-    found, known = orientation(Rotation.from_rotvec(turns).as_matrix()), Rotation.from_rotvec(turns)
+    found, known = quaternions(Rotation.from_rotvec(turns).as_matrix()), Rotation.from_rotvec(turns)
     same = np.abs(np.einsum("ni,ni->n", found, known.as_quat(scalar_first=True)))
     assert np.allclose(same, 1.0, atol=1e-14) and np.allclose(np.linalg.norm(found, axis=1), 1.0, atol=1e-15)
     assert np.allclose(Rotation.from_quat(found, scalar_first=True).as_matrix(), known.as_matrix(), atol=1e-14)
@@ -94,7 +95,7 @@ def test_a_tensor_in_the_axes_of_a_body() -> None:
     rng = np.random.default_rng(5)
     turn, tensor, vector = Rotation.random(9, rng=rng).as_matrix(), rng.normal(size=(9, 3, 3)), rng.normal(size=(9, 3))
     in_space = turn @ tensor @ np.swapaxes(turn, 1, 2)
-    assert np.allclose(rotated(turn, tensor, vector), (in_space @ vector[:, :, None])[:, :, 0], atol=1e-14)
+    assert np.allclose(apply_tensor(turn, tensor, vector), (in_space @ vector[:, :, None])[:, :, 0], atol=1e-14)
 
 
 def test_what_drives_bodies_changes_their_momenta_by_what_it_gives() -> None:
@@ -107,7 +108,7 @@ def test_what_drives_bodies_changes_their_momenta_by_what_it_gives() -> None:
     velocity, spin, force = (rng.normal(size=(6, k)) for k in (3, 3, 6))
     force[0], spin[0], force[1, 3:] = 0.0, 50.0, 1e4
     gravity, dt, most = np.array([0.0, 0.0, -9.81]), 0.01, 10.0
-    motion = driven(turn, inertia, np.linalg.inv(inertia), mass, (velocity, spin), force, gravity, dt, most)
+    motion = accelerate(turn, inertia, np.linalg.inv(inertia), mass, (velocity, spin), force, gravity, dt, most)
     pushed = mass[:, None] * (motion[0] - velocity) / dt - mass[:, None] * gravity
     assert np.allclose(pushed, force[:, :3], atol=1e-10)
     own = turn @ inertia @ np.swapaxes(turn, 1, 2)

@@ -12,7 +12,7 @@ from types import FrameType
 import numpy as np
 from mpi4py import MPI
 
-from ..errors import SAME_REQUEST, STOP_SIGNALS, FracsimError, Stopped
+from ..errors import REPEATED_SIGNAL_INTERVAL, STOP_SIGNALS, FracsimError, Stopped
 
 MAX_UNINTERRUPTED_SECONDS = 0.5  # a step that has taken no longer is finished before the run stops
 _SOURCE = Path(__file__).with_name("signals.c")
@@ -58,7 +58,7 @@ class InterruptHandler:
                 continue
             self._previous_handlers[number] = signal.signal(number, self._on_signal)
             if code is not None:
-                code.watch_signal(int(number), SAME_REQUEST)
+                code.watch_signal(int(number), REPEATED_SIGNAL_INTERVAL)
         return self
 
     def __exit__(self, *_: object) -> None:

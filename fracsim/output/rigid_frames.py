@@ -22,7 +22,7 @@ from ..mesh.split_surface.surface_motion import PointParents
 from ..meshes.data import MeshData
 from ..meshes.topology import signed_measures
 from ..rigid.bodies import Bodies
-from ..rigid.instance_placement import Poses
+from ..rigid.instance_placement import InstancePoses
 from .surface.body_surface import BodySurface
 from .surface.fragment_table import FragmentNames, FragmentTable, enclosed_volumes, group_sums
 from .surface.vtk_files import SurfaceFiles
@@ -46,7 +46,7 @@ class RigidFrames:
         self,
         folder: Path,
         mesh: MeshData,
-        poses: Poses,
+        poses: InstancePoses,
         density: float,
         obstacles: Sequence[RigidObstacle],
         resume_at: float | None = None,
@@ -108,13 +108,13 @@ class RigidFrames:
         surface.update(pattern, cut)
         surface.set_rest_points(dented)
         built = surface.split
-        body_of_point, bodies = built.point_fragment, bodies.part(slice(built.fragment_count))
-        points = bodies.to_space(built.points, body_of_point)
+        body_of_point, bodies = built.point_fragment, bodies.select(slice(built.fragment_count))
+        points = bodies.to_current(built.points, body_of_point)
         velocity = bodies.velocity_at(points, body_of_point)
         nodes = np.bincount(built.node_fragment, minlength=built.fragment_count)
-        rotation = np.asarray(Rotation.from_matrix(bodies.turn).as_rotvec())
+        rotation = np.asarray(Rotation.from_matrix(bodies.rotation).as_rotvec())
         table = FragmentTable(
-            surface.fragment_names, nodes, bodies.mass, surface.volume, bodies.place, bodies.velocity, bodies.spin,
+            surface.fragment_names, nodes, bodies.mass, surface.volume, bodies.position, bodies.velocity, bodies.spin,
             rotation,
         )  # fmt: skip
         broken_at = np.where(self.broken_at == NEVER_BROKEN, np.nan, self.broken_at)
@@ -131,7 +131,7 @@ class InstanceSurface(BodySurface):
         skeleton: edges, facets and boundary of one instance.
     """
 
-    def __init__(self, mesh: MeshData, poses: Poses, density: float) -> None:
+    def __init__(self, mesh: MeshData, poses: InstancePoses, density: float) -> None:
         """Build the surface of the intact instances.
 
         Args:
@@ -204,7 +204,7 @@ class InstanceSurface(BodySurface):
         self.build_count += 1
 
 
-def join_surfaces(instances: Sequence[SplitSurface], skeleton: EntityNumbering, poses: Poses) -> SplitSurface:
+def join_surfaces(instances: Sequence[SplitSurface], skeleton: EntityNumbering, poses: InstancePoses) -> SplitSurface:
     """One surface of all instances in their reference poses.
 
     Args:
@@ -222,7 +222,7 @@ def join_surfaces(instances: Sequence[SplitSurface], skeleton: EntityNumbering, 
         )
 
     points, nodes = [len(instance.points) for instance in instances], len(skeleton.points)
-    posed = list(zip(instances, poses.turn, poses.place, strict=True))
+    posed = list(zip(instances, poses.rotation, poses.position, strict=True))
     x = [instance.points @ turn.T + place for instance, turn, place in posed]
     parents = [instance.parents.parents + nodes * number for number, instance in enumerate(instances)]
     starts = np.cumsum([0, *(len(rows) for rows in parents)])

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import SAME_REQUEST, STOP_SIGNALS, Exit, InputError, NotConverged, Stopped, one_line
+from ..errors import REPEATED_SIGNAL_INTERVAL, STOP_SIGNALS, Exit, InputError, NotConverged, Stopped, one_line
 from ..meshes.plain_files import create, replacing_all
 from ..output.file_ownership import check_ownership, has_resumable_run
 from ..output.lock import FolderLock, describe_lock_holder
@@ -280,7 +280,7 @@ class _Forwarding:
 
     def _pass_on(self, number: int, _: Any) -> None:
         now, first = time.monotonic(), self.asked is None
-        if self.asked is not None and now < self.asked + SAME_REQUEST:
+        if self.asked is not None and now < self.asked + REPEATED_SIGNAL_INTERVAL:
             return
         self.asked = now if self.asked is None else self.asked
         if self._process is not None and self._process.poll() is None:

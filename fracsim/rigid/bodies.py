@@ -1,12 +1,8 @@
-"""Rigid bodies that are pieces of one mesh: what they weigh, where they are, and how they move.
+"""Rigid bodies: mass, inertia, position, rotation and velocity, and their motion between contacts.
 
-How a rigid body turns where nothing acts: its angular momentum stays, to round-off.
+Rotations follow the implicit midpoint rule, which conserves angular momentum l to round-off:
 
     R' = exp(dt w_m) R,   w_m = (R_m I R_m^T)^-1 l,   R_m = exp(dt w_m / 2) R
-
-the implicit midpoint rule, of second order and without a drift of the energy, found by fixed points: it converges where
-a body turns by less than about a radian a step. What turns by more than PART does so in equal parts: at a radian a step
-the energy of a flat shard goes up and down by some per cent otherwise.
 
 Equations: docs/theory.md#motion-and-contact-of-rigid-bodies.
 """
@@ -16,6 +12,7 @@ from __future__ import annotations
 from ctypes import c_double, c_int64
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -24,161 +21,273 @@ from ..errors import NotConverged
 from ..mesh.c_library import load_library
 from ..mesh.split_surface.polyhedron_moments import PolyhedronMoments
 
+if TYPE_CHECKING:
+    from .mujoco_model import MujocoModel
+
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
-LARGEST = 1e150  # a number whose square overflows is as good as infinite
 SOURCE = Path(__file__).with_name("rotation_integrator.c")
-ROUNDS = 30
-PART = 0.2  # rad
-LIMIT = 1e4  # rad
-SAME = 1e-14  # change of the turn in a step, rad, that is none
+
+
+@dataclass(frozen=True)
+class MotionLimits:
+    """Accuracy of the rotation integrator, and bounds on motion.
+
+    Attributes:
+        midpoint_iterations: largest number of fixed-point iterations of the midpoint rule in a substep.
+        rotation_tolerance: rad; the iteration ends when the rotation changes by less.
+        substep_angle: rad; larger rotations are divided into equal substeps. With one radian a step the energy of a
+            flat fragment oscillates by some per cent.
+        step_angle: rad; a body that rotates by more in a step is an error of the input.
+        contact_spin: rad; contacts make a body rotate by at most this much in a step, since they act at points and
+            would spin a single-node fragment arbitrarily fast.
+        magnitude: largest admitted number; the square of a larger one overflows.
+    """
+
+    midpoint_iterations: int = 30
+    rotation_tolerance: float = 1e-14
+    substep_angle: float = 0.2
+    step_angle: float = 1e4
+    contact_spin: float = 1.0
+    magnitude: float = 1e150
+
+
+LIMITS = MotionLimits()
+# Names of the arrays in a checkpoint, where they differ from the attribute.
+STORED_NAMES = {"position": "place", "rotation": "turn"}
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """n rigid bodies in space; a point X of one at rest is at x = place + turn (X - centre).
+    """State of n rigid bodies; a point X at rest is at x = position + rotation (X - centre).
 
     Attributes:
-        mass: (n,) kg.    centre: (n, 3) of mass at rest, m.    inertia: (n, 3, 3) about it at rest, kg m^2.
-        place: (n, 3) of the centre, m.    turn: (n, 3, 3) rotations.
-        velocity: (n, 3) of the centre, m/s.    spin: (n, 3) rad/s, in the axes of space.
+        mass: (n,) kg.
+        centre: (n, 3) centres of mass at rest, m.
+        inertia: (n, 3, 3) about the centre, in the axes at rest, kg m^2.
+        position: (n, 3) current centres of mass, m.
+        rotation: (n, 3, 3) rotation matrices from the axes at rest to the current ones.
+        velocity: (n, 3) of the centres, m/s.
+        spin: (n, 3) angular velocities in the axes of space, rad/s.
     """
 
     mass: Values
     centre: Values
     inertia: Values
-    place: Values
-    turn: Values
+    position: Values
+    rotation: Values
     velocity: Values
     spin: Values
 
     @classmethod
-    def at_rest(cls, density: Values, of: PolyhedronMoments) -> Bodies:
-        """Where the mesh has them; `density`: (n,) kg/m^3."""
-        n = len(of.volume)
-        still, turn = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
-        inertia = density[:, None, None] * of.inertia
-        return cls(density * of.volume, of.centre, inertia, of.centre, turn, still, still)
+    def at_rest(cls, density: Values, moments: PolyhedronMoments) -> Bodies:
+        """Return bodies at their place in the mesh, without motion; `density`: (n,) kg/m^3."""
+        n = len(moments.volume)
+        zero, rotation = np.zeros((n, 3)), np.tile(np.eye(3), (n, 1, 1))
+        inertia = density[:, None, None] * moments.inertia
+        return cls(density * moments.volume, moments.centre, inertia, moments.centre, rotation, zero, zero)
 
     def __len__(self) -> int:
         return len(self.mass)
 
-    def to_space(self, X: Values, body: Ints) -> Values:
-        """(k, 3) where points X (k, 3) at rest of some bodies (k,) are now, m."""
-        return self.place[body] + np.einsum("kij,kj->ki", self.turn[body], X - self.centre[body])
+    # --- checkpoints ---
 
-    def to_rest(self, x: Values, body: int) -> Values:
-        """(k, 3) where points x (k, 3) of a body are at rest, m."""
-        return np.asarray((x - self.place[body]) @ self.turn[body] + self.centre[body])
+    def to_checkpoint(self) -> dict[str, Values]:
+        """Return the arrays that a checkpoint stores, by their names there."""
+        return {f"body.{STORED_NAMES.get(name, name)}": values for name, values in vars(self).items()}
+
+    @classmethod
+    def from_checkpoint(cls, arrays: dict[str, Values]) -> Bodies:
+        """Return the bodies that `to_checkpoint` stored."""
+        return cls(*(arrays[f"body.{STORED_NAMES.get(name, name)}"] for name in cls.__dataclass_fields__))
+
+    # --- points of bodies ---
+
+    def to_current(self, X: Values, body: Ints) -> Values:
+        """Return the current positions (k, 3), m, of points X (k, 3) at rest on the bodies `body` (k,)."""
+        return self.position[body] + np.einsum("kij,kj->ki", self.rotation[body], X - self.centre[body])
+
+    def to_reference(self, x: Values, body: int) -> Values:
+        """Return the positions at rest (k, 3), m, of current points x (k, 3) of one body."""
+        return np.asarray((x - self.position[body]) @ self.rotation[body] + self.centre[body])
 
     def velocity_at(self, x: Values, body: Ints) -> Values:
-        """(k, 3) velocity of bodies (k,) at points x (k, 3), m/s."""
-        return np.asarray(self.velocity[body] + np.cross(self.spin[body], x - self.place[body]))
+        """Return the velocities (k, 3), m/s, of bodies (k,) at current points x (k, 3)."""
+        return np.asarray(self.velocity[body] + np.cross(self.spin[body], x - self.position[body]))
 
-    def divided(self, density: Values, of: PolyhedronMoments, parent: Ints) -> Bodies:
-        """The pieces that they have broken into, each a part of one body `parent` (m,) and moving as that did there:
-        v_i = v + w x r_i, w_i = w (B07 sec. 7)."""
-        parts = Bodies.at_rest(density, of)
-        place = self.to_space(of.centre, parent)
-        velocity = self.velocity_at(place, parent)
-        return replace(parts, place=place, turn=self.turn[parent], velocity=velocity, spin=self.spin[parent])
+    # --- other sets of bodies ---
 
-    def reshaped(self, of: PolyhedronMoments, which: Ints) -> Bodies:
-        """Some (k,) of them have other shapes: mass stays, and so do the place of the centre, momentum and angular
-        momentum."""
-        centre, inertia, spin = (np.array(each) for each in (self.centre, self.inertia, self.spin))
-        across = np.swapaxes(self.turn[which], 1, 2)
-        momentum = inertia[which] @ (across @ spin[which, :, None])
-        centre[which] = of.centre[which]
-        inertia[which] = (self.mass[which] / of.volume[which])[:, None, None] * of.inertia[which]
-        spin[which] = (self.turn[which] @ np.linalg.solve(inertia[which], momentum))[:, :, 0]
+    def split_into(self, density: Values, moments: PolyhedronMoments, parent: Ints) -> Bodies:
+        """Return fragments (m,) that move as their parent body (m,) did at their centres.
+
+        v_i = v + w x r_i, w_i = w (B07, section 7).
+        """
+        fragments = Bodies.at_rest(density, moments)
+        position = self.to_current(moments.centre, parent)
+        velocity, spin = self.velocity_at(position, parent), self.spin[parent]
+        return replace(fragments, position=position, rotation=self.rotation[parent], velocity=velocity, spin=spin)
+
+    def with_shapes(self, moments: PolyhedronMoments, changed: Ints) -> Bodies:
+        """Return the bodies after those `changed` (k,) were given the shapes of `moments`.
+
+        Mass, position of the centre, momentum and angular momentum stay as they are.
+        """
+        centre, inertia, spin = (np.array(values) for values in (self.centre, self.inertia, self.spin))
+        transposed = np.swapaxes(self.rotation[changed], 1, 2)
+        momentum = inertia[changed] @ (transposed @ spin[changed, :, None])
+        centre[changed] = moments.centre[changed]
+        density = self.mass[changed] / moments.volume[changed]
+        inertia[changed] = density[:, None, None] * moments.inertia[changed]
+        spin[changed] = (self.rotation[changed] @ np.linalg.solve(inertia[changed], momentum))[:, :, 0]
         return replace(self, centre=centre, inertia=inertia, spin=spin)
 
-    def part(self, which: slice) -> Bodies:
-        """Some of them."""
-        return Bodies(*(each[which] for each in vars(self).values()))
+    def select(self, chosen: slice) -> Bodies:
+        """Return a contiguous part of the bodies."""
+        return Bodies(*(values[chosen] for values in vars(self).values()))
 
-    def with_more(self, others: Bodies) -> Bodies:
-        """And others after them."""
-        if not len(others):
+    def concatenate(self, following: Bodies) -> Bodies:
+        """Return these bodies and the `following` ones after them."""
+        if not len(following):
             return self
-        return Bodies(*(np.concatenate(both) for both in zip(vars(self).values(), vars(others).values(), strict=True)))
+        pairs = zip(vars(self).values(), vars(following).values(), strict=True)
+        return Bodies(*(np.concatenate(pair) for pair in pairs))
 
     @property
-    def finite(self) -> bool:
-        """Whether all numbers are finite, and so are their squares."""
-        return all(float(np.max(np.abs(values), initial=0.0)) < LARGEST for values in vars(self).values())
+    def is_finite(self) -> bool:
+        """True if all numbers are finite and so are their squares."""
+        return all(float(np.max(np.abs(values), initial=0.0)) < LIMITS.magnitude for values in vars(self).values())
 
-    # --- sums ---
+    # --- momenta and energy ---
 
     @property
-    def inertia_in_space(self) -> Values:
-        """(n, 3, 3) R I R^T, kg m^2."""
-        return np.asarray(self.turn @ self.inertia @ np.swapaxes(self.turn, 1, 2))
+    def spatial_inertia(self) -> Values:
+        """Inertia in the axes of space, R I R^T (n, 3, 3), kg m^2."""
+        return np.asarray(self.rotation @ self.inertia @ np.swapaxes(self.rotation, 1, 2))
 
     @property
     def momentum(self) -> Values:
-        """(3,) sum m v, N s."""
+        """Total momentum, sum m v (3,), N s."""
         return np.asarray(self.mass @ self.velocity)
 
     @property
     def angular_momentum(self) -> Values:
-        """(3,) sum m x x v + I w about the origin, N m s."""
-        own = np.einsum("nij,nj->i", self.inertia_in_space, self.spin)
-        return np.asarray((self.mass[:, None] * np.cross(self.place, self.velocity)).sum(axis=0) + own)
+        """Total angular momentum about the origin, sum m x x v + I w (3,), N m s."""
+        about_centres = np.einsum("nij,nj->i", self.spatial_inertia, self.spin)
+        return np.asarray((self.mass[:, None] * np.cross(self.position, self.velocity)).sum(axis=0) + about_centres)
 
     @property
-    def kinetics(self) -> Values:
-        """(n,) of each, J."""
-        turning = np.einsum("ni,nij,nj->n", self.spin, self.inertia_in_space, self.spin)
-        return np.asarray(self.mass * np.einsum("ni,ni->n", self.velocity, self.velocity) + turning) / 2
+    def kinetic_energies(self) -> Values:
+        """Kinetic energy of every body (n,), J."""
+        rotational = np.einsum("ni,nij,nj->n", self.spin, self.spatial_inertia, self.spin)
+        return np.asarray(self.mass * np.einsum("ni,ni->n", self.velocity, self.velocity) + rotational) / 2
 
     @property
-    def kinetic(self) -> float:
-        """J."""
-        turning = np.einsum("ni,nij,nj->", self.spin, self.inertia_in_space, self.spin)
-        return float(self.mass @ np.einsum("ni,ni->n", self.velocity, self.velocity) + turning) / 2
+    def kinetic_energy(self) -> float:
+        """Total kinetic energy, J."""
+        rotational = np.einsum("ni,nij,nj->", self.spin, self.spatial_inertia, self.spin)
+        return float(self.mass @ np.einsum("ni,ni->n", self.velocity, self.velocity) + rotational) / 2
 
 
-def tumbled(turn: Values, inverse: Values, momentum: Values, dt: Values) -> Values:
-    """(n, 3, 3) rotations after times dt (n,) s, from those before and angular momenta (n, 3), N m s.
+# --- motion between contacts: v' = v + dt (g + F / m), l' = l + dt M, x' = x + t v' ---
 
-    `inverse`: (n, 3, 3) of the inertia in the axes of the bodies, 1 / (kg m^2). NotConverged where one turns by more
-    than LIMIT.
+
+def fly(model: MujocoModel, bodies: Bodies, time: Values) -> Bodies:
+    """Return the bodies after times (n,), s, in which no force acts on them."""
+    momentum = apply_tensor(bodies.rotation, model.inertia, bodies.spin)
+    rotation = rotate_freely(bodies.rotation, model.inverse_inertia, momentum, time)
+    position = bodies.position + time[:, None] * bodies.velocity
+    spin = apply_tensor(rotation, model.inverse_inertia, momentum)
+    return replace(bodies, position=position, rotation=rotation, spin=spin)
+
+
+def apply_contact_forces(model: MujocoModel, bodies: Bodies, force: Values, gravity: Values, dt: float) -> Bodies:
+    """Return the bodies with the velocities that contact forces and gravity (3,) give them in dt, s.
+
+    `force`: (n, 6) forces in N and moments in N m, the moments in the axes of the bodies. Positions do not change.
     """
-    given = [np.ascontiguousarray(each) for each in (turn, inverse, momentum, dt)]
-    after: Values = np.empty(turn.shape)
-    how = c_int64(ROUNDS), c_double(SAME), c_double(PART), c_double(LIMIT)
-    if load_library(SOURCE).tumbled(c_int64(len(turn)), *given, *how, after):
+    motion = bodies.velocity, bodies.spin
+    velocity, spin = accelerate(
+        bodies.rotation, model.inertia, model.inverse_inertia, model.mass, motion, force, gravity, dt,
+        LIMITS.contact_spin / dt,
+    )  # fmt: skip
+    return replace(bodies, velocity=velocity, spin=spin)
+
+
+def forces_for_velocity_changes(model: MujocoModel, bodies: Bodies, change: Values, dt: float) -> Values:
+    """Return forces and moments (n, 6), moments in the axes of the bodies, that change velocities and spins.
+
+    `change`: (n, 6) m/s and rad/s, in the axes of space, within dt, s.
+    """
+    spin_change = np.einsum("nji,nj->ni", bodies.rotation, change[:, 3:])
+    moment = np.einsum("nij,nj->ni", model.inertia, spin_change)
+    return np.concatenate([model.mass[:, None] * change[:, :3], moment], axis=1) / dt
+
+
+def velocities_of_all(bodies: Bodies, obstacle_velocity: Values) -> tuple[Values, Values]:
+    """Return velocities and spins of the bodies and then of prescribed obstacles, (n + m, 3) each.
+
+    `obstacle_velocity`: (m, 3) m/s; these obstacles do not rotate.
+    """
+    velocity = np.concatenate([bodies.velocity, obstacle_velocity])
+    return velocity, np.concatenate([bodies.spin, 0 * obstacle_velocity])
+
+
+# --- compiled kernels ---
+
+
+def rotate_freely(rotation: Values, inverse_inertia: Values, momentum: Values, time: Values) -> Values:
+    """Return rotations (n, 3, 3) after times (n,), s, from rotations before and angular momenta (n, 3), N m s.
+
+    `inverse_inertia`: (n, 3, 3) in the axes of the bodies, 1 / (kg m^2). Raises NotConverged if a body rotates by more
+    than `LIMITS.step_angle`.
+    """
+    arrays = [np.ascontiguousarray(values) for values in (rotation, inverse_inertia, momentum, time)]
+    after: Values = np.empty(rotation.shape)
+    accuracy = c_int64(LIMITS.midpoint_iterations), c_double(LIMITS.rotation_tolerance)
+    angles = c_double(LIMITS.substep_angle), c_double(LIMITS.step_angle)
+    if load_library(SOURCE).rotate_freely(c_int64(len(rotation)), *arrays, *accuracy, *angles, after):
         raise NotConverged(
-            f"A body turns by more than {LIMIT:g} rad in a step: speeds and spins are too high for time.step"
+            f"A body turns by more than {LIMITS.step_angle:g} rad in a step: speeds and spins are too high for "
+            "time.step"
         )
     return after
 
 
-def rotated(turn: Values, tensor: Values, vector: Values) -> Values:
-    """(n, 3) R T R^T v of tensors in the axes of bodies (n, 3, 3), inertia or its inverse, and vectors in space (n, 3):
-    spins, or angular momenta."""
-    given, result = [np.ascontiguousarray(each) for each in (turn, tensor, vector)], np.empty(vector.shape)
-    load_library(SOURCE).rotations(c_int64(len(turn)), *given, result)
+def apply_tensor(rotation: Values, tensor: Values, vector: Values) -> Values:
+    """Return R T R^T v (n, 3) of tensors T (n, 3, 3) in the axes of bodies and vectors v (n, 3) in those of space.
+
+    T is the inertia and v a spin, or T is the inverse inertia and v an angular momentum.
+    """
+    arrays, result = [np.ascontiguousarray(values) for values in (rotation, tensor, vector)], np.empty(vector.shape)
+    load_library(SOURCE).apply_tensor(c_int64(len(rotation)), *arrays, result)
     return result
 
 
-def driven(
-    turn: Values, inertia: Values, inverse: Values, mass: Values, motion: tuple[Values, Values], force: Values,
-    gravity: Values, dt: float, most: float,
+def accelerate(
+    rotation: Values, inertia: Values, inverse_inertia: Values, mass: Values, motion: tuple[Values, Values],
+    force: Values, gravity: Values, dt: float, max_spin: float,
 ) -> tuple[Values, Values]:  # fmt: skip
-    """(n, 3) velocities and (n, 3) spins after dt, s, from those before, `motion`, of bodies with masses (n,) that turn
-    where they are by `gravity` (3,) and forces and moments (n, 6), these in their own axes; no moment sets one spinning
-    by more than `most`, rad/s."""
-    arrays = (turn, inertia, inverse, mass, *motion, force, gravity)
-    given, after = [np.ascontiguousarray(each, float) for each in arrays], np.empty((len(mass), 6))
-    load_library(SOURCE).driven(c_int64(len(mass)), *given, c_double(dt), c_double(most), after)
+    """Return velocities and spins (n, 3) after dt, s, at the present positions.
+
+    Args:
+        rotation: (n, 3, 3).
+        inertia: (n, 3, 3) in the axes of the bodies, kg m^2.
+        inverse_inertia: (n, 3, 3) likewise.
+        mass: (n,) kg.
+        motion: velocities and spins (n, 3) before.
+        force: (n, 6) forces and moments, the moments in the axes of the bodies, N and N m.
+        gravity: (3,) m/s^2.
+        dt: s.
+        max_spin: rad/s that moments may bring a body to.
+    """
+    values = (rotation, inertia, inverse_inertia, mass, *motion, force, gravity)
+    arrays, after = [np.ascontiguousarray(value, float) for value in values], np.empty((len(mass), 6))
+    load_library(SOURCE).accelerate(c_int64(len(mass)), *arrays, c_double(dt), c_double(max_spin), after)
     return np.ascontiguousarray(after[:, :3]), np.ascontiguousarray(after[:, 3:])
 
 
-def orientation(turn: Values) -> Values:
-    """(n, 4) of rotations (n, 3, 3) quaternions, the scalar first."""
-    turn, quat = np.ascontiguousarray(turn), np.empty((len(turn), 4))
-    load_library(SOURCE).orientations(c_int64(len(turn)), turn, quat)
-    return quat
+def quaternions(rotation: Values) -> Values:
+    """Return unit quaternions (n, 4), scalar first, of rotations (n, 3, 3)."""
+    rotation, result = np.ascontiguousarray(rotation), np.empty((len(rotation), 4))
+    load_library(SOURCE).quaternions(c_int64(len(rotation)), rotation, result)
+    return result

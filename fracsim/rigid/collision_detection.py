@@ -1,8 +1,9 @@
-"""Contacts that MuJoCo finds between hulls and shapes, and those of hulls with planes."""
+"""Contacts that may close in a step: bounds of motion, MuJoCo's collision detection, and contacts with planes."""
 
 from __future__ import annotations
 
-from copy import copy
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import mujoco
@@ -10,125 +11,191 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import NotConverged
-from .bodies import Bodies, orientation
+from .bodies import Bodies, fly, quaternions
 from .contact_points import Contacts
-from .core_contact import Cores
-from .fragment_overlap import Parting
-from .free_flight import flown
-from .mujoco_model import Looked, Model
-from .swept_bounds import Course
-from .worker_ranks import Helper
+from .core_contact import CoreContact
+from .fragment_overlap import AdmittedOverlaps
+from .mujoco_model import CheckedCorners, ContactParameters, MujocoModel
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-FEW = 100  # things that look for others: fewer are not worth a second thread
-FIRST = 0.4  # of these: what they meet is half of all that is met, or so
+# A body that moves farther than this multiple of its bound is searched for contacts again.
+EXCESS_REACH_RATIO = 1.5
 
 
-class _Search:
-    """MuJoCo's, in a model that nobody else looks in meanwhile."""
+# --- bounds of motion ---
 
-    def __init__(self, model: Model, made: Any) -> None:
-        self._made, self._data, n = made, mujoco.MjData(made), len(model.mass)
-        self._thing, self._driven = model.thing, n + model.driven
-        body = np.concatenate([[-1], np.arange(n), self._driven])  # things; of what stands still the last flag
-        kinds = [(made.geom_contype, self._thing, False), (made.body_contype, body, False),
-                 (made.geom_conaffinity, self._thing, True), (made.body_conaffinity, body, True)]  # fmt: skip
-        self._kinds = [(kind, kind.copy(), of, hides) for kind, of, hides in kinds]
 
-    def __call__(self, places: Values, quat: Values, margin: Values, looks: Flags, hidden: Flags) -> list[Any]:
-        """Geoms (k, 2), points, axes, distances and friction of what things (things,) at some places find within the
-        sum of their margins, m. Of two things one `looks` (things + 1,), and neither is `hidden`; the last margin and
-        flags are those of all that stands still."""
-        made, data, n = self._made, self._data, len(quat)
-        made.body_pos[1 : n + 1], made.body_pos[n + 1 :] = places[:n], places[self._driven]
-        made.body_quat[1 : n + 1] = quat
-        made.geom_gap[:] = margin[self._thing]
-        made.body_margin[:] = np.concatenate([margin[-1:], margin[:n], margin[self._driven]])
-        for kind, usual, of, hides in self._kinds:
-            kind[:] = np.where((~hidden if hides else looks)[of], usual, 0)
-        mujoco.mj_kinematics(made, data)
-        mujoco.mj_collision(made, data)
+@dataclass(frozen=True)
+class MotionBounds:
+    """Bounds of the distance that any point of a body moves in a step.
+
+    Attributes:
+        obstacle_velocity: (m, 3) of prescribed obstacles, m/s.
+        common_velocity: (3,) that most bodies share, m/s.
+        reach: two arrays (n,), m: bounds relative to the common velocity, and relative to space.
+    """
+
+    obstacle_velocity: Values
+    common_velocity: Values
+    reach: Sequence[Values]
+
+    def obstacle_reach(self, dt: float) -> list[Values]:
+        """Return how far obstacles move in dt, s: (m,) relative to the common velocity, and relative to space, m."""
+        return [dt * np.linalg.norm(self.obstacle_velocity - frame, axis=1) for frame in (self.common_velocity, 0.0)]
+
+    def exceeded_by(self, present: MotionBounds) -> Flags:
+        """Return (n,) flags of bodies whose `present` bounds are much larger than these."""
+        pairs = zip(present.reach, self.reach, strict=True)
+        return np.any([now > EXCESS_REACH_RATIO * before for now, before in pairs], axis=0)
+
+    def widen(self, exceeded: Flags, present: MotionBounds) -> MotionBounds:
+        """Return bounds that also cover the `present` motion of the bodies flagged in `exceeded` (n,)."""
+        pairs = zip(self.reach, present.reach, strict=True)
+        return replace(self, reach=[np.where(exceeded, np.maximum(*pair), pair[0]) for pair in pairs])
+
+
+def no_motion(obstacles: int, bodies: int) -> MotionBounds:
+    """Return the bounds of bodies and obstacles, numbers of which are given, that do not move."""
+    return MotionBounds(np.zeros((obstacles, 3)), np.zeros(3), 2 * [np.zeros(bodies)])
+
+
+def bound_motion(
+    model: MujocoModel, parameters: ContactParameters, bodies: Bodies, obstacle_velocity: Values,
+    common_velocity: Values | None = None,
+) -> MotionBounds:  # fmt: skip
+    """Return the bounds of the motion of bodies in a step.
+
+    `obstacle_velocity`: (m, 3) m/s; `common_velocity`: (3,) m/s; None: the median of all velocities.
+    """
+    if common_velocity is None:
+        common_velocity = np.median(np.concatenate([bodies.velocity, obstacle_velocity]), axis=0)
+    reach = [_reach(model, parameters, bodies, frame) for frame in (common_velocity, 0.0)]
+    return MotionBounds(obstacle_velocity, common_velocity, reach)
+
+
+def _reach(model: MujocoModel, parameters: ContactParameters, bodies: Bodies, frame: Values | float) -> Values:
+    """Return bounds (n,), m, of the distance that points move in a step, relative to a `frame` velocity, m/s."""
+    rotational = model.extent * np.linalg.norm(bodies.spin, axis=1)
+    speed = np.linalg.norm(bodies.velocity - frame, axis=1) + rotational
+    # two bodies approach by no more than the sum of their bounds
+    return np.asarray(parameters.time_step * (speed + parameters.impact_threshold))
+
+
+# --- search ---
+
+
+class _MujocoSearch:
+    """MuJoCo's collision detection in a compiled model."""
+
+    def __init__(self, model: MujocoModel) -> None:
+        compiled, n = model.compiled, len(model.mass)
+        self._compiled, self._data = compiled, mujoco.MjData(compiled)
+        self._body_of_geom, self._driven = model.body_of_geom, n + model.driven
+        # MuJoCo's bodies: the world, bodies, driven obstacles; the last flag is that of all fixed obstacles
+        body = np.concatenate([[-1], np.arange(n), self._driven])
+        masks = [(compiled.geom_contype, self._body_of_geom), (compiled.body_contype, body)]
+        self._masks = [(mask, mask.copy(), numbers) for mask, numbers in masks]
+
+    def __call__(self, centres: Values, quat: Values, margin: Values, searching: Flags) -> list[Any]:
+        """Return geoms (k, 2), points, axes, gaps and friction of pairs of which at least one is `searching`.
+
+        Args:
+            centres: (n + m, 3) of bodies and obstacles, m.
+            quat: (n, 4) of bodies.
+            margin: (n + m + 1,) distances, m; pairs within the sum of their margins are found.
+            searching: (n + m + 1,) flags. The last margin and flag are those of all fixed obstacles.
+        """
+        compiled, data, n = self._compiled, self._data, len(quat)
+        compiled.body_pos[1 : n + 1], compiled.body_pos[n + 1 :] = centres[:n], centres[self._driven]
+        compiled.body_quat[1 : n + 1] = quat
+        compiled.geom_gap[:] = margin[self._body_of_geom]
+        compiled.body_margin[:] = np.concatenate([margin[-1:], margin[:n], margin[self._driven]])
+        for mask, initial, numbers in self._masks:
+            mask[:] = np.where(searching[numbers], initial, 0)
+        mujoco.mj_kinematics(compiled, data)
+        mujoco.mj_collision(compiled, data)
         if data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL].number:
             raise NotConverged(
                 f"{data.ncon} contacts are more than the rigid engine has room for; a smaller time.step or a larger "
                 "mesh.h has fewer"
             )
-        met = data.contact
-        return [met.geom.reshape(-1, 2).copy(), met.pos.reshape(-1, 3).copy(), met.frame.reshape(-1, 3, 3).copy(),
-                met.dist.copy(), met.friction.reshape(-1, 5)[:, 0].copy()]  # fmt: skip
+        contact = data.contact
+        return [contact.geom.reshape(-1, 2).copy(), contact.pos.reshape(-1, 3).copy(),
+                contact.frame.reshape(-1, 3, 3).copy(), contact.dist.copy(),
+                contact.friction.reshape(-1, 5)[:, 0].copy()]  # fmt: skip
 
 
-class Finder:
-    """Of the contacts of a model's bodies, and of what stands in their way."""
+class CollisionDetector:
+    """Search for contacts between the bodies of a model, and of bodies with obstacles."""
 
-    def __init__(
-        self, model: Model, helper: Helper | None = None, cores: Cores | None = None, friction: float = 0.0
-    ) -> None:
-        """`helper`: a second thread, with which the same is found; `cores` of the first bodies, which have a
-        `friction` there."""
-        self._model, self._count, self._helper = model, len(model.mass), helper
-        self._cores, self._friction = cores, friction
-        self._searches = [_Search(model, model.made)]
+    def __init__(self, model: MujocoModel, cores: CoreContact | None = None, friction: float = 0.0) -> None:
+        """Keep the model; `cores`: those of the first bodies, with the coefficient of `friction` there."""
+        self._model, self._cores, self._friction = model, cores, friction
+        self._search = _MujocoSearch(model)
 
     def __call__(
-        self, bodies: Bodies, ways: Values, course: Course, step: float, looked: Looked, only: Flags | None = None,
-        parting: Parting | None = None,
+        self, bodies: Bodies, obstacle_points: Values, bounds: MotionBounds, dt: float, checked: CheckedCorners,
+        chosen: Flags | None = None, overlaps: AdmittedOverlaps | None = None,
     ) -> Contacts:  # fmt: skip
-        """What comes together in a step, s, of a course, what stands being at `ways` (stands, 3), m; `looked`: at
-        corners over planes in it; `only`: (n,) of some bodies, what others have with one another and with what stands
-        is not looked for; `parting`: of those that keep out of one another's cores (None: none does)."""
-        model, places = self._model, np.concatenate([bodies.place, ways])
-        reach, slide = course.reach, course.slide(step)
-        margin = np.concatenate([reach[0], slide[0], [slide[0].max(initial=0.0)]])
-        looks = np.ones(len(margin), bool) if only is None else np.append(only, np.zeros(len(ways) + 1, bool))
-        met, *where = self._searched(places, orientation(bodies.turn), margin, looks)
-        geoms, (point, axes, gap, friction) = met.astype(np.int64), where
-        every = Contacts.found(geoms, model.thing[geoms], point, axes, gap, friction, places)
-        for each in self._of_planes(bodies, ways, reach[1], slide[1], step, looked, only):
-            every = every.and_more(each)
-        if self._cores is None or parting is None:
-            return every
-        pairs = parting.pairs if only is None else parting.pairs[only[parting.pairs].any(axis=1)]
-        return every.and_more(self._in_cores(self._cores, pairs, bodies, places, step)) if len(pairs) else every
+        """Return the contacts that may close in a step.
 
-    def _in_cores(self, cores: Cores, pairs: Ints, bodies: Bodies, places: Values, step: float) -> Contacts:
-        """Contacts of pairs (k, 2) of pieces with the cores of one another: of no geoms."""
-        later = flown(self._model, bodies, np.full(len(bodies), step))
-        things, point, axes, gap = cores(pairs, bodies, later, step)
+        Args:
+            bodies: as the step begins.
+            obstacle_points: (m, 3) reference points of prescribed obstacles, m.
+            bounds: of the motion in the step.
+            dt: s.
+            checked: corners above planes that were checked in this step; updated.
+            chosen: (n,) bodies whose contacts are searched for; None: all.
+            overlaps: of fragments, which keep out of the cores of one another; None: there are none.
+        """
+        model, centres = self._model, np.concatenate([bodies.position, obstacle_points])
+        reach, obstacle_reach = bounds.reach, bounds.obstacle_reach(dt)
+        margin = np.concatenate([reach[0], obstacle_reach[0], [obstacle_reach[0].max(initial=0.0)]])
+        searching: Flags = np.ones(len(margin), bool)
+        if chosen is not None:
+            searching = np.append(chosen, np.zeros(len(obstacle_points) + 1, bool))
+        geoms, point, axes, gap, friction = self._search(centres, quaternions(bodies.rotation), margin, searching)
+        geoms = geoms.astype(np.int64)
+        contacts = Contacts.with_arms(geoms, model.body_of_geom[geoms], point, axes, gap, friction, centres)
+        for of_plane in self._find_plane_contacts(
+            bodies, obstacle_points, reach[1], obstacle_reach[1], dt, checked, chosen
+        ):
+            contacts = contacts.concatenate(of_plane)
+        if self._cores is None or overlaps is None:
+            return contacts
+        pairs = overlaps.body_pairs
+        if chosen is not None:
+            pairs = pairs[chosen[pairs].any(axis=1)]
+        if not len(pairs):
+            return contacts
+        return contacts.concatenate(self._find_core_contacts(self._cores, pairs, bodies, centres, dt))
+
+    def _find_core_contacts(
+        self, cores: CoreContact, pairs: Ints, bodies: Bodies, centres: Values, dt: float
+    ) -> Contacts:
+        """Return contacts of pairs (k, 2) of fragments with the cores of one another; they belong to no geoms."""
+        end = fly(self._model, bodies, np.full(len(bodies), dt))
+        numbers, point, axes, gap = cores(pairs, bodies, end, dt)
         friction = np.full(len(gap), self._friction)
-        return Contacts.found(np.full_like(things, -1), things, point, axes, gap, friction, places)
+        return Contacts.with_arms(np.full_like(numbers, -1), numbers, point, axes, gap, friction, centres)
 
-    def _searched(self, places: Values, quat: Values, margin: Values, looks: Flags) -> list[Any]:
-        """What things find that look for others, by the numbers of their bodies: those of a first share of them, and,
-        with a helper at once, those of the others among themselves."""
-        helper, hidden, mine = self._helper, np.zeros(len(looks), bool), np.flatnonzero(looks[: self._count])
-        if helper is None or len(mine) < FEW:
-            return self._searches[0](places, quat, margin, looks, hidden)
-        if len(self._searches) == 1:
-            self._searches.append(_Search(self._model, copy(self._model.made)))
-        first, second = self._searches
-        hidden[mine[: int(FIRST * len(mine))]] = True
-        parts = helper.both(
-            lambda: first(places, quat, margin, looks & hidden, np.zeros_like(hidden)),
-            lambda: second(places, quat, margin, looks & ~hidden, hidden),
-        )
-        found = [np.concatenate(both) for both in zip(*parts, strict=True)]
-        of = np.sort(self._model.made.geom_bodyid[found[0]].astype(np.int64), axis=1)
-        order = np.argsort(of[:, 0] * self._model.made.nbody + of[:, 1], kind="stable")
-        return [each[order] for each in found]
-
-    def _of_planes(
-        self, bodies: Bodies, ways: Values, reach: Values, speeds: Values, step: float, looked: Looked,
-        only: Flags | None,
+    def _find_plane_contacts(
+        self, bodies: Bodies, obstacle_points: Values, reach: Values, obstacle_reach: Values, dt: float,
+        checked: CheckedCorners, chosen: Flags | None,
     ) -> list[Contacts]:  # fmt: skip
-        """Contacts of hulls with planes: the first thing is the plane."""
-        planes, model, places, found = self._model.planes, self._model, np.concatenate([bodies.place, ways]), []
-        for number, parts, gaps, points in planes.near(bodies, ways, reach, speeds, step, looked, only):
-            geoms = np.stack([np.full(len(parts), planes.geom[number]), parts], axis=1)
-            axes = np.tile(planes.across[number][:, [2, 0, 1]].T, (len(parts), 1, 1))
-            friction = np.full(len(parts), planes.friction[number])
-            found.append(Contacts.found(geoms, model.thing[geoms], points, axes, gaps, friction, places))
-        return found
+        """Return contacts of convex hulls with planes; the plane is the first body of each."""
+        planes, model = self._model.planes, self._model
+        centres, result = np.concatenate([bodies.position, obstacle_points]), []
+        for number, corner_geoms, gaps, points in planes.find_contacts(
+            bodies, obstacle_points, reach, obstacle_reach, dt, checked, chosen
+        ):
+            geoms = np.stack([np.full(len(corner_geoms), planes.plane_geom[number]), corner_geoms], axis=1)
+            # the normal of the plane comes first
+            axes = np.tile(planes.frames[number][:, [2, 0, 1]].T, (len(corner_geoms), 1, 1))
+            friction = np.full(len(corner_geoms), planes.friction[number])
+            pairs = model.body_of_geom[geoms]
+            result.append(Contacts.with_arms(geoms, pairs, points, axes, gaps, friction, centres))
+        return result

@@ -1,16 +1,10 @@
-"""How contacts act in a step: velocities after it, in one solve with all contacts (J. J. Moreau 1988, time stepping).
+"""Contact law of a time step: unilateral constraints on velocities at all contacts (J. J. Moreau 1988).
 
-    0 <= force  _|_  speed after + r / dt >= 0
+    0 <= force  _|_  separation speed after the step + r / dt >= 0
 
-along the normal, speeds of parting; with r the distance g still between two things, so that they come no nearer than
-touching. What meets fast, c > c_0, within the step, c dt > g, bounces or stops at once, r = -e c dt, and until it
-meets, after the share g / (c dt) of the step, it flies as if there were nothing: it ends where it touches (to c_0 dt,
-which is not waited for). So a blow gives its whole impulse in the step that it falls in. What lies in one another even
-so (turns are not linear) comes apart no faster than c_0 / 4, which hardly any energy comes of.
-
-Where a step is taken apart (rigid.impact_sequence) what else it would meet in it waits, for it may never come there: it
-goes on with what the blow left it, and what it still meets then is the next event, of a few. Things that touch are at
-one time in every event; what would meet after the last one comes to touch as the step ends, and meets in the next.
+r is the distance that the two bodies may still approach. In resting contact r is the gap. An impact is faster than
+c_0 and closes the gap within the step, c dt > g; it has r = -e c dt, and the body flies freely for the share g / (c dt)
+of the step before. In a sequence of impacts (impact_sequence) later impacts are postponed to the next event.
 
 Equations: docs/theory.md#motion-and-contact-of-rigid-bodies.
 """
@@ -28,91 +22,158 @@ Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-RECOVERED = 0.2  # of what things lie in one another by, in a step
-SLOWLY = 0.25  # c_0: what is jammed is driven apart with the force that jams it, which is work
-SOON = 0.01  # of a step: what meets within it meets now
+
+@dataclass(frozen=True)
+class ContactLawSettings:
+    """Numbers of the contact law.
+
+    Attributes:
+        overlap_recovery: share of an overlap that is removed in a step.
+        recovery_speed: largest speed of separation of overlapping bodies, in units of c_0. The forces that jam bodies
+            do work as they separate, so that a faster recovery would add energy.
+        simultaneity: share of a step; impacts within it are simultaneous.
+    """
+
+    overlap_recovery: float = 0.2
+    recovery_speed: float = 0.25
+    simultaneity: float = 0.01
+
+
+LAW = ContactLawSettings()
 
 
 @dataclass(frozen=True)
-class Meetings:
-    """Of k contacts.
+class ContactConstraints:
+    """Constraints at contacts (k) in a step or an event of it.
 
     Attributes:
-        gap: (k,) distances, m.    aim: (k,) r, m.    near: (k,) whether they may touch in the step.
-        closing: (k,) m/s of what meets fast, 0 of all others.    when: (k,) share of the step, of these.
-        waits: (k,) of these, what does not meet where things are now, where a step is taken apart.
-        rest: (k,) share of the step that is left.
+        gap: (k,) m.
+        allowed_approach: (k,) r, m.
+        may_touch: (k,) whether the contact may close in the step.
+        impact_speed: (k,) normal speed of impacts, m/s; 0 for other contacts.
+        impact_fraction: (k,) share of the step after which an impact happens.
+        postponed: (k,) impacts that happen in a later event.
+        remaining_fraction: (k,) share of the step that is left, 1 in a step with one event.
     """
 
     gap: Values
-    aim: Values
-    near: Flags
-    closing: Values
-    when: Values
-    waits: Flags
-    rest: Values | float = 1.0
+    allowed_approach: Values
+    may_touch: Flags
+    impact_speed: Values
+    impact_fraction: Values
+    postponed: Flags
+    remaining_fraction: Values | float = 1.0
 
 
-def meetings(gap: Values, closing: Values, dt: float, fast: float, restitution: float) -> Meetings:
-    """Of contacts at distances `gap` (k,) m whose things come together at `closing` (k,) m/s; `fast`: c_0, m/s."""
-    hits = (closing > fast) & (gap < closing * dt)
-    aim = np.where(hits, -restitution * closing * dt, _nearer(gap, gap, dt, fast))
-    share = np.divide(gap, closing * dt, out=np.zeros_like(gap), where=hits & (gap > fast * dt))
-    near, none = gap < (closing + fast) * dt, np.zeros(len(gap), bool)
-    return Meetings(gap, aim, near, np.where(hits, closing, 0.0), np.clip(share, 0.0, 1.0), none)
+def make_constraints(
+    gap: Values, approach_speed: Values, dt: float, threshold: float, restitution: float
+) -> ContactConstraints:
+    """Return the constraints of a step with a single event.
+
+    Args:
+        gap: (k,) m.
+        approach_speed: (k,) m/s.
+        dt: s.
+        threshold: c_0, m/s.
+        restitution: coefficient of restitution e, 0 to 1.
+    """
+    impacts = (approach_speed > threshold) & (gap < approach_speed * dt)
+    resting = _approach_without_impact(gap, gap, dt, threshold)
+    allowed = np.where(impacts, -restitution * approach_speed * dt, resting)
+    share = np.divide(gap, approach_speed * dt, out=np.zeros_like(gap), where=impacts & (gap > threshold * dt))
+    may_touch, none = gap < (approach_speed + threshold) * dt, np.zeros(len(gap), bool)
+    impact_speed = np.where(impacts, approach_speed, 0.0)
+    return ContactConstraints(gap, allowed, may_touch, impact_speed, np.clip(share, 0.0, 1.0), none)
 
 
-def meetings_apart(
-    gap: Values, closing: Values, dt: float, fast: float, restitution: float, come: Values, rest: Values, strikes: Flags
-) -> Meetings:
-    """Likewise in a step that is taken apart, of which a `rest` (k,) is left, and in which they have come together by
-    `come` (k,) m so far, at that speed; of what `strikes` (k,) that waits which does not meet yet. In the last event it
-    comes to touch as the step ends."""
-    hits = strikes & (gap + come < closing * dt)
-    waits = hits & later(gap, closing, dt, fast)
-    aim = np.where(hits & ~waits, -restitution * closing * dt, _nearer(gap, gap / rest, dt, fast))
-    share = np.divide(gap + come, closing * dt, out=np.zeros_like(gap), where=hits & (gap > fast * dt))
-    near = gap < (closing * rest + fast) * dt
-    return Meetings(gap, aim, near, np.where(hits, closing, 0.0), np.clip(share, 0.0, 1.0), waits, rest)
+def make_event_constraints(
+    gap: Values, approach_speed: Values, dt: float, threshold: float, restitution: float, approach: Values,
+    remaining: Values, impact_candidates: Flags,
+) -> ContactConstraints:  # fmt: skip
+    """Return the constraints of one event in a sequence.
+
+    In the last event contacts that would be postponed close just as the step ends.
+
+    Args:
+        gap: (k,) m.
+        approach_speed: (k,) m/s.
+        dt: s.
+        threshold: c_0, m/s.
+        restitution: coefficient of restitution e, 0 to 1.
+        approach: (k,) distance that bodies would have approached since the step began, at their present speed, m.
+        remaining: (k,) share of the step that is left.
+        impact_candidates: (k,) contacts in which an impact counts.
+    """
+    impacts = impact_candidates & (gap + approach < approach_speed * dt)
+    postponed = impacts & impacts_later(gap, approach_speed, dt, threshold)
+    resting = _approach_without_impact(gap, gap / remaining, dt, threshold)
+    allowed = np.where(impacts & ~postponed, -restitution * approach_speed * dt, resting)
+    far = impacts & (gap > threshold * dt)
+    share = np.divide(gap + approach, approach_speed * dt, out=np.zeros_like(gap), where=far)
+    may_touch, impact_speed = (
+        gap < (approach_speed * remaining + threshold) * dt,
+        np.where(impacts, approach_speed, 0.0),
+    )
+    return ContactConstraints(
+        gap, allowed, may_touch, impact_speed, np.clip(share, 0.0, 1.0), postponed, remaining
+    )  # fmt: skip
 
 
-def _nearer(gap: Values, room: Values, dt: float, fast: float) -> Values:
-    """(k,) r of what does not strike, at distances `gap` (k,) m with `room` (k,) m to come nearer by."""
-    return np.where(gap < 0, np.maximum(RECOVERED * gap, -SLOWLY * fast * dt), room)
+def _approach_without_impact(gap: Values, room: Values, dt: float, threshold: float) -> Values:
+    """Return r (k,), m: the `room` (k,), m, of open contacts, and a negative distance for overlapping bodies."""
+    recovery = np.maximum(LAW.overlap_recovery * gap, -LAW.recovery_speed * threshold * dt)
+    return np.where(gap < 0, recovery, room)
 
 
-def later(gap: Values, closing: Values, dt: float, fast: float) -> Flags:
-    """(k,) what comes together fast, and does not touch yet."""
-    return np.asarray((closing > fast) & (gap > (fast + SOON * closing) * dt))
+def impacts_later(gap: Values, approach_speed: Values, dt: float, threshold: float) -> Flags:
+    """Return (k,) flags of bodies that approach faster than c_0 = `threshold` and do not touch yet."""
+    return np.asarray((approach_speed > threshold) & (gap > (threshold + LAW.simultaneity * approach_speed) * dt))
 
 
-def flown(meeting: Meetings, things: Ints, count: int) -> Values:
-    """(count,) share of the step that bodies fly for before something strikes them, 0 of what nothing does; `things`:
-    (k, 2) of the contacts, bodies below `count`."""
-    rows = np.flatnonzero(meeting.closing)
-    share = _earliest(np.minimum(things[rows], count), meeting.when[rows], count)[:count]
+# --- free flight before impacts ---
+
+
+def flight_fractions(constraints: ContactConstraints, pairs: Ints, count: int) -> Values:
+    """Return the shares (count,) of the step that bodies fly before their first impact; 0 for bodies without one.
+
+    `pairs`: (k, 2) bodies of the contacts, obstacles from `count` on.
+    """
+    rows = np.flatnonzero(constraints.impact_speed)
+    share = _earliest(np.minimum(pairs[rows], count), constraints.impact_fraction[rows], count)[:count]
     return np.where(np.isfinite(share), share, 0.0)
 
 
-def flown_together(meeting: Meetings, things: Ints, begun: Values, near: float) -> Values:
-    """(n,) likewise of bodies that have flown for `begun` (n,). What is within `near`, m, flies as long, or things
-    would be held against one another where they are at different times; nothing flies to what something else strikes
-    before."""
-    count, rows = len(begun), np.flatnonzero(meeting.closing)
-    links = things[meeting.gap < near]
+def joint_flight_fractions(constraints: ContactConstraints, pairs: Ints, elapsed: Values, near: float) -> Values:
+    """Return the shares (n,) of the step at which bodies of a sequence are impacted next.
+
+    Bodies with gaps below `near`, m, fly equally long, since contact forces between bodies at different times would be
+    meaningless. No body flies beyond an impact of another one that comes before.
+
+    Args:
+        constraints: of the event.
+        pairs: (k, 2) bodies of the contacts.
+        elapsed: (n,) shares of the step that the bodies have flown.
+        near: m.
+    """
+    count, rows = len(elapsed), np.flatnonzero(constraints.impact_speed)
+    links = pairs[constraints.gap < near]
     links = links[np.maximum(*links.T) < count]
-    joined = csr_array((np.ones(len(links)), links.T), shape=(count, count))
-    of = np.append(connected_components(joined, directed=False)[1], count)
-    groups, when = of[np.minimum(things[rows], count)], meeting.when[rows]
-    share = _earliest(groups, when, count)
-    now = when <= share[groups].min(axis=1) + SOON
-    first = _earliest(groups[now], when[now], count)[of[:-1]]
-    return np.where(np.isfinite(first), np.maximum(first, begun), begun)
+    graph = csr_array((np.ones(len(links)), links.T), shape=(count, count))
+    group_of_body = np.append(connected_components(graph, directed=False)[1], count)
+    groups, fraction = group_of_body[np.minimum(pairs[rows], count)], constraints.impact_fraction[rows]
+    earliest = _earliest(groups, fraction, count)
+    # an impact happens now only if it is the first one of both groups
+    now = fraction <= earliest[groups].min(axis=1) + LAW.simultaneity
+    first = _earliest(groups[now], fraction[now], count)[group_of_body[:-1]]
+    return np.where(np.isfinite(first), np.maximum(first, elapsed), elapsed)
 
 
-def _earliest(groups: Ints, when: Values, count: int) -> Values:
-    """(count + 1,) when the first of pairs (k, 2) meet that things are in; infinite of none, and of the last."""
+def _earliest(groups: Ints, fraction: Values, count: int) -> Values:
+    """Return the least impact fraction (count + 1,) of the pairs (k, 2) that a group is in; infinite without any.
+
+    The last entry is that of obstacles, which is infinite.
+    """
     first: Values = np.full(count + 1, np.inf)
-    np.minimum.at(first, groups, np.repeat(when[:, None], 2, axis=1))
+    np.minimum.at(first, groups, np.repeat(fraction[:, None], 2, axis=1))
     first[count] = np.inf
     return first

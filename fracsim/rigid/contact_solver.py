@@ -1,36 +1,15 @@
-"""What contacts of an event give: few of them by Newton's method, a crowd by projected gradients.
+"""Impulses of all contacts of an event, with Coulomb friction.
 
-What does not come near enough to touch is left out, and looked at again with the velocities that come of it.
+Up to a few hundred contacts are solved by MuJoCo: a convex problem with elliptic friction cones, by Newton's method.
+More contacts are solved by accelerated projected gradients on
 
-Forces of contacts by MuJoCo's solver: a convex problem with elliptic friction cones, by Newton's method.
+    K_mu  3  p  _|_  u + (r / dt + mu |u_t|) n,   u = u_0 + J M^-1 J^T p,   K_mu = {|p_t| <= mu p_n}
 
-Its model has bodies without shapes; it is made where it is needed first, for the solver's start takes the inverse of
-the mass matrix for each body, which is most of what a crowd's model would cost.
+with impulses p, velocities u of the second body relative to the first after the step, u_0 without impulses, and r the
+distance that they may approach (G. De Saxce, Z.-Q. Feng 1991). The term mu |u_t| makes it Coulomb's law; without it the
+convex problem separates bodies that slip.
 
-Impulses of a crowd of contacts: Coulomb's law for all of them at once.
-
-    u = u_0 + J M^-1 J^T p,   K_mu = {|p_t| <= mu p_n},   K_mu  3  p  _|_  u + (r / dt + mu |u_t|) n
-
-with the velocities u of the second thing beside the first after the step, u_0 of them without impulses p, and r the
-distance that may be lost (G. De Saxce, Z.-Q. Feng 1991: with mu |u_t| it is Coulomb's law, without it a convex problem
-that lifts what slips). It is solved by projections onto the cones,
-
-    p  <-  P_K(q - D^-1 (u(q) + (r / dt + mu |u_t|) n)),   q = p + beta (p - p_before)
-
-with Nesterov's beta, begun anew for the contacts of a body on which p turns back (H. Mazhar et al. 2015, ACM Trans.
-Graph. 34; B. O'Donoghue, E. Candes 2015). Of a body with rows J of each contact, w = tr J M^-1 J^T,
-
-    J M^-1 J^T <= D = sum over bodies of lambda w,   lambda the largest eigenvalue of M^-1 sum J^T J / w   (6, 6)
-
-at most as many as it has contacts (R. Tonge et al. 2012) and mostly half of that: no step is too long, whatever bodies
-weigh. lambda^64 is taken for the trace of the 64th power, at most 6 times as much, which is 3 % of lambda. Only
-contacts that press, or that things would go through, are solved for: of what lies near in a heap fewer than half press.
-Which these are is looked at again after LOOK, 2 LOOK, 4 LOOK iterations. Newton's method on the convex problem needs
-factors of one great matrix each time, and which of a thousand hard contacts press it finds by trial.
-Gauss and Seidel's sweeps cost as much as these iterations and leave up to four times the error after as many.
-
-What is done to each contact in each iteration is in projected_gradient.c, compiled where it is needed first: to one
-half of the contacts and to the other, by one thread or by two.
+Contacts that do not come close enough to touch are left out, and checked with the velocities of the solution.
 
 Equations: docs/theory.md#motion-and-contact-of-rigid-bodies.
 """
@@ -38,7 +17,7 @@ Equations: docs/theory.md#motion-and-contact-of-rigid-bodies.
 from __future__ import annotations
 
 import ctypes
-from ctypes import c_double, c_int64, c_void_p
+from ctypes import c_double, c_int64
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -50,325 +29,432 @@ import numpy.typing as npt
 
 from ..errors import NotConverged
 from ..mesh.c_library import Float64, Int64, load_library, struct_pointer
-from .bodies import Bodies, orientation
-from .contact_law import later
-from .contact_points import Contacts
-from .contact_records import Touches
-from .free_flight import driven_on, forces, of_things
-from .impact_sequence import Event
-from .mujoco_model import Model, Rules
-from .worker_ranks import Helper
+from .bodies import Bodies, apply_contact_forces, forces_for_velocity_changes, quaternions, velocities_of_all
+from .contact_law import impacts_later
+from .contact_points import ContactImpulses, Contacts
+from .impact_sequence import ImpactEvent
+from .mujoco_model import ContactParameters, MujocoModel
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-HARD = 0.9999  # impedance of contacts, which MuJoCo lets be no harder: what they give way by, in steps, is 1 - HARD
-IMPEDANCE = [HARD, HARD, 1e-3, 0.5, 2.0]
-TOLERANCE, ITERATIONS = 1e-10, 200  # of MuJoCo's solver, to the mean inertia, and at most
-HELD = 1e6  # mass of what is driven, in masses of all bodies
-MEMORY, LEAST_MEMORY = 2**18, 2**26  # bytes a body, and in all
-FIELDS = ("dim", "solref", "solreffriction", "solimp", "includemargin", "efc_address", "mu", "H", "flex", "elem",
-          "vert", "adhesion", "surfacevel")  # fmt: skip
-STAGES = (mujoco.mj_island, mujoco.mj_projectConstraint, mujoco.mj_fwdVelocity, mujoco.mj_fwdAcceleration,
-          mujoco.mj_fwdConstraint)  # fmt: skip
-AT_ONCE = 60  # iterations of Newton's method: what takes more is solved with softer contacts first,
-SOFTER = (100.0, 10.0, 1.0)  # times what they give way by, each from where the last came to
-ISLAND = 300  # rows of an island: three times its contacts
+Motions = tuple[Values, Values]  # velocities and spins (n, 3)
 SOURCE = Path(__file__).with_name("projected_gradient.c")
-FEW = 1000  # contacts: fewer are not worth a second thread
-Motions = tuple[Values, Values]  # velocities and spins of things
-SLIPS = 10  # rounds of slip, at most,
-CLOSE = 0.02  # c_0: what slips otherwise than was thought by less, times mu, is not looked at again
-CROWD = 300  # contacts: more are not given to Newton's method
-NEARLY = 0.01  # c_0: what velocities of a crowd may be off by,
-MOST, WORK = 150, 3_000_000  # after so many iterations, at most, of few contacts so many in all
-LOOKS, ROUGH = 3, 30  # looks for what meets what, at most, and iterations of all but the first whole one
+
+# Fields of MuJoCo's contacts that are the same in all of them.
+CONTACT_FIELDS = ("dim", "solref", "solreffriction", "solimp", "includemargin", "efc_address", "mu", "H", "flex",
+                  "elem", "vert", "adhesion", "surfacevel")  # fmt: skip
+# Stages of MuJoCo's forward dynamics that follow the assembly of the constraints.
+SOLVER_STAGES = (mujoco.mj_island, mujoco.mj_projectConstraint, mujoco.mj_fwdVelocity, mujoco.mj_fwdAcceleration,
+                 mujoco.mj_fwdConstraint)  # fmt: skip
 
 
-class Newton:
-    """Of the bodies of a model, and what is driven in it."""
+@dataclass(frozen=True)
+class ContactSolverSettings:
+    """Numbers of both contact solvers.
 
-    def __init__(self, model: Model, rules: Rules) -> None:
+    Attributes:
+        impedance: of MuJoCo's contacts, whose compliance is 1 - impedance per step; MuJoCo admits no harder ones.
+        newton_tolerance: of MuJoCo's solver, relative to the mean inertia.
+        newton_iterations: largest number of Newton iterations.
+        direct_iterations: Newton iterations after which softer contacts are solved first.
+        compliance_factors: factors of the compliance in successive solutions of a difficult problem.
+        island_rows: rows of the largest island above which MuJoCo's count of iterations is not checked by the first
+            one.
+        slip_rounds: largest number of updates of the slip speeds.
+        slip_tolerance: c_0; the slip speeds are accepted when mu times their change is below.
+        max_newton_contacts: contacts in an event above which projected gradients take over.
+        gradient_tolerance: c_0; accepted error of velocities in projected gradients.
+        gradient_iterations: least number of iterations that projected gradients may take.
+        gradient_work: contacts times iterations that they may take in any case.
+        search_rounds: largest number of searches for contacts that were left out.
+        rough_iterations: iterations of a rough solution, and of searches after the first one.
+        obstacle_mass: mass of a driven obstacle in MuJoCo, in masses of all bodies.
+        bytes_per_body: memory for MuJoCo's arena.
+        min_bytes: least memory for it.
+    """
+
+    impedance: float = 0.9999
+    newton_tolerance: float = 1e-10
+    newton_iterations: int = 200
+    direct_iterations: int = 60
+    compliance_factors: tuple[float, ...] = (100.0, 10.0, 1.0)
+    island_rows: int = 300
+    slip_rounds: int = 10
+    slip_tolerance: float = 0.02
+    max_newton_contacts: int = 300
+    gradient_tolerance: float = 0.01
+    gradient_iterations: int = 150
+    gradient_work: int = 3_000_000
+    search_rounds: int = 3
+    rough_iterations: int = 30
+    obstacle_mass: float = 1e6
+    bytes_per_body: int = 2**18
+    min_bytes: int = 2**26
+
+
+SETTINGS = ContactSolverSettings()
+
+
+# --- few contacts: MuJoCo ---
+
+
+class MujocoNewtonSolver:
+    """MuJoCo's solver for the contacts of the bodies and the driven obstacles of a model.
+
+    It has a MuJoCo model of its own, of bodies without shapes. The model is made when it is first needed, since MuJoCo
+    computes the inverse of the mass matrix for every body as it starts.
+    """
+
+    def __init__(self, model: MujocoModel, parameters: ContactParameters) -> None:
+        """Compile the model; `parameters` has time step, gravity and friction."""
         n = self._count = len(model.mass)
-        self._made = _dynamics(model, rules)
-        self._data, self._alike = mujoco.MjData(self._made), _contact(rules)
+        self._compiled = _dynamic_model(model, parameters)
+        self._data, self._template = mujoco.MjData(self._compiled), _contact_template(parameters)
         moving = np.concatenate([np.arange(n), n + model.driven])
-        things = int(np.concatenate([model.thing, moving]).max(initial=0)) + 1
-        self._geom = np.zeros(things, int)  # all that stands still is one
+        things = int(np.concatenate([model.body_of_geom, moving]).max(initial=0)) + 1
+        # geom 0 stands for everything that does not move
+        self._geom = np.zeros(things, int)
         self._geom[moving] = 1 + np.arange(len(moving))
 
-    def begin(self, bodies: Bodies, ways: Values, rates: Values, contacts: Contacts, gravity: Values) -> None:
-        """A step of the bodies, of what is driven at `ways` (driven, 3) at `rates` (driven, 3), and these contacts,
-        with `gravity` (3,) m/s^2. Raises NotConverged where there is no room for them."""
-        made, data, n = self._made, self._data, self._count
-        made.opt.gravity[:] = gravity
-        q, v = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
-        q[:n, :3], q[n:, :3] = bodies.place, ways
-        q[:n, 3:], q[n:, 3:] = orientation(bodies.turn), [1.0, 0.0, 0.0, 0.0]
-        v[:n, :3], v[n:, :3], v[n:, 3:] = bodies.velocity, rates, 0.0
-        v[:n, 3:] = np.einsum("nji,nj->ni", bodies.turn, bodies.spin)
-        for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_makeM, mujoco.mj_factorM):
-            stage(made, data)
-        self._fill(contacts)
-        data.qacc_warmstart[:] = 0.0  # or a restart would come to other digits
+    def set_up(self, bodies: Bodies, positions: Values, rates: Values, contacts: Contacts, gravity: Values) -> None:
+        """Set the state and the contacts of a step. Raises NotConverged if MuJoCo has no memory for them.
 
-    def _fill(self, contacts: Contacts) -> None:
-        """Contacts as MuJoCo has them: mj_addContact, one after the other, takes ten times as long."""
+        Args:
+            bodies: at the positions of the impacts.
+            positions: (m, 3) of driven obstacles, m.
+            rates: (m, 3) their velocities, m/s.
+            contacts: all that may touch.
+            gravity: (3,) m/s^2.
+        """
+        compiled, data, n = self._compiled, self._data, self._count
+        compiled.opt.gravity[:] = gravity
+        q, v = data.qpos.reshape(-1, 7), data.qvel.reshape(-1, 6)
+        q[:n, :3], q[n:, :3] = bodies.position, positions
+        q[:n, 3:], q[n:, 3:] = quaternions(bodies.rotation), [1.0, 0.0, 0.0, 0.0]
+        v[:n, :3], v[n:, :3], v[n:, 3:] = bodies.velocity, rates, 0.0
+        # MuJoCo has angular velocities in the axes of the bodies
+        v[:n, 3:] = np.einsum("nji,nj->ni", bodies.rotation, bodies.spin)
+        for stage in (mujoco.mj_kinematics, mujoco.mj_comPos, mujoco.mj_makeM, mujoco.mj_factorM):
+            stage(compiled, data)
+        self._write_contacts(contacts)
+        # a warm start from the last step would give other digits after a restart
+        data.qacc_warmstart[:] = 0.0
+
+    def _write_contacts(self, contacts: Contacts) -> None:
+        """Write the contacts into MuJoCo's arena; mj_addContact for every one takes ten times as long."""
         data, k = self._data, len(contacts)
         data.ncon = k
-        made = data.contact
-        data.parena = k * made.dist.strides[0]
+        records = data.contact
+        data.parena = k * records.dist.strides[0]
         if data.parena >= data.narena:
             raise NotConverged(
                 f"{k} contacts are more than the rigid engine has room for; a smaller time.step or a larger mesh.h has "
                 "fewer"
             )
-        for name in FIELDS:
-            getattr(made, name)[:] = getattr(self._alike, name)
-        made.geom[:], made.pos[:] = self._geom[contacts.things], contacts.point
-        made.frame[:] = contacts.axes.reshape(-1, 9)
-        made.friction[:], made.friction[:, :2] = 0.0, np.maximum(contacts.friction, mujoco.mjMINMU)[:, None]
+        for name in CONTACT_FIELDS:
+            getattr(records, name)[:] = getattr(self._template, name)
+        records.geom[:], records.pos[:] = self._geom[contacts.pairs], contacts.point
+        records.frame[:] = contacts.axes.reshape(-1, 9)
+        friction = np.maximum(contacts.friction, mujoco.mjMINMU)
+        records.friction[:], records.friction[:, :2] = 0.0, friction[:, None]
 
-    def solved(self, aim: Values, kept: Flags) -> tuple[Values, Values, Flags]:
-        """Forces and moments (n, 6) that kept (k,) contacts give, which may come nearer by aims (k,) m, these in the
-        axes of the bodies, N and N m; the forces (k, 3) of contacts along their axes, N; and which (k,) press.
+    def solve(self, allowed_approach: Values, active: Flags) -> tuple[Values, Values, Flags]:
+        """Return forces and moments of bodies, forces of contacts, and which contacts transmit a force.
 
-        Which of many contacts press Newton's method finds by trial: it flips some at every iteration. Where it has not
-        found them after many, soft ones, taken first, tell it sooner, and each harder set takes a dozen. A later look
-        begins where the last one came to, and is mostly done at once.
+        Newton's method changes the set of closed contacts in every iteration, and may need many iterations for it. Then
+        softer contacts are solved first, of which each solution starts the next one.
+
+        Args:
+            allowed_approach: (k,) distance that the bodies may approach, m.
+            active: (k,) contacts that are solved for.
+
+        Returns:
+            Forces and moments (n, 6), moments in the axes of the bodies, N and N m; forces (k, 3) along the axes of the
+            contacts, N; flags (k,) of contacts under pressure.
         """
         data = self._data
-        data.contact.dist[:], data.contact.exclude[:] = aim, ~kept
-        self._press(1.0, AT_ONCE)
-        if not self._simple():
-            for softer in SOFTER:
-                self._press(softer, ITERATIONS)
-        pressed = kept & (data.efc_force[data.contact.efc_address] > 0)
-        rows, each = np.flatnonzero(pressed), np.zeros((len(kept), 3))
-        each[rows] = data.efc_force[data.contact.efc_address[rows, None] + np.arange(3)]
-        return data.qfrc_constraint.reshape(-1, 6)[: self._count].copy(), each, pressed
+        data.contact.dist[:], data.contact.exclude[:] = allowed_approach, ~active
+        self._run_solver(1.0, SETTINGS.direct_iterations)
+        if not self._has_converged():
+            for factor in SETTINGS.compliance_factors:
+                self._run_solver(factor, SETTINGS.newton_iterations)
+        closed = active & (data.efc_force[data.contact.efc_address] > 0)
+        rows, contact_force = np.flatnonzero(closed), np.zeros((len(active), 3))
+        contact_force[rows] = data.efc_force[data.contact.efc_address[rows, None] + np.arange(3)]
+        return data.qfrc_constraint.reshape(-1, 6)[: self._count].copy(), contact_force, closed
 
-    def _press(self, softer: float, most: int) -> None:
-        """Solve, in so many iterations from the last solution on, with contacts that give way by so many times more."""
-        made, data = self._made, self._data
-        made.opt.iterations = most
-        mujoco.mj_makeConstraint(made, data)
-        if softer > 1:
-            data.efc_R[:] *= softer
-            data.efc_D[:] /= softer
-        for stage in STAGES:
-            stage(made, data)
+    def _run_solver(self, compliance_factor: float, max_iterations: int) -> None:
+        """Solve with a multiple of the compliance, starting from the last solution."""
+        compiled, data = self._compiled, self._data
+        compiled.opt.iterations = max_iterations
+        mujoco.mj_makeConstraint(compiled, data)
+        if compliance_factor > 1:
+            data.efc_R[:] *= compliance_factor
+            data.efc_D[:] /= compliance_factor
+        for stage in SOLVER_STAGES:
+            stage(compiled, data)
         data.qacc_warmstart[:] = data.qacc
 
-    def _simple(self) -> bool:
-        """Whether what was solved at once has been solved; MuJoCo counts iterations of the first twenty islands."""
-        data, many = self._data, self._data.nisland
-        if not many or data.island_nefc[:many].max() < ISLAND:
-            return bool(data.solver_niter[: max(many, 1)].max() < AT_ONCE)
-        return many <= len(data.solver_niter) and bool(data.solver_niter[:many].max() < AT_ONCE)
+    def _has_converged(self) -> bool:
+        """Return whether no island reached the limit of iterations."""
+        data, islands = self._data, self._data.nisland
+        # MuJoCo keeps the iterations of the first twenty islands only
+        if not islands or data.island_nefc[:islands].max() < SETTINGS.island_rows:
+            return bool(data.solver_niter[: max(islands, 1)].max() < SETTINGS.direct_iterations)
+        counted = islands <= len(data.solver_niter)
+        return counted and bool(data.solver_niter[:islands].max() < SETTINGS.direct_iterations)
 
 
-def _dynamics(model: Model, rules: Rules) -> Any:
-    """MuJoCo's model of bodies without shapes: a geom each, for contacts to name them by, and one of all that stands
-    still, the first."""
+def _dynamic_model(model: MujocoModel, parameters: ContactParameters) -> Any:
+    """Return MuJoCo's model of bodies without shapes: one geom a body, to name it, and one for all that is fixed."""
     spec, driven = mujoco.MjSpec(), len(model.driven)
     option = spec.option
-    option.timestep, option.gravity = rules.step, rules.gravity
+    option.timestep, option.gravity = parameters.time_step, parameters.gravity
     option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    option.tolerance, option.iterations = TOLERANCE / (HELD if driven else 1.0), ITERATIONS  # of what is not driven
-    spec.compiler.balanceinertia = True  # of a sliver, which round-off has made flatter than flat
-    spec.memory = max(LEAST_MEMORY, MEMORY * (len(model.mass) + driven))
-    _name(spec.worldbody)
+    # the tolerance is relative to the mean inertia, which driven obstacles raise
+    option.tolerance = SETTINGS.newton_tolerance / (SETTINGS.obstacle_mass if driven else 1.0)
+    option.iterations = SETTINGS.newton_iterations
+    # round-off may give slivers an inertia that no body has
+    spec.compiler.balanceinertia = True
+    spec.memory = max(SETTINGS.min_bytes, SETTINGS.bytes_per_body * (len(model.mass) + driven))
+    _add_name_geom(spec.worldbody)
     for mass, inertia in zip(model.mass, [*model.inertia], strict=True):
-        _free(spec, float(mass), inertia)
-    heavy = HELD * max(float(model.mass.sum()), 1e-9)
+        _add_free_body(spec, float(mass), inertia)
+    heavy = SETTINGS.obstacle_mass * max(float(model.mass.sum()), 1e-9)
     for _ in range(driven):
-        _free(spec, heavy, heavy * np.eye(3), weightless=True)
+        _add_free_body(spec, heavy, heavy * np.eye(3), weightless=True)
     return spec.compile()
 
 
-def _free(spec: Any, mass: float, inertia: Values, weightless: bool = False) -> None:
-    """A body that nothing holds, about its centre of mass."""
+def _add_free_body(spec: Any, mass: float, inertia: Values, weightless: bool = False) -> None:
+    """Add a body with a free joint at its centre of mass; inertia (3, 3), kg m^2."""
     body = spec.worldbody.add_body()
     body.add_freejoint()
     body.explicitinertial, body.mass, body.ipos = True, mass, np.zeros(3)
     body.fullinertia = inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     body.gravcomp = 1.0 if weightless else 0.0
-    _name(body)
+    _add_name_geom(body)
 
 
-def _name(body: Any) -> None:
-    """What contacts call a body by: a geom that meets nothing."""
+def _add_name_geom(body: Any) -> None:
+    """Add a geom that collides with nothing; contacts refer to a body by it."""
     geom = body.add_geom()
     geom.type, geom.size = mujoco.mjtGeom.mjGEOM_SPHERE, np.ones(3)
     geom.contype = geom.conaffinity = 0
 
 
-def _contact(rules: Rules) -> Any:
-    """A contact as MuJoCo has them, but for what it touches and where: accelerations -(c + r / dt) / dt."""
-    made = mujoco.MjContact()
-    made.dim, made.flex, made.elem, made.vert = 3, [-1, -1], [-1, -1], [-1, -1]
-    made.solref, made.solimp = [-HARD / rules.step**2, -HARD / rules.step], IMPEDANCE
-    return made
+def _contact_template(parameters: ContactParameters) -> Any:
+    """Return a MuJoCo contact with reference acceleration -(c + r / dt) / dt, without bodies and position."""
+    contact, hard = mujoco.MjContact(), SETTINGS.impedance
+    contact.dim, contact.flex, contact.elem, contact.vert = 3, [-1, -1], [-1, -1], [-1, -1]
+    contact.solref = [-hard / parameters.time_step**2, -hard / parameters.time_step]
+    contact.solimp = [hard, hard, 1e-3, 0.5, 2.0]
+    return contact
 
 
-class _Crowd(ctypes.Structure):
-    """As projected_gradient.c has it."""
+# --- many contacts: projected gradients ---
+
+
+class _System(ctypes.Structure):
+    """The struct of projected_gradient.c."""
 
     _fields_ = (("count", c_int64), ("bodies", c_int64), ("contact", Float64),
-                ("things", Int64), ("mass", Float64), ("inertia", Float64))  # fmt: skip
+                ("pairs", Int64), ("mass", Float64), ("inertia", Float64))  # fmt: skip
 
 
 @dataclass(frozen=True)
-class Crowd:
-    """k contacts of n bodies.
+class ProjectedGradientSolver:
+    """Coulomb's law at k contacts of n bodies, by accelerated projected gradients.
+
+    p  <-  P_K(q - D^-1 (u(q) + (r / dt + mu |u_t|) n)),   q = p + beta (p - p_before)
+
+    beta is Nesterov's factor. It is reset for the contacts of a body on which p reverses (H. Mazhar et al. 2015;
+    B. O'Donoghue, E. Candes 2015). D bounds J M^-1 J^T, so that no step is too long whatever the masses are: with the
+    rows J of a contact of a body and w = tr J M^-1 J^T,
+
+    J M^-1 J^T <= D = sum over bodies of lambda w,   lambda the largest eigenvalue of M^-1 sum J^T J / w   (6, 6)
+
+    lambda is at most the number of contacts of the body (R. Tonge et al. 2012) and mostly half of it.
 
     Attributes:
-        contacts: (k, 19) axes, arms of the two things, u_0 with r / dt, friction.    things: (k, 2), n of all that
-        stands.    mass: (n,) 1 / kg, inverse.    inertia: (n, 3, 3) likewise, in the axes of space.
+        contact_rows: (k, 19) axes, arms of the two bodies, u_0 with r / dt, friction.
+        pairs: (k, 2) bodies; n for prescribed obstacles.
+        inverse_mass: (n,) 1 / kg.
+        inverse_inertia: (n, 3, 3) in the axes of space.
     """
 
-    contacts: Values
-    things: Ints
-    mass: Values
-    inertia: Values
+    contact_rows: Values
+    pairs: Ints
+    inverse_mass: Values
+    inverse_inertia: Values
 
     @classmethod
-    def of(cls, contacts: Contacts, free: Values, aim: Values, mass: Values, inverse: Values) -> Crowd:
-        """Of contacts of bodies with masses (n,) kg and inverse inertia (n, 3, 3) in the axes of space; `free`: (k, 3)
-        m/s, u_0; `aim`: (k,) m/s, r / dt."""
+    def assemble(
+        cls, contacts: Contacts, free: Values, approach_rate: Values, mass: Values, inverse_inertia: Values
+    ) -> ProjectedGradientSolver:
+        """Return the system of contacts.
+
+        Args:
+            contacts: k of them.
+            free: (k, 3) u_0, m/s.
+            approach_rate: (k,) r / dt, m/s.
+            mass: (n,) kg.
+            inverse_inertia: (n, 3, 3) in the axes of space.
+        """
         count = len(contacts)
         rows: Values = np.empty((count, 19))
         rows[:, :9], rows[:, 15:18], rows[:, 18] = contacts.axes.reshape(count, 9), free, contacts.friction
         rows[:, 9:15] = contacts.arms.reshape(count, 6)
-        rows[:, 15] += aim
-        things = np.ascontiguousarray(np.minimum(contacts.things, len(mass)))
-        return cls(rows, things, 1 / mass, np.ascontiguousarray(inverse))
+        rows[:, 15] += approach_rate
+        pairs = np.ascontiguousarray(np.minimum(contacts.pairs, len(mass)))
+        return cls(rows, pairs, 1 / mass, np.ascontiguousarray(inverse_inertia))
 
-    def impulses(self, enough: float, most: int, start: Values, helper: Helper | None = None) -> Values:
-        """(k, 3) N s that second things receive, along the axes of the contacts; `enough`: m/s that velocities may be
-        off by; `most`: of iterations; `start`: (k, 3) N s from where to go on; `helper`: a second thread, with which
-        all comes out the same to the last digit."""
-        p, loops = np.array(start, order="C"), _loops()
-        now = c_void_p(loops.begun(self._given, c_double(enough), c_int64(most), p))
-        if not now:
+    def solve(self, tolerance: float, max_iterations: int, start: Values) -> Values:
+        """Return the impulses (k, 3), N s, that second bodies receive, along the axes of the contacts.
+
+        Args:
+            tolerance: accepted error of velocities, m/s.
+            max_iterations: largest number of iterations.
+            start: (k, 3) impulses to start from, N s.
+        """
+        p = np.array(start, order="C")
+        if load_library(SOURCE).solve(self._struct, c_double(tolerance), c_int64(max_iterations), p):
             raise MemoryError(f"no room for {len(p)} contacts")
-        if helper is not None and len(p) >= FEW:
-            helper.both(lambda: loops.impulses(now), lambda: loops.help(now))
-        else:
-            loops.impulses(now)
-        loops.finished(now)
         return p
 
-    def gained(self, impulses: Values) -> Values:
-        """(n, 6) velocities and spins that impulses (k, 3) give."""
-        level: Values = np.empty((len(self.mass) + 1, 6))
-        load_library(SOURCE).gained(self._given, np.ascontiguousarray(impulses), level)
-        return level[:-1]
+    def velocity_changes(self, impulses: Values) -> Values:
+        """Return the changes of velocity and spin (n, 6) by impulses (k, 3)."""
+        changes: Values = np.empty((len(self.inverse_mass) + 1, 6))
+        load_library(SOURCE).velocity_changes(self._struct, np.ascontiguousarray(impulses), changes)
+        return changes[:-1]
 
-    def bound(self) -> Values:
-        """(k,) D."""
-        d: Values = np.empty(len(self.contacts))
-        if load_library(SOURCE).bound(self._given, d):
+    def diagonal_bounds(self) -> Values:
+        """Return the diagonal D (k,)."""
+        d: Values = np.empty(len(self.contact_rows))
+        if load_library(SOURCE).diagonal_bounds(self._struct, d):
             raise MemoryError(f"no room for {len(d)} contacts")
         return d
 
     @cached_property
-    def _given(self) -> Any:
-        """For C; the arrays are this crowd's, and stay as long as it."""
-        arrays = map(struct_pointer, (self.contacts, self.things, self.mass, self.inertia))
-        return ctypes.byref(_Crowd(len(self.contacts), len(self.mass), *arrays))
+    def _struct(self) -> Any:
+        """The system for C; its arrays live as long as this object."""
+        arrays = map(struct_pointer, (self.contact_rows, self.pairs, self.inverse_mass, self.inverse_inertia))
+        return ctypes.byref(_System(len(self.contact_rows), len(self.inverse_mass), *arrays))
 
 
-def _loops() -> ctypes.CDLL:
-    """The functions of projected_gradient.c, one of which tells where something is."""
-    return load_library(SOURCE)
+def project_on_cones(p: Values, mu: Values) -> Values:
+    """Return the closest points (k, 3) to p (k, 3) in the cones |p_t| <= mu p_n, `mu` (k,)."""
+    projected = np.array(p, order="C")
+    load_library(SOURCE).project_on_cones(c_int64(len(mu)), projected, mu)
+    return projected
 
 
-def projected(p: Values, mu: Values) -> Values:
-    """(k, 3) the nearest of each cone |p_t| <= mu p_n."""
-    near = np.array(p, order="C")
-    load_library(SOURCE).projected(c_int64(len(mu)), near, mu)
-    return near
+def has_many_contacts(event: ImpactEvent) -> bool:
+    """Return whether an event has too many contacts for Newton's method."""
+    return np.count_nonzero(event.constraints.may_touch) > SETTINGS.max_newton_contacts
 
 
-def crowded(met: Event) -> bool:
-    """Whether these are too many contacts for Newton's method."""
-    return np.count_nonzero(met.meeting.near) > CROWD
+# --- either of them ---
 
 
-class Pushing:
-    """Of the bodies of a model."""
+class ContactSolver:
+    """Solver for the contact forces of an event, of the bodies of a model."""
 
-    def __init__(self, model: Model, rules: Rules, helper: Helper | None = None) -> None:
-        """`helper`: a second thread (None: there is none)."""
-        self._model, self._rules, self._helper = model, rules, helper
-        self._newton: Newton | None = None
+    def __init__(self, model: MujocoModel, parameters: ContactParameters) -> None:
+        """Keep the model; MuJoCo's solver is made when it is first needed."""
+        self._model, self._parameters = model, parameters
+        self._newton: MujocoNewtonSolver | None = None
 
-    def __call__(self, met: Event, ways: Values, *, rough: bool) -> tuple[Values, Touches, bool]:
-        """Forces and moments (n, 6) that contacts give, these in the axes of the bodies, N and N m; what touched; and
-        whether these are the last ones: a crowd is only looked through where it may be `rough`. `ways`: (stands, 3)."""
-        if not np.any(met.meeting.near):
-            return np.zeros((len(met.bodies), 6)), Touches.none(), True
-        if crowded(met):
-            force, done = self._by_projections(met, rough=rough), not rough
-        else:
-            force, done = self._by_newton(met, ways), True
-        rows = np.flatnonzero(met.impulse[:, 0] > 0)
-        closing = np.where(met.strikes, met.meeting.closing, 0.0)
-        return force, met.contacts.touches(rows, met.impulse[rows], closing), done
+    def __call__(
+        self, event: ImpactEvent, obstacle_points: Values, *, rough: bool
+    ) -> tuple[Values, ContactImpulses, bool]:
+        """Return contact forces of an event, the record of impulses, and whether the solution is accurate.
 
-    def driven_on(self, met: Event, force: Values) -> Bodies:
-        """The bodies of an event with the motion that forces and moments (n, 6) of a step give them."""
-        return driven_on(self._model, met.bodies, force, met.stage.gravity, self._rules.step)
+        Args:
+            event: its flags of active contacts and its impulses are updated.
+            obstacle_points: (m, 3) reference points of prescribed obstacles, m.
+            rough: with many contacts, find an approximation that shows which contacts close.
 
-    def _by_newton(self, met: Event, ways: Values) -> Values:
-        """Forces and moments (n, 6) of contacts by MuJoCo's solver.
-
-        The convex problem wants what slips at a speed s to part at mu s, which would throw up what spins: contacts may
-        come by as much nearer, mu s dt, with s as it comes out (see rigid.contact_solver). What is given too much of it
-        sinks in by the difference, at every step in which it slides.
+        Returns:
+            Forces and moments (n, 6), moments in the axes of the bodies, N and N m; the record; False if rough.
         """
-        dt, contacts, kept, model = self._rules.step, met.contacts, met.near, self._model
-        rates, newton = met.course.rates, self._newton or Newton(model, self._rules)
+        if not np.any(event.constraints.may_touch):
+            return np.zeros((len(event.bodies), 6)), ContactImpulses.empty(), True
+        if has_many_contacts(event):
+            force, accurate = self._solve_by_gradients(event, rough=rough), not rough
+        else:
+            force, accurate = self._solve_by_newton(event, obstacle_points), True
+        rows = np.flatnonzero(event.impulse[:, 0] > 0)
+        impact_speed = np.where(event.impacts, event.constraints.impact_speed, 0.0)
+        return force, event.contacts.impulse_record(rows, event.impulse[rows], impact_speed), accurate
+
+    def apply_forces(self, event: ImpactEvent, force: Values) -> Bodies:
+        """Return the bodies of an event with the velocities that forces and moments (n, 6) give them in a step."""
+        return apply_contact_forces(
+            self._model, event.bodies, force, event.conditions.gravity, self._parameters.time_step
+        )  # fmt: skip
+
+    def _solve_by_newton(self, event: ImpactEvent, obstacle_points: Values) -> Values:
+        """Return forces and moments (n, 6) by MuJoCo's solver.
+
+        MuJoCo's convex problem separates contacts that slip with speed s at mu s. Therefore they may approach by mu s
+        dt more, with the slip speed of the solution, which is updated a few times. With a slip speed that is too
+        large the body would sink in by the difference in every step.
+        """
+        dt, contacts, active, model = self._parameters.time_step, event.contacts, event.active, self._model
+        rates, newton = event.bounds.obstacle_velocity, self._newton or MujocoNewtonSolver(model, self._parameters)
         self._newton = newton
-        newton.begin(met.bodies, ways[model.driven], rates[model.driven], contacts, met.stage.gravity)
-        lifts = dt * contacts.friction
-        thrown = lifts * contacts.slipping(*of_things(met.bodies, rates), kept)
-        for _ in range(SLIPS):
-            force, each, pressed = newton.solved(met.meeting.aim + thrown, kept)
-            motion = of_things(self.driven_on(met, force), rates)
-            missed = self._missed(met, kept, motion)
-            kept, before = kept | missed, thrown
-            thrown = np.minimum(thrown, lifts * contacts.slipping(*motion, kept))
-            if not np.any(missed) and np.all((before - thrown)[pressed] < CLOSE * self._rules.fast * dt):
+        points = obstacle_points[model.driven]
+        newton.set_up(event.bodies, points, rates[model.driven], contacts, event.conditions.gravity)
+        factor = dt * contacts.friction
+        slip_approach = factor * contacts.slip_speeds(*velocities_of_all(event.bodies, rates), active)
+        for _ in range(SETTINGS.slip_rounds):
+            force, contact_force, closed = newton.solve(event.constraints.allowed_approach + slip_approach, active)
+            motion = velocities_of_all(self.apply_forces(event, force), rates)
+            missed = self._find_missed(event, active, motion)
+            active, before = active | missed, slip_approach
+            slip_approach = np.minimum(slip_approach, factor * contacts.slip_speeds(*motion, active))
+            change = (before - slip_approach)[closed]
+            if not np.any(missed) and np.all(change < SETTINGS.slip_tolerance * self._parameters.impact_threshold * dt):
                 break
-        met.impulse[:] = np.where(pressed[:, None], dt * each, 0.0)  # not what pressed in a look before
+        # without the forces of earlier searches
+        event.impulse[:] = np.where(closed[:, None], dt * contact_force, 0.0)
         return force
 
-    def _by_projections(self, met: Event, *, rough: bool) -> Values:
-        """As `_by_newton`, whatever there is of them, from where it was left: where it may be `rough`, to see what is
-        missed."""
-        dt, bodies, model, rates = self._rules.step, met.bodies, self._model, met.course.rates
-        inverse = bodies.turn @ model.inverse @ np.swapaxes(bodies.turn, 1, 2)
-        free = of_things(self.driven_on(met, np.zeros((len(bodies), 6))), rates)
-        for number in range(1 if rough else LOOKS):
-            rows = np.flatnonzero(met.near)
-            some = met.contacts.chosen(rows)
-            aim: Values = np.asarray(met.meeting.aim[rows] / dt)
-            crowd = Crowd.of(some, some.parting(*free), aim, model.mass, inverse)
-            enough = NEARLY * self._rules.fast
-            most = ROUGH if rough or number else max(MOST, WORK // max(len(rows), 1))
-            met.impulse[rows] = crowd.impulses(enough, most, met.impulse[rows], self._helper)
-            force = forces(model, bodies, crowd.gained(met.impulse[rows]), dt)
-            missed = self._missed(met, met.near, of_things(self.driven_on(met, force), rates))
-            met.near |= missed
+    def _solve_by_gradients(self, event: ImpactEvent, *, rough: bool) -> Values:
+        """Return forces and moments (n, 6) by projected gradients, starting from the impulses of the event."""
+        dt, bodies, model = self._parameters.time_step, event.bodies, self._model
+        rates, threshold = event.bounds.obstacle_velocity, self._parameters.impact_threshold
+        inverse = bodies.rotation @ model.inverse_inertia @ np.swapaxes(bodies.rotation, 1, 2)
+        free = velocities_of_all(self.apply_forces(event, np.zeros((len(bodies), 6))), rates)
+        for search in range(1 if rough else SETTINGS.search_rounds):
+            rows = np.flatnonzero(event.active)
+            contacts = event.contacts.select(rows)
+            approach_rate: Values = np.asarray(event.constraints.allowed_approach[rows] / dt)
+            relative = contacts.relative_velocities(*free)
+            system = ProjectedGradientSolver.assemble(contacts, relative, approach_rate, model.mass, inverse)
+            iterations = max(SETTINGS.gradient_iterations, SETTINGS.gradient_work // max(len(rows), 1))
+            if rough or search:
+                iterations = SETTINGS.rough_iterations
+            event.impulse[rows] = system.solve(
+                SETTINGS.gradient_tolerance * threshold, iterations, event.impulse[rows]
+            )  # fmt: skip
+            change = system.velocity_changes(event.impulse[rows])
+            force = forces_for_velocity_changes(model, bodies, change, dt)
+            motion = velocities_of_all(self.apply_forces(event, force), rates)
+            missed = self._find_missed(event, event.active, motion)
+            event.active |= missed
             if not np.any(missed):
                 break
         return force
 
-    def _missed(self, met: Event, kept: Flags, motion: Motions) -> Flags:
-        """(k,) contacts beside those kept (k,) that things come to touch in with these velocities and spins."""
-        rules, gap, closing = self._rules, met.meeting.gap, met.contacts.closing(*motion)
-        missed: Flags = ~kept & (gap < rules.step * met.meeting.rest * closing)
-        return missed if met.last else missed & ~later(gap, closing, rules.step, rules.fast)
+    def _find_missed(self, event: ImpactEvent, active: Flags, motion: Motions) -> Flags:
+        """Return (k,) flags of contacts beyond the active ones that close with velocities and spins `motion`."""
+        parameters, constraints = self._parameters, event.constraints
+        speeds = event.contacts.approach_speeds(*motion)
+        closing = parameters.time_step * constraints.remaining_fraction * speeds
+        missed: Flags = ~active & (constraints.gap < closing)
+        if event.is_last:
+            return missed
+        return missed & ~impacts_later(constraints.gap, speeds, parameters.time_step, parameters.impact_threshold)

@@ -1,5 +1,4 @@
-/* Nodes of pieces that come into the cores of others (rigid.core_contact). */
-
+/* Nodes of fragments in the cores of other fragments (rigid.core_contact). */
 
 #include <math.h>
 #include <stdint.h>
@@ -7,7 +6,7 @@
 
 typedef struct {
     double side;
-    const int64_t *boxes, *first, *of; /* (7,) of each piece: its lowest box, how many, where they begin; their faces */
+    const int64_t *boxes, *first, *of; /* (7,) of each fragment: its lowest box, how many, where they begin; their faces */
     const double *corners;             /* (9,) of each face */
     const int64_t *crack;              /* whether it is beside a crack */
 } Grid;
@@ -38,7 +37,7 @@ static void nearest_in(const double *p, const double *a, const double *b, const 
 }
 
 /* Whether a face is nearer to p than what was found so far, of all or of those beside cracks. Of faces as near, which
-   meet at a side or a corner, the one whose plane is farthest from p tells on which side of the piece that is. */
+   meet at a side or a corner, the one whose plane is farthest from p tells on which side of the fragment that is. */
 static void look(const Grid *grid, int64_t face, const double *p, Nearest *any, Nearest *crack)
 {
     const double *a = grid->corners + 9 * face, *b = a + 3, *c = a + 6, close = 1e-12 * grid->side * grid->side;
@@ -57,15 +56,15 @@ static void look(const Grid *grid, int64_t face, const double *p, Nearest *any, 
     if (this.square < any->square - close || fabs(this.high) > fabs(any->high)) *any = this;
 }
 
-/* The faces of a piece nearest to p, nearer than `reach`, of all and of those beside cracks, of which `known` is one that
+/* Faces of a fragment closest to p, closer than `reach`, of all and of those beside cracks, of which `known` is one that
    is not far, or -1. */
-static void nearest(const Grid *grid, int64_t piece, const double *p, double reach, int64_t known, Nearest *any,
+static void nearest(const Grid *grid, int64_t fragment, const double *p, double reach, int64_t known, Nearest *any,
                     Nearest *crack)
 {
     *any = *crack = (Nearest){reach * reach, {0, 0, 0}, 0, known};
     if (known >= 0) look(grid, known, p, any, crack);
     reach = sqrt(crack->square) + 1e-6 * grid->side;
-    const int64_t *mine = grid->boxes + 7 * piece, *many = mine + 3;
+    const int64_t *mine = grid->boxes + 7 * fragment, *many = mine + 3;
     int64_t low[3], high[3];
     for (int i = 0; i < 3; i++) {
         low[i] = (int64_t)floor((p[i] - reach) / grid->side) - mine[i];
@@ -81,10 +80,10 @@ static void nearest(const Grid *grid, int64_t piece, const double *p, double rea
             }
 }
 
-/* How far p is from the boxes of a piece, at least. */
-static double outside(const Grid *grid, int64_t piece, const double *p)
+/* Lower bound of the distance of p from the boxes of a fragment. */
+static double outside(const Grid *grid, int64_t fragment, const double *p)
 {
-    const int64_t *mine = grid->boxes + 7 * piece;
+    const int64_t *mine = grid->boxes + 7 * fragment;
     double square = 0;
     for (int i = 0; i < 3; i++) {
         double below = mine[i] * grid->side - p[i], above = p[i] - (mine[i] + mine[3 + i]) * grid->side;
@@ -94,7 +93,7 @@ static double outside(const Grid *grid, int64_t piece, const double *p)
     return sqrt(square);
 }
 
-/* Whether p is in the closed surface of faces `first` to `end`: they are seen from there under an angle of 4 pi (A. Van
+/* Whether p is inside the closed surface of faces `first` to `end`: they are seen from there under an angle of 4 pi (A. Van
    Oosterom, J. Strackee 1983). What is nearest, a corner, need not tell. */
 static int enclosed(const double *corners, int64_t first, int64_t end, const double *p)
 {
@@ -149,7 +148,7 @@ static int64_t put(int64_t count, int64_t most, int64_t q, double depth, const d
    nodes and faces of each body begin. `last` (4,) of each node of each pair, from `where` (pairs,) on: where it was when it was looked at
    last, and how far from there it may be deeper than that; `near`: the face that was the nearest, or -1. `reach`: m,
    what is farther from faces is not looked for. `found` (k,): how many. */
-void within(int64_t k, const int64_t *chosen, const int64_t *pairs, const double *turn, const double *place,
+void find_deepest(int64_t k, const int64_t *chosen, const int64_t *pairs, const double *turn, const double *place,
             const double *centre, const int64_t *begin, const double *points, const int64_t *boxes,
             const int64_t *first, const int64_t *of, const double *corners, const int64_t *at_crack, const int64_t *faces,
             double side, double least, double reach, int64_t most, double *last, int64_t *near, const int64_t *where,

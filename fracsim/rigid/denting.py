@@ -1,31 +1,21 @@
-"""What a blow leaves behind in a body that flows: it is dented or bent (docs/theory.md#denting; B07 7.2).
+"""Permanent deformation of bodies by blows: dents and bends (docs/theory.md#denting; B07, section 7.2).
 
-Cells whose von Mises stress q = sqrt(3/2 s : s) exceeds their yield stress k flow, with linear hardening H,
+Cells whose von Mises stress q = sqrt(3/2 s : s) exceeds their yield stress k yield, with linear hardening H,
 
     eps_p = 3/2 (q - k) / H  s / q,   k' = q,
 
-so that a load that is looked at twice, or in steps, flows once. The body takes the shape that these strains leave in it
-where nothing loads it, by the operator of its analysis,
+so that a load that is analysed twice, or in steps, causes the same strain once. The body takes the shape that these
+strains leave in it without load, by the operator of its analysis,
 
-    K u = int B^T C eps_p,   C eps_p = 2 G eps_p,
+    K u = int B^T C eps_p,   C eps_p = 2 G eps_p.
 
-and pieces of it that turn by more than small angles turn as they are: with e and w the symmetric and the skew part of
-grad u, the places x are those nearest to the deformation of each cell, by least squares (a Poisson equation),
+Rotations may be large: with the symmetric part e and the skew part w of grad u, the new positions x minimise
 
-    min sum V |grad x - exp(w) (1 + e)|^2.
+    sum V |grad x - exp(w) (1 + e)|^2.
 
-Along a uniaxial stress this is x += alpha (u - u_k), alpha = E / H, with u_k the displacement at which the body begins
-to flow: B07's step along u, from there on. Moving the nodes that flow by alpha u, and no others, would depend on which
-of all rigid motions u has, and leave the ends of a bent rod where they are. Stress is that of the elastic body: flow
-hands none of it on.
+The forces of a blow are multiplied by l <= 1 such that its energy E pays for the strain and for the flow,
 
-A body that bends or flows is struck for longer than Hertz's time, and less hard. So forces are at most as many times
-theirs, l <= 1, as the energy E of the blow can pay for: what it strains the body with, and what flow takes,
-
-    l^2 U + sum V ((l q)^2 - k^2)_+ / (2 H) <= E,   U = int sigma : eps / 2,
-
-piecewise linear in l^2. (B07 spends what it likes: a rod of steel 4 cm thick that comes at 5 m/s bent by 45 degrees,
-which takes 3 kJ; it has 70 J.)
+    l^2 U + sum V ((l q)^2 - k^2)_+ / (2 H) <= E,   U = int sigma : eps / 2.
 """
 
 from __future__ import annotations
@@ -43,104 +33,128 @@ from ..mesh.small_matrices import barycentric_gradients, polar_rotation
 from ..meshes.topology import signed_measures
 
 if TYPE_CHECKING:
-    from .free_body_analysis import FreeBody, Stiffness
+    from .free_body_analysis import SolidBody, SolidStiffness
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-
-BORNE = 2.8  # mean pressure, in yield stresses, of a ball on what flows
+# Mean contact pressure under a ball on a yielding body, in yield stresses (D. Tabor; K. L. Johnson 1985, section 6.3).
+PRESSURE_YIELD_RATIO = 2.8
 
 
 @dataclass(frozen=True)
-class Shape:
-    """What flow has made of a mesh: `points` (N, 3) where its nodes are at rest, m, and `yields` (C,) the yield stress
-    of its cells, Pa, both in the order of the input mesh."""
+class DentedShape:
+    """Shape of a mesh after plastic flow, in the order of the input mesh.
+
+    Attributes:
+        points: (N, 3) positions of the nodes at rest, m.
+        yield_stress: (C,) of the cells, Pa.
+    """
 
     points: Values
-    yields: Values
+    yield_stress: Values
 
 
-class Flow:
-    """Of the cells of one mesh (one rank)."""
+class PlasticDenting:
+    """Plastic flow of the cells of one mesh under blows (one rank)."""
 
-    def __init__(self, stiffness: Stiffness, yields: Values, hardening: float) -> None:
-        """`yields`: (cells,) yield stress now, Pa; `hardening`: H > 0, Pa per unit of plastic strain."""
-        self._stiffness, self._yields, self._hardening = stiffness, yields, hardening
+    def __init__(self, stiffness: SolidStiffness, yield_stress: Values, hardening: float) -> None:
+        """Keep the material.
+
+        Args:
+            stiffness: operator of the mesh.
+            yield_stress: (cells,) present yield stress, Pa.
+            hardening: H > 0, Pa per unit of plastic strain.
+        """
+        self._stiffness, self._yield_stress, self._hardening = stiffness, yield_stress, hardening
         self._domain = stiffness.stress.domain
         material = stiffness.stress.material
-        self._shear = np.broadcast_to(material.mu, yields.shape)
-        self._bulk = np.broadcast_to(material.lmbda, yields.shape) + 2 / 3 * self._shear
+        self._shear = np.broadcast_to(material.mu, yield_stress.shape)
+        self._bulk = np.broadcast_to(material.lmbda, yield_stress.shape) + 2 / 3 * self._shear
 
     @property
-    def weakest(self) -> float:
-        """The least stress at which a cell flows, Pa."""
-        return float(self._yields.min())
+    def min_yield_stress(self) -> float:
+        """Least yield stress of all cells, Pa."""
+        return float(self._yield_stress.min())
 
-    def pressed(self, force: Values) -> Values:
-        """(k,) m, least radii of the circles that forces (k, 3) press on: what flows bears 2.8 times its yield stress
-        in the mean (D. Tabor; K. L. Johnson, Contact Mechanics, 1985, sec. 6.3)."""
-        return np.asarray(np.sqrt(np.linalg.norm(force, axis=1) / (np.pi * BORNE * self.weakest)))
+    def min_contact_radii(self, force: Values) -> Values:
+        """Return the least radii (k,), m, of the circles that forces (k, 3), N, press on a yielding body."""
+        size = np.linalg.norm(force, axis=1)
+        return np.asarray(np.sqrt(size / (np.pi * PRESSURE_YIELD_RATIO * self.min_yield_stress)))
 
-    def __call__(self, body: FreeBody, stress: Values, energy: float = np.inf) -> Shape | None:
-        """The shape that a stress (cells, 6) of forces with an energy to spend, J, leaves a body in, of cells that are
-        all its own or not at all; None: it does not flow. Raises NotConverged, also where it would be turned inside
-        out."""
+    def __call__(self, body: SolidBody, stress: Values, energy: float = np.inf) -> DentedShape | None:
+        """Return the shape after a blow; None if no cell yields.
+
+        Args:
+            body: that the stress acts in; each cell belongs to it entirely or not at all.
+            stress: (cells, 6) of the blow, Pa.
+            energy: of the blow, J.
+
+        Raises:
+            NotConverged: an analysis failed, or cells would be inverted.
+        """
         s, q = deviator(stress)
-        share = self._paid(stress, q, energy)
-        s, q = share * s, share * q
-        over = (q > self._yields) & (body.share > 0)
-        if not np.any(over):
+        factor = self._affordable_factor(stress, q, energy)
+        s, q = factor * s, factor * q
+        yields = (q > self._yield_stress) & (body.cell_fractions > 0)
+        if not np.any(yields):
             return None
         domain, source = self._domain, self._domain.source
         assert source is not None
-        cells = np.flatnonzero(body.share)
+        cells = np.flatnonzero(body.cell_fractions)
         nodes = domain.cell_nodes[cells]
         gradients = barycentric_gradients(domain.nodes[nodes])
-        much = 3 * self._shear * np.where(over, 1 - self._yields / np.where(over, q, 1.0), 0.0) / self._hardening
-        each = np.einsum("c,cij,cnj->cni", domain.volumes[cells] * much[cells], s[cells], gradients)
+        relative_excess = np.where(yields, 1 - self._yield_stress / np.where(yields, q, 1.0), 0.0)
+        # 2 G eps_p = stress_factor s
+        stress_factor = 3 * self._shear * relative_excess / self._hardening
+        weight = domain.volumes[cells] * stress_factor[cells]
         force = np.zeros((len(domain.nodes), 3))
-        np.add.at(force, nodes, each)
+        np.add.at(force, nodes, np.einsum("c,cij,cnj->cni", weight, s[cells], gradients))
         u = body(force)
-        place = np.zeros(len(domain.nodes), np.int64)
-        place[body.nodes] = np.arange(len(body.nodes))
+        row_of_node = np.zeros(len(domain.nodes), np.int64)
+        row_of_node[body.nodes] = np.arange(len(body.nodes))
         gradient = np.einsum("cni,cnj->cij", u[nodes], gradients)
-        F = turned_strain(gradient)
-        own, corners, volumes = domain.nodes[body.nodes], place[nodes], domain.volumes[cells]
+        F = finite_gradient(gradient)
+        at_rest, corners, volumes = domain.nodes[body.nodes], row_of_node[nodes], domain.volumes[cells]
         points = source.points.copy()
-        points[domain.node_input[body.nodes]] = settled(
-            own, fitted(own, corners, gradients, volumes, F), corners, volumes
+        points[domain.node_input[body.nodes]] = remove_rigid_motion(
+            at_rest, fit_positions(at_rest, corners, gradients, volumes, F), corners, volumes
         )
         crushed = np.linalg.eigvalsh(gradient + np.swapaxes(gradient, 1, 2))[:, 0] <= -2
-        if bad := max(np.count_nonzero(crushed), np.count_nonzero(signed_measures(points, source.cells) <= 0)):
-            strain = float((much * q / (3 * self._shear)).max())
+        inverted = np.count_nonzero(signed_measures(points, source.cells) <= 0)
+        if bad := max(np.count_nonzero(crushed), inverted):
+            strain = float((stress_factor * q / (3 * self._shear)).max())
             raise NotConverged(
                 f"a blow of {q.max():.3g} Pa would turn {bad} cells of it inside out (plastic strain {strain:.2g}): "
                 f"raise plasticity.hardening ({self._hardening:g} Pa) or yield_stress, or strike less hard"
             )
-        yields = np.empty_like(q)
-        yields[domain.cell_input] = np.where(over, q, self._yields)
-        return Shape(points, yields)
+        yield_stress = np.empty_like(q)
+        yield_stress[domain.cell_input] = np.where(yields, q, self._yield_stress)
+        return DentedShape(points, yield_stress)
 
-    def _paid(self, stress: Values, q: Values, energy: float) -> float:
-        """l, of stresses (cells, 6) with von Mises' q (cells,), Pa."""
+    def _affordable_factor(self, stress: Values, q: Values, energy: float) -> float:
+        """Return l for stresses (cells, 6) with von Mises stress q (cells,), Pa, and an energy, J.
+
+        The energy is piecewise linear in l^2.
+        """
         if energy == np.inf:
             return 1.0
         volumes, pressure = self._domain.volumes, stress[:, :3].mean(axis=1)
         elastic = float(volumes @ (q**2 / (6 * self._shear) + pressure**2 / (2 * self._bulk)))
-        over = np.flatnonzero(q > self._yields)
-        begins = (self._yields[over] / q[over]) ** 2  # l^2 from which on each flows
-        over, begins = over[order := np.argsort(begins)], begins[order]
-        each = volumes[over] / (2 * self._hardening)
-        slope = elastic + np.concatenate([[0.0], np.cumsum(each * q[over] ** 2)])
-        start = np.concatenate([[0.0], np.cumsum(each * self._yields[over] ** 2)])
-        spent = slope[:-1] * begins - start[:-1]  # where each begins to flow
-        k = np.searchsorted(spent, energy)
-        return float(np.sqrt(min((energy + start[k]) / slope[k], 1.0)))
+        over = np.flatnonzero(q > self._yield_stress)
+        # l^2 at which each cell begins to yield
+        onset = (self._yield_stress[over] / q[over]) ** 2
+        over, onset = over[order := np.argsort(onset)], onset[order]
+        weight = volumes[over] / (2 * self._hardening)
+        slope = elastic + np.concatenate([[0.0], np.cumsum(weight * q[over] ** 2)])
+        offset = np.concatenate([[0.0], np.cumsum(weight * self._yield_stress[over] ** 2)])
+        spent_at_onset = slope[:-1] * onset - offset[:-1]
+        k = np.searchsorted(spent_at_onset, energy)
+        return float(np.sqrt(min((energy + offset[k]) / slope[k], 1.0)))
 
 
 def deviator(stress: Values) -> tuple[Values, Values]:
-    """(n, 3, 3) s and (n,) von Mises' q of stresses (n, 6), Pa."""
+    """Return the deviators s (n, 3, 3) and the von Mises stresses q (n,) of stresses (n, 6), Pa."""
     sigma = np.empty((len(stress), 3, 3))
     for k, (i, j) in enumerate(SYMMETRIC_COMPONENTS[3]):
         sigma[:, i, j] = sigma[:, j, i] = stress[:, k]
@@ -148,17 +162,25 @@ def deviator(stress: Values) -> tuple[Values, Values]:
     return s, np.asarray(np.sqrt(1.5 * np.einsum("nij,nij->n", s, s)))
 
 
-def turned_strain(gradient: Values) -> Values:
-    """(n, 3, 3) exp(w) (1 + e) of gradients of displacement (n, 3, 3)."""
-    across = np.swapaxes(gradient, 1, 2)
-    skew = (gradient - across) / 2
-    turn = Rotation.from_rotvec(np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)).as_matrix()
-    return np.asarray(turn @ (np.eye(3) + (gradient + across) / 2))
+def finite_gradient(gradient: Values) -> Values:
+    """Return the deformation gradients exp(w) (1 + e) (n, 3, 3) of displacement gradients (n, 3, 3)."""
+    transposed = np.swapaxes(gradient, 1, 2)
+    skew = (gradient - transposed) / 2
+    axial = np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], axis=1)
+    rotation = Rotation.from_rotvec(axial).as_matrix()
+    return np.asarray(rotation @ (np.eye(3) + (gradient + transposed) / 2))
 
 
-def fitted(points: Values, cells: Ints, gradients: Values, volumes: Values, F: Values) -> Values:
-    """(n, 3) places of connected nodes at rest at points (n, 3), the first of which stays, whose gradients in cells
-    (m, 4) of volumes (m,) are nearest to F (m, 3, 3)."""
+def fit_positions(points: Values, cells: Ints, gradients: Values, volumes: Values, F: Values) -> Values:
+    """Return the positions (n, 3) whose gradients are closest to F by least squares: a Poisson equation.
+
+    Args:
+        points: (n, 3) positions at rest of connected nodes, of which the first one stays, m.
+        cells: (m, 4) corners.
+        gradients: (m, 4, 3) of the barycentric coordinates, 1/m.
+        volumes: (m,) m^3.
+        F: (m, 3, 3) wanted deformation gradients.
+    """
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import splu
 
@@ -171,14 +193,22 @@ def fitted(points: Values, cells: Ints, gradients: Values, volumes: Values, F: V
     return points + np.concatenate([np.zeros((1, 3)), factors.solve(load[1:])])
 
 
-def settled(points: Values, moved: Values, cells: Ints, mass: Values) -> Values:
-    """Places `moved` (n, 3), with the rigid motion that brings cells (m, 4) of masses (m,) nearest to where they were,
-    at `points` (n, 3): flow has no momentum, and none about the centre."""
-    before, now = points[cells], moved[cells]
-    middle, centre = (np.average(each.mean(axis=1), axis=0, weights=mass) for each in (before, now))
-    before, now = before - middle, now - centre
+def remove_rigid_motion(points: Values, moved: Values, cells: Ints, mass: Values) -> Values:
+    """Return positions `moved` (n, 3) after the rigid motion that brings cells closest to where they were.
+
+    Plastic flow transmits no momentum, and no angular momentum about the centre.
+
+    Args:
+        points: (n, 3) positions before, m.
+        moved: (n, 3) positions after, m.
+        cells: (m, 4) corners.
+        mass: (m,) of the cells, in any unit.
+    """
+    before, after = points[cells], moved[cells]
+    centre, new_centre = (np.average(x.mean(axis=1), axis=0, weights=mass) for x in (before, after))
+    before, after = before - centre, after - new_centre
     # int x y^T of linear x and y over a tetrahedron: V / 20 (sum x_i y_i^T + sum x_i sum y_i^T)
-    both = np.einsum("c,cni,cnj->ij", mass, before, now)
-    both += np.einsum("c,ci,cj->ij", mass, before.sum(axis=1), now.sum(axis=1))
-    turn = polar_rotation(both[None] / np.linalg.norm(both))[0]
-    return np.asarray((moved - centre) @ turn.T + middle)
+    covariance = np.einsum("c,cni,cnj->ij", mass, before, after)
+    covariance += np.einsum("c,ci,cj->ij", mass, before.sum(axis=1), after.sum(axis=1))
+    rotation = polar_rotation(covariance[None] / np.linalg.norm(covariance))[0]
+    return np.asarray((moved - new_centre) @ rotation.T + centre)

@@ -1,4 +1,4 @@
-"""The shapes of pieces: what they weigh and how they collide, from the split surface of the mesh that they are of."""
+"""Mass properties and collision shapes of fragments, from the split surface of their mesh."""
 
 from __future__ import annotations
 
@@ -12,147 +12,187 @@ from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surfac
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.polyhedron_moments import PolyhedronMoments, moments
 from ..meshes.data import MeshData
-from .convex_decomposition import Solid, convex_parts, outermost
-from .core_contact import Core, Cores
-from .instance_placement import Poses
-from .shell_clusters import clustered_parts
+from .convex_decomposition import Polyhedron, convex_parts, hull_corners, shell_convex_parts
+from .core_contact import CoreContact, CoreGeometry
+from .instance_placement import InstancePoses
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Patterns = npt.NDArray[np.uint8]
-_Kept = tuple[int, list[Values], Values]
+# Key of the surface, corners of the convex parts, outermost points.
+_CollisionShape = tuple[int, list[Values], Values]
 
 
 @dataclass(frozen=True)
-class Shapes:
-    """Of n pieces, numbered by their lowest node.
+class FragmentShapes:
+    """Shapes of n fragments, which are named by their lowest node.
 
     Attributes:
-        names: (n,) lowest node of each.    moments: of what each encloses.    piece_of_node: (N,).
-        parts: corners (m, 3) of the convex parts of each about its centre, in the axes of the mesh, m; copies that are
-        whole share theirs.    turn: (n, 3, 3) from these axes to those of the body at rest.
-        outer: (k, 3) the outermost points of each, likewise.    cores: of them, None where none has broken.
+        names: (n,) lowest nodes.
+        moments: of the solid within each split surface.
+        node_fragment: (N,).
+        convex_parts: corners (m, 3) of the convex parts of each, relative to its centre, in the axes of the mesh, m.
+            Unbroken instances share theirs.
+        rotation: (n, 3, 3) from these axes to those of the body at rest.
+        hull_points: outermost points (k, 3) of each, likewise.
+        core_contact: None if nothing has broken.
     """
 
     names: Ints
     moments: PolyhedronMoments
-    piece_of_node: Ints
-    parts: list[list[Values]]
-    turn: Values
-    outer: list[Values]
-    cores: Cores | None = None
+    node_fragment: Ints
+    convex_parts: list[list[Values]]
+    rotation: Values
+    hull_points: list[Values]
+    core_contact: CoreContact | None = None
 
 
 @dataclass(frozen=True)
-class _Copy:
-    """A copy as it was last broken or dented, in the axes of the mesh, its nodes, at `points`, counted from 0."""
+class _InstanceShapes:
+    """Shapes of the fragments of one instance, in the axes of the mesh, with its nodes at `points` (N, 3), m.
+
+    Nodes are numbered from 0. The other attributes are those of FragmentShapes.
+    """
 
     points: Values
     pattern: Patterns
     names: Ints
-    of: PolyhedronMoments
-    piece_of_node: Ints
-    parts: list[list[Values]]
-    outer: list[Values]
-    core: Core
+    moments: PolyhedronMoments
+    node_fragment: Ints
+    convex_parts: list[list[Values]]
+    hull_points: list[Values]
+    core: CoreGeometry
 
 
-class Geometry:
-    """Of copies of one mesh, on the rank that has it. What has not changed is not worked out again.
+class FragmentGeometry:
+    """Shapes of the fragments of all instances of a mesh (one rank); unchanged ones are not computed again.
 
     Attributes:
         mean_edge: of the mesh, m.
     """
 
-    def __init__(self, mesh: MeshData, poses: Poses | None = None) -> None:
-        """`poses`: where the copies are at rest; None: one, where the mesh has it."""
-        self.skeleton, self.poses = EntityNumbering(mesh), poses or Poses.at_rest(1)
+    def __init__(self, mesh: MeshData, poses: InstancePoses | None = None) -> None:
+        """Compute the shape of the unbroken mesh; `poses`: of the instances at rest; None: one, as the mesh is."""
+        self.numbering, self.poses = EntityNumbering(mesh), poses or InstancePoses.identity(1)
         self._shell = mesh.shell
-        self.mean_edge = float(np.linalg.norm(np.diff(mesh.points[self.skeleton.edges], axis=1), axis=2).mean())
-        # of each copy, by lowest node: the key of its surface to the last digit, or a restart would come to other hulls
-        # (cells that others share change as these break); convex parts and outermost points
-        self._hulls: dict[int, dict[int, _Kept]] = {}
-        self._whole = self._copy(np.zeros(len(mesh.cells), np.uint8), None, 0, mesh.points)
-        self._placed = [self._at(number, self._whole) for number in range(len(self.poses))]
-        self._known: dict[int, _Copy] = {}
+        edges = mesh.points[self.numbering.edges]
+        self.mean_edge = float(np.linalg.norm(np.diff(edges, axis=1), axis=2).mean())
+        # Collision shapes of each instance by lowest node. They are kept only if all digits of the surface are the
+        # same: cells that fragments share change as neighbours break, and a restart must find the same shapes.
+        self._collision_shapes: dict[int, dict[int, _CollisionShape]] = {}
+        self._unbroken = self._make_shapes(np.zeros(len(mesh.cells), np.uint8), None, 0, mesh.points)
+        self._placed = [self._place(number, self._unbroken) for number in range(len(self.poses))]
+        self._changed: dict[int, _InstanceShapes] = {}
 
-    def shapes(
+    def update_shapes(
         self, damage: Mapping[int, tuple[Patterns, Values | None]], points: Mapping[int, Values] | None = None
-    ) -> Shapes:
-        """Of copies by their numbers: patterns (C,) of broken edges, cut where (E,), and `points` (N, 3) where nodes
-        are, m; all others are whole, and as the mesh is."""
-        points, whole = points or {}, (self._whole.pattern, None)
+    ) -> FragmentShapes:
+        """Return the shapes of all fragments.
+
+        Args:
+            damage: by number of the instance, patterns (C,) of broken edges and cut positions (E,) of edges. Other
+                instances are unbroken.
+            points: by number of the instance, positions (N, 3) of its nodes after plastic flow, m.
+        """
+        points, unbroken = points or {}, (self._unbroken.pattern, None)
         for number in sorted({*damage, *points}):
-            (pattern, cut), at = damage.get(number, whole), points.get(number, self._whole.points)
-            known = self._known.get(number, self._whole)
-            if at is not known.points:
-                self._hulls.pop(number, None)
-            if at is not known.points or not np.array_equal(known.pattern, pattern):
-                self._known[number] = known = self._copy(pattern.copy(), cut, number, at)
-                self._placed[number] = self._at(number, known)
-        pieces = np.cumsum([0, *(len(each.names) for each in self._placed)])
-        of = PolyhedronMoments(*(np.concatenate([getattr(each.moments, name) for each in self._placed])
-                       for name in ("volume", "centre", "second")))  # fmt: skip
-        piece = [each.piece_of_node + first for each, first in zip(self._placed, pieces, strict=False)]
-        parts = [part for each in self._placed for part in each.parts]
-        outer = [each for placed in self._placed for each in placed.outer]
-        names, turn = (np.concatenate([getattr(each, name) for each in self._placed]) for name in ("names", "turn"))
-        return Shapes(names, of, np.concatenate(piece), parts, turn, outer, self._cores(turn))
+            (pattern, cut), x = damage.get(number, unbroken), points.get(number, self._unbroken.points)
+            shapes = self._changed.get(number, self._unbroken)
+            moved = x is not shapes.points
+            if moved:
+                self._collision_shapes.pop(number, None)
+            if moved or not np.array_equal(shapes.pattern, pattern):
+                self._changed[number] = shapes = self._make_shapes(pattern.copy(), cut, number, x)
+                self._placed[number] = self._place(number, shapes)
+        return self._join_instances()
 
-    def _cores(self, turn: Values) -> Cores | None:
-        """Of all pieces, turned by (n, 3, 3)."""
-        every = [self._known.get(number, self._whole) for number in range(len(self.poses))]
-        if not any(len(each.core.faces) for each in every):
+    def _join_instances(self) -> FragmentShapes:
+        """Return the shapes of all instances one after another."""
+        placed = self._placed
+        first = np.cumsum([0, *(len(shapes.names) for shapes in placed)])
+        total = PolyhedronMoments(*(np.concatenate([getattr(shapes.moments, name) for shapes in placed])
+                          for name in ("volume", "centre", "second")))  # fmt: skip
+        fragment = np.concatenate([shapes.node_fragment + start for shapes, start in zip(placed, first, strict=False)])
+        parts = [part for shapes in placed for part in shapes.convex_parts]
+        hull_points = [points for shapes in placed for points in shapes.hull_points]
+        names = np.concatenate([shapes.names for shapes in placed])
+        rotation = np.concatenate([shapes.rotation for shapes in placed])
+        cores = self._make_core_contact(rotation)
+        return FragmentShapes(names, total, fragment, parts, rotation, hull_points, cores)
+
+    def _make_core_contact(self, rotation: Values) -> CoreContact | None:
+        """Return the core contact of all fragments with rotations (n, 3, 3); None if there are no cores."""
+        instances = [self._changed.get(number, self._unbroken) for number in range(len(self.poses))]
+        if not any(len(shapes.core.faces) for shapes in instances):
             return None
-        centre = np.concatenate([each.of.centre for each in every])
-        pieces = [len(each.names) for each in every]
-        return Cores([each.core for each in every], pieces, centre, turn, self.mean_edge)
+        centre = np.concatenate([shapes.moments.centre for shapes in instances])
+        counts = [len(shapes.names) for shapes in instances]
+        return CoreContact([shapes.core for shapes in instances], counts, centre, rotation, self.mean_edge)
 
-    def _copy(self, pattern: Patterns, cut: Values | None, number: int, at: Values) -> _Copy:
-        """A copy with patterns (C,), and nodes at places (N, 3)."""
-        made = build_split_surface(self.skeleton.moved(at), pattern, cut)
-        piece = made.point_fragment[made.elements[:, 0]]
-        of = moments(made.points, made.elements, piece, made.fragment_count)
-        names = np.unique(made.node_fragment, return_index=True)[1]
-        solids = _solids(made, piece)
-        before = self._hulls.get(number, {})
-        same = [before.get(name) for name in map(int, names)]
-        new = [each for each, kept in enumerate(same) if kept is None or kept[0] != solids[each].key]
-        for each, hulls in zip(new, self._parts(made, piece, solids, np.array(new, np.int64)), strict=True):
-            far = outermost(solids[each].points if self._in_clusters(made) else np.concatenate(hulls))
-            same[each] = solids[each].key, [corners - of.centre[each] for corners in hulls], far - of.centre[each]
-        found = [kept for kept in same if kept is not None]
-        self._hulls[number] = dict(zip(map(int, names), found, strict=True))
-        parts, outer = [kept[1] for kept in found], [kept[2] for kept in found]
-        drawn = made.fragment_count > 1 and not self._in_clusters(made)
-        core = Core.of_split(made, self.skeleton) if drawn else Core.none()
-        return _Copy(at, pattern, names, of, made.node_fragment, parts, outer, core)
+    def _make_shapes(self, pattern: Patterns, cut: Values | None, number: int, points: Values) -> _InstanceShapes:
+        """Return the shapes of an instance with patterns (C,) and nodes at `points` (N, 3)."""
+        surface = build_split_surface(self.numbering.moved(points), pattern, cut)
+        fragment = surface.point_fragment[surface.elements[:, 0]]
+        fragment_moments = moments(surface.points, surface.elements, fragment, surface.fragment_count)
+        names = np.unique(surface.node_fragment, return_index=True)[1]
+        solids = _fragment_solids(surface, fragment)
+        before = self._collision_shapes.get(number, {})
+        shapes = [before.get(name) for name in map(int, names)]
+        new = [k for k, shape in enumerate(shapes) if shape is None or shape[0] != solids[k].content_key]
+        parts_of_new = self._convex_parts(surface, fragment, solids, np.array(new, np.int64))
+        for k, parts in zip(new, parts_of_new, strict=True):
+            centre = fragment_moments.centre[k]
+            extreme = hull_corners(solids[k].points if self._uses_clusters(surface) else np.concatenate(parts))
+            shapes[k] = solids[k].content_key, [corners - centre for corners in parts], extreme - centre
+        found = [shape for shape in shapes if shape is not None]
+        self._collision_shapes[number] = dict(zip(map(int, names), found, strict=True))
+        has_cores = surface.fragment_count > 1 and not self._uses_clusters(surface)
+        core = CoreGeometry.from_split_surface(surface, self.numbering) if has_cores else CoreGeometry.empty()
+        parts_of_all, hull_points = [shape[1] for shape in found], [shape[2] for shape in found]
+        return _InstanceShapes(
+            points, pattern, names, fragment_moments, surface.node_fragment, parts_of_all, hull_points, core
+        )
 
-    def _parts(self, made: SplitSurface, piece: Ints, solids: list[Solid], chosen: Ints) -> list[list[Values]]:
-        """Convex parts of chosen (k,) pieces of a split surface, whose elements are of pieces (m,)."""
-        if not self._in_clusters(made):
-            return [convex_parts(solids[each].filled, self.mean_edge) for each in chosen]
-        place = np.full(made.fragment_count, -1)
-        place[chosen] = np.arange(len(chosen))
-        of = place[piece]
+    def _convex_parts(
+        self, surface: SplitSurface, fragment: Ints, solids: list[Polyhedron], chosen: Ints
+    ) -> list[list[Values]]:
+        """Return the convex parts of the fragments `chosen` (k,); `fragment`: (m,) of the surface elements."""
+        if not self._uses_clusters(surface):
+            return [convex_parts(solids[number].without_cavities, self.mean_edge) for number in chosen]
+        order = np.full(surface.fragment_count, -1)
+        order[chosen] = np.arange(len(chosen))
+        of_chosen = order[fragment]
         assert self._shell is not None
-        mine, thickness = np.flatnonzero(of >= 0), self._shell.thickness
-        return clustered_parts(made.points, made.elements[mine], of[mine], len(chosen), thickness, self.mean_edge)
+        rows, thickness = np.flatnonzero(of_chosen >= 0), self._shell.thickness
+        return shell_convex_parts(
+            surface.points, surface.elements[rows], of_chosen[rows], len(chosen), thickness, self.mean_edge
+        )
 
-    def _in_clusters(self, made: SplitSurface) -> bool:
-        """Whether parts are clusters, of few corners: whole a shell may be closed, and its parts are for all copies."""
-        return self._shell is not None and made.fragment_count > 1
+    def _uses_clusters(self, surface: SplitSurface) -> bool:
+        """Return whether parts are clusters of triangles: those of broken shells.
 
-    def _at(self, number: int, copy: _Copy) -> Shapes:
-        """A copy where it is at rest."""
-        turn, place = self.poses.turn[number], self.poses.place[number]
-        of = PolyhedronMoments(copy.of.volume, copy.of.centre @ turn.T + place, turn @ copy.of.second @ turn.T)
-        names, turns = copy.names + number * len(copy.piece_of_node), np.tile(turn, (len(copy.names), 1, 1))
-        return Shapes(names, of, copy.piece_of_node, copy.parts, turns, copy.outer)
+        An unbroken shell may be closed, and its parts serve all instances.
+        """
+        return self._shell is not None and surface.fragment_count > 1
+
+    def _place(self, number: int, shapes: _InstanceShapes) -> FragmentShapes:
+        """Return the shapes of an instance at its pose at rest."""
+        rotation, position = self.poses.rotation[number], self.poses.position[number]
+        local = shapes.moments
+        placed = PolyhedronMoments(
+            local.volume, local.centre @ rotation.T + position, rotation @ local.second @ rotation.T
+        )
+        names = shapes.names + number * len(shapes.node_fragment)
+        rotations = np.tile(rotation, (len(shapes.names), 1, 1))
+        return FragmentShapes(
+            names, placed, shapes.node_fragment, shapes.convex_parts, rotations, shapes.hull_points
+        )  # fmt: skip
 
 
-def _solids(made: SplitSurface, piece: Ints) -> list[Solid]:
-    """What each piece of a split surface, whose elements are of pieces (m,), encloses."""
-    order = np.argsort(piece, kind="stable")
-    ends = np.cumsum(np.bincount(piece, minlength=made.fragment_count))[:-1]
-    return [Solid.of(made.points, elements) for elements in np.split(made.elements[order], ends)]
+def _fragment_solids(surface: SplitSurface, fragment: Ints) -> list[Polyhedron]:
+    """Return the solids within a split surface, whose elements belong to fragments (m,)."""
+    order = np.argsort(fragment, kind="stable")
+    ends = np.cumsum(np.bincount(fragment, minlength=surface.fragment_count))[:-1]
+    return [
+        Polyhedron.from_triangles(surface.points, elements) for elements in np.split(surface.elements[order], ends)
+    ]  # fmt: skip

@@ -1,7 +1,8 @@
-"""Pieces that lie in one another from birth: hulls of neighbours overlap along rough and curved cracks.
+"""Overlaps of convex parts of fragments, which exist from the moment of fracture.
 
-Two parts that overlap by d when their body breaks may go on doing so, and come no deeper: their distance counts from d,
-which shrinks with what they part by. So pieces stay where they broke, push nothing apart, and carry one another.
+Convex hulls of neighbours overlap along rough and curved cracks. Two parts that overlap by d when their body breaks may
+keep that overlap: the gap is measured from -d, and d decreases monotonically as the parts separate. So fragments stay
+where they broke, do not push each other apart, and support one another.
 
 Equations: docs/theory.md#motion-and-contact-of-rigid-bodies.
 """
@@ -16,17 +17,20 @@ import numpy.typing as npt
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
-NEW = -1  # of parts: of two pieces none has been looked at
+# Number of a part in pairs of fragments whose overlap has not been measured yet.
+UNMEASURED = -1
 
 
 @dataclass(frozen=True)
-class Overlaps:
-    """k pairs of parts of pieces.
+class InitialOverlaps:
+    """Overlaps of k pairs of parts of fragments. Checkpoints store the arrays by the names of the attributes.
 
     Attributes:
-        names: (k, 2) of the pieces, the lower first.    parts: (k, 2) of each; NEW: whatever overlaps next is allowed.
-        depth: (k,) that is allowed, m.
+        names: (k, 2) names of the two fragments, ascending.
+        parts: (k, 2) numbers of their parts; UNMEASURED: the next overlap of the fragments is admitted as it is.
+        depth: (k,) admitted overlap, m.
     """
 
     names: Ints
@@ -34,117 +38,151 @@ class Overlaps:
     depth: Values
 
     @classmethod
-    def none(cls) -> Overlaps:
-        """No pair at all."""
+    def empty(cls) -> InitialOverlaps:
+        """Return no overlaps."""
         return cls(np.empty((0, 2), np.int64), np.empty((0, 2), np.int64), np.empty(0))
 
     @classmethod
-    def new(cls, names: Ints) -> Overlaps:
-        """Pairs of pieces (k, 2) that have just come of one body."""
-        return cls(names, np.full_like(names, NEW), np.full(len(names), np.inf))
+    def between_new_fragments(cls, names: Ints) -> InitialOverlaps:
+        """Return unmeasured overlaps of pairs of fragments, names (k, 2), that have just separated."""
+        return cls(names, np.full_like(names, UNMEASURED), np.full(len(names), np.inf))
 
-    def divided(self, names: Ints, parent: Ints) -> Overlaps:
-        """After pieces broke, `names` (n,) of what there is now and of what each was a part of, `parent` (n,): what did
-        not break keeps its pairs, what comes of one piece or of an overlapping pair is new."""
+    def after_fracture(self, names: Ints, parent: Ints) -> InitialOverlaps:
+        """Return the overlaps after bodies broke.
+
+        Pairs of bodies that did not break stay. Pairs of fragments of one body, or of a pair that overlapped, are new.
+
+        Args:
+            names: (n,) of the present bodies, ascending.
+            parent: (n,) names of the bodies that they were part of.
+        """
         order = np.argsort(parent, kind="stable")
         old, start, count = np.unique(parent[order], return_index=True, return_counts=True)
-        torn = count > 1
+        broken = count > 1
         pairs = np.searchsorted(old, self.names)
-        lost = torn[pairs].any(axis=1)
-        families = np.tile(np.flatnonzero(torn)[:, None], 2)
-        across = np.unique(pairs[lost], axis=0)
-        first, second = (names[order[each]] for each in _crossed(np.concatenate([families, across]), start, count))
-        both = np.stack([first, second], axis=1)
-        both = both[
-            (first < second) | (parent[np.searchsorted(names, first)] != parent[np.searchsorted(names, second)])
-        ]
-        new = Overlaps.new(np.sort(both, axis=1))
-        return Overlaps(*(np.concatenate([mine[~lost], more]) for mine, more in zip(
-            (self.names, self.parts, self.depth), (new.names, new.parts, new.depth), strict=True)))  # fmt: skip
+        replaced: Flags = np.asarray(broken[pairs].any(axis=1))
+        within = np.tile(np.flatnonzero(broken)[:, None], 2)
+        across = np.unique(pairs[replaced], axis=0)
+        candidates = _all_pairs(np.concatenate([within, across]), start, count)
+        first, second = (names[order[members]] for members in candidates)
+        new = np.stack([first, second], axis=1)
+        # of one body every pair is listed twice: keep it once
+        first_parent, second_parent = (parent[np.searchsorted(names, name)] for name in (first, second))
+        new = new[(first < second) | (first_parent != second_parent)]
+        return self._select(~replaced)._concatenate(InitialOverlaps.between_new_fragments(np.sort(new, axis=1)))
+
+    def _select(self, rows: Flags) -> InitialOverlaps:
+        return InitialOverlaps(self.names[rows], self.parts[rows], self.depth[rows])
+
+    def _concatenate(self, following: InitialOverlaps) -> InitialOverlaps:
+        pairs = zip(vars(self).values(), vars(following).values(), strict=True)
+        return InitialOverlaps(*(np.concatenate(pair) for pair in pairs))
 
 
-def _crossed(pairs: Ints, start: Ints, count: Ints) -> tuple[Ints, Ints]:
-    """Every member of the first group of pairs (k, 2) with every one of the second; members follow `start`."""
+def _all_pairs(pairs: Ints, start: Ints, count: Ints) -> tuple[Ints, Ints]:
+    """Return every member of the first group with every member of the second, of pairs of groups (k, 2).
+
+    Members of a group are consecutive numbers: `count` of them from `start` on.
+    """
     a, b = pairs.T
-    many = count[a] * count[b]
-    of = np.repeat(np.arange(len(pairs)), many)
-    place = np.arange(many.sum()) - np.repeat(np.cumsum(many) - many, many)
-    return start[a[of]] + place // count[b[of]], start[b[of]] + place % count[b[of]]
+    sizes = count[a] * count[b]
+    row = np.repeat(np.arange(len(pairs)), sizes)
+    number = np.arange(sizes.sum()) - np.repeat(np.cumsum(sizes) - sizes, sizes)
+    return start[a[row]] + number // count[b[row]], start[b[row]] + number % count[b[row]]
 
 
 @dataclass(frozen=True)
-class Parting:
-    """Overlaps between the geoms of an engine.
+class AdmittedOverlaps:
+    """Overlaps that are admitted between the geoms (convex parts) of an engine.
+
+    A pair (i, j) of numbers below `geom_count` is stored as the code min(i, j) geom_count + max(i, j).
 
     Attributes:
-        names: (n,) of the bodies, ascending.    first: (n,) geom of each, of so many `geoms`.
-        new: codes of pairs of bodies.    known, depth: (k,) codes of pairs of geoms, ascending, and what is allowed, m.
+        names: (n,) of the bodies, ascending.
+        first_geom: (n,) first geom of every body.
+        geom_count: number of geoms.
+        new_pairs: codes of pairs of bodies whose overlap has not been measured.
+        geom_pairs: (k,) codes of pairs of geoms, ascending.
+        depth: (k,) admitted overlap, m.
     """
 
     names: Ints
-    first: Ints
-    geoms: int
-    new: Ints
-    known: Ints
+    first_geom: Ints
+    geom_count: int
+    new_pairs: Ints
+    geom_pairs: Ints
     depth: Values
 
     @classmethod
-    def of(cls, overlaps: Overlaps, names: Ints, first: Ints, geoms: int) -> Parting:
-        """Overlaps of pieces that are bodies of these names (n,)."""
-        pairs, new = np.searchsorted(names, overlaps.names), overlaps.parts[:, 0] == NEW
-        code = _code(first[pairs[~new]] + overlaps.parts[~new], geoms)
+    def from_overlaps(
+        cls, overlaps: InitialOverlaps, names: Ints, first_geom: Ints, geom_count: int
+    ) -> AdmittedOverlaps:
+        """Return the overlaps of fragments that are bodies of the names (n,)."""
+        pairs, new = np.searchsorted(names, overlaps.names), overlaps.parts[:, 0] == UNMEASURED
+        code = _pair_codes(first_geom[pairs[~new]] + overlaps.parts[~new], geom_count)
         order = np.argsort(code)
-        return cls(names, first, geoms, _code(pairs[new], geoms), code[order], overlaps.depth[~new][order])
+        depth = overlaps.depth[~new][order]
+        return cls(names, first_geom, geom_count, _pair_codes(pairs[new], geom_count), code[order], depth)
 
-    def __call__(self, geoms: Ints, things: Ints, gap: Values) -> tuple[Values, Parting]:
-        """(k,) distances of contacts of geoms (k, 2), -1 of none, of things (k, 2) beyond those allowed, from distances
-        (k,), m; and what is allowed from then on."""
-        if not len(self.known) and not len(self.new):
+    def __call__(self, geoms: Ints, pairs: Ints, gap: Values) -> tuple[Values, AdmittedOverlaps]:
+        """Return gaps measured from the admitted overlaps, and the overlaps that are admitted from now on.
+
+        Args:
+            geoms: (k, 2) of the contacts; -1 for none.
+            pairs: (k, 2) bodies of the contacts.
+            gap: (k,) m.
+        """
+        if not len(self.geom_pairs) and not len(self.new_pairs):
             return gap, self
-        every, deep = _code(geoms, self.geoms), np.flatnonzero((gap < 0) & (geoms[:, 0] >= 0))
-        code, place = np.unique(every[deep], return_inverse=True)
+        codes, overlapping = _pair_codes(geoms, self.geom_count), np.flatnonzero((gap < 0) & (geoms[:, 0] >= 0))
+        # the deepest contact of every pair of geoms
+        code, row = np.unique(codes[overlapping], return_inverse=True)
         depth: Values = np.zeros(len(code))
-        np.maximum.at(depth, place, -gap[deep])
-        allowed: Values = np.zeros(len(code))
-        pairs = things[deep]
-        bodies = np.maximum(*pairs.T) < len(self.names)
-        allowed[place[bodies & np.isin(_code(pairs, self.geoms), self.new)]] = np.inf
-        _, at, known = np.intersect1d(code, self.known, assume_unique=True, return_indices=True)
-        allowed[at] = self.depth[known]
-        some = allowed > 0
-        code, allowed = code[some], np.minimum(allowed, depth)[some]
-        return gap + _looked_up(every, code, allowed), replace(self.gone, known=code, depth=allowed)
+        np.maximum.at(depth, row, -gap[overlapping])
+        admitted: Values = np.zeros(len(code))
+        overlapping_pairs = pairs[overlapping]
+        between_bodies = np.maximum(*overlapping_pairs.T) < len(self.names)
+        is_new = np.isin(_pair_codes(overlapping_pairs, self.geom_count), self.new_pairs)
+        admitted[row[between_bodies & is_new]] = np.inf
+        _, present, stored = np.intersect1d(code, self.geom_pairs, assume_unique=True, return_indices=True)
+        admitted[present] = self.depth[stored]
+        remain = admitted > 0
+        code, admitted = code[remain], np.minimum(admitted, depth)[remain]
+        after = replace(self.without_contact, geom_pairs=code, depth=admitted)
+        return gap + _look_up(codes, code, admitted), after
 
     @cached_property
-    def pairs(self) -> Ints:
-        """(k, 2) bodies that lie in one another, or may."""
-        geoms = np.stack([self.known // self.geoms, self.known % self.geoms], axis=1)
-        known = np.searchsorted(self.first, geoms, side="right") - 1
-        new = np.stack([self.new // self.geoms, self.new % self.geoms], axis=1)
-        return np.unique(np.concatenate([known, new]), axis=0)
+    def body_pairs(self) -> Ints:
+        """Pairs (k, 2) of bodies that overlap or may do so."""
+        measured = np.searchsorted(self.first_geom, _decode(self.geom_pairs, self.geom_count), side="right") - 1
+        return np.unique(np.concatenate([measured, _decode(self.new_pairs, self.geom_count)]), axis=0)
 
     @property
-    def gone(self) -> Parting:
-        """Where nothing touches."""
-        return replace(self, new=self.new[:0], known=self.known[:0], depth=self.depth[:0])
+    def without_contact(self) -> AdmittedOverlaps:
+        """The same bodies without admitted overlaps."""
+        return replace(self, new_pairs=self.new_pairs[:0], geom_pairs=self.geom_pairs[:0], depth=self.depth[:0])
 
-    @property
-    def overlaps(self) -> Overlaps:
-        """As they are now."""
-        geoms = np.stack([self.known // self.geoms, self.known % self.geoms], axis=1)
-        body = np.searchsorted(self.first, geoms, side="right") - 1
-        known = Overlaps(self.names[body], geoms - self.first[body], self.depth)
-        new = Overlaps.new(self.names[np.stack([self.new // self.geoms, self.new % self.geoms], axis=1)])
-        return Overlaps(*(np.concatenate(each) for each in zip(vars(known).values(), vars(new).values(), strict=True)))
-
-
-def _code(pairs: Ints, geoms: int) -> Ints:
-    """(k,) of pairs (k, 2) below a number."""
-    return np.asarray(np.minimum(*pairs.T) * geoms + np.maximum(*pairs.T), np.int64)
+    def to_initial_overlaps(self) -> InitialOverlaps:
+        """Return the overlaps by names of fragments."""
+        geoms = _decode(self.geom_pairs, self.geom_count)
+        body = np.searchsorted(self.first_geom, geoms, side="right") - 1
+        measured = InitialOverlaps(self.names[body], geoms - self.first_geom[body], self.depth)
+        new = InitialOverlaps.between_new_fragments(self.names[_decode(self.new_pairs, self.geom_count)])
+        return measured._concatenate(new)
 
 
-def _looked_up(codes: Ints, known: Ints, values: Values) -> Values:
-    """(k,) the values (m,) of codes (k,) among those known (m,), ascending; 0 of all others."""
-    place = np.searchsorted(known, codes)
-    there = np.append(known, -1)[place] == codes
-    return np.asarray(np.where(there, np.append(values, 0.0)[place], 0.0))
+def _pair_codes(pairs: Ints, count: int) -> Ints:
+    """Return the codes (k,) of pairs (k, 2) of numbers below `count`."""
+    return np.asarray(np.minimum(*pairs.T) * count + np.maximum(*pairs.T), np.int64)
+
+
+def _decode(codes: Ints, count: int) -> Ints:
+    """Return the pairs (k, 2) that codes (k,) stand for."""
+    return np.stack([codes // count, codes % count], axis=1)
+
+
+def _look_up(codes: Ints, keys: Ints, values: Values) -> Values:
+    """Return for codes (k,) the values (m,) of the ascending keys (m,); 0 for codes that are no key."""
+    row = np.searchsorted(keys, codes)
+    is_key = np.append(keys, -1)[row] == codes
+    return np.asarray(np.where(is_key, np.append(values, 0.0)[row], 0.0))

@@ -1,16 +1,15 @@
-"""Events of a step that is taken apart: what strikes bodies first, then what they meet with what that left them.
+"""Sequences of impact events within a step.
 
-Else all that meets in a step acts at once. A step is taken apart where something strikes a body and would go on into
-something else behind it, which would stop it in the air. In a crowd, where every event is dear, only where that would
-be wrong most: the body may break (or is of pieces of one, and what strikes it breaks no more); pieces of one body are
-no such thing for one another there, or heaps would be taken apart at every step.
+As a rule all impacts of a step act at once. A step becomes a sequence of events where a body, after an impact, would go
+on into another body behind it: with simultaneous impacts the second one would stop it in the air. With many contacts,
+where each event is expensive, a sequence is used only if the body may break.
 
-What strikes at less than a hundredth of the greatest speed does not count (solutions are no more exact), nor what met
-in the event before, where nothing has moved since.
+Impacts below a hundredth of the greatest speed do not count, since solutions are no more accurate. Impacts of the event
+before do not count either where nothing has moved since.
 
-Bodies that touch are at one time t dt in an event, all others at times of their own. So what two things have come
-together by since the step began, with the velocities v that they have now, is dt (c(t_1 v_1) - c(t_2 v_2)), c the part
-along the normal; what is driven is where it was as the step began.
+In an event bodies that touch are at one time t dt, others at times of their own. Two bodies at times t_1 and t_2 have
+approached by dt (c(t_1 v_1) - c(t_2 v_2)) since the step began, at their present velocities v, with c the component
+along the normal. Prescribed obstacles are where they were as the step began.
 """
 
 from __future__ import annotations
@@ -22,137 +21,179 @@ import numpy as np
 import numpy.typing as npt
 
 from .bodies import Bodies
-from .contact_law import SOON, Meetings
+from .collision_detection import MotionBounds
+from .contact_law import LAW, ContactConstraints
 from .contact_points import Contacts
-from .fragment_overlap import Parting
-from .swept_bounds import Course
+from .fragment_overlap import AdmittedOverlaps
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-Kin = Callable[[Ints], Ints]  # of bodies (m,): the number c of what each is a piece of, -2 - c if it breaks no more; -1
+# Family of bodies (m,): the number c of the instance that a fragment is of, -2 - c if it cannot break any more, else
+# -1.
+FamilyFunction = Callable[[Ints], Ints]
 
 
 @dataclass(frozen=True)
-class Stage:
-    """Which event of a step: the only one, where it is not taken apart.
+class EventConditions:
+    """Conditions at the beginning of an event of a step.
 
     Attributes:
-        gravity: (3,) m/s^2 that acts in it: in the first.    parting: how overlaps stand as it begins.
-        begun: (n,) shares of the step that bodies have come through, None where it is not taken apart.
-        after: so many events may follow.    quick: m/s, what is slower strikes nothing.
-        first: whether it is the first one.
+        gravity: (3,) m/s^2 that acts in the event; all of it in the first one.
+        overlaps: overlaps of fragments that are admitted.
+        elapsed: (n,) shares of the step that bodies have flown; None in a step with a single event.
+        events_left: number of events that may follow.
+        min_impact_speed: m/s; slower contacts are not impacts.
+        is_first: whether it is the first event.
     """
 
     gravity: Values
-    parting: Parting
-    begun: Values | None = None
-    after: int = 0
-    quick: float = 0.0
-    first: bool = True
+    overlaps: AdmittedOverlaps
+    elapsed: Values | None = None
+    events_left: int = 0
+    min_impact_speed: float = 0.0
+    is_first: bool = True
 
     @property
-    def apart(self) -> bool:
-        """Whether the step is taken apart."""
-        return self.begun is not None
+    def in_sequence(self) -> bool:
+        """Whether the step is a sequence of events."""
+        return self.elapsed is not None
 
     @property
-    def since(self) -> Values | float:
-        """(n,) shares of the step that bodies have come through."""
-        return 0.0 if self.begun is None else self.begun
+    def elapsed_or_zero(self) -> Values | float:
+        """Shares (n,) of the step that bodies have flown."""
+        return 0.0 if self.elapsed is None else self.elapsed
 
-    def after_it(self, share: Values, parting: Parting) -> Stage:
-        """The next one, of bodies that have come through shares (n,)."""
-        return Stage(0 * self.gravity, parting, share, self.after - 1, self.quick, first=False)
+    def following(self, elapsed: Values, overlaps: AdmittedOverlaps) -> EventConditions:
+        """Return the conditions of the next event, with bodies after shares `elapsed` (n,) of the step."""
+        left = self.events_left - 1
+        return EventConditions(0 * self.gravity, overlaps, elapsed, left, self.min_impact_speed, is_first=False)
 
 
-class Event:
-    """What comes together in an event of a step.
+class ImpactEvent:
+    """Contacts of one event of a step, with the impulses found so far.
 
     Attributes:
-        stage, course: which, and how far things come.    before: what was near bodies as it began.
-        bodies: where they are struck, after the share (n,) of the step.    contacts, meeting: k of them.
-        parting: how overlaps stand in it.    near: (k,) those that are looked at so far.
-        impulse: (k, 3) of them so far, along their axes, N s.
+        conditions: at its beginning.
+        bounds: of the motion of bodies and obstacles.
+        initial_contacts: contacts near the bodies as the event begins.
+        bodies: at their impacts.
+        elapsed: (n,) shares of the step until these.
+        contacts: k contacts near these bodies.
+        constraints: of these contacts.
+        overlaps: admitted overlaps of fragments in the event.
+        active: (k,) contacts that are solved for.
+        impulse: (k, 3) along the axes of the contacts, N s.
     """
 
     def __init__(
-        self, stage: Stage, course: Course, before: Contacts, bodies: Bodies, share: Values, contacts: Contacts,
-        meeting: Meetings, parting: Parting,
+        self, conditions: EventConditions, bounds: MotionBounds, initial_contacts: Contacts, bodies: Bodies,
+        elapsed: Values, contacts: Contacts, constraints: ContactConstraints, overlaps: AdmittedOverlaps,
     ) -> None:  # fmt: skip
-        self.stage, self.course, self.before, self.bodies, self.share = stage, course, before, bodies, share
-        self.contacts, self.meeting, self.parting = contacts, meeting, parting
-        self.near: Flags = meeting.near & ~self.waits
+        """Begin with the contacts that may touch, and no impulses."""
+        self.conditions, self.bounds, self.initial_contacts = conditions, bounds, initial_contacts
+        self.bodies, self.elapsed = bodies, elapsed
+        self.contacts, self.constraints, self.overlaps = contacts, constraints, overlaps
+        self.active: Flags = constraints.may_touch & ~self.postponed
         self.impulse: Values = np.zeros((len(contacts), 3))
 
     @property
-    def last(self) -> bool:
-        """Whether no other one follows."""
-        return not self.stage.after
+    def is_last(self) -> bool:
+        """Whether no event may follow."""
+        return not self.conditions.events_left
 
     @property
-    def waits(self) -> Flags:
-        """(k,) what is left to the events after it."""
-        return self.meeting.waits & (self.stage.after > 0)
+    def postponed(self) -> Flags:
+        """(k,) flags of impacts that are left to later events."""
+        return self.constraints.postponed & (self.conditions.events_left > 0)
 
     @property
-    def strikes(self) -> Flags:
-        """(k,) what strikes in it."""
-        return (self.meeting.closing > 0) & ~self.meeting.waits
+    def impacts(self) -> Flags:
+        """(k,) flags of impacts in this event."""
+        return (self.constraints.impact_speed > 0) & ~self.constraints.postponed
 
-    def taken_apart(self, events: int) -> Stage:
-        """The first of at most so many, instead of it."""
-        quick = SOON * float(self.meeting.closing.max())
-        return Stage(self.stage.gravity, self.stage.parting, np.zeros(len(self.bodies)), events - 1, quick)
+    def begin_sequence(self, events: int) -> EventConditions:
+        """Return the conditions of the first of at most `events` events, in place of this single one."""
+        min_impact_speed = LAW.simultaneity * float(self.constraints.impact_speed.max())
+        conditions, elapsed = self.conditions, np.zeros(len(self.bodies))
+        return EventConditions(conditions.gravity, conditions.overlaps, elapsed, events - 1, min_impact_speed)
 
 
-def behind(event: Event, waits: Flags, near: float, count: int, kin: Kin | None) -> bool:
-    """Whether what moves (bodies below `count`) strikes a body, or is within `near` of it, m, and would go on into
-    something behind it: a contact that `waits` (k,). `kin`: only where that body may break, and what is behind it is
-    not of the same."""
-    if not np.any(waits):
+def would_hit_next(
+    event: ImpactEvent, postponed: Flags, near: float, count: int, family: FamilyFunction | None
+) -> bool:
+    """Return whether a body would go on, after an impact, into something behind what it hit.
+
+    Args:
+        event: with all impacts at once.
+        postponed: (k,) contacts that would close later.
+        near: gap below which bodies count as touching, m.
+        count: number of bodies; obstacles have the numbers from there on.
+        family: only bodies that may break count, and only obstacles behind them of another family; None: all count.
+    """
+    if not np.any(postponed):
         return False
-    closing, contacts = event.meeting.closing, event.contacts
-    rows = np.flatnonzero((closing > 0) | (event.meeting.gap < near))
-    things, axis = contacts.things[rows], contacts.axes[rows, 0]
-    own, other = np.concatenate([things, things[:, ::-1]]).T
-    way, late, speed = np.concatenate([axis, -axis]), np.tile(waits[rows], 2), np.tile(closing[rows], 2)
-    strikes = np.flatnonzero(~late & (other < count) & (own < count))
-    first = np.full(count + 1, -1)  # of what a body strikes or touches: what it strikes hardest
-    order = strikes[np.argsort(speed[strikes], kind="stable")]
-    first[own[order]] = order
-    then = np.flatnonzero(late & (first[np.minimum(own, count)] >= 0))
-    now = first[own[then]]
-    on = (np.einsum("ki,ki->k", way[then], way[now]) > 0) & (other[then] != other[now])
-    if kin is None or not np.any(on):
-        return bool(np.any(on))
-    mine, screen, beyond = (_kin(of[on], count, kin) for of in (own[now], other[now], other[then]))
-    gives_way = (screen >= 0) | ((screen < -1) & (mine == -1))
-    return bool(np.any(gives_way & (screen != mine) & (screen != beyond)))
+    impact_speed, contacts = event.constraints.impact_speed, event.contacts
+    rows = np.flatnonzero((impact_speed > 0) | (event.constraints.gap < near))
+    pairs, axis = contacts.pairs[rows], contacts.axes[rows, 0]
+    # every contact is seen from both of its bodies
+    body, partner = np.concatenate([pairs, pairs[:, ::-1]]).T
+    direction, late = np.concatenate([axis, -axis]), np.tile(postponed[rows], 2)
+    speed = np.tile(impact_speed[rows], 2)
+    impacts = np.flatnonzero(~late & (partner < count) & (body < count))
+    # of the bodies that a body hits or touches, the one that it hits hardest
+    hardest = np.full(count + 1, -1)
+    order = impacts[np.argsort(speed[impacts], kind="stable")]
+    hardest[body[order]] = order
+    later = np.flatnonzero(late & (hardest[np.minimum(body, count)] >= 0))
+    earlier = hardest[body[later]]
+    same_direction = np.einsum("ki,ki->k", direction[later], direction[earlier]) > 0
+    behind = same_direction & (partner[later] != partner[earlier])
+    if family is None or not np.any(behind):
+        return bool(np.any(behind))
+    own, screen, beyond = (
+        _families(numbers[behind], count, family) for numbers in (body[earlier], partner[earlier], partner[later])
+    )
+    # a fragment that cannot break is hit aside by bodies of no family alone
+    gives_way = (screen >= 0) | ((screen < -1) & (own == -1))
+    return bool(np.any(gives_way & (screen != own) & (screen != beyond)))
 
 
-def _kin(things: Ints, count: int, kin: Kin) -> Ints:
-    """(k,) of things (k,), of which bodies are the first `count`; of what stands -1."""
-    found = np.full(len(things), -1)
-    bodies = things < count
-    found[bodies] = kin(things[bodies])
-    return found
+def _families(numbers: Ints, count: int, family: FamilyFunction) -> Ints:
+    """Return the families (k,) of bodies and obstacles (k,); -1 for obstacles, whose numbers begin at `count`."""
+    result = np.full(len(numbers), -1)
+    bodies = numbers < count
+    result[bodies] = family(numbers[bodies])
+    return result
 
 
-def so_far(
-    contacts: Contacts, gap: Values, motion: tuple[Values, Values], rates: Values, past: Values, dt: float
-) -> tuple[Values, Values, Values]:
-    """Of contacts at distances (k,) m of bodies that have come through shares `past` (n,) of the step: distances, m,
-    what things came together by in these shares as they move now, m, and which share of the step is left, of the one
-    that has more of it.    motion: (things, 3) velocities and spins.    rates: (stands, 3) m/s of what stands."""
-    n = len(past)
-    every, (velocity, spin) = np.append(past, np.zeros(len(rates))), motion
-    least = np.minimum(*np.append(past, np.ones(len(rates)))[contacts.things.T])
-    both = np.maximum(*every[contacts.things.T])
-    among = contacts.closing(every[:, None] * velocity, every[:, None] * spin)
-    come = np.where(np.maximum(*contacts.things.T) < n, among, both * contacts.closing(velocity, spin))
-    if np.any(rates):
-        moved: Values = np.zeros((len(every), 3))
-        moved[n:] = rates
-        gap = gap - dt * both * contacts.closing(moved, 0 * moved)
-    return gap, dt * come, np.maximum(1 - least, SOON)
+def elapsed_approach(
+    contacts: Contacts, gap: Values, motion: tuple[Values, Values], obstacle_velocity: Values, elapsed: Values,
+    dt: float,
+) -> tuple[Values, Values, Values]:  # fmt: skip
+    """Return gaps, approach so far and the remaining share of the step at contacts in a sequence.
+
+    Args:
+        contacts: k contacts.
+        gap: (k,) m, with obstacles where they were as the step began.
+        motion: (n + m, 3) velocities and spins of bodies and obstacles.
+        obstacle_velocity: (m, 3) m/s.
+        elapsed: (n,) shares of the step that bodies have flown.
+        dt: s.
+
+    Returns:
+        Gaps (k,), m; approach (k,), m, in the elapsed shares at the present velocities; the remaining share (k,) of the
+        body that has more of it left.
+    """
+    n = len(elapsed)
+    times, (velocity, spin) = np.append(elapsed, np.zeros(len(obstacle_velocity))), motion
+    earlier = np.minimum(*np.append(elapsed, np.ones(len(obstacle_velocity)))[contacts.pairs.T])
+    later = np.maximum(*times[contacts.pairs.T])
+    between_bodies = contacts.approach_speeds(times[:, None] * velocity, times[:, None] * spin)
+    with_obstacles = later * contacts.approach_speeds(velocity, spin)
+    approach = np.where(np.maximum(*contacts.pairs.T) < n, between_bodies, with_obstacles)
+    if np.any(obstacle_velocity):
+        obstacles_alone: Values = np.zeros((len(times), 3))
+        obstacles_alone[n:] = obstacle_velocity
+        gap = gap - dt * later * contacts.approach_speeds(obstacles_alone, 0 * obstacles_alone)
+    return gap, dt * approach, np.maximum(1 - earlier, LAW.simultaneity)

@@ -1,4 +1,4 @@
-"""Bodies of one shape, placed in space: one mesh of all of them."""
+"""Placement of the instances of one mesh in space, and one mesh of all of them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,15 @@ Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where a copy of the mesh is at the start: x = position + R X, with R the turn by `rotation` (3,) in rad; and how
-    it moves, `velocity` (3,) of its middle and `spin` (3,), m/s and rad/s."""
+class InstancePlacement:
+    """Pose and motion of one instance at the start: x = position + R X with the rotation R.
+
+    Attributes:
+        position: (3,) m.
+        rotation: (3,) rotation vector, rad.
+        velocity: (3,) of the centre of mass, m/s.
+        spin: (3,) angular velocity, rad/s.
+    """
 
     position: Values
     rotation: Values
@@ -26,50 +32,66 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Poses:
-    """Of copies: a point X of the mesh is at x = place + turn X; turn (n, 3, 3), place (n, 3) m."""
+class InstancePoses:
+    """Poses of n instances at rest: a point X of the mesh is at x = position + rotation X.
 
-    turn: Values
-    place: Values
+    Attributes:
+        rotation: (n, 3, 3) rotation matrices.
+        position: (n, 3) m.
+    """
+
+    rotation: Values
+    position: Values
 
     @classmethod
-    def of(cls, places: list[Place]) -> Poses:
-        """At the start."""
-        turn = Rotation.from_rotvec(np.array([each.rotation for each in places])).as_matrix()
-        return cls(turn, np.array([each.position for each in places]))
+    def from_placements(cls, placements: list[InstancePlacement]) -> InstancePoses:
+        """Return the poses at the start."""
+        rotation = Rotation.from_rotvec(np.array([placement.rotation for placement in placements])).as_matrix()
+        return cls(rotation, np.array([placement.position for placement in placements]))
 
     @classmethod
-    def at_rest(cls, count: int) -> Poses:
-        """As the mesh is."""
+    def identity(cls, count: int) -> InstancePoses:
+        """Return `count` poses that leave the mesh as it is."""
         return cls(np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)))
 
     def __len__(self) -> int:
-        return len(self.place)
+        return len(self.position)
 
 
-def placed(mesh: MeshData, places: list[Place]) -> MeshData:
-    """A mesh of all copies, one after the other; groups and regions have those of all."""
-    poses = Poses.of(places)
-    points = np.einsum("kij,nj->kni", poses.turn, mesh.points) + poses.place[:, None]
-    nodes, cells = len(mesh.points) * np.arange(len(places)), len(mesh.cells) * np.arange(len(places))
+def place_mesh(mesh: MeshData, placements: list[InstancePlacement]) -> MeshData:
+    """Return one mesh of all instances, one after another; its groups and regions contain those of all."""
+    poses = InstancePoses.from_placements(placements)
+    points = np.einsum("kij,nj->kni", poses.rotation, mesh.points) + poses.position[:, None]
+    first_node, first_cell = (size * np.arange(len(placements)) for size in (len(mesh.points), len(mesh.cells)))
     return MeshData(
-        points.reshape(-1, 3), _copied(mesh.cells, nodes),
-        {name: _copied(facets, nodes) for name, facets in mesh.facet_groups.items()},
-        {name: _copied(members, cells) for name, members in mesh.regions.items()}, mesh.notes,
+        points.reshape(-1, 3), _repeat_with_offsets(mesh.cells, first_node),
+        {name: _repeat_with_offsets(facets, first_node) for name, facets in mesh.facet_groups.items()},
+        {name: _repeat_with_offsets(cells, first_cell) for name, cells in mesh.regions.items()}, mesh.notes,
     )  # fmt: skip
 
 
-def _copied(numbers: Ints, first: Ints) -> Ints:
-    """Rows of numbers once for each of `first`, which is added to them."""
-    shape = (len(first), *(1,) * numbers.ndim)
-    return np.asarray((numbers[None] + first.reshape(shape)).reshape(-1, *numbers.shape[1:]), np.int64)
+def _repeat_with_offsets(numbers: Ints, offsets: Ints) -> Ints:
+    """Return rows of numbers repeated for each of the offsets (n,), which is added to them."""
+    shape = (len(offsets), *(1,) * numbers.ndim)
+    return np.asarray((numbers[None] + offsets.reshape(shape)).reshape(-1, *numbers.shape[1:]), np.int64)
 
 
-def motion(names: Ints, nodes: int, centre: Values, mass: Values, places: list[Place]) -> tuple[Values, Values]:
-    """(n, 3) velocities and (n, 3) spins of bodies by their lowest nodes (n,), `nodes` a copy, and centres (n, 3): each
-    copy moves as one about its centre of mass."""
-    copy = names // nodes
-    weight = np.bincount(copy, mass, len(places))
-    middle = np.stack([np.bincount(copy, mass * each, len(places)) for each in centre.T], axis=1) / weight[:, None]
-    velocity, spin = (np.array([getattr(place, key) for place in places])[copy] for key in ("velocity", "spin"))
-    return np.asarray(velocity + np.cross(spin, centre - middle[copy])), np.asarray(spin)
+def instance_motion(
+    names: Ints, nodes: int, centre: Values, mass: Values, placements: list[InstancePlacement]
+) -> tuple[Values, Values]:
+    """Return velocities and spins (n, 3) of bodies: each instance moves as one about its centre of mass.
+
+    Args:
+        names: (n,) lowest nodes of the bodies.
+        nodes: number of nodes of an instance.
+        centre: (n, 3) m.
+        mass: (n,) kg.
+        placements: of the instances.
+    """
+    instance = names // nodes
+    total = np.bincount(instance, mass, len(placements))
+    moment = np.stack([np.bincount(instance, mass * x, len(placements)) for x in centre.T], axis=1)
+    middle = moment / total[:, None]
+    velocity = np.array([placement.velocity for placement in placements])[instance]
+    spin = np.array([placement.spin for placement in placements])[instance]
+    return np.asarray(velocity + np.cross(spin, centre - middle[instance])), np.asarray(spin)

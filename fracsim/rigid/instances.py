@@ -1,7 +1,7 @@
-"""Copies of one mesh as they break: a blow on one of them costs what that one costs.
+"""Instances of one mesh as they break: a blow on one of them costs what that one costs.
 
-All share the mesh as it was built, its stress and the operator of the whole body, in the axes of the mesh; each knows
-its own damage, from the first blow on that may break it. One that is dented is a mesh of its own.
+All instances share the mesh, its stress and the operator of the whole body, in the axes of the mesh. Each has damage of
+its own, from the first blow that may break it. A dented instance is a mesh of its own.
 """
 
 from __future__ import annotations
@@ -13,159 +13,193 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from .breakage import Breakable, Opened
-from .instance_placement import Poses
+from .breakage import BreakableBody, ImpactOutcome
+from .instance_placement import InstancePoses
 
 if TYPE_CHECKING:
-    from .denting import Shape
+    from .denting import DentedShape
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Patterns = npt.NDArray[np.uint8]
-Kept = tuple[dict[int, dict[str, npt.NDArray[Any]]], "dict[int, Shape]"]  # by the numbers of copies
+Arrays = dict[str, npt.NDArray[Any]]
+# Arrays of broken instances, and shapes of dented ones, by their numbers.
+InstancesSnapshot = tuple[dict[int, Arrays], "dict[int, DentedShape]"]
 
 
-class Copies:
-    """Of a mesh of some nodes, at their poses (one rank).
+class Instances:
+    """Bodies of one mesh at their poses (one rank).
 
     Attributes:
-        poses: where they are at rest.    nodes: of a copy; those of copy k follow k times as many.
-        shapes: of the copies that have flowed, by their numbers.
-        passes, iterations: analyses, and iterations of CG in them, that were taken.
+        poses: at rest.
+        node_count: nodes of an instance; those of instance k follow after k times as many.
+        dented_shapes: of instances that yielded, by their numbers.
+        analyses: number of analyses so far.
+        cg_iterations: iterations of CG in them.
     """
 
     def __init__(
-        self, make: Callable[[int, Shape | None], Breakable], poses: Poses, sizes: tuple[int, int, int]
+        self,
+        make: Callable[[int, DentedShape | None], BreakableBody],
+        poses: InstancePoses,
+        sizes: tuple[int, int, int],
     ) -> None:
-        """`make`: the copy of a number, whole, of a shape (None: as the mesh is); `sizes`: nodes, cells and edges of
-        the mesh."""
+        """Begin with unbroken instances, which are made when they are first needed.
+
+        Args:
+            make: returns the instance of a number, unbroken, with a shape; None: that of the mesh.
+            poses: at rest.
+            sizes: numbers of nodes, cells and edges of the mesh.
+        """
         self._make, self.poses = make, poses
-        self.shapes: dict[int, Shape] = {}
-        self.nodes, self._cells, self._edges = sizes
-        self._made: dict[int, Breakable] = {}
-        self.passes = self.iterations = 0
+        self.dented_shapes: dict[int, DentedShape] = {}
+        self.node_count, self._cell_count, self._edge_count = sizes
+        self._bodies: dict[int, BreakableBody] = {}
+        self.analyses = self.cg_iterations = 0
 
     @classmethod
-    def of(cls, body: Breakable) -> Copies:
-        """One, where the mesh has it."""
+    def of_body(cls, body: BreakableBody) -> Instances:
+        """Return a single instance, placed as the mesh is."""
         graph = body.graph
         sizes = len(graph.domain.nodes), graph.domain.cell_count, len(graph.broken)
-        return cls(lambda *_: body, Poses.at_rest(1), sizes)
+        return cls(lambda *_: body, InstancePoses.identity(1), sizes)
 
     def __len__(self) -> int:
         return len(self.poses)
 
-    def copy(self, number: int) -> Breakable:
-        """One of them."""
-        if number not in self._made:
-            self._made[number] = self._make(number, self.shapes.get(number))
-        return self._made[number]
+    def get(self, number: int) -> BreakableBody:
+        """Return the instance of a number."""
+        if number not in self._bodies:
+            self._bodies[number] = self._make(number, self.dented_shapes.get(number))
+        return self._bodies[number]
 
     @property
-    def damaged(self) -> dict[int, Breakable]:
-        """Those with a broken edge, by their numbers."""
-        return {number: each for number, each in sorted(self._made.items()) if each.graph.broken.any()}
+    def damaged(self) -> dict[int, BreakableBody]:
+        """Instances with a broken edge, by their numbers."""
+        return {number: body for number, body in sorted(self._bodies.items()) if body.graph.broken.any()}
 
     def damage(self) -> tuple[Patterns, Values]:
-        """Patterns (C,) of all cells and where each edge (E,) is cut, in the order of the mesh of all copies."""
-        pattern = np.zeros((len(self), self._cells), np.uint8)
-        cut: Values = np.full((len(self), self._edges), np.nan)
-        for number, each in self.damaged.items():
-            pattern[number], cut[number] = each.damage()
+        """Return patterns (C,) of all cells and cut positions (E,) of all edges, in the order of the mesh of all."""
+        pattern = np.zeros((len(self), self._cell_count), np.uint8)
+        cut: Values = np.full((len(self), self._edge_count), np.nan)
+        for number, body in self.damaged.items():
+            pattern[number], cut[number] = body.input_damage()
         return pattern.reshape(-1), cut.reshape(-1)
 
     @property
-    def split_cells(self) -> int:
-        """Cells that have come apart."""
-        return sum(int(np.count_nonzero(each.graph.split)) for each in self._made.values())
+    def split_cell_count(self) -> int:
+        """Number of split cells of all instances."""
+        return sum(int(np.count_nonzero(body.graph.split)) for body in self._bodies.values())
 
-    def left(self, name: int) -> tuple[int, int]:
-        """The copy that the body of a name is of, and the surfaces that may still open in it: each copy has its own, or
-        what is struck first would take those of all."""
-        number = name // self.nodes
-        return number, self.copy(number).left
+    def surfaces_left(self, name: int) -> tuple[int, int]:
+        """Return the instance that a body belongs to, and the number of surfaces that may still open in it.
 
-    def breaks(self, number: int) -> bool:
-        """Whether surfaces may still open in one of them."""
-        return self.copy(number).breaks
+        The limit is that of each instance; a common one would be used up by those that are impacted first.
+        """
+        number = name // self.node_count
+        return number, self.get(number).surfaces_left
 
-    # --- strikes ---
+    def can_break(self, number: int) -> bool:
+        """Return whether surfaces may still open in an instance."""
+        return self.get(number).can_break
+
+    # --- analyses ---
 
     def may_break(self, name: int, force: float) -> bool:
-        """Whether forces of this sum (N) could break the body of a name; see `Breakable`."""
-        number, node = divmod(name, self.nodes)
-        each = self.copy(number)
-        return each.may_break(each.piece_of(node), force)
+        """Return whether forces, the sum of whose sizes is `force`, N, could break a body; see BreakableBody."""
+        number, node = divmod(name, self.node_count)
+        body = self.get(number)
+        return body.may_break(body.fragment_of(node), force)
 
-    def opened(
-        self, name: int, points: Values, force: Values, radius: Values, share: int, energy: float = np.inf
-    ) -> Opened:
-        """What forces (k, 3) on circles of radii (k,) about points (k, 3) of a body at rest open, N and m, at most
-        `share` surfaces, or the shape that they leave for an energy, J. Whether they count is up to `take`. Raises
-        NotConverged."""
-        number, node = divmod(name, self.nodes)
-        each, turn = self.copy(number), self.poses.turn[number]
-        inside = (points - self.poses.place[number]) @ turn
-        found = each.opened(node, each.loads(each.piece_of(node), inside, force @ turn, radius), share, energy)
-        return replace(found, name=name)
+    def find_outcome(
+        self, name: int, points: Values, force: Values, radius: Values, max_surfaces: int, energy: float = np.inf
+    ) -> ImpactOutcome:
+        """Analyse a body under contact forces. The outcome has no effect before `apply_outcomes`.
 
-    def take(self, every: list[Opened]) -> None:
-        """Have all of that open, whichever rank found it."""
-        of = [each.name // self.nodes for each in every]
-        for number in dict.fromkeys(of):
-            self.copy(number).take([each for each, mine in zip(every, of, strict=True) if mine == number])
-        for number, each in zip(of, every, strict=True):
-            if each.shape is not None:
-                self._reshape(number, each.shape)
-        self.passes += sum(each.passes for each in every)
-        self.iterations += sum(each.iterations for each in every)
+        Args:
+            name: of the body.
+            points: (k, 3) at rest, m.
+            force: (k, 3) at rest, N.
+            radius: (k,) of the circles that the forces press on, m.
+            max_surfaces: surfaces that may open.
+            energy: that plastic flow may dissipate, J.
 
-    def _reshape(self, number: int, shape: Shape) -> None:
-        """A copy is of another shape from here on."""
-        if (made := self._made.pop(number, None)) is not None:
-            made.destroy(alone=number in self.shapes)
-        self.shapes[number] = shape
+        Raises:
+            NotConverged: an analysis failed.
+        """
+        number, node = divmod(name, self.node_count)
+        body, rotation = self.get(number), self.poses.rotation[number]
+        # into the axes of the mesh
+        mesh_points, mesh_force = (points - self.poses.position[number]) @ rotation, force @ rotation
+        loads = body.distribute_forces(body.fragment_of(node), mesh_points, mesh_force, radius)
+        return replace(body.find_outcome(node, loads, max_surfaces, energy), body_name=name)
 
-    # --- a checkpoint ---
+    def apply_outcomes(self, outcomes: list[ImpactOutcome]) -> None:
+        """Break edges and change shapes as analyses on any rank found."""
+        numbers = [outcome.body_name // self.node_count for outcome in outcomes]
+        for number in dict.fromkeys(numbers):
+            own = [outcome for outcome, owner in zip(outcomes, numbers, strict=True) if owner == number]
+            self.get(number).apply_outcomes(own)
+        for number, outcome in zip(numbers, outcomes, strict=True):
+            if outcome.shape is not None:
+                self._change_shape(number, outcome.shape)
+        self.analyses += sum(outcome.analyses for outcome in outcomes)
+        self.cg_iterations += sum(outcome.cg_iterations for outcome in outcomes)
 
-    def kept(self, names: Iterable[int]) -> Kept:
-        """What the copies are now that bodies of these names are of, for `saved` once they have been struck."""
-        return {n: self.copy(n).saved() for n in {name // self.nodes for name in names}}, self.shapes.copy()
+    def _change_shape(self, number: int, shape: DentedShape) -> None:
+        """Give an instance another shape."""
+        if (body := self._bodies.pop(number, None)) is not None:
+            body.destroy(owns_operator=number in self.dented_shapes)
+        self.dented_shapes[number] = shape
 
-    def saved(self, kept: Kept | None = None) -> dict[str, npt.NDArray[Any]]:
-        """What a checkpoint keeps: keys (n, 2) of broken edges and their cuts; where surfaces started, and in which;
-        shapes of those that flowed. `kept`: what copies were that have been struck since."""
-        before, shapes = ({}, self.shapes) if kept is None else kept
-        if shapes:  # nothing breaks where something flows
-            every = shapes.values()
+    # --- checkpoints ---
+
+    def snapshot(self, names: Iterable[int]) -> InstancesSnapshot:
+        """Return the state of the instances of bodies `names`, for a checkpoint of the time before they change."""
+        numbers = {name // self.node_count for name in names}
+        return {number: self.get(number).to_checkpoint() for number in numbers}, self.dented_shapes.copy()
+
+    def to_checkpoint(self, earlier: InstancesSnapshot | None = None) -> Arrays:
+        """Return the arrays that a checkpoint stores.
+
+        They are keys (n, 2) and cut positions of broken edges, starts of surfaces with their instances, or shapes of
+        dented instances. `earlier`: states in place of the present ones, of instances that changed since.
+        """
+        before, shapes = ({}, self.dented_shapes) if earlier is None else earlier
+        # bodies that yield do not break
+        if shapes:
             return {
                 "shape_of": np.array([*shapes]),
-                "shape_points": np.stack([each.points for each in every]),
-                "shape_yields": np.stack([each.yields for each in every]),
+                "shape_points": np.stack([shape.points for shape in shapes.values()]),
+                "shape_yields": np.stack([shape.yield_stress for shape in shapes.values()]),
             }
-        parts = {number: before[number] if number in before else each.saved()
-                 for number, each in sorted(self._made.items())}  # fmt: skip
-        parts = {number: each for number, each in parts.items() if each}
+        parts = {
+            number: before[number] if number in before else body.to_checkpoint()
+            for number, body in sorted(self._bodies.items())
+        }
+        parts = {number: arrays for number, arrays in parts.items() if arrays}
         if not parts:
             return {}
         return {
-            "broken": np.concatenate([each["broken"] + number * self.nodes for number, each in parts.items()]),
-            "cut": np.concatenate([each["cut"] for each in parts.values()]),
-            "starts": np.concatenate([each["starts"] for each in parts.values()]),
-            "starts_of": np.repeat([*parts], [len(each["starts"]) for each in parts.values()]),
+            "broken": np.concatenate([arrays["broken"] + number * self.node_count for number, arrays in parts.items()]),
+            "cut": np.concatenate([arrays["cut"] for arrays in parts.values()]),
+            "starts": np.concatenate([arrays["starts"] for arrays in parts.values()]),
+            "starts_of": np.repeat([*parts], [len(arrays["starts"]) for arrays in parts.values()]),
         }
 
-    def restore(self, saved: dict[str, npt.NDArray[Any]]) -> None:
-        """Be as `saved` said."""
-        if "shape_of" in saved:
-            from .denting import Shape
+    def from_checkpoint(self, arrays: Arrays) -> None:
+        """Restore the state that `to_checkpoint` stored."""
+        if "shape_of" in arrays:
+            from .denting import DentedShape
 
-            for number, *shape in zip(*(saved[f"shape_{key}"] for key in ("of", "points", "yields")), strict=True):
-                self._reshape(int(number), Shape(*shape))
-        if "broken" not in saved:
+            names = ("shape_of", "shape_points", "shape_yields")
+            for number, points, yield_stress in zip(*(arrays[name] for name in names), strict=True):
+                self._change_shape(int(number), DentedShape(points, yield_stress))
+        if "broken" not in arrays:
             return
-        of = saved["broken"][:, 0] // self.nodes
-        for number in map(int, np.union1d(np.union1d(of, saved["starts_of"]), [*self._made])):
-            mine, starts = of == number, saved["starts"][saved["starts_of"] == number]
-            broken = saved["broken"][mine] - number * self.nodes
-            self.copy(number).restore({"broken": broken, "cut": saved["cut"][mine], "starts": starts})
+        edge_instance, start_instance = arrays["broken"][:, 0] // self.node_count, arrays["starts_of"]
+        for number in map(int, np.union1d(np.union1d(edge_instance, start_instance), [*self._bodies])):
+            edges = edge_instance == number
+            broken = arrays["broken"][edges] - number * self.node_count
+            starts = arrays["starts"][start_instance == number]
+            self.get(number).from_checkpoint({"broken": broken, "cut": arrays["cut"][edges], "starts": starts})

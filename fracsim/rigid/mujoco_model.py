@@ -1,10 +1,8 @@
-"""The model of a scene that MuJoCo finds contacts in: bodies of convex parts, and what stands in their way.
+"""Scene as MuJoCo's collision detection has it, and contacts of convex hulls with planes.
 
-Contacts of hulls with planes: every corner that may come as far.
-
-MuJoCo finds three places of a hull at most. A shard that turns fast falls through a floor with a fourth. Which corners
-may come as far is told by how bodies move as a step begins: what something strikes comes down with others, and is
-looked at once more with these.
+MuJoCo finds at most three contacts of a hull with a plane, so that a fragment that spins fast can fall through a floor
+with a fourth corner. Contacts with planes are found here instead: those of all corners that may come as far, judged by
+the motion as the step begins. A body that is impacted may come down with other corners, which are checked afterwards.
 """
 
 from __future__ import annotations
@@ -21,285 +19,394 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from ..contact.shape_base import frame_about
-from .bodies import Bodies, orientation
-from .obstacle_shapes import Primitive
+from .bodies import Bodies, quaternions
+from .obstacles import Part, PrescribedObstacle, PrimitiveShape
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-SURELY, SLACK = 1.5, 0.25  # times what a corner comes in a step, and of what its body may: it is looked at
-NEAREST = 6  # corners of a body that are looked at in any case
-SECTORS, LOWEST, WIDEST = 8, 2, 1  # of a body around its centre: corners that may touch in each, lowest and outermost
-_warned: set[str] = set()
-Part = Values | Primitive  # corners (n, 3) of a hull about the body's centre, in its axes at rest, m; or a shape
-LEAST_MASS = 1e-14  # kg, and kg m^2 about any axis: the engine refuses what weighs less, and a speck may
-SLAB = 20.0  # half the sides of a plane that is driven, in sizes of all that there is: the engine's planes stand still
-MEMORY, LEAST_MEMORY = 2**18, 2**26  # bytes a part, and in all: pairs of parts that may touch are held at once
-FLAT, OTHER = 1, 2  # bits of what meets what
-SLOW = 1e-3  # m/s: what comes together slower than this strikes nothing, whatever the step
 
 
-def _first(of: Ints, value: Values, many: int) -> Flags:
-    """(k,) whether corners of groups (k,) are among the `many` with the least value (k,) of theirs."""
-    order = np.lexsort((value, of))
-    _, start, count = np.unique(of[order], return_index=True, return_counts=True)
-    rank = np.empty(len(of), np.int64)
-    rank[order] = np.arange(len(of)) - np.repeat(start, count)
-    return np.asarray(rank < many)
+@dataclass(frozen=True)
+class ModelSettings:
+    """Numbers of the model and of contacts with planes.
+
+    Attributes:
+        approach_factor: multiple of the approach of a corner in a step within which it is a contact.
+        reach_share: share of the bound of its body that is added to it.
+        nearest_corners: closest corners of a body, which always are contacts.
+        sectors: directions around a body in which corners that may support it are chosen.
+        lowest_corners: corners in each sector that come closest.
+        outermost_corners: corners in each sector that are farthest out.
+        min_mass: kg, and kg m^2 of the inertia; MuJoCo refuses smaller values.
+        slab_size: half the side of the box that stands for a driven plane, in sizes of the scene. MuJoCo's planes are
+            fixed.
+        bytes_per_part: memory for pairs of parts that may touch.
+        min_bytes: least memory for them.
+        min_impact_speed: m/s; slower contacts are no impacts, whatever the step is.
+    """
+
+    approach_factor: float = 1.5
+    reach_share: float = 0.25
+    nearest_corners: int = 6
+    sectors: int = 8
+    lowest_corners: int = 2
+    outermost_corners: int = 1
+    min_mass: float = 1e-14
+    slab_size: float = 20.0
+    bytes_per_part: int = 2**18
+    min_bytes: int = 2**26
+    min_impact_speed: float = 1e-3
 
 
-def _bearing(of: Ints, arm: Values, across: Values, later: Values) -> Flags:
-    """(k,) which corners of bodies (k,) at `arm` (k, 3) from their centres bear: those `later` (k,) lowest and those
-    farthest out in every direction along the plane with axes (3, 3), the last one its normal; all of a body that has
-    few."""
-    along = arm @ across[:, 0], arm @ across[:, 1]
-    sector = np.floor((np.arctan2(*along) / (2 * np.pi) + 0.5) * SECTORS).astype(np.int64)
-    group = SECTORS * of + np.minimum(sector, SECTORS - 1)
-    few = np.bincount(of) <= SECTORS * (LOWEST + WIDEST)
-    return np.asarray(_first(group, later, LOWEST) | _first(group, -np.hypot(*along), WIDEST) | few[of])
+SETTINGS = ModelSettings()
+# Bits of MuJoCo's masks of what collides: shapes with hulls, and everything with everything else.
+PLANE_BIT, GENERAL_BIT = 1, 2
+
+
+# --- contacts with planes ---
+
+
+def _is_among_first(group: Ints, value: Values, count: int) -> Flags:
+    """Return (k,) flags of items that are among the `count` with the least value (k,) of their group (k,)."""
+    order = np.lexsort((value, group))
+    _, start, sizes = np.unique(group[order], return_index=True, return_counts=True)
+    rank = np.empty(len(group), np.int64)
+    rank[order] = np.arange(len(group)) - np.repeat(start, sizes)
+    return np.asarray(rank < count)
+
+
+def _supporting_corners(body: Ints, arm: Values, axes: Values, later_gap: Values) -> Flags:
+    """Return (k,) flags of corners that may support their body: the lowest and the outermost in each sector.
+
+    A body with few corners is supported by all of them.
+
+    Args:
+        body: (k,) of the corners.
+        arm: (k, 3) from the centre of the body, m.
+        axes: (3, 3) two tangents of the plane, and its normal.
+        later_gap: (k,) distance from the plane after the step, m.
+    """
+    x, y = arm @ axes[:, 0], arm @ axes[:, 1]
+    sector = np.floor((np.arctan2(x, y) / (2 * np.pi) + 0.5) * SETTINGS.sectors).astype(np.int64)
+    group = SETTINGS.sectors * body + np.minimum(sector, SETTINGS.sectors - 1)
+    few = np.bincount(body) <= SETTINGS.sectors * (SETTINGS.lowest_corners + SETTINGS.outermost_corners)
+    lowest = _is_among_first(group, later_gap, SETTINGS.lowest_corners)
+    outermost = _is_among_first(group, -np.hypot(x, y), SETTINGS.outermost_corners)
+    return np.asarray(lowest | outermost | few[body])
 
 
 @dataclass
-class Looked:
-    """(p, N) corners that were looked at in a step when it was last asked for what is near, and those that are in any
-    case."""
+class CheckedCorners:
+    """Corners above planes in a step.
 
-    at: Flags
-    always: Flags
+    Attributes:
+        checked: (p, N) corners that were contacts in the last search.
+        required: (p, N) corners that are contacts in any case.
+    """
+
+    checked: Flags
+    required: Flags
 
 
 @dataclass(frozen=True)
-class Planes:
-    """p planes, and N corners of hulls.
+class PlaneContacts:
+    """Planes (p) and the corners (N) of convex hulls.
 
     Attributes:
-        stand, geom: (p,) their numbers among what stands and of the engine.    normal: (p, 3) outwards.
-        friction: (p,)    corners: (N, 3) about the centres of the bodies at rest, m.    of, part: (N,) body and geom.
-        extent: (n,) how far each body reaches from its centre, m.
+        obstacle: (p,) numbers of the planes among prescribed obstacles.
+        plane_geom: (p,) their geoms.
+        normal: (p, 3) outwards.
+        friction: (p,) coefficients.
+        corners: (N, 3) relative to the centres of the bodies at rest, m.
+        corner_body: (N,) bodies.
+        corner_geom: (N,) geoms.
+        extent: (n,) distance that each body reaches from its centre, m.
     """
 
-    stand: Ints
-    geom: Ints
+    obstacle: Ints
+    plane_geom: Ints
     normal: Values
     friction: Values
     corners: Values
-    of: Ints
-    part: Ints
+    corner_body: Ints
+    corner_geom: Ints
     extent: Values
 
     @cached_property
-    def across(self) -> list[Values]:
-        """(3, 3) axes of each, the last one its normal."""
+    def frames(self) -> list[Values]:
+        """Axes (3, 3) of each plane: two tangents and the normal."""
         return [frame_about(normal) for normal in self.normal]
 
-    def looked(self) -> Looked:
-        """As a step begins: nothing has been missed in it."""
-        none = np.zeros((len(self.stand), len(self.corners)), bool)
-        return Looked(none, none.copy())
+    def begin_step(self) -> CheckedCorners:
+        """Return the record of a step in which no corner has been checked."""
+        none = np.zeros((len(self.obstacle), len(self.corners)), bool)
+        return CheckedCorners(none, none.copy())
 
-    def missed(self, bodies: Bodies, ways: Values, deep: float, looked: Looked) -> Flags:
-        """(n,) bodies with corners that are in a plane by more than `deep`, m, and were not looked at: now they are, in
-        this step, as far as they bear. `bodies`, `ways`: (stands, 3) where things are after it."""
-        found = np.zeros(len(bodies), bool)
-        for number, (stand, normal) in enumerate(zip(self.stand, [*self.normal], strict=True)):
-            near, gap = self._around(bodies, ways[stand], normal, np.zeros(len(bodies)))
-            rows = np.flatnonzero((gap < -deep) & ~looked.at[number, near])
+    def find_missed(self, bodies: Bodies, obstacle_points: Values, depth: float, checked: CheckedCorners) -> Flags:
+        """Return (n,) flags of bodies with unchecked corners that penetrate a plane by more than `depth`, m.
+
+        Those that may support the body are required from now on.
+
+        Args:
+            bodies: after the step.
+            obstacle_points: (m, 3) reference points of obstacles after the step, m.
+            depth: m.
+            checked: updated.
+        """
+        missed = np.zeros(len(bodies), bool)
+        for number, (obstacle, normal) in enumerate(zip(self.obstacle, [*self.normal], strict=True)):
+            near, gap = self._corners_near(bodies, obstacle_points[obstacle], normal, np.zeros(len(bodies)))
+            rows = np.flatnonzero((gap < -depth) & ~checked.checked[number, near])
             if len(rows):
-                of = self.of[near[rows]]
-                bears = _bearing(of, self._arms(bodies, near[rows]), self.across[number], gap[rows])
-                looked.always[number, near[rows[bears]]] = found[of] = True
-        return found
+                body = self.corner_body[near[rows]]
+                supporting = _supporting_corners(body, self._arms(bodies, near[rows]), self.frames[number], gap[rows])
+                checked.required[number, near[rows[supporting]]] = missed[body] = True
+        return missed
 
-    def _around(
-        self, bodies: Bodies, way: Values, normal: Values, reach: Values, only: Flags | None = None
+    def _corners_near(
+        self, bodies: Bodies, point: Values, normal: Values, reach: Values, chosen: Flags | None = None
     ) -> tuple[Ints, Values]:
-        """Corners (k,) of bodies that come near a plane with a normal (3,) through a point (3,), and how far from it
-        they are (k,), m; `reach`: (n,) how far each and the plane come, m; `only`: (n,) of these bodies."""
-        height, across = (bodies.place - way) @ normal, np.einsum("nij,i->nj", bodies.turn, normal)
-        low = height < self.extent + reach
-        near = np.flatnonzero((low if only is None else low & only)[self.of])
-        of = self.of[near]
-        return near, np.einsum("kj,kj->k", across[of], self.corners[near]) + height[of]
+        """Return corners (k,) of bodies that may reach a plane, and their distances (k,) from it, m.
+
+        Args:
+            bodies: n of them.
+            point: (3,) of the plane, m.
+            normal: (3,).
+            reach: (n,) how far each body and the plane move, m.
+            chosen: (n,) bodies that count; None: all.
+        """
+        height, local_normal = (bodies.position - point) @ normal, np.einsum("nij,i->nj", bodies.rotation, normal)
+        is_low = height < self.extent + reach
+        near = np.flatnonzero((is_low if chosen is None else is_low & chosen)[self.corner_body])
+        body = self.corner_body[near]
+        return near, np.einsum("kj,kj->k", local_normal[body], self.corners[near]) + height[body]
 
     def _arms(self, bodies: Bodies, corners: Ints) -> Values:
-        """(k, 3) corners (k,) beside the centres of their bodies, m."""
-        return np.asarray(np.einsum("kij,kj->ki", bodies.turn[self.of[corners]], self.corners[corners]))
+        """Return the vectors (k, 3), m, from the centres of the bodies to corners (k,)."""
+        return np.asarray(np.einsum("kij,kj->ki", bodies.rotation[self.corner_body[corners]], self.corners[corners]))
 
-    def near(
-        self, bodies: Bodies, ways: Values, reach: Values, speeds: Values, step: float, looked: Looked,
-        only: Flags | None = None,
+    def find_contacts(
+        self, bodies: Bodies, obstacle_points: Values, reach: Values, obstacle_reach: Values, dt: float,
+        checked: CheckedCorners, chosen: Flags | None = None,
     ) -> list[tuple[int, Ints, Values, Values]]:  # fmt: skip
-        """Of each plane that anything is near to: its number here, the parts (k,) that are, the distances (k,) of
-        corners and the points (k, 3), m. `ways`, `speeds`: (stands, 3) and (stands,) where planes are and what they
-        come in a step, m; `reach`: (n,) what bodies do; `step`: s; `only`: (n,) of these bodies."""
-        if not len(self.stand) or not len(self.corners):
+        """Return for each plane near bodies its number here, geoms (k,), gaps (k,), m, and points (k, 3), m.
+
+        Args:
+            bodies: n of them.
+            obstacle_points: (m, 3) reference points of obstacles, m.
+            reach: (n,) how far bodies may move in the step, m.
+            obstacle_reach: (m,) how far obstacles move, m.
+            dt: s.
+            checked: updated.
+            chosen: (n,) bodies whose contacts are searched for; None: all.
+        """
+        if not len(self.obstacle) or not len(self.corners):
             return []
-        found = []
-        for number, (stand, normal) in enumerate(zip(self.stand, [*self.normal], strict=True)):
-            near, gap = self._around(bodies, ways[stand], normal, reach + speeds[stand], only)
-            seen, always = looked.at[number], looked.always[number]
-            seen[slice(None) if only is None else only[self.of]] = False
-            rows = np.flatnonzero((gap < reach[self.of[near]] + speeds[stand]) | always[near])
-            if len(rows):
-                near, of, gap = near[rows], self.of[near[rows]], gap[rows]
-                arms = self._arms(bodies, near)
-                x = arms + bodies.place[of]
-                way = -step * np.einsum("ki,i->k", bodies.velocity_at(x, of), normal)
-                soon = np.flatnonzero(gap < SURELY * way + SLACK * reach[of] + speeds[stand])
-                kept = _first(of, gap, NEAREST) | always[near]
-                kept[soon] |= _bearing(of[soon], arms[soon], self.across[number], (gap - way)[soon])
-                seen[near[kept]] = True
-                points = x[kept] - gap[kept, None] / 2 * normal
-                found.append((number, self.part[near[kept]], gap[kept], points))
-        return found
+        result = []
+        for number, (obstacle, normal) in enumerate(zip(self.obstacle, [*self.normal], strict=True)):
+            plane_reach = obstacle_reach[obstacle]
+            near, gap = self._corners_near(bodies, obstacle_points[obstacle], normal, reach + plane_reach, chosen)
+            is_checked, required = checked.checked[number], checked.required[number]
+            is_checked[slice(None) if chosen is None else chosen[self.corner_body]] = False
+            rows = np.flatnonzero((gap < reach[self.corner_body[near]] + plane_reach) | required[near])
+            if not len(rows):
+                continue
+            near, body, gap = near[rows], self.corner_body[near[rows]], gap[rows]
+            arms = self._arms(bodies, near)
+            x = arms + bodies.position[body]
+            approach = -dt * np.einsum("ki,i->k", bodies.velocity_at(x, body), normal)
+            limit = SETTINGS.approach_factor * approach + SETTINGS.reach_share * reach[body] + plane_reach
+            soon = np.flatnonzero(gap < limit)
+            kept = _is_among_first(body, gap, SETTINGS.nearest_corners) | required[near]
+            kept[soon] |= _supporting_corners(body[soon], arms[soon], self.frames[number], (gap - approach)[soon])
+            is_checked[near[kept]] = True
+            # half-way between the corner and the plane
+            points = x[kept] - gap[kept, None] / 2 * normal
+            result.append((number, self.corner_geom[near[kept]], gap[kept], points))
+        return result
 
 
-def _warn(text: str) -> None:
-    """Tell a warning of MuJoCo once; by itself it writes them into MUJOCO_LOG.TXT of the working folder."""
-    known = text.partition(" at DOF")[0]
-    if known not in _warned:
-        _warned.add(known)
-        print(f"fracsim: note: MuJoCo: {known}", file=sys.stderr)
+# --- the model ---
+
+_warned: set[str] = set()
 
 
-mujoco.set_mju_user_warning(_warn)
+def _print_warning(text: str) -> None:
+    """Print a warning of MuJoCo once, which by itself would write a file into the working folder."""
+    message = text.partition(" at DOF")[0]
+    if message not in _warned:
+        _warned.add(message)
+        print(f"fracsim: note: MuJoCo: {message}", file=sys.stderr)
+
+
+mujoco.set_mju_user_warning(_print_warning)
 
 
 @dataclass(frozen=True)
-class Rules:
-    """Of a study: `step` s, `gravity` (3,) m/s^2, `friction` of bodies with one another, `restitution` 0 to 1."""
+class ContactParameters:
+    """Time step and contact of a study.
 
-    step: float
+    Attributes:
+        time_step: s.
+        gravity: (3,) m/s^2.
+        friction: coefficient of Coulomb's friction between bodies.
+        restitution: coefficient of restitution, 0 to 1.
+    """
+
+    time_step: float
     gravity: Values
     friction: float = 0.0
     restitution: float = 0.0
 
     @cached_property
-    def fast(self) -> float:
-        """m/s: what comes together faster than resting contact explains, 2 g dt, strikes."""
-        return max(2 * float(np.linalg.norm(self.gravity)) * self.step, SLOW)
+    def impact_threshold(self) -> float:
+        """c_0 = 2 g dt, m/s: bodies that approach faster are not in resting contact."""
+        return max(2 * float(np.linalg.norm(self.gravity)) * self.time_step, SETTINGS.min_impact_speed)
 
 
 @dataclass(frozen=True)
-class Stand:
-    """Something that bodies meet and that nothing moves but its driver.
+class MujocoModel:
+    """Model for MuJoCo's collision detection, and mass properties of its bodies.
 
     Attributes:
-        shape: about its reference point.    at: (3,) that point, m.    friction: Coulomb's coefficient with bodies.
-        driven: whether it ever moves.
+        compiled: MuJoCo's model, of bodies that are placed and have no dynamics.
+        body_of_geom: (geoms,) numbers of bodies, then of prescribed obstacles.
+        first_geom: (n,) first geom of each body.
+        driven: numbers of driven obstacles.
+        mass: (n,) kg, none below the least one.
+        inertia: (n, 3, 3) kg m^2, likewise.
+        inverse_inertia: (n, 3, 3).
+        extent: (n,) distance that each body reaches from its centre, m.
+        planes: contacts of hulls with planes, which MuJoCo does not search for.
     """
 
-    shape: Primitive
-    at: Values
-    friction: float = 0.0
-    driven: bool = False
-
-
-@dataclass(frozen=True)
-class Model:
-    """As MuJoCo has it, which finds contacts in it: bodies that are put where they are, and weigh nothing.
-
-    Attributes:
-        made: MuJoCo's.    thing: (geoms,) bodies by their numbers, then what stands.    first: (n,) geom of each body.
-        driven: numbers of what is driven.    mass, inertia: (n,) kg and (n, 3, 3) kg m^2 of bodies, none too light.
-        inverse: (n, 3, 3) of the inertia.
-        extent: (n,) how far each reaches from its centre, m.    planes: of what stands, whose contacts with hulls
-        MuJoCo leaves alone.
-    """
-
-    made: Any
-    thing: Ints
-    first: Ints
+    compiled: Any
+    body_of_geom: Ints
+    first_geom: Ints
     driven: Ints
     mass: Values
     inertia: Values
-    inverse: Values
+    inverse_inertia: Values
     extent: Values
-    planes: Planes
+    planes: PlaneContacts
 
 
-def model_of(
+def build_model(
     bodies: Bodies,
     parts: Sequence[Sequence[Part]],
-    stands: Sequence[Stand],
-    rules: Rules,
-    outer: Sequence[Values] | None = None,
-    turn: Values | None = None,
-) -> Model:
-    """Of bodies of these convex parts and `outer` points, turned by `turn` (n, 3, 3). What several bodies
-    share is made once. MuJoCo numbers the geoms of what stands still first."""
-    mass, inertia = np.maximum(bodies.mass, LEAST_MASS), bodies.inertia + LEAST_MASS * np.eye(3)
-    turn = np.tile(np.eye(3), (len(bodies), 1, 1)) if turn is None else turn
-    quat = orientation(turn)
-    spec, things, meshes, count = mujoco.MjSpec(), [], _Meshes(), len(bodies)
-    for number, each in enumerate(parts):
-        things += [number] * _add_parts(spec, _placed(spec), each, rules.friction, meshes=meshes, quat=quat[number])
-    driven, fixed = ([number for number, each in enumerate(stands) if each.driven == which] for which in (True, False))
+    obstacles: Sequence[PrescribedObstacle],
+    parameters: ContactParameters,
+    hull_points: Sequence[Values] | None = None,
+    rotation: Values | None = None,
+) -> MujocoModel:
+    """Return the model of bodies and obstacles.
+
+    Args:
+        bodies: n of them.
+        parts: convex parts of each body; arrays that several bodies share become one mesh.
+        obstacles: prescribed ones.
+        parameters: of contact.
+        hull_points: outermost points of each body, m; None: all corners of the parts.
+        rotation: (n, 3, 3) from the axes of parts and points to those of the bodies at rest; None: identity.
+    """
+    mass, inertia = np.maximum(bodies.mass, SETTINGS.min_mass), bodies.inertia + SETTINGS.min_mass * np.eye(3)
+    rotation = np.tile(np.eye(3), (len(bodies), 1, 1)) if rotation is None else rotation
+    quat = quaternions(rotation)
+    spec, moving, meshes, count = mujoco.MjSpec(), [], _Meshes(), len(bodies)
+    for number, body_parts in enumerate(parts):
+        body = _add_placed_body(spec)
+        moving += [number] * _add_parts(spec, body, body_parts, parameters.friction, meshes=meshes, quat=quat[number])
+    driven = [number for number, obstacle in enumerate(obstacles) if obstacle.driven]
+    fixed = [number for number, obstacle in enumerate(obstacles) if not obstacle.driven]
     for number in driven:
-        stand = stands[number]
-        shape, at = _movable(stand.shape, SLAB * _spread(bodies, parts))
-        flat, body = stand.shape.kind == "plane", _placed(spec)
-        things += [count + number] * _add_parts(spec, body, [shape], stand.friction, 1, at, flat=flat, meshes=meshes)
+        obstacle = obstacles[number]
+        shape, offset = _movable_shape(obstacle.shape, SETTINGS.slab_size * _scene_size(bodies, parts))
+        is_plane, body = obstacle.shape.kind == "plane", _add_placed_body(spec)
+        geoms = _add_parts(spec, body, [shape], obstacle.friction, 1, offset, is_plane=is_plane, meshes=meshes)
+        moving += [count + number] * geoms
     for number in fixed:
-        stand = stands[number]
-        flat = stand.shape.kind == "plane"
-        _add_parts(spec, spec.worldbody, [stand.shape], stand.friction, 1, stand.at, flat=flat, meshes=meshes)
-    first = len(fixed) + np.searchsorted(things, np.arange(count))
-    thing = np.array([count + number for number in fixed] + things, np.int64)
-    extent = _extents(parts if outer is None else [[*each, more] for each, more in zip(parts, outer, strict=True)])
-    planes = _planes(parts, stands, thing, first, outer, turn, extent)
-    spec.memory = max(LEAST_MEMORY, MEMORY * len(thing))
+        obstacle = obstacles[number]
+        is_plane = obstacle.shape.kind == "plane"
+        _add_parts(
+            spec, spec.worldbody, [obstacle.shape], obstacle.friction, 1, obstacle.position, is_plane=is_plane,
+            meshes=meshes,
+        )  # fmt: skip
+    # MuJoCo numbers the geoms of the world, which are those of fixed obstacles, first
+    first_geom = len(fixed) + np.searchsorted(moving, np.arange(count))
+    body_of_geom = np.array([count + number for number in fixed] + moving, np.int64)
+    points = parts
+    if hull_points is not None:
+        points = [[*body_parts, outer] for body_parts, outer in zip(parts, hull_points, strict=True)]
+    extent = _extents(points)
+    planes = _make_plane_contacts(parts, obstacles, body_of_geom, first_geom, hull_points, rotation, extent)
+    spec.memory = max(SETTINGS.min_bytes, SETTINGS.bytes_per_part * len(body_of_geom))
     inverse: Values = np.asarray(np.linalg.inv(inertia)) if count else inertia
-    return Model(spec.compile(), thing, first, np.array(driven, np.int64), mass, inertia, inverse, extent, planes)
+    driven_numbers = np.array(driven, np.int64)
+    return MujocoModel(spec.compile(), body_of_geom, first_geom, driven_numbers, mass, inertia, inverse, extent, planes)
 
 
-def _planes(
-    parts: Sequence[Sequence[Part]], stands: Sequence[Stand], thing: Ints, first: Ints, outer: Sequence[Values] | None,
-    turn: Values, extent: Values,
-) -> Planes:  # fmt: skip
-    """Planes among what stands, and the outermost points of bodies, of the first of their parts, or all corners."""
-    stand = np.array([number for number, each in enumerate(stands) if each.shape.kind == "plane"], np.int64)
-    normal = np.array([stands[number].shape.turn[:, 2] for number in stand]).reshape(-1, 3)
-    hulls = [(number, first[number] + place, each) for number, part in enumerate(parts)
-             for place, each in enumerate(part) if not isinstance(each, Primitive)]  # fmt: skip
-    if outer is not None:
-        hulls = [(number, first[number], each) for number, each in enumerate(outer)]
-    corners = np.concatenate([np.empty((0, 3)), *(each for *_, each in hulls)])
-    sizes = [len(each) for *_, each in hulls]
-    of, part = (np.repeat(np.array([each[k] for each in hulls], np.int64), sizes) for k in (0, 1))
-    corners = np.einsum("kij,kj->ki", turn[of], corners)
-    geom = np.array([np.flatnonzero(thing == len(parts) + number)[0] for number in stand], np.int64)
-    friction = np.array([stands[k].friction for k in stand])
-    return Planes(stand, geom, normal, friction, corners, of, part, extent)
+def _make_plane_contacts(
+    parts: Sequence[Sequence[Part]], obstacles: Sequence[PrescribedObstacle], body_of_geom: Ints, first_geom: Ints,
+    hull_points: Sequence[Values] | None, rotation: Values, extent: Values,
+) -> PlaneContacts:  # fmt: skip
+    """Return the planes among the obstacles, and the outermost points of bodies or all corners of their parts."""
+    planes = [number for number, obstacle in enumerate(obstacles) if obstacle.shape.kind == "plane"]
+    numbers = np.array(planes, np.int64)
+    normal = np.array([obstacles[number].shape.rotation[:, 2] for number in numbers]).reshape(-1, 3)
+    # body, geom and corners of each hull
+    hulls = [
+        (body, first_geom[body] + k, part)
+        for body, body_parts in enumerate(parts)
+        for k, part in enumerate(body_parts) if not isinstance(part, PrimitiveShape)
+    ]  # fmt: skip
+    if hull_points is not None:
+        hulls = [(body, first_geom[body], points) for body, points in enumerate(hull_points)]
+    corners = np.concatenate([np.empty((0, 3)), *(points for *_, points in hulls)])
+    sizes = [len(points) for *_, points in hulls]
+    body, geom = (np.repeat(np.array([hull[k] for hull in hulls], np.int64), sizes) for k in (0, 1))
+    corners = np.einsum("kij,kj->ki", rotation[body], corners)
+    plane_geom = [np.flatnonzero(body_of_geom == len(parts) + number)[0] for number in numbers]
+    friction = np.array([obstacles[number].friction for number in numbers])
+    return PlaneContacts(numbers, np.array(plane_geom, np.int64), normal, friction, corners, body, geom, extent)
 
 
-def _spread(bodies: Bodies, parts: Sequence[Sequence[Part]]) -> float:
-    """How far bodies lie apart, with their own size, m."""
-    hulls = [np.abs(each).max() for part in parts for each in part if not isinstance(each, Primitive)]
-    return float(np.ptp(bodies.place, axis=0).max() + 2 * max(hulls, default=1.0))
+def _scene_size(bodies: Bodies, parts: Sequence[Sequence[Part]]) -> float:
+    """Return the distance over which bodies are spread, with their own size, m."""
+    hulls = [
+        np.abs(part).max() for body_parts in parts for part in body_parts if not isinstance(part, PrimitiveShape)
+    ]  # fmt: skip
+    return float(np.ptp(bodies.position, axis=0).max() + 2 * max(hulls, default=1.0))
 
 
 def _extents(parts: Sequence[Sequence[Part]]) -> Values:
-    """(n,) how far bodies reach from their centres, m."""
-    shapes = [(number, each.span if isinstance(each, Primitive) else each)
-              for number, part in enumerate(parts) for each in part]  # fmt: skip
-    reach = np.zeros(len(parts))
-    if shapes:
-        of = np.repeat([number for number, _ in shapes], [len(each) for _, each in shapes])
-        np.maximum.at(reach, of, np.linalg.norm(np.concatenate([each for _, each in shapes]), axis=1))
-    return reach
+    """Return the distances (n,), m, that bodies reach from their centres."""
+    points = [
+        (body, part.extreme_points if isinstance(part, PrimitiveShape) else part)
+        for body, body_parts in enumerate(parts)
+        for part in body_parts
+    ]
+    extent = np.zeros(len(parts))
+    if points:
+        body = np.repeat([number for number, _ in points], [len(x) for _, x in points])
+        np.maximum.at(extent, body, np.linalg.norm(np.concatenate([x for _, x in points]), axis=1))
+    return extent
 
 
-def _movable(shape: Primitive, side: float) -> tuple[Primitive, Values]:
-    """A shape that may be driven and where it is on its body: of a plane the slab behind it, half as thick as wide."""
+def _movable_shape(shape: PrimitiveShape, side: float) -> tuple[PrimitiveShape, Values]:
+    """Return a shape that can be driven, and its offset (3,), m: for a plane a box behind it, half as thick as wide."""
     if shape.kind != "plane":
         return shape, np.zeros(3)
-    return Primitive("box", (side, side, side / 2), shape.turn, side), -side / 2 * shape.turn[:, 2]
+    box = PrimitiveShape("box", (side, side, side / 2), shape.rotation, side)
+    return box, -side / 2 * shape.rotation[:, 2]
 
 
-def _placed(spec: Any) -> Any:
-    """A body that is put where it is. One that is free would cost MuJoCo the inverse of its mass matrix, which grows
-    as their number squared; two that could not move at all would not be looked at."""
+def _add_placed_body(spec: Any) -> Any:
+    """Add a body whose position is set directly.
+
+    With free joints MuJoCo would compute the inverse of the mass matrix, at a cost that grows with the square of the
+    number of bodies. Pairs of bodies without any joint are not searched for contacts.
+    """
     body = spec.worldbody.add_body()
     body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE)
     body.explicitinertial, body.mass, body.inertia = True, 1.0, np.ones(3)
@@ -307,13 +414,13 @@ def _placed(spec: Any) -> Any:
 
 
 class _Meshes:
-    """Names of the hulls that a model has, by the arrays of their corners."""
+    """Names of the hulls of a model, by the identity of their arrays of corners."""
 
     def __init__(self) -> None:
         self._names: dict[int, str] = {}
 
     def name(self, spec: Any, corners: Values) -> str:
-        """Of a hull with corners (n, 3), which is added where it is not there."""
+        """Return the name of a hull with corners (n, 3), which is added if it is new."""
         name = self._names.get(id(corners))
         if name is None:
             mesh, name = spec.add_mesh(), f"part{len(self._names)}"
@@ -324,28 +431,31 @@ class _Meshes:
 
 
 def _add_parts(
-    spec: Any, body: Any, parts: Sequence[Part], friction: float, priority: int = 0, at: Values | None = None,
-    *, flat: bool = False, meshes: _Meshes | None = None, quat: Values | None = None,
+    spec: Any, body: Any, parts: Sequence[Part], friction: float, priority: int = 0, offset: Values | None = None,
+    *, is_plane: bool = False, meshes: _Meshes | None = None, quat: Values | None = None,
 ) -> int:  # fmt: skip
-    """The parts of a body, hulls turned by `quat`; returns how many. What has a priority says what friction is. What is
-    `flat` meets no hulls as MuJoCo goes: those contacts are found by rigid.mujoco_model."""
+    """Add geoms to a body, hulls rotated by `quat`; return their number.
+
+    A contact has the friction of the geom with the higher priority. A plane does not collide with hulls in MuJoCo;
+    those contacts are found by PlaneContacts.
+    """
     for part in parts:
         geom = body.add_geom()
         geom.friction, geom.priority = [friction, 0.0, 0.0], priority
-        if at is not None:
-            geom.pos = at
-        if isinstance(part, Primitive) and part.friction is not None:
+        if offset is not None:
+            geom.pos = offset
+        if isinstance(part, PrimitiveShape) and part.friction is not None:
             geom.friction, geom.priority = [part.friction, 0.0, 0.0], 1
-        if isinstance(part, Primitive) and part.corners is None:
+        if isinstance(part, PrimitiveShape) and part.corners is None:
             geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.upper()}")
             geom.size = part.size
-            geom.quat = Rotation.from_matrix(part.turn).as_quat(scalar_first=True)
-            geom.contype = geom.conaffinity = FLAT if flat else FLAT | OTHER
+            geom.quat = Rotation.from_matrix(part.rotation).as_quat(scalar_first=True)
+            geom.contype = geom.conaffinity = PLANE_BIT if is_plane else PLANE_BIT | GENERAL_BIT
         else:
-            corners = part if not isinstance(part, Primitive) else part.corners
+            corners = part if not isinstance(part, PrimitiveShape) else part.corners
             assert meshes is not None and corners is not None
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, meshes.name(spec, corners)
-            geom.contype = geom.conaffinity = OTHER
+            geom.contype = geom.conaffinity = GENERAL_BIT
             if quat is not None:
                 geom.quat = quat
     return len(parts)

@@ -1,12 +1,12 @@
-"""Obstacles among rigid bodies: what stands, held or driven, and what moves freely, as bodies do that do not break.
+"""Obstacles among rigid bodies: fixed or driven ones, and free ones, which move like bodies that do not break.
 
-Things are numbered: pieces first, then free obstacles, then the parts of what stands.
+Bodies are numbered as follows: fragments, free obstacles, parts of prescribed (fixed or driven) obstacles.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 
 from ..contact.obstacle import RigidObstacle
 from ..contact.pose import Pose, PosedShape
+from ..contact.shape_base import frame_about, unit_vector
+from ..contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylinder, Shape, Sphere
+from ..errors import InputError
 from .bodies import Bodies
-from .convex_decomposition import outermost
-from .mujoco_model import Part, Stand
-from .obstacle_shapes import Primitive, primitives
+from .convex_decomposition import Polyhedron, convex_parts, hull_corners
 
 if TYPE_CHECKING:
     from ..contact.obstacle import FreeObstacle
@@ -27,82 +28,199 @@ Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
 
-class Others:
-    """Of a study, beside its bodies.
+# --- shapes ---
+
+
+@dataclass(frozen=True)
+class PrimitiveShape:
+    """Shape of MuJoCo, relative to a reference point.
 
     Attributes:
-        every: all of them.    free: numbers of those that move freely.
-        owner: (things,) the obstacle that each free one, and then each part of what stands, is of.
-        parts, outer: convex parts and outermost points of each that is free, as of bodies.
-        extent: (things,) half sizes, m; infinite of planes.
+        kind: plane, sphere, capsule, cylinder, box or hull.
+        size: half sizes and radii as MuJoCo has them, m.
+        rotation: (3, 3) from the axes of the kind, whose own axis or normal is z.
+        half_size: half the size of the obstacle, m; infinite for a plane.
+        corners: (n, 3) of a hull, m.
+        friction: coefficient of Coulomb's friction of a free obstacle; None: that of its body.
     """
 
-    def __init__(self, every: Sequence[RigidObstacle]) -> None:
-        self.every = every
-        self.free = [number for number, each in enumerate(every) if each.free]
-        shapes = [primitives(each.shape, f"obstacle {each.name}") for each in every]
-        self.parts: list[list[Part]] = [
-            [replace(part, friction=every[number].friction) for part in shapes[number]] for number in self.free
+    kind: str
+    size: tuple[float, float, float]
+    rotation: Values
+    half_size: float
+    corners: Values | None = None
+    friction: float | None = None
+
+    @property
+    def extreme_points(self) -> Values:
+        """Points (k, 3), m, one of which is as far from the reference point as the shape reaches."""
+        if self.corners is not None:
+            return self.corners
+        x, y, z = self.size
+        return np.array([[x + y, 0.0, 0.0] if self.kind == "capsule" else [x, y, z]])
+
+
+# Convex part of a body: corners (n, 3) of a hull relative to the centre, in the axes at rest, m, or a shape.
+Part = Values | PrimitiveShape
+
+
+@dataclass(frozen=True)
+class PrescribedObstacle:
+    """Convex part of an obstacle that is fixed or driven.
+
+    Attributes:
+        shape: relative to the reference point.
+        position: (3,) of the reference point, m.
+        friction: coefficient of Coulomb's friction with bodies.
+        driven: whether it ever moves.
+    """
+
+    shape: PrimitiveShape
+    position: Values
+    friction: float = 0.0
+    driven: bool = False
+
+
+def obstacle_parts(shape: Shape, name: str) -> list[PrimitiveShape]:
+    """Return the convex parts of the shape of an obstacle; `name` is for error messages.
+
+    Rounded edges are sharp. A shape from a file becomes a union of convex hulls. Raises InputError for other shapes.
+    """
+    from ..contact.triangle_mesh_shape import TriangleMeshShape
+
+    if not isinstance(shape, TriangleMeshShape):
+        return [obstacle_primitive(shape, name)]
+    half_size = float(np.ptp(shape.points, axis=0).min()) / 2
+    parts = convex_parts(Polyhedron.from_triangles(shape.points, shape.triangles).without_cavities)
+    return [PrimitiveShape("hull", (0.0, 0.0, 0.0), np.eye(3), half_size, corners) for corners in parts]
+
+
+def obstacle_primitive(shape: Shape, name: str) -> PrimitiveShape:
+    """Return MuJoCo's shape for that of an obstacle. Raises InputError if there is none."""
+    if shape.dim != 3:
+        raise InputError(f'{name} has {shape.dim} dimensions: time.scheme = "rigid" is for bodies in space')
+    if not shape.convex:
+        raise InputError(f'{name} is hollow, which time.scheme = "rigid" does not have: build it of boxes or planes')
+    upright = np.eye(3)
+    match shape:
+        case HalfSpace():
+            return PrimitiveShape("plane", (0.0, 0.0, 1.0), frame_about(unit_vector(shape.direction)), np.inf)
+        case Sphere():
+            return PrimitiveShape("sphere", (shape.radius, 0.0, 0.0), upright, shape.radius)
+        case Capsule():
+            size = (shape.radius, shape.length / 2, 0.0)
+            return PrimitiveShape("capsule", size, frame_about(unit_vector(shape.axis)), shape.radius)
+        case RoundedCylinder():
+            size = (shape.radius, shape.length / 2, 0.0)
+            half_size = min(shape.radius, shape.length / 2)
+            return PrimitiveShape("cylinder", size, frame_about(unit_vector(shape.axis)), half_size)
+        case RoundedBox():
+            x, y, z = (side / 2 for side in shape.size)
+            return PrimitiveShape("box", (x, y, z), upright, min(x, y, z))
+    raise InputError(f'{name}: time.scheme = "rigid" has no {shape.kind}')
+
+
+# --- the obstacles of a study ---
+
+
+class ObstacleSet:
+    """Obstacles of a study beside its bodies.
+
+    Attributes:
+        obstacles: all of them.
+        free_numbers: numbers of those that move freely.
+        obstacle_of: (m,) number of the obstacle of each free body, and then of each part of prescribed ones.
+        convex_parts: of each free obstacle.
+        hull_points: outermost points (k, 3) of each free obstacle, m.
+        half_sizes: (m,) m; infinite for planes.
+    """
+
+    def __init__(self, obstacles: Sequence[RigidObstacle]) -> None:
+        """Divide the obstacles into convex parts."""
+        self.obstacles = obstacles
+        self.free_numbers = [number for number, obstacle in enumerate(obstacles) if obstacle.free]
+        shapes = [obstacle_parts(obstacle.shape, f"obstacle {obstacle.name}") for obstacle in obstacles]
+        self.convex_parts: list[list[Part]] = [
+            [replace(part, friction=obstacles[number].friction) for part in shapes[number]]
+            for number in self.free_numbers
         ]
-        self.outer = [_outer(shapes[number]) for number in self.free]
-        self._standing = [(k, part) for k, each in enumerate(every) if not each.free for part in shapes[k]]
-        self.owner: Ints = np.array([*self.free, *(number for number, _ in self._standing)], np.int64)
-        standing = [part.extent for _, part in self._standing]
-        self.extent = np.array([*(shapes[number][0].extent for number in self.free), *standing])
-        self.driven = any(each.prescribed_displacement is not None for each in every)
+        self.hull_points = [_hull_points(shapes[number]) for number in self.free_numbers]
+        self._prescribed = [
+            (number, part)
+            for number, obstacle in enumerate(obstacles) if not obstacle.free
+            for part in shapes[number]
+        ]  # fmt: skip
+        numbers = [*self.free_numbers, *(number for number, _ in self._prescribed)]
+        self.obstacle_of: Ints = np.array(numbers, np.int64)
+        free_sizes = [shapes[number][0].half_size for number in self.free_numbers]
+        self.half_sizes = np.array([*free_sizes, *(part.half_size for _, part in self._prescribed)])
+        self.driven = any(obstacle.prescribed_displacement is not None for obstacle in obstacles)
 
-    def bodies(self) -> Bodies:
-        """Those that are free, at the start."""
-        free = [cast("FreeObstacle", self.every[number]) for number in self.free]
-        at = np.array([each.start_point for each in free]).reshape(-1, 3)
-        rate = np.array([each.start_rate for each in free]).reshape(-1, 6)
-        inertia = np.array([each.inertia for each in free]).reshape(-1, 3, 3)
-        mass, turn = np.array([each.mass for each in free]), np.tile(np.eye(3), (len(free), 1, 1))
-        return Bodies(mass, at, inertia, at, turn, rate[:, :3], rate[:, 3:])
+    def free_bodies(self) -> Bodies:
+        """Return the free obstacles as bodies at the start."""
+        free = [cast("FreeObstacle", self.obstacles[number]) for number in self.free_numbers]
+        centre = np.array([obstacle.start_point for obstacle in free]).reshape(-1, 3)
+        rate = np.array([obstacle.start_rate for obstacle in free]).reshape(-1, 6)
+        inertia = np.array([obstacle.inertia for obstacle in free]).reshape(-1, 3, 3)
+        mass, rotation = np.array([obstacle.mass for obstacle in free]), np.tile(np.eye(3), (len(free), 1, 1))
+        return Bodies(mass, centre, inertia, centre, rotation, rate[:, :3], rate[:, 3:])
 
-    def stands(self, t: float) -> list[Stand]:
-        """What stands at a time, s."""
-        every = self.every
-        return [Stand(part, self.way(number, t), every[number].friction,
-                      every[number].prescribed_displacement is not None)
-                for number, part in self._standing]  # fmt: skip
-
-    def ways(self, t: float) -> Values | None:
-        """(stands, 3) reference points at a time, s; None where nothing is driven."""
-        return np.array([self.way(number, t) for number, _ in self._standing]) if self.driven else None
-
-    def way(self, number: int, t: float) -> Values:
-        """(3,) where the reference point of what stands is at a time, s."""
-        return np.asarray(self.every[number].start_point + self.every[number].displacement(t), float)
-
-    def moved(self, t: float, dt: float) -> Values:
-        """(obstacles, 3) how far each goes that is driven, in the step from a time on, m."""
-        return np.array([self.way(k, t + dt) - self.way(k, t) for k in range(len(self.every))]).reshape(-1, 3)
-
-    def placed(self, t: float, bodies: Bodies) -> list[PosedShape]:
-        """Where they are at a time, s, with the free ones after all pieces among the `bodies`."""
-        first = len(bodies) - len(self.free)
-        result = [each.posed_at(t) for each in self.every]
-        for place, number in enumerate(self.free, first):
-            result[number] = PosedShape(self.every[number].shape, Pose(bodies.place[place], bodies.turn[place]))
+    def prescribed_obstacles(self, t: float) -> list[PrescribedObstacle]:
+        """Return the parts of fixed and driven obstacles at a time, s."""
+        result = []
+        for number, part in self._prescribed:
+            obstacle, point = self.obstacles[number], self.reference_point(number, t)
+            result.append(
+                PrescribedObstacle(part, point, obstacle.friction, obstacle.prescribed_displacement is not None)
+            )
         return result
 
-    def readings(self, bodies: Bodies) -> Values:
-        """What columns_of each free one tell: place, velocity, turn, spin and energy of motion."""
-        mine = bodies.part(slice(len(bodies) - len(self.free), None))
-        turn = Rotation.from_matrix(mine.turn).as_rotvec() if self.free else mine.spin
-        return np.concatenate([mine.place, mine.velocity, turn, mine.spin, mine.kinetics[:, None]], axis=1).ravel()
+    def reference_points(self, t: float) -> Values | None:
+        """Return the reference points (m, 3), m, of prescribed parts at a time, s; None if no obstacle is driven."""
+        if not self.driven:
+            return None
+        return np.array([self.reference_point(number, t) for number, _ in self._prescribed])
+
+    def reference_point(self, number: int, t: float) -> Values:
+        """Return the reference point (3,), m, of a prescribed obstacle at a time, s."""
+        return np.asarray(self.obstacles[number].start_point + self.obstacles[number].displacement(t), float)
+
+    def displacements(self, t: float, dt: float) -> Values:
+        """Return how far prescribed obstacles move (obstacles, 3), m, from a time on, within dt, s."""
+        numbers = range(len(self.obstacles))
+        moved = [self.reference_point(number, t + dt) - self.reference_point(number, t) for number in numbers]
+        return np.array(moved).reshape(-1, 3)
+
+    def placed_shapes(self, t: float, bodies: Bodies) -> list[PosedShape]:
+        """Return all obstacles at a time, s; the free ones are the last of `bodies`."""
+        first = len(bodies) - len(self.free_numbers)
+        result = [obstacle.posed_at(t) for obstacle in self.obstacles]
+        for body, number in enumerate(self.free_numbers, first):
+            result[number] = PosedShape(
+                self.obstacles[number].shape, Pose(bodies.position[body], bodies.rotation[body])
+            )
+        return result
+
+    # --- columns of history.csv ---
 
     def columns(self) -> list[str]:
-        """Names of the readings."""
-        if not self.free:
+        """Return the names of the columns of free obstacles."""
+        if not self.free_numbers:
             return []
         from ..contact.rigid_obstacle_state import column_names
 
-        return [name for number in self.free for name in column_names(cast("FreeObstacle", self.every[number]))]
+        free = [cast("FreeObstacle", self.obstacles[number]) for number in self.free_numbers]
+        return [name for obstacle in free for name in column_names(obstacle)]
+
+    def readings(self, bodies: Bodies) -> Values:
+        """Return the values of the columns: position, velocity, rotation, spin and kinetic energy of each."""
+        free = bodies.select(slice(len(bodies) - len(self.free_numbers), None))
+        rotation = Rotation.from_matrix(free.rotation).as_rotvec() if self.free_numbers else free.spin
+        values = [free.position, free.velocity, rotation, free.spin, free.kinetic_energies[:, None]]
+        return np.concatenate(values, axis=1).ravel()
 
 
-def _outer(parts: Sequence[Primitive]) -> Values:
-    """(k, 3) corners that a plane may meet; none of round things, which the engine has itself."""
+def _hull_points(parts: Sequence[PrimitiveShape]) -> Values:
+    """Return the corners (k, 3), m, that a plane may touch; none of round shapes, which MuJoCo has itself."""
     hulls = [part.corners for part in parts if part.corners is not None]
-    return outermost(np.concatenate(hulls)) if hulls else np.empty((0, 3))
+    return hull_corners(np.concatenate(hulls)) if hulls else np.empty((0, 3))

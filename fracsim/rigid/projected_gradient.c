@@ -1,30 +1,28 @@
-/* What rigid.contact_solver does to each contact in every iteration.
+/* Accelerated projected gradients for Coulomb's law at many contacts (rigid.contact_solver).
 
-   Vectors of a contact are along its axes, first the normal. Things are n bodies and, as the last one, all that stands:
-   it has no inverse mass. What bodies are given is six numbers each, impulse and moment, or velocity and spin. */
+   Vectors of a contact are along its axes, the normal first. There are n bodies; number n stands for all obstacles, which
+   have no inverse mass. A level has six numbers for each body: impulse and moment, or velocity and spin. */
 
-#define _POSIX_C_SOURCE 199309L
 #include <math.h>
-#include <sched.h>
-#include <stdatomic.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 
-enum { CHECK = 10, LOOK = 15, SQUARINGS = 6, PATIENCE = 5000 };
-enum { TAKEN = 1, DONE = 2, STAGES = 4 };
+/* Iterations between tests of convergence; iterations after which contacts are selected again for the first time; and
+   squarings of a matrix, whose 64th power has a trace that gives its largest eigenvalue within 3 %. */
+enum { CHECK_INTERVAL = 10, FIRST_SELECTION = 15, SQUARINGS = 6 };
 
 typedef struct {
-    double axes[9], arms[6], given[3], friction; /* rows of axes; arms from what first and second turn about */
+    double axes[9], arms[6], free[3], friction; /* rows of axes; from the centres of the bodies; u_0 with r / dt */
 } Contact;
 
 typedef struct {
     int64_t count, bodies;
     const Contact *contact;
-    const int64_t *things; /* (count, 2) */
-    const double *mass;    /* (bodies,) 1 / kg, inverse */
-    const double *inertia; /* (bodies, 9) inverse */
-} Crowd;
+    const int64_t *pairs;  /* (count, 2) */
+    const double *mass;    /* (bodies,) inverse, 1 / kg */
+    const double *inertia; /* (bodies, 9) inverse, in the axes of space */
+} System;
 
 static void cross(const double *a, const double *b, double *c)
 {
@@ -35,8 +33,8 @@ static void cross(const double *a, const double *b, double *c)
 
 static double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
-/* Add to what bodies are given what an impulse p of a contact does. */
-static void push(const Contact *at, const double *p, double *first, double *second)
+/* Add an impulse p of a contact to the levels of its bodies. */
+static void add_impulse(const Contact *at, const double *p, double *first, double *second)
 {
     double f[3], m[3];
     for (int j = 0; j < 3; j++) f[j] = at->axes[j] * p[0] + at->axes[3 + j] * p[1] + at->axes[6 + j] * p[2];
@@ -46,38 +44,38 @@ static void push(const Contact *at, const double *p, double *first, double *seco
     for (int j = 0; j < 3; j++) { second[j] += f[j]; second[3 + j] += m[j]; }
 }
 
-/* Velocities and spins of some bodies, from impulses and moments. */
-static void move(const Crowd *crowd, int64_t first, int64_t last, double *level)
+/* Turn impulses and moments of bodies into velocities and spins. */
+static void to_velocities(const System *system, int64_t first, int64_t last, double *level)
 {
     for (int64_t n = first; n < last; n++) {
-        const double *inverse = crowd->inertia + 9 * n;
+        const double *inverse = system->inertia + 9 * n;
         double *v = level + 6 * n, m[3] = {v[3], v[4], v[5]};
-        for (int j = 0; j < 3; j++) { v[j] *= crowd->mass[n]; v[3 + j] = dot(inverse + 3 * j, m); }
+        for (int j = 0; j < 3; j++) { v[j] *= system->mass[n]; v[3 + j] = dot(inverse + 3 * j, m); }
     }
 }
 
-/* What impulses (count, 3) give. */
-void gained(const Crowd *crowd, const double *p, double *level)
+/* Changes of velocity and spin (bodies + 1, 6) by impulses (count, 3). */
+void velocity_changes(const System *system, const double *p, double *level)
 {
-    memset(level, 0, 6 * (crowd->bodies + 1) * sizeof(double));
-    for (int64_t k = 0; k < crowd->count; k++)
+    memset(level, 0, 6 * (system->bodies + 1) * sizeof(double));
+    for (int64_t k = 0; k < system->count; k++)
         if (p[3 * k] > 0)
-            push(crowd->contact + k, p + 3 * k, level + 6 * crowd->things[2 * k], level + 6 * crowd->things[2 * k + 1]);
-    move(crowd, 0, crowd->bodies, level);
-    memset(level + 6 * crowd->bodies, 0, 6 * sizeof(double));
+            add_impulse(system->contact + k, p + 3 * k, level + 6 * system->pairs[2 * k], level + 6 * system->pairs[2 * k + 1]);
+    to_velocities(system, 0, system->bodies, level);
+    memset(level + 6 * system->bodies, 0, 6 * sizeof(double));
 }
 
-/* Velocity u of the second thing beside the first. */
-static void part(const Contact *at, const double *first, const double *second, double *u)
+/* Velocity u of the second body relative to the first. */
+static void relative_velocity(const Contact *at, const double *first, const double *second, double *u)
 {
     double a[3], b[3];
     cross(first + 3, at->arms, a);
     cross(second + 3, at->arms + 3, b);
     for (int j = 0; j < 3; j++) a[j] = second[j] + b[j] - first[j] - a[j];
-    for (int j = 0; j < 3; j++) u[j] = dot(at->axes + 3 * j, a) + at->given[j];
+    for (int j = 0; j < 3; j++) u[j] = dot(at->axes + 3 * j, a) + at->free[j];
 }
 
-/* The nearest of the cone |p_t| <= mu p_n. */
+/* Move p to the closest point of the cone |p_t| <= mu p_n. */
 static void project(double *p, double mu)
 {
     double along = sqrt(p[1] * p[1] + p[2] * p[2]);
@@ -88,21 +86,21 @@ static void project(double *p, double mu)
     p[2] *= share;
 }
 
-void projected(int64_t count, double *p, const double *mu)
+void project_on_cones(int64_t count, double *p, const double *mu)
 {
     for (int64_t k = 0; k < count; k++) project(p + 3 * k, mu[k]);
 }
 
-/* w = tr J M^-1 J^T of one side of a contact, and J^T J / w added to the (6, 6) of its body. */
-static double weigh(const Contact *at, const double *arm, double mass, const double *inverse, double *square)
+/* Return w = tr J M^-1 J^T of one side of a contact, and add J^T J / w to the (6, 6) matrix of its body. */
+static double add_square(const Contact *at, const double *arm, double mass, const double *inverse, double *square)
 {
     double rows[3][6], w = 0;
     for (int a = 0; a < 3; a++) {
-        double *turning = rows[a] + 3;
+        double *angular = rows[a] + 3;
         memcpy(rows[a], at->axes + 3 * a, 3 * sizeof(double));
-        cross(arm, rows[a], turning);
+        cross(arm, rows[a], angular);
         w += mass;
-        for (int j = 0; j < 3; j++) w += turning[j] * dot(inverse + 3 * j, turning);
+        for (int j = 0; j < 3; j++) w += angular[j] * dot(inverse + 3 * j, angular);
     }
     for (int i = 0; i < 6; i++)
         for (int j = 0; j < 6; j++)
@@ -110,8 +108,8 @@ static double weigh(const Contact *at, const double *arm, double mass, const dou
     return w;
 }
 
-/* The largest eigenvalue of M^-1 S, S (6, 6), or a little more: tr (M^-1 S)^m to the power of 1 / m, m = 2^SQUARINGS. */
-static double largest(const double *square, double mass, const double *inverse)
+/* Upper bound of the largest eigenvalue of M^-1 S, S (6, 6): the trace of (M^-1 S)^m to the power 1 / m, m = 2^SQUARINGS. */
+static double bound_eigenvalue(const double *square, double mass, const double *inverse)
 {
     double b[6][6], trace = 0, power;
     for (int j = 0; j < 6; j++)
@@ -135,265 +133,249 @@ static double largest(const double *square, double mass, const double *inverse)
     return trace * pow(power, 1.0 / (1 << SQUARINGS));
 }
 
-/* A contact that is solved for, one after the other in memory. */
+/* A selected contact; these are consecutive in memory. */
 typedef struct {
     Contact at;
-    double d, p[3], change[3], q[3]; /* impulses, how they last changed, and where they are looked at */
-    int64_t number, age;             /* of all contacts; iterations since p turned back */
+    double d, p[3], change[3], q[3]; /* D; impulses, their last change, and the extrapolated ones */
+    int64_t number, age;             /* number among all contacts; iterations since p reversed */
     int32_t first, second;
 } Row;
 
-/* What is worked on in two halves, by one thread or by two: sums are the same to the last digit. */
-typedef struct State State;
-typedef void (*Work)(State *, int);
-struct State {
-    const Crowd *crowd;
+/* State of the iterations. Sums over contacts are formed in two halves. Another order of summation would change results
+   in the last digit, and with them the course of a heap. */
+typedef struct {
+    const System *system;
     double *p, *change;         /* (count, 3) of all contacts */
     double *d, *w;              /* (count,), (count, 2) */
-    int64_t *age, *rows;        /* (count,) by contact; some of them */
-    double *level[2], *back[2]; /* of each half: (bodies + 1, 6) what is given to bodies, (bodies + 1,) how far p turned
-                                   back in the last iteration */
-    double *square[2], *most;   /* of each half: (bodies + 1, 36), see `squares`; (bodies + 1,) */
-    double *beta;               /* (most,) by age */
-    double worst[2], enough;    /* m/s that velocities are off by, its square, of each half; and may be */
-    Row *row;                   /* some of count */
-    int64_t some, limit;
-    int missed;
-    Work work;                   /* what is done to both halves, */
-    atomic_int_fast64_t offer;   /* the STAGES of the second: offered, TAKEN, DONE; -1 in the end */
-};
+    int64_t *age, *rows;        /* (count,) of all contacts; numbers of the selected ones */
+    double *level[2], *back[2]; /* of each half: (bodies + 1, 6), and (bodies + 1,) by how much p reversed */
+    double *square[2], *lambda; /* of each half: (bodies + 1, 36) sums of J^T J / w; (bodies + 1,) bounds of eigenvalues */
+    double *beta;               /* Nesterov's factor by age */
+    double worst[2], tolerance; /* of each half: square of the largest error, m/s; accepted error, m/s */
+    Row *row;                   /* selected contacts */
+    int64_t selected, limit;    /* number of these; largest number of iterations */
+    int missed;                 /* whether a contact without impulse closes */
+} State;
 
-/* Look again, and after a while let others have the core. */
-static void patient(int *waited)
+typedef void (*Work)(State *, int);
+
+static void in_halves(State *state, Work work)
 {
-    if (*waited < PATIENCE) ++*waited;
-    else sched_yield();
+    work(state, 0);
+    work(state, 1);
 }
 
-/* Do something to both halves. A second thread does the second one, if it is there before the first is through with its
-   own: where cores have more to do, nobody waits for a thread that does not run. */
-static void share(State *now, Work work)
-{
-    now->work = work;
-    int_fast64_t open = atomic_load(&now->offer) / STAGES * STAGES + STAGES;
-    atomic_store(&now->offer, open);
-    work(now, 0);
-    if (atomic_compare_exchange_strong(&now->offer, &(int_fast64_t){open}, open + TAKEN)) work(now, 1);
-    else for (int waited = 0; atomic_load(&now->offer) != open + DONE;) patient(&waited);
-}
-
-/* What a second thread does, until there is no more to do. */
-void help(State *now)
-{
-    for (int waited = 0; atomic_load(&now->offer) >= 0;) {
-        int_fast64_t open = atomic_load(&now->offer);
-        if (open > 0 && open % STAGES == 0 && atomic_compare_exchange_strong(&now->offer, &open, open + TAKEN)) {
-            now->work(now, 1);
-            atomic_store(&now->offer, open + DONE);
-            waited = 0;
-        } else patient(&waited);
-    }
-}
-
+/* Where a half of `count` items begins. */
 static int64_t begins(int64_t count, int half) { return half * count / 2; }
 
-/* Which contacts press, or would let things through by `enough`; whether any would that gives nothing. */
-static void look(State *now)
+/* Select the contacts that have an impulse, or that close by more than the tolerance allows. */
+static void select_contacts(State *state)
 {
-    const Crowd *crowd = now->crowd;
-    double *level = now->level[0];
-    now->missed = 0, now->some = 0;
-    gained(crowd, now->p, level);
-    for (int64_t k = 0; k < crowd->count; k++) {
-        const int64_t *n = crowd->things + 2 * k;
+    const System *system = state->system;
+    double *level = state->level[0];
+    state->missed = 0, state->selected = 0;
+    velocity_changes(system, state->p, level);
+    for (int64_t k = 0; k < system->count; k++) {
+        const int64_t *n = system->pairs + 2 * k;
         double u[3];
-        part(crowd->contact + k, level + 6 * n[0], level + 6 * n[1], u);
-        now->missed |= u[0] < -now->enough && now->p[3 * k] == 0;
-        if (u[0] < now->enough || now->p[3 * k] > 0) now->rows[now->some++] = k;
+        relative_velocity(system->contact + k, level + 6 * n[0], level + 6 * n[1], u);
+        state->missed |= u[0] < -state->tolerance && state->p[3 * k] == 0;
+        if (u[0] < state->tolerance || state->p[3 * k] > 0) state->rows[state->selected++] = k;
     }
 }
 
-/* J^T J / w of the contacts of a half, summed by bodies. */
-static void squares(State *now, int half)
+/* Sum J^T J / w by bodies. */
+static void sum_squares(State *state, int half)
 {
-    const Crowd *crowd = now->crowd;
-    memset(now->square[half], 0, 36 * (crowd->bodies + 1) * sizeof(double));
-    for (int64_t r = begins(now->some, half); r < begins(now->some, half + 1); r++)
+    const System *system = state->system;
+    memset(state->square[half], 0, 36 * (system->bodies + 1) * sizeof(double));
+    for (int64_t r = begins(state->selected, half); r < begins(state->selected, half + 1); r++)
         for (int side = 0; side < 2; side++) {
-            int64_t k = now->rows[r], n = crowd->things[2 * k + side];
-            now->w[2 * k + side] = n == crowd->bodies ? 0 : weigh(crowd->contact + k,
-                crowd->contact[k].arms + 3 * side, crowd->mass[n], crowd->inertia + 9 * n, now->square[half] + 36 * n);
+            int64_t k = state->rows[r], n = system->pairs[2 * k + side];
+            state->w[2 * k + side] = n == system->bodies ? 0 : add_square(system->contact + k,
+                system->contact[k].arms + 3 * side, system->mass[n], system->inertia + 9 * n,
+                state->square[half] + 36 * n);
         }
 }
 
-static void largests(State *now, int half)
+/* Bound the eigenvalues of bodies. */
+static void bound_bodies(State *state, int half)
 {
-    const Crowd *crowd = now->crowd;
-    for (int64_t n = begins(crowd->bodies, half); n < begins(crowd->bodies, half + 1); n++) {
-        double *square = now->square[0] + 36 * n;
-        for (int i = 0; i < 36; i++) square[i] += now->square[1][36 * n + i];
-        now->most[n] = largest(square, crowd->mass[n], crowd->inertia + 9 * n);
+    const System *system = state->system;
+    for (int64_t n = begins(system->bodies, half); n < begins(system->bodies, half + 1); n++) {
+        double *square = state->square[0] + 36 * n;
+        for (int i = 0; i < 36; i++) square[i] += state->square[1][36 * n + i];
+        state->lambda[n] = bound_eigenvalue(square, system->mass[n], system->inertia + 9 * n);
     }
 }
 
-/* D of the contacts of a half. */
-static void bounds(State *now, int half)
+/* D of selected contacts. */
+static void bound_contacts(State *state, int half)
 {
-    for (int64_t r = begins(now->some, half); r < begins(now->some, half + 1); r++) {
-        const int64_t k = now->rows[r], *n = now->crowd->things + 2 * k;
-        now->d[k] = fmax(now->most[n[0]] * now->w[2 * k] + now->most[n[1]] * now->w[2 * k + 1], 1e-300);
+    const double *lambda = state->lambda;
+    for (int64_t r = begins(state->selected, half); r < begins(state->selected, half + 1); r++) {
+        const int64_t k = state->rows[r], *n = state->system->pairs + 2 * k;
+        state->d[k] = fmax(lambda[n[0]] * state->w[2 * k] + lambda[n[1]] * state->w[2 * k + 1], 1e-300);
     }
 }
 
-static void taken(State *now, int half)
+/* Copy selected contacts into rows. */
+static void load_rows(State *state, int half)
 {
-    for (int64_t r = begins(now->some, half); r < begins(now->some, half + 1); r++) {
-        int64_t k = now->rows[r];
-        Row row = {.at = now->crowd->contact[k], .d = now->d[k], .number = k, .age = now->age[k],
-                   .first = (int32_t)now->crowd->things[2 * k], .second = (int32_t)now->crowd->things[2 * k + 1]};
-        memcpy(row.p, now->p + 3 * k, sizeof row.p);
-        memcpy(row.change, now->change + 3 * k, sizeof row.change);
-        now->row[r] = row;
+    const System *system = state->system;
+    for (int64_t r = begins(state->selected, half); r < begins(state->selected, half + 1); r++) {
+        int64_t k = state->rows[r];
+        Row row = {.at = system->contact[k], .d = state->d[k], .number = k, .age = state->age[k],
+                   .first = (int32_t)system->pairs[2 * k], .second = (int32_t)system->pairs[2 * k + 1]};
+        memcpy(row.p, state->p + 3 * k, sizeof row.p);
+        memcpy(row.change, state->change + 3 * k, sizeof row.change);
+        state->row[r] = row;
     }
 }
 
-static void handed(State *now, int half)
+/* Copy the results of rows back. */
+static void store_rows(State *state, int half)
 {
-    for (int64_t r = begins(now->some, half); r < begins(now->some, half + 1); r++) {
-        const Row *row = now->row + r;
-        now->age[row->number] = row->age;
-        memcpy(now->p + 3 * row->number, row->p, sizeof row->p);
-        memcpy(now->change + 3 * row->number, row->change, sizeof row->change);
+    for (int64_t r = begins(state->selected, half); r < begins(state->selected, half + 1); r++) {
+        const Row *row = state->row + r;
+        state->age[row->number] = row->age;
+        memcpy(state->p + 3 * row->number, row->p, sizeof row->p);
+        memcpy(state->change + 3 * row->number, row->change, sizeof row->change);
     }
 }
 
-/* q = p + beta change, and what bodies are given by it. */
-static void ahead(State *now, int half)
+/* Extrapolate, q = p + beta change, and sum the impulses q by bodies. */
+static void extrapolate(State *state, int half)
 {
-    double *level = now->level[half], *back = now->back[0], *more = now->back[1];
-    memset(level, 0, 6 * (now->crowd->bodies + 1) * sizeof(double));
-    for (Row *row = now->row + begins(now->some, half); row < now->row + begins(now->some, half + 1); row++) {
+    double *level = state->level[half], *back = state->back[0], *more = state->back[1];
+    Row *end = state->row + begins(state->selected, half + 1);
+    memset(level, 0, 6 * (state->system->bodies + 1) * sizeof(double));
+    for (Row *row = state->row + begins(state->selected, half); row < end; row++) {
         if (back[row->first] + more[row->first] > 0 || back[row->second] + more[row->second] > 0) row->age = 0;
-        double beta = now->beta[row->age++];
+        double beta = state->beta[row->age++];
         for (int j = 0; j < 3; j++) row->q[j] = row->p[j] + beta * row->change[j];
-        push(&row->at, row->q, level + 6 * row->first, level + 6 * row->second);
+        add_impulse(&row->at, row->q, level + 6 * row->first, level + 6 * row->second);
     }
 }
 
-/* What bodies move with; both halves of what they are given are one. */
-static void moved(State *now, int half)
+/* Add the levels of both halves, and turn them into velocities. */
+static void update_velocities(State *state, int half)
 {
-    const Crowd *crowd = now->crowd;
-    int64_t first = begins(crowd->bodies, half), last = begins(crowd->bodies, half + 1);
-    double *level = now->level[0], *more = now->level[1];
+    const System *system = state->system;
+    int64_t first = begins(system->bodies, half), last = begins(system->bodies, half + 1);
+    double *level = state->level[0], *more = state->level[1];
     for (int64_t i = 6 * first; i < 6 * last; i++) level[i] += more[i];
-    move(crowd, first, last, level);
-    if (half) memset(level + 6 * crowd->bodies, 0, 6 * sizeof(double));
-    memset(now->back[half], 0, (crowd->bodies + 1) * sizeof(double));
+    to_velocities(system, first, last, level);
+    if (half) memset(level + 6 * system->bodies, 0, 6 * sizeof(double));
+    memset(state->back[half], 0, (system->bodies + 1) * sizeof(double));
 }
 
-/* The cones; the square of the most, in m/s, that any contact was off by. */
-static void iterated(State *now, int half)
+/* Take a gradient step, project on the cones, and find the largest error. */
+static void project_rows(State *state, int half)
 {
-    double worst = 0, *level = now->level[0], *back = now->back[half];
-    for (Row *row = now->row + begins(now->some, half); row < now->row + begins(now->some, half + 1); row++) {
+    double worst = 0, *level = state->level[0], *back = state->back[half];
+    Row *end = state->row + begins(state->selected, half + 1);
+    for (Row *row = state->row + begins(state->selected, half); row < end; row++) {
         double u[3], left[3], mu = row->at.friction, step = 1 / row->d;
-        part(&row->at, level + 6 * row->first, level + 6 * row->second, u);
+        relative_velocity(&row->at, level + 6 * row->first, level + 6 * row->second, u);
         u[0] += mu * sqrt(u[1] * u[1] + u[2] * u[2]);
         for (int j = 0; j < 3; j++) { row->change[j] = row->p[j]; row->p[j] = row->q[j] - step * u[j]; }
         project(row->p, mu);
         for (int j = 0; j < 3; j++) { left[j] = row->q[j] - row->p[j]; row->change[j] = row->p[j] - row->change[j]; }
-        double turned = row->d * dot(left, row->change);
-        back[row->first] += turned;
-        back[row->second] += turned;
+        double reversal = row->d * dot(left, row->change);
+        back[row->first] += reversal;
+        back[row->second] += reversal;
         worst = fmax(worst, row->d * row->d * dot(left, left));
     }
-    back[now->crowd->bodies] = 0;
-    now->worst[half] = worst;
+    back[state->system->bodies] = 0;
+    state->worst[half] = worst;
 }
 
-/* Iterations, at most so many; how many it took. */
-static int64_t solved(State *now)
+/* Iterate to the tolerance or the limit. Contacts are selected again after 15, 30, 60, ... iterations. */
+static void iterate(State *state)
 {
     int64_t spent = 0;
-    for (int done = 0; spent < now->limit;) {
-        int64_t until = spent + (spent > LOOK ? spent : LOOK);
-        look(now);
-        if (!now->missed && done) break;
-        share(now, squares);
-        share(now, largests);
-        share(now, bounds);
-        share(now, taken);
-        for (done = 0; !done && spent < until && spent < now->limit; spent++) {
-            share(now, ahead);
-            share(now, moved);
-            share(now, iterated);
-            done = fmax(now->worst[0], now->worst[1]) < now->enough * now->enough && (spent + 1) % CHECK == 0;
+    for (int done = 0; spent < state->limit;) {
+        int64_t until = spent + (spent > FIRST_SELECTION ? spent : FIRST_SELECTION);
+        select_contacts(state);
+        if (!state->missed && done) break;
+        in_halves(state, sum_squares);
+        in_halves(state, bound_bodies);
+        in_halves(state, bound_contacts);
+        in_halves(state, load_rows);
+        for (done = 0; !done && spent < until && spent < state->limit; spent++) {
+            in_halves(state, extrapolate);
+            in_halves(state, update_velocities);
+            in_halves(state, project_rows);
+            double worst = fmax(state->worst[0], state->worst[1]);
+            done = worst < state->tolerance * state->tolerance && (spent + 1) % CHECK_INTERVAL == 0;
         }
-        share(now, handed);
-    }
-    return spent;
-}
-
-/* Nesterov's (pace - 1) / pace', pace' = (1 + sqrt(1 + 4 pace^2)) / 2 from pace = 1 on. */
-static void betas(double *beta, int64_t most)
-{
-    double pace = 1;
-    for (int64_t age = 0; age < most; age++) {
-        double faster = (1 + sqrt(1 + 4 * pace * pace)) / 2;
-        beta[age] = (pace - 1) / faster;
-        pace = faster;
+        in_halves(state, store_rows);
     }
 }
 
-void finished(State *now)
+/* Nesterov's (t - 1) / t', t' = (1 + sqrt(1 + 4 t^2)) / 2 from t = 1 on. */
+static void nesterov_factors(double *beta, int64_t count)
 {
-    if (!now) return;
-    free(now->row);
-    free(now->rows);
-    free(now->change);
-    free(now);
+    double t = 1;
+    for (int64_t age = 0; age < count; age++) {
+        double next = (1 + sqrt(1 + 4 * t * t)) / 2;
+        beta[age] = (t - 1) / next;
+        t = next;
+    }
 }
 
-/* What is to be solved; NULL where there is no memory for it. */
-State *begun(const Crowd *crowd, double enough, int64_t most, double *p)
+static void free_state(State *state)
 {
-    int64_t k = crowd->count, n = crowd->bodies + 1;
-    State *now = calloc(1, sizeof(State));
-    if (!now) return NULL;
-    double *room = now->change = calloc(6 * k + 87 * n + most, sizeof(double));
-    now->rows = calloc(2 * k + 1, sizeof(int64_t)), now->row = malloc((k + 1) * sizeof(Row));
-    if (!room || !now->rows || !now->row) {
-        finished(now);
+    if (!state) return;
+    free(state->row);
+    free(state->rows);
+    free(state->change);
+    free(state);
+}
+
+/* Return a new state; NULL where there is no memory for it. */
+static State *make_state(const System *system, double tolerance, int64_t limit, double *p)
+{
+    int64_t k = system->count, n = system->bodies + 1;
+    State *state = calloc(1, sizeof(State));
+    if (!state) return NULL;
+    double *room = state->change = calloc(6 * k + 87 * n + limit, sizeof(double));
+    state->rows = calloc(2 * k + 1, sizeof(int64_t)), state->row = malloc((k + 1) * sizeof(Row));
+    if (!room || !state->rows || !state->row) {
+        free_state(state);
         return NULL;
     }
-    now->crowd = crowd, now->p = p, now->enough = enough, now->limit = most;
-    now->age = now->rows + k, now->d = room + 3 * k, now->w = now->d + k, room += 6 * k;
+    state->system = system, state->p = p, state->tolerance = tolerance, state->limit = limit;
+    state->age = state->rows + k, state->d = room + 3 * k, state->w = state->d + k, room += 6 * k;
     for (int half = 0; half < 2; half++, room += 43 * n)
-        now->level[half] = room, now->back[half] = room + 6 * n, now->square[half] = room + 7 * n;
-    now->most = room, now->beta = room + n;
-    betas(now->beta, most);
-    return now;
+        state->level[half] = room, state->back[half] = room + 6 * n, state->square[half] = room + 7 * n;
+    state->lambda = room, state->beta = room + n;
+    nesterov_factors(state->beta, limit);
+    return state;
 }
 
-/* The same from impulses p (count, 3) on, which it changes; how many iterations it took. */
-int64_t impulses(State *now)
+/* Solve for the impulses p (count, 3), which are those to start from; return -1 where there is no memory, else 0. */
+int64_t solve(const System *system, double tolerance, int64_t limit, double *p)
 {
-    int64_t spent = solved(now);
-    atomic_store(&now->offer, -1);
-    return spent;
+    State *state = make_state(system, tolerance, limit, p);
+    if (!state) return -1;
+    iterate(state);
+    free_state(state);
+    return 0;
 }
 
-/* D (count,) of all contacts; -1 where there is no memory for it. */
-int64_t bound(const Crowd *crowd, double *d)
+/* D (count,) of all contacts; return -1 where there is no memory, else 0. */
+int64_t diagonal_bounds(const System *system, double *d)
 {
-    State *now = begun(crowd, 0, 0, d);
-    if (!now) return -1;
-    for (now->some = 0; now->some < crowd->count; now->some++) now->rows[now->some] = now->some;
-    share(now, squares);
-    share(now, largests);
-    share(now, bounds);
-    memcpy(d, now->d, crowd->count * sizeof(double));
-    finished(now);
+    State *state = make_state(system, 0, 0, d);
+    if (!state) return -1;
+    for (state->selected = 0; state->selected < system->count; state->selected++)
+        state->rows[state->selected] = state->selected;
+    in_halves(state, sum_squares);
+    in_halves(state, bound_bodies);
+    in_halves(state, bound_contacts);
+    memcpy(d, state->d, system->count * sizeof(double));
+    free_state(state);
     return 0;
 }

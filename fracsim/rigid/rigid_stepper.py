@@ -1,4 +1,4 @@
-"""A step of rigid bodies: they move, what was struck is analysed, what breaks goes on as pieces."""
+"""Time step of rigid bodies: motion, analyses of impacted bodies, fracture, and motion again with the fragments."""
 
 from __future__ import annotations
 
@@ -14,27 +14,33 @@ from ..contact.obstacle import RigidObstacle
 from ..errors import NotConverged
 from ..timestepping.stepper import StepAborted
 from .bodies import Bodies
-from .contact_records import Touches
+from .contact_points import ContactImpulses
 from .engine import Engine
-from .fragment_geometry import Geometry, Shapes
-from .fragment_overlap import Overlaps
-from .hertz import Hertz, reduced
-from .impact_detection import Blows, Strain
-from .instances import Copies, Kept
-from .mujoco_model import Part, Rules
-from .obstacles import Others
-from .parallel_analyses import Analyses, Strike
-from .worker_ranks import Helper
+from .fragment_geometry import FragmentGeometry, FragmentShapes
+from .fragment_overlap import InitialOverlaps
+from .impact_detection import BodyLoad, ImpactDetector
+from .instances import Instances, InstancesSnapshot
+from .mujoco_model import ContactParameters
+from .obstacles import ObstacleSet, Part
+from .parallel_analyses import ImpactLoads, ParallelAnalyses
+from .surface_loads import HertzContact, reduced_value
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
+Arrays = dict[str, npt.NDArray[Any]]
 
 
 @dataclass(frozen=True)
 class RigidState:
-    """Bodies at time t (s), pieces first, then obstacles that are free; `step` of the run, and what gravity and drivers
-    have done since its start, J."""
+    """Bodies at one time.
+
+    Attributes:
+        t: s.
+        step: number of the step.
+        bodies: fragments, then free obstacles.
+        work: of gravity and driven obstacles since the start, J.
+    """
 
     t: float
     step: int
@@ -44,289 +50,339 @@ class RigidState:
 
 @dataclass(frozen=True)
 class RigidReport:
-    """What a step did.
+    """Figures of a step.
 
     Attributes:
-        broken: edges that broke.    blows, loads: analyses that were due.    kinetic: J, of the bodies.
-        pushed: (obstacles, 3) mean force of the pieces on each, N.    worked: (obstacles,) what each did, J; a free
-        one: what it lost.
-        krylov: iterations of CG in all analyses.    seconds: it took.
+        broken: edges that broke.
+        blows: number of blows that were found.
+        loads: number of loads that were found.
+        kinetic_energy: of all bodies, J.
+        obstacle_forces: (obstacles, 3) mean force of the fragments on each obstacle, N.
+        obstacle_work: (obstacles,) work of each obstacle, J; of a free one: the energy that it lost.
+        cg_iterations: in all analyses.
+        seconds: wall time.
     """
 
     broken: int
     blows: int
     loads: int
-    kinetic: float
-    pushed: Values
-    worked: Values
-    krylov: int
+    kinetic_energy: float
+    obstacle_forces: Values
+    obstacle_work: Values
+    cg_iterations: int
     seconds: float
 
 
 @dataclass
-class _Begun:
-    """What a step began with beside its state: overlaps, what `Blows.saved` gave, and of copies that are analysed in it
-    what they were."""
+class _StepSnapshot:
+    """State beside the RigidState as a step begins.
 
-    overlaps: Overlaps
-    blows: dict[str, npt.NDArray[Any]]
-    copies: Kept | None = None
+    Attributes:
+        overlaps: of fragments.
+        detector: arrays of the impact detector.
+        instances: those that are analysed in the step, as they were; None: none is.
+    """
+
+    overlaps: InitialOverlaps
+    detector: Arrays
+    instances: InstancesSnapshot | None = None
 
 
 @dataclass
-class Phases:
-    """Seconds in each part of the steps so far."""
+class PhaseTimes:
+    """Wall time, s, of each phase of the steps so far."""
 
     seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(("motion", "analysis", "pieces"), 0.0))
 
     def add(self, phase: str, began: float) -> float:
-        """To a phase, since a time; returns the time now."""
+        """Add the time since `began`, s, to a phase; return the present time."""
         now = time.perf_counter()
         self.seconds[phase] += now - began
         return now
 
 
 class RigidStepper:
-    """Copies of one mesh, on one rank; the bodies of a state are their pieces as they are broken now.
+    """Stepper for the instances of one mesh (one rank); the bodies of a state are their present fragments.
 
     Attributes:
-        shapes: of the pieces.    copies: of the mesh.    others: obstacles.    phases: seconds so far.
+        instances: of the mesh.
+        obstacles: fixed, driven and free ones.
+        shapes: of the fragments.
+        impact_detector: tells blows and loads.
+        analyses: of impacted bodies.
+        initial_overlaps: of fragments.
+        phases: wall time so far.
     """
 
-    shapes: Shapes
-    _mass: Values  # of all things, and half their sizes
-    _size: Values
+    shapes: FragmentShapes
+    # of all bodies and obstacles: masses, kg, and half their sizes, m
+    _mass: Values
+    _half_size: Values
 
     def __init__(
         self,
-        copies: Copies,
-        geometry: Geometry,
+        instances: Instances,
+        geometry: FragmentGeometry,
         density: float,
         obstacles: Sequence[RigidObstacle],
-        rules: Rules,
-        hertz: Hertz,
+        parameters: ContactParameters,
+        hertz: HertzContact,
         contact_time: float | None = None,
-        analyses: Analyses | None = None,
-        helper: Helper | None = None,
+        analyses: ParallelAnalyses | None = None,
     ) -> None:
-        """`density`: kg/m^3; `contact_time`: s, of every blow; None: Hertz's; `analyses`: of the mesh; `helper`: a
-        second thread, None: there is none."""
-        self.analyses, self._helper = analyses or Analyses(copies), helper
-        self.copies, self._geometry, self._density = copies, geometry, density
-        self.others, self._rules, self._hertz, self._given = Others(obstacles), rules, hertz, contact_time
-        self.blows, self.phases, self.overlaps = (
-            Blows(rules.step, rules.fast, self._time, self._spread),
-            Phases(),
-            Overlaps.none(),
-        )
-        self._engine: Engine | None = None
-        self._abandoned: _Begun | None = None  # what was before a step that was abandoned
-        self._broke: set[int] = set()  # copies, in this step
-        self.look_again()
+        """Find the fragments of the instances as they are.
 
-    def look_again(self) -> None:
-        """Copies have broken: shapes are those of their pieces."""
-        damage = {number: each.damage() for number, each in self.copies.damaged.items()}
-        points = {number: each.points for number, each in self.copies.shapes.items()}
-        self.shapes, self._engine = self._geometry.shapes(damage, points), None
-        self._mass, self._size = self._weights()
+        Args:
+            instances: of the mesh.
+            geometry: of their fragments.
+            density: kg/m^3.
+            obstacles: of the study.
+            parameters: time step and contact.
+            hertz: contact law for durations and circles.
+            contact_time: duration of all blows, s; None: Hertz's.
+            analyses: of the mesh; None: on this rank alone.
+        """
+        self.analyses = analyses or ParallelAnalyses(instances)
+        self.instances, self._geometry, self._density = instances, geometry, density
+        self.obstacles, self._parameters, self._hertz = ObstacleSet(obstacles), parameters, hertz
+        self._contact_time = contact_time
+        self.impact_detector = ImpactDetector(
+            parameters.time_step, parameters.impact_threshold, self._impact_duration, self._radius_cubed_per_force
+        )
+        self.phases, self.initial_overlaps = PhaseTimes(), InitialOverlaps.empty()
+        self._engine: Engine | None = None
+        # state before a step that was abandoned
+        self._abandoned: _StepSnapshot | None = None
+        # instances that broke in this step
+        self._broken_instances: set[int] = set()
+        self.update_shapes()
+
+    def update_shapes(self) -> None:
+        """Compute the shapes of the fragments after instances changed."""
+        damage = {number: body.input_damage() for number, body in self.instances.damaged.items()}
+        points = {number: shape.points for number, shape in self.instances.dented_shapes.items()}
+        self.shapes, self._engine = self._geometry.update_shapes(damage, points), None
+        self._mass, self._half_size = self._masses_and_sizes()
 
     def start(self) -> RigidState:
-        """The bodies where the mesh has them, at rest."""
-        pieces = Bodies.at_rest(self._densities(), self.shapes.moments)
-        return RigidState(0.0, 0, pieces.with_more(self.others.bodies()))
+        """Return the state at t = 0: the bodies at their place, without motion."""
+        fragments = Bodies.at_rest(self._densities(), self.shapes.moments)
+        return RigidState(0.0, 0, fragments.concatenate(self.obstacles.free_bodies()))
 
     def _densities(self) -> Values:
-        return np.full(self.count, self._density)
+        return np.full(self.fragment_count, self._density)
 
     @property
-    def count(self) -> int:
-        """Of pieces."""
+    def fragment_count(self) -> int:
+        """Number of fragments."""
         return len(self.shapes.names)
 
     @property
-    def names(self) -> Ints:
-        """(n,) of all bodies: of pieces their lowest node, of free obstacles more than any has."""
-        more = len(self.shapes.piece_of_node) + np.arange(len(self.others.free))
-        return np.concatenate([self.shapes.names, more])
+    def body_names(self) -> Ints:
+        """Names (n,) of all bodies: lowest nodes of fragments, larger numbers for free obstacles."""
+        free = len(self.shapes.node_fragment) + np.arange(len(self.obstacles.free_numbers))
+        return np.concatenate([self.shapes.names, free])
 
-    # --- a checkpoint ---
+    # --- checkpoints ---
 
-    def saved(self, state: RigidState) -> dict[str, npt.NDArray[Any]]:
-        """Arrays that `restore` goes on from; where the step after `state` was abandoned, as they were before it."""
-        bodies = {f"body.{name}": values for name, values in vars(state.bodies).items()}
-        begun = self._abandoned or self._begun()
-        overlaps = {f"overlap.{name}": values for name, values in vars(begun.overlaps).items()}
-        return {**bodies, **overlaps, **self.copies.saved(begun.copies), **begun.blows}
+    def to_checkpoint(self, state: RigidState) -> Arrays:
+        """Return the arrays that a checkpoint stores; of the time before the step if the step was abandoned."""
+        snapshot = self._abandoned or self._snapshot()
+        overlaps = {f"overlap.{name}": values for name, values in vars(snapshot.overlaps).items()}
+        instances = self.instances.to_checkpoint(snapshot.instances)
+        return {**state.bodies.to_checkpoint(), **overlaps, **instances, **snapshot.detector}
 
-    def _begun(self) -> _Begun:
-        return _Begun(self.overlaps, {name: values.copy() for name, values in self.blows.saved().items()})
+    def _snapshot(self) -> _StepSnapshot:
+        arrays = {name: values.copy() for name, values in self.impact_detector.to_checkpoint().items()}
+        return _StepSnapshot(self.initial_overlaps, arrays)
 
-    def restore(self, saved: dict[str, npt.NDArray[Any]], t: float, step: int, work: float) -> RigidState:
-        """The state that `saved` was of, with the mesh as broken as then."""
-        self.copies.restore(saved)
-        self.analyses.restored()
-        self.look_again()
-        self.overlaps = Overlaps(**{name: saved[f"overlap.{name}"] for name in vars(self.overlaps)})
-        self.blows.restore(saved)
-        bodies = {name.removeprefix("body."): values for name, values in saved.items() if name.startswith("body.")}
-        return RigidState(t, step, Bodies(**bodies), work)
+    def from_checkpoint(self, arrays: Arrays, t: float, step: int, work: float) -> RigidState:
+        """Return the state that `to_checkpoint` stored, and restore the damage of the mesh."""
+        self.instances.from_checkpoint(arrays)
+        self.analyses.reset_workers()
+        self.update_shapes()
+        names = vars(self.initial_overlaps)
+        self.initial_overlaps = InitialOverlaps(**{name: arrays[f"overlap.{name}"] for name in names})
+        self.impact_detector.from_checkpoint(arrays)
+        return RigidState(t, step, Bodies.from_checkpoint(arrays), work)
 
-    # --- a step ---
+    # --- steps ---
 
     def advance(self, state: RigidState) -> tuple[RigidState, RigidReport]:
-        """The state a step later. Raises NotConverged where an analysis fails, or the motion is not finite, Abandoned
-        where the run is to stop; then `saved` gives what was before.
+        """Return the state one step later, and the figures of the step.
 
-        Where something breaks the step is taken again with the pieces, which take no more of a blow than they can.
+        If bodies break, the step is repeated with the fragments, which take no more of a blow than they can.
+
+        Raises:
+            NotConverged: an analysis failed, or the motion is not finite.
+            StepAborted: the run is to stop; `to_checkpoint` returns the state before the step.
         """
-        begun, self._abandoned = self._begun(), None
+        snapshot, self._abandoned = self._snapshot(), None
         try:
-            return self._advance(state, begun)
+            return self._advance(state, snapshot)
         except StepAborted:
-            self._abandoned = begun
+            self._abandoned = snapshot
             raise
 
-    def _advance(self, state: RigidState, begun: _Begun) -> tuple[RigidState, RigidReport]:
+    def _advance(self, state: RigidState, snapshot: _StepSnapshot) -> tuple[RigidState, RigidReport]:
+        """Take a step; `snapshot` receives the instances that are analysed, as they were."""
         began = clock = time.perf_counter()
-        iterations, bodies, shapes = self.copies.iterations, state.bodies, self.copies.shapes.copy()
+        iterations, bodies = self.instances.cg_iterations, state.bodies
+        shapes_before = self.instances.dented_shapes.copy()
         _check_finite(bodies, state.t)
-        self._broke.clear()
-        moved, touches = self._moved(state, bodies)
-        due = self.blows.look(touches, bodies, self.names)
+        self._broken_instances.clear()
+        moved, impulses = self._move(state, bodies)
+        found = self.impact_detector.find_loads(impulses, bodies, self.body_names)
         clock = self.phases.add("motion", clock)
-        if strikes := self._strikes(due, touches):
-            begun.copies = self.copies.kept(each.name for each in strikes)
-        struck = self.analyses(strikes)
+        if loads := self._select_loads(found, impulses):
+            snapshot.instances = self.instances.snapshot(load.body_name for load in loads)
+        broken_by_name = self.analyses(loads)
         clock = self.phases.add("analysis", clock)
-        broken = sum(struck.values())
+        broken = sum(broken_by_name.values())
         if broken:
-            bodies = self._divided(bodies, {name for name, count in struck.items() if count})
+            bodies = self._replace_by_fragments(bodies, {name for name, count in broken_by_name.items() if count})
             clock = self.phases.add("pieces", clock)
-            moved, touches = self._moved(state, bodies)
+            moved, impulses = self._move(state, bodies)
             self.phases.add("motion", clock)
-        self.blows.keep(touches, bodies, self.names)
-        if dented := [number for number, each in self.copies.shapes.items() if each is not shapes.get(number)]:
-            moved = self._reshaped(moved, dented)
-        _check_finite(moved, state.t + self._rules.step)
-        pushed, worked = self._given_by(touches, state.t)
-        fallen = moved.mass * ((moved.place - bodies.place) @ self._rules.gravity)
-        work = state.work + float(fallen.sum()) + float(worked.sum())
-        worked[self.others.free] = (fallen + bodies.kinetics - moved.kinetics)[self.count :]
-        after = RigidState(state.t + self._rules.step, state.step + 1, moved, work)
-        blows = sum(each.speed > 0 for each in due)
-        krylov, seconds = self.copies.iterations - iterations, time.perf_counter() - began
-        return after, RigidReport(broken, blows, len(due) - blows, moved.kinetic, pushed, worked, krylov, seconds)
+        self.impact_detector.record_step(impulses, bodies, self.body_names)
+        shapes = self.instances.dented_shapes
+        if dented := [number for number, shape in shapes.items() if shape is not shapes_before.get(number)]:
+            moved = self._apply_dented_shapes(moved, dented)
+        _check_finite(moved, state.t + self._parameters.time_step)
+        forces, obstacle_work = self._obstacle_forces_and_work(impulses, state.t)
+        gravity_work = moved.mass * ((moved.position - bodies.position) @ self._parameters.gravity)
+        work = state.work + float(gravity_work.sum()) + float(obstacle_work.sum())
+        lost = gravity_work + bodies.kinetic_energies - moved.kinetic_energies
+        obstacle_work[self.obstacles.free_numbers] = lost[self.fragment_count :]
+        after = RigidState(state.t + self._parameters.time_step, state.step + 1, moved, work)
+        blows = sum(load.speed > 0 for load in found)
+        cg_iterations, seconds = self.instances.cg_iterations - iterations, time.perf_counter() - began
+        return after, RigidReport(
+            broken, blows, len(found) - blows, moved.kinetic_energy, forces, obstacle_work, cg_iterations, seconds
+        )
 
-    def _moved(self, state: RigidState, bodies: Bodies) -> tuple[Bodies, Touches]:
-        """The bodies of a state, or the pieces that they are now, a step later, and what touched."""
-        engine, end = self._engine or self._made(state.t, bodies), state.t + self._rules.step
-        moved, touches = engine.advance(bodies, self.others.ways(end), self._kin)
-        self.overlaps = engine.overlaps
-        return moved, touches
+    def _move(self, state: RigidState, bodies: Bodies) -> tuple[Bodies, ContactImpulses]:
+        """Return the bodies of a state, or their present fragments, one step later, and the contact impulses."""
+        engine, end = self._engine or self._make_engine(state.t, bodies), state.t + self._parameters.time_step
+        moved, impulses = engine.advance(bodies, self.obstacles.reference_points(end), self._families)
+        self.initial_overlaps = engine.initial_overlaps
+        return moved, impulses
 
-    def _kin(self, bodies: Ints) -> Ints:
-        """(m,) of bodies (m,), see rigid.impact_sequence: copies c of those that may break, or have done so in this
-        step,
-        -2 - c of pieces that may not."""
-        found, mine = np.full(len(bodies), -1), bodies < self.count
-        of, place = np.unique(self.shapes.names[bodies[mine]] // self.copies.nodes, return_inverse=True)
-        may = [number in self._broke or self.copies.breaks(number) for number in map(int, of)]
-        found[mine] = np.where(may, of, -2 - of)[place]
-        return found
+    def _families(self, bodies: Ints) -> Ints:
+        """Return the families (m,) of bodies (m,), see impact_sequence.
 
-    def _made(self, t: float, bodies: Bodies) -> Engine:
-        """The engine for the bodies as they are now."""
-        of, others = self.shapes, self.others
-        parts: list[Sequence[Part]] = [*of.parts, *others.parts]
-        outer, turn = [*of.outer, *others.outer], of.turn
-        if others.free:
-            turn = np.concatenate([turn, np.tile(np.eye(3), (len(others.free), 1, 1))])
-        stands = others.stands(t)
-        rest = self.names, outer, turn, self._helper, of.cores
-        self._engine = Engine(bodies, parts, stands, self._rules, self.overlaps, *rest)
+        The family is the instance c of a body that may break or broke in this step, -2 - c of another fragment, and
+        -1 of an obstacle.
+        """
+        result, is_fragment = np.full(len(bodies), -1), bodies < self.fragment_count
+        names = self.shapes.names[bodies[is_fragment]]
+        instances, row = np.unique(names // self.instances.node_count, return_inverse=True)
+        may_break = [
+            number in self._broken_instances or self.instances.can_break(number) for number in map(int, instances)
+        ]
+        result[is_fragment] = np.where(may_break, instances, -2 - instances)[row]
+        return result
+
+    def _make_engine(self, t: float, bodies: Bodies) -> Engine:
+        """Make the engine for the present bodies; `t`: s, of the obstacles."""
+        shapes, obstacles = self.shapes, self.obstacles
+        parts: list[Sequence[Part]] = [*shapes.convex_parts, *obstacles.convex_parts]
+        hull_points, rotation = [*shapes.hull_points, *obstacles.hull_points], shapes.rotation
+        if obstacles.free_numbers:
+            rotation = np.concatenate([rotation, np.tile(np.eye(3), (len(obstacles.free_numbers), 1, 1))])
+        self._engine = Engine(
+            bodies, parts, obstacles.prescribed_obstacles(t), self._parameters, self.initial_overlaps,
+            self.body_names, hull_points, rotation, shapes.core_contact,
+        )  # fmt: skip
         return self._engine
 
-    def depths(self, state: RigidState) -> list[tuple[int, int, float]]:
-        """(thing, thing, depth in m) of what is in one another by more than hulls of pieces are from birth."""
-        return (self._engine or self._made(state.t, state.bodies)).depth(state.bodies)
+    def find_penetrations(self, state: RigidState) -> list[tuple[int, int, float]]:
+        """Return (body, body, depth in m) of all pairs that overlap by more than is admitted between fragments."""
+        return (self._engine or self._make_engine(state.t, state.bodies)).find_penetrations(state.bodies)
 
-    def _given_by(self, touches: Touches, t: float) -> tuple[Values, Values]:
-        """Mean force of the pieces on each obstacle (m, 3) in N, and what drivers did (m,) in J."""
-        count, dt, others = self.count, self._rules.step, self.others
-        pushed, more = np.zeros((2, len(others.every), 3))
-        for things, partner, sign in ((touches.first, touches.second, -1.0), (touches.second, touches.first, 1.0)):
-            for chosen, sums in ((partner < count, pushed), (partner >= count, more)):
-                mine = (things >= count) & chosen
-                np.add.at(sums, others.owner[things[mine] - count], sign * touches.impulse[mine] / dt)
-        return pushed, -np.einsum("mi,mi->m", pushed + more, others.moved(t, dt))
+    def _obstacle_forces_and_work(self, impulses: ContactImpulses, t: float) -> tuple[Values, Values]:
+        """Return the mean forces (m, 3), N, of fragments on obstacles, and the work (m,), J, of driven obstacles."""
+        count, dt, obstacles = self.fragment_count, self._parameters.time_step, self.obstacles
+        of_fragments, of_obstacles = np.zeros((2, len(obstacles.obstacles), 3))
+        sides = ((impulses.first, impulses.second, -1.0), (impulses.second, impulses.first, 1.0))
+        for receiver, partner, sign in sides:
+            for chosen, total in ((partner < count, of_fragments), (partner >= count, of_obstacles)):
+                rows = (receiver >= count) & chosen
+                owner = obstacles.obstacle_of[receiver[rows] - count]
+                np.add.at(total, owner, sign * impulses.impulse[rows] / dt)
+        work = -np.einsum("mi,mi->m", of_fragments + of_obstacles, obstacles.displacements(t, dt))
+        return of_fragments, work
 
-    def _strikes(self, due: list[Strain], touches: Touches) -> list[Strike]:
-        """Those that might break a body."""
-        due = [each for each in due if each.body < self.count]
-        if not due:
+    # --- analyses and fracture ---
+
+    def _select_loads(self, found: list[BodyLoad], impulses: ContactImpulses) -> list[ImpactLoads]:
+        """Return the loads that could break a fragment or make it yield."""
+        found = [load for load in found if load.body_number < self.fragment_count]
+        if not found:
             return []
-        energy = touches.energies(self.count, self._rules.restitution)
-        every = [Strike(int(self.shapes.names[each.body]), each.points, each.force, each.radius,
-                        energy=each.energy(float(energy[each.body]))) for each in due]  # fmt: skip
-        sums = [float(np.linalg.norm(each.force, axis=1).sum()) for each in due]
-        may = [self.copies.may_break(each.name, much) for each, much in zip(every, sums, strict=True)]
-        return [each for each, yes in zip(every, may, strict=True) if yes]
+        energies = impulses.impact_energies(self.fragment_count, self._parameters.restitution)
+        result = []
+        for load in found:
+            name = int(self.shapes.names[load.body_number])
+            total_force = float(np.linalg.norm(load.force, axis=1).sum())
+            if self.instances.may_break(name, total_force):
+                energy = load.available_energy(float(energies[load.body_number]))
+                result.append(ImpactLoads(name, load.points, load.force, load.circle_radii, energy=energy))
+        return result
 
-    def _divided(self, bodies: Bodies, names: set[int]) -> Bodies:
-        """The pieces that bodies of these names broke into, among those that did not."""
-        before, free = self.shapes, bodies.part(slice(self.count, None))
-        bodies = bodies.part(slice(self.count))
-        self.look_again()
+    def _replace_by_fragments(self, bodies: Bodies, names: set[int]) -> Bodies:
+        """Return the bodies with those of the names replaced by their fragments."""
+        before = self.shapes
+        free, bodies = bodies.select(slice(self.fragment_count, None)), bodies.select(slice(self.fragment_count))
+        self.update_shapes()
         after = self.shapes
-        parent = np.searchsorted(before.names, before.names[before.piece_of_node[after.names]])
-        parts = bodies.divided(self._densities(), after.moments, parent)
-        self.blows.forget(np.array([*names], np.int64))
-        self._broke = {name // self.copies.nodes for name in names}
-        whole = ~np.isin(before.names[parent], list(names))  # not even by round-off are these other bodies now
-        kept = {key: np.array(values) for key, values in vars(parts).items()}
-        for key, values in kept.items():
-            values[whole] = getattr(bodies, key)[parent[whole]]
-        self.overlaps = self.overlaps.divided(after.names, before.names[parent])
-        return replace(parts, **kept).with_more(free)
+        parent = np.searchsorted(before.names, before.names[before.node_fragment[after.names]])
+        fragments = bodies.split_into(self._densities(), after.moments, parent)
+        self.impact_detector.forget_bodies(np.array([*names], np.int64))
+        self._broken_instances = {name // self.instances.node_count for name in names}
+        # bodies that did not break stay the same to the last digit
+        unbroken = ~np.isin(before.names[parent], list(names))
+        values = {name: np.array(array) for name, array in vars(fragments).items()}
+        for name, array in values.items():
+            array[unbroken] = getattr(bodies, name)[parent[unbroken]]
+        self.initial_overlaps = self.initial_overlaps.after_fracture(after.names, before.names[parent])
+        return replace(fragments, **values).concatenate(free)
 
-    def _reshaped(self, bodies: Bodies, copies: list[int]) -> Bodies:
-        """The bodies, those of some copies as they are dented now. The step stays as it was: what is struck and dented
-        has been struck all the same."""
-        self.look_again()
-        mine = np.isin(self.shapes.names // self.copies.nodes, copies)
-        return bodies.reshaped(self.shapes.moments, np.flatnonzero(mine))
+    def _apply_dented_shapes(self, bodies: Bodies, instances: list[int]) -> Bodies:
+        """Return the bodies with the shapes of instances that have been dented; the step is not repeated."""
+        self.update_shapes()
+        changed = np.isin(self.shapes.names // self.instances.node_count, instances)
+        return bodies.with_shapes(self.shapes.moments, np.flatnonzero(changed))
 
-    # --- how long a blow lasts, and what it presses on ---
+    # --- Hertz's contact ---
 
-    def _time(self, first: Ints, second: Ints, speed: Values) -> Values:
-        """s, of things (k,) that meet others (k,) at speeds (k,), m/s."""
-        if self._given is not None:
-            return np.full(len(first), self._given)
-        mass, size, both = self._mass, self._size, self._both_give(first, second)
-        return self._hertz(reduced(mass[first], mass[second]), reduced(size[first], size[second]), speed, both)
+    def _impact_duration(self, first: Ints, second: Ints, speed: Values) -> Values:
+        """Return the durations (k,), s, of impacts of bodies (k,) with others (k,) at speeds (k,), m/s."""
+        if self._contact_time is not None:
+            return np.full(len(first), self._contact_time)
+        mass = reduced_value(self._mass[first], self._mass[second])
+        radius = reduced_value(self._half_size[first], self._half_size[second])
+        return self._hertz.duration(mass, radius, speed, self._are_both_elastic(first, second))
 
-    def _spread(self, first: Ints, second: Ints) -> Values:
-        """a^3 / F, m^3/N, of things (k,) that touch others (k,)."""
-        size = self._size
-        return self._hertz.spread(reduced(size[first], size[second]), self._both_give(first, second))
+    def _radius_cubed_per_force(self, first: Ints, second: Ints) -> Values:
+        """Return a^3 / F (k,), m^3/N, of contacts of bodies (k,) with others (k,)."""
+        radius = reduced_value(self._half_size[first], self._half_size[second])
+        return self._hertz.radius_cubed_per_force(radius, self._are_both_elastic(first, second))
 
-    def _both_give(self, first: Ints, second: Ints) -> Flags:
-        """(k,) whether both are bodies: what stands does not give way."""
-        return np.asarray(np.maximum(first, second) < self.count)
+    def _are_both_elastic(self, first: Ints, second: Ints) -> Flags:
+        """Return (k,) flags of pairs of fragments; obstacles are rigid."""
+        return np.asarray(np.maximum(first, second) < self.fragment_count)
 
-    def _weights(self) -> tuple[Values, Values]:
-        """Masses of all things in kg and half their sizes in m: half the side of a cube as large."""
-        volume, others = self.shapes.moments.volume, self.others
-        free = others.bodies().mass
-        stands = np.full(len(others.extent) - len(free), np.inf)
-        return (
-            np.concatenate([self._density * volume, free, stands]),
-            np.concatenate([np.cbrt(volume) / 2, others.extent]),
-        )
+    def _masses_and_sizes(self) -> tuple[Values, Values]:
+        """Return masses, kg, of all bodies and obstacles, and half their sizes, m: that of a cube of equal volume."""
+        volume, obstacles = self.shapes.moments.volume, self.obstacles
+        free = obstacles.free_bodies().mass
+        prescribed = np.full(len(obstacles.half_sizes) - len(free), np.inf)
+        mass = np.concatenate([self._density * volume, free, prescribed])
+        return mass, np.concatenate([np.cbrt(volume) / 2, obstacles.half_sizes])
 
 
 def _check_finite(bodies: Bodies, t: float) -> None:
-    """NotConverged where bodies are, or move, at time t (s) as no numbers can say."""
-    if not bodies.finite:
+    """Raise NotConverged if positions or velocities at time t, s, are not finite."""
+    if not bodies.is_finite:
         raise NotConverged(f"the motion of the bodies is not finite at t = {t:g} s; look at velocities and time.step")

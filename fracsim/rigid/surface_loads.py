@@ -1,11 +1,9 @@
-"""Forces at points of the surfaces of bodies, handed to the nodes of the cells that hold the points.
+"""Hertz's contact of spheres, and contact forces as nodal loads on a body (docs/theory.md#blows-and-loads).
 
-Forces on circles of contact, with Hertz's pressure (K. L. Johnson, Contact Mechanics, 1985, eq. 3.39).
+    tau = 2.87 (m^2 / (R E*^2 v))^(1/5),   a = (3 F R / (4 E*))^(1/3),   p(r) = 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2)
 
-    p(r) = 3 F / (2 pi a^2) sqrt(1 - r^2 / a^2)
-
-as points of equal force, in the plane across it: a share q of the force acts within r = a sqrt(1 - (1 - q)^(2/3)). They
-lie on a spiral of golden angles, each with its mirror image, so that the force keeps its moment.
+with the reduced mass m and radius R of two bodies of one material that meet at a speed v, and E* = E / (1 - nu^2) / 2.
+E* is twice as large if one of the two is rigid (K. L. Johnson 1985, equations 11.24, 4.22 and 3.39).
 """
 
 from __future__ import annotations
@@ -21,20 +19,83 @@ from ..mesh.small_matrices import barycentric_gradients
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-NEAREST = 24  # cells whose middles are nearest to a point: one of them holds it, or is the nearest that could
-FINE = 0.05  # mean edges: a smaller circle is a point
-DENSE = 12.0  # points to a square edge
-FEWEST, MOST = 8, 256  # pairs of points to a circle
-GOLDEN = np.pi * (3 - np.sqrt(5))
+
+
+@dataclass(frozen=True)
+class LoadSettings:
+    """Resolution of contact forces.
+
+    Attributes:
+        nearest_cells: cells with the closest centres that are tried for a point; one of them has it, or is the nearest.
+        min_radius: mean edges; the force on a smaller circle acts at a point.
+        density: points on a square of a mean edge.
+        min_pairs: least number of pairs of points on a circle.
+        max_pairs: largest number of them.
+    """
+
+    nearest_cells: int = 24
+    min_radius: float = 0.05
+    density: float = 12.0
+    min_pairs: int = 8
+    max_pairs: int = 256
+
+
+SETTINGS = LoadSettings()
+GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
+
+
+# --- Hertz's contact ---
+
+
+@dataclass(frozen=True)
+class HertzContact:
+    """Contact of elastic spheres of one material.
+
+    Attributes:
+        young: Young's modulus, Pa.
+        poisson: Poisson's ratio.
+    """
+
+    young: float
+    poisson: float
+
+    def duration(self, mass: Values, radius: Values, speed: Values, both_elastic: Flags) -> Values:
+        """Return the durations tau (k,), s, of impacts.
+
+        Args:
+            mass: (k,) reduced masses, kg.
+            radius: (k,) reduced radii, m.
+            speed: (k,) m/s.
+            both_elastic: (k,) False where one of the two bodies is rigid.
+        """
+        modulus = self._contact_modulus(both_elastic)
+        return np.asarray(2.87 * (mass**2 / (radius * modulus**2 * speed)) ** 0.2)
+
+    def radius_cubed_per_force(self, radius: Values, both_elastic: Flags) -> Values:
+        """Return a^3 / F (k,), m^3/N, for reduced radii (k,), m."""
+        return np.asarray(0.75 * radius / self._contact_modulus(both_elastic))
+
+    def _contact_modulus(self, both_elastic: Flags) -> Values:
+        """Return E* (k,), Pa."""
+        return np.asarray(self.young / (1 - self.poisson**2) / np.where(both_elastic, 2, 1))
+
+
+def reduced_value(first: Values, second: Values) -> Values:
+    """Return reduced masses or radii 1 / (1 / a + 1 / b); a or b may be infinite."""
+    return np.asarray(1.0 / (1.0 / first + 1.0 / second))
+
+
+# --- nodal loads ---
 
 
 @dataclass(frozen=True)
 class PointLoads:
-    """k forces on a mesh at rest.
+    """Forces (k) at points within cells of a mesh at rest.
 
     Attributes:
-        nodes: (k, d + 1) of the cell that holds each point.    weights: (k, d + 1) barycentric, 0 to 1.
-        force: (k, d) N, in the directions of the body at rest.
+        nodes: (k, d + 1) nodes of the cell that has the point.
+        weights: (k, d + 1) barycentric coordinates of the point, 0 to 1.
+        force: (k, d) in the axes of the body at rest, N.
     """
 
     nodes: Ints
@@ -43,65 +104,82 @@ class PointLoads:
 
     @property
     def owner(self) -> Ints:
-        """(k,) the node that each point is nearest to, in the measure of its cell: it says which piece is pushed."""
+        """(k,) node with the largest barycentric coordinate; the force acts on the fragment of this node."""
         return np.asarray(np.take_along_axis(self.nodes, self.weights.argmax(axis=1)[:, None], axis=1)[:, 0])
 
-    def of(self, chosen: Flags) -> PointLoads:
-        """Some of them, by flags (k,)."""
+    def select(self, chosen: Flags) -> PointLoads:
+        """Return the forces flagged in `chosen` (k,)."""
         return PointLoads(self.nodes[chosen], self.weights[chosen], self.force[chosen])
 
-    def nodal(self, count: int) -> Values:
-        """(count, d) forces at the nodes of the mesh, N."""
+    def nodal_forces(self, count: int) -> Values:
+        """Return the forces (count, d), N, at all nodes of the mesh."""
         result = np.zeros((count, self.force.shape[1]))
         np.add.at(result, self.nodes, self.weights[:, :, None] * self.force[:, None])
         return result
 
 
-def point_loads(places: Values, cells: Ints, points: Values, force: Values) -> PointLoads:
-    """Loads `force` (k, d) at `points` (k, d), each in the one of `cells` (m, d + 1) that holds it or, where none does,
-    at the nearest place of the nearest cell; `places`: (N, d) of the nodes.
+def locate_forces(nodes: Values, cells: Ints, points: Values, force: Values) -> PointLoads:
+    """Return forces at points as loads on the cells that have the points.
 
-    The hulls that collide are a little larger than the body: a point of touch may lie outside of it.
+    The convex parts that collide are a little larger than the body. A point outside of it is moved to the nearest cell.
+
+    Args:
+        nodes: (N, d) positions, m.
+        cells: (m, d + 1) cells that may be loaded.
+        points: (k, d) m.
+        force: (k, d) N.
     """
-    corners = places[cells]
-    _, near = cKDTree(corners.mean(axis=1)).query(points, k=np.arange(1, min(NEAREST, len(cells)) + 1))
-    of = corners[near.reshape(-1)]
-    arm = np.repeat(points, near.shape[1], axis=0) - of[:, 0]
-    weights = np.einsum("nkd,nd->nk", barycentric_gradients(of), arm)
+    corners = nodes[cells]
+    count = min(SETTINGS.nearest_cells, len(cells))
+    _, near = cKDTree(corners.mean(axis=1)).query(points, k=np.arange(1, count + 1))
+    candidates = corners[near.reshape(-1)]
+    arm = np.repeat(points, near.shape[1], axis=0) - candidates[:, 0]
+    weights = np.einsum("nkd,nd->nk", barycentric_gradients(candidates), arm)
     weights[:, 0] += 1.0
     inside = np.maximum(weights, 0.0)
     inside /= inside.sum(axis=1, keepdims=True)
-    off = np.einsum("nk,nkd->nd", inside - weights, of)
-    best = np.einsum("nd,nd->n", off, off).reshape(near.shape).argmin(axis=1)
+    # distance of the point from its projection into each candidate
+    offset = np.einsum("nk,nkd->nd", inside - weights, candidates)
+    best = np.einsum("nd,nd->n", offset, offset).reshape(near.shape).argmin(axis=1)
     rows = np.arange(len(points))
     return PointLoads(cells[near[rows, best]].astype(np.int64), inside.reshape(*near.shape, -1)[rows, best], force)
 
 
-def patches(points: Values, force: Values, radius: Values, edge: float) -> tuple[Values, Values]:
-    """(n, 3) points and (n, 3) forces on circles of radii (k,) about points (k, 3), m, from forces (k, 3), N; `edge`:
-    of the cells that they fall on, m."""
-    wide = np.flatnonzero(radius > FINE * edge)
+def distribute_on_circles(points: Values, force: Values, radius: Values, edge: float) -> tuple[Values, Values]:
+    """Return points (n, 3), m, and forces (n, 3), N, that represent Hertz's pressure on circles across the forces.
+
+    The points have equal forces: a share q of the force acts within r = a sqrt(1 - (1 - q)^(2/3)). They lie on a
+    spiral of golden angles, each with its mirror image, so that the moment of the force is kept.
+
+    Args:
+        points: (k, 3) centres of the circles, m.
+        force: (k, 3) N.
+        radius: (k,) a, m.
+        edge: mean edge of the mesh, m.
+    """
+    wide = np.flatnonzero(radius > SETTINGS.min_radius * edge)
     if not len(wide):
         return points, force
     narrow = np.setdiff1d(np.arange(len(radius)), wide)
-    pairs = np.clip(np.pi * DENSE / 2 * (radius[wide] / edge) ** 2, FEWEST, MOST).astype(np.int64)
-    of = np.repeat(np.arange(len(wide)), pairs)
-    number = np.arange(len(of)) - np.repeat(np.cumsum(pairs) - pairs, pairs)
-    share = (number + 0.5) / pairs[of]
-    r, angle = radius[wide][of] * np.sqrt(1 - (1 - share) ** (2 / 3)), GOLDEN * number
-    first, second = _across(force[wide])
-    arm = (r * np.cos(angle))[:, None] * first[of] + (r * np.sin(angle))[:, None] * second[of]
-    middle, each = points[wide][of], (force[wide] / (2 * pairs[:, None]))[of]
+    pairs_wanted = np.pi * SETTINGS.density / 2 * (radius[wide] / edge) ** 2
+    pairs = np.clip(pairs_wanted, SETTINGS.min_pairs, SETTINGS.max_pairs).astype(np.int64)
+    circle = np.repeat(np.arange(len(wide)), pairs)
+    number = np.arange(len(circle)) - np.repeat(np.cumsum(pairs) - pairs, pairs)
+    share = (number + 0.5) / pairs[circle]
+    r, angle = radius[wide][circle] * np.sqrt(1 - (1 - share) ** (2 / 3)), GOLDEN_ANGLE * number
+    first, second = _perpendicular_axes(force[wide])
+    arm = (r * np.cos(angle))[:, None] * first[circle] + (r * np.sin(angle))[:, None] * second[circle]
+    centre, point_force = points[wide][circle], (force[wide] / (2 * pairs[:, None]))[circle]
     return (
-        np.concatenate([points[narrow], middle + arm, middle - arm]),
-        np.concatenate([force[narrow], each, each]),
+        np.concatenate([points[narrow], centre + arm, centre - arm]),
+        np.concatenate([force[narrow], point_force, point_force]),
     )
 
 
-def _across(way: Values) -> tuple[Values, Values]:
-    """Two (k, 3) unit vectors across directions (k, 3) of any length but none."""
-    least = np.eye(3)[np.abs(way).argmin(axis=1)]
-    first = np.cross(way, least)
+def _perpendicular_axes(direction: Values) -> tuple[Values, Values]:
+    """Return two unit vectors (k, 3) across each direction (k, 3), which may have any length but 0."""
+    coordinate_axis = np.eye(3)[np.abs(direction).argmin(axis=1)]
+    first = np.cross(direction, coordinate_axis)
     first /= np.linalg.norm(first, axis=1)[:, None]
-    second = np.cross(way, first)
+    second = np.cross(direction, first)
     return first, second / np.linalg.norm(second, axis=1)[:, None]

@@ -1,11 +1,11 @@
-"""A study bound to its mesh: everything that a run moves, built and checked before anything is written.
+"""Scene: the objects that a study asks for, built and checked before anything is written.
 
-Here alone a study becomes physics: what lies below this room takes numbers, arrays and functions.
+Only this room turns the keys of a study into physics. The rooms below it take numbers, arrays and functions.
 
-material_model     the energy, its moduli and the yield law
-terms              what adds to the balance of forces, and the balance
-contact_terms      obstacles, and how they act
-inelastic_updates  what flows and what breaks after a step
+terms              material, terms of the balance of forces, and the balance
+contact_terms      obstacles and self-contact
+inelastic_updates  plastic flow and fracture, which follow a step
+rigid_scene        rigid bodies
 """
 
 from __future__ import annotations
@@ -39,22 +39,37 @@ from ..timestepping.initial_conditions import initial_velocity  # noqa: E402
 from ..timestepping.protocols import FractureProtocol, NoFracture, PlasticFlowProtocol  # noqa: E402
 from ..timestepping.state import State  # noqa: E402
 from ..timestepping.stepper import Stepper, StepSizes  # noqa: E402
-from .inelastic_updates import breaking_of, flow_of  # noqa: E402
-from .material_model import material_of  # noqa: E402
-from .terms import TERMS, Parts, balance_of  # noqa: E402
+from .inelastic_updates import build_breaking, build_flow  # noqa: E402
+from .material_model import build_material  # noqa: E402
+from .terms import TERMS, TermInputs, build_balance  # noqa: E402
 
 if TYPE_CHECKING:
     from ..fracture.fracture_pass import FracturePass as EdgeBreaking
 
-__all__ = ["TERMS", "Parts", "Scene", "build_scene", "make_scheme", "make_stepper", "material_of", "scene_on"]
+__all__ = [
+    "TERMS",
+    "Scene",
+    "TermInputs",
+    "build_material",
+    "build_scene",
+    "build_scene_on",
+    "make_scheme",
+    "make_stepper",
+]
 
 
 @dataclass
 class Scene:
-    """A study bound to its mesh: what a run moves.
+    """Objects that a run of one deformable body needs.
 
     Attributes:
-        solver: of implicit schemes; None for explicit ones.    fracture: what breaks; None where nothing does.
+        study: that was built.
+        domain: the distributed mesh.
+        balance: of forces.
+        solver: of implicit schemes; None for explicit ones.
+        stepper: takes a state to the next one.
+        fracture: what breaks edges; None without [fracture].
+        probes: what history.csv records beside energies.
     """
 
     study: Study
@@ -66,61 +81,73 @@ class Scene:
     probes: ProbeReader
 
     def start(self) -> State:
-        """The state at t = 0 (collective)."""
+        """Return the state at t = 0 (collective)."""
         motion = initial_motion(self.study, self.domain.dim)
         return self.stepper.start(None if motion is None else initial_velocity(self.balance, *motion))
 
     def ended(self, state: State) -> bool:
-        """Whether the state is at the end of the study."""
+        """Return whether the state is at the end of the study."""
         return state.t >= self.study.time.end * (1 - 1e-12)
 
     def destroy(self) -> None:
-        """Give the memory of PETSc's objects back (collective)."""
+        """Free the memory of PETSc's objects (collective)."""
         if self.solver is not None:
             self.solver.destroy()
         self.balance.destroy()
 
 
 def build_scene(comm: MPI.Comm, study: Study, stage: Callable[[str], None] = lambda name: None) -> Scene:
-    """Mesh, balance, solver and, where the study has them, fracture and probes. InputError where they do not fit.
+    """Return the scene of a study (collective).
 
-    `stage`: is told what is done from now on (collective).
+    Args:
+        comm: ranks that share the mesh.
+        study: of one deformable body.
+        stage: called with the name of each stage as it begins.
+
+    Raises:
+        InputError: mesh and study do not fit.
     """
     stage("building the mesh" if study.mesh.builder else "reading the mesh")
     mesh = on_root(comm, lambda: build_checked_mesh(study))
     stage("sharing the mesh among ranks" if comm.size > 1 else "building the edges of the mesh")
-    return scene_on(distribute(comm, mesh, study.mesh.order), study, stage=stage)
+    return build_scene_on(distribute(comm, mesh, study.mesh.order), study, stage=stage)
 
 
-def scene_on(
+def build_scene_on(
     domain: Domain,
     study: Study,
     material: MaterialFields | None = None,
     *,
     stage: Callable[[str], None] = lambda name: None,
 ) -> Scene:
-    """The scene of a study on a mesh that is there; `material`: in place of the study's own; `stage`: as above."""
+    """Return the scene of a study on an existing mesh (collective).
+
+    Args:
+        domain: the distributed mesh.
+        study: of one deformable body.
+        material: in place of that of the study.
+        stage: called with the name of each stage as it begins.
+    """
     stage("setting up the balance of forces (kernels are compiled the first time)")
     collect_dropped_scenes(domain.comm)
     scheme = make_scheme(study.time)
-    balance = balance_of(study, domain, scheme, material or material_of(study, domain))
+    balance = build_balance(study, domain, scheme, material or build_material(study, domain))
     if not scheme.inertia:
         check_supports(domain, balance.motion)
     stage("setting up what breaks and what solves")
-    flow = flow_of(study, balance)
-    breaking = breaking_of(study, balance)
+    flow = build_flow(study, balance)
+    breaking = build_breaking(study, balance)
     solver = NonlinearSolver(balance, study.solver) if scheme.implicit else None
     breaks, frames = breaking or NoFracture(balance, flow), study.frame_interval
     stepper = make_stepper(balance, study.time, flow, breaks, solver, frames)
-    ways = {
-        each.name: each.displacement for each in obstacle_placements(study, domain.dim) if each.displacement is not None
-    }
-    probes = ProbeReader(balance, _probes(study, domain), motions=ways, thickness=study.thickness)
+    placements = obstacle_placements(study, domain.dim)
+    motions = {obstacle.name: obstacle.displacement for obstacle in placements if obstacle.displacement is not None}
+    probes = ProbeReader(balance, _probes(study, domain), motions=motions, thickness=study.thickness)
     return Scene(study, domain, balance, solver, stepper, breaking, probes)
 
 
 def make_scheme(timing: TimeSettings) -> Scheme:
-    """The time scheme of a study."""
+    """Return the time scheme of a study."""
     return timing.scheme_class(**timing.scheme_parameters)
 
 
@@ -132,7 +159,16 @@ def make_stepper(
     solver: NonlinearSolver | None,
     frames: float = 0.0,
 ) -> Stepper:
-    """What steps a balance of this scheme; `frames`: s between times at which steps end, 0: they need not."""
+    """Return the stepper for the scheme of a balance.
+
+    Args:
+        balance: of forces.
+        timing: the table [time].
+        flow: plastic flow.
+        breaking: fracture.
+        solver: of implicit schemes; None for explicit ones.
+        frames: interval between times at which a step ends, s; 0: none.
+    """
     smallest, course = timing.smallest or timing.min_step / 1024, step_size_function(timing)
     sizes = StepSizes(
         timing.max_step, timing.end, smallest, timing.adapt, timing.breaking_step or math.inf, course, frames
@@ -151,7 +187,7 @@ def make_stepper(
 
 
 def _probes(study: Study, domain: Domain) -> list[ProbeGroup]:
-    """[[probe]] entries with the nodes that they look at."""
+    """Return the entries of [[probe]] with their nodes (collective)."""
     probes = []
     for i, entry in enumerate(study.probe):
         if entry.point is not None:

@@ -1,9 +1,9 @@
-"""Contact that a study asks for: its obstacles, and how they act. Imported where there are any."""
+"""Contact terms of a study: obstacles and self-contact. The module is imported only if there are any."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, cast
@@ -38,64 +38,137 @@ if TYPE_CHECKING:
 
 Values = npt.NDArray[np.float64]
 
-DISTANCE = 0.05  # of the mean edge: a hundredth of it is where a press of a hundredth of Young's modulus holds
-STIFFNESS = 0.1  # of Young's modulus
-DISTANCE_ITSELF = 0.03  # the same: ipctk's barrier presses 3.6 times as hard
-# of Young's modulus: with 0.03 crumbs that are caught between pieces are pressed to a thousandth of the distance, and
-# Newton's method takes 20 iterations and factors where this takes 6 and multigrid
-STIFFNESS_ITSELF = 0.3
-# of the square of the highest frequency of the body, that the penalty of explicit steps may add to it: steps are at
-# least 0.82 of what they would be without, however light a node of the surface
-ADDED = 0.5
-CREEP = 1e-3  # of the body's size, a second
-# of the speed of the body: crumbs at metres a second that change from sticking to sliding within micrometres a second
-# take Newton's method forty iterations where this takes fourteen (a vase struck at 40 m/s)
-OF_SPEED = 0.05
+
+@dataclass(frozen=True)
+class ContactDefaults:
+    """Values of [contact] that a study does not give.
+
+    Attributes:
+        distance: gap at which contact begins, in mean edges. A pressure of a hundredth of Young's modulus holds at a
+            hundredth of it.
+        stiffness: Young's moduli; factor of barrier and penalty.
+        self_distance: like distance, for self-contact, whose barrier is 3.6 times as stiff.
+        self_stiffness: Young's moduli, for self-contact. With 0.03 single-node fragments between others are pressed to
+            a thousandth of the distance, and Newton's method takes 20 iterations in place of 6.
+        added_frequency: what the penalty of explicit steps may add to the square of the highest frequency of the body,
+            relative to it. Steps are at least 0.82 of those without contact.
+        creep: sizes of the body per second; speed below which friction sticks.
+        creep_ratio: speeds of the body; likewise. Fragments at metres a second that change from sticking to slipping
+            within micrometres a second take forty Newton iterations in place of fourteen.
+    """
+
+    distance: float = 0.05
+    stiffness: float = 0.1
+    self_distance: float = 0.03
+    self_stiffness: float = 0.3
+    added_frequency: float = 0.5
+    creep: float = 1e-3
+    creep_ratio: float = 0.05
 
 
-def obstacles_of(
+DEFAULTS = ContactDefaults()
+
+
+# --- obstacles that are described by their distance ---
+
+
+def build_obstacle_term(
     study: Study, domain: Domain, u: fem.Function, material: MaterialFields, scheme: Scheme
 ) -> ObstacleTerm:
-    """The term of all obstacles of a study (collective). InputError where one overlaps the body at the start."""
-    entries, law = obstacle_entries(study, domain.dim), _law(_contact(study), domain, material)
-    if not any(each.free for each in entries):
-        return build_inactive_at_rest(domain, entries, law, partial(ObstacleTerm, domain, u), mutual=False)
+    """Return the term of all obstacles but those from files (collective).
+
+    Raises InputError if one overlaps the body at the start.
+    """
+    obstacles, law = build_shape_obstacles(study, domain.dim), _obstacle_law(_contact(study), domain, material)
+    if not any(obstacle.free for obstacle in obstacles):
+        return build_inactive_at_rest(domain, obstacles, law, partial(ObstacleTerm, domain, u), mutual=False)
     from ..contact.rigid_obstacle_term import FreeObstacleTerm
 
-    made = partial(FreeObstacleTerm, domain, u, scheme=scheme)
-    return build_inactive_at_rest(domain, entries, law, made, mutual=True)
+    make = partial(FreeObstacleTerm, domain, u, scheme=scheme)
+    return build_inactive_at_rest(domain, obstacles, law, make, mutual=True)
 
 
-def explicit_obstacles_of(
+def build_explicit_obstacle_term(
     study: Study, domain: Domain, u: fem.Function, stress: Stress, mass: Values
 ) -> PenaltyObstacleTerm:
-    """The same for explicit steps; `mass`: (owned dofs,) lumped, kg (collective)."""
+    """Return the term of the same obstacles for explicit steps (collective); `mass`: (owned dofs,) lumped, kg."""
     from ..contact.penalty_law import Penalty
     from ..contact.penalty_obstacles import PenaltyObstacleTerm
 
-    entries = obstacle_entries(study, domain.dim)
+    obstacles = build_shape_obstacles(study, domain.dim)
     contact = _contact(study)
-    law, most = _law(contact, domain, stress.material, Penalty), _most_added(contact, domain, stress)
-    kind = PenaltyObstacleTerm
-    if any(each.free for each in entries):
+    law = _obstacle_law(contact, domain, stress.material, Penalty)
+    limit = _max_added_frequency(contact, domain, stress)
+    term_type = PenaltyObstacleTerm
+    if any(obstacle.free for obstacle in obstacles):
         from ..contact.penalty_rigid_obstacles import PenaltyFreeObstacleTerm
 
-        kind = PenaltyFreeObstacleTerm
-    return build_inactive_at_rest(domain, entries, law, partial(kind, domain, u, mass=mass, most=most), mutual=False)
+        term_type = PenaltyFreeObstacleTerm
+    make = partial(term_type, domain, u, mass=mass, most=limit)
+    return build_inactive_at_rest(domain, obstacles, law, make, mutual=False)
 
 
-def _most_added(contact: ContactSettings, domain: Domain, stress: Stress) -> float:
-    """What a penalty may add to the square of the highest frequency, 1/s^2 (collective)."""
+def _max_added_frequency(contact: ContactSettings, domain: Domain, stress: Stress) -> float:
+    """Return what a penalty may add to the square of the highest frequency, 1/s^2 (collective)."""
     from ..timestepping.stable_time_step import cell_frequencies
 
     if contact.stiffness is not None:
         return float("inf")
-    return float(ADDED * domain.comm.allreduce(float(np.max(cell_frequencies(stress), initial=0.0)), op=MPI.MAX))
+    highest = float(np.max(cell_frequencies(stress), initial=0.0))
+    return float(DEFAULTS.added_frequency * domain.comm.allreduce(highest, op=MPI.MAX))
 
 
-def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields, scheme: Scheme) -> Term:
-    """The term of the obstacles that are read from files (collective). InputError where one overlaps the body at the
-    start, or without ipctk."""
+def build_shape_obstacles(study: Study, dim: int) -> list[RigidObstacle]:
+    """Return all obstacles but those from files.
+
+    Raises InputError if a shape is impossible or does not fit the dimension.
+    """
+    entries = enumerate(obstacle_placements(study, dim))
+    return [_build_obstacle(entry, number) for number, entry in entries if entry.shape != "mesh"]
+
+
+def build_rigid_obstacles(study: Study) -> list[RigidObstacle]:
+    """Return all obstacles of a study of rigid bodies in their order, those from files too (one rank)."""
+    return [
+        _read_obstacle(MPI.COMM_SELF, entry, number) if entry.shape == "mesh" else _build_obstacle(entry, number)
+        for number, entry in enumerate(obstacle_placements(study, 3))
+    ]
+
+
+def _build_obstacle(entry: ObstaclePlacement, number: int) -> RigidObstacle:
+    """Return the obstacle of an entry of [[obstacle]]; `number`: of the entry, for messages."""
+    shape = build_shape(entry, number)
+    if entry.free_motion is not None:
+        return _build_free_obstacle(entry, entry.free_motion, shape)
+    return RigidObstacle(entry.name, shape, entry.reference_point, entry.displacement, entry.friction)
+
+
+def _build_free_obstacle(entry: ObstaclePlacement, motion: FreeObstacleMotion, shape: Shape) -> RigidObstacle:
+    """Return an obstacle with a mass; if it has a hinge, that is its reference point."""
+    from ..contact.obstacle import FreeObstacle
+    from ..contact.offset_shape import TranslatedShape
+
+    density = motion.density or (motion.mass or 0.0) / shape.volume
+    point, centre = entry.reference_point, 0 * entry.reference_point
+    if motion.hinge is not None:
+        point, centre = motion.hinge, entry.reference_point - motion.hinge
+        shape = TranslatedShape(shape, centre)
+    return FreeObstacle(
+        entry.name, shape, point, friction=entry.friction, mass=density * shape.volume, inertia=shape.inertia(density),
+        motion_basis=motion.pose_basis, mass_centre=centre, gravity=motion.gravity, start_rate=motion.initial_rate,
+    )  # fmt: skip
+
+
+# --- obstacles from files ---
+
+
+def build_mesh_obstacle_term(
+    study: Study, domain: Domain, u: fem.Function, material: MaterialFields, scheme: Scheme
+) -> Term:
+    """Return the term of the obstacles from files (collective).
+
+    Raises InputError if one overlaps the body at the start, or without ipctk.
+    """
     try:
         from ..contact import ipc_surface
         from ..contact.mesh_obstacle_term import MeshObstacleTerm
@@ -103,75 +176,88 @@ def solids_of(study: Study, domain: Domain, u: fem.Function, material: MaterialF
         raise InputError(
             'an obstacle of shape = "mesh" needs ipctk, which this environment lacks: pip install fracsim[contact]'
         ) from None
-    every = enumerate(obstacle_placements(study, domain.dim))
-    entries = {number: _solid(domain.comm, each, number) for number, each in every if each.shape == "mesh"}
+    placements = obstacle_placements(study, domain.dim)
+    obstacles = {
+        number: _read_obstacle(domain.comm, entry, number)
+        for number, entry in enumerate(placements)
+        if entry.shape == "mesh"
+    }
     contact = _contact(study)
-    law, stiffness = _law(contact, domain, material), contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
-    of_speed = 0.0 if contact.creep else OF_SPEED
-    how = ipc_surface.SelfContactLaw(
-        law.barrier.width, stiffness, 0.0, law.sticking_speed, of_speed, corners_only=_straight(study)
-    )
-    if not any(each.free for each in entries.values()):
-        return _with_room(
-            partial(MeshObstacleTerm, domain, u, entries), how, contact, "an obstacle from a file and the body"
-        )
+    obstacle_law = _obstacle_law(contact, domain, material)
+    stiffness = contact.stiffness or DEFAULTS.self_stiffness * _max_young(domain, material)
+    creep_ratio = 0.0 if contact.creep else DEFAULTS.creep_ratio
+    law = ipc_surface.SelfContactLaw(
+        obstacle_law.barrier.width, stiffness, 0.0, obstacle_law.sticking_speed, creep_ratio,
+        corners_only=_uses_corners_only(study),
+    )  # fmt: skip
+    between = "an obstacle from a file and the body"
+    if not any(obstacle.free for obstacle in obstacles.values()):
+        return _fit_distance(partial(MeshObstacleTerm, domain, u, obstacles), law, contact, between)
     from ..contact.mesh_rigid_term import FreeMeshTerm
     from ..contact.supporting_obstacles import offset_from_meshes
 
-    every = enumerate(obstacle_placements(study, domain.dim))
-    rest = {number: each for number, each in every if each.shape != "mesh" and each.free_motion is None}
-    free = [each for each in entries.values() if each.free]
-    shapes = {number: _obstacle(each, number) for number, each in rest.items()}
-    others = offset_from_meshes(shapes, free, law.barrier.width, domain.mean_edge_length)
-    made = partial(
-        FreeMeshTerm, domain, u, entries, scheme=scheme, others=others, barrier=cast("Barrier", law.barrier)
-    )  # fmt: skip
-    return _with_room(made, how, contact, "an obstacle from a file and the body")
+    free = [obstacle for obstacle in obstacles.values() if obstacle.free]
+    prescribed = {
+        number: _build_obstacle(entry, number)
+        for number, entry in enumerate(placements)
+        if entry.shape != "mesh" and entry.free_motion is None
+    }
+    barrier = cast("Barrier", obstacle_law.barrier)
+    offset = offset_from_meshes(prescribed, free, barrier.width, domain.mean_edge_length)
+    make = partial(FreeMeshTerm, domain, u, obstacles, scheme=scheme, others=offset, barrier=barrier)
+    return _fit_distance(make, law, contact, between)
 
 
-def _solid(comm: MPI.Intracomm, entry: ObstaclePlacement, number: int) -> RigidObstacle:
-    """Read on rank 0 (collective)."""
+def _read_obstacle(comm: MPI.Intracomm, entry: ObstaclePlacement, number: int) -> RigidObstacle:
+    """Return an obstacle from a file, which rank 0 reads (collective)."""
     from ..contact.triangle_mesh_shape import TriangleMeshShape
 
-    given = entry.geometry
-    surface = from_root(
-        comm, lambda: read_obstacle_surface(given["file"], given.get("scale", 1.0), f"obstacle.{number}")
-    )
-    solid = TriangleMeshShape(surface.points, surface.triangles)
+    file, scale = entry.geometry["file"], entry.geometry.get("scale", 1.0)
+    surface = from_root(comm, lambda: read_obstacle_surface(file, scale, f"obstacle.{number}"))
+    shape = TriangleMeshShape(surface.points, surface.triangles)
     if entry.free_motion is not None:
-        return _free_solid(entry, entry.free_motion, solid)
-    return RigidObstacle(entry.name, solid, entry.reference_point, entry.displacement, entry.friction, entry.spin)
+        return _build_free_mesh_obstacle(entry, entry.free_motion, shape)
+    return RigidObstacle(entry.name, shape, entry.reference_point, entry.displacement, entry.friction, entry.spin)
 
 
-def _free_solid(entry: ObstaclePlacement, loose: FreeObstacleMotion, solid: TriangleMeshShape) -> RigidObstacle:
-    """One with a mass: it moves about its centre of mass, or turns about its hinge."""
+def _build_free_mesh_obstacle(
+    entry: ObstaclePlacement, motion: FreeObstacleMotion, shape: TriangleMeshShape
+) -> RigidObstacle:
+    """Return an obstacle with a mass; its reference point is its centre of mass, or its hinge."""
     from ..contact.obstacle import FreeObstacle
 
-    density, own = loose.density or (loose.mass or 0.0) / solid.volume, solid.centre
-    at = entry.reference_point + own if loose.hinge is None else loose.hinge
-    solid = solid.translated(entry.reference_point - at)
+    density, centre = motion.density or (motion.mass or 0.0) / shape.volume, shape.centre
+    point = entry.reference_point + centre if motion.hinge is None else motion.hinge
+    shape = shape.translated(entry.reference_point - point)
     return FreeObstacle(
-        entry.name, solid, at, friction=entry.friction, mass=density * solid.volume, inertia=solid.inertia(density),
-        motion_basis=loose.pose_basis, mass_centre=entry.reference_point + own - at,
-        gravity=loose.gravity, start_rate=loose.initial_rate,
+        entry.name, shape, point, friction=entry.friction, mass=density * shape.volume, inertia=shape.inertia(density),
+        motion_basis=motion.pose_basis, mass_centre=entry.reference_point + centre - point,
+        gravity=motion.gravity, start_rate=motion.initial_rate,
     )  # fmt: skip
 
 
-def self_contact_of(study: Study, domain: Domain, u: fem.Function, material: MaterialFields) -> Term:
-    """The term of a body that touches itself (collective). InputError without ipctk."""
-    itself = _by_ipctk("self_contact")
-    return _self_contact(study, domain, material, DISTANCE_ITSELF, partial(itself.SelfContact, domain, u))
+# --- self-contact ---
 
 
-def explicit_self_contact_of(study: Study, domain: Domain, u: fem.Function, stress: Stress, mass: Values) -> Term:
-    """The same for explicit steps; `mass`: (owned dofs,) lumped, kg (collective)."""
-    most, itself = _most_added(_contact(study), domain, stress), _by_ipctk("penalty_self_contact")
-    made = partial(itself.PenaltySelfContact, domain, u, mass=mass, most=most)
-    return _self_contact(study, domain, stress.material, DISTANCE, made)
+def build_self_contact_term(study: Study, domain: Domain, u: fem.Function, material: MaterialFields) -> Term:
+    """Return the term of self-contact (collective). Raises InputError without ipctk."""
+    module = _import_with_ipctk("self_contact")
+    make = partial(module.SelfContact, domain, u)
+    return _build_self_contact(study, domain, material, DEFAULTS.self_distance, make)
 
 
-def _by_ipctk(name: str) -> Any:
-    """A module of contact that imports ipctk."""
+def build_explicit_self_contact_term(
+    study: Study, domain: Domain, u: fem.Function, stress: Stress, mass: Values
+) -> Term:
+    """Return the term of self-contact for explicit steps (collective); `mass`: (owned dofs,) lumped, kg."""
+    limit = _max_added_frequency(_contact(study), domain, stress)
+    module = _import_with_ipctk("penalty_self_contact")
+    make = partial(module.PenaltySelfContact, domain, u, mass=mass, most=limit)
+    return _build_self_contact(study, domain, stress.material, DEFAULTS.distance, make)
+
+
+def _import_with_ipctk(name: str) -> Any:
+    """Return a module of contact that imports ipctk."""
     try:
         return import_module(f"..contact.{name}", __package__)
     except ImportError:
@@ -180,93 +266,64 @@ def _by_ipctk(name: str) -> Any:
         ) from None
 
 
-def _self_contact(
-    study: Study, domain: Domain, material: MaterialFields, share: float, made: Callable[[Any], Any]
+def _build_self_contact(
+    study: Study, domain: Domain, material: MaterialFields, distance_ratio: float, make: Callable[[Any], Any]
 ) -> Term:
-    """A term that begins at this `share` of an edge, `made` for a law."""
+    """Return the term that `make` returns for a law; `distance_ratio`: default of the distance, in mean edges."""
     from ..contact import ipc_surface
 
     contact = _contact(study)
-    distance = contact.distance or share * domain.mean_edge_length
-    stiffness = contact.stiffness or STIFFNESS_ITSELF * _young(domain, material)
-    creep, of_speed = contact.creep or CREEP * domain.size, 0.0 if contact.creep else OF_SPEED
-    pieces, straight = contact.itself == "pieces", _straight(study)
-    law = ipc_surface.SelfContactLaw(distance, stiffness, contact.friction, creep, of_speed, pieces, straight)
-    return _with_room(made, law, contact, "parts of the body")
+    law = ipc_surface.SelfContactLaw(
+        contact.distance or distance_ratio * domain.mean_edge_length,
+        contact.stiffness or DEFAULTS.self_stiffness * _max_young(domain, material),
+        contact.friction,
+        contact.creep or DEFAULTS.creep * domain.size,
+        0.0 if contact.creep else DEFAULTS.creep_ratio,
+        contact.itself == "pieces",
+        _uses_corners_only(study),
+    )
+    return _fit_distance(make, law, contact, "parts of the body")
 
 
-def _with_room(made: Callable[[Any], Any], law: Any, contact: ContactSettings, what: str) -> Any:
-    """The term that is `made` of a law whose barrier begins below half of the gap at rest between `what` (collective).
+def _fit_distance(make: Callable[[Any], Any], law: Any, contact: ContactSettings, between: str) -> Any:
+    """Return the term that `make` returns for a law, with a distance of at most half the least gap (collective).
 
-    InputError where the study gives a distance that is more than the gap.
+    With a larger distance surfaces would repel each other at the start. Raises InputError if the study gives one.
+    `between`: what the gap is between, for the message.
     """
-    term = made(law)
+    term = make(law)
     if (gap := term.min_gap()) >= (1 - 1e-6) * law.distance:
         return term
-    term.destroy()  # they would push each other apart from the start
+    term.destroy()
     if contact.distance:
         raise InputError(
-            f"contact.distance = {contact.distance:g} m is more than what lies between {what} at rest, {gap:.3g} m; "
+            f"contact.distance = {contact.distance:g} m is more than what lies between {between} at rest, {gap:.3g} m; "
             f"give at most {0.5 * gap:.2g}, or leave it out"
         )
-    return made(replace(law, distance=0.5 * gap))
+    return make(replace(law, distance=0.5 * gap))
 
 
-def obstacle_entries(study: Study, dim: int) -> list[RigidObstacle]:
-    """Obstacles that are felt by their distance: all but those from files. InputError where one does not fit the
-    dimension, or is no shape."""
-    every = enumerate(obstacle_placements(study, dim))
-    return [_obstacle(each, number) for number, each in every if each.shape != "mesh"]
-
-
-def every_obstacle(study: Study) -> list[RigidObstacle]:
-    """Of a body in space on one rank, in the order of the study, those from files too."""
-    every = enumerate(obstacle_placements(study, 3))
-    return [_solid(MPI.COMM_SELF, each, k) if each.shape == "mesh" else _obstacle(each, k) for k, each in every]
-
-
-def _obstacle(entry: ObstaclePlacement, number: int) -> RigidObstacle:
-    shape = build_shape(entry, number)
-    if entry.free_motion is not None:
-        return _free_obstacle(entry, entry.free_motion, shape)
-    return RigidObstacle(entry.name, shape, entry.reference_point, entry.displacement, entry.friction)
-
-
-def _free_obstacle(entry: ObstaclePlacement, loose: FreeObstacleMotion, shape: Shape) -> RigidObstacle:
-    """One with a mass; on a hinge it is placed, and turns, about that."""
-    from ..contact.obstacle import FreeObstacle
-    from ..contact.offset_shape import TranslatedShape
-
-    density = loose.density or (loose.mass or 0.0) / shape.volume
-    at, centre = entry.reference_point, 0 * entry.reference_point
-    if loose.hinge is not None:
-        at, centre = loose.hinge, entry.reference_point - loose.hinge
-        shape = TranslatedShape(shape, centre)
-    return FreeObstacle(
-        entry.name, shape, at, friction=entry.friction, mass=density * shape.volume, inertia=shape.inertia(density),
-        motion_basis=loose.pose_basis, mass_centre=centre, gravity=loose.gravity, start_rate=loose.initial_rate,
-    )  # fmt: skip
+# --- settings ---
 
 
 def _contact(study: Study) -> ContactSettings:
     return study.contact or ContactSettings()
 
 
-def _straight(study: Study) -> bool:
-    """Whether cells are quadratic and walls of cracks may touch, which follow corners."""
+def _uses_corners_only(study: Study) -> bool:
+    """Return whether surfaces follow the corners of quadratic cells: crack faces may touch."""
     return study.mesh.order == 2 and study.fracture is not None
 
 
-def _law(
+def _obstacle_law(
     contact: ContactSettings, domain: Domain, material: MaterialFields, barrier: type[Barrier | Penalty] = Barrier
 ) -> ObstacleLaw:
-    distance = contact.distance or DISTANCE * domain.mean_edge_length
-    return ObstacleLaw(
-        barrier(contact.stiffness or STIFFNESS * _young(domain, material), distance),
-        contact.creep or CREEP * domain.size,
-    )
+    """Return the law of obstacles with a barrier or a penalty (collective)."""
+    distance = contact.distance or DEFAULTS.distance * domain.mean_edge_length
+    stiffness = contact.stiffness or DEFAULTS.stiffness * _max_young(domain, material)
+    return ObstacleLaw(barrier(stiffness, distance), contact.creep or DEFAULTS.creep * domain.size)
 
 
-def _young(domain: Domain, material: MaterialFields) -> float:
-    """The largest Young's modulus, Pa (collective)."""
+def _max_young(domain: Domain, material: MaterialFields) -> float:
+    """Return the largest Young's modulus, Pa (collective)."""
     return float(domain.comm.allreduce(float(np.max(material.young, initial=0.0)), op=MPI.MAX))

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ..mesh.edge_graph import EdgeGraph
 
 
-def flow_of(study: Study, balance: Balance) -> PlasticFlowProtocol:
+def build_flow(study: Study, balance: Balance) -> PlasticFlowProtocol:
     """What flows."""
     if study.plasticity is None:
         return NoPlasticFlow()
@@ -38,7 +38,7 @@ def flow_of(study: Study, balance: Balance) -> PlasticFlowProtocol:
     return ReturnMapping(balance.stress)
 
 
-def breaking_of(study: Study, balance: Balance) -> FracturePass | None:
+def build_breaking(study: Study, balance: Balance) -> FracturePass | None:
     """What breaks; None without [fracture]."""
     if study.fracture is None:
         return None
@@ -79,7 +79,7 @@ def _tearing(
     check_branching_dimension(study, balance.domain.dim)
     if study.fracture.law == "cohesive":
         return _cohesive(study, balance, graph, passes, opened)
-    stress, strength = balance.stress, strength_of(study, balance.domain, graph)
+    stress, strength = balance.stress, build_strength(study, balance.domain, graph)
     toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
     given, moves = study.fracture.passes is not None, balance.scheme.inertia
     rows = balance.domain.dim == 3 and not moves
@@ -112,7 +112,7 @@ def _cohesive(
 
     assert study.fracture is not None
     stress, cuts = balance.stress, EdgeGraph(balance.domain)
-    strength = strength_of(study, balance.domain, cuts)
+    strength = build_strength(study, balance.domain, cuts)
     toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
     tips = CohesiveTipCriterion(stress, cuts, strength, toughness, opened)
     softening = CohesiveSoftening(stress, cuts, strength, toughness, tips.cut_positions)
@@ -135,7 +135,7 @@ def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> OverloadedEdge
     from ..fracture.criterion import OverloadedEdges
 
     assert study.fracture is not None
-    strength, average = strength_of(study, stress.domain, graph), average_of(study, stress.domain)
+    strength, average = build_strength(study, stress.domain, graph), build_average(study, stress.domain)
     if study.brittle is None:
         failing = OverloadedEdges(stress, graph, strength, average, study.fracture.cap)
         if study.fracture.crumbs:
@@ -145,7 +145,7 @@ def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> OverloadedEdge
         return CellRetention(failing, stress, graph)
     from ..fracture.brittle.surface_criterion import BrittleSurfaces
 
-    return BrittleSurfaces(stress, graph, strength, average, surface_rules(study.brittle))
+    return BrittleSurfaces(stress, graph, strength, average, build_surface_rules(study.brittle))
 
 
 def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: EdgeStrength) -> NodeAttachment | None:
@@ -161,7 +161,7 @@ def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: EdgeStr
     )
 
 
-def average_of(study: Study, domain: Domain) -> CellAverage | None:
+def build_average(study: Study, domain: Domain) -> CellAverage | None:
     """The average that a study takes of its stress; None: it takes the stress as it is."""
     table = study.fracture
     if table is None:
@@ -177,7 +177,7 @@ def average_of(study: Study, domain: Domain) -> CellAverage | None:
     return NonlocalAverage(domain, table.radius, table.kernel)
 
 
-def strength_of(study: Study, domain: Domain, graph: EdgeGraph, copy: int = 0) -> EdgeStrength:
+def build_strength(study: Study, domain: Domain, graph: EdgeGraph, copy: int = 0) -> EdgeStrength:
     """Strength of edges by region, with scatter, another one in each `copy` of a mesh, and a fibre."""
     from ..fracture.strength import EdgeStrength, FibreAnisotropy, WeibullScatter
 
@@ -190,7 +190,7 @@ def strength_of(study: Study, domain: Domain, graph: EdgeGraph, copy: int = 0) -
     return EdgeStrength(graph, of_cell, tie_break=table.tie_break, scatter=scatter, fibre=fibre)
 
 
-def surface_rules(table: BrittleSettings, copy: int = 0) -> SurfaceParameters:
+def build_surface_rules(table: BrittleSettings, copy: int = 0) -> SurfaceParameters:
     """[brittle] as numbers; seeds differ from `copy` to copy of a mesh."""
     from ..fracture.brittle.grains import GrainParameters, SurfaceParameters
 

@@ -10,7 +10,7 @@ from ..mesh.selectors import check_regions
 from ..study import Study
 
 
-def material_of(study: Study, domain: Domain) -> MaterialFields:
+def build_material(study: Study, domain: Domain) -> MaterialFields:
     """The energy with its moduli and what flow needs. InputError where a region does not exist in the mesh."""
     table = study.material
     check_regions(table.regions, domain.region_names)

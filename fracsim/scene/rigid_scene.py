@@ -1,4 +1,4 @@
-"""A study of rigid bodies bound to its mesh; on one rank."""
+"""Scene of a study of rigid bodies, on one rank: mesh, obstacles, instances and stepper."""
 
 from __future__ import annotations
 
@@ -20,24 +20,23 @@ from ..mesh.edge_graph import EdgeGraph
 from ..mesh.input_topology import MeshTopology
 from ..meshes.data import MeshData
 from ..meshes.text import format_point
-from ..rigid.breakage import Breakable, Operator, Within
-from ..rigid.fragment_geometry import Geometry
-from ..rigid.free_body_analysis import Stiffness
-from ..rigid.hertz import Hertz
-from ..rigid.instance_placement import Place, Poses, motion, placed
-from ..rigid.instances import Copies
-from ..rigid.parallel_analyses import Analyses, serve
-from ..rigid.worker_ranks import lent
+from ..rigid.breakage import BreakableBody, FragmentAverage, StiffnessOperator
+from ..rigid.fragment_geometry import FragmentGeometry
+from ..rigid.free_body_analysis import SolidStiffness
+from ..rigid.instance_placement import InstancePlacement, InstancePoses, instance_motion, place_mesh
+from ..rigid.instances import Instances
+from ..rigid.parallel_analyses import ParallelAnalyses, serve_analyses
+from ..rigid.surface_loads import HertzContact
 from ..study import ContactSettings, Study
 from ..study.check import build_checked_mesh
 from ..study.conditions import volume_loads
 from ..study.overlap_checks import body_placements
-from .contact_terms import every_obstacle
-from .inelastic_updates import average_of, strength_of, surface_rules
-from .material_model import material_of, per_cell
+from .contact_terms import build_rigid_obstacles
+from .inelastic_updates import build_average, build_strength, build_surface_rules
+from .material_model import build_material, per_cell
 
 try:
-    from ..rigid.mujoco_model import Rules
+    from ..rigid.mujoco_model import ContactParameters
     from ..rigid.rigid_stepper import RigidState, RigidStepper
 except ImportError:
     raise InputError(
@@ -46,128 +45,171 @@ except ImportError:
 
 if TYPE_CHECKING:
     from ..fracture.criterion import CellAverage
-    from ..rigid.denting import Shape
+    from ..rigid.denting import DentedShape
 
 Values = npt.NDArray[np.float64]
 
-DEEP = 0.01  # of the mean edge: bodies that lie in one another by more at the start are refused
+# Bodies that overlap at the start by more than this share of the mean edge are refused.
+MAX_OVERLAP_RATIO = 0.01
 
 
 @dataclass
 class RigidScene:
-    """What a run of rigid bodies moves.
+    """Objects that a run of rigid bodies needs.
 
     Attributes:
-        mesh: of all bodies, where they are at the start.    obstacles: what stands in their way.
-        first: the state at t = 0.    made_of: the mesh of a copy, and where copies are at rest.
+        study: that was built.
+        mesh: of all instances, at the start.
+        stepper: of the bodies.
+        obstacles: of the study.
+        initial_state: at t = 0.
+        instance_mesh: mesh of one instance.
+        poses: of the instances at rest.
     """
 
     study: Study
     mesh: MeshData
     stepper: RigidStepper
     obstacles: list[RigidObstacle]
-    first: RigidState
-    made_of: tuple[MeshData, Poses]
+    initial_state: RigidState
+    instance_mesh: MeshData
+    poses: InstancePoses
 
     def ended(self, state: RigidState) -> bool:
-        """Whether the state is at the end of the study."""
+        """Return whether the state is at the end of the study."""
         return state.t >= self.study.time.end * (1 - 1e-12)
 
 
 def build_rigid_scene(
-    study: Study, comm: MPI.Comm = MPI.COMM_SELF, heed: Callable[[], None] | None = None
+    study: Study, comm: MPI.Comm = MPI.COMM_SELF, check_abort: Callable[[], None] | None = None
 ) -> RigidScene:
-    """Mesh, bodies, obstacles and engine, on rank 0; the others `help_rigid`. InputError where they do not fit. `heed`:
-    is called before an analysis, and raises Abandoned where the run is to stop."""
-    single = build_checked_mesh(study)
-    _check_shell(study, single)
-    places = body_placements(study)
-    copies, poses, density = _copies(study, single, places, heed), Poses.of(places), float(study.material.density)
+    """Return the scene of a study on rank 0, while the other ranks are in `serve_rigid_analyses`.
+
+    Args:
+        study: of rigid bodies.
+        comm: ranks that share the analyses.
+        check_abort: called before an analysis; raises StepAborted if the run is to stop.
+
+    Raises:
+        InputError: mesh, bodies and obstacles do not fit.
+    """
+    mesh = build_checked_mesh(study)
+    _check_shell(study, mesh)
+    placements = body_placements(study)
+    instances = _build_instances(study, mesh, placements, check_abort)
+    poses, density = InstancePoses.from_placements(placements), float(study.material.density)
     load = volume_loads(study, 3)
     gravity = load["gravity"](0.0) if "gravity" in load else np.zeros(3)
-    contact, obstacles = study.contact or ContactSettings(), every_obstacle(study)
-    rules = Rules(study.time.max_step, gravity, contact.friction, contact.restitution or 0.0)
-    hertz = Hertz(study.material.young, study.material.poisson)
-    analyses = Analyses(copies, comm, (study, single, places))
-    geometry = Geometry(single, poses)
-    time, helper = contact.contact_time, lent(comm)
-    stepper = RigidStepper(copies, geometry, density, obstacles, rules, hertz, time, analyses, helper)
-    first = stepper.start()
-    _check_masses(first)
-    at_rest, free = first.bodies.part(slice(stepper.count)), first.bodies.part(slice(stepper.count, None))
-    velocity, spin = motion(stepper.shapes.names, len(single.points), at_rest.centre, at_rest.mass, places)
-    first = replace(first, bodies=replace(at_rest, velocity=velocity, spin=spin).with_more(free))
-    _check_room(stepper, first, obstacles, geometry.mean_edge)
-    return RigidScene(study, placed(single, places), stepper, obstacles, first, (single, poses))
+    contact, obstacles = study.contact or ContactSettings(), build_rigid_obstacles(study)
+    parameters = ContactParameters(study.time.max_step, gravity, contact.friction, contact.restitution or 0.0)
+    hertz = HertzContact(study.material.young, study.material.poisson)
+    analyses = ParallelAnalyses(instances, comm, (study, mesh, placements))
+    geometry = FragmentGeometry(mesh, poses)
+    stepper = RigidStepper(
+        instances, geometry, density, obstacles, parameters, hertz, contact.contact_time, analyses
+    )  # fmt: skip
+    state = stepper.start()
+    _check_masses(state)
+    state = _set_initial_motion(stepper, state, len(mesh.points), placements)
+    _check_overlaps(stepper, state, obstacles, geometry.mean_edge)
+    return RigidScene(study, place_mesh(mesh, placements), stepper, obstacles, state, mesh, poses)
 
 
-def help_rigid(comm: MPI.Comm, heed: Callable[[], None] | None = None) -> None:
-    """On all ranks but the first: analyse bodies, until it lets go; `heed` as there."""
+def _set_initial_motion(
+    stepper: RigidStepper, state: RigidState, nodes: int, placements: list[InstancePlacement]
+) -> RigidState:
+    """Return the state with the velocities of the placements; `nodes`: number of nodes of an instance."""
+    count = stepper.fragment_count
+    at_rest, free = state.bodies.select(slice(count)), state.bodies.select(slice(count, None))
+    velocity, spin = instance_motion(stepper.shapes.names, nodes, at_rest.centre, at_rest.mass, placements)
+    return replace(state, bodies=replace(at_rest, velocity=velocity, spin=spin).concatenate(free))
 
-    def made(begin: tuple[Study, MeshData, list[Place]]) -> Copies:
-        return _copies(*begin, heed)
 
-    serve(comm, made)
+def serve_rigid_analyses(comm: MPI.Comm, check_abort: Callable[[], None] | None = None) -> None:
+    """Analyse bodies on all ranks but the first, until rank 0 has finished.
+
+    `check_abort`: as in `build_rigid_scene`.
+    """
+
+    def make(setup: tuple[Study, MeshData, list[InstancePlacement]]) -> Instances:
+        return _build_instances(*setup, check_abort)
+
+    serve_analyses(comm, make)
 
 
-def _copies(study: Study, mesh: MeshData, places: list[Place], heed: Callable[[], None] | None) -> Copies:
-    """Of the mesh, in its own axes."""
-    stiffness = _operator(study, mesh)
-    average = average_of(study, stiffness.stress.domain)
+# --- bodies ---
+
+
+def _build_instances(
+    study: Study, mesh: MeshData, placements: list[InstancePlacement], check_abort: Callable[[], None] | None
+) -> Instances:
+    """Return the instances of a mesh, which share the operator of the unbroken body."""
+    stiffness = _build_operator(study, mesh)
+    average = build_average(study, stiffness.stress.domain)
     sizes = len(mesh.points), len(mesh.cells), len(MeshTopology(mesh).edges)
 
-    def made(number: int, shape: Shape | None) -> Breakable:
+    def make(number: int, shape: DentedShape | None) -> BreakableBody:
         if study.plasticity is None:
-            return _breakable(study, stiffness, average, number, heed)
-        own = stiffness if shape is None else _operator(study, replace(mesh, points=shape.points))
-        return _flowing(study, own, shape, heed)  # type: ignore[arg-type]
+            return _build_breakable(study, stiffness, average, number, check_abort)
+        # a dented instance has an operator of its own
+        operator = stiffness if shape is None else _build_operator(study, replace(mesh, points=shape.points))
+        return _build_yielding(study, operator, shape, check_abort)  # type: ignore[arg-type]
 
-    return Copies(made, Poses.of(places), sizes)
+    return Instances(make, InstancePoses.from_placements(placements), sizes)
 
 
-def _operator(study: Study, mesh: MeshData) -> Operator:
-    """Of all cells of a mesh."""
+def _build_operator(study: Study, mesh: MeshData) -> StiffnessOperator:
+    """Return the stiffness operator of a mesh of solid cells or of a shell."""
     domain, density = distribute(MPI.COMM_SELF, mesh), float(study.material.density)
-    elastic = material_of(study.model_copy(update={"plasticity": None}), domain)
+    elastic = build_material(study.model_copy(update={"plasticity": None}), domain)
     stress = Stress(VectorAssembler(domain), fem.Function(domain.space), elastic, DegradationModel("chi"))
     if mesh.shell is None:
-        return Stiffness(stress, np.full(domain.cell_count, density))
+        return SolidStiffness(stress, np.full(domain.cell_count, density))
     from ..rigid.shell_analysis import ShellStiffness
 
     return ShellStiffness(stress, mesh.shell, study.material.young, study.material.poisson, density)
 
 
-def _flowing(study: Study, stiffness: Stiffness, shape: Shape | None, heed: Callable[[], None] | None) -> Breakable:
-    """A copy of the mesh that blows dent."""
-    from ..rigid.denting import Flow
+def _build_yielding(
+    study: Study, stiffness: SolidStiffness, shape: DentedShape | None, check_abort: Callable[[], None] | None
+) -> BreakableBody:
+    """Return an instance that blows dent; `shape`: after earlier blows, None before the first one."""
+    from ..rigid.denting import PlasticDenting
 
     table, domain = study.plasticity, stiffness.stress.domain
     assert table is not None
     if shape is None:
-        yields = np.broadcast_to(per_cell(study, domain, table, "yield_stress"), domain.cell_count)
+        yield_stress = np.broadcast_to(per_cell(study, domain, table, "yield_stress"), domain.cell_count)
     else:
-        yields = shape.yields[domain.cell_input]
-    flow, within = Flow(stiffness, yields, table.hardening), Within(None, domain.cell_count)
-    return Breakable(stiffness, EdgeGraph(domain), None, within, study.solver, flow, heed)
+        yield_stress = shape.yield_stress[domain.cell_input]
+    denting, average = (
+        PlasticDenting(stiffness, yield_stress, table.hardening),
+        FragmentAverage(None, domain.cell_count),
+    )
+    return BreakableBody(stiffness, EdgeGraph(domain), None, average, study.solver, denting, check_abort)
 
 
-def _breakable(
-    study: Study, stiffness: Operator, average: CellAverage | None, number: int, heed: Callable[[], None] | None
-) -> Breakable:
-    """A copy of the mesh, with what breaks of it. Chance differs from copy to copy."""
+def _build_breakable(
+    study: Study, stiffness: StiffnessOperator, average: CellAverage | None, number: int,
+    check_abort: Callable[[], None] | None,
+) -> BreakableBody:  # fmt: skip
+    """Return the instance of a number that may break; the seeds of its grains and scatter depend on the number."""
     domain = stiffness.stress.domain
-    graph, within = EdgeGraph(domain), Within(average, domain.cell_count)
+    graph, fragment_average = EdgeGraph(domain), FragmentAverage(average, domain.cell_count)
     criterion = None
     if study.brittle is not None:
         from ..fracture.brittle.surface_criterion import BrittleSurfaces
 
-        strength, rules = strength_of(study, domain, graph, number), surface_rules(study.brittle, number)
-        criterion = BrittleSurfaces(stiffness.stress, graph, strength, within, rules)
-    return Breakable(stiffness, graph, criterion, within, study.solver, heed=heed)
+        strength, rules = build_strength(study, domain, graph, number), build_surface_rules(study.brittle, number)
+        criterion = BrittleSurfaces(stiffness.stress, graph, strength, fragment_average, rules)
+    return BreakableBody(stiffness, graph, criterion, fragment_average, study.solver, check_abort=check_abort)
+
+
+# --- checks ---
 
 
 def _check_shell(study: Study, mesh: MeshData) -> None:
-    """InputError where a shell is asked for what shells do not have."""
+    """Raise InputError if the study asks for something that shells do not support."""
     if mesh.shell is None:
         return
     if study.brittle is not None and study.brittle.shape == "curved":
@@ -179,25 +221,29 @@ def _check_shell(study: Study, mesh: MeshData) -> None:
 
 
 def _check_masses(state: RigidState) -> None:
+    """Raise InputError if a body has no mass."""
     bad = np.flatnonzero(state.bodies.mass <= 0)
     if len(bad):
-        where = format_point(state.bodies.place[bad[0]])
+        where = format_point(state.bodies.position[bad[0]])
         raise InputError(f"body {bad[0]} around {where} has no mass ({state.bodies.mass[bad[0]]:g} kg): its cells are "
                          "inside out or flat; mend the mesh")  # fmt: skip
 
 
-def _check_room(stepper: RigidStepper, state: RigidState, obstacles: list[RigidObstacle], edge: float) -> None:
-    """InputError where bodies lie in one another, or in an obstacle, at the start."""
-    found = [each for each in stepper.depths(state) if each[2] > DEEP * edge]
-    if not found:
+def _check_overlaps(stepper: RigidStepper, state: RigidState, obstacles: list[RigidObstacle], edge: float) -> None:
+    """Raise InputError if bodies overlap one another or an obstacle at the start; `edge`: mean edge, m."""
+    overlaps = [pair for pair in stepper.find_penetrations(state) if pair[2] > MAX_OVERLAP_RATIO * edge]
+    if not overlaps:
         return
-    first, second, depth = max(found, key=lambda each: each[2])
-    what, other = (
-        f"body {thing} around {format_point(state.bodies.place[thing])}" if thing < stepper.count
-        else f"obstacle {obstacles[stepper.others.owner[thing - stepper.count]].name}" for thing in (first, second)
-    )  # fmt: skip
-    more = f" (one of {len(found)} such pairs)" if len(found) > 1 else ""
+
+    def describe(number: int) -> str:
+        count = stepper.fragment_count
+        if number < count:
+            return f"body {number} around {format_point(state.bodies.position[number])}"
+        return f"obstacle {obstacles[stepper.obstacles.obstacle_of[number - count]].name}"
+
+    first, second, depth = max(overlaps, key=lambda pair: pair[2])
+    more = f" (one of {len(overlaps)} such pairs)" if len(overlaps) > 1 else ""
     raise InputError(
-        f"{what} lies in {other} at the start, by {depth:.3g} m as convex parts of them go{more}: move them apart "
-        "(body.N.position, spacing, or `at` of the obstacle)"
+        f"{describe(first)} lies in {describe(second)} at the start, by {depth:.3g} m as convex parts of them go{more}"
+        ": move them apart (body.N.position, spacing, or `at` of the obstacle)"
     )

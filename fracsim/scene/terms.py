@@ -26,7 +26,7 @@ from ..study.conditions import BoundaryCondition, boundary_conditions, volume_lo
 
 
 @dataclass(frozen=True)
-class Parts:
+class TermInputs:
     """What terms of the balance are made from.
 
     Attributes:
@@ -54,7 +54,7 @@ class Parts:
         return [(self.domain.select_facets(each.place, f"{each.key}.on"), each.function) for each in of_kind]
 
 
-def _viscosity(parts: Parts) -> Term | None:
+def _viscosity(parts: TermInputs) -> Term | None:
     damping = parts.study.damping
     if damping is None or not damping.stiffness:
         return None
@@ -63,13 +63,13 @@ def _viscosity(parts: Parts) -> Term | None:
     return Viscosity(parts.assembler, parts.u, parts.stress, damping.stiffness)
 
 
-def _pressure(parts: Parts) -> Term | None:
+def _pressure(parts: TermInputs) -> Term | None:
     pressures = parts.on_facets("pressure")
     linear = parts.stress.material.energy.linear
     return Pressure(parts.assembler, parts.u, pressures, linear=linear) if pressures else None
 
 
-def _dead_loads(parts: Parts) -> Term | None:
+def _dead_loads(parts: TermInputs) -> Term | None:
     tractions, on_volume = [*parts.on_facets("traction"), *_spread(parts)], volume_loads(parts.study, parts.domain.dim)
     if not tractions and not on_volume:
         return None
@@ -78,7 +78,7 @@ def _dead_loads(parts: Parts) -> Term | None:
     return DeadLoads(parts.assembler, parts.u, tractions=tractions, gravity=gravity, body_force=body_force)
 
 
-def _spread(parts: Parts) -> list[OnFacets]:
+def _spread(parts: TermInputs) -> list[OnFacets]:
     """Forces as tractions on the area of their facets (collective)."""
     return [(facets, _shared(force, surface_area(parts.domain, facets))) for facets, force in parts.on_facets("force")]
 
@@ -87,35 +87,35 @@ def _shared(force: TimeFunction, area: float) -> TimeFunction:
     return lambda t: np.asarray(force(t) / area)
 
 
-def _obstacles(parts: Parts) -> Term | None:
+def _obstacles(parts: TermInputs) -> Term | None:
     if all(each.shape == "mesh" for each in parts.study.obstacle):
         return None
-    from .contact_terms import explicit_obstacles_of, obstacles_of
+    from .contact_terms import build_explicit_obstacle_term, build_obstacle_term
 
     if not parts.scheme.implicit:
-        return explicit_obstacles_of(parts.study, parts.domain, parts.u, parts.stress, parts.mass.lumped)
-    return obstacles_of(parts.study, parts.domain, parts.u, parts.stress.material, parts.scheme)
+        return build_explicit_obstacle_term(parts.study, parts.domain, parts.u, parts.stress, parts.mass.lumped)
+    return build_obstacle_term(parts.study, parts.domain, parts.u, parts.stress.material, parts.scheme)
 
 
-def _solids(parts: Parts) -> Term | None:
+def _solids(parts: TermInputs) -> Term | None:
     if not any(each.shape == "mesh" for each in parts.study.obstacle):
         return None
-    from .contact_terms import solids_of
+    from .contact_terms import build_mesh_obstacle_term
 
-    return solids_of(parts.study, parts.domain, parts.u, parts.stress.material, parts.scheme)
+    return build_mesh_obstacle_term(parts.study, parts.domain, parts.u, parts.stress.material, parts.scheme)
 
 
-def _contact(parts: Parts) -> Term | None:
+def _contact(parts: TermInputs) -> Term | None:
     if parts.study.contact is None or not parts.study.contact.itself:
         return None
-    from .contact_terms import explicit_self_contact_of, self_contact_of
+    from .contact_terms import build_explicit_self_contact_term, build_self_contact_term
 
     if not parts.scheme.implicit:
-        return explicit_self_contact_of(parts.study, parts.domain, parts.u, parts.stress, parts.mass.lumped)
-    return self_contact_of(parts.study, parts.domain, parts.u, parts.stress.material)
+        return build_explicit_self_contact_term(parts.study, parts.domain, parts.u, parts.stress, parts.mass.lumped)
+    return build_self_contact_term(parts.study, parts.domain, parts.u, parts.stress.material)
 
 
-def _tethers(parts: Parts) -> Term | None:
+def _tethers(parts: TermInputs) -> Term | None:
     fracture = parts.study.fracture
     if fracture is None or fracture.crumbs or fracture.approach != "chi" or parts.domain.order > 1:
         return None
@@ -126,11 +126,11 @@ def _tethers(parts: Parts) -> Term | None:
     return NodeTies(domain, parts.u, young, parts.mass.lumped, parts.motion.prescribed_nodes)
 
 
-def _inertia(parts: Parts) -> Term | None:
+def _inertia(parts: TermInputs) -> Term | None:
     return Inertia(parts.u, parts.mass) if parts.scheme.inertia else None
 
 
-def _drag(parts: Parts) -> Term | None:
+def _drag(parts: TermInputs) -> Term | None:
     damping = parts.study.damping
     if damping is None or not damping.mass:
         return None
@@ -140,7 +140,7 @@ def _drag(parts: Parts) -> Term | None:
 
 
 # What may add to the balance beside the stress, in this order. A new term has its line here.
-TERMS: dict[str, Callable[[Parts], Term | None]] = {
+TERMS: dict[str, Callable[[TermInputs], Term | None]] = {
     "viscosity": _viscosity,
     "pressure": _pressure,
     "dead loads": _dead_loads,
@@ -153,7 +153,7 @@ TERMS: dict[str, Callable[[Parts], Term | None]] = {
 }
 
 
-def balance_of(study: Study, domain: Domain, scheme: Scheme, material: MaterialFields) -> Balance:
+def build_balance(study: Study, domain: Domain, scheme: Scheme, material: MaterialFields) -> Balance:
     """The balance of a body of this material (collective). InputError where a place selects nothing."""
     assembler, u = VectorAssembler(domain), fem.Function(domain.space, name="displacement")
     entries = boundary_conditions(study, domain.dim)
@@ -169,6 +169,6 @@ def balance_of(study: Study, domain: Domain, scheme: Scheme, material: MaterialF
     fracture, floor = study.fracture, 0.0 if scheme.inertia else RESIDUAL_STIFFNESS
     weakening = None if fracture is None else DegradationModel(fracture.approach, fracture.unilateral)
     stress = Stress(assembler, u, material, weakening, floor=floor)
-    parts = Parts(study, scheme, assembler, u, density, stress, mass, motion, entries)
+    parts = TermInputs(study, scheme, assembler, u, density, stress, mass, motion, entries)
     others = [term for make in TERMS.values() if (term := make(parts)) is not None]
     return Balance(assembler, u, [stress, *others], motion, mass, scheme, study.time.max_step)

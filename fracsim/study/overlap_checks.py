@@ -23,7 +23,7 @@ from .conditions import ObstaclePlacement, obstacle_placements
 from .mesh_source import read_obstacle_surface
 
 if TYPE_CHECKING:
-    from ..rigid.instance_placement import Place
+    from ..rigid.instance_placement import InstancePlacement
     from . import Study
 
 Values = npt.NDArray[np.float64]
@@ -42,20 +42,20 @@ def build_shape(entry: ObstaclePlacement, number: int) -> Shape:
         raise InputError(f"obstacle.{number}: {error}") from None
 
 
-def body_placements(study: Study) -> list[Place]:
+def body_placements(study: Study) -> list[InstancePlacement]:
     """Returns position, rotation vector, velocity and spin of all copies of all entries of [[body]].
 
     Without an entry there is one body at the position of the mesh.
     """
-    from ..rigid.instance_placement import Place
+    from ..rigid.instance_placement import InstancePlacement
 
     if not study.body:
-        return [Place(*np.zeros((4, 3)))]
+        return [InstancePlacement(*np.zeros((4, 3)))]
     placements = []
     for entry in study.body:
         grid = np.indices(entry.copies).reshape(3, -1).T * np.array(entry.spacing or [0.0, 0.0, 0.0])
         motion = [np.array(vector) for vector in (entry.rotation, entry.velocity, entry.spin)]
-        placements += [Place(np.array(entry.position) + shift, *motion) for shift in grid]
+        placements += [InstancePlacement(np.array(entry.position) + shift, *motion) for shift in grid]
     return placements
 
 
@@ -216,10 +216,10 @@ def _check_mesh_obstacle(entry: ObstaclePlacement, number: int, mesh: MeshData) 
 
 def _copies_in_space(study: Study, x: Values) -> Values:
     """Points x (n, 3) of the mesh at their positions in all copies at the start, (copies, n, 3) in m."""
-    from ..rigid.instance_placement import Poses
+    from ..rigid.instance_placement import InstancePoses
 
-    poses = Poses.of(body_placements(study))
-    return np.asarray(np.einsum("kij,nj->kni", poses.turn, x) + poses.place[:, None])
+    poses = InstancePoses.from_placements(body_placements(study))
+    return np.asarray(np.einsum("kij,nj->kni", poses.rotation, x) + poses.position[:, None])
 
 
 def _check_rigid_bodies(study: Study, mesh: MeshData, entries: list[ObstaclePlacement]) -> None:
@@ -227,21 +227,21 @@ def _check_rigid_bodies(study: Study, mesh: MeshData, entries: list[ObstaclePlac
 
     The run checks obstacles from files, and rigid bodies against each other.
     """
-    from ..rigid.instance_placement import Poses
+    from ..rigid.instance_placement import InstancePoses
 
-    poses, edges = Poses.of(body_placements(study)), edges_of(mesh.cells)
+    poses, edges = InstancePoses.from_placements(body_placements(study)), edges_of(mesh.cells)
     mean_edge = float(np.linalg.norm(np.diff(mesh.points[edges], axis=1)[:, 0], axis=1).mean())
     max_depth = LIMITS.max_rigid_overlap * mean_edge
     centre = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
     radius = float(np.linalg.norm(mesh.points - centre, axis=1).max())
-    centres = poses.place + poses.turn @ centre
+    centres = poses.position + poses.rotation @ centre
     for number, entry in enumerate(entries):
         # the run refuses hollow obstacles
         if entry.shape == "mesh" or entry.geometry.get("hollow"):
             continue
         placed = _placed(entry, number)
         for copy in np.flatnonzero(placed.distance(centres) < radius):
-            x = mesh.points @ poses.turn[copy].T + poses.place[copy]
+            x = mesh.points @ poses.rotation[copy].T + poses.position[copy]
             least = float(placed.distance(x).min())
             if least < -max_depth:
                 raise InputError(

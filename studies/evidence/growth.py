@@ -171,7 +171,7 @@ class VirtualNodes:
         any more, and would turn the cells inside out that the copies are."""
         from ...mesh.domain import distribute
         from ...mesh.simplices import node_groups
-        from ...scene import make_stepper, material_of, scene_on
+        from ...scene import build_material, build_scene_on, make_stepper
         from ...timestepping.protocols import NoFracture, NoPlasticFlow
         from .virtual_nodes import duplicate
 
@@ -180,8 +180,8 @@ class VirtualNodes:
         self.new = duplicate(old.cell_nodes, node_groups(old.dim)[graph.pattern], old.node_count)
         domain = distribute(old.comm, self._mesh(old))
         share = self.new.share[domain.cell_input]
-        material = material_of(study, domain)
-        scene = scene_on(domain, study, replace(material, density=share * material.density))
+        material = build_material(study, domain)
+        scene = build_scene_on(domain, study, replace(material, density=share * material.density))
         assert scene.balance.stress.chi is not None
         scene.balance.stress.chi.x.array[: len(share)] = share
         self.stepper = make_stepper(scene.balance, study.time, NoPlasticFlow(), NoFracture(scene.balance), scene.solver)

@@ -11,12 +11,12 @@ from fracsim.fracture.brittle.grains import SurfaceParameters
 from fracsim.mechanics.time_functions import TimeFunction
 from fracsim.meshes.data import MeshData
 from fracsim.rigid.bodies import Bodies
-from fracsim.rigid.fragment_geometry import Geometry
-from fracsim.rigid.hertz import Hertz
-from fracsim.rigid.instances import Copies
-from fracsim.rigid.mujoco_model import Rules, Stand
-from fracsim.rigid.obstacle_shapes import primitive
+from fracsim.rigid.fragment_geometry import FragmentGeometry
+from fracsim.rigid.instances import Instances
+from fracsim.rigid.mujoco_model import ContactParameters, PrescribedObstacle
+from fracsim.rigid.obstacles import obstacle_primitive
 from fracsim.rigid.rigid_stepper import RigidStepper
+from fracsim.rigid.surface_loads import HertzContact
 from support.rigid import DENSITY, breakable
 
 Values = npt.NDArray[np.float64]
@@ -35,9 +35,9 @@ def cubes(places: list[list[float]], velocity: list[float] | None = None) -> Bod
     return Bodies(np.full(n, MASS), np.zeros((n, 3)), inertia, np.array(places, float), turn, speed, np.zeros((n, 3)))
 
 
-def floor(friction: float = 0.5, normal: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> Stand:
+def floor(friction: float = 0.5, normal: tuple[float, float, float] = (0.0, 0.0, 1.0)) -> PrescribedObstacle:
     """The plane z = 0."""
-    return Stand(primitive(HalfSpace(normal), "floor"), np.zeros(3), friction)
+    return PrescribedObstacle(obstacle_primitive(HalfSpace(normal), "floor"), np.zeros(3), friction)
 
 
 def stepper_of(
@@ -59,5 +59,7 @@ def stepper_of(
         if obstacles is None
         else obstacles
     )
-    rules = Rules(step, gravity, 0.5, restitution)
-    return RigidStepper(Copies.of(body), Geometry(mesh), DENSITY, stand, rules, Hertz(1e9, 0.2), contact_time)
+    rules = ContactParameters(step, gravity, 0.5, restitution)
+    return RigidStepper(
+        Instances.of_body(body), FragmentGeometry(mesh), DENSITY, stand, rules, HertzContact(1e9, 0.2), contact_time
+    )

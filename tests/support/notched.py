@@ -10,7 +10,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from fracsim.mesh.domain import distribute
-from fracsim.scene import Scene, scene_on
+from fracsim.scene import Scene, build_scene_on
 
 from .scenes import make_study
 from .squares import square
@@ -43,7 +43,7 @@ def plate(kind: str, n: int, side: float = 1.0, order: int = 1, **tables: Any) -
     """A square of n by n cells of this kind, its side in m."""
     mesh = {"builder": "box", "size": [side, side], "h": side, "order": order}
     study = make_study(**plate_tables() | tables, mesh=mesh)
-    return scene_on(distribute(MPI.COMM_SELF, square(kind, n, side), order), study)
+    return build_scene_on(distribute(MPI.COMM_SELF, square(kind, n, side), order), study)
 
 
 def torn(scene: Scene) -> Iterator[tuple[float, float, Any]]:

@@ -20,8 +20,8 @@ from fracsim.mesh.split_surface.closed_surface import build_split_surface
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
 from fracsim.mesh.split_surface.polyhedron_moments import PolyhedronMoments, moments
 from fracsim.meshes.data import MeshData
-from fracsim.rigid.breakage import Breakable, Operator, Within
-from fracsim.rigid.free_body_analysis import FreeBody, Stiffness
+from fracsim.rigid.breakage import BreakableBody, FragmentAverage, StiffnessOperator
+from fracsim.rigid.free_body_analysis import SolidBody, SolidStiffness
 from fracsim.rigid.shell_analysis import ShellStiffness
 
 Values = npt.NDArray[np.float64]
@@ -29,12 +29,12 @@ DENSITY = 2000.0  # kg/m^3
 TIGHT: dict[str, bool | int | float | str] = {"ksp_rtol": 1e-13}
 
 
-def stiffness_of(mesh: MeshData, young: float = 1e9, poisson: float = 0.2) -> Stiffness:
+def stiffness_of(mesh: MeshData, young: float = 1e9, poisson: float = 0.2) -> SolidStiffness:
     """Of a mesh of linear material."""
     domain = distribute(MPI.COMM_SELF, mesh)
     material = material_fields(domain, "linear", young=young, poisson=poisson, density=DENSITY)
     stress = Stress(VectorAssembler(domain), fem.Function(domain.space), material, DegradationModel("chi"))
-    return Stiffness(stress, np.full(domain.cell_count, DENSITY))
+    return SolidStiffness(stress, np.full(domain.cell_count, DENSITY))
 
 
 def shell_of(mesh: MeshData, young: float = 1e9, poisson: float = 0.2) -> ShellStiffness:
@@ -43,11 +43,11 @@ def shell_of(mesh: MeshData, young: float = 1e9, poisson: float = 0.2) -> ShellS
     return ShellStiffness(stiffness_of(mesh, young, poisson).stress, mesh.shell, young, poisson, DENSITY)
 
 
-def whole_body(mesh: MeshData) -> tuple[Stiffness, FreeBody, Domain]:
+def whole_body(mesh: MeshData) -> tuple[SolidStiffness, SolidBody, Domain]:
     """All cells of a mesh as one body."""
     stiffness = stiffness_of(mesh)
     domain = stiffness.stress.domain
-    return stiffness, FreeBody(stiffness, np.ones(domain.cell_count), TIGHT), domain
+    return stiffness, SolidBody(stiffness, np.ones(domain.cell_count), TIGHT), domain
 
 
 def section_mean(domain: Domain, values: Values, axis: int, low: float, high: float) -> float:
@@ -57,13 +57,15 @@ def section_mean(domain: Domain, values: Values, axis: int, low: float, high: fl
     return float(np.average(values[inside], weights=domain.volumes[inside]))
 
 
-def breakable(mesh: MeshData, strength: float, rules: SurfaceParameters, poisson: float = 0.2) -> Breakable:
+def breakable(mesh: MeshData, strength: float, rules: SurfaceParameters, poisson: float = 0.2) -> BreakableBody:
     """A mesh that breaks along surfaces where its stress, averaged over neighbours, reaches a strength in Pa."""
-    stiffness: Operator = stiffness_of(mesh, poisson=poisson) if mesh.shell is None else shell_of(mesh, poisson=poisson)
+    stiffness: StiffnessOperator = (
+        stiffness_of(mesh, poisson=poisson) if mesh.shell is None else shell_of(mesh, poisson=poisson)
+    )
     domain = stiffness.stress.domain
-    graph, within = EdgeGraph(domain), Within(NeighbourAverage(domain), domain.cell_count)
+    graph, within = EdgeGraph(domain), FragmentAverage(NeighbourAverage(domain), domain.cell_count)
     criterion = BrittleSurfaces(stiffness.stress, graph, EdgeStrength(graph, strength, tie_break=1e-6), within, rules)
-    return Breakable(stiffness, graph, criterion, within)
+    return BreakableBody(stiffness, graph, criterion, within)
 
 
 def density_of(bodies: PolyhedronMoments) -> Values:
@@ -71,7 +73,7 @@ def density_of(bodies: PolyhedronMoments) -> Values:
     return np.full(len(bodies.volume), DENSITY)
 
 
-def moments_of(body: Breakable) -> PolyhedronMoments:
+def moments_of(body: BreakableBody) -> PolyhedronMoments:
     """Of the pieces, from the split surface of the mesh at rest."""
     domain = body.graph.domain
     assert domain.source is not None

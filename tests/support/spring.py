@@ -8,7 +8,7 @@ from dolfinx import fem
 from petsc4py import PETSc
 
 from fracsim.mechanics.term import Term, Values
-from fracsim.scene import Parts
+from fracsim.scene import TermInputs
 
 
 class Spring(Term):
@@ -20,9 +20,9 @@ class Spring(Term):
         self._u, self._owned, self._k = u, owned, k
 
     @classmethod
-    def of(cls, parts: Parts) -> Spring:
+    def of(cls, inputs: TermInputs) -> Spring:
         """As TERMS makes it."""
-        return cls(parts.u, parts.assembler.owned_dof_count, 2.0)
+        return cls(inputs.u, inputs.assembler.owned_dof_count, 2.0)
 
     @property
     def _at(self) -> Values:

@@ -26,7 +26,7 @@ from ufl.core.expr import Expr
 from ....forms.energies import first_piola_kirchhoff
 from ....forms.kinematics import deformation_gradient
 from ....mechanics.term import Form, Term
-from ....scene import TERMS, Parts, Scene, build_scene
+from ....scene import TERMS, Scene, TermInputs, build_scene
 from ....study.reader import validate
 from .smooth import ENERGIES
 
@@ -47,7 +47,7 @@ class Load(Term):
     name = "load"
     linear = True
 
-    def __init__(self, parts: Parts) -> None:
+    def __init__(self, parts: TermInputs) -> None:
         domain = parts.domain
         x = ufl.SpatialCoordinate(domain.mesh)
         F = deformation_gradient(ufl.as_vector(wanted([x[i] for i in range(domain.dim)], ufl)))
