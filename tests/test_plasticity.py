@@ -13,7 +13,7 @@ from scipy.optimize import brentq
 from fracsim.forms.energies import ENERGIES
 from fracsim.forms.schemes import SCHEMES
 from fracsim.mechanics.plasticity import LIMITS, ImplicitPlasticFlow
-from fracsim.mechanics.return_mapping import CLOSE
+from fracsim.mechanics.return_mapping import POLICY
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.write import write_mesh
 from fracsim.output.frame_files import FieldEvaluator
@@ -211,7 +211,9 @@ def test_the_energy_known_from_flow_is_the_assembled_one(energy: str, measure: s
         scene.stepper.flow.begin_step(0.1)
         scene.stepper.flow()
         assert plastic_strain(scene).all()
-        assert scene.stepper.flow.elastic_energy == pytest.approx(scene.balance.stress.stored_energy(), rel=10 * CLOSE)
+        assert scene.stepper.flow.elastic_energy == pytest.approx(
+            scene.balance.stress.stored_energy(), rel=10 * POLICY.tolerance
+        )
 
 
 def two_halves(folder: Path) -> Path:
@@ -290,9 +292,9 @@ def test_the_return_is_that_of_a_dense_solver(energy: str, measure: str) -> None
 
     assert excess(0) > Y  # well beyond yield
     beta = brentq(lambda x: excess(x) - (1 - share) * excess(0), 0, 1, xtol=1e-14)
-    np.testing.assert_allclose(plastic_strain(scene), 0.02 + beta * size, rtol=100 * CLOSE)
+    np.testing.assert_allclose(plastic_strain(scene), 0.02 + beta * size, rtol=100 * POLICY.tolerance)
     expected = U @ np.diag(S * np.exp(-beta * e)) @ Vt
-    np.testing.assert_allclose(F @ inverse, np.broadcast_to(expected, inverse.shape), atol=100 * CLOSE)
+    np.testing.assert_allclose(F @ inverse, np.broadcast_to(expected, inverse.shape), atol=100 * POLICY.tolerance)
 
 
 @pytest.mark.parametrize("energy", FINITE)
@@ -307,7 +309,7 @@ def test_stress_beyond_yield_decays_with_the_flow_rate(energy: str) -> None:
             scene.stepper.flow.begin_step(dt)
             scene.stepper.flow()
         found = FieldEvaluator(scene.balance.stress, ["von_mises"])(state, None)[1].values
-        np.testing.assert_allclose(found, Y + (q_0 - Y) * np.exp(-rate * 0.5), rtol=20 * CLOSE)
+        np.testing.assert_allclose(found, Y + (q_0 - Y) * np.exp(-rate * 0.5), rtol=20 * POLICY.tolerance)
 
 
 # --- paths of homogeneous deformation -------------------------------------------------------------------------------
@@ -365,7 +367,7 @@ def test_a_turning_body_flows_alike(energy: str) -> None:
     assert memory[0][:, -1].min() > 0.01
     np.testing.assert_allclose(memory[1], memory[0], atol=1e-6 * memory[0][:, -1].max())
     led(scenes[0], lambda t: angle(3 * t) @ winding(1.0), 5)
-    np.testing.assert_allclose(memory_of(scenes[0]), memory[0], atol=10 * CLOSE * 2e-3)
+    np.testing.assert_allclose(memory_of(scenes[0]), memory[0], atol=10 * POLICY.tolerance * 2e-3)
 
 
 def test_pressure_makes_nothing_flow() -> None:

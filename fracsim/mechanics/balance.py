@@ -98,18 +98,13 @@ class Balance:
         self.work_vector, self._force_vector = assembler.create_vector(), assembler.create_vector()
         self.reactions: Values = np.zeros(self.owned_dof_count)
         self._is_prescribed = bool(sum_over_ranks(domain.comm, len(motion.owned_dofs))[0])
-        self._work = self._virtual_work(None)
-        self._work_at_supports = self._virtual_work(_cells_at_supports(domain, motion))
+        self._work = _virtual_work(domain, self.terms)
+        self._work_at_supports = _virtual_work(domain, self.terms, _cells_at_supports(domain, motion))
         if scheme.implicit:
             self.tangent = self._new_tangent()
         self.energies = EnergySums(self)
-        rest = np.zeros(self.owned_dof_count)
-        self._set_level(TimeLevel(0.0, 0.0, rest, rest, self.c_a, self.c_v, rest, rest), motion.displacements_at(0.0))
-
-    def _virtual_work(self, cells: npt.NDArray[np.int32] | None) -> CellForm:
-        """Sum of the terms' virtual works over owned cells; None: over all of them."""
-        w, dx = ufl.TestFunction(self.domain.space), cell_measure(self.domain, cells)
-        return CellForm(sum_of_forms([term.virtual_work(w, dx) for term in self.terms]))
+        zero = np.zeros(self.owned_dof_count)
+        self._set_level(TimeLevel(0.0, 0.0, zero, zero, self.c_a, self.c_v, zero, zero), motion.displacements_at(0.0))
 
     def _new_tangent(self) -> Tangent:
         return Tangent(self.u, self.terms, self.stress, self.motion, self.mass)
@@ -123,9 +118,9 @@ class Balance:
         self.c_a, self.c_v = scheme.rate_coefficients(dt)
         prescribed = (1 - late) * motion.displacements_at(t) + late * motion.displacements_at(t - dt)
         u_a, u_v = scheme.reference_displacements(dt, u, v, a)
-        own, end = motion.owned_dofs, prescribed[: len(motion.owned_dofs)]
-        if not late and (rates := scheme.prescribed_dof_rates(dt, end, u[own], v[own])) is not None:
-            u_a[own], u_v[own] = end - rates[1] / self.c_a, end - rates[0] / self.c_v
+        dofs, end = motion.owned_dofs, prescribed[: len(motion.owned_dofs)]
+        if not late and (rates := scheme.prescribed_dof_rates(dt, end, u[dofs], v[dofs])) is not None:
+            u_a[dofs], u_v[dofs] = end - rates[1] / self.c_a, end - rates[0] / self.c_v
         level = TimeLevel(t - late * dt, dt, u, v, self.c_a, self.c_v, u_a, u_v, 1 - late, self.contact_weights)
         self._set_level(level, prescribed)
 
@@ -216,8 +211,8 @@ class Balance:
         """Contact forces with their weight in r; without it on prescribed dofs, so that reactions balance them."""
         if (weight := self.level.contact_weight) == 1:
             return contact_forces
-        result, own = weight * contact_forces, self.motion.owned_dofs
-        result[own] = contact_forces[own]
+        result, dofs = weight * contact_forces, self.motion.owned_dofs
+        result[dofs] = contact_forces[dofs]
         return result
 
     def assemble_free_residual(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
@@ -380,6 +375,12 @@ class EnergySums:
         dofs = domain.space.dofmap.index_map.size_global * domain.dim
         young = self._comm.allreduce(float(np.max(self._balance.stress.material.young, initial=0.0)), op=MPI.MAX)
         return float(young * domain.mean_edge_length ** (domain.dim - 2)), float(domain.size * np.sqrt(dofs))
+
+
+def _virtual_work(domain: Domain, terms: Sequence[Term], cells: npt.NDArray[np.int32] | None = None) -> CellForm:
+    """Sum of the terms' virtual works over owned cells; None: over all of them (collective)."""
+    w, dx = ufl.TestFunction(domain.space), cell_measure(domain, cells)
+    return CellForm(sum_of_forms([term.virtual_work(w, dx) for term in terms]))
 
 
 def _cells_at_supports(domain: Domain, motion: PrescribedMotion) -> npt.NDArray[np.int32]:

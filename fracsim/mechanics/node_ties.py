@@ -134,8 +134,8 @@ class NodeTies(Term):
     def _owned(self, numbers: Ints) -> tuple[Ints, Ints]:
         """Indices of those input nodes (n,) that this rank owns, and their local numbers."""
         position = np.minimum(np.searchsorted(self._sorted, numbers), max(len(self._sorted) - 1, 0))
-        own = np.flatnonzero(self._sorted[position] == numbers) if len(self._sorted) else np.empty(0, np.int64)
-        return own, self._order[position[own]]
+        owned = np.flatnonzero(self._sorted[position] == numbers) if len(self._sorted) else np.empty(0, np.int64)
+        return owned, self._order[position[owned]]
 
     # --- selection of nodes and cells ---
 
@@ -143,11 +143,11 @@ class NodeTies(Term):
         """Tie nodes without an unsplit cell, and again those whose cell split; free nodes with an unsplit cell."""
         self._pattern, domain = pattern.copy(), self._domain
         without = self._around(~is_split(domain.dim)[pattern]) == 0
-        local_links, own = self._links(pattern, without)
-        if not sum_over_ranks(domain.comm, len(own) + len(self.ties.cell))[0]:
+        local_links, local_nodes = self._links(pattern, without)
+        if not sum_over_ranks(domain.comm, len(local_nodes) + len(self.ties.cell))[0]:
             return
         links, nodes = (
-            np.unique(np.concatenate(allgather(domain.comm, array)), axis=0) for array in (local_links, own)
+            np.unique(np.concatenate(allgather(domain.comm, array)), axis=0) for array in (local_links, local_nodes)
         )
         unchanged = np.isin(self.ties.nodes[:, 0], nodes) & self._is_unsplit(self.ties.cell)
         self._dissipated += self._energy(~unchanged)
@@ -163,8 +163,8 @@ class NodeTies(Term):
         ends = domain.cell_nodes[cells][:, pairs]  # (n, edges, 2)
         intact = (pattern[cells, None] >> np.arange(len(pairs))) & 1 == 0
         ends = ends[intact & without[ends].any(axis=2)]
-        own = np.unique(ends[without[ends] & ~self._prescribed[ends]])
-        return np.sort(domain.node_input[ends], axis=1), domain.node_input[own]
+        detached = np.unique(ends[without[ends] & ~self._prescribed[ends]])
+        return np.sort(domain.node_input[ends], axis=1), domain.node_input[detached]
 
     def _groups(self, links: Ints, nodes: Ints) -> tuple[Ints, Ints]:
         """All nodes (k,) of links (m, 2) and of `nodes` (n,), and the connected component (k,) of each."""

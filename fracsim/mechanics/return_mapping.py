@@ -1,6 +1,6 @@
-"""Plastic flow at the end of a step: the elastic stretches of cells past yield flow back to the yield surface.
+"""Return mapping at the end of a step: points beyond yield flow back to the yield surface.
 
-With F_e = U Sigma V^T and the logarithmic deviator e = V dev(log Sigma) V^T of the elastic stretch a cell flows by
+With F_e = U Sigma V^T and the logarithmic deviator e = V dev(log Sigma) V^T of the elastic stretch a point flows by
 
     F_p <- exp(beta e) F_p,    exp(beta e) = V (det(Sigma)^(-1/3) Sigma)^beta V^T,
 
@@ -10,15 +10,16 @@ accumulated plastic strain alpha grows by beta sqrt(2/3) |e|, and beta is the ro
 
     q(beta) - Y(alpha + beta sqrt(2/3) |e|) = exp(-nu dt) (q(0) - Y(alpha)),
 
-q the measure of the Cauchy stress and Y = yield_stress + K alpha: the stress beyond yield decays like exp(-nu t) where
-the body is held, however it is cut into steps, and is gone at once for nu -> infinity. Eq. 31 is the first guess of the
-root without hardening (with nu for 1 - exp(-nu dt), so that halving the step would double the flow).
+q the measure of the Cauchy stress and Y = yield_stress + K alpha: the stress beyond yield decays like exp(-nu t) at
+constant displacement, for any sizes of steps, and at once for nu -> infinity. Eq. 31 is the initial guess of the root
+without hardening (with nu instead of 1 - exp(-nu dt), so that half the step would double the flow).
 
 Equations: docs/theory.md#plasticity.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -32,18 +33,33 @@ from .tensor_functions import deviatoric_power, eigenvalues, multiply_unimodular
 
 Values = npt.NDArray[np.float64]
 Points = npt.NDArray[np.int32]
-Chosen = slice | npt.NDArray[np.intp]  # some of an array, or all of it without a copy
+Selection = slice | npt.NDArray[np.intp]  # part of an array, or all of it without a copy
 
-CLOSE = 1e-6  # of the stress: how near the root is found
-ITERATIONS = 12  # of the secant; one does for small elastic strains
-BLOCK = 4096  # cells at a time: their arrays stay in the cache
+
+@dataclass(frozen=True)
+class ReturnMappingPolicy:
+    """Numbers of the secant method for beta.
+
+    Attributes:
+        tolerance: error of the root, relative to the stress.
+        max_iterations: of the secant method; small elastic strains need one.
+        block: points at a time, whose arrays stay in the processor's cache.
+    """
+
+    tolerance: float = 1e-6
+    max_iterations: int = 12
+    block: int = 4096
+
+
+POLICY = ReturnMappingPolicy()
 
 
 class ReturnMapping:
-    """The flow of a step, once its displacement is known: a part of timestepping.protocols.
+    """Plastic flow of a step whose displacement is known (a protocol of timestepping.protocols).
 
     Attributes:
-        stored: this rank's share of int psi dX after it, J; without damage.
+        stored: stored energy int psi dX after it, without damage, part of this rank, J.
+        plastic: history of plastic flow.
     """
 
     elastic_energy: float | None = 0.0
@@ -54,23 +70,26 @@ class ReturnMapping:
         self.plastic: PlasticHistory = plastic
         self._stress, self._flowed = stress, True
         trial = TrialStress(plastic.energy, stress.u, stress.rotation_field)
-        asked = trial.state(), trial.measures()
-        self._state, self._measures = (point_expression(domain, each, kernels=stress.kernels) for each in asked)
+        self._state, self._measures = (
+            point_expression(domain, expression, kernels=stress.kernels)
+            for expression in (trial.state(), trial.measures())
+        )
 
     def begin_step(self, dt: float) -> None:
-        """The flow to come is that of a step of dt."""
+        """Begin a step of dt (s)."""
         self.plastic.begin_step(dt)
 
     def __call__(self) -> float:
-        """Let the cells past yield flow; returns the energy that this rank's cells lost to it, J."""
+        """Return points beyond yield to the yield surface; energy dissipated on this rank, J."""
         plastic, dt = self.plastic, self.plastic.dt
         self._put_back()
         state = self._state.evaluate_at_points().reshape(-1, self._state.width)
         measure, Y = self.measured(state), plastic.flow_stress(plastic.accumulated_strain)
-        points = np.flatnonzero((measure > Y * (1 + CLOSE)) & np.isfinite(measure)).astype(np.int32)
+        beyond = (measure > Y * (1 + POLICY.tolerance)) & np.isfinite(measure)
+        points = np.flatnonzero(beyond).astype(np.int32)
         power, lost, psi = np.empty((6, len(points))), 0.0, state[:, 2]
         if plastic.fraction > 0:
-            for part in (slice(k, k + BLOCK) for k in range(0, len(points), BLOCK)):
+            for part in (slice(k, k + POLICY.block) for k in range(0, len(points), POLICY.block)):
                 where = points[part]
                 block = _Return(self, where, state[where], measure[where])
                 power[:, part] = block.find()
@@ -97,35 +116,35 @@ class ReturnMapping:
         return self.plastic.restore(saved)
 
     def _put_back(self) -> None:
-        """F_p of the step's start, in place of what it was solved with."""
+        """Restore F_p of the step's start, which the prediction replaced."""
         if self.plastic.prediction is None:
             return
         self.plastic.prediction.begin_step(0.0, 0.0)
         if self.plastic.prediction.form is None:
-            self._stress.update_displacement()  # its rotation was that of another F_e
+            self._stress.update_displacement()  # the rotation was that of another F_e
 
     def measures(self, points: Points) -> Values:
-        """(n, 3) measures of some points at their present F_p."""
+        """(n, 3) measures (von Mises stress, pressure, energy) of points at their present F_p."""
         count = self.plastic.points_per_cell
         if count == 1:
             return self._measures(points)
-        cells, place = np.unique(points // count, return_inverse=True)
-        return self._measures.evaluate_at_points(cells.astype(np.int32)).reshape(-1, count, 3)[place, points % count]
+        cells, index = np.unique(points // count, return_inverse=True)
+        return self._measures.evaluate_at_points(cells.astype(np.int32)).reshape(-1, count, 3)[index, points % count]
 
     def measured(self, stress: Values) -> Values:
-        """What is compared with Y, from rows of measures: q, or |sigma| with |sigma|^2 = 2/3 q^2 + 3 p^2."""
+        """(n,) measure that is compared with Y, Pa: q, or |sigma| with |sigma|^2 = 2/3 q^2 + 3 p^2."""
         vm, p = stress[:, 0], stress[:, 1]
         return np.sqrt(2 / 3 * vm**2 + 3 * p**2) if self.plastic.frobenius else vm.copy()
 
     def _lost(self, block: _Return) -> float:
-        """Energy that a block of points lost, J; takes up their plastic strain."""
+        """Energy dissipated by a block of points, J; updates their accumulated strain."""
         plastic, points = self.plastic, block.points
         flowed = block.beta * block.size
         plastic.accumulated_strain[points] = block.alpha + flowed
         gain = plastic.flow_stress(plastic.accumulated_strain[points], points) - plastic.flow_stress(
             block.alpha, points
         )
-        # What psi lost goes down from the trial stress, which the body never had: it flowed at the yield stress.
+        # the loss of psi starts at the trial stress, which the body never had: it flowed at the yield stress
         (vm, _, psi), (vm_trial, _, psi_trial) = block.after.T, block.trial.T
         over = block.J * (vm_trial - vm) + gain
         chi = 1.0 if self._stress.chi is None else self._stress.chi.x.array[points // plastic.points_per_cell]
@@ -133,11 +152,14 @@ class ReturnMapping:
 
 
 class _Return:
-    """Points past yield on their way back to the yield surface.
+    """Return of points beyond yield to the yield surface.
 
     Attributes:
-        trial, after: (n, 3) measures before and after.    alpha: (n,) accumulated plastic strain before.
-        size: (n,) sqrt(2/3) |e|.    beta: (n,) the root.
+        points: (n,) the points.
+        trial, after: (n, 3) measures before and after.
+        alpha: (n,) accumulated plastic strain before.
+        size: (n,) sqrt(2/3) |e|.
+        beta: (n,) the root.
     """
 
     def __init__(self, flow: ReturnMapping, points: Points, state: Values, measure: Values) -> None:
@@ -161,57 +183,58 @@ class _Return:
         return np.sqrt(np.prod(self._values, axis=0))
 
     def find(self) -> Values:
-        """Let the points flow; returns (6, n) exp(-beta e), beta by the secant from 0 and the root for linear stress.
+        """(6, n) exp(-beta e), with beta by the secant method from 0 and the root for linear stress.
 
-        Where the last two excesses promise that the next secant step is the root (errors of the secant multiply), it is
-        taken and not looked at. A beta of 1 has no deviator left to lose: the Frobenius norm of a large pressure may
-        stay above yield.
+        If the last two excesses show that the next secant step is the root (errors of the secant method multiply), it
+        is taken and not checked. A beta of 1 leaves no deviator: the Frobenius norm of a large pressure may stay above
+        yield.
         """
         plastic, q = self._flow.plastic, self._measure
         before, g_before = np.zeros(len(q)), plastic.fraction * self._excess
         self.beta = np.clip(g_before / (q + np.maximum(plastic.hardening, 0.0) * self.size), 0.0, 1.0)
-        live: Chosen = slice(None)  # those whose root is not found
-        for last in (False,) * (ITERATIONS - 1) + (True,):
-            now, g = self.beta[live].copy(), self._left(live)
-            # the step that led here, once more
-            share = np.divide(g, g_before[live] - g, out=np.zeros_like(g), where=g != g_before[live])
-            self.beta[live] = np.clip(now + share * (now - before[live]), 0.0, 1.0)
-            near = CLOSE * q[live]
-            sure = (np.abs(g) <= near) | (g * g <= near * np.abs(g_before[live])) | ((now == 1) & (g > 0)) | last
-            self._settle(_among(live, sure), now[sure])
-            if sure.all():
+        live: Selection = slice(None)  # points without a root
+        for is_last in (False,) * (POLICY.max_iterations - 1) + (True,):
+            beta, g = self.beta[live].copy(), self._excess_at(live)
+            ratio = np.divide(g, g_before[live] - g, out=np.zeros_like(g), where=g != g_before[live])
+            self.beta[live] = np.clip(beta + ratio * (beta - before[live]), 0.0, 1.0)
+            tolerance = POLICY.tolerance * q[live]
+            converged = (np.abs(g) <= tolerance) | (g * g <= tolerance * np.abs(g_before[live]))
+            converged = converged | ((beta == 1) & (g > 0)) | is_last
+            self._complete(_narrow(live, converged), beta[converged])
+            if converged.all():
                 break
-            before[live], g_before[live] = now, g
-            live = _among(live, ~sure)
+            before[live], g_before[live] = beta, g
+            live = _narrow(live, ~converged)
         return self._power
 
-    def _left(self, live: Chosen) -> Values:
-        """What the excess of points is above exp(-nu dt) of the old one, Pa, at their beta."""
+    def _excess_at(self, live: Selection) -> Values:
+        """(n,) excess of the stress over exp(-nu dt) of the former excess, Pa, at the present beta."""
         plastic, points = self._flow.plastic, self.points[live]
         self._return(live)
         self.after[live] = stress = self._flow.measures(points)
         Y = plastic.flow_stress(self.alpha[live] + self.beta[live] * self.size[live], points)
         return self._flow.measured(stress) - Y - (1 - plastic.fraction) * self._excess[live]
 
-    def _settle(self, points: Chosen, before: Values) -> None:
-        """A last step from the beta `before`: small, so that the measures go along straight lines."""
+    def _complete(self, points: Selection, before: Values) -> None:
+        """Take a last step from beta = `before`, so small that the measures are linear in it."""
         self._return(points)
-        step, now = self.beta[points] - before, self.after[points]
+        step, measures = self.beta[points] - before, self.after[points]
         slope = np.divide(step, before, out=np.zeros_like(step), where=before > 0)
-        now[:, :2] += slope[:, None] * (now - self.trial[points])[:, :2]
-        now[:, 2] -= self.J[points] * now[:, 0] * self.size[points] * step  # s : e of a von Mises stress along e
-        self.after[points] = now
+        measures[:, :2] += slope[:, None] * (measures - self.trial[points])[:, :2]
+        # s : e of a von Mises stress along e
+        measures[:, 2] -= self.J[points] * measures[:, 0] * self.size[points] * step
+        self.after[points] = measures
 
-    def _return(self, points: Chosen) -> None:
-        """F_p^-1 <- F_p^-1 exp(-beta e), from that of the step's start."""
-        C, values, logs = (each[:, points] for each in (self._C, self._values, self._logs))
+    def _return(self, points: Selection) -> None:
+        """Set F_p^-1 = F_p^-1 exp(-beta e), from F_p of the step's start."""
+        C, values, logs = (array[:, points] for array in (self._C, self._values, self._logs))
         power = deviatoric_power(C, values, logs, -self.beta[points] / 2)
         self._flow.plastic.inverse_rows[self.points[points]] = multiply_unimodular(self._start[:, points], power).T
         self._power[:, points] = power
 
 
-def _among(points: Chosen, mask: npt.NDArray[np.bool_]) -> Chosen:
-    """`points` narrowed to those of the mask; where that is all of them, without a copy."""
+def _narrow(points: Selection, mask: npt.NDArray[np.bool_]) -> Selection:
+    """`points` of the mask; without a copy if these are all."""
     if mask.all():
         return points
     return np.flatnonzero(mask) if isinstance(points, slice) else points[mask]

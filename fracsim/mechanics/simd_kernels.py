@@ -1,11 +1,9 @@
-"""Forms and expressions of several cells at a time: FFCx's kernel with numbers of LANES lanes, and what becomes of what
-it makes (simd_kernels.c).
+"""Forms and expressions of several cells at a time, by SIMD: FFCx's kernels with vectors of LANES numbers.
 
-FFCx writes C for one cell, and the tangent of a hyperelastic tetrahedron is 2,000 products and sums of scalars, of
-which a processor does one at a time; DOLFINx then looks up the place of each of 16 blocks. Here the same C is compiled
-with vectors in the place of scalars (GCC's and Clang's, a lane a cell: no rounding differs), and places are looked up
-once: 220 ns a cell where it took 950. What vectors of C cannot do, a choice by a condition and most functions, stays
-DOLFINx's work.
+FFCx writes C for one cell. The tangent of a hyperelastic tetrahedron is 2,000 products and sums of scalars, one at a
+time, and DOLFINx then searches for the position of each of 16 blocks. Here the same C is compiled with vectors instead
+of scalars (extensions of GCC and Clang, one lane a cell, with the same rounding), and positions are searched for once:
+220 ns a cell instead of 950. Kernels with conditions, or with functions that vectors do not have, are left to DOLFINx.
 """
 
 from __future__ import annotations
@@ -36,21 +34,21 @@ from ..mesh.dolfinx_compat import (
 
 Values = npt.NDArray[np.float64]
 
-LANES = 4
-FUNCTIONS = ("fabs", "sqrt", "log", "exp")  # that are taken lane by lane
+LANES = 4  # cells at a time: doubles in a vector register of AVX2
+FUNCTIONS = ("fabs", "sqrt", "log", "exp")  # evaluated lane by lane
 SOURCE = Path(__file__).with_suffix(".c")
 _LANE_BY_LANE = """
 static inline real lanes_{0}(real x) {{ for (int i = 0; i < LANES; ++i) x[i] = {0}(x[i]); return x; }}
 #define {0} lanes_{0}
 """
-_POWERS = """ // by a number
+_POWERS = """ // with a constant exponent
 static inline real lanes_pow(real x, double n) { for (int i = 0; i < LANES; ++i) x[i] = pow(x[i], n); return x; }
 #define pow lanes_pow
 """
 
 
-class _Form(Structure):
-    """As in C."""
+class _SimdForm(Structure):
+    """Structure `Form` of simd_kernels.c."""
 
     _fields_ = (
         *((name, c_int64) for name in ("count", "width", "size")),
@@ -60,124 +58,125 @@ class _Form(Structure):
     )  # fmt: skip
 
 
-class _Field(Structure):
-    """The same."""
+class _SimdField(Structure):
+    """Structure `Field` of simd_kernels.c."""
 
     _fields_ = (("dofs", Int32), ("values", Float64))
 
 
-class _Fields:
-    """What a kernel is given of functions: looked up in their own arrays, cell by cell.
+class _KernelFields:
+    """Coefficients of a kernel, which C reads from their own arrays.
 
     Attributes:
-        width: numbers in a cell.    place: where C has them.
+        width: number of values in a cell.    pointer: to the structures of the fields.
     """
 
     def __init__(self, fields: Sequence[FormField]) -> None:
-        self._kept = [(struct_pointer(field.dofs), struct_pointer(field.values)) for field in fields]
-        self._here = (_Field * (len(fields) + 1))(*(_Field(*each) for each in self._kept))
+        self._pointers = [(struct_pointer(field.dofs), struct_pointer(field.values)) for field in fields]
+        self._structures = (_SimdField * (len(fields) + 1))(*(_SimdField(*pair) for pair in self._pointers))
         self.width = sum(field.dofs.shape[1] * field.size for field in fields)
-        self.place = cast(self._here, c_void_p)
+        self.pointer = cast(self._structures, c_void_p)
 
 
 class SimdKernel:
-    """A form of cells, whose kernel takes several at a time."""
+    """Form over cells, whose kernel takes several cells at a time."""
 
     @classmethod
     def for_form(cls, form: fem.Form, *more: Any) -> Self | None:
-        """Those of a form, where that can be done; `more`: what the class takes beside it (collective)."""
+        """Kernel of a form, None if it cannot be vectorised; `more`: further arguments of the class (collective)."""
         code = compile_simd_form(form)
         return None if code is None else cls(form, code, *more)
 
     def __init__(self, form: fem.Form, code: CDLL) -> None:
-        """`code`: what `compiled` has made of the form."""
+        """`code`: library of `compile_simd_form`."""
         self._form, self._code = form, code
         self._nodes = nodes_of_cells(form) if form.rank else form.mesh.geometry.dofmap
-        self._fields = _Fields(form_fields(form))
+        self._fields = _KernelFields(form_fields(form))
 
-    def _call(self, function: Any, *given: npt.NDArray[Any]) -> int:
-        """What a function of C returns."""
+    def _call(self, function: Any, *arguments: npt.NDArray[Any]) -> int:
+        """Result of a C function of the form and further arrays."""
         cells, geometry, c = cells_of(self._form), self._form.mesh.geometry, constants_of(self._form)
         arrays = cells, self._nodes, geometry.dofmap, geometry.x, c
-        form = _Form(len(cells), self._fields.width, len(c), *map(struct_pointer, arrays), self._fields.place)
-        return int(function(byref(form), *given) or 0)
+        form = _SimdForm(len(cells), self._fields.width, len(c), *map(struct_pointer, arrays), self._fields.pointer)
+        return int(function(byref(form), *arguments) or 0)
 
 
 class SimdFunctional(SimdKernel):
-    """A functional of cells."""
+    """Integral over cells."""
 
     def integrate(self) -> float:
-        """Of this rank's cells."""
+        """Sum over this rank's cells."""
         values = np.empty(len(cells_of(self._form)))
         self._call(self._code.fill, values)
         return float(values.sum())
 
 
 class SimdLinearForm(SimdKernel):
-    """A linear form of cells."""
+    """Linear form over cells."""
 
     def add_to(self, values: Values) -> None:
-        """Add this rank's part to the values of dofs, ghosts included."""
+        """Add this rank's part to the values of dofs (dofs,), ghosts included."""
         self._call(self._code.add, values)
 
 
 class SimdBilinearForm(SimdKernel):
-    """A bilinear form of cells, and where what it adds is in a matrix of blocks, or of single entries."""
+    """Bilinear form over cells, and the positions of its blocks in a matrix of blocks or of single entries."""
 
     def __init__(self, form: fem.Form, code: CDLL, matrix: la.MatrixCSR) -> None:
         super().__init__(form, code)
         dofmap = form.function_spaces[0].dofmap
         self._bs = dofmap.index_map_bs
-        self._held = np.zeros(dofmap.index_map.size_local + dofmap.index_map.num_ghosts, np.uint8)
-        self._places = np.zeros((len(self._nodes), self._nodes.shape[1] ** 2), np.int32)
+        self._prescribed = np.zeros(dofmap.index_map.size_local + dofmap.index_map.num_ghosts, np.uint8)
+        self._positions = np.zeros((len(self._nodes), self._nodes.shape[1] ** 2), np.int32)
         starts = matrix.indptr.astype(np.int64)
-        apart = 1 if matrix.block_size[0] > 1 else self._bs
-        lengths = np.diff(starts)[::apart]  # of rows
-        self._strides = (np.full_like(lengths, self._bs) if apart == 1 else lengths).astype(np.int32)
-        code.find(c_int64(len(self._nodes)), self._nodes, c_int64(apart), starts, matrix.indices, self._places)
+        # rows and columns of a node are so far apart: 1 in a matrix of blocks
+        spacing = 1 if matrix.block_size[0] > 1 else self._bs
+        row_lengths = np.diff(starts)[::spacing]
+        self._strides = (np.full_like(row_lengths, self._bs) if spacing == 1 else row_lengths).astype(np.int32)
+        code.find(c_int64(len(self._nodes)), self._nodes, c_int64(spacing), starts, matrix.indices, self._positions)
 
     def add_to(self, matrix: la.MatrixCSR, bcs: list[fem.DirichletBC]) -> None:
-        """Add this rank's part as DOLFINx does: rows and columns of prescribed dofs become the identity's."""
-        self._held[:] = 0
+        """Add this rank's part as DOLFINx does: rows and columns of prescribed dofs become those of the identity."""
+        self._prescribed[:] = 0  # a bit for each prescribed axis of a node
         for bc in bcs:
             dofs = bc.dof_indices()[0]
-            np.bitwise_or.at(self._held, dofs // self._bs, (1 << dofs % self._bs).astype(np.uint8))
-        if missing := self._call(self._code.add_blocks, self._places, self._strides, self._held, matrix.data):
+            np.bitwise_or.at(self._prescribed, dofs // self._bs, (1 << dofs % self._bs).astype(np.uint8))
+        if missing := self._call(self._code.add_blocks, self._positions, self._strides, self._prescribed, matrix.data):
             raise ValueError(f"the matrix has no place for cell {missing - 1} of its form")
         identity_rows(matrix, self._form, bcs)
 
 
 class SimdExpression:
-    """An expression, at a point of each cell."""
+    """Expression at one point of each cell."""
 
     @classmethod
     def for_expression(cls, expression: fem.Expression, mesh: Mesh, source: Path) -> Self | None:
-        """That of FFCx's kernel in `source`, where it can be done (collective)."""
+        """Expression of FFCx's kernel in the file `source`; None if it cannot be vectorised (collective)."""
         kernel = vectorise_kernel(source.read_text())
         if kernel is None:
             return None
         sizes = {"RANK": 0, "D": 1, "NODES": expression.value_size, "CORNERS": mesh.geometry.cmap.dim}
-        code = _built(mesh.comm, kernel, sizes, expression_fields(expression), "-O3")
+        code = _compile(mesh.comm, kernel, sizes, expression_fields(expression), "-O3")
         return None if code is None else cls(expression, mesh, code)
 
     def __init__(self, expression: fem.Expression, mesh: Mesh, code: CDLL) -> None:
-        """`code`: what `of` has made of the expression."""
+        """`code`: library of `for_expression`."""
         self._expression, self._geometry, self._code = expression, mesh.geometry, code
-        self._fields = _Fields(expression_fields(expression))
+        self._fields = _KernelFields(expression_fields(expression))
 
     def __call__(self, cells: npt.NDArray[np.int32], values: Values) -> None:
-        """Fill values (cells, components) with those of cells."""
+        """Evaluate the expression in cells (n,) into values (n, components)."""
         c = constants_of(self._expression)
-        of_mesh = struct_pointer(self._geometry.dofmap), struct_pointer(self._geometry.x)
-        form = _Form(
+        geometry = struct_pointer(self._geometry.dofmap), struct_pointer(self._geometry.x)
+        form = _SimdForm(
             len(cells),
             self._fields.width,
             len(c),
             struct_pointer(cells),
             None,
-            *of_mesh,
+            *geometry,
             struct_pointer(c),
-            self._fields.place,
+            self._fields.pointer,
         )
         self._code.fill(byref(form), values)
 
@@ -186,7 +185,7 @@ class SimdExpression:
 
 
 def compile_simd_form(form: fem.Form) -> CDLL | None:
-    """What `Lanes` takes of a form; None where there is no such thing (collective)."""
+    """Library of the vectorised kernel of a form; None if it cannot be vectorised (collective)."""
     if integrals(form) != [fem.IntegralType.cell]:
         return None
     fields, corners = form_fields(form), form.mesh.geometry.cmap.dim
@@ -194,21 +193,30 @@ def compile_simd_form(form: fem.Form) -> CDLL | None:
     if form.rank:
         space = form.function_spaces[0]
         bs, nodes = space.dofmap.index_map_bs, space.element.space_dimension // space.dofmap.index_map_bs
-    if max([nodes, *(each.dofs.shape[1] for each in fields)]) > corners:  # bent cells gain half, and compile in 15 s
+    # kernels of curved cells gain only half, and take 15 s to compile
+    if max([nodes, *(field.dofs.shape[1] for field in fields)]) > corners:
         return None
     sizes = {"RANK": form.rank, "D": bs, "NODES": nodes, "CORNERS": corners}
     source = Path(str(form.module.__file__))  # type: ignore[union-attr]
     kernel = vectorise_kernel(source.with_name(source.name.split(".")[0] + ".c").read_text())
     if kernel is None:
         return None
-    return _built(form.mesh.comm, kernel, sizes, fields)
+    return _compile(form.mesh.comm, kernel, sizes, fields)
 
 
-def _built(
+def _compile(
     comm: MPI.Comm, kernel: str, sizes: Mapping[str, int], fields: Sequence[FormField], *more: str
 ) -> CDLL | None:
-    """simd_kernels.c around a kernel that is given fields, with `more` flags (collective)."""
-    takes = (f"TAKE({number},{each.dofs.shape[1]},{each.size})" for number, each in enumerate(fields))
+    """Library of simd_kernels.c with a vectorised kernel (collective).
+
+    Args:
+        comm: of the mesh.
+        kernel: body of the kernel.
+        sizes: macros of simd_kernels.c.
+        fields: coefficients of the kernel.
+        more: further compiler flags.
+    """
+    takes = (f"TAKE({number},{field.dofs.shape[1]},{field.size})" for number, field in enumerate(fields))
     functions = "".join(_LANE_BY_LANE.format(name) for name in FUNCTIONS) + _POWERS
     text = SOURCE.read_text().replace("// functions\n", functions).replace("// kernel\n", f"{kernel}\n")
     defined = [f"-D{name}={value}" for name, value in sizes.items()] + [f"-DFIELDS={''.join(takes)}"]
@@ -216,7 +224,7 @@ def _built(
 
 
 def vectorise_kernel(source: str) -> str | None:
-    """The body of the only kernel in FFCx's C, for numbers with lanes; None where it does what those cannot."""
+    """Body of the only kernel in FFCx's C, for vectors of LANES numbers; None if it cannot be vectorised."""
     _, *kernels = source.split("\nvoid tabulate_tensor_")
     end = re.search(r"\n(ufcx_integral|bool enabled_|static double points_)", kernels[0]) if len(kernels) == 1 else None
     if end is None or "{" not in kernels[0]:
@@ -225,11 +233,11 @@ def vectorise_kernel(source: str) -> str | None:
     called = set(re.findall(r"\b([A-Za-z_]\w*) *\(", re.sub(r"//.*|\bpow\(\w+, \d+\)", "", body)))
     if "?" in body or not called <= {"for", *FUNCTIONS}:
         return None
-    return "\n".join(_line_in_lanes(line) for line in body.split("\n"))
+    return "\n".join(_vectorise_line(line) for line in body.split("\n"))
 
 
-def _line_in_lanes(line: str) -> str:
-    """A line of C: tables stay numbers, what is declared beside them has lanes, and loops are written out."""
+def _vectorise_line(line: str) -> str:
+    """Line of C with vectors instead of scalars: tables stay scalars, loops are unrolled."""
     if loop := re.match(r" *for \(int [ij]", line):
         return f"#pragma GCC unroll 4\n{loop.string}"
     declared = re.match(r" *double (\w+(?:\[\d+\])*) = (.*);$", line)
@@ -239,5 +247,5 @@ def _line_in_lanes(line: str) -> str:
     return f"real {name} = {{0}};" if value in ("0", "0.0", "{0}") else f"real {name} = ({value}) - zero;"
 
 
-# sums with the zeros of tables are left out; nothing else may be, or sums would be taken in another order
+# terms with the zeros of tables are dropped; no other flag may change the order of sums
 _FLAGS = ["-O2", f"-DLANES={LANES}", "-fno-signed-zeros", "-ffinite-math-only", "-fno-trapping-math", "-fno-math-errno"]
