@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .cell_cutting import PLURALS, oriented_parts, tetrahedra_of, triangles_of
+from .cell_cutting import FACES, PLURALS, oriented_parts, tetrahedra_of, triangles_of
 from .data import Indices, MeshData, MeshError, Points
 from .topology import Mask, boundary_facets, distinct_rows, facets_where
 
@@ -21,6 +21,13 @@ LAGRANGE = {
     "VTK_LAGRANGE_PYRAMID": "pyramid",
 }
 DIMENSIONS = {"vertex": 0, "line": 1, "triangle": 2, "quad": 2, "polygon": 2}  # every other kind is a solid
+# shape -> the places of the corners of its facets
+FACETS: dict[str, tuple[tuple[int, ...], ...]] = {
+    "triangle": ((0, 1), (1, 2), (2, 0)),
+    "quad": ((0, 1), (1, 2), (2, 3), (3, 0)),
+    "tetra": ((0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)),
+    **FACES,
+}
 MAX_NAMES = 8  # in a note
 MAX_LOST_SHARE = 0.1  # of a file's nodes that may be in no cell
 MAX_LOST_NODES = 3  # that may be in no cell of a small file: reference points, centres of arcs
@@ -111,7 +118,8 @@ class Contents:
         if self.copies:
             cells, regions = _each_once(cells, regions)
         groups = cut._node_groups(cells, len(points)) | cut._facet_sets(below)
-        notes = self.notes + notes + self._order_note(dim) + cut_notes + self._unused_note({*groups, *regions}, dim)
+        notes = self.notes + notes + self._order_note(dim) + self._stray_note(dim) + cut_notes
+        notes += self._unused_note({*groups, *regions}, dim)
         mesh = MeshData(points, cells, groups, regions, notes)
         return _without(mesh, self._middle_nodes())
 
@@ -199,6 +207,46 @@ class Contents:
         if not curved:
             return ()
         return (f"{curved} cells are of second or higher order; only their corner nodes are kept (straight edges).",)
+
+    def _stray_note(self, dim: int) -> tuple[str, ...]:
+        """A note where cells of one dimension less, on nodes of the body, are no facets of its cells.
+
+        A damaged file may give a cell the type of another one with as many nodes: a quadrilateral in place of a
+        tetrahedron, a quadrilateral of second order in place of a hexahedron.
+        """
+        body = [block for block in self.blocks if block.dim == dim and block.shape in FACETS]
+        lower = [block for block in self.blocks if block.dim == dim - 1 and block.shape in CORNERS and len(block.nodes)]
+        inside = [
+            rows.size == 0 or 0 <= rows.min() <= rows.max() < len(self.points) for rows in self._rows(body + lower)
+        ]
+        if not lower or not all(inside):
+            return ()
+        of_lower, of_body = self._nodes_of(self._rows(lower)), self._nodes_of(self._rows(body))
+        curved = any(block.kind != block.shape for block in body)
+        stray: dict[str, int] = {}
+        for width in {CORNERS[block.shape] for block in lower}:
+            facets: list[Indices] = [np.zeros((0, width), np.int64)]
+            for block in body:
+                for places in (places for places in FACETS[block.shape] if len(places) == width):
+                    rows = block.nodes[:, places]
+                    facets.append(rows[of_lower[rows].all(axis=1)])
+            known = np.concatenate(facets)
+            for block in (block for block in lower if CORNERS[block.shape] == width):
+                _, _, place = distinct_rows(np.sort(np.concatenate([known, block.corners]), axis=1))
+                is_facet = np.isin(place[len(known) :], place[: len(known)]) & (curved or block.kind == block.shape)
+                if count := int(np.count_nonzero(~is_facet & of_body[block.corners].all(axis=1))):
+                    stray[block.kind] = stray.get(block.kind, 0) + count
+        if not stray:
+            return ()
+        listed = " and ".join(f"{count} {kind}" for kind, count in stray.items())
+        return (
+            f"{listed} on nodes of the body are no facets of its cells, and not part of it: if they are not meant to "
+            "be there, the file is damaged and cells are missing.",
+        )
+
+    @staticmethod
+    def _rows(blocks: list[Block]) -> list[Indices]:
+        return [block.nodes for block in blocks]
 
     def _unused_note(self, used: set[str], dim: int) -> tuple[str, ...]:
         """Sets that are neither regions nor groups."""

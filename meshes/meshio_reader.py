@@ -11,7 +11,7 @@ import io
 import os
 import re
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn
@@ -49,6 +49,16 @@ _PLY_BYTES = {
     "int32": 4, "uint32": 4, "float": 4, "float32": 4, "int64": 8, "uint64": 8, "double": 8, "float64": 8,
 }  # fmt: skip
 SU2_NODES = {3: 2, 5: 3, 9: 4, 10: 4, 12: 8, 13: 6, 14: 5}  # of each type of element: those of VTK
+# Formats that do not say how many elements they have: a part of the file with elements, and the number of one in it.
+_LINE_NUMBER = re.compile(rb"^[ \t]*(\d{1,15})\b", re.MULTILINE)
+_KRATOS = re.compile(rb"^[ \t]*Begin Elements\b[^\n]*\n.*?(?=^[ \t]*End\b)", re.MULTILINE | re.DOTALL)
+_PERMAS = re.compile(rb"^\$ELEMENT\b[^\n]*\n[^$]*", re.MULTILINE)
+_ELEMENTS = {
+    ".mdpa": (_KRATOS, _LINE_NUMBER),
+    ".post": (_PERMAS, _LINE_NUMBER), ".dato": (_PERMAS, _LINE_NUMBER),
+    ".f3grid": (re.compile(rb".+", re.DOTALL), re.compile(rb"^Z[ \t]+\w+[ \t]+(\d{1,15})\b", re.MULTILINE)),
+}  # fmt: skip
+MAX_GAPS, MAX_GAP_SHARE = 3, 0.01  # element numbers left out that are told of, or so many of all elements
 MAX_PLY_HEAD = 65536  # bytes
 MAX_PLY_FILLING = 8  # bytes behind the last face, too few for a face
 MAX_LINE_SEARCH = 1 << 26  # bytes of a file in which the line of a fault is looked for
@@ -65,7 +75,8 @@ def read_with_meshio(path: Path) -> Contents:
     try:
         with contextlib.redirect_stdout(io.StringIO()), warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            return _contents(path, _mesh(path, position))
+            contents = _contents(path, _mesh(path, position))
+            return replace(contents, notes=contents.notes + _gap_note(path))
     except MeshError:
         raise
     except (Exception, SystemExit):  # readers of meshio raise whatever their parsers raise, or exit
@@ -166,6 +177,24 @@ def _names_of(mesh: Any, tag: int, dim: int) -> list[str]:
         if np.shape(value) == (2,) and (int(value[0]), int(value[1])) == (tag, dim) and str(name).strip():
             return [str(name)]
     return [f"tag-{tag}"]
+
+
+def _gap_note(path: Path) -> tuple[str, ...]:
+    """A note where a few element numbers are left out, in a format that does not say how many elements it has."""
+    patterns = _ELEMENTS.get(path.suffix.lower())
+    if patterns is None:
+        return ()
+    section, element = patterns
+    data = path.read_bytes().replace(b"\r", b"\n")
+    numbers = [int(found[1]) for part in section.finditer(data) for found in element.finditer(data, *part.span())]
+    distinct = np.unique(numbers)
+    missing = int(distinct[-1]) - len(distinct) if len(distinct) else 0
+    if not 0 < missing <= max(MAX_GAPS, MAX_GAP_SHARE * len(distinct)):
+        return ()
+    first = int(np.flatnonzero(np.append(distinct, 0) != np.arange(1, len(distinct) + 2))[0]) + 1
+    return (
+        f"Element numbers left out: {missing}, first {first}; are cells missing because lines of the file are lost?",
+    )
 
 
 # --- files before meshio opens them ---------------------------------------------------------------------------------
@@ -290,7 +319,7 @@ def _ugrid(path: Path) -> Any:
     from meshio.ugrid._ugrid import determine_file_type, read_buffer
 
     kind = determine_file_type(str(path))
-    with path.open("r" if kind["type"] == "ascii" else "rb") as file:
+    with path.open(encoding="utf-8", errors="replace") if kind["type"] == "ascii" else path.open("rb") as file:
         mesh = read_buffer(file, kind)
         behind = len(file.read().strip())
     if behind:
@@ -416,6 +445,6 @@ class _Lines(io.TextIOWrapper):
 
 def _check_begun(path: Path) -> None:
     """MeshError for a file of TetGen without numbers, of which meshio waits for the first line."""
-    with path.open(errors="replace") as file:
+    with path.open(encoding="utf-8", errors="replace") as file:
         if not any(line.strip() and not line.strip().startswith("#") for line in file):
             raise MeshError(f"Mesh file '{path}' could not be read: it holds no numbers.")

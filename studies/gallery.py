@@ -159,7 +159,7 @@ def main() -> None:
     with ThreadPoolExecutor(asked.jobs) as pool:
         list(pool.map(lambda run: simulate(*run, again=asked.again), runs.items()))
         list(pool.map(draw, wanted))
-    PAGE.write_text(HEAD + "".join(text_of(entry) for entry in ENTRIES if picture_of(entry).exists()))
+    PAGE.write_text(HEAD + "".join(text_of(entry) for entry in ENTRIES if picture_of(entry).exists()), encoding="utf-8")
     for folder in runs:
         count, single = pieces_of(RUNS / folder)
         if single > MOST_SINGLE * count:
@@ -188,7 +188,7 @@ def draw(entry: Entry) -> None:
 def has_ended(folder: Path) -> bool:
     """A run is there, to its end."""
     try:
-        return bool(json.loads((folder / "summary.json").read_text())["outcome"] == "done")
+        return bool(json.loads((folder / "summary.json").read_text(encoding="utf-8"))["outcome"] == "done")
     except (OSError, ValueError, KeyError):
         return False
 
@@ -225,11 +225,11 @@ def figures(entry: Entry) -> str:
     """Seconds and pieces of its runs; what the page has of them where they are not all here."""
     folders = [RUNS / folder for folder, _ in entry.runs]
     if not all(map(has_ended, folders)):
-        page = PAGE.read_text() if PAGE.exists() else ""
+        page = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
         of_it = next((part for part in page.split("\n## ") if part.startswith(f"{entry.name}\n")), "")
         found = re.search(r" (\d+ s[.;].*)$", of_it, re.MULTILINE)
         return found[1] if found else ""
-    seconds = sum(json.loads((folder / "summary.json").read_text())["cpu"] for folder in folders)
+    seconds = sum(json.loads((folder / "summary.json").read_text(encoding="utf-8"))["cpu"] for folder in folders)
     counts = [pieces_of(folder) for folder in folders]
     parts = ", ".join(f"{count} ({single} of one node)" if single else str(count) for count, single in counts if count)
     return (f"{seconds:.0f} s" + (f"; pieces: {parts}" if parts else "") + ".") if entry.runs else ""
@@ -238,7 +238,7 @@ def figures(entry: Entry) -> str:
 def pieces_of(folder: Path) -> tuple[int, int]:
     """Pieces in the end of a run that has broken, and those of a single node."""
     path = folder / "pieces.csv"
-    rows = list(csv.DictReader(path.open())) if path.exists() else []
+    rows = list(csv.DictReader(path.open(encoding="utf-8"))) if path.exists() else []
     last = [row for row in rows if row["time"] == rows[-1]["time"]]
     return len(last), sum(float(row["dust"]) > 0 for row in last)
 

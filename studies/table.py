@@ -85,10 +85,10 @@ def run(name: str, out: Path, *, small: bool, ranks: int, limit: float) -> dict[
 
 def row(name: str, folder: Path) -> dict[str, Any]:
     """The figures of a run, in the order of COLUMNS."""
-    with (folder / "history.csv").open(newline="") as file:
+    with (folder / "history.csv").open(newline="", encoding="utf-8") as file:
         steps = list(csv.DictReader(file))
     seconds, paper = [float(step["wall_step"]) for step in steps], SCENES[name].seconds
-    cells = json.loads((folder / "summary.json").read_text())["cells"]
+    cells = json.loads((folder / "summary.json").read_text(encoding="utf-8"))["cells"]
     middle = median(seconds)
     figures = (name, cells, SCENES[name].cells * 1e3, float(steps[0]["dt"]), len(steps), middle, max(seconds), paper,
                middle / paper)  # fmt: skip

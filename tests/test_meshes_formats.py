@@ -21,6 +21,7 @@ from scipy.io import netcdf_file
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from attack.meshes import _read as attacked
 from attack.meshes import mutated
 from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
@@ -911,3 +912,49 @@ def test_universal_file_with_types_in_turn(tmp_path: Path) -> None:
     blocks = {block.kind: len(block.nodes) for block in read_contents(tmp_path / "part.unv").blocks}
     assert blocks == {"tetra": 20000, "triangle": 20000}
     assert time.process_time() - begin < 20
+
+
+@pytest.mark.parametrize(("type_", "kind"), [("3 2 0 1", "quad"), ("4 2 0 1", "")])
+def test_a_tetrahedron_that_became_a_quadrilateral_is_told(tmp_path: Path, type_: str, kind: str) -> None:
+    """Types of four nodes differ by one digit: the number of elements and of numbers is as declared."""
+    mesh = BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.5).build()
+    elements = [f"{i} 4 2 0 1 " + " ".join(map(str, row)) for i, row in enumerate(mesh.cells + 1, 1)]
+    elements[20] = elements[20].replace("4 2 0 1", type_, 1)
+    nodes = [f"{i} {x} {y} {z}" for i, (x, y, z) in enumerate(mesh.points, 1)]
+    lines = ["$MeshFormat", "2.2 0 8", "$EndMeshFormat", "$Nodes", str(len(nodes)), *nodes, "$EndNodes"]
+    lines += ["$Elements", str(len(elements)), *elements, "$EndElements", ""]
+    (tmp_path / "a.msh").write_text("\n".join(lines))
+    notes = [note for note in read_mesh(tmp_path / "a.msh").notes if "no facets of its cells" in note]
+    assert [note.partition(" on nodes")[0] for note in notes] == ([f"1 {kind}"] if kind else [])
+
+
+def test_facets_and_shells_beside_the_body_are_not_told(tmp_path: Path) -> None:
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [2, 0, 0], [2, 1, 0]], float)
+    cells = [("tetra", np.array([[0, 1, 2, 3]])), ("triangle", np.array([[2, 1, 0], [1, 4, 5]]))]
+    meshio.write(tmp_path / "a.vtu", meshio.Mesh(points, cells))
+    assert not any("no facets" in note for note in read_mesh(tmp_path / "a.vtu").notes)
+
+
+def test_a_quadrilateral_of_second_order_in_place_of_a_hexahedron(tmp_path: Path) -> None:
+    points = np.array([[x, y, z] for z in range(3) for y in range(2) for x in range(2)], float)
+    cube = np.array([0, 1, 3, 2, 4, 5, 7, 6])
+    meshio.write(tmp_path / "a.vtu", meshio.Mesh(points, [("hexahedron", cube[None]), ("quad8", 4 + cube[None])]))
+    assert any(note.startswith("1 quad8 on nodes of the body") or "belong to no cell" in note
+               for note in check_mesh(read_mesh(tmp_path / "a.vtu")).notes)  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "format_"), [("a.mdpa", None), ("a.post", "permas"), ("a.f3grid", "flac3d")])
+def test_a_lost_line_is_told_where_the_format_has_no_count(tmp_path: Path, name: str, format_: str | None) -> None:
+    mesh = BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.5).build()
+    options = {"binary": False} if format_ == "flac3d" else {}
+    meshio.write(tmp_path / name, meshio.Mesh(mesh.points, [("tetra", mesh.cells)]), file_format=format_, **options)
+    assert not any("left out" in note for note in read_contents(tmp_path / name).notes)
+    lines = (tmp_path / name).read_text(encoding="utf-8").splitlines(keepends=True)
+    fifth = next(i for i, line in enumerate(lines) if re.match(r"(Z T4 )?\s*5 (0 )?\s*(\d+ ){3}\d+\s*$", line))
+    (tmp_path / name).write_text("".join(lines[:fifth] + lines[fifth + 1 :]), encoding="utf-8")
+    assert any("Element numbers left out: 1, first 5" in note for note in read_contents(tmp_path / name).notes)
+
+
+def test_surfaces_with_faces_of_two_corners_can_be_attacked(tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2\nf 1 2 3\n")
+    assert len(attacked(tmp_path / "a.obj", True)[0]) == 1

@@ -179,3 +179,13 @@ def test_the_page_of_rooms_has_a_row_for_each_of_them() -> None:
     folders = {f"fracsim/{path.name}" for path in ROOT.iterdir() if (path / "__init__.py").exists()}
     assert folders | {"forms", "meshes", "studies", "tests"} <= rows
     assert all((ARCHITECTURE.parent.parent / row).is_dir() for row in rows)
+
+
+def test_text_is_read_and_written_with_an_encoding() -> None:
+    """VTK's writer of legacy files sets the locale of the process to C, and with it Python's default encoding."""
+    root = Path(__file__).parents[1]
+    for path in (path for room in ("fracsim", "meshes", "forms") for path in (root / room).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            is_call = isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
+            if is_call and node.func.attr in ("read_text", "write_text"):
+                assert any(key.arg == "encoding" for key in node.keywords), f"{path}, line {node.lineno}"

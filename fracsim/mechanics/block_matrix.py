@@ -94,7 +94,7 @@ class BlockMatrix:
 
 def compile_block_product(comm: MPI.Comm, size: int) -> CDLL | None:
     """Library of products with blocks of size x size numbers; None without a compiler (collective)."""
-    return compile_on_all_ranks(comm, "products", SOURCE.read_text(), [*FAST_FLAGS, f"-DD={size}"])
+    return compile_on_all_ranks(comm, "products", SOURCE.read_text(encoding="utf-8"), [*FAST_FLAGS, f"-DD={size}"])
 
 
 class TieMatrix:

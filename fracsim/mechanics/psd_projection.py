@@ -96,4 +96,6 @@ def psd_correction(A: Values, tolerance: float, C: Values, nonzero: npt.NDArray[
 
 @cache
 def _code(size: int) -> CDLL:
-    return compile_library("positive", SOURCE.read_text(), [*FAST_FLAGS, f"-DN={size}", f"-DLANES={LANES}"])
+    return compile_library(
+        "positive", SOURCE.read_text(encoding="utf-8"), [*FAST_FLAGS, f"-DN={size}", f"-DLANES={LANES}"]
+    )

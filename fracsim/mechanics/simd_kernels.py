@@ -152,7 +152,7 @@ class SimdExpression:
     @classmethod
     def for_expression(cls, expression: fem.Expression, mesh: Mesh, source: Path) -> Self | None:
         """Expression of FFCx's kernel in the file `source`; None if it cannot be vectorised (collective)."""
-        kernel = vectorise_kernel(source.read_text())
+        kernel = vectorise_kernel(source.read_text(encoding="utf-8"))
         if kernel is None:
             return None
         sizes = {"RANK": 0, "D": 1, "NODES": expression.value_size, "CORNERS": mesh.geometry.cmap.dim}
@@ -198,7 +198,7 @@ def compile_simd_form(form: fem.Form) -> CDLL | None:
         return None
     sizes = {"RANK": form.rank, "D": bs, "NODES": nodes, "CORNERS": corners}
     source = Path(str(form.module.__file__))  # type: ignore[union-attr]
-    kernel = vectorise_kernel(source.with_name(source.name.split(".")[0] + ".c").read_text())
+    kernel = vectorise_kernel(source.with_name(source.name.split(".")[0] + ".c").read_text(encoding="utf-8"))
     if kernel is None:
         return None
     return _compile(form.mesh.comm, kernel, sizes, fields)
@@ -218,7 +218,7 @@ def _compile(
     """
     takes = (f"TAKE({number},{field.dofs.shape[1]},{field.size})" for number, field in enumerate(fields))
     functions = "".join(_LANE_BY_LANE.format(name) for name in FUNCTIONS) + _POWERS
-    text = SOURCE.read_text().replace("// functions\n", functions).replace("// kernel\n", f"{kernel}\n")
+    text = SOURCE.read_text(encoding="utf-8").replace("// functions\n", functions).replace("// kernel\n", f"{kernel}\n")
     defined = [f"-D{name}={value}" for name, value in sizes.items()] + [f"-DFIELDS={''.join(takes)}"]
     return compile_on_all_ranks(comm, "lanes", text, [*_FLAGS, *more, *defined])
 

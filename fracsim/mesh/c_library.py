@@ -53,7 +53,7 @@ def load_library(source: Path, *, separate_rounding: bool = False) -> ctypes.CDL
         CannotWrite: if the library cannot be stored.
     """
     flags = FAST_FLAGS + (SEPARATE_ROUNDING_FLAGS if separate_rounding else [])
-    return compile_library(source.stem, source.read_text(), flags)
+    return compile_library(source.stem, source.read_text(encoding="utf-8"), flags)
 
 
 def compile_library(name: str, text: str, more: list[str]) -> ctypes.CDLL:
@@ -94,7 +94,7 @@ def _compile(command: list[str], name: str, text: str, file: Path) -> None:
     """Compile a library; only the whole of it, and its digest, are left in the folder."""
     with not_for_others(), tempfile.TemporaryDirectory(dir=file.parent) as scratch:
         source, output = Path(scratch) / f"{name}.c", Path(scratch) / file.name
-        source.write_text(text)
+        source.write_text(text, encoding="utf-8")
         try:
             _run([*command, str(source), "-o", str(output), "-lm"])
         except InputError:
@@ -158,7 +158,9 @@ def machine_flags() -> list[str]:
     """
     try:
         cpu = next(
-            line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features"))
+            line
+            for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+            if line.startswith(("flags", "Features"))
         )
     except (OSError, StopIteration):
         cpu = os.uname().machine

@@ -110,6 +110,6 @@ def has_resumable_run(folder: Path) -> bool:
     if not (folder / CHECKPOINT_FILE).is_file():
         return False
     try:
-        return bool(json.loads((folder / "summary.json").read_text())["outcome"] != "done")
+        return bool(json.loads((folder / "summary.json").read_text(encoding="utf-8"))["outcome"] != "done")
     except (OSError, ValueError, KeyError, TypeError):
         return True

@@ -18,12 +18,16 @@ MESSAGE_PREFIX = "fracsim: "  # before every message of the program's own
 
 def read_log_messages(log: Path) -> str:
     """All lines that are the program's own, in one that begins as they do; "" where there are none."""
-    own = [line for line in log.read_text(errors="replace").splitlines() if line.startswith(MESSAGE_PREFIX)]
+    own = [
+        line
+        for line in log.read_text(encoding="utf-8", errors="replace").splitlines()
+        if line.startswith(MESSAGE_PREFIX)
+    ]
     return MESSAGE_PREFIX + "; ".join(line.removeprefix(MESSAGE_PREFIX) for line in own) if own else ""
 
 
 def read_last_message(log: Path) -> str:
     """The last line that is the program's own, else the last of all: what it said of its failure; "" where nothing."""
-    said = [line for line in log.read_text(errors="replace").splitlines() if line.strip()]
+    said = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
     own = [line for line in said if line.startswith(MESSAGE_PREFIX)]
     return (own or said or [""])[-1]

@@ -142,7 +142,7 @@ def _obj(path: Path, pieces: list[FragmentMesh], skin: MaterialLook, t: float) -
             lines += [f"g {piece.name}_{group}"] if which.any() else []
             lines += ["f {} {} {}".format(*corners) for corners in piece.triangles[which] + first]
         first += len(piece.points)
-    path.write_text("\n".join(lines) + "\n")
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
 def _glb(path: Path, pieces: list[FragmentMesh], skin: MaterialLook, t: float) -> None:

@@ -203,7 +203,7 @@ def _environment() -> dict[str, str]:
 def _state(case: SweepCase, study: str) -> str:
     """ "done", "begun" (there is a checkpoint) or "new"; what is there of another study counts for nothing."""
     try:
-        if tomllib.loads((case.folder / "study.toml").read_text()) != tomllib.loads(study):
+        if tomllib.loads((case.folder / "study.toml").read_text(encoding="utf-8")) != tomllib.loads(study):
             return "new"
     except (OSError, ValueError):
         return "new"
@@ -215,7 +215,7 @@ def _state(case: SweepCase, study: str) -> str:
 def _summary(case: SweepCase) -> dict[str, Any]:
     """summary.json of a case, empty where there is none."""
     try:
-        return dict(json.loads((case.folder / "summary.json").read_text()))
+        return dict(json.loads((case.folder / "summary.json").read_text(encoding="utf-8")))
     except (OSError, ValueError):
         return {}
 
@@ -235,7 +235,7 @@ def _run(study: str, case: SweepCase, text: str, ranks: int) -> str:
     # what is there may be overwritten: _check_folder has looked
     log, work = case.folder / "log.txt", run_command(study, case, ranks, "restart" if state == "begun" else "overwrite")
     create(log).close()
-    with log.open("w") as file, _Forwarding() as forwarding:
+    with log.open("w", encoding="utf-8") as file, _Forwarding() as forwarding:
         # in a session of its own: Ctrl-C would reach it beside the signal passed on, and mpirun kills its ranks at once
         process = subprocess.Popen(work, stdout=file, stderr=file, start_new_session=True, env=_environment())
         code = forwarding.wait_for(process)
@@ -298,7 +298,7 @@ def write_sweep_table(cases: list[SweepCase], outcomes: dict[str, str], out: Pat
         rows.append({"case": case.folder.name, **case.values, "outcome": outcomes.get(case.folder.name, "not run yet")})
         rows[-1] |= figures
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    with replacing_all(out / "sweep.csv") as new, new.open("w", newline="") as file:
+    with replacing_all(out / "sweep.csv") as new, new.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, restval="")
         writer.writeheader()
         writer.writerows(rows)

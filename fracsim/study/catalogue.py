@@ -42,7 +42,9 @@ def material_table() -> list[str]:
 
 def catalogue() -> dict[str, dict[str, str]]:
     """Returns heading -> name -> description."""
-    studies = {path.stem: tomllib.loads(path.read_text())["title"] for path in sorted(folder().glob("*.toml"))}
+    studies = {
+        path.stem: tomllib.loads(path.read_text(encoding="utf-8"))["title"] for path in sorted(folder().glob("*.toml"))
+    }
     builders = {name: (kind.__doc__ or "").strip().splitlines()[0] for name, kind in BUILDERS.items()}
     default = TimeSettings.model_fields["scheme"].default
     schemes = {name: kind.summary + " (default)" * (name == default) for name, kind in SCHEMES.items()}

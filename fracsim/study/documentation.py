@@ -313,4 +313,4 @@ def _description(model: type[BaseModel]) -> str:
 
 
 if __name__ == "__main__":
-    Path(sys.argv[1]).write_text(study_file_page())
+    Path(sys.argv[1]).write_text(study_file_page(), encoding="utf-8")

@@ -77,7 +77,7 @@ def _time_again(doubtful: Any, runs: list[tuple[Trial, dict[str, Any]]], out: Pa
 def recorded(trial: Trial, out: Path) -> bool:
     """Whether this very trial has been run before."""
     path = folder_in(out, trial) / RECORD
-    return path.exists() and json.loads(path.read_text())["digest"] == fingerprint(trial)
+    return path.exists() and json.loads(path.read_text(encoding="utf-8"))["digest"] == fingerprint(trial)
 
 
 def write_evidence(out: Path, records: dict[str, Records], makers: dict[str, Any]) -> Path:
@@ -86,7 +86,7 @@ def write_evidence(out: Path, records: dict[str, Records], makers: dict[str, Any
     Groups that were left out this time keep their place. A group whose section cannot be made says so in its place.
     """
     path = out / "evidence.json"
-    groups = json.loads(path.read_text())["groups"] if path.exists() else {}
+    groups = json.loads(path.read_text(encoding="utf-8"))["groups"] if path.exists() else {}
     groups |= {name: {"sections": _sections(makers[name], group)} for name, group in records.items()}
     ordered = {name: groups[name] for name in GROUPS if name in groups}
     out.mkdir(parents=True, exist_ok=True)

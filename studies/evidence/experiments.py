@@ -118,7 +118,7 @@ def trials() -> list[Trial]:
 
 def study_of(experiment: Experiment, h: float) -> dict[str, Any]:
     """The packaged study with the changes of an experiment, on one of its meshes."""
-    data = tomllib.loads((packaged() / f"{experiment.study}.toml").read_text())
+    data = tomllib.loads((packaged() / f"{experiment.study}.toml").read_text(encoding="utf-8"))
     for table, values in deepcopy(experiment.changes).items():
         data[table] = values if isinstance(values, list) else data.get(table, {}) | values
     data["mesh"][experiment.sizes[0]] = h

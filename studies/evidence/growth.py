@@ -70,7 +70,7 @@ def _trial(case: str, ranks: int) -> Trial:
 def _loaf(name: str) -> Trial:
     from .. import folder
 
-    study = tomllib.loads((folder() / "loaf.toml").read_text())
+    study = tomllib.loads((folder() / "loaf.toml").read_text(encoding="utf-8"))
     study["mesh"]["h"] = LOAVES[name]
     study["output"] = {"interval": 0.15, "fields": ["damage"]}
     large = name == "620k"

@@ -161,7 +161,7 @@ def main() -> None:
     part = given.out.with_name("alone.json")
     command = [sys.executable, "-m", "fracsim.studies.evidence.ladder", given.rung, "--n", str(given.n), "--alone"]
     subprocess.run([*command, "-o", str(part)], check=True, timeout=600)
-    given.out.write_text(json.dumps(figures | json.loads(part.read_text()), indent=1) + "\n")
+    given.out.write_text(json.dumps(figures | json.loads(part.read_text(encoding="utf-8")), indent=1) + "\n")
 
 
 def started(name: str, n: int, folder: Path) -> Any:
@@ -210,7 +210,7 @@ def alone(name: str, n: int, began: float) -> dict[str, Any]:
 
 def _memory(which: str) -> float:
     """Bytes that this process holds (VmRSS) or has held at most (VmHWM); ru_maxrss would start from its parent's."""
-    lines = Path("/proc/self/status").read_text().splitlines()
+    lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     return 1024 * float(next(line for line in lines if line.startswith(which)).split()[1])
 
 

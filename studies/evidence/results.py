@@ -22,7 +22,7 @@ def history(run: Path) -> dict[str, Values]:
 
 def columns(path: Path) -> dict[str, Values]:
     """Columns of a table of numbers by name: (rows,) each."""
-    with path.open(newline="") as file:
+    with path.open(encoding="utf-8", newline="") as file:
         rows = list(csv.reader(file))
     table = np.array(rows[1:], float).reshape(-1, len(rows[0]))
     return dict(zip(rows[0], table.T, strict=True))
@@ -40,7 +40,7 @@ def last_frame(run: Path) -> dict[str, Any]:
 
 def study(run: Path) -> dict[str, Any]:
     """The study as it was run, every default written out."""
-    return tomllib.loads((run / "study.toml").read_text())
+    return tomllib.loads((run / "study.toml").read_text(encoding="utf-8"))
 
 
 def first_break(run: Path) -> float:

@@ -34,7 +34,7 @@ def run_trial(trial: Trial, out: Path) -> dict[str, Any]:
     folder = folder_in(out, trial)
     path = folder / RECORD
     digest = fingerprint(trial)
-    record: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+    record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
     if record.get("digest") != digest:
         folder.mkdir(parents=True, exist_ok=True)
         command = _command(trial, folder)
@@ -132,7 +132,7 @@ def _once(command: list[str], folder: Path, limit: float) -> dict[str, Any]:
         "outcome": outcome,
         "wall": time.perf_counter() - began,
         "message": (read_log_messages if outcome == "done" else read_last_message)(folder / "log.txt"),
-        "summary": json.loads(summary.read_text()) if summary.exists() else None,
+        "summary": json.loads(summary.read_text(encoding="utf-8")) if summary.exists() else None,
     }
 
 
@@ -159,7 +159,7 @@ def _measure(trial: Trial, folder: Path, record: dict[str, Any]) -> None:
         return
     try:
         if (script := folder / "figures.json").exists():
-            record["figures"] = json.loads(script.read_text())
+            record["figures"] = json.loads(script.read_text(encoding="utf-8"))
         if trial.measure:
             module, _, function = trial.measure.partition(":")
             measured = getattr(importlib.import_module(f".{module}", __package__), function)(folder / "run")

@@ -93,7 +93,7 @@ def run_written(make: Callable[[], tuple[Any, dict[str, Any]]]) -> None:
     if MPI.COMM_WORLD.rank == 0:
         mesh, study = make()
         write_mesh(mesh, Path(FILE["file"]))
-        Path("trial.toml").write_text(tomli_w.dumps(study))
+        Path("trial.toml").write_text(tomli_w.dumps(study), encoding="utf-8")
     MPI.COMM_WORLD.barrier()
     sys.argv = ["fracsim", "run", "trial.toml", "-o", "run", "--overwrite"]
     cli.main()

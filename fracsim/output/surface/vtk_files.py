@@ -129,7 +129,7 @@ class SurfaceFiles:
         times = {f"{t:.12g}" for t in self.times}
         if not self._csv.exists():
             return []
-        with self._csv.open(newline="") as file:
+        with self._csv.open(newline="", encoding="utf-8") as file:
             rows = list(csv.reader(file))[1:]
         return [row for row in rows if len(row) == len(self._columns) and row[0] in times]
 
@@ -214,7 +214,7 @@ def _pvd_line(entry: PvdEntry, has_blocks: bool) -> str:
 def read_pvd(pvd: Path) -> list[PvdEntry]:
     """Entries of a surface.pvd. Raises InputError if it refers to a file that no run writes."""
     check_readable(pvd)
-    matches = _PVD_ENTRY.findall(pvd.read_text())
+    matches = _PVD_ENTRY.findall(pvd.read_text(encoding="utf-8"))
     for *_, file in matches:
         # VTK chooses its reader by the suffix, and would read any file
         if not (file.startswith(SURFACE_FOLDER) and FRAME_FILE_PATTERN.fullmatch(file.removeprefix(SURFACE_FOLDER))):

@@ -137,7 +137,9 @@ class BlockDiagonal:
 def compile_block_csr(comm: MPI.Comm, size: int) -> CDLL | None:
     """For blocks of size x size; None without a compiler (collective)."""
     lanes = next(n for n in (2, 4, 8) if n >= size)
-    return compile_on_all_ranks(comm, "rows", SOURCE.read_text(), [*FAST_FLAGS, f"-DR={size}", f"-DLANES={lanes}"])
+    return compile_on_all_ranks(
+        comm, "rows", SOURCE.read_text(encoding="utf-8"), [*FAST_FLAGS, f"-DR={size}", f"-DLANES={lanes}"]
+    )
 
 
 class Prolongation:
@@ -165,5 +167,5 @@ class Prolongation:
 def compile_prolongation(comm: MPI.Comm, rows: int, columns: int) -> CDLL | None:
     """For blocks of that size; None without a compiler (collective)."""
     return compile_on_all_ranks(
-        comm, "between", PROLONGATION_SOURCE.read_text(), [*FAST_FLAGS, f"-DR={rows}", f"-DC={columns}"]
+        comm, "between", PROLONGATION_SOURCE.read_text(encoding="utf-8"), [*FAST_FLAGS, f"-DR={rows}", f"-DC={columns}"]
     )

@@ -57,7 +57,7 @@ def model_of(mesh: Any, problem: dict[str, Any]) -> Any:
     words += " Plane_Stress = true\n]\n" if problem["plane_stress"] else "]\n"
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "material.dat")
-        path.write_text(words)
+        path.write_text(words, encoding="utf-8")
         akantu.parseInput(str(path))
     model = akantu.SolidMechanicsModel(mesh)
     model.initFull(_analysis_method=akantu._implicit_dynamic if step else akantu._static)
