@@ -333,8 +333,8 @@ def test_check_tells_when_tips_branch() -> None:
             time={"scheme": "newmark", "step": step, "end": 10.0},
         )
         lines = check_study(study)
-        assert any("tips branch to which 2 G_c flows" in line for line in lines)
-        told.append(any("none does" in line for line in lines))
+        assert any("a tip that receives 2 G_c branches" in line for line in lines)
+        told.append(any("no tip branches" in line for line in lines))
     assert told == [False, True]
 
 

@@ -91,8 +91,8 @@ def test_check_tells_what_contact_costs(tmp_path: Path) -> None:
     for mesh, facets in ((box, "58 facets or more"), ({"file": str(tmp_path / "bar.vtu")}, "80 facets")):
         data = BAR | {"mesh": mesh, "boundary": [], "probe": [], "obstacle": [floor], "contact": {"friction": 0.3}}
         told = {line.split()[0]: line for line in check_study(validate(data, "test.toml"))}
-        assert f"touched by the points of {facets}, and of cracks" in told["touched"]
-        assert "nothing is gathered" in told["touched"]
+        assert f"acts on the points of {facets}, and of cracks" in told["acts"]
+        assert "nothing is gathered" in told["acts"]
         assert "friction 0.3; gathered and detected on one rank" in told["contact"]
         assert f"its surface has {facets}" in told["its"]
 

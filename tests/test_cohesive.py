@@ -224,5 +224,5 @@ def test_check_says_which_law_acts(law: str, h: float, said: str) -> None:
         boundary=[{"on": "left", "fix": "xy"}], time=SLOW,
     )  # fmt: skip
     lines = "\n".join(check_study(study))
-    assert f"begin at 100 Pa; law {law}" in lines and said in lines
+    assert f"strength 100 Pa; law {law}" in lines and said in lines
     assert ("too coarse" in lines) == (h > 0.075)

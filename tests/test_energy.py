@@ -581,4 +581,6 @@ def test_check_tells_irwins_length() -> None:
     lines = check_study(make_study(**plate_tables(strength=3e7), mesh=fine))
     assert any("over a fifth of the body" in line for line in lines)
     lines = check_study(make_study(**plate_tables(strength=7.9e7), mesh=fine))
-    assert [line for line in lines if "note" in line and "pieces" not in line] == []  # pieces: a linear energy's note
+    assert [
+        line for line in lines if "note" in line and "fragments" not in line
+    ] == []  # fragments: a linear energy's note

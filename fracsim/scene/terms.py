@@ -51,7 +51,7 @@ class TermInputs:
     def on_facets(self, kind: str) -> list[OnFacets]:
         """Facets and function of time of each condition of a kind."""
         of_kind = [each for each in self.conditions if each.kind == kind]
-        return [(self.domain.select_facets(each.place, f"{each.key}.on"), each.function) for each in of_kind]
+        return [(self.domain.select_facets(each.selector, f"{each.key}.on"), each.function) for each in of_kind]
 
 
 def _viscosity(parts: TermInputs) -> Term | None:
@@ -158,7 +158,7 @@ def build_balance(study: Study, domain: Domain, scheme: Scheme, material: Materi
     assembler, u = VectorAssembler(domain), fem.Function(domain.space, name="displacement")
     entries = boundary_conditions(study, domain.dim)
     moved = [each for each in entries if each.prescribes_motion]
-    nodes = [domain.select_nodes(each.place, f"{each.key}.on") for each in moved]
+    nodes = [domain.select_nodes(each.selector, f"{each.key}.on") for each in moved]
     motion = PrescribedMotion(
         domain, [(at, each.components, each.function) for at, each in zip(nodes, moved, strict=True)]
     )

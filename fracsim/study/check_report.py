@@ -26,11 +26,11 @@ from .unit_checks import unit_questions
 # nodes of a mesh with quadratic displacement over those with linear displacement: edges have nodes, too
 _NODE_RATIO = {2: "4 times", 3: "7 to 8 times"}
 # Measured with boxes of 25,000 and 207,000 tetrahedra without contact, with two obstacles and with the body alone.
-_AS_CRACKS_OPEN = "and of cracks as they open"
-_OBSTACLE_COST = "nothing is gathered; some 2 % of a step until they touch"
-_MESH_OBSTACLE_COST = "gathered and detected on one rank, from two edges' length on"
+_AS_CRACKS_OPEN = "and of cracks that open"
+_OBSTACLE_COST = "nothing is gathered; about 2 % of a step without contact"
+_MESH_OBSTACLE_COST = "gathered and detected on one rank, within two edge lengths"
 _CONTACT_COST = {
-    implicit: f"gathered and detected on one rank: some {share} until something touches, on n ranks n times that share"
+    implicit: f"gathered and detected on one rank: about {share} without contact, on n ranks n times that share"
     for implicit, share in ((True, "tenth of a step"), (False, "two fifths of an explicit step (12,000 cells)"))
 }
 _INDENT = " " * 12
@@ -62,8 +62,8 @@ def report_lines(study: Study, summary: MeshSummary, near: list[str]) -> Iterato
     yield from _contact_lines(study, summary)
     yield from _time_lines(study, summary)
     if near and summary.mesh is None:
-        yield f"{_INDENT}whether the body lies in {' or '.join(near)} is not looked at in meshes of more than"
-        yield f"{_INDENT}{LIMITS.max_built_cells:,} cells that are not built yet; the run does"
+        yield f"{_INDENT}whether the body overlaps {' or '.join(near)} is not checked for meshes of more than"
+        yield f"{_INDENT}{LIMITS.max_built_cells:,} cells that are not built yet; the run checks it"
     options = ", ".join(f"{name}={value}" for name, value in study.solver.items())
     yield f"solver      {options or 'defaults (Newton with line search, CG, algebraic multigrid)'}"
     yield f"probes      {', '.join(f'{probe.name} ({probe.quantity})' for probe in study.probe) or 'none'}"
@@ -99,8 +99,8 @@ def _fracture_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
     else:
         yield f"fracture    {_fracture(study)}"
         if table is not None and not table.crumbs and not table.retains_nodes(study.material.energy):
-            yield f'{_INDENT}note: crumbs = false holds no node with approach = "edge" and the corotated energy;'
-            yield f'{_INDENT}energy = "linear" or approach = "chi" keeps them'
+            yield f'{_INDENT}note: crumbs = false retains no node with approach = "edge" and the corotated energy;'
+            yield f'{_INDENT}energy = "linear" or approach = "chi" does'
     notes = length_scale_notes(study, summary.h, summary.min_side)
     for line in (*notes, *small_strain_notes(study), *_direction_notes(study, summary)):
         yield f"{_INDENT}{line}"
@@ -123,19 +123,19 @@ def _contact_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
         any_free = any(obstacle.is_free for obstacle in study.obstacle)
         if any(shape != "mesh" for shape in shapes):
             surface = summary.surface_text()
-            yield f"{_INDENT}touched by the points of {surface}, {_AS_CRACKS_OPEN}; {_OBSTACLE_COST}"
+            yield f"{_INDENT}acts on the points of {surface}, {_AS_CRACKS_OPEN}; {_OBSTACLE_COST}"
         for i, obstacle in enumerate(study.obstacle):
             if obstacle.file is not None:
                 text = _mesh_obstacle(obstacle.file, obstacle.scale or 1.0, f"obstacle.{i}")
                 yield f"{_INDENT}{obstacle.name}: {text}"
         if len(study.obstacle) > 1 and any_free and not study.time.scheme_class.implicit:
-            yield f"{_INDENT}note: in explicit steps obstacles do not feel, and pass through each other"
+            yield f"{_INDENT}note: in explicit steps obstacles pass through each other"
         if any_free and "mesh" in shapes:
-            yield f"{_INDENT}note: obstacles that move freely do not feel those from files; free ones from files feel"
-            yield f"{_INDENT}shapes that are held or driven, with their points"
+            yield f"{_INDENT}note: free obstacles have no contact with those from files; free ones from files have it"
+            yield f"{_INDENT}with fixed and driven shapes, at their points"
     if study.contact is not None and study.contact.itself:
         between_fragments = study.contact.itself == "pieces"
-        partners = "of pieces alone with one another" if between_fragments else "of the body with itself"
+        partners = "of fragments with each other" if between_fragments else "of the body with itself"
         cost = _CONTACT_COST[study.time.scheme_class.implicit]
         yield f"contact     {partners}, friction {study.contact.friction:g}; {cost}"
         yield f"{_INDENT}its surface has {summary.surface_text()}, {_AS_CRACKS_OPEN}"
@@ -149,8 +149,8 @@ def _time_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
         yield f"{_INDENT}ends where the force on {study.monitored_load} has fallen by {until.drop:.0%} from its peak"
     linear = study.material.energy == "linear"
     if linear and estimated_rotation(study, summary.dim, summary.min_side) > LIMITS.max_linear_rotation:
-        yield f'{_INDENT}note: with energy = "linear" pieces that come off and turn swell by 1/cos of their angle;'
-        yield f'{_INDENT}"corotated" costs little more, and turns them as they are'
+        yield f'{_INDENT}note: with energy = "linear" fragments that rotate swell by 1/cos of their angle;'
+        yield f'{_INDENT}"corotated" costs little more and does not'
 
 
 def _rigid_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
@@ -161,21 +161,21 @@ def _rigid_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
     for line in unit_questions(study, summary.max_side):
         yield f"{_INDENT}{line}"
     copies = sum(int(np.prod(body.copies)) for body in study.body) or 1
-    yield f"bodies      {copies} times the mesh; motion on one rank, no fields.xdmf"
+    yield f"bodies      {copies} times the mesh; they move on one rank, no fields.xdmf"
     if study.brittle is not None and study.fracture is not None:
         yield f"fracture    strength {study.fracture.strength:g} Pa, {_average(study.fracture)}"
         yield f"brittle     {'of each body, ' if copies > 1 else ''}{_brittle(study.brittle)}"
     elif study.plasticity is not None:
         table = study.plasticity
         limits = f"{table.yield_stress:g} Pa, hardening {table.hardening:g} Pa"
-        yield f"plasticity  what is struck keeps a dent where von Mises stress exceeds {limits}"
+        yield f"plasticity  impacts leave dents where the von Mises stress exceeds {limits}"
     else:
-        yield "fracture    off: nothing is analysed"
+        yield "fracture    off: no analyses"
     yield f"obstacles   {_obstacle_list(study) or 'none'}"
     contact = study.contact or ContactSettings()
     duration = "Hertz's time" if contact.contact_time is None else f"{contact.contact_time:g} s"
     restitution = contact.restitution or 0.0
-    yield f"contact     friction {contact.friction:g}, restitution {restitution:g}, a blow lasts {duration}"
+    yield f"contact     friction {contact.friction:g}, restitution {restitution:g}, an impact lasts {duration}"
     yield f"time        rigid, {study.time.end / study.time.max_step:.0f} steps of {study.time.max_step:g} s"
     yield from _frame_lines(study)
 
@@ -231,7 +231,7 @@ def _direction_notes(study: Study, summary: MeshSummary) -> Iterator[str]:
         yield "and cracks run along edges: take random points (builders, surface, outline), or fracture.energy"
     elif ratio > limit:
         yield f"the mesh has {ratio:.2g} times as many edges along its commonest directions as one without any; cracks"
-        yield "that take an energy go through cells, and cross edges in any direction"
+        yield "with a fracture energy go through cells, in any direction"
 
 
 def _size(summary: MeshSummary) -> str:
@@ -272,7 +272,7 @@ def _brittle(brittle: BrittleSettings) -> str:
     count = f"{brittle.surfaces} surfaces" if brittle.surfaces > 1 else "1 surface"
     spacing = f"starts {brittle.spacing:g} m apart" if brittle.spacing else "starts two mesh edges apart"
     per_pass = f", {brittle.per_pass} a pass" if brittle.per_pass else ""
-    return f"up to {count}{per_pass}, {_surface_kind(brittle)}, {spacing}; edges do not break by themselves"
+    return f"up to {count}{per_pass}, {_surface_kind(brittle)}, {spacing}; single edges do not break"
 
 
 def _surface_kind(brittle: BrittleSettings) -> str:

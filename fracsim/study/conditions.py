@@ -43,7 +43,7 @@ class BoundaryCondition:
     Attributes:
         key: path in the study, such as `boundary.0`.
         kind: fix, displacement, velocity, traction, force or pressure.
-        place: selector of nodes or facets.
+        selector: of nodes or facets.
         function: of time: displacement (d,) in m for the three motions, traction (d,) or pressure (1,) in Pa, force
             (d,) in N, in 2D per metre of thickness.
         components: (d,) components that a motion prescribes; none for a load.
@@ -51,7 +51,7 @@ class BoundaryCondition:
 
     key: str
     kind: str
-    place: Selector
+    selector: Selector
     function: TimeFunction
     components: Flags
 
@@ -125,7 +125,7 @@ def check_conflicts(entries: Sequence[BoundaryCondition], dim: int) -> None:
             has no effect.
     """
     for motion, second in permutations(entries, 2):
-        if motion.place != second.place or not motion.prescribes_motion:
+        if motion.selector != second.selector or not motion.prescribes_motion:
             continue
         common = motion.components & (second.components if second.prescribes_motion else _loaded(second, dim))
         if not common.any():
@@ -133,13 +133,13 @@ def check_conflicts(entries: Sequence[BoundaryCondition], dim: int) -> None:
         axis = AXES[int(np.argmax(common))]
         if not second.prescribes_motion:
             raise InputError(
-                f"{second.key}.{second.kind} acts along {axis} on {second.place}, where {motion.key} prescribes {axis}:"
-                f" it would do nothing; set its {axis} to 0, or leave {axis} free"
+                f"{second.key}.{second.kind} acts along {axis} on {second.selector}, where {motion.key} prescribes "
+                f"{axis}: it would do nothing; set its {axis} to 0, or leave {axis} free"
             )
         if {motion.kind, second.kind} != {"fix"}:
             raise InputError(
-                f"{motion.key} and {second.key} both prescribe {axis} of {motion.place}: remove one of them, or give "
-                f'"free" for {axis}'
+                f"{motion.key} and {second.key} both prescribe {axis} of {motion.selector}: remove one of them, or "
+                f'give "free" for {axis}'
             )
 
 
@@ -152,7 +152,7 @@ def _loaded(load: BoundaryCondition, dim: int) -> Flags:
 
 
 def _condition(entry: BoundarySettings, dim: int, key: str, thickness: float) -> BoundaryCondition:
-    place, value = find_selector(entry.on, dim, f"{key}.on"), getattr(entry, entry.kind)
+    selector, value = find_selector(entry.on, dim, f"{key}.on"), getattr(entry, entry.kind)
     function: TimeFunction
     components: Flags = np.zeros(dim, bool)
     if entry.fix is not None:
@@ -165,7 +165,7 @@ def _condition(entry: BoundarySettings, dim: int, key: str, thickness: float) ->
             function = table.integral
         if entry.kind == "force":
             function = TabulatedFunction(table.times, np.asarray(table.rows / thickness))
-    return BoundaryCondition(key, entry.kind, place, function, components)
+    return BoundaryCondition(key, entry.kind, selector, function, components)
 
 
 def _named(axes: str, dim: int, key: str, word: str = "fix") -> Flags:

@@ -58,9 +58,9 @@ def validation_message(errors: Sequence[Any], table: str = "") -> str:
 
 def unknown_key_message(where: str, known: Iterable[str]) -> str:
     """Returns a sentence on an unknown key, with the nearest known key, or all known keys of its table."""
-    known = sorted(known)
-    near = difflib.get_close_matches(where.rpartition(".")[2], known, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(known)}"
+    keys = sorted(known)
+    near = difflib.get_close_matches(where.rpartition(".")[2], keys, n=1, cutoff=0.5)
+    hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(keys)}"
     return f"{where} is not a known key; {hint}"
 
 

@@ -57,12 +57,12 @@ def _edge_energy_notes(study: Study, modulus: float, h: float) -> Iterator[str]:
     energy = table.strength**2 * h / (2 * modulus)
     material_energy = MATERIALS[like].energy if like is not None else None
     word = "radius" if table.radius else "h"
-    yield f"edges break one by one: a crack takes some f_t^2 {word} / 2 E' = {energy:.2g} J/m^2, as much as h has it"
+    yield f"edges break one by one: a crack takes about f_t^2 {word} / 2 E' = {energy:.2g} J/m^2"
     ratio = LIMITS.max_energy_ratio
     if material_energy is not None and not material_energy / ratio < energy < material_energy * ratio:
         yield (
-            f"note: {like} takes {material_energy:g} J/m^2: give fracture.energy = true (2D), or {word} = "
-            f"{2 * modulus * material_energy / table.strength**2:.2g} m"
+            f"note: {like} takes {material_energy:g} J/m^2: give fracture.energy = true (2D), or "
+            f"{word} = {2 * modulus * material_energy / table.strength**2:.2g} m"
         )
 
 
@@ -94,14 +94,14 @@ def energy_criterion_notes(study: Study, h: float, max_side: float) -> Iterator[
         assert energy is not None
         length = plane_modulus(study, region) * energy / strength**2
         prefix = f"in {name}: " if name else ""
-        yield f"{prefix}cracks that take {energy:g} J/m^2, and begin at {strength:g} Pa; law {table.law}"
+        yield f"{prefix}cracks with fracture energy {energy:g} J/m^2 and strength {strength:g} Pa; law {table.law}"
         yield f"{prefix}l_ch = E' G_c / f_t^2 = {length:.3g} m = {length / h:.3g} h"
         if table.law == "cohesive":
             yield from _cohesive_notes(length, h)
             continue
         yield from _process_zone_notes(length, strength, h, max_side)
         if length >= LIMITS.min_zone_cells * h and study.time.scheme == "quasi-static":
-            yield 'cells resolve that: with law = "cohesive" cracks hold on while they open, as concrete does'
+            yield 'cells resolve the process zone: with law = "cohesive" cracks soften as they open, as in concrete'
     if table.branching:
         yield from _branching_notes(study, h)
 
@@ -122,13 +122,13 @@ def check_branching_dimension(study: Study, dim: int) -> None:
 
 def _branching_notes(study: Study, h: float) -> Iterator[str]:
     """Yield whether steps are short enough for the branching of tips."""
-    yield "cracks run at up to half of the Rayleigh speed; tips branch to which 2 G_c flows"
+    yield "cracks run at up to half of the Rayleigh speed; a tip that receives 2 G_c branches"
     material, step = study.material, study.time.breaking_step or study.time.max_step
     shear = (material.young / (2 * (1 + material.poisson) * material.density)) ** 0.5
     wave = LIMITS.tip_radius * h / rayleigh_wave_speed(shear, material.poisson)
     if step > wave:
-        yield f"note: in steps of {step:.2g} s none does: a Rayleigh wave leaves the disc of a tip in {wave:.2g} s;"
-        yield f"breaking_step = {wave / 2:.1g} s would do"
+        yield f"note: no tip branches in steps of {step:.2g} s: a Rayleigh wave leaves its disc in {wave:.2g} s;"
+        yield f"breaking_step = {wave / 2:.1g} s is sufficient"
 
 
 def plane_modulus(study: Study, region: RegionSettings) -> float:
@@ -142,16 +142,16 @@ def _cohesive_notes(length: float, h: float) -> Iterator[str]:
     cells = LIMITS.min_zone_cells
     if length < cells * h:
         yield f'note: that is less than {cells:g} h: cells are too coarse for law = "cohesive";'
-        yield f'h = {length / cells:.2g} m would do, or law = "griffith"'
+        yield f'h = {length / cells:.2g} m is sufficient, or law = "griffith"'
 
 
 def _process_zone_notes(length: float, strength: float, h: float, max_side: float) -> Iterator[str]:
     """Yield a note if Irwin's length is below a cell or above a fifth of the body; lengths in m."""
     if 0 < length < h:
-        yield f"note: that is less than h = {h:.3g} m: in smooth places cracks begin late and take more than G_c;"
-        yield f"h = {length:.2g} m would do, or a strength of {strength * (length / h) ** 0.5:.2g} Pa"
+        yield f"note: that is less than h = {h:.3g} m: without a notch cracks start late and take more than G_c;"
+        yield f"h = {length:.2g} m is sufficient, or a strength of {strength * (length / h) ** 0.5:.2g} Pa"
     elif length * LIMITS.min_zone_share > max_side:
-        yield "note: that is over a fifth of the body: a crack's process zone has no room, and loads are too high"
+        yield "note: that is over a fifth of the body: the process zone of a crack has no space, and loads are too high"
 
 
 def estimated_rotation(study: Study, dim: int, min_side: float) -> float:

@@ -40,14 +40,14 @@ def resultant_lines(study: Study, dim: int, mesh: MeshData | None) -> Iterator[s
         return
     if mesh is None:
         yield (
-            f"areas and resultants are not worked out of meshes of more than {LIMITS.max_built_cells:,} cells; "
+            f"areas and resultants are not computed for meshes of more than {LIMITS.max_built_cells:,} cells; "
             "coarsen mesh.h"
         )
         return
     thickness = study.thickness if dim == 2 else 1.0
     for load in loads:
         vector, area = facet_area_vectors(mesh, load)
-        yield f"{load.key}.{load.kind} on {load.place}: {_facet_resultant(load, vector, area, thickness, dim)}"
+        yield f"{load.key}.{load.kind} on {load.selector}: {_facet_resultant(load, vector, area, thickness, dim)}"
     for name, function in volume_loads(study, dim).items():
         assert isinstance(function, TabulatedFunction)
         rows = _volume_factor(study, mesh, name) * thickness * function.rows
@@ -61,9 +61,9 @@ def facet_area_vectors(mesh: MeshData, load: BoundaryCondition) -> tuple[Values,
     Raises:
         InputError: if the load selects no facet.
     """
-    facets = _facets(mesh, load.place)
+    facets = _facets(mesh, load.selector)
     if not len(facets):
-        raise InputError(f"{load.key}.on: {load.place} selects no boundary facet")
+        raise InputError(f"{load.key}.on: {load.selector} selects no boundary facet")
     vectors = _area_vectors(mesh, facets)
     return vectors.sum(axis=0), float(np.linalg.norm(vectors, axis=1).sum())
 

@@ -45,10 +45,10 @@ def find_builder(mesh: MeshSettings) -> Any:
 
 def _with_parameters(kind: Any, parameters: dict[str, Any]) -> Any:
     """A builder of a class with the parameters of a study. InputError for an unknown or invalid parameter."""
-    known = [field.name for field in dataclasses.fields(kind)]
+    names = [field.name for field in dataclasses.fields(kind)]
     for key in parameters:
-        if key not in known:
-            raise InputError(unknown_key_message(f"mesh.{key}", known))
+        if key not in names:
+            raise InputError(unknown_key_message(f"mesh.{key}", names))
     try:
         # JSON keeps numbers strict, and converts a list to a tuple
         return _reader(kind).validate_json(json.dumps(parameters, default=str), strict=True)

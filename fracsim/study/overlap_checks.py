@@ -148,10 +148,10 @@ def _check_shape(entry: ObstaclePlacement, number: int, mesh: MeshData) -> None:
     placed = _placed(entry, number)
     if placed.distance_bound(mesh.points) > 0:
         return
-    least = float(placed.distance(mesh.points).min())
-    if least < -LIMITS.overlap_round_off * float(np.linalg.norm(np.ptp(mesh.points, axis=0))):
+    gap = float(placed.distance(mesh.points).min())
+    if gap < -LIMITS.overlap_round_off * float(np.linalg.norm(np.ptp(mesh.points, axis=0))):
         raise InputError(
-            f"obstacle.{number}: {entry.name} overlaps the body at the start, by {-least:.4g} m; "
+            f"obstacle.{number}: {entry.name} overlaps the body at the start, by {-gap:.4g} m; "
             "move it away or make it smaller"
         )
     if not placed.shape.convex or not np.isfinite(placed.shape.volume):
@@ -242,9 +242,9 @@ def _check_rigid_bodies(study: Study, mesh: MeshData, entries: list[ObstaclePlac
         placed = _placed(entry, number)
         for copy in np.flatnonzero(placed.distance(centres) < radius):
             x = mesh.points @ poses.rotation[copy].T + poses.position[copy]
-            least = float(placed.distance(x).min())
-            if least < -max_depth:
+            gap = float(placed.distance(x).min())
+            if gap < -max_depth:
                 raise InputError(
                     f"body {copy} around {format_point(centres[copy])} lies in obstacle {entry.name} at the start, by "
-                    f"{-least:.3g} m: move them apart (body.N.position, spacing, or `at` of the obstacle)"
+                    f"{-gap:.3g} m: move them apart (body.N.position, spacing, or `at` of the obstacle)"
                 )

@@ -50,11 +50,11 @@ def _explicit_lines(study: Study, steps: str, stable: float) -> Iterator[str]:
         yield f"time        {timing.scheme}, {steps}, which are stable (up to some {stable:.2g} s)"
         return
     count = timing.end / stable
-    yield f"time        {timing.scheme}, some {count:,.0f} steps of {stable:.2g} s, the longest that are stable;"
-    yield f"            time.step = {timing.max_step:g} s is a bound that they do not reach"
+    yield f"time        {timing.scheme}, some {count:,.0f} steps of {stable:.2g} s, the longest stable ones;"
+    yield f"            time.step = {timing.max_step:g} s is an upper bound that they do not reach"
     if count > LIMITS.max_steps:
         yield "            note: that is more than a million steps: take larger cells or a shorter end, or an implicit"
-        yield "            scheme, which has no such bound"
+        yield "            scheme, which has no such limit"
 
 
 def estimated_explicit_step(study: Study, dim: int, h: float, mesh: MeshData | None) -> float:

@@ -265,8 +265,10 @@ class Study(StudyTable):
         if (len(names) == 1 and name is None) or name in names:
             return self
         which = f"of = {name!r} is none of them" if name is not None else "say which, of = NAME"
-        there = ", ".join(names) or "none: add a [[probe]] with on = the group that is driven"
-        raise ValueError(f"time.until watches the force on a probed group or an obstacle: {which}; there are: {there}")
+        available = ", ".join(names) or "none: add a [[probe]] with on = the group that is driven"
+        raise ValueError(
+            f"time.until watches the force on a probed group or an obstacle: {which}; there are: {available}"
+        )
 
     @property
     def monitored_load(self) -> str:
