@@ -64,6 +64,10 @@ class Stopped(FracsimError):
     exit_code = Exit.STOPPED
 
 
+class StepAborted(Exception):
+    """A step was given up since the run is to stop; the body is as at the start of the step (on all ranks)."""
+
+
 class CannotWrite(FracsimError):
     """Output could not be written in the middle of a run (disk full, folder gone); the message has what, and why."""
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from .errors import CannotWrite, NotConverged, Stopped
+from .errors import CannotWrite, NotConverged, StepAborted, Stopped
 from .output.atomic_write import write_on_root
 from .output.checkpoint_file import (
     CHECKPOINT_LIMITS,
@@ -39,7 +39,6 @@ from .output.run_folder import (
 from .output.summary import print_notes, write_summary
 from .rigid.rigid_stepper import RigidReport
 from .scene.rigid_scene import RigidScene
-from .timestepping.stepper import StepAborted
 
 if TYPE_CHECKING:
     from collections.abc import Callable

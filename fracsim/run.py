@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from .errors import CannotWrite, NotConverged, Stopped, one_line
+from .errors import CannotWrite, NotConverged, StepAborted, Stopped, one_line
 from .mesh.parallel import end_unless_all_failed, from_root, on_root, sum_over_ranks
 from .monitors import CHECKPOINT_MONITORS, RunMonitors, wants_surface
 from .output.atomic_write import write_on_root
@@ -45,7 +45,7 @@ from .scene import Scene, build_scene
 from .study import Study
 from .study.conditions import initial_cracks
 from .study.reader import add_missing_defaults, study_text
-from .timestepping.stepper import StepAborted, StepReport
+from .timestepping.stepper import StepReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable

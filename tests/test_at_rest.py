@@ -11,6 +11,7 @@ from fracsim.solvers import nonlinear_elimination, nonlinear_solver
 from support.ranks import OnRanks, Results, starting
 from support.reference import dense_tangent
 from support.scenes import make_scene, positions
+from support.solver_policy import set_policy
 from support.thrown import thrown
 from test_joining import tied
 
@@ -44,14 +45,14 @@ def test_a_thrown_corner_comes_to_rest_by_itself(monkeypatch: pytest.MonkeyPatch
     made: list[int] = []
     assemble = Tangent._assemble_body
     monkeypatch.setattr(Tangent, "_assemble_body", lambda self, *given: made.append(1) or assemble(self, *given))
-    monkeypatch.setattr(nonlinear_elimination, "FEW", 0.2)
+    set_policy(monkeypatch, max_relaxed_nodes=0.2)
     scene, state = thrown()
     u, tangents = state.u.copy(), len(made)
-    assert scene.solver is not None and scene.solver._newton._patches is not None
+    assert scene.solver is not None and scene.solver._newton._elimination is not None
     made.clear()
-    monkeypatch.setattr(nonlinear_solver.NonlinearSolver, "damage_changed", lambda *_: None)
+    monkeypatch.setattr(nonlinear_solver.NonlinearSolver, "edges_broke", lambda *_: None)
     scene, state = thrown()
-    assert scene.solver is not None and scene.solver._newton._patches is None
+    assert scene.solver is not None and scene.solver._newton._elimination is None
     np.testing.assert_allclose(u, state.u, atol=1e-7 * np.abs(state.u).max())
     assert tangents < len(made)
 
@@ -59,7 +60,7 @@ def test_a_thrown_corner_comes_to_rest_by_itself(monkeypatch: pytest.MonkeyPatch
 def test_nodes_elsewhere_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """A corner that is pushed through its cell: it and its neighbours lower the potential, their forces are next to
     nothing, nothing else moves, and there K is positive."""
-    monkeypatch.setattr(nonlinear_elimination, "FEW", 0.2)
+    policy = set_policy(monkeypatch, max_relaxed_nodes=0.2)
     scene, _ = thrown(steps=0)
     balance = scene.balance
     balance.begin_step(0.01, 0.01, *(np.zeros(balance.owned_dof_count) for _ in range(3)))
@@ -68,13 +69,13 @@ def test_nodes_elsewhere_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) ->
     u[corner] = -0.3
     balance.set_displacement(u.reshape(-1))
     before, high = balance.update_forces().copy().reshape(-1, 3), balance.energies.incremental_potential()[0]
-    few = nonlinear_elimination.create_elimination(balance)
+    few = nonlinear_elimination.create_elimination(balance, policy)
     assert few is not None and few.relax_nodes(0.0)
     moved = np.flatnonzero(np.abs(balance.u.x.array.reshape(-1, 3) - u).max(axis=1))
     touched = np.unique(scene.domain.cell_nodes[(scene.domain.cell_nodes == corner).any(axis=1)])
     assert set(touched) <= set(moved) and len(moved) < 0.7 * len(u)
     after = balance.update_forces().reshape(-1, 3)
-    assert np.linalg.norm(after[moved]) < nonlinear_elimination.ENOUGH * np.linalg.norm(before)
+    assert np.linalg.norm(after[moved]) < policy.patch_rtol * np.linalg.norm(before)
     assert balance.energies.incremental_potential()[0] < high
     dofs = (3 * moved[:, None] + np.arange(3)).reshape(-1)
     K = dense_tangent(scene) + balance.c_a * np.diag(balance.mass.lumped)
@@ -85,7 +86,7 @@ def test_nodes_elsewhere_stay_where_they_are(monkeypatch: pytest.MonkeyPatch) ->
 def test_what_is_tied_comes_to_rest_with_its_ties(monkeypatch: pytest.MonkeyPatch, dim: int) -> None:
     """A node without cells that is pulled away from where it is tied goes back: the potential, with what ties store, is
     lower, and the forces of all nodes that moved, which ties are part of, are next to nothing."""
-    monkeypatch.setattr(nonlinear_elimination, "FEW", 0.5)
+    policy = set_policy(monkeypatch, max_relaxed_nodes=0.5)
     scene, state, tethers = tied(dim, time={"scheme": "backward-euler", "step": 10.0, "end": 100.0})
     balance = scene.balance
     balance.begin_step(10.0, 10.0, state.u, np.zeros(balance.owned_dof_count), np.zeros(balance.owned_dof_count))
@@ -98,13 +99,11 @@ def test_what_is_tied_comes_to_rest_with_its_ties(monkeypatch: pytest.MonkeyPatc
         balance.energies.incremental_potential()[0],
         tethers.stored_energy(),
     )
-    few = nonlinear_elimination.create_elimination(balance)
+    few = nonlinear_elimination.create_elimination(balance, policy)
     assert few is not None and few.relax_nodes(0.0)
     moved = np.flatnonzero(np.abs(balance.u.x.array.reshape(-1, dim) - u).max(axis=1))
     assert node in moved
-    assert np.linalg.norm(
-        balance.update_forces().reshape(-1, dim)[moved]
-    ) < nonlinear_elimination.ENOUGH * np.linalg.norm(before)
+    assert np.linalg.norm(balance.update_forces().reshape(-1, dim)[moved]) < policy.patch_rtol * np.linalg.norm(before)
     assert balance.energies.incremental_potential()[0] < high - 0.9 * stored
 
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from fracsim.errors import StepAborted
 from fracsim.output.interrupt import InterruptHandler
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study import Study
 from fracsim.study.reader import study_text
-from fracsim.timestepping.stepper import StepAborted
 from support.continued import CASES, differences, other, unlike
 from support.ranks import run_on_ranks
 from support.scenes import make_study

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,10 +17,11 @@ from fracsim.mechanics.matrix_assembly import TangentAssembler
 from fracsim.mechanics.tangent import Tangent
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers import preconditioner
-from fracsim.solvers.multigrid import block_operator
 from fracsim.solvers.nonlinear_solver import NonlinearSolver
+from fracsim.solvers.policy import DEFAULT_POLICY
 from fracsim.studies.evidence.growth import random_planes
 from support.scenes import Walk
+from support.solver_policy import set_policy
 
 SOLVER: dict[str, Any] = {"snes_type": "ksponly", "ksp_rtol": 1e-6}
 
@@ -55,8 +57,9 @@ def test_multigrid_of_another_kind_takes_over_where_a_body_is_in_pieces() -> Non
 def test_a_thin_body_has_aggregates_of_strong_links(monkeypatch: pytest.MonkeyPatch) -> None:
     """A sheet of two cells that is bent takes at most 0.8 of the iterations that it takes with all links; a cube, which
     takes more of them with strong links, has all of them again. A user who asks for some keeps them."""
-    monkeypatch.setattr(preconditioner, "SLOW", 5)
-    monkeypatch.setattr(block_operator, "SMALL", 10**9)  # or what nobody asked for is smoothed otherwise, too
+    set_policy(
+        monkeypatch, slow_iterations=5, min_block_dofs=10**9
+    )  # or what nobody asked for is smoothed otherwise, too
     sheet, cube = ((0.15, 0.1, 0.01), 0.0048), ((0.1, 0.1, 0.1), 0.02)
     assert bent_its(*sheet, {}) < 0.8 * bent_its(*sheet, {"pc_gamg_threshold": 0.0})
     assert bent_its(*cube, {}) == bent_its(*cube, {"pc_gamg_threshold": 0.0})
@@ -81,26 +84,27 @@ def test_the_finest_level_is_smoothed_by_nodes(monkeypatch: pytest.MonkeyPatch) 
     """Of a large body that is slow to solve for, to whose tangent terms add single entries, and once, at every set-up:
     at most half as many iterations more, for two products less in five. Others, a small one and one in pieces keep what
     they have."""
-    monkeypatch.setattr(preconditioner, "SLOW", 5)
-    monkeypatch.setattr(preconditioner, "WORTH_IT", 10.0)
+    set_policy(monkeypatch, slow_iterations=5, strong_link_gain=10.0)
     scene, by_entries = shattered(0.025, 0, {}, 3)
     assert set(smoothers(scene)) == {("jacobi", 2)}
-    monkeypatch.setattr(block_operator, "SMALL", 0)
+    set_policy(monkeypatch, min_block_dofs=0)
     monkeypatch.setattr(Tangent, "switch_to_blocks", lambda _: None)
     scene, by_nodes = shattered(0.025, 0, {}, 3)
     assert by_nodes[-1] <= 1.5 * by_entries[-1]
     solver = scene.solver
     assert isinstance(solver, NonlinearSolver)
-    for due in (preconditioner.Due.NOTHING, preconditioner.Due.REFRESH, preconditioner.Due.REBUILD):
-        solver.linear.preconditioner.due = due
+    own = solver.linear.preconditioner
+    assert isinstance(own, preconditioner.Preconditioner)
+    for update in preconditioner.Update:
+        own._due = update
         solver.linear_response(np.ones(scene.balance.owned_dof_count))
         *coarse, finest = smoothers(scene)
         assert finest == ("pbjacobi", 1) and set(coarse) == {("jacobi", 2)}
     assert set(smoothers(shattered(0.025, 0, {"mg_levels_pc_type": "jacobi"}, 1)[0])) == {("jacobi", 2)}
-    solver.linear.preconditioner._change()
+    own._suit_fragments()
     solver.linear_response(np.ones(scene.balance.owned_dof_count))
     assert set(smoothers(scene)) == {("sor", 1)}
-    monkeypatch.setattr(preconditioner, "SLOW", 99)
+    set_policy(monkeypatch, slow_iterations=99)
     assert set(smoothers(shattered(0.025, 0, {}, 1)[0])) == {("jacobi", 2)}
 
 
@@ -121,8 +125,8 @@ def test_what_hangs_is_solved_for_by_itself_in_long_steps(monkeypatch: pytest.Mo
     """Ten planes through a bar and steps in which inertia holds nothing: at most half the iterations that it
     takes by multigrid of another kind."""
     its = []
-    for held in (preconditioner.HELD, 0.0):
-        monkeypatch.setattr(preconditioner, "HELD", held)
+    for held in (DEFAULT_POLICY.held_by_inertia, 0.0):
+        set_policy(monkeypatch, held_by_inertia=held)
         its.append(sum(shattered(0.04, 10, {}, 6, step=0.1)[1][-3:]))
     assert its[0] < its[1] / 2, f"{its[0]} iterations, {its[1]} without"
 
@@ -130,13 +134,13 @@ def test_what_hangs_is_solved_for_by_itself_in_long_steps(monkeypatch: pytest.Mo
 def test_sweeps_do_for_what_is_in_pieces_in_short_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten planes through a bar: SSOR takes over, to the same motion as by a user's own preconditioner, and multigrid
     again once inertia holds less."""
-    monkeypatch.setattr(preconditioner, "IN_PIECES", 0.5)
+    set_policy(monkeypatch, fragmented_ratio=0.5)
     scene, its = shattered(0.04, 10, {"ksp_rtol": 1e-9}, 6, step=5e-3)
     asked, _ = shattered(0.04, 10, {"ksp_rtol": 1e-9, "pc_type": "jacobi"}, 6, step=5e-3)
     solver, u, v = scene.solver, scene.balance.u.x.array, asked.balance.u.x.array
     assert isinstance(solver, NonlinearSolver) and solver.snes.ksp.pc.getType() == "sor" and its[-1] > 5
     np.testing.assert_allclose(u, v, atol=1e-6 * np.abs(v).max())
-    monkeypatch.setattr(preconditioner, "SWEPT", 1.0)
+    solver.linear.preconditioner._policy = replace(DEFAULT_POLICY, sweeps_suffice=1.0)  # type: ignore[union-attr]
     solver.linear_response(np.ones(scene.balance.owned_dof_count))
     assert set(smoothers(scene)) == {("sor", 1)}
 
@@ -177,7 +181,7 @@ def cut(scene: Scene, planes: list[Any]) -> None:
     graph.break_unloaded_edges()
     assert scene.balance.stress.chi is not None and scene.solver is not None
     scene.balance.stress.chi.x.array[: scene.domain.cell_count][graph.split] = 0.0
-    scene.solver.damage_changed()
+    scene.solver.edges_broke(None)
 
 
 @pytest.mark.parametrize("first", [True, False])
@@ -185,11 +189,11 @@ def test_rows_of_the_tangent_are_those_of_its_products(first: bool, monkeypatch:
     """A bar in pieces: rows of some nodes, of blocks with ties beside them or of the matrix, against products with unit
     vectors."""
     if first:
-        monkeypatch.setattr(block_operator, "SMALL", 0)
+        set_policy(monkeypatch, min_block_dofs=0)
     scene, _ = shattered(0.06, 10, {}, 2)
     solver, nodes = scene.solver, np.array([5, 0, 17, 40])
-    assert isinstance(solver, NonlinearSolver) and (solver.linear._blocks is not None) is first
-    K, d = solver.linear.operator, scene.domain.dim
+    assert isinstance(solver, NonlinearSolver) and (solver.linear.operators.block_operator is not None) is first
+    K, d = solver.linear.operators.operator, scene.domain.dim
     if first:
         random, tied = np.random.default_rng(1), np.array([17, 3, 5])
         ties = csr_matrix(random.normal(size=(3, 3)))
@@ -210,13 +214,13 @@ def test_rows_of_the_tangent_are_those_of_its_products(first: bool, monkeypatch:
 def test_products_in_blocks_are_those_of_single_entries(first: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A bar in pieces, whose matrices are made anew on the way: CG and the finest level of multigrid multiply with
     blocks, to the last digits as with the tangent, be they assembled first or copied from single entries."""
-    monkeypatch.setattr(block_operator, "SMALL", 0)
+    set_policy(monkeypatch, min_block_dofs=0)
     if not first:
         monkeypatch.setattr(Tangent, "switch_to_blocks", lambda _: None)
     scene, _ = shattered(0.04, 10, {}, 6)
     solver = scene.solver
-    assert isinstance(solver, NonlinearSolver) and solver.linear._blocks is not None
-    assert (solver.linear._blocks.assembled is not None) is first
+    assert isinstance(solver, NonlinearSolver) and solver.linear.operators.block_operator is not None
+    assert (solver.linear.operators.block_operator.assembled is not None) is first
     pc = solver.linear.preconditioner.pc
     assert pc.getMGSmoother(pc.getMGLevels() - 1).getOperators()[0].getType() == "python"
     tangent = scene.balance.tangent.matrix
@@ -230,9 +234,9 @@ def test_products_in_blocks_are_those_of_single_entries(first: bool, monkeypatch
             tangent = single_entries(scene)
         else:
             tangent.scale(factor)
-        solver.linear._blocks.update_copy()
+        solver.linear.operators.block_operator.update_copy()
         tangent.mult(x, alone)
-        solver.linear._blocks.mult(tangent, x, by_blocks)
+        solver.linear.operators.block_operator.mult(tangent, x, by_blocks)
         by_blocks.axpy(-1.0, alone)
         assert by_blocks.norm() < 1e-13 * alone.norm()
 

@@ -12,12 +12,12 @@ from petsc4py import PETSc
 
 from cases import BAR, study
 from fracsim.scene import Scene, build_scene
-from fracsim.solvers import linear_solver as linear_room
-from fracsim.solvers import preconditioner as preconditioner_room
 from fracsim.solvers.linear_solver import LinearSolver
-from fracsim.solvers.multigrid import bcsr, block_operator, smoother, vcycle
-from fracsim.solvers.preconditioner import Due
+from fracsim.solvers.multigrid import bcsr, smoother, vcycle
+from fracsim.solvers.policy import DEFAULT_POLICY
+from fracsim.solvers.preconditioner import Update, mass_stiffness_ratio
 from support.scenes import Walk
+from support.solver_policy import set_policy
 
 Values = npt.NDArray[np.float64]
 
@@ -103,15 +103,14 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
     finest, also where it has stiffened by more than smoothers of before would bear; symmetric and positive. Of the
     largest eigenvalue Lanczos' method finds nine tenths at least. `slowly`: 0 where more is done with coarser
     levels."""
-    monkeypatch.setattr(block_operator, "SMALL", 0)
-    monkeypatch.setattr(vcycle, "SLOWLY", slowly)
+    set_policy(monkeypatch, min_block_dofs=0, slow_cycle=slowly)
     small = {2: {"size": [0.6, 0.14], "h": 0.02}, 3: {"size": [0.6, 0.15, 0.15], "h": 0.05}}  # matrices are dense
     scene = bar(dim, {}, mesh=small[dim])
     Walk(scene).advance()
     linear, preconditioner = linear_of(scene), linear_of(scene).preconditioner
-    preconditioner.due = Due.REFRESH
+    preconditioner._due = Update.REFRESH
     assert linear.solve()
-    made, pc = preconditioner._cycle, preconditioner.pc
+    made, pc = preconditioner._vcycle, preconditioner.pc
     assert isinstance(made, vcycle.SinglePrecisionVCycle) and preconditioner.serving.handle == made.pc.handle
     A = [dense(pc.getMGSmoother(level).getOperators()[1]) for level in range(pc.getMGLevels())]
     P = [dense(pc.getMGInterpolation(level)) for level in range(1, len(A))]
@@ -120,7 +119,10 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
     largest = [largest_of(level) for level in made._levels]
     finest, *coarser = [level.smoothing for level in made._levels[::-1]]
     usual = [finest] * len(coarser)
-    assert finest == (2, 0.1, 1) and coarser == (usual if slowly else list(vcycle.THOROUGH[: len(coarser)])) != []
+    assert (
+        finest == (2, 0.1, 1)
+        and coarser == (usual if slowly else list(vcycle.THOROUGH_SMOOTHING[: len(coarser)])) != []
+    )
     inverses = [inverse_blocks(each, size) for each, size in zip(A[1:], sizes, strict=True)]
     at_first = [largest_eigenvalue(B, each) for B, each in zip(inverses, A[1:], strict=True)]
     assert np.all(np.abs(np.divide(largest, at_first) - 0.95) < 0.05 + 1e-5)
@@ -128,10 +130,10 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
     for moved in (0.0, 0.2, 0.4):
         wild = np.random.default_rng(1).uniform(-1.0, 1.0, len(free)) * moved * balance.domain.mean_edge_length
         balance.set_displacement(balance.u.x.array[: len(free)] + np.where(free, wild, 0.0))
-        preconditioner.due = Due.NOTHING
+        preconditioner._due = Update.NONE
         assert linear.solve() or moved > 0.2  # where the tangent is not positive
-        linear.stiffness.update_entries()
-        before, A[-1] = A[-1], dense(linear.stiffness.matrix)
+        linear.tangent.update_entries()
+        before, A[-1] = A[-1], dense(linear.tangent.matrix)
         assert np.abs(A[-1] - before).max() >= moved / 2 * np.abs(before).max()
         reference, M = (
             each[np.ix_(free, free)]
@@ -145,34 +147,34 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
 
 def test_more_is_done_with_coarser_levels_of_what_is_slender(monkeypatch: pytest.MonkeyPatch) -> None:
     """A strip that is bent slowly takes fewer iterations for it; with a block nothing more is done."""
-    monkeypatch.setattr(block_operator, "SMALL", 0)
-    monkeypatch.setattr(preconditioner_room, "SLOW", 99)  # aggregates stay of one kind
+    set_policy(monkeypatch, min_block_dofs=0)
+    set_policy(monkeypatch, slow_iterations=99)  # aggregates stay of one kind
     strip, block, its = [3.0, 0.04, 0.02], [0.2, 0.2, 0.2], []
-    for size, slowly in ((strip, vcycle.SLOWLY), (strip, 1.0), (block, vcycle.SLOWLY)):
-        monkeypatch.setattr(vcycle, "SLOWLY", slowly)
+    for size, slowly in ((strip, DEFAULT_POLICY.slow_cycle), (strip, 1.0), (block, DEFAULT_POLICY.slow_cycle)):
+        set_policy(monkeypatch, slow_cycle=slowly)
         scene = bar(
             3, {}, mesh={"size": size, "h": 0.02, "pattern": "unstructured"},
             boundary=[{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [0.0, 0.0, 0.01]}],
             time={"end": 9.0, "scheme": "backward-euler", "step": 3.0},
         )  # fmt: skip
         its.append(Walk(scene).advance().solve.krylov_iterations)
-        made = linear_of(scene).preconditioner._cycle
+        made = linear_of(scene).preconditioner._vcycle
         assert made is not None
-        assert (made._levels[-2].smoothing == vcycle.THOROUGH[0]) == (size is strip and slowly < 1)
+        assert (made._levels[-2].smoothing == vcycle.THOROUGH_SMOOTHING[0]) == (size is strip and slowly < 1)
     assert its[0] < 0.8 * its[1] and its[2] < its[0]
 
 
 def test_it_takes_no_more_iterations_than_in_double_precision(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of PETSc's own cycle, which a user who names its smoother keeps, and which goes by single entries of the
     diagonal: the same motion to the solver's tolerance."""
-    monkeypatch.setattr(block_operator, "SMALL", 0)
+    set_policy(monkeypatch, min_block_dofs=0)
     its, u = [], []
     for given in ({}, {"mg_levels_pc_type": "jacobi"}):
         scene = bar(3, given | {"ksp_rtol": 1e-8})
         walk = Walk(scene)
         its.append([walk.advance().solve.krylov_iterations for _ in range(4)])
         u.append(walk.u)
-        assert (linear_of(scene).preconditioner._cycle is None) == bool(given)
+        assert (linear_of(scene).preconditioner._vcycle is None) == bool(given)
     assert all(0.8 * double <= single <= double for single, double in zip(*its, strict=True)) and min(its[0]) > 5
     np.testing.assert_allclose(*u, rtol=0, atol=1e-6 * np.abs(u[1]).max())
 
@@ -181,42 +183,45 @@ def test_it_takes_no_more_iterations_than_in_double_precision(monkeypatch: pytes
 def test_corrections_go_by_the_tangent_in_single_precision(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Six digits of K, written out, and all of how it resists what moves along as one; solves by themselves go by all
     of them."""
-    monkeypatch.setattr(block_operator, "SMALL", 0)
+    set_policy(monkeypatch, min_block_dofs=0)
     scene = bar(dim, {"snes_type": "newtonls"})
     Walk(scene).advance()
     linear = linear_of(scene)
-    context = linear.operator.getPythonContext()
-    assert context.single is linear.preconditioner.finest
-    linear.stiffness.update_entries()
-    K = dense(linear.stiffness.matrix)
-    error = written_out(linear.operator.mult, scene.balance.work_vector) - K
+    context = linear.operators.operator.getPythonContext()
+    assert context.fine_level is linear.preconditioner.fine_level
+    linear.tangent.update_entries()
+    K = dense(linear.tangent.matrix)
+    error = written_out(linear.operators.operator.mult, scene.balance.work_vector) - K
     assert 0 < np.abs(error).max() < 1e-6 * np.abs(K).max()
     assert np.abs(error - error.T).max() < 1e-14 * np.abs(K).max()
     moved = error.reshape(len(K) // dim, dim, -1, dim).sum(axis=2)  # what a translation meets at each node
     assert 1e-9 * np.abs(K).max() < np.abs(moved).max()
     assert np.abs(moved + moved.transpose(0, 2, 1)).max() < 1e-14 * np.abs(K).max()
-    assert linear.solve() and context.single is None
-    linear.stiffness.update_entries()
-    K = dense(linear.stiffness.matrix)
-    assert np.abs(written_out(linear.operator.mult, scene.balance.work_vector) - K).max() < 1e-14 * np.abs(K).max()
+    assert linear.solve() and context.fine_level is None
+    linear.tangent.update_entries()
+    K = dense(linear.tangent.matrix)
+    assert (
+        np.abs(written_out(linear.operators.operator.mult, scene.balance.work_vector) - K).max()
+        < 1e-14 * np.abs(K).max()
+    )
 
 
 @pytest.mark.parametrize("step", [5e-3, 0.8])
 def test_what_is_rounded_is_found_by_the_next_correction(step: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same motion as with corrections in double precision, in as many iterations, also in steps so long that
     inertia has some 1e-6 of a cell's stiffness; which those are where it holds next to nothing."""
-    monkeypatch.setattr(block_operator, "SMALL", 0)
+    set_policy(monkeypatch, min_block_dofs=0)
     pulled = [{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [0.02 / step, 0.0, 0.0]}]
     more = {"time": {"end": 200 * step, "scheme": "backward-euler", "step": step}, "boundary": pulled}
     its, u = [], []
-    for rounded in (linear_room.ROUNDED, np.inf):
-        monkeypatch.setattr(linear_room, "ROUNDED", rounded)
+    for rounded in (DEFAULT_POLICY.min_single_precision_inertia, np.inf):
+        set_policy(monkeypatch, min_single_precision_inertia=rounded)
         scene = bar(3, {"snes_type": "newtonls", "snes_rtol": 1e-9}, **more)
-        assert step < 0.8 or linear_room.mass_stiffness_ratio(scene.balance) < 2e-6
+        assert step < 0.8 or mass_stiffness_ratio(scene.balance) < 2e-6
         walk = Walk(scene)
         its.append([walk.advance().solve.newton_iterations for _ in range(4)])
         u.append(walk.u)
-        assert (linear_of(scene).operator.getPythonContext().single is None) == (rounded == np.inf)
+        assert (linear_of(scene).operators.operator.getPythonContext().fine_level is None) == (rounded == np.inf)
     assert its[0] == its[1]
     np.testing.assert_allclose(*u, rtol=0, atol=1e-8 * np.abs(u[1]).max())
 
@@ -224,29 +229,29 @@ def test_what_is_rounded_is_found_by_the_next_correction(step: float, monkeypatc
 def test_coarse_spaces_are_kept_where_no_edge_has_broken(monkeypatch: pytest.MonkeyPatch) -> None:
     """Once CG has taken longer by some iterations, the cycle is made anew on the same ones; once by more of them, or
     where edges broke, everything is."""
-    monkeypatch.setattr(block_operator, "SMALL", 0)
+    set_policy(monkeypatch, min_block_dofs=0)
     scene = bar(3, {})
     Walk(scene).advance()
     linear, preconditioner = linear_of(scene), linear_of(scene).preconditioner
-    all_of_it, some = preconditioner_room.SET_UP, preconditioner_room.REFRESHED
+    all_of_it, some = DEFAULT_POLICY.vcycle_setup_cost, DEFAULT_POLICY.vcycle_refresh_cost
     assert 1 < some + 1 < 2 * some + 2 < all_of_it
     for extra, broke, cycle_kept, spaces_kept in (
         (some - 1, 0, True, True), (some + 1, 0, False, True), (2 * some, 0, True, True),
         (2 * some + 2, 0, False, True), (all_of_it + 1, 0, False, False),
         (some + 1, 1, True, True), (all_of_it + 1, 1, False, False), (some + 1, 0, False, True),
     ):  # fmt: skip
-        preconditioner._extra = extra
-        preconditioner.damage_changed(broke)
-        made, spaces = preconditioner._cycle, preconditioner.pc.getMGInterpolation(1)
+        preconditioner._extra_iterations = extra
+        preconditioner.edges_broke(broke)
+        made, spaces = preconditioner._vcycle, preconditioner.pc.getMGInterpolation(1)
         assert linear.solve()
-        assert (preconditioner._cycle is made) == cycle_kept, (extra, broke)
+        assert (preconditioner._vcycle is made) == cycle_kept, (extra, broke)
         assert (preconditioner.pc.getMGInterpolation(1).handle == spaces.handle) == spaces_kept, (extra, broke)
 
 
 def test_without_a_compiler_petscs_own_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(block_operator, "SMALL", 0)
+    set_policy(monkeypatch, min_block_dofs=0)
     monkeypatch.setattr(bcsr, "compile_block_csr", lambda *_: None)
     scene = bar(3, {})
     assert Walk(scene).advance().solve.converged
     preconditioner = linear_of(scene).preconditioner
-    assert preconditioner._cycle is None and preconditioner.serving.getType() == "gamg"
+    assert preconditioner._vcycle is None and preconditioner.serving.getType() == "gamg"

@@ -14,16 +14,17 @@ class Hill:
     """A balance whose potential is that of the place x (1,), J; something always touches."""
 
     def __init__(self) -> None:
-        self.vector, self.moves, self._x = PETSc.Vec().createSeq(1), 0, 0.0
+        self.work_vector, self.displacement_version, self._x = PETSc.Vec().createSeq(1), 0, 0.0
+        self.contact = self.energies = self
 
-    def displace_to(self, x: PETSc.Vec) -> None:
+    def set_iterate(self, x: PETSc.Vec) -> None:
         if x.array_r[0] != self._x:
-            self._x, self.moves = float(x.array_r[0]), self.moves + 1
+            self._x, self.displacement_version = float(x.array_r[0]), self.displacement_version + 1
 
-    def acts(self) -> bool:
+    def is_active(self) -> bool:
         return True
 
-    def potential(self) -> tuple[float, float]:
+    def incremental_potential(self) -> tuple[float, float]:
         return self._x, 1.0
 
 

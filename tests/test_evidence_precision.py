@@ -396,7 +396,7 @@ def test_the_first_screen_has_the_cheapest_of_each_case_and_its_peers() -> None:
 
 
 def test_the_tolerances_called_default_are() -> None:
-    from fracsim.solvers.linear_solver import DEFAULTS
+    from fracsim.solvers.linear_solver import DEFAULT_OPTIONS
     from fracsim.studies.evidence.precision import finite
 
-    assert (DEFAULTS["snes_rtol"], DEFAULTS["ksp_rtol"]) == finite.DEFAULT
+    assert (DEFAULT_OPTIONS["snes_rtol"], DEFAULT_OPTIONS["ksp_rtol"]) == finite.DEFAULT

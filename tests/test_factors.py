@@ -51,7 +51,7 @@ def test_a_body_that_cg_is_cheap_for_keeps_it() -> None:
     for solver in (solvers.WAYS["default"], solvers.WAYS["CG"]):
         scene, walk = make_scene(**{key: study[key] for key in TABLES}, solver=solver)
         found.append([walk.advance().solve.krylov_iterations for _ in range(2)])
-        assert scene.solver is not None and scene.solver._choice.left == 0
+        assert scene.solver is not None and scene.solver.selector.remaining == 0
         scene.destroy()
     assert found[0] == found[1]
 
@@ -61,7 +61,7 @@ def test_factors_that_are_preferred_find_a_stable_balance() -> None:
     positive (dense eigenvalues)."""
     scene, walk = pressed(solver={"snes_rtol": 1e-9})
     assert scene.solver is not None
-    scene.solver._choice.take(preferred=True)
+    scene.solver.selector.start_spell(preferred=True)
     assert walk.advance().solve.converged
     assert abs(displacement(scene, walk)[:, 0]).max() > 0.2 and scene.balance.stress.stored_energy() < 20.0
     free = np.flatnonzero(scene.balance.motion.free_dofs)
@@ -77,20 +77,20 @@ def test_what_factors_tell_is_what_dense_eigenvalues_tell(shift: float, positive
     X = scene.domain.nodes
     straight = np.stack([0.0 * X[:, 0], shift * X[:, 1]], axis=1).reshape(-1)
     balance.set_displacement(straight)
-    with solver.linear.factors.of(solver.snes.ksp):
+    with solver.linear.factors():
         balance.work_vector.array_w[:] = 1.0
         assert solver.linear.solve()
-        solver.linear.factors.learn(solver.snes.ksp)
-        told, beside = solver.linear.factors.worth, PETSc.PC().create(scene.domain.comm)
+        solver.linear.direct.measure_cost(solver.snes.ksp)
+        told, beside = solver.linear.direct.equivalent_iterations, PETSc.PC().create(scene.domain.comm)
         beside.setType("python")  # as where springs beside the tangent go before the factors
         beside.setOperators(*solver.snes.ksp.getOperators())
         solver.snes.ksp.setPC(beside)
-        solver.linear.factors.learn(solver.snes.ksp)
-        assert solver.linear.factors.worth == told
+        solver.linear.direct.measure_cost(solver.snes.ksp)
+        assert solver.linear.direct.equivalent_iterations == told
     free = np.flatnonzero(balance.motion.free_dofs)
     least = np.linalg.eigvalsh(dense_tangent(scene)[np.ix_(free, free)])[0]
-    assert (least > 0) == positive == solver.linear.factors.positive
-    assert 1 < solver.linear.factors.worth < 100
+    assert (least > 0) == positive == solver.linear.direct.is_positive
+    assert 1 < solver.linear.direct.equivalent_iterations < 100
 
 
 def test_factors_that_could_not_be_made_are_not_kept() -> None:
@@ -102,16 +102,17 @@ def test_factors_that_could_not_be_made_are_not_kept() -> None:
     ksp, (b, x) = PETSc.KSP().create(PETSc.COMM_SELF), K.createVecs()
     b.set(1.0)
     ksp.setType("cg")
-    factors = DirectSolver(SimpleNamespace(pc=ksp.getPC(), due=None, keep=True), symmetric=True, dofs=2, dim=2)
+    factors = DirectSolver(symmetric=True, dofs=2, dim=2)
+    tangent: Any = SimpleNamespace(
+        update_entries=lambda: None, set_on=lambda ksp, pc: (ksp.setPC(pc), ksp.setOperators(K))
+    )
     for _ in range(2):
-        with factors.of(ksp):
-            ksp.setPC(factors._pc)
-            ksp.setOperators(K)
+        with factors.serving(ksp, ksp.getPC()):
+            factors.update(ksp, tangent)
             ksp.solve(b, x)
             assert ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED
     K.shift(2.0)
-    with factors.of(ksp):
-        ksp.setPC(factors._pc)
-        ksp.setOperators(K)
+    with factors.serving(ksp, ksp.getPC()):
+        factors.update(ksp, tangent)
         ksp.solve(b, x)
     assert x.array == pytest.approx([0.5, 0.5])

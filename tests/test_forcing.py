@@ -9,15 +9,10 @@ import pytest
 
 import fracsim.mechanics.tangent as tangent_module
 from fracsim.solvers.forcing_terms import (
-    LOOSE,
-    LOOSEST,
-    MOST,
-    ROUGHEST,
-    SHARE,
-    SMALL,
     ContractionForcing,
     EisenstatWalkerForcing,
 )
+from fracsim.solvers.policy import DEFAULT_POLICY
 from support.scenes import make_scene, march, positions
 from test_itself import SOFT, two_blocks
 
@@ -30,15 +25,15 @@ def nothing() -> float:
 
 
 def test_digits_are_asked_for_as_the_residual_falls() -> None:
-    """0.9 (|r_k| / |r_k-1|)^2 between rtol and LOOSE; no more of them than the solution needs."""
+    """0.9 (|r_k| / |r_k-1|)^2 between rtol and loosest_with_contact; no more of them than the solution needs."""
     forcing = EisenstatWalkerForcing(RTOL)
-    assert forcing.tolerance_for(10.0, 0.0) == LOOSE  # nothing is known of the first
-    assert forcing.tolerance_for(5.0, 0.0) == LOOSE
+    assert forcing.tolerance_for(10.0, 0.0) == DEFAULT_POLICY.loosest_with_contact  # nothing is known of the first
+    assert forcing.tolerance_for(5.0, 0.0) == DEFAULT_POLICY.loosest_with_contact
     assert forcing.tolerance_for(0.1, 0.0) == pytest.approx(0.9 * 0.02**2)
     assert forcing.tolerance_for(1e-6, 0.0) == RTOL
     assert forcing.tolerance_for(1e-8, 1e-10) == pytest.approx(1e-3)
     forcing.begin_attempt()
-    assert forcing.tolerance_for(1e-6, 0.0) == LOOSE and forcing.tight_tolerance() == RTOL
+    assert forcing.tolerance_for(1e-6, 0.0) == DEFAULT_POLICY.loosest_with_contact and forcing.tight_tolerance() == RTOL
 
 
 def test_iterations_are_those_of_an_exact_solve() -> None:
@@ -56,33 +51,33 @@ def test_without_contact_a_solve_leaves_a_share_of_what_the_tangent_leaves() -> 
     assert not sparing.record_iterate(1.0, 1e-5, nothing)
     assert sparing.tolerance_for(1e-5, kept=False) == RTOL  # nothing is known of the first
     assert not sparing.record_iterate(0.05, 1e-5, nothing)
-    assert sparing.tolerance_for(1e-5, kept=False) == pytest.approx(SHARE * 0.05**2)
+    assert sparing.tolerance_for(1e-5, kept=False) == pytest.approx(DEFAULT_POLICY.cg_share * 0.05**2)
     assert sparing.record_iterate(1e-4, 1e-5, nothing)  # which leaves 4e-7 of r, less than LEFT of little
-    assert sparing.tolerance_for(1e-5, kept=True) == pytest.approx(SMALL * 1e-5 / 1e-4)
+    assert sparing.tolerance_for(1e-5, kept=True) == pytest.approx(DEFAULT_POLICY.cg_share_of_solution * 1e-5 / 1e-4)
     sparing.begin_attempt()
     sparing.record_iterate(1.0, 1e-5, nothing)
-    assert sparing.tolerance_for(1e-5, kept=False) == pytest.approx(SHARE * 0.05)
+    assert sparing.tolerance_for(1e-5, kept=False) == pytest.approx(DEFAULT_POLICY.cg_share * 0.05)
 
 
 def test_what_cg_leaves_is_not_taken_for_what_the_tangent_leaves() -> None:
     """Where CG leaves more of r than of its own norm the first solve of the next attempt leaves less of that, so that
-    at most MOST of q are CG's."""
+    at most DEFAULT_POLICY.cg_share_of_residual of q are CG's."""
     sparing = ContractionForcing(RTOL)
     sparing.record_iterate(10.0, 1e-5, nothing)
     assert sparing.tolerance_for(1e-5, kept=False) == RTOL
     sparing.record_iterate(0.5, 1e-5, lambda: 1e-3)  # ten times RTOL of r
     sparing.begin_attempt()
     sparing.record_iterate(10.0, 1e-5, nothing)
-    assert sparing.tolerance_for(1e-5, kept=False) == pytest.approx(MOST * 0.05 / 10)
+    assert sparing.tolerance_for(1e-5, kept=False) == pytest.approx(DEFAULT_POLICY.cg_share_of_residual * 0.05 / 10)
 
 
 def test_no_correction_is_rougher_than_may_be() -> None:
     sparing = ContractionForcing(RTOL)
     sparing.record_iterate(1.0, 1e-6, nothing)
     assert not sparing.record_iterate(0.9, 1e-6, nothing)  # a tangent that leaves nearly all of r
-    assert sparing.tolerance_for(1e-6, kept=False) == ROUGHEST
+    assert sparing.tolerance_for(1e-6, kept=False) == DEFAULT_POLICY.loosest_correction
     sparing.record_iterate(1e-9, 1e-6, nothing)
-    assert sparing.tolerance_for(1e-6, kept=True) == LOOSEST  # far below what is little
+    assert sparing.tolerance_for(1e-6, kept=True) == DEFAULT_POLICY.loosest_last_correction  # far below what is little
     sparing.record_iterate(0.0, 0.0, nothing)
     assert sparing.tolerance_for(0.0, kept=True) >= RTOL  # nothing divides by a residual of 0
     assert sparing.equivalent_iterations(2) == 0  # too few to tell

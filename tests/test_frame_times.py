@@ -23,8 +23,8 @@ from fracsim.report.pictures.picture import render
 from fracsim.report.pictures.picture_options import PictureOptions
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
+from fracsim.solvers.newton import SolveResult
 from fracsim.study import Study
-from fracsim.timestepping.stepper import SolveResult
 from support.solids import lattice
 
 Values = npt.NDArray[np.float64]

@@ -18,9 +18,9 @@ from fracsim.mesh.fragments import find_fragments
 from fracsim.mesh.node_cells import node_components
 from fracsim.scene import Scene
 from fracsim.solvers.deflation import create_deflation
-from fracsim.solvers.multigrid import block_operator
-from fracsim.solvers.preconditioner import Due
+from fracsim.solvers.preconditioner import Update
 from support.scenes import Walk, each_step, make_scene, march
+from support.solver_policy import set_policy
 from test_cycle import by_hand, dense, written_out
 
 Values = npt.NDArray[np.float64]
@@ -206,21 +206,21 @@ def test_ties_beside_blocks_are_those_among_single_entries(dim: int) -> None:
 @pytest.mark.parametrize("dim", (2, 3))
 def test_ties_beside_blocks_are_in_products_and_in_the_cycle(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """As they are now, written out: also ties a hundred times as stiff as when multigrid was set up."""
-    monkeypatch.setattr(block_operator, "SMALL", 0)
+    set_policy(monkeypatch, min_block_dofs=0)
     finer = MESHES[dim] | {"h": {2: 0.6, 3: 0.7}[dim] * MESHES[dim]["h"]}
     scene, _, tethers = tied(dim, mesh=finer, solver={"snes_type": "ksponly", "ksp_rtol": 1e-8})
     linear, stiffness = scene.solver.linear, scene.balance.tangent  # type: ignore[union-attr]
     assert linear.solve()
-    made, pc = linear.preconditioner._cycle, linear.preconditioner.pc
+    made, pc = linear.preconditioner._vcycle, linear.preconditioner.pc
     assert made is not None
     A = [dense(pc.getMGSmoother(level).getOperators()[1]) for level in range(pc.getMGLevels())]
     P = [dense(pc.getMGInterpolation(level)) for level in range(1, len(A))]
     for stiffer in (1.0, 100.0):
         tethers.stiffness *= stiffer
         tethers._set_ties(tethers.ties)
-        linear.preconditioner.due = Due.NOTHING
+        linear.preconditioner._due = Update.NONE
         assert linear.solve()
-        products = written_out(linear.operator.mult, scene.balance.work_vector)
+        products = written_out(linear.operators.operator.mult, scene.balance.work_vector)
         stiffness.update_entries()
         before, A[-1] = A[-1], dense(stiffness.matrix)
         assert (np.abs(A[-1] - before).max() > 0.01 * np.abs(before).max()) == (stiffer > 1)

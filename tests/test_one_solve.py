@@ -86,7 +86,7 @@ def test_a_whole_body_at_rest_is_solved_as_one() -> None:
     assert [each.newton_iterations for each in solves] == [1, 0, 0, 0, 0] and solves[0].krylov_iterations > 3
     assert len(list(each_step(exact.scene, exact))) == 5
     np.testing.assert_allclose(state.u, exact.u, atol=1e-6 * np.abs(exact.u).max())
-    assert not make_scene(**tables | TORN | {"solver": {}})[0].solver.linear.linearly
+    assert not make_scene(**tables | TORN | {"solver": {}})[0].solver.linear.steps_are_linear
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from fracsim.mechanics.psd_projection import psd_correction
-from fracsim.solvers import newton
+from fracsim.solvers.policy import DEFAULT_POLICY
 from support.reference import dense_tangent
 from support.scenes import displacement, make_scene, positions
+from support.solver_policy import set_policy
 
 RANDOM = np.random.default_rng(3)
 
@@ -72,7 +73,7 @@ def test_a_step_that_exact_tangents_do_not_get_through_is_taken() -> None:
     )
     assert abs(displacement(scene, walk)[:, 0]).max() > 0.2
     assert balance.stress.stored_energy() < 20.0
-    assert scene.solver is not None and scene.solver._downhill is not None
+    assert scene.solver is not None and scene.solver._newton._second_modified is not None
 
 
 def test_a_first_guess_that_is_inside_out_gives_way_to_the_start_of_the_step() -> None:
@@ -102,8 +103,8 @@ def test_what_crawls_goes_on_down_the_potential(monkeypatch: pytest.MonkeyPatch)
     """A step of a block that is swung, by the norm of its residual and, from the first iteration on, down its
     potential: to the same place, which no norm has to be halved for."""
     found = []
-    for crawl in (newton.CRAWL, 0):
-        monkeypatch.setattr(newton, "CRAWL", crawl)
+    for crawl in (DEFAULT_POLICY.crawl_iterations, 0):
+        set_policy(monkeypatch, crawl_iterations=crawl)
         scene, state = make_scene(
             mesh={"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.34}, solver={"snes_rtol": 1e-10},
             material={"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 1.0},
@@ -112,6 +113,6 @@ def test_what_crawls_goes_on_down_the_potential(monkeypatch: pytest.MonkeyPatch)
         state.v = np.where(state.u == 0, 3.0 * positions(scene)[:, [1, 2, 0]].reshape(-1), 0.0)
         state.settle()
         state.advance()
-        assert scene.solver is not None and (scene.solver._downhill is not None) == (crawl == 0)
+        assert scene.solver is not None and (scene.solver._newton._second_modified is not None) == (crawl == 0)
         found.append(state.u.copy())
     np.testing.assert_allclose(found[1], found[0], atol=1e-7 * np.abs(found[0]).max())

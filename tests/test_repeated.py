@@ -8,7 +8,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 import fracsim.solvers.petsc_options  # noqa: F401
-from fracsim.solvers.rigid_body_modes import rigid_body_nullspace
+from fracsim.solvers.preconditioner import rigid_body_nullspace
 
 SIZE = 1001
 FAR = 4000

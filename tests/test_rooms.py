@@ -22,8 +22,6 @@ ARCHITECTURE = Path(__file__).parent.parent / "docs" / "architecture.md"
 # rooms of a floor do not know one another; they may use the floors before theirs
 FLOORS = ({"mesh"}, {"mechanics"}, {"contact", "fracture", "solvers"}, {"timestepping"}, {"rigid"}, {"output"})
 LAYERS = tuple(room for floor in FLOORS for room in sorted(floor))
-# Newton's method returns the stepper's SolveResult: file -> what it uses of a floor above
-ABOVE = {"solvers/newton.py": {"timestepping.stepper"}, "solvers/nonlinear_solver.py": {"timestepping.stepper"}}
 BELOW = {"errors", "forms", "meshes"}  # what any of them may use
 # modules that the study room uses: those without DOLFINx
 WITHOUT_DOLFINX = {
@@ -64,7 +62,7 @@ def own(room: str) -> dict[str, set[str]]:
         package = ".".join(["fracsim", *path.relative_to(ROOT).parent.parts])
         names = {name for name in imports(path, package) if name.split(".")[0] == "fracsim"}
         file = path.relative_to(ROOT).as_posix()
-        result[file] = {name.removeprefix("fracsim").strip(".") for name in names} - ABOVE.get(file, set())
+        result[file] = {name.removeprefix("fracsim").strip(".") for name in names}
     assert result
     return result
 

@@ -27,8 +27,7 @@ from ..mechanics.jit import CellExpression, CellForm, cell_measure
 from ..mechanics.matrix_assembly import TangentAssembler
 from ..mechanics.stress import Stress
 from ..solvers.petsc_options import PetscOptions, PetscOptionSet, call_petsc
-from ..solvers.preconditioner import GAMG_OPTIONS
-from ..solvers.rigid_body_modes import rigid_body_nullspace
+from ..solvers.preconditioner import GAMG_OPTIONS, rigid_body_nullspace
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -11,8 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..contact.obstacle import RigidObstacle
-from ..errors import NotConverged
-from ..timestepping.stepper import StepAborted
+from ..errors import NotConverged, StepAborted
 from .bodies import Bodies
 from .contact_points import ContactImpulses
 from .engine import Engine

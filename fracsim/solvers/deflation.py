@@ -29,24 +29,25 @@ from ..mechanics.term_protocols import TieTerm
 from ..mesh.domain import Domain
 from ..mesh.node_cells import node_components
 from ..mesh.parallel import allgather, sum_over_ranks
+from .policy import DEFAULT_POLICY, SolverPolicy
 from .weak_callbacks import ApplyContext
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-
-DEPENDENT = 1e-8  # of the largest eigenvalue of a part's Gram matrix: motions that are the same on its nodes
 
 
 class DeflatedPreconditioner:
     """The context of a PETSc preconditioner.
 
     Attributes:
-        body: M.    pc: P.
+        base_pc: M.    pc: P.
     """
 
-    def __init__(self, balance: Balance, body: PETSc.PC, nodes: Ints, part: Ints, count: int) -> None:
-        """`nodes`: (n,) owned ones that move with their `part` (n,) of so many."""
-        self._balance, self.base_pc = balance, body
+    def __init__(
+        self, balance: Balance, base_pc: PETSc.PC, nodes: Ints, part: Ints, count: int, policy: SolverPolicy
+    ) -> None:
+        """`nodes`: (n,) owned nodes that move with their fragment, `part` (n,) of `count`."""
+        self._balance, self.base_pc, self._policy = balance, base_pc, policy
         self._nodes, self._part, self._count = nodes, part, count
         self.pc = PETSc.PC().create(balance.domain.comm)
         self.pc.setType("python")
@@ -59,7 +60,7 @@ class DeflatedPreconditioner:
         x, free = domain.nodes[self._nodes], balance.motion.free_dofs.reshape(-1, domain.dim)[self._nodes]
         if not balance.linear:
             x = x + balance.u.x.array.reshape(-1, domain.dim)[self._nodes]
-        columns, values, width = _motions(domain, self._part, x, free, self._count)
+        columns, values, width = _motions(domain, self._part, x, free, self._count, self._policy)
         if not width:
             return False
         self._take(columns, values, width)
@@ -103,7 +104,9 @@ class DeflatedPreconditioner:
         self._rest.destroy()
 
 
-def create_deflation(balance: Balance, base_pc: PETSc.PC) -> DeflatedPreconditioner | None:
+def create_deflation(
+    balance: Balance, base_pc: PETSc.PC, policy: SolverPolicy = DEFAULT_POLICY
+) -> DeflatedPreconditioner | None:
     """That of a body as it is now, whose preconditioner is `body`; None: all of it is one part (collective)."""
     domain, multiplier = balance.domain, balance.stress.energy_multiplier
     if multiplier is None:  # nothing breaks; a restart tells of damage that may have changed all the same
@@ -111,7 +114,9 @@ def create_deflation(balance: Balance, base_pc: PETSc.PC) -> DeflatedPreconditio
     count, part = node_components(domain, multiplier.x.array[: domain.cell_count] > 0)
     _join_tied(balance, part)
     nodes = np.flatnonzero(part > 0)
-    return DeflatedPreconditioner(balance, base_pc, nodes, part[nodes] - 1, count - 1) if count > 1 else None
+    if count <= 1:
+        return None
+    return DeflatedPreconditioner(balance, base_pc, nodes, part[nodes] - 1, count - 1, policy)
 
 
 def _join_tied(balance: Balance, part: Ints) -> None:
@@ -130,7 +135,7 @@ def _join_tied(balance: Balance, part: Ints) -> None:
 
 
 def _motions(
-    domain: Domain, part: Ints, x: Values, free: npt.NDArray[np.bool_], count: int
+    domain: Domain, part: Ints, x: Values, free: npt.NDArray[np.bool_], count: int, policy: SolverPolicy
 ) -> tuple[Ints, Values, int]:
     """Orthonormal rigid motions of `count` parts at nodes (n,) of this rank at x (n, d): columns (n, r) and values
     (n, d, r), and how many columns there are on all ranks; values of column -1 are none (collective)."""
@@ -143,7 +148,7 @@ def _motions(
     gram = np.zeros((count, B.shape[2], B.shape[2]))
     np.add.at(gram, part, np.einsum("ndi,ndj->nij", B, B))
     values, vectors = np.linalg.eigh(sum_over_ranks(comm, gram))
-    kept = values > DEPENDENT * np.maximum(values[:, -1:], 1.0)
+    kept = values > policy.dependent_motion * np.maximum(values[:, -1:], 1.0)
     scaled = np.where(kept, 1 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
     columns = np.where(kept, np.cumsum(kept).reshape(kept.shape) - 1, -1)
     return columns[part], np.einsum("ndi,nij,nj->ndj", B, vectors[part], scaled[part]), int(kept.sum())

@@ -1,87 +1,97 @@
-"""Factors instead of iterations, for tangents that no Krylov method gets through: pieces that hang by a thread, or no
-compressibility. A shorter step would be no easier. And where CG takes more iterations than factors cost.
+"""Factors of the tangent in place of Krylov iterations, and what they cost.
 
-What factors cost is known once they have been made: MUMPS counts the operations of its elimination (RINFOG(3)). With
-`FLOPS` of them for each entry of the tangent they take as long as an iteration of CG with multigrid: measured 4 to 16,
-of 13 bodies in the plane and in space, slender, thin, compact, linear, quadratic, with 600 to 100,000 dofs. In the
-plane they are worth 15 to 70 iterations, in space 30 (600 dofs) to 600 (compact, 15,000). A symmetric tangent is
-factorised as one (L D L^T: half the operations), and D tells whether it is positive, as that of a stable balance is.
+Factors serve where no Krylov method converges (fragments that hang by a thread, nearly incompressible bodies), where a
+shorter step would be no easier, and where CG takes more iterations than factors cost. MUMPS counts the operations of
+its elimination, from which the number of iterations that take as long is known (`SolverPolicy.flops_per_iteration`).
 
-MUMPS orders the unknowns once for a pattern, a third of the time in the plane: the object is kept from solve to solve
-until iterations have their turn again, since its factors are memory.
+Equations: docs/theory.md#linear-systems.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from petsc4py import PETSc
 
-from .preconditioner import Due, Preconditioner
+from .policy import DEFAULT_POLICY, SolverPolicy
 
-# dofs up to which a system that no Krylov method gets through is factorised: seconds, and a few GB at most
-FACTORISED = 100_000
-# dofs up to which that takes no longer than GMRES does to give up, by dimension
-SOONER_THAN_GMRES = {2: FACTORISED, 3: 10_000}
-TRIED, FLOPS = 40, 11  # iterations for one tangent from which on it is tried what factors cost; see above
-# iterations of one solve after which it goes on with factors on trial: four tangents' worth, or what factors cost at
-# most in space, where a compact body of n dofs takes n / 16
-MANY, COMPACT = 4, 1 / 16
+if TYPE_CHECKING:
+    from .tangent_operators import TangentOperators
 
 
 class DirectSolver:
-    """The factors of one KSP, which its preconditioner gives way to.
+    """Factors of the tangent by MUMPS, which serve a KSP in place of its preconditioner.
+
+    Symmetric tangents are factorised as L D L^T, at half the operations; D tells whether they are positive definite.
+    The ordering of the unknowns, a third of the time in the plane, is kept until the pattern changes or `release`.
 
     Attributes:
-        worth: iterations of CG that take as long as making them, as far as is known.
-        dear: iterations of a solve from which on it may go on with factors.
-        positive: whether the last tangent was, as far as factors tell: only those of a symmetric one do.
+        equivalent_iterations: iterations of CG that take as long as the factors of one tangent, as far as is known.
+        trial_iterations: iterations of an attempt from which on it may go on with factors.
+        is_positive: whether the last tangent was positive definite; True where it is not symmetric.
+        serves: whether the KSP solves by factors now.
     """
 
-    def __init__(self, preconditioner: Preconditioner, *, symmetric: bool, dofs: int, dim: int) -> None:
-        """`symmetric`: all tangents are."""
-        self._preconditioner, self._symmetric = preconditioner, symmetric
-        self.worth, self.positive = float(TRIED), True
-        self.dear = max(MANY * TRIED, dofs * COMPACT if dim == 3 else 0.0)
+    def __init__(self, *, symmetric: bool, dofs: int, dim: int, policy: SolverPolicy = DEFAULT_POLICY) -> None:
+        """`symmetric`: all tangents are; `dofs`, `dim`: of the body."""
+        self._policy, self._symmetric = policy, symmetric
+        self.equivalent_iterations, self.is_positive = float(policy.assumed_direct_cost), True
+        compact = dofs * policy.compact_direct_cost if dim == 3 else 0.0
+        self.trial_iterations = max(policy.tangents_on_trial * policy.assumed_direct_cost, compact)
+        self.serves = False
         self._pc: PETSc.PC | None = None
 
     @contextmanager
-    def of(self, ksp: PETSc.KSP) -> Iterator[None]:
-        """Solve by factors, for as long as it lasts (collective)."""
-        preconditioner, kind = self._preconditioner, ksp.getType()
-        iterative, preconditioner.due = preconditioner.pc, Due.REFRESH
-        preconditioner.pc = self._pc = self._pc or self._made(ksp)
-        preconditioner.keep = False
+    def serving(self, ksp: PETSc.KSP, afterwards: PETSc.PC) -> Iterator[None]:
+        """Solve by factors within the block, with the preconditioner `afterwards` after it (collective)."""
+        method = ksp.getType()
         ksp.setType("preonly")
+        self.serves = True
         try:
             yield
         finally:
-            ksp.setType(kind)
-            ksp.setPC(iterative)
-            preconditioner.pc, preconditioner.due, preconditioner.keep = iterative, Due.REBUILD, True
+            self.serves = False
+            ksp.setType(method)
+            ksp.setPC(afterwards)
             if ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
-                self.forget()  # PETSc takes them for set up the next time, and MUMPS has nothing to solve with
+                self.release()  # PETSc takes failed factors for made the next time
 
-    def forget(self) -> None:
-        """Give their memory back (collective)."""
+    @property
+    def pc(self) -> PETSc.PC:
+        """The factors as a preconditioner."""
+        assert self._pc is not None
+        return self._pc
+
+    def update(self, ksp: PETSc.KSP, operators: TangentOperators) -> None:
+        """Factorise the tangent of the next solve (collective)."""
+        operators.update_entries()
+        if self._pc is None:
+            self._pc = PETSc.PC().create(ksp.comm)
+            self._pc.setType("cholesky" if self._symmetric else "lu")
+            self._pc.setFactorSolverType("mumps")
+        operators.set_on(ksp, self._pc)
+
+    def pattern_changed(self) -> None:
+        """The tangent has entries at other places: factors of the old ones would be written past their arrays."""
+        if self._pc is not None:
+            self._pc.reset()
+
+    def measure_cost(self, ksp: PETSc.KSP) -> None:
+        """Learn what the factors that served last cost, and whether the tangent is positive definite (collective).
+
+        The KSP's own preconditioner may be another one, which corrects these factors for springs (low_rank).
+        """
+        factors, entries = self.pc.getFactorMatrix(), ksp.getOperators()[1].getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)
+        operations = factors.getMumpsRinfog(3)
+        self.equivalent_iterations = operations / (self._policy.flops_per_iteration * entries["nz_used"])
+        self.trial_iterations = self._policy.tangents_on_trial * self.equivalent_iterations
+        negative_pivots = factors.getMumpsInfog(12)
+        self.is_positive = not self._symmetric or negative_pivots == 0
+
+    def release(self) -> None:
+        """Give the memory of the factors back (collective)."""
         if self._pc is not None:
             self._pc.destroy()
             self._pc = None
-
-    def _made(self, ksp: PETSc.KSP) -> PETSc.PC:
-        pc = PETSc.PC().create(ksp.comm)
-        pc.setType("cholesky" if self._symmetric else "lu")
-        pc.setFactorSolverType("mumps")
-        return pc
-
-    def learn(self, ksp: PETSc.KSP) -> None:
-        """What the factors cost that have just served, and what they tell (collective).
-
-        With springs beside the tangent the KSP's own preconditioner is what has them in it (solvers.low_rank).
-        """
-        assert self._pc is not None
-        factors, entries = self._pc.getFactorMatrix(), ksp.getOperators()[1].getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)
-        self.worth = factors.getMumpsRinfog(3) / (FLOPS * entries["nz_used"])
-        self.dear = MANY * self.worth
-        self.positive = not self._symmetric or factors.getMumpsInfog(12) == 0  # negative pivots

@@ -1,22 +1,6 @@
-"""Newton's method down the incremental potential: the objective of a SNES, and tangents that are made positive.
+"""The line search of Newton's method: its merit function, tangents made positive, and clipped corrections.
 
-Exact tangents of a body that tears, buckles or is squeezed are not positive: CG stops, and what other methods find may
-go up. With positive moduli (mechanics.psd_projection) directions go down from anywhere. Near the solution tangents are
-exact again, for there Newton's method gains its digits; where they are not positive even there, they stay as they were
-made.
-
-What the line search of Newton's method goes down where contact limits its steps, or moduli are made positive.
-
-The incremental potential: on the norm of r, which a barrier makes steep, it cuts good steps to nothing. But where no
-contact acts at either end of a step the norm tells as well, and its residual is asked for next anyway; the energy of
-the body is then not summed at all.
-
-Corrections that would throw few nodes far are held back there, so that all others go their whole way.
-
-With moduli made positive a cell that is all but flat, or hangs by a node, has next to no stiffness in some direction:
-Newton's correction throws its nodes tens to hundreds of edges far, and the line search cuts everybody's to a twentieth
-for their sake, iteration after iteration. So a node goes no further than an edge, unless many would: what a whole part
-does is its motion. What is held back is found again from where it has come to.
+Equations: docs/theory.md#newtons-method.
 """
 
 from __future__ import annotations
@@ -30,190 +14,203 @@ from petsc4py import PETSc
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
+from .policy import DEFAULT_POLICY, SolverPolicy
 from .weak_callbacks import weak_callback
 
-# Potentials that differ by less than this share of their terms are the same.
-ROUND_OFF = 1e4 * float(np.finfo(float).eps)
-NEARLY = 1e3  # times that: whole steps that rise by no more are near the solution
-DOWN = -1e100  # J: taken as it is
-FEW = 0.03  # of all nodes, which are held back at most
-PATIENCE = 10  # iterations with exact tangents that find no smaller residual, after which there is no use in more
+TAKEN_AT_ONCE = -1e100  # J: a merit so low that the step is accepted
 
 
 class MeritFunction:
-    """The objective of a SNES, J: how far it is above where the step set out."""
+    """The merit function of a SNES: rise of the incremental potential since the start of the iteration, J.
 
-    def __init__(self, balance: Balance, snes: PETSc.SNES) -> None:
-        self._balance, self._snes = balance, snes
-        self._from, self._residual = balance.work_vector.duplicate(), balance.work_vector.duplicate()
+    On |r|, which a barrier makes steep, a line search cuts good steps to nothing. Where no contact acts at either end
+    of a step a fall of |r| is accepted as well: its residual is asked for next anyway, and no energy has to be summed.
+    """
+
+    def __init__(self, balance: Balance, snes: PETSc.SNES, policy: SolverPolicy = DEFAULT_POLICY) -> None:
+        self._balance, self._snes, self._policy = balance, snes, policy
+        self._start, self._residual = balance.work_vector.duplicate(), balance.work_vector.duplicate()
         self.begin_solve()
 
     def begin_solve(self) -> None:
         """A solve begins: nothing is known of it."""
-        self._whole: float | None = None  # J, what the whole step of an iteration rises by
-        self._known, self._known_at, self._residual_at = (0.0, 0.0), -1, -1  # after how many moves of the body
-        self._height, self._norm, self._sets_out, self._by_norm = 0.0, 0.0, True, False
-        self._rested = False
+        self._whole_step_rise: float | None = None  # J, of the first trial of an iteration
+        # Values are known by the version of the displacement that they belong to.
+        self._potential_known, self._potential_version, self._residual_version = (0.0, 0.0), -1, -1
+        self._start_potential, self._start_norm = 0.0, 0.0
+        self._at_start, self._by_norm, self._eliminated = True, False, False
 
     def begin_line_search(self) -> None:
-        """The direction of an iteration is found: PETSc asks for its start next."""
-        self._sets_out = True
+        """The direction of an iteration is known: PETSc asks for the merit of its start next."""
+        self._at_start = True
 
     def note_elimination(self) -> None:
-        """Some nodes went down by themselves, where the residual of others may rise: from here on the norm is no merit,
-        or what they gained would be given back, again and again."""
-        self._rested = True
+        """Nodes were relaxed separately, where the residual of others may rise: from here on |r| is no merit, or what
+        they gained would be given back in each iteration."""
+        self._eliminated = True
 
     def evaluate_residual(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
         """r at x into b (collective)."""
         self._balance.set_iterate(x)
-        if self._residual_at == self._balance.displacement_version:
+        if self._residual_version == self._balance.displacement_version:
             self._residual.copy(b)
         else:
             self._balance.assemble_free_residual(x, b)
 
     def __call__(self, x: PETSc.Vec) -> float:
-        """J, at x (collective).
+        """The merit at x, J (collective).
 
-        Near the solution potentials differ by round-off alone: such a step counts as one downwards, so that it is taken
-        whole. One that was cut until it made no difference is none: its direction goes up.
+        Near the solution potentials differ by round-off alone: such a whole step counts as a descent. A step that was
+        cut until it made no difference does not: its direction rises.
         """
         self._balance.set_iterate(x)
-        if self._sets_out:
-            self._set_out_from(x)
+        if self._at_start:
+            self._start_from(x)
             return 0.0
         if self._by_norm:
-            if not self._balance.contact.is_active() and self._norm_at(x) < self._norm:
-                return DOWN
-            self._ask_for_the_start(x)
+            if not self._balance.contact.is_active() and self._norm_at(x) < self._start_norm:
+                return TAKEN_AT_ONCE
+            self._evaluate_start(x)
         potential, size = self._potential()
-        rise, slack = potential - self._height, ROUND_OFF * size
-        if self._whole is None:
-            self._whole = rise
-        return -slack if abs(rise) <= slack and self._whole <= NEARLY * slack else rise
+        rise, slack = potential - self._start_potential, self._policy.potential_round_off * size
+        if self._whole_step_rise is None:
+            self._whole_step_rise = rise
+        is_near = self._whole_step_rise <= self._policy.near_solution * slack
+        return -slack if abs(rise) <= slack and is_near else rise
 
-    def _set_out_from(self, x: PETSc.Vec) -> None:
-        self._sets_out, self._whole = False, None
-        self._by_norm = not self._rested and not self._balance.contact.is_active()
+    def _start_from(self, x: PETSc.Vec) -> None:
+        self._at_start, self._whole_step_rise = False, None
+        self._by_norm = not self._eliminated and not self._balance.contact.is_active()
         if self._by_norm:
-            x.copy(self._from)
-            self._norm = self._snes.getFunctionNorm()
+            x.copy(self._start)
+            self._start_norm = self._snes.getFunctionNorm()
         else:
-            self._height = self._potential()[0]
+            self._start_potential = self._potential()[0]
 
     def _potential(self) -> tuple[float, float]:
-        """Potential and its size where the body is, J; mostly asked for where the line search has just been."""
-        if self._known_at != self._balance.displacement_version:
-            self._known, self._known_at = (
-                self._balance.energies.incremental_potential(),
-                self._balance.displacement_version,
-            )
-        return self._known
+        """Potential and the size of its summands, J; mostly asked for where the line search has just been."""
+        if self._potential_version != self._balance.displacement_version:
+            self._potential_known = self._balance.energies.incremental_potential()
+            self._potential_version = self._balance.displacement_version
+        return self._potential_known
 
     def _norm_at(self, x: PETSc.Vec) -> float:
         """|r| at x, N."""
         self._balance.assemble_free_residual(x, self._residual)
-        self._residual_at = self._balance.displacement_version
+        self._residual_version = self._balance.displacement_version
         return float(self._residual.norm())
 
-    def _ask_for_the_start(self, x: PETSc.Vec) -> None:
-        """Go by the potential after all."""
-        self._balance.set_iterate(self._from)
-        self._height, self._by_norm = self._potential()[0], False
+    def _evaluate_start(self, x: PETSc.Vec) -> None:
+        """Compare potentials after all."""
+        self._balance.set_iterate(self._start)
+        self._start_potential, self._by_norm = self._potential()[0], False
         self._balance.set_iterate(x)
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
-        self._from.destroy()
+        self._start.destroy()
         self._residual.destroy()
 
 
-def clip_correction(domain: Domain, y: PETSc.Vec, r: PETSc.Vec) -> None:
-    """Shorten a correction x <- x - y, m, of the FEW nodes that go further than an edge, where it still leads down a
-    potential whose derivative at x is `r`, N (collective)."""
+def clip_correction(domain: Domain, y: PETSc.Vec, r: PETSc.Vec, policy: SolverPolicy = DEFAULT_POLICY) -> None:
+    """Shorten a correction x <- x - y, m, of nodes that it moves by more than a mean edge (collective).
+
+    With tangents made positive a cell that is all but flat, or hangs by one node, has next to no stiffness in some
+    direction. The correction throws its nodes tens of edges far, for whose sake the line search would cut those of all
+    nodes. At most `max_clipped_nodes` of them are clipped: what a whole part does is its motion. The correction stays
+    as it is where the clipped one is no descent of a potential with the gradient `r`, N.
+    """
     moves = y.array_r.reshape(-1, domain.dim)
-    lengths, far = np.sqrt((moves * moves).sum(axis=1)), domain.mean_edge_length
-    most = FEW * domain.space.dofmap.index_map.size_global
-    while (beyond := sum_over_ranks(domain.comm, np.count_nonzero(lengths > far))[0]) > most:
-        far *= 2
-    if not beyond:
+    lengths, limit = np.sqrt((moves * moves).sum(axis=1)), domain.mean_edge_length
+    allowed = policy.max_clipped_nodes * domain.space.dofmap.index_map.size_global
+    while (clipped := sum_over_ranks(domain.comm, np.count_nonzero(lengths > limit))[0]) > allowed:
+        limit *= 2
+    if not clipped:
         return
     whole = y.copy()
-    y.array_w[:] = (moves * np.minimum(1.0, far / np.maximum(lengths, far))[:, None]).reshape(-1)
+    y.array_w[:] = (moves * np.minimum(1.0, limit / np.maximum(lengths, limit))[:, None]).reshape(-1)
     if y.dot(r) <= 0:
         whole.copy(y)
     whole.destroy()
 
 
 class TangentModification(NamedTuple):
-    """How an attempt goes down.
+    """How tangents are made positive in an attempt.
 
     Attributes:
-        exact_below: share of the greatest residual below which tangents are exact.
-        small: negative eigenvalues that are let be otherwise, in mean moduli of a cell.
-        anew: whether preconditioners are made for each tangent.    goes_on: from where the last attempt has come to.
+        name: of the strategy.
+        exact_below: share of the largest |r| of the attempt below which tangents are exact.
+        eigenvalue_floor: negative eigenvalues that are kept otherwise, in mean moduli of a cell.
+        rebuild_preconditioner: whether preconditioners are set up for each tangent.
+        from_last_iterate: whether it starts where the last attempt ended.
     """
 
+    name: str
     exact_below: float
     eigenvalue_floor: float
     rebuild_preconditioner: bool = False
     from_last_iterate: bool = False
 
 
-# with positive moduli; the second and the third go on from where exact tangents have misled the one before
+# Tried in turn. The second and the third go on from where exact tangents have misled the one before.
 POSITIVE_TANGENTS = (
-    TangentModification(1e-2, 1e-2),
-    TangentModification(1e-2, 0.0, from_last_iterate=True),
-    TangentModification(0.0, 0.0, from_last_iterate=True),
-    TangentModification(0.0, 0.0, rebuild_preconditioner=True),
+    TangentModification("positive tangents", DEFAULT_POLICY.exact_below, DEFAULT_POLICY.eigenvalue_floor),
+    TangentModification("strictly positive tangents", DEFAULT_POLICY.exact_below, 0.0, from_last_iterate=True),
+    TangentModification("strictly positive tangents to the end", 0.0, 0.0, from_last_iterate=True),
+    TangentModification("strictly positive tangents, preconditioner for each", 0.0, 0.0, rebuild_preconditioner=True),
 )
-
-
-EXACT_TANGENTS = TangentModification(math.inf, 0.0, from_last_iterate=True)  # exact tangents throughout
+EXACT_TANGENTS = TangentModification("exact tangents, descent of the potential", math.inf, 0.0, from_last_iterate=True)
 
 
 class ModifiedNewton:
-    """What a SNES goes by.
+    """A SNES whose line search goes down the incremental potential, with tangents that may be made positive.
+
+    Exact tangents of a body that tears, buckles or is squeezed are indefinite: CG stops, and other methods may find a
+    direction that rises. With positive moduli directions descend from anywhere. Near the solution tangents are exact
+    again, where Newton's method converges quadratically.
 
     Attributes:
-        snes: it.    descent: its objective.
+        snes: the SNES.    merit: its merit function.
     """
 
-    def __init__(self, balance: Balance, snes: PETSc.SNES) -> None:
-        """Makes the incremental potential of `balance`, which has one, the objective of `snes`."""
-        self.snes, self._balance = snes, balance
-        self.merit = descent = MeritFunction(balance, snes)
-        objective, residual = weak_callback(descent.__call__), weak_callback(descent.evaluate_residual)
+    def __init__(self, balance: Balance, snes: PETSc.SNES, policy: SolverPolicy = DEFAULT_POLICY) -> None:
+        """Make the incremental potential of a conservative balance the objective of `snes`."""
+        self.snes, self._balance, self._policy = snes, balance, policy
+        self.merit = merit = MeritFunction(balance, snes, policy)
+        objective, residual = weak_callback(merit.__call__), weak_callback(merit.evaluate_residual)
         snes.setObjective(lambda _, x: objective(x))
         snes.setFunction(lambda _, x, b: residual(x, b), balance.work_vector)
         self.use_modification(None)
 
-    def use_modification(self, how: TangentModification | None) -> None:
-        """An attempt begins: tangents are those of a way, or exact."""
-        self._how, self._highest = how, 0.0
-        self._least, self._least_at = math.inf, 0
+    def use_modification(self, modification: TangentModification | None) -> None:
+        """An attempt begins: with tangents of this kind; None: exact ones."""
+        self._modification, self._largest_norm = modification, 0.0
+        self._smallest_norm, self._smallest_at = math.inf, 0
 
-    @property
     def eigenvalue_floor(self) -> float | None:
-        """Of the tangent at the present iterate (Stiffness.assemble); None: it is exact."""
-        if self._how is None:
+        """Negative eigenvalues that the tangent at the present iterate keeps, in mean moduli; None: it is exact."""
+        if self._modification is None:
             return None
         norm = self.snes.getFunctionNorm()
-        self._highest = max(self._highest, norm)
-        return None if norm < self._how.exact_below * self._highest else self._how.eigenvalue_floor
+        self._largest_norm = max(self._largest_norm, norm)
+        is_exact = norm < self._modification.exact_below * self._largest_norm
+        return None if is_exact else self._modification.eigenvalue_floor
 
     def clip_correction(self, y: PETSc.Vec) -> None:
-        """Of a correction what would throw few nodes far, where moduli are made positive (line_search). Without inertia
-        nothing tells where a part goes that hangs by a thread (collective)."""
-        if self._balance.scheme.inertia and self.eigenvalue_floor is not None:
-            clip_correction(self._balance.domain, y, self.snes.getFunction()[0])
+        """Clip a correction from a tangent that was made positive (collective).
+
+        Not without inertia: nothing tells then where a part moves that hangs by a thread.
+        """
+        if self._balance.scheme.inertia and self.eigenvalue_floor() is not None:
+            clip_correction(self._balance.domain, y, self.snes.getFunction()[0], self._policy)
 
     def has_stalled(self, norm: float, its: int) -> bool:
-        """Whether it goes about in circles: exact tangents that are not positive, though CG does not notice, lead past
-        the solution for as long as they may. |r| is `norm`, N, after `its` iterations."""
-        if norm < self._least or not its:
-            self._least, self._least_at = norm, its
-        return self._how is not None and self.eigenvalue_floor is None and its - self._least_at >= PATIENCE
+        """Whether the attempt cycles: exact tangents that are indefinite, though CG does not notice, lead past the
+        solution again and again. |r| is `norm`, N, after `its` iterations."""
+        if norm < self._smallest_norm or not its:
+            self._smallest_norm, self._smallest_at = norm, its
+        is_exact = self._modification is not None and self.eigenvalue_floor() is None
+        return is_exact and its - self._smallest_at >= self._policy.max_stalled_iterations
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""

@@ -1,18 +1,10 @@
-"""A tangent with what is kept beside it: K - sum of U C U^T + sum of C', applied only.
+"""What terms keep beside the entries of a tangent: parts of low rank of its products, stiff springs of its inverse.
 
-The part of low rank is that of unknowns which terms have eliminated, C' the springs (mechanics.extra_couplings).
-
-A preconditioner of a body that is held by a few stiff springs: that of the body, and the springs exactly.
-
-    (P^-1 + U S U^T)^-1 = P - V G V^T,   V = P U,   G = (S^-1 + U^T V)^-1
-
-(Sherman, Morrison and Woodbury). P: the body's own, symmetric; U, S: what a balance has of Stiff. It costs an
-application of P for each spring and tangent, and 2 m products a dof for each iteration.
+Equations: docs/theory.md#linear-systems.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,62 +12,67 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from ..mechanics.extra_couplings import StiffCoupling
+from ..mechanics.tangent import Tangent
 from ..mesh.parallel import sum_over_ranks
 
 Values = npt.NDArray[np.float64]
 
 
 class LowRankOperator:
-    """The context of a PETSc matrix; preconditioners are made of K alone: k more iterations see to the part of low
-    rank, and woodbury to springs."""
+    """The context of a PETSc matrix K - sum of U C U^T + sum of C', for products.
 
-    def __init__(
-        self,
-        tangent: PETSc.Mat,
-        parts: Callable[[], list[tuple[Values, Values]]],
-        springs: Callable[[], list[StiffCoupling]],
-    ) -> None:
-        """`parts`: U (owned dofs, k) and C (k, k) of each, `springs`: as they are now."""
-        self._tangent, self._parts, self._springs = tangent, parts, springs
+    U C U^T are of unknowns that terms have eliminated, C' are stiff couplings. Preconditioners are made of K alone: a
+    part of rank k costs k more iterations, and `WoodburyPreconditioner` inverts the couplings.
+    """
+
+    def __init__(self, matrix: PETSc.Mat, tangent: Tangent) -> None:
+        """`matrix`: products with K; `tangent`: has the parts of the present linearisation beside it."""
+        self._matrix, self._tangent = matrix, tangent
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = (K - sum of U C U^T + sum of C') x (collective)."""
-        self._tangent.mult(x, y)
-        for U, C in self._parts():
-            y.array_w[:] -= U @ (C @ sum_over_ranks(self._tangent.comm.tompi4py(), U.T @ x.array_r))
-        for each in self._springs():
-            each.matrix.multAdd(x, y, y)
+        self._matrix.mult(x, y)
+        for U, C in self._tangent.low_rank_updates:
+            y.array_w[:] -= U @ (C @ sum_over_ranks(self._matrix.comm.tompi4py(), U.T @ x.array_r))
+        for coupling in self._tangent.stiff_couplings:
+            coupling.matrix.multAdd(x, y, y)
 
     def to_petsc(self) -> PETSc.Mat:
-        """The matrix."""
-        result: Any = PETSc.Mat().createPython(self._tangent.getSizes(), self, comm=self._tangent.comm)
+        """The operator as a matrix of PETSc."""
+        result: Any = PETSc.Mat().createPython(self._matrix.getSizes(), self, comm=self._matrix.comm)
         result.setUp()
         return result
 
 
 class WoodburyPreconditioner:
-    """The context of a PETSc preconditioner."""
+    """The context of a PETSc preconditioner that inverts few stiff couplings U S U^T beside the body exactly.
 
-    def __init__(self, body: PETSc.PC, springs: list[StiffCoupling], like: PETSc.Vec) -> None:
-        """`body`: P, set up; `like`: a vector of its size (collective)."""
-        self._body, self._comm = body, like.comm.tompi4py()
-        U = np.concatenate([each.directions for each in springs], axis=1)
-        self._V = _applied(body, U, like)
-        flexibility = np.diag(1.0 / np.concatenate([each.stiffness for each in springs]))
+    (P^-1 + U S U^T)^-1 = P - V G V^T,   V = P U,   G = (S^-1 + U^T V)^-1      (Sherman, Morrison, Woodbury 1950)
+
+    P is the symmetric preconditioner of the body. Each tangent costs an application of P for each of the m columns of
+    U, each iteration 2 m products for each dof.
+    """
+
+    def __init__(self, base_pc: PETSc.PC, couplings: list[StiffCoupling], like: PETSc.Vec) -> None:
+        """`base_pc`: P, set up; `like`: a vector of its size (collective)."""
+        self._base_pc, self._comm = base_pc, like.comm.tompi4py()
+        U = np.concatenate([coupling.directions for coupling in couplings], axis=1)
+        self._V = _apply_to_columns(base_pc, U, like)
+        flexibility = np.diag(1.0 / np.concatenate([coupling.stiffness for coupling in couplings]))
         self._G = np.linalg.inv(flexibility + sum_over_ranks(self._comm, U.T @ self._V))
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = (P - V G V^T) x (collective)."""
-        self._body.apply(x, y)
+        self._base_pc.apply(x, y)
         y.array_w[:] -= self._V @ (self._G @ sum_over_ranks(self._comm, self._V.T @ x.array_r))
 
 
-def _applied(body: PETSc.PC, U: Values, like: PETSc.Vec) -> Values:
-    """(owned dofs, m) P U (collective)."""
+def _apply_to_columns(base_pc: PETSc.PC, U: Values, like: PETSc.Vec) -> Values:
+    """P U, (owned dofs, m) (collective)."""
     x, y, V = like.duplicate(), like.duplicate(), np.empty_like(U)
     for column in range(U.shape[1]):
         x.array_w[:] = U[:, column]
-        body.apply(x, y)
+        base_pc.apply(x, y)
         V[:, column] = y.array_r
     x.destroy()
     y.destroy()

@@ -38,25 +38,16 @@ from ..mechanics.tangent import adds_single_entries
 from ..mechanics.term import Term
 from ..mechanics.term_protocols import TieTerm
 from ..mesh.parallel import allgather, sum_over_ranks
-from .line_search import ROUND_OFF
+from .policy import DEFAULT_POLICY, SolverPolicy
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-RTOL, MOST = 1e-2, 200  # of the conjugate gradients
 Flags = npt.NDArray[np.bool_]
-HELD, LEAST_HELD = 0.99, 0.9  # of |r|^2, by nodes that are brought to rest: no more of them than it takes, and at least
-FEW = 0.003  # of all nodes, which these may be: with their neighbours some hundredths of the body
-ITERATIONS = 40
-ENOUGH = 1e-2  # of a patch's residual, which it may keep
-SMALL = 0.1  # of what is little for the whole body, which it may keep, too
-# radius of trust at first, in mean edges, and at last, where it is given up
-FIRST, LAST = 0.3, 1e-8
-LEAST = 1e-8  # of the greatest eigenvalue of a block that is preconditioned with
-# shares of what the model promised, below which a step is not taken, above which the next one may be longer
-POOR, GOOD = 0.05, 0.7
 
 
-def steihaug_step(K: sparray, inverse: Values, g: Values, of: Ints, radius: Values) -> tuple[Values, Values]:
+def steihaug_step(
+    K: sparray, inverse: Values, g: Values, of: Ints, radius: Values, policy: SolverPolicy = DEFAULT_POLICY
+) -> tuple[Values, Values]:
     """Steps z (n, d) of problems that share no entry of K, and by how much each lowers its model (p,).
 
     `inverse`: (n, d, d) blocks to precondition with; `g`: (n, d); `of`: (n,) the problem of each node; `radius`: (p,).
@@ -68,8 +59,8 @@ def steihaug_step(K: sparray, inverse: Values, g: Values, of: Ints, radius: Valu
     z, r = np.zeros_like(g), g.copy()
     y = np.einsum("nij,nj->ni", inverse, r)
     p, size = -y, sums(r * y)
-    enough, going = RTOL**2 * size, size > 0
-    for _ in range(MOST):
+    enough, going = policy.trust_cg_rtol**2 * size, size > 0
+    for _ in range(policy.max_trust_cg_iterations):
         if not going.any():
             break
         q = (K @ p.reshape(-1)).reshape(p.shape)
@@ -93,7 +84,7 @@ def sum_by_patch(of: Ints, values: Values, count: int) -> Values:
     return np.asarray(np.bincount(of, values, count), np.float64)
 
 
-def create_elimination(balance: Balance) -> NonlinearElimination | None:
+def create_elimination(balance: Balance, policy: SolverPolicy = DEFAULT_POLICY) -> NonlinearElimination | None:
     """Those of a balance that has what they come to rest by: a potential, of which all parts but the stress of each
     cell are constant forces, inertia and ties; None: it has not (collective)."""
     others = [term for term in balance.terms if term is not balance.stress]
@@ -101,14 +92,14 @@ def create_elimination(balance: Balance) -> NonlinearElimination | None:
     whole = balance.domain.order == 1 and balance.stress.rotation is None
     lumped = balance.mass.is_diagonal and balance.scheme.inertia
     fit = whole and lumped and not bent and not balance.contact.limits_newton_steps and balance.conservative
-    return NonlinearElimination(balance) if fit else None
+    return NonlinearElimination(balance, policy) if fit else None
 
 
 class NonlinearElimination:
     """Those of a balance."""
 
-    def __init__(self, balance: Balance) -> None:
-        self._balance = balance
+    def __init__(self, balance: Balance, policy: SolverPolicy) -> None:
+        self._balance, self._policy = balance, policy
         numbers = balance.domain.space.dofmap.index_map
         self._count = numbers.size_global
         self._names = numbers.local_to_global(np.arange(numbers.size_local + numbers.num_ghosts))
@@ -127,7 +118,7 @@ class NonlinearElimination:
         if not len(nodes):
             return False
         region = self._around(nodes)
-        moved = _settle(region, little, self._balance.domain.mean_edge_length)
+        moved = _settle(region, little, self._balance.domain.mean_edge_length, self._policy)
         u = self._balance.u.x.array[: self._balance.owned_dof_count].copy()
         self._balance.set_displacement(u)
         return moved
@@ -137,16 +128,16 @@ class NonlinearElimination:
         not hold LEAST_HELD (collective)."""
         comm, d = self._balance.domain.comm, self._balance.domain.dim
         squares = np.square((self._balance.reactions * self._free).reshape(-1, d)).sum(axis=1)
-        most, own = int(FEW * self._count), np.flatnonzero(squares)
+        most, own = int(self._policy.max_relaxed_nodes * self._count), np.flatnonzero(squares)
         if len(own) > most:
             own = own[np.argpartition(-squares[own], most)[: most + 1]]
         of_all = sum_over_ranks(comm, np.sum(squares))[0]
         names, parts = map(np.concatenate, zip(*allgather(comm, (self._names[own], squares[own])), strict=True))
         falling = np.sort(parts)[::-1][:most]
         held = np.cumsum(falling)
-        if not len(held) or held[-1] < LEAST_HELD * of_all:
+        if not len(held) or held[-1] < self._policy.min_relaxed_share * of_all:
             return np.asarray(names[:0])
-        last = min(int(np.searchsorted(held, HELD * of_all)), len(held) - 1)
+        last = min(int(np.searchsorted(held, self._policy.relaxed_share * of_all)), len(held) - 1)
         return np.asarray(names[parts >= falling[last]])
 
     def _around(self, nodes: Ints) -> _Region:
@@ -166,7 +157,7 @@ class NonlinearElimination:
         names, here = names[order], np.flatnonzero(chosen)
         of_here, at = np.searchsorted(names, self._names[here]), _places(corners, names)
         forces = inertia[order], r[order], free[order], self._ties(names)
-        return _Region(balance, self._energy, cells, here, of_here, at, *forces)
+        return _Region(balance, self._energy, cells, here, of_here, at, *forces, policy=self._policy)
 
     def _ties(self, names: Ints) -> coo_array:
         """(n, n) K of what ties nodes of global numbers, rising, the same along each axis, N/m (collective)."""
@@ -205,13 +196,14 @@ class _Region:
 
     def __init__(
         self, balance: Balance, energy: CellEnergy, cells: npt.NDArray[np.int32], here: Ints, of_here: Ints, at: Ints,
-        inertia: Values, r: Values, free: Values, ties: coo_array,
+        inertia: Values, r: Values, free: Values, ties: coo_array, *, policy: SolverPolicy,
     ) -> None:  # fmt: skip
         """`cells`: owned cells of this rank; `here`: its nodes, of which `of_here` tells the place among all; and of
         all ranks `at`: (k, c) such places of the corners of cells, -1 of those that stay, `inertia`: (n, d) m c_a, N/m,
         `r`: (n, d) the residual, N, `free`: (n, d) 0 where motion is prescribed, and `ties`: (n, n) K of what ties
         nodes, N/m."""
         n, d = self.shape = r.shape
+        self._policy = policy
         self._comm, self._energy, self._u = balance.domain.comm, energy, balance.u.x.array.reshape(-1, d)
         self._cells, self._here, self._of_here, self._at = cells, here, of_here, at
         self._start, self._inertia, self._free = self._u[here].copy(), inertia, free
@@ -271,7 +263,7 @@ class _Region:
         data = np.add.reduceat(blocks[made.order], made.first)
         values, vectors = np.linalg.eigh(data[made.diagonal])
         largest = abs(values).max(axis=1, keepdims=True)
-        values = np.maximum(abs(values), np.where(largest > 0, LEAST * largest, 1.0))
+        values = np.maximum(abs(values), np.where(largest > 0, self._policy.min_block_eigenvalue * largest, 1.0))
         inverse = (vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1)
         return bsr_array((data, made.columns, made.starts), shape=(n * d, n * d)), inverse
 
@@ -316,25 +308,25 @@ class _Look(NamedTuple):
         return _Look(*(np.where(*each) for each in zip(choices, self, other, strict=True)))
 
 
-def _settle(region: _Region, little: float, edge: float) -> bool:
+def _settle(region: _Region, little: float, edge: float, policy: SolverPolicy) -> bool:
     """Each patch goes down to a minimum, or as far as it gets; whether any moved (collective)."""
     w = np.zeros(region.shape)
     now = region.at_first
-    enough = np.maximum(ENOUGH * region.norms(now.forces), SMALL * little)
-    radius = np.full(region.count, FIRST * edge)
-    for _ in range(ITERATIONS):
+    enough = np.maximum(policy.patch_rtol * region.norms(now.forces), policy.patch_residual * little)
+    radius = np.full(region.count, policy.first_trust_radius * edge)
+    for _ in range(policy.max_trust_steps):
         norms = region.norms(now.forces)
-        going = (norms > enough) & (radius > LAST * edge)
+        going = (norms > enough) & (radius > policy.last_trust_radius * edge)
         if not going.any():
             break
         pulled = np.where(going[region.of, None], now.forces, 0.0)
-        step, promised = steihaug_step(*region.tangent(now.stiffness), pulled, region.of, radius)
+        step, promised = steihaug_step(*region.tangent(now.stiffness), pulled, region.of, radius, policy)
         there = region.look(w + step)
-        fell, slack = now.potential - there.potential, ROUND_OFF * now.size
+        fell, slack = now.potential - there.potential, policy.potential_round_off * now.size
         gain = np.divide(fell, promised, out=np.zeros_like(fell), where=promised > 0)
-        taken = going & ((gain > POOR) | ((abs(fell) <= slack) & (region.norms(there.forces) < norms)))
+        taken = going & ((gain > policy.poor_decrease) | ((abs(fell) <= slack) & (region.norms(there.forces) < norms)))
         long = region.norms(step)
-        longer = taken & (gain > GOOD) & (long > 0.9 * radius)
+        longer = taken & (gain > policy.good_decrease) & (long > 0.9 * radius)
         radius = np.where(longer, 2 * radius, np.where(taken | ~going, radius, long / 4))
         w = np.where(taken[region.of, None], w + step, w)
         now = there.where(taken, now, region)

@@ -1,56 +1,36 @@
-"""When the preconditioner is made anew, and of what kind.
+"""The preconditioner of the tangent: of which kind it is, and when it is set up anew.
 
-It is kept from tangent to tangent: making multigrid's coarse spaces costs more than the rest of a Newton iteration. It
-is made anew where CG takes a third more iterations than when it was fresh, or the tangent has given up entries of dead
-cells (mechanics.matrix_assembly), and refreshed (new coarse operators and smoothers on the same coarse spaces) after
-edges broke: once there were many of them, or what CG has taken longer for their sake adds up to a refresh. Where its
-cycle is quick (vcycle) a set-up costs a hundred iterations and more, or sixty thorough ones, and it is made anew once
-what CG has taken longer adds up to SET_UP; where no edge has broken since its coarse spaces were made these are good
-still, and a refresh, a third of a set-up, is enough for REFRESHED of it.
+A `Preconditioner` is told facts (`edges_broke`, `pattern_changed`, `solved`, `solve_failed`, `bypassed`) and decides in
+`_decide` alone whether it is kept, refreshed (new operators and smoothers on the same coarse spaces) or rebuilt.
 
-Where a body comes apart, cells hang from it by a node or an edge and turn there against nothing but their inertia.
-Smoothed aggregation with Jacobi's smoother needs three times the iterations then, and a set-up that a few broken edges
-spoil. Where steps are so long that inertia is next to nothing, it is a hundred times, and what hangs is solved for by
-itself (deflation), which is looked for after edges broke. In shorter ones other aggregates do: those without
-smoothing cost a fifth of the set-up, and a sweep of SSOR deals with what hangs: 18 iterations where the whole body took
-9 and the cut one 27 (33,000 tetrahedra, 10 planes), a step in 0.85 of the time; after 100 planes 0.7. In steps so short
-that inertia has a hundredth of the stiffness of a cell, or more, SSOR alone does: a porcelain figure that shatters
-(46,000 tetrahedra, a sixth) takes 2.5 times the iterations and half the time.
-
-A whole body that is slow to solve for is thin, or all but incompressible. Aggregates are made anew of the stronger
-links between its nodes there: a sheet of two cells (nu = 0.45, 234,000 tetrahedra) takes 38 iterations where it took
-77, and a fresh set-up costs the same. A compact body gains nothing (9 for 9), and its set-up would cost up to half as
-much again. Where it is large, too, and its levels are not copied in single precision (vcycle), its finest one is
-smoothed by one step with the inverse of each node's block instead of two with the diagonal, as products with that level
-are the larger part of a solve: the sheet takes as many iterations for a force at random (25), 31 to 37 for 27 to 30 in
-its steps, each of three products instead of five. A compact one would take 12 or 13 for 9 or 10, in as long. On coarser
-levels such blocks may be singular, of aggregates of a node or two.
-
-How much of what holds a cell is its inertia: which preconditioner does for a body that comes apart.
-
-c_a rho h^2 / Y,   c_a = da/du of the scheme (1 / dt^2 in backward Euler),   h: mean edge
+Equations: docs/theory.md#linear-systems.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import IntEnum
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
 from ..mesh.parallel import sum_over_ranks
 from .petsc_options import PetscOptions, PetscOptionSet
+from .policy import SolverPolicy
 
 if TYPE_CHECKING:
     from .deflation import DeflatedPreconditioner
     from .multigrid.fine_level import FineLevel
     from .multigrid.vcycle import SinglePrecisionVCycle
+    from .tangent_operators import TangentOperators
 
-HELD = 1e-3  # above which what hangs by a node or an edge is held by its inertia
-SWEPT = 1e-2  # above which sweeps do without coarse spaces: no force gets far in a step
+Values = npt.NDArray[np.float64]
+
 GAMG_OPTIONS: PetscOptions = {
     "pc_type": "gamg",
     "pc_gamg_reuse_interpolation": True,
@@ -58,286 +38,379 @@ GAMG_OPTIONS: PetscOptions = {
     "mg_levels_ksp_max_it": 2,
     "mg_levels_pc_type": "jacobi",
 }
-OF_PIECES: PetscOptions = {
+# A body in fragments: aggregates without smoothing cost a fifth of the set-up; a sweep of SSOR smooths what hangs.
+FRAGMENT_OPTIONS: PetscOptions = {
     "pc_gamg_agg_nsmooths": 0,
     "mg_levels_ksp_type": "richardson",
     "mg_levels_ksp_max_it": 1,
     "mg_levels_pc_type": "sor",
 }
-SWEEPS: PetscOptions = {"pc_type": "sor"}
-LEVELS: PetscOptions = {"pc_type": "gamg"}
-# on the finest level: one step, with blocks of a node's dofs, within bounds of their own spectrum
-BY_NODES: PetscOptions = {"pc_type": "pbjacobi", "ksp_max_it": 1, "ksp_chebyshev_esteig": "0,0.05,0,1.1"}
+SSOR_OPTIONS: PetscOptions = {"pc_type": "sor"}
+MULTIGRID_OPTIONS: PetscOptions = {"pc_type": "gamg"}
+# The finest level: one step with the inverses of the nodes' blocks, within bounds of their own spectrum.
+NODE_BLOCK_OPTIONS: PetscOptions = {
+    "pc_type": "pbjacobi", "ksp_max_it": 1, "ksp_chebyshev_esteig": "0,0.05,0,1.1"
+}  # fmt: skip
 STRONG_LINKS: PetscOptions = {"pc_gamg_threshold": 0.05, "pc_gamg_aggressive_square_graph": False}
-# on several ranks PETSc (3.22) coarsens the square of a graph of strong links, since it does not end without (MISk)
+# On several ranks PETSc (3.22) coarsens the square of a graph of strong links: without, MISk does not end.
 STRONG_LINKS_ON_RANKS: PetscOptions = STRONG_LINKS | {"pc_gamg_aggressive_square_graph": True}
 ALL_LINKS: PetscOptions = {"pc_gamg_threshold": 0.0, "pc_gamg_aggressive_square_graph": True}
-SLOW = 25  # iterations of a whole body from which on aggregates of strong links are tried
-WORTH_IT = 0.9  # of these iterations, which they may take at most
-REBUILD_ABOVE = 1.3  # made anew where CG takes this many times the iterations that it took when fresh, and two more
-REBUILD_ABOVE_OF_PIECES = 1.1  # the same where setting up costs little
-IN_PIECES = 1.5  # of another kind where even a fresh one takes this many times those of the whole body, and two more
-MANY = 0.02  # edges that broke, for each node, after which it is refreshed
-REFRESH_ITS = 10  # iterations that a refresh costs
-# more than it would take when fresh, after which one whose cycle is quick is made anew, or, of a body that nothing has
-# broken in, refreshed
-SET_UP, REFRESHED = 100, 40
-THOROUGHLY = 0.6  # of them, where more is done in each iteration
-PATTERN = "pattern"  # attribute of a PC: Stiffness.pattern when it was set up
-# solves of which the slowest tells what it takes when fresh, where its cycle is quick (vcycle): those of a step, as one
-# tangent of it may take three times the iterations of another, whichever it was made for. By two solves alone a jelly
-# that flies about seemed slow in each step, and was set up for
-FRESH = 5
+
+
+def rigid_body_nullspace(comm: MPI.Comm, positions: Values) -> PETSc.NullSpace:
+    """Translations and linearised rotations, orthonormal: 3 vectors in the plane, 6 in space (collective).
+
+    `positions`: (n, d) of this rank's nodes relative to the centre of the rotations, m.
+    """
+    coordinates = PETSc.Vec().createWithArray(positions.reshape(-1), bsize=positions.shape[1], comm=comm)
+    return PETSc.NullSpace().createRigidBody(coordinates)
 
 
 def mass_stiffness_ratio(balance: Balance) -> float:
-    """The inertia of a cell as a share of its stiffness, in the step that is solved now (collective)."""
+    """Inertia of a cell over its stiffness in the present step, c_a rho h^2 / Y (collective).
+
+    c_a = da/du of the scheme, 1 / dt^2 in backward Euler; h is the mean edge.
+    """
     domain, material = balance.domain, balance.stress.material
-    sums = [np.sum(each * domain.volumes) for each in (material.young, material.density)]
+    sums = [np.sum(field * domain.volumes) for field in (material.young, material.density)]
     stiffness, mass = sum_over_ranks(domain.comm, np.array(sums))
     return float(balance.c_a * mass * domain.mean_edge_length**2 / stiffness)
 
 
-class Due(IntEnum):
-    """What has to be done before the next solve."""
+class Update(IntEnum):
+    """What is done to the preconditioner before a solve."""
 
-    NOTHING = 0
+    NONE = 0
     REFRESH = 1  # new operators on the same coarse spaces
-    REBUILD = 2  # everything anew
+    REBUILD = 2  # coarse spaces too
 
 
 class Preconditioner:
-    """The preconditioner of one KSP.
+    """The preconditioner of one KSP, which is kept from tangent to tangent while it serves.
 
     Attributes:
-        due: what has to be done before the next solve.    keep: whether it serves more than one tangent.
-        pc: that of the body alone, also where the KSP uses one that is made of it.
-        serving: that, or one made of it that sees to loose parts.
-        its: iterations of the last solve, where the KSP does not know; 0: nothing is known; None: it does.
+        pc: PETSc's preconditioner of the whole body.
+        serving: what is applied: `pc`, the V cycle copied from it, or deflation around one of these.
     """
 
     def __init__(
         self,
         ksp: PETSc.KSP,
         options: PetscOptionSet,
+        balance: Balance,
+        policy: SolverPolicy,
         *,
-        keep: bool,
-        may_change: bool,
-        large: bool,
-        loosen: Callable[[PETSc.PC], DeflatedPreconditioner | None],
-        hasten: Callable[[PETSc.PC], SinglePrecisionVCycle | None],
-        bring: Callable[[], None],
-        pattern: Callable[[], int],
-        inertia: Callable[[], float],
-        nodes: int,
+        is_default: bool,
+        keeps: bool,
+        has_block_products: bool,
     ) -> None:
-        """`may_change`: it is multigrid of the program's own choice, of a body that may come apart; `loosen`: makes one
-        that sees to loose parts out of `pc`, None: there are none; `hasten`: what does the same in less time, None
-        where nothing does; `large`: whether products are the larger part of its work; `bring`: brings the entries of
-        the tangent to what they are; `pattern`: Stiffness.pattern; `inertia`: of a cell, as a share of its stiffness
-        (all collective); `nodes`: of the body."""
-        self._ksp, self.pc, self._options = ksp, ksp.getPC(), options
-        self.serving, self._loosen, self._bring, self._pattern = self.pc, loosen, bring, pattern
-        self._inertia, self._nodes = inertia, nodes
-        self._loose: DeflatedPreconditioner | None = None
-        self._hasten = hasten
-        self._cycle: SinglePrecisionVCycle | None = None
-        self._looks_for_parts = False  # before the next solve
-        self._sweeps: bool | None = None  # of a body in pieces: whether sweeps do for it
-        self._broke, self._extra = 0, 0.0  # edges and iterations since it was set up
-        self._refreshed_at, self._torn = 0.0, False  # such iterations, and whether edges broke since it was made anew
-        self.due, self.keep = Due.REBUILD, keep
-        self._large, self._by_nodes = large, False
-        self._own = self._may_change = may_change
-        self._broken, self._rebuild_above = False, REBUILD_ABOVE
-        self.its: int | None = None
-        # of aggregates of all links, where strong ones are on trial; 0: nothing is known; None: it is settled
-        self._all_links_its: int | None = 0 if may_change else None
-        self._fresh_its = self._whole_its = self._solves = 0
+        """`is_default`: the study chooses no preconditioner; `keeps`: it serves more than one tangent, as factors do
+        not; `has_block_products`: products with the finest level are most of the work (collective)."""
+        self._ksp, self._options, self._balance, self._policy = ksp, options, balance, policy
+        self.pc = self.serving = ksp.getPC()
+        self._node_count = balance.domain.space.dofmap.index_map.size_global
+        self._is_default = is_default
+        self._has_block_products = has_block_products
+        self._deflation: DeflatedPreconditioner | None = None
+        self._vcycle: SinglePrecisionVCycle | None = None
+        # --- facts that were told ---
+        self._iterations = self._equivalent = 0  # of the last solve, and those of one to full accuracy
+        self._edges_since_update = 0
+        self._edges_since_rebuild = False
+        self._ever_broken = False
+        self._pattern_is_new = False
+        self._looks_for_fragments = False  # before the next solve
+        # --- what they have led to ---
+        self._due, self._keeps = Update.REBUILD, keeps
+        self._solves = 0  # since it was rebuilt
+        self._fresh_iterations = 0  # of a solve when it was fresh; 0: unknown
+        self._whole_iterations = 0  # of a fresh set-up while the body was whole
+        self._extra_iterations = 0.0  # beyond the fresh ones since it was rebuilt
+        self._extra_at_refresh = 0.0
+        # multigrid of another kind may take over for a body in fragments, which inertia has to hold
+        self._may_suit_fragments = is_default and balance.scheme.inertia
+        # iterations with aggregates of all links, while strong ones are on trial; 0: unknown; None: settled
+        self._all_links_iterations: int | None = 0 if self._may_suit_fragments else None
+        self._uses_node_blocks = False
+        self._uses_ssor: bool | None = None  # of a body in fragments; None: it is in one piece
+        self._rebuild_ratio = policy.rebuild_ratio
 
-    def damage_changed(self, broke: int | None) -> None:
-        """Some cells lost stiffness as so many edges broke, on all ranks (None: nobody knows): refresh at the next
-        tangent, where that pays."""
-        self._broken = self._looks_for_parts = True
-        self._broke += self._nodes if broke is None else broke
-        self._torn = self._torn or broke != 0
-        if self._broke > MANY * self._nodes:
-            self.due = max(self.due, Due.REFRESH)
+    # --- facts ---
 
-    def refresh(self, tangent: PETSc.Mat, products: PETSc.Mat | None = None) -> None:
-        """Set up what is due for a tangent that is solved with next; `products`: what it is multiplied with, if that is
-        another matrix. Done here, since SNES knows a fixed lag only."""
-        self.look()
-        self._count()
-        self._see_to_pieces()
-        ksp = self._ksp
-        if self.due == Due.NOTHING and not self._is_of_another_pattern():
-            self._follow(tangent)
-            return
-        self._bring()
-        if anew := self.due == Due.REBUILD or self._is_of_another_pattern():
-            self.pc.reset()
-            self._fresh_its = self._solves = 0
-            self._torn = False
-        self._forget_cycle()
-        ksp.setPC(self.pc)
-        self.pc.setReusePreconditioner(False)
-        self.pc.setUseAmat(products is not None)
-        ksp.setOperators(products or tangent, tangent)
-        ksp.setUp()
-        self.pc.setAttr(PATTERN, self._pattern())
-        self._cycle = self._hasten(self.pc)
-        if self._cycle is None and self._by_nodes and self.pc.getType() == "gamg":
-            self._smooth_by_nodes()
-        self.due, self._broke = Due.NOTHING, 0
-        self._refreshed_at = self._extra = 0.0 if anew or self._cycle is None else self._extra
-        self._looks_for_parts = self._broken
-        self._follow(tangent)
+    def edges_broke(self, count: int | None) -> None:
+        """So many edges broke on all ranks; None: an unknown number, as after a restart."""
+        self._ever_broken = self._looks_for_fragments = True
+        self._edges_since_update += self._node_count if count is None else count
+        self._edges_since_rebuild = self._edges_since_rebuild or count != 0
 
-    def _is_of_another_pattern(self) -> bool:
-        """Whether `pc` was set up for an earlier pattern of the tangent: factors would be written past the end of their
-        arrays."""
-        return self.pc.getAttr(PATTERN) not in (None, self._pattern())
+    def pattern_changed(self) -> None:
+        """The tangent is another matrix or has entries at other places."""
+        self._pattern_is_new = True
 
-    def _smooth_by_nodes(self) -> None:
-        """On the finest level alone."""
-        finest = self.pc.getMGSmoother(self.pc.getMGLevels() - 1)
-        options = PETSc.Options(finest.getOptionsPrefix())
-        for key, value in BY_NODES.items():
-            options[key] = value
-        finest.setFromOptions()
-        for key in BY_NODES:
-            options.delValue(key)
+    def solved(self, iterations: int, equivalent: int) -> None:
+        """The last solve took so many iterations; `equivalent`: a solve to full accuracy; 0: unknown.
 
-    def _follow(self, tangent: PETSc.Mat) -> None:
-        """What serves is brought to a tangent that is solved with next."""
-        self.serving = self._body
-        if self._cycle is not None and self.serving is self._cycle.pc:
-            self._cycle.update_operator()
-        if self._looks_for_parts and self._own and self.pc.getType() == "gamg":
-            self.forget_parts()
-            self._looks_for_parts = False
-            if self._inertia() <= HELD:
-                self._loose = self._loosen(self.serving)
-        loose = self._loose
-        if loose is None or loose.base_pc is not self.serving:
-            return
-        if loose.update_operator(tangent):
-            self.pc.setReusePreconditioner(True)
-            self.serving = loose.pc
+        May be told again of the same solve.
+        """
+        self._iterations, self._equivalent = iterations, equivalent
 
-    @property
-    def _body(self) -> PETSc.PC:
-        """That of the body alone, in single precision where there is such a one."""
-        return self.pc if (quick := self._quick) is None else quick.pc
+    def solve_failed(self) -> None:
+        """A solve failed. Smoothers of an older tangent need not be positive for this one."""
+        self._due = Update.REBUILD
 
-    @property
-    def finest(self) -> FineLevel | None:
-        """The tangent that is solved with next, in single precision; None: it is not kept so."""
-        return None if (quick := self._quick) is None else quick.fine_level
+    def bypassed(self) -> None:
+        """Another solver served meanwhile, and the tangent is another one."""
+        self._due = Update.REBUILD
+        self._release_vcycle()
 
-    @property
-    def _quick(self) -> SinglePrecisionVCycle | None:
-        """The cycle that serves in place of `pc`."""
-        cycle = self._cycle
-        return None if cycle is None or cycle.gamg is not self.pc else cycle
+    @contextmanager
+    def updated_for_each_tangent(self) -> Iterator[None]:
+        """Rebuilt for the first tangent, and refreshed for each that follows."""
+        keeps, self._due, self._keeps = self._keeps, Update.REBUILD, False
+        try:
+            yield
+        finally:
+            self._keeps = keeps
 
-    def forget(self) -> None:
-        """Give the memory of what was made of `pc` back."""
-        self.forget_parts()
-        self._forget_cycle()
+    # --- the decision ---
 
-    def _forget_cycle(self) -> None:
-        if self._cycle is not None:
-            self._cycle.destroy()
-            self._cycle = None
+    def next_update(self) -> Update:
+        """What the facts so far ask for before the next solve; asking again gives the same answer (collective)."""
+        return self._decide(counts_solve=False)
 
-    def forget_parts(self) -> None:
-        """Give the memory of loose parts back."""
-        if self._loose is not None:
-            self._loose.destroy()
-            self._loose = None
+    def _decide(self, *, counts_solve: bool) -> Update:
+        """Decide what is done before the next solve, the only place where that is done (collective).
 
-    def look(self) -> None:
-        """See from the iterations of the last solve whether a rebuild is due (more than once does no harm)."""
-        its = self._last_its
-        if self.due == Due.NOTHING:
-            self._look_at(its)
-            if self._cycle is not None and self._solves < FRESH:
-                self._fresh_its = max(self._fresh_its, its)
-        # also where a refresh is due: coarse spaces from before a crack carry the motion of one side to the other
-        if self._cycle is None and self._fresh_its and its > self._rebuild_above * self._fresh_its + 2:
-            self.due = Due.REBUILD
-
-    @property
-    def _last_its(self) -> int:
-        return int(self._ksp.its) if self.its is None else self.its
-
-    def _count(self) -> None:
-        """Iterations more than when it was fresh, since edges broke: once they add up to a refresh one is due. Where
-        its cycle is quick whatever they are for, and to a set-up, or to a refresh where no edge broke."""
+        `counts_solve`: the solve is next, so that iterations of the last one are added to those since the set-up.
+        """
+        policy, equivalent = self._policy, self._equivalent
+        # Many edges broke.
+        if self._edges_since_update > policy.refresh_edges * self._node_count:
+            self._due = max(self._due, Update.REFRESH)
+        if self._due == Update.NONE:
+            # SSOR is always set up, others where they serve one tangent; strong links or no smoothing may take over.
+            self._learn_from_solve(equivalent)
+            if self._vcycle is not None and self._solves < policy.fresh_solves:
+                self._fresh_iterations = max(self._fresh_iterations, equivalent)
+        # Too many iterations. Also where a refresh is due: coarse spaces from before a crack carry the motion of one
+        # side to the other.
+        fresh = self._fresh_iterations
+        if self._vcycle is None and fresh and equivalent > self._rebuild_ratio * fresh + 2:
+            self._due = Update.REBUILD
+        # Factors and coarse spaces of another pattern would be written past the end of their arrays.
+        if self._pattern_is_new:
+            self._due = Update.REBUILD
+        if not counts_solve:
+            return self._due
+        # Iterations beyond the fresh ones have added up to what an update costs.
         self._solves += 1
-        its, fresh = self._last_its, self._fresh_its
-        if self._cycle is not None:
-            if its > fresh > 0:
-                self._extra += int(self._ksp.its) * (1 - fresh / its)
-            enough = THOROUGHLY if self._cycle.has_thorough_smoothing else 1.0
-            if self._extra > enough * SET_UP:
-                self.due = Due.REBUILD
-            elif not self._torn and self._extra > self._refreshed_at + enough * REFRESHED:
-                self.due = max(self.due, Due.REFRESH)
-            return
-        if self._broke:
-            self._extra += max(its - fresh, 0)
-        if self._extra > REFRESH_ITS:
-            self.due = max(self.due, Due.REFRESH)
+        if self._vcycle is None:
+            if self._edges_since_update:
+                self._extra_iterations += max(equivalent - fresh, 0)
+            if self._extra_iterations > policy.refresh_cost:
+                self._due = max(self._due, Update.REFRESH)
+        else:
+            if equivalent > fresh > 0:
+                self._extra_iterations += self._iterations * (1 - fresh / equivalent)
+            factor = policy.thorough_cost_factor if self._vcycle.has_thorough_smoothing else 1.0
+            if self._extra_iterations > factor * policy.vcycle_setup_cost:
+                self._due = Update.REBUILD
+            elif (
+                not self._edges_since_rebuild  # its coarse spaces are good still
+                and self._extra_iterations > self._extra_at_refresh + factor * policy.vcycle_refresh_cost
+            ):
+                self._due = max(self._due, Update.REFRESH)
+        # The step size calls for sweeps or for multigrid.
+        if self._uses_ssor is not None and self._uses_ssor != (self._inertia() > policy.sweeps_suffice):
+            self._uses_ssor, self._fresh_iterations = not self._uses_ssor, 0
+            self._change_kind(SSOR_OPTIONS if self._uses_ssor else MULTIGRID_OPTIONS)
+        return self._due
 
-    def _look_at(self, its: int) -> None:
-        """Iterations of a solve since it was set up."""
-        if self._sweeps:
-            self.due = Due.REFRESH
+    def _learn_from_solve(self, equivalent: int) -> None:
+        """Learn from iterations of a solve since the last update how it serves, and change its kind if need be."""
+        if self._uses_ssor:
+            self._due = Update.REFRESH
             return
-        if not self._fresh_its:
-            self._fresh_its = its
-            if not self._broken and self._tries_links(its):
+        if not self._fresh_iterations:
+            self._fresh_iterations = equivalent
+            if not self._ever_broken and self._tries_other_links(equivalent):
                 return
-            self._whole_its = self._whole_its or its
-            if self._broken and self._may_change and its > IN_PIECES * self._whole_its + 2:
-                self._change()
-        if not self.keep:
-            self.due = max(self.due, Due.REFRESH)
+            self._whole_iterations = self._whole_iterations or equivalent
+            limit = self._policy.fragmented_ratio * self._whole_iterations + 2
+            if self._ever_broken and self._may_suit_fragments and equivalent > limit:
+                self._suit_fragments()
+        if not self._keeps:
+            self._due = max(self._due, Update.REFRESH)
 
-    def _tries_links(self, its: int) -> bool:
-        """Whether it is of another kind from now on: of strong links where a fresh one took so many iterations, of all
-        of them again where that was no better."""
-        all_links = self._all_links_its
-        if all_links is None or not its:
+    def _tries_other_links(self, equivalent: int) -> bool:
+        """Take strong links for a whole body that is slow to solve, all links again where these are no better; whether
+        the kind has changed."""
+        all_links = self._all_links_iterations
+        if all_links is None or not equivalent:
             return False
-        worse = its > (WORTH_IT * all_links if all_links else SLOW)
-        self._all_links_its = its if worse and not all_links else (None if all_links else 0)
-        if worse:
-            self._by_nodes = self._large
+        policy = self._policy
+        is_worse = equivalent > (policy.strong_link_gain * all_links if all_links else policy.slow_iterations)
+        self._all_links_iterations = equivalent if is_worse and not all_links else (None if all_links else 0)
+        if is_worse:
+            self._uses_node_blocks = self._has_block_products
             strong = STRONG_LINKS if self._ksp.comm.size == 1 else STRONG_LINKS_ON_RANKS
-            self._become(ALL_LINKS if all_links else strong)
-            self._fresh_its = 0
-        return worse
+            self._change_kind(ALL_LINKS if all_links else strong)
+            self._fresh_iterations = 0
+        return is_worse
 
-    def _change(self) -> None:
-        if self._inertia() <= HELD:
+    def _suit_fragments(self) -> None:
+        """Aggregate without smoothing from here on, where inertia holds what hangs by a node or an edge
+        (collective)."""
+        if self._inertia() <= self._policy.held_by_inertia:
             return
-        self._may_change = self._by_nodes = self._sweeps = False
-        self._rebuild_above = REBUILD_ABOVE_OF_PIECES
-        self._become(OF_PIECES)
+        self._may_suit_fragments = self._uses_node_blocks = self._uses_ssor = False
+        self._rebuild_ratio = self._policy.rebuild_ratio_fragments
+        self._change_kind(FRAGMENT_OPTIONS)
 
-    def _see_to_pieces(self) -> None:
-        """In the way that goes with how long steps are."""
-        if self._sweeps is None or self._sweeps == (self._inertia() > SWEPT):
-            return
-        self._sweeps, self._fresh_its = not self._sweeps, 0
-        self._become(SWEEPS if self._sweeps else LEVELS)
-
-    def _become(self, kind: PetscOptions) -> None:
-        self.due = Due.REBUILD
-        self._options.change(kind)
+    def _change_kind(self, options: PetscOptions) -> None:
+        self._due = Update.REBUILD
+        self._options.change(options)
         self.pc.reset()
         self.pc.setFromOptions()
+
+    def _inertia(self) -> float:
+        return mass_stiffness_ratio(self._balance)
+
+    # --- setting up ---
+
+    def update(self, operators: TangentOperators) -> None:
+        """Bring the preconditioner to the tangent of the next solve (collective).
+
+        SNES is not asked: it knows a fixed number of tangents between two set-ups only.
+        """
+        if self._decide(counts_solve=True) != Update.NONE:
+            operators.update_entries()  # which may tell of a new pattern
+            self._set_up(operators, self._decide(counts_solve=False))
+        self._serve(operators)
+
+    def _set_up(self, operators: TangentOperators, update: Update) -> None:
+        if update == Update.REBUILD:
+            self.pc.reset()
+            self._fresh_iterations = self._solves = 0
+            self._edges_since_rebuild = False
+        self._release_vcycle()
+        operators.set_on(self._ksp, self.pc)
+        self._vcycle = self._create_vcycle(operators)
+        if self._vcycle is None and self._uses_node_blocks and self.pc.getType() == "gamg":
+            self._smooth_by_node_blocks()
+        if update == Update.REBUILD or self._vcycle is None:
+            self._extra_iterations = 0.0
+        self._extra_at_refresh = self._extra_iterations
+        self._due, self._edges_since_update, self._pattern_is_new = Update.NONE, 0, False
+        self._looks_for_fragments = self._ever_broken
+
+    def _create_vcycle(self, operators: TangentOperators) -> SinglePrecisionVCycle | None:
+        """The V cycle in single precision; None where PETSc's own is applied."""
+        if not self._is_default or operators.blocks is None:
+            return None
+        from .multigrid.vcycle import create_vcycle
+
+        return create_vcycle(self.pc, operators.blocks, self._policy)
+
+    def _smooth_by_node_blocks(self) -> None:
+        """Smooth the finest level by blocks of a node's dofs: most products of a large body are with that level."""
+        finest = self.pc.getMGSmoother(self.pc.getMGLevels() - 1)
+        options = PETSc.Options(finest.getOptionsPrefix())
+        for key, value in NODE_BLOCK_OPTIONS.items():
+            options[key] = value
+        finest.setFromOptions()
+        for key in NODE_BLOCK_OPTIONS:
+            options.delValue(key)
+
+    def _serve(self, operators: TangentOperators) -> None:
+        """Choose what is applied to the tangent of the next solve (collective)."""
+        base = self.pc if self._vcycle is None else self._vcycle.pc
+        self.serving = base
+        if self._vcycle is not None:
+            self._vcycle.update_operator()
+        if self._looks_for_fragments and self._may_deflate and self.pc.getType() == "gamg":
+            self.release_deflation()
+            self._looks_for_fragments = False
+            if self._inertia() <= self._policy.held_by_inertia:
+                from .deflation import create_deflation
+
+                self._deflation = create_deflation(self._balance, base, self._policy)
+        deflation = self._deflation
+        if deflation is None or deflation.base_pc is not base:
+            return
+        if deflation.update_operator(operators.matrix):
+            self.pc.setReusePreconditioner(True)
+            self.serving = deflation.pc
+
+    @property
+    def _may_deflate(self) -> bool:
+        """Whether fragments may be solved for by themselves: without inertia they hang by a residual stiffness."""
+        return self._is_default and self._balance.scheme.inertia
+
+    @property
+    def fine_level(self) -> FineLevel | None:
+        """The tangent of the next solve in single precision; None: it is not kept so."""
+        return None if self._vcycle is None else self._vcycle.fine_level
+
+    def destroy(self) -> None:
+        """Give back what was made of `pc`."""
+        self.release_deflation()
+        self._release_vcycle()
+
+    def _release_vcycle(self) -> None:
+        if self._vcycle is not None:
+            self._vcycle.destroy()
+            self._vcycle = None
+
+    def release_deflation(self) -> None:
+        """Give the memory of deflation back."""
+        if self._deflation is not None:
+            self._deflation.destroy()
+            self._deflation = None
+
+
+class PlainPreconditioner:
+    """The plain twin of `Preconditioner`: PETSc sets its own up for each tangent, and no fact matters.
+
+    Attributes:
+        pc, serving: PETSc's preconditioner.
+    """
+
+    fine_level: FineLevel | None = None
+
+    def __init__(self, ksp: PETSc.KSP) -> None:
+        self._ksp = ksp
+        self.pc = self.serving = ksp.getPC()
+
+    def edges_broke(self, count: int | None) -> None:
+        """Without consequence."""
+
+    def pattern_changed(self) -> None:
+        """PETSc's multigrid does not notice entries at other places."""
+        self.pc.reset()
+
+    def solved(self, iterations: int, equivalent: int) -> None:
+        """Without consequence."""
+
+    def solve_failed(self) -> None:
+        """Without consequence."""
+
+    def bypassed(self) -> None:
+        """Without consequence."""
+
+    @contextmanager
+    def updated_for_each_tangent(self) -> Iterator[None]:
+        """As always."""
+        yield
+
+    def next_update(self) -> Update:
+        """A rebuild, always."""
+        return Update.REBUILD
+
+    def update(self, operators: TangentOperators) -> None:
+        """Set up for the tangent of the next solve (collective)."""
+        operators.update_entries()
+        operators.set_on(self._ksp, self.pc)
+
+    def destroy(self) -> None:
+        """Nothing is kept."""

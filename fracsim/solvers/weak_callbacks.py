@@ -14,7 +14,8 @@ from weakref import WeakMethod
 from mpi4py import MPI
 from petsc4py import PETSc
 
-OFTEN = 32  # scenes after which those that were dropped are freed: some 13 communicators belong to a scene
+from .policy import DEFAULT_POLICY
+
 _scenes = itertools.count(1)
 
 
@@ -45,7 +46,7 @@ def collect_dropped_scenes(comm: MPI.Comm) -> None:
     Python looks for garbage when its own objects have piled up, and knows nothing of communicators; on several ranks
     PETSc keeps what Python has freed until all of them free it together.
     """
-    if next(_scenes) % OFTEN == 0:
+    if next(_scenes) % DEFAULT_POLICY.scenes_between_collections == 0:
         for _ in range(2):  # contexts of matrices are freed with these, and hold others
             gc.collect()
             PETSc.garbage_cleanup(comm)

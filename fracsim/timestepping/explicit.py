@@ -16,11 +16,12 @@ from mpi4py import MPI
 from ..mechanics.balance import Balance
 from ..mechanics.damping import Drag, Viscosity
 from ..mechanics.stability_limit import SAFETY, stable_step
+from ..solvers.newton import SolveResult
 from .energy_balance import released_state
 from .protocols import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
 from .stable_time_step import cell_frequencies, damaged_frequencies
 from .state import State
-from .stepper import BalanceStepper, SolveResult, StepReport, StepSizes
+from .stepper import BalanceStepper, StepReport, StepSizes
 
 if TYPE_CHECKING:
     from .stable_time_step_damaged import DamagedCellFrequencies

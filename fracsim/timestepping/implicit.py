@@ -10,11 +10,12 @@ import numpy.typing as npt
 
 from ..mechanics.balance import Balance
 from ..mesh.parallel import sum_over_ranks
+from ..solvers.newton import SolveResult
 from ..solvers.nonlinear_solver import NonlinearSolver
 from .energy_balance import released_state
 from .protocols import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
 from .state import State
-from .stepper import BalanceStepper, SolveResult, StepSizes
+from .stepper import BalanceStepper, StepSizes
 
 Values = npt.NDArray[np.float64]
 
@@ -49,7 +50,7 @@ class ImplicitStepper(BalanceStepper):
         """Tell the solver of the damage that there is, whenever that came about."""
         pattern = self.breaking.broken_edge_patterns
         torn = pattern is not None and sum_over_ranks(self.comm, np.count_nonzero(pattern))[0] > 0
-        self.solver.damage_changed(None if torn else 0)
+        self.solver.edges_broke(None if torn else 0)
 
     def discard_unsaved_data(self) -> None:
         """Forget tangent, preconditioner, factors, and what earlier solves have told of the next one (collective)."""
@@ -113,7 +114,7 @@ class ImplicitStepper(BalanceStepper):
     def _damage_changed(self, result: PassResultProtocol) -> None:
         super()._damage_changed(result)
         if result.broken_edges:
-            self.solver.damage_changed(result.broken_edges)
+            self.solver.edges_broke(result.broken_edges)
 
 
 UNLIMITED = 10_000  # passes: there is no body with more left to break in one step

@@ -19,11 +19,12 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from ..solvers.newton import SolveResult
 from .energy_balance import balanced_forces
 from .implicit import UNLIMITED, ImplicitStepper
 from .protocols import PassResultProtocol
 from .state import State
-from .stepper import SolveResult, StepReport
+from .stepper import StepReport
 
 Values = npt.NDArray[np.float64]
 

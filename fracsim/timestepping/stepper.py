@@ -19,10 +19,11 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..errors import NotConverged
+from ..errors import NotConverged, StepAborted
 from ..mechanics.balance import Balance
 from ..mechanics.time_functions import TabulatedFunction
 from ..mesh.parallel import sum_over_ranks
+from ..solvers.newton import SolveResult
 from .energy_balance import balanced_forces, step_work
 from .protocols import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
 from .state import State
@@ -32,16 +33,6 @@ Values = npt.NDArray[np.float64]
 SAME = 1e-6  # of a step: times that are so close are the same
 PASSED = 1e-5  # of an interval between frames: before its end by so much it has passed
 EASY_STEPS = 4  # steps in a row without trouble before a halved step is doubled again
-
-
-@dataclass(frozen=True)
-class SolveResult:
-    """How a solve ended."""
-
-    converged: bool
-    newton_iterations: int
-    krylov_iterations: int
-    reason: str  # a sentence where it did not converge
 
 
 @dataclass(frozen=True)
@@ -87,10 +78,6 @@ class StepSizes:
             return self.step
         later = self.schedule.times[self.schedule.times > t * (1 + 1e-9) + 1e-9 * self.smallest]
         return min(float(self.schedule(t)[0]), float(np.min(later - t, initial=math.inf)))
-
-
-class StepAborted(Exception):
-    """The step was given up since the run is to stop; the body is as at the start of the step (on all ranks)."""
 
 
 class StepTooLong(Exception):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import tempfile
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,7 @@ from petsc4py import PETSc
 
 from cases import BAR, STRIP, study
 from fracsim.scene import build_scene
-from fracsim.solvers import weak_callbacks
-from fracsim.solvers.multigrid import block_operator
+from fracsim.solvers import policy, weak_callbacks
 from support.scenes import Walk
 
 IN_USE = "living objects of PETSc", "communicators", "options", "MiB"
@@ -34,7 +34,7 @@ KINDS: dict[str, dict[str, Any]] = {
 
 def build_and_drop(kind: str, count: int, steps: int) -> Iterator[None]:
     """Build a scene, take some steps and drop it, so many times; small bodies are multiplied with in blocks, too."""
-    block_operator.SMALL = 0
+    policy.DEFAULT_POLICY = replace(policy.DEFAULT_POLICY, min_block_dofs=0)
     tables = dict(KINDS[kind])
     table = study(tables.pop("base"), **tables)
     for _ in range(count):

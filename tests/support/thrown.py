@@ -6,6 +6,7 @@ import numpy as np
 
 from fracsim.scene import Scene
 from fracsim.solvers import line_search, nonlinear_elimination
+from support.solver_policy import other_policy
 
 from .scenes import Values, Walk, make_scene, positions
 from .torn import Found
@@ -20,7 +21,7 @@ def thrown(steps: int = 3) -> tuple[Scene, Walk]:
         time={"scheme": "backward-euler", "step": 0.01, "end": 1.0},
     )  # fmt: skip
     assert scene.solver is not None
-    scene.solver.damage_changed()
+    scene.solver.edges_broke(None)
     v = np.zeros_like(positions(scene))
     v[np.linalg.norm(positions(scene) - 1.0, axis=1) < 0.1] = -40.0  # through the cells behind it in a step
     state.v = v.reshape(-1)
@@ -42,13 +43,13 @@ def _held_back(scene: Scene) -> Values:
 def compared() -> Found:
     """Where its nodes are after three steps, in the order of the input mesh; how often some came to rest; and how far,
     in edges, nodes go of a correction that would throw those near a corner."""
-    few, nonlinear_elimination.FEW = nonlinear_elimination.FEW, 0.2
     rest, rested = nonlinear_elimination.NonlinearElimination.relax_nodes, []
     nonlinear_elimination.NonlinearElimination.relax_nodes = lambda self, little: (
         rest(self, little) and not rested.append(1)
     )  # type: ignore[method-assign]
-    scene, state = thrown()
-    nonlinear_elimination.FEW, nonlinear_elimination.NonlinearElimination.relax_nodes = few, rest  # type: ignore[method-assign]
+    with other_policy(max_relaxed_nodes=0.2):
+        scene, state = thrown()
+    nonlinear_elimination.NonlinearElimination.relax_nodes = rest  # type: ignore[method-assign]
     return {
         "thrown-u": scene.domain.gather_nodes(state.u.reshape(-1, 3)),
         "thrown-rested": np.array([len(rested)]),

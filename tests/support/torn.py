@@ -24,8 +24,8 @@ from fracsim.mesh.node_cells import node_components
 from fracsim.mesh.parallel import sum_over_ranks
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers.deflation import create_deflation
-from fracsim.solvers.multigrid import block_operator
 from fracsim.timestepping.state import State
+from support.solver_policy import other_policy
 
 from .failing import Failing
 from .scenes import Values, break_across, each_step, make_scene, make_study
@@ -424,9 +424,8 @@ def by_rows() -> Found:
 
 def in_blocks() -> Found:
     """Edges that the block breaks where its tangent is multiplied with in blocks."""
-    small, block_operator.SMALL = block_operator.SMALL, 0
-    found = run("block") | run("joined")
-    block_operator.SMALL = small
+    with other_policy(min_block_dofs=0):
+        found = run("block") | run("joined")
     return {f"{key}-in-blocks": found[key] for key in ("block-broken", "block-u", "joined-broken", "joined-u")}
 
 

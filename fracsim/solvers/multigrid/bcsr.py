@@ -24,7 +24,7 @@ from .hierarchy import BlockCSRData
 Single = npt.NDArray[np.float32]
 Values = npt.NDArray[np.float64]
 SOURCE = Path(__file__).with_suffix(".c")
-BEHIND = 8  # numbers behind the last block, which are read and made nothing of
+BEHIND = 8  # numbers after the last block, which SIMD instructions read and ignore
 PROLONGATION_SOURCE = Path(__file__).with_name("prolongation.c")
 
 
@@ -60,14 +60,14 @@ class BlockCSR:
         blocks: (blocks, numbers of one) column by column.
     """
 
-    def __init__(self, made: CDLL, size: int, starts: npt.NDArray[np.int64], columns: npt.NDArray[np.int32]) -> None:
-        """`made`: `code` for blocks of size x size; `starts`: (rows + 1,) of rows; `columns`: (blocks,)."""
-        self._code, numbers = made, np.zeros(int(starts[-1]) * size**2 + BEHIND, np.float32)
+    def __init__(self, code: CDLL, size: int, starts: npt.NDArray[np.int64], columns: npt.NDArray[np.int32]) -> None:
+        """`code`: compiled for blocks of size x size; `starts`: (rows + 1,) of rows; `columns`: (blocks,)."""
+        self._code, numbers = code, np.zeros(int(starts[-1]) * size**2 + BEHIND, np.float32)
         self.blocks: Single = numbers[:-BEHIND].reshape(-1, size**2)
         self._pattern = c_int64(len(starts) - 1), array_pointer(starts), array_pointer(columns)
         self._all = *self._pattern, array_pointer(numbers)
         self._residual, self._smooth, self._add = (
-            unchecked_function(made, name, *self._all) for name in ("residual", "smooth", "add")
+            unchecked_function(code, name, *self._all) for name in ("residual", "smooth", "add")
         )  # fmt: skip
 
     def assign_scaled(self, blocks: Values, left: Values, right: Values) -> None:
@@ -119,10 +119,10 @@ class BlockDiagonal:
         blocks: (rows, size, size).    place: where they begin.
     """
 
-    def __init__(self, made: CDLL, size: int, rows: int) -> None:
-        """`made`: `code` for blocks of size x size."""
+    def __init__(self, code: CDLL, size: int, rows: int) -> None:
+        """`code`: compiled for blocks of size x size."""
         numbers = np.zeros(rows * size**2 + BEHIND, np.float32)
-        self._code, self._rows, self.pointer = made, c_int64(rows), array_pointer(numbers)
+        self._code, self._rows, self.pointer = code, c_int64(rows), array_pointer(numbers)
         self.blocks: Single = numbers[:-BEHIND].reshape(rows, size, size)
 
     def assign_inverse(self, D: Single) -> None:
@@ -145,14 +145,14 @@ def compile_block_csr(comm: MPI.Comm, size: int) -> CDLL | None:
 class Prolongation:
     """diag(left) P diag(right), of P's blocks in the rows of this rank."""
 
-    def __init__(self, made: CDLL, P: BlockCSRData, left: Values, right: Values) -> None:
-        """`made`: `code` for blocks of that size."""
+    def __init__(self, code: CDLL, P: BlockCSRData, left: Values, right: Values) -> None:
+        """`code`: compiled for blocks of that size."""
         numbers = np.empty(P.values.size, np.float32)
         pattern = c_int64(len(P.starts) - 1), array_pointer(P.starts), array_pointer(P.columns)
-        made.scale(*pattern, array_pointer(P.values), array_pointer(left), array_pointer(right), array_pointer(numbers))
+        code.scale(*pattern, array_pointer(P.values), array_pointer(left), array_pointer(right), array_pointer(numbers))
         self._all = *pattern, array_pointer(numbers)
         self._add, self._add_transposed = (
-            unchecked_function(made, name, *self._all) for name in ("add", "add_transposed")
+            unchecked_function(code, name, *self._all) for name in ("add", "add_transposed")
         )
 
     def add_product(self, x: GhostedVector, y: GhostedVector) -> None:

@@ -1,16 +1,13 @@
-"""The tangent in blocks of the d dofs of a node: what products are made with.
+"""Products with the tangent in blocks of the d dofs of a node.
 
-A product takes half the time, for an index is read for d^2 values instead of for d, and CG with multigrid makes some
-six an iteration on the finest level. Where nothing but cells and their mass add to the tangent it is assembled in
-blocks; ties of a few nodes to others (mechanics.block_matrix) stay beside these. Smoothed aggregation cannot set itself
-up from blocks, so that there is a matrix of single entries, too, which is brought to where they are when multigrid is
-set up. Where terms add to single entries the blocks are a copy of them, which costs what two iterations gain. Small
-bodies have no use for it: their matrices stay in the cache, and each product is called from here.
+An index is read for d^2 values instead of for d, so a product takes half the time; CG with multigrid makes some six of
+them on the finest level in an iteration. Where only cells, mass and ties contribute, K is assembled in blocks, and the
+matrix of single entries, which smoothed aggregation needs, follows when multigrid is set up. Where terms add single
+entries the blocks are a copy of them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from petsc4py import PETSc
@@ -19,46 +16,52 @@ if TYPE_CHECKING:
     from ...mechanics.block_matrix import BlockMatrix
     from .fine_level import FineLevel
 
-SMALL = 10_000  # dofs below which a product costs no more than calling it
-
 
 class BlockOperator:
-    """The context of a PETSc matrix that is multiplied with.
+    """The context of a PETSc matrix for products with the tangent.
 
     Attributes:
-        tangent: the matrix of single entries that it is a copy of.
-        assembled: products with the blocks, where they are assembled first.
-        single: what is multiplied with instead, in single precision.
+        tangent: the matrix of single entries.
+        assembled: products with the blocks that K is assembled in; None where these are a copy.
     """
 
-    def __init__(self, tangent: PETSc.Mat, assembled: BlockMatrix | None, pattern: Callable[[], int]) -> None:
-        """`pattern`: Stiffness.pattern."""
-        self.tangent, self._pattern = tangent, pattern
-        self.assembled = assembled
-        self.single: FineLevel | None = None
+    def __init__(self, tangent: PETSc.Mat, assembled: BlockMatrix | None) -> None:
+        self.tangent, self.assembled = tangent, assembled
+        self._fine_level: FineLevel | None = None
         self._copy: PETSc.Mat | None = None
-        self._copied, self._state = -1, -1  # pattern and state of the tangent
+        self._copied_state = -1
+
+    @property
+    def fine_level(self) -> FineLevel | None:
+        """The copy of the tangent in single precision that products are made with; None: in double precision."""
+        return self._fine_level
+
+    def multiply_by(self, fine_level: FineLevel | None) -> None:
+        """Multiply with this copy of the tangent in single precision; None: in double precision."""
+        self._fine_level = fine_level
+
+    def pattern_changed(self) -> None:
+        """The tangent has entries at other places."""
+        self.release_copy()
 
     def update_copy(self) -> None:
-        """Be the tangent as it is now (collective)."""
-        if self.assembled is not None or self._state == (state := self.tangent.stateGet()):
+        """Bring the blocks to the tangent as it is now (collective)."""
+        if self.assembled is not None or self._copied_state == (state := self.tangent.stateGet()):
             return
-        if self._copied != (pattern := self._pattern()):
-            self.release_copy()
         self._copy = self.tangent.convert(PETSc.Mat.Type.BAIJ, self._copy or PETSc.Mat())
-        self._copied, self._state = pattern, state
+        self._copied_state = state
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = K x (collective)."""
-        if self.single is not None:
-            self.single.multiply(x, y)
+        if self._fine_level is not None:
+            self._fine_level.multiply(x, y)
             return
-        by = self.assembled or self._copy
-        assert by is not None
-        by.mult(x, y)
+        blocks = self.assembled or self._copy
+        assert blocks is not None
+        blocks.mult(x, y)
 
     def to_petsc(self) -> PETSc.Mat:
-        """The matrix."""
+        """The operator as a matrix of PETSc."""
         result: Any = PETSc.Mat().createPython(self.tangent.getSizes(), self, comm=self.tangent.comm)
         result.setUp()
         return result
@@ -68,8 +71,9 @@ class BlockOperator:
         if self._copy is not None:
             self._copy.destroy()
             self._copy = None
+        self._copied_state = -1
 
 
-def blocks_pay_off(tangent: PETSc.Mat) -> bool:
-    """Whether products with blocks are quicker."""
-    return tangent.getBlockSize() > 1 and tangent.getSize()[0] >= SMALL
+def blocks_pay_off(tangent: PETSc.Mat, min_dofs: int) -> bool:
+    """Whether products in blocks are faster: small matrices stay in the cache."""
+    return tangent.getBlockSize() > 1 and tangent.getSize()[0] >= min_dofs

@@ -1,29 +1,17 @@
-"""Multigrid's cycle in single precision: PETSc's levels, copied, in blocks of a node's dofs.
+"""A multigrid cycle in single precision: the levels of PETSc's smoothed aggregation, copied in blocks of a node's dofs.
 
-CG with multigrid is bound by what it reads: five products with the finest level an iteration, four of them in the
-cycle, where six digits are plenty. Floats in blocks are 40 bytes for nine entries, doubles in blocks 76, single entries
-108; an iteration takes 0.4 to 0.5 of the time. CG itself goes by the tangent in double precision, but for corrections
-of Newton's method (linear_solver), which finds the last digits by its residuals: for these the cycle's finest level is
-what CG multiplies with (fine_level).
+CG with multigrid is bound by memory: five products with the finest level an iteration, four of them in the cycle, where
+six digits suffice. Floats in blocks are 40 bytes for nine entries, doubles as single entries 108. From x = 0 the cycle
+is
 
-Each level is scaled by the diagonal that it was set up with, A' = S A S, S = diag(A)^(-1/2), so that its numbers are
-about 1, and P' = S_fine^-1 P S_coarse. It is smoothed by p = q(B A') B, Chebyshev's polynomial of B A' (smoother). The
-finest level is the tangent of now, B with it: one of before would smooth cells that have stiffened beyond what is
-stable, or, weakened for their sake, hardly smooth the others. Below the coarsest level that is smoothed PETSc solves.
-The cycle from 0 is
+    M = 2 p - p A' p + (1 - p A') C (1 - A' p),    C = P' A'_coarse^-1 P'^T,    A' = S A S,  P' = S_fine^-1 P S_coarse
 
-    M = 2 p - p A' p + (1 - p A') C (1 - A' p),    C = P' A'_coarse^-1 P'^T
+with Chebyshev's smoother p = q(B A') B (smoother). It is symmetric, and positive definite where p A' is within (0, 2),
+whatever rounding has made of A' where it is almost singular. The finest level is the present tangent: the smoother of
+an earlier one may be unstable for cells that have become stiffer.
 
-which is symmetric and, where p A' is within (0, 2), positive, whatever rounding has made of A' where it is almost
-singular: rigid motions of what hardly anything holds are C's, which is positive by itself.
-
-Coarser levels are smoothed as the finest, in two steps, as PETSc's V cycle has them. But where cycles of theirs leave
-much (`Cycle.converges_slowly`) they have more steps, that reach further down, and C is two of such cycles, 2 B - B A' B
-(a W cycle): they have a twelfth of the finest's numbers and less. That is where a body is thin, and where it has torn:
-it bends as strips of two cells, and what coarser levels leave of that CG goes on for. A doormat after 110 steps took 31
-iterations for 98, in 0.4 of the time, by twice the steps that they have here (with an exact C 24); by these all its
-steps together take a seventh more iterations, in 0.9 of the time. A compact body takes as many as in a V cycle, and
-would pay for them.
+Where cycles from the second finest level down converge slowly, thin and torn bodies, coarse levels have more steps that
+reach further down, and C is two cycles (a W cycle). They have a twelfth of the numbers of the finest level and less.
 
 Equations: docs/theory.md#linear-systems.
 """
@@ -39,6 +27,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 
+from ..policy import DEFAULT_POLICY, SolverPolicy
 from ..weak_callbacks import ApplyContext
 from . import bcsr
 from .bcsr import GhostedVector, Prolongation
@@ -50,150 +39,161 @@ if TYPE_CHECKING:
     from ...mechanics.block_matrix import BlockMatrix
 
 Values = npt.NDArray[np.float64]
-# by the size of a level's blocks; by the sizes of the finer level's and the coarser's, for what is between them
-type Codes = dict[tuple[int, ...], CDLL]
+# By the size of a level's blocks; by the sizes of the finer level's and the coarser's for prolongations.
+type CompiledProducts = dict[tuple[int, ...], CDLL]
 
-SMOOTHED = ("chebyshev", "jacobi", 2)  # how PETSc's levels are, which these replace
-# where coarser levels converge slowly: the effort of the first of them, of the next, and of all that follow, which have
-# so few numbers that calls are what they cost
-THOROUGH = SmoothingParameters(2, 0.08, 2), SmoothingParameters(4, 0.03, 2), SmoothingParameters(8, 0.03)
-TRIED, SLOWLY = 4, 0.8  # cycles of theirs; share that the last of them leaves where they do
+SMOOTHED = ("chebyshev", "jacobi", 2)  # the smoother of PETSc's levels that these replace
+# Where coarse levels converge slowly: the smoothing of the second finest level, of the next, and of all that follow,
+# which have so few numbers that they cost what calling costs.
+THOROUGH_SMOOTHING = (
+    SmoothingParameters(2, 0.08, 2), SmoothingParameters(4, 0.03, 2), SmoothingParameters(8, 0.03)
+)  # fmt: skip
 
 
 class SinglePrecisionVCycle:
-    """The context of a PETSc preconditioner.
+    """The context of a PETSc preconditioner that applies the cycle.
 
     Attributes:
-        body: PETSc's multigrid.    pc: the preconditioner.    finest: the level of the tangent.
-        thorough: whether more is done with coarser levels, which takes as long as the finest then.
+        gamg: PETSc's multigrid.    pc: the preconditioner.
+        fine_level: the level of the tangent.
+        has_thorough_smoothing: whether coarse levels are smoothed more, and take as long as the finest.
     """
 
-    def __init__(self, body: PETSc.PC, products: BlockMatrix, codes: Codes) -> None:
-        """`body`: of the kind that `in_single` takes; `products`: with the tangent, which it has yet to `follow`;
+    def __init__(
+        self, gamg: PETSc.PC, blocks: BlockMatrix, codes: CompiledProducts, policy: SolverPolicy = DEFAULT_POLICY
+    ) -> None:
+        """`gamg`: of the kind that `create_vcycle` takes; `blocks`: the tangent, which `update_operator` takes over;
         `codes`: for the sizes of its blocks (collective)."""
-        self.gamg, self._products, self._tangent = body, products, products.matrix
-        coarsest, *found = copy_levels(body, self._tangent.index_map(1))
+        self.gamg, self._blocks, self._tangent, self._policy = gamg, blocks, blocks.matrix, policy
+        coarsest, *finer = copy_levels(gamg, self._tangent.index_map(1))
         starts = self._tangent.indptr[: self._tangent.index_map(0).size_local + 1]
-        tangent = BlockCSRData(starts, self._tangent.indices[: starts[-1]], self._values)
+        pattern = BlockCSRData(starts, self._tangent.indices[: starts[-1]], self._values)
         self._levels: list[SmoothedLevel] = []
-        self._between: list[Prolongation] = []
-        below = coarsest
+        self._prolongations: list[Prolongation] = []
+        coarser = coarsest
         scale: Values = np.ones(len(coarsest.diagonal))
-        for here in found:
-            square = codes[here.size,]
-            if here.matrix:
-                level = SmoothedLevel(here, here.matrix, square)
-                level.assign_values(here.matrix.values)
+        for data in finer:
+            square = codes[data.size,]
+            if data.matrix:
+                level = SmoothedLevel(data, data.matrix, square, policy)
+                level.assign_values(data.matrix.values)
             else:
-                level = self.fine_level = FineLevel(here, tangent, square)
+                level = self.fine_level = FineLevel(data, pattern, square, policy)
             self._levels.append(level)
-            assert here.prolongation is not None
-            made = codes[here.size, below.size]
-            self._between.append(Prolongation(made, here.prolongation, 1 / level.scale, scale))
-            below, scale = here, level.scale
-        own = (len(starts) - 1) * self._tangent.block_size[0]
-        self._scale = scale[:own].astype(np.float32)
-        self._b, self._x = (GhostedVector(coarsest.nodes, coarsest.size) for _ in range(2))
-        self._solver = body.getMGCoarseSolve()
-        self._ends = self._solver.getOperators()[1].createVecs()
-        self.pc = PETSc.PC().createPython(ApplyContext(self.apply), comm=body.comm)
-        self.pc.setOperators(*body.getOperators())  # or it may serve a KSP alone
+            assert data.prolongation is not None
+            code = codes[data.size, coarser.size]
+            self._prolongations.append(Prolongation(code, data.prolongation, 1 / level.scale, scale))
+            coarser, scale = data, level.scale
+        owned = (len(starts) - 1) * self._tangent.block_size[0]
+        self._scale = scale[:owned].astype(np.float32)
+        self._coarsest_b, self._coarsest_x = (GhostedVector(coarsest.nodes, coarsest.size) for _ in range(2))
+        self._coarsest_solver = gamg.getMGCoarseSolve()
+        self._coarsest_vectors = self._coarsest_solver.getOperators()[1].createVecs()
+        self.pc = PETSc.PC().createPython(ApplyContext(self.apply), comm=gamg.comm)
+        self.pc.setOperators(*gamg.getOperators())  # it may serve a KSP that has no other
         self.has_thorough_smoothing = len(self._levels) > 1 and self.converges_slowly()
         if self.has_thorough_smoothing:
-            for level, effort in zip(self._levels[-2::-1], chain(THOROUGH, repeat(THOROUGH[-1])), strict=False):
-                level.set_smoothing(effort)
+            smoothings = chain(THOROUGH_SMOOTHING, repeat(THOROUGH_SMOOTHING[-1]))
+            for level, smoothing in zip(self._levels[-2::-1], smoothings, strict=False):
+                level.set_smoothing(smoothing)
 
     def converges_slowly(self) -> bool:
-        """Whether cycles from the second finest level down do, of what is left of anything after a few of them; not
-        where they diverge, of a tangent that is not positive (collective)."""
-        at, level = len(self._levels) - 2, self._levels[-2]
+        """Whether cycles from the second finest level down reduce a random residual slowly (collective).
+
+        Not where they diverge, of a tangent that is indefinite.
+        """
+        number, level = len(self._levels) - 2, self._levels[-2]
         level.set_random_rhs()
-        left = []
-        for _ in range(TRIED):
-            self._go_through(at)
+        norms = []
+        for _ in range(self._policy.trial_cycles):
+            self._apply_cycle(number)
             level.restart_from_residual()
-            left.append(level.rhs_norm())
-        return SLOWLY * left[-2] < left[-1] < left[-2]
+            norms.append(level.rhs_norm())
+        return self._policy.slow_cycle * norms[-2] < norms[-1] < norms[-2]
 
     @property
     def _values(self) -> Values:
-        """Of the tangent's blocks."""
+        """(blocks, size^2) values of the tangent's blocks."""
         return np.asarray(self._tangent.data, np.float64)
 
     def update_operator(self) -> None:
         """Take the tangent as it is now for the finest level (collective)."""
-        self.fine_level.extra_terms = self._products.ties
-        self.fine_level.assign_values(self._values)
+        self.fine_level.assign_values(self._values, self._blocks.ties)
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = M x (collective)."""
         finest, n = self.fine_level, x.getLocalSize()
-        b, found = finest.b.array[:n], y.array_w
-        b[:] = x.array_r  # products of two kinds of numbers take three times as long
+        b, result = finest.b.array[:n], y.array_w
+        b[:] = x.array_r  # a product of two types of number would take three times as long
         b *= self._scale
-        self._go_through(len(self._levels) - 1)
-        found[:] = finest.x.array[:n]
-        found *= finest.scale[:n]
+        self._apply_cycle(len(self._levels) - 1)
+        result[:] = finest.x.array[:n]
+        result *= finest.scale[:n]
 
-    def _go_through(self, at: int) -> None:
-        """The cycle from a level down."""
-        level = self._levels[at]
+    def _apply_cycle(self, number: int) -> None:
+        """Apply the cycle from a level down (collective)."""
+        level = self._levels[number]
         level.pre_smooth()
-        b = self._levels[at - 1].b if at else self._b
+        b = self._levels[number - 1].b if number else self._coarsest_b
         b.array[:] = 0.0
-        self._between[at].add_transposed_product(level.residual, b)
+        self._prolongations[number].add_transposed_product(level.residual, b)
         b.add_ghosts_to_owners()
-        if at:
-            self._correct(at - 1)
+        if number:
+            self._correct(number - 1)
         else:
             self._solve_coarsest()
-        x = self._levels[at - 1].x if at else self._x
+        x = self._levels[number - 1].x if number else self._coarsest_x
         x.update_ghosts()
-        self._between[at].add_product(x, level.x)
+        self._prolongations[number].add_product(x, level.x)
         level.post_smooth()
 
-    def _correct(self, at: int) -> None:
-        """Cycles from a coarser level down, each of what the one before has left."""
-        level = self._levels[at]
-        self._go_through(at)
+    def _correct(self, number: int) -> None:
+        """Apply the cycles of a coarser level, each to the residual of the one before (collective)."""
+        level = self._levels[number]
+        self._apply_cycle(number)
         for _ in range(level.smoothing.cycles - 1):
             level.restart_from_residual()
-            self._go_through(at)
+            self._apply_cycle(number)
             level.add_previous_cycle()
 
     def _solve_coarsest(self) -> None:
-        b, x = self._ends
+        b, x = self._coarsest_vectors
         n = b.getLocalSize()
-        b.array_w[:] = self._b.array[:n]
-        self._solver.solve(b, x)
-        self._x.array[:n] = x.array_r
+        b.array_w[:] = self._coarsest_b.array[:n]
+        self._coarsest_solver.solve(b, x)
+        self._coarsest_x.array[:n] = x.array_r
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
-        for each in (*self._ends, self.pc):
-            each.destroy()
+        for owned in (*self._coarsest_vectors, self.pc):
+            owned.destroy()
 
 
-def create_vcycle(body: PETSc.PC, products: BlockMatrix) -> SinglePrecisionVCycle | None:
-    """The cycle of multigrid that is set up from a tangent, of the products with this; None where it is of another kind
-    than PETSc's own choice for smoothed aggregation, or there is no compiler (collective)."""
-    if body.getType() != "gamg" or body.getMGLevels() < 2:
+def create_vcycle(
+    gamg: PETSc.PC, blocks: BlockMatrix, policy: SolverPolicy = DEFAULT_POLICY
+) -> SinglePrecisionVCycle | None:
+    """The cycle of multigrid that was set up from a tangent in these blocks (collective).
+
+    None where it is of another kind than PETSc's default for smoothed aggregation, or there is no compiler.
+    """
+    if gamg.getType() != "gamg" or gamg.getMGLevels() < 2:
         return None
-    solvers = [body.getMGSmoother(level) for level in range(body.getMGLevels())]
-    if any((each.getType(), each.getPC().getType(), each.max_it) != SMOOTHED for each in solvers[1:]):
+    smoothers = [gamg.getMGSmoother(level) for level in range(gamg.getMGLevels())]
+    if any((ksp.getType(), ksp.getPC().getType(), ksp.max_it) != SMOOTHED for ksp in smoothers[1:]):
         return None
-    sizes = [each.getOperators()[1].getBlockSize() for each in solvers]
-    codes = _compiled(body.comm.tompi4py(), sizes)
-    return None if codes is None else SinglePrecisionVCycle(body, products, codes)
+    sizes = [ksp.getOperators()[1].getBlockSize() for ksp in smoothers]
+    codes = _compile_products(gamg.comm.tompi4py(), sizes)
+    return None if codes is None else SinglePrecisionVCycle(gamg, blocks, codes, policy)
 
 
-def _compiled(comm: MPI.Comm, sizes: list[int]) -> Codes | None:
-    """For levels with so many dofs of a node, from the coarsest on; None without a compiler (collective)."""
-    asked: dict[tuple[int, ...], CDLL | None] = {
+def _compile_products(comm: MPI.Comm, sizes: list[int]) -> CompiledProducts | None:
+    """Compiled code for levels with so many dofs of a node, from the coarsest on; None without a compiler
+    (collective)."""
+    codes: dict[tuple[int, ...], CDLL | None] = {
         (size,): bcsr.compile_block_csr(comm, size) for size in sorted(set(sizes[1:]))
     }
-    asked |= {
+    codes |= {
         (fine, coarse): bcsr.compile_prolongation(comm, fine, coarse) for coarse, fine in sorted(set(pairwise(sizes)))
     }
-    made = {key: each for key, each in asked.items() if each is not None}
-    return made if len(made) == len(asked) else None
+    compiled = {key: code for key, code in codes.items() if code is not None}
+    return compiled if len(compiled) == len(codes) else None

@@ -223,11 +223,11 @@ def cheapest(case: Case, rows: list[Row], limit: float) -> Row | None:
 
 def defaults() -> dict[str, Any]:
     """Settings that trials vary and for which the program has a default."""
-    from ....solvers.linear_solver import DEFAULTS
+    from ....solvers.linear_solver import DEFAULT_OPTIONS
     from ....solvers.preconditioner import GAMG_OPTIONS
     from ....study import PlasticitySettings, TimeSettings
 
-    ours = {key: DEFAULTS[key] for key in ("ksp_type", "ksp_rtol", "snes_rtol", "snes_type")}
+    ours = {key: DEFAULT_OPTIONS[key] for key in ("ksp_type", "ksp_rtol", "snes_rtol", "snes_type")}
     fields = {key: TimeSettings.model_fields[key].default for key in ("scheme", "mass", "rho")}
     fields["update"] = PlasticitySettings.model_fields["update"].default
     return ours | fields | {"pc_type": GAMG_OPTIONS["pc_type"]}

@@ -84,10 +84,10 @@ def block_of_slivers() -> Study:
 
 def _shown(given: dict[str, Any]) -> dict[str, Any]:
     """Columns of the table: the defaults of fracsim.solvers.linear_solver where nothing is given."""
-    from ....solvers.linear_solver import DEFAULTS
+    from ....solvers.linear_solver import DEFAULT_OPTIONS
 
     keys = ("snes_rtol", "ksp_rtol", "snes_type", "ksp_type")
-    plain = {"pc_type": "gamg"} | {key: DEFAULTS[key] for key in keys}
+    plain = {"pc_type": "gamg"} | {key: DEFAULT_OPTIONS[key] for key in keys}
     return plain | {key: value for key, value in given.items() if key in plain}
 
 

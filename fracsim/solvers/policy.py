@@ -1,0 +1,185 @@
+"""The tuned numbers of the solver: one frozen dataclass, each field with its unit, what it bounds, and its evidence.
+
+`DEFAULT_POLICY` is read once by each solver that is made; another policy can be handed to `NonlinearSolver`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class SolverPolicy:
+    """Numbers that decide how systems are solved, not what their solution is.
+
+    A field without a unit is a ratio. "Measured" names the bodies on which the value was chosen.
+    """
+
+    # --- Newton's method (newton) ---
+    # Mean edges. Longest jump of prescribed dofs that Newton's method starts from without a linear extension into the
+    # body; cells at a support that takes a longer jump alone may turn inside out.
+    max_support_jump: float = 0.01
+    # Share of |r| that an iteration leaves. Below it the method converges by itself and no nodes are relaxed
+    # separately.
+    fast_reduction: float = 0.1
+    # Eliminations in an attempt that is judged by |r|, which may rise in each of them: bounds a cycle.
+    max_eliminations: int = 4
+    # Iterations in which |r| has to be halved where it is the merit function; a crawling attempt is given up.
+    crawl_iterations: int = 2
+    # Linear solves of a step with a linear balance, before Newton's method takes over. One is the rule.
+    max_linear_solves: int = 3
+    # Solves of a step in which jammed obstacles advance, at most, and before advancing may be judged as too slow.
+    max_obstacle_solves: int = 20
+    min_obstacle_solves: int = 5
+    # Relative tolerance of |r| of all those solves but the last, whose solution alone is kept.
+    intermediate_rtol: float = 1e-2
+
+    # --- line search (line_search) ---
+    # Share of the summed terms of the potential, below which two potentials are equal up to round-off.
+    potential_round_off: float = 1e4 * float(np.finfo(float).eps)
+    # Multiples of that round-off. Whole steps whose potential rises by no more are taken as steps near the solution.
+    near_solution: float = 1e3
+    # Share of all nodes whose correction may be clipped. Clipping more would brake the motion of a whole part.
+    max_clipped_nodes: float = 0.03
+    # Iterations with exact tangents without a smaller |r|, after which an attempt is given up: it cycles.
+    max_stalled_iterations: int = 10
+    # Share of the largest |r| of an attempt below which its tangents are exact, and mean moduli of a cell: negative
+    # eigenvalues above minus this floor stay. Measured on a doormat and a jelly that tear.
+    exact_below: float = 1e-2
+    eigenvalue_floor: float = 1e-2
+
+    # --- inexact Newton (forcing_terms) ---
+    # Largest relative tolerance of CG while contact acts. CG takes four times as many iterations with contact.
+    loosest_with_contact: float = 1e-2
+    # Shares of what the tangent leaves of r, which CG may leave: in its own norm, and in the norm of r.
+    cg_share: float = 0.1
+    cg_share_of_residual: float = 0.3
+    # Share of the residual of a solution that CG may leave. Ranks differ by it.
+    cg_share_of_solution: float = 1e-2
+    # Share of the residual of a solution that a tangent which is kept may leave.
+    kept_tangent_share: float = 0.3
+    # Largest relative tolerance of a correction, and of a last one. A rougher correction of a slender body may not
+    # be a direction of descent.
+    loosest_correction: float = 1e-2
+    loosest_last_correction: float = 0.1
+    # Iterations of CG from which on its rate of convergence is known.
+    min_rate_iterations: int = 3
+
+    # --- linear steps and the tangent (linear_solver) ---
+    # Share of the residual of a solution that a linear step without inertia leaves: loads that grow in proportion are
+    # extrapolated to a solution then, which takes no iteration.
+    static_residual: float = 0.3
+    # Share of the cells of a matrix that are alive, below which a smaller matrix is made.
+    shrink_below: float = 0.9
+    # c_a rho h^2 / Y. Above it CG multiplies with the tangent in single precision: rounding takes 6e-8 of a stiffness
+    # where neighbours move apart, less than the inertia of what hangs by one node.
+    min_single_precision_inertia: float = 1e-6
+    # Dofs from which on products in blocks of a node are used. Smaller matrices stay in the cache.
+    min_block_dofs: int = 10_000
+
+    # --- direct solver (direct_solver) ---
+    # Dofs up to which a system is factorised where no Krylov method converges: seconds, and a few GB at most.
+    max_direct_dofs: int = 100_000
+    # Dofs up to which factors take no longer than GMRES takes to fail: in the plane, in space.
+    max_direct_before_gmres_2d: int = 100_000
+    max_direct_before_gmres_3d: int = 10_000
+    # Iterations of CG for one tangent, which factors are taken to cost until their cost is known.
+    assumed_direct_cost: int = 40
+    # Operations of MUMPS for each entry of the tangent that take as long as an iteration of CG. Measured 4 to 16 on 13
+    # bodies: plane and solid, slender and compact, linear and quadratic, 600 to 100,000 dofs.
+    flops_per_iteration: float = 11.0
+    # Tangents whose factors an attempt may cost in iterations, before it goes on with factors on trial.
+    tangents_on_trial: int = 4
+    # Iterations for each dof that factors cost at most in space: a compact body of n dofs takes n / 16.
+    compact_direct_cost: float = 1 / 16
+    # Solves that start with factors after iterations have failed: the first time, and at most.
+    first_direct_spell: int = 8
+    longest_direct_spell: int = 256
+
+    # Dofs up to which `[solver] plain = true` factorises; larger systems are solved by CG with GAMG.
+    max_plain_direct_dofs: int = 30_000
+
+    # --- fallbacks (nonlinear_solver) ---
+    # Restart length of GMRES. With PETSc's 30 it stalls on nearly incompressible bodies.
+    gmres_restart: int = 200
+    # Solves that begin with positive tangents after exact first tangents have failed in two solves in a row.
+    positive_spell: int = 8
+
+    # --- preconditioner ---
+    # c_a rho h^2 / Y. Above it inertia holds what hangs by a node or an edge, and no deflation is needed.
+    held_by_inertia: float = 1e-3
+    # c_a rho h^2 / Y. Above it SSOR alone serves a body in fragments. Measured on a porcelain figure that shatters
+    # (46,000 tetrahedra, a sixth): 2.5 times the iterations, half the time.
+    sweeps_suffice: float = 1e-2
+    # Iterations of a whole body from which on aggregates of strong links are tried, and share of these that the new
+    # aggregates may take. Measured: 38 iterations for 77 on a sheet of 234,000 tetrahedra, nu = 0.45.
+    slow_iterations: int = 25
+    strong_link_gain: float = 0.9
+    # Iterations as a multiple of those of a fresh set-up, plus 2, above which coarse spaces are made anew; second:
+    # without smoothing of aggregates, whose set-up is a fifth.
+    rebuild_ratio: float = 1.3
+    rebuild_ratio_fragments: float = 1.1
+    # Iterations of a fresh set-up as a multiple of those of the whole body, plus 2, above which aggregates are not
+    # smoothed any more. Measured: a step in 0.85 of the time (33,000 tetrahedra, 10 planes), 0.7 after 100 planes.
+    fragmented_ratio: float = 1.5
+    # Edges that broke for each node of the body, after which operators are refreshed.
+    refresh_edges: float = 0.02
+    # Iterations that a refresh costs.
+    refresh_cost: int = 10
+    # Iterations that a set-up and, where no edge broke, a refresh cost beside the V cycle in single precision.
+    vcycle_setup_cost: int = 100
+    vcycle_refresh_cost: int = 40
+    # Factor of both where coarse levels are smoothed thoroughly and an iteration costs more.
+    thorough_cost_factor: float = 0.6
+    # Solves whose slowest tells the iterations of a fresh set-up beside the V cycle. One step has tangents that differ
+    # by three times the iterations; with two solves a jelly that tumbles was set up in each step.
+    fresh_solves: int = 5
+
+    # --- deflation ---
+    # Share of the largest eigenvalue of a fragment's Gram matrix, below which rigid motions are linearly dependent.
+    dependent_motion: float = 1e-8
+
+    # --- nonlinear elimination ---
+    # Share of |r|^2 on the nodes that are relaxed: no more of them than it takes, and the least that is worth it.
+    relaxed_share: float = 0.99
+    min_relaxed_share: float = 0.9
+    # Share of all nodes that are relaxed at most. With their neighbours they are some hundredths of the body.
+    max_relaxed_nodes: float = 0.003
+    # Trust-region steps of a patch.
+    max_trust_steps: int = 40
+    # Shares of a patch's first |r| and of the residual of a solution of the body, which a patch may keep.
+    patch_rtol: float = 1e-2
+    patch_residual: float = 0.1
+    # Mean edges. First trust radius, and radius at which a patch is given up.
+    first_trust_radius: float = 0.3
+    last_trust_radius: float = 1e-8
+    # Share of the largest eigenvalue of a node's block, to which smaller ones are raised for preconditioning.
+    min_block_eigenvalue: float = 1e-8
+    # Actual over predicted decrease: below the first a step is refused, above the second the radius may grow.
+    poor_decrease: float = 0.05
+    good_decrease: float = 0.7
+    # Relative tolerance and iterations of the conjugate gradients of a trust-region step.
+    trust_cg_rtol: float = 1e-2
+    max_trust_cg_iterations: int = 200
+
+    # --- multigrid ---
+    # Lanczos products that estimate the largest eigenvalue of a level, and multiple of it up to which is smoothed.
+    lanczos_products: int = 10
+    chebyshev_upper: float = 1.1
+    # Cycles that tell whether coarse levels converge slowly, and share that the last of them leaves where they do.
+    # Measured on a doormat after 110 steps: 31 iterations for 98, in 0.4 of the time.
+    trial_cycles: int = 4
+    slow_cycle: float = 0.8
+
+    # --- memory (weak_callbacks) ---
+    # Scenes after which dropped ones are freed. A scene has some 13 communicators.
+    scenes_between_collections: int = 32
+
+    def max_direct_before_gmres(self, dim: int) -> int:
+        """Dofs up to which factors take no longer than GMRES takes to fail, by dimension."""
+        return self.max_direct_before_gmres_2d if dim == 2 else self.max_direct_before_gmres_3d
+
+
+DEFAULT_POLICY = SolverPolicy()

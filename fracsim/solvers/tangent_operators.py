@@ -1,0 +1,171 @@
+"""The tangent of a balance as the matrices that a KSP takes: for products and for setting preconditioners up."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Protocol
+
+from petsc4py import PETSc
+
+from ..mechanics.balance import Balance
+from ..mesh.domain import Domain
+from .multigrid.block_operator import BlockOperator, blocks_pay_off
+from .policy import SolverPolicy
+from .preconditioner import mass_stiffness_ratio, rigid_body_nullspace
+
+if TYPE_CHECKING:
+    from ..mechanics.block_matrix import BlockMatrix
+    from .multigrid.fine_level import FineLevel
+
+
+class PatternListener(Protocol):
+    """Whoever keeps factors, coarse spaces or copies of a matrix."""
+
+    def pattern_changed(self) -> None:
+        """The matrix is another one, or has got entries at other places."""
+
+
+class TangentOperators:
+    """K of a balance at the present displacement, in one matrix or several.
+
+    Attributes:
+        operator: K for the products of a Krylov method, with all that terms keep beside their entries.
+        products: K for products without what terms keep beside it; None: they are with `matrix`.
+        blocks: products with K assembled in blocks of a node's dofs; None where it is not.
+        eigenvalue_floor: that of the last assembly (mechanics.psd_projection); None: the tangent is exact.
+    """
+
+    def __init__(self, balance: Balance, policy: SolverPolicy, *, for_multigrid: bool, may_use_blocks: bool) -> None:
+        """`for_multigrid`: rigid body modes are attached to the matrix; `may_use_blocks`: products may be with blocks
+        (collective)."""
+        self._balance, self._tangent, self._policy = balance, balance.tangent, policy
+        self._may_use_blocks = may_use_blocks
+        self._near_nullspace = near_nullspace(balance.domain) if for_multigrid else None
+        self._block_operator: BlockOperator | None = None
+        self._low_rank_operator: PETSc.Mat | None = None
+        self.eigenvalue_floor: float | None = None
+        self._known_pattern = self._tangent.pattern_version
+        self._listeners: tuple[PatternListener, ...] = ()
+        self._make_operators()
+
+    # --- matrices ---
+
+    @property
+    def matrix(self) -> PETSc.Mat:
+        """Entries of K, which may be behind its blocks until `update_entries`."""
+        return self._tangent.matrix
+
+    @property
+    def block_operator(self) -> BlockOperator | None:
+        """The context of `products`."""
+        return self._block_operator
+
+    @property
+    def blocks(self) -> BlockMatrix | None:
+        """BlockMatrix with K as it is assembled in blocks."""
+        return None if self._block_operator is None else self._block_operator.assembled
+
+    def _make_operators(self) -> None:
+        self._release_operators()
+        tangent = self._tangent
+        self.products: PETSc.Mat | None = None
+        if self._may_use_blocks and blocks_pay_off(tangent.matrix, self._policy.min_block_dofs):
+            blocks = tangent.switch_to_blocks()
+            self._block_operator = BlockOperator(tangent.matrix, blocks)
+            self.products = self._block_operator.to_petsc()
+        self.operator = self.products or tangent.matrix
+        if tangent.may_be_incomplete:
+            from .low_rank import LowRankOperator
+
+            self._low_rank_operator = LowRankOperator(self.operator, tangent).to_petsc()
+            self.operator = self._low_rank_operator
+        self._attach_nullspace()
+
+    def _attach_nullspace(self) -> None:
+        """Attach the rigid body modes to the matrix.
+
+        PETSc's sum of matrices of two patterns loses them; multigrid would know translations alone.
+        """
+        if self._near_nullspace is not None and not self.matrix.getNearNullSpace():
+            self.matrix.setNearNullSpace(self._near_nullspace)
+
+    def shrink(self, share: float) -> bool:
+        """Make smaller matrices without the entries of dead cells, where at most `share` of the cells are alive;
+        whether they are new (collective)."""
+        if not self._tangent.shrink(share):
+            return False
+        self._make_operators()
+        return True
+
+    # --- values ---
+
+    def assemble(self, eigenvalue_floor: float | None) -> None:
+        """K at the present displacement, in blocks where there are any (collective)."""
+        self.multiply_by(None)
+        self.eigenvalue_floor = eigenvalue_floor
+        self._tangent.assemble(psd_tolerance=eigenvalue_floor, blocks_only=True)
+        self._check_pattern()
+
+    def tell_of_pattern(self, *listeners: PatternListener) -> None:
+        """Tell these from here on when the matrix is another one, or has got entries at other places."""
+        self._listeners += listeners
+
+    def _check_pattern(self) -> None:
+        if self._known_pattern == self._tangent.pattern_version:
+            return
+        self._known_pattern = self._tangent.pattern_version
+        if self._block_operator is not None:
+            self._block_operator.pattern_changed()
+        for listener in self._listeners:
+            listener.pattern_changed()
+
+    def update_products(self) -> None:
+        """Bring products and rigid body modes to the tangent that was assembled last (collective)."""
+        if self._block_operator is not None:
+            self._block_operator.update_copy()
+        self._attach_nullspace()
+
+    def update_entries(self) -> None:
+        """Bring `matrix` to where the blocks are (collective)."""
+        self._tangent.update_entries()
+        self._check_pattern()  # ties beside the blocks may be new
+        self._attach_nullspace()
+
+    def multiply_by(self, fine_level: FineLevel | None) -> None:
+        """Multiply with this copy of the tangent in single precision; None: in double precision.
+
+        Only where inertia is more than what rounding takes from a stiffness (collective).
+        """
+        if self._block_operator is None:
+            return
+        if fine_level is not None and mass_stiffness_ratio(self._balance) <= self._policy.min_single_precision_inertia:
+            fine_level = None
+        self._block_operator.multiply_by(fine_level)
+
+    def set_on(self, ksp: PETSc.KSP, pc: PETSc.PC) -> None:
+        """Let a KSP with this preconditioner take the tangent, and set both up (collective)."""
+        ksp.setPC(pc)
+        pc.setReusePreconditioner(False)
+        pc.setUseAmat(self.products is not None)
+        ksp.setOperators(self.products or self.matrix, self.matrix)
+        ksp.setUp()
+
+    # --- end ---
+
+    def _release_operators(self) -> None:
+        if self._block_operator is not None:
+            self._block_operator.release_copy()
+            self._block_operator = None
+        if self._low_rank_operator is not None:
+            self._low_rank_operator.destroy()
+            self._low_rank_operator = None
+
+    def destroy(self) -> None:
+        """Give back PETSc's objects."""
+        self._release_operators()
+        if self._near_nullspace is not None:
+            self._near_nullspace.destroy()
+
+
+def near_nullspace(domain: Domain) -> PETSc.NullSpace:
+    """The rigid body modes of a body about its centre (collective)."""
+    return rigid_body_nullspace(domain.comm, domain.nodes[: domain.node_count] - (domain.lower + domain.upper) / 2)
