@@ -7,14 +7,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fracsim.contact.barrier import KEPT, Barrier, safe_fractions
+from fracsim.contact import laws
 from fracsim.contact.facet_contact import ContactFacets, evaluate_facets
-from fracsim.contact.friction import CoulombFriction, tangential
-from fracsim.contact.laws import TimeAveragedPotential
+from fracsim.contact.laws import Barrier, CoulombFriction, TimeAveragedPotential, tangential
 from fracsim.contact.node_contact import StepStart, evaluate_points
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, Shape, Sphere
-from fracsim.contact.step_limit import PointMotion, safe_motion_fractions
+from fracsim.contact.step_limit import PointMotion, safe_fractions, safe_motion_fractions
 from fracsim.errors import InputError
 from support.laws import rotation
 from support.shapes import ALL, Values, differences, points
@@ -141,7 +140,7 @@ def test_nothing_tunnels_through_a_thin_capsule(dim: int, seed: int) -> None:
     assert q.any() or (share < 1).all()  # the wire at rest is hit by all
     now = wire.distance(x)
     for part in np.linspace(0, 1, 300):
-        assert (motion.gap(part * share) >= KEPT * now * (1 - 1e-9)).all()
+        assert (motion.gap(part * share) >= laws.BARRIER.min_gap_ratio * now * (1 - 1e-9)).all()
 
 
 def still(shape: Shape, x: Values, moved: Values) -> PointMotion:
@@ -166,7 +165,7 @@ def test_a_free_way_past_a_sphere_is_taken() -> None:
     for speed in (motion.speed, lambda share: np.linalg.norm(moved, axis=1)):  # tangents; 1-Lipschitz alone
         share = safe_fractions(motion.gap, speed, 2)
         assert share[0] == 1 and share[1] < 1
-        assert motion.gap(share)[1] == pytest.approx(KEPT * sphere.distance(x)[1], rel=0.01)
+        assert motion.gap(share)[1] == pytest.approx(laws.BARRIER.min_gap_ratio * sphere.distance(x)[1], rel=0.01)
 
 
 @pytest.mark.parametrize("gap", (1e-3, 1e-6, 1e-9))
@@ -205,7 +204,7 @@ def test_a_container_keeps_what_is_in_it() -> None:
     room, rng = RoundedBox((1.0, 1.0, 1.0), hollow=True), np.random.default_rng(0)
     motion = still(room, rng.uniform(-0.45, 0.45, (200, 3)), rng.normal(size=(200, 3)) * 5)
     share = safe_fractions(motion.gap, motion.speed, 200)
-    assert (motion.gap(share) >= KEPT * room.distance(motion.x) * (1 - 1e-9)).all()
+    assert (motion.gap(share) >= laws.BARRIER.min_gap_ratio * room.distance(motion.x) * (1 - 1e-9)).all()
 
 
 FRICTION = CoulombFriction(coefficient=0.4, sticking_slip=1e-3)

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fracsim.contact.barrier import Barrier
+from fracsim.contact.laws import Barrier
 from fracsim.contact.node_contact import ContactForces, StepStart, evaluate_points
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.shapes import RoundedBox, Shape, Sphere

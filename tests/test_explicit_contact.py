@@ -10,9 +10,7 @@ import numpy.typing as npt
 import pytest
 from pydantic import ValidationError
 
-from fracsim.contact.penalty_law import NodalMassShare
-from fracsim.contact.penalty_obstacles import PenaltyObstacleTerm
-from fracsim.contact.penalty_rigid_obstacles import PenaltyFreeObstacleTerm
+from fracsim.contact.penalty_obstacles import NodalMassShare, PenaltyFreeObstacleTerm, PenaltyObstacleTerm
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.split_surface.local_surface import LocalSurface, ParentMatrix
 from fracsim.scene import Scene

@@ -9,10 +9,9 @@ import numpy.typing as npt
 import pytest
 from scipy.linalg import block_diag
 
-from fracsim.contact.barrier import Barrier
 from fracsim.contact.closest_point import find_closest_points, minimise_on_simplex, smoothing_error
 from fracsim.contact.facet_contact import ContactFacets, FacetForces, add_facet_friction, evaluate_facets, merge_forces
-from fracsim.contact.friction import CoulombFriction
+from fracsim.contact.laws import Barrier, CoulombFriction
 from fracsim.contact.node_contact import ContactForces, evaluate_points, lag_contact, no_contact
 from fracsim.contact.obstacle_term import ObstacleTerm
 from fracsim.contact.pose import Pose, PosedShape, rotation_derivative

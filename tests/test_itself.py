@@ -8,7 +8,7 @@ import meshio
 import numpy as np
 import pytest
 
-from fracsim.contact.laws import TIGHT
+from fracsim.contact.laws import BARRIER
 from fracsim.contact.self_contact import SelfContact
 from fracsim.errors import InputError
 from fracsim.meshes.builders.box import Box
@@ -127,7 +127,7 @@ def test_contact_that_is_too_soft_is_made_stiffer(tmp_path: Path) -> None:
         gaps.append(contact.min_gap() / contact.law.distance)
         its.append([report.solve.newton_iterations for report in reports])
         forces.append(scene.probes()[0])
-    assert min(gaps) > TIGHT
+    assert min(gaps) > BARRIER.tight_gap
     assert sum(its[1][5:]) <= sum(its[0][5:]) + 5
     assert forces[1] == pytest.approx(forces[0], rel=0.05)  # the gap itself is 3 % of the way
     assert contact.law.stiffness > 100 * 3e-3

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fracsim.contact.barrier import Barrier
+from fracsim.contact.laws import Barrier
 from fracsim.contact.obstacle import RigidObstacle
 from fracsim.contact.obstacle_pairs import ObstaclePair
 from fracsim.contact.pose import Pose

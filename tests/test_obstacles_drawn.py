@@ -11,7 +11,7 @@ import pytest
 import pyvista
 from mpi4py import MPI
 
-from fracsim.contact.drawing import ObstacleTessellation
+from fracsim.contact.obstacle_tessellation import ObstacleTessellation
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.shapes import HalfSpace, Sphere
 from fracsim.output.surface.vtk_files import read_pvd

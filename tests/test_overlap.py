@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fracsim.contact.initial_overlap import overlap_depth
+from fracsim.contact.obstacle import overlap_depth
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.shapes import HalfSpace, RoundedBox, Shape, Sphere
 from support.shapes import ALL, BODIES

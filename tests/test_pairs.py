@@ -13,8 +13,8 @@ from fracsim.meshes.data import MeshData
 from support.solids import four_cells, lattice, separated, torn, two_cells
 
 pytest.importorskip("ipctk", reason="an environment made without a network")
-from fracsim.contact.crack_wall_offset import offset_crack_faces
-from fracsim.contact.ipc_pairs import VERTICES, IpcPairs
+from fracsim.contact.ipc_pairs import PAIRS, IpcPairs
+from fracsim.contact.ipc_surface import offset_crack_faces
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -123,10 +123,10 @@ def pressure(gap: float, reach: float = REACH) -> float:
 @pytest.mark.parametrize("dim", [2, 3])
 def test_pressure_does_not_depend_on_the_mesh(dim, share):
     """Faces of area 1, by their centroids. To vertices on the rim half of the sides' area belongs, 0.8, in 2D half of
-    the sides' length; vertices are pressed from VERTICES of the distance on."""
+    the sides' length; vertices are pressed from vertex_distance of the distance on."""
     gap = share * REACH
     area = 1 + 0.4 if dim == 3 else 1 + 0.2
-    expected = pressure(gap) + area * pressure(gap, VERTICES * REACH)
+    expected = pressure(gap) + area * pressure(gap, PAIRS.vertex_distance * REACH)
     for counts, seeds in (((4, 4), (1, 2)), ((4, 4), (3, 3)), ((5, 13), (5, 6)), ((16, 16), (7, 8))):
         x, elements, upper = stacked(dim, gap, counts, seeds)
         force = -IpcPairs(x, elements, distance=REACH, stiffness=STIFF).gradient(x)[upper]
@@ -187,8 +187,8 @@ def test_ways_too_short_to_meet_ask_no_collision_detection(dim, gap, monkeypatch
     x, elements, upper = stacked(dim, gap)
     pairs = IpcPairs(x, elements, distance=REACH, stiffness=STIFF)
     asked = []
-    free = pairs._near.free_fraction
-    monkeypatch.setattr(pairs._near, "free_fraction", lambda *ends: asked.append(1) or free(*ends))
+    free = pairs._search.free_fraction
+    monkeypatch.setattr(pairs._search, "free_fraction", lambda *ends: asked.append(1) or free(*ends))
     for length in np.linspace(0.02, 1.5, 60) * gap:
         asked.clear()
         way = -length * upper[:, None] * np.eye(dim)[-1]

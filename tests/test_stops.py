@@ -9,9 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fracsim.contact.barrier import Barrier
-from fracsim.contact.initial_overlap import overlap_depth
-from fracsim.contact.obstacle import RigidObstacle
+from fracsim.contact.laws import Barrier
+from fracsim.contact.obstacle import RigidObstacle, overlap_depth
 from fracsim.contact.obstacle_pairs import ObstaclePairs
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.rigid_obstacle_term import FreeObstacleTerm

@@ -1,26 +1,11 @@
-"""The place on a facet that is nearest to a convex obstacle, or deepest in it.
+"""Closest points of triangles and segments to a convex obstacle, smoothed.
 
-    G(x) = min over shares l of   D(y) + mu/2 |l - 1/c|^2,      y = sum_c l_c x_c,   l_c >= 0,  sum l_c = 1
+    G(x) = min over barycentric l of   D(y) + mu/2 |l - 1/c|^2,      y = sum_c l_c x_c,   l_c >= 0,  sum l_c = 1
 
-D the signed distance, x (c, d) the corners of a triangle (c = 3) or a segment (c = 2). Without the last term the place
-would jump from one end of a flat obstacle to the other as the facet tilts; with it the shares are unique and change
-steadily, and G, the least of a convex function, has the derivatives
+D is the signed distance of the obstacle, x (c, d) the corners of a triangle (c = 3) or a segment (c = 2). Without the
+second term the closest point would jump from one end of a flat obstacle to the other as a facet tilts.
 
-    dG/dx_c = l_c n(y),      d2G/dx2 = L_xx - L_xl S L_lx
-
-n the normal of the distance, L the function above, S the inverse of L_ll over shares that may change. It is never more
-than mu/2 (1 - 1/c) above the least distance of the facet.
-
-The least of a quadratic over shares: a step of Newton's method to the deepest place of a facet.
-
-What the deepest place of a facet would be before an obstacle that is flat: the least of its corners' gaps, softened.
-
-    G'(g) = min over shares l of   sum_c l_c g_c + mu/2 |l - 1/c|^2,      l_c >= 0,  sum l_c = 1
-
-As `deepest`, with distances that are linear between the corners: there G = G' with all derivatives, and before a convex
-obstacle G <= G'.
-
-    dG'/dg_c = l_c,      d2G'/dg2 = - (1 - 1 1^T / n) / mu   over the n shares above 0
+Equations: docs/theory.md#facets.
 """
 
 from __future__ import annotations
@@ -35,50 +20,81 @@ from .pose import PosedShape
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-ITERATIONS, LOOKS = 40, 40
-ENOUGH = 0.1  # of the slope along a step: what is left where it ends
-FAR = 1e3  # of its size, from which on an obstacle is as good as flat for a facet
-STILL = 1e-13  # of all shares: a step that is none
-FOUND = 1e-11  # of the size of a facet: what is left of a derivative by shares
 
 
-def minimise_on_simplex(Q: Values, slope: Values, share: Values) -> Values:
-    """(k, c) shares m where slope . (m - l) + (m - l) . Q (m - l) / 2 is least, m >= 0, sum m = 1, l = `share` (k, c);
-    of segments (c = 2) or triangles (c = 3), Q (k, c, c) positive definite for changes that sum to 0.
+@dataclass(frozen=True)
+class ClosestPointPolicy:
+    """Tuned numbers of the search for closest points.
 
-    Inside, if the least of all changes is there; else on that side where it is lowest.
+    Attributes:
+        max_iterations: of Newton's method.
+        max_trials: of a line search.
+        slope_reduction: part of the initial slope at which a line search ends.
+        flat_distance: distance, in facet sizes, from which on an obstacle counts as flat for the initial guess.
+        min_change: change of barycentric coordinates that counts as none.
+        tolerance: remaining derivative by barycentric coordinates, in facet sizes.
     """
-    c = share.shape[1]
-    b = slope - np.einsum("kce,ke->kc", Q, share)
+
+    max_iterations: int = 40
+    max_trials: int = 40
+    slope_reduction: float = 0.1
+    flat_distance: float = 1e3
+    min_change: float = 1e-13
+    tolerance: float = 1e-11
+
+
+SEARCH = ClosestPointPolicy()
+
+
+def minimise_on_simplex(Q: Values, slope: Values, barycentric: Values) -> Values:
+    """(k, c) minimisers m of slope . (m - l) + (m - l) . Q (m - l) / 2 over m >= 0, sum m = 1.
+
+    The minimum over all changes, if that is inside; else the minimum over the side where the value is lowest.
+
+    Args:
+        Q: (k, c, c), positive definite for changes that sum to 0; c = 2 (segments) or 3 (triangles).
+        slope: (k, c).
+        barycentric: (k, c) l.
+    """
+    c = barycentric.shape[1]
+    b = slope - np.einsum("kce,ke->kc", Q, barycentric)
     first = np.arange(c if c == 3 else 1)
     last = (first + 1) % c
-    ends, across = np.einsum("kcc->kc", Q), Q[:, first, last]
-    fall = across - ends[:, first] + b[:, last] - b[:, first]
-    bent = ends[:, first] + ends[:, last] - 2 * across
-    t = np.clip(np.divide(-fall, bent, out=np.zeros_like(fall), where=bent > 0), 0.0, 1.0)
-    value = ends[:, first] / 2 + b[:, first] + t * (fall + t * bent / 2)
-    best, every = value.argmin(axis=1), np.arange(len(value))
-    least = np.zeros_like(share)
-    least[every, first[best]], least[every, last[best]] = 1 - t[every, best], t[every, best]
+    diagonal, coupling = np.einsum("kcc->kc", Q), Q[:, first, last]
+    # along each side the value is a parabola in t, from its first to its last corner
+    linear = coupling - diagonal[:, first] + b[:, last] - b[:, first]
+    quadratic = diagonal[:, first] + diagonal[:, last] - 2 * coupling
+    t = np.clip(np.divide(-linear, quadratic, out=np.zeros_like(linear), where=quadratic > 0), 0.0, 1.0)
+    value = diagonal[:, first] / 2 + b[:, first] + t * (linear + t * quadratic / 2)
+    side, row = value.argmin(axis=1), np.arange(len(value))
+    on_side = np.zeros_like(barycentric)
+    on_side[row, first[side]], on_side[row, last[side]] = 1 - t[row, side], t[row, side]
     if c == 2:
-        return least
-    # from the first corner along the sides to the others
-    mixed = ends[:, 0] - across[:, 0] - across[:, 2] + across[:, 1]
-    back = across[:, 2] - ends[:, 0] + b[:, 2] - b[:, 0]
+        return on_side
+    # interior minimum, in coordinates from the first corner along the sides to the two others
+    mixed = diagonal[:, 0] - coupling[:, 0] - coupling[:, 2] + coupling[:, 1]
+    linear_back = coupling[:, 2] - diagonal[:, 0] + b[:, 2] - b[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        det = bent[:, 0] * bent[:, 2] - mixed**2
-        m1 = (mixed * back - bent[:, 2] * fall[:, 0]) / det
-        m2 = (mixed * fall[:, 0] - bent[:, 0] * back) / det
-        inner = np.stack([1 - m1 - m2, m1, m2], axis=1)
-    return np.where(np.all(inner > 0, axis=1, keepdims=True), inner, least)
+        det = quadratic[:, 0] * quadratic[:, 2] - mixed**2
+        m1 = (mixed * linear_back - quadratic[:, 2] * linear[:, 0]) / det
+        m2 = (mixed * linear[:, 0] - quadratic[:, 0] * linear_back) / det
+        interior = np.stack([1 - m1 - m2, m1, m2], axis=1)
+    return np.where(np.all(interior > 0, axis=1, keepdims=True), interior, on_side)
 
 
 @dataclass(frozen=True, eq=False)
 class FacetClosestPoints:
-    """The places on facets with corners x (k, c, d).
+    """Closest points of facets to an obstacle, with derivatives of the smoothed gap G.
+
+        dG/dx_c = l_c n(y),      d2G/dx2 = L_xx - L_xl S L_lx
+
+    L is the function that l minimises, n the normal of the distance, S the inverse of L_ll over the l that are free.
 
     Attributes:
-        placed: the obstacle.    soften: mu, m.    share: (k, c) l.
+        posed: the obstacle.
+        x: (k, c, d) corners, m.
+        smoothing: mu, m.
+        barycentric: (k, c) l.
     """
 
     posed: PosedShape
@@ -93,14 +109,13 @@ class FacetClosestPoints:
 
     @cached_property
     def gap(self) -> Values:
-        """(k,) G less the most that it can be above the least distance, m."""
-        return _height(self.posed, self.x, self.barycentric, self.smoothing) - smoothing_error(
-            self.x.shape[1], self.smoothing
-        )
+        """(k,) G minus its largest possible excess over the minimum distance, m."""
+        value = _smoothed_distance(self.posed, self.x, self.barycentric, self.smoothing)
+        return value - smoothing_error(self.x.shape[1], self.smoothing)
 
     @cached_property
     def normal(self) -> Values:
-        """(k, d) n."""
+        """(k, d) unit normals n of the distance at the closest points."""
         return self.posed.normal(self.position)
 
     @property
@@ -110,131 +125,165 @@ class FacetClosestPoints:
 
     @cached_property
     def corner_rise(self) -> Values:
-        """(k, c) by how much the tangent of L rises from the place to each corner, m: where a place is found roughly it
-        may fall."""
-        slope = _slope(self.x, self.normal, self.barycentric, self.smoothing)
+        """(k, c) rise of the tangent plane of L from the closest point to each corner, m.
+
+        It may be negative where the closest point was found with a coarse tolerance.
+        """
+        slope = _barycentric_slope(self.x, self.normal, self.barycentric, self.smoothing)
         return np.asarray(slope - np.einsum("kc,kc->k", self.barycentric, slope)[:, None])
 
     def curvature(self) -> Values:
         """(k, c d, c d) d2G/dx2, 1/m."""
         k, c, d = self.x.shape
         H, free = self.posed.curvature(self.position), self.barycentric > 0
-        out = np.einsum("kij,kcj->kci", H, self.x - self.position[:, None])
-        Q = np.einsum("kci,kei->kce", self.x - self.position[:, None], out) + self.smoothing * np.eye(c)
-        both = free[:, :, None] & free[:, None, :]
+        H_arms = np.einsum("kij,kcj->kci", H, self.x - self.position[:, None])
+        Q = np.einsum("kci,kei->kce", self.x - self.position[:, None], H_arms) + self.smoothing * np.eye(c)
+        free_pairs = free[:, :, None] & free[:, None, :]
+        # bordered matrix of the constraint that changes of l sum to 0
         bordered = np.zeros((k, c + 1, c + 1))
-        bordered[:, :c, :c] = np.where(both, Q, np.eye(c) * ~free[:, :, None])
+        bordered[:, :c, :c] = np.where(free_pairs, Q, np.eye(c) * ~free[:, :, None])
         bordered[:, :c, c] = bordered[:, c, :c] = free
-        S = np.where(both, np.linalg.inv(bordered)[:, :c, :c], 0.0)
-        mixed = np.einsum("kc,kei->kcie", self.barycentric, out) + np.einsum("ce,ki->kcie", np.eye(c), self.normal)
+        S = np.where(free_pairs, np.linalg.inv(bordered)[:, :c, :c], 0.0)
+        mixed = np.einsum("kc,kei->kcie", self.barycentric, H_arms) + np.einsum("ce,ki->kcie", np.eye(c), self.normal)
         mixed = mixed.reshape(k, c * d, c)
         direct = np.einsum("kc,ke,kij->kciej", self.barycentric, self.barycentric, H).reshape(k, c * d, c * d)
         return np.asarray(direct - mixed @ S @ mixed.transpose(0, 2, 1))
 
 
-def smoothing_error(corners: int, soften: float) -> float:
-    """m, the most that G can be above the least distance."""
-    return soften / 2 * (1 - 1 / corners)
+def smoothing_error(corners: int, smoothing: float) -> float:
+    """Largest excess of G over the minimum distance of a facet, mu/2 (1 - 1/c), m."""
+    return smoothing / 2 * (1 - 1 / corners)
 
 
 def find_closest_points(
-    placed: PosedShape, x: Values, soften: float, start: Values | None = None, found: float = FOUND
+    posed: PosedShape,
+    x: Values,
+    smoothing: float,
+    start: Values | None = None,
+    tolerance: float = SEARCH.tolerance,
 ) -> FacetClosestPoints:
-    """Of facets with corners x (k, c, d); `start`: shares (k, c) to look first at, `found`: what is left of derivatives
-    by shares, of the size of a facet.
+    """Closest points of facets by Newton's method with a line search on the simplex.
 
-    By Newton's method, each step of which goes towards the least of a quadratic over all shares, as far as L goes down.
+    Args:
+        posed: convex obstacle.
+        x: (k, c, d) corners, m.
+        smoothing: mu, m.
+        start: (k, c) barycentric coordinates to start from.
+        tolerance: remaining derivative by barycentric coordinates, in facet sizes.
     """
-    small = found * np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
-    share = initial_barycentric(placed, x, soften) if start is None else start.copy()
-    slope, left = _Slope(placed, x, soften)(share), np.arange(len(x))
-    for _ in range(ITERATIONS):
-        rise = _over(slope[left], share[left])
-        left = left[np.where(share[left] > 0, abs(rise), -rise).max(axis=1) > small[left]]
-        if not len(left):
+    max_residual = tolerance * np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+    lam = initial_barycentric(posed, x, smoothing) if start is None else start.copy()
+    slope, active = _SlopeFunction(posed, x, smoothing)(lam), np.arange(len(x))
+    for _ in range(SEARCH.max_iterations):
+        rise = _rise(slope[active], lam[active])
+        active = active[np.where(lam[active] > 0, abs(rise), -rise).max(axis=1) > max_residual[active]]
+        if not len(active):
             break
-        now, corners = share[left], x[left]
-        step = minimise_on_simplex(_bent(placed, corners, now, soften), slope[left], now) - now
-        part, slope[left] = _down(_Slope(placed, corners, soften), now, step, slope[left])
-        share[left] = now + part[:, None] * step
-        left = left[part * abs(step).max(axis=1) > STILL]
-    return FacetClosestPoints(placed, x, soften, share)
+        start_lam, corners = lam[active], x[active]
+        step = minimise_on_simplex(_barycentric_hessian(posed, corners, start_lam, smoothing), slope[active], start_lam)
+        step = step - start_lam
+        fraction, slope[active] = _line_search(
+            _SlopeFunction(posed, corners, smoothing), start_lam, step, slope[active]
+        )
+        lam[active] = start_lam + fraction[:, None] * step
+        active = active[fraction * abs(step).max(axis=1) > SEARCH.min_change]
+    return FacetClosestPoints(posed, x, smoothing, lam)
 
 
-def initial_barycentric(placed: PosedShape, x: Values, soften: float) -> Values:
-    """(k, c) shares of the places of facets nearest to that point of the core of an obstacle, which its least radius
-    rounds, that is nearest to their middles: before a ball the deepest, but for what is softened."""
+def initial_barycentric(posed: PosedShape, x: Values, smoothing: float) -> Values:
+    """(k, c) barycentric coordinates of the points of facets closest to a point of the obstacle's core.
+
+    The core is the obstacle without its least radius; its point is the one closest to the centroid of the facet.
+    For a sphere this is the closest point itself, apart from the smoothing.
+    """
     k, c, _ = x.shape
-    middle = x.mean(axis=1)
-    arms = x - middle[:, None]
+    centroid = x.mean(axis=1)
+    arms = x - centroid[:, None]
     size = np.linalg.norm(arms, axis=2).max(axis=1, initial=0.0)
-    away = np.minimum(placed.distance(middle) + placed.shape.min_radius, FAR * size)
-    bent = np.einsum("kci,kei->kce", arms, arms) + soften * (abs(away) + soften)[:, None, None] * np.eye(c)
-    fall = away[:, None] * np.einsum("kcd,kd->kc", arms, placed.normal(middle))
-    return minimise_on_simplex(bent, fall, np.full((k, c), 1 / c))
+    radius = np.minimum(posed.distance(centroid) + posed.shape.min_radius, SEARCH.flat_distance * size)
+    Q = np.einsum("kci,kei->kce", arms, arms) + smoothing * (abs(radius) + smoothing)[:, None, None] * np.eye(c)
+    slope = radius[:, None] * np.einsum("kcd,kd->kc", arms, posed.normal(centroid))
+    return minimise_on_simplex(Q, slope, np.full((k, c), 1 / c))
 
 
-def _bent(placed: PosedShape, x: Values, share: Values, soften: float) -> Values:
-    """(k, c, c) second derivative of L by the shares, but for what is the same of all."""
-    place = np.einsum("kc,kcd->kd", share, x)
-    arms = x - place[:, None]
-    return np.asarray(arms @ placed.curvature(place) @ arms.transpose(0, 2, 1) + soften * np.eye(x.shape[1]))
+def _barycentric_hessian(posed: PosedShape, x: Values, barycentric: Values, smoothing: float) -> Values:
+    """(k, c, c) second derivative of L by the barycentric coordinates, up to parts common to all corners."""
+    y = np.einsum("kc,kcd->kd", barycentric, x)
+    arms = x - y[:, None]
+    return np.asarray(arms @ posed.curvature(y) @ arms.transpose(0, 2, 1) + smoothing * np.eye(x.shape[1]))
 
 
 @dataclass(frozen=True)
-class _Slope:
-    """Derivative of L by shares (k, c), but for what is the same of all."""
+class _SlopeFunction:
+    """Derivative of L by the barycentric coordinates (k, c), up to parts common to all corners."""
 
-    placed: PosedShape
+    posed: PosedShape
     x: Values
-    soften: float
+    smoothing: float
 
-    def __call__(self, share: Values, of: Ints | slice = slice(None)) -> Values:
-        x = self.x[of]
-        return _slope(x, self.placed.normal(np.einsum("kc,kcd->kd", share, x)), share, self.soften)
-
-
-def _over(slope: Values, share: Values) -> Values:
-    """(k, c) how L rises towards each corner."""
-    return np.asarray(slope - np.einsum("kc,kc->k", slope, share)[:, None])
+    def __call__(self, barycentric: Values, rows: Ints | slice = slice(None)) -> Values:
+        x = self.x[rows]
+        normal = self.posed.normal(np.einsum("kc,kcd->kd", barycentric, x))
+        return _barycentric_slope(x, normal, barycentric, self.smoothing)
 
 
-def _down(look: _Slope, share: Values, step: Values, slope: Values) -> tuple[Values, Values]:
-    """(k,) parts of steps (k, c) after which L, a convex function, is no longer steep along them; and the slopes (k, c)
-    there."""
-    part, after = np.ones(len(share)), look(share + step)
-    # right to the last digits where it is almost nothing: steps sum to 0 but for round-off
-    falls, rises = (np.einsum("kc,kc->k", _over(each, share), step) for each in (slope, after))
-    low, high, at_low, at_high = np.zeros(len(share)), np.ones(len(share)), falls.copy(), rises
-    left = np.flatnonzero((rises > -ENOUGH * falls) & (falls < 0))
-    for count in range(LOOKS):
-        if not len(left):
+def _rise(slope: Values, barycentric: Values) -> Values:
+    """(k, c) rise of L towards each corner."""
+    return np.asarray(slope - np.einsum("kc,kc->k", slope, barycentric)[:, None])
+
+
+def _line_search(slope_at: _SlopeFunction, barycentric: Values, step: Values, slope: Values) -> tuple[Values, Values]:
+    """(k,) fractions of steps (k, c) after which the convex L is no longer steep along them, and slopes (k, c) there.
+
+    The root of the directional derivative is bracketed; regula falsi with a bisection every third trial.
+    """
+    fraction, end_slope = np.ones(len(barycentric)), slope_at(barycentric + step)
+    # by the rise towards corners: exact to the last digits near 0, as steps sum to 0 but for round-off
+    start_rate, end_rate = (np.einsum("kc,kc->k", _rise(s, barycentric), step) for s in (slope, end_slope))
+    low, high = np.zeros(len(barycentric)), np.ones(len(barycentric))
+    rate_low, rate_high = start_rate.copy(), end_rate
+    active = np.flatnonzero((end_rate > -SEARCH.slope_reduction * start_rate) & (start_rate < 0))
+    for trial in range(SEARCH.max_trials):
+        if not len(active):
             break
-        falsely = low[left] - at_low[left] * (high[left] - low[left]) / (at_high[left] - at_low[left])
-        part[left] = (low[left] + high[left]) / 2 if count % 3 == 2 else falsely  # which may stall
-        after[left] = look(share[left] + part[left, None] * step[left], left)
-        now = np.einsum("kc,kc->k", _over(after[left], share[left]), step[left])
-        below, above = left[now < 0], left[now >= 0]
-        low[below], at_low[below] = part[below], now[now < 0]
-        high[above], at_high[above] = part[above], now[now >= 0]
-        left = left[(abs(now) > -ENOUGH * falls[left]) & (high[left] - low[left] > STILL)]
-    return part, after
+        secant = low[active] - rate_low[active] * (high[active] - low[active]) / (rate_high[active] - rate_low[active])
+        # bisection from time to time, as regula falsi may stall
+        fraction[active] = (low[active] + high[active]) / 2 if trial % 3 == 2 else secant
+        end_slope[active] = slope_at(barycentric[active] + fraction[active, None] * step[active], active)
+        rate = np.einsum("kc,kc->k", _rise(end_slope[active], barycentric[active]), step[active])
+        falling, rising = active[rate < 0], active[rate >= 0]
+        low[falling], rate_low[falling] = fraction[falling], rate[rate < 0]
+        high[rising], rate_high[rising] = fraction[rising], rate[rate >= 0]
+        steep = abs(rate) > -SEARCH.slope_reduction * start_rate[active]
+        active = active[steep & (high[active] - low[active] > SEARCH.min_change)]
+    return fraction, end_slope
 
 
-def _height(placed: PosedShape, x: Values, share: Values, soften: float) -> Values:
-    """(k,) D(y) + mu/2 |l - 1/c|^2."""
-    away = share - 1 / x.shape[1]
-    return placed.distance(np.einsum("kc,kcd->kd", share, x)) + soften / 2 * np.einsum("kc,kc->k", away, away)
+def _smoothed_distance(posed: PosedShape, x: Values, barycentric: Values, smoothing: float) -> Values:
+    """(k,) L = D(y) + mu/2 |l - 1/c|^2, m."""
+    offset = barycentric - 1 / x.shape[1]
+    distance = posed.distance(np.einsum("kc,kcd->kd", barycentric, x))
+    return distance + smoothing / 2 * np.einsum("kc,kc->k", offset, offset)
 
 
-def _slope(x: Values, normal: Values, share: Values, soften: float) -> Values:
-    """(k, c) its derivative by the shares, but for what is the same of all."""
-    return np.asarray(np.einsum("kcd,kd->kc", x - x[:, :1], normal) + soften * (share - 1 / x.shape[1]))
+def _barycentric_slope(x: Values, normal: Values, barycentric: Values, smoothing: float) -> Values:
+    """(k, c) derivative of L by the barycentric coordinates, up to parts common to all corners."""
+    return np.asarray(np.einsum("kcd,kd->kc", x - x[:, :1], normal) + smoothing * (barycentric - 1 / x.shape[1]))
 
 
 @dataclass(frozen=True, eq=False)
 class SoftMinGap:
-    """Of facets whose corners have `gaps` (k, c), m; `soften`: mu, m."""
+    """Smoothed minimum of the nodal gaps of facets; equal to G, with all derivatives, in front of a plane.
+
+        G'(g) = min over barycentric l of   sum_c l_c g_c + mu/2 |l - 1/c|^2
+        dG'/dg_c = l_c,      d2G'/dg2 = -(1 - 1 1^T / n) / mu   over the n coordinates above 0
+
+    Before a convex obstacle G <= G'.
+
+    Attributes:
+        gaps: (k, c) nodal gaps, m.
+        smoothing: mu, m.
+    """
 
     gaps: Values
     smoothing: float
@@ -247,15 +296,15 @@ class SoftMinGap:
 
     @property
     def gap(self) -> Values:
-        """(k,) G' less the most that it can be above the least, m."""
+        """(k,) G' minus its largest possible excess over the minimum, m."""
         c = self.gaps.shape[1]
-        off = self.barycentric - 1 / c
-        above = self.smoothing / 2 * np.einsum("kc,kc->k", off, off) - smoothing_error(c, self.smoothing)
-        return np.asarray(np.einsum("kc,kc->k", self.barycentric, self.gaps) + above)
+        offset = self.barycentric - 1 / c
+        excess = self.smoothing / 2 * np.einsum("kc,kc->k", offset, offset) - smoothing_error(c, self.smoothing)
+        return np.asarray(np.einsum("kc,kc->k", self.barycentric, self.gaps) + excess)
 
     def curvature(self) -> Values:
         """(k, c, c) d2G'/dg2, 1/m."""
         free = self.barycentric > 0
-        both = free[:, :, None] & free[:, None, :]
+        free_pairs = free[:, :, None] & free[:, None, :]
         count = free.sum(axis=1)[:, None, None]
-        return np.asarray(np.where(both, 1 / count - np.eye(self.gaps.shape[1]), 0.0) / self.smoothing)
+        return np.asarray(np.where(free_pairs, 1 / count - np.eye(self.gaps.shape[1]), 0.0) / self.smoothing)

@@ -1,5 +1,4 @@
-"""What touches in a step: points of the body (contact_surface), obstacles on their ways (step_limit), and what friction
-holds."""
+"""State of contact between a body and obstacles in a time step: points, obstacles and lagged friction."""
 
 from __future__ import annotations
 
@@ -15,8 +14,7 @@ from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from .contact_surface import ContactSurface, FacetGapFunction
 from .facet_contact import ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
-from .friction import CoulombFriction
-from .laws import ObstacleLaw
+from .laws import CoulombFriction, ObstacleLaw
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
 from .obstacle import RigidObstacle
 from .pose import PosedShape, min_distance
@@ -26,95 +24,102 @@ Values = npt.NDArray[np.float64]
 
 
 class ContactState:
-    """Obstacles, and the points that they act on at the end of a step.
+    """Obstacles, and the points of a body that they act on at the end of a step.
 
     Attributes:
-        obstacles: held or driven (or free: free_obstacles).    law: how they act.    skin: what touches them.
-        x: (n, d) where its points are at the end of the step that belongs to u, m.
+        obstacles: held, driven or free.
+        law: contact law.
+        surface: points of the body that may touch.
+        positions: (n, d) positions of these points at the end of the step that belongs to u, m.
     """
 
     positions: Values
-    _lagged: list[LaggedContact | None]  # what friction holds of each
-    _step_starts: list[
-        StepStart | None
-    ]  # the points before each at the start of the step, where barriers act along the way
+    _lagged: list[LaggedContact | None]  # contact at the start of the step, one per obstacle with friction
+    _step_starts: list[StepStart | None]  # points at the start of the step, where barriers are averaged over it
 
     def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[RigidObstacle], law: ObstacleLaw) -> None:
-        """InputError where the body at rest lies in an obstacle, or a free obstacle in another one (collective)."""
-        self.obstacles, self.law, self.surface = tuple(obstacles), law, ContactSurface(domain, law.barrier.width)
+        """Raise InputError where the body at rest, or a free obstacle, overlaps an obstacle (collective)."""
+        self.obstacles, self.law = tuple(obstacles), law
+        self.surface = ContactSurface(domain, law.barrier.width)
         self._kinematics = ObstacleKinematics(self.obstacles, self._prescribed_numbers())
         self._domain, self._u, self._owned = domain, u, domain.node_count * domain.dim
         self.comm = domain.comm
         self._contact_forces: list[ContactForces] | None = None
-        self._end, self._dt = -np.inf, 0.0  # s, of the step that is taken or has been
-        self._attempts = 0  # of Newton's method in it
-        self._tangent_positions: Values | None = None  # places of the points at the last tangent of this attempt
+        self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
+        self._attempts = 0  # of Newton's method in the step
+        self._tangent_positions: Values | None = None  # of the points at the last tangent of this attempt
         check_obstacles_apart(self.comm, self.surface.rest_positions, self.obstacles)
-        if any(each.free for each in self.obstacles):
-            from .initial_overlap import check_free_apart
+        if any(obstacle.free for obstacle in self.obstacles):
+            from .obstacle import check_free_obstacles
 
-            check_free_apart(self.obstacles)
+            check_free_obstacles(self.obstacles)
         self._facet_obstacles = self._find_facet_obstacles()
         if self._facet_obstacles:
             self._check_facets()
 
     def _find_facet_obstacles(self) -> list[int]:
-        """Numbers of those that facets feel between their corners (collective)."""
-        edge, width, every = self.surface.mean_edge_length, self.law.barrier.width, enumerate(self.obstacles)
-        return [number for number, each in every if facets_matter(each.shape.min_radius, edge, width)]
+        """Numbers of obstacles so curved that facets touch them between their nodes (collective)."""
+        edge, width = self.surface.mean_edge_length, self.law.barrier.width
+        return [
+            number
+            for number, obstacle in enumerate(self.obstacles)
+            if facets_matter(obstacle.shape.min_radius, edge, width)
+        ]
 
     @property
     def mean_edge_length(self) -> float:
-        """Of the body's mesh in the mean, m (collective)."""
+        """Mean edge length of the body's mesh, m (collective)."""
         return self.surface.mean_edge_length
 
     @property
     def barrier_width(self) -> float:
-        """Of the barrier, m."""
+        """Gap from which on contact acts, m."""
         return self.law.barrier.width
 
     def points_only_flags(self) -> list[tuple[RigidObstacle, bool]]:
-        """Each obstacle, and whether nothing between points feels it."""
-        return [(each, number not in self._facet_obstacles) for number, each in enumerate(self.obstacles)]
+        """Each obstacle, and whether it acts on points alone and not on facets."""
+        return [(obstacle, number not in self._facet_obstacles) for number, obstacle in enumerate(self.obstacles)]
 
     def _check_facets(self) -> None:
-        """InputError where a facet of the body at rest is cut; what is nearly so waits until there is room
-        (collective)."""
-        x, placed = self.surface.rest_positions, [each.posed_at(0.0) for each in self.obstacles]
+        """Raise InputError where an obstacle cuts a facet of the body at rest (collective).
+
+        Facets that are cut only by the smoothing are excluded until there is room.
+        """
+        x, posed = self.surface.rest_positions, [obstacle.posed_at(0.0) for obstacle in self.obstacles]
         for number in self._facet_obstacles:
-            distances = self.surface.facets.distances(placed[number], x, 0.0)
+            distances = self.surface.facets.distances(posed[number], x, 0.0)
             refuse_overlap(self.comm, distances, number, self.obstacles[number])
-        cuts = self._facet_gap_function(placed)
-        assert cuts is not None
-        self.surface.exclude_cut_facets(x, cuts)
+        facet_gaps = self._facet_gap_function(posed)
+        assert facet_gaps is not None
+        self.surface.exclude_cut_facets(x, facet_gaps)
 
     def _facets_for(self, number: int) -> ContactFacets | None:
-        """Facets that feel an obstacle."""
+        """Facets on which an obstacle acts; None if it acts on points alone."""
         return self.surface.facets if number in self._facet_obstacles else None
 
-    def _facet_gap_function(self, placed: Sequence[PosedShape]) -> FacetGapFunction | None:
-        """Gaps between facets and the obstacles that they feel, where these are now; None: they feel none."""
+    def _facet_gap_function(self, posed: Sequence[PosedShape]) -> FacetGapFunction | None:
+        """Function for the gaps between facets and obstacles that act on them; None if none does."""
         if not self._facet_obstacles:
             return None
-        sharp, width = [placed[number] for number in self._facet_obstacles], self.law.barrier.width
-        return lambda facets, x: np.asarray(np.min([facets.gaps(each, x, width) for each in sharp], axis=0))
+        curved, width = [posed[number] for number in self._facet_obstacles], self.law.barrier.width
+        return lambda facets, x: np.asarray(np.min([facets.gaps(shape, x, width) for shape in curved], axis=0))
 
     def _facets_are_open(self, x: Values) -> bool:
-        """Whether no facet is cut with points at x (n, d) (collective)."""
-        if (cuts := self._facet_gap_function(self._kinematics.posed)) is None:
+        """Whether no facet is cut with points at x (n, d), m (collective)."""
+        if (facet_gaps := self._facet_gap_function(self._kinematics.posed)) is None:
             return True
-        return bool(self.comm.allreduce(bool((cuts(self.surface.facets, x) > 0).all()), op=MPI.LAND))
+        return bool(self.comm.allreduce(bool((facet_gaps(self.surface.facets, x) > 0).all()), op=MPI.LAND))
 
     def _prescribed_numbers(self) -> list[int]:
-        """Numbers of those whose way is known: all that are held or driven."""
+        """Numbers of obstacles with a prescribed motion: held or driven."""
         return list(range(len(self.obstacles)))
 
     def begin_step(self, level: TimeLevel) -> None:
-        """Obstacles go to where they are at the end of the step; friction holds what is in touch at its start."""
+        """Move obstacles to the end of the step, and store the contact at its start for friction."""
         self._level, self._contact_forces, self._attempts = level, None, 0
         end = level.t + (1 - level.fraction) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
-            return  # a look at what a step has ended with: grips and ways are still those of the step
+            return  # evaluation of a step's result: lagged contact and motions are still those of the step
         self._end, self._dt, self._start_velocity = end, level.dt, level.v_n
         self._place_obstacles(end - level.dt, end)
         self._discard_start()
@@ -122,35 +127,35 @@ class ContactState:
             self._begin_new_step()
 
     def _place_obstacles(self, start: float, end: float) -> None:
-        """Where obstacles are at the ends of a step, s."""
+        """Place obstacles at the times of the start and the end of a step, s."""
         self._kinematics.begin_step(start, end)
 
     def _begin_new_step(self) -> None:
-        at = self._kinematics.start_posed
-        self.surface.release_points(self._level.u_n, partial(min_distance, at), self._facet_gap_function(at))
+        posed, barrier = self._kinematics.start_posed, self.law.barrier
+        self.surface.release_points(self._level.u_n, partial(min_distance, posed), self._facet_gap_function(posed))
         x = self.surface.positions(self._level.u_n)
-        gaps = [placed.distance(x) for placed in at]
-        held = [
-            lag_contact(x, gap, self.surface.area, placed, self.law.barrier)
-            for gap, placed in zip(gaps, at, strict=True)
+        gaps = [shape.distance(x) for shape in posed]
+        lagged = [
+            lag_contact(x, gap, self.surface.area, shape, barrier) for gap, shape in zip(gaps, posed, strict=True)
         ]
         if self._level.contact_weights.time_averaged:
             self._step_starts = [
-                StepStart(gap, each.points, each.normal, each.position) for gap, each in zip(gaps, held, strict=True)
+                StepStart(gap, contact.points, contact.normal, contact.position)
+                for gap, contact in zip(gaps, lagged, strict=True)
             ]
-        self._start_forces = [each.force @ each.normal for each in held]
+        self._start_forces = [contact.force @ contact.normal for contact in lagged]
         for number in self._facet_obstacles:
-            found, _ = evaluate_facets(self.surface.facets, at[number], x, self.law.barrier)
-            self._start_forces[number] = self._start_forces[number] + found.forces.sum(axis=(0, 1))
+            of_facets, _ = evaluate_facets(self.surface.facets, posed[number], x, barrier)
+            self._start_forces[number] = self._start_forces[number] + of_facets.forces.sum(axis=(0, 1))
             if self.obstacles[number].friction:
-                held[number] = add_facet_friction(held[number], found, x)
+                lagged[number] = add_facet_friction(lagged[number], of_facets, x)
         self._lagged = [
-            each if obstacle.friction else None for each, obstacle in zip(held, self.obstacles, strict=True)
+            contact if obstacle.friction else None for contact, obstacle in zip(lagged, self.obstacles, strict=True)
         ]
         self._start_positions = x
 
     def _discard_start(self) -> None:
-        """The points are others than those that the step began with."""
+        """Discard the contact at the start of the step, as the points are no longer the same."""
         none = [None] * len(self.obstacles)
         self._lagged, self._step_starts, self._contact_forces, self._tangent_positions = [*none], [*none], None, None
 
@@ -159,60 +164,65 @@ class ContactState:
         return self._level.displacement_at_end(self._u.x.array[: self._owned])
 
     def obstacle_forces(self) -> list[ContactForces]:
-        """What each obstacle does at the current u (collective)."""
+        """Forces of each obstacle at the current u (collective)."""
         if self._contact_forces is None:
             self.positions = self.surface.positions(self._end_displacement())
             self._contact_forces = [
-                self._evaluate_obstacle(number, placed) for number, placed in enumerate(self._kinematics.posed)
+                self._evaluate_obstacle(number, posed) for number, posed in enumerate(self._kinematics.posed)
             ]
         return self._contact_forces
 
-    def _evaluate_obstacle(self, number: int, placed: PosedShape) -> ContactForces:
-        """What an obstacle at `placed` does to the points where they are now."""
-        if self._is_out_of_range(number, placed):
+    def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
+        """Forces of an obstacle at a given pose on the points."""
+        if self._is_out_of_range(number, posed):
             return no_contact(self._domain.dim)
-        obstacle, held = self.obstacles[number], self._lagged[number]
-        rub = CoulombFriction(obstacle.friction, self.law.sticking_speed * self._dt) if held is not None else None
-        under, start = self._contact_point_motion(number, placed), self._step_starts[number]
+        obstacle, lagged = self.obstacles[number], self._lagged[number]
+        sticking_slip = self.law.sticking_speed * self._dt
+        friction = CoulombFriction(obstacle.friction, sticking_slip) if lagged is not None else None
+        obstacle_motion, start = self._contact_point_motion(number, posed), self._step_starts[number]
+        start_posed = self._kinematics.start_posed[number]
         if start is not None:
-            start = start.carried_with(self._kinematics.start_posed[number].pose, placed.pose)
-        found = evaluate_points(self.positions, self.surface.area, placed, self.law.barrier, held, rub, under, start)
-        if number not in self._facet_obstacles:
-            return found
-        then = None if start is None else (self._kinematics.start_posed[number], self._start_positions)
-        inner, stored = evaluate_facets(self.surface.facets, placed, self.positions, self.law.barrier, then)
-        return merge_forces(found, inner, stored)
-
-    def _is_out_of_range(self, number: int, placed: PosedShape) -> bool:
-        """Whether an obstacle at `placed` is too far from all points to be felt, and was so as the step began."""
-        held, start, width = self._lagged[number], self._step_starts[number], self.law.barrier.width
-        if (held is not None and len(held.points)) or (start is not None and len(start.active)):
-            return False
-        if placed.distance_bound(self.positions) < width:
-            return False
-        return (
-            start is None
-            or number not in self._facet_obstacles
-            or self._kinematics.start_posed[number].distance_bound(self._start_positions) >= width
+            start = start.carried_with(start_posed.pose, posed.pose)
+        of_points = evaluate_points(
+            self.positions, self.surface.area, posed, self.law.barrier, lagged, friction, obstacle_motion, start
         )
+        if number not in self._facet_obstacles:
+            return of_points
+        facet_start = None if start is None else (start_posed, self._start_positions)
+        inner, stored = evaluate_facets(self.surface.facets, posed, self.positions, self.law.barrier, facet_start)
+        return merge_forces(of_points, inner, stored)
 
-    def _contact_point_motion(self, number: int, placed: PosedShape) -> Values:
-        """(d,) or (k, d) way in the step of what is under the points that friction holds, m."""
+    def _is_out_of_range(self, number: int, posed: PosedShape) -> bool:
+        """Whether an obstacle is too far from all points to act, now and at the start of the step."""
+        lagged, start, width = self._lagged[number], self._step_starts[number], self.law.barrier.width
+        if (lagged is not None and len(lagged.points)) or (start is not None and len(start.active)):
+            return False
+        if posed.distance_bound(self.positions) < width:
+            return False
+        if start is None or number not in self._facet_obstacles:
+            return True
+        return self._kinematics.start_posed[number].distance_bound(self._start_positions) >= width
+
+    def _contact_point_motion(self, number: int, posed: PosedShape) -> Values:
+        """(d,) motion of an obstacle in the step, or (k, d) of its points in lagged contact, m."""
         return np.asarray(self._kinematics.increments[number][: self._domain.dim])
 
     def nodal_forces(self) -> Values:
         """(owned dofs,) forces of the obstacles on the nodes at the end of the step, N (collective)."""
         forces = np.zeros_like(self.surface.rest_positions)
-        for each in self.obstacle_forces():
-            forces[each.points] += each.normal + each.friction
+        for contact in self.obstacle_forces():
+            forces[contact.points] += contact.normal + contact.friction
         return self.surface.interpolation.assemble_to_nodes(forces)
 
     def friction_work(self, number: int) -> tuple[float, float]:
-        """Work of friction on the body in the step, and what of it an obstacle does by its own way, this rank's share,
-        J (collective); the rest is lost."""
-        found, held = self.obstacle_forces()[number], self._lagged[number]
-        if held is None or not len(held.points):
+        """Work of friction on the body in the step, and the part of it done by the obstacle's own motion.
+
+        The difference is dissipated. Both of this rank, J (collective).
+        """
+        contact, lagged = self.obstacle_forces()[number], self._lagged[number]
+        if lagged is None or not len(lagged.points):
             return 0.0, 0.0
-        force = found.friction[np.searchsorted(found.points, held.points)]
-        under = self._contact_point_motion(number, self._kinematics.posed[number])
-        return float(np.vdot(force, self.positions[held.points] - held.position)), float((force * under).sum())
+        force = contact.friction[np.searchsorted(contact.points, lagged.points)]
+        obstacle_motion = self._contact_point_motion(number, self._kinematics.posed[number])
+        motion = self.positions[lagged.points] - lagged.position
+        return float(np.vdot(force, motion)), float((force * obstacle_motion).sum())

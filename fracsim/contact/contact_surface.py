@@ -1,14 +1,11 @@
-"""What obstacles touch: points of this rank's surface, walls of cracks among them, as far as there is room for these.
+"""Points of a body's split surface that obstacles act on, with new crack faces retracted where there is no room.
 
-New walls that would lie in an obstacle are drawn in or left out, and come back as there is room.
+A crack may open where an obstacle or the body itself leaves no gap. A point of a new face is therefore retracted
+towards the nodes that it follows: the factor of its arm from them is the largest at which no barrier acts. A point
+that existed before keeps at least its gap, so that contact gains no energy. A point without room even at its nodes is
+excluded. In every step points are extended again as far as the barrier allows.
 
-Room for walls that come to light where there is none: their points are drawn in towards their nodes.
-
-Gaps inside a body are closed before anything is there that could touch: it bends around an obstacle, is squeezed, or a
-crumb whose cells are all split loses its deformation gradient. A new point takes the largest share of its arm that
-brings no barrier to act, one that was there before the largest at which it is no nearer than it was: no energy comes
-from nothing. Where there is no room even at the node, the point is left out. With every step points go out again as
-far as the barrier lets them.
+Equations: docs/theory.md#new-crack-faces.
 """
 
 from __future__ import annotations
@@ -27,94 +24,141 @@ from ..mesh.parallel import gather
 from ..mesh.split_surface.local_surface import LocalSurface, ParentMatrix
 from ..mesh.split_surface.point_matching import match_points
 from ..mesh.split_surface.surface_map import SurfaceMap
-from .facet_contact import SOFTEN, ContactFacets
+from .facet_contact import FACETS, ContactFacets
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
-SHARES = np.linspace(1.0, 0.0, 11)  # of the share that a point had
-NEARER = (0.8,) * 12 + (0.0,)  # what an element that is cut leaves of its points' shares, each time
-OUT = 0.2  # of the arm, that a step gives back
+
+
+@dataclass(frozen=True)
+class RetractionPolicy:
+    """Tuned numbers of the retraction of crack faces; arms are measured as factors of the full arm.
+
+    Attributes:
+        trials: factors of the current arm that are tried for a point, in turn.
+        cut_trials: factors for the points of an element that is cut, applied one after another.
+        extension: arm that one step gives back.
+        facet_rounds: rounds in which points of new facets are retracted.
+        facet_factor: factor of the arm in each round.
+        min_arm: arm below which points of new facets are not retracted further.
+        round_off: relative tolerance of gaps that have to be kept.
+    """
+
+    trials: tuple[float, ...] = tuple(np.linspace(1.0, 0.0, 11))
+    cut_trials: tuple[float, ...] = (0.8,) * 12 + (0.0,)
+    extension: float = 0.2
+    facet_rounds: int = 10
+    facet_factor: float = 0.7
+    min_arm: float = 0.05
+    round_off: float = 1e-9
+
+
+RETRACTION = RetractionPolicy()
 TINY = float(np.finfo(float).tiny)
-ROUNDS, IN, LEAST = 10, 0.7, 0.05  # in which facets are drawn in: what is left of an arm each time, and in all
+
+type GapFunction = Callable[[Values], Values]  # (n,) distances of positions (n, d) to the nearest obstacle, m
+type FacetGapFunction = Callable[[ContactFacets, Values], Values]  # (m,) gaps of facets with points at (n, d), m
 
 
 @dataclass(frozen=True)
 class RetractedPoints:
-    """Copies that are worth knowing again: rows of `identity`, their shares (k,), and gaps (k,) in m; nan: left out."""
+    """Points on crack faces near an obstacle or retracted, to be matched after edges break.
+
+    Attributes:
+        identity: (k, 2 d + 1) rows that identify the points.
+        share: (k,) factors of their arms.
+        gap: (k,) m; nan: excluded.
+    """
 
     identity: Values
     share: Values
     gap: Values
 
     @classmethod
-    def select(cls, rows: Values, share: Values, gap: Values, width: float) -> RetractedPoints:
-        """Of all copies those that are within `width` m, or drawn in."""
-        which = np.flatnonzero(~(gap >= width) | (share < 1))
-        return cls(rows[which], share[which], gap[which])
+    def select(cls, identity: Values, share: Values, gap: Values, width: float) -> RetractedPoints:
+        """Those of all points on crack faces that are within `width`, m, of an obstacle or retracted."""
+        selected = np.flatnonzero(~(gap >= width) | (share < 1))
+        return cls(identity[selected], share[selected], gap[selected])
 
-    def match(self, rows: Values, width: float) -> tuple[Values, Values]:
-        """(n,) shares that the copies `rows` begin with, and gaps that they must keep: all of `width`, if new."""
-        share, gap = np.ones(len(rows)), np.full(len(rows), width)
-        at = match_points(self.identity, rows)
-        share[at[at >= 0]], gap[at[at >= 0]] = self.share[at >= 0], self.gap[at >= 0]
+    def match(self, identity: Values, width: float) -> tuple[Values, Values]:
+        """(n,) factors that points begin with, and gaps that they must keep, m: `width` for new points."""
+        share, gap = np.ones(len(identity)), np.full(len(identity), width)
+        rows = match_points(self.identity, identity)
+        share[rows[rows >= 0]], gap[rows[rows >= 0]] = self.share[rows >= 0], self.gap[rows >= 0]
         return share, np.where(np.isnan(gap), width, np.minimum(gap, width))
 
 
 def retract_points(
-    at: SurfaceMap, u: Values, which: Ints, share: Values, wanted: Values, gaps: Callable[[Values], Values]
+    point_map: SurfaceMap, u: Values, points: Ints, share: Values, min_gap: Values, gaps: GapFunction
 ) -> tuple[SurfaceMap, Ints]:
-    """Points `which` (k,) drawn in from `share` (k,) until gaps(x) reach `wanted` (k,), m; and those that have no room,
-    whose shares stay. `u`: (nodes, d) displacements, m."""
-    found, left = at.share.copy(), np.arange(len(which))
-    found[which] = share
-    for part in SHARES:
-        trial = part * share[left]
-        # of what does not move: round-off
-        fits = gaps(at.evaluate_points(u, which[left], trial)) >= wanted[left] - 1e-9 * abs(wanted[left])
-        found[which[left[fits]]] = trial[fits]
-        left = left[~fits]
-        if not len(left):
+    """Retract points until their gaps suffice.
+
+    Args:
+        point_map: map from nodes to points.
+        u: (nodes, d) displacements, m.
+        points: (k,) points to retract.
+        share: (k,) factors of their arms to start from.
+        min_gap: (k,) gaps that suffice, m.
+        gaps: gap function.
+
+    Returns:
+        The new map, and the points without room, whose arms stay.
+    """
+    new_share, remaining = point_map.share.copy(), np.arange(len(points))
+    new_share[points] = share
+    for factor in RETRACTION.trials:
+        trial = factor * share[remaining]
+        gap = gaps(point_map.evaluate_points(u, points[remaining], trial))
+        # the gap of a point that does not move may change by round-off
+        fits = gap >= min_gap[remaining] - RETRACTION.round_off * abs(min_gap[remaining])
+        new_share[points[remaining[fits]]] = trial[fits]
+        remaining = remaining[~fits]
+        if not len(remaining):
             break
-    return at if np.array_equal(found, at.share) else at.with_arm_share(found), which[left]
+    unchanged = np.array_equal(new_share, point_map.share)
+    return point_map if unchanged else point_map.with_arm_share(new_share), points[remaining]
 
 
-def retract_cut_elements(at: SurfaceMap, u: Values, elements: Ints, cut: Callable[[Values], Flags]) -> SurfaceMap:
-    """Copies of elements (m, d) that are `cut` drawn in until none is, or they are at their nodes. `cut`: of points at
-    x (n, d), m, (m,) flags. `u`: (nodes, d) displacements, m."""
-    for part in NEARER:
-        tight = np.intersect1d(elements[cut(at(u))], at.copies)
-        tight = tight[at.share[tight] > 0]
-        if not len(tight):
+def retract_cut_elements(
+    point_map: SurfaceMap, u: Values, elements: Ints, cut: Callable[[Values], Flags]
+) -> SurfaceMap:
+    """Retract points of elements until no element is cut, or its points are at their nodes.
+
+    Args:
+        point_map: map from nodes to points.
+        u: (nodes, d) displacements, m.
+        elements: (m, d) points of elements.
+        cut: function of positions (n, d), m, that returns (m,) flags.
+    """
+    for factor in RETRACTION.cut_trials:
+        points = np.intersect1d(elements[cut(point_map(u))], point_map.copies)
+        points = points[point_map.share[points] > 0]
+        if not len(points):
             break
-        share = at.share.copy()
-        share[tight] *= part
-        at = at.with_arm_share(share)
-    return at
+        share = point_map.share.copy()
+        share[points] *= factor
+        point_map = point_map.with_arm_share(share)
+    return point_map
 
 
-def extend_points(at: SurfaceMap, u: Values, wanted: float, gaps: Callable[[Values], Values]) -> SurfaceMap:
-    """Points that were drawn in go out by OUT where gaps stay `wanted`, m."""
-    inside = np.flatnonzero(at.share < 1)
-    if not len(inside):
-        return at
-    trial, share = np.minimum(at.share[inside] + OUT, 1.0), at.share.copy()
-    fits = gaps(at.evaluate_points(u, inside, trial)) >= wanted
-    share[inside[fits]] = trial[fits]
-    return at.with_arm_share(share)
-
-
-type GapFunction = Callable[[Values], Values]  # (n,) distances of places (n, d) to what is nearest, m
-
-
-type FacetGapFunction = Callable[[ContactFacets, Values], Values]  # (m,) gaps of facets with points at places (n, d), m
+def extend_points(point_map: SurfaceMap, u: Values, min_gap: float, gaps: GapFunction) -> SurfaceMap:
+    """Extend retracted points by one increment where their gap stays at least `min_gap`, m."""
+    retracted = np.flatnonzero(point_map.share < 1)
+    if not len(retracted):
+        return point_map
+    trial, share = np.minimum(point_map.share[retracted] + RETRACTION.extension, 1.0), point_map.share.copy()
+    fits = gaps(point_map.evaluate_points(u, retracted, trial)) >= min_gap
+    share[retracted[fits]] = trial[fits]
+    return point_map.with_arm_share(share)
 
 
 class ContactSurface:
-    """The points, and how they follow the nodes.
+    """Points of this rank's split surface, and their interpolation from the nodes.
 
     Attributes:
-        area: (n,) of the points of this rank's surface, m^2; 0 of those left out.    follow: from nodes to points.
+        area: (n,) shares of the points in the reference area, m^2; 0 of excluded points.
+        interpolation: map between nodes and points.
     """
 
     def __init__(self, domain: Domain, width: float) -> None:
@@ -124,257 +168,274 @@ class ContactSurface:
         self.interpolation = ParentMatrix(domain, self._surface)
         self.area: Values = self._surface.area
         self._all: ContactFacets | None = None
-        self._active: tuple[Values, Ints, ContactFacets] | None = None  # of which areas, and facets left out
+        # areas and excluded facets for which the active facets were selected, and these
+        self._active: tuple[Values, Ints, ContactFacets] | None = None
         self._excluded_facets: Ints = np.empty(0, np.int64)
 
     @property
     def facets(self) -> ContactFacets:
-        """Those whose corners are not left out, nor they themselves (not collective)."""
-        if self._active is None or self._active[0] is not self.area or self._active[1] is not self._excluded_facets:
-            every = self._all_facets()
-            acts = np.ones(len(every.area), bool)
-            acts[self._excluded_facets] = False
-            acts &= (self.area[every.corners] > 0).all(axis=1)
-            self._active = (
-                self.area,
-                self._excluded_facets,
-                ContactFacets(every.corners[acts], every.area[acts], every.smoothing),
-            )
-        return self._active[2]
+        """Facets of which neither a corner nor the facet itself is excluded (not collective)."""
+        cached = self._active
+        if cached is None or cached[0] is not self.area or cached[1] is not self._excluded_facets:
+            facets = self._all_facets()
+            active = np.ones(len(facets.area), bool)
+            active[self._excluded_facets] = False
+            active &= (self.area[facets.corners] > 0).all(axis=1)
+            selected = ContactFacets(facets.corners[active], facets.area[active], facets.smoothing)
+            cached = self._active = self.area, self._excluded_facets, selected
+        return cached[2]
 
     def _all_facets(self) -> ContactFacets:
         if self._all is None:
-            self._all = ContactFacets(*self._surface.facets(), SOFTEN * self._width)
+            self._all = ContactFacets(*self._surface.facets(), FACETS.smoothing * self._width)
         return self._all
 
     def facets_from(self, elements: Ints) -> ContactFacets:
-        """Elements (m, d) of a surface that is drawn, as facets that feel obstacles."""
-        return ContactFacets(elements, np.ones(len(elements)), SOFTEN * self._width)
+        """Facets made of the elements (m, d) of a surface for output."""
+        return ContactFacets(elements, np.ones(len(elements)), FACETS.smoothing * self._width)
 
-    def exclude_cut_facets(self, x: Values, cuts: FacetGapFunction) -> None:
-        """Facets that are cut with points at x (n, d) are left out until there is room."""
-        every = self._all_facets()
-        self._excluded_facets = np.flatnonzero(cuts(every, x) <= 0)
+    def exclude_cut_facets(self, x: Values, facet_gaps: FacetGapFunction) -> None:
+        """Exclude facets that are cut with points at x (n, d), m, until there is room."""
+        facets = self._all_facets()
+        self._excluded_facets = np.flatnonzero(facet_gaps(facets, x) <= 0)
 
     @property
     def point_map(self) -> SurfaceMap:
-        """Where the points are."""
+        """Map from nodal displacements to positions of points."""
         return self._surface.at
 
     def identity(self, points: Ints) -> Values:
-        """(k, 2 d + 1) rows that tell points (k,) from all others, whatever breaks."""
+        """(k, 2 d + 1) rows that identify points (k,), whatever breaks."""
         return self._surface.identity(points)
 
     @property
     def rest_positions(self) -> Values:
-        """(n, d) where the points are in the body at rest, m."""
+        """(n, d) reference positions of the points, m."""
         return self._surface.at.rest
 
     @property
     def node_numbers(self) -> Ints:
-        """Global numbers of the nodes that the points follow."""
+        """Global numbers of the nodes that the points depend on."""
         return self._surface.columns
 
     @property
     def mean_edge_length(self) -> float:
-        """Of the body's mesh in the mean, m (collective)."""
+        """Mean edge length of the body's mesh, m (collective)."""
         return self._domain.mean_edge_length
 
     def positions(self, u: Values) -> Values:
-        """(n, d) x of the points at the owned displacements u, m (collective)."""
+        """(n, d) positions of the points for owned displacements u, m (collective)."""
         return np.asarray(self.rest_positions + self.interpolation(u))
 
     def min_distance(self, distances: Values) -> float:
-        """The least of distances (n,), m, of points that are not left out; on this rank."""
+        """Minimum of distances (n,), m, over this rank's points that are not excluded."""
         return float(distances[self.area > 0].min(initial=np.inf))
 
     def gaps_are_open(self, distances: Values) -> bool:
-        """Whether no gap (n,) is closed on any rank (collective)."""
+        """Whether all gaps (n,) are positive, on all ranks (collective)."""
         return bool(self.comm.allreduce(self.min_distance(distances) > 0, op=MPI.LAND))
 
-    def min_fraction(self, shares: Values) -> float:
-        """The least of shares (n,) of a way, on all ranks; 1 where there is none (collective)."""
-        mine = shares[self.area > 0].min(initial=1.0)
-        return float(self.comm.allreduce(float(mine), op=MPI.MIN))
+    def min_fraction(self, fractions: Values) -> float:
+        """Minimum of fractions (n,) of a motion over all ranks, at most 1 (collective)."""
+        local = fractions[self.area > 0].min(initial=1.0)
+        return float(self.comm.allreduce(float(local), op=MPI.MIN))
 
     def point_stiffness(self, points: Ints, blocks: Values) -> csr_matrix:
-        """W^T B W over the nodes of `columns` of blocks B (k, d, d) at points (k,), N/m."""
+        """W^T B W over `node_numbers`, N/m, of blocks B (k, d, d) at points (k,)."""
         k, d = blocks.shape[:2]
         W = kron(self._surface.at.weights[points], np.eye(d), format="csr")
         B = bsr_matrix((blocks, np.arange(k), np.arange(k + 1)), shape=(k * d, k * d)).tocsr()
         return (W.T @ B @ W).tocsr()
 
     def facet_stiffness(self, corners: Ints, blocks: Values) -> csr_matrix:
-        """The same of blocks (k, c d, c d) between points (k, c)."""
+        """W^T B W over `node_numbers`, N/m, of blocks B (k, c d, c d) at facets with corners (k, c)."""
         d = blocks.shape[1] // corners.shape[1]
-        points, place = np.unique(corners, return_inverse=True)
-        dofs = (d * place.reshape(corners.shape)[:, :, None] + np.arange(d)).reshape(len(corners), -1)
+        points, local = np.unique(corners, return_inverse=True)
+        dofs = (d * local.reshape(corners.shape)[:, :, None] + np.arange(d)).reshape(len(corners), -1)
         rows, columns = np.repeat(dofs, dofs.shape[1], axis=1), np.tile(dofs, dofs.shape[1])
         size = d * len(points)
         B = csr_matrix((blocks.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(size, size))
         W = kron(self._surface.at.weights[points], np.eye(d), format="csr")
         return (W.T @ B @ W).tocsr()
 
-    # --- walls that come to light ---
+    # --- new crack faces ---
 
     def edges_broke(
-        self, pattern: npt.NDArray[np.uint8], u: Values, gaps: GapFunction, cuts: FacetGapFunction | None = None
+        self,
+        pattern: npt.NDArray[np.uint8],
+        u: Values,
+        gaps: GapFunction,
+        facet_gaps: FacetGapFunction | None = None,
     ) -> None:
-        """New walls are part of it, drawn in where they would lie in an obstacle; `cuts`: gaps of facets, where these
-        are felt (collective)."""
-        old, rows, cut = self._surface.at, self._surface.identity(), self._corner_identities(self._excluded_facets)
+        """Add new crack faces, retracted where they would lie in an obstacle (collective).
+
+        Args:
+            pattern: (cells,) broken edges of each cell.
+            u: (owned dofs,) displacements, m.
+            gaps: gap function of points.
+            facet_gaps: gap function of facets, where obstacles act on them.
+        """
+        old_map, old_identity = self._surface.at, self._surface.identity()
+        excluded = self._corner_identities(self._excluded_facets)
         gap = np.where(self.area > 0, gaps(self.positions(u)), np.nan)
-        known = RetractedPoints.select(rows, old.share[old.copies], gap[old.copies], self._width)
+        copies = old_map.copies
+        retracted = RetractedPoints.select(old_identity, old_map.share[copies], gap[copies], self._width)
         self._surface.update_damage(pattern)
         self.interpolation.destroy()
         self.interpolation, self._all, self._active = ParentMatrix(self._domain, self._surface), None, None
-        at, nodal = self._surface.at, self.interpolation.nodal(u)
-        share, gap = known.match(self._surface.identity(), self._width)
-        self._surface.at, out = retract_points(at, nodal, at.copies, share, gap, gaps)
-        self._exclude_points(out)
-        if cuts is not None:
-            new = np.zeros(len(at.share), bool)
-            new[at.copies] = True
-            again = match_points(rows, self._surface.identity())
-            new[at.copies[again[again >= 0]]] = False
-            self._excluded_facets = self._match_facets(cut)
-            self._retract_new_facets(new, nodal, gaps, cuts)
+        point_map, nodal = self._surface.at, self.interpolation.nodal(u)
+        share, gap = retracted.match(self._surface.identity(), self._width)
+        self._surface.at, without_room = retract_points(point_map, nodal, point_map.copies, share, gap, gaps)
+        self._exclude_points(without_room)
+        if facet_gaps is not None:
+            is_new = np.zeros(len(point_map.share), bool)
+            is_new[point_map.copies] = True
+            rows = match_points(old_identity, self._surface.identity())
+            is_new[point_map.copies[rows[rows >= 0]]] = False
+            self._excluded_facets = self._match_facets(excluded)
+            self._retract_new_facets(is_new, nodal, gaps, facet_gaps)
 
-    def _retract_new_facets(
-        self, new: npt.NDArray[np.bool_], u: Values, gaps: GapFunction, cuts: FacetGapFunction
-    ) -> None:
-        """Draw in new points (n,) of facets that would be cut, or feel anything; leave out those of no use."""
-        for _ in range(ROUNDS):
-            at, facets = self._surface.at, self.facets
-            of_new = new[facets.corners].any(axis=1)
-            close = cuts(facets, at(u)) < np.where(of_new, self._width, TINY)
-            tight = np.unique(facets.corners[close])
-            tight = tight[new[tight] & (at.share[tight] > LEAST)]
-            if not len(tight):
+    def _retract_new_facets(self, is_new: Flags, u: Values, gaps: GapFunction, facet_gaps: FacetGapFunction) -> None:
+        """Retract new points (n,) of facets that would be cut or in contact; exclude facets for which this fails."""
+        for _ in range(RETRACTION.facet_rounds):
+            point_map, facets = self._surface.at, self.facets
+            has_new = is_new[facets.corners].any(axis=1)
+            too_close = facet_gaps(facets, point_map(u)) < np.where(has_new, self._width, TINY)
+            points = np.unique(facets.corners[too_close])
+            points = points[is_new[points] & (point_map.share[points] > RETRACTION.min_arm)]
+            if not len(points):
                 break
-            share = at.share.copy()
-            share[tight] *= IN
-            self._surface.at = at.with_arm_share(share)
-        lost = np.flatnonzero(new & (self.area > 0))
-        lost = lost[gaps(self._surface.at(u)[lost]) <= 0]
-        if len(lost):
-            self._exclude_points(np.union1d(lost, np.flatnonzero(self.area == 0)))
-        self._exclude_facets(np.flatnonzero(self._facets_too_close(new, u, cuts)))
+            share = point_map.share.copy()
+            share[points] *= RETRACTION.facet_factor
+            self._surface.at = point_map.with_arm_share(share)
+        closed = np.flatnonzero(is_new & (self.area > 0))
+        closed = closed[gaps(self._surface.at(u)[closed]) <= 0]
+        if len(closed):
+            self._exclude_points(np.union1d(closed, np.flatnonzero(self.area == 0)))
+        self._exclude_facets(np.flatnonzero(self._facets_too_close(is_new, u, facet_gaps)))
 
-    def _facets_too_close(
-        self, moved: npt.NDArray[np.bool_], u: Values, cuts: FacetGapFunction
-    ) -> npt.NDArray[np.bool_]:
-        """(m,) facets of all that are cut, or have a point that has `moved` (n,) and would feel anything."""
-        every = self._all_facets()
-        wanted = np.where(moved[every.corners].any(axis=1), self._width, TINY)
-        return np.asarray(cuts(every, self._surface.at(u)) < wanted)
+    def _facets_too_close(self, moved: Flags, u: Values, facet_gaps: FacetGapFunction) -> Flags:
+        """(m,) facets that are cut, or have a point that has `moved` (n,) and would be in contact."""
+        facets = self._all_facets()
+        min_gap = np.where(moved[facets.corners].any(axis=1), self._width, TINY)
+        return np.asarray(facet_gaps(facets, self._surface.at(u)) < min_gap)
 
     def _exclude_facets(self, facets: Ints) -> None:
-        """Leave out these as well."""
+        """Exclude these facets as well."""
         if len(np.setdiff1d(facets, self._excluded_facets)):
             self._excluded_facets = np.union1d(facets, self._excluded_facets)
 
-    def release_points(self, u: Values, gaps: GapFunction, cuts: FacetGapFunction | None = None) -> None:
-        """Points and facets that were drawn in or left out come back as far as there is room (collective)."""
-        nodal, before, none = self.interpolation.nodal(u), self._surface.at, self.area == 0
-        at = extend_points(before, nodal, self._width, gaps)
-        if len(out := np.flatnonzero(none)):
-            at, out = retract_points(at, nodal, out, np.ones(len(out)), np.full(len(out), self._width), gaps)
-            self._exclude_points(out)
-        self._surface.at = at
-        if cuts is not None and (at is not before or len(out) or len(self._excluded_facets)):
-            self._restore_facets(before, none, nodal, cuts)
+    def release_points(self, u: Values, gaps: GapFunction, facet_gaps: FacetGapFunction | None = None) -> None:
+        """Extend retracted points, and include excluded points and facets, as far as there is room (collective)."""
+        nodal, old_map, excluded = self.interpolation.nodal(u), self._surface.at, self.area == 0
+        point_map = extend_points(old_map, nodal, self._width, gaps)
+        if len(points := np.flatnonzero(excluded)):
+            full, min_gap = np.ones(len(points)), np.full(len(points), self._width)
+            point_map, points = retract_points(point_map, nodal, points, full, min_gap, gaps)
+            self._exclude_points(points)
+        self._surface.at = point_map
+        changed = point_map is not old_map or len(points) or len(self._excluded_facets)
+        if facet_gaps is not None and changed:
+            self._restore_facets(old_map, excluded, nodal, facet_gaps)
 
-    def _restore_facets(self, before: SurfaceMap, none: Flags, u: Values, cuts: FacetGapFunction) -> None:
-        """Points that went out go back where a facet would feel it; facets come back that feel nothing."""
-        at = self._surface.at
-        moved = (at.share != before.share) | none
-        close = self._facets_too_close(moved, u, cuts)
-        back = np.unique(self._all_facets().corners[close])
-        back = back[moved[back]]
-        if len(back):
-            share = at.share.copy()
-            share[back] = before.share[back]
-            self._surface.at = at.with_arm_share(share)
+    def _restore_facets(self, old_map: SurfaceMap, excluded: Flags, u: Values, facet_gaps: FacetGapFunction) -> None:
+        """Undo extensions that bring a facet into contact; include facets that are not in contact."""
+        point_map = self._surface.at
+        moved = (point_map.share != old_map.share) | excluded
+        too_close = self._facets_too_close(moved, u, facet_gaps)
+        undone = np.unique(self._all_facets().corners[too_close])
+        undone = undone[moved[undone]]
+        if len(undone):
+            share = point_map.share.copy()
+            share[undone] = old_map.share[undone]
+            self._surface.at = point_map.with_arm_share(share)
         if len(self._excluded_facets):
-            gap = cuts(self._all_facets(), self._surface.at(u))[self._excluded_facets]
+            gap = facet_gaps(self._all_facets(), self._surface.at(u))[self._excluded_facets]
             if (gap >= self._width).any():
                 self._excluded_facets = self._excluded_facets[gap < self._width]
-        self._exclude_facets(np.flatnonzero(self._facets_too_close(none, u, cuts)))
+        self._exclude_facets(np.flatnonzero(self._facets_too_close(excluded, u, facet_gaps)))
 
     def _corner_identities(self, facets: Ints) -> Values:
-        """(k c, 2 d + 1) rows that tell the corners of facets (k,) from all other points."""
+        """(k c, 2 d + 1) rows that identify the corners of facets (k,)."""
         if not len(facets):
             return np.empty((0, 2 * self._domain.dim + 1))
         return self._surface.identity(self._all_facets().corners[facets].reshape(-1))
 
-    def _match_facets(self, rows: Values) -> Ints:
-        """The facets of which `_named` gave these rows."""
-        if not len(rows):
+    def _match_facets(self, identity: Values) -> Ints:
+        """Facets whose corners have the rows that `_corner_identities` returned."""
+        if not len(identity):
             return np.empty(0, np.int64)
-        every = np.sort(self._all_facets().corners, axis=1)
-        at = match_points(rows, self._surface.identity(np.arange(len(self.area)))).reshape(-1, every.shape[1])
-        at = np.sort(at[(at >= 0).all(axis=1)], axis=1)
-        _, where = np.unique(np.concatenate([at, every]), axis=0, return_inverse=True)
-        return np.flatnonzero(np.isin(where.reshape(-1)[len(at) :], where.reshape(-1)[: len(at)]))
+        corners = np.sort(self._all_facets().corners, axis=1)
+        all_identities = self._surface.identity(np.arange(len(self.area)))
+        matched = match_points(identity, all_identities).reshape(-1, corners.shape[1])
+        matched = np.sort(matched[(matched >= 0).all(axis=1)], axis=1)
+        _, group = np.unique(np.concatenate([matched, corners]), axis=0, return_inverse=True)
+        return np.flatnonzero(np.isin(group.reshape(-1)[len(matched) :], group.reshape(-1)[: len(matched)]))
 
     def _exclude_points(self, points: Ints) -> None:
         self.area = self._surface.area.copy()
         self.area[points] = 0.0
 
+    # --- state ---
+
     def snapshot(self) -> object:
-        """Shares of arms, areas, and facets left out."""
+        """Factors of arms, areas, and excluded facets."""
         return self._surface.at.share, self.area, self._excluded_facets
 
     def restore(self, memory: object) -> None:
-        """Be again what `memory` gave of this surface; where edges have broken since, in an earlier pass of the step,
-        it is another one and stays as those left it (not collective)."""
-        share, area, cut = cast("tuple[Values, Values, Ints]", memory)
+        """Restore a snapshot of this surface (not collective).
+
+        Where edges have broken since, in an earlier pass of the step, the surface is another one and stays as it is.
+        """
+        share, area, excluded_facets = cast("tuple[Values, Values, Ints]", memory)
         if len(share) != len(self._surface.at.share):
             return
-        self._excluded_facets = cut
+        self._excluded_facets = excluded_facets
         if share is not self._surface.at.share:
             self._surface.at = self._surface.at.with_arm_share(share)
         self.area = area
 
     def to_checkpoint(self) -> Values:
-        """Rows of copies that are drawn in or left out: identity, share, whether left out; on rank 0 (collective)."""
-        at = self._surface.at
-        which = np.flatnonzero((at.share[at.copies] < 1) | (self.area[at.copies] == 0))
-        rows = self._surface.identity()[which]
-        of = at.copies[which]
-        known = np.column_stack([rows, at.share[of], self.area[of] == 0])
-        gathered = gather(self.comm, known)
-        return np.concatenate(gathered) if gathered is not None else known
+        """Rows of points that are retracted or excluded: identity, factor, whether excluded; on rank 0 (collective)."""
+        point_map = self._surface.at
+        excluded = self.area[point_map.copies] == 0
+        selected = np.flatnonzero((point_map.share[point_map.copies] < 1) | excluded)
+        identity = self._surface.identity()[selected]
+        points = point_map.copies[selected]
+        rows = np.column_stack([identity, point_map.share[points], self.area[points] == 0])
+        gathered = gather(self.comm, rows)
+        return np.concatenate(gathered) if gathered is not None else rows
 
     def from_checkpoint(self, rows: Values) -> None:
-        """Be again what `saved` gave."""
-        at = self._surface.at
-        place = match_points(rows[:, :-2], self._surface.identity())
-        which, share = at.copies[place[place >= 0]], np.ones(len(at.share))
-        share[which] = rows[place >= 0, -2]
-        self._surface.at = at.with_arm_share(share)
-        self._exclude_points(which[rows[place >= 0, -1] > 0])
+        """Set the state from the rows of a checkpoint."""
+        point_map = self._surface.at
+        matched = match_points(rows[:, :-2], self._surface.identity())
+        points, share = point_map.copies[matched[matched >= 0]], np.ones(len(point_map.share))
+        share[points] = rows[matched >= 0, -2]
+        self._surface.at = point_map.with_arm_share(share)
+        self._exclude_points(points[rows[matched >= 0, -1] > 0])
 
     def cut_to_checkpoint(self) -> Values:
-        """Rows of the corners of facets that are left out, on rank 0 (collective)."""
+        """Rows that identify the corners of excluded facets, on rank 0 (collective)."""
         gathered = gather(self.comm, self._corner_identities(self._excluded_facets))
         return np.concatenate(gathered) if gathered is not None else np.empty((0, 2 * self._domain.dim + 1))
 
     def cut_from_checkpoint(self, rows: Values) -> None:
-        """Be again what `saved_cut` gave."""
+        """Set the excluded facets from the rows of a checkpoint."""
         self._excluded_facets = self._match_facets(rows)
 
     def clear_caches(self) -> None:
-        """Forget the facets that were near, and where they were nearest: searches start from there."""
+        """Discard facets and their closest points, from which searches start."""
         self._all = self._active = None
 
     def destroy(self) -> None:
-        """Give the memory of PETSc's objects back."""
+        """Destroy the objects of PETSc."""
         self.interpolation.destroy()
 
 
-def retract_from_obstacles(at: SurfaceMap, u: Values, gaps: GapFunction) -> SurfaceMap:
-    """Places whose copies are drawn in where they would lie in an obstacle, as the points are that touch."""
-    inside = at.copies[gaps(at(u))[at.copies] <= 0]
-    return retract_points(at, u, inside, at.share[inside], np.full(len(inside), TINY), gaps)[0] if len(inside) else at
+def retract_from_obstacles(point_map: SurfaceMap, u: Values, gaps: GapFunction) -> SurfaceMap:
+    """Retract points on crack faces that would lie in an obstacle, as those of contact are."""
+    inside = point_map.copies[gaps(point_map(u))[point_map.copies] <= 0]
+    if not len(inside):
+        return point_map
+    return retract_points(point_map, u, inside, point_map.share[inside], np.full(len(inside), TINY), gaps)[0]

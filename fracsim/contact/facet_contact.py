@@ -1,31 +1,13 @@
-"""What an obstacle does to facets between their corners: their deepest place has a barrier, too.
+"""Contact of facets with small or sharply curved obstacles, between the nodes of the facets.
 
     F(x) = A [ b(gap) - b(gap') ]
 
-A the reference area of a facet, gap that of its deepest place (closest_point), gap' what it would be from the gaps of
-its corners before an obstacle that is flat (closest_point). The corners' own energy A/c sum_c b(gap_c) is that of
-points (node_contact). Before what is flat F is 0 with all its derivatives, and nothing is counted twice; before what is
-round F > 0, and grows without bound before the facet is cut. (The largest of the b(gap_c), smoothly, in place of
-b(gap') is the same for a facet that lies flat, but not for one that is about to tilt: it made tangents of large flat
-faces indefinite.)
+A is the reference area of a facet, gap that of its closest point to the obstacle, gap' the smoothed minimum of its
+nodal gaps (closest_point). The nodes have the energy A/c sum_c b(gap_c) of their own (node_contact). Before a plane
+F is 0 with all its derivatives, so that nothing counts twice. Before a curved obstacle F > 0, and grows without bound
+before the facet is cut.
 
 Equations: docs/theory.md#facets.
-
-Facets that may be near an obstacle: looked for among all only when points or the obstacle have gone far.
-
-A distance to an obstacle changes by no more than the point moves, |t| of its reference point and ||R - R_0|| times the
-radius of the obstacle about that.
-
-Friction on facets: what presses on them between their corners counts at these, as much as each bears of it.
-
-The force on a corner is that at the point itself and its share of those of the facets around it; its size and direction
-are the normal force and the normal that friction of the step is lagged with. So all that presses rubs, with the moment
-of what presses. What slides under a corner is the obstacle where it presses: the mean of these places, by their forces.
-
-What an obstacle does to points, joined with what it does to the facets between them (facet_contact).
-
-Friction acts at the points alone. A place on a facet sticks where its corners do not, and with the slip that passes for
-sticking so small Newton's method hunts for which of them do: 20 to 50 iterations a step in place of 3 to 5.
 """
 
 from __future__ import annotations
@@ -37,24 +19,46 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from .barrier import KEPT
 from .closest_point import FacetClosestPoints, SoftMinGap, find_closest_points, initial_barycentric, smoothing_error
-from .laws import GapPotential, TimeAveragedPotential
+from .laws import BARRIER, GapPotential, TimeAveragedPotential
 from .node_contact import ContactForces, LaggedContact, positive_part
 from .pose import PosedShape
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-OUTLINE = 1.1  # an outline is drawn within its shape
 Flags = npt.NDArray[np.bool_]
-SOFTEN = 0.1  # of the width of the barrier, of deepest places
-FLAT = 0.1  # of the width: facets that bend away from an obstacle by less are as good as flat
+
+
+@dataclass(frozen=True)
+class FacetPolicy:
+    """Tuned numbers of the contact of facets.
+
+    Attributes:
+        smoothing: mu of closest points, in barrier widths.
+        max_bow: facets whose middle comes nearer to an obstacle than their nodes by less, in barrier widths, are
+            left to their nodes.
+        outline_excess: factor of the radius of a tessellation, which lies within its shape.
+    """
+
+    smoothing: float = 0.1
+    max_bow: float = 0.1
+    outline_excess: float = 1.1
+
+
+FACETS = FacetPolicy()
 
 
 @dataclass(frozen=True)
 class _SearchState:
-    """Where points (n, d) and an obstacle were, and the facets (k,) that were within a distance of it, m, but for
-    `margin`."""
+    """Result of a search, and where it was made.
+
+    Attributes:
+        x: (n, d) points then, m.
+        posed: obstacle then.
+        distance: of facets that were asked for, m.
+        margin: by which facets farther away were found as well, m.
+        facets: (k,) those found.
+    """
 
     x: Values
     posed: PosedShape
@@ -62,58 +66,71 @@ class _SearchState:
     margin: float
     facets: Ints
 
-    def is_valid(self, placed: PosedShape, x: Values, within: float) -> bool:
-        """Whether no facet within that distance, m, can be missing."""
-        off = x - self.x
-        moved = float(np.sqrt(np.einsum("nd,nd->n", off, off).max(initial=0.0)))
-        now, then = placed.pose, self.posed.pose
-        turned = float(np.linalg.norm(now.rotation - then.rotation))
-        carried = float(np.linalg.norm(now.centre - then.centre)) + (turned and turned * _radius(placed))
-        return within - self.distance + moved + carried <= self.margin
+    def is_valid(self, posed: PosedShape, x: Values, distance: float) -> bool:
+        """Whether no facet within that distance, m, can be missing.
+
+        A distance changes by no more than the point moves, |t| of the obstacle, and ||R - R_0|| times its radius.
+        """
+        motion = x - self.x
+        point_motion = float(np.sqrt(np.einsum("nd,nd->n", motion, motion).max(initial=0.0)))
+        pose, old_pose = posed.pose, self.posed.pose
+        rotation = float(np.linalg.norm(pose.rotation - old_pose.rotation))
+        obstacle_motion = float(np.linalg.norm(pose.centre - old_pose.centre)) + (
+            rotation and rotation * _outer_radius(posed)
+        )
+        return distance - self.distance + point_motion + obstacle_motion <= self.margin
 
 
 @dataclass(frozen=True, eq=False)
 class FacetCandidates:
-    """Of facets with these corners (m, c)."""
+    """Facets that may be near an obstacle; all facets are searched again only when something has moved far.
+
+    Attributes:
+        corners: (m, c) of all facets.
+    """
 
     corners: Ints
     _states: dict[int, _SearchState] = field(default_factory=dict)
 
-    def __call__(self, placed: PosedShape, x: Values, within: float) -> Ints:
-        """(k,) all that have a place nearer than `within` m to an obstacle with points at x (n, d), and others."""
-        last = self._states.get(id(placed.shape))
-        if last is None or last.posed.shape is not placed.shape or not last.is_valid(placed, x, within):
-            last = self._states[id(placed.shape)] = self._search(placed, x, within)
+    def __call__(self, posed: PosedShape, x: Values, distance: float) -> Ints:
+        """(k,) facets with a point nearer than `distance`, m, to an obstacle, points at x (n, d), m; others too."""
+        last = self._states.get(id(posed.shape))
+        if last is None or last.posed.shape is not posed.shape or not last.is_valid(posed, x, distance):
+            last = self._states[id(posed.shape)] = self._search(posed, x, distance)
         return last.facets
 
-    def _search(self, placed: PosedShape, x: Values, within: float) -> _SearchState:
+    def _search(self, posed: PosedShape, x: Values, distance: float) -> _SearchState:
         corners = x[self.corners]
-        middle = corners.mean(axis=1)
-        arms = corners - middle[:, None]
-        around = np.sqrt(np.einsum("kcd,kcd->kc", arms, arms).max(axis=1, initial=0.0))
-        margin = max(float(around.mean()) if len(around) else 0.0, within)
-        return _SearchState(
-            x, placed, within, margin, np.flatnonzero(placed.distance(middle) - around < within + margin)
-        )
+        centroid = corners.mean(axis=1)
+        arms = corners - centroid[:, None]
+        radius = np.sqrt(np.einsum("kcd,kcd->kc", arms, arms).max(axis=1, initial=0.0))
+        margin = max(float(radius.mean()) if len(radius) else 0.0, distance)
+        near = np.flatnonzero(posed.distance(centroid) - radius < distance + margin)
+        return _SearchState(x, posed, distance, margin, near)
 
 
-def _radius(placed: PosedShape) -> float:
-    """m, of a shape about its reference point."""
-    points, _ = placed.shape.tessellate()
-    return OUTLINE * float(np.linalg.norm(points, axis=1).max())
+def _outer_radius(posed: PosedShape) -> float:
+    """Radius of a shape about its reference point, m."""
+    points, _ = posed.shape.tessellate()
+    return FACETS.outline_excess * float(np.linalg.norm(points, axis=1).max())
 
 
 def facets_matter(radius: float, edge: float, width: float) -> bool:
-    """Whether facets with edges of that length, m, may come nearer to an obstacle of that least radius of curvature,
-    m, than their corners: by a^2 / (6 R) in the middle of a triangle."""
-    return edge**2 > 6 * radius * FLAT * width
+    """Whether facets of that edge length come noticeably nearer to an obstacle of that radius than their nodes, m.
+
+    The middle of a triangle with edges a comes nearer to a sphere of radius R by a^2 / (6 R).
+    """
+    return edge**2 > 6 * radius * FACETS.max_bow * width
 
 
 @dataclass(frozen=True, eq=False)
 class ContactFacets:
-    """Facets of a surface: numbers of their corners (m, c) among its points, and their areas (m,), m^2 (2D: m).
+    """Facets of a surface.
 
-    `soften`: m, of their deepest places; shares of these, where they were last, are where they are looked for first.
+    Attributes:
+        corners: (m, c) points.
+        area: (m,) m^2 (2D: m).
+        smoothing: mu of closest points, m.
     """
 
     corners: Ints
@@ -122,7 +139,7 @@ class ContactFacets:
 
     @cached_property
     def _last_barycentric(self) -> Values:
-        """(m, c) shares; nan: not known yet."""
+        """(m, c) closest points found last, from which the next search starts; nan: not known yet."""
         return np.full(self.corners.shape, np.nan)
 
     @cached_property
@@ -131,81 +148,95 @@ class ContactFacets:
 
     @property
     def max_gap_error(self) -> float:
-        """m, by how much a gap is taken for smaller than it is, at most."""
+        """Largest amount by which smoothing makes a gap smaller, m."""
         return smoothing_error(self.corners.shape[1], self.smoothing)
 
-    def closest_points(self, placed: PosedShape, x: Values, which: Ints) -> FacetClosestPoints:
-        """The deepest places of facets (k,) with points at x (n, d), m."""
-        corners, start = x[self.corners[which]], self._last_barycentric[which]
+    def closest_points(self, posed: PosedShape, x: Values, facets: Ints) -> FacetClosestPoints:
+        """Closest points of facets (k,), with points at x (n, d), m."""
+        corners, start = x[self.corners[facets]], self._last_barycentric[facets]
         if (new := np.isnan(start[:, 0])).any():
-            start[new] = initial_barycentric(placed, corners[new], self.smoothing)
-        at = find_closest_points(placed, corners, self.smoothing, start)
-        self._last_barycentric[which] = at.barycentric
-        return at
+            start[new] = initial_barycentric(posed, corners[new], self.smoothing)
+        closest = find_closest_points(posed, corners, self.smoothing, start)
+        self._last_barycentric[facets] = closest.barycentric
+        return closest
 
-    def within_reach(self, placed: PosedShape, x: Values, reach: float) -> Ints:
-        """(k,) those that may come nearer than `reach` m to an obstacle, with points at x (n, d), m."""
-        near, _, over, _ = self._tangents(placed, x, np.full(1, reach))
-        return near[over.min(axis=1, initial=np.inf) < reach]
+    def within_reach(self, posed: PosedShape, x: Values, reach: float) -> Ints:
+        """(k,) facets that may come nearer than `reach`, m, to an obstacle, with points at x (n, d), m."""
+        near, _, corner_bounds, _ = self._tangent_planes(posed, x, np.full(1, reach))
+        return near[corner_bounds.min(axis=1, initial=np.inf) < reach]
 
     def closing_facets(
-        self, placed: PosedShape, x: Values, relative: Values, swept: Values | None, reach: Values
+        self, posed: PosedShape, x: Values, relative: Values, rotation_motion: Values | None, reach: Values
     ) -> Ints:
-        """(k,) those whose gaps a motion may close by more than is safe (barrier), on the ways `relative` (n, d) of the
-        points to an obstacle, m, that its turn adds `swept` (n,) to at most; all no longer than `reach` (n,)."""
-        near, distance, over, normal = self._tangents(placed, x, reach)
-        after = over + np.einsum("kcd,kd->kc", relative[self.corners[near]], normal)
-        if swept is not None:
-            after = after - swept[self.corners[near]]
-        return near[np.minimum(over, after).min(axis=1, initial=np.inf) < KEPT * distance]
+        """(k,) facets whose gaps a motion may close by more than `BARRIER.min_gap_ratio` allows.
 
-    def _tangents(self, placed: PosedShape, x: Values, reach: Values) -> tuple[Ints, Values, Values, Values]:
-        """Facets (k,) within `reach` m of an obstacle, of all or of points (n,), as far as their sizes tell;
-        distances (k,) and normals (k, d) at their middles, and those (k, c) of their corners less `kept` were it flat:
-        the distance to what is convex is more."""
+        Args:
+            posed: obstacle.
+            x: (n, d) points, m.
+            relative: (n, d) motion of the points relative to the obstacle, m.
+            rotation_motion: (n,) bound of the motion that a rotation of the obstacle adds, m.
+            reach: (n,) bound of all motions, m.
+        """
+        near, distance, corner_bounds, normal = self._tangent_planes(posed, x, reach)
+        after = corner_bounds + np.einsum("kcd,kd->kc", relative[self.corners[near]], normal)
+        if rotation_motion is not None:
+            after = after - rotation_motion[self.corners[near]]
+        smallest = np.minimum(corner_bounds, after).min(axis=1, initial=np.inf)
+        return near[smallest < BARRIER.min_gap_ratio * distance]
+
+    def _tangent_planes(self, posed: PosedShape, x: Values, reach: Values) -> tuple[Ints, Values, Values, Values]:
+        """Facets within reach, and the tangent plane of the distance at their centroids.
+
+        The distance to a convex obstacle lies above its tangent plane.
+
+        Returns:
+            (k,) facets within `reach` (m, one value or (n,) of points) as far as their sizes tell; (k,) distances at
+            centroids; (k, c) distances of corners on the tangent plane minus `max_gap_error`; (k, d) normals.
+        """
         (_, c), d = self.corners.shape, x.shape[1]
-        if placed.distance_bound(x) >= reach.max(initial=0.0) + self.max_gap_error:
+        if posed.distance_bound(x) >= reach.max(initial=0.0) + self.max_gap_error:
             return np.empty(0, np.int64), np.empty(0), np.empty((0, c)), np.empty((0, d))
-        near = self._candidates(placed, x, float(reach.max(initial=0.0)) + self.max_gap_error)
-        within = np.broadcast_to(reach, len(x))[self.corners[near]].max(axis=1, initial=0.0) + self.max_gap_error
+        near = self._candidates(posed, x, float(reach.max(initial=0.0)) + self.max_gap_error)
+        facet_reach = np.broadcast_to(reach, len(x))[self.corners[near]].max(axis=1, initial=0.0) + self.max_gap_error
         corners = x[self.corners[near]]
-        middle = corners.mean(axis=1)
-        around, distance = np.linalg.norm(corners - middle[:, None], axis=2), placed.distance(middle)
-        left = distance < around.max(axis=1, initial=0.0) + within
-        distance, normal, arms = distance[left], placed.normal(middle[left]), (corners - middle[:, None])[left]
-        return (
-            near[left],
-            distance,
-            distance[:, None] - self.max_gap_error + np.einsum("kcd,kd->kc", arms, normal),
-            normal,
-        )
+        centroid = corners.mean(axis=1)
+        radius, distance = np.linalg.norm(corners - centroid[:, None], axis=2), posed.distance(centroid)
+        is_near = distance < radius.max(axis=1, initial=0.0) + facet_reach
+        distance, normal = distance[is_near], posed.normal(centroid[is_near])
+        arms = (corners - centroid[:, None])[is_near]
+        corner_bounds = distance[:, None] - self.max_gap_error + np.einsum("kcd,kd->kc", arms, normal)
+        return near[is_near], distance, corner_bounds, normal
 
-    def distances(self, placed: PosedShape, x: Values, reach: float) -> Values:
-        """(k,) of the deepest places of those that are near, m."""
-        return placed.distance(self.closest_points(placed, x, self.within_reach(placed, x, reach)).position)
+    def distances(self, posed: PosedShape, x: Values, reach: float) -> Values:
+        """(k,) distances of the closest points of facets within `reach`, m."""
+        return posed.distance(self.closest_points(posed, x, self.within_reach(posed, x, reach)).position)
 
-    def are_open(self, every: Sequence[PosedShape], x: Values) -> Flags:
-        """(m,) those that none of several obstacles cuts."""
-        found = np.ones(len(self.area), bool)
-        for placed in every:
-            near = self.within_reach(placed, x, 0.0)
-            found[near] &= self.closest_points(placed, x, near).gap > 0
-        return found
+    def are_open(self, obstacles: Sequence[PosedShape], x: Values) -> Flags:
+        """(m,) facets that none of several obstacles cuts."""
+        is_open = np.ones(len(self.area), bool)
+        for posed in obstacles:
+            near = self.within_reach(posed, x, 0.0)
+            is_open[near] &= self.closest_points(posed, x, near).gap > 0
+        return is_open
 
-    def gaps(self, placed: PosedShape, x: Values, reach: float) -> Values:
-        """(m,) to an obstacle, m; infinite of those that are not near."""
-        near, found = self.within_reach(placed, x, reach), np.full(len(self.area), np.inf)
-        found[near] = self.closest_points(placed, x, near).gap
-        return found
+    def gaps(self, posed: PosedShape, x: Values, reach: float) -> Values:
+        """(m,) gaps to an obstacle, m; infinite beyond `reach`."""
+        near, gaps = self.within_reach(posed, x, reach), np.full(len(self.area), np.inf)
+        gaps[near] = self.closest_points(posed, x, near).gap
+        return gaps
 
 
 @dataclass(frozen=True, eq=False)
 class FacetForces:
-    """F of facets near an obstacle.
+    """Energy F of facets near an obstacle, its forces and second derivatives.
 
     Attributes:
-        corners: (k, c) points.    area: (k,).    at: their deepest places.
-        law, if_flat, of_corners: b of the gaps of these, of gap', and of all their corners.
+        corners: (k, c) points.
+        area: (k,) m^2.
+        closest: closest points.
+        potential: b of the gap of the closest points.
+        plane_potential: b of the smoothed minimum of the nodal gaps.
+        corner_potential: b of the nodal gaps.
     """
 
     corners: Ints
@@ -217,13 +248,13 @@ class FacetForces:
 
     @cached_property
     def _corner_gaps(self) -> Values:
-        """(k, c) of the corners, m."""
+        """(k, c) nodal gaps, m."""
         k, c, d = self.closest.x.shape
         return self.closest.posed.distance(self.closest.x.reshape(-1, d)).reshape(k, c)
 
     @cached_property
     def _corner_normals(self) -> Values:
-        """(k, c, d) at the corners."""
+        """(k, c, d) unit normals at the nodes."""
         k, c, d = self.closest.x.shape
         return self.closest.posed.normal(self.closest.x.reshape(-1, d)).reshape(k, c, d)
 
@@ -233,124 +264,146 @@ class FacetForces:
 
     @property
     def energy(self) -> Values:
-        """(k,) J; infinite where a facet is cut."""
-        inner, flat = self.potential.energy(self.closest.gap), self.plane_potential.energy(self._plane_gap.gap)
+        """(k,) F, J; infinite where a facet is cut."""
+        inner = self.potential.energy(self.closest.gap)
+        plane = self.plane_potential.energy(self._plane_gap.gap)
         cut = ~np.isfinite(inner)
-        return np.where(cut, np.inf, self.area * (np.where(cut, 0.0, inner) - np.where(cut, 0.0, flat)))
+        return np.where(cut, np.inf, self.area * (np.where(cut, 0.0, inner) - np.where(cut, 0.0, plane)))
 
     @cached_property
     def forces(self) -> Values:
-        """(k, c, d) on the corners, N."""
-        own = self.potential.slope(self.closest.gap)[:, None, None] * self.closest.gradient
+        """(k, c, d) forces on the corners, N."""
+        of_closest = self.potential.slope(self.closest.gap)[:, None, None] * self.closest.gradient
         slope = self.plane_potential.slope(self._plane_gap.gap)[:, None]
-        return np.asarray(
-            -self.area[:, None, None] * (own - (slope * self._plane_gap.barycentric)[:, :, None] * self._corner_normals)
-        )
+        of_plane = (slope * self._plane_gap.barycentric)[:, :, None] * self._corner_normals
+        return np.asarray(-self.area[:, None, None] * (of_closest - of_plane))
 
     @cached_property
     def hessian(self) -> Values:
         """(k, c d, c d) second derivative of F, N/m."""
         k, c, d = self.closest.x.shape
         n = self.closest.gradient.reshape(k, c * d)
-        own = self.potential.curvature(self.closest.gap)[:, None, None] * n[:, :, None] * n[:, None, :]
-        own = own + self.potential.slope(self.closest.gap)[:, None, None] * self.closest.curvature()
-        return np.asarray(self.area[:, None, None] * (own - self._plane_hessian()))
+        of_closest = self.potential.curvature(self.closest.gap)[:, None, None] * n[:, :, None] * n[:, None, :]
+        of_closest = of_closest + self.potential.slope(self.closest.gap)[:, None, None] * self.closest.curvature()
+        return np.asarray(self.area[:, None, None] * (of_closest - self._plane_hessian()))
 
     def _plane_hessian(self) -> Values:
         """(k, c d, c d) second derivative of b(gap'), Pa/m."""
         k, c, d = self.closest.x.shape
-        flat, n = self._plane_gap, self._corner_normals
-        slope, share = self.plane_potential.slope(flat.gap)[:, None, None], flat.barycentric
-        twice = self.plane_potential.curvature(flat.gap)[:, None, None] * share[:, :, None] * share[:, None, :]
-        bent = np.einsum("kce,kci,kej->kciej", twice + slope * flat.curvature(), n, n)
+        plane, n = self._plane_gap, self._corner_normals
+        slope, lam = self.plane_potential.slope(plane.gap)[:, None, None], plane.barycentric
+        by_gaps = self.plane_potential.curvature(plane.gap)[:, None, None] * lam[:, :, None] * lam[:, None, :]
+        blocks = np.einsum("kce,kci,kej->kciej", by_gaps + slope * plane.curvature(), n, n)
         H = self.closest.posed.curvature(self.closest.x.reshape(-1, d)).reshape(k, c, d, d)
-        bent[:, range(c), :, range(c), :] += (slope[..., None] * share[:, :, None, None] * H).transpose(1, 0, 2, 3)
-        return np.asarray(bent.reshape(k, c * d, c * d))
+        blocks[:, range(c), :, range(c), :] += (slope[..., None] * lam[:, :, None, None] * H).transpose(1, 0, 2, 3)
+        return np.asarray(blocks.reshape(k, c * d, c * d))
 
     def _corner_hessians(self) -> Values:
-        """(k, c, d, d) second derivative of b at each corner, Pa/m."""
+        """(k, c, d, d) second derivative of b at each node, Pa/m."""
         k, c, d = self.closest.x.shape
         gap = self._corner_gaps.reshape(-1)
         n, H = self._corner_normals.reshape(-1, d), self.closest.posed.curvature(self.closest.x.reshape(-1, d))
-        bent = self.corner_potential.curvature(gap)[:, None, None] * n[:, :, None] * n[:, None, :]
-        return np.asarray(bent + self.corner_potential.slope(gap)[:, None, None] * H).reshape(k, c, d, d)
+        blocks = self.corner_potential.curvature(gap)[:, None, None] * n[:, :, None] * n[:, None, :]
+        return np.asarray(blocks + self.corner_potential.slope(gap)[:, None, None] * H).reshape(k, c, d, d)
 
     @cached_property
     def stiffness(self) -> Values:
-        """(k, c d, c d) for a tangent: positive semi-definite together with the share of the facet in the stiffness of
-        its corners, which have that already (node_contact)."""
+        """(k, c d, c d) part of a tangent, N/m.
+
+        It is positive semi-definite together with the facet's share of the stiffness of its nodes, which
+        node_contact adds.
+        """
         k, c, d = self.closest.x.shape
-        own = (self.area / c)[:, None, None, None] * self._corner_hessians()
-        kept = positive_part(own.reshape(-1, d, d)).reshape(k, c, d, d)
-        return np.asarray(positive_part(self.hessian + _diagonal(own)) - _diagonal(kept))
+        of_nodes = (self.area / c)[:, None, None, None] * self._corner_hessians()
+        node_stiffness = positive_part(of_nodes.reshape(-1, d, d)).reshape(k, c, d, d)
+        return np.asarray(positive_part(self.hessian + _block_diagonal(of_nodes)) - _block_diagonal(node_stiffness))
 
 
 def evaluate_facets(
     facets: ContactFacets,
-    placed: PosedShape,
+    posed: PosedShape,
     x: Values,
     law: GapPotential,
     start: tuple[PosedShape, Values] | None = None,
 ) -> tuple[FacetForces, float]:
-    """What acts on facets with points at x (n, d), and the energy that it stores, J; `start`: the obstacle and the
-    points as the step began, where the barrier acts along the way (laws)."""
-    near = facets.within_reach(placed, x, law.width)
+    """Forces on facets near an obstacle, and the energy that they store, J.
+
+    Args:
+        facets: all facets.
+        posed: obstacle.
+        x: (n, d) points, m.
+        law: b.
+        start: obstacle and points (n, d) at the start of the step, where the barrier is averaged over the step.
+    """
+    near = facets.within_reach(posed, x, law.width)
     if start is not None:
         near = np.union1d(near, facets.within_reach(*start, law.width))
     corners, area = facets.corners[near], facets.area[near]
-    at = facets.closest_points(placed, x, near)
-    stored = FacetForces(corners, area, at, law, law, law)
+    closest = facets.closest_points(posed, x, near)
+    stored = FacetForces(corners, area, closest, law, law, law)
     if start is None:
         return stored, float(stored.energy.sum())
-    then = find_closest_points(start[0], start[1][corners], facets.smoothing, at.barycentric).gap
-    of_corners = start[0].distance(start[1][corners].reshape(-1, x.shape[1]))
-    flat = SoftMinGap(of_corners.reshape(corners.shape), facets.smoothing).gap
-    laws = (TimeAveragedPotential(law, gap) for gap in (then, flat, of_corners))
-    return FacetForces(corners, area, at, *laws), float(stored.energy.sum())
+    start_gap = find_closest_points(start[0], start[1][corners], facets.smoothing, closest.barycentric).gap
+    corner_gaps = start[0].distance(start[1][corners].reshape(-1, x.shape[1]))
+    plane_gap = SoftMinGap(corner_gaps.reshape(corners.shape), facets.smoothing).gap
+    laws = (TimeAveragedPotential(law, gap) for gap in (start_gap, plane_gap, corner_gaps))
+    return FacetForces(corners, area, closest, *laws), float(stored.energy.sum())
 
 
-def _diagonal(blocks: Values) -> Values:
-    """(k, c d, c d) of blocks (k, c, d, d)."""
+def _block_diagonal(blocks: Values) -> Values:
+    """(k, c d, c d) block-diagonal matrices of blocks (k, c, d, d)."""
     k, c, d = blocks.shape[:3]
     full = np.zeros((k, c, d, c, d))
     full[:, range(c), :, range(c), :] = blocks.transpose(1, 0, 2, 3)
     return full.reshape(k, c * d, c * d)
 
 
-def add_facet_friction(held: LaggedContact, inner: FacetForces, x: Values) -> LaggedContact:
-    """`held`: points alone, of the start of a step at x (n, d), m; with what acts on facets then."""
+def add_facet_friction(lagged: LaggedContact, inner: FacetForces, x: Values) -> LaggedContact:
+    """Lagged contact of points, with the normal forces on facets added to their corners.
+
+    Friction acts at points alone. A point within a facet would stick where its corners slip, and Newton's method
+    would take many iterations to find which of them do. The point of the obstacle that rubs is the mean of the
+    points that press, weighted with their forces.
+
+    Args:
+        lagged: contact of points at the start of the step.
+        inner: forces on facets then.
+        x: (n, d) points then, m.
+    """
     corners, d = inner.corners.reshape(-1), x.shape[1]
-    points = np.union1d(held.points, corners)
+    points = np.union1d(lagged.points, corners)
     if len(points) == 0:
-        return held
-    at, of = np.searchsorted(points, held.points), np.searchsorted(points, corners)
-    force, weight, under = np.zeros((len(points), d)), np.zeros(len(points)), np.zeros((len(points), d))
-    force[at], weight[at] = held.force[:, None] * held.normal, held.force
-    under[at] = held.force[:, None] * held.position
-    np.add.at(force, of, inner.forces.reshape(-1, d))
-    pressed = np.linalg.norm(inner.forces, axis=2)
-    np.add.at(weight, of, pressed.reshape(-1))
-    np.add.at(under, of, (pressed[:, :, None] * inner.closest.position[:, None, :]).reshape(-1, d))
+        return lagged
+    point_rows, corner_rows = np.searchsorted(points, lagged.points), np.searchsorted(points, corners)
+    force, weight, moment = np.zeros((len(points), d)), np.zeros(len(points)), np.zeros((len(points), d))
+    force[point_rows], weight[point_rows] = lagged.force[:, None] * lagged.normal, lagged.force
+    moment[point_rows] = lagged.force[:, None] * lagged.position
+    np.add.at(force, corner_rows, inner.forces.reshape(-1, d))
+    corner_force = np.linalg.norm(inner.forces, axis=2)
+    np.add.at(weight, corner_rows, corner_force.reshape(-1))
+    corner_moment = corner_force[:, :, None] * inner.closest.position[:, None, :]
+    np.add.at(moment, corner_rows, corner_moment.reshape(-1, d))
     size = np.linalg.norm(force, axis=1)
-    kept = np.flatnonzero(size > 0)
-    points, size, start = points[kept], size[kept], x[points[kept]]
-    return LaggedContact(points, size, force[kept] / size[:, None], start, under[kept] / weight[kept, None])
+    loaded = np.flatnonzero(size > 0)
+    points, size, position = points[loaded], size[loaded], x[points[loaded]]
+    normal, obstacle_point = force[loaded] / size[:, None], moment[loaded] / weight[loaded, None]
+    return LaggedContact(points, size, normal, position, obstacle_point)
 
 
-def merge_forces(found: ContactForces, inner: FacetForces, stored: float) -> ContactForces:
-    """A touch with what facets feel, which store J, added to their corners, and their stiffness between these."""
+def merge_forces(of_points: ContactForces, inner: FacetForces, stored: float) -> ContactForces:
+    """Forces on points and on facets together; `stored`: energy of the facets, J."""
     if not len(inner.area):
-        return found
-    points = np.union1d(found.points, inner.corners.reshape(-1))
-    place, d = np.searchsorted(points, found.points), found.normal.shape[1]
-    normal, rubbed = np.zeros((2, len(points), d))
-    normal[place], rubbed[place] = found.normal, found.friction
+        return of_points
+    points = np.union1d(of_points.points, inner.corners.reshape(-1))
+    rows, d = np.searchsorted(points, of_points.points), of_points.normal.shape[1]
+    normal, friction = np.zeros((2, len(points), d))
+    normal[rows], friction[rows] = of_points.normal, of_points.friction
     np.add.at(normal, np.searchsorted(points, inner.corners), inner.forces)
 
-    def parts() -> tuple[Values, Values]:
-        exact, stick = np.zeros((2, len(points), d, d))
-        exact[place], stick[place] = found.normal_hessian, found.friction_hessian
-        return exact, stick
+    def hessians() -> tuple[Values, Values]:
+        of_normal, of_friction = np.zeros((2, len(points), d, d))
+        of_normal[rows], of_friction[rows] = of_points.normal_hessian, of_points.friction_hessian
+        return of_normal, of_friction
 
-    potential = found.potential + float(inner.energy.sum())
-    return ContactForces(points, found.energy + stored, normal, rubbed, potential, parts, inner)
+    potential = of_points.potential + float(inner.energy.sum())
+    return ContactForces(points, of_points.energy + stored, normal, friction, potential, hessians, inner)

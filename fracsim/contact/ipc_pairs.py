@@ -1,28 +1,17 @@
-"""Contact between the elements of one surface: barrier, friction and collision detection of ipctk, on one rank.
+"""Contact between the elements of one surface: barrier, lagged friction and collision detection of ipctk, on one rank.
 
     E(x) = k int b(d(x)) dA,   b(d) = -D (s - 1)^2 ln s where s = (d / D)^2 < 1, 0 elsewhere   (m)
 
-with d the distance from a point of the surface to the rest of it, D the distance at which the barrier begins and k the
-stiffness in Pa. The integral is the mean of both sides, with one sample point an element: the centroid, weighted with
-the reference area (2D: length, and all per m of thickness). So the pressure between parallel faces is k |b'(d)|, and
-has no tangential part where rims lie above one another (sample_points). The "improved max" set of ipctk (Li et al.
-2023, Convergent IPC) counts elements near the same point once, and keeps E continuously differentiable.
-
-A vertex or an edge may come near with no centroid near. Each has a barrier of its own, which begins nearer: of vertices
-at VERTICES D, of edges against edges in 3D at EDGES D. As many edges cross each other between two flat faces as their
-meshes please; from D on, the pressure would depend on them (by a factor of 1.6 to 2.8). At D / 2 the pressure is 4.3 k
-by centroids, and 2.6 k more by vertices. Elements that share a point do not touch each other.
+d is the distance from a point of the surface to the rest of it, D the distance at which the barrier begins, k the
+stiffness in Pa. The integral is the mean of both sides, with one sample point an element, its centroid
+(sample_points), weighted with the reference area (2D: length, all per m of thickness). The "improved max" set of
+ipctk (Li et al. 2023, Convergent IPC) counts elements near the same point once, and keeps E continuously
+differentiable. Vertices, and edges against edges in 3D, have barriers of their own, which begin nearer. Elements that
+share a point do not touch each other.
 
 The caller maps nodes to points of the surface and forces back: x = W u and W^T f; ipctk's displacement map is unused.
 
-Equations: docs/theory.md#barrier.
-
-Which elements of a surface are near each other: candidates, kept while points move little, and pairs that touch.
-
-Three kinds of pairs: centroids against elements, vertices against elements, and in 3D edges against edges, each with a
-barrier of its own.
-
-Elements of a surface that cut each other.
+Equations: docs/theory.md#barrier, docs/theory.md#friction.
 """
 
 from __future__ import annotations
@@ -30,34 +19,60 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Protocol
 
 import ipctk
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
-from .ipc_friction import IpcFriction, projection
+from .laws import BARRIER
 from .sample_points import Centroids, Vertices, measures
 
 Values = npt.NDArray[np.float64]
-KEPT = 0.1  # of a gap is left by a step
-# of the collision detection: faces that slide on each other would take for ever; with 1,000 of them pairs at a
-# thousandth of the barrier's distance held Newton's method to a fifth of its steps
-ROUNDS = 10_000
-CCD = ipctk.AdditiveCCD(ROUNDS, 1.0 - KEPT)
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
-NONE: Ints = np.empty((0, 2), np.int64)
-VERTICES = 0.8  # of the distance of the barrier, as EDGES
-EDGES = 0.5  # of the distance of the barrier
-MARGIN = 0.5  # of the distance of the barrier: how far points may move before candidates are looked for again
-MOST, WIDE = 128, 3.0  # pieces of a step, and the measure of the boxes in one
+NO_PAIRS: Ints = np.empty((0, 2), np.int64)
+
+
+@dataclass(frozen=True)
+class PairPolicy:
+    """Tuned numbers of pairs and of collision detection.
+
+    Attributes:
+        vertex_distance: distance at which the barrier of vertices begins, in D, and its stiffness in that of
+            centroids. At D / 2 the pressure of centroids is 4.3 k; vertices add 2.6 k.
+        edge_distance: the same of edges against edges. From D on, the pressure would depend on how the meshes of two
+            flat faces cross, by a factor of 1.6 to 2.8.
+        search_margin: motion of points, in D, after which candidates are searched again.
+        max_pieces: pieces of one motion, so that bounding boxes of long motions do not all overlap.
+        max_box_growth: mean measure of the bounding boxes of a piece, in that of one around an edge.
+        max_ccd_iterations: of additive collision detection. Faces that slide on each other would take forever; with
+            1,000 iterations pairs at a thousandth of D held Newton's method to a fifth of its steps.
+    """
+
+    vertex_distance: float = 0.8
+    edge_distance: float = 0.5
+    search_margin: float = 0.5
+    max_pieces: int = 128
+    max_box_growth: float = 3.0
+    max_ccd_iterations: int = 10_000
+
+
+PAIRS = PairPolicy()
+CCD = ipctk.AdditiveCCD(PAIRS.max_ccd_iterations, 1.0 - BARRIER.min_gap_ratio)
 
 
 @dataclass(frozen=True)
 class PairKind:
-    """The barrier of one kind of pairs, from `distance` m on with `stiffness` Pa, between sample points or edges and
-    elements; `name` of the list of ipctk's candidates, "" for centroids, which have candidates of their own."""
+    """Barrier between sample points, or edges, and elements.
+
+    Attributes:
+        distance: at which the barrier begins, m.
+        stiffness: Pa.
+        name: list of ipctk's candidates; empty for centroids, which have candidates of their own.
+        samples: sample points.
+    """
 
     distance: float
     stiffness: float
@@ -66,11 +81,11 @@ class PairKind:
 
     @cached_property
     def barrier(self) -> ipctk.BarrierPotential:
-        """That of ipctk."""
+        """Barrier of ipctk."""
         return ipctk.BarrierPotential(self.distance, self.stiffness, True)
 
     def active_pairs(self, candidates: ipctk.Candidates, x: Values) -> ActivePairs:
-        """Those of the candidates on which the barrier acts with vertices at x (n, d)."""
+        """Candidates on which the barrier acts, with vertices at x (n, d), m."""
         pairs = ipctk.NormalCollisions()
         pairs.use_area_weighting = True
         pairs.collision_set_type = ipctk.NormalCollisions.IMPROVED_MAX_APPROX
@@ -82,297 +97,336 @@ class PairKind:
 
 @dataclass(frozen=True)
 class ActivePairs:
-    """Pairs on which the barrier of a kind acts, with the sample points at `positions` (p, d), m."""
+    """Pairs on which the barrier of a kind acts.
+
+    Attributes:
+        kind: kind of pairs.
+        pairs: ipctk's pairs.
+        positions: (p, d) sample points, m.
+    """
 
     kind: PairKind
     pairs: ipctk.NormalCollisions
     positions: Values
 
     def energy(self) -> float:
-        """J."""
+        """Energy of the barrier, J."""
         return float(self.kind.barrier(self.pairs, self.kind.samples.mesh, self.positions))
 
     def gradient(self) -> Values:
-        """(n d,) by the vertices, N."""
+        """(n d,) derivatives of the energy by the vertices, N."""
         samples = self.kind.samples
         return samples.gradient(self.kind.barrier.gradient(self.pairs, samples.mesh, self.positions))
 
     def hessian(self, projection: ipctk.PSDProjectionMethod) -> csr_matrix:
-        """(n d, n d) by the vertices, N/m."""
+        """(n d, n d) second derivatives of the energy by the vertices, N/m."""
         samples = self.kind.samples
         return samples.hessian(self.kind.barrier.hessian(self.pairs, samples.mesh, self.positions, projection))
 
     def least_squared_distance(self) -> float:
-        """m^2."""
+        """Least squared distance of a pair, m^2."""
         return float(self.pairs.compute_minimum_distance(self.kind.samples.mesh, self.positions))
 
 
 class PairSearch:
-    """Candidates within `distance` + 2 `margin` (m) of each other; x (n, d) of the mesh's points.
+    """Candidates within `distance` + 2 `margin` (m) of each other; x (n, d) of the mesh's points, m.
 
-    They are looked for on the whole way of a step of Newton's method, and serve all that stays within `margin` of it:
-    where the line search stops, the steps after it, and the way of the next one, which mostly goes on along it.
+    Candidates are searched along a whole step of Newton's method and serve all positions within `margin` of it: the
+    trials of the line search, the steps after it, and mostly the next one.
     """
 
     def __init__(self, mesh: ipctk.CollisionMesh, kinds: list[PairKind], distance: float, margin: float) -> None:
+        """`kinds`: kinds of pairs, of which the last one takes the remaining candidates."""
         self._mesh, self._kinds, self._margin, self._radius = mesh, kinds, margin, 0.5 * distance + margin
         self.clear_caches()
 
     def clear_caches(self) -> None:
-        """Nothing is known of any place."""
+        """Discard all candidates and pairs."""
         self._candidates: list[ipctk.Candidates] = []
-        self._found: list[ActivePairs] = []
-        self._from = self._way = self._found_at = np.full(self._mesh.rest_positions.shape, np.nan)
+        self._active: list[ActivePairs] = []
+        unknown = np.full(self._mesh.rest_positions.shape, np.nan)
+        self._search_start = self._search_motion = self._active_positions = unknown
 
     def active_pairs(self, x: Values) -> list[ActivePairs]:
-        """The pairs of each kind on which its barrier acts; those of the last x are kept."""
-        if not np.array_equal(x, self._found_at):
-            each = zip(self._kinds, self.candidates(x), strict=True)
-            self._found = [kind.active_pairs(candidates, x) for kind, candidates in each]
-            self._found_at = x.copy()
-        return self._found
+        """Pairs of each kind on which its barrier acts; those of the last x are kept."""
+        if not np.array_equal(x, self._active_positions):
+            items = zip(self._kinds, self.candidates(x), strict=True)
+            self._active = [kind.active_pairs(candidates, x) for kind, candidates in items]
+            self._active_positions = x.copy()
+        return self._active
 
     def set_stiffness(self, stiffness: Sequence[float]) -> None:
-        """Barriers have this stiffness of each kind, Pa, from here on; what touches stays."""
+        """Set the stiffness of each kind, Pa; active pairs stay."""
         self._kinds = [replace(kind, stiffness=k) for kind, k in zip(self._kinds, stiffness, strict=True)]
-        self._found = [replace(met, kind=kind) for kind, met in zip(self._kinds, self._found, strict=False)]
+        self._active = [replace(pairs, kind=kind) for kind, pairs in zip(self._kinds, self._active, strict=False)]
 
     def candidates(self, x: Values) -> list[ipctk.Candidates]:
-        """Of each kind; the same ones while they hold."""
-        if not self._holds(x):
-            self._look(x, x)
+        """Candidates of each kind; the same ones while they are valid."""
+        if not self._is_valid(x):
+            self._search(x, x)
         return self._candidates
 
-    def free_fraction(self, x: Values, to: Values) -> float:
-        """The share in (0, 1] of the way from x to `to` on which nothing meets: KEPT of each gap is left."""
-        self.search_along(x, to)
-        own = [each for kind, each in zip(self._kinds, self._candidates, strict=True) if kind.name]
-        steps = (each.compute_collision_free_stepsize(self._mesh, x, to, 0.0, CCD) for each in own)
+    def free_fraction(self, x: Values, end: Values) -> float:
+        """Fraction in (0, 1] of the motion from x to `end` that leaves `BARRIER.min_gap_ratio` of each gap."""
+        self.search_along(x, end)
+        named = [pairs for kind, pairs in zip(self._kinds, self._candidates, strict=True) if kind.name]
+        steps = (pairs.compute_collision_free_stepsize(self._mesh, x, end, 0.0, CCD) for pairs in named)
         return float(min(steps))
 
-    def search_along(self, x: Values, to: Values) -> None:
-        """Have candidates for all the way from x to `to`."""
-        if not (self._holds(x) and self._holds(to)):
-            self._look(x, to)
+    def search_along(self, x: Values, end: Values) -> None:
+        """Search candidates for the whole motion from x to `end`, unless they are valid."""
+        if not (self._is_valid(x) and self._is_valid(end)):
+            self._search(x, end)
 
-    def _look(self, x: Values, to: Values) -> None:
-        """Candidates on the way from x to `to`; what all points have in common brings nothing together."""
-        start, end = centred(x), centred(to)
-        found = ipctk.Candidates()  # one tree for all kinds: it is most of what a look costs
-        found.build(self._mesh, start, end, self._radius, ipctk.LBVH())
-        self._candidates = [self._of_kind(kind, found, start, end) for kind in self._kinds[:-1]] + [found]
-        self._from, self._way = start, end - start
+    def _search(self, x: Values, end: Values) -> None:
+        """Search candidates along a motion; the mean motion brings nothing together."""
+        start, centred_end = centred(x), centred(end)
+        all_candidates = ipctk.Candidates()
+        # one tree for all kinds, as it takes most of the time
+        all_candidates.build(self._mesh, start, centred_end, self._radius, ipctk.LBVH())
+        self._candidates = [self._of_kind(kind, all_candidates, start, centred_end) for kind in self._kinds[:-1]] + [
+            all_candidates
+        ]
+        self._search_start, self._search_motion = start, centred_end - start
 
-    def _of_kind(self, kind: PairKind, found: ipctk.Candidates, start: Values, end: Values) -> ipctk.Candidates:
+    def _of_kind(
+        self, kind: PairKind, all_candidates: ipctk.Candidates, start: Values, end: Values
+    ) -> ipctk.Candidates:
         if isinstance(kind.samples, Centroids):
             return kind.samples.candidates(start, end, self._radius)
-        return _taken(found, kind.name)
+        return _extract(all_candidates, kind.name)
 
-    def _holds(self, x: Values) -> bool:
-        """Whether no pair within reach can be missing: points are near the way on which was looked."""
-        off, squares = centred(x) - self._from, np.sum(self._way**2, axis=1)
-        along = np.clip(np.sum(off * self._way, axis=1) / np.where(squares > 0, squares, 1.0), 0.0, 1.0)
-        return max_length(off - along[:, None] * self._way) <= self._margin
+    def _is_valid(self, x: Values) -> bool:
+        """Whether no pair within reach can be missing: all points are near their motion in the last search."""
+        offset, squares = centred(x) - self._search_start, np.sum(self._search_motion**2, axis=1)
+        along = np.sum(offset * self._search_motion, axis=1) / np.where(squares > 0, squares, 1.0)
+        along = np.clip(along, 0.0, 1.0)
+        return max_length(offset - along[:, None] * self._search_motion) <= self._margin
 
 
-def _taken(found: ipctk.Candidates, name: str) -> ipctk.Candidates:
-    """The candidates of that name, which `found` loses."""
+def _extract(candidates: ipctk.Candidates, name: str) -> ipctk.Candidates:
+    """Candidates in the list of that name, which `candidates` loses."""
     part = ipctk.Candidates()
-    setattr(part, name, getattr(found, name))
-    setattr(found, name, [])
+    setattr(part, name, getattr(candidates, name))
+    setattr(candidates, name, [])
     return part
 
 
 def centred(x: Values) -> Values:
-    """x (n, d) about their mean."""
+    """(n, d) positions relative to their mean, m."""
     result: Values = x - x.mean(axis=0)
     return result
 
 
 def max_length(vectors: Values) -> float:
-    """The greatest length of the rows."""
+    """Largest length of the rows of an array (n, d)."""
     return float(np.sqrt(np.max(np.sum(vectors**2, axis=1), initial=0.0)))
 
 
+# --- intersections ---
+
+
 def intersecting_elements(mesh: ipctk.CollisionMesh, x: Values) -> Ints:
-    """(k, 2) elements at x (n, d), m, of which neither is a neighbour of the other."""
+    """(k, 2) elements that intersect and are not neighbours, with vertices at x (n, d), m."""
     phase = ipctk.LBVH()
     phase.build(x, mesh.edges, mesh.faces, 0.0)
-    return _of_triangles(phase, mesh, x) if x.shape[1] == 3 else _of_segments(phase, mesh, x)
+    return _intersecting_triangles(phase, mesh, x) if x.shape[1] == 3 else _intersecting_segments(phase, mesh, x)
 
 
-def _of_segments(phase: ipctk.LBVH, mesh: ipctk.CollisionMesh, x: Values) -> Ints:
-    near = _pairs([(each.edge0_id, each.edge1_id) for each in phase.detect_edge_edge_candidates()])
+def _intersecting_segments(phase: ipctk.LBVH, mesh: ipctk.CollisionMesh, x: Values) -> Ints:
+    near = _as_pairs([(pair.edge0_id, pair.edge1_id) for pair in phase.detect_edge_edge_candidates()])
     (a, b), (c, d) = (x[mesh.edges[near[:, k]]].transpose(1, 0, 2) for k in range(2))
-    return near[_part(a, b, c, d) & _part(c, d, a, b)]
+    return near[_separates(a, b, c, d) & _separates(c, d, a, b)]
 
 
-def _part(a: Values, b: Values, c: Values, d: Values) -> Flags:
-    """(k,) whether the line through a and b parts c from d, (k, 2) each."""
-    (way_x, way_y), to = (b - a).T, [(each - a).T for each in (c, d)]
-    side = [way_x * y - way_y * x for x, y in to]
+def _separates(a: Values, b: Values, c: Values, d: Values) -> Flags:
+    """(k,) whether the line through a and b separates c from d, (k, 2) each."""
+    (x, y), arms = (b - a).T, [(point - a).T for point in (c, d)]
+    side = [x * arm_y - y * arm_x for arm_x, arm_y in arms]
     return np.asarray(side[0] * side[1] <= 0)
 
 
-def _of_triangles(phase: ipctk.LBVH, mesh: ipctk.CollisionMesh, x: Values) -> Ints:
-    near = _pairs([(each.edge_id, each.face_id) for each in phase.detect_edge_face_candidates()])
-    near = near[_pierced(x[mesh.edges[near[:, 0]]], x[mesh.faces[near[:, 1]]])]
-    which, triangle = _around(mesh.faces_to_edges, near[:, 0])
-    return np.unique(np.sort(np.column_stack([triangle, near[which, 1]]), axis=1), axis=0)
+def _intersecting_triangles(phase: ipctk.LBVH, mesh: ipctk.CollisionMesh, x: Values) -> Ints:
+    near = _as_pairs([(pair.edge_id, pair.face_id) for pair in phase.detect_edge_face_candidates()])
+    near = near[_pierces(x[mesh.edges[near[:, 0]]], x[mesh.faces[near[:, 1]]])]
+    row, triangle = _triangles_at_edges(mesh.faces_to_edges, near[:, 0])
+    return np.unique(np.sort(np.column_stack([triangle, near[row, 1]]), axis=1), axis=0)
 
 
-def _around(edges: Ints, of: Ints) -> tuple[Ints, Ints]:
-    """All triangles at the edges `of` (k,): (m,) which of the k, and (m,) the triangle; `edges` (triangles, 3)."""
-    order = np.argsort(edges, axis=None, kind="stable")
-    sorted_edges = edges.reshape(-1)[order]
-    first, end = np.searchsorted(sorted_edges, of, "left"), np.searchsorted(sorted_edges, of, "right")
-    which = np.repeat(np.arange(len(of)), count := end - first)
-    at = np.arange(len(which)) + np.repeat(first - np.cumsum(count) + count, count)
-    return which, order[at] // edges.shape[1]
+def _triangles_at_edges(triangle_edges: Ints, edges: Ints) -> tuple[Ints, Ints]:
+    """All triangles at edges (k,): rows (m,) of these, and triangles (m,); `triangle_edges`: (triangles, 3)."""
+    order = np.argsort(triangle_edges, axis=None, kind="stable")
+    sorted_edges = triangle_edges.reshape(-1)[order]
+    first, end = np.searchsorted(sorted_edges, edges, "left"), np.searchsorted(sorted_edges, edges, "right")
+    row = np.repeat(np.arange(len(edges)), count := end - first)
+    position = np.arange(len(row)) + np.repeat(first - np.cumsum(count) + count, count)
+    return row, order[position] // triangle_edges.shape[1]
 
 
-def _pierced(ends: Values, corners: Values) -> Flags:
-    """(k,) whether edges (k, 2, 3) go through triangles (k, 3, 3): their ends are on both sides, and the edge turns the
-    same way about all three sides."""
-    start, way = ends[:, 0], ends[:, 1] - ends[:, 0]
+def _pierces(ends: Values, corners: Values) -> Flags:
+    """(k,) whether edges (k, 2, 3) pass through triangles (k, 3, 3).
+
+    The ends are on both sides of the plane, and the edge turns in the same sense about all three sides.
+    """
+    start, direction = ends[:, 0], ends[:, 1] - ends[:, 0]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    above = [np.einsum("ij,ij->i", ends[:, k] - corners[:, 0], normal) for k in range(2)]
-    turns = [
-        np.einsum("ij,ij->i", way, np.cross(corners[:, k] - start, corners[:, (k + 1) % 3] - start)) for k in range(3)
+    height = [np.einsum("ij,ij->i", ends[:, k] - corners[:, 0], normal) for k in range(2)]
+    sense = [
+        np.einsum("ij,ij->i", direction, np.cross(corners[:, k] - start, corners[:, (k + 1) % 3] - start))
+        for k in range(3)
     ]
-    same = np.all(np.array(turns) >= 0, axis=0) | np.all(np.array(turns) <= 0, axis=0)
-    return np.asarray((above[0] * above[1] <= 0) & (above[0] != above[1]) & same)
+    same = np.all(np.array(sense) >= 0, axis=0) | np.all(np.array(sense) <= 0, axis=0)
+    return np.asarray((height[0] * height[1] <= 0) & (height[0] != height[1]) & same)
 
 
-def _pairs(found: list[tuple[int, int]]) -> Ints:
-    return np.array(found, np.int64).reshape(-1, 2)
+def _as_pairs(numbers: list[tuple[int, int]]) -> Ints:
+    return np.array(numbers, np.int64).reshape(-1, 2)
 
 
 class IpcPairs:
-    """Barrier and lagged Coulomb friction between the elements of a surface.
-
-    x is always (n, d): where the points are, m. Candidates are kept until a point has moved by MARGIN `distance`.
-    """
+    """Barrier and lagged Coulomb friction between the elements of a surface; x is always (n, d), m."""
 
     def __init__(
-        self, rest: Values, elements: Ints, *, distance: float, stiffness: float, friction: float = 0.0
+        self, rest_positions: Values, elements: Ints, *, distance: float, stiffness: float, friction: float = 0.0
     ) -> None:
-        """`rest` (n, d) m; `elements` (m, d) points of segments or triangles; `distance` m, `stiffness` Pa.
+        """Pairs of a surface; points of no element are ignored.
 
-        Points of no element are let alone. `friction` is Coulomb's coefficient.
+        Args:
+            rest_positions: (n, d) reference positions, m.
+            elements: (m, d) points of segments or triangles.
+            distance: D, m.
+            stiffness: k, Pa.
+            friction: coefficient of friction.
         """
-        ipctk.set_num_threads(1)  # a thread a rank, and sums in the same order each time
+        # one thread a rank, and sums in the same order each time
+        ipctk.set_num_threads(1)
         self._elements, corners = elements, elements.astype(np.int32)
-        solid = rest.shape[1] == 3
-        faces = (corners,) if solid else ()
-        self._mesh = ipctk.CollisionMesh.build_from_full_mesh(rest, ipctk.edges(corners) if solid else corners, *faces)
-        # the points of a triangle's side are half of all that touches it in ipctk's count, the edges the other half
+        is_3d = rest_positions.shape[1] == 3
+        faces = (corners,) if is_3d else ()
+        edges = ipctk.edges(corners) if is_3d else corners
+        self._mesh = ipctk.CollisionMesh.build_from_full_mesh(rest_positions, edges, *faces)
+        # in 3D ipctk weights points as half of all pairs of a triangle, and edges as the other half
         vertices = Vertices(self._mesh)
-        kinds: list[tuple[float, float, str, Vertices | Centroids]] = [(1.0 + solid, 1.0, "", Centroids(self._mesh))]
-        kinds += [(1.0 + solid, VERTICES, "fv_candidates" if solid else "ev_candidates", vertices)]
-        kinds += [(1.0, EDGES, "ee_candidates", vertices)] if solid else []
-        self._times = [times for times, *_ in kinds]
-        made = [PairKind(share * distance, times * stiffness, name, of) for times, share, name, of in kinds]
-        self._near = PairSearch(self._mesh, made, distance, MARGIN * distance)
+        kinds: list[tuple[float, float, str, Vertices | Centroids]] = [(1.0 + is_3d, 1.0, "", Centroids(self._mesh))]
+        point_list = "fv_candidates" if is_3d else "ev_candidates"
+        kinds += [(1.0 + is_3d, PAIRS.vertex_distance, point_list, vertices)]
+        kinds += [(1.0, PAIRS.edge_distance, "ee_candidates", vertices)] if is_3d else []
+        self._weights = [weight for weight, *_ in kinds]
+        pair_kinds = [
+            PairKind(ratio * distance, weight * stiffness, name, samples) for weight, ratio, name, samples in kinds
+        ]
+        self._search = PairSearch(self._mesh, pair_kinds, distance, PAIRS.search_margin * distance)
         self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
         self._friction, self._distance = friction, distance
-        self._area = vertex_areas(rest, elements)
+        self._area = vertex_areas(rest_positions, elements)
 
-    # --- the barrier ---
+    # --- barrier ---
 
     def energy(self, x: Values) -> float:
-        """E(x), J."""
-        on = self._mesh.vertices(x)
-        return sum(met.energy() for met in self._near.active_pairs(on))
+        """Energy E(x), J."""
+        vertices = self._mesh.vertices(x)
+        return sum(pairs.energy() for pairs in self._search.active_pairs(vertices))
 
     def gradient(self, x: Values) -> Values:
-        """(n, d) dE/dx, N: the force on the points is its negative."""
-        on = self._mesh.vertices(x)
-        found = sum(met.gradient() for met in self._near.active_pairs(on))
-        return np.asarray(self._mesh.to_full_dof(found)).reshape(x.shape)
+        """(n, d) dE/dx, N: minus the forces on the points."""
+        vertices = self._mesh.vertices(x)
+        total = sum(pairs.gradient() for pairs in self._search.active_pairs(vertices))
+        return np.asarray(self._mesh.to_full_dof(total)).reshape(x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
-        """(n d, n d) d2E/dx2, N/m; unless `exact`, the share of each pair without its negative eigenvalues."""
-        on, how = self._mesh.vertices(x), projection(exact=exact)
-        found = sum(met.hessian(how) for met in self._near.active_pairs(on))
-        return csr_matrix(self._mesh.to_full_dof(found))
+        """(n d, n d) d2E/dx2, N/m; unless `exact`, each pair without its negative eigenvalues."""
+        vertices, method = self._mesh.vertices(x), projection(exact=exact)
+        total = sum(pairs.hessian(method) for pairs in self._search.active_pairs(vertices))
+        return csr_matrix(self._mesh.to_full_dof(total))
 
     def set_stiffness(self, stiffness: float) -> None:
-        """The barrier has this stiffness, Pa, from here on."""
-        self._near.set_stiffness([times * stiffness for times in self._times])
+        """Set the stiffness k, Pa."""
+        self._search.set_stiffness([weight * stiffness for weight in self._weights])
 
     def clear_caches(self) -> None:
-        """Forget which elements were near."""
-        self._near.clear_caches()
+        """Discard the candidates of collision detection."""
+        self._search.clear_caches()
 
     def min_gap(self, x: Values) -> float:
-        """The least distance between elements on which the barrier acts, m; infinite where there is none."""
+        """Least distance between elements on which the barrier acts, m; infinite where there is none."""
         return self._gap_at(self._mesh.vertices(x))
 
-    def _gap_at(self, on: Values) -> float:
-        return float(np.sqrt(min(met.least_squared_distance() for met in self._near.active_pairs(on))))
+    def _gap_at(self, vertices: Values) -> float:
+        return float(np.sqrt(min(pairs.least_squared_distance() for pairs in self._search.active_pairs(vertices))))
 
-    def search_along(self, x: Values, to: Values) -> None:
-        """Have candidates for all the way from x to `to` (n, d), m."""
-        self._near.search_along(self._mesh.vertices(x), self._mesh.vertices(to))
+    def search_along(self, x: Values, end: Values) -> None:
+        """Search candidates for the whole motion from x to `end` (n, d), m."""
+        self._search.search_along(self._mesh.vertices(x), self._mesh.vertices(end))
 
     # --- friction ---
 
     def lag_friction(self, x: Values, start: Values, slip: float) -> IpcFriction:
-        """Friction with the pressures and directions at x, as points move away from `start` (n, d), m.
+        """Friction with pressures and tangents at x.
 
-        `slip`, m: from this sliding on it has its full size; a speed times the time step.
+        Args:
+            x: (n, d) positions at which friction is lagged, m.
+            start: (n, d) positions from which slip is measured, m.
+            slip: from which on friction has its full size, m: a speed times the time step.
         """
-        on = self._mesh.vertices(x)
+        vertices = self._mesh.vertices(x)
         parts = []
-        for met in self._near.active_pairs(on):
+        for pairs in self._search.active_pairs(vertices):
             part = ipctk.TangentialCollisions()
-            part.build(met.kind.samples.mesh, met.positions, met.pairs, met.kind.barrier, self._friction)
-            parts.append((met.kind.samples, part))
+            part.build(pairs.kind.samples.mesh, pairs.positions, pairs.pairs, pairs.kind.barrier, self._friction)
+            parts.append((pairs.kind.samples, part))
         return IpcFriction(self._mesh, parts, self._mesh.vertices(start), ipctk.FrictionPotential(slip))
 
     # --- collisions ---
 
-    def free_fraction(self, x: Values, to: Values) -> float:
-        """The share in (0, 1] of the straight way from x to `to` on which nothing meets.
+    def free_fraction(self, x: Values, end: Values) -> float:
+        """Fraction in (0, 1] of the straight motion from x to `end` without a collision.
 
-        The way is walked in pieces, MOST at most (boxes around longer ones would all meet), and the pair that would
-        meet is left at least KEPT of its distance at the begin of the piece.
+        The motion is divided into pieces. A pair that would collide keeps at least `BARRIER.min_gap_ratio` of its
+        distance at the begin of the piece.
         """
-        on, way = self._mesh.vertices(x), self._mesh.vertices(to) - self._mesh.vertices(x)
-        way -= way.mean(axis=0)  # what all have in common brings nothing together
-        if self._is_short(on, way):
+        vertices, motion = self._mesh.vertices(x), self._mesh.vertices(end) - self._mesh.vertices(x)
+        motion -= motion.mean(axis=0)  # the mean motion brings nothing together
+        if self._is_short(vertices, motion):
             return 1.0
-        pieces = self._pieces(way)
-        for piece in range(min(pieces, MOST)):
-            share = self._near.free_fraction(on + piece / pieces * way, on + (piece + 1) / pieces * way)
-            if share < 1.0:
-                return (piece + share) / pieces
-        return min(pieces, MOST) / pieces
+        pieces = self._piece_count(motion)
+        for piece in range(min(pieces, PAIRS.max_pieces)):
+            start, stop = piece / pieces, (piece + 1) / pieces
+            fraction = self._search.free_fraction(vertices + start * motion, vertices + stop * motion)
+            if fraction < 1.0:
+                return (piece + fraction) / pieces
+        return min(pieces, PAIRS.max_pieces) / pieces
 
-    def _is_short(self, on: Values, way: Values) -> bool:
-        """Whether a way (n, d) leaves KEPT of every gap however points go, as half of Newton's corrections do.
+    def _is_short(self, vertices: Values, motion: Values) -> bool:
+        """Whether a motion (n, d) is safe in whatever direction points move, as half of Newton's steps are.
 
-        A pair on which no barrier acts is no nearer than that of edges begins.
+        A pair on which no barrier acts is no nearer than the distance at which that of edges begins.
         """
-        most = 2.0 * max_length(way) / (1.0 - KEPT)
-        return most <= EDGES * self._distance and most <= self._gap_at(on)
+        approach = 2.0 * max_length(motion) / (1.0 - BARRIER.min_gap_ratio)
+        return approach <= PAIRS.edge_distance * self._distance and approach <= self._gap_at(vertices)
 
-    def _pieces(self, way: Values) -> int:
-        """In how many pieces a way (n, d) is walked: so many that boxes around what moves have on average WIDE times
-        the measure of one around an edge. A few fast points alone do not make ways shorter."""
+    def _piece_count(self, motion: Values) -> int:
+        """Number of pieces in which a motion (n, d) is searched.
+
+        The bounding boxes of a piece have on average at most `max_box_growth` times the measure of one around an
+        edge. A few fast points alone do not make pieces shorter.
+        """
         pieces = 1
-        while pieces < 2**30 and np.mean(np.prod(1.0 + abs(way) / (pieces * self._edge), axis=1)) > WIDE:
+        while (
+            pieces < 2**30
+            and np.mean(np.prod(1.0 + abs(motion) / (pieces * self._edge), axis=1)) > PAIRS.max_box_growth
+        ):
             pieces *= 2
         return pieces
 
     def intersections(self, x: Values) -> Ints:
-        """(k, 2) elements that cut each other."""
-        on = self._mesh.vertices(x)
-        return intersecting_elements(self._mesh, on) if ipctk.has_intersections(self._mesh, on, ipctk.LBVH()) else NONE
+        """(k, 2) elements that intersect."""
+        vertices = self._mesh.vertices(x)
+        if not ipctk.has_intersections(self._mesh, vertices, ipctk.LBVH()):
+            return NO_PAIRS
+        return intersecting_elements(self._mesh, vertices)
 
     def pressure(self, x: Values) -> Values:
-        """(n,) the barrier's force on each point by its share of the reference surface, Pa; 0 where it has none."""
+        """(n,) force of the barrier on each point by its share of the reference area, Pa; 0 where it has none."""
         force, area = np.linalg.norm(self.gradient(x), axis=1), self._area
         return np.asarray(np.divide(force, area, out=np.zeros_like(area), where=area > 0))
 
@@ -381,3 +435,72 @@ def vertex_areas(x: Values, elements: Ints) -> Values:
     """(n,) share of each point in the measure of the elements around it, m^2 (2D: m)."""
     measure, d = measures(x, elements), x.shape[1]
     return np.asarray(np.bincount(elements.reshape(-1), np.repeat(measure / d, d), minlength=len(x)), float)
+
+
+class SlipFriction(Protocol):
+    """Lagged friction of a surface at positions x (n, d), m: a potential of the slip."""
+
+    def energy(self, x: Values) -> float:
+        """Potential, J."""
+
+    def gradient(self, x: Values) -> Values:
+        """(n, d) minus the forces on the points, N."""
+
+    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
+        """(n d, n d) second derivatives, N/m."""
+
+
+@dataclass(frozen=True)
+class IpcFriction:
+    """Lagged Coulomb friction of ipctk's pairs: a potential of the slip (Li et al. 2020, eq. 19).
+
+        E(x) = mu sum_k N_k f(|T_k^T (x - x_0)|),   f(y) = y for y > e, -y^3 / (3 e^2) + y^2 / e + e / 3 below
+
+    N_k is the normal force of a pair, N, T_k its tangents, e the slip that counts as sticking, m. The gradient is the
+    friction of a backward Euler step: against the slip, and at most mu N_k.
+
+    Attributes:
+        mesh: surface.
+        parts: sample points and pairs of each kind.
+        start: (n, d) x_0, m.
+        potential: of ipctk.
+    """
+
+    mesh: ipctk.CollisionMesh
+    parts: list[tuple[Vertices | Centroids, ipctk.TangentialCollisions]]
+    start: Values
+    potential: ipctk.FrictionPotential
+
+    def energy(self, x: Values) -> float:
+        """E(x), J: not stored, but the work of friction where the slip is longer than e."""
+        motion = self._motion(x)
+        return float(
+            sum(self.potential(pairs, samples.mesh, samples.positions(motion)) for samples, pairs in self.parts)
+        )
+
+    def gradient(self, x: Values) -> Values:
+        """(n, d) dE/dx, N: minus the forces on the points."""
+        motion = self._motion(x)
+        total = sum(
+            samples.gradient(self.potential.gradient(pairs, samples.mesh, samples.positions(motion)))
+            for samples, pairs in self.parts
+        )
+        return np.asarray(self.mesh.to_full_dof(total)).reshape(x.shape)
+
+    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
+        """(n d, n d) d2E/dx2, N/m; unless `exact`, each pair without its negative eigenvalues."""
+        motion, method = self._motion(x), projection(exact=exact)
+        total = sum(
+            samples.hessian(self.potential.hessian(pairs, samples.mesh, samples.positions(motion), method))
+            for samples, pairs in self.parts
+        )
+        return csr_matrix(self.mesh.to_full_dof(total))
+
+    def _motion(self, x: Values) -> Values:
+        motion: Values = self.mesh.vertices(x) - self.start
+        return motion
+
+
+def projection(*, exact: bool) -> ipctk.PSDProjectionMethod:
+    """Treatment of negative eigenvalues by ipctk: none if `exact`, else clamped to 0."""
+    return ipctk.PSDProjectionMethod.NONE if exact else ipctk.PSDProjectionMethod.CLAMP

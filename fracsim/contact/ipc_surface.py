@@ -1,16 +1,19 @@
-"""The surface of a body that touches itself, with room for walls that come to light where it is crowded (rank 0).
+"""Surface of a body for contact with itself, on rank 0, with crack faces retracted where there is no room.
 
-The sides of a new crack recede (crack_wall_offset); where that is not enough, in a body that is squeezed or for a crumb
-that has lost its deformation gradient, walls are drawn in towards their nodes until no barrier presses harder on them
-than before the edge broke: no energy comes from nothing. What is crowded even so is left out. With every step walls go
-out again, and those left out come back, where nothing acts on them.
+The two sides of a new crack coincide. They are offset by a gap of twice the distance of the barrier, so that no
+barrier acts as an edge breaks; with the default distance there is room for a strain of about 1 %. Where that is not
+enough, in a compressed body or for a single-node fragment without a deformation gradient, faces are retracted towards
+their nodes until no barrier acts more strongly than before: contact gains no energy. Faces without room even so are
+excluded. In later steps faces are extended and included again where nothing acts on them.
+
+Equations: docs/theory.md#new-crack-faces.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import chain, repeat
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -18,36 +21,71 @@ from scipy.sparse import csr_matrix, kron
 
 from ..errors import InputError
 from ..mechanics.extra_couplings import stiff_directions
-from ..mesh.split_surface.closed_surface import build_split_surface
-from ..mesh.split_surface.entity_numbering import EntityNumbering
+from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
+from ..mesh.split_surface.entity_numbering import CRACK, EntityNumbering
 from ..mesh.split_surface.fragment_surface import build_fragment_surface, has_same_fragments, project_onto_fragments
 from ..mesh.split_surface.point_matching import match_points, point_identity
 from ..mesh.split_surface.surface_map import SurfaceMap, whole
 from ..meshes.text import format_point
-from .crack_wall_offset import offset_crack_faces
-from .ipc_pairs import IpcPairs, max_length
+from .ipc_pairs import IpcPairs, SlipFriction, max_length
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
-Memory = tuple[Values, Ints, tuple[int, int]]
+# factors of arms, excluded elements, steps between two releases of faces and steps to the next
+SurfaceSnapshot = tuple[Values, Ints, tuple[int, int]]
 
-GAP = 2.0  # between the sides of a new crack, in distances of the barrier (crack_wall_offset)
-IN, LEAST = 0.7, 0.2  # what is left of an arm each time that it is shortened, and in all
-GENTLY = 4  # times, and then at once: in a crowd one wall makes room for the next, and each look costs
-LONGEST_PAUSE = 16  # steps
-NEAR = 10.0  # pressure, in stiffnesses, of walls as good as closed: at a fifth of the barrier's distance
-ROUND_OFF = 1e-6  # of a pressure
-# of the barrier's distance: steps below it are taken with the exact tangent. Without its negative eigenvalues Newton's
-# method gains a digit in two iterations to the end; with them CG may find none. In a first attempt, and in others
-NEAR_END = 1.0, 0.1
+
+@dataclass(frozen=True)
+class SurfacePolicy:
+    """Tuned numbers of the surface of self-contact.
+
+    Attributes:
+        face_gap: gap between the sides of a new crack, in distances of the barrier.
+        max_offset: part of the way to its nodes by which a crack face is offset at most, for slivers.
+        factor: of an arm each time that it is shortened.
+        min_arm: arm, in the full one, below which it is not shortened.
+        gentle_rounds: rounds with `factor`, after which arms are shortened to `min_arm` at once. One face makes room
+            for the next, and each round costs a search.
+        max_pause: largest number of steps between two attempts to release faces.
+        closed_pressure: pressure, in stiffnesses, of faces without room: that of a fifth of the barrier's distance.
+        round_off: relative tolerance of pressures.
+        exact_first, exact_later: length of steps of Newton's method, in distances of the barrier, below which
+            tangents are exact, in the first attempt and in later ones. Farther away CG may find no solution.
+        stiff_ratio: stiffness, in that of a face of an edge's size, from which on directions are kept apart from
+            the matrix.
+    """
+
+    face_gap: float = 2.0
+    max_offset: float = 0.4
+    factor: float = 0.7
+    min_arm: float = 0.2
+    gentle_rounds: int = 4
+    max_pause: int = 16
+    closed_pressure: float = 10.0
+    round_off: float = 1e-6
+    exact_first: float = 1.0
+    exact_later: float = 0.1
+    stiff_ratio: float = 100.0
+
+
+SURFACE = SurfacePolicy()
 
 
 @dataclass(frozen=True)
 class SelfContactLaw:
-    """Barrier from `distance` m on with `stiffness` Pa; Coulomb's `friction`, sticking below `creep` m/s, or below the
-    share `of_speed` of the speed of the body, where that is more. `pieces`: without walls inside a piece, and without
-    crumbs (split.solid). `straight`: quadratic cells are touched by their corners alone, as walls of cracks are."""
+    """Law of contact of a body with itself.
+
+    Attributes:
+        distance: at which the barrier begins, m.
+        stiffness: of the barrier, Pa.
+        friction: coefficient of friction.
+        sticking_speed: slip velocity below which friction counts as sticking, m/s.
+        sticking_speed_ratio: the same in the speed of the body; the larger one counts.
+        fragments_only: contact between fragments alone, without crack faces inside one and single-node fragments.
+        corners_only: quadratic cells are in contact by their corners alone, as crack faces are.
+    """
 
     distance: float
     stiffness: float
@@ -58,19 +96,58 @@ class SelfContactLaw:
     corners_only: bool = False
 
 
+class SurfacePairs(Protocol):
+    """Contact of the points of a surface at x (n, d), m; methods as of IpcPairs."""
+
+    def energy(self, x: Values) -> float:
+        """Energy, J."""
+
+    def gradient(self, x: Values) -> Values:
+        """(n, d) derivatives of the energy, N."""
+
+    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
+        """(n d, n d) second derivatives of the energy, N/m."""
+
+    def lag_friction(self, x: Values, start: Values, slip: float) -> SlipFriction:
+        """Friction with pressures and tangents at x."""
+
+    def pressure(self, x: Values) -> Values:
+        """(n,) pressure on each point, Pa."""
+
+    def min_gap(self, x: Values) -> float:
+        """Least distance within the barrier, m."""
+
+    def intersections(self, x: Values) -> Ints:
+        """(k, 2) elements that intersect."""
+
+    def free_fraction(self, x: Values, end: Values) -> float:
+        """Fraction of the motion from x to `end` without a collision."""
+
+    def search_along(self, x: Values, end: Values) -> None:
+        """Search candidates for the motion from x to `end`."""
+
+    def set_stiffness(self, stiffness: float) -> None:
+        """Set the stiffness, Pa."""
+
+    def clear_caches(self) -> None:
+        """Discard the candidates of collision detection."""
+
+
 class SelfContactSurface:
-    """The split surface and its pairs for a state of damage.
+    """Split surface and its pairs for a state of damage.
 
     Attributes:
-        made: the surface.    at: where its points are, new walls drawn back.    pairs: what may touch.
-        gap: between the sides of a new crack, in distances of the barrier.
-        close: pressure, in stiffnesses, of walls as good as closed.
-        at_once: whether candidates are looked for on the ways of all walls once some are drawn in: fewer looks, and
-            more candidates after.
+        split: the surface.
+        point_map: map from nodes to its points, with new faces retracted.
+        pairs: pairs that may be in contact.
+        face_gap: gap between the sides of a new crack, in distances of the barrier.
+        closed_pressure: pressure, in stiffnesses, of faces without room.
+        search_all_faces: whether candidates are searched for the retraction of all faces once some are retracted:
+            fewer searches, and more candidates after them.
     """
 
-    face_gap: ClassVar[float] = GAP
-    closed_pressure: ClassVar[float] = NEAR
+    face_gap: ClassVar[float] = SURFACE.face_gap
+    closed_pressure: ClassVar[float] = SURFACE.closed_pressure
     search_all_faces: ClassVar[bool] = False
 
     def __init__(
@@ -79,11 +156,20 @@ class SelfContactSurface:
         pattern: npt.NDArray[np.uint8],
         law: SelfContactLaw,
         u: Values,
-        before: SelfContactSurface | None,
+        previous: SelfContactSurface | None,
         cut: Values | None = None,
     ) -> None:
-        """`u`: (nodes, d) where the body is, m; `before`: the surface until now. `cut`: (E,) where edges are cut, for
-        contact between pieces (split.build); all others are cut in the middle, which leaves both sides most room."""
+        """Build the surface.
+
+        Args:
+            skeleton: of the mesh.
+            pattern: (cells,) broken edges of each cell.
+            law: contact law.
+            u: (nodes, d) displacements, m.
+            previous: surface until now.
+            cut: (edges,) positions at which edges are cut, for contact between fragments; other edges are cut in the
+                middle, which leaves both sides most room.
+        """
         self._skeleton, self._pattern, self._fragments_only = skeleton, pattern, law.fragments_only
         if law.fragments_only:
             self.split = build_fragment_surface(skeleton, pattern, cut)
@@ -92,188 +178,256 @@ class SelfContactSurface:
         self._rest_positions = offset_crack_faces(self.split, self.face_gap * law.distance)
         self.point_map = whole(self.split, skeleton, pattern, self._rest_positions)
         self._parameters = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
-        copies = np.zeros(len(self._rest_positions), bool)
-        copies[self.point_map.copies] = True
-        self._crack_faces = np.flatnonzero(copies[self.split.elements].any(axis=1))
+        is_copy = np.zeros(len(self._rest_positions), bool)
+        is_copy[self.point_map.copies] = True
+        self._crack_faces = np.flatnonzero(is_copy[self.split.elements].any(axis=1))
         self._nodes, self._size = len(skeleton.points), float(np.linalg.norm(np.ptp(skeleton.points, axis=0)))
-        self.pairs = self._build_all_pairs()
+        self.pairs: SurfacePairs = self._build_all_pairs()
         self._excluded: Ints = np.empty(0, np.int64)
-        self._release_interval = (1, 1)  # steps between two looks for room, and to the next
-        if before is None:
+        self._release_interval = (1, 1)  # steps between two attempts to release faces, and to the next one
+        if previous is None:
             self._check_apart()
         else:
-            share, load = self._previous_state(before, u)
+            share, pressure = self._previous_state(previous, u)
             self.point_map = self.point_map.with_arm_share(share)
-            self._retract_faces(u, load)
+            self._retract_faces(u, pressure)
 
     def represents(self, pattern: npt.NDArray[np.uint8]) -> bool:
-        """Whether it is the surface of these patterns (C,) too: most edges break within pieces."""
+        """Whether the surface is also that of a pattern (cells,): most edges break within fragments."""
         if same := self._fragments_only and has_same_fragments(self._skeleton, pattern, self._pattern):
             self._pattern = pattern
         return same
 
-    def place_faces(self, at: SurfaceMap) -> SurfaceMap:
-        """All walls of the body, those between pieces where they are here."""
-        return project_onto_fragments(at, self._skeleton, self._pattern, self.point_map)
+    def place_faces(self, point_map: SurfaceMap) -> SurfaceMap:
+        """Map of all crack faces of the body with those between fragments where they are here."""
+        return project_onto_fragments(point_map, self._skeleton, self._pattern, self.point_map)
 
     def _check_apart(self) -> None:
-        """InputError where a body at rest cuts or touches itself."""
-        if len(found := self.pairs.intersections(self.split.points)):
-            where = format_point(self.split.points[self.split.elements[found[0]]].mean(axis=(0, 1)))
+        """Raise InputError where a body at rest intersects or touches itself."""
+        if len(cut_pairs := self.pairs.intersections(self.split.points)):
+            position = format_point(self.split.points[self.split.elements[cut_pairs[0]]].mean(axis=(0, 1)))
             raise InputError(
-                f"[contact]: {len(found)} pairs of surface elements cut or touch each other at the start, the first "
-                f"near {where}; move the bodies apart"
+                f"[contact]: {len(cut_pairs)} pairs of surface elements cut or touch each other at the start, the "
+                f"first near {position}; move the bodies apart"
             )
 
-    def _build_all_pairs(self) -> IpcPairs:
+    def _build_all_pairs(self) -> SurfacePairs:
         return self._build_pairs(self.split.elements)
 
-    def _build_pairs(self, elements: Ints) -> IpcPairs:
+    def _build_pairs(self, elements: Ints) -> SurfacePairs:
         return IpcPairs(self._rest_positions, elements, **self._parameters)
 
     def _exclude(self, elements: Ints) -> None:
-        """Pairs without these elements (k,)."""
+        """Build pairs without these elements (k,)."""
         if len(elements):
             self.pairs = self._build_pairs(np.delete(self.split.elements, elements, axis=0))
         self._excluded = elements
 
     def set_stiffness(self, stiffness: float) -> None:
-        """The barrier has this stiffness, Pa, from here on."""
+        """Set the stiffness of the barrier, Pa."""
         self._parameters["stiffness"] = stiffness
         self.pairs.set_stiffness(stiffness)
 
-    def snapshot(self) -> Memory:
-        """Shares of arms, elements that are left out, and when room is looked for again."""
+    def snapshot(self) -> SurfaceSnapshot:
+        """Factors of arms, excluded elements, and steps to the next release of faces."""
         return self.point_map.share, self._excluded, self._release_interval
 
-    def restore(self, memory: Memory) -> None:
-        """Be again what `memory` gave of this surface; where edges have broken since, in an earlier pass of the step,
-        it is another one and stays as those left it."""
-        share, out, pause = memory
+    def restore(self, memory: SurfaceSnapshot) -> None:
+        """Restore a snapshot of this surface.
+
+        Where edges have broken since, in an earlier pass of the step, the surface is another one and stays as it is.
+        """
+        share, excluded, interval = memory
         if len(share) != len(self.point_map.share):
             return
-        self._release_interval = pause
+        self._release_interval = interval
         if share is not self.point_map.share:
             self.point_map = self.point_map.with_arm_share(share)
-        if out is not self._excluded:
+        if excluded is not self._excluded:
             self.pairs = self._build_all_pairs()
-            self._exclude(out)
+            self._exclude(excluded)
 
-    # --- what is crowded ---
+    # --- retraction and release of crack faces ---
 
     def _identity(self, points: Ints | None = None) -> Values:
-        return point_identity(
-            self.split, self.point_map.copies if points is None else points, np.arange(self._nodes), self._size
-        )
+        selected = self.point_map.copies if points is None else points
+        return point_identity(self.split, selected, np.arange(self._nodes), self._size)
 
-    def _previous_state(self, before: SelfContactSurface, u: Values) -> tuple[Values, Values]:
-        """(n,) shares and pressures, Pa, that points had before; of new ones 1 and 0. Nodes have kept their numbers."""
+    def _previous_state(self, previous: SelfContactSurface, u: Values) -> tuple[Values, Values]:
+        """(n,) factors of arms and pressures, Pa, of points on the previous surface; of new points 1 and 0."""
         share, load = np.ones(len(self.split.points)), np.zeros(len(self.split.points))
-        pressure, old = before.pairs.pressure(before.point_map(u)), before.point_map.copies
-        which = np.flatnonzero((pressure[old] > 0) | (before.point_map.share[old] < 1))
-        again = match_points(before._identity()[which], self._identity())
-        at = self.point_map.copies[again[again >= 0]]
-        share[at], load[at] = before.point_map.share[old[which]][again >= 0], pressure[old[which]][again >= 0]
+        pressure, old = previous.pairs.pressure(previous.point_map(u)), previous.point_map.copies
+        selected = np.flatnonzero((pressure[old] > 0) | (previous.point_map.share[old] < 1))
+        rows = match_points(previous._identity()[selected], self._identity())
+        points = self.point_map.copies[rows[rows >= 0]]
+        share[points] = previous.point_map.share[old[selected]][rows >= 0]
+        load[points] = pressure[old[selected]][rows >= 0]
+        # nodes have kept their numbers, and come before copies
         nodes = min(old.min(initial=len(pressure)), self.point_map.copies.min(initial=len(load)))
         load[:nodes] = pressure[:nodes]
         return share, load
 
-    def _crowded(self, u: Values, most: Values) -> Ints:
-        """Walls that are pressed harder than `most` (n,) Pa at a corner, or else those that cut something."""
-        pressed = self._pressed(u, most)
-        return pressed if len(pressed) else self._cutting(u)
+    def _crowded_faces(self, u: Values, max_pressure: Values) -> Ints:
+        """Crack faces with a pressure above `max_pressure` (n,), Pa, at a corner, or else those that intersect."""
+        pressed = self._pressed_faces(u, max_pressure)
+        return pressed if len(pressed) else self._intersecting_faces(u)
 
-    def _pressed(self, u: Values, most: Values) -> Ints:
-        over = self.pairs.pressure(self.point_map(u)) > most * (1 + ROUND_OFF)
-        return self._crack_faces[over[self.split.elements[self._crack_faces]].any(axis=1)]
+    def _pressed_faces(self, u: Values, max_pressure: Values) -> Ints:
+        above = self.pairs.pressure(self.point_map(u)) > max_pressure * (1 + SURFACE.round_off)
+        return self._crack_faces[above[self.split.elements[self._crack_faces]].any(axis=1)]
 
-    def _cutting(self, u: Values) -> Ints:
+    def _intersecting_faces(self, u: Values) -> Ints:
         return np.intersect1d(self._crack_faces, self.pairs.intersections(self.point_map(u)))
 
-    def _shorten(self, u: Values, walls: Ints, left: float) -> bool:
-        """Whether the arms of any of these walls can be shortened, which they are: to that share of what they were."""
-        share, tight = self.point_map.share.copy(), np.unique(self.split.elements[walls])
-        share[tight] = np.maximum(left * share[tight], np.minimum(LEAST, share[tight]))
+    def _shorten(self, u: Values, faces: Ints, factor: float) -> bool:
+        """Shorten the arms of crack faces by a factor; whether any arm has changed."""
+        share, points = self.point_map.share.copy(), np.unique(self.split.elements[faces])
+        share[points] = np.maximum(factor * share[points], np.minimum(SURFACE.min_arm, share[points]))
         changed = not np.array_equal(share, self.point_map.share)
         if changed:
-            may = np.unique(self.split.elements[self._crack_faces]) if self.search_all_faces else tight
+            movable = np.unique(self.split.elements[self._crack_faces]) if self.search_all_faces else points
             end = (x := self.point_map(u)).copy()
-            end[may] = self.point_map.evaluate_points(u, may, np.minimum(LEAST, self.point_map.share[may]))
-            self.pairs.search_along(x, end)  # once for all the shares that follow
+            end[movable] = self.point_map.evaluate_points(
+                u, movable, np.minimum(SURFACE.min_arm, self.point_map.share[movable])
+            )
+            # one search for all the factors that follow
+            self.pairs.search_along(x, end)
             self.point_map = self.point_map.with_arm_share(share)
         return changed
 
     def _retract_faces(self, u: Values, load: Values) -> None:
-        """Draw in walls that are pressed harder than with `load` (n,) Pa, and leave out what is as good as closed even
-        so. Pairs are those of all elements."""
+        """Retract faces with a pressure above `load` (n,), Pa, and exclude those without room even so.
+
+        The pairs are those of all elements.
+        """
         start = self.point_map.share
-        for left in chain(repeat(IN, GENTLY), repeat(LEAST)):
-            if not (self._shorten(u, self._pressed(u, load), left) or self._shorten(u, cut := self._cutting(u), left)):
+        for factor in chain(repeat(SURFACE.factor, SURFACE.gentle_rounds), repeat(SURFACE.min_arm)):
+            if not (
+                self._shorten(u, self._pressed_faces(u, load), factor)
+                or self._shorten(u, cut := self._intersecting_faces(u), factor)
+            ):
                 break
-        crowded = np.union1d(
-            self._pressed(u, np.maximum(load, self.closed_pressure * self._parameters["stiffness"])), cut
-        )
-        self._exclude(crowded)
-        if len(crowded):  # what is out is to come back as it was, not smaller each time
-            gone = np.ones(len(start), bool)
-            gone[np.delete(self.split.elements, crowded, axis=0)] = False
-            self.point_map = self.point_map.with_arm_share(np.where(gone, start, self.point_map.share))
+        max_pressure = np.maximum(load, self.closed_pressure * self._parameters["stiffness"])
+        without_room = np.union1d(self._pressed_faces(u, max_pressure), cut)
+        self._exclude(without_room)
+        if len(without_room):
+            # points of excluded faces alone keep their arms, so as not to come back smaller each time
+            unused = np.ones(len(start), bool)
+            unused[np.delete(self.split.elements, without_room, axis=0)] = False
+            self.point_map = self.point_map.with_arm_share(np.where(unused, start, self.point_map.share))
 
     def extend_faces(self, u: Values) -> None:
-        """A step begins at u (nodes, d), m: what was drawn in or left out comes back where there is room.
+        """Extend retracted faces and include excluded ones where there is room, at displacements u (nodes, d), m.
 
-        Not in a step after one in which edges broke, and ever more seldom where there is none: each look costs as much
-        as two of Newton's iterations.
+        Not in the step after edges broke, and less often where there is no room: each attempt costs as much as two
+        iterations of Newton's method.
         """
-        share, out, (pause, waits) = self.snapshot()
-        if np.all(share == 1) and not len(out):
+        share, excluded, (pause, remaining) = self.snapshot()
+        if np.all(share == 1) and not len(excluded):
             return
-        if waits:
-            self._release_interval = pause, waits - 1
+        if remaining:
+            self._release_interval = pause, remaining - 1
             return
         load = self.pairs.pressure(self.point_map(u))
         if np.any(share < 1):
             self._extend_retracted(u, load)
-        if len(out):
+        if len(excluded):
             self.pairs = self._build_all_pairs()
             self._retract_faces(u, load)
-        stays = np.array_equal(share, self.point_map.share) and np.array_equal(out, self._excluded)
-        pause = min(2 * pause, LONGEST_PAUSE) if stays else 1
+        unchanged = np.array_equal(share, self.point_map.share) and np.array_equal(excluded, self._excluded)
+        pause = min(2 * pause, SURFACE.max_pause) if unchanged else 1
         self._release_interval = pause, pause - 1
 
     def _extend_retracted(self, u: Values, load: Values) -> None:
-        before = self.point_map.share
-        self.point_map = self.point_map.with_arm_share(np.minimum(before / IN, 1.0))
-        for _ in range(2):  # what stays in may be in the way of its neighbours
-            crowded = self._crowded(u, load)
+        previous = self.point_map.share
+        self.point_map = self.point_map.with_arm_share(np.minimum(previous / SURFACE.factor, 1.0))
+        # twice, as a face that stays may be in the way of its neighbours
+        for _ in range(2):
+            crowded = self._crowded_faces(u, load)
             if not len(crowded):
                 return
-            share, tight = self.point_map.share.copy(), np.unique(self.split.elements[crowded])
-            share[tight] = before[tight]
+            share, points = self.point_map.share.copy(), np.unique(self.split.elements[crowded])
+            share[points] = previous[points]
             self.point_map = self.point_map.with_arm_share(share)
-        if len(self._crowded(u, load)):
-            self.point_map = self.point_map.with_arm_share(before)
+        if len(self._crowded_faces(u, load)):
+            self.point_map = self.point_map.with_arm_share(previous)
 
-    def is_near_tangent(self, x: Values, other: Values | None, *, again: bool) -> bool:
-        """Whether x (n, d) is so near to the place of the last tangent that Newton's method is at its end; `again`: it
-        has failed before."""
-        return other is not None and max_length(x - other) < NEAR_END[again] * self._parameters["distance"]
+    def is_near_tangent(self, x: Values, tangent_x: Values | None, *, again: bool) -> bool:
+        """Whether positions x (n, d), m, are so near to those of the last tangent that a tangent may be exact.
+
+        Args:
+            x: positions.
+            tangent_x: positions of the last tangent; None: there was none.
+            again: whether Newton's method has failed before.
+        """
+        limit = SURFACE.exact_later if again else SURFACE.exact_first
+        return tangent_x is not None and max_length(x - tangent_x) < limit * self._parameters["distance"]
 
     # --- from nodes to points and back ---
 
     def nodal_forces(self, forces: Values) -> Values:
-        """(nodes, d) of forces (n, d) at the points, N."""
+        """(nodes, d) forces on nodes of forces (n, d) on the points, N."""
         return np.asarray(self.point_map.weights.T @ forces)
 
-    def nodal_stiffness(self, H: csr_matrix, least: float) -> tuple[csr_matrix, tuple[Values, Values] | None]:
-        """(nodes d, nodes d) of (n d, n d), N/m; and where it is little, (nodes, d m) directions stiffer than `least`
-        N/m with their (m,) stiffness."""
+    def nodal_stiffness(self, H: csr_matrix, threshold: float) -> tuple[csr_matrix, tuple[Values, Values] | None]:
+        """Stiffness at the nodes of second derivatives H (n d, n d) at the points, N/m.
+
+        Returns:
+            (nodes d, nodes d) stiffness; and where few directions are stiffer than `threshold`, N/m, these
+            (nodes d, m) with their stiffness (m,).
+        """
         d = self._rest_positions.shape[1]
-        points = np.unique(np.flatnonzero(np.diff(H.indptr)) // d)  # few, mostly
+        # mostly few points have entries
+        points = np.unique(np.flatnonzero(np.diff(H.indptr)) // d)
         rows = (d * points[:, None] + np.arange(d)).reshape(-1)
         W, H = kron(self.point_map.weights[points], np.eye(d), format="csr"), H[rows][:, rows]
         K = (W.T @ H @ W).tocsr()
-        if (found := stiff_directions(H, least)) is None:
+        if (stiff := stiff_directions(H, threshold)) is None:
             return K, None
-        directions, stiffness = found
+        directions, stiffness = stiff
         return K, ((W.T @ directions).toarray().reshape(self._nodes, d * len(stiffness)), stiffness)
+
+
+# --- offset of new crack faces ---
+
+
+def offset_crack_faces(surface: SplitSurface, gap: float) -> Values:
+    """(n, d) reference positions, m, with opposite crack faces `gap`, m, apart where the shape of cells allows it.
+
+    Every copy moves towards the mean of the nodes that it follows, so far that all crack faces at it recede by half
+    the gap along their normals. (A fixed part of the edge would leave faces aslant to their edge nearer to each
+    other.) Points on the boundary of the body stay, and so do tips, points with one copy.
+    """
+    start = surface.parents.start
+    arm = np.add.reduceat(surface.parents.arm, start[:-1], axis=0) / np.diff(start)[:, None]
+    length = np.linalg.norm(arm, axis=1)
+    outward = arm / np.where(length > 0, length, 1.0)[:, None]
+    cosine = _min_cosine(surface, outward)
+    distance = np.where(cosine > 0, 0.5 * gap / np.where(cosine > 0, cosine, 1.0), np.inf)
+    distance = np.where(_is_tip(surface.points), 0.0, np.minimum(distance, SURFACE.max_offset * length))
+    result: Values = surface.points - distance[:, None] * outward
+    return result
+
+
+def _min_cosine(surface: SplitSurface, outward: Values) -> Values:
+    """(n,) least cosine between `outward` (n, d) and the normals of crack faces at each point; inf without any."""
+    corners = surface.elements[surface.origin == CRACK]
+    cosine = np.einsum("ekj,ej->ek", outward[corners], unit_normals(surface.points[corners]))
+    result = np.full(len(outward), np.inf)
+    np.minimum.at(result, corners, cosine)
+    return result
+
+
+def unit_normals(corners: Values) -> Values:
+    """(m, d) outward unit normals of segments or triangles (m, d, d)."""
+    side = corners[:, 1:] - corners[:, :1]
+    normal = np.cross(side[:, 0], side[:, 1]) if side.shape[1] == 2 else side[:, 0, ::-1] * [1.0, -1.0]
+    size = np.linalg.norm(normal, axis=1, keepdims=True)
+    result: Values = normal / np.where(size > 0, size, 1.0)
+    return result
+
+
+def _is_tip(points: Values) -> Flags:
+    """(n,) whether no other point is at the same position."""
+    _, group, count = np.unique(points, axis=0, return_inverse=True, return_counts=True)
+    return count[group.ravel()] == 1

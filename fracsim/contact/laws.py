@@ -1,30 +1,9 @@
-"""How contact with obstacles acts.
+"""Laws of contact: barrier and penalty potentials of the gap, and Coulomb friction.
 
-A barrier's force as a mean over the way of a step, for schemes of second order.
+A potential b(g) is an energy per area of the gap g; its pressure is -b'(g). The barrier follows Li et al. (2020,
+Incremental Potential Contact), but acts on the distance itself, so that it does not depend on the mesh.
 
-Forces at the end of a step (blow) lose b(g_n) - b(g) + b'(g) (g - g_n) >= 0 in each, of first order in dt: a fifth of a
-bounce of fifty steps. The mean of b' over gaps from g_n to g would lose nothing. By Radau's two points it is
-
-    3/4 b'((2 g_n + g) / 3) + 1/4 b'(g),
-
-exact for b' of second degree and, as (-1)^k b^(k) >= 0 up to k = 4, no less than the mean on the way in and no more on
-the way out: it gives no energy at any step. (Gauss's points give some on the way in, Simpson's on the way out.) But a
-gap that steps do not resolve swings about its rest without end. So a share of the force stays that at the end,
-
-    p = 3 c / 4 b'((2 g_n + g) / 3) + (1 - 3 c / 4) b'(g),    c = 0.8:
-
-it still gives none, a bounce of fifty steps loses 4 %, and of the swing of a stiff gap c / (2 - c) = 2/3 is left after
-a step. p is the slope of 9 c / 4 b((2 g_n + g) / 3) + (1 - 3 c / 4) b(g).
-
-Equations: docs/theory.md#contact-in-a-time-step.
-
-How much stiffer a barrier has to be where what presses on it has all but closed a gap.
-
-A barrier holds any pressure, a small stiffness at a small gap: kappa b'(g) = p. But at a gap of TIGHT its stiffness
-b'' = p / g is so much more than that of the body around it that Newton's method creeps: with a ten-thousandth of the
-stiffness that contact has by itself steps were halved without end. From there on kappa is what bears the pressure at
-EASY. (To double it each time, as Li et al. 2020 do, takes ten steps for the same.) It never goes back: a barrier that
-is stiffer than need be costs little.
+Equations: docs/theory.md#barrier, docs/theory.md#contact-in-a-time-step, docs/theory.md#friction.
 """
 
 from __future__ import annotations
@@ -36,19 +15,42 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from .barrier import Barrier
+from ..errors import InputError
 
 Values = npt.NDArray[np.float64]
-EARLIER = 0.75 * 0.8  # 3 c / 4: weight of the force after a third of the way
-TIGHT, EASY = 3e-3, 0.1  # of the barrier's width. By itself contact came down to 0.016 in a torn loaf that recoils
+
+
+@dataclass(frozen=True)
+class BarrierPolicy:
+    """Tuned numbers of barriers.
+
+    Attributes:
+        min_gap_ratio: part of a gap that a step of Newton's method leaves at least. Smaller values need more
+            iterations to open the gap again.
+        tight_gap: gap, in barrier distances, below which the barrier is made stiffer. There b'' = p / g exceeds the
+            stiffness of the body so much that Newton's method creeps.
+        target_gap: gap, in barrier distances, at which the stiffer barrier bears the same pressure.
+        averaging: c in [0, 1], weight of Radau's rule in the mean of a force over a step. With 1 a gap that steps do
+            not resolve oscillates without end; with 0.8 the part c / (2 - c) = 2/3 of the oscillation is left.
+        closed_value: Pa and Pa/m, pressure and stiffness of a closed gap. Infinity has no product with 0.
+    """
+
+    min_gap_ratio: float = 0.1
+    tight_gap: float = 3e-3
+    target_gap: float = 0.1
+    averaging: float = 0.8
+    closed_value: float = 1e200
+
+
+BARRIER = BarrierPolicy()
 
 
 class GapPotential(Protocol):
-    """An energy per area of gaps g (n,), m, that are less than a width: what pushes apart (barrier, penalty)."""
+    """Energy per area of gaps g (n,), m, that are smaller than a width."""
 
     @property
     def width(self) -> float:
-        """m."""
+        """Gap from which on nothing acts, m."""
 
     def energy(self, g: Values) -> Values:
         """(n,) b, J/m^2."""
@@ -62,43 +64,213 @@ class GapPotential(Protocol):
 
 @dataclass(frozen=True)
 class ObstacleLaw:
-    """The barrier, and the speed of slip, m/s, below which friction passes for sticking."""
+    """Law of contact with obstacles.
+
+    Attributes:
+        barrier: potential of the gap.
+        sticking_speed: slip velocity below which friction counts as sticking, m/s.
+    """
 
     barrier: GapPotential
     sticking_speed: float
 
 
 @dataclass(frozen=True)
+class Barrier:
+    """Logarithmic barrier b(g) = -kappa d (s - 1)^2 ln s, s = g / d; 0 from s = 1 on, where it is C2.
+
+    The pressure -b'(g) grows without bound as a gap closes.
+
+    Attributes:
+        stiffness: kappa, Pa.
+        width: d, m.
+    """
+
+    stiffness: float
+    width: float
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless both are positive and finite."""
+        _require_positive("a barrier", stiffness=self.stiffness, width=self.width)
+
+    def energy(self, g: Values) -> Values:
+        """(n,) b, J/m^2; infinite where a gap is closed."""
+        s = self._relative_gap(g)
+        return self._where_open(g, -self.stiffness * self.width * (s - 1) ** 2 * np.log(s), np.inf)
+
+    def slope(self, g: Values) -> Values:
+        """(n,) b', Pa: minus the pressure, never positive; -closed_value where a gap is closed."""
+        s = self._relative_gap(g)
+        return self._where_open(g, -self.stiffness * (s - 1) * (2 * np.log(s) + (s - 1) / s), -BARRIER.closed_value)
+
+    def curvature(self, g: Values) -> Values:
+        """(n,) b'', Pa/m; never negative."""
+        s = self._relative_gap(g)
+        # equal to 2 ln s + 3 - 2 / s - 1 / s^2, but without cancellation at s = 1
+        factor = 2 * np.log1p(s - 1) + (s - 1) * (3 * s + 1) / s**2
+        return self._where_open(g, -self.stiffness / self.width * factor, BARRIER.closed_value)
+
+    def _relative_gap(self, g: Values) -> Values:
+        """(n,) s within (0, 1]; 1, where all derivatives vanish, for gaps beyond the width and for closed ones."""
+        return np.where((g > 0) & (g < self.width), g, self.width) / self.width
+
+    @staticmethod
+    def _where_open(g: Values, open_value: Values, closed_value: float) -> Values:
+        # + 0.0 turns -0.0 into 0.0
+        return np.where(g > 0, open_value, closed_value) + 0.0
+
+
+@dataclass(frozen=True)
+class Penalty:
+    """Quadratic penalty b(g) = kappa (d - g)^2 / (2 d) below the gap g = d, 0 above, for explicit steps.
+
+    Its force and its stiffness are bounded. The law continues for negative gaps, which explicit steps may reach.
+
+    Attributes:
+        stiffness: kappa, Pa, the pressure of a gap that is just closed.
+        width: d, m.
+    """
+
+    stiffness: float
+    width: float
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless both are positive and finite."""
+        _require_positive("a penalty", stiffness=self.stiffness, width=self.width)
+
+    @property
+    def rate(self) -> float:
+        """Stiffness b'' = kappa / d, Pa/m."""
+        return self.stiffness / self.width
+
+    def energy(self, g: Values) -> Values:
+        """(n,) b, J/m^2."""
+        return np.asarray(self.rate / 2 * self._penetration(g) ** 2)
+
+    def slope(self, g: Values) -> Values:
+        """(n,) b', Pa: minus the pressure."""
+        # + 0.0 turns -0.0 into 0.0
+        return np.asarray(-self.rate * self._penetration(g)) + 0.0
+
+    def curvature(self, g: Values) -> Values:
+        """(n,) b'', Pa/m."""
+        return np.where(g < self.width, self.rate, 0.0)
+
+    def _penetration(self, g: Values) -> Values:
+        return np.maximum(self.width - g, 0.0)
+
+
+@dataclass(frozen=True)
 class TimeAveragedPotential:
-    """A barrier over steps that begin with gaps `start` (n,), m: a function of the gaps g (n,) at their ends."""
+    """Potential whose slope is a mean of the barrier's slope over a time step; for schemes of second order.
+
+        p = 3 c / 4 b'((2 g_n + g) / 3) + (1 - 3 c / 4) b'(g)
+
+    With c = 1 this is Radau's rule, exact for quadratic b'. It never adds energy. The rest damps gaps that steps do
+    not resolve (docs/theory.md#contact-in-a-time-step).
+
+    Attributes:
+        barrier: b.
+        start_gap: (n,) gaps g_n at the start of the step, m.
+    """
 
     barrier: GapPotential
     start_gap: Values
 
     def energy(self, g: Values) -> Values:
-        """(n,) its potential, J/m^2; infinite where a gap is closed."""
-        earlier, end = self._both(self.barrier.energy, g)
-        return np.asarray(3 * EARLIER * earlier + (1 - EARLIER) * end)
+        """(n,) potential of p, J/m^2; infinite where a gap is closed."""
+        early, late = self._evaluate_both(self.barrier.energy, g)
+        return np.asarray(3 * _EARLY_WEIGHT * early + (1 - _EARLY_WEIGHT) * late)
 
     def slope(self, g: Values) -> Values:
         """(n,) p, Pa: minus the pressure; never positive."""
-        earlier, end = self._both(self.barrier.slope, g)
-        return np.asarray(EARLIER * earlier + (1 - EARLIER) * end)
+        early, late = self._evaluate_both(self.barrier.slope, g)
+        return np.asarray(_EARLY_WEIGHT * early + (1 - _EARLY_WEIGHT) * late)
 
     def curvature(self, g: Values) -> Values:
         """(n,) dp/dg, Pa/m; never negative."""
-        earlier, end = self._both(self.barrier.curvature, g)
-        return np.asarray(EARLIER / 3 * earlier + (1 - EARLIER) * end)
+        early, late = self._evaluate_both(self.barrier.curvature, g)
+        return np.asarray(_EARLY_WEIGHT / 3 * early + (1 - _EARLY_WEIGHT) * late)
 
-    def _both(self, law: Callable[[Values], Values], g: Values) -> tuple[Values, Values]:
-        """(n,) after a third of the way, where gaps are open if they are at its end, and there."""
-        return law(np.where(g > 0, (2 * self.start_gap + g) / 3, g)), law(g)
+    def _evaluate_both(self, function: Callable[[Values], Values], g: Values) -> tuple[Values, Values]:
+        """(n,) values after a third of the step and at its end; a gap closed at the end counts as closed before."""
+        return function(np.where(g > 0, (2 * self.start_gap + g) / 3, g)), function(g)
 
 
-def stiffness_factor(share: float) -> float:
-    """Factor of kappa with which the pressure at a gap of `share` of the width stands at EASY; 1 where it is not
-    TIGHT."""
-    if not 0 < share < TIGHT:
+# weight of the force after a third of the step
+_EARLY_WEIGHT = 0.75 * BARRIER.averaging
+
+
+def stiffness_factor(relative_gap: float) -> float:
+    """Factor of kappa that moves a gap, given in barrier distances, to the target gap at the same pressure.
+
+    It is 1 unless the gap is below the tight gap. The stiffness is never reduced again. Doubling it, as Li et al.
+    (2020) do, takes ten steps for the same.
+    """
+    if not 0 < relative_gap < BARRIER.tight_gap:
         return 1.0
-    tight, easy = Barrier(1.0, 1.0).slope(np.array([share, EASY]))
-    return float(tight / easy)
+    tight, target = Barrier(1.0, 1.0).slope(np.array([relative_gap, BARRIER.target_gap]))
+    return float(tight / target)
+
+
+@dataclass(frozen=True)
+class CoulombFriction:
+    """Lagged Coulomb friction of points: the potential mu lambda f0(|s|), J.
+
+    lambda (N) and n are the normal force and the unit normal of the step's start, s = (1 - n n^T) motion the slip of
+    the step, m. `motion` (n, d) is the motion of a point minus that of the obstacle under it. f0' = f1 is
+    2 y / h - (y / h)^2 below y = h and 1 above, so that f0 is convex and C2. f0(0) = h / 3 is no stored energy.
+
+    Attributes:
+        coefficient: mu.
+        sticking_slip: h, slip below which friction counts as sticking, m.
+    """
+
+    coefficient: float
+    sticking_slip: float
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless mu is not negative and h positive."""
+        if not 0 <= self.coefficient < np.inf:
+            raise InputError(f"the coefficient of friction is {self.coefficient}: it must be 0 or positive")
+        if not 0 < self.sticking_slip < np.inf:
+            raise InputError(f"the slip that passes for sticking is {self.sticking_slip} m: it must be positive")
+
+    def energy(self, force: Values, normal: Values, motion: Values) -> Values:
+        """(n,) mu lambda f0, J; f0 = -y^3 / (3 h^2) + y^2 / h + h / 3 below y = |s| = h, and y above."""
+        h, y = self.sticking_slip, np.linalg.norm(tangential(normal, motion), axis=1)
+        z = np.minimum(y / h, 1.0)
+        return self.coefficient * force * np.where(y < h, h * (z**2 - z**3 / 3 + 1 / 3), y)
+
+    def gradient(self, force: Values, normal: Values, motion: Values) -> Values:
+        """(n, d) mu lambda f1 s / |s|, N: minus the friction force; never longer than mu lambda."""
+        s = tangential(normal, motion)
+        secant, _ = self._secant_and_tangent(np.linalg.norm(s, axis=1))
+        return (self.coefficient * force * secant)[:, None] * s
+
+    def hessian(self, force: Values, normal: Values, motion: Values) -> Values:
+        """(n, d, d) mu lambda (f1 / |s| (T - e e^T) + f1' e e^T), e = s / |s|, N/m; positive semi-definite."""
+        s = tangential(normal, motion)
+        y = np.linalg.norm(s, axis=1)
+        secant, tangent = self._secant_and_tangent(y)
+        e = s / np.maximum(y, np.finfo(float).tiny)[:, None]
+        T = np.eye(s.shape[1]) - normal[:, :, None] * normal[:, None, :]
+        blocks = secant[:, None, None] * T + (tangent - secant)[:, None, None] * e[:, :, None] * e[:, None, :]
+        return (self.coefficient * force)[:, None, None] * blocks
+
+    def _secant_and_tangent(self, y: Values) -> tuple[Values, Values]:
+        """(n,) f1 / y and f1', 1/m."""
+        h = self.sticking_slip
+        sticks = y < h
+        return np.where(sticks, (2 - y / h) / h, 1 / np.maximum(y, h)), np.where(sticks, 2 * (1 - y / h) / h, 0.0)
+
+
+def tangential(normal: Values, motion: Values) -> Values:
+    """(n, d) part of `motion` (n, d) orthogonal to unit normals (n, d)."""
+    return np.asarray(motion - np.einsum("ni,ni->n", normal, motion)[:, None] * normal)
+
+
+def _require_positive(kind: str, **lengths: float) -> None:
+    for word, value in lengths.items():
+        if not 0 < value < np.inf:
+            raise InputError(f"the {word} of {kind} is {value}: it must be a positive number")

@@ -1,19 +1,18 @@
-"""Contact of a body with solids, obstacles whose surface is read from a file: a term of the balance
-(docs/theory.md#contact).
+"""Term of the balance for contact of a body with triangle-mesh obstacles, held or driven.
 
-As that of a body with itself (self_contact): the split surface lies on rank 0, which finds what touches and hands
-forces and stiffness down to the nodes. The points of a solid are no unknowns; they are where its way says at the end of
-a step.
+As for contact of a body with itself (self_contact), the split surface is on rank 0, which finds pairs in contact and
+maps forces and stiffness to the nodes. The points of an obstacle are no unknowns; they are where its motion says at the
+end of a step. Nothing is gathered on rank 0 while bounding boxes of body and obstacles are apart.
 
-Whether a body may be near any solid at all: boxes around its nodes on all ranks, and around solids on their ways.
-
-First guesses that have passed through no solid: what would is stopped before it, and taken along from there.
+Equations: docs/theory.md#contact.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -29,217 +28,260 @@ from ..mesh.domain import Domain
 from ..mesh.parallel import from_root, on_root
 from ..mesh.split_surface.surface_map import SurfaceMap
 from ..meshes.text import AXES
-from .drawing import ObstacleTessellations
-from .ipc_pairs import KEPT, max_length
+from .ipc_pairs import max_length
 from .ipc_surface import SelfContactLaw
+from .laws import BARRIER
 from .mesh_obstacles import AllMeshPairs, MeshContactSurface, MeshFriction, MeshObstacle, MeshObstaclePairs
 from .obstacle import RigidObstacle
+from .obstacle_tessellation import ObstacleTessellations
 from .pose import Pose, PosedShape
 from .self_contact import SelfContact
 from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
 
 Values = npt.NDArray[np.float64]
-ARMS = 2.0  # longest edges at rest: how far points of walls may be from the nodes that they follow
-ROUNDS = 5  # in which points that follow several nodes are brought back
-PIECES = 50  # of a way, each of an edge's length
-WEIGHT = 1e-3  # of points that are stopped, from which on a node is brought back with them
 Ints = npt.NDArray[np.int64]
 
 
+@dataclass(frozen=True)
+class MeshGuessPolicy:
+    """Tuned numbers of proximity tests and first guesses before triangle-mesh obstacles.
+
+    Attributes:
+        max_arm: distance of points of crack faces from the nodes that they follow, in longest edges.
+        max_rounds: rounds in which points that depend on several nodes are stopped.
+        max_pieces: pieces of a motion, each of an edge's length.
+        min_weight: sum of weights of stopped points from which on a node is moved back.
+        search_margin: factor of the search distance for safe motions.
+        max_search_edges: largest search distance for safe motions, in edges.
+    """
+
+    max_arm: float = 2.0
+    max_rounds: int = 5
+    max_pieces: int = 50
+    min_weight: float = 1e-3
+    search_margin: float = 1.01
+    max_search_edges: float = 2.0
+
+
+GUESS = MeshGuessPolicy()
+
+
 class ProximityTest:
-    """Boxes; nothing is gathered."""
+    """Test by bounding boxes whether a body can be near an obstacle; nothing is gathered."""
 
     def __init__(self, domain: Domain, obstacles: Sequence[RigidObstacle], distance: float) -> None:
         """`distance`: of the barrier, m (collective)."""
         corners = domain.nodes[domain.cell_nodes]
-        longest = float(np.ptp(corners, axis=1).max(initial=0.0)) * np.sqrt(domain.dim)
-        self._reach = distance + ARMS * float(domain.comm.allreduce(longest, op=MPI.MAX))
+        diameter = float(np.ptp(corners, axis=1).max(initial=0.0)) * np.sqrt(domain.dim)
+        self._reach = distance + GUESS.max_arm * float(domain.comm.allreduce(diameter, op=MPI.MAX))
         self._comm, self._X = domain.comm, domain.nodes[: domain.node_count]
-        self._own = [_BoundingBox(each.shape.tessellate()[0]) for each in obstacles]
+        self._boxes = [_BoundingBox(obstacle.shape.tessellate()[0]) for obstacle in obstacles]
 
-    def is_far(self, bodies: Sequence[Values], ways: Sequence[tuple[Pose, Pose]]) -> bool:
-        """Whether nothing of a body with the owned displacements `bodies`, or between them, can be within the barrier
-        of a solid between the two poses of its way (collective)."""
+    def is_far(self, displacements: Sequence[Values], poses: Sequence[tuple[Pose, Pose]]) -> bool:
+        """Whether no point of the body can be within the barrier of an obstacle (collective).
+
+        Args:
+            displacements: (owned dofs,) of the body, m; positions between them count as well.
+            poses: of each obstacle at the start and the end of its motion.
+        """
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
-        for u in bodies:
+        for u in displacements:
             x = self._X + u.reshape(-1, 3)
             low, high = np.minimum(low, x.min(axis=0, initial=np.inf)), np.maximum(high, x.max(axis=0, initial=-np.inf))
-        ends = np.concatenate([low, -high])
-        self._comm.Allreduce(MPI.IN_PLACE, ends, MPI.MIN)
-        low, high = ends[:3] - self._reach, -ends[3:] + self._reach
+        bounds = np.concatenate([low, -high])
+        self._comm.Allreduce(MPI.IN_PLACE, bounds, MPI.MIN)
+        low, high = bounds[:3] - self._reach, -bounds[3:] + self._reach
         return not any(
-            np.all(low < above) and np.all(high > below)
-            for below, above in (own.swept(*way) for own, way in zip(self._own, ways, strict=True))
+            np.all(low < box_high) and np.all(high > box_low)
+            for box_low, box_high in (box.swept(*ends) for box, ends in zip(self._boxes, poses, strict=True))
         )
 
 
 class _BoundingBox:
-    """Of a solid's points (m, 3) in its own frame, m."""
+    """Bounding box of an obstacle in its own frame."""
 
     def __init__(self, points: Values) -> None:
+        """`points`: (m, 3) in its own frame, m."""
         self._low, self._high = points.min(axis=0), points.max(axis=0)
-        self._reach = float(np.linalg.norm(points, axis=1).max())
+        self._radius = float(np.linalg.norm(points, axis=1).max())
 
     def swept(self, start: Pose, end: Pose) -> tuple[Values, Values]:
-        """(3,) corners of a box around it on its way, m; of one that is turned around a ball about its reference."""
-        turned = not all(np.array_equal(each.rotation, np.eye(3)) for each in (start, end))
-        low, high = (-self._reach, self._reach) if turned else (self._low, self._high)
+        """(3,) corners of a box around the motion between two poses, m; with a rotation, around a sphere."""
+        rotated = not all(np.array_equal(pose.rotation, np.eye(3)) for pose in (start, end))
+        low, high = (-self._radius, self._radius) if rotated else (self._low, self._high)
         return np.minimum(start.centre, end.centre) + low, np.maximum(start.centre, end.centre) + high
 
 
 def stop_before_meshes(
-    front: MeshContactSurface, pairs: AllMeshPairs, start: Values, end: Values, before: Sequence[Pose]
+    surface: MeshContactSurface, pairs: AllMeshPairs, start: Values, end: Values, start_poses: Sequence[Pose]
 ) -> Values:
-    """(nodes, 3) displacements at the `end` of a step, m, with points stopped where they would pass into a solid of
-    `pairs`; at the `start` solids were at poses `before`; they are where they will be. The same array where none
-    would."""
-    at = front.point_map
-    x = at(start)
-    for _ in range(ROUNDS):
-        to = at(end)
-        if pairs.moving_free_fraction(x, to, before) == 1:
+    """First guess with points stopped where they would cross an obstacle; the same array where none would.
+
+    Args:
+        surface: of the body.
+        pairs: of obstacles, which are at the end of their motion.
+        start: (nodes, 3) displacements at the start, m.
+        end: (nodes, 3) first guess of displacements at the end, m.
+        start_poses: of the obstacles at the start.
+    """
+    point_map = surface.point_map
+    x = point_map(start)
+    for _ in range(GUESS.max_rounds):
+        x_end = point_map(end)
+        if pairs.moving_free_fraction(x, x_end, start_poses) == 1:
             return end
-        back = np.sum([motion_corrections(*each, x, to) for each in zip(pairs.pairs, before, strict=True)], axis=0)
-        if not back.any():
+        items = zip(pairs.pairs, start_poses, strict=True)
+        correction = np.sum([motion_corrections(*item, x, x_end) for item in items], axis=0)
+        if not correction.any():
             return end
-        end = end + _of_nodes(abs(at.weights).T, back)
+        end = end + _node_means(abs(point_map.weights).T, correction)
     return end
 
 
-def _of_nodes(weights: csr_matrix, back: Values) -> Values:
-    """(nodes, 3) means of what is `back` (n, 3) over the points that are stopped, by `weights` (nodes, n) >= 0."""
-    weight = weights @ back.any(axis=1).astype(float)
-    taken = weight > WEIGHT
-    return np.where(taken[:, None], (weights @ back) / np.where(taken, weight, 1.0)[:, None], 0.0)
+def _node_means(weights: csr_matrix, correction: Values) -> Values:
+    """(nodes, 3) means of corrections (n, 3) over the points that are stopped, by `weights` (nodes, n) >= 0."""
+    weight = weights @ correction.any(axis=1).astype(float)
+    counts = weight > GUESS.min_weight
+    return np.where(counts[:, None], (weights @ correction) / np.where(counts, weight, 1.0)[:, None], 0.0)
 
 
-def motion_corrections(facing: MeshObstaclePairs, before: Pose, x: Values, to: Values) -> Values:
-    """(n, 3) what the ways of points from x to `to` lack of safe ones, m: seen from the solid a point stops where it
-    comes as near to it as a tenth of its distance; piece by piece, each point on its own."""
-    way = to - facing.mesh.pose.points_to_space(before.to_body(x))  # seen from the solid
-    edge = facing.mean_edge_length
-    count = min(max(1, int(np.ceil(max_length(way) / edge))), PIECES)
-    now, there = to - way, to - way  # beside the solid where it is now
-    going = np.ones(len(x), bool)
+def motion_corrections(pairs: MeshObstaclePairs, start_pose: Pose, x: Values, end: Values) -> Values:
+    """(n, 3) differences of safe motions of points and their motions from x to `end`, m.
+
+    In the frame of the obstacle a point stops where it comes as near to it as a tenth of its distance; piece by piece,
+    each point by itself.
+    """
+    # motion relative to the obstacle
+    motion = end - pairs.mesh.pose.points_to_space(start_pose.to_body(x))
+    edge = pairs.mean_edge_length
+    count = min(max(1, int(np.ceil(max_length(motion) / edge))), GUESS.max_pieces)
+    # safe and unlimited positions, before the obstacle at its end
+    safe_x, free_x = end - motion, end - motion
+    is_moving = np.ones(len(x), bool)
+    open_ratio = 1 - BARRIER.min_gap_ratio
     for piece in range(count):
-        step = to - way * (1 - (piece + 1) / count) - there
+        step = end - motion * (1 - (piece + 1) / count) - free_x
         length = np.linalg.norm(step, axis=1)
-        safe = (1 - KEPT) * facing.safe_distances(now, min(1.01 * max_length(step) / (1 - KEPT), 2 * edge))
-        going &= length <= safe
-        now = now + np.where(going[:, None], step, 0.0)
-        there = there + step
-    return np.where(going[:, None], 0.0, now - to)
+        limit = min(GUESS.search_margin * max_length(step) / open_ratio, GUESS.max_search_edges * edge)
+        is_moving &= length <= open_ratio * pairs.safe_distances(safe_x, limit)
+        safe_x = safe_x + np.where(is_moving[:, None], step, 0.0)
+        free_x = free_x + step
+    return np.where(is_moving[:, None], 0.0, safe_x - end)
 
 
 class MeshObstacleTerm(SelfContact):
-    """Solids that the body cannot pass through.
+    """Triangle-mesh obstacles that the body cannot penetrate.
 
     Attributes:
-        obstacles: held or driven, their shapes solids.    law: how they act, but for friction, which each has its own.
+        obstacles: held or driven, their shapes triangle meshes.
+        law: contact law, except for the coefficient of friction, which is that of each obstacle.
     """
 
     name = "solids"
     _surface: MeshContactSurface | None
-    _friction: MeshFriction | None  # type: ignore[assignment]
+    _friction: MeshFriction | None
 
     def __init__(
         self, domain: Domain, u: fem.Function, obstacles: dict[int, RigidObstacle], law: SelfContactLaw
     ) -> None:
-        """`obstacles`: by their number in the study. InputError where one overlaps the body at rest (collective)."""
+        """Build the term; `obstacles` by their numbers in the study (collective).
+
+        Raises:
+            InputError: if an obstacle overlaps the body at rest.
+        """
         self.obstacles, edge = tuple(obstacles.values()), domain.mean_edge_length
         self._drawings = ObstacleTessellations(self.obstacles, domain.lower, domain.upper)
-        self._meshes = on_root(domain.comm, lambda: [_standing(*each, edge) for each in obstacles.items()]) or []
-        self._start_poses = [each.posed_at(0.0).pose for each in self.obstacles]
+        # on rank 0 alone
+        self._meshes = on_root(domain.comm, lambda: [_build_mesh(*item, edge) for item in obstacles.items()]) or []
+        self._start_poses = [obstacle.posed_at(0.0).pose for obstacle in self.obstacles]
         self._increments: list[Values] = [np.zeros(6) for _ in self.obstacles]  # (6,) of each in the step
         self._place_meshes(1.0)
-        self._end, self._dt = -np.inf, 0.0
+        self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
         self._proximity = ProximityTest(domain, self.obstacles, law.distance)
         self._started_near = True
-        self._far: bool | None = None  # of the current u; None: not known yet
+        self._far: bool | None = None  # at the current u; None: not known yet
+        # of the last step: work of each obstacle, J, dissipation by friction, J, and forces on each, N
         self._obstacle_work, self._friction_loss = [0.0] * len(obstacles), 0.0
-        self._force_readings: list[Values] | None = None  # forces on each, N; None: not yet
+        self._force_readings: list[Values] | None = None  # None: no step yet
         super().__init__(domain, u, law)
 
     @property
     def mean_edge_length(self) -> float:
-        """Of the body's mesh in the mean, m."""
+        """Mean edge length of the body's mesh, m."""
         return self._domain.mean_edge_length
 
     @property
     def barrier_width(self) -> float:
-        """Of the barrier, m."""
+        """Gap from which on contact acts, m."""
         return self.law.distance
 
     def points_only_flags(self) -> list[tuple[RigidObstacle, bool]]:
-        """As of other obstacles: points, sides and faces all feel a solid."""
-        return [(each, False) for each in self.obstacles]
+        """Each obstacle and False: points, edges and faces are in contact with it."""
+        return [(obstacle, False) for obstacle in self.obstacles]
 
-    # --- where the surface and the solids are ---
+    # --- surface and obstacles ---
 
     def _rebuild(self) -> None:
         pattern, u = self._gathered_pattern(), self._gathered(self._u.x.array[: self._owned])
 
-        def made() -> MeshContactSurface:
+        def build() -> MeshContactSurface:
             assert self._skeleton is not None and pattern is not None and u is not None
             return MeshContactSurface(self._skeleton, pattern, self._meshes, self.law, u, self._surface)
 
-        self._surface = on_root(self.comm, made)
+        self._surface = on_root(self.comm, build)
         self._positions = self._start_positions = self._tangent_positions = self._friction = None
         self._is_stale = True
 
     def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
-        """Drawn in as the walls are that touch."""
+        """Retract points of a surface for output as those of contact are."""
         assert self._surface is not None
         return at.with_arm_share(np.minimum(self._surface.point_map.share, at.share))
 
     def posed_obstacles(self, t: float) -> list[PosedShape]:
-        """Each solid at time t, s (not collective)."""
-        return [each.posed_at(t) for each in self.obstacles]
+        """Each obstacle at time t, s (not collective)."""
+        return [obstacle.posed_at(t) for obstacle in self.obstacles]
 
     def output_surfaces(self, t: float) -> dict[str, SurfaceData]:
-        """Each solid at time t, s, by its name."""
+        """Tessellation of each obstacle at time t, s, by its name."""
         return self._drawings(self.posed_obstacles(t))
 
-    def _place_meshes(self, gone: float) -> None:
-        """Solids have gone this share of their way in the step."""
-        self._travelled, self._is_stale = gone, True
-        self._poses = [self._pose_after(number, gone) for number in range(len(self.obstacles))]
-        for each, pose in zip(self._meshes, self._poses, strict=False):  # they are on rank 0 alone
-            each.move_to(pose)
+    def _place_meshes(self, travelled: float) -> None:
+        """Move obstacles to a fraction of their motion in the step."""
+        self._travelled, self._is_stale = travelled, True
+        self._poses = [self._pose_after(number, travelled) for number in range(len(self.obstacles))]
+        # meshes are on rank 0 alone
+        for mesh, pose in zip(self._meshes, self._poses, strict=False):
+            mesh.move_to(pose)
 
-    def _pose_after(self, number: int, gone: float) -> Pose:
-        """Where a solid is after that share of its way."""
-        return self._start_poses[number].incremented(gone * self._increments[number])
+    def _pose_after(self, number: int, travelled: float) -> Pose:
+        """Pose of an obstacle after a fraction of its motion."""
+        return self._start_poses[number].incremented(travelled * self._increments[number])
 
     def _step_poses(self) -> list[tuple[Pose, Pose]]:
-        """Poses of each solid at the start of the step, and where it is at its end."""
+        """Poses of each obstacle at the start and the end of the step."""
         ends = [self._pose_after(number, 1.0) for number in range(len(self.obstacles))]
         return list(zip(self._start_poses, ends, strict=True))
 
     def _is_far(self) -> bool:
-        """Whether nothing can touch at the current u, nor could as the step began: nothing rubs then (collective)."""
+        """Whether nothing can be in contact at the current u, nor could at the start of the step (collective)."""
         if self._far is None:
-            at_end = self._level.displacement_at_end(self._u.x.array[: self._owned])
-            self._far = not self._started_near and self._proximity.is_far([self._level.u_n, at_end], self._step_poses())
+            end = self._level.displacement_at_end(self._u.x.array[: self._owned])
+            self._far = not self._started_near and self._proximity.is_far([self._level.u_n, end], self._step_poses())
         return self._far
 
     def update_displacement(self) -> None:
-        """What touches has to be found anew."""
+        """Discard positions and forces, as u has changed."""
         super().update_displacement()
         self._far = None
 
-    # --- what it adds to the balance: nothing, and nothing is gathered, where it is far ---
+    # --- forces, tangent and energy: nothing is gathered where obstacles are far ---
 
-    def contact_forces(self) -> Values | None:  # type: ignore[override]
-        """(owned dofs,) forces at the end of the step, N (collective)."""
+    def contact_forces(self) -> Values | None:
+        """(owned dofs,) contact forces at the end of the step, N; None: nothing is near (collective)."""
         return None if self._is_far() else super().contact_forces()
 
-    def reference_forces(self) -> Values | None:  # type: ignore[override]
-        """(owned dofs,) the same as they enter r, N (collective)."""
-        return None if self._is_far() else super().reference_forces()
-
     def coupling_matrix(self) -> PETSc.Mat | StiffCoupling | None:
-        """Minus the derivative of the forces, where anything is in touch; as of SelfContact (collective)."""
+        """Minus the derivative of the forces; as of SelfContact (collective)."""
         return None if self._is_far() else super().coupling_matrix()
 
     def stored_energy(self) -> float:
@@ -247,206 +289,213 @@ class MeshObstacleTerm(SelfContact):
         return 0.0 if self._is_far() else super().stored_energy()
 
     def stiffen_contact(self) -> float:
-        """As of SelfContact (collective)."""
+        """Make a barrier stiffer whose gaps have nearly closed; as of SelfContact (collective)."""
         return 0.0 if self._is_far() else super().stiffen_contact()
 
     def potential(self) -> float:
-        """Barrier and friction as they enter that of r, on rank 0, J (collective)."""
+        """Potential of barrier and friction as they enter the residual, on rank 0, J (collective)."""
         return 0.0 if self._is_far() else super().potential()
 
-    # --- a step ---
+    # --- steps ---
 
     def begin_step(self, level: TimeLevel) -> None:
-        """Solids go to where they are at the end of the step; friction holds what is in touch at its start."""
+        """Move obstacles to the end of the step, and lag friction with the contact at its start."""
         self._level, self._is_stale, self._far, self._attempts = level, True, None, 0
         end = level.t + (1 - level.fraction) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
-            return  # a look at what a step has ended with: friction and places are still those of the step
+            return  # evaluation of a step's result: friction and motions are still those of the step
         self._end, self._dt, self._start_velocity = end, level.dt, level.v_n
         self._friction = self._tangent_positions = None
         self._place_obstacles(end - level.dt, end)
-        self._started_near, self._start_positions = not self._proximity.is_far([level.u_n], self._step_poses()), None
-        none: Values = np.zeros((1, 3))
-        self._start_gradients = [none for _ in self.obstacles]
+        self._started_near = not self._proximity.is_far([level.u_n], self._step_poses())
+        self._start_positions = None
+        zero: Values = np.zeros((1, 3))
+        self._start_gradients = [zero for _ in self.obstacles]
         if level.dt and self._started_near:
-            nodal, creep = (
-                self._gathered(level.u_n),
-                max(self.law.sticking_speed, self.law.sticking_speed_ratio * self._speed(level.v_n)),
-            )
+            nodal, sticking_speed = self._gathered(level.u_n), self._sticking_speed(level.v_n)
             if self._surface is not None and nodal is not None:
                 self._place_meshes(0.0)
-                self._begin_on_root(self._surface, nodal, creep * level.dt)
+                self._begin_on_root(self._surface, nodal, sticking_speed * level.dt)
         self._place_meshes(1.0)
 
     def _place_obstacles(self, start: float, end: float) -> None:
-        """Where solids are at the ends of a step, s."""
-        self._start_poses = [each.posed_at(start).pose for each in self.obstacles]
-        self._increments = [each.pose_increment(start, end) for each in self.obstacles]
+        """Store the motions of obstacles between the times of a step, s."""
+        self._start_poses = [obstacle.posed_at(start).pose for obstacle in self.obstacles]
+        self._increments = [obstacle.pose_increment(start, end) for obstacle in self.obstacles]
 
-    def _begin_on_root(self, front: MeshContactSurface, nodal: Values, slip: float) -> None:
-        """A step begins at displacements (nodes, 3), m, on rank 0; `slip`: that passes for sticking, m."""
-        front.extend_faces(nodal)
-        self._start_positions = x = front.point_map(nodal)
-        self._start_gradients = [each.full_gradient(x)[len(x) :] for each in front.pairs.pairs]
-        if any(each.friction for each in self._meshes):
-            self._friction = front.pairs.lag_friction(x, slip)
+    def _begin_on_root(self, surface: MeshContactSurface, nodal: Values, slip: float) -> None:
+        """Begin a step on rank 0 at displacements (nodes, 3), m; `slip`: that counts as sticking, m."""
+        surface.extend_faces(nodal)
+        self._start_positions = x = surface.point_map(nodal)
+        self._start_gradients = [pairs.full_gradient(x)[len(x) :] for pairs in surface.pairs.pairs]
+        if any(mesh.friction for mesh in self._meshes):
+            self._friction = surface.pairs.lag_friction(x, x, slip)
 
     def accept_step(self) -> None:
-        """What contact has done in the step is booked (collective)."""
+        """Record forces and work of contact in the step (collective)."""
         self._friction_loss, self._obstacle_work = 0.0, [0.0] * len(self.obstacles)
-        read: list[Values] = [np.zeros(3) for _ in self.obstacles]
-        self._force_readings = read
+        forces: list[Values] = [np.zeros(3) for _ in self.obstacles]
+        self._force_readings = forces
         if not self._is_far() and (x := self._end_positions()) is not None and self._surface is not None:
-            self._record_work(x, self._surface, read)
+            self._record_work(x, self._surface, forces)
 
-    def _record_work(self, x: Values, front: MeshContactSurface, read: list[Values]) -> None:
-        """The same on rank 0, with the body's points at x (n, 3), m; forces on each solid go into `read`, N."""
-        end, pushed, n = self._level.contact_weights.end_work_share, self._start_gradients, len(x)
-        for k, (each, start) in enumerate(zip(front.pairs.pairs, self._start_poses, strict=True)):
-            normal, under = each.full_gradient(x)[n:], 0.0  # of the solid on the body, at the places where it does
-            read[k] -= normal.sum(axis=0)
-            moved = each.mesh.positions - each.mesh.positions_at(start)
+    def _record_work(self, x: Values, surface: MeshContactSurface, forces: list[Values]) -> None:
+        """Record work on rank 0 with the body at x (n, 3), m; forces on obstacles are added to `forces`, N."""
+        end_weight, start_gradients, n = self._level.contact_weights.end_work_share, self._start_gradients, len(x)
+        for number, (pairs, start_pose) in enumerate(zip(surface.pairs.pairs, self._start_poses, strict=True)):
+            # of the obstacle on the body, at the points of the obstacle
+            gradient, friction_work = pairs.full_gradient(x)[n:], 0.0
+            forces[number] -= gradient.sum(axis=0)
+            motion = pairs.mesh.positions - pairs.mesh.positions_at(start_pose)
             if self._friction is not None and self._start_positions is not None:
-                friction = self._friction.full_gradient(each, x)
-                under = float(np.vdot(friction[n:], moved))
-                self._friction_loss += under + float(np.vdot(friction[:n], x - self._start_positions))
-                read[k] -= friction[n:].sum(axis=0)
-            self._obstacle_work[k] = float(np.vdot(end * normal + (1 - end) * pushed[k], moved)) + under
+                friction = self._friction.full_gradient(pairs, x)
+                friction_work = float(np.vdot(friction[n:], motion))
+                self._friction_loss += friction_work + float(np.vdot(friction[:n], x - self._start_positions))
+                forces[number] -= friction[n:].sum(axis=0)
+            mean_gradient = end_weight * gradient + (1 - end_weight) * start_gradients[number]
+            self._obstacle_work[number] = float(np.vdot(mean_gradient, motion)) + friction_work
 
     def step_work(self) -> tuple[float, float]:
-        """Work of the solids' own motion in the step, and what friction takes, on rank 0, J."""
+        """Work of the obstacles' own motion in the step, and dissipation by friction, on rank 0, J."""
         return sum(self._obstacle_work), self._friction_loss
 
     def damping_forces(self) -> None:
-        """Friction is booked step by step: `driven`."""
+        """Return None: dissipation is summed step by step (`step_work`)."""
 
-    # --- how far Newton's method may go ---
+    # --- step limits ---
 
     def max_step_fraction(self, change: Values) -> float:
-        """Share of a change of u on the way of which nothing meets (collective)."""
+        """Fraction of a change of u (owned dofs,), m, without a collision (collective)."""
         u, level = self._u.x.array[: self._owned], self._level
         ends = [level.displacement_at_end(u), level.displacement_at_end(u + change)]
         return 1.0 if self._proximity.is_far(ends, self._step_poses()) else super().max_step_fraction(change)
 
     def feasible_guess(self, u: Values) -> Values:
-        """(owned dofs,) a first guess of u that has passed through nothing on its way from the start (collective)."""
+        """(owned dofs,) first guess of u, m, that crosses no obstacle on its way from the start (collective)."""
         level = self._level
-        if not level.dt or self._proximity.is_far([level.u_n, level.displacement_at_end(u)], self._step_poses()):
+        if not level.dt:
+            return u
+        if self._proximity.is_far([level.u_n, level.displacement_at_end(u)], self._step_poses()):
             return u
         start, end = self._gathered(level.u_n), self._gathered(level.displacement_at_end(u))
 
-        def found() -> Values | None:
+        def correction_on_root() -> Values | None:
             assert self._surface is not None and start is not None and end is not None
-            led = self._first_guess(self._surface, start, end)
-            return None if led is end else led - end
+            guess = self._first_guess(self._surface, start, end)
+            return None if guess is end else guess - end
 
-        aside = on_root(self.comm, found)
-        if not self.comm.bcast(aside is not None):
+        correction = on_root(self.comm, correction_on_root)
+        if not self.comm.bcast(correction is not None):
             return u
-        by = np.asarray(self._gather.scatter(aside)).reshape(-1)
-        return np.asarray(u + level.fraction * (self._domain.with_straight_edges(by) if self.law.corners_only else by))
+        change: Values = np.asarray(self._gather.scatter(correction)).reshape(-1)
+        if self.law.corners_only:
+            change = self._domain.with_straight_edges(change)
+        return np.asarray(u + level.fraction * change)
 
-    def _first_guess(self, front: MeshContactSurface, start: Values, end: Values) -> Values:
-        """(nodes, 3) where the body gets to on its way from the `start` to the `end` of the step, on rank 0."""
-        return stop_before_meshes(front, front.pairs, start, end, self._start_poses)
+    def _first_guess(self, surface: MeshContactSurface, start: Values, end: Values) -> Values:
+        """(nodes, 3) displacements that the body reaches on its way from `start` to `end`, m, on rank 0."""
+        return stop_before_meshes(surface, surface.pairs, start, end, self._start_poses)
 
     def is_feasible(self, u: Values) -> bool:
-        """Whether nothing is passed on the straight way from the start to u (collective)."""
-        if self._proximity.is_far([self._level.u_n, self._level.displacement_at_end(u)], self._step_poses()):
+        """Whether nothing is crossed on the straight way from the start to u (collective)."""
+        u_n, u_end = self._level.u_n, self._level.displacement_at_end(u)
+        if self._proximity.is_far([u_n, u_end], self._step_poses()):
             return True
-        start, end = self._gathered(self._level.u_n), self._gathered(self._level.displacement_at_end(u))
+        start, end = self._gathered(u_n), self._gathered(u_end)
 
-        def found() -> bool:
+        def is_free() -> bool:
             assert self._surface is not None and start is not None and end is not None
-            at, pairs = self._surface.point_map, self._surface.pairs
-            return pairs.moving_free_fraction(at(start), at(end), self._start_poses) == 1
+            point_map, pairs = self._surface.point_map, self._surface.pairs
+            return pairs.moving_free_fraction(point_map(start), point_map(end), self._start_poses) == 1
 
-        return from_root(self.comm, found)
+        return from_root(self.comm, is_free)
 
     def restrict_motion(self) -> None:
-        """Solids wait where the step began (collective)."""
+        """Hold obstacles where they would meet the body at the step's start (collective)."""
         self._place_meshes(0.0)
         self._advance(self._level.u_n)
 
     def remaining_motion(self) -> float:
-        """The share of the solids' way that is left."""
+        """Fraction of the obstacles' motion that remains in the step."""
         return 1.0 - self._travelled
 
     def continue_motion(self) -> None:
-        """The rest of the way, or as far as the body where it is now lets them (collective)."""
+        """Advance held obstacles as far as the body at the current u allows (collective)."""
         if self.remaining_motion():
             self._advance(self._level.displacement_at_end(self._u.x.array[: self._owned]))
 
     def _advance(self, u: Values) -> None:
-        """As far on their way as the body at the owned displacements u lets solids go (collective)."""
-        nodal, gone = self._gathered(u), self._travelled
+        """Advance obstacles as far as the body at owned displacements u allows (collective)."""
+        nodal, travelled = self._gathered(u), self._travelled
 
-        def found() -> float:
+        def free_fraction() -> float:
             assert self._surface is not None and nodal is not None
-            x, before = self._surface.point_map(nodal), [each.pose for each in self._meshes]
+            x, start_poses = self._surface.point_map(nodal), [mesh.pose for mesh in self._meshes]
             self._place_meshes(1.0)
-            return self._surface.pairs.moving_free_fraction(x, x, before)
+            return self._surface.pairs.moving_free_fraction(x, x, start_poses)
 
-        share = from_root(self.comm, found)
-        self._place_meshes(1.0 if share == 1 else gone + share * (1.0 - gone))
+        fraction = from_root(self.comm, free_fraction)
+        self._place_meshes(1.0 if fraction == 1 else travelled + fraction * (1.0 - travelled))
 
-    # --- columns of history.csv, and what the end of a run tells ---
+    # --- columns of history.csv, and figures for the end of a run ---
 
     def summed_columns(self) -> dict[str, Callable[[], Values]]:
-        """contact_NAME_AXIS: (1,) force of the body on each solid in the last step, on rank 0, N."""
+        """contact_NAME_AXIS: (1,) force of the body on each obstacle in the last step, on rank 0, N."""
         return {
-            f"contact_{each.name}_{axis}": partial(self._force_reading, number, place)
-            for number, each in enumerate(self.obstacles)
-            for place, axis in enumerate(AXES)
+            f"contact_{obstacle.name}_{axis_name}": partial(self._force_reading, number, axis)
+            for number, obstacle in enumerate(self.obstacles)
+            for axis, axis_name in enumerate(AXES)
         }
 
     def _force_reading(self, number: int, axis: int) -> Values:
         if self._force_readings is None:
-            x, front = self._end_positions(), self._surface
-            force = (
-                np.zeros(3) if x is None or front is None else front.pairs.pairs[number].body_gradient(x).sum(axis=0)
-            )
+            x, surface, force = self._end_positions(), self._surface, cast("Values", np.zeros(3))
+            if x is not None and surface is not None:
+                force = surface.pairs.pairs[number].body_gradient(x).sum(axis=0)
         else:
             force = self._force_readings[number]
         return np.asarray(force[axis : axis + 1])
 
     def minimum_columns(self) -> dict[str, Callable[[], float]]:
-        """gap_NAME: least distance between each solid and the body, m (on rank 0; infinite elsewhere)."""
-        return {f"gap_{each.name}": partial(self._gap, number) for number, each in enumerate(self.obstacles)}
+        """gap_NAME: least distance between each obstacle and the body, m (on rank 0; infinite elsewhere)."""
+        return {f"gap_{obstacle.name}": partial(self._gap, number) for number, obstacle in enumerate(self.obstacles)}
 
     def _gap(self, number: int) -> float:
         x = self._end_positions()
         return np.inf if x is None or self._surface is None else self._surface.pairs.pairs[number].gap(x)
 
     def work_columns(self) -> dict[str, Callable[[], float]]:
-        """work_NAME: what each solid has done on the body in the step that has ended, J."""
-        return {f"work_{each.name}": partial(self._work, k) for k, each in enumerate(self.obstacles)}
+        """work_NAME: work of each obstacle on the body in the last step, J."""
+        return {f"work_{obstacle.name}": partial(self._work, number) for number, obstacle in enumerate(self.obstacles)}
 
     def _work(self, number: int) -> float:
         return self._obstacle_work[number]
 
     def closing_distances(self) -> list[float]:
-        """How far each solid and the points that it pushes would have come closer in the step, had nothing stopped
-        them, m, on rank 0 (collective)."""
+        """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
+
+        It is that of the velocities at the start, without any contact; on rank 0.
+        """
         if self._is_far():
             return [0.0] * len(self.obstacles)
         x, v = self._end_positions(), self._gathered(self._start_velocity)
         if x is None or v is None or self._surface is None:
             return [0.0] * len(self.obstacles)
-        moved, result = self._dt * (self._surface.point_map.weights @ v), []
-        for each, start in zip(self._surface.pairs.pairs, self._start_poses, strict=True):
-            force = -each.body_gradient(x)
+        motion, result = self._dt * (self._surface.point_map.weights @ v), []
+        for pairs, start_pose in zip(self._surface.pairs.pairs, self._start_poses, strict=True):
+            force = -pairs.body_gradient(x)
             size = np.linalg.norm(force, axis=1)
-            on = size > 0
-            under = x[on] - start.points_to_space(each.mesh.pose.to_body(x[on]))
-            closer = np.einsum("ni,ni->n", under - moved[on], force[on] / size[on, None])
-            result.append(float(closer.max(initial=0.0)))
+            pushed = size > 0
+            obstacle_motion = x[pushed] - start_pose.points_to_space(pairs.mesh.pose.to_body(x[pushed]))
+            normal = force[pushed] / size[pushed, None]
+            approach = np.einsum("ni,ni->n", obstacle_motion - motion[pushed], normal)
+            result.append(float(approach.max(initial=0.0)))
         return result
 
 
-def _standing(number: int, obstacle: RigidObstacle, edge: float) -> MeshObstacle:
-    """A solid where it is at the start, with triangles as small as those of the body (rank 0)."""
-    solid = obstacle.shape
-    assert isinstance(solid, TriangleMeshShape)
-    points, triangles = refine_triangles(solid.points, solid.triangles, edge)
+def _build_mesh(number: int, obstacle: RigidObstacle, edge: float) -> MeshObstacle:
+    """Obstacle at the start, with triangles as small as those of the body (rank 0)."""
+    shape = obstacle.shape
+    assert isinstance(shape, TriangleMeshShape)
+    points, triangles = refine_triangles(shape.points, shape.triangles, edge)
     return MeshObstacle(f"obstacle.{number}: {obstacle.name}", points, triangles, obstacle.friction)

@@ -1,9 +1,7 @@
-"""Barrier, friction and collision detection between the surface of a body and solids that are where they are put.
+"""Barrier, friction and collision detection between the surface of a body and triangle-mesh obstacles.
 
-The points of a solid are no unknowns: x (n, 3) are those of the body, and what acts on a solid is minus the sum of what
-it does to them. Each solid has pairs of its own with the body: its friction, its force, its gap.
-
-The split surface of a body before solids: walls that come to light inside one are drawn in, or left out (crowd).
+The points of an obstacle are no unknowns: x (n, 3) are those of the body, and the force on an obstacle is minus the sum
+of its forces on them. Each obstacle has pairs of its own with the body: its friction, its force, its gap.
 """
 
 from __future__ import annotations
@@ -20,25 +18,46 @@ from scipy.spatial import cKDTree
 
 from ..errors import InputError
 from ..mesh.split_surface.entity_numbering import EntityNumbering
-from .ipc_friction import IpcFriction
-from .ipc_pairs import KEPT, NONE, IpcPairs
+from .ipc_pairs import NO_PAIRS, IpcFriction, IpcPairs
 from .ipc_surface import SelfContactLaw, SelfContactSurface
+from .laws import BARRIER
 from .pose import Pose
 from .triangle_mesh_shape import penetration_depth
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-ASKED = 500  # points that a solid's box is nearest to
-TURN = 0.3  # rad of a solid's turn in one piece
-LEAST = 1e-4  # of a piece: a way that is none
+
+
+@dataclass(frozen=True)
+class MeshObstaclePolicy:
+    """Tuned numbers of triangle-mesh obstacles.
+
+    Attributes:
+        query_points: points nearest to an obstacle's bounding box that bound its distance first.
+        max_rotation: rotation of an obstacle in one piece of a motion, rad.
+        min_fraction: of a piece, below which nothing moves.
+        unlimited: part of the search distance from which on a safe distance counts as unlimited.
+    """
+
+    query_points: int = 500
+    max_rotation: float = 0.3
+    min_fraction: float = 1e-4
+    unlimited: float = 0.999
+
+
+MESH = MeshObstaclePolicy()
 
 
 class MeshObstacle:
-    """A solid, somewhere.
+    """Triangle-mesh obstacle at a pose.
 
     Attributes:
-        name: where messages find it.    points: (m, 3) in its own frame, m.    triangles: (k, 3).
-        friction: Coulomb's coefficient.    pose: where it is now.    here: (m, 3) its points there, m.
+        name: in messages.
+        points: (m, 3) in its own frame, m.
+        triangles: (k, 3).
+        friction: coefficient of friction.
+        pose: current pose.
+        positions: (m, 3) its points at that pose, m.
     """
 
     def __init__(self, name: str, points: Values, triangles: Ints, friction: float) -> None:
@@ -47,257 +66,305 @@ class MeshObstacle:
         self.move_to(Pose.at_point(np.zeros(3)))
 
     def move_to(self, pose: Pose) -> None:
-        """It is there."""
+        """Move to a pose."""
         self.pose, self.positions = pose, self.positions_at(pose)
-        self._around = self.positions.min(axis=0), self.positions.max(axis=0)
+        self._bounds = self.positions.min(axis=0), self.positions.max(axis=0)
 
     def positions_at(self, pose: Pose) -> Values:
-        """(m, 3) its points then, m."""
+        """(m, 3) its points at a pose, m."""
         return pose.points_to_space(self.points)
 
     def is_far(self, x: Values, distance: float) -> bool:
-        """Whether its box is farther than `distance` from that of points x (n, 3), m."""
-        low, high = self._around
+        """Whether its bounding box is farther than `distance` from that of points x (n, 3), m."""
+        low, high = self._bounds
         return bool(np.any(x.min(axis=0) - high > distance) or np.any(low - x.max(axis=0) > distance))
 
     def vertex_distance(self, x: Values) -> float:
-        """Distance from points x (n, 3) to its points, m: half an edge more than to its surface, at most."""
+        """Least distance from points x (n, 3) to its vertices, m: at most half an edge more than to its surface."""
         x = self.pose.to_body(x)
-        out = np.linalg.norm(np.maximum(np.maximum(self._box[0] - x, x - self._box[1]), 0.0), axis=1)
-        first = np.argpartition(out, min(ASKED, len(out)) - 1)[:ASKED]
-        least = float(self._tree.query(x[first])[0].min())
-        rest = np.flatnonzero(out < least)
-        return float(self._tree.query(x[rest])[0].min(initial=least))
+        box_distance = np.linalg.norm(np.maximum(np.maximum(self._box[0] - x, x - self._box[1]), 0.0), axis=1)
+        count = MESH.query_points
+        first = np.argpartition(box_distance, min(count, len(box_distance)) - 1)[:count]
+        distance = float(self._tree.query(x[first])[0].min())
+        # points whose box distance is larger cannot be nearer
+        candidates = np.flatnonzero(box_distance < distance)
+        return float(self._tree.query(x[candidates])[0].min(initial=distance))
 
 
 class MeshObstaclePairs(IpcPairs):
-    """The surface of a body before one solid. Points are (n + m, 3): those of the body, then those of the solid."""
+    """Pairs of a body's surface and one obstacle.
 
-    def __init__(self, rest: Values, elements: Ints, solid: MeshObstacle, *, distance: float, stiffness: float) -> None:
-        """`rest` (n, 3) m and `elements` (k, 3) of the body; as for Pairs."""
-        self.mesh, self.body_count, self._of_body, self._reach = solid, len(rest), len(elements), distance
-        points = np.concatenate([rest, solid.points])  # in its own frame: the measures of its elements stay as they are
-        triangles = np.concatenate([elements, solid.triangles + len(rest)])
-        super().__init__(points, triangles, distance=distance, stiffness=stiffness, friction=solid.friction)
-        side = np.repeat(np.array([0, 1], np.int32), [len(rest), len(solid.points)])
+    Points are (n + m, 3): those of the body, then those of the obstacle.
+
+    Attributes:
+        mesh: the obstacle.
+        body_count: n.
+    """
+
+    def __init__(
+        self, rest_positions: Values, elements: Ints, mesh: MeshObstacle, *, distance: float, stiffness: float
+    ) -> None:
+        """`rest_positions` (n, 3), m, and `elements` (k, 3) of the body; the others as for IpcPairs."""
+        self.mesh, self.body_count, self._element_count, self._reach = (
+            mesh,
+            len(rest_positions),
+            len(elements),
+            distance,
+        )
+        # the obstacle in its own frame, so that the measures of its elements are constant
+        points = np.concatenate([rest_positions, mesh.points])
+        triangles = np.concatenate([elements, mesh.triangles + len(rest_positions)])
+        super().__init__(points, triangles, distance=distance, stiffness=stiffness, friction=mesh.friction)
+        side = np.repeat(np.array([0, 1], np.int32), [len(rest_positions), len(mesh.points)])
         included = np.unique(triangles)
         self._mesh.can_collide = ipctk.make_vertex_patches_filter(side[included])
-        self._body = np.unique(elements)
+        self._body_points = np.unique(elements)
 
     @property
     def mean_edge_length(self) -> float:
-        """The mean length of sides, m."""
+        """Mean edge length of both surfaces, m."""
         return float(self._edge)
 
     def with_mesh(self, x: Values) -> Values:
-        """(n + m, 3) the body's points at x (n, 3), and the solid's where it is, m."""
+        """(n + m, 3) points of the body at x (n, 3), and of the obstacle at its current pose, m."""
         return np.concatenate([x, self.mesh.positions])
 
     def is_far(self, x: Values) -> bool:
-        """Whether nothing of the body at x (n, 3) can be within the barrier."""
-        return not len(self._body) or self.mesh.is_far(x[self._body], self._reach)
+        """Whether no point of the body at x (n, 3) can be within the barrier."""
+        return not len(self._body_points) or self.mesh.is_far(x[self._body_points], self._reach)
 
     def body_gradient(self, x: Values) -> Values:
-        """(n, 3) dE/dx with the body at x (n, 3), N: the force of the solid on it is its negative."""
+        """(n, 3) dE/dx with the body at x (n, 3), N: minus the forces of the obstacle on the body."""
         return self.full_gradient(x)[: self.body_count]
 
     def full_gradient(self, x: Values) -> Values:
-        """(n + m, 3) the same, and dE/dx of the solid's points, N."""
-        both = self.with_mesh(x)
-        return np.zeros_like(both) if self.is_far(x) else self.gradient(both)
+        """(n + m, 3) dE/dx by the points of the body and of the obstacle, N."""
+        points = self.with_mesh(x)
+        return np.zeros_like(points) if self.is_far(x) else self.gradient(points)
 
-    def moving_free_fraction(self, x: Values, to: Values, before: Pose) -> float:
-        """The share of the straight way of the body from x to `to`, and of the solid from a pose `before` to where it
-        is, on which they do not meet.
+    def moving_free_fraction(self, x: Values, end: Values, start_pose: Pose) -> float:
+        """Fraction of the motions of body and obstacle without a collision.
 
-        The points of one that turns go on arcs, which are walked in chords that end on them.
+        The points of an obstacle that rotates move on arcs, which are divided into chords that end on them.
+
+        Args:
+            x: (n, 3) points of the body at the start, m.
+            end: (n, 3) points of the body at the end of their straight motion, m.
+            start_pose: pose of the obstacle at the start; it is at the end now.
         """
-        end, q = self.mesh.pose, before.increment_to(self.mesh.pose)
+        end_pose, q = self.mesh.pose, start_pose.increment_to(self.mesh.pose)
         if not q[3:].any():
-            return self.free_fraction(self._both(x, before), self._both(to, end))
-        pieces, way = 1 + int(np.linalg.norm(q[3:]) / TURN), to - x
+            return self.free_fraction(self._points_at(x, start_pose), self._points_at(end, end_pose))
+        pieces, motion = 1 + int(np.linalg.norm(q[3:]) / MESH.max_rotation), end - x
         for piece in range(pieces):
-            here, share, chord = piece / pieces, 1.0, 0.0
-            start = self._both(x + here * way, before.incremented(here * q))
-            while chord < 1 and share > LEAST:
-                there = here + share / pieces
-                chord = self.free_fraction(start, self._both(x + there * way, before.incremented(there * q)))
-                share *= 1.0 if chord == 1 else (1 - KEPT) * chord
+            first, fraction, chord = piece / pieces, 1.0, 0.0
+            start = self._points_at(x + first * motion, start_pose.incremented(first * q))
+            while chord < 1 and fraction > MESH.min_fraction:
+                last = first + fraction / pieces
+                stop = self._points_at(x + last * motion, start_pose.incremented(last * q))
+                chord = self.free_fraction(start, stop)
+                fraction *= 1.0 if chord == 1 else (1 - BARRIER.min_gap_ratio) * chord
             if chord < 1:
-                return here
-            if share < 1:
-                return here + share / pieces
+                return first
+            if fraction < 1:
+                return first + fraction / pieces
         return 1.0
 
-    def _both(self, x: Values, pose: Pose) -> Values:
+    def _points_at(self, x: Values, pose: Pose) -> Values:
         return np.concatenate([x, self.mesh.positions_at(pose)])
 
     def cut_elements(self, x: Values) -> Ints:
-        """Elements of the body at x (n, 3) that the solid cuts."""
+        """(k,) elements of the body at x (n, 3) that the obstacle intersects."""
         if self.is_far(x):
             return np.empty(0, np.int64)
-        both = np.sort(self.intersections(self.with_mesh(x)), axis=1)
-        return np.unique(both[(both[:, 0] < self._of_body) & (both[:, 1] >= self._of_body), 0])
+        pairs = np.sort(self.intersections(self.with_mesh(x)), axis=1)
+        of_both = (pairs[:, 0] < self._element_count) & (pairs[:, 1] >= self._element_count)
+        return np.unique(pairs[of_both, 0])
 
     def gap(self, x: Values) -> float:
-        """The least distance with the body at x (n, 3), m; beyond the barrier as Standing.about has it."""
-        if not len(self._body):
+        """Least distance with the body at x (n, 3), m; beyond the barrier that of vertices."""
+        if not len(self._body_points):
             return float("inf")
-        least = float("inf") if self.is_far(x) else self.min_gap(self.with_mesh(x))
-        return least if least < float("inf") else max(self.mesh.vertex_distance(x[self._body]), self._reach)
+        gap = float("inf") if self.is_far(x) else self.min_gap(self.with_mesh(x))
+        return gap if gap < float("inf") else max(self.mesh.vertex_distance(x[self._body_points]), self._reach)
 
-    def safe_distances(self, x: Values, most: float) -> Values:
-        """(n,) how far each point of the body at x (n, 3) may go by itself, m; infinite from `most` on."""
-        on, near = self._mesh.vertices(self.with_mesh(x)), ipctk.Candidates()
-        near.build(self._mesh, on, most, ipctk.LBVH())
-        safe = near.compute_per_vertex_safe_distances(self._mesh, on, most)
-        every = np.asarray(self._mesh.to_full_dof(np.repeat(safe, 3))).reshape(-1, 3)[: self.body_count, 0]
-        free = np.ones(self.body_count, bool)
-        free[self._body] = every[self._body] >= 0.999 * most
-        return np.where(free, np.inf, every)
+    def safe_distances(self, x: Values, limit: float) -> Values:
+        """(n,) distances that each point of the body at x (n, 3) may move by itself, m; infinite from `limit` on."""
+        vertices, candidates = self._mesh.vertices(self.with_mesh(x)), ipctk.Candidates()
+        candidates.build(self._mesh, vertices, limit, ipctk.LBVH())
+        safe = candidates.compute_per_vertex_safe_distances(self._mesh, vertices, limit)
+        distances = np.asarray(self._mesh.to_full_dof(np.repeat(safe, 3))).reshape(-1, 3)[: self.body_count, 0]
+        unlimited = np.ones(self.body_count, bool)
+        unlimited[self._body_points] = distances[self._body_points] >= MESH.unlimited * limit
+        return np.where(unlimited, np.inf, distances)
 
 
 class AllMeshPairs:
-    """The surface of a body before several solids: what Pairs are to a body and itself."""
+    """Pairs of a body's surface and several obstacles; x (n, 3) of the body, m.
+
+    Attributes:
+        pairs: of each obstacle.
+    """
 
     def __init__(
-        self, rest: Values, elements: Ints, solids: Sequence[MeshObstacle], *, distance: float, stiffness: float
-    ):
-        """As for Facing."""
-        how = {"distance": distance, "stiffness": stiffness}
-        self.pairs = [MeshObstaclePairs(rest, elements, solid, **how) for solid in solids]
+        self,
+        rest_positions: Values,
+        elements: Ints,
+        obstacles: Sequence[MeshObstacle],
+        *,
+        distance: float,
+        stiffness: float,
+    ) -> None:
+        """As for MeshObstaclePairs."""
+        self.pairs = [
+            MeshObstaclePairs(rest_positions, elements, mesh, distance=distance, stiffness=stiffness)
+            for mesh in obstacles
+        ]
 
-    def select(self, which: Sequence[int]) -> AllMeshPairs:
-        """Before some of the solids."""
-        part = copy(self)
-        part.pairs = [self.pairs[k] for k in which]
-        return part
+    def select(self, numbers: Sequence[int]) -> AllMeshPairs:
+        """Pairs of some of the obstacles."""
+        selected = copy(self)
+        selected.pairs = [self.pairs[number] for number in numbers]
+        return selected
+
+    def _near(self, x: Values) -> list[MeshObstaclePairs]:
+        return [pairs for pairs in self.pairs if not pairs.is_far(x)]
 
     def energy(self, x: Values) -> float:
-        """E, J."""
-        return sum(each.energy(each.with_mesh(x)) for each in self.pairs if not each.is_far(x))
+        """Energy E, J."""
+        return sum(pairs.energy(pairs.with_mesh(x)) for pairs in self._near(x))
 
     def gradient(self, x: Values) -> Values:
         """(n, 3) dE/dx, N."""
-        return np.sum([each.body_gradient(x) for each in self.pairs], axis=0)
+        return np.sum([pairs.body_gradient(x) for pairs in self.pairs], axis=0)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
-        """(3 n, 3 n) d2E/dx2, N/m; as for Pairs."""
+        """(3 n, 3 n) d2E/dx2, N/m; as for IpcPairs."""
         H, size = csr_matrix((x.size, x.size)), x.size
-        for each in self.pairs:
-            if not each.is_far(x):
-                H = H + each.hessian(each.with_mesh(x), exact=exact)[:size, :size]
+        for pairs in self._near(x):
+            H = H + pairs.hessian(pairs.with_mesh(x), exact=exact)[:size, :size]
         return csr_matrix(H)
 
     def set_stiffness(self, stiffness: float) -> None:
-        """Barriers have this stiffness, Pa, from here on."""
-        for each in self.pairs:
-            each.set_stiffness(stiffness)
+        """Set the stiffness of the barriers, Pa."""
+        for pairs in self.pairs:
+            pairs.set_stiffness(stiffness)
 
     def clear_caches(self) -> None:
-        """Forget which elements were near."""
-        for each in self.pairs:
-            each.clear_caches()
+        """Discard the candidates of collision detection."""
+        for pairs in self.pairs:
+            pairs.clear_caches()
 
     def min_gap(self, x: Values) -> float:
-        """The least distance within the barrier, m; infinite where there is none."""
-        return min((each.min_gap(each.with_mesh(x)) for each in self.pairs if not each.is_far(x)), default=np.inf)
+        """Least distance within the barrier, m; infinite where there is none."""
+        return min((pairs.min_gap(pairs.with_mesh(x)) for pairs in self._near(x)), default=np.inf)
 
-    def free_fraction(self, x: Values, to: Values) -> float:
-        """The share in (0, 1] of the straight way of the body from x to `to` on which it meets no solid at rest."""
-        return self.moving_free_fraction(x, to, [each.mesh.pose for each in self.pairs])
+    def free_fraction(self, x: Values, end: Values) -> float:
+        """Fraction in (0, 1] of the straight motion of the body from x to `end` with obstacles at rest."""
+        return self.moving_free_fraction(x, end, [pairs.mesh.pose for pairs in self.pairs])
 
-    def moving_free_fraction(self, x: Values, to: Values, before: Sequence[Pose]) -> float:
-        """The same where solids come from poses `before` to where they are."""
-        ways = zip(self.pairs, before, strict=True)
-        return min((each.moving_free_fraction(x, to, then) for each, then in ways), default=1.0)
+    def moving_free_fraction(self, x: Values, end: Values, start_poses: Sequence[Pose]) -> float:
+        """Fraction of the motions of body and obstacles without a collision; obstacles come from `start_poses`."""
+        items = zip(self.pairs, start_poses, strict=True)
+        return min((pairs.moving_free_fraction(x, end, pose) for pairs, pose in items), default=1.0)
 
-    def search_along(self, x: Values, to: Values) -> None:
-        """Have candidates for all the way of the body from x to `to`."""
-        for each in self.pairs:
-            if not each.is_far(x):
-                each.search_along(each.with_mesh(x), each.with_mesh(to))
+    def search_along(self, x: Values, end: Values) -> None:
+        """Search candidates for the whole motion of the body from x to `end`."""
+        for pairs in self._near(x):
+            pairs.search_along(pairs.with_mesh(x), pairs.with_mesh(end))
 
     def pressure(self, x: Values) -> Values:
-        """(n,) the sum of the barriers' pressures on each point, Pa."""
-        near = [each.pressure(each.with_mesh(x))[: len(x)] for each in self.pairs if not each.is_far(x)]
-        return np.sum(near, axis=0) if near else np.zeros(len(x))
+        """(n,) sum of the pressures of all barriers on each point, Pa."""
+        pressures = [pairs.pressure(pairs.with_mesh(x))[: len(x)] for pairs in self._near(x)]
+        return np.sum(pressures, axis=0) if pressures else np.zeros(len(x))
 
     def intersections(self, x: Values) -> Ints:
-        """(k, 2) elements of the body that solids cut, twice."""
-        cut = np.concatenate([each.cut_elements(x) for each in self.pairs])
-        return np.column_stack([cut, cut]) if len(cut) else NONE
+        """(k, 2) elements of the body that obstacles intersect, twice each."""
+        cut = np.concatenate([pairs.cut_elements(x) for pairs in self.pairs])
+        return np.column_stack([cut, cut]) if len(cut) else NO_PAIRS
 
-    def lag_friction(self, x: Values, slip: float) -> MeshFriction:
-        """Friction of a step that begins with the body at x and solids where they are; `slip` as for Pairs."""
-        rubs = [each for each in self.pairs if each.mesh.friction and not each.is_far(x)]
-        at = [each.with_mesh(x) for each in rubs]
-        return MeshFriction(rubs, [each.lag_friction(there, there, slip) for each, there in zip(rubs, at, strict=True)])
+    def lag_friction(self, x: Values, start: Values, slip: float) -> MeshFriction:
+        """Friction with pressures and tangents at x and obstacles at their current poses; as of IpcPairs."""
+        rubbing = [pairs for pairs in self._near(x) if pairs.mesh.friction]
+        friction = [pairs.lag_friction(pairs.with_mesh(x), pairs.with_mesh(start), slip) for pairs in rubbing]
+        return MeshFriction(rubbing, friction)
 
 
 @dataclass(frozen=True)
 class MeshFriction:
-    """Lagged friction with some of several solids; x (n, 3) of the body."""
+    """Lagged friction with several obstacles; x (n, 3) of the body, m.
+
+    Attributes:
+        pairs: of obstacles with friction.
+        friction: of each.
+    """
 
     pairs: list[MeshObstaclePairs]
     friction: list[IpcFriction]
 
     def energy(self, x: Values) -> float:
-        """J, as of Friction."""
-        return sum(part.energy(each.with_mesh(x)) for each, part in zip(self.pairs, self.friction, strict=True))
+        """Potential, J; as of IpcFriction."""
+        return sum(
+            friction.energy(pairs.with_mesh(x)) for pairs, friction in zip(self.pairs, self.friction, strict=True)
+        )
 
-    def full_gradient(self, which: MeshObstaclePairs, x: Values) -> Values:
-        """(n + m, 3) dE/dx by one of the solids, of the body's points and of its own, N."""
-        both, part = which.with_mesh(x), self.friction_with(which)
-        return np.zeros_like(both) if part is None else part.gradient(both)
+    def full_gradient(self, pairs: MeshObstaclePairs, x: Values) -> Values:
+        """(n + m, 3) derivatives of the friction with one obstacle by the points of both, N."""
+        points, friction = pairs.with_mesh(x), self.friction_with(pairs)
+        return np.zeros_like(points) if friction is None else friction.gradient(points)
 
-    def friction_with(self, which: MeshObstaclePairs) -> IpcFriction | None:
-        """That with one of the solids; None: it rubs nothing."""
-        return next((part for each, part in zip(self.pairs, self.friction, strict=True) if each is which), None)
+    def friction_with(self, pairs: MeshObstaclePairs) -> IpcFriction | None:
+        """Friction with one obstacle; None: without friction."""
+        items = zip(self.pairs, self.friction, strict=True)
+        return next((friction for item_pairs, friction in items if item_pairs is pairs), None)
 
     def gradient(self, x: Values) -> Values:
-        """(n, 3) dE/dx, N."""
-        return np.sum([np.zeros_like(x), *(self.full_gradient(each, x)[: len(x)] for each in self.pairs)], axis=0)
+        """(n, 3) derivatives by the points of the body, N."""
+        gradients = (self.full_gradient(pairs, x)[: len(x)] for pairs in self.pairs)
+        return np.sum([np.zeros_like(x), *gradients], axis=0)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
-        """(3 n, 3 n) d2E/dx2, N/m."""
+        """(3 n, 3 n) second derivatives by the points of the body, N/m."""
         H, size = csr_matrix((x.size, x.size)), x.size
-        for each, part in zip(self.pairs, self.friction, strict=True):
-            H = H + part.hessian(each.with_mesh(x), exact=exact)[:size, :size]
+        for pairs, friction in zip(self.pairs, self.friction, strict=True):
+            H = H + friction.hessian(pairs.with_mesh(x), exact=exact)[:size, :size]
         return csr_matrix(H)
 
 
 class MeshContactSurface(SelfContactSurface):
-    """The surface, and its pairs with solids where these are. Walls of cracks do not recede from each other: they feel
-    solids alone."""
+    """Surface of a body, and its pairs with triangle-mesh obstacles.
+
+    Crack faces are not offset from one another: they are in contact with obstacles alone.
+    """
 
     face_gap = 0.0
-    pairs: AllMeshPairs  # type: ignore[assignment]
+    pairs: AllMeshPairs
 
     def __init__(
         self,
         skeleton: EntityNumbering,
         pattern: npt.NDArray[np.uint8],
-        solids: Sequence[MeshObstacle],
+        obstacles: Sequence[MeshObstacle],
         law: SelfContactLaw,
         u: Values,
-        before: SelfContactSurface | None,
+        previous: SelfContactSurface | None,
     ) -> None:
-        """As for Surface. InputError where a solid overlaps the body at rest."""
-        self._solids = solids
-        super().__init__(skeleton, pattern, law, u, before)
+        """As for SelfContactSurface. Raises InputError where an obstacle overlaps the body at rest."""
+        self._obstacles = obstacles
+        super().__init__(skeleton, pattern, law, u, previous)
 
     def _check_apart(self) -> None:
-        """InputError where a solid cuts the body at rest, or one is in the other."""
-        made = self.split
-        for each in self.pairs.pairs:
-            solid, cut = each.mesh, len(each.cut_elements(made.points)) > 0
-            deep = penetration_depth((made.points, made.elements), (solid.positions, solid.triangles), cut=cut)
-            if cut or deep is not None:
-                how = "cuts" if deep is None else "overlaps"
-                by = "" if deep is None else f", by {deep:.4g} m"
-                raise InputError(f"{solid.name} {how} the body at the start{by}; move it away or make it smaller")
+        """Raise InputError where an obstacle cuts the body at rest, or one is inside the other."""
+        split = self.split
+        for pairs in self.pairs.pairs:
+            mesh, cut = pairs.mesh, len(pairs.cut_elements(split.points)) > 0
+            depth = penetration_depth((split.points, split.elements), (mesh.positions, mesh.triangles), cut=cut)
+            if cut or depth is not None:
+                verb = "cuts" if depth is None else "overlaps"
+                by = "" if depth is None else f", by {depth:.4g} m"
+                raise InputError(f"{mesh.name} {verb} the body at the start{by}; move it away or make it smaller")
 
-    def _build_pairs(self, elements: Ints) -> AllMeshPairs:  # type: ignore[override]
-        how = {name: self._parameters[name] for name in ("distance", "stiffness")}  # friction is each solid's own
-        return AllMeshPairs(self._rest_positions, elements, self._solids, **how)
+    def _build_pairs(self, elements: Ints) -> AllMeshPairs:
+        # the coefficient of friction is that of each obstacle
+        parameters = {name: self._parameters[name] for name in ("distance", "stiffness")}
+        return AllMeshPairs(self._rest_positions, elements, self._obstacles, **parameters)

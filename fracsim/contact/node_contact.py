@@ -1,15 +1,13 @@
-"""What an obstacle does to the points of a surface: barrier and lagged friction, with the forces of both.
+"""Contact of points of a surface with one obstacle: barrier and lagged friction, forces and second derivatives.
 
-The gap to a round obstacle over a step in which a point slides around it.
+Second-order schemes use the curved gap of a step. With the normal n at the end of a motion d from gap g_n to g the
+force of a barrier does the work p n . d instead of p (g - g_n). A point that slides round a sphere would gain the
+difference, about p d . H d / 2 with the curvature H, in every step. The barrier therefore acts on
 
-With the normal n at the end of a way d from gap g_n to g the force of a barrier does p n . d, and not p (g - g_n): more
-by p e~, e~ = n . d - (g - g_n) about d . H d / 2 of the curvature H, which a point that slides around a ball gains in
-every step. With the normal n_n of the start it loses as much. The barrier acts on
+    f = g - e / 2,    e = g - g_n - n_n . d,    so that its force has the direction (n + n_n) / 2.
 
-    f = g - e / 2,    e = g - g_n - n_n . d,    so that its force has the direction (n + n_n) / 2
-
-and is right to second order. Where e is no longer small beside g, f = g (g + e / 2) / (g + e): open wherever g is.
-The start is seen from the obstacle, and goes with it.
+Where e is not small beside g, f = g (g + e / 2) / (g + e), which is open wherever g is. The start of the step is taken
+in the frame of the obstacle.
 
 Equations: docs/theory.md#contact-in-a-time-step.
 """
@@ -24,21 +22,25 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from .friction import CoulombFriction
-from .laws import GapPotential, TimeAveragedPotential
+from .laws import CoulombFriction, GapPotential, TimeAveragedPotential
 from .pose import Pose, PosedShape
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-HUGE_STIFFNESS = 1e150  # N/m, of a gap that is closed or as good as that
+
+# N/m, of a closed gap (laws.BARRIER.closed_value times an area)
+CLOSED_STIFFNESS = 1e150
 
 
 @dataclass(frozen=True, eq=False)
 class StepStart:
-    """Points as a step began.
+    """Points at the start of a step.
 
     Attributes:
-        gap: (n,) of all, m.    known: (k,) those that the barrier acted on.    normal, place: (k, d) of these, m.
+        gap: (n,) gaps of all points, m.
+        active: (k,) points on which the barrier acted.
+        normal: (k, d) unit normals at these.
+        position: (k, d) positions of these, m.
     """
 
     gap: Values
@@ -48,30 +50,33 @@ class StepStart:
 
     @classmethod
     def from_gaps(cls, gap: Values, dim: int) -> StepStart:
-        """Of points of which nothing but gaps (n,), m, is known: f = g."""
+        """Points of which the gaps (n,), m, alone are known: f = g."""
         return cls(gap, np.empty(0, np.int64), np.empty((0, dim)), np.empty((0, dim)))
 
-    def carried_with(self, then: Pose, now: Pose) -> StepStart:
-        """As it is where the obstacle has gone from one pose to another."""
-        normal = now.vectors_to_space(self.normal @ then.rotation)
-        return StepStart(self.gap, self.active, normal, now.points_to_space(then.to_body(self.position)))
+    def carried_with(self, start: Pose, end: Pose) -> StepStart:
+        """The same start, moved with an obstacle from its pose at the start to that at the end."""
+        normal = end.vectors_to_space(self.normal @ start.rotation)
+        return StepStart(self.gap, self.active, normal, end.points_to_space(start.to_body(self.position)))
 
     def curved_gap(self, points: Ints, gap: Values, normal: Values, x: Values) -> CurvedGap:
-        """f of some points (m,), those that are known among them, with gaps (m,) and normals (m, d) at places x."""
-        e, turned, has = np.zeros(len(points)), np.zeros_like(x), np.zeros(len(points), bool)
-        at = np.searchsorted(points, self.active)
-        e[at] = gap[at] - self.gap[self.active] - np.einsum("ni,ni->n", self.normal, x[at] - self.position)
-        turned[at], has[at] = normal[at] - self.normal, True
-        return CurvedGap.from_gaps(gap, e, normal, turned, has)
+        """Curved gap f of points (m,), which include the active ones, with gaps (m,) and normals (m, d) at x (m, d)."""
+        e, e_gradient, has_excess = np.zeros(len(points)), np.zeros_like(x), np.zeros(len(points), bool)
+        rows = np.searchsorted(points, self.active)
+        motion = x[rows] - self.position
+        e[rows] = gap[rows] - self.gap[self.active] - np.einsum("ni,ni->n", self.normal, motion)
+        e_gradient[rows], has_excess[rows] = normal[rows] - self.normal, True
+        return CurvedGap.from_gaps(gap, e, normal, e_gradient, has_excess)
 
 
 @dataclass(frozen=True, eq=False)
 class CurvedGap:
-    """f of points before an obstacle.
+    """Gap f of points to an obstacle with its derivatives.
 
     Attributes:
-        value: (m,) m.    gradient: (m, d).    of_curvature: (m,) its second derivative is that share of the gap's, and
-            rest: (m, d, d), 1/m.
+        value: (m,) f, m.
+        gradient: (m, d).
+        curvature_factor: (m,) factor of the gap's own Hessian in that of f.
+        remainder: (m, d, d) the other part of the Hessian of f, 1/m.
     """
 
     value: Values
@@ -80,29 +85,33 @@ class CurvedGap:
     remainder: Values
 
     @classmethod
-    def from_gaps(cls, g: Values, e: Values, n: Values, m: Values, has: npt.NDArray[np.bool_]) -> CurvedGap:
-        """Of gaps g and excesses e (k,) with gradients n and m (k, d); f = g but where it `has` an excess.
+    def from_gaps(cls, g: Values, e: Values, n: Values, m: Values, has_excess: npt.NDArray[np.bool_]) -> CurvedGap:
+        """Curved gap of gaps g and excesses e (k,) with gradients n and m (k, d); f = g where there is no excess.
 
-        Before hollow obstacles e is negative, and f = g - e / 2.
+        In hollow obstacles e is negative, and f = g - e / 2.
         """
-        over = np.where((e > 0) & (g > 0), e, 0.0)
-        whole = np.where(over > 0, g + over, 1.0)
-        s, t = np.where(over > 0, g / whole, 1.0), over / whole  # s + t = 1
-        value = np.where(over > 0, g * (s + t / 2), g - np.where(has & (g > 0), np.minimum(e, 0.0), 0.0) / 2)
-        by_g, by_e = 1 - t**2 / 2, np.where(has, -(s**2) / 2, 0.0)
-        gg, ge, ee = (np.where(over > 0, each / whole, 0.0)[:, None, None] for each in (t**2, -s * t, s**2))
+        positive_e = np.where((e > 0) & (g > 0), e, 0.0)
+        total = np.where(positive_e > 0, g + positive_e, 1.0)
+        s, t = np.where(positive_e > 0, g / total, 1.0), positive_e / total  # s + t = 1
+        negative_e = np.where(has_excess & (g > 0), np.minimum(e, 0.0), 0.0)
+        value = np.where(positive_e > 0, g * (s + t / 2), g - negative_e / 2)
+        by_g, by_e = 1 - t**2 / 2, np.where(has_excess, -(s**2) / 2, 0.0)
+        gg, ge, ee = (np.where(positive_e > 0, f / total, 0.0)[:, None, None] for f in (t**2, -s * t, s**2))
         nn, nm, mm = (a[:, :, None] * b[:, None, :] for a, b in ((n, n), (n, m), (m, m)))
-        rest = gg * nn + ge * (nm + nm.transpose(0, 2, 1)) + ee * mm
-        return cls(value, by_g[:, None] * n + by_e[:, None] * m, by_g + by_e, rest)
+        remainder = gg * nn + ge * (nm + nm.transpose(0, 2, 1)) + ee * mm
+        return cls(value, by_g[:, None] * n + by_e[:, None] * m, by_g + by_e, remainder)
 
 
 @dataclass(frozen=True)
 class LaggedContact:
-    """Where a step began: points in touch then, whose friction of the step is lagged.
+    """Contact at the start of a step, with which the friction of the step is lagged.
 
     Attributes:
-        points: (k,) of the surface.    force: (k,) normal force, N.    normal: (k, d).    start: (k, d) places, m.
-        under: (k, d) places that the obstacle presses at, m.
+        points: (k,) of the surface.
+        force: (k,) normal forces, N.
+        normal: (k, d) unit normals.
+        position: (k, d) positions of the points, m.
+        obstacle_point: (k, d) points of the obstacle that press on them, m.
     """
 
     points: Ints
@@ -113,7 +122,7 @@ class LaggedContact:
 
 
 class FacetCoupling(Protocol):
-    """What acts between points and not at each alone (facet_contact)."""
+    """Second derivatives of an energy that couples the corners of facets (facet_contact)."""
 
     @property
     def corners(self) -> Ints:
@@ -130,14 +139,16 @@ class FacetCoupling(Protocol):
 
 @dataclass(frozen=True)
 class ContactForces:
-    """Points in touch with one obstacle, and what acts on them.
+    """Forces of one obstacle on points, and their derivatives.
 
     Attributes:
-        points: (k,) of the surface, with a gap below the barrier's width or gripped by friction.
-        energy: of the barrier, J.    normal, friction: (k, d) forces on the points, N.
-        potential: J, of which both are minus the derivatives.
-        make_parts: gives `exact` and `stick`, once they are asked for.
-        between: what acts between them, its forces being among `normal` (facet_contact); None: nothing does.
+        points: (k,) of the surface, with a gap below the barrier's width or in lagged contact.
+        energy: of the barrier, J.
+        normal: (k, d) normal forces on the points, N.
+        friction: (k, d) friction forces on the points, N.
+        potential: J; both forces are minus its derivatives.
+        make_hessians: returns `normal_hessian` and `friction_hessian`; called once, when they are needed.
+        facets: coupling of corners of facets, whose forces are in `normal`; None without any.
     """
 
     points: Ints
@@ -159,86 +170,97 @@ class ContactForces:
 
     @property
     def friction_hessian(self) -> Values:
-        """(k, d, d) that of friction, positive semi-definite, N/m."""
+        """(k, d, d) minus the derivative of the friction forces, positive semi-definite, N/m."""
         return self._hessians[1]
 
     @cached_property
     def normal_stiffness(self) -> Values:
-        """(k, d, d) the part of `exact` that is positive semi-definite, N/m."""
+        """(k, d, d) positive semi-definite part of `normal_hessian`, N/m."""
         return positive_part(self.normal_hessian)
 
     @property
     def stiffness(self) -> Values:
-        """(k, d, d) minus the derivative of the forces, positive semi-definite, N/m."""
+        """(k, d, d) minus the derivative of all forces, positive semi-definite, N/m."""
         return self.tangent(exact=False)
 
     def tangent(self, *, exact: bool) -> Values:
-        """(k, d, d) the same, or `exact`, N/m."""
+        """(k, d, d) minus the derivative of all forces, N/m; positive semi-definite unless `exact`."""
         return (self.normal_hessian if exact else self.normal_stiffness) + self.friction_hessian
 
 
-def lag_contact(x: Values, gap: Values, area: Values, placed: PosedShape, barrier: GapPotential) -> LaggedContact:
-    """Normal forces at places x (n, d) of the start of a step, with gaps (n,), m."""
+def lag_contact(x: Values, gap: Values, area: Values, posed: PosedShape, barrier: GapPotential) -> LaggedContact:
+    """Normal forces of the start of a step at points x (n, d) with gaps (n,), m, and areas (n,), m^2."""
     near = np.flatnonzero((gap > 0) & (gap < barrier.width) & (area > 0))
-    return LaggedContact(near, -area[near] * barrier.slope(gap[near]), placed.normal(x[near]), x[near], x[near])
+    return LaggedContact(near, -area[near] * barrier.slope(gap[near]), posed.normal(x[near]), x[near], x[near])
 
 
 def evaluate_points(
     x: Values,
     area: Values,
-    placed: PosedShape,
+    posed: PosedShape,
     barrier: GapPotential,
-    held: LaggedContact | None,
+    lagged: LaggedContact | None,
     friction: CoulombFriction | None,
-    way: Values,
+    obstacle_motion: Values,
     start: StepStart | None = None,
 ) -> ContactForces:
-    """What acts at places x (n, d); `way`: (d,) of the obstacle since the step's start, or (k, d) of its places under
-    the points that are held, m; `start`: all as they were then, where the barrier acts along the way (along, bent).
+    """Forces of an obstacle on points; the energy is the integral of b(gap) over the surface.
 
-    The barrier's energy is the integral of b(gap) over the surface, each point with its area.
+    Args:
+        x: (n, d) positions, m.
+        area: (n,) areas of the points, m^2; 0 of those left out.
+        posed: the obstacle.
+        barrier: b.
+        lagged: contact at the start of the step, for friction.
+        friction: law of friction.
+        obstacle_motion: (d,) motion of the obstacle in the step, or (k, d) of its points in lagged contact, m.
+        start: points at the start of the step, where the barrier is averaged over the step.
     """
-    gap = placed.distance(x)
+    gap = posed.distance(x)
     near = ((gap if start is None else np.minimum(gap, start.gap)) < barrier.width) & (area > 0)
-    if friction is not None and held is not None:
-        near[held.points] = True
+    if friction is not None and lagged is not None:
+        near[lagged.points] = True
     points = np.flatnonzero(near)
-    gap, share, at = gap[points], area[points], x[points]
-    normal = placed.normal(at)
-    acting = barrier if start is None else TimeAveragedPotential(barrier, start.gap[points])
-    bent = None if start is None else start.curved_gap(points, gap, normal, at)
-    along, value = (normal, gap) if bent is None else (bent.gradient, bent.value)
-    slope = acting.slope(value)
-    rubbed, rubbing = np.zeros_like(at), 0.0
-    if friction is not None and held is not None and len(held.points):
-        moved = x[held.points] - held.position - way
-        rubbed[np.searchsorted(points, held.points)] = -friction.gradient(held.force, held.normal, moved)
-        rubbing = float(friction.energy(held.force, held.normal, moved).sum())
+    gap, point_area, positions = gap[points], area[points], x[points]
+    normal = posed.normal(positions)
+    potential = barrier if start is None else TimeAveragedPotential(barrier, start.gap[points])
+    curved = None if start is None else start.curved_gap(points, gap, normal, positions)
+    gradient, value = (normal, gap) if curved is None else (curved.gradient, curved.value)
+    slope = potential.slope(value)
+    friction_force, friction_energy = np.zeros_like(positions), 0.0
+    if friction is not None and lagged is not None and len(lagged.points):
+        motion = x[lagged.points] - lagged.position - obstacle_motion
+        rows = np.searchsorted(points, lagged.points)
+        friction_force[rows] = -friction.gradient(lagged.force, lagged.normal, motion)
+        friction_energy = float(friction.energy(lagged.force, lagged.normal, motion).sum())
 
-    def parts() -> tuple[Values, Values]:
-        stiff = acting.curvature(value)[:, None, None] * along[:, :, None] * along[:, None, :]
-        curved = placed.curvature(at)
-        if bent is not None:
-            curved = bent.curvature_factor[:, None, None] * curved + bent.remainder
-        exact = share[:, None, None] * (stiff + slope[:, None, None] * curved)
-        stick = np.zeros_like(exact)
-        if friction is not None and held is not None and len(held.points):
-            stick[np.searchsorted(points, held.points)] = friction.hessian(held.force, held.normal, moved)
-        return exact, stick
+    def hessians() -> tuple[Values, Values]:
+        along_normal = potential.curvature(value)[:, None, None] * gradient[:, :, None] * gradient[:, None, :]
+        gap_hessian = posed.curvature(positions)
+        if curved is not None:
+            gap_hessian = curved.curvature_factor[:, None, None] * gap_hessian + curved.remainder
+        of_normal = point_area[:, None, None] * (along_normal + slope[:, None, None] * gap_hessian)
+        of_friction = np.zeros_like(of_normal)
+        if friction is not None and lagged is not None and len(lagged.points):
+            of_friction[np.searchsorted(points, lagged.points)] = friction.hessian(lagged.force, lagged.normal, motion)
+        return of_normal, of_friction
 
-    energy, potential = float(share @ barrier.energy(gap)), float(share @ acting.energy(value))
-    return ContactForces(points, energy, -(share * slope)[:, None] * along, rubbed, potential + rubbing, parts)
+    energy, total = float(point_area @ barrier.energy(gap)), float(point_area @ potential.energy(value))
+    normal_force = -(point_area * slope)[:, None] * gradient
+    return ContactForces(points, energy, normal_force, friction_force, total + friction_energy, hessians)
 
 
 def no_contact(d: int) -> ContactForces:
-    """What an obstacle does that is far away."""
-    none = np.empty((0, d))
-    return ContactForces(np.empty(0, np.int64), 0.0, none, none, 0.0, lambda: (np.empty((0, d, d)),) * 2)
+    """Forces of an obstacle that is out of range."""
+    empty = np.empty((0, d))
+    return ContactForces(np.empty(0, np.int64), 0.0, empty, empty, 0.0, lambda: (np.empty((0, d, d)),) * 2)
 
 
 def positive_part(blocks: Values) -> Values:
-    """(n, d, d) symmetric blocks without their negative eigenvalues: a tangent that CG can solve with. Nothing of gaps
-    that are closed (barrier.HUGE): there is no step from there."""
-    is_open = np.all(abs(blocks) < HUGE_STIFFNESS, axis=(1, 2), keepdims=True)
+    """(n, d, d) symmetric blocks without their negative eigenvalues, for a tangent that CG can solve with.
+
+    Blocks of closed gaps become 0: Newton's method cannot start from there.
+    """
+    is_open = np.all(abs(blocks) < CLOSED_STIFFNESS, axis=(1, 2), keepdims=True)
     values, vectors = np.linalg.eigh(np.where(is_open, blocks, 0.0))
     return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1))

@@ -1,31 +1,51 @@
-"""An obstacle that is held or driven: a shape whose reference point goes the way that a function of time says.
-
-A rigid obstacle that moves by itself: a dropped weight, a striker in flight, a pendulum; and how it is moving.
-"""
+"""Rigid obstacles: held or driven, and free ones with a mass; their state of motion and their overlaps."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import combinations
 from typing import ClassVar
 
 import numpy as np
 
+from ..errors import InputError
 from ..mechanics.time_functions import TimeFunction
+from ..meshes.text import AXES
 from .pose import Pose, PosedShape, Values, rotation_derivative, rotation_second_derivative
 from .shape_base import Shape
 
 
-@dataclass(frozen=True, eq=False)
-class RigidObstacle:
-    """A rigid obstacle without a mass of its own.
+@dataclass(frozen=True)
+class OverlapPolicy:
+    """Tuned numbers of the search for overlaps.
 
     Attributes:
-        name: of its columns in history.csv.    shape: about its reference point.    at: (d,) that point at t = 0, m.
-        moved: (d,) displacement of the obstacle at a time, m; None: it is held.
-        friction: Coulomb's coefficient against the body.
-        spin: (3,) rad/s at which it is turned about its reference point (solids alone); None: it does not turn.
+        iterations: of the search for the deepest point of an overlap.
+        step_ratio: length of each step of that search, in the one before.
+        min_overlap: overlap, in sizes of the free obstacle, below which obstacles merely touch.
+    """
+
+    iterations: int = 60
+    step_ratio: float = 0.8
+    min_overlap: float = 1e-6
+
+
+OVERLAP = OverlapPolicy()
+
+
+@dataclass(frozen=True, eq=False)
+class RigidObstacle:
+    """Rigid obstacle without a mass: held, or driven by a function of time.
+
+    Attributes:
+        name: of its columns in history.csv.
+        shape: shape about its reference point.
+        start_point: (d,) reference point at t = 0, m.
+        prescribed_displacement: (d,) displacement at a time, m; None: held.
+        friction: coefficient of friction with the body.
+        spin: (3,) angular velocity about the reference point, rad/s (triangle meshes only); None: no rotation.
     """
 
     name: str
@@ -34,40 +54,43 @@ class RigidObstacle:
     prescribed_displacement: TimeFunction | None = None
     friction: float = 0.0
     spin: Values | None = None
-    free: ClassVar[bool] = False  # whether it has a mass, and moves by itself
+    free: ClassVar[bool] = False  # whether it has a mass and moves by itself
 
     def posed_at(self, t: float) -> PosedShape:
-        """Where it is at time t, s."""
+        """Shape at its pose at time t, s."""
         pose = Pose.at_point(self.start_point + self.displacement(t))
-        return PosedShape(
-            self.shape, pose if self.spin is None else pose.incremented(np.append(0 * self.start_point, t * self.spin))
-        )
+        if self.spin is not None:
+            pose = pose.incremented(np.append(0 * self.start_point, t * self.spin))
+        return PosedShape(self.shape, pose)
 
     def displacement(self, t: float) -> Values:
-        """(d,) m."""
+        """(d,) displacement of the reference point at time t, m."""
         return (
             np.zeros(len(self.start_point)) if self.prescribed_displacement is None else self.prescribed_displacement(t)
         )
 
     def pose_increment(self, start: float, end: float) -> Values:
-        """(p,) increment q of its pose from one time to another."""
+        """(p,) increment of its pose from one time to another, s."""
         shift = self.displacement(end) - self.displacement(start)
-        return np.concatenate([shift, np.zeros(self._turns) if self.spin is None else (end - start) * self.spin])
+        return np.concatenate([shift, np.zeros(self._rotations) if self.spin is None else (end - start) * self.spin])
 
     @cached_property
-    def _turns(self) -> int:
+    def _rotations(self) -> int:
+        """Number of rotational degrees of freedom."""
         return 1 if len(self.start_point) == 2 else 3
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FreeObstacle(RigidObstacle):
-    """An obstacle with a mass. Its reference point is its centre, or the hinge that it hangs on.
+    """Rigid obstacle with a mass. Its reference point is its centre of mass, or the hinge that it hangs on.
 
     Attributes:
-        mass: kg (2D: per metre of thickness).    inertia: (3, 3), in 2D (), about the reference point at the start.
-        ways: (p, k) what it may do: its pose moves by ways @ z, z (k,). The identity: anything.
-        centre: (d,) its centre of mass from the reference point, at the start, m.    gravity: (d,) m/s^2.
-        rate: (k,) dz/dt at the start, m/s and rad/s.
+        mass: kg (2D: per metre of thickness).
+        inertia: (3, 3), in 2D (), about the reference point at the start, kg m^2.
+        motion_basis: (p, k) admissible increments of the pose: q = motion_basis @ z, z (k,). The identity if free.
+        mass_centre: (d,) centre of mass relative to the reference point, at the start, m.
+        gravity: (d,) m/s^2.
+        start_rate: (k,) dz/dt at the start, m/s and rad/s.
     """
 
     mass: float
@@ -80,13 +103,13 @@ class FreeObstacle(RigidObstacle):
 
     @cached_property
     def pose_size(self) -> int:
-        """p."""
-        return len(self.start_point) + self._turns
+        """Number p of components of an increment of the pose."""
+        return len(self.start_point) + self._rotations
 
     def mass_matrix(self, rotation: Values) -> Values:
-        """(k, k) mass matrix of z with the body turned by `rotation`.
+        """(k, k) mass matrix of z at a rotation (d, d), kg and kg m^2.
 
-        Where the centre of mass is not the reference point that point is held: no motion couples the two.
+        A reference point that is not the centre of mass is held: no motion couples the two.
         """
         d, full = len(self.start_point), np.zeros((self.pose_size, self.pose_size))
         full[:d, :d] = self.mass * np.eye(d)
@@ -94,39 +117,39 @@ class FreeObstacle(RigidObstacle):
         return np.asarray(self.motion_basis.T @ full @ self.motion_basis)
 
     def gravity_potential(self, pose: Pose) -> tuple[float, Values, Values]:
-        """-m g . x of the centre of mass, J, with its derivatives (p,), (p, p) by an increment of the pose."""
+        """Potential -m g . x of the centre of mass, J, and its derivatives (p,), (p, p) by an increment of the pose."""
         d, arm, force = len(self.start_point), pose.rotation @ self.mass_centre, self.mass * self.gravity
         gradient, hessian = np.zeros(self.pose_size), np.zeros((self.pose_size, self.pose_size))
         gradient[:d], gradient[d:] = -force, force @ rotation_derivative(arm[None])[0]
         hessian[d:, d:] = -rotation_second_derivative(force[None], arm[None])[0]
         return -float(force @ (pose.centre + arm)), gradient, hessian
 
-    def history_values(self, flight: RigidMotion) -> Values:
-        """(2 d + 2 r + 1,) place and velocity of the centre of mass, turn and spin, energy of motion; m, m/s, rad,
-        rad/s, J."""
-        pose, d = flight.pose, len(self.start_point)
-        rate = np.linalg.solve(self.mass_matrix(pose.rotation), flight.momentum)
+    def history_values(self, motion: RigidMotion) -> Values:
+        """(2 d + 2 r + 1,) position and velocity of the centre of mass, rotation, angular velocity, kinetic energy."""
+        pose, d = motion.pose, len(self.start_point)
+        rate = np.linalg.solve(self.mass_matrix(pose.rotation), motion.momentum)
         arm, q = pose.rotation @ self.mass_centre, self.motion_basis @ rate
         velocity = q[:d] - rotation_derivative(arm[None])[0] @ q[d:]
-        energy = 0.5 * float(flight.momentum @ rate)
-        return np.concatenate([pose.centre + arm, velocity, flight.rotation, q[d:], [energy]])
+        energy = 0.5 * float(motion.momentum @ rate)
+        return np.concatenate([pose.centre + arm, velocity, motion.rotation, q[d:], [energy]])
 
     def start_motion(self) -> RigidMotion:
-        """How it moves at t = 0, before anything touches it."""
+        """Motion at t = 0, before any contact."""
         pose = Pose.at_point(self.start_point)
         momentum = self.mass_matrix(pose.rotation) @ self.start_rate
         force = -self.motion_basis.T @ self.gravity_potential(pose)[1]
-        return RigidMotion(pose, momentum, force, np.zeros(self._turns))
+        return RigidMotion(pose, momentum, force, np.zeros(self._rotations))
 
 
 @dataclass(frozen=True, eq=False)
 class RigidMotion:
-    """How an obstacle is moving.
+    """State of motion of a free obstacle.
 
     Attributes:
-        pose: where it is.    momentum: (k,) of its ways, M dz/dt, kg m/s and kg m^2/s (about the reference point).
-        force: (k,) the rate of the momentum that second-order schemes carry, N and N m.
-        turned: (r,) in 2D the angle since the start, rad, whole turns counted; in 3D the rotation vector.
+        pose: its pose.
+        momentum: (k,) M dz/dt, kg m/s and kg m^2/s, about the reference point.
+        force: (k,) rate of the momentum that second-order schemes carry, N and N m.
+        rotation: (r,) in 2D the angle since the start, rad, full turns counted; in 3D the rotation vector.
     """
 
     pose: Pose
@@ -135,20 +158,72 @@ class RigidMotion:
     rotation: Values = field(default_factory=lambda: np.zeros(1))
 
     def to_array(self) -> Values:
-        """All its numbers in a row."""
+        """All its numbers in one row."""
         return np.concatenate(
             [self.pose.centre, self.pose.rotation.reshape(-1), self.momentum, self.force, self.rotation]
         )
 
     def from_array(self, numbers: Values) -> RigidMotion:
-        """The flight whose `flat` gave these numbers, of the same obstacle."""
+        """State of motion of the same obstacle with the numbers of `to_array`."""
         d, k, r = self.pose.dim, len(self.momentum), len(self.rotation)
-        centre, rotation, momentum, force, turned, _ = np.split(numbers, np.cumsum([d, d * d, k, k, r]))
-        return RigidMotion(Pose(centre, rotation.reshape(d, d)), momentum, force, turned)
+        centre, R, momentum, force, rotation, _ = np.split(numbers, np.cumsum([d, d * d, k, k, r]))
+        return RigidMotion(Pose(centre, R.reshape(d, d)), momentum, force, rotation)
 
 
-def motion_rows(flights: Iterable[RigidMotion]) -> Values:
-    """(n, m) the numbers of flights, a row each; shorter rows, as of what turns about a hinge, end with zeros."""
-    rows = [flight.to_array() for flight in flights]
-    longest = max(map(len, rows), default=0)
-    return np.array([np.pad(row, (0, longest - len(row))) for row in rows])
+def motion_rows(motions: Iterable[RigidMotion]) -> Values:
+    """(n, m) numbers of states of motion, one row each; shorter rows, as of a pendulum, end with zeros."""
+    rows = [motion.to_array() for motion in motions]
+    length = max(map(len, rows), default=0)
+    return np.array([np.pad(row, (0, length - len(row))) for row in rows])
+
+
+def column_names(body: FreeObstacle) -> list[str]:
+    """Names of the numbers that `history_values` returns."""
+    d = len(body.start_point)
+    axes, rotation_axes = AXES[:d], AXES[2:] if d == 2 else AXES
+    kinds = [("position", axes), ("velocity", axes), ("turn", rotation_axes), ("spin", rotation_axes)]
+    return [*[f"{kind}_{body.name}_{axis}" for kind, names in kinds for axis in names], f"kinetic_{body.name}"]
+
+
+# --- overlaps ---
+
+
+def free_pairs(obstacles: Sequence[RigidObstacle]) -> list[tuple[int, int]]:
+    """Numbers of a free obstacle and another one, each pair once."""
+    pairs = combinations(range(len(obstacles)), 2)
+    free_first = [(a, b) if obstacles[a].free else (b, a) for a, b in pairs]
+    return [(a, b) for a, b in free_first if obstacles[a].free]
+
+
+def find_overlaps(
+    posed: Sequence[PosedShape], pairs: Sequence[tuple[int, int]], min_overlap: float = OVERLAP.min_overlap
+) -> Iterator[tuple[int, int, float]]:
+    """Pairs that overlap, and how deep, m; `min_overlap`: in sizes of the first shape."""
+    for a, b in pairs:
+        size = float(np.ptp(posed[a].shape.tessellate()[0], axis=0).max())
+        if (depth := overlap_depth(posed[a], posed[b])) > min_overlap * size:
+            yield a, b, depth
+
+
+def overlap_depth(body: PosedShape, second: PosedShape) -> float:
+    """Depth of an overlap, m: minus the minimum of the distance to `second` over a convex body; negative if apart.
+
+    Steepest descent from the points of its tessellation by ever shorter steps, each projected back onto the body.
+    """
+    x = body.pose.points_to_space(body.shape.tessellate()[0])
+    step, minimum = float(np.linalg.norm(np.ptp(x, axis=0))), second.distance(x)
+    for _ in range(OVERLAP.iterations):
+        x = x - step * second.normal(x)
+        x = x - np.maximum(body.distance(x), 0.0)[:, None] * body.normal(x)
+        minimum, step = np.minimum(minimum, second.distance(x)), OVERLAP.step_ratio * step
+    return -float(minimum.min())
+
+
+def check_free_obstacles(obstacles: Sequence[RigidObstacle]) -> None:
+    """Raise InputError where a free obstacle overlaps or touches another one at the start."""
+    posed = [obstacle.posed_at(0.0) for obstacle in obstacles]
+    for a, b, depth in find_overlaps(posed, free_pairs(obstacles), -OVERLAP.min_overlap):
+        raise InputError(
+            f"obstacle.{a}: {obstacles[a].name} moves freely and overlaps {obstacles[b].name} at the start, by "
+            f"{max(0.0, depth):.4g} m; move it away or make it smaller"
+        )

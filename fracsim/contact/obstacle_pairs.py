@@ -1,42 +1,130 @@
-"""All that a free obstacle meets beside the body: obstacles that are held or driven. No friction acts between them.
+"""Contact of a free obstacle with held or driven ones, by barriers at inset points; without friction.
 
-A free obstacle before one that is held or driven: points of the skeleton of each, and the distance to the other.
+    E = sum over points of both of  A b(gap),    gap: distance to the other shape minus the radius of the points
 
-    E = sum over points of both of  A b(gap),    gap: distance to the other shape less the radius of the skeleton
-
-A the share of a point in the surface of its shape, b the barrier of the contact with the body.
+A is the share of a point in the surface of its shape, b the barrier of the contact with the body. A shape is all within
+a radius of its inset points: for spheres and capsules a point or segment, for boxes and cylinders the edges without
+their rounding. Where two convex bodies are nearest to each other one of these points is nearest to the other body:
+exactly in 2D, and in 3D except for two edges that cross, of which points are sampled.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
-from .barrier import safe_fractions
-from .inset_points import InsetPoints, OffsetShape, inset_points
 from .laws import GapPotential
 from .node_contact import ContactForces, StepStart, evaluate_points
 from .obstacle import RigidObstacle
 from .pose import Pose, PosedShape, rotate_vectors
 from .rigid_body import PoseDerivatives, carried_point_derivatives, pose_derivatives
-from .shape_base import Shape
-from .step_limit import PoseMotion
+from .shape_base import ConvexBody, Shape, frame_about, unit_vector
+from .shapes import Capsule, OffsetShape, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
+from .step_limit import PoseMotion, safe_fractions
 from .triangle_mesh_shape import TriangleMeshShape
 
 Values = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class ObstaclePair:
-    """Of a free obstacle, the first, and another one.
+@dataclass(frozen=True)
+class InsetPolicy:
+    """Numbers of sampled points.
 
     Attributes:
-        bones: their skeletons.    areas: (n,) shares of their points, m^2.    seen: what the points of each see of the
-            other, grown by their radius.
+        edge_points: points on an edge or a segment, and circles on a cylinder.
+        circle_points: points on a circle.
+    """
+
+    edge_points: int = 9
+    circle_points: int = 24
+
+
+SAMPLES = InsetPolicy()
+
+
+@dataclass(frozen=True, eq=False)
+class InsetPoints:
+    """Points such that a shape is all within a radius of them.
+
+    Attributes:
+        points: (n, d) in the frame of the shape, m.
+        radius: m.
+        area: share of each point in the surface of the shape, m^2 (2D: m).
+    """
+
+    points: Values
+    radius: float
+    area: float = 0.0
+
+
+def inset_points(shape: Shape) -> InsetPoints:
+    """Inset points of a shape; none of half spaces and hollow shapes."""
+    if isinstance(shape, TranslatedShape):
+        original = inset_points(shape.shape)
+        return InsetPoints(original.points + shape.offset, original.radius, original.area)
+    if isinstance(shape, TriangleMeshShape):
+        return InsetPoints(shape.points, 0.0, surface_measure(shape) / len(shape.points))
+    points, radius = _points_and_radius(shape)
+    return InsetPoints(points, radius, surface_measure(shape) / max(len(points), 1))
+
+
+def _points_and_radius(shape: Shape) -> tuple[Values, float]:
+    if isinstance(shape, ConvexBody) and not shape.hollow:
+        if isinstance(shape, Sphere):
+            return np.zeros((1, shape.dim)), shape.radius
+        if isinstance(shape, Capsule):
+            along = np.linspace(-0.5, 0.5, SAMPLES.edge_points) * shape.length
+            return along[:, None] * unit_vector(shape.axis), shape.radius
+        if isinstance(shape, RoundedBox):
+            return _edge_points(np.array(shape.size) / 2 - shape.fillet), shape.fillet
+        if isinstance(shape, RoundedCylinder):
+            return _circle_points(shape), shape.fillet
+    return np.empty((0, shape.dim)), 0.0
+
+
+def surface_measure(shape: Shape) -> float:
+    """Area of the tessellation of a shape, m^2 (2D: length, m)."""
+    points, elements = shape.tessellate()
+    side = points[elements[:, 1:]] - points[elements[:, :1]]
+    if shape.dim == 2:
+        return float(np.linalg.norm(side[:, 0], axis=1).sum())
+    return float(np.linalg.norm(np.cross(side[:, 0], side[:, 1]), axis=1).sum() / 2)
+
+
+def _edge_points(half: Values) -> Values:
+    """Points on the edges of a box of half sizes (d,), m; in 2D its corners."""
+    d = len(half)
+    if d == 2:
+        return np.array(list(product((-1.0, 1.0), repeat=2))) * half
+    along = np.linspace(-1.0, 1.0, SAMPLES.edge_points)
+    lines = [np.insert(np.array(ends), axis, t) for axis in range(d) for ends in product((-1.0, 1.0), repeat=2)
+             for t in along]  # fmt: skip
+    return np.unique(np.array(lines), axis=0) * half
+
+
+def _circle_points(shape: RoundedCylinder) -> Values:
+    """Points on circles over the side of a cylinder."""
+    angle = np.arange(SAMPLES.circle_points) * (2 * np.pi / SAMPLES.circle_points)
+    radius, half = shape.radius - shape.fillet, shape.length / 2 - shape.fillet
+    circle = radius * np.column_stack([np.cos(angle), np.sin(angle)])
+    heights = np.linspace(-half, half, SAMPLES.edge_points)
+    rings = [np.column_stack([circle, np.full(SAMPLES.circle_points, height)]) for height in heights]
+    return np.concatenate(rings) @ frame_about(unit_vector(shape.axis)).T
+
+
+@dataclass(frozen=True, eq=False)
+class ObstaclePair:
+    """A free obstacle, the first, and another one.
+
+    Attributes:
+        points: their inset points.
+        areas: (n,) shares of these, m^2.
+        targets: shapes that the points of each are in contact with: the other one, grown by their radius.
     """
 
     points: tuple[InsetPoints, InsetPoints]
@@ -44,51 +132,71 @@ class ObstaclePair:
     targets: tuple[Shape, Shape]
 
     @classmethod
-    def between(cls, body: RigidObstacle, other: RigidObstacle) -> ObstaclePair:
-        """Between two obstacles."""
-        mine, its = inset_points(body.shape), inset_points(other.shape)
-        if isinstance(body.shape, TriangleMeshShape):  # which has no distance: it feels others at its points
-            nobody = InsetPoints(np.empty((0, 3)), 0.0)
-            return cls((mine, nobody), (np.full(len(mine.points), mine.area), np.empty(0)), (other.shape,) * 2)
-        areas = np.full(len(mine.points), mine.area), np.full(len(its.points), its.area)
-        seen = OffsetShape(other.shape, mine.radius), OffsetShape(body.shape, its.radius)
-        return cls((mine, its), areas, cast("tuple[Shape, Shape]", seen))  # what `touch` asks of a shape they have
+    def between(cls, body: RigidObstacle, obstacle: RigidObstacle) -> ObstaclePair:
+        """Pair of two obstacles."""
+        first, second = inset_points(body.shape), inset_points(obstacle.shape)
+        # a triangle mesh has no distance function: it is in contact with others at its own points alone
+        if isinstance(body.shape, TriangleMeshShape):
+            none = InsetPoints(np.empty((0, 3)), 0.0)
+            areas = np.full(len(first.points), first.area), np.empty(0)
+            return cls((first, none), areas, (obstacle.shape,) * 2)
+        areas = np.full(len(first.points), first.area), np.full(len(second.points), second.area)
+        targets = OffsetShape(obstacle.shape, first.radius), OffsetShape(body.shape, second.radius)
+        # an OffsetShape has all of a Shape that `evaluate_points` needs
+        return cls((first, second), areas, cast("tuple[Shape, Shape]", targets))
 
-    def sides(self, body: Pose, other: Pose) -> Iterator[tuple[Values, PosedShape]]:
-        """(n, d) points of each in space, m, and what they see of the other one."""
-        yield body.points_to_space(self.points[0].points), PosedShape(self.targets[0], other)
-        yield other.points_to_space(self.points[1].points), PosedShape(self.targets[1], body)
+    def sides(self, body: Pose, obstacle: Pose) -> Iterator[tuple[Values, PosedShape]]:
+        """(n, d) points of each obstacle in space, m, and the shape that they are in contact with."""
+        yield body.points_to_space(self.points[0].points), PosedShape(self.targets[0], obstacle)
+        yield obstacle.points_to_space(self.points[1].points), PosedShape(self.targets[1], body)
 
-    def gaps(self, body: Pose, other: Pose) -> list[Values]:
-        """(n,) of the points of each, m."""
-        return [placed.distance(x) for x, placed in self.sides(body, other)]
+    def gaps(self, body: Pose, obstacle: Pose) -> list[Values]:
+        """(n,) gaps of the points of each, m."""
+        return [posed.distance(x) for x, posed in self.sides(body, obstacle)]
 
     def contact_forces(
-        self, body: Pose, other: Pose, barrier: GapPotential, start: list[Values] | None
+        self, body: Pose, obstacle: Pose, barrier: GapPotential, start: list[Values] | None
     ) -> list[tuple[ContactForces, Values]]:
-        """What acts on the points of each, and where these are; `start`: gaps as the step began (laws)."""
-        begun: list[StepStart | None] = (
-            [None, None] if start is None else [StepStart.from_gaps(gap, body.dim) for gap in start]
-        )
-        still = np.zeros(body.dim)
+        """Forces on the points of each, and their positions (n, d), m.
+
+        Args:
+            body: pose of the free obstacle.
+            obstacle: pose of the other one.
+            barrier: b.
+            start: gaps at the start of the step, where the barrier is averaged over it.
+        """
+        starts: list[StepStart | None] = [None, None]
+        if start is not None:
+            starts = [StepStart.from_gaps(gap, body.dim) for gap in start]
+        no_motion = np.zeros(body.dim)
         return [
-            (evaluate_points(x, area, placed, barrier, None, None, still, gap), x)
-            for (x, placed), area, gap in zip(self.sides(body, other), self.areas, begun, strict=True)
+            (evaluate_points(x, area, posed, barrier, None, None, no_motion, step_start), x)
+            for (x, posed), area, step_start in zip(self.sides(body, obstacle), self.areas, starts, strict=True)
         ]
 
-    def safe_fraction(self, body: Pose, q: Values, other: Pose, its: Values) -> float:
-        """Share of the ways q and `its` (p,) of the body and the other one that leaves a tenth of each gap."""
-        (x, there), (y, here) = self.sides(body, other)
-        ways = [
-            _PairMotion(there, x - body.centre, body.centre, q, there.effective_increment(its)),
-            _PairMotion(here, y - other.centre, other.centre, its, here.effective_increment(q)),
+    def safe_fraction(self, body: Pose, q: Values, obstacle: Pose, other_q: Values) -> float:
+        """Fraction of the increments q and `other_q` (p,) of both poses that leaves a tenth of each gap."""
+        (x, target), (y, other_target) = self.sides(body, obstacle)
+        motions = [
+            _PairMotion(target, x - body.centre, body.centre, q, target.effective_increment(other_q)),
+            _PairMotion(
+                other_target, y - obstacle.centre, obstacle.centre, other_q, other_target.effective_increment(q)
+            ),
         ]
-        return min(way.safe_fraction() for way in ways)
+        return min(motion.safe_fraction() for motion in motions)
 
 
 @dataclass(frozen=True, eq=False)
 class _PairMotion:
-    """Points go with a body, arms (n, d) about its centre, by q (p,), and an obstacle before them by `its` (p,)."""
+    """Motion of points with a rigid body, and of an obstacle before them.
+
+    Attributes:
+        obstacle: at the start.
+        arm: (n, d) points relative to the centre of the body, m.
+        centre: (d,) of the body, m.
+        increment: (p,) of the body's pose.
+        obstacle_increment: (p,) of the obstacle's pose.
+    """
 
     obstacle: PosedShape
     arm: Values
@@ -97,100 +205,105 @@ class _PairMotion:
     obstacle_increment: Values
 
     def safe_fraction(self) -> float:
-        """Of the way, that leaves a tenth of each gap; 0 where one is closed."""
+        """Fraction of the motion that leaves a tenth of each gap; 0 where one is closed."""
         if not len(self.arm):
             return 1.0
         if not (self.gap(np.zeros(len(self.arm))) > 0).all():
             return 0.0
         return float(safe_fractions(self.gap, self.speed, len(self.arm)).min())
 
-    def gap(self, share: Values) -> Values:
-        """(n,) after shares (n,) of the way, m."""
-        return self.obstacle.shape.distance(self._seen(share))
+    def gap(self, fraction: Values) -> Values:
+        """(n,) gaps after fractions (n,) of the motion, m."""
+        return self.obstacle.shape.distance(self._obstacle_frame(fraction))
 
-    def speed(self, share: Values) -> Values:
-        """(n,) bounds of how fast gaps close, m per whole way (motion.Motion); a turn of the obstacle closes them by no
-        more than its size times the points' distance from its centre."""
-        d, arm = len(self.centre), np.linalg.norm(self.arm, axis=1)
-        straight, turn, turned_ = (
-            self.increment[:d] - self.obstacle_increment[:d],
-            np.linalg.norm(self.increment[d:]),
-            np.linalg.norm(self.obstacle_increment[d:]),
-        )
+    def speed(self, fraction: Values) -> Values:
+        """(n,) bounds of the closing speed, m per whole motion (step_limit.PointMotion).
+
+        A rotation of the obstacle adds at most its angle times the distance of the points from its centre.
+        """
+        d, radius = len(self.centre), np.linalg.norm(self.arm, axis=1)
+        straight = self.increment[:d] - self.obstacle_increment[:d]
+        angle, obstacle_angle = np.linalg.norm(self.increment[d:]), np.linalg.norm(self.obstacle_increment[d:])
         closing: Values = np.full(len(self.arm), float(np.linalg.norm(straight)))
         if self.obstacle.shape.convex:
-            v = self._turned(np.tile(straight, (len(self.arm), 1)), share)
-            closing = np.maximum(-np.einsum("ni,ni->n", self.obstacle.shape.normal(self._seen(share)), v), 0.0)
-        away = np.linalg.norm(self.centre - self.obstacle.pose.centre) + np.linalg.norm(straight) + arm
-        return np.asarray(closing + turn * arm + turned_ * away)
+            v = self._rotated_back(np.tile(straight, (len(self.arm), 1)), fraction)
+            normal = self.obstacle.shape.normal(self._obstacle_frame(fraction))
+            closing = np.maximum(-np.einsum("ni,ni->n", normal, v), 0.0)
+        distance = np.linalg.norm(self.centre - self.obstacle.pose.centre) + np.linalg.norm(straight) + radius
+        return np.asarray(closing + angle * radius + obstacle_angle * distance)
 
-    def _seen(self, share: Values) -> Values:
-        """(n, d) the points in the frame of the obstacle."""
+    def _obstacle_frame(self, fraction: Values) -> Values:
+        """(n, d) points in the frame of the obstacle, m."""
         d = len(self.centre)
-        along = share[:, None] * (self.increment[:d] - self.obstacle_increment[:d]) + rotate_vectors(
-            self.arm, share[:, None] * self.increment[d:]
-        )
-        return self._turned(self.centre - self.obstacle.pose.centre + along, share)
+        straight = fraction[:, None] * (self.increment[:d] - self.obstacle_increment[:d])
+        motion = straight + rotate_vectors(self.arm, fraction[:, None] * self.increment[d:])
+        return self._rotated_back(self.centre - self.obstacle.pose.centre + motion, fraction)
 
-    def _turned(self, vectors: Values, share: Values) -> Values:
-        return np.asarray(
-            rotate_vectors(vectors, -share[:, None] * self.obstacle_increment[len(self.centre) :])
-            @ self.obstacle.pose.rotation
-        )
+    def _rotated_back(self, vectors: Values, fraction: Values) -> Values:
+        """(n, d) vectors in the frame that the obstacle has at each fraction."""
+        w = -fraction[:, None] * self.obstacle_increment[len(self.centre) :]
+        return np.asarray(rotate_vectors(vectors, w) @ self.obstacle.pose.rotation)
 
 
 type PosedObstacles = Mapping[int, PosedShape] | Sequence[PosedShape]  # by the numbers of obstacles
 
 
 class ObstaclePairs:
-    """Of one free obstacle; `placed` is where all obstacles are, by their numbers."""
+    """All pairs of one free obstacle; `posed` are all obstacles at their poses, by their numbers."""
 
-    def __init__(self, body: RigidObstacle, others: dict[int, RigidObstacle], barrier: GapPotential) -> None:
-        """`others`: by their numbers."""
-        self._pairs = {number: ObstaclePair.between(body, other) for number, other in others.items()}
-        self._barrier, self._count = barrier, len(body.pose_increment(0.0, 0.0))
+    def __init__(self, body: RigidObstacle, prescribed: dict[int, RigidObstacle], barrier: GapPotential) -> None:
+        """`prescribed`: held or driven obstacles, by their numbers."""
+        self._pairs = {number: ObstaclePair.between(body, obstacle) for number, obstacle in prescribed.items()}
+        self._barrier, self._pose_size = barrier, len(body.pose_increment(0.0, 0.0))
         self._start: dict[int, list[Values]] = {}
 
-    def begin_step(self, pose: Pose, placed: PosedObstacles, *, along: bool) -> None:
-        """A step begins; `along`: barriers act along its way (laws)."""
-        each = self._pairs.items() if along else []
-        self._start = {number: stop.gaps(pose, placed[number].pose) for number, stop in each}
+    def begin_step(self, pose: Pose, posed: PosedObstacles, *, along: bool) -> None:
+        """Begin a step; `along`: barriers are averaged over it."""
+        pairs = self._pairs.items() if along else []
+        self._start = {number: pair.gaps(pose, posed[number].pose) for number, pair in pairs}
 
-    def are_open(self, pose: Pose, placed: PosedObstacles) -> bool:
-        """Whether it lies in none."""
-        found = [stop.gaps(pose, placed[number].pose) for number, stop in self._pairs.items()]
-        return all(gap.min(initial=np.inf) > 0 for both in found for gap in both)
+    def are_open(self, pose: Pose, posed: PosedObstacles) -> bool:
+        """Whether all gaps are open at a pose."""
+        gaps = [pair.gaps(pose, posed[number].pose) for number, pair in self._pairs.items()]
+        return all(gap.min(initial=np.inf) > 0 for sides in gaps for gap in sides)
 
-    def safe_fraction(self, pose: Pose, q: Values, ways: dict[int, PoseMotion]) -> float:
-        """Share of its way q (p,) that closes no gap, where others are and go by their numbers."""
-        shares = [stop.safe_fraction(pose, q, ways[n][0].pose, ways[n][1]) for n, stop in self._pairs.items()]
-        return min(shares, default=1.0)
+    def safe_fraction(self, pose: Pose, q: Values, motions: dict[int, PoseMotion]) -> float:
+        """Fraction of the increment q (p,) that leaves a tenth of each gap, with motions of the others."""
+        fractions = [
+            pair.safe_fraction(pose, q, motions[number][0].pose, motions[number][1])
+            for number, pair in self._pairs.items()
+        ]
+        return min(fractions, default=1.0)
 
-    def pose_derivatives(self, pose: Pose, placed: PosedObstacles) -> PoseDerivatives:
-        """What they do to its pose."""
-        p = self._count
+    def pose_derivatives(self, pose: Pose, posed: PosedObstacles) -> PoseDerivatives:
+        """Energy of contact with the others, and its derivatives by the pose."""
+        p = self._pose_size
         total = PoseDerivatives(0.0, np.zeros(p), np.zeros((p, p)), np.zeros((p, p)))
         for number in self._pairs:
-            (own, x), (its, y) = self._contact_forces(number, pose, placed)
-            total = total + carried_point_derivatives(own, x, pose) + pose_derivatives(its, y, pose, None, pose)
+            (of_body, x), (of_other, y) = self._contact_forces(number, pose, posed)
+            total = (
+                total + carried_point_derivatives(of_body, x, pose) + pose_derivatives(of_other, y, pose, None, pose)
+            )
         return total
 
-    def wrench(self, pose: Pose, placed: PosedObstacles) -> Values:
-        """(p,) force and moment of all of them on it, N and N m."""
-        return -self.pose_derivatives(pose, placed).gradient
+    def wrench(self, pose: Pose, posed: PosedObstacles) -> Values:
+        """(p,) force and moment of the others on the obstacle, N and N m."""
+        return -self.pose_derivatives(pose, posed).gradient
 
-    def energies(self, pose: Pose, placed: PosedObstacles) -> tuple[float, float]:
-        """What their barriers store, and what their forces in the step are the derivative of, J."""
-        found = [touch for number in self._pairs for touch, _ in self._contact_forces(number, pose, placed)]
-        return sum(touch.energy for touch in found), sum(touch.potential for touch in found)
+    def energies(self, pose: Pose, posed: PosedObstacles) -> tuple[float, float]:
+        """Energy of the barriers, and potential of their forces in the step, J."""
+        contacts = [contact for number in self._pairs for contact, _ in self._contact_forces(number, pose, posed)]
+        return sum(contact.energy for contact in contacts), sum(contact.potential for contact in contacts)
 
-    def work(self, pose: Pose, placed: PosedObstacles, ways: Mapping[int, Values] | Sequence[Values]) -> float:
-        """What they have done to it by their own ways (p,) in the step, J."""
-        done = 0.0
+    def work(self, pose: Pose, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> float:
+        """Work of the others on the obstacle by their own increments (p,) in the step, J."""
+        total = 0.0
         for number in self._pairs:
-            (own, _), (its, _) = self._contact_forces(number, pose, placed)
-            done += float((own.normal.sum(axis=0) - its.normal.sum(axis=0)) @ ways[number][: pose.dim])
-        return done
+            (of_body, _), (of_other, _) = self._contact_forces(number, pose, posed)
+            force = of_body.normal.sum(axis=0) - of_other.normal.sum(axis=0)
+            total += float(force @ increments[number][: pose.dim])
+        return total
 
-    def _contact_forces(self, number: int, pose: Pose, placed: PosedObstacles) -> list[tuple[ContactForces, Values]]:
-        return self._pairs[number].contact_forces(pose, placed[number].pose, self._barrier, self._start.get(number))
+    def _contact_forces(self, number: int, pose: Pose, posed: PosedObstacles) -> list[tuple[ContactForces, Values]]:
+        pair, start = self._pairs[number], self._start.get(number)
+        return pair.contact_forces(pose, posed[number].pose, self._barrier, start)

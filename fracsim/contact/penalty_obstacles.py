@@ -1,19 +1,16 @@
-"""Contact with obstacles in explicit steps: the same term with a penalty in place of the barrier.
+"""Terms of the balance for contact with analytic obstacles in explicit steps: a penalty in place of the barrier.
 
-    E(u) = sum over obstacles of  sum over points in touch of  k_p (d - gap)^2 / 2 + k_p |s|^2 / 2
+    E(u) = sum over obstacles of  sum over points in contact of  k_p (d - gap)^2 / 2 + k_p |s|^2 / 2
 
-d the gap from which on it acts, k_p the stiffness of a point, s the stretch of the spring by which friction holds it
-(penalty_obstacles). k_p = kappa A_p / d, A_p its share of the surface, but no more than `most` M_p, M_p what it carries
-of its nodes' mass (penalty_law): contact then adds `most` at most to the square of the body's highest frequency, from
-which the step is taken. Forces at the end of a step are those that the next one starts with; the work of both is taken
-by trapezia, as velocity Verlet steps do.
+d is the gap below which the penalty acts, k_p the stiffness of a point, s the stretch of the spring of friction.
+k_p = kappa A_p / d, A_p the share of the point in the surface, but at most `max_added` M_p, M_p its share of its nodes'
+mass. So contact adds at most `max_added` to the square of the body's highest frequency, from which the step is taken.
+Forces at the end of a step are those that the next one starts with; the work of both is summed by the trapezoidal rule,
+as in velocity Verlet.
 
-Equations: docs/theory.md#explicit-contact.
-
-Coulomb friction in explicit steps: each point in touch hangs on a spring that slips once it pulls harder than mu N.
-
-P. A. Cundall, O. D. L. Strack: A discrete numerical model for granular assemblies. Geotechnique 29 (1979) 47-65. A
-body at rest on a slope stays there: friction that is a function of the velocity alone would let it creep.
+Coulomb friction: each point in contact has a spring that slips when it pulls harder than mu N (Cundall and Strack 1979,
+A discrete numerical model for granular assemblies). So a body at rest on a slope stays; with friction that depends on
+the velocity alone it would creep.
 
 Equations: docs/theory.md#explicit-contact.
 """
@@ -28,28 +25,87 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from mpi4py import MPI
 
 from ..mesh.domain import Domain
-from ..mesh.parallel import gather
+from ..mesh.parallel import gather, sum_over_ranks
+from ..mesh.split_surface.local_surface import ParentMatrix
 from ..mesh.split_surface.point_matching import match_points
-from .friction import tangential
-from .laws import ObstacleLaw
+from ..mesh.split_surface.surface_map import SurfaceMap
+from .laws import ObstacleLaw, tangential
 from .node_contact import ContactForces
-from .obstacle import RigidObstacle
+from .obstacle import FreeObstacle, RigidMotion, RigidObstacle
 from .obstacle_term import ObstacleTerm
-from .penalty_law import NodalMassShare
-from .pose import PosedShape, min_distance
+from .pose import PosedShape, min_distance, rotation_derivative
+from .rigid_body import contact_wrench, solve_matrix
+from .rigid_obstacle_term import FreeObstacleBase
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class FrictionSprings:
-    """The springs of one obstacle.
+class PenaltyPolicy:
+    """Tuned numbers of penalty contact.
 
     Attributes:
-        points: (k,) of the surface, ascending.    slip: (k, d) by which they are stretched, m.
+        min_weight: weight of a node, in the sum of all of a point, below which it is round-off of arms that cancel.
+        near_gap: gap, in widths of the penalty, of points that may be in contact a step later.
+    """
+
+    min_weight: float = 1e-6
+    near_gap: float = 3.0
+
+
+PENALTY = PenaltyPolicy()
+
+
+class NodalMassShare:
+    """Share of points in the mass of their nodes, and bounds of frequencies of springs at points.
+
+    Points follow nodes by weights w: springs k_p between points and what is at rest are K = sum_p k_p w_p w_p^T. The
+    rows of M^-1 K bound its eigenvalues (Gershgorin), whatever the directions of the springs:
+
+        omega^2  <=  max over nodes a of  1/m_a  sum_p |w_pa| k_p S_p,    S_p = sum_b |w_pb|
+
+    With k_p = M_p the bound is 1, where M_p = A_p min over nodes a of p of  m_a / (sum_q |w_qa| A_q S_q).
+    """
+
+    def __init__(self, point_map: SurfaceMap, interpolation: ParentMatrix, mass: Values) -> None:
+        """`mass`: (owned dofs,) lumped, kg (collective)."""
+        self._interpolation, self._weights = interpolation, abs(point_map.weights)
+        self._sum = np.asarray(self._weights.sum(axis=1)).ravel()
+        self._mass = interpolation.nodal(mass)[:, 0].copy()
+
+    def node_rates(self, stiffness: Values) -> Values:
+        """(columns,) 1/m_a sum_p |w_pa| k_p S_p at nodes, 1/s^2, of k (n,), N/m (collective)."""
+        load = self._weights.T @ (stiffness * self._sum)
+        vector = np.zeros((len(load), self._interpolation.dim))
+        vector[:, 0] = load
+        summed = self._interpolation.nodal(self._interpolation.summed(vector))[:, 0]
+        return np.asarray(summed / np.maximum(self._mass, np.finfo(float).tiny))
+
+    def max_rate(self, stiffness: Values) -> float:
+        """Bound of omega^2 over all ranks, 1/s^2, of k (n,), N/m (collective)."""
+        rate = float(self.node_rates(stiffness).max(initial=0.0))
+        return float(self._interpolation.comm.allreduce(rate, op=MPI.MAX))
+
+    def point_masses(self, area: Values) -> Values:
+        """(n,) masses M_p of points with areas `area` (n,), kg (collective)."""
+        rate, weights = self.node_rates(area), self._weights.tocoo()
+        counts = weights.data > PENALTY.min_weight * self._sum[weights.row]
+        max_rate = np.zeros(len(area))
+        np.maximum.at(max_rate, weights.row[counts], rate[weights.col[counts]])
+        return np.where(max_rate > 0, area / np.where(max_rate > 0, max_rate, 1.0), 0.0)
+
+
+@dataclass(frozen=True)
+class FrictionSprings:
+    """Springs of friction of one obstacle.
+
+    Attributes:
+        points: (k,) of the surface, ascending.
+        slip: (k, d) stretch, m.
         stiffness: (k,) N/m.
     """
 
@@ -59,51 +115,65 @@ class FrictionSprings:
 
     @classmethod
     def none(cls, dim: int) -> FrictionSprings:
-        """Nothing is in touch."""
+        """No springs."""
         return cls(np.empty(0, np.int64), np.empty((0, dim)), np.empty(0))
 
     @property
     def force(self) -> Values:
-        """(k, d) on the points, N."""
+        """(k, d) forces on the points, N."""
         return -self.stiffness[:, None] * self.slip
 
     @property
     def energy(self) -> float:
-        """J."""
+        """Stored energy, J."""
         return 0.5 * float(self.stiffness @ np.sum(self.slip**2, axis=1))
 
     def stretched(
-        self, points: Ints, moved: Values, normal: Values, stiffness: Values, most: Values
+        self, points: Ints, motion: Values, normal: Values, stiffness: Values, max_force: Values
     ) -> FrictionSprings:
-        """After points (k,) in touch have moved by `moved` (k, d) over the obstacle: stretched across the `normal`
-        (k, d), by forces of at most `most` (k,), N. Points that let go lose their springs, new ones begin with none."""
-        slip = moved.copy()
-        if len(points) and len(self.points):
-            place = np.minimum(np.searchsorted(points, self.points), len(points) - 1)
-            known = points[place] == self.points
-            slip[place[known]] += self.slip[known]
-        slip = tangential(normal, slip)
-        pull = stiffness * np.linalg.norm(slip, axis=1)
-        share = np.divide(most, pull, out=np.ones(len(pull)), where=pull > most)
-        return FrictionSprings(points, share[:, None] * slip, stiffness)
+        """Springs after a motion of points in contact; points out of contact lose theirs, new ones begin with none.
 
-    def dissipated(self, before: FrictionSprings, moved: Values) -> float:
-        """What friction has taken, J, as points (n, d) moved by `moved`: its work by the trapezoidal rule, less what
-        the springs store."""
-        work = sum(float(np.vdot(each.force, moved[each.points])) for each in (before, self)) / 2
-        return before.energy - self.energy - work
+        Args:
+            points: (k,) in contact.
+            motion: (k, d) relative to the obstacle, m.
+            normal: (k, d) unit normals.
+            stiffness: (k,) N/m.
+            max_force: (k,) mu N, N.
+        """
+        slip = motion.copy()
+        if len(points) and len(self.points):
+            rows = np.minimum(np.searchsorted(points, self.points), len(points) - 1)
+            stays = points[rows] == self.points
+            slip[rows[stays]] += self.slip[stays]
+        slip = tangential(normal, slip)
+        force = stiffness * np.linalg.norm(slip, axis=1)
+        factor = np.divide(max_force, force, out=np.ones(len(force)), where=force > max_force)
+        return FrictionSprings(points, factor[:, None] * slip, stiffness)
+
+    def dissipated(self, previous: FrictionSprings, motion: Values) -> float:
+        """Energy dissipated in a step in which points moved by `motion` (n, d), m, J.
+
+        Minus the work of friction by the trapezoidal rule, minus the change of the energy of the springs.
+        """
+        work = sum(float(np.vdot(springs.force, motion[springs.points])) for springs in (previous, self)) / 2
+        return previous.energy - self.energy - work
 
 
 @dataclass(frozen=True)
 class StepEnd:
-    """What a step ended with: the springs of each obstacle, and the sums (d,) of its forces on the body, N."""
+    """Contact at the end of a step.
+
+    Attributes:
+        springs: of each obstacle.
+        forces: (d,) sum of the forces of each obstacle on the body, N.
+    """
 
     springs: list[FrictionSprings]
     forces: list[Values]
 
 
 class PenaltyObstacleTerm(ObstacleTerm):
-    """Obstacles that explicit steps run into.
+    """Obstacles in explicit steps.
 
     Attributes:
         stiffness: (n,) k_p of the points of this rank, N/m.
@@ -116,15 +186,25 @@ class PenaltyObstacleTerm(ObstacleTerm):
         obstacles: Sequence[RigidObstacle],
         law: ObstacleLaw,
         mass: Values,
-        most: float,
+        max_added: float,
     ) -> None:
-        """`mass`: (owned dofs,) lumped, kg; `most`: what contact may add to the square of the highest frequency, 1/s^2.
+        """Build the term (collective).
 
-        InputError where the body at rest lies in an obstacle (collective).
+        Args:
+            domain: mesh.
+            u: displacement.
+            obstacles: obstacles.
+            law: contact law with a penalty.
+            mass: (owned dofs,) lumped, kg.
+            max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
+
+        Raises:
+            InputError: if the body at rest overlaps an obstacle.
         """
-        self._mass, self._max_added = mass, most
-        self._step_end = self._at_rest(len(obstacles), domain.dim)
-        self._start_points: Values | None = None  # places of the points at the start of a step that is under way
+        self._mass, self._max_added = mass, max_added
+        dim, count = domain.dim, len(obstacles)
+        self._step_end = StepEnd([FrictionSprings.none(dim)] * count, [np.zeros(dim)] * count)
+        self._start_points: Values | None = None  # (n, d) at the start of a step that is not accepted yet, m
         self._springs = self._step_end.springs
         super().__init__(domain, u, obstacles, law)
         self._update_stiffness()
@@ -132,142 +212,285 @@ class PenaltyObstacleTerm(ObstacleTerm):
     def _find_facet_obstacles(self) -> list[int]:
         return []  # facets have no penalty of their own
 
-    @staticmethod
-    def _at_rest(count: int, dim: int) -> StepEnd:
-        return StepEnd([FrictionSprings.none(dim)] * count, [np.zeros(dim)] * count)
-
-    # --- how stiff it is ---
+    # --- stiffness ---
 
     def _update_stiffness(self) -> None:
-        """Stiffness of the points of the surface as it is now (collective)."""
-        at, area = self.surface.point_map, self.surface.area
-        carried = NodalMassShare(at, self.surface.interpolation, self._mass)
+        """Compute the stiffness of the points of the current surface (collective)."""
+        point_map, area = self.surface.point_map, self.surface.area
+        mass_share = NodalMassShare(point_map, self.surface.interpolation, self._mass)
         self.stiffness: Values = self.law.barrier.curvature(np.zeros(len(area))) * area
         if np.isfinite(self._max_added):
-            self.stiffness = np.minimum(self.stiffness, self._max_added * carried.point_masses(area))
-        self._fastest, self._stiffened = carried.max_rate(self.stiffness), (at, area)
+            self.stiffness = np.minimum(self.stiffness, self._max_added * mass_share.point_masses(area))
+        self._added_frequency, self._stiffness_of = mass_share.max_rate(self.stiffness), (point_map, area)
 
     def frequency_bound(self) -> float:
-        """What contact adds at most, were all points in touch, 1/s^2."""
-        return self._fastest
+        """Increase of the square of the highest frequency if all points were in contact, 1/s^2."""
+        return self._added_frequency
 
-    # --- a step ---
+    # --- steps ---
 
     def _begin_new_step(self) -> None:
         self.surface.release_points(self._level.u_n, partial(min_distance, self._kinematics.start_posed))
-        at, area = self._stiffened
-        if self.comm.allreduce(at is not self.surface.point_map or area is not self.surface.area):
+        point_map, area = self._stiffness_of
+        if self.comm.allreduce(point_map is not self.surface.point_map or area is not self.surface.area):
             self._update_stiffness()
         self._start_points = self.surface.positions(self._level.u_n)
 
-    def _evaluate_obstacle(self, number: int, placed: PosedShape) -> ContactForces:
-        law, gap = self.law.barrier, placed.distance(self.positions)
+    def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
+        law, gap = self.law.barrier, posed.distance(self.positions)
         points = np.flatnonzero((gap < law.width) & (self.surface.area > 0))
-        gap, k, normal = gap[points], self.stiffness[points], placed.normal(self.positions[points])
-        pressed = k * (law.width - gap)
-        energy, rubbed = 0.5 * float(pressed @ (law.width - gap)), np.zeros_like(normal)
-        if friction := self.obstacles[number].friction:
-            moved = self._relative_motion(number, placed)[points]
-            spring = self._step_end.springs[number].stretched(points, moved, normal, k, friction * pressed)
-            self._springs[number], rubbed, energy = spring, spring.force, energy + spring.energy
-        return ContactForces(points, energy, pressed[:, None] * normal, rubbed, 0.0, _no_tangent)
+        gap, k, normal = gap[points], self.stiffness[points], posed.normal(self.positions[points])
+        pressure = k * (law.width - gap)
+        energy, friction = 0.5 * float(pressure @ (law.width - gap)), np.zeros_like(normal)
+        if coefficient := self.obstacles[number].friction:
+            motion = self._relative_motion(number, posed)[points]
+            springs = self._step_end.springs[number].stretched(points, motion, normal, k, coefficient * pressure)
+            self._springs[number], friction, energy = springs, springs.force, energy + springs.energy
+        return ContactForces(points, energy, pressure[:, None] * normal, friction, 0.0, _no_tangent)
 
-    def _relative_motion(self, number: int, placed: PosedShape) -> Values:
-        """(n, d) way of the points over an obstacle in the step, m; none once it is over."""
+    def _relative_motion(self, number: int, posed: PosedShape) -> Values:
+        """(n, d) motion of the points relative to an obstacle in the step, m; zero once the step is accepted."""
         if self._start_points is None:
             return np.zeros_like(self.positions)
-        return np.asarray(self.positions - self._start_points - self._obstacle_point_motion(number, placed))
+        return np.asarray(self.positions - self._start_points - self._obstacle_point_motion(number, posed))
 
-    def _obstacle_point_motion(self, number: int, placed: PosedShape) -> Values:
-        """(d,) or (n, d) way in the step of what is under the points, m."""
+    def _obstacle_point_motion(self, number: int, posed: PosedShape) -> Values:
+        """(d,) or (n, d) motion of an obstacle under the points in the step, m."""
         return np.asarray(self._kinematics.increments[number][: self._domain.dim])
 
     def obstacle_forces(self) -> list[ContactForces]:
-        """What each obstacle does at the current u (collective)."""
+        """Forces of each obstacle at the current u (collective)."""
         if self._contact_forces is None:
             self._springs = list(self._step_end.springs)
         return super().obstacle_forces()
 
     def accept_step(self) -> None:
-        """The step is over: its work is summed, and its springs are those that the next begins with (collective)."""
-        found, past = self.obstacle_forces(), self._step_end
-        pushed = [(each.normal + each.friction).sum(axis=0) for each in found]
-        self._friction_loss, self._force_readings = 0.0, [-each for each in pushed]
-        for number, (obstacle, placed) in enumerate(zip(self.obstacles, self._kinematics.posed, strict=True)):
+        """Sum the work of the step, and store springs and forces for the next one (collective)."""
+        contacts, previous = self.obstacle_forces(), self._step_end
+        forces = [(contact.normal + contact.friction).sum(axis=0) for contact in contacts]
+        self._friction_loss, self._force_readings = 0.0, [-force for force in forces]
+        for number, (obstacle, posed) in enumerate(zip(self.obstacles, self._kinematics.posed, strict=True)):
             if obstacle.friction:
-                self._friction_loss += self._springs[number].dissipated(
-                    past.springs[number], self._relative_motion(number, placed)
-                )
+                motion = self._relative_motion(number, posed)
+                self._friction_loss += self._springs[number].dissipated(previous.springs[number], motion)
         for number in self._kinematics.prescribed:
             shift = self._kinematics.increments[number][: self._domain.dim]
-            self._obstacle_work[number] = float((pushed[number] + past.forces[number]) @ shift) / 2
-        self._step_end, self._start_points = StepEnd(self._springs, pushed), None
+            self._obstacle_work[number] = float((forces[number] + previous.forces[number]) @ shift) / 2
+        self._step_end, self._start_points = StepEnd(self._springs, forces), None
 
-    # --- its past ---
+    # --- state ---
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
-        """Springs of points that are still there go on (collective)."""
-        held = [(spring, self.surface.identity(spring.points)) for spring in self._step_end.springs]
+        """Add new crack faces; springs of points that still exist stay (collective)."""
+        springs = [(spring, self.surface.identity(spring.points)) for spring in self._step_end.springs]
         super().edges_broke(pattern)
-        self._step_end = StepEnd([self._matched_springs(*each) for each in held], self._step_end.forces)
+        self._step_end = StepEnd([self._matched_springs(*item) for item in springs], self._step_end.forces)
         self._update_stiffness()
 
-    def _matched_springs(self, spring: FrictionSprings, rows: Values) -> FrictionSprings:
-        """Springs of the points with the identity `rows`, as the surface is now."""
-        every = np.arange(len(self.surface.area))
-        at = match_points(rows, self.surface.identity(every)) if len(rows) else spring.points
-        kept = np.flatnonzero(at >= 0)
-        kept = kept[np.argsort(at[kept])]
-        return FrictionSprings(at[kept], spring.slip[kept], spring.stiffness[kept])
+    def _matched_springs(self, spring: FrictionSprings, identity: Values) -> FrictionSprings:
+        """Springs of points with rows of `identity`, on the current surface."""
+        points = spring.points
+        if len(identity):
+            points = match_points(identity, self.surface.identity(np.arange(len(self.surface.area))))
+        matched = np.flatnonzero(points >= 0)
+        matched = matched[np.argsort(points[matched])]
+        return FrictionSprings(points[matched], spring.slip[matched], spring.stiffness[matched])
 
     def snapshot(self) -> object:
-        """That of the points, and what the step ended with."""
+        """State of the surface, and contact at the end of the last step."""
         return super().snapshot(), self._step_end
 
     def restore(self, memory: object) -> None:
-        """Be again what `memory` gave (not collective)."""
-        points, self._step_end = cast("tuple[object, StepEnd]", memory)
-        super().restore(points)
+        """Restore a snapshot (not collective)."""
+        surface, self._step_end = cast("tuple[object, StepEnd]", memory)
+        super().restore(surface)
 
     def to_checkpoint(self) -> dict[str, Values]:
-        """With rows of springs: obstacle, rank, share of the surface, identity, stretch, stiffness; and sums of forces
-        on each rank, on rank 0 (collective). Ranks that share a point have a spring there each."""
+        """Arrays for a checkpoint (collective).
+
+        With rows of springs on rank 0: obstacle, rank, area, identity, stretch, stiffness; and sums of forces on each
+        rank. Ranks that share a point have a spring each.
+        """
         rows = [
-            np.column_stack([np.full(len(each.points), k), np.full(len(each.points), self.comm.rank),
-                             self.surface.area[each.points], self.surface.identity(each.points),
-                             each.slip, each.stiffness])
-            for k, each in enumerate(self._step_end.springs)
+            np.column_stack([np.full(len(spring.points), number), np.full(len(spring.points), self.comm.rank),
+                             self.surface.area[spring.points], self.surface.identity(spring.points), spring.slip,
+                             spring.stiffness])
+            for number, spring in enumerate(self._step_end.springs)
         ]  # fmt: skip
         gathered = gather(self.comm, (np.concatenate(rows), np.array(self._step_end.forces)))
         if gathered is None:
             return super().to_checkpoint()
-        springs, pushed = zip(*gathered, strict=True)
-        return super().to_checkpoint() | {"springs": np.concatenate(springs), "pushed": np.array(pushed)}
+        springs, forces = zip(*gathered, strict=True)
+        return super().to_checkpoint() | {"springs": np.concatenate(springs), "pushed": np.array(forces)}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Be again what `saved` gave."""
+        """Set the state from the arrays of a checkpoint."""
         super().from_checkpoint(saved)
-        rows, pushed = saved["springs"], saved["pushed"]
+        rows, forces = saved["springs"], saved["pushed"]
         springs = [self._springs_from_rows(rows[rows[:, 0] == number, 1:]) for number in range(len(self.obstacles))]
-        if len(pushed) == self.comm.size:
-            own = pushed[self.comm.rank]
-        else:  # by other ranks: the sum is what counts
-            own = pushed.sum(axis=0) if self.comm.rank == 0 else np.zeros_like(pushed[0])
-        self._step_end = StepEnd(springs, list(own))
+        if len(forces) == self.comm.size:
+            local = forces[self.comm.rank]
+        else:
+            # written by another number of ranks: only the sum counts
+            local = forces.sum(axis=0) if self.comm.rank == 0 else np.zeros_like(forces[0])
+        self._step_end = StepEnd(springs, list(local))
 
     def _springs_from_rows(self, rows: Values) -> FrictionSprings:
-        """Springs of the points of this rank, from rows of all ranks as `saved` has them. Where several had a spring at
-        the same point that of this rank counts, or of the lowest, for the share that this rank has now."""
-        rank, area, known, slip, k = np.split(rows, [1, 2, -1 - self._domain.dim, -1], axis=1)
-        at = match_points(known, self.surface.identity(np.arange(len(self.surface.area))))
-        order = np.lexsort((rank[:, 0], rank[:, 0] != self.comm.rank, at))
-        order = order[at[order] >= 0]
-        points, first = np.unique(at[order], return_index=True)
-        which = order[first]
-        had = area[which, 0]
-        share = np.where(had > 0, self.surface.area[points] / np.where(had > 0, had, 1.0), 1.0)
-        return FrictionSprings(points, slip[which], share * k[which, 0])
+        """Springs of the points of this rank, from rows of all ranks in a checkpoint.
+
+        Where several ranks had a spring at one point, that of this rank counts, or of the lowest one, for the area
+        that this rank has now.
+        """
+        rank, area, identity, slip, k = np.split(rows, [1, 2, -1 - self._domain.dim, -1], axis=1)
+        matched = match_points(identity, self.surface.identity(np.arange(len(self.surface.area))))
+        order = np.lexsort((rank[:, 0], rank[:, 0] != self.comm.rank, matched))
+        order = order[matched[order] >= 0]
+        points, first = np.unique(matched[order], return_index=True)
+        selected = order[first]
+        old_area = area[selected, 0]
+        factor = np.where(old_area > 0, self.surface.area[points] / np.where(old_area > 0, old_area, 1.0), 1.0)
+        return FrictionSprings(points, slip[selected], factor * k[selected, 0])
 
 
 def _no_tangent() -> tuple[Values, Values]:
     raise NotImplementedError("explicit steps ask for no tangent")
+
+
+# --- free obstacles ---
+
+
+class VerletObstacle:
+    """Free obstacle in explicit steps: velocity Verlet of its momentum.
+
+        p_{n+1/2} = p_n + dt/2 f_n,    z = dt M^-1 p_{n+1/2},    p_{n+1} = p_{n+1/2} + dt/2 f_{n+1}
+
+    p is the momentum of z, M the mass matrix at the middle of the step. Forces and moments are those on the points
+    themselves: body and obstacle exchange momentum to round-off, in steps of any size.
+
+    Attributes:
+        body: the obstacle.
+        motion: its state of motion at the start of a step, until that is accepted.
+        gravity_work: work of gravity in the last step, J.
+    """
+
+    gravity_work: float = 0.0
+
+    def __init__(self, body: FreeObstacle) -> None:
+        self.body, self.motion = body, body.start_motion()
+
+    def reset_pose(self) -> PosedShape:
+        """Pose of the state of motion."""
+        return PosedShape(self.body.shape, self.motion.pose)
+
+    def begin_step(self, dt: float) -> PosedShape:
+        """Begin a step of dt, s; returns the obstacle at the pose of its end."""
+        start, basis = self.motion.pose, self.body.motion_basis
+        self._dt, self._half_momentum = dt, self.motion.momentum + dt / 2 * self.motion.force
+        half = dt / 2 * solve_matrix(self.body.mass_matrix(start.rotation), self._half_momentum)
+        mass = self.body.mass_matrix(start.incremented(basis @ half).rotation)
+        self._increment: Values = np.asarray(basis @ (dt * solve_matrix(mass, self._half_momentum)))
+        return PosedShape(self.body.shape, start.incremented(self._increment))
+
+    def end_step(self, posed: PosedShape, wrench: Values) -> float:
+        """Accept the step; returns the work of contact on the obstacle, J.
+
+        Args:
+            posed: obstacle at the end.
+            wrench: (p,) force and moment of the body on it there, N and N m.
+        """
+        start, body, pose = self.motion, self.body, posed.pose
+        force = body.motion_basis.T @ (wrench - body.gravity_potential(pose)[1])
+        rotation = pose.rotation_vector() if pose.dim == 3 else start.rotation + self._increment[2:]
+        self.motion = RigidMotion(pose, self._half_momentum + self._dt / 2 * force, force, rotation)
+        self.gravity_work = body.gravity_potential(start.pose)[0] - body.gravity_potential(pose)[0]
+        change = float(body.history_values(self.motion)[-1] - body.history_values(start)[-1])
+        return change - self.gravity_work
+
+    def contact_point_motion(self, x: Values, posed: PosedShape) -> Values:
+        """(n, d) motion in the step of the obstacle's points that were at x (n, d) at its start, m."""
+        return posed.pose.points_to_space(self.motion.pose.to_body(x)) - x
+
+    def spring_stiffness(self, x: Values, k: Values, posed: PosedShape) -> Values:
+        """(k, k) stiffness by z of springs k (n,), N/m, in any direction at positions x (n, d), m."""
+        arm = x - posed.pose.centre
+        translation = np.broadcast_to(-np.eye(arm.shape[1]), (len(arm), arm.shape[1], arm.shape[1]))
+        J = np.concatenate([translation, rotation_derivative(arm)], axis=2) @ self.body.motion_basis
+        return np.asarray(np.einsum("n,nip,niq->pq", k, J, J))
+
+    def max_frequency(self, stiffness: Values, posed: PosedShape) -> float:
+        """Square of the highest frequency on springs of a stiffness (k, k), with the body at rest, 1/s^2."""
+        mass = self.body.mass_matrix(posed.pose.rotation)
+        return float(np.linalg.eigvals(solve_matrix(mass, stiffness)).real.max(initial=0.0))
+
+
+class PenaltyFreeObstacleTerm(FreeObstacleBase, PenaltyObstacleTerm):
+    """Obstacles, at least one of them free, in explicit steps; they are not in contact with one another."""
+
+    free: dict[int, VerletObstacle]
+
+    def __init__(
+        self,
+        domain: Domain,
+        u: fem.Function,
+        obstacles: Sequence[RigidObstacle],
+        law: ObstacleLaw,
+        mass: Values,
+        max_added: float,
+    ) -> None:
+        """As of PenaltyObstacleTerm (collective)."""
+        self.free = {
+            number: VerletObstacle(obstacle)
+            for number, obstacle in enumerate(obstacles)
+            if isinstance(obstacle, FreeObstacle)
+        }
+        super().__init__(domain, u, obstacles, law, mass, max_added)
+
+    def frequency_bound(self) -> float:
+        """Increase of the square of the highest frequency, with that of the lightest obstacle, 1/s^2 (collective).
+
+        The squares of a body and an obstacle on one spring add up.
+        """
+        self.obstacle_forces()
+        return super().frequency_bound() + max(self._obstacle_frequency(*item) for item in self.free.items())
+
+    def _obstacle_frequency(self, number: int, obstacle: VerletObstacle) -> float:
+        posed = self._kinematics.posed[number]
+        near = np.flatnonzero(posed.distance(self.positions) < PENALTY.near_gap * self.law.barrier.width)
+        stiffness = obstacle.spring_stiffness(self.positions[near], self.stiffness[near], posed)
+        return obstacle.max_frequency(sum_over_ranks(self.comm, stiffness.reshape(-1)).reshape(stiffness.shape), posed)
+
+    # --- steps ---
+
+    def _begin_new_step(self) -> None:
+        super()._begin_new_step()
+        for number, obstacle in self.free.items():
+            self._kinematics.posed[number] = obstacle.begin_step(self._level.dt)
+
+    def _obstacle_point_motion(self, number: int, posed: PosedShape) -> Values:
+        if number in self.free and self._start_points is not None:
+            return self.free[number].contact_point_motion(self._start_points, posed)
+        return super()._obstacle_point_motion(number, posed)
+
+    def accept_step(self) -> None:
+        """Sum the work of the step, and give free obstacles their momentum (collective)."""
+        super().accept_step()
+        for number, obstacle in self.free.items():
+            posed, contact = self._kinematics.posed[number], self.obstacle_forces()[number]
+            wrench = contact_wrench(contact, self.positions, posed.pose)
+            work = obstacle.end_step(posed, sum_over_ranks(self.comm, wrench))
+            self._obstacle_work[number] = 0.0 if self.comm.rank else -work
+
+    def step_work(self) -> tuple[float, float]:
+        """Work of the obstacles' own motion, and of gravity on free ones (on rank 0); dissipation by friction, J."""
+        work, dissipation = super().step_work()
+        by_gravity = 0.0 if self.comm.rank else sum(obstacle.gravity_work for obstacle in self.free.values())
+        return work + by_gravity, dissipation
+
+    # --- state ---
+
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
+        """Set the state from the arrays of a checkpoint."""
+        super().from_checkpoint(saved)
+        for number, obstacle in self.free.items():
+            self._kinematics.hold_at_start(number, obstacle.reset_pose())
+        self.update_displacement()

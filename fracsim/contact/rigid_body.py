@@ -1,30 +1,20 @@
-"""A step of a free obstacle: its pose as the minimum of an incremental potential, for a body that is where it is.
+"""Motion of free obstacles in an implicit step: the pose as minimiser of an incremental potential.
 
-z (k,) is its way in the step, pose(z) = start moved by q = ways @ z, E(z) and V(z) the energies of contact and weight.
-The scheme of the study steps the momentum M dz/dt as it steps that of every node, with M (inertia in axes of space)
-held where the obstacle will be half-way; its unknown is s z, s the level of the step where forces balance (term.Level),
-contact enters as a blow of factor k (blow), and
+z (k,) is the increment of the step, pose(z) the start incremented by q = motion_basis @ z. E(z) and V(z) are the
+energies of contact and weight. The scheme steps the momentum M dz/dt as that of every node, with M at the middle of
+the step. Its unknown is s z, s the level of the step at which forces balance, k the factor of contact in the step:
 
     Phi(z) = c_a / 2 (s z - z_a) . M (s z - z_a) + s^2 (k E(z) + V(z)) - s b . z,    b: (1 - s) times the weight.
 
-So the linear momentum that body and obstacle exchange is the same to the last digit, in 2D the angular one too, and
-without a moment the angular momentum of a body that tumbles stays as it is. In 3D a moment would act through J(w)^T
-(pose), an error of the order of the turn in a step; the momentum at the end is therefore that of the moment itself.
+So the linear momentum that body and obstacle exchange is equal to round-off, in 2D the angular momentum too. In 3D a
+moment would act through J(w)^T (pose), an error of the order of the rotation in a step; the momentum at the end is
+therefore that of the moment itself.
+
+Points depend on the obstacle through x - c alone, in its frame. With D the energy of a point by its position there, y
+its arm and J = [-1, G(y)] (pose), the derivative by an increment (t, w) is J^T D'. The second derivative is J^T D'' J
+and, of forces D' that rotate with the obstacle, G(D') between t and w and `rotation_second_derivative` in w.
 
 Equations: docs/theory.md#rigid-obstacles.
-
-What contact does to the pose of an obstacle: energy of the points in touch, and its derivatives.
-
-Points see the obstacle through x - c alone, turned with it. With D the energy of a point as a function of its place
-seen from the obstacle, y its arm and J = [-1, G(y)] (pose), the derivative by an increment (t, w) is J^T D', the second
-one J^T D'' J and, of forces D' that turn with the obstacle, G(D') between t and w and `second_order_turn` in w.
-
-How far a free obstacle is on its way with a step of Newton's method that takes it along.
-
-Poses of several rigid bodies as the least of one potential: the sum of theirs, with barriers between them.
-
-Phi(z) = sum over bodies of Phi_i(z_i) (rigid_body) + s^2 k sum over pairs of E_ij(z_i, z_j), by Newton's method on ways
-that pass through nothing. One body by itself is the same with no pair.
 """
 
 from __future__ import annotations
@@ -46,19 +36,42 @@ from .obstacle import FreeObstacle, RigidMotion
 from .pose import Pose, left_jacobian, left_jacobian_derivative, rotation_derivative, rotation_second_derivative
 
 Values = npt.NDArray[np.float64]
-ITERATIONS = 100
-SMALL = 1e-18  # share of the energies at play: Newton's decrement where z is found
-ROUND_OFF = 1e-13  # share of the energies at play by which Phi may be wrong
-SHORTEST = 1e-12  # share of a step of Newton's method
+
+
+@dataclass(frozen=True)
+class RigidSolverPolicy:
+    """Tuned numbers of Newton's method for the poses of free obstacles.
+
+    Attributes:
+        max_iterations: of Newton's method.
+        decrement_tolerance: Newton's decrement, in the energies involved, at which it ends.
+        round_off: error of Phi, in the energies involved, that the line search tolerates.
+        min_fraction: of a step of Newton's method in the line search.
+        sufficient_decrease: part of the predicted decrease that a step must achieve (Armijo).
+    """
+
+    max_iterations: int = 100
+    decrement_tolerance: float = 1e-18
+    round_off: float = 1e-13
+    min_fraction: float = 1e-12
+    sufficient_decrease: float = 1e-4
+
+
+SOLVER = RigidSolverPolicy()
+
+
+# --- derivatives of contact by a pose ---
 
 
 @dataclass(frozen=True)
 class PoseDerivatives:
-    """Of one obstacle, summed over its points.
+    """Energy of contact of one obstacle, and its derivatives by an increment of the pose.
 
     Attributes:
-        energy: of barrier and friction, J.    gradient: (p,) by an increment of the pose.    hessian: (p, p).
-        stiffness: (p, p) the part of the Hessian that is sure to be positive semi-definite.
+        energy: of barrier and friction, J.
+        gradient: (p,) minus force and moment, N and N m.
+        hessian: (p, p).
+        stiffness: (p, p) positive semi-definite part of the Hessian.
     """
 
     energy: float
@@ -66,83 +79,110 @@ class PoseDerivatives:
     hessian: Values
     stiffness: Values
 
-    def __add__(self, other: PoseDerivatives) -> PoseDerivatives:
-        """Both together."""
+    def __add__(self, second: PoseDerivatives) -> PoseDerivatives:
+        """Sum of both."""
         return PoseDerivatives(
-            self.energy + other.energy, self.gradient + other.gradient, self.hessian + other.hessian,
-            self.stiffness + other.stiffness,
+            self.energy + second.energy, self.gradient + second.gradient, self.hessian + second.hessian,
+            self.stiffness + second.stiffness,
         )  # fmt: skip
 
 
 def pose_derivatives(
-    found: ContactForces, x: Values, pose: Pose, held: LaggedContact | None, start: Pose
+    contact: ContactForces, x: Values, pose: Pose, lagged: LaggedContact | None, start: Pose
 ) -> PoseDerivatives:
-    """Of points in touch at x (n, d), m; friction holds the places of the obstacle that were under them at its pose at
-    the `start` of the step, not those that are there now."""
-    arm = x[found.points] - pose.centre
-    J, gradient = _by_pose(arm), -found.normal
-    stiffness, hessian = (_summed(J, blocks) for blocks in (found.normal_stiffness, found.normal_hessian))
-    if (inner := found.facets) is not None:
-        facing = _of_facets(inner, x, pose)
-        stiffness, hessian = stiffness + _summed(facing, inner.stiffness), hessian + _summed(facing, inner.hessian)
-    hessian = hessian + _turning_with(gradient, arm)
-    total = np.einsum("ndp,nd->p", J, gradient)
-    if held is not None and len(held.points):
-        arm = _under(found, arm, pose, held, start)
-        J = _by_pose(arm)
-        stick = _summed(J, found.friction_hessian)
-        total = total - np.einsum("ndp,nd->p", J, found.friction)
-        stiffness, hessian = stiffness + stick, hessian + stick
+    """Derivatives of contact of points by the pose of an obstacle.
+
+    Args:
+        contact: forces on points.
+        x: (n, d) points, m.
+        pose: of the obstacle.
+        lagged: contact at the start of the step. Friction holds the points of the obstacle that were under it then.
+        start: pose of the obstacle at the start of the step.
+    """
+    arm = x[contact.points] - pose.centre
+    J, gradient = _jacobian(arm), -contact.normal
+    stiffness, hessian = (_congruence(J, blocks) for blocks in (contact.normal_stiffness, contact.normal_hessian))
+    if (facets := contact.facets) is not None:
+        facet_J = _facet_jacobian(facets, x, pose)
+        stiffness, hessian = (
+            stiffness + _congruence(facet_J, facets.stiffness),
+            hessian + _congruence(facet_J, facets.hessian),
+        )
+    hessian = hessian + _rotating_forces(gradient, arm)
+    pose_gradient = np.einsum("ndp,nd->p", J, gradient)
+    if lagged is not None and len(lagged.points):
+        arm = _friction_arms(contact, arm, pose, lagged, start)
+        J = _jacobian(arm)
+        friction = _congruence(J, contact.friction_hessian)
+        pose_gradient = pose_gradient - np.einsum("ndp,nd->p", J, contact.friction)
+        stiffness, hessian = stiffness + friction, hessian + friction
         d = pose.dim
-        hessian[d:, d:] += rotation_second_derivative(found.friction, arm).sum(axis=0)
-    return PoseDerivatives(found.potential, total, hessian, stiffness)
+        hessian[d:, d:] += rotation_second_derivative(contact.friction, arm).sum(axis=0)
+    return PoseDerivatives(contact.potential, pose_gradient, hessian, stiffness)
 
 
-def carried_point_derivatives(found: ContactForces, x: Values, pose: Pose) -> PoseDerivatives:
-    """Of points in touch at x (n, d), m, that the body carries itself: they go by -J q."""
-    arm = x[found.points] - pose.centre
-    J, gradient = _by_pose(arm), -found.normal
-    stiffness, hessian = (_summed(J, blocks) for blocks in (found.stiffness, found.normal_hessian))
+def carried_point_derivatives(contact: ContactForces, x: Values, pose: Pose) -> PoseDerivatives:
+    """Derivatives of contact of points x (n, d), m, that the obstacle itself carries, by its pose."""
+    arm = x[contact.points] - pose.centre
+    J, gradient = _jacobian(arm), -contact.normal
+    stiffness, hessian = (_congruence(J, blocks) for blocks in (contact.stiffness, contact.normal_hessian))
     d = pose.dim
     hessian[d:, d:] += rotation_second_derivative(gradient, arm).sum(axis=0)
-    return PoseDerivatives(found.potential, -np.einsum("ndp,nd->p", J, gradient), hessian, stiffness)
+    # points move by -J q
+    return PoseDerivatives(contact.potential, -np.einsum("ndp,nd->p", J, gradient), hessian, stiffness)
 
 
-def mixed_pose_hessian(found: ContactForces, x: Values, own: Pose, other: Pose) -> tuple[Values, Values]:
-    """(p, p) second derivative of the energy of points at x (n, d) that one body carries before another one, by
-    increments of both their poses, exact and of the positive part."""
-    at, d = x[found.points], own.dim
-    mine, its = _by_pose(at - own.centre), _by_pose(at - other.centre)
-    turned = its.copy()
-    n, p = len(at), its.shape[2]
+def mixed_pose_hessian(contact: ContactForces, x: Values, carrier: Pose, second: Pose) -> tuple[Values, Values]:
+    """(p, p) second derivatives of the energy by the poses of a carrier of points and of another obstacle.
+
+    Args:
+        contact: forces on points.
+        x: (n, d) points, m.
+        carrier: pose of the obstacle that carries the points.
+        other: pose of the obstacle before them.
+
+    Returns:
+        The exact one, and that of the positive part.
+    """
+    points, d = x[contact.points], carrier.dim
+    carrier_J, other_J = _jacobian(points - carrier.centre), _jacobian(points - second.centre)
+    rotating = other_J.copy()
+    n, p = len(points), other_J.shape[2]
     exact, stiffness = (
-        -mine.reshape(n * d, p).T @ (blocks @ its).reshape(n * d, p)
-        for blocks in (found.normal_hessian, found.stiffness)
+        -carrier_J.reshape(n * d, p).T @ (blocks @ other_J).reshape(n * d, p)
+        for blocks in (contact.normal_hessian, contact.stiffness)
     )
-    turned[:, :, :d], turned[:, :, d:] = 0.0, rotation_derivative(-found.normal)
-    return np.asarray(exact + mine.reshape(n * d, p).T @ turned.reshape(n * d, p)), np.asarray(stiffness)
+    rotating[:, :, :d], rotating[:, :, d:] = 0.0, rotation_derivative(-contact.normal)
+    exact = exact + carrier_J.reshape(n * d, p).T @ rotating.reshape(n * d, p)
+    return np.asarray(exact), np.asarray(stiffness)
 
 
 def point_set_derivatives(
     energy: float, gradient: Values, exact: csr_matrix, stiff: csr_matrix, arm: Values
 ) -> PoseDerivatives:
-    """Of all points that the body carries, with arms (m, d): derivatives (m, d) of the energy by them, and second ones
-    (m d, m d), exact and positive semi-definite."""
+    """Derivatives by the pose of an energy of all points that the obstacle carries.
+
+    Args:
+        energy: J.
+        gradient: (m, d) by the points, N.
+        exact: (m d, m d) second derivatives, N/m.
+        stiff: (m d, m d) their positive semi-definite part.
+        arm: (m, d) of the points about the centre, m.
+    """
     d, J = arm.shape[1], point_jacobian(arm).reshape(arm.size, -1)
-    hessian, stiffness = (np.asarray(J.T @ (each @ J)) for each in (exact, stiff))
+    hessian, stiffness = (np.asarray(J.T @ (blocks @ J)) for blocks in (exact, stiff))
     hessian[d:, d:] += rotation_second_derivative(gradient, arm).sum(axis=0)
     return PoseDerivatives(energy, J.T @ gradient.reshape(-1), hessian, stiffness)
 
 
 def point_jacobian(arm: Values) -> Values:
-    """(m, d, p) how points with arms (m, d) go with an increment of the pose."""
-    return -_by_pose(arm)
+    """(m, d, p) derivatives of points with arms (m, d), m, by an increment of the pose."""
+    return -_jacobian(arm)
 
 
-def contact_wrench(found: ContactForces, x: Values, pose: Pose) -> Values:
-    """(p,) force and moment of the body on the obstacle about its reference point, N and N m: action and reaction at
-    the points themselves."""
-    return resultant(-(found.normal + found.friction), x[found.points] - pose.centre)
+def contact_wrench(contact: ContactForces, x: Values, pose: Pose) -> Values:
+    """(p,) force and moment of the body, points x (n, d), on the obstacle about its reference point, N and N m."""
+    return resultant(-(contact.normal + contact.friction), x[contact.points] - pose.centre)
 
 
 def resultant(force: Values, arm: Values) -> Values:
@@ -152,85 +192,106 @@ def resultant(force: Values, arm: Values) -> Values:
 
 
 def point_pose_hessian(
-    found: ContactForces, x: Values, pose: Pose, held: LaggedContact | None, start: Pose, *, exact: bool = False
+    contact: ContactForces,
+    x: Values,
+    pose: Pose,
+    lagged: LaggedContact | None,
+    start: Pose,
+    *,
+    exact: bool = False,
 ) -> Values:
-    """(k, d, p) derivative of minus the forces on the points by an increment of the pose, as `stiffness` has it, or
-    `exact`; friction as in `push`: with an arm other than that of the stiffness Newton's method would creep."""
-    arm = x[found.points] - pose.centre
-    result = np.asarray((found.normal_hessian if exact else found.normal_stiffness) @ _by_pose(arm))
-    if held is not None and len(held.points):
-        result = result + found.friction_hessian @ _by_pose(_under(found, arm, pose, held, start))
+    """(k, d, p) derivatives of minus the forces on points by an increment of the pose.
+
+    As `stiffness` has it, or `exact`. Friction as in `pose_derivatives`: with an arm other than that of the stiffness
+    Newton's method would creep.
+    """
+    arm = x[contact.points] - pose.centre
+    result = np.asarray((contact.normal_hessian if exact else contact.normal_stiffness) @ _jacobian(arm))
+    if lagged is not None and len(lagged.points):
+        friction_arm = _friction_arms(contact, arm, pose, lagged, start)
+        result = result + contact.friction_hessian @ _jacobian(friction_arm)
     if exact:
-        result[:, :, pose.dim :] += rotation_derivative(found.normal)
-    if (inner := found.facets) is not None:
-        blocks = (inner.hessian if exact else inner.stiffness) @ _of_facets(inner, x, pose)
-        at = np.searchsorted(found.points, inner.corners)
-        np.add.at(result, at, blocks.reshape(*at.shape, x.shape[1], -1))
+        result[:, :, pose.dim :] += rotation_derivative(contact.normal)
+    if (facets := contact.facets) is not None:
+        blocks = (facets.hessian if exact else facets.stiffness) @ _facet_jacobian(facets, x, pose)
+        rows = np.searchsorted(contact.points, facets.corners)
+        np.add.at(result, rows, blocks.reshape(*rows.shape, x.shape[1], -1))
     return result
 
 
-def _under(found: ContactForces, arm: Values, pose: Pose, held: LaggedContact, start: Pose) -> Values:
-    """(k, d) arms of what friction holds: places of the obstacle that were under points as the step began."""
-    arm, turned = arm.copy(), pose.rotation @ start.rotation.T
-    arm[np.searchsorted(found.points, held.points)] = (held.obstacle_point - start.centre) @ turned.T
+def _friction_arms(contact: ContactForces, arm: Values, pose: Pose, lagged: LaggedContact, start: Pose) -> Values:
+    """(k, d) arms of the points of the obstacle that were under the points in lagged contact, m."""
+    arm, rotation = arm.copy(), pose.rotation @ start.rotation.T
+    arm[np.searchsorted(contact.points, lagged.points)] = (lagged.obstacle_point - start.centre) @ rotation.T
     return arm
 
 
-def _by_pose(arm: Values) -> Values:
-    """(n, d, p) J."""
-    still = np.broadcast_to(-np.eye(arm.shape[1]), (len(arm), arm.shape[1], arm.shape[1]))
-    return np.concatenate([still, rotation_derivative(arm)], axis=2)
+def _jacobian(arm: Values) -> Values:
+    """(n, d, p) J of arms (n, d), m."""
+    translation = np.broadcast_to(-np.eye(arm.shape[1]), (len(arm), arm.shape[1], arm.shape[1]))
+    return np.concatenate([translation, rotation_derivative(arm)], axis=2)
 
 
-def _of_facets(inner: FacetCoupling, x: Values, pose: Pose) -> Values:
+def _facet_jacobian(facets: FacetCoupling, x: Values, pose: Pose) -> Values:
     """(k, c d, p) J of the corners of facets."""
-    k, c = inner.corners.shape
+    k, c = facets.corners.shape
     d = x.shape[1]
-    return _by_pose(x[inner.corners.reshape(-1)] - pose.centre).reshape(k, c * d, -1)
+    return _jacobian(x[facets.corners.reshape(-1)] - pose.centre).reshape(k, c * d, -1)
 
 
-def _summed(J: Values, blocks: Values) -> Values:
-    """(p, p) sum of J^T B J."""
+def _congruence(J: Values, blocks: Values) -> Values:
+    """(p, p) sum of J^T B J over blocks B (n, i, i) and J (n, i, p)."""
     n, i, p = J.shape
     return np.asarray(J.reshape(n * i, p).T @ (blocks @ J).reshape(n * i, p))
 
 
-def _turning_with(gradient: Values, arm: Values) -> Values:
-    """(p, p) of normal forces, which turn with the obstacle."""
+def _rotating_forces(gradient: Values, arm: Values) -> Values:
+    """(p, p) second derivative due to normal forces, which rotate with the obstacle."""
     d = arm.shape[1]
-    mixed, twice = rotation_derivative(gradient).sum(axis=0), rotation_second_derivative(gradient, arm).sum(axis=0)
-    return np.block([[np.zeros((d, d)), mixed], [mixed.T, twice]])
+    mixed = rotation_derivative(gradient).sum(axis=0)
+    by_rotation = rotation_second_derivative(gradient, arm).sum(axis=0)
+    return np.block([[np.zeros((d, d)), mixed], [mixed.T, by_rotation]])
+
+
+# --- poses ---
 
 
 @dataclass(frozen=True)
 class PosePredictor:
-    """From points at x (n, d) by `moved` (n, d), m, and from the obstacle's way z (k,) by `dz`."""
+    """Linear path of a step of Newton's method that moves points and an obstacle together.
+
+    Attributes:
+        positions: (n, d) points at its start, m.
+        motion: (n, d) of the points, m.
+        z: (k,) increment of the obstacle at its start.
+        dz: (k,) its change.
+    """
 
     positions: Values
     motion: Values
     z: Values
     dz: Values
 
-    def fraction_at(self, x: Values, comm: MPI.Comm = MPI.COMM_SELF) -> float:
-        """Of the way, where the points of all ranks of `comm` are at x (n, d) now: the nearest place on it
-        (collective)."""
-        gone, length = sum_over_ranks(
+    def fraction_at(self, x: Values, comm: MPI.Intracomm = MPI.COMM_SELF) -> float:
+        """Fraction of the path nearest to the points of all ranks at x (n, d), m (collective)."""
+        along, length = sum_over_ranks(
             comm, [float(np.vdot(x - self.positions, self.motion)), float(np.vdot(self.motion, self.motion))]
         )
-        return float(np.clip(gone / length, 0.0, 1.0)) if length > 0 else 0.0
+        return float(np.clip(along / length, 0.0, 1.0)) if length > 0 else 0.0
 
-    def way_at(self, share: float) -> Values:
-        """(k,) z there."""
-        return self.z + share * self.dz
+    def way_at(self, fraction: float) -> Values:
+        """(k,) z at a fraction of the path."""
+        return self.z + fraction * self.dz
 
 
 @dataclass(frozen=True)
 class SystemDerivatives:
-    """What contact does to bodies.
+    """Derivatives of contact of several obstacles.
 
     Attributes:
-        each: of every one; their energies sum to that of all.    mixed: of pairs (i, j), i < j, the second derivative
-            (p, p) of their energy by an increment of the first pose and of the second, exact and the positive part's.
+        bodies: derivatives of each; their energies sum to that of all.
+        mixed: of pairs (i, j), i < j, second derivatives (p, p) of their energy by the increments of both poses, exact
+            and of the positive part.
     """
 
     bodies: Sequence[PoseDerivatives]
@@ -238,37 +299,39 @@ class SystemDerivatives:
 
     @property
     def energy(self) -> float:
-        """J."""
-        return sum(push.energy for push in self.bodies)
+        """Energy of all contact, J."""
+        return sum(body.energy for body in self.bodies)
 
 
 class RigidSystem:
-    """Steps of several bodies, of one scheme and size; z: (k,) of each."""
+    """Several free obstacles in one step, with a potential in common.
+
+    Phi(z) = sum over obstacles of Phi_i(z_i) + s^2 k sum over pairs of E_ij(z_i, z_j), z: (k,) of each. Steps are of
+    one scheme and size.
+    """
 
     def __init__(self, steps: Sequence[RigidStep]) -> None:
         self._steps, first = steps, steps[0]
-        self._share, self._factor = first.share, first.factor
+        self._level, self._factor = first.share, first.factor
         self._ends = np.cumsum([len(step.M) for step in steps])
 
     def split(self, values: Values) -> list[Values]:
-        """Those of each body."""
+        """Values of each obstacle, of an array of all."""
         return np.split(values, self._ends[:-1])
 
     def system(self, z: Sequence[Values], contact: SystemDerivatives) -> tuple[Values, Values, Values]:
-        """(K,) gradient of Phi / s, (K, K) Hessian of Phi / s^2, and its part that is positive definite."""
-        parts = [step.system(way, push) for step, way, push in zip(self._steps, z, contact.bodies, strict=True)]
-        size, at = (
-            int(self._ends[-1]),
-            [slice(end - len(g), end) for end, (g, _, _) in zip(self._ends, parts, strict=True)],
-        )
+        """(K,) gradient of Phi / s, (K, K) Hessian of Phi / s^2, and its positive definite part."""
+        parts = [step.system(z_i, body) for step, z_i, body in zip(self._steps, z, contact.bodies, strict=True)]
+        size = int(self._ends[-1])
+        blocks = [slice(end - len(g), end) for end, (g, _, _) in zip(self._ends, parts, strict=True)]
         hessian, stiffness = np.zeros((size, size)), np.zeros((size, size))
-        for where, (_, exact, positive) in zip(at, parts, strict=True):
-            hessian[where, where], stiffness[where, where] = exact, positive
-        for (i, j), both in contact.mixed.items():
+        for block, (_, exact, positive) in zip(blocks, parts, strict=True):
+            hessian[block, block], stiffness[block, block] = exact, positive
+        for (i, j), mixed in contact.mixed.items():
             T, S = self._steps[i].pose_jacobian(z[i]), self._steps[j].pose_jacobian(z[j])
-            for whole, block in zip((hessian, stiffness), both, strict=True):
-                whole[at[i], at[j]] = self._factor * T.T @ block @ S
-                whole[at[j], at[i]] = whole[at[i], at[j]].T
+            for matrix, coupling in zip((hessian, stiffness), mixed, strict=True):
+                matrix[blocks[i], blocks[j]] = self._factor * T.T @ coupling @ S
+                matrix[blocks[j], blocks[i]] = matrix[blocks[i], blocks[j]].T
         return np.concatenate([g for g, _, _ in parts]), hessian, stiffness
 
     def minimise(
@@ -277,45 +340,45 @@ class RigidSystem:
         contact: Callable[[Sequence[Values]], SystemDerivatives],
         free: Callable[[Sequence[Values], Sequence[Values]], float],
     ) -> tuple[Sequence[Values], SystemDerivatives]:
-        """The z of least Phi that is reached from z on ways that pass through nothing, and what contact does there
-        (collective).
+        """Minimiser of Phi by Newton's method from z, and the derivatives of contact there (collective).
 
-        `contact`: z -> Pushes, of all ranks.    `free`: share of the way from z by dz on which no gap closes.
+        Args:
+            z: start.
+            contact: z -> derivatives of contact, of all ranks.
+            free: z, dz -> fraction of dz on which no gap closes.
         """
-        now, weight = contact(z), self._factor * self._share**2
-        height = self._free_potential(z) + weight * now.energy
-        for _ in range(ITERATIONS):
-            gradient, hessian, stiffness = self.system(z, now)
-            step: Values = np.asarray(-_solved(hessian, stiffness, gradient) / self._share)
-            decrement, dz = -self._share * float(gradient @ step), self.split(step)
-            at_play = (
-                sum(each.energy_scale(way) for each, way in zip(self._steps, z, strict=True)) + weight * now.energy
-            )
-            if not decrement > SMALL * at_play:
+        derivatives, weight = contact(z), self._factor * self._level**2
+        phi = self._free_potential(z) + weight * derivatives.energy
+        for _ in range(SOLVER.max_iterations):
+            gradient, hessian, stiffness = self.system(z, derivatives)
+            step: Values = np.asarray(-_solve(hessian, stiffness, gradient) / self._level)
+            decrement, dz = -self._level * float(gradient @ step), self.split(step)
+            scale = sum(body.energy_scale(z_i) for body, z_i in zip(self._steps, z, strict=True))
+            scale = scale + weight * derivatives.energy
+            if not decrement > SOLVER.decrement_tolerance * scale:
                 break
-            share, slack = free(z, dz), ROUND_OFF * (at_play + abs(height))
-            while share > SHORTEST:
-                there = [way + share * change for way, change in zip(z, dz, strict=True)]
-                found = contact(there)
-                level = self._free_potential(there) + weight * found.energy
-                if level <= height - 1e-4 * share * decrement + slack:
+            fraction, tolerance = free(z, dz), SOLVER.round_off * (scale + abs(phi))
+            while fraction > SOLVER.min_fraction:
+                trial = [z_i + fraction * dz_i for z_i, dz_i in zip(z, dz, strict=True)]
+                trial_derivatives = contact(trial)
+                trial_phi = self._free_potential(trial) + weight * trial_derivatives.energy
+                if trial_phi <= phi - SOLVER.sufficient_decrease * fraction * decrement + tolerance:
                     break
-                share /= 2
+                fraction /= 2
             else:
                 break
-            z, now, height = there, found, level
-        return z, now
+            z, derivatives, phi = trial, trial_derivatives, trial_phi
+        return z, derivatives
 
     def _free_potential(self, z: Sequence[Values]) -> float:
-        return sum(step.free_potential(way) for step, way in zip(self._steps, z, strict=True))
+        return sum(step.free_potential(z_i) for step, z_i in zip(self._steps, z, strict=True))
 
 
-def _solved(hessian: Values, stiffness: Values, gradient: Values) -> Values:
-    """H^-1 g with H the Hessian where that is positive definite, else the stiffness."""
+def _solve(hessian: Values, stiffness: Values, gradient: Values) -> Values:
+    """H^-1 g, where H is the Hessian if it is positive definite, else the stiffness."""
     with np.errstate(all="ignore"):
-        return np.asarray(
-            np.linalg.solve(hessian if is_positive_definite(hessian) else stiffness, gradient), np.float64
-        )
+        matrix = hessian if is_positive_definite(hessian) else stiffness
+        return np.asarray(np.linalg.solve(matrix, gradient), np.float64)
 
 
 def is_positive_definite(matrix: Values) -> bool:
@@ -329,11 +392,16 @@ def is_positive_definite(matrix: Values) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class RigidStep:
-    """One obstacle in one step.
+    """One free obstacle in one step.
 
     Attributes:
-        body, start: what moves, and how at the start.    scheme, dt: of the step, s.    c_a, share: of the level.
-        factor: k.
+        body: the obstacle.
+        start: its motion at the start.
+        scheme: of time integration.
+        dt: size of the step, s.
+        c_a: of the scheme, 1/s^2.
+        share: s, level of the step at which forces balance.
+        factor: k of contact.
     """
 
     body: FreeObstacle
@@ -344,124 +412,122 @@ class RigidStep:
     share: float
     factor: float
 
-    # --- what holds during the step ---
+    # --- constants of the step ---
 
     @cached_property
     def M(self) -> Values:
-        """(k, k) half-way of a step that goes on as it began."""
-        half = 0.5 * self.dt * self._rate(self.start.pose)
+        """(k, k) mass matrix at the middle of a step that continues as it began."""
+        half = 0.5 * self.dt * solve_matrix(self.body.mass_matrix(self.start.pose.rotation), self.start.momentum)
         return self.body.mass_matrix(self.start.pose.incremented(self.body.motion_basis @ half).rotation)
 
-    def _rate(self, pose: Pose) -> Values:
-        return _over(self.body.mass_matrix(pose.rotation), self.start.momentum)
-
     @cached_property
-    def _motion(self) -> tuple[Values, Values]:
-        """(z, dz/dt) and its rate at the start, by the momentum and the mass half-way."""
-        return _over(self.M, self.start.momentum), _over(self.M, self.start.force)
+    def _rates(self) -> tuple[Values, Values]:
+        """(k,) dz/dt and d2z/dt2 at the start, by momentum, force and M."""
+        return solve_matrix(self.M, self.start.momentum), solve_matrix(self.M, self.start.force)
 
     @cached_property
     def z_a(self) -> Values:
-        """(k,) level of s z without acceleration."""
-        return np.asarray(self.scheme.reference_displacements(self.dt, np.zeros(len(self.M)), *self._motion)[0])
+        """(k,) value of s z without acceleration."""
+        return np.asarray(self.scheme.reference_displacements(self.dt, np.zeros(len(self.M)), *self._rates)[0])
 
     @cached_property
     def weight_load(self) -> Values:
         """(k,) b."""
-        late = 1 - self.share
-        return np.asarray(-late * self.body.motion_basis.T @ self.body.gravity_potential(self.start.pose)[1])
+        return np.asarray(
+            -(1 - self.share) * self.body.motion_basis.T @ self.body.gravity_potential(self.start.pose)[1]
+        )
 
     @cached_property
     def free_flight(self) -> Values:
-        """(k,) z of free flight, with the weight of the start."""
+        """(k,) z without contact, with the weight of the start."""
         weight = -self.body.motion_basis.T @ self.body.gravity_potential(self.start.pose)[1]
-        return np.asarray((self.z_a + _over(self.M, self.weight_load + self.share * weight) / self.c_a) / self.share)
+        acceleration = solve_matrix(self.M, self.weight_load + self.share * weight) / self.c_a
+        return np.asarray((self.z_a + acceleration) / self.share)
 
-    # --- where it goes ---
+    # --- kinematics ---
 
     def increment(self, z: Values) -> Values:
-        """(p,) q."""
+        """(p,) increment q of the pose in the step."""
         return np.asarray(self.body.motion_basis @ z)
 
     def pose(self, z: Values) -> Pose:
-        """Where it is then."""
+        """Pose at z (k,)."""
         return self.start.pose.incremented(self.increment(z))
 
     def pose_change(self, z: Values, dz: Values) -> Values:
-        """(p,) increment of the pose at z that dz is, to first order."""
+        """(p,) increment of the pose at z for a change dz (k,), to first order."""
         q = self.increment(dz)
-        q[self.start.pose.dim :] = self._jacobian(z) @ q[self.start.pose.dim :]
+        q[self.start.pose.dim :] = self._left_jacobian(z) @ q[self.start.pose.dim :]
         return q
 
-    def _jacobian(self, z: Values) -> Values:
+    def _left_jacobian(self, z: Values) -> Values:
         return left_jacobian(self.increment(z)[self.start.pose.dim :])
 
     def pose_jacobian(self, z: Values) -> Values:
         """(p, k) derivative of the increment of the pose at z by z."""
         T = self.body.motion_basis.copy()
         d = self.start.pose.dim
-        T[d:] = self._jacobian(z) @ T[d:]
+        T[d:] = self._left_jacobian(z) @ T[d:]
         return T
 
-    # --- the potential ---
+    # --- potential ---
 
     def free_potential(self, z: Values) -> float:
         """Phi without contact, J."""
-        away = self.share * z - self.z_a
-        inertia = self.c_a / 2 * float(away @ self.M @ away)
-        return (
-            inertia
-            + self.share**2 * self.body.gravity_potential(self.pose(z))[0]
-            - self.share * float(self.weight_load @ z)
-        )
+        offset = self.share * z - self.z_a
+        inertia = self.c_a / 2 * float(offset @ self.M @ offset)
+        weight = self.body.gravity_potential(self.pose(z))[0]
+        return inertia + self.share**2 * weight - self.share * float(self.weight_load @ z)
 
     def system(self, z: Values, contact: PoseDerivatives) -> tuple[Values, Values, Values]:
-        """(k,) gradient of Phi / s, (k, k) Hessian of Phi / s^2, and its part that is positive definite."""
+        """(k,) gradient of Phi / s, (k, k) Hessian of Phi / s^2, and its positive definite part."""
         d, T = self.start.pose.dim, self.pose_jacobian(z)
-        _, by_pose, twice = self.body.gravity_potential(self.pose(z))
-        forces = self.factor * contact.gradient + by_pose
-        gradient = self.c_a * self.M @ (self.share * z - self.z_a) + self.share * T.T @ forces - self.weight_load
+        _, weight_gradient, weight_hessian = self.body.gravity_potential(self.pose(z))
+        forces = self.factor * contact.gradient + weight_gradient
+        inertia = self.c_a * self.M @ (self.share * z - self.z_a)
+        gradient = inertia + self.share * T.T @ forces - self.weight_load
         stiffness = self.c_a * self.M + self.factor * T.T @ contact.stiffness @ T
-        bent = np.zeros_like(twice)
-        bent[d:, d:] = left_jacobian_derivative(self.increment(z)[d:], forces[d:])
-        curved = T.T @ (self.factor * contact.hessian + twice) @ T
-        hessian = self.c_a * self.M + curved + self.body.motion_basis.T @ bent @ self.body.motion_basis
+        by_jacobian = np.zeros_like(weight_hessian)
+        by_jacobian[d:, d:] = left_jacobian_derivative(self.increment(z)[d:], forces[d:])
+        by_pose = T.T @ (self.factor * contact.hessian + weight_hessian) @ T
+        hessian = self.c_a * self.M + by_pose + self.body.motion_basis.T @ by_jacobian @ self.body.motion_basis
         return gradient, hessian, stiffness
 
     def energy_scale(self, z: Values) -> float:
-        """Energies that Phi is the difference of, J."""
-        moved = self.share * z
-        return self.c_a / 2 * float(moved @ self.M @ moved + self.z_a @ self.M @ self.z_a)
+        """Size of the energies of which Phi is the difference, J."""
+        s_z = self.share * z
+        return self.c_a / 2 * float(s_z @ self.M @ s_z + self.z_a @ self.M @ self.z_a)
 
     def minimise(
-        self, z: Values, contact: Callable[[Values], PoseDerivatives], free: Callable[[Values, Values], float]
+        self,
+        z: Values,
+        contact: Callable[[Values], PoseDerivatives],
+        free: Callable[[Values, Values], float],
     ) -> tuple[Values, PoseDerivatives]:
-        """(k,) the z of least Phi that is reached from z on ways that pass through nothing, and what contact does
-        there (collective).
-
-        `contact`: z -> Push, of all ranks.    `free`: share of the way from z by dz on which no gap closes.
-        """
-        found, now = RigidSystem([self]).minimise(
-            [z], lambda ways: SystemDerivatives([contact(ways[0])]), lambda ways, changes: free(ways[0], changes[0])
+        """(k,) minimiser of Phi from z, and the derivatives of contact there; as of RigidSystem (collective)."""
+        result, derivatives = RigidSystem([self]).minimise(
+            [z], lambda z: SystemDerivatives([contact(z[0])]), lambda z, dz: free(z[0], dz[0])
         )
-        return found[0], now.bodies[0]
+        return result[0], derivatives.bodies[0]
 
     def end_motion(self, z: Values, force: Values) -> RigidMotion:
-        """How it moves at the end, which is at z, with force and moment (p,) of the body on it there, N and N m."""
+        """State of motion at the end, with force and moment (p,) of the body on the obstacle there, N and N m."""
         pose = self.pose(z)
         weight = self.body.motion_basis.T @ -self.body.gravity_potential(pose)[1]
-        struck = self.share * self.factor * _over(self.M, self.body.motion_basis.T @ force) / self.c_a
-        reached = self.z_a + _over(self.M, self.share * weight + self.weight_load) / self.c_a + struck
-        _, rate, change = self.scheme.complete_step(self.dt, reached, np.zeros(len(z)), *self._motion)
-        carried = change - acceleration_change(self.scheme, self.dt, struck)
-        return RigidMotion(pose, self.M @ rate, self.M @ carried, self._turned(pose, z))
+        by_contact = self.share * self.factor * solve_matrix(self.M, self.body.motion_basis.T @ force) / self.c_a
+        by_weight = solve_matrix(self.M, self.share * weight + self.weight_load) / self.c_a
+        end = self.z_a + by_weight + by_contact
+        _, rate, acceleration = self.scheme.complete_step(self.dt, end, np.zeros(len(z)), *self._rates)
+        # the force that is carried on is without contact
+        carried = acceleration - acceleration_change(self.scheme, self.dt, by_contact)
+        return RigidMotion(pose, self.M @ rate, self.M @ carried, self._end_rotation(pose, z))
 
-    def _turned(self, pose: Pose, z: Values) -> Values:
+    def _end_rotation(self, pose: Pose, z: Values) -> Values:
         if pose.dim == 2:
             return self.start.rotation + self.increment(z)[2:]
         return pose.rotation_vector()
 
 
-def _over(matrix: Values, values: Values) -> Values:
-    """A^-1 b."""
+def solve_matrix(matrix: Values, values: Values) -> Values:
+    """A^-1 b of a matrix (k, k) and values (k,) or (k, m)."""
     return np.asarray(np.linalg.solve(matrix, values), np.float64)

@@ -1,23 +1,23 @@
-"""Contact with obstacles of which some move freely: the same term, with their poses as further unknowns.
+"""Terms of the balance for contact with analytic obstacles of which some are free rigid bodies.
 
-For a body that is at x the poses are the minimum of the incremental potential (rigid_pose), found by a small Newton
-method within the term. The body sees what is left, a function of x alone:
+For a body at x the poses z minimise the incremental potential Phi (rigid_pose), by a small Newton method within the
+term. The body is in contact with a function of x alone:
 
     E(x) = min over z of Phi(x, z),    dE/dx = dPhi/dx at that z,    d2E/dx2 = Phi_xx - Phi_xz Phi_zz^-1 Phi_zx
 
-So the system of equations keeps its size, and its solution is the same as if poses were among its unknowns. The last
-part couples all points in touch with one another; it is of rank k, the freedoms of an obstacle, and is applied, not
-stored. (Without it a disk of a third of the body's mass takes 17,892 iterations in place of 127, or finds no solution.)
-Every rank finds the same poses from sums over all ranks. Free obstacles meet those that are held or driven
-(obstacle_pairs), and one another (rigid_pose).
+So the system of equations keeps its size, with the solution of the full system. The last part couples all points in
+contact with one another. Its rank is that of the poses, and it is applied, not stored. Every rank finds the same poses
+from sums over all ranks.
 
 Equations: docs/theory.md#rigid-obstacles.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
+from typing import Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -29,23 +29,171 @@ from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
 from .laws import ObstacleLaw
 from .node_contact import ContactForces
-from .obstacle import FreeObstacle, RigidObstacle
+from .obstacle import FreeObstacle, RigidMotion, RigidObstacle, column_names, motion_rows
 from .obstacle_pairs import ObstaclePairs
+from .obstacle_term import ObstacleTerm
 from .pose import PosedShape
 from .rigid_body import RigidStep, is_positive_definite
-from .rigid_obstacle_state import FreeObstacleBase
 from .rigid_pose import BodySurroundings, CondensedPose, FreeObstacleSystem
 
 Values = npt.NDArray[np.float64]
 
-WALKS = 4  # until what is held back is let go, whatever it presses on
+# evaluations in which free obstacles are held back, before they are released whatever they press on
+MAX_HOLDS = 4
+
+
+# --- state of motion of free obstacles ---
+
+
+class MovingObstacle(Protocol):
+    """Free obstacle, with its state of motion at the start of a step until that is accepted."""
+
+    body: FreeObstacle
+    motion: RigidMotion
+
+
+class PlaceableObstacle(MovingObstacle, Protocol):
+    """Free obstacle with a pose in a step."""
+
+    def reset_pose(self) -> PosedShape:
+        """Return to the pose of the state of motion."""
+
+
+@dataclass(frozen=True)
+class FreeMotions:
+    """States of motion of free obstacles: history of a term, and columns of history.csv.
+
+    Attributes:
+        free: free obstacles by their numbers.
+        comm: ranks of the term.
+    """
+
+    free: Mapping[int, MovingObstacle]
+    comm: MPI.Intracomm
+
+    def snapshot(self) -> dict[int, RigidMotion]:
+        """State of motion of each, by its number."""
+        return {number: obstacle.motion for number, obstacle in self.free.items()}
+
+    def restore(self, motions: Mapping[int, RigidMotion]) -> None:
+        """Restore states of motion."""
+        for number, obstacle in self.free.items():
+            obstacle.motion = motions[number]
+
+    def to_checkpoint(self) -> dict[str, Values]:
+        """Rows of numbers for a checkpoint."""
+        return {"flights": motion_rows(obstacle.motion for obstacle in self.free.values())}
+
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
+        """Set states of motion from the rows of a checkpoint."""
+        for row, obstacle in enumerate(self.free.values()):
+            obstacle.motion = obstacle.motion.from_array(saved["flights"][row])
+
+    def place(self, posed: list[PosedShape]) -> list[PosedShape]:
+        """All obstacles, by their numbers, with free ones at the poses of their states of motion."""
+        for number, obstacle in self.free.items():
+            posed[number] = PosedShape(posed[number].shape, obstacle.motion.pose)
+        return posed
+
+    def kinetic_energy(self) -> float:
+        """Kinetic energy of the free obstacles, on rank 0, J."""
+        if self.comm.rank:
+            return 0.0
+        return float(sum(obstacle.body.history_values(obstacle.motion)[-1] for obstacle in self.free.values()))
+
+    def columns(self) -> dict[str, Callable[[], Values]]:
+        """Columns of history.csv, each with a function that returns this rank's share, (1,).
+
+        position_NAME_x and velocity_NAME_x of the centre of mass, m and m/s; turn_NAME_z and spin_NAME_z, rad and
+        rad/s; kinetic_NAME, J.
+        """
+        return {
+            name: partial(reader, index)
+            for obstacle in self.free.values()
+            for reader in [_MotionReader(obstacle, self.comm)]
+            for index, name in enumerate(column_names(obstacle.body))
+        }
+
+
+class _MotionReader:
+    """Numbers of an obstacle for history.csv: read column by column, evaluated once for each state of motion."""
+
+    def __init__(self, obstacle: MovingObstacle, comm: MPI.Intracomm) -> None:
+        self._obstacle, self._is_root = obstacle, comm.rank == 0
+        self._motion: RigidMotion | None = None
+        self._values: Values = np.empty(0)
+
+    def __call__(self, index: int) -> Values:
+        """(1,) value of a column; 0 on other ranks than 0."""
+        if not self._is_root:
+            return np.zeros(1)
+        if self._motion is not self._obstacle.motion:
+            self._motion = self._obstacle.motion
+            self._values = self._obstacle.body.history_values(self._motion)
+        return self._values[index : index + 1]
+
+
+class FreeObstacleBase(ObstacleTerm):
+    """Term with obstacles of which some are free.
+
+    Attributes:
+        free: the free ones by their numbers.
+    """
+
+    free: Mapping[int, PlaceableObstacle]
+
+    @property
+    def _motions(self) -> FreeMotions:
+        return FreeMotions(self.free, self.comm)
+
+    def _prescribed_numbers(self) -> list[int]:
+        return [number for number in super()._prescribed_numbers() if number not in self.free]
+
+    def _place_obstacles(self, start: float, end: float) -> None:
+        super()._place_obstacles(start, end)
+        for number, obstacle in self.free.items():
+            self._kinematics.hold_at_start(number, obstacle.reset_pose())
+
+    def snapshot(self) -> object:
+        """State of the surface, and states of motion."""
+        return super().snapshot(), self._motions.snapshot()
+
+    def restore(self, memory: object) -> None:
+        """Restore a snapshot (not collective)."""
+        surface, motions = cast("tuple[object, dict[int, RigidMotion]]", memory)
+        super().restore(surface)
+        self._motions.restore(motions)
+
+    def to_checkpoint(self) -> dict[str, Values]:
+        """Arrays for a checkpoint, with rows of states of motion (collective)."""
+        return super().to_checkpoint() | self._motions.to_checkpoint()
+
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
+        """Set the state from the arrays of a checkpoint."""
+        super().from_checkpoint(saved)
+        self._motions.from_checkpoint(saved)
+
+    def posed_obstacles(self, t: float) -> list[PosedShape]:
+        """Each obstacle at the time t of the state, s (not collective)."""
+        return self._motions.place(super().posed_obstacles(t))
+
+    def kinetic_energy(self) -> float:
+        """Kinetic energy of the free obstacles, on rank 0, J."""
+        return self._motions.kinetic_energy()
+
+    def summed_columns(self) -> dict[str, Callable[[], Values]]:
+        """Columns of all obstacles, and those of the motion of free ones (FreeMotions.columns)."""
+        return super().summed_columns() | self._motions.columns()
+
+
+# --- implicit steps ---
 
 
 class FreeObstacleTerm(FreeObstacleBase):
-    """Obstacles, at least one of them free.
+    """Obstacles, at least one of them free, in implicit steps.
 
     Attributes:
-        free: the free ones by their number.
+        free: the free ones by their numbers.
     """
 
     leaves_tangent_incomplete = True
@@ -54,52 +202,52 @@ class FreeObstacleTerm(FreeObstacleBase):
     def __init__(
         self, domain: Domain, u: fem.Function, obstacles: Sequence[RigidObstacle], law: ObstacleLaw, scheme: Scheme
     ) -> None:
-        """InputError where the body at rest lies in an obstacle (collective)."""
-        others = {number: each for number, each in enumerate(obstacles) if not each.free}
+        """Raise InputError where the body at rest overlaps an obstacle (collective)."""
+        prescribed = {number: obstacle for number, obstacle in enumerate(obstacles) if not obstacle.free}
         self.free = {
-            number: CondensedPose(each, ObstaclePairs(each, others, law.barrier))
-            for number, each in enumerate(obstacles)
-            if isinstance(each, FreeObstacle)
+            number: CondensedPose(obstacle, ObstaclePairs(obstacle, prescribed, law.barrier))
+            for number, obstacle in enumerate(obstacles)
+            if isinstance(obstacle, FreeObstacle)
         }
-        self._scheme, self._free_system = (
-            scheme,
-            FreeObstacleSystem(self.free, law.barrier) if len(self.free) > 1 else None,
-        )
-        self._equilibrium_positions: Values | None = None  # places of the points that poses belong to
-        self._is_first_evaluation = False  # whether Newton's method begins: nothing has given way to anything yet
-        self._held_fraction = 0.0  # share of their way to where they belong that free obstacles are held back from
-        self._hold_count = 0  # on which they have been held back
+        self._scheme = scheme
+        self._free_system = FreeObstacleSystem(self.free, law.barrier) if len(self.free) > 1 else None
+        self._equilibrium_positions: Values | None = None  # (n, d) of points for which the poses are in equilibrium
+        self._is_first_evaluation = False  # of a solve: the body has not been moved by the obstacles yet
+        self._held_fraction = 0.0  # fraction of their way to equilibrium from which free obstacles are held back
+        self._hold_count = 0  # evaluations in which they were held back
         super().__init__(domain, u, obstacles, law)
 
-    # --- a step ---
+    # --- steps ---
 
     def _begin_new_step(self) -> None:
         super()._begin_new_step()
         level, self._equilibrium_positions = self._level, None
-        for number, each in self.free.items():
+        weights = level.contact_weights
+        for number, obstacle in self.free.items():
             step = RigidStep(
-                each.body, each.motion, self._scheme, level.dt, level.c_a, level.fraction, level.contact_weights.factor
+                obstacle.body, obstacle.motion, self._scheme, level.dt, level.c_a, level.fraction, weights.factor
             )
-            self._kinematics.increments[number] = each.begin_step(step, self._lagged[number])
-            along = level.contact_weights.time_averaged
-            each.obstacle_pairs.begin_step(each.motion.pose, self._kinematics.start_posed, along=along)
+            self._kinematics.increments[number] = obstacle.begin_step(step, self._lagged[number])
+            obstacle.obstacle_pairs.begin_step(
+                obstacle.motion.pose, self._kinematics.start_posed, along=weights.time_averaged
+            )
         if self._free_system is not None:
-            self._free_system.begin_step(along=level.contact_weights.time_averaged)
+            self._free_system.begin_step(along=weights.time_averaged)
 
     def accept_step(self) -> None:
-        """The step is over: obstacles have the momentum that it gave them (collective)."""
+        """Record contact in the step, and give free obstacles their momentum (collective)."""
         super().accept_step()
-        found, others = self.obstacle_forces(), {} if self._free_system is None else self._free_system.wrenches()
-        for number, each in self.free.items():
-            each.end_step(found[number], self._surroundings(number), others.get(number, 0.0))
+        contacts, wrenches = self.obstacle_forces(), {} if self._free_system is None else self._free_system.wrenches()
+        for number, obstacle in self.free.items():
+            obstacle.end_step(contacts[number], self._surroundings(number), wrenches.get(number, 0.0))
 
-    # --- where free obstacles are ---
+    # --- equilibrium of free obstacles ---
 
     def obstacle_forces(self) -> list[ContactForces]:
-        """What each obstacle does at the current u, free ones where they belong then (collective)."""
+        """Forces of each obstacle at the current u, free ones in equilibrium (collective)."""
         if self._contact_forces is None and self._in_step():
             self.positions = self.surface.positions(self._end_displacement())
-            if not self.comm.allreduce(_same(self.positions, self._equilibrium_positions), op=MPI.LAND):
+            if not self.comm.allreduce(_is_same(self.positions, self._equilibrium_positions), op=MPI.LAND):
                 self._equilibrium_positions = self.positions
                 if self._is_first_evaluation:
                     self._approach_equilibrium()
@@ -109,122 +257,124 @@ class FreeObstacleTerm(FreeObstacleBase):
         return super().obstacle_forces()
 
     def _reset_equilibrium(self) -> None:
-        """Newton's method begins, with poses that belong to no points yet."""
-        self._equilibrium_positions, self._is_first_evaluation, self._held_fraction, self._hold_count = (
-            None,
-            True,
-            0.0,
-            0,
-        )
+        """Begin a solve: poses are not in equilibrium."""
+        self._equilibrium_positions, self._is_first_evaluation = None, True
+        self._held_fraction, self._hold_count = 0.0, 0
 
     def _approach_equilibrium(self) -> None:
-        """To where all belong, or as far as closes no gap by more than is safe: before a body that has not given way
-        yet what is heavy would come to rest a hair's breadth away, with a force that tells nothing (collective)."""
+        """Move free obstacles towards equilibrium as far as is safe (collective).
+
+        Before a body that has not given way yet, a heavy obstacle would come to rest at a tiny distance, with a force
+        that is of no use.
+        """
         self._is_first_evaluation = False
-        began = {number: each.z for number, each in self.free.items()}
+        start = {number: obstacle.z for number, obstacle in self.free.items()}
         self._equilibrate()
-        ways = {number: each.z - began[number] for number, each in self.free.items()}
-        arounds = self._all_surroundings()
+        changes = {number: obstacle.z - start[number] for number, obstacle in self.free.items()}
+        surroundings = self._all_surroundings()
         if self._free_system is not None:
-            share = self._free_system.free_fraction(arounds, began, ways)
+            fraction = self._free_system.free_fraction(surroundings, start, changes)
         else:
-            share = min(each.free_fraction(arounds[k], began[k], ways[k]) for k, each in self.free.items())
+            fraction = min(
+                obstacle.free_fraction(surroundings[number], start[number], changes[number])
+                for number, obstacle in self.free.items()
+            )
         self._hold_count += 1
-        if self._hold_count == WALKS:
-            share = 1.0
-        self._held_fraction = 1 - share
-        for number, each in self.free.items():
-            each.move_to(began[number] + share * ways[number])
-            if share < 1:
-                each.discard_derivatives()
+        if self._hold_count == MAX_HOLDS:
+            fraction = 1.0
+        self._held_fraction = 1 - fraction
+        for number, obstacle in self.free.items():
+            obstacle.move_to(start[number] + fraction * changes[number])
+            if fraction < 1:
+                obstacle.discard_derivatives()
 
     def _equilibrate(self) -> None:
-        """All are where they belong with the points where they are now (collective)."""
+        """Move all free obstacles to equilibrium with the points at their current positions (collective)."""
         if self._free_system is not None:
             return self._free_system.equilibrate(self._all_surroundings())
-        for number, each in self.free.items():
-            each.equilibrate(self._surroundings(number))
+        for number, obstacle in self.free.items():
+            obstacle.equilibrate(self._surroundings(number))
 
     def _all_surroundings(self) -> dict[int, BodySurroundings]:
         return {number: self._surroundings(number) for number in self.free}
 
     def _in_step(self) -> bool:
-        """Whether this is no mere look, and the step that began is not over yet."""
-        return bool(self._level.dt) and all(each.in_step for each in self.free.values())
+        """Whether a step has begun and is not accepted yet."""
+        return bool(self._level.dt) and all(obstacle.in_step for obstacle in self.free.values())
 
     def _surroundings(self, number: int) -> BodySurroundings:
         return self._surroundings_at(number, self.positions)
 
     def _surroundings_at(self, number: int, x: Values) -> BodySurroundings:
-        return BodySurroundings(
-            self.surface, x, partial(self._evaluate_obstacle, number), self._facets_for(number), self._kinematics.posed
-        )
+        evaluate, facets = partial(self._evaluate_obstacle, number), self._facets_for(number)
+        return BodySurroundings(self.surface, x, evaluate, facets, self._kinematics.posed)
 
     def _update_kinematics(self) -> None:
-        """All see free obstacles where they are."""
-        for number, each in self.free.items():
-            self._kinematics.posed[number] = each.posed
+        """Set the poses of free obstacles in the kinematics of all."""
+        for number, obstacle in self.free.items():
+            self._kinematics.posed[number] = obstacle.posed
 
-    def _contact_point_motion(self, number: int, placed: PosedShape) -> Values:
-        held = self._lagged[number]
-        if number not in self.free or held is None:
-            return super()._contact_point_motion(number, placed)
-        return self.free[number].contact_point_motion(held, placed)
+    def _contact_point_motion(self, number: int, posed: PosedShape) -> Values:
+        lagged = self._lagged[number]
+        if number not in self.free or lagged is None:
+            return super()._contact_point_motion(number, posed)
+        return self.free[number].contact_point_motion(lagged, posed)
 
-    # --- what they add to the balance ---
+    # --- forces, tangent and energy ---
 
     def potential(self) -> float:
-        """That of all obstacles, with the inertia and the weight of the free ones on rank 0, J (collective)."""
+        """Potential of contact, with inertia and weight of free obstacles on rank 0, J (collective)."""
         energy, level = super().potential(), self._level
         if self.comm.rank == 0 and level.dt:
-            for each in self.free.values():
-                _, stopped = each.obstacle_pairs.energies(each.posed.pose, self._kinematics.posed)
-                energy += each.step.free_potential(each.z) + level.contact_weight * level.fraction * stopped
+            for obstacle in self.free.values():
+                _, of_pairs = obstacle.obstacle_pairs.energies(obstacle.posed.pose, self._kinematics.posed)
+                energy += obstacle.step.free_potential(obstacle.z) + level.contact_weight * level.fraction * of_pairs
             if self._free_system is not None:
                 energy += level.contact_weight * level.fraction * self._free_system.energies()[1]
         return energy
 
     def stored_energy(self) -> float:
-        """That of all obstacles, with the barriers between them on rank 0, J (collective)."""
+        """Energy of all barriers, those between obstacles on rank 0, J (collective)."""
         energy = super().stored_energy()
         if self.comm.rank == 0:
-            placed = self._kinematics.posed
-            energy += sum(each.obstacle_pairs.energies(each.posed.pose, placed)[0] for each in self.free.values())
+            posed = self._kinematics.posed
+            energy += sum(body.obstacle_pairs.energies(body.posed.pose, posed)[0] for body in self.free.values())
             energy += 0.0 if self._free_system is None else self._free_system.energies()[0]
         return energy
 
     def low_rank_updates(self) -> list[tuple[Values, Values]]:
-        """Phi_xz and Phi_zz^-1 of each obstacle that is touched and under way (collective)."""
-        if not self._in_step() or not (touches := self.obstacle_forces()) or self._held_fraction:
+        """Phi_xz (owned dofs, k) and Phi_zz^-1 (k, k) of obstacles in contact (collective)."""
+        if not self._in_step() or not (contacts := self.obstacle_forces()) or self._held_fraction:
             return []
-        counts = sum_over_ranks(self.comm, np.array([len(touches[number].points) for number in self.free]))
+        counts = sum_over_ranks(self.comm, np.array([len(contacts[number].points) for number in self.free]))
         touched = [number for number, count in zip(self.free, counts, strict=True) if count]
         if self._free_system is not None and touched:
-            U = np.concatenate([self._mixed_block(number, touches[number]) for number in self.free], axis=1)
+            U = np.concatenate([self._mixed_block(number, contacts[number]) for number in self.free], axis=1)
             return [(U, self._free_system.compliance(self._all_surroundings(), exact=self._tangent_is_exact))]
-        return [(self._mixed_block(number, touches[number]), self._compliance(number)) for number in touched]
+        return [(self._mixed_block(number, contacts[number]), self._compliance(number)) for number in touched]
 
-    def _mixed_block(self, number: int, found: ContactForces) -> Values:
+    def _mixed_block(self, number: int, contact: ContactForces) -> Values:
         """(owned dofs, k) Phi_xz (collective)."""
-        by_z = self.free[number].mixed_block(found, self.positions, exact=self._tangent_is_exact)
+        by_z = self.free[number].mixed_block(contact, self.positions, exact=self._tangent_is_exact)
         forces = np.zeros((len(self.positions), *by_z.shape[1:]))
-        forces[found.points] = by_z
+        forces[contact.points] = by_z
         to_nodes = self.surface.interpolation.assemble_to_nodes
-        return np.stack([to_nodes(each) for each in np.moveaxis(forces, 2, 0)], axis=1)
+        return np.stack([to_nodes(column) for column in np.moveaxis(forces, 2, 0)], axis=1)
 
     def _compliance(self, number: int) -> Values:
         """(k, k) Phi_zz^-1 (collective)."""
-        resistance = self.free[number].hessian(self._surroundings(number), exact=self._tangent_is_exact)
-        return np.asarray(np.linalg.inv(resistance), np.float64)
+        hessian = self.free[number].hessian(self._surroundings(number), exact=self._tangent_is_exact)
+        return np.asarray(np.linalg.inv(hessian), np.float64)
 
-    def _exact_tangent_allowed(self, moved: float) -> bool:
-        """And all free obstacles stand where the potential is least (collective)."""
-        if not super()._exact_tangent_allowed(moved):
+    def _exact_tangent_allowed(self, motion: float) -> bool:
+        """Whether Newton's method is near the solution, and Phi_zz is positive definite (collective)."""
+        if not super()._exact_tangent_allowed(motion):
             return False
         if self._free_system is not None:
             return is_positive_definite(self._free_system.hessian(self._all_surroundings(), exact=True))
         return all(
-            is_positive_definite(each.hessian(self._surroundings(k), exact=True)) for k, each in self.free.items()
+            is_positive_definite(obstacle.hessian(self._surroundings(number), exact=True))
+            for number, obstacle in self.free.items()
         )
 
     def _normal_work(self, number: int) -> float:
@@ -233,85 +383,94 @@ class FreeObstacleTerm(FreeObstacleBase):
         return self.free[number].normal_work(self.obstacle_forces()[number], self.positions)
 
     def step_work(self) -> tuple[float, float]:
-        """With the work of gravity, and of other obstacles' motion, on free ones (collective)."""
-        work, lost = super().step_work()
+        """Work of obstacles' own motion, of gravity and other obstacles on free ones; dissipation (collective)."""
+        work, dissipation = super().step_work()
         if self.comm.rank == 0:
-            for number, each in self.free.items():
-                ends = self._kinematics.start_posed[number].pose, each.posed.pose
-                work += each.body.gravity_potential(ends[0])[0] - each.body.gravity_potential(ends[1])[0]
-                work += each.obstacle_pairs.work(ends[1], self._kinematics.posed, self._kinematics.increments)
-        return work, lost
+            for number, obstacle in self.free.items():
+                start, end = self._kinematics.start_posed[number].pose, obstacle.posed.pose
+                work += obstacle.body.gravity_potential(start)[0] - obstacle.body.gravity_potential(end)[0]
+                work += obstacle.obstacle_pairs.work(end, self._kinematics.posed, self._kinematics.increments)
+        return work, dissipation
 
-    # --- how far Newton's method may go ---
+    # --- step limits ---
 
-    def _obstacle_increments(self, moved: Values) -> list[Values]:
-        """As Newton's method moves them together with the points (collective)."""
-        ways, found = super()._obstacle_increments(moved), self.obstacle_forces()
+    def _obstacle_increments(self, motion: Values) -> list[Values]:
+        """(p,) increments of the poses with which Newton's method moves obstacles and points (collective)."""
+        increments, contacts = super()._obstacle_increments(motion), self.obstacle_forces()
         if self._held_fraction:
-            return ways
+            return increments
+        exact = self._tangent_is_exact
         if self._free_system is not None:
-            every = self._free_system.predict_increments(
-                dict(enumerate(found)), self._all_surroundings(), moved, exact=self._tangent_is_exact
+            predicted = self._free_system.predict_increments(
+                dict(enumerate(contacts)), self._all_surroundings(), motion, exact=exact
             )
-            for number, q in every.items():
-                ways[number] = q
-            return ways
-        for number, each in self.free.items():
-            ways[number] = each.predict_increment(
-                found[number], self._surroundings(number), moved, exact=self._tangent_is_exact
+            for number, q in predicted.items():
+                increments[number] = q
+            return increments
+        for number, obstacle in self.free.items():
+            increments[number] = obstacle.predict_increment(
+                contacts[number], self._surroundings(number), motion, exact=exact
             )
-        return ways
+        return increments
 
     def feasible_guess(self, u: Values) -> Values:
-        """(owned dofs,) a first guess that has passed through nothing on its way from the start: free obstacles stop,
-        or the body with them, before they meet (collective)."""
+        """(owned dofs,) first guess without a collision: obstacles stop before they meet, or the body (collective)."""
         u, level = super().feasible_guess(u), self._level
         self._reset_equilibrium()
-        for each in self.free.values():
-            each.discard_predictor()
+        for obstacle in self.free.values():
+            obstacle.discard_predictor()
         if not level.dt:
             return u
         x = self.surface.positions(level.u_n)
-        moved = self.surface.positions(level.displacement_at_end(u)) - x
-        share, taken = 1.0, {}
-        for number, each in self.free.items():
-            taken[number], free = self._first_guess(each, self._surroundings_at(number, x), moved)
-            share = min(share, free)
+        motion = self.surface.positions(level.displacement_at_end(u)) - x
+        fraction, guesses = 1.0, {}
+        for number, obstacle in self.free.items():
+            guesses[number], safe = self._first_guess(obstacle, self._surroundings_at(number, x), motion)
+            fraction = min(fraction, safe)
         if self._free_system is not None:
-            share = min(share, self._free_system.safe_guess(taken))
-        for number, z in taken.items():
-            self.free[number].move_to(share * z)
+            fraction = min(fraction, self._free_system.safe_guess(guesses))
+        for number, z in guesses.items():
+            self.free[number].move_to(fraction * z)
         self._update_kinematics()
-        return u if share == 1 else np.asarray(level.u_n + share * (u - level.u_n))
+        return u if fraction == 1 else np.asarray(level.u_n + fraction * (u - level.u_n))
 
-    def _first_guess(self, each: CondensedPose, around: BodySurroundings, moved: Values) -> tuple[Values, float]:
-        """Where one goes by itself, stays or is taken along by another one, whichever is free first, and the share of
-        that way that closes no gap, with points that go by `moved` (n, d) (collective)."""
-        others = self._kinematics.full_motions()
-        along = [each.carried_by(way) for _, way in others.values() if way.any()]
-        ways = [each.step.free_flight, 0 * each.step.free_flight, *along]
-        first = 0.0
-        for z in ways:
-            share = each.safe_fraction(around, moved, z, others)
-            if share == 1:
+    def _first_guess(
+        self, obstacle: CondensedPose, surroundings: BodySurroundings, motion: Values
+    ) -> tuple[Values, float]:
+        """First guess (k,) of an increment, and its fraction that closes no gap (collective).
+
+        The first of these without a collision: free flight, rest, motion with a driven obstacle.
+
+        Args:
+            obstacle: free obstacle.
+            surroundings: body at the start of the step.
+            motion: (n, d) of the points, m.
+        """
+        motions = self._kinematics.full_motions()
+        carried = [obstacle.carried_by(increment) for _, increment in motions.values() if increment.any()]
+        guesses = [obstacle.step.free_flight, 0 * obstacle.step.free_flight, *carried]
+        fraction = 0.0
+        for z in guesses:
+            safe = obstacle.safe_fraction(surroundings, motion, z, motions)
+            if safe == 1:
                 return z, 1.0
-            first = min(first, share) if first else share
-        return ways[0], first
+            fraction = min(fraction, safe) if fraction else safe
+        return guesses[0], fraction
 
     def is_feasible(self, u: Values) -> bool:
-        """Whether every gap is open with the body at u, those between obstacles as well (collective)."""
-        placed = self._kinematics.posed
-        apart = all(each.obstacle_pairs.are_open(each.posed.pose, placed) for each in self.free.values())
+        """Whether every gap is open with the body at u, also between obstacles (collective)."""
+        posed = self._kinematics.posed
+        apart = all(body.obstacle_pairs.are_open(body.posed.pose, posed) for body in self.free.values())
         return super().is_feasible(u) and apart and (self._free_system is None or self._free_system.are_open())
 
     def remaining_motion(self) -> float:
-        """And that of free ones which are held back (collective)."""
+        """Remaining fraction of the motion of prescribed obstacles, or of free ones to equilibrium (collective)."""
         if self._is_first_evaluation:
             self.obstacle_forces()
         return max(super().remaining_motion(), self._held_fraction)
 
     def continue_motion(self) -> None:
-        """Free obstacles as well (collective)."""
+        """Advance held obstacles, and free ones towards equilibrium (collective)."""
         super().continue_motion()
         if self._held_fraction:
             self.obstacle_forces()
@@ -320,22 +479,24 @@ class FreeObstacleTerm(FreeObstacleBase):
             self._contact_forces = None
 
     def _advance_obstacles(self, x: Values) -> None:
-        """As far as free obstacles let others."""
-        rest, still = self._kinematics.remaining_motions(), np.zeros_like(self._kinematics.increments[0])
-        shares = [each.obstacle_pairs.safe_fraction(each.posed.pose, still, rest) for each in self.free.values()]
-        self._kinematics.advance(
-            x, self._kinematics.prescribed_motions(self._facets_for), self.surface.min_fraction, min(shares)
-        )
+        """Advance prescribed obstacles as far as the body and free obstacles allow."""
+        remaining, no_motion = self._kinematics.remaining_motions(), np.zeros_like(self._kinematics.increments[0])
+        fractions = [
+            obstacle.obstacle_pairs.safe_fraction(obstacle.posed.pose, no_motion, remaining)
+            for obstacle in self.free.values()
+        ]
+        motions = self._kinematics.prescribed_motions(self._facets_for)
+        self._kinematics.advance(x, motions, self.surface.min_fraction, min(fractions))
         self._contact_forces = self._equilibrium_positions = None
 
     def restrict_motion(self) -> None:
-        """All stay where the step began (collective)."""
-        for each in self.free.values():
-            each.return_to_start()
+        """Hold all obstacles at the start of the step (collective)."""
+        for obstacle in self.free.values():
+            obstacle.return_to_start()
         self._update_kinematics()
         self._reset_equilibrium()
         super().restrict_motion()
 
 
-def _same(x: Values, before: Values | None) -> bool:
-    return before is not None and np.array_equal(x, before)
+def _is_same(x: Values, previous: Values | None) -> bool:
+    return previous is not None and np.array_equal(x, previous)

@@ -1,4 +1,4 @@
-"""Points at which the barrier between the elements of a surface is integrated: vertices, or centroids of elements.
+"""Sample points of the barrier between the elements of a surface: vertices, or centroids of elements.
 
 With one point at the centroid of an element, weighted with the element's measure, the barrier between two parallel
 faces presses along their normal as long as no centroid overhangs. Points on the rim press outwards as soon as aligned
@@ -25,7 +25,11 @@ Flags = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Vertices:
-    """The vertices of a surface, weighted by ipctk with their shares of the elements around them."""
+    """Vertices of a surface, weighted by ipctk with their shares of the elements around them.
+
+    Attributes:
+        mesh: the surface.
+    """
 
     mesh: ipctk.CollisionMesh
 
@@ -42,13 +46,16 @@ class Vertices:
         return at_samples
 
     def weight(self, pairs: ipctk.NormalCollisions) -> None:
-        """Give pairs their weights, which ipctk has done."""
+        """Do nothing: ipctk has set the weights of pairs."""
 
 
 class Centroids:
-    """The centroids of the elements of a surface, each weighted with the measure of its element.
+    """Centroids of the elements of a surface, each weighted with the measure of its element.
 
     The sample points are the n vertices, which the elements need, and after them the m centroids.
+
+    Attributes:
+        elements: (m, d) vertices of segments or triangles.
     """
 
     def __init__(self, surface: ipctk.CollisionMesh) -> None:
@@ -58,7 +65,7 @@ class Centroids:
 
     @cached_property
     def _incidence(self) -> csr_matrix:
-        """(m, n) 1 for each vertex of an element."""
+        """(m, n) incidence: 1 for each vertex of an element."""
         m, corners = self.elements.shape
         return csr_matrix(
             (np.ones(m * corners), self.elements.reshape(-1), np.arange(0, m * corners + 1, corners)),
@@ -76,10 +83,10 @@ class Centroids:
 
     @cached_property
     def mesh(self) -> ipctk.CollisionMesh:
-        """The surface with the centroids as points of no element."""
-        rest = np.asfortranarray(self._map @ self._surface.rest_positions)
+        """Surface with the centroids as points of no element."""
+        rest_positions = np.asfortranarray(self._map @ self._surface.rest_positions)
         faces = (self._surface.faces,) if self._surface.dim == 3 else ()
-        return ipctk.CollisionMesh(rest, self._surface.edges, *faces)
+        return ipctk.CollisionMesh(rest_positions, self._surface.edges, *faces)
 
     @cached_property
     def _weights(self) -> list[float]:
@@ -99,7 +106,7 @@ class Centroids:
         return (self._map_of_dofs.T @ at_samples @ self._map_of_dofs).tocsr()
 
     def weight(self, pairs: ipctk.NormalCollisions) -> None:
-        """Give pairs the measures of elements as weights: ipctk gives points of no element the measure 1."""
+        """Multiply the weights of pairs by the measures of elements: ipctk gives points of no element the measure 1."""
         measure = self._weights
         for pair in (*pairs.fv_collisions, *pairs.ev_collisions):
             pair.weight *= measure[pair.vertex_id]
@@ -107,35 +114,35 @@ class Centroids:
             pair.weight *= measure[max(pair.vertex0_id, pair.vertex1_id)]
 
     def candidates(self, start: Values, end: Values, radius: float) -> ipctk.Candidates:
-        """Centroids and elements whose boxes, grown by `radius` (m), meet on the way from start to end (n, d).
+        """Centroids and elements whose boxes, grown by `radius` (m), overlap on the motion from start to end (n, d), m.
 
-        Elements that share a vertex are left out.
+        Elements that share a vertex are excluded.
         """
-        tree, solid = ipctk.LBVH(), self._surface.dim == 3
+        tree, is_3d = ipctk.LBVH(), self._surface.dim == 3
         tree.can_vertices_collide = self._surface.can_collide
-        none = np.empty((0, 3), np.int32)
-        tree.build(start, end, none[:, :2] if solid else self._surface.edges, self._surface.faces, radius)
-        if solid:
+        no_faces = np.empty((0, 3), np.int32)
+        tree.build(start, end, no_faces[:, :2] if is_3d else self._surface.edges, self._surface.faces, radius)
+        if is_3d:
             ids = [(pair.face0_id, pair.face1_id) for pair in tree.detect_face_face_candidates()]
         else:
             ids = [(pair.edge0_id, pair.edge1_id) for pair in tree.detect_edge_edge_candidates()]
         pairs = np.array(ids, np.int64).reshape(-1, 2)
         centre, element = np.concatenate([pairs, pairs[:, ::-1]]).T
-        meet = self._boxes_meet(centre, element, start, end, radius)
-        numbers = zip(element[meet].tolist(), (self._count + centre[meet]).tolist(), strict=True)
-        found = ipctk.Candidates()
-        if solid:
-            found.fv_candidates = [ipctk.FaceVertexCandidate(*pair) for pair in numbers]
+        overlap = self._boxes_overlap(centre, element, start, end, radius)
+        numbers = zip(element[overlap].tolist(), (self._count + centre[overlap]).tolist(), strict=True)
+        candidates = ipctk.Candidates()
+        if is_3d:
+            candidates.fv_candidates = [ipctk.FaceVertexCandidate(*pair) for pair in numbers]
         else:
-            found.ev_candidates = [ipctk.EdgeVertexCandidate(*pair) for pair in numbers]
-        return found
+            candidates.ev_candidates = [ipctk.EdgeVertexCandidate(*pair) for pair in numbers]
+        return candidates
 
-    def _boxes_meet(self, centre: Ints, element: Ints, start: Values, end: Values, radius: float) -> Flags:
-        """(k,) whether the box of the way of a centroid and that of an element meet, both grown by `radius`."""
+    def _boxes_overlap(self, centre: Ints, element: Ints, start: Values, end: Values, radius: float) -> Flags:
+        """(k,) whether the box of the motion of a centroid and that of an element overlap, both grown by `radius`."""
         corners = np.concatenate([start[self.elements], end[self.elements]], axis=1)
         low, high = corners.min(axis=1)[element] - 2 * radius, corners.max(axis=1)[element] + 2 * radius
-        one, other = (x[self.elements].mean(axis=1)[centre] for x in (start, end))
-        return np.asarray(np.all((np.minimum(one, other) <= high) & (np.maximum(one, other) >= low), axis=1))
+        first, last = (x[self.elements].mean(axis=1)[centre] for x in (start, end))
+        return np.asarray(np.all((np.minimum(first, last) <= high) & (np.maximum(first, last) >= low), axis=1))
 
 
 def measures(x: Values, elements: Ints) -> Values:

@@ -1,12 +1,7 @@
-"""Obstacles by the name that a user writes: half space, sphere, capsule, box, cylinder.
+"""Shapes of obstacles: half space, sphere, capsule, box, cylinder, and shapes made of others.
 
-A half space bounded by a plane (in 2D a line).
-
-Sphere and capsule (in 2D disk and stadium): all points within a radius of a point or a segment.
-
-A box with rounded edges; in 2D a rectangle with rounded corners.
-
-A finite cylinder with rounded edges, in 3D.
+Edges are rounded, so that distances are C1 outside. In 2D a half space is bounded by a line, a sphere is a disk, a
+capsule a stadium, a box a rectangle.
 """
 
 from __future__ import annotations
@@ -19,48 +14,62 @@ import numpy as np
 
 from ..errors import InputError
 from .shape_base import (
-    FILLET,
+    SHAPE,
     ConvexBody,
     QuadrantDistance,
     Shape,
+    Tessellation,
     Values,
     frame_about,
+    polygon,
+    profile,
     require_fillet,
     require_lengths,
     resized_fillet,
+    revolved,
+    rounded_block,
+    rounded_box,
+    surface_of_revolution,
     unit_vector,
 )
-from .tessellation import Tessellation, polygon, profile, revolved, rounded_block, rounded_box, surface_of_revolution
 
-__all__ = ["SHAPES", "Capsule", "HalfSpace", "RoundedBox", "RoundedCylinder", "Shape", "Sphere"]
+__all__ = [
+    "SHAPES", "Capsule", "HalfSpace", "OffsetShape", "RoundedBox", "RoundedCylinder", "Shape", "Sphere",
+    "TranslatedShape",
+]  # fmt: skip
 
 
 @dataclass(frozen=True)
 class HalfSpace:
-    """The half space n . x <= 0, n along `direction` (d numbers of any length), which points out of it."""
+    """Half space n . x <= 0.
+
+    Attributes:
+        direction: (d,) along n, of any length, out of the half space.
+        extent: edge of the patch that `tessellate` returns, m.
+    """
 
     kind: ClassVar[str] = "plane"
     direction: tuple[float, ...]
-    extent: float = 1.0  # edge of the patch that is drawn, m
+    extent: float = 1.0
 
     def __post_init__(self) -> None:
-        """InputError where it is no plane."""
+        """Raise InputError without a direction or extent."""
         unit_vector(self.direction)
-        require_lengths(self, extent=self.extent)
+        require_lengths(self.kind, extent=self.extent)
 
     @property
     def dim(self) -> int:
-        """2 or 3."""
+        """Dimension, 2 or 3."""
         return len(self.direction)
 
     @property
     def convex(self) -> bool:
-        """A half space is."""
+        """True."""
         return True
 
     @property
     def rotation_invariant(self) -> bool:
-        """It is not."""
+        """False."""
         return False
 
     @property
@@ -86,7 +95,7 @@ class HalfSpace:
         return np.zeros((len(x), self.dim, self.dim))
 
     def tessellate(self) -> Tessellation:
-        """A square patch of two triangles (in 2D one segment) about the reference point; not closed."""
+        """Square patch of two triangles (in 2D one segment) about the reference point; not closed."""
         R, h = frame_about(unit_vector(self.direction)), self.extent / 2
         if self.dim == 2:
             # outward is to the right of a segment, as on a counterclockwise polygon
@@ -95,20 +104,20 @@ class HalfSpace:
         return square @ R.T, np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 
     def inertia(self, density: float) -> Values:
-        """InputError: a half space has no finite mass."""
+        """Raise InputError: a half space has no finite mass."""
         raise InputError("a plane is a half space without end, so it cannot move freely: hold it or drive it")
 
 
 @dataclass(frozen=True)
-class _Swept(ConvexBody):
-    """All within a radius of a segment or point, which the subclasses say."""
+class _SweptSphere(ConvexBody):
+    """All points within a radius of a point or segment, the core."""
 
     @abstractmethod
     def _core(self) -> tuple[Values, float, float]:
         """Unit vector along the segment, half its length and the radius, m."""
 
     def _from_core(self, x: Values) -> tuple[Values, Values, Values]:
-        """Vectors (n, d) from the nearest points of the segment, their lengths, and heights along it (n,)."""
+        """Vectors (n, d) from the closest points of the core, their lengths (n,), and heights along it (n,), m."""
         axis, half, _ = self._core()
         height = x @ axis
         away = x - np.clip(height, -half, half)[:, None] * axis
@@ -122,18 +131,19 @@ class _Swept(ConvexBody):
         on_core = length < np.finfo(float).tiny
         if not on_core.any():
             return np.asarray(away / length[:, None])
-        some = frame_about(self._core()[0])[:, 0]  # on the segment itself every direction across it is as good
-        return np.where(on_core[:, None], some, away / np.where(on_core, 1.0, length)[:, None])
+        # on the core every direction across it is a closest one
+        across = frame_about(self._core()[0])[:, 0]
+        return np.where(on_core[:, None], across, away / np.where(on_core, 1.0, length)[:, None])
 
     def _curvature(self, x: Values) -> Values:
-        """(P - n n^T) / |x - nearest|, P across the axis beside the segment and the identity beyond its ends."""
+        """(n, d, d) (P - n n^T) / |x - closest|, P across the axis beside the core, the identity beyond its ends."""
         axis, half, _ = self._core()
         _, length, height = self._from_core(x)
         n, beside = self._normal(x), (abs(height) < half).astype(float)
         P = np.eye(self.dim) - beside[:, None, None] * np.outer(axis, axis)
         on_core = length < np.finfo(float).tiny
-        bent = (P - n[:, :, None] * n[:, None, :]) / np.where(on_core, 1.0, length)[:, None, None]
-        return np.where(on_core[:, None, None], 0.0, bent)
+        hessian = (P - n[:, :, None] * n[:, None, :]) / np.where(on_core, 1.0, length)[:, None, None]
+        return np.where(on_core[:, None, None], 0.0, hessian)
 
     def _radius(self) -> float:
         return self._core()[2]
@@ -144,7 +154,7 @@ class _Swept(ConvexBody):
     def _resized(self, by: float) -> Self:
         return replace(self, radius=self._radius() + by)  # type: ignore[call-arg]
 
-    def _outline(self) -> Tessellation:
+    def _tessellate(self) -> Tessellation:
         axis, half, radius = self._core()
         side = profile(0.0, half, radius)
         points, elements = polygon(side) if self.dim == 2 else surface_of_revolution(side)
@@ -156,22 +166,27 @@ class _Swept(ConvexBody):
 
 
 @dataclass(frozen=True)
-class Sphere(_Swept):
-    """All within `radius` (m) of the centre; in 2D a disk."""
+class Sphere(_SweptSphere):
+    """Sphere about the reference point; in 2D a disk.
+
+    Attributes:
+        radius: m.
+        dim: 2 or 3.
+    """
 
     kind: ClassVar[str] = "sphere"
     radius: float
     dim: int = 3
 
     def __post_init__(self) -> None:
-        """InputError where it is no sphere."""
-        require_lengths(self, radius=self.radius)
+        """Raise InputError unless radius and dimension are valid."""
+        require_lengths(self.kind, radius=self.radius)
         if self.dim not in (2, 3):
             raise InputError(f"a sphere in {self.dim} dimensions is not known: dim is 2 or 3")
 
     @property
     def rotation_invariant(self) -> bool:
-        """It is."""
+        """True."""
         return True
 
     def _core(self) -> tuple[Values, float, float]:
@@ -179,8 +194,14 @@ class Sphere(_Swept):
 
 
 @dataclass(frozen=True)
-class Capsule(_Swept):
-    """All within `radius` of a segment of `length` along `axis`, m: from end to end length + 2 radius. 2D: stadium."""
+class Capsule(_SweptSphere):
+    """All points within a radius of a segment; in 2D a stadium. Its overall length is length + 2 radius.
+
+    Attributes:
+        radius: m.
+        length: of the segment, m.
+        axis: (d,) along the segment.
+    """
 
     kind: ClassVar[str] = "capsule"
     radius: float
@@ -188,13 +209,13 @@ class Capsule(_Swept):
     axis: tuple[float, ...] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """InputError where it is no capsule."""
+        """Raise InputError unless lengths and axis are valid."""
         unit_vector(self.axis)
-        require_lengths(self, radius=self.radius, length=self.length)
+        require_lengths(self.kind, radius=self.radius, length=self.length)
 
     @property
     def dim(self) -> int:
-        """2 or 3."""
+        """Dimension, 2 or 3."""
         return len(self.axis)
 
     def _core(self) -> tuple[Values, float, float]:
@@ -203,10 +224,14 @@ class Capsule(_Swept):
 
 @dataclass(frozen=True)
 class RoundedBox(ConvexBody):
-    """A box of full `size` (d numbers, m), edges rounded with `rounding` (m, default: FILLET of the least half size).
+    """Box with rounded edges; in 2D a rectangle.
 
-    From inside, as of a container, the distance is C1 within the rounding of the wall; further in, where another wall
-    becomes the nearest, its gradient jumps: a barrier must be thinner than the rounding.
+    Inside a container the distance is C1 within the rounding of the wall. Farther in, where another wall becomes the
+    nearest, its gradient jumps: a barrier must be thinner than the rounding.
+
+    Attributes:
+        size: (d,) full sizes, m.
+        rounding: radius of the edges, m; default: `SHAPE.fillet_ratio` of the least half size.
     """
 
     kind: ClassVar[str] = "box"
@@ -214,22 +239,22 @@ class RoundedBox(ConvexBody):
     rounding: float | None = None
 
     def __post_init__(self) -> None:
-        """InputError where it is no box."""
+        """Raise InputError unless sizes and rounding are valid."""
         if len(self.size) not in (2, 3):
             raise InputError(f"a box of {len(self.size)} sizes is not known: give 2 or 3")
         for size in self.size:
-            require_lengths(self, size=size)
-        require_fillet(self, self.fillet, min(self.size) / 2)
+            require_lengths(self.kind, size=size)
+        require_fillet(self.kind, self.fillet, min(self.size) / 2)
 
     @property
     def dim(self) -> int:
-        """2 or 3."""
+        """Dimension, 2 or 3."""
         return len(self.size)
 
     @property
     def fillet(self) -> float:
         """Radius of the edges, m."""
-        return FILLET * min(self.size) / 2 if self.rounding is None else self.rounding
+        return SHAPE.fillet_ratio * min(self.size) / 2 if self.rounding is None else self.rounding
 
     def _half(self) -> Values:
         """(d,) half sizes of the sharp core that the fillet grows, m."""
@@ -258,7 +283,7 @@ class RoundedBox(ConvexBody):
         size = tuple(side + 2 * by for side in self.size)
         return replace(self, size=size, rounding=resized_fillet(self.fillet, by))
 
-    def _outline(self) -> Tessellation:
+    def _tessellate(self) -> Tessellation:
         half = self._half()
         if self.dim == 3:
             return rounded_block(half, self.fillet)
@@ -269,16 +294,22 @@ class RoundedBox(ConvexBody):
 
 
 def _signs(x: Values) -> Values:
-    """-1 or 1, never 0: on a middle plane there is a nearest face as well."""
+    """Signs -1 or 1, never 0: a point on a middle plane has a nearest face as well."""
     return np.where(x < 0, -1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class RoundedCylinder(ConvexBody):
-    """A cylinder of `radius` and full `length` along `axis`, edges rounded with `rounding` (m, default FILLET radius).
+    """Finite cylinder with rounded edges, in 3D.
 
-    In the half plane through the axis it is a corner, q = (rho - (R - r), |height| - (L / 2 - r)). From inside the
-    distance is C1 within the rounding of the wall, as for a box.
+    In the half plane through the axis it is a quadrant, q = (rho - (R - r), |height| - (L / 2 - r)). Inside a
+    container the distance is C1 within the rounding of the wall, as for a box.
+
+    Attributes:
+        radius: R, m.
+        length: full length L, m.
+        rounding: radius r of the edges, m; default: `SHAPE.fillet_ratio` of the radius.
+        axis: (3,) direction.
     """
 
     kind: ClassVar[str] = "cylinder"
@@ -288,31 +319,31 @@ class RoundedCylinder(ConvexBody):
     axis: tuple[float, ...] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        """InputError where it is no cylinder."""
+        """Raise InputError unless lengths, rounding and axis are valid."""
         unit_vector(self.axis)
         if len(self.axis) != 3:
             raise InputError("a cylinder needs an axis of 3 numbers: in 2D take a sphere (a disk) or a box")
-        require_lengths(self, radius=self.radius, length=self.length)
-        require_fillet(self, self.fillet, min(self.radius, self.length / 2))
+        require_lengths(self.kind, radius=self.radius, length=self.length)
+        require_fillet(self.kind, self.fillet, min(self.radius, self.length / 2))
         if self.fillet == self.radius:
             raise InputError("the rounding of a cylinder is its radius: take a capsule")
 
     @property
     def dim(self) -> int:
-        """3."""
+        """Dimension, 3."""
         return 3
 
     @property
     def fillet(self) -> float:
-        """Radius of the edges, m; for a thin disk no more than half its thickness."""
-        return min(FILLET * self.radius, self.length / 2) if self.rounding is None else self.rounding
+        """Radius of the edges, m; of a thin disk at most half its thickness."""
+        return min(SHAPE.fillet_ratio * self.radius, self.length / 2) if self.rounding is None else self.rounding
 
     def _core(self) -> tuple[float, float]:
         """Radius and half length of the sharp core that the fillet grows, m."""
         return self.radius - self.fillet, self.length / 2 - self.fillet
 
     def _polar(self, x: Values) -> tuple[QuadrantDistance, Values, Values, Values]:
-        """The corner, distances from the axis (n,), and unit vectors (n, d) away from the axis and up or down it."""
+        """Quadrant distance, distances from the axis (n,), m, unit vectors (n, d) away from the axis and along it."""
         axis, (radius, half) = unit_vector(self.axis), self._core()
         height = x @ axis
         across = x - height[:, None] * axis
@@ -332,14 +363,14 @@ class RoundedCylinder(ConvexBody):
         return corner.gradient[:, :1] * away + corner.gradient[:, 1:] * up
 
     def _curvature(self, x: Values) -> Values:
-        """The corner's Hessian in the half plane, and f_rho / rho around the axis (0 on it: an end is nearest)."""
+        """(n, d, d) quadrant's Hessian in the half plane, and f_rho / rho around the axis (0 on it)."""
         corner, rho, away, up = self._polar(x)
         plane = np.stack([away, up], axis=1)
         around = np.cross(away, up)
         on_axis = rho < np.finfo(float).tiny
-        ring = np.where(on_axis, 0.0, corner.gradient[:, 0] / np.where(on_axis, 1.0, rho))
-        bent = plane.transpose(0, 2, 1) @ corner.hessian @ plane
-        return np.asarray(bent + ring[:, None, None] * around[:, :, None] * around[:, None, :])
+        hoop = np.where(on_axis, 0.0, corner.gradient[:, 0] / np.where(on_axis, 1.0, rho))
+        in_plane = plane.transpose(0, 2, 1) @ corner.hessian @ plane
+        return np.asarray(in_plane + hoop[:, None, None] * around[:, :, None] * around[:, None, :])
 
     def _radius(self) -> float:
         return self.fillet
@@ -351,7 +382,7 @@ class RoundedCylinder(ConvexBody):
         rounding = resized_fillet(self.fillet, by)
         return replace(self, radius=self.radius + by, length=self.length + 2 * by, rounding=rounding)
 
-    def _outline(self) -> Tessellation:
+    def _tessellate(self) -> Tessellation:
         radius, half = self._core()
         side = profile(radius, half, self.fillet)
         points, triangles = surface_of_revolution(side)
@@ -362,6 +393,106 @@ class RoundedCylinder(ConvexBody):
         return revolved(unit_vector(self.axis), radius, half, self.fillet)
 
 
+@dataclass(frozen=True, eq=False)
+class _ModifiedShape:
+    """Shape made of another one, of which it has the dimension and the kind of surface."""
+
+    kind: ClassVar[str] = "modified shape"
+    shape: Shape
+
+    @property
+    def dim(self) -> int:
+        """Dimension, 2 or 3."""
+        return self.shape.dim
+
+    @property
+    def convex(self) -> bool:
+        """Whether the shape is convex."""
+        return self.shape.convex
+
+    @property
+    def min_radius(self) -> float:
+        """Smallest radius of curvature of the original shape, m."""
+        return self.shape.min_radius
+
+    @property
+    def volume(self) -> float:
+        """Volume of the original shape, m^3 (2D: m^2)."""
+        return self.shape.volume
+
+
+@dataclass(frozen=True, eq=False)
+class TranslatedShape(_ModifiedShape):
+    """Shape centred at an offset from its reference point, as of a pendulum about its hinge.
+
+    Attributes:
+        shape: original shape.
+        offset: (d,) its centre, m.
+    """
+
+    offset: Values
+
+    @property
+    def rotation_invariant(self) -> bool:
+        """False: a rotation about the reference point moves it."""
+        return False
+
+    def distance(self, x: Values) -> Values:
+        """(n,) signed distances, m."""
+        return self.shape.distance(x - self.offset)
+
+    def normal(self, x: Values) -> Values:
+        """(n, d) gradients of the distance."""
+        return self.shape.normal(x - self.offset)
+
+    def curvature(self, x: Values) -> Values:
+        """(n, d, d) Hessians of the distance, 1/m."""
+        return self.shape.curvature(x - self.offset)
+
+    def tessellate(self) -> Tessellation:
+        """Tessellation of the original shape, moved."""
+        points, elements = self.shape.tessellate()
+        return points + self.offset, elements
+
+    def inertia(self, density: float) -> Values:
+        """Moment of inertia about the reference point: I + m (|o|^2 1 - o o^T) (Huygens and Steiner)."""
+        mass, o = density * self.volume, self.offset
+        central = self.shape.inertia(density)
+        if self.dim == 2:
+            return np.asarray(central + mass * (o @ o))
+        return np.asarray(central + mass * ((o @ o) * np.eye(3) - np.outer(o, o)))
+
+
+@dataclass(frozen=True, eq=False)
+class OffsetShape(_ModifiedShape):
+    """All points within an offset of a shape: its distance minus the offset.
+
+    Attributes:
+        shape: original shape.
+        offset: m.
+    """
+
+    offset: float
+
+    @property
+    def rotation_invariant(self) -> bool:
+        """Whether no rotation about the reference point changes the shape."""
+        return self.shape.rotation_invariant
+
+    def distance(self, x: Values) -> Values:
+        """(n,) signed distances, m."""
+        return self.shape.distance(x) - self.offset
+
+    def normal(self, x: Values) -> Values:
+        """(n, d) gradients of the distance."""
+        return self.shape.normal(x)
+
+    def curvature(self, x: Values) -> Values:
+        """(n, d, d) Hessians of the distance, 1/m."""
+        return self.shape.curvature(x)
+
+
+# the name that a study gives -> class
 SHAPES: dict[str, type[Shape]] = {
     "plane": HalfSpace, "sphere": Sphere, "capsule": Capsule, "box": RoundedBox, "cylinder": RoundedCylinder,
 }  # fmt: skip

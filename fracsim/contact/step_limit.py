@@ -1,8 +1,10 @@
-"""Points on their way: how far they may go before an obstacle, and first guesses that have passed through nothing.
+"""Step limits of points and facets before obstacles, and the motion of obstacles in a step.
 
-Points and an obstacle in motion: the gaps on the way, and bounds of how fast they close.
+Conservative advancement: from a gap g a point may move on by (g - g_min) / speed, where the speed bounds how fast its
+gap closes. First guesses that would cross an obstacle are stopped in front of it. Obstacles that would crush a jammed
+body are held, and advance as far as the body allows.
 
-Where obstacles are in a step, and how far on their way: those that are jammed wait and come on bit by bit.
+Equations: docs/theory.md#step-limits.
 """
 
 from __future__ import annotations
@@ -16,297 +18,382 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ..errors import InputError
-from .barrier import safe_fractions
 from .closest_point import FacetClosestPoints, find_closest_points
 from .contact_surface import ContactSurface
 from .facet_contact import ContactFacets
+from .laws import BARRIER
 from .obstacle import RigidObstacle
 from .pose import PosedShape, rotate_vectors
 
-Ints = npt.NDArray[np.int64]
-ROUGH = 1e-6  # of the size of a facet: what is left of derivatives where its deepest place is found roughly
 Values = npt.NDArray[np.float64]
-ROUNDS = 20  # in which points that follow several nodes are brought back
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class StepLimitPolicy:
+    """Tuned numbers of step limits.
+
+    Attributes:
+        max_iterations: of conservative advancement. Each ends with safe fractions.
+        min_progress: relative change of a fraction at which the advancement ends.
+        closest_point_tolerance: remaining derivative by barycentric coordinates, in facet sizes, on the way.
+        reach: points nearer to an obstacle than this times their motion are looked at.
+        max_rounds: rounds in which points that depend on several nodes are stopped before obstacles.
+        min_weight: sum of weights of stopped points from which on a node is moved back.
+    """
+
+    max_iterations: int = 50
+    min_progress: float = 1e-3
+    closest_point_tolerance: float = 1e-6
+    reach: float = 1.2
+    max_rounds: int = 20
+    min_weight: float = 1e-3
+
+
+LIMITS = StepLimitPolicy()
+
+
+def safe_fractions(gap: Callable[[Values], Values], speed: Callable[[Values], Values], count: int) -> Values:
+    """(count,) fractions in (0, 1] of a motion that leave `BARRIER.min_gap_ratio` of every gap all along the way.
+
+    Args:
+        gap: fractions (n,) -> gaps (n,) there, m, obstacles having moved by the same fractions.
+        speed: fractions (n,) -> bounds (n,) of the closing speed from there to the end, m per whole motion.
+        count: n.
+
+    Raises:
+        ValueError: if a gap is closed at the start.
+    """
+    fraction = np.zeros(count)
+    distance = gap(fraction)
+    if not (distance > 0).all():
+        raise ValueError(f"{int((~(distance > 0)).sum())} gaps are closed before the motion: no share of it is safe")
+    min_gap = BARRIER.min_gap_ratio * distance
+    for _ in range(LIMITS.max_iterations):
+        # round-off may put a gap just below its minimum: no step back
+        excess = np.maximum(distance - min_gap, 0)
+        advance = excess / np.maximum(np.maximum(speed(fraction), excess), np.finfo(float).tiny)
+        fraction = np.minimum(fraction + advance, 1.0)
+        if ((fraction == 1) | (advance < LIMITS.min_progress * fraction)).all():
+            break
+        distance = gap(fraction)
+    return fraction
 
 
 @dataclass(frozen=True, eq=False)
 class PointMotion:
-    """Points x (n, d) go straight by `moved` (n, d), m, and the pose of an obstacle by q: at share s by s q."""
+    """Straight motion of points, and of an obstacle whose pose is incremented by s q at the fraction s.
+
+    Attributes:
+        obstacle: at the start.
+        x: (n, d) points at the start, m.
+        motion: (n, d) of the points, m.
+        increment: (p,) q.
+    """
 
     obstacle: PosedShape
     x: Values
     motion: Values
     increment: Values
 
-    def gap(self, share: Values) -> Values:
-        """(n,) distances after shares (n,) of the motion, m."""
-        return self.obstacle.shape.distance(self._place(share))
+    def gap(self, fraction: Values) -> Values:
+        """(n,) distances after fractions (n,) of the motion, m."""
+        return self.obstacle.shape.distance(self._body_positions(fraction))
 
-    def speed(self, share: Values) -> Values:
-        """(n,) no gap closes faster than this from `share` to the end, m per whole motion.
+    def speed(self, fraction: Values) -> Values:
+        """(n,) bounds of the closing speed from `fraction` to the end, m per whole motion.
 
-        Seen from the centre a point goes straight, by v. The distance to a convex body is a convex function, which lies
-        above its tangent: a gap loses no more than -n . v, n its normal at `share`. So what slides along a floor may go
-        on. To a hollow body the distance is 1-Lipschitz only: |v|. A turn by w adds |w| times the reach.
+        Relative to the centre a point moves straight, by v. The distance to a convex body lies above its tangent
+        plane: a gap loses at most -n . v, n its normal at `fraction`. So a point that slides along a plane may move
+        on. The distance to a hollow body is Lipschitz alone: |v|. A rotation by w adds |w| times the distance from
+        the centre.
         """
         v = self._relative
         if self.obstacle.shape.convex:
-            n = self.obstacle.shape.normal(self._place(share))
-            closing = np.maximum(-np.einsum("ni,ni->n", n, self._seen(v, share)), 0)
+            n = self.obstacle.shape.normal(self._body_positions(fraction))
+            closing = np.maximum(-np.einsum("ni,ni->n", n, self._to_body(v, fraction)), 0)
         else:
             closing = np.linalg.norm(v, axis=1)
-        return closing + self._turning
+        return closing + self._rotation_speed
 
     @cached_property
     def _relative(self) -> Values:
         return self.motion - self.increment[: self.obstacle.pose.dim]
 
     @cached_property
-    def _turn(self) -> Values:
+    def _rotation(self) -> Values:
         return self.increment[self.obstacle.pose.dim :]
 
     @cached_property
-    def _turning(self) -> Values:
+    def _rotation_speed(self) -> Values:
         """(n,) |w| times the largest distance from the centre on the way, which is at one of its ends."""
-        ends = [np.linalg.norm(self._from_centre(np.full(len(self.x), share)), axis=1) for share in (0.0, 1.0)]
-        return np.asarray(np.linalg.norm(self._turn) * np.maximum(*ends))
+        ends = [np.linalg.norm(self._from_centre(np.full(len(self.x), end)), axis=1) for end in (0.0, 1.0)]
+        return np.asarray(np.linalg.norm(self._rotation) * np.maximum(*ends))
 
-    def _place(self, share: Values) -> Values:
-        """(n, d) the points in the frame of the body. Kept: gaps and speeds are asked for at the same shares."""
-        kept = vars(self).get("kept")
-        if kept is None or kept[0] is not share:
-            kept = vars(self)["kept"] = share, self._seen(self._from_centre(share), share)
-        return kept[1]
+    def _body_positions(self, fraction: Values) -> Values:
+        """(n, d) points in the frame of the obstacle; cached, as gap and speed need the same ones."""
+        cached = vars(self).get("cached")
+        if cached is None or cached[0] is not fraction:
+            cached = vars(self)["cached"] = fraction, self._to_body(self._from_centre(fraction), fraction)
+        return cached[1]
 
-    def _from_centre(self, share: Values) -> Values:
-        return np.asarray(self.x - self.obstacle.pose.centre + share[:, None] * self._relative)
+    def _from_centre(self, fraction: Values) -> Values:
+        return np.asarray(self.x - self.obstacle.pose.centre + fraction[:, None] * self._relative)
 
-    def _seen(self, vectors: Values, share: Values) -> Values:
-        """(n, d) vectors in the frame that the body has at each share."""
-        return np.asarray(rotate_vectors(vectors, -share[:, None] * self._turn) @ self.obstacle.pose.rotation)
+    def _to_body(self, vectors: Values, fraction: Values) -> Values:
+        """(n, d) vectors in the frame that the obstacle has at each fraction."""
+        return np.asarray(rotate_vectors(vectors, -fraction[:, None] * self._rotation) @ self.obstacle.pose.rotation)
 
 
 class FacetMotion:
-    """Facets whose deepest places are `at`, and whose corners go straight by `relative` (k, c, d), m, past a convex
-    obstacle that turns by `turn` (r,), rad, meanwhile.
+    """Motion of facets past a convex obstacle that rotates.
 
-    On the way these are found roughly: L (closest_point) lies above its tangent at any place, which is what counts. The
-    obstacle stays where it was, and corners go as they are seen from it.
+    On the way closest points are found with a coarse tolerance: L (closest_point) lies above its tangent plane at any
+    point. The obstacle stays where it was, and corners move relative to it.
     """
 
-    def __init__(self, at: FacetClosestPoints, relative: Values, turn: Values) -> None:
-        self._start, self._relative, self._turn = at.x, relative, turn
-        self._share: Values = np.zeros(len(at.x))
-        self._at = at
-        self._centre, self._turns = at.posed.pose.centre, float(np.linalg.norm(turn))
+    def __init__(self, closest: FacetClosestPoints, relative: Values, rotation: Values) -> None:
+        """Motion of facets.
+
+        Args:
+            closest: closest points at the start.
+            relative: (k, c, d) straight motion of the corners relative to the obstacle, m.
+            rotation: (r,) of the obstacle, rad.
+        """
+        self._start, self._relative, self._rotation = closest.x, relative, rotation
+        self._fraction: Values = np.zeros(len(closest.x))
+        self._closest = closest
+        self._centre, self._angle = closest.posed.pose.centre, float(np.linalg.norm(rotation))
 
     @property
     def count(self) -> int:
-        """k."""
+        """Number k of facets."""
         return len(self._start)
 
-    def select(self, which: Ints) -> FacetMotion:
-        """Some of them, at the start."""
-        at = self._at
-        some = FacetClosestPoints(at.posed, at.x[which], at.smoothing, at.barycentric[which])
-        return FacetMotion(some, self._relative[which], self._turn)
+    def select(self, facets: Ints) -> FacetMotion:
+        """Motion of some of the facets, at the start."""
+        closest = self._closest
+        selected = FacetClosestPoints(closest.posed, closest.x[facets], closest.smoothing, closest.barycentric[facets])
+        return FacetMotion(selected, self._relative[facets], self._rotation)
 
-    def _there(self, share: Values) -> FacetClosestPoints:
-        if not np.array_equal(share, self._share):
-            x, at = self._start + share[:, None, None] * self._relative, self._at
-            if self._turns:
-                x = self._centre + self._seen(x - self._centre, share)
-            self._share, self._at = share.copy(), find_closest_points(at.posed, x, at.smoothing, at.barycentric, ROUGH)
-        return self._at
+    def _closest_at(self, fraction: Values) -> FacetClosestPoints:
+        if not np.array_equal(fraction, self._fraction):
+            x, closest = self._start + fraction[:, None, None] * self._relative, self._closest
+            if self._angle:
+                x = self._centre + self._rotated_back(x - self._centre, fraction)
+            self._fraction, tolerance = fraction.copy(), LIMITS.closest_point_tolerance
+            self._closest = find_closest_points(closest.posed, x, closest.smoothing, closest.barycentric, tolerance)
+        return self._closest
 
-    def _seen(self, vectors: Values, share: Values) -> Values:
-        """(k, c, d) vectors in the axes of the obstacle at each share, turned back to those that it had."""
-        (k, c, d), w = vectors.shape, -share[:, None] * self._turn
+    def _rotated_back(self, vectors: Values, fraction: Values) -> Values:
+        """(k, c, d) vectors relative to the obstacle at each fraction, in the axes that it had at the start."""
+        (k, c, d), w = vectors.shape, -fraction[:, None] * self._rotation
         return rotate_vectors(vectors.reshape(-1, d), np.repeat(w, c, axis=0)).reshape(k, c, d)
 
-    def gap(self, share: Values) -> Values:
-        """(k,) no less is left after shares (k,) of the motion, m."""
-        at = self._there(share)
-        return at.gap + np.minimum(at.corner_rise.min(axis=1), 0.0)
+    def gap(self, fraction: Values) -> Values:
+        """(k,) lower bounds of gaps after fractions (k,) of the motion, m."""
+        closest = self._closest_at(fraction)
+        return closest.gap + np.minimum(closest.corner_rise.min(axis=1), 0.0)
 
-    def speed(self, share: Values) -> Values:
-        """(k,) no gap closes faster than this from `share` to the end, m per whole motion.
+    def speed(self, fraction: Values) -> Values:
+        """(k,) bounds of the closing speed from `fraction` to the end, m per whole motion.
 
-        Each corner is over the tangent by its slack, or more: one that comes closer by v may go on by the share
-        (gap + slack) / v. A turn by w adds |w| times the reach.
+        A corner is above the tangent plane by its rise: if it approaches by v, the facet may move on by the fraction
+        (gap + rise) / v. A rotation by w adds |w| times the distance from the centre.
         """
-        at, gap = self._there(share), np.maximum(self.gap(share), np.finfo(float).tiny)[:, None]
-        v = self._seen(self._relative, share) if self._turns else self._relative
-        closing = np.maximum(-np.einsum("kcd,kd->kc", v, at.normal), 0.0)
-        if self._turns:
-            closing += self._turns * self._reach()
-        over = np.maximum(at.gap[:, None] + at.corner_rise, gap)
-        return np.asarray((closing * gap / over).max(axis=1))
+        closest, gap = self._closest_at(fraction), np.maximum(self.gap(fraction), np.finfo(float).tiny)[:, None]
+        v = self._rotated_back(self._relative, fraction) if self._angle else self._relative
+        closing = np.maximum(-np.einsum("kcd,kd->kc", v, closest.normal), 0.0)
+        if self._angle:
+            closing += self._angle * self._max_distance()
+        height = np.maximum(closest.gap[:, None] + closest.corner_rise, gap)
+        return np.asarray((closing * gap / height).max(axis=1))
 
-    def _reach(self) -> Values:
-        """(k, c) the largest distance of corners from the centre on the way, which is at one of its ends."""
+    def _max_distance(self) -> Values:
+        """(k, c) largest distance of corners from the centre on the way, which is at one of its ends, m."""
         ends = self._start - self._centre, self._start - self._centre + self._relative
-        return np.maximum(*(np.linalg.norm(each, axis=2) for each in ends))
+        return np.maximum(*(np.linalg.norm(end, axis=2) for end in ends))
 
 
-type ObstacleMotion = tuple[
-    PosedShape, Values, ContactFacets | None
-]  # where an obstacle begins, increment (p,) of its pose, what feels it
+# obstacle at the start, increment (p,) of its pose, and facets on which it acts
+type ObstacleMotion = tuple[PosedShape, Values, ContactFacets | None]
 
 
 def safe_motion_fractions(
-    placed: PosedShape, x: Values, moved: Values, q: Values, facets: ContactFacets | None = None
+    posed: PosedShape, x: Values, motion: Values, q: Values, facets: ContactFacets | None = None
 ) -> Values:
-    """(n,) shares in [0, 1] of the ways `moved` (n, d) of points x that leave a tenth of each gap to an obstacle which
-    moves by q meanwhile, and of those of their `facets`; 0 where the gap is closed already."""
-    turn = (q := placed.effective_increment(q))[placed.pose.dim :]
-    relative = moved - q[: placed.pose.dim]
-    reach, swept = np.linalg.norm(relative, axis=1), None
-    if turn.any():
-        swept = np.linalg.norm(turn) * (np.linalg.norm(x - placed.pose.centre, axis=1) + reach)
-        reach = reach + swept
-    if placed.distance_bound(x) > 1.2 * reach.max(initial=0.0):
-        return np.ones(len(x))
-    gap = placed.distance(x)
-    share = np.where(gap > 0, 1.0, 0.0)
-    near = np.flatnonzero((gap > 0) & (gap < 1.2 * reach))
-    if len(near):
-        motion = PointMotion(placed, x[near], moved[near], q)
-        share[near] = safe_fractions(motion.gap, motion.speed, len(near))
-    if facets is not None:
-        near = facets.closing_facets(placed, x, relative, swept, 1.2 * reach)
-        free = _facet_shares(FacetMotion(facets.closest_points(placed, x, near), relative[facets.corners[near]], turn))
-        np.minimum.at(share, facets.corners[near], free[:, None])
-    return share
+    """(n,) fractions in [0, 1] of motions that leave a tenth of each gap to an obstacle; 0 where a gap is closed.
 
-
-def _facet_shares(passing: FacetMotion) -> Values:
-    """(k,) shares of the ways of facets to an obstacle that leave a tenth of their gaps."""
-    gap = passing.gap(np.zeros(passing.count))
-    share, open_ = np.zeros(len(gap)), np.flatnonzero(gap > 0)
-    if len(open_):
-        passing = passing.select(open_)
-        share[open_] = safe_fractions(passing.gap, passing.speed, len(open_))
-    return share
-
-
-def stop_before_obstacles(skin: ContactSurface, ways: Sequence[ObstacleMotion], start: Values, end: Values) -> Values:
-    """(owned dofs,) of displacements at the start and a guess of the end of a step, the end with every point stopped
-    where it would pass into an obstacle; from there on the obstacle takes it along (collective).
-
-    Each point on its own: to shorten the step of the whole body would leave a driven obstacle inside it. A point of a
-    crack follows several nodes, which it brings back with it.
+    Args:
+        posed: obstacle at the start.
+        x: (n, d) points at the start, m.
+        motion: (n, d) of the points, m.
+        q: (p,) increment of the obstacle's pose.
+        facets: facets on which the obstacle acts; corners get the fractions of their facets as well.
     """
-    x, follow = skin.positions(start), skin.interpolation
-    for _ in range(ROUNDS):
-        back, stopped = _brought_back(skin.area, ways, x, follow(end - start))
-        if not skin.comm.allreduce(int(stopped.any())):
+    rotation = (q := posed.effective_increment(q))[posed.pose.dim :]
+    relative = motion - q[: posed.pose.dim]
+    reach, rotation_motion = np.linalg.norm(relative, axis=1), None
+    if rotation.any():
+        rotation_motion = np.linalg.norm(rotation) * (np.linalg.norm(x - posed.pose.centre, axis=1) + reach)
+        reach = reach + rotation_motion
+    if posed.distance_bound(x) > LIMITS.reach * reach.max(initial=0.0):
+        return np.ones(len(x))
+    gap = posed.distance(x)
+    fraction = np.where(gap > 0, 1.0, 0.0)
+    near = np.flatnonzero((gap > 0) & (gap < LIMITS.reach * reach))
+    if len(near):
+        points = PointMotion(posed, x[near], motion[near], q)
+        fraction[near] = safe_fractions(points.gap, points.speed, len(near))
+    if facets is not None:
+        near = facets.closing_facets(posed, x, relative, rotation_motion, LIMITS.reach * reach)
+        closest, corners = facets.closest_points(posed, x, near), facets.corners[near]
+        facet_fraction = _facet_fractions(FacetMotion(closest, relative[corners], rotation))
+        np.minimum.at(fraction, corners, facet_fraction[:, None])
+    return fraction
+
+
+def _facet_fractions(facets: FacetMotion) -> Values:
+    """(k,) fractions of the motions of facets that leave a tenth of their gaps."""
+    gap = facets.gap(np.zeros(facets.count))
+    fraction, is_open = np.zeros(len(gap)), np.flatnonzero(gap > 0)
+    if len(is_open):
+        facets = facets.select(is_open)
+        fraction[is_open] = safe_fractions(facets.gap, facets.speed, len(is_open))
+    return fraction
+
+
+def stop_before_obstacles(
+    surface: ContactSurface, motions: Sequence[ObstacleMotion], start: Values, end: Values
+) -> Values:
+    """First guess with every point stopped where it would cross an obstacle; the obstacle then takes it along.
+
+    Each point by itself: to shorten the step of the whole body would leave a driven obstacle inside it. A point of a
+    crack face depends on several nodes, which are moved back with it (collective).
+
+    Args:
+        surface: points.
+        motions: motions of the obstacles.
+        start: (owned dofs,) displacements at the start, m.
+        end: (owned dofs,) first guess of those at the end, m.
+    """
+    x, interpolation = surface.positions(start), surface.interpolation
+    for _ in range(LIMITS.max_rounds):
+        correction, stopped = _corrections(surface.area, motions, x, interpolation(end - start))
+        if not surface.comm.allreduce(int(stopped.any())):
             return end
-        weight = follow.assemble_to_nodes(np.repeat(stopped[:, None], x.shape[1], axis=1).astype(float))
-        change = follow.assemble_to_nodes(back)
-        end = end + np.where(np.abs(weight) > 1e-3, change / np.where(np.abs(weight) > 1e-3, weight, 1.0), 0.0)
+        weight = interpolation.assemble_to_nodes(np.repeat(stopped[:, None], x.shape[1], axis=1).astype(float))
+        change = interpolation.assemble_to_nodes(correction)
+        counts = np.abs(weight) > LIMITS.min_weight
+        end = end + np.where(counts, change / np.where(counts, weight, 1.0), 0.0)
     return end
 
 
-def _brought_back(
-    area: Values, ways: Sequence[ObstacleMotion], x: Values, moved: Values
-) -> tuple[Values, npt.NDArray[np.bool_]]:
-    """(n, d) what is to be added to the ways of points, and which of them are stopped."""
-    back, stopped = np.zeros_like(x), np.zeros(len(x), bool)
-    for placed, q, facets in ways:
-        share = np.where(area > 0, safe_motion_fractions(placed, x, moved, q, facets), 1.0)
-        held = share < 1
-        back[held] = ((share - 1)[:, None] * (moved - q[: x.shape[1]]))[held]
-        stopped |= held
-    return back, stopped
+def _corrections(area: Values, motions: Sequence[ObstacleMotion], x: Values, motion: Values) -> tuple[Values, Flags]:
+    """(n, d) corrections of the motions of points, m, and (n,) whether a point is stopped."""
+    correction, stopped = np.zeros_like(x), np.zeros(len(x), bool)
+    for posed, q, facets in motions:
+        fraction = np.where(area > 0, safe_motion_fractions(posed, x, motion, q, facets), 1.0)
+        limited = fraction < 1
+        correction[limited] = ((fraction - 1)[:, None] * (motion - q[: x.shape[1]]))[limited]
+        stopped |= limited
+    return correction, stopped
 
 
 def check_obstacles_apart(comm: MPI.Intracomm, x: Values, obstacles: tuple[RigidObstacle, ...]) -> None:
-    """InputError where a point of the body lies in an obstacle before the first step (collective)."""
-    for number, each in enumerate(obstacles):
-        refuse_overlap(comm, each.posed_at(0.0).distance(x), number, each)
+    """Raise InputError where a point x (n, d) of the body lies in an obstacle before the first step (collective)."""
+    for number, obstacle in enumerate(obstacles):
+        refuse_overlap(comm, obstacle.posed_at(0.0).distance(x), number, obstacle)
 
 
-def refuse_overlap(comm: MPI.Intracomm, gaps: Values, number: int, each: RigidObstacle) -> None:
-    """InputError where a distance to an obstacle at the start is not positive (collective)."""
-    least = comm.allreduce(float(gaps.min(initial=np.inf)), op=MPI.MIN)
-    if least <= 0:
+def refuse_overlap(comm: MPI.Intracomm, gaps: Values, number: int, obstacle: RigidObstacle) -> None:
+    """Raise InputError where a gap (n,) to an obstacle at the start is not positive (collective)."""
+    min_gap = comm.allreduce(float(gaps.min(initial=np.inf)), op=MPI.MIN)
+    if min_gap <= 0:
         raise InputError(
-            f"obstacle.{number}: {each.name} overlaps the body at the start, by {-least:.4g} m; "
+            f"obstacle.{number}: {obstacle.name} overlaps the body at the start, by {-min_gap:.4g} m; "
             "move it away or make it smaller"
         )
 
 
-type PoseMotion = tuple[PosedShape, Values]  # where an obstacle begins, and the increment (p,) of its pose
+type PoseMotion = tuple[PosedShape, Values]  # an obstacle at its start, and the increment (p,) of its pose
 
 
 class ObstacleKinematics:
-    """Obstacles on their ways.
+    """Poses and motions of obstacles in a step.
 
     Attributes:
-        placed, at_start: where each is, and was as the step began.    ways: (p,) increment of its pose in the step.
-        led: numbers of those whose way is known.
+        posed: obstacles at their current poses.
+        start_posed: obstacles at the start of the step.
+        increments: (p,) increment of each pose in the step.
+        prescribed: numbers of obstacles with a prescribed motion.
     """
 
     posed: list[PosedShape]
     start_posed: list[PosedShape]
     increments: list[Values]
 
-    def __init__(self, obstacles: Sequence[RigidObstacle], led: list[int]) -> None:
-        self._obstacles, self.prescribed = obstacles, led
-        self._travelled = 1.0  # share of their way
+    def __init__(self, obstacles: Sequence[RigidObstacle], prescribed: list[int]) -> None:
+        self._obstacles, self.prescribed = obstacles, prescribed
+        self._travelled = 1.0  # fraction of their motion
 
     def begin_step(self, start: float, end: float) -> None:
-        """A step between these times, s, or a look at a state at `end`."""
-        self.posed = [each.posed_at(end) for each in self._obstacles]
-        self.start_posed = [each.posed_at(start) for each in self._obstacles]
-        self.increments = [each.pose_increment(start, end) for each in self._obstacles]
+        """Begin a step between these times, s, or an evaluation of a state at `end`."""
+        self.posed = [obstacle.posed_at(end) for obstacle in self._obstacles]
+        self.start_posed = [obstacle.posed_at(start) for obstacle in self._obstacles]
+        self.increments = [obstacle.pose_increment(start, end) for obstacle in self._obstacles]
         self._travelled = 1.0
 
-    def hold_at_start(self, number: int, placed: PosedShape) -> None:
-        """One whose way is not known yet stays where it began."""
-        self.posed[number] = self.start_posed[number] = placed
+    def hold_at_start(self, number: int, posed: PosedShape) -> None:
+        """Place an obstacle whose motion is not known yet where it began."""
+        self.posed[number] = self.start_posed[number] = posed
 
     def prescribed_motions(self, facets: Callable[[int], ContactFacets | None]) -> list[ObstacleMotion]:
-        """Where each obstacle whose way is known is at the start of the step, its way (p,) to the end, and the facets
-        that feel it, by its number."""
+        """Full motions of the prescribed obstacles; `facets`: number -> facets on which an obstacle acts."""
         return [(self.start_posed[number], self.increments[number], facets(number)) for number in self.prescribed]
 
     def return_to_start(self) -> None:
-        """None has gone any of its way."""
+        """Move the prescribed obstacles back to the start."""
         self._travelled = 0.0
 
     @property
     def remaining_fraction(self) -> float:
-        """The share of their way that is left; 0: all have gone all of it."""
+        """Fraction of the motion of prescribed obstacles that remains."""
         return 1 - self._travelled
 
     def full_motions(self) -> dict[int, PoseMotion]:
-        """Where each whose way is known was as the step began, and its way (p,), by numbers."""
+        """Full motion of each prescribed obstacle, by its number."""
         return {number: (self.start_posed[number], self.increments[number]) for number in self.prescribed}
 
     def remaining_motions(self) -> dict[int, PoseMotion]:
-        """Where it is now, and what is left of its way."""
+        """Remaining motion of each prescribed obstacle, by its number."""
         return {
-            number: (self._posed_after(*way), (1 - self._travelled) * way[1])
-            for number, way in self.full_motions().items()
+            number: (self._posed_after(*motion), (1 - self._travelled) * motion[1])
+            for number, motion in self.full_motions().items()
         }
 
     def advance(
-        self, x: Values, ways: list[ObstacleMotion], least: Callable[[Values], float], most: float = 1.0
+        self, x: Values, motions: list[ObstacleMotion], minimum: Callable[[Values], float], limit: float = 1.0
     ) -> None:
-        """A share of the rest of the `known` ways, `most` at most, that is safe with points at x (n, d); `least`: of
-        shares (n,), on all ranks (collective)."""
-        rest, still = 1 - self._travelled, np.zeros_like(x)
-        shares = [
-            safe_motion_fractions(self._posed_after(placed, q), x, still, rest * q, facets)
-            for placed, q, facets in ways
-        ]
-        share = min(least(np.min(shares, axis=0)) if shares else 1.0, most)
-        self._travelled = 1.0 if share == 1 else self._travelled + share * rest
-        for number, (placed, q, _) in zip(self.prescribed, ways, strict=True):
-            self.posed[number] = self._posed_after(placed, q)
+        """Advance the prescribed obstacles as far as is safe (collective).
 
-    def _posed_after(self, placed: PosedShape, way: Values) -> PosedShape:
-        """Where one that began at `placed` is now."""
-        return PosedShape(placed.shape, placed.pose.incremented(self._travelled * way))
+        Args:
+            x: (n, d) points, which rest, m.
+            motions: full motions (`prescribed_motions`).
+            minimum: minimum of fractions (n,) over all ranks.
+            limit: largest fraction of the remaining motion.
+        """
+        remaining, no_motion = 1 - self._travelled, np.zeros_like(x)
+        fractions = [
+            safe_motion_fractions(self._posed_after(posed, q), x, no_motion, remaining * q, facets)
+            for posed, q, facets in motions
+        ]
+        fraction = min(minimum(np.min(fractions, axis=0)) if fractions else 1.0, limit)
+        self._travelled = 1.0 if fraction == 1 else self._travelled + fraction * remaining
+        for number, (posed, q, _) in zip(self.prescribed, motions, strict=True):
+            self.posed[number] = self._posed_after(posed, q)
+
+    def _posed_after(self, posed: PosedShape, increment: Values) -> PosedShape:
+        """Current pose of an obstacle that was at `posed` at the start."""
+        return PosedShape(posed.shape, posed.pose.incremented(self._travelled * increment))

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from mpi4py import MPI
 
-from ..contact.drawing import min_extent
-from ..contact.initial_overlap import find_overlaps, free_pairs
-from ..contact.obstacle import RigidObstacle
+from ..contact.obstacle import RigidObstacle, find_overlaps, free_pairs
+from ..contact.obstacle_tessellation import min_extent
 from ..timestepping.state import State
 
 if TYPE_CHECKING:

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from ..contact.drawing import ObstacleTessellations
 from ..contact.obstacle import RigidObstacle
+from ..contact.obstacle_tessellation import ObstacleTessellations
 from ..contact.pose import PosedShape
 from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from ..mesh.split_surface.entity_numbering import EntityNumbering

@@ -207,7 +207,7 @@ class ObstacleSet:
         """Return the names of the columns of free obstacles."""
         if not self.free_numbers:
             return []
-        from ..contact.rigid_obstacle_state import column_names
+        from ..contact.obstacle import column_names
 
         free = [cast("FreeObstacle", self.obstacles[number]) for number in self.free_numbers]
         return [name for obstacle in free for name in column_names(obstacle)]

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
-from ..contact.barrier import Barrier
+from ..contact.laws import Barrier
 from ..contact.laws import ObstacleLaw
 from ..contact.obstacle import RigidObstacle
 from ..contact.obstacle_term import ObstacleTerm
@@ -32,7 +32,7 @@ from ..study.mesh_source import read_obstacle_surface
 from ..study.overlap_checks import build_shape
 
 if TYPE_CHECKING:
-    from ..contact.penalty_law import Penalty
+    from ..contact.laws import Penalty
     from ..contact.penalty_obstacles import PenaltyObstacleTerm
     from ..contact.triangle_mesh_shape import TriangleMeshShape
 
@@ -92,7 +92,7 @@ def build_explicit_obstacle_term(
     study: Study, domain: Domain, u: fem.Function, stress: Stress, mass: Values
 ) -> PenaltyObstacleTerm:
     """Return the term of the same obstacles for explicit steps (collective); `mass`: (owned dofs,) lumped, kg."""
-    from ..contact.penalty_law import Penalty
+    from ..contact.laws import Penalty
     from ..contact.penalty_obstacles import PenaltyObstacleTerm
 
     obstacles = build_shape_obstacles(study, domain.dim)
@@ -101,10 +101,10 @@ def build_explicit_obstacle_term(
     limit = _max_added_frequency(contact, domain, stress)
     term_type = PenaltyObstacleTerm
     if any(obstacle.free for obstacle in obstacles):
-        from ..contact.penalty_rigid_obstacles import PenaltyFreeObstacleTerm
+        from ..contact.penalty_obstacles import PenaltyFreeObstacleTerm
 
         term_type = PenaltyFreeObstacleTerm
-    make = partial(term_type, domain, u, mass=mass, most=limit)
+    make = partial(term_type, domain, u, mass=mass, max_added=limit)
     return build_inactive_at_rest(domain, obstacles, law, make, mutual=False)
 
 
@@ -146,7 +146,7 @@ def _build_obstacle(entry: ObstaclePlacement, number: int) -> RigidObstacle:
 def _build_free_obstacle(entry: ObstaclePlacement, motion: FreeObstacleMotion, shape: Shape) -> RigidObstacle:
     """Return an obstacle with a mass; if it has a hinge, that is its reference point."""
     from ..contact.obstacle import FreeObstacle
-    from ..contact.offset_shape import TranslatedShape
+    from ..contact.shapes import TranslatedShape
 
     density = motion.density or (motion.mass or 0.0) / shape.volume
     point, centre = entry.reference_point, 0 * entry.reference_point
@@ -204,7 +204,7 @@ def build_mesh_obstacle_term(
     }
     barrier = cast("Barrier", obstacle_law.barrier)
     offset = offset_from_meshes(prescribed, free, barrier.width, domain.mean_edge_length)
-    make = partial(FreeMeshTerm, domain, u, obstacles, scheme=scheme, others=offset, barrier=barrier)
+    make = partial(FreeMeshTerm, domain, u, obstacles, scheme=scheme, analytic=offset, barrier=barrier)
     return _fit_distance(make, law, contact, between)
 
 
@@ -252,7 +252,7 @@ def build_explicit_self_contact_term(
     """Return the term of self-contact for explicit steps (collective); `mass`: (owned dofs,) lumped, kg."""
     limit = _max_added_frequency(_contact(study), domain, stress)
     module = _import_with_ipctk("penalty_self_contact")
-    make = partial(module.PenaltySelfContact, domain, u, mass=mass, most=limit)
+    make = partial(module.PenaltySelfContact, domain, u, mass=mass, max_added=limit)
     return _build_self_contact(study, domain, stress.material, DEFAULTS.distance, make)
 
 

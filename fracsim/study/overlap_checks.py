@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..contact.initial_overlap import find_overlaps, free_pairs
+from ..contact.obstacle import find_overlaps, free_pairs
 from ..contact.pose import Pose, PosedShape
 from ..contact.shapes import SHAPES, Shape
 from ..errors import InputError

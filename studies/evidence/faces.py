@@ -108,7 +108,7 @@ def of_pairs(surface: Any, x: Any) -> dict[str, Any]:
         "gradient": lambda k: pairs.gradient(away if k % 2 else x),
         "hessian": lambda k: pairs.hessian(away if k % 2 else x),
     }
-    touching = sum(len(found) for _, found in pairs._near.active_pairs(pairs._mesh.vertices(x)))
+    touching = sum(len(found) for _, found in pairs._search.active_pairs(pairs._mesh.vertices(x)))
     return {"touching": touching} | {name: median(map(_timed(work), range(REPEATS))) for name, work in asked.items()}
 
 
