@@ -14,7 +14,7 @@ from fracsim.solvers.forcing_terms import (
 )
 from fracsim.solvers.policy import DEFAULT_POLICY
 from support.scenes import make_scene, march, positions
-from test_itself import SOFT, two_blocks
+from test_self_contact import SOFT, two_blocks
 
 RTOL = 1e-5
 

@@ -13,8 +13,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
-from ..contact.laws import Barrier
-from ..contact.laws import ObstacleLaw
+from ..contact.laws import Barrier, ObstacleLaw
 from ..contact.obstacle import RigidObstacle
 from ..contact.obstacle_term import ObstacleTerm
 from ..contact.shapes import Shape

@@ -110,7 +110,7 @@ def differences(comm: MPI.Intracomm, name: str, folder: Path) -> list[str]:
     """
     tables, steps, stops = CASES[name]
     if not tables["mesh"]:
-        from test_itself import two_blocks
+        from test_self_contact import two_blocks
 
         folder.mkdir(exist_ok=True)
         tables = tables | {"mesh": {"file": comm.bcast(two_blocks(folder, 2, 0.05) if comm.rank == 0 else "")}}

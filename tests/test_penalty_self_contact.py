@@ -18,7 +18,7 @@ from fracsim.scene import Scene
 from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import break_across, each_step, make_scene, march, positions
 from support.torn import RUNS
-from test_itself import SOFT, two_blocks
+from test_self_contact import SOFT, two_blocks
 
 Values = npt.NDArray[np.float64]
 
