@@ -63,7 +63,7 @@ ENTRIES = (
     one("loaf", "A loaf of bread, held by its two ends and torn.", "--sheet 0,14,18,-1 --floor"),
     Entry(
         "cuts", "Edges cut in the middle, by nodal forces, and so that the crack is smooth (M22 fig. 12).",
-        tuple((f"cut-{each}", f"loaf {CUTS}{each}") for each in ("middle", "forces", "smooth")),
+        tuple((f"cut-{item}", f"loaf {CUTS}{item}") for item in ("middle", "forces", "smooth")),
         "--view 1.1,-1.0,0.5 --size 1400x1100",
     ),
     Entry(
@@ -227,8 +227,8 @@ def figures(entry: Entry) -> str:
     if not all(map(has_ended, folders)):
         page = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
         of_it = next((part for part in page.split("\n## ") if part.startswith(f"{entry.name}\n")), "")
-        found = re.search(r" (\d+ s[.;].*)$", of_it, re.MULTILINE)
-        return found[1] if found else ""
+        results = re.search(r" (\d+ s[.;].*)$", of_it, re.MULTILINE)
+        return results[1] if results else ""
     seconds = sum(json.loads((folder / "summary.json").read_text(encoding="utf-8"))["cpu"] for folder in folders)
     counts = [pieces_of(folder) for folder in folders]
     parts = ", ".join(f"{count} ({single} of one node)" if single else str(count) for count, single in counts if count)

@@ -80,7 +80,7 @@ def stresses() -> tuple[Values, Values, Values]:
     held = body._stiffness.cell_stress(solve_pinned(free.matrix, domain.nodes, force), share)  # type: ignore[attr-defined]
     x = domain.nodes[domain.cell_nodes].mean(axis=1)[:, 0]
     return x, *(
-        np.asarray(np.abs(np.linalg.eigvalsh(symmetric_tensors(each, 3))).max(axis=1)) for each in (relieved, held)
+        np.asarray(np.abs(np.linalg.eigvalsh(symmetric_tensors(item, 3))).max(axis=1)) for item in (relieved, held)
     )
 
 
@@ -129,16 +129,16 @@ def main() -> None:
     pushes = [snapshot(step) for step in STEPS]
     cracks = [crack(push) for push in pushes]
     print(f"blow: {blow():.3g} N, {true.sum()} edges broken, at any step")
-    for step, push, each in zip(STEPS, pushes, cracks, strict=True):
-        alike = (each & true).sum() / max((each | true).sum(), 1)
-        print(f"snapshot at {step:g} s: {push:.3g} N, {each.sum()} edges broken, {alike:.0%} of both alike")
+    for step, push, item in zip(STEPS, pushes, cracks, strict=True):
+        alike = (item & true).sum() / max((item | true).sum(), 1)
+        print(f"snapshot at {step:g} s: {push:.3g} N, {item.sum()} edges broken, {alike:.0%} of both alike")
     x, relieved, held = stresses()
     far = x > SIZE[0] / 2
     print(f"far from the push: at most {relieved[far].max():.3g} Pa with relief, {held[far].max():.3g} Pa with pins")
     for angle, strain, swell in zip(ANGLES, *turned(), strict=True):
         print(f"turned by {np.degrees(angle):.0f} degrees: strain {strain:.2g}; linearised: {swell:.2g} longer")
     if len(sys.argv) > 1:
-        draw(Path(sys.argv[1]), [int(each.sum()) for each in cracks], int(true.sum()), (x, relieved, held))
+        draw(Path(sys.argv[1]), [int(item.sum()) for item in cracks], int(true.sum()), (x, relieved, held))
 
 
 def draw(path: Path, snapshots: list[int], true: int, stress: tuple[Values, Values, Values]) -> None:
@@ -163,8 +163,8 @@ def draw(path: Path, snapshots: list[int], true: int, stress: tuple[Values, Valu
     third.loglog(np.degrees(ANGLES), strain, "o-", color="#b0835c", label="linear strain of a rotation")
     third.loglog(np.degrees(ANGLES), swell, "s--", color="#222222", label="stretch of a linearised one")
     third.set(xlabel="angle / degrees", title="Rotations and linear strain")
-    for each in (first, second, third):
-        each.legend(frameon=False)
+    for item in (first, second, third):
+        item.legend(frameon=False)
     figure.savefig(path, dpi=90)
 
 

@@ -72,7 +72,7 @@ def overrides(scene: Scene, *, small: bool) -> list[str]:
 def run(name: str, out: Path, *, small: bool, ranks: int, limit: float) -> dict[str, Any]:
     """A row of the table from a run in processes of its own."""
     scene, folder = SCENES[name], out / name
-    sets = [word for each in overrides(scene, small=small) for word in ("--set", each)]
+    sets = [word for override in overrides(scene, small=small) for word in ("--set", override)]
     command = [shutil.which("fracsim") or "fracsim", "run", scene.study, *sets, "-o", str(folder), "--overwrite",
                "--wall-limit", f"{limit:g}"]  # fmt: skip
     if ranks > 1:
@@ -98,10 +98,10 @@ def row(name: str, folder: Path) -> dict[str, Any]:
 def words(rows: list[dict[str, Any]]) -> str:
     """The table on screen."""
     lines = [list(COLUMNS)]
-    ran = [each for each in rows if "failed" not in each]
-    lines += [[each["scene"], *(f"{each[key]:.4g}" for key in COLUMNS[1:])] for each in ran]
+    ran = [item for item in rows if "failed" not in item]
+    lines += [[item["scene"], *(f"{item[key]:.4g}" for key in COLUMNS[1:])] for item in ran]
     widths = [max(len(line[column]) for line in lines) for column in range(len(COLUMNS))]
-    failed = [f"{each['scene']}: {' '.join(each['failed'])}" for each in rows if "failed" in each]
+    failed = [f"{item['scene']}: {' '.join(item['failed'])}" for item in rows if "failed" in item]
     return "\n".join([*(" ".join(map(str.rjust, line, widths)) for line in lines), *failed])
 
 

@@ -90,7 +90,7 @@ def test_the_cap_lets_the_strongest_loaded_break() -> None:
         time={"scheme": "quasi-static", "step": 1.0, "end": 10.0},
     )
     loads: dict[int, float] = {}
-    original = scene.fracture.criterion.overloaded
+    original = scene.fracture.criterion.find_overloaded
 
     def watched(cells: Any, averaged: Any) -> Any:
         found, load = original(cells, averaged)
@@ -99,7 +99,7 @@ def test_the_cap_lets_the_strongest_loaded_break() -> None:
             loads[edge] = max(ratio, loads.get(edge, 0.0))
         return found, load
 
-    scene.fracture.criterion.overloaded = watched
+    scene.fracture.criterion.find_overloaded = watched
     before = scene.fracture.graph.broken.copy()
     while not march(scene, state, 1)[0].broken:
         pass

@@ -131,9 +131,9 @@ def _together(*made: Any) -> Any:
     """Bodies that share no node as one mesh."""
     from ...meshes.data import MeshData
 
-    first = np.cumsum([0, *(len(each.points) for each in made)])
-    cells = [each.cells + number for each, number in zip(made, first, strict=False)]
-    return MeshData(np.concatenate([each.points for each in made]), np.concatenate(cells))
+    first = np.cumsum([0, *(len(item.points) for item in made)])
+    cells = [item.cells + number for item, number in zip(made, first, strict=False)]
+    return MeshData(np.concatenate([item.points for item in made]), np.concatenate(cells))
 
 
 MESHES = {

@@ -91,7 +91,7 @@ def broken(run: Path, specimen: slit.Specimen) -> Record:
 def path(along: npt.NDArray[np.float64], off: npt.NDArray[np.float64]) -> list[list[float]]:
     """At most PLACES places of new surface, from one side to the other: how far along the slit, how far off it, m."""
     order = np.argsort(along, kind="stable")[:: max(1, -(-len(along) // PLACES))]
-    return [[float(each) for each in row] for row in np.column_stack([along, off])[order]]
+    return [[float(item) for item in row] for row in np.column_stack([along, off])[order]]
 
 
 def crack_faces(run: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
@@ -173,12 +173,12 @@ def spread(values: list[float]) -> float:
 
 
 def _spreads(records: list[Record]) -> list[tuple[TableCell, ...]]:
-    found: list[tuple[TableCell, ...]] = []
+    outcome: list[tuple[TableCell, ...]] = []
     for case in dict.fromkeys(record["case"] for record in records):
         done = [record["figures"] for record in records if record["case"] == case and record["outcome"] == "done"]
         if done:
-            found.append((case, len(done), *(spread([figures[key] for figures in done]) for key in FIGURES)))
-    return found
+            outcome.append((case, len(done), *(spread([figures[key] for figures in done]) for key in FIGURES)))
+    return outcome
 
 
 def _plates(records: list[Record]) -> list[Plot]:
@@ -188,8 +188,8 @@ def _plates(records: list[Record]) -> list[Plot]:
         return []
     cases = {case: [r for r in done if r["case"] == case] for case in dict.fromkeys(r["case"] for r in done)}
     peaks = tuple(
-        Series(case, tuple(r["settings"]["h"] for r in each), tuple(r["figures"]["peak_load"] for r in each))
-        for case, each in cases.items()
+        Series(case, tuple(r["settings"]["h"] for r in item), tuple(r["figures"]["peak_load"] for r in item))
+        for case, item in cases.items()
     )
     paths = tuple(_crack(r) for r in done if r["case"] != "plate-averaged" and r["figures"]["path"])
     return [

@@ -108,12 +108,12 @@ EXPERIMENTS = (
         "branching", "branching", ("h", (5e-4, 4.5e-4, 4e-4)), "", "", 0.0, "no load, but the angles below", {}
     ),
 )  # fmt: skip
-BY_CASE = {each.case: each for each in EXPERIMENTS}
+BY_CASE = {item.case: item for item in EXPERIMENTS}
 
 
 def trials() -> list[Trial]:
     """Each experiment on its meshes."""
-    return [_trial(each, h) for each in EXPERIMENTS for h in each.sizes[1]]
+    return [_trial(experiment, h) for experiment in EXPERIMENTS for h in experiment.sizes[1]]
 
 
 def study_of(experiment: Experiment, h: float) -> dict[str, Any]:
@@ -193,10 +193,10 @@ def measured_branching(run: Path) -> Record:
     size, centres = crack_faces(run)
     (x0, y0), rows = results.study(run)["crack"][0]["segment"][1], results.history(run)
     places, apart = centres[:, :2] - [x0, y0], MANY * float(np.median(size))
-    found, first = branches(places, apart), branches(places, apart, FIRST)
-    if found is None or first is None:
+    outcome, first = branches(places, apart), branches(places, apart, FIRST)
+    if outcome is None or first is None:
         return {"fork": None, "pieces": float(rows["pieces"][-1])}
-    x, upper, lower = found
+    x, upper, lower = outcome
     on_its_way = np.flatnonzero(rows["tip_x"] > x0 + 1e-6)
     begun, there = rows["time"][on_its_way[0]], rows["time"][np.argmax(rows["tip_x"] >= x0 + x)]
     rayleigh = 2125.0  # m/s, of the glass in the study
@@ -248,7 +248,7 @@ def figures(rows: dict[str, Values], pushed: str, axis: str) -> Record:
         "absorbed": float(rows[f"work_{pushed}" if f"work_{pushed}" in rows else "external_work"][-1]),
         "travel": float(way[-1]) - touched,
         "pieces": float(rows["pieces"][-1]),
-        "curve": [[float(value) for value in each] for each in thinned(way, load)],
+        "curve": [[float(value) for value in item] for item in thinned(way, load)],
     }
 
 
@@ -327,27 +327,27 @@ def sections(records: list[Record]) -> list[Section]:
 def _compared(record: Record) -> float | None:
     """The load that the reference is of: of what snaps the one after the inertia, of what bends that which stays."""
     key = {"A516": "second", "NVE36": "plateau"}.get(record["case"].rpartition("-")[2], "peak")
-    found: float | None = record["figures"].get(key)
-    return found
+    outcome: float | None = record["figures"].get(key)
+    return outcome
 
 
 def _row(record: Record) -> tuple[TableCell, ...]:
-    found, peak = record["figures"], _compared(record)
+    outcome, peak = record["figures"], _compared(record)
     over = None if peak is None or not BY_CASE[record["case"]].peak else peak / BY_CASE[record["case"]].peak
     loads, others = ("peak", "second", "plateau", "last"), ("absorbed", "travel", "pieces")
-    return (record["case"], record["settings"]["h"], record["outcome"], *(found.get(key) for key in loads), over,
-            *(found.get(key) for key in others))  # fmt: skip
+    return (record["case"], record["settings"]["h"], record["outcome"], *(outcome.get(key) for key in loads), over,
+            *(outcome.get(key) for key in others))  # fmt: skip
 
 
 def _spreads(records: list[Record]) -> list[tuple[TableCell, ...]]:
-    found: list[tuple[TableCell, ...]] = []
+    outcome: list[tuple[TableCell, ...]] = []
     for case, experiment in BY_CASE.items():
         peaks = [p for r in records if r["case"] == case and r["outcome"] == "done" and (p := _compared(r)) is not None]
         if peaks:
             mean = sum(peaks) / len(peaks)
             off = mean / experiment.peak - 1
-            found.append((case, len(peaks), mean, spread(peaks), experiment.peak, off, experiment.source))
-    return found
+            outcome.append((case, len(peaks), mean, spread(peaks), experiment.peak, off, experiment.source))
+    return outcome
 
 
 def _claims(records: list[Record]) -> tuple[Claim, ...]:
@@ -359,11 +359,11 @@ def _claims(records: list[Record]) -> tuple[Claim, ...]:
 
 def _of_panels(records: list[Record]) -> Claim:
     panel = BY_CASE["l-panel"]
-    found = [r["figures"] for r in records if r["case"] == panel.case and r["outcome"] == "done"]
-    off = [each["peak"] / panel.peak - 1 for each in found]
+    outcome = [r["figures"] for r in records if r["case"] == panel.case and r["outcome"] == "done"]
+    off = [item["peak"] / panel.peak - 1 for item in outcome]
     return Claim(
         "A panel of concrete carries at most a tenth more or less than was measured, on three meshes",
-        _said(off, "{:+.1%}"), all(abs(each) <= (panel.within or 0.0) for each in off) if len(off) == 3 else None,
+        _said(off, "{:+.1%}"), all(abs(item) <= (panel.within or 0.0) for item in off) if len(off) == 3 else None,
     )  # fmt: skip
 
 
@@ -371,19 +371,19 @@ def _of_notches(records: list[Record]) -> tuple[Claim, ...]:
     plate = BY_CASE["notched-tension"]
     done = {case: [r["figures"] for r in records if r["case"] == case and r["outcome"] == "done"]
             for case in (plate.case, "kalthoff", "branching")}  # fmt: skip
-    off = [found["peak"] / plate.peak - 1 for found in done[plate.case]]
-    forks = [found for found in done["branching"] if found["fork"] is not None]
-    on = [abs(found["fork"] - found["first"]) < FIRST for found in forks]  # the first two, not later ones
-    askew = [found["upper"] - found["lower"] if runs else np.inf for found, runs in zip(forks, on, strict=True)]
-    angles = [found["angle"] for found in done["kalthoff"] if found["angle"] is not None]
+    off = [outcome["peak"] / plate.peak - 1 for outcome in done[plate.case]]
+    forks = [outcome for outcome in done["branching"] if outcome["fork"] is not None]
+    on = [abs(outcome["fork"] - outcome["first"]) < FIRST for outcome in forks]  # the first two, not later ones
+    askew = [outcome["upper"] - outcome["lower"] if runs else np.inf for outcome, runs in zip(forks, on, strict=True)]
+    angles = [outcome["angle"] for outcome in done["kalthoff"] if outcome["angle"] is not None]
     return (
         Claim("A notched plate in tension breaks within 3 % of Griffith's load on three meshes", _said(off, "{:+.1%}"),
-              all(abs(each) <= (plate.within or 0.0) for each in off) if len(off) == 3 else None),
+              all(abs(item) <= (plate.within or 0.0) for item in off) if len(off) == 3 else None),
         Claim("Kalthoff's crack goes at 65 to 75 degrees on three meshes", _said(angles, "{:.0f}"),
-              all(65 <= each <= 75 for each in angles) if len(angles) == 3 else None),
+              all(65 <= angle <= 75 for angle in angles) if len(angles) == 3 else None),
         Claim("A pane's crack branches on three meshes, symmetric within 10 degrees (inf: one branch stops)",
               _said(askew, "{:+.0f}"),
-              all(abs(each) <= 10 for each in askew) and len(forks) == 3 if len(done["branching"]) == 3 else None),
+              all(abs(item) <= 10 for item in askew) and len(forks) == 3 if len(done["branching"]) == 3 else None),
     )  # fmt: skip
 
 
@@ -395,11 +395,11 @@ def _of_disks(disks: list[Record]) -> tuple[Claim, ...]:
     many = len(disks) == 3
     return (
         Claim("The Brazilian peak is within 10 % of pi D t f_t / 2 on three meshes", _said(off, "{:+.1%}"),
-              all(abs(each) <= limit for each in off) if many else None),
+              all(abs(item) <= limit for item in off) if many else None),
         Claim("Its load falls by half after the peak", _said(left, "{:.2f} left"),
-              all(each <= 0.5 for each in left) if many else None),
+              all(item <= 0.5 for item in left) if many else None),
         Claim("Cracks follow half of the loaded diameter, within a tenth of the radius", _said(along, "{:.0%}"),
-              all(each >= 0.5 for each in along) if many else None),
+              all(item >= 0.5 for item in along) if many else None),
     )  # fmt: skip
 
 
@@ -414,9 +414,9 @@ def _of_steels(A516: list[Record], NVE36: list[Record]) -> tuple[Claim, ...]:
     both = len(A516) == 6 and len(NVE36) == 6
     return (
         Claim("A516 drops below 0.4 of what it has carried, Charpy and Izod", _said(left, "{:.2f}"),
-              all(each <= 0.4 for each in left) if both else None),
+              all(item <= 0.4 for item in left) if both else None),
         Claim("NVE 36 bends, and goes on carrying 0.8 of it and more", _said(stays, "{:.2f}"),
-              all(each > 0.8 for each in stays) if both else None),
+              all(stay > 0.8 for stay in stays) if both else None),
     )  # fmt: skip
 
 

@@ -86,13 +86,13 @@ def measured(kind: str, n: int) -> dict[str, Any]:
 
 def _in_touch(run: Any, contact: Any) -> list[tuple[float, int]]:
     """Processor time, s, and Newton iterations of each of the first STEPS steps that end in touch."""
-    found: list[tuple[float, int]] = []
-    while len(found) < STEPS:
+    results: list[tuple[float, int]] = []
+    while len(results) < STEPS:
         began = time.process_time()
         run.step()
         if contact.stored_energy() > 0:
-            found.append((time.process_time() - began, run.scene.stepper.solver.snes.its))
-    return found
+            results.append((time.process_time() - began, run.scene.stepper.solver.snes.its))
+    return results
 
 
 def of_pairs(surface: Any, x: Any) -> dict[str, Any]:
@@ -108,7 +108,7 @@ def of_pairs(surface: Any, x: Any) -> dict[str, Any]:
         "gradient": lambda k: pairs.gradient(away if k % 2 else x),
         "hessian": lambda k: pairs.hessian(away if k % 2 else x),
     }
-    touching = sum(len(found) for _, found in pairs._search.active_pairs(pairs._mesh.vertices(x)))
+    touching = sum(len(results) for _, results in pairs._search.active_pairs(pairs._mesh.vertices(x)))
     return {"touching": touching} | {name: median(map(_timed(work), range(REPEATS))) for name, work in asked.items()}
 
 
@@ -139,7 +139,7 @@ def section(records: list[dict[str, Any]]) -> Section:
 
 def _row(record: dict[str, Any]) -> tuple[Any, ...]:
     figures = record["figures"]
-    milliseconds = (1e3 * figures[each] if each in figures else None for each in OF_PAIRS)
+    milliseconds = (1e3 * figures[of_pair] if of_pair in figures else None for of_pair in OF_PAIRS)
     outcome = record["outcome"] if record["outcome"] == "done" else f"{record['outcome']}: {record['message']}"
     counts = (figures.get(key) for key in ("triangles", "touching", "newton", "step"))
     return record["name"], *counts, *milliseconds, outcome

@@ -222,8 +222,8 @@ def _fields() -> dict[str, int]:
 
     gc.collect()
     # by type: isinstance would ask proxies for their class
-    found = [thing for thing in gc.get_objects() if type(thing) is fem.Function]
-    return {"fields": len(found), "field_bytes": sum(function.x.array.nbytes for function in found)}
+    results = [thing for thing in gc.get_objects() if type(thing) is fem.Function]
+    return {"fields": len(results), "field_bytes": sum(function.x.array.nbytes for function in results)}
 
 
 def in_turn(name: str, n: int) -> dict[str, Any]:
@@ -323,7 +323,7 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     table = ReportTable("ladder", "What each feature costs", columns, rows)
     title = "Ladder: the cost of what is used, and of what is not"
     first = Section(title, text, _claims(records), (table,), (plot,))
-    return [first, *(PARTS[case].section(found) for case, found in by_itself.items() if found)]
+    return [first, *(PARTS[case].section(results) for case, results in by_itself.items() if results)]
 
 
 def _modules_of_elastic(records: list[dict[str, Any]]) -> set[str]:
@@ -350,19 +350,19 @@ def _bars(records: list[dict[str, Any]]) -> tuple[Series, ...]:
         figures = [record["figures"] for record in shown]
         if shown:
             names, places = tuple(record["name"] for record in shown), tuple(map(float, range(len(shown))))
-            y, spread = (tuple(each[key] for each in figures) for key in ("ratio", "ratio_spread"))
+            y, spread = (tuple(figure[key] for figure in figures) for key in ("ratio", "ratio_spread"))
             result.append(Series(f"{24 * n**3:,} tets", places, y, "points", names, spread))
     return tuple(result)
 
 
 def _claims(records: list[dict[str, Any]]) -> tuple[Claim, ...]:
-    found = {
+    results = {
         record["name"]: strangers(record["name"], record["settings"]["n"], record["figures"]["modules"])
         for record in records
         if "modules" in record["figures"]
     }
-    extra = "; ".join(f"{name}: {', '.join(modules)}" for name, modules in found.items() if modules)
-    none = f"{len(found)} scenes, none imports the modules of another's feature"
+    extra = "; ".join(f"{name}: {', '.join(modules)}" for name, modules in results.items() if modules)
+    none = f"{len(results)} scenes, none imports the modules of another's feature"
     return (
         _limit(
             "Features that are off cost at most 5 % of a step (elastic scene over a bare loop that records its energy)",
@@ -382,18 +382,18 @@ def _claims(records: list[dict[str, Any]]) -> tuple[Claim, ...]:
             "obstacle",
             NEAR_NOTHING,
         ),
-        Claim("A feature that is off imports nothing", extra or none, not extra if found else None),
+        Claim("A feature that is off imports nothing", extra or none, not extra if results else None),
     )
 
 
 def _limit(text: str, records: list[dict[str, Any]], rung: str, limit: float) -> Claim:
     """Whether a rung costs at most `limit` times what it is compared with."""
-    found = [record["figures"] for record in records if record["name"] == rung and "ratio" in record["figures"]]
+    results = [record["figures"] for record in records if record["name"] == rung and "ratio" in record["figures"]]
     measured = ", ".join(
         f"{figures['ratio']:.3f} at {figures['cells']:,} tets (Newton iterations: {figures['newton']})"
-        for figures in found
+        for figures in results
     )
-    return Claim(text, measured or "nothing", all(each["ratio"] <= limit for each in found) if found else None)
+    return Claim(text, measured or "nothing", all(item["ratio"] <= limit for item in results) if results else None)
 
 
 if __name__ == "__main__":

@@ -34,8 +34,8 @@ def last_frame(run: Path) -> dict[str, Any]:
 
     with h5py.File(run / "fields.h5") as file:
         frame = file["frames"][max(file["frames"])]
-        found = {name: read_field(data) for name, data in frame.items()}
-        return {"time": float(frame.attrs["time"]), "points": file["points"][()], "cells": file["cells"][()]} | found
+        results = {name: read_field(data) for name, data in frame.items()}
+        return {"time": float(frame.attrs["time"]), "points": file["points"][()], "cells": file["cells"][()]} | results
 
 
 def study(run: Path) -> dict[str, Any]:

@@ -69,10 +69,10 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=600.0, help="seconds of the run")
     parser.add_argument("-o", "--out", type=Path, required=True)
     given = parser.parse_args()
-    found = run(given.row, given.out.parent, small=False, ranks=RANKS, limit=given.limit)
-    if "failed" in found:
-        raise SystemExit(f"{given.row}: {' '.join(found['failed'])}")
-    given.out.write_text(json.dumps(found, indent=1) + "\n")
+    results = run(given.row, given.out.parent, small=False, ranks=RANKS, limit=given.limit)
+    if "failed" in results:
+        raise SystemExit(f"{given.row}: {' '.join(results['failed'])}")
+    given.out.write_text(json.dumps(results, indent=1) + "\n")
 
 
 if __name__ == "__main__":

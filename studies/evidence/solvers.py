@@ -76,17 +76,17 @@ def trials() -> list[Trial]:
 def measured(name: str) -> dict[str, Any]:
     """Seconds and iterations of each way, and how far the displacement is from that of factors, of the greatest."""
     runs: dict[str, list[dict[str, Any]]] = {way: [_run(name, way)] for way in WAYS}
-    quickest = min(each[0]["seconds"] for each in runs.values())
+    quickest = min(item[0]["seconds"] for item in runs.values())
     if quickest < SHORT:
         rounds = [{way: _run(name, way) for way in WAYS} for _ in range(_rounds(quickest))]
-        runs = {way: [each[way] for each in rounds] for way in WAYS}
+        runs = {way: [round[way] for round in rounds] for way in WAYS}
     exact = runs["factors"][0]["u"]
     return {
         "dofs": len(exact),
-        **{way: {key: each[0][key] for key in ("newton", "krylov")} | {
-            "seconds": min(run["seconds"] for run in each),
-            "apart": float(np.abs(each[0]["u"] - exact).max() / np.abs(exact).max()),
-        } for way, each in runs.items()},
+        **{way: {key: item[0][key] for key in ("newton", "krylov")} | {
+            "seconds": min(run["seconds"] for run in item),
+            "apart": float(np.abs(item[0]["u"] - exact).max() / np.abs(exact).max()),
+        } for way, item in runs.items()},
     }  # fmt: skip
 
 
@@ -140,7 +140,7 @@ def section(records: list[dict[str, Any]]) -> Section:
     worst = max(share, key=share.__getitem__, default="")
     told = f"{share[worst]:.2f} at most ({worst}), of {len(share)} studies" if share else "nothing"
     claim = Claim(f"The default takes at most {LIMIT:g} times the better of CG and factors", told,
-                  all(each <= LIMIT for each in share.values()) if share else None)  # fmt: skip
+                  all(item <= LIMIT for item in share.values()) if share else None)  # fmt: skip
     columns = ("study", "dofs", *(f"{way}, s" for way in WAYS), "default over best",
                *(f"{way}: Newton / Krylov" for way in WAYS), "default apart from factors", "outcome")  # fmt: skip
     rows = tuple(_row(record, share.get(record["settings"]["of"])) for record in records)

@@ -23,11 +23,11 @@ def measured(run: Path, time: Values, load: Values) -> Record:
     """What `along` says of the frame at which the load, N, has fallen to SPLIT, and of the last."""
     fallen = np.flatnonzero((np.arange(len(load)) > load.argmax()) & (load <= SPLIT * load.max()))
     mesh = results.study(run)["mesh"]
-    found: Record = {}
+    outcome: Record = {}
     for name, at in (("split", float(time[fallen[0]]) if len(fallen) else None), ("end", None)):
         figures = along(crack_corners(run, at), float(mesh["radius"]), float(mesh["length"]))
-        found |= {f"{name}_{key}": value for key, value in figures.items()}
-    return found
+        outcome |= {f"{name}_{key}": value for key, value in figures.items()}
+    return outcome
 
 
 def along(corners: Values, radius: float, length: float) -> Record:
@@ -79,17 +79,17 @@ def claims(figures: list[Record], peak: float, within: float) -> tuple[Claim, ..
 
     def said(text: str, form: str, values: list[float], least: float, most: float = np.inf) -> Claim:
         words: str = ", ".join(form.format(value) for value in values) or "not run"
-        return Claim(text, words, all(least <= each <= most for each in values) if len(values) == 3 else None)
+        return Claim(text, words, all(least <= item <= most for item in values) if len(values) == 3 else None)
 
-    off = [each["peak"] / peak - 1 for each in figures]
-    left = [each["last"] / each["peak"] for each in figures]
-    split, end = ([each[f"{name}_along"] for each in figures] for name in ("split", "end"))
+    off = [figure["peak"] / peak - 1 for figure in figures]
+    left = [figure["last"] / figure["peak"] for figure in figures]
+    split, end = ([figure[f"{name}_along"] for figure in figures] for name in ("split", "end"))
     return (
         said(f"A granite cylinder's peak is within {within:.0%} of pi D t f_t / 2 on three meshes", "{:+.1%}", off,
              -within, within),
         said("Its load falls by half after the peak", "{:.2f} left", left, 0.0, 0.5),
         said("When it has fallen by a tenth its cracks cover half of the section along the loaded diameter", "{:.0%}",
-             [each["split_covered"] for each in figures], 0.5),
+             [figure["split_covered"] for figure in figures], 0.5),
         said("Half of all crack faces and more are there by then", "{:.0%}", split, 0.5),
         said("Half of all are there when the load has fallen by half", "{:.0%}", end, 0.5),
     )  # fmt: skip

@@ -26,7 +26,7 @@ def trials() -> list[Trial]:
         _steps(), _stiffness(), _poisson(), _densities(), _stretches(), _inverted(), _slivers(), _shells(),
         _strengths(), _many(), _one_cell(), _lengths(), _long_steps(), _edge(), _contacts(), _failed(),
     )  # fmt: skip
-    return [_on_ranks(trial, *each) for trial in cases for each in (ONCE if trial.case == "failed" else REPEATED)]
+    return [_on_ranks(trial, *item) for trial in cases for item in (ONCE if trial.case == "failed" else REPEATED)]
 
 
 def _on_ranks(trial: Trial, ranks: int, time: int) -> Trial:
@@ -74,11 +74,11 @@ def _stiffness() -> list[Trial]:
 
 
 def _poisson() -> list[Trial]:
-    found = []
+    results = []
     for nu in (-0.9, 0.0, 0.49, 0.499, 0.4999):
-        found.append(_trial("poisson", f"{nu:g}", x.block(1.3, material={"poisson": nu}), "pulled"))
+        results.append(_trial("poisson", f"{nu:g}", x.block(1.3, material={"poisson": nu}), "pulled"))
     torn = x.torn(x.BAR, speed=1.0, step=1e-2, steps=60, strength=2e5, material={"poisson": 0.4999})
-    return [*found, _trial("poisson", "0.4999-torn", torn)]
+    return [*results, _trial("poisson", "0.4999-torn", torn)]
 
 
 def _densities() -> list[Trial]:
@@ -89,35 +89,35 @@ def _densities() -> list[Trial]:
 
 
 def _stretches() -> list[Trial]:
-    found = []
+    results = []
     for energy in ("linear", "corotated", "stvk", "neo-hookean"):
         material = {"energy": energy, "poisson": 0.05}
-        found.append(_trial("stretch", f"10x-{energy}", x.block(10.0, material=material), "pulled"))
+        results.append(_trial("stretch", f"10x-{energy}", x.block(10.0, material=material), "pulled"))
         crushed = x.block(0.05, material=material, confined=True)
-        found.append(_trial("compression", f"5-percent-{energy}", crushed, "pulled"))
-    return found
+        results.append(_trial("compression", f"5-percent-{energy}", crushed, "pulled"))
+    return results
 
 
 def _inverted() -> list[Trial]:
     """Bodies that start inside out, and one whose right face is pushed through the left one in one step."""
     energies = ("corotated", "stvk", "neo-hookean")
-    found = [_script("inverted", energy, "inverted", energy, measure="") for energy in energies]
-    found.append(_trial("inverted", "pushed-through", x.block(-1.0, steps=1, confined=True), "pulled"))
+    results = [_script("inverted", energy, "inverted", energy, measure="") for energy in energies]
+    results.append(_trial("inverted", "pushed-through", x.block(-1.0, steps=1, confined=True), "pulled"))
     swift = x.torn(x.BAR, speed=-20.0, step=0.1, steps=2, strength=float("inf"))
-    return [*found, _trial("inverted", "pushed-through-moving", swift)]
+    return [*results, _trial("inverted", "pushed-through-moving", swift)]
 
 
 def _slivers() -> list[Trial]:
-    found = []
+    results = []
     for ratio in (1e2, 1e3, 1e4):
         mesh = {"builder": "box", "size": [4.0, 4.0, 1 / ratio], "h": 1.0}
-        found.append(_trial("slivers", f"{ratio:.0e}-along", x.block(1.3, mesh=mesh, strength=2e5), "pulled"))
+        results.append(_trial("slivers", f"{ratio:.0e}-along", x.block(1.3, mesh=mesh, strength=2e5), "pulled"))
         mesh = {"builder": "box", "size": [1 / ratio, 4.0, 4.0], "h": 1.0}
-        found.append(_trial("slivers", f"{ratio:.0e}-across", x.block(1.3, mesh=mesh, strength=2e5), "pulled"))
-    exact = found[-1].study | {"solver": {"snes_rtol": 1e-10}}  # type: ignore[operator]
-    found.append(_trial("slivers", "1e+04-across-snes_rtol-1e-10", exact, "pulled"))
+        results.append(_trial("slivers", f"{ratio:.0e}-across", x.block(1.3, mesh=mesh, strength=2e5), "pulled"))
+    exact = results[-1].study | {"solver": {"snes_rtol": 1e-10}}  # type: ignore[operator]
+    results.append(_trial("slivers", "1e+04-across-snes_rtol-1e-10", exact, "pulled"))
     mesh = {"builder": "box", "size": [4.0, 4.0, 1e-4], "h": 1.0}
-    return [*found, _trial("slivers", "1e+04-torn", x.torn(mesh, speed=1.0, step=2e-2, steps=60, strength=1e5))]
+    return [*results, _trial("slivers", "1e+04-torn", x.torn(mesh, speed=1.0, step=2e-2, steps=60, strength=1e5))]
 
 
 def _shells() -> list[Trial]:
@@ -132,11 +132,11 @@ def _shells() -> list[Trial]:
 
 
 def _strengths() -> list[Trial]:
-    found = []
+    results = []
     for strength in (0.0, 1e-45, 1e-3, 1e3, 1e30, float("inf")):
         study = x.torn(x.BAR, speed=1.0, step=1e-2, steps=40, strength=strength)
-        found.append(_trial("strength", f"{strength:g}-Pa", study))
-    return [*found, _trial("strength", "nan-Pa", x.torn(x.BAR, speed=1.0, step=1e-2, steps=40, strength=float("nan")))]
+        results.append(_trial("strength", f"{strength:g}-Pa", study))
+    return [*results, _trial("strength", "nan-Pa", x.torn(x.BAR, speed=1.0, step=1e-2, steps=40, strength=float("nan")))]
 
 
 def _many() -> list[Trial]:
@@ -153,61 +153,61 @@ def _one_cell() -> list[Trial]:
 
 
 def _lengths() -> list[Trial]:
-    found = []
+    results = []
     for name, unit in (("micrometres", 1e-6), ("kilometres", 1e3)):
         mesh = {"builder": "box", "size": [unit, 0.25 * unit, 0.25 * unit], "h": 0.125 * unit}
-        found.append(_trial("lengths", name, x.block(1.3, mesh=mesh, strength=1.5e5), "pulled"))
+        results.append(_trial("lengths", name, x.block(1.3, mesh=mesh, strength=1.5e5), "pulled"))
         # the same bar in every length, its time scaled with it: the same breaks
         study = x.torn(mesh, speed=1.0, step=1e-2 * unit, steps=60, strength=1e5)
-        found.append(_trial("lengths", f"{name}-torn", study))
-    return found
+        results.append(_trial("lengths", f"{name}-torn", study))
+    return results
 
 
 def _long_steps() -> list[Trial]:
     """M22's cylinder of about 600 nodes at dt = 5e-2 s, where XFEM is not stable."""
     mesh = {"builder": "cylinder", "radius": 0.25, "length": 1.0, "h": 0.095}
-    found = []
+    results = []
     for energy in ("stvk", "neo-hookean", "corotated"):
         study = x.torn(
             mesh, speed=0.5, step=5e-2, steps=60, strength=5e5, ends=("bottom", "top"), axis=2,
             material={"energy": energy, "young": 1e7},
         )  # fmt: skip
-        found.append(_trial("dt-5e-2", f"cylinder-{energy}", study))
-    return found
+        results.append(_trial("dt-5e-2", f"cylinder-{energy}", study))
+    return results
 
 
 def _edge() -> list[Trial]:
     """The approach is for small strains: what a strength that allows 30 % does to it."""
-    found = []
+    results = []
     for energy in ("linear", "corotated"):
         study = x.torn(
             x.BAR, speed=1.0, step=1e-2, steps=60, strength=3e5, approach="edge", material={"energy": energy}
         )
-        found.append(_trial("edge-approach", f"30-percent-{energy}", study))
-    return found
+        results.append(_trial("edge-approach", f"30-percent-{energy}", study))
+    return results
 
 
 def _contacts() -> list[Trial]:
     """Falls on a floor, blows of light and heavy balls, a press, and bodies that touch one another."""
     fell, struck = "contacts:fell", "contacts:was_struck"
-    found = [_trial("contact", f"dt-{step:.0e}-s", contacts.fallen(step), fell) for step in (*STEPS[:-1], 5e-2)]
+    results = [_trial("contact", f"dt-{step:.0e}-s", contacts.fallen(step), fell) for step in (*STEPS[:-1], 5e-2)]
     others = {"newmark": 50, "generalized-alpha": 100}  # steps: Newmark's gains energy at large strains, and takes more
-    found += [
+    results += [
         _trial("contact", f"dt-1e-02-s-{name}", contacts.fallen(1e-2, scheme=name, steps=steps), fell)
         for name, steps in others.items()
     ]
     for young in (1e3, 1e5, 1e7, 1e9, 1e11):
         soft = contacts.fallen(5e-3, young=young, speed=0.3, gravity=0.0)
-        found.append(_trial("contact", f"young-{young:.0e}-Pa", soft, fell))
+        results.append(_trial("contact", f"young-{young:.0e}-Pa", soft, fell))
     for ratio in (1e-4, 1.0, 1e4):
-        found.append(_trial("contact", f"mass-ratio-{ratio:.0e}", contacts.struck(ratio), struck))
+        results.append(_trial("contact", f"mass-ratio-{ratio:.0e}", contacts.struck(ratio), struck))
     broken = x.breaking(contacts.struck(1e4), 3e5)
-    found.append(_trial("contact", "mass-ratio-1e+04-torn", broken, struck))
-    found.append(_trial("contact", "shell-1-to-1000-pressed", contacts.pressed(1e-3), "contacts:was_pressed"))
+    results.append(_trial("contact", "mass-ratio-1e+04-torn", broken, struck))
+    results.append(_trial("contact", "shell-1-to-1000-pressed", contacts.pressed(1e-3), "contacts:was_pressed"))
     itself = (name for name in contacts.MESHES if name.startswith("itself"))
-    found += [_script("contact", name, "written", name, measure="contacts:fell_on_itself") for name in itself]
-    found.append(_script("contact", "shell-in-a-stack", "written", "stacked-4mm", measure="contacts:was_stacked"))
-    return found + _without_contact()
+    results += [_script("contact", name, "written", name, measure="contacts:fell_on_itself") for name in itself]
+    results.append(_script("contact", "shell-in-a-stack", "written", "stacked-4mm", measure="contacts:was_stacked"))
+    return results + _without_contact()
 
 
 # row of a body in contact -> row of the same one without
@@ -267,9 +267,9 @@ def sections(records: list[Record]) -> list[Section]:
         "(in a ball not deeper than chords of facets may), or the row is wrong. Each row was run on 1 and on 2 ranks, "
         "those on 1 two at a time."
     )
-    found = [record for record in records if record["case"] == "failed"]
+    results = [record for record in records if record["case"] == "failed"]
     first = Section("Stability", text, claims=_claims(table), tables=(_table(table),))
-    return [first, *([contact] if (contact := _iterations(table)) else []), *([section(found)] if found else [])]
+    return [first, *([contact] if (contact := _iterations(table)) else []), *([section(results)] if results else [])]
 
 
 def _claims(records: list[Record]) -> tuple[Claim, ...]:
@@ -327,7 +327,7 @@ def _alike(one: Record, *others: Record) -> bool:
 
 def _iterations(records: list[Record]) -> Section | None:
     """Newton's and CG's iterations with contact beside those without."""
-    figures = {_place(each): each["figures"] for each in records if each["case"] == "contact" and each["ranks"] == 1}
+    figures = {_place(record): record["figures"] for record in records if record["case"] == "contact" and record["ranks"] == 1}
     rows = [_counts(name, figures[name], {}) for name in figures if name not in (*ALONE, *ALONE.values())]
     rows += [
         _counts(name, figures[name], figures[alone]) for name, alone in ALONE.items() if {name, alone} <= {*figures}
@@ -346,9 +346,9 @@ def _iterations(records: list[Record]) -> Section | None:
 
 
 def _counts(name: str, *both: Record) -> tuple[TableCell, ...]:
-    found = [[each.get(key) for key in COUNTS] for each in both]
-    each_time = [counts[2] / counts[0] if counts[0] else None for counts in found]
-    return name, *found[0], each_time[0], *found[1], each_time[1]
+    results = [[item.get(key) for key in COUNTS] for item in both]
+    each_time = [counts[2] / counts[0] if counts[0] else None for counts in results]
+    return name, *results[0], each_time[0], *results[1], each_time[1]
 
 
 COUNTS = ("newton_mean", "newton_max", "krylov_mean", "krylov_max")

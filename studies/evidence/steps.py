@@ -117,7 +117,7 @@ def front() -> Data:
 def _in_turn(study: Data, more: Data, turns: int, block: int) -> Data:
     """Blocks of steps of a study, and of the same with more in it."""
     with tempfile.TemporaryDirectory() as folder:
-        runs = [_run(each, "in turn", Path(folder) / name) for name, each in (("whole", study), ("more", study | more))]
+        runs = [_run(item, "in turn", Path(folder) / name) for name, item in (("whole", study), ("more", study | more))]
         seconds: list[list[float]] = [[], []]
         reports = []
         for run in runs:
@@ -168,17 +168,17 @@ def main() -> None:
 def section(records: list[Data]) -> Section:
     """Tables and claims."""
     done = {record["settings"]["of"]: record["figures"] for record in records if record["figures"]}
-    found = {name: figures for name, figures in done.items() if name in COLLAPSES}
+    results = {name: figures for name, figures in done.items() if name in COLLAPSES}
     text = (
         "Processor seconds. A lattice of 5,280 triangles with a notch under a load that grows in 20 steps until it "
         "comes apart: one step of such a collapse once took 129 s, whole runs on meshes of random points 5 s. "
         "And explicit steps in turn in one process: of a pane, whole and where it breaks, and of a column in space "
         f"with `[fracture] energy`, whole and with a front of 60 cells in a load far below its own.{again(records)}"
     )
-    worst = max(found, key=lambda name: found[name]["worst"], default="")
+    worst = max(results, key=lambda name: results[name]["worst"], default="")
     told, quick = "nothing", None
-    if found:
-        told, quick = f"{found[worst]['worst']:.2g} s ({worst})", found[worst]["worst"] <= WORST
+    if results:
+        told, quick = f"{results[worst]['worst']:.2g} s ({worst})", results[worst]["worst"] <= WORST
     pane, column = done.get(EXPLICIT), done.get(FRONT)
     claims = (
         Claim(f"No step of a collapse takes more than {WORST:g} s", told, quick),

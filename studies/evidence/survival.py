@@ -83,8 +83,8 @@ def drifting(run: Path) -> Figures:
 
 def moves_at_start(study: dict[str, Any]) -> bool:
     """Whether body or free obstacles bring energy of motion."""
-    free = (each for each in study.get("obstacle", []) if "mass" in each or "density" in each)
-    return "initial" in study or any("velocity" in each or "spin" in each for each in free)
+    free = (item for item in study.get("obstacle", []) if "mass" in item or "density" in item)
+    return "initial" in study or any("velocity" in item or "spin" in item for item in free)
 
 
 def energy_growth(rows: dict[str, Values], *, moving_at_start: bool) -> float:

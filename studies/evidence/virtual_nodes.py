@@ -54,10 +54,10 @@ def duplicate(cells: npt.NDArray[np.integer], groups: npt.NDArray[np.integer], n
     while True:
         kept = shared[:, ~alone[(shared - nodes) // corners.shape[1]].any(axis=0)]
         places, source = _joined(np.concatenate([own, kept], axis=1), nodes, corners[cell])
-        found = _third_cells(places, owned, cell) & ~alone
-        if not found.any():
+        results = _third_cells(places, owned, cell) & ~alone
+        if not results.any():
             return Duplicated(places, owned, cell, source, owned.mean(axis=1))
-        alone |= found
+        alone |= results
 
 
 def _joined(pairs: Ints, nodes: int, originals: Ints) -> tuple[Ints, Ints]:

@@ -108,5 +108,5 @@ class Akantu:
         self._process.communicate()
         if self._process.returncode:
             raise RuntimeError(f"Akantu ended with code {self._process.returncode}")
-        with np.load(self._result) as found:
-            return np.asarray(found["displacement"], np.float64)
+        with np.load(self._result) as results:
+            return np.asarray(results["displacement"], np.float64)

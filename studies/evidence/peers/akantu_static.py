@@ -40,7 +40,7 @@ def figures_of(case: str, problem: dict[str, Any], u: Values) -> dict[str, float
 
 def stress_of(problem: dict[str, Any], u: Values) -> Values:
     """(cells, 4) stress xx, xy, yx, yy, Pa, in plane stress: of the corners, and so of linear cells."""
-    X, values = (each[problem["cells"][:, :3]] for each in (problem["points"], u))
+    X, values = (item[problem["cells"][:, :3]] for item in (problem["points"], u))
     gradient = np.linalg.solve(X[:, 1:] - X[:, :1], values[:, 1:] - values[:, :1]).swapaxes(1, 2)
     strain = (gradient + gradient.swapaxes(1, 2)) / 2
     young, poisson = problem["young"], problem["poisson"]

@@ -115,15 +115,15 @@ TITLE = "A linear step beside Akantu's"
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
     """Table and claims; a sentence where Akantu is not there."""
-    found = [record for record in records if record["case"] == "linear-step"]
-    done = [record["figures"] for record in found if record["figures"]]
+    results = [record for record in records if record["case"] == "linear-step"]
+    done = [record["figures"] for record in results if record["figures"]]
     if not done:
-        return [Section(TITLE, found[0]["message"] if found else ABSENT)]
+        return [Section(TITLE, results[0]["message"] if results else ABSENT)]
     text = (
         f"Block of 24 n^3 tetrahedra, {STEPS} steps of {STEP:g} s after the first {WARM}, in turn, one process and "
         f"thread each; medians. '{FIRST}' solves Akantu's equations. Akantu keeps the factors of a direct solver, we "
         "keep multigrid and begin CG from earlier solutions. First: the first step, with what is made in it."
-        f"{again(found)}"
+        f"{again(results)}"
     )
     columns = ("tetrahedra", "program", "wall s a step", "core-seconds a step", "over Akantu's", "first, core-seconds")
     rows = tuple(row for figures in done for row in _rows(figures))
@@ -132,10 +132,10 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
 
 def _rows(figures: dict[str, Any]) -> list[tuple[Any, ...]]:
     theirs = figures["akantu"]
-    programs = {"Akantu": theirs} | {f"fracsim, {way}": each for way, each in figures["ours"].items()}
+    programs = {"Akantu": theirs} | {f"fracsim, {way}": item for way, item in figures["ours"].items()}
     return [
-        (figures["cells"], name, each["wall"], each["cpu"], each["cpu"] / theirs["cpu"], each["first"])
-        for name, each in programs.items()
+        (figures["cells"], name, item["wall"], item["cpu"], item["cpu"] / theirs["cpu"], item["first"])
+        for name, item in programs.items()
     ]
 
 
@@ -150,8 +150,8 @@ def _claims(done: list[dict[str, Any]]) -> tuple[Claim, ...]:
         ),
         Claim(
             f"Both end at the same displacement, to {SAME:g} of the greatest",
-            ", ".join(f"{each:.1e} at {cells:,} tetrahedra" for cells, each in apart.items()),
-            all(each <= SAME for each in apart.values()),
+            ", ".join(f"{item:.1e} at {cells:,} tetrahedra" for cells, item in apart.items()),
+            all(item <= SAME for item in apart.values()),
         ),
     )
 

@@ -156,9 +156,9 @@ def _theirs(n: int, pull: str) -> dict[str, float]:
         if done.returncode:
             raise RuntimeError(f"PhaseFieldX ended with code {done.returncode}: {done.stderr[-500:]}")
         said = json.loads(done.stdout.splitlines()[-1])
-        with np.load(result) as found:  # kN for a thickness of 1 mm
-            crack = found["crack"] / MM - SIDE / 2
-            return _figures(found["load"] * 1e3, given.course, crack, said["cpu"], said["solves"])
+        with np.load(result) as results:  # kN for a thickness of 1 mm
+            crack = results["crack"] / MM - SIDE / 2
+            return _figures(results["load"] * 1e3, given.course, crack, said["cpu"], said["solves"])
 
 
 def direction(crack: Values) -> float:
@@ -203,10 +203,10 @@ COLUMNS = (
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
     """A table; a sentence where PhaseFieldX is not there."""
-    found = [record for record in records if record["case"] == "notched-plate"]
-    done = [record["figures"] for record in found if record["figures"]]
+    results = [record for record in records if record["case"] == "notched-plate"]
+    done = [record["figures"] for record in results if record["figures"]]
     if not done:
-        return [Section(TITLE, found[0]["message"] if found else ABSENT)]
+        return [Section(TITLE, results[0]["message"] if results else ABSENT)]
     rows = tuple(row for figures in done for row in _rows(figures))
     return [Section(TITLE, TEXT, tables=(ReportTable("peers-notched-plate", TITLE, COLUMNS, rows),))]
 
@@ -214,8 +214,8 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
 def _rows(figures: dict[str, Any]) -> list[tuple[TableCell, ...]]:
     programs = {"PhaseFieldX": figures["theirs"], "fracsim": figures["ours"]}
     return [
-        (figures["pull"], figures["cells"], name, *(each[key] for key in ("peak", "at", "turn", "seconds", "solves")))
-        for name, each in programs.items()
+        (figures["pull"], figures["cells"], name, *(item[key] for key in ("peak", "at", "turn", "seconds", "solves")))
+        for name, item in programs.items()
     ]
 
 

@@ -36,8 +36,8 @@ WAYS: dict[str, dict[str, Any]] = {
 
 def job(way: str) -> dict[str, Any]:
     """Ten steps of the block with 3,000 tetrahedra."""
-    found = study(5, "newmark, consistent mass") | WAYS[way]
-    return found | {"time": found["time"] | {"end": STEPS * STEP}}
+    results = study(5, "newmark, consistent mass") | WAYS[way]
+    return results | {"time": results["time"] | {"end": STEPS * STEP}}
 
 
 def trials() -> list[Trial]:
@@ -58,7 +58,7 @@ def measured() -> dict[str, float]:
         for _ in range(RUNS):
             for name, command in commands.items():
                 seconds[name].append(_cost(command))
-    return {name: median(found) for name, found in seconds.items()}
+    return {name: median(results) for name, results in seconds.items()}
 
 
 def _ours(way: str, folder: Path) -> Callable[[], None]:
@@ -107,13 +107,13 @@ def main() -> None:
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
     """Table and claim."""
-    found = next((record for record in records if record["case"] == "start-up"), None)
-    if found is None or not found["figures"]:
+    results = next((record for record in records if record["case"] == "start-up"), None)
+    if results is None or not results["figures"]:
         return []
-    figures = found["figures"]
+    figures = results["figures"]
     text = (
         f"3,000 tetrahedra, {STEPS} steps, from the command to its end: processor seconds, medians of {RUNS} runs in "
-        f"turn.{'' if 'Akantu' in figures else f' {ABSENT}'}{again([found])}"
+        f"turn.{'' if 'Akantu' in figures else f' {ABSENT}'}{again([results])}"
     )
     worst = max(figures[way] for way in WAYS)
     shown = ", ".join(f"{name} {seconds:.2f}" for name, seconds in figures.items())

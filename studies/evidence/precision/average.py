@@ -51,9 +51,9 @@ def measure(parts: int) -> dict[str, float]:
         began = time.perf_counter()
         average = NonlocalAverage(domain, RADIUS, kernel)
         built = time.perf_counter()
-        found = average(values[:, None])[inside, 0]
+        results = average(values[:, None])[inside, 0]
         exact = values[inside] + kernel_moment(kernel) / 2
-        figures[kernel] = float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
+        figures[kernel] = float(np.linalg.norm(results - exact) / np.linalg.norm(exact))
         figures[f"{kernel} to build s"] = built - began
         figures[f"{kernel} to use s"] = time.perf_counter() - built
     return figures | {"seconds": figures["linear to build s"] + figures["linear to use s"], "cells": len(values)}

@@ -51,13 +51,13 @@ def beam(h: float, scheme: str, step: float, end: float = 2 * PERIOD, **solver: 
 
 def static_study(h: float) -> Study:
     """What the reference for the frequency takes from the study: mesh, material, clamp."""
-    found = beam(h, "newmark", 1.0, 1.0)
-    return found | {"boundary": found["boundary"][:1]}
+    results = beam(h, "newmark", 1.0, 1.0)
+    return results | {"boundary": results["boundary"][:1]}
 
 
 def trials() -> list[Trial]:
     """dt by scheme on the coarse mesh, an explicit run as their reference; h with small steps."""
-    found = [
+    results = [
         trial("beam", f"{scheme}-{count}", beam(MESH, scheme, PERIOD / count), "beam:measure",
               {"scheme": scheme, "dt": PERIOD / count, "h": MESH})
         for scheme, counts in STEPS.items()
@@ -65,18 +65,18 @@ def trials() -> list[Trial]:
     ]  # fmt: skip
     explicit = beam(MESH, "explicit", PERIOD)
     del explicit["solver"]
-    found.append(trial("beam", "explicit", explicit, "beam:measure", {"scheme": "explicit", "h": MESH}))
-    found += [
+    results.append(trial("beam", "explicit", explicit, "beam:measure", {"scheme": "explicit", "h": MESH}))
+    results += [
         trial("frequency", f"h-{h:g}", beam(h, "newmark", PERIOD / 100, 3 * PERIOD), "beam:measure",
               {"scheme": "newmark", "dt": PERIOD / 100, "h": h}, full=h == FULL_SIZE)
         for h in SIZES
     ]  # fmt: skip
-    found += [
+    results += [
         script("frequency", f"quadratic-h-{h:g}", "quadratic", {"case": "frequency", "h": h},
                {"h": h, "elements": "quadratic"})
         for h in (0.025, 0.0125)
     ]  # fmt: skip
-    return found
+    return results
 
 
 def measure(run: Path) -> dict[str, float]:

@@ -81,25 +81,25 @@ def split(parts: int, radius: float) -> Study:
 
 def trials() -> list[Trial]:
     """h for both; the peak with and without an average."""
-    found = [
+    results = [
         trial("disk", f"parts-{parts}", pressed(parts), "brazilian:measure_centre", {"h": RADIUS / parts, "order": 1})
         for parts in PARTS
     ]
-    found += [
+    results += [
         trial("disk", f"order-2-parts-{parts}", pressed(parts, 2), "brazilian:measure_centre",
               {"h": RADIUS / parts, "order": 2})
         for parts in SECOND
     ]  # fmt: skip
     for order, all_parts in ((1, PARTS), (2, SECOND)):
         for parts in all_parts:
-            found += beside_akantu("disk", RADIUS / parts, order)
+            results += beside_akantu("disk", RADIUS / parts, order)
     runs = [(parts, 0.0) for parts in PEAK_PARTS] + [(parts, RADIUS / 10) for parts in AVERAGED]
-    found += [
+    results += [
         trial("disk-peak", f"parts-{parts}-radius-{radius:g}", split(parts, radius), "brazilian:measure_peak",
               {"h": RADIUS / parts, "radius": radius})
         for parts, radius in runs
     ]  # fmt: skip
-    return found
+    return results
 
 
 def measure_centre(run: Path) -> dict[str, float]:
@@ -115,11 +115,11 @@ def centre(frame: dict[str, Any]) -> dict[str, float]:
     else:
         stress = plane_stress(frame, GRANITE["young"], GRANITE["poisson"], MIDDLES)  # type: ignore[arg-type]
     fourth, half = (_within(corners, stress, RADIUS * share) for share in (1 / 4, 1 / 2))
-    (found, exact), (wide, wide_exact) = fourth[:2], half[:2]
+    (results, exact), (wide, wide_exact) = fourth[:2], half[:2]
     return {
-        "sigma_x": abs(float(found[0] / exact[0]) - 1),
-        "sigma_y": abs(float(found[1] / exact[1]) - 1),
-        "centre": float(np.linalg.norm(found - exact) / np.linalg.norm(exact)),
+        "sigma_x": abs(float(results[0] / exact[0]) - 1),
+        "sigma_y": abs(float(results[1] / exact[1]) - 1),
+        "centre": float(np.linalg.norm(results - exact) / np.linalg.norm(exact)),
         "mean stress": float(np.linalg.norm(wide - wide_exact) / np.linalg.norm(wide_exact)),
         "stress": half[2],
     }
@@ -180,9 +180,9 @@ def _text(records: Records) -> str:
 
 
 def _peak_text(records: Records) -> str:
-    found = "; ".join(_forces(record) for record in records if record["figures"])
+    results = "; ".join(_forces(record) for record in records if record["figures"])
     return (
-        f"Forces over pi D t sigma_t / 2: {found}.\n\nNo theory gives an order: an edge feels all of the tension only "
+        f"Forces over pi D t sigma_t / 2: {results}.\n\nNo theory gives an order: an edge feels all of the tension only "
         "where it lies along it, and the threefold compression across counts against it (10 degrees off: a tenth of "
         "the load more), so that a coarse mesh breaks late. The crack load is that of the step in which most edges "
         "broke. It is not a peak: a torn cell still carries the compression along the crack, and so the force goes on "

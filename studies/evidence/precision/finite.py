@@ -82,15 +82,15 @@ def shear_gradient(energy: str) -> Any:
 
 def trials() -> list[Trial]:
     """Tolerances with the neo-Hookean energy; the others as they come."""
-    found = []
+    results = []
     for case, make in (("uniaxial", stretched), ("shear", sheared)):
         runs = [("neo-hookean", pair) for pair in TOLERANCES] + [("stvk", DEFAULT)]
-        found += [
+        results += [
             trial(case, f"{energy}-snes-{snes:g}-ksp-{ksp:g}", make(energy, (snes, ksp)), "finite:measure",
                   {"energy": energy, "snes_rtol": snes, "ksp_rtol": ksp})
             for energy, (snes, ksp) in runs
         ]  # fmt: skip
-    return found
+    return results
 
 
 def measure(run: Path) -> dict[str, float]:

@@ -106,22 +106,22 @@ def measure_recoil(run: Path) -> dict[str, float]:
 
 def trials() -> list[Trial]:
     """dt for the break time; h with dt for the recoil, by scheme."""
-    found = [
+    results = [
         trial("break", f"steps-{count}", pulled(count), "fracture:measure_break",
               {"dt": BREAK / (count + 1 / 3), "h": 0.125})
         for count in COUNTS
     ]  # fmt: skip
-    found.append(
+    results.append(
         trial("break", "steps-40-fine", pulled(40, 0.0625), "fracture:measure_break",
               {"dt": BREAK / (40 + 1 / 3), "h": 0.0625})
     )  # fmt: skip
-    found += [
+    results += [
         trial("recoil", f"{scheme}-{cells}", torn(cells, scheme), "fracture:measure_recoil",
               {"scheme": scheme, "h": 1 / cells})
         for scheme in SCHEMES
         for cells in CELLS
     ]  # fmt: skip
-    return found
+    return results
 
 
 def _break_text(records: Records) -> str:

@@ -119,7 +119,7 @@ def main() -> None:
     began = time.process_time()
     scene = solved(given.energy, given.order, given.dim, given.h)
     seconds = time.process_time() - began
-    displacement, gradient = (float(each) for each in errors(scene))
+    displacement, gradient = (float(error) for error in errors(scene))
     figures = {"displacement": displacement, "gradient": gradient, "seconds": seconds}
     given.o.write_text(json.dumps(figures) + "\n")
 

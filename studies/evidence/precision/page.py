@@ -147,8 +147,8 @@ def in_doubt(case: Case, records: Records) -> set[str]:
         return set()
     advice, _ = _advice(case, rows)
     rivals = [
-        row.record for each in advice if each.default is not None and not _as_good(each.default, each.candidate)
-        for row in (each.default, each.candidate) if row is not None
+        row.record for item in advice if item.default is not None and not _as_good(item.default, item.candidate)
+        for row in (item.default, item.candidate) if row is not None
     ]  # fmt: skip
     return {record["name"] for record in rivals if 0 < len(record["cpu"]) < TIMED}
 
@@ -164,9 +164,9 @@ def _order_claim(order: Order, rows: list[Row]) -> Claim:
     sizes = [float(row.record["settings"][order.variable]) for row in chosen]
     if len(set(sizes)) < 3:
         return Claim(text, "not run: fewer than three sizes", None)
-    found = fitted_order(sizes, [row.errors[order.error] for row in chosen])
-    measured = f"{found:.2f} from {order.variable} = {max(sizes):.3g} to {min(sizes):.3g} ({len(sizes)} runs)"
-    return Claim(text, measured, found >= order.theory - WITHIN if order.least else abs(found - order.theory) <= WITHIN)
+    results = fitted_order(sizes, [row.errors[order.error] for row in chosen])
+    measured = f"{results:.2f} from {order.variable} = {max(sizes):.3g} to {min(sizes):.3g} ({len(sizes)} runs)"
+    return Claim(text, measured, results >= order.theory - WITHIN if order.least else abs(results - order.theory) <= WITHIN)
 
 
 # --- recommended settings ---
@@ -184,8 +184,8 @@ class Advice:
 
 def _advice(case: Case, rows: list[Row]) -> tuple[list[Advice], list[int]]:
     usable = [row for row in rows if counts(case, row)]
-    found = [_for_limit(case, usable, limit) for limit in LIMITS]
-    return found, sorted({rows.index(each.chosen) for each in found if each.chosen is not None})
+    results = [_for_limit(case, usable, limit) for limit in LIMITS]
+    return results, sorted({rows.index(item.chosen) for item in results if item.chosen is not None})
 
 
 def counts(case: Case, row: Row) -> bool:
@@ -250,7 +250,7 @@ def _words(advice: list[Advice], case: Case) -> str:
             " Nor is a looser CG, which fails on slender bodies (ksp-1e-3-slender among the solver settings), nor a "
             "looser Newton, which takes the first guess for the answer on slivers (snes-1e-4-slivers)."
         )
-    return " ".join(_sentence(each, case) for each in advice) + why
+    return " ".join(_sentence(item, case) for item in advice) + why
 
 
 def _sentence(advice: Advice, case: Case) -> str:
@@ -272,7 +272,7 @@ def _default_claims(case: Case, advice: list[Advice]) -> tuple[Claim, ...]:
     known = defaults()
     if not any(column in known for column in case.columns):
         return ()
-    return tuple(_default_claim(case, each) for each in advice)
+    return tuple(_default_claim(case, item) for item in advice)
 
 
 def _default_claim(case: Case, advice: Advice) -> Claim:

@@ -14,20 +14,20 @@ PEERS = {"quadratic": "DOLFINx alone, quadratic"}  # by the setting `elements` o
 
 def summary(cases: list[Case], records: Records) -> list[Section]:
     """The section, where any case has rows."""
-    found = [(case, rows) for case in cases if case.priced and (rows := rows_of(case, records))]
-    if not found:
+    results = [(case, rows) for case in cases if case.priced and (rows := rows_of(case, records))]
+    if not results:
         return []
-    peers = sorted({peer for _, rows in found for row in rows if (peer := peer_of(row.record))})
+    peers = sorted({peer for _, rows in results for row in rows if (peer := peer_of(row.record))})
     seconds = [f"{peer}: s for {limit:.0%}" for peer in peers for limit in LIMITS]
     own = [words for limit in LIMITS for words in (f"cheapest setting for {limit:.0%}", f"s for {limit:.0%}")]
     table = ReportTable(
         "precision-short", "Core-seconds in the steps that an error takes. Empty: no setting that ran is that good.",
-        ("case", "error of", *own, *seconds), tuple(_line(case, rows, peers) for case, rows in found),
+        ("case", "error of", *own, *seconds), tuple(_line(case, rows, peers) for case, rows in results),
     )  # fmt: skip
     plot = Plot(
         f"Error against core-seconds: the best settings of each case. Errors below {FINEST:g} count as that.",
         "core-seconds in the steps", "relative error",
-        tuple(_front(case, rows) for case, rows in found), "loglog", levels=LIMITS,
+        tuple(_front(case, rows) for case, rows in results), "loglog", levels=LIMITS,
     )  # fmt: skip
     without = "" if peers else " No other program has run beside them here."
     if "Akantu" not in peers and interpreter() is None:

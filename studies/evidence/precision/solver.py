@@ -58,23 +58,23 @@ def block(solver: dict[str, Any]) -> Study:
 
 def trials() -> list[Trial]:
     """All settings, the default on two ranks too, and the reference."""
-    found = [
+    results = [
         trial("solver", name, block(given), "solver:measure", {"solver": name} | _shown(given), repeats=2)
         for name, given in SETTINGS.items()
     ]
-    found.append(
+    results.append(
         trial("solver", "default-ranks-2", block({}), "solver:measure", {"solver": "default"} | _shown({}), ranks=2)
     )
     # why CG is not left looser: on a slender body under a force the residual does not fall
     slender = cantilever(0.01) | {"solver": {"ksp_rtol": 1e-3}}
-    found.append(Trial(GROUP, "solver", "ksp-1e-3-slender", study=slender, settings=_shown({"ksp_rtol": 1e-3})))
+    results.append(Trial(GROUP, "solver", "ksp-1e-3-slender", study=slender, settings=_shown({"ksp_rtol": 1e-3})))
     # nor Newton: on slivers the first guess has hardly any residual, and is far off
     sliver = block_of_slivers() | {"solver": {"snes_rtol": 1e-4}}
-    found.append(
+    results.append(
         Trial(GROUP, "solver", "snes-1e-4-slivers", study=sliver, settings=_shown({"snes_rtol": 1e-4}),
               measure="survival:pulled")
     )  # fmt: skip
-    return [*found, trial("solver", "reference", block(REFERENCE), "solver:measure", {"solver": "reference"})]
+    return [*results, trial("solver", "reference", block(REFERENCE), "solver:measure", {"solver": "reference"})]
 
 
 def block_of_slivers() -> Study:

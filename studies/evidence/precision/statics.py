@@ -64,26 +64,26 @@ STUDIES: dict[str, Callable[..., Study]] = {"cantilever": cantilever, "plate": p
 
 def trials() -> list[Trial]:
     """Both cases over h; the cantilever with every energy and on two ranks too."""
-    found = [
+    results = [
         trial(case, f"h-{h:g}", STUDIES[case](h), f"statics:measure_{case}", _settings(h), full=h == FULL[case])
         for case, sizes in SIZES.items()
         for h in sizes
     ]
-    found += [
+    results += [
         trial(case, f"order-2-h-{h:g}", STUDIES[case](h, order=2), f"statics:measure_{case}", _settings(h, order=2))
         for case, sizes in SECOND.items()
         for h in sizes
     ]
-    found += [
+    results += [
         trial("cantilever", f"{energy}-h-0.0125", cantilever(0.0125, energy), "statics:measure_cantilever",
               _settings(0.0125, energy))
         for energy in ("corotated", "stvk", "neo-hookean")
     ]  # fmt: skip
-    found.append(
+    results.append(
         trial("cantilever", "h-0.00625-ranks-2", cantilever(0.00625), "statics:measure_cantilever", _settings(0.00625),
               ranks=2)
     )  # fmt: skip
-    found += [
+    results += [
         script(case, f"quadratic-h-{h:g}", "quadratic", {"case": case, "h": h}, {"h": h, "elements": "quadratic"},
                full=h == sizes[-1])
         for case, sizes in QUADRATIC.items()
@@ -92,8 +92,8 @@ def trials() -> list[Trial]:
     for order, of_cases in ((1, SIZES), (2, SECOND)):
         for case, sizes in of_cases.items():
             for h in sizes:
-                found += beside_akantu(case, h, order, full=order == 1 and case == "cantilever" and h < 0.01)
-    return found
+                results += beside_akantu(case, h, order, full=order == 1 and case == "cantilever" and h < 0.01)
+    return results
 
 
 def _settings(h: float, energy: str = "linear", order: int = 1) -> dict[str, str | float | int | bool]:
@@ -117,12 +117,12 @@ def measure_plate(run: Path) -> dict[str, float]:
 
 def _references(records: Records, key: str) -> list[tuple[float, float]]:
     """(h, figure) of the runs with quadratic elements, the finest last."""
-    found = [
+    results = [
         record for record in records if record["settings"].get("elements") == "quadratic" and key in record["figures"]
     ]
-    if len(found) < 2:
+    if len(results) < 2:
         raise KeyError(f"{key} with quadratic elements on two meshes")
-    return sorted(((record["settings"]["h"], record["figures"][key]) for record in found), reverse=True)
+    return sorted(((record["settings"]["h"], record["figures"][key]) for record in results), reverse=True)
 
 
 def _converged(records: Records, key: str) -> float:
@@ -144,14 +144,14 @@ def _cantilever_errors(records: Records) -> dict[str, dict[str, float]]:
 def _plate_errors(records: Records) -> dict[str, dict[str, float]]:
     """The error of the stress in the energy norm, squared, is the energy that is missing: a(u, u) - a(u_h, u_h)."""
     exact, peak = (_converged(records, key) for key in ("deflection", "peak"))
-    found = {}
+    results = {}
     for record in records:
         if figures := record["figures"]:
             missing = relative(figures["deflection"], exact)
-            found[record["name"]] = {"stress": missing**0.5, "edge displacement": missing}
+            results[record["name"]] = {"stress": missing**0.5, "edge displacement": missing}
             if "peak" in figures:
-                found[record["name"]]["peak stress"] = relative(figures["peak"], peak)
-    return found
+                results[record["name"]]["peak stress"] = relative(figures["peak"], peak)
+    return results
 
 
 def _cantilever_text(records: Records) -> str:

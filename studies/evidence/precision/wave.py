@@ -28,7 +28,7 @@ def bar(cells: int, scheme: str, step: float, load: str) -> Study:
     h = 1 / cells
     t = np.linspace(0.0, DURATION, KNOTS + 1)
     smooth = {"time": t.tolist(), "value": [[float(PULL * p), 0.0] for p in pulse(t, DURATION)]}
-    found: Study = {
+    results: Study = {
         "title": f"A {load} in a bar",
         "mesh": {"builder": "box", "size": [1.0, 4 * h], "h": h},
         "material": {"energy": "linear", "young": 1.0, "poisson": 0.0, "density": 1.0},
@@ -36,19 +36,19 @@ def bar(cells: int, scheme: str, step: float, load: str) -> Study:
         "time": {"scheme": scheme, "step": step, "end": END},
         "output": QUIET | {"fields": ["velocity"]},
     }
-    return found if scheme == "explicit" else found | {"solver": TIGHT}
+    return results if scheme == "explicit" else results | {"solver": TIGHT}
 
 
 def trials() -> list[Trial]:
     """Both loads: dt = h / 2 for schemes of second order (explicit: what is stable), dt alone for backward Euler."""
-    found = []
+    results = []
     for load in ("pulse", "step"):
         for scheme in SECOND_ORDER:
-            found += [_trial(load, cells, scheme, 0.5 / cells) for cells in CELLS if load == "pulse" or cells > 32]
-    found += [_trial("pulse", FIRST_CELLS, "backward-euler", 1 / count) for count in STEPS]
-    found += [_trial("step", cells, "backward-euler", 0.5 / cells) for cells in CELLS if cells > 32]
-    found.append(_trial("pulse", 256, "explicit", 0.5 / 256, ranks=2))
-    return found
+            results += [_trial(load, cells, scheme, 0.5 / cells) for cells in CELLS if load == "pulse" or cells > 32]
+    results += [_trial("pulse", FIRST_CELLS, "backward-euler", 1 / count) for count in STEPS]
+    results += [_trial("step", cells, "backward-euler", 0.5 / cells) for cells in CELLS if cells > 32]
+    results.append(_trial("pulse", 256, "explicit", 0.5 / 256, ranks=2))
+    return results
 
 
 def _trial(load: str, cells: int, scheme: str, step: float, ranks: int = 1) -> Trial:
