@@ -136,7 +136,10 @@ def _strengths() -> list[Trial]:
     for strength in (0.0, 1e-45, 1e-3, 1e3, 1e30, float("inf")):
         study = x.torn(x.BAR, speed=1.0, step=1e-2, steps=40, strength=strength)
         results.append(_trial("strength", f"{strength:g}-Pa", study))
-    return [*results, _trial("strength", "nan-Pa", x.torn(x.BAR, speed=1.0, step=1e-2, steps=40, strength=float("nan")))]
+    return [
+        *results,
+        _trial("strength", "nan-Pa", x.torn(x.BAR, speed=1.0, step=1e-2, steps=40, strength=float("nan"))),
+    ]
 
 
 def _many() -> list[Trial]:
@@ -327,7 +330,9 @@ def _alike(one: Record, *others: Record) -> bool:
 
 def _iterations(records: list[Record]) -> Section | None:
     """Newton's and CG's iterations with contact beside those without."""
-    figures = {_place(record): record["figures"] for record in records if record["case"] == "contact" and record["ranks"] == 1}
+    figures = {
+        _place(record): record["figures"] for record in records if record["case"] == "contact" and record["ranks"] == 1
+    }
     rows = [_counts(name, figures[name], {}) for name in figures if name not in (*ALONE, *ALONE.values())]
     rows += [
         _counts(name, figures[name], figures[alone]) for name, alone in ALONE.items() if {name, alone} <= {*figures}

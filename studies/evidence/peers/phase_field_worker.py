@@ -68,7 +68,11 @@ def main() -> None:
 
 def _found(name: str) -> Any:
     """A field of the solver that runs, which gives it to nobody."""
-    return next(get_object for get_object in gc.get_objects() if isinstance(get_object, fem.Function) and get_object.name == name)
+    return next(
+        get_object
+        for get_object in gc.get_objects()
+        if isinstance(get_object, fem.Function) and get_object.name == name
+    )
 
 
 def _cracked(W: Any, phase: Any) -> Any:

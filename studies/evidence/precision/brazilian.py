@@ -180,9 +180,9 @@ def _text(records: Records) -> str:
 
 
 def _peak_text(records: Records) -> str:
-    results = "; ".join(_forces(record) for record in records if record["figures"])
+    forces = "; ".join(_forces(record) for record in records if record["figures"])
     return (
-        f"Forces over pi D t sigma_t / 2: {results}.\n\nNo theory gives an order: an edge feels all of the tension only "
+        f"Forces over pi D t sigma_t / 2: {forces}.\n\nNo theory gives an order: an edge feels all of the tension only "
         "where it lies along it, and the threefold compression across counts against it (10 degrees off: a tenth of "
         "the load more), so that a coarse mesh breaks late. The crack load is that of the step in which most edges "
         "broke. It is not a peak: a torn cell still carries the compression along the crack, and so the force goes on "

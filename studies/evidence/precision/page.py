@@ -166,7 +166,9 @@ def _order_claim(order: Order, rows: list[Row]) -> Claim:
         return Claim(text, "not run: fewer than three sizes", None)
     results = fitted_order(sizes, [row.errors[order.error] for row in chosen])
     measured = f"{results:.2f} from {order.variable} = {max(sizes):.3g} to {min(sizes):.3g} ({len(sizes)} runs)"
-    return Claim(text, measured, results >= order.theory - WITHIN if order.least else abs(results - order.theory) <= WITHIN)
+    return Claim(
+        text, measured, results >= order.theory - WITHIN if order.least else abs(results - order.theory) <= WITHIN
+    )
 
 
 # --- recommended settings ---
