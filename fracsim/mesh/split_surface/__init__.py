@@ -1,4 +1,4 @@
-"""The split surface of a torn body (docs/theory.md#split-surface): drawn and used for contact, never solved for.
+"""The split surface of a damaged body, for output and contact; the system of equations does not contain it.
 
 cut_patterns      what every damage pattern does to one cell, derived once; cells cut flat between pieces; solid: the
                   surface of pieces alone; laid: all walls, those of pieces there

@@ -1,6 +1,6 @@
-"""From damage to a closed surface: points, elements, and the nodes that each point follows.
+"""The closed split surface of a damaged mesh: points, elements, and the nodes that each point follows.
 
-The points of the split surface: nodes that stay, and copies of edge, facet and cell points.
+Points are nodes of the mesh, and copies of points of edges, facets and cells (cut_patterns).
 """
 
 from __future__ import annotations
@@ -23,24 +23,25 @@ Values = npt.NDArray[np.float64]
 
 
 class SurfacePoints:
-    """Points of a state of damage, numbered: nodes first, then copies of edge, facet and cell points.
+    """The numbered points of the split surface: nodes first, then copies of edge, facet and cell points.
 
     Attributes:
         positions: (n, d) reference coordinates, m.
-        follow: the nodes that each point follows.
+        parents: the nodes that each point follows.
         first: number of the first copy.
-        cell, kind, entity: (copies,) what is copied: of which cell, and of that which edge, facet or the whole.
-        group: (copies, d + 1) nodes of the cell that each follows.
+        cell, kind, entity: (copies,) a cell that contains each copy; kind (EDGE, FACET, CELL) and local number of its
+            entity.
+        group: (copies, d + 1) flags of the nodes of the cell that each copy follows.
     """
 
     def __init__(
-        self, skeleton: EntityNumbering, damaged: Ints, pattern: Ints, cut: Values | None, table: CutTable
+        self, topology: EntityNumbering, damaged: Ints, pattern: Ints, cut: Values | None, table: CutTable
     ) -> None:
-        """`pattern`: of the damaged cells; `cut`: see build.split."""
-        self._skeleton, self._copies = skeleton, table.copies
+        """`pattern`: of the `damaged` cells; `cut`: see build_split_surface."""
+        self._topology, self._copies = topology, table.copies
         self._cut = cut if cut is not None and np.isfinite(cut).any() else None
-        nodes = np.arange(len(skeleton.points)) if skeleton.dim == 2 else skeleton.boundary_nodes
-        self._of_node = np.full(len(skeleton.points), -1)
+        nodes = np.arange(len(topology.points)) if topology.dim == 2 else topology.boundary_nodes
+        self._of_node = np.full(len(topology.points), -1)
         self._of_node[nodes] = np.arange(len(nodes))
         row, owner = self._copies.expand(pattern)
         self._first = np.searchsorted(owner, np.arange(len(damaged)))  # first copy of each damaged cell
@@ -49,70 +50,70 @@ class SurfacePoints:
         row, cell = row[one], damaged[owner[one]]
         self.cell, self.kind, self.entity = cell, self._copies.kind[row], self._copies.entity[row]
         self.first, self.group = len(nodes), (group := self._copies.group[row])
-        parents = np.concatenate([nodes, skeleton.cells[cell][group]])
+        parents = np.concatenate([nodes, topology.cells[cell][group]])
         count = np.concatenate([np.ones(len(nodes), np.int64), group.sum(axis=1)])
-        self.positions: Values = np.concatenate([skeleton.points[nodes], self._places(row, cell)])
-        self.parents = PointParents.of(parents, count, self.positions, skeleton.points)
+        self.positions: Values = np.concatenate([topology.points[nodes], self._places(row, cell)])
+        self.parents = PointParents.of(parents, count, self.positions, topology.points)
 
     def of_nodes(self, nodes: Ints) -> Ints:
-        """Points of nodes that have one: those of the boundary, in 2D all."""
+        """Points of boundary nodes (2D: of any nodes); -1 for other nodes."""
         return self._of_node[nodes]
 
     def of_corners(self, corners: Ints, place: Ints, cell: Ints) -> Ints:
-        """Points of table.Elements.corners (n, w), each row of the damaged cell `cell` (n,), the place-th of them."""
+        """(n, w) points of PatternElements.corners (n, w); `place` (n,) is the index of `cell` (n,) in `damaged`."""
         copy = np.minimum(self._first[place][:, None] + np.maximum(corners, 0), len(self._of_copy) - 1)
-        node = self._skeleton.cells[cell[:, None], np.maximum(-1 - corners, 0)]
+        node = self._topology.cells[cell[:, None], np.maximum(-1 - corners, 0)]
         return np.where(corners >= 0, self._of_copy[copy], self._of_node[node])
 
     def _keys(self, row: Ints, cell: Ints, owner: Ints) -> Ints:
-        """A number for every copy that all its cells agree on: (edge, end), (facet, group), (cell, group)."""
-        skeleton, copies, d = self._skeleton, self._copies, self._skeleton.dim
+        """(copies,) keys that are equal in all cells of a copy: (edge, end), (facet, group) or (cell, group)."""
+        topology, copies, d = self._topology, self._copies, self._topology.dim
         kind, entity, lead = copies.kind[row], copies.entity[row], copies.lead[row]
         keys = np.empty(len(row), np.int64)
         at = np.flatnonzero(kind == EDGE)
-        edge = skeleton.cell_edges[cell[at], entity[at]]
-        keys[at] = 2 * edge + (skeleton.cells[cell[at], lead[at]] == skeleton.edges[edge, 1])
+        edge = topology.cell_edges[cell[at], entity[at]]
+        keys[at] = 2 * edge + (topology.cells[cell[at], lead[at]] == topology.edges[edge, 1])
         at = np.flatnonzero(kind == FACET)
-        facet = skeleton.cell_facets[cell[at], entity[at]]
-        group = np.where(copies.group[row[at]], skeleton.cells[cell[at]], len(skeleton.points))
-        rank = np.count_nonzero(skeleton.facets[facet] < group.min(axis=1)[:, None], axis=1)
-        base = 2 * len(skeleton.edges)
+        facet = topology.cell_facets[cell[at], entity[at]]
+        group = np.where(copies.group[row[at]], topology.cells[cell[at]], len(topology.points))
+        rank = np.count_nonzero(topology.facets[facet] < group.min(axis=1)[:, None], axis=1)
+        base = 2 * len(topology.edges)
         keys[at] = base + d * facet + rank
         at = np.flatnonzero(kind == CELL)
-        keys[at] = base + d * len(skeleton.facets) + (d + 1) * owner[at] + lead[at]
+        keys[at] = base + d * len(topology.facets) + (d + 1) * owner[at] + lead[at]
         return keys
 
-    # --- where they are in the reference configuration ---
+    # --- reference positions ---
 
     def _places(self, row: Ints, cell: Ints) -> Values:
-        skeleton, kind, entity = self._skeleton, self._copies.kind[row], self._copies.entity[row]
-        result = np.empty((len(row), skeleton.dim))
+        topology, kind, entity = self._topology, self._copies.kind[row], self._copies.entity[row]
+        result = np.empty((len(row), topology.dim))
         at = kind == EDGE
-        result[at] = self._edge_points(skeleton.cell_edges[cell[at], entity[at]])
+        result[at] = self._edge_points(topology.cell_edges[cell[at], entity[at]])
         at = kind == FACET
         if at.any():
-            nodes = skeleton.facets[skeleton.cell_facets[cell[at], entity[at]]]
-            # ascending, so that all copies of a point are at the same place to the last bit
-            edges = np.sort(skeleton.cell_edges[cell[at][:, None], _facet_edges()[entity[at]]], axis=1)
+            nodes = topology.facets[topology.cell_facets[cell[at], entity[at]]]
+            # ascending, so that all copies of a point have the same position to the last bit
+            edges = np.sort(topology.cell_edges[cell[at][:, None], _facet_edges()[entity[at]]], axis=1)
             result[at] = self._centres(nodes, edges)
         at = kind == CELL
-        result[at] = self._centres(skeleton.cells[cell[at]], skeleton.cell_edges[cell[at]])
+        result[at] = self._centres(topology.cells[cell[at]], topology.cell_edges[cell[at]])
         return result
 
     def _edge_points(self, edges: Ints) -> Values:
-        ends = self._skeleton.points[self._skeleton.edges[edges]]
+        ends = self._topology.points[self._topology.edges[edges]]
         share = 0.5 if self._cut is None else np.where(np.isnan(self._cut[edges]), 0.5, self._cut[edges])[:, None]
         cut: Values = ends[:, 0] + share * (ends[:, 1] - ends[:, 0])
         return cut
 
     def _centres(self, nodes: Ints, edges: Ints) -> Values:
-        """Centroids, or the mean of the cuts with a place where there are two or more: a planar cut stays planar."""
-        centre: Values = self._skeleton.points[nodes].mean(axis=1)
+        """Centroids, or the mean of the given cuts if there are two or more, so that a planar crack stays planar."""
+        centre: Values = self._topology.points[nodes].mean(axis=1)
         if self._cut is not None:
             placed = ~np.isnan(self._cut[edges])
             at = np.flatnonzero(placed.sum(axis=1) >= 2)
             weight = placed[at] / placed[at].sum(axis=1, keepdims=True)
-            cuts = self._edge_points(edges[at].ravel()).reshape(*edges[at].shape, self._skeleton.dim)
+            cuts = self._edge_points(edges[at].ravel()).reshape(*edges[at].shape, self._topology.dim)
             centre[at] = np.einsum("ne,nei->ni", weight, cuts)
         return centre
 
@@ -124,9 +125,9 @@ def _facet_edges() -> Ints:
 
 
 def _numbered(keys: Ints) -> tuple[Ints, Ints]:
-    """Number of each key among the distinct ones, ascending; and the first place where each distinct key stands.
+    """The number of each key among the distinct keys, ascending, and the first position of each distinct key.
 
-    Counting in place of sorting: the keys are dense.
+    By counting, since the keys are dense.
     """
     used = np.zeros(int(keys.max(initial=-1)) + 1, bool)
     used[keys] = True
@@ -138,11 +139,11 @@ def _numbered(keys: Ints) -> tuple[Ints, Ints]:
 
 @dataclass(frozen=True)
 class SplitSurface:
-    """The surface of a state of damage, in the reference configuration.
+    """The split surface in the reference configuration.
 
     Attributes:
         points: (n, d) reference coordinates, m: nodes of the mesh first (3D: of its boundary), then the copies.
-        follow: the nodes that each point follows.
+        parents: the nodes that each point follows.
         elements: (m, d) triangles with normals outwards (3D) or segments with the body to their left (2D): closed.
         cell: (m,) of the mesh. edge: (m,) whose breaking opened it, -1 on the boundary. origin: (m,) see Skeleton.
         fill: (k, 3) triangles that cover the body in 2D, none in 3D; fill_cell: (k,).
@@ -164,51 +165,51 @@ class SplitSurface:
 
     @property
     def point_fragment(self) -> Ints:
-        """(n,) the parents of a point are all of one piece."""
+        """(n,) fragment of each point: that of all its parents."""
         return self.node_fragment[self.parents.first_parent]
 
 
 def build_split_surface(
-    skeleton: EntityNumbering,
+    topology: EntityNumbering,
     pattern: npt.NDArray[np.integer],
     cut: Values | None = None,
     table: Callable[[int], CutTable] = cut_table,
 ) -> SplitSurface:
-    """The surface of damage patterns (C,), as in EdgeGraph.pattern.
+    """The split surface of damage patterns (C,), see EdgeGraph.pattern.
 
-    `cut`: (E,) where edges are cut, from the lower node (0) to the higher (1); NaN: in the middle. `table`: what the
-    patterns mean, by dimension.
+    `cut`: (E,) position of the cut of each edge, from the lower node (0) to the higher (1); NaN: 1/2.
+    `table`: the table of patterns for a dimension.
     """
     rows = table if pattern.any() else intact_cell_table
-    return _Builder(skeleton, pattern, cut, rows(skeleton.dim))()
+    return _Builder(topology, pattern, cut, rows(topology.dim))()
 
 
 def build_surface_points(
-    skeleton: EntityNumbering, pattern: npt.NDArray[np.integer], table: Callable[[int], CutTable] = cut_table
+    topology: EntityNumbering, pattern: npt.NDArray[np.integer], table: Callable[[int], CutTable] = cut_table
 ) -> SurfacePoints:
-    """The points of the same, cut in the middle."""
+    """The points of the split surface with edges cut at 1/2."""
     damaged = np.flatnonzero(pattern)
-    return SurfacePoints(skeleton, damaged, pattern[damaged].astype(np.int64), None, table(skeleton.dim))
+    return SurfacePoints(topology, damaged, pattern[damaged].astype(np.int64), None, table(topology.dim))
 
 
 class _Builder:
-    """Works on the damaged cells only; the boundary facets of all others stay as they are."""
+    """Builds the split surface; boundary facets of undamaged cells are elements as they are."""
 
     def __init__(
-        self, skeleton: EntityNumbering, pattern: npt.NDArray[np.integer], cut: Values | None, table: CutTable
+        self, topology: EntityNumbering, pattern: npt.NDArray[np.integer], cut: Values | None, table: CutTable
     ) -> None:
-        self.skeleton, self.table = skeleton, table
+        self.topology, self.table = topology, table
         self.damaged = np.flatnonzero(pattern)
         self.pattern = pattern[self.damaged].astype(np.int64)
         self.place = np.full(len(pattern), -1)  # of a cell among the damaged ones
         self.place[self.damaged] = np.arange(len(self.damaged))
-        self.broken = skeleton.broken_edges(pattern)
-        self.points = SurfacePoints(skeleton, self.damaged, self.pattern, cut, table)
+        self.broken = topology.broken_edges(pattern)
+        self.points = SurfacePoints(topology, self.damaged, self.pattern, cut, table)
 
     def __call__(self) -> SplitSurface:
         parts = self._whole_facets(), self._torn_facets(), self._walls()
-        elements, cell, edge, origin = (np.concatenate(each) for each in zip(*parts, strict=True))
-        count, piece = self.skeleton.pieces(self.broken)
+        elements, cell, edge, origin = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        count, piece = self.topology.pieces(self.broken)
         points = self.points
         return SplitSurface(
             points.positions, points.parents, elements, cell, edge, origin, *self._fill(), self.broken, count, piece
@@ -216,45 +217,46 @@ class _Builder:
 
     def _whole_facets(self) -> tuple[Ints, ...]:
         """(corners, cell, edge, origin) of boundary facets of undamaged cells."""
-        boundary = self.skeleton.boundary
+        boundary = self.topology.boundary
         at = np.flatnonzero(self.place[boundary[:, 0]] < 0)
         cell = boundary[at, 0]
-        corners = self.points.of_nodes(boundary_corners(self.skeleton, at))
-        return corners, cell, np.full(len(at), -1), self.skeleton.origin[at]
+        corners = self.points.of_nodes(boundary_corners(self.topology, at))
+        return corners, cell, np.full(len(at), -1), self.topology.origin[at]
 
     def _torn_facets(self) -> tuple[Ints, ...]:
-        """The same of boundary facets of damaged cells."""
-        cell, facet = self.skeleton.boundary.T
+        """(corners, cell, edge, origin) of boundary facets of damaged cells."""
+        cell, facet = self.topology.boundary.T
         at = np.flatnonzero(self.place[cell] >= 0)
         place = self.place[cell[at]]
-        key = (self.skeleton.dim + 1) * self.pattern[place] + facet[at]
+        key = (self.topology.dim + 1) * self.pattern[place] + facet[at]
         corners, owner, edge = self._expand(self.table.facets, key, place)
-        return corners, cell[at[owner]], edge, self.skeleton.origin[at[owner]]
+        return corners, cell[at[owner]], edge, self.topology.origin[at[owner]]
 
     def _walls(self) -> tuple[Ints, ...]:
-        """The same of both sides of the cracks."""
+        """(corners, cell, edge, origin) of crack faces, both sides."""
         corners, owner, edge = self._expand(self.table.crack_faces, self.pattern, np.arange(len(self.damaged)))
         cell = self.damaged[owner]
-        return corners, cell, self.skeleton.cell_edges[cell, edge], np.full(len(cell), CRACK)
+        return corners, cell, self.topology.cell_edges[cell, edge], np.full(len(cell), CRACK)
 
     def _fill(self) -> tuple[Ints, Ints]:
-        """Triangles that cover the body in 2D, and the cell of each."""
-        if self.skeleton.dim == 3:
+        """Triangles that cover the body in 2D, and the cell of each; none in 3D."""
+        if self.topology.dim == 3:
             return np.empty((0, 3), np.int64), np.empty(0, np.int64)
         whole = np.flatnonzero(self.place < 0)
         corners, owner, _ = self._expand(self.table.fill, self.pattern, np.arange(len(self.damaged)))
-        triangles = np.concatenate([self.skeleton.cells[whole], corners])
+        triangles = np.concatenate([self.topology.cells[whole], corners])
         return triangles, np.concatenate([whole, self.damaged[owner]])
 
     def _expand(self, elements: PatternElements, key: Ints, place: Ints) -> tuple[Ints, Ints, Ints]:
-        """(corners, owner, local edge) of the elements of each key; `place` of its damaged cell."""
+        """(corners, owner, local edge) of the elements of each key, in the damaged cell number `place` (keys,)."""
         row, owner = elements.expand(key)
-        of = place[owner]
-        return self.points.of_corners(elements.corners[row], of, self.damaged[of]), owner, elements.edge[row]
+        damaged = place[owner]
+        corners = self.points.of_corners(elements.corners[row], damaged, self.damaged[damaged])
+        return corners, owner, elements.edge[row]
 
 
-def boundary_corners(skeleton: EntityNumbering, which: Ints) -> Ints:
-    """(n, d) nodes of boundary facets, their normals outwards."""
-    outward = facets_of(np.arange(skeleton.dim + 1)[None])[0]
-    cell, facet = skeleton.boundary[which].T
-    return skeleton.cells[cell[:, None], outward[facet]]
+def boundary_corners(topology: EntityNumbering, which: Ints) -> Ints:
+    """(n, d) nodes of boundary facets `which` (n,), oriented with normals outwards."""
+    outward = facets_of(np.arange(topology.dim + 1)[None])[0]
+    cell, facet = topology.boundary[which].T
+    return topology.cells[cell[:, None], outward[facet]]

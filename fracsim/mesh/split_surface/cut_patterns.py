@@ -1,22 +1,21 @@
-"""What each damage pattern does to one cell: the points that it adds and the elements between them.
+"""Tables of all patterns of broken edges of one cell: the points that a pattern adds and the elements between them.
 
-Every node owns a part of its cell. Between the parts of i and j stands one wall per cell, open where edge ij is broken:
+Each node owns a part of its cell. One crack face per cell lies between the parts of nodes i and j, and is open if edge
+ij is broken:
 
-    3D: the quad (m, G_ijk, T, G_ijl)        2D: the segment (m, T)
+    3D: the quadrilateral (m, G_ijk, T, G_ijl)        2D: the segment (m, T)
 
-with m the point of the edge, G of a facet, T of the cell. An open wall is there twice, once with the copies of i and
-once, turned round and cut along the same diagonal m-T, with those of j. (The other diagonal G-G would be an edge of
-four triangles where both facets stay whole.) A copy of m belongs to its end node; a copy of G or T belongs to a
-connected group of the nodes of the facet or cell, under the intact edges *of that facet or cell alone*. So neighbours
-agree on a copy without asking, and every group lies in one piece of the body.
+with m the point of the edge, G of a facet, T of the cell. An open crack face exists twice, with opposite orientation:
+with the copies of i and with those of j. Both are divided along the diagonal m-T. (The diagonal G-G would be an edge of
+four triangles if both facets are intact.) A copy of m belongs to its end node. A copy of G or T belongs to a group of
+nodes of the facet or cell that intact edges of *that facet or cell alone* connect. Hence neighbours have the same
+copies, and each group lies in one fragment.
+
+Planar cuts between fragments: if all edges between two groups of nodes are broken, the plane through the cut points of
+the edges replaces the faces through T. It is one triangle around a node, or two between two pairs of nodes: a fifth of
+the elements. Its points lie on edges alone, so that neighbours have the same points.
 
 Equations: docs/theory.md#split-surface.
-
-Cells cut flat between pieces: by one triangle around a node, or by two between two nodes and two.
-
-What a node owns of its cell ends at six triangles that meet in the middle of the cell (cut_patterns). Between pieces,
-where every edge from one group of nodes to another is broken, the plane through the places where these are cut does: a
-fifth of the elements, and no corners that stick out. Its points are on edges alone, so that neighbours agree on them.
 """
 
 from __future__ import annotations
@@ -37,27 +36,30 @@ EDGE, FACET, CELL = 0, 1, 2
 
 
 class PatternPoint(NamedTuple):
-    """A copy of the point of an edge, facet or cell: facet i lies opposite node i, as in DOLFINx."""
+    """A copy of the point of an edge, facet or cell, for one group of nodes; facet i lies opposite node i.
+
+    `group`: local nodes that the copy follows, ascending.
+    """
 
     kind: int
     entity: int
-    group: tuple[int, ...]  # local nodes that it follows, ascending
+    group: tuple[int, ...]
 
 
-Corner = int | PatternPoint  # a node of the cell, or a copy
-
-
-Element = tuple[tuple[Corner, ...], int]  # corners, and the local edge whose breaking opened it (-1: none)
+# a node of the cell, or a copy
+Corner = int | PatternPoint
+# corners, and the local edge that opened the element when it broke (-1: none)
+Element = tuple[tuple[Corner, ...], int]
 
 
 @dataclass(frozen=True)
 class PatternRows:
-    """Rows of a table by key: those of key k are start[k] : start[k + 1]."""
+    """Rows of a table, grouped by key: the rows of key k are start[k] : start[k + 1]."""
 
     start: Ints
 
     def expand(self, keys: Ints) -> tuple[Ints, Ints]:
-        """(row, owner): the rows of every key in turn, and which of the keys each row came from."""
+        """(n,) the rows of all `keys` in turn, and (n,) the index in `keys` that each row belongs to."""
         count = self.start[keys + 1] - self.start[keys]
         owner = np.repeat(np.arange(len(keys)), count)
         before = np.cumsum(count) - count
@@ -66,7 +68,10 @@ class PatternRows:
 
 @dataclass(frozen=True)
 class PatternPoints(PatternRows):
-    """Copies of each pattern: kind, entity, lead (lowest local node of the group): (rows,); group (rows, d + 1)."""
+    """The copies of points of each pattern.
+
+    `kind`, `entity`, `lead` (lowest local node of the group): (rows,).    `group`: (rows, d + 1) flags of local nodes.
+    """
 
     kind: Ints
     entity: Ints
@@ -76,7 +81,10 @@ class PatternPoints(PatternRows):
 
 @dataclass(frozen=True)
 class PatternElements(PatternRows):
-    """Elements of each key. corners (rows, w): >= 0 a copy of the cell's pattern, -1 - i node i; edge (rows,) or -1."""
+    """The elements of each key.
+
+    `corners`: (rows, w) index of a copy of the pattern, or -1 - i for node i.    `edge`: (rows,) local edge, or -1.
+    """
 
     corners: Ints
     edge: Ints
@@ -84,12 +92,12 @@ class PatternElements(PatternRows):
 
 @dataclass(frozen=True)
 class CutTable:
-    """The patterns of a simplex of dimension d.
+    """Points and elements of all patterns of a simplex of dimension d.
 
     Attributes:
-        copies, walls: by pattern.
-        facets: by pattern * (d + 1) + local facet: what becomes of the facet where it is on the boundary.
-        fill: by pattern: triangles that cover a cell in 2D, none in 3D.
+        copies, crack_faces: by pattern.
+        facets: elements of a boundary facet, by pattern * (d + 1) + local facet.
+        fill: triangles that cover a cell in 2D, by pattern; none in 3D.
     """
 
     copies: PatternPoints
@@ -100,73 +108,77 @@ class CutTable:
 
 @cache
 def cut_table(dim: int) -> CutTable:
-    """The table for triangles (8 patterns) or tetrahedra (64), worked out once."""
+    """The table of triangles (8 patterns) or tetrahedra (64 patterns), computed once."""
     return tabled(CutCell, dim)
 
 
 @cache
 def intact_cell_table(dim: int) -> CutTable:
-    """The first row of it, which does for a body in which nothing has broken."""
+    """The table of the pattern without broken edges alone, for an undamaged body."""
     return tabled(CutCell, dim, 1)
 
 
 def tabled(kind: type[CutCell], dim: int, patterns: int | None = None) -> CutTable:
-    """What that kind of cell makes of every pattern, or of the first few."""
+    """The table of a kind of cell, for all patterns or the first `patterns`."""
     cells = [kind(dim, pattern) for pattern in range(patterns or 1 << len(local_edges(dim)))]
     nodes = range(dim + 1)
     return CutTable(
         _copies(cells, dim),
-        _elements([(cell, cell.walls) for cell in cells], dim),
+        _elements([(cell, cell.crack_faces) for cell in cells], dim),
         _elements([(cell, cell.boundary(facet)) for cell in cells for facet in nodes], dim),
         _elements([(cell, cell.fan(cell.T, (0, 1, 2)) if dim == 2 else []) for cell in cells], 3),
     )
 
 
 class CutCell:
-    """One cell with one pattern, in words."""
+    """Points and elements of one cell with one pattern of broken edges."""
 
     def __init__(self, dim: int, pattern: int) -> None:
         self.dim, self.pattern = dim, pattern
         pairs: list[list[int]] = local_edges(dim).tolist()  # type: ignore[assignment]
         self.edge = {frozenset(pair): k for k, pair in enumerate(pairs)}
-        self.walls = self._walls()
-        used = {corner for corners, _ in self.walls for corner in corners if isinstance(corner, PatternPoint)}
+        self.crack_faces = self._crack_faces()
+        used = {corner for corners, _ in self.crack_faces for corner in corners if isinstance(corner, PatternPoint)}
         self.copies = sorted(used)
 
     def broken(self, i: int, j: int) -> bool:
+        """Whether the edge between local nodes i and j is broken."""
         return bool(self.pattern >> self.edge[frozenset((i, j))] & 1)
 
     def group(self, nodes: Iterable[int], i: int) -> tuple[int, ...]:
-        """The nodes that intact edges among `nodes` join to i."""
-        nodes, found = set(nodes), {i}
-        while more := {k for j in found for k in nodes - found if not self.broken(j, k)}:
-            found |= more
-        return tuple(sorted(found))
+        """The nodes, ascending, that intact edges between `nodes` connect to i."""
+        nodes, connected = set(nodes), {i}
+        while new := {k for j in connected for k in nodes - connected if not self.broken(j, k)}:
+            connected |= new
+        return tuple(sorted(connected))
 
     def m(self, i: int, j: int) -> PatternPoint:
+        """The copy of the point of edge ij that follows i."""
         return PatternPoint(EDGE, self.edge[frozenset((i, j))], (i,))
 
     def G(self, facet: int, i: int) -> PatternPoint:
+        """The copy of the point of a facet that follows the group of i."""
         return PatternPoint(FACET, facet, self.group(set(range(self.dim + 1)) - {facet}, i))
 
     def T(self, i: int) -> PatternPoint:
+        """The copy of the point of the cell that follows the group of i."""
         return PatternPoint(CELL, 0, self.group(range(self.dim + 1), i))
 
-    def _walls(self) -> list[Element]:
-        return [element for i, j, *rest in _turned(self.dim) for element in self._wall(i, j, rest)]
+    def _crack_faces(self) -> list[Element]:
+        return [element for i, j, *remaining in _turned(self.dim) for element in self._crack_face(i, j, remaining)]
 
-    def _wall(self, i: int, j: int, rest: list[int]) -> list[Element]:
-        """The side of i of the wall towards j, positively ordered as seen from outside i's part."""
+    def _crack_face(self, i: int, j: int, remaining: list[int]) -> list[Element]:
+        """The crack face towards j on the side of i, with its normal out of the part of i."""
         if not self.broken(i, j):
             return []
         m, T, edge = self.m(i, j), self.T(i), self.edge[frozenset((i, j))]
         if self.dim == 2:  # the part of i lies to the left
-            return [((m, T) if sign((i, j, *rest)) > 0 else (T, m), edge)]
-        k, last = rest
+            return [((m, T) if sign((i, j, *remaining)) > 0 else (T, m), edge)]
+        k, last = remaining
         return [((m, self.G(last, i), T), edge), ((m, T, self.G(k, i)), edge)]
 
     def boundary(self, facet: int) -> list[Element]:
-        """What covers a boundary facet: itself where it has no broken edge, so that no neighbour meets a T-junction."""
+        """The elements of a boundary facet: the facet itself if it has no broken edge, so that no T-junction arises."""
         loop = [node for node in range(self.dim + 1) if node != facet]
         loop = loop if facet % 2 == 0 else [loop[1], loop[0], *loop[2:]]
         if self.dim == 3:
@@ -177,7 +189,7 @@ class CutCell:
         return [((a, self.m(a, b)), -1), ((self.m(b, a), b), -1)]
 
     def fan(self, centre: Callable[[int], PatternPoint], loop: tuple[int, ...]) -> list[Element]:
-        """A triangle as it is, or as a fan from the copies of its centre."""
+        """The elements of a triangle: itself if its edges are intact, else a fan around the copies of its centre."""
         sides = list(zip(loop, loop[1:] + loop[:1], strict=True))
         if not any(self.broken(i, j) for i, j in sides):
             return [(loop, -1)]
@@ -192,11 +204,12 @@ class CutCell:
 
 @cache
 def _turned(dim: int) -> list[tuple[int, ...]]:
-    """Orderings (i, j, ...) of the nodes, one for each ordered pair: in 3D the even ones."""
+    """Permutations (i, j, ...) of the nodes, one for each ordered pair: in 3D the even permutations."""
     return [order for order in permutations(range(dim + 1)) if dim == 2 or sign(order) > 0]
 
 
 def sign(order: tuple[int, ...]) -> int:
+    """Sign of a permutation, 1 or -1."""
     swaps = sum(order[a] > order[b] for a in range(len(order)) for b in range(a + 1, len(order)))
     return -1 if swaps % 2 else 1
 
@@ -213,51 +226,51 @@ def _copies(cells: list[CutCell], dim: int) -> PatternPoints:
 def _elements(lists: list[tuple[CutCell, list[Element]]], width: int) -> PatternElements:
     corners, edges = [], []
     for cell, elements in lists:
-        place = {copy: index for index, copy in enumerate(cell.copies)}
+        index = {copy: number for number, copy in enumerate(cell.copies)}
         for element, edge in elements:
-            corners.append([place[corner] if isinstance(corner, PatternPoint) else -1 - corner for corner in element])
+            corners.append([index[corner] if isinstance(corner, PatternPoint) else -1 - corner for corner in element])
             edges.append(edge)
     start = _starts([elements for _, elements in lists])
     return PatternElements(start, np.array(corners, np.int64).reshape(-1, width), np.array(edges, np.int64))
 
 
 def _starts(lists: list[list[Element]] | list[list[PatternPoint]]) -> Ints:
-    return np.concatenate([[0], np.cumsum([len(each) for each in lists])]).astype(np.int64)
+    return np.concatenate([[0], np.cumsum([len(rows) for rows in lists])]).astype(np.int64)
 
 
 @cache
 def planar_cut_table(dim: int) -> CutTable:
-    """The table of cells that are cut flat, worked out once."""
+    """The table of planar cuts, computed once."""
     return tabled(PlanarCutCell, dim)
 
 
 class PlanarCutCell(CutCell):
-    """A cell that is cut between its groups of nodes; edges within a group count as whole."""
+    """A cell with planar cuts between its groups of nodes; edges within a group count as intact."""
 
     def __init__(self, dim: int, pattern: int) -> None:
         group, ends = node_groups(dim)[pattern], local_edges(dim)
         apart = group[ends[:, 0]] != group[ends[:, 1]]
         super().__init__(dim, int(apart @ (1 << np.arange(len(ends)))))
 
-    def _walls(self) -> list[Element]:
+    def _crack_faces(self) -> list[Element]:
         nodes = range(self.dim + 1)
         parts = sorted({self.group(nodes, i) for i in nodes})
-        walls = [corners for part in parts if len(part) < len(nodes) for corners in self._around(part)]
-        return [(corners, min(corner.entity for corner in corners)) for corners in walls]
+        faces = [corners for part in parts if len(part) < len(nodes) for corners in self._around(part)]
+        return [(corners, min(corner.entity for corner in corners)) for corners in faces]
 
     def _around(self, part: tuple[int, ...]) -> list[tuple[PatternPoint, ...]]:
-        """Between these nodes and the others, positively ordered as seen from there."""
-        part, rest = _ordered(part, tuple(node for node in range(self.dim + 1) if node not in part))
+        """The elements between `part` and the other nodes, with normals out of `part`."""
+        part, complement = _ordered(part, tuple(node for node in range(self.dim + 1) if node not in part))
         if len(part) == 1:
-            return [tuple(self.m(part[0], node) for node in rest)]
-        if len(rest) == 1:
-            return [tuple(self.m(node, rest[0]) for node in (part if self.dim == 3 else part[::-1]))]
-        (i, j), (k, last) = part, rest
+            return [tuple(self.m(part[0], node) for node in complement)]
+        if len(complement) == 1:
+            return [tuple(self.m(node, complement[0]) for node in (part if self.dim == 3 else part[::-1]))]
+        (i, j), (k, last) = part, complement
         a, b, c, d = self.m(i, k), self.m(i, last), self.m(j, last), self.m(j, k)
-        return [(a, b, c), (a, c, d)]  # along the same diagonal from both sides: middles
+        return [(a, b, c), (a, c, d)]  # the same diagonal from both sides: see middles
 
     def fan(self, centre: Callable[[int], PatternPoint], loop: tuple[int, ...]) -> list[Element]:
-        """A triangle, without a centre."""
+        """The elements of a triangle, without a point at its centre."""
         corners: list[tuple[Corner, ...]] = []
         turns = [loop, (*loop[1:], loop[0]), (*loop[2:], *loop[:2])]
         for a, b, c in turns:
@@ -265,32 +278,35 @@ class PlanarCutCell(CutCell):
                 corners.append((a, self.m(a, b), self.m(a, c)))
                 if not self.broken(b, c):
                     corners += [(self.m(b, a), b, c), (self.m(b, a), c, self.m(c, a))]
-        return [(each, -1) for each in corners or [loop]]
+        return [(element, -1) for element in corners or [loop]]
 
 
 @cache
 def middles(dim: int) -> npt.NDArray[np.float64]:
-    """(2^(d+1), 2^(d+1), d + 1, d + 1): of nodes `mine` and `others` of a cell or a facet, each by its bits, the shares
-    with which points of edges from i to j make the middle of the wall between them."""
+    """(2^(d+1), 2^(d+1), d + 1, d + 1) weights of the edge points ij in the centre of the face between two groups.
+
+    The first two indices are the groups of nodes of a cell or facet, as bits; i is in the first, j in the second group.
+    """
     size = dim + 1
     result = np.zeros((1 << size, 1 << size, size, size))
-    for mine, other in product(range(1, 1 << size), repeat=2):
-        if mine & other:
+    for first_bits, second_bits in product(range(1, 1 << size), repeat=2):
+        if first_bits & second_bits:
             continue
-        part, rest = (tuple(node for node in range(size) if bits >> node & 1) for bits in (mine, other))
-        pairs = list(product(part, rest))
-        if len(part) == len(rest) == 2:  # a quad in two triangles: the middle of their common side
-            pairs = list(zip(*_ordered(part, rest), strict=True))
+        first, second = (tuple(node for node in range(size) if bits >> node & 1) for bits in (first_bits, second_bits))
+        pairs = list(product(first, second))
+        # a quadrilateral is two triangles: the centre is the middle of their common side
+        if len(first) == len(second) == 2:
+            pairs = list(zip(*_ordered(first, second), strict=True))
         for i, j in pairs:
-            result[mine, other, i, j] = 1 / len(pairs)
+            result[first_bits, second_bits, i, j] = 1 / len(pairs)
     return result
 
 
-def _ordered(part: tuple[int, ...], rest: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
-    """The same with two nodes exchanged where all in turn are an odd permutation."""
-    if sign(part + rest) > 0:
-        return part, rest
-    return (part, _swapped(rest)) if len(rest) > 1 else (_swapped(part), rest)
+def _ordered(part: tuple[int, ...], complement: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """The two groups, with two nodes exchanged if part + complement is an odd permutation."""
+    if sign(part + complement) > 0:
+        return part, complement
+    return (part, _swapped(complement)) if len(complement) > 1 else (_swapped(part), complement)
 
 
 def _swapped(nodes: tuple[int, ...]) -> tuple[int, ...]:

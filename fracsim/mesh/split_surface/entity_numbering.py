@@ -1,4 +1,4 @@
-"""Numbers of the edges and facets of the input mesh, and its boundary: made once, on the rank that has the mesh."""
+"""Numbers of the edges, facets and boundary facets of a mesh on one rank."""
 
 from __future__ import annotations
 
@@ -15,17 +15,19 @@ from ..input_topology import MeshTopology
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
-CRACK, BODY = 0, 1  # origins of elements that are on no boundary facet
+CRACK, BODY = 0, 1  # origins of elements that do not lie on a boundary facet
 
 
 class EntityNumbering(MeshTopology):
-    """A mesh with its facets as well.
+    """A mesh with numbered edges, facets and boundary facets.
 
     Attributes:
-        facets: (F, d) nodes, ascending; cell_facets: (C, d + 1), facet i opposite node i.
+        facets: (F, d) nodes of each facet, ascending.
+        cell_facets: (C, d + 1) facets of each cell; facet i lies opposite node i.
         boundary: (B, 2) cell and local facet of each boundary facet, in the order of the cells.
-        origins: names of the places that an element may come from; origin (B,) of each boundary facet.
-            A facet of several groups has them all in its name: "left + grip". "boundary": a facet of no group.
+        origins: names of the possible origins of an element: "crack", "body", and combinations of facet groups, for
+            instance "left + grip", or "boundary" for a facet of no group.
+        origin: (B,) index into `origins` of each boundary facet.
     """
 
     def __init__(self, mesh: MeshData) -> None:
@@ -37,7 +39,7 @@ class EntityNumbering(MeshTopology):
         self.origins, self.origin = _origins(mesh, self.facets[self.cell_facets[tuple(self.boundary.T)]])
 
     def moved(self, points: Values) -> EntityNumbering:
-        """The same with nodes at other places (N, d), m."""
+        """The same topology with nodes at `points` (N, d), m."""
         if points is self.points:
             return self
         result = copy(self)
@@ -46,19 +48,19 @@ class EntityNumbering(MeshTopology):
 
     @cached_property
     def boundary_nodes(self) -> Ints:
-        """Nodes of boundary facets, ascending."""
+        """(n,) nodes of boundary facets, ascending."""
         on_boundary = np.zeros(len(self.points), bool)
         on_boundary[self.facets[self.cell_facets[tuple(self.boundary.T)]]] = True
         return np.flatnonzero(on_boundary)
 
     def of_edges(self, keys: Ints, values: Values) -> Values:
-        """(E,) values of edges named by pairs of nodes (n, 2), NaN for all others."""
+        """(E,) values of the edges between pairs of nodes `keys` (n, 2), NaN for all other edges."""
         result = np.full(len(self.edges), np.nan)
         result[self.find_edges(keys)] = values
         return result
 
     def broken_edges(self, pattern: npt.NDArray[np.integer]) -> npt.NDArray[np.bool_]:
-        """(E,) which edges the patterns (C,) of the cells call broken."""
+        """(E,) whether each edge is broken in the patterns (C,) of the cells."""
         damaged = np.flatnonzero(pattern)
         bits = np.arange(self.cell_edges.shape[1])
         broken = np.zeros(len(self.edges), bool)
@@ -66,17 +68,19 @@ class EntityNumbering(MeshTopology):
         return broken
 
     def pieces(self, broken: npt.NDArray[np.bool_]) -> tuple[int, Ints]:
-        """How many pieces the intact edges leave, and the piece of each node, numbered by their lowest node."""
+        """The number of fragments, and (N,) the fragment of each node; `broken` (E,). Numbered by their lowest node."""
         return components(self.edges[~broken], len(self.points))
 
 
 def _origins(mesh: MeshData, facets: Ints) -> tuple[list[str], Ints]:
-    """Names, and the number of the name of each of the (B, d) boundary facets."""
+    """The names of origins, and (B,) the index of the name of each boundary facet (B, d)."""
     groups = mesh.facet_groups
-    _, _, place = distinct_rows(np.sort(np.concatenate([facets, *groups.values()]), axis=1))
-    own, rest = place[: len(facets)], place[len(facets) :]
-    parts = np.split(rest, np.cumsum([len(group) for group in groups.values()])[:-1]) if groups else []
-    member = np.stack([np.isin(own, part) for part in parts], axis=1) if groups else np.zeros((len(own), 0), bool)
-    kinds, number = np.unique(member, axis=0, return_inverse=True)
+    _, _, number = distinct_rows(np.sort(np.concatenate([facets, *groups.values()]), axis=1))
+    boundary, grouped = number[: len(facets)], number[len(facets) :]
+    members = np.split(grouped, np.cumsum([len(group) for group in groups.values()])[:-1]) if groups else []
+    member: npt.NDArray[np.bool_] = np.zeros((len(boundary), 0), bool)
+    if groups:
+        member = np.stack([np.isin(boundary, numbers) for numbers in members], axis=1)
+    kinds, kind_number = np.unique(member, axis=0, return_inverse=True)
     named = [" + ".join(np.array(list(groups))[kind]) if kind.any() else "boundary" for kind in kinds]
-    return ["crack", "body", *named], number.reshape(-1) + 2
+    return ["crack", "body", *named], kind_number.reshape(-1) + 2

@@ -1,11 +1,9 @@
-"""The surface of what holds together: pieces apart, and of nodes alone that still have a whole cell.
+"""The surface of fragments for contact: crack faces between fragments alone, with planar cuts.
 
-Where a soft body tears, most of its walls are those of cracks within a piece, of crumbs without a cell, and of nodes
-that hang by a few torn ones: on a loaf of 25,000 cells nine in ten. Contact may do without them. What is left is cut
-flat (cut_patterns): a quarter of the elements, a third of what contact takes.
+Most crack faces of a torn soft body lie within a fragment, or bound single-node fragments and nodes of split cells
+only: nine in ten on a loaf of 25,000 cells. Contact does not need them. The others are cut by planes (cut_patterns).
 
-Walls between pieces, drawn where those lie that are cut flat: what contact keeps apart does not overlap in a
-picture.
+In output, crack faces between fragments are projected onto these planes, so that they do not overlap in pictures.
 """
 
 from __future__ import annotations
@@ -26,95 +24,106 @@ Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Patterns = npt.NDArray[np.integer]
-KEPT = 0.15  # of an edge
+MIN_CUT_DISTANCE = 0.15  # of an edge, from a cut to an end: thinner parts have no room for contact
 
 
-def build_fragment_surface(skeleton: EntityNumbering, pattern: Patterns, cut: Values | None = None) -> SplitSurface:
-    """The split surface of damage patterns (C,) without the elements of loose nodes, which have no whole cell, and
-    without walls between nodes of one piece: edges are open that join other pieces, or lead to loose nodes. `cut`: (E,)
-    as for `split`, but no nearer to an end than KEPT: what is thinner has no room for contact."""
-    apart, loose, _ = parted(skeleton, pattern)
-    cut = None if cut is None else np.clip(cut, KEPT, 1 - KEPT)
-    made = build_split_surface(skeleton, patterns_of(skeleton, apart), cut, planar_cut_table)
-    kept = ~loose[made.parents.first_parent[made.elements[:, 0]]]  # all corners of an element follow the same side
-    each = {name: getattr(made, name)[kept] for name in ("elements", "cell", "edge", "origin")}
-    return replace(made, **each)
+def build_fragment_surface(topology: EntityNumbering, pattern: Patterns, cut: Values | None = None) -> SplitSurface:
+    """The split surface of damage patterns (C,) without crack faces within fragments and without loose nodes.
+
+    A loose node has no undamaged cell. Edges between fragments, and to loose nodes, are open. `cut`: (E,) as in
+    build_split_surface, at least MIN_CUT_DISTANCE from the ends.
+    """
+    apart, loose, _ = open_edges(topology, pattern)
+    cut = None if cut is None else np.clip(cut, MIN_CUT_DISTANCE, 1 - MIN_CUT_DISTANCE)
+    surface = build_split_surface(topology, patterns_of(topology, apart), cut, planar_cut_table)
+    # all corners of an element follow nodes of the same side
+    selected = ~loose[surface.parents.first_parent[surface.elements[:, 0]]]
+    fields = {name: getattr(surface, name)[selected] for name in ("elements", "cell", "edge", "origin")}
+    return replace(surface, **fields)
 
 
-def has_same_fragments(skeleton: EntityNumbering, pattern: Patterns, before: Patterns) -> bool:
-    """Whether damage patterns (C,) of now and of before have the same surface of pieces, and the same cells say how it
-    moves with its nodes: cracks within a piece change neither."""
-    apart, loose, _ = parted(skeleton, pattern)
-    if not all(np.array_equal(now, then) for now, then in zip((apart, loose), parted(skeleton, before), strict=False)):
+def has_same_fragments(topology: EntityNumbering, pattern: Patterns, before: Patterns) -> bool:
+    """Whether the surface of fragments is the same for two damage patterns (C,), and moves alike with the nodes.
+
+    Cracks within a fragment change neither.
+    """
+    apart, loose, _ = open_edges(topology, pattern)
+    apart_before, loose_before, _ = open_edges(topology, before)
+    if not (np.array_equal(apart, apart_before) and np.array_equal(loose, loose_before)):
         return False
-    ends = np.zeros(len(skeleton.points), bool)
-    ends[skeleton.edges[apart]] = True
-    at = ends[skeleton.cells].any(axis=1)
-    gone = is_split(skeleton.dim)
+    ends = np.zeros(len(topology.points), bool)
+    ends[topology.edges[apart]] = True
+    at = ends[topology.cells].any(axis=1)
+    gone = is_split(topology.dim)
     return np.array_equal(gone[pattern[at]], gone[before[at]])
 
 
-def parted(skeleton: EntityNumbering, pattern: Patterns) -> tuple[Flags, Flags, Ints]:
-    """(E,) open edges, (N,) loose nodes, and what (N,) holds together without edges that are broken or lead there."""
-    loose = np.ones(len(skeleton.points), bool)
-    loose[skeleton.cells[pattern == 0]] = False
-    ends = skeleton.edges
-    cut = skeleton.broken_edges(pattern) | loose[ends].any(axis=1)
-    _, piece = skeleton.pieces(cut)
+def open_edges(topology: EntityNumbering, pattern: Patterns) -> tuple[Flags, Flags, Ints]:
+    """(E,) flags of open edges, (N,) flags of loose nodes, and (N,) the fragment of each node.
+
+    Fragments are connected by edges that are intact and do not lead to a loose node.
+    """
+    loose = np.ones(len(topology.points), bool)
+    loose[topology.cells[pattern == 0]] = False
+    ends = topology.edges
+    cut = topology.broken_edges(pattern) | loose[ends].any(axis=1)
+    _, piece = topology.pieces(cut)
     return cut & (piece[ends[:, 0]] != piece[ends[:, 1]]), loose, piece
 
 
-def patterns_of(skeleton: EntityNumbering, broken: Flags) -> Patterns:
-    """(C,) patterns of the cells with `broken` (E,) edges."""
-    bits = np.arange(skeleton.cell_edges.shape[1])
-    return np.asarray((broken[skeleton.cell_edges] << bits).sum(axis=1), np.uint8)
+def patterns_of(topology: EntityNumbering, broken: Flags) -> Patterns:
+    """(C,) patterns of the cells for `broken` edges (E,)."""
+    bits = np.arange(topology.cell_edges.shape[1])
+    return np.asarray((broken[topology.cell_edges] << bits).sum(axis=1), np.uint8)
 
 
 def project_onto_fragments(
-    at: SurfaceMap, skeleton: EntityNumbering, pattern: npt.NDArray[np.integer], flat: SurfaceMap
+    at: SurfaceMap, topology: EntityNumbering, pattern: npt.NDArray[np.integer], flat: SurfaceMap
 ) -> SurfaceMap:
-    """The points of `split` with those on walls between pieces where `flat` has those of `split_of_pieces`.
+    """The map `at` with points on crack faces between fragments projected onto the planar cuts `flat`.
 
-    Where a crack within the piece has come to one its sides are there at rest, and go with their own nodes from then
-    on. Nodes without a whole cell keep their walls.
+    Points beside a crack within the fragment lie there in the reference configuration, and move with their own nodes.
+    Points of loose nodes are not projected.
     """
-    drawn = build_surface_points(skeleton, pattern)
-    points, mean, cracked = _on_flat(skeleton, pattern, drawn)
+    drawn = build_surface_points(topology, pattern)
+    points, mean, cracked = _on_flat(topology, pattern, drawn)
     at = at.projected_onto(points[~cracked], mean[~cracked], flat)
     if not cracked.any():
         return at
-    places, beside = drawn.positions.copy(), points[cracked]
-    places[beside] = mean[cracked] @ flat.rest
+    positions, beside = drawn.positions.copy(), points[cracked]
+    positions[beside] = mean[cracked] @ flat.rest
     return at.projected_onto(
-        beside, eye_array(len(places), format="csr")[beside], whole(drawn, skeleton, pattern, places)
+        beside, eye_array(len(positions), format="csr")[beside], whole(drawn, topology, pattern, positions)
     )
 
 
 def _on_flat(
-    skeleton: EntityNumbering, pattern: npt.NDArray[np.integer], drawn: SurfacePoints
+    topology: EntityNumbering, pattern: npt.NDArray[np.integer], drawn: SurfacePoints
 ) -> tuple[Ints, csr_matrix, Flags]:
-    """Numbers (k,) of the points `drawn` on walls between pieces, rows (k, m) of which points of the flat surface each
-    is the mean, and flags (k,) of those beside a crack within the piece."""
-    apart, loose, piece = parted(skeleton, pattern)
-    flat = build_surface_points(skeleton, patterns_of(skeleton, apart), planar_cut_table)
-    node = skeleton.cells[drawn.cell]
+    """Points (k,) of `drawn` on crack faces between fragments, and their means of points of the planar surface.
+
+    Also returns (k, m) the matrix of the means, and (k,) flags of points beside a crack within the fragment.
+    """
+    apart, loose, piece = open_edges(topology, pattern)
+    flat = build_surface_points(topology, patterns_of(topology, apart), planar_cut_table)
+    node = topology.cells[drawn.cell]
     lead = node[np.arange(len(node)), drawn.group.argmax(axis=1)]
-    own = np.where(loose[node], -1, piece[node]) == piece[lead][:, None]
-    within = _within(drawn, skeleton.dim)
-    mine, others = within & own, within & ~own
-    at = np.flatnonzero(others.any(axis=1) & ~loose[lead])
-    bits = 1 << np.arange(skeleton.dim + 1)
-    share = middles(skeleton.dim)[mine[at] @ bits, others[at] @ bits]
+    same_fragment = np.where(loose[node], -1, piece[node]) == piece[lead][:, None]
+    within = _within(drawn, topology.dim)
+    same_side, opposite = within & same_fragment, within & ~same_fragment
+    at = np.flatnonzero(opposite.any(axis=1) & ~loose[lead])
+    bits = 1 << np.arange(topology.dim + 1)
+    share = middles(topology.dim)[same_side[at] @ bits, opposite[at] @ bits]
     row, i, j = np.nonzero(share)
     ends = np.stack([node[at[row], i], node[at[row], j]], axis=1)
-    column = flat.first + np.searchsorted(_keys(skeleton, flat), _key(skeleton, ends))
+    column = flat.first + np.searchsorted(_keys(topology, flat), _key(topology, ends))
     shape = len(at), len(flat.positions)
-    cracked = (drawn.group != mine)[at].any(axis=1)
+    cracked = (drawn.group != same_side)[at].any(axis=1)
     return drawn.first + at, csr_matrix((share[row, i, j], (row, column)), shape=shape), cracked
 
 
 def _within(points: SurfacePoints, dim: int) -> Flags:
-    """(copies, d + 1) nodes of the cell that the edge, facet or cell has of which a point is the middle."""
+    """(copies, d + 1) flags of the nodes of the edge, facet or cell that each point is the centre of."""
     result = np.ones(points.group.shape, bool)
     at = np.flatnonzero(points.kind == FACET)
     result[at, points.entity[at]] = False
@@ -124,14 +133,14 @@ def _within(points: SurfacePoints, dim: int) -> Flags:
     return result
 
 
-def _keys(skeleton: EntityNumbering, flat: SurfacePoints) -> Ints:
-    """(copies,) that of each point, all on edges: ascending, as they are numbered."""
-    edge = skeleton.cell_edges[flat.cell, flat.entity]
-    end = skeleton.cells[flat.cell, flat.group.argmax(axis=1)]
-    return np.asarray(2 * edge + (end == skeleton.edges[edge, 1]))
+def _keys(topology: EntityNumbering, flat: SurfacePoints) -> Ints:
+    """(copies,) keys of the points, which all lie on edges, ascending."""
+    edge = topology.cell_edges[flat.cell, flat.entity]
+    end = topology.cells[flat.cell, flat.group.argmax(axis=1)]
+    return np.asarray(2 * edge + (end == topology.edges[edge, 1]))
 
 
-def _key(skeleton: EntityNumbering, ends: Ints) -> Ints:
-    """(k,) of the points of the edges between nodes (k, 2) that follow the first of them."""
-    edge = skeleton.find_edges(ends)
-    return np.asarray(2 * edge + (ends[:, 0] == skeleton.edges[edge, 1]))
+def _key(topology: EntityNumbering, ends: Ints) -> Ints:
+    """(k,) keys of the points of the edges between nodes `ends` (k, 2) that follow the first end."""
+    edge = topology.find_edges(ends)
+    return np.asarray(2 * edge + (ends[:, 0] == topology.edges[edge, 1]))

@@ -1,14 +1,13 @@
-"""The split surface of this rank's cells, as points that follow nodes linearly: what an obstacle touches.
+"""The split surface of the cells of this rank, as points that are linear in the nodes, for contact.
 
     x = mean over p of (x_p + F_p (X - X_p)) = sum over nodes a of w_a x_a
 
-with F_p the volume average of the deformation gradient of the intact cells around p, on all ranks; the identity where
-there are none. Unlike the polar rotation of `follow` this is linear in the nodes, sum w_a = 1, and every affine motion
-is reproduced: the transpose of w hands forces down to the nodes with their resultant and their moment
+with F_p the volume average of the deformation gradient of the intact cells around p on all ranks, or the identity if
+there are none. The map is linear in the nodes, unlike that of `surface_motion` with polar rotations. Sum w_a = 1, and
+affine motions are reproduced. Hence the transpose of w distributes forces to nodes with equal resultant and moment
 (docs/theory.md#split-surface).
 
-Nothing is gathered. A point on the border of two ranks is there on both, each time with the area of that rank's own
-elements around it.
+Nothing is gathered. A point on the border of two ranks exists on both, with the area of the elements of each rank.
 """
 
 from __future__ import annotations
@@ -32,81 +31,86 @@ from .surface_map import SurfaceMap, gradient_entries, middles
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
-OUTSIDE = "outside"  # the group of the body's own boundary: the borders of a rank are none of it
+OUTSIDE = "outside"  # facet group of the boundary of the body; borders between ranks do not belong to it
 
 
 class LocalSurface:
-    """Points of the surface of this rank's cells.
+    """Points of the split surface of the cells of this rank.
 
     Attributes:
-        at: where the n points are.    area: (n,) share of each in the surface, m^2 (2D: m).
-        columns: global numbers of the nodes that the points follow: the columns of the weights of `at`.
+        at: map from nodal displacements to the n points.
+        area: (n,) area of each point, m^2 (2D: length, m).
+        columns: global numbers of the nodes in the columns of the weights of `at`.
     """
 
     def __init__(self, domain: Domain) -> None:
         self._domain = domain
         mesh = _mesh_of(domain)
-        self._skeleton = EntityNumbering(mesh)
+        self._topology = EntityNumbering(mesh)
         self.update_damage(np.zeros(len(mesh.cells), np.uint8))
 
     def update_damage(self, pattern: npt.NDArray[np.uint8]) -> None:
-        """Be the surface of a body with these patterns of broken edges, (cells,) (collective)."""
-        made = build_split_surface(self._skeleton, pattern)
+        """Rebuild the surface for patterns of broken edges (cells,) (collective)."""
+        surface = build_split_surface(self._topology, pattern)
         if self._domain.order == 2:
             from .quadratic_surface import with_midside_points
 
-            made = with_midside_points(made, self._domain, pattern)
-        area = _areas(made, self._skeleton)
-        self._touching = np.flatnonzero(area > 0)
-        self.area, self._made = area[self._touching], made
-        means = self._means(made)
-        turning = self._domain.comm.allreduce(len(made.parents.rotating_nodes)) > 0
-        arms = self._arms(made, pattern) if turning else csr_matrix(means.shape)
+            surface = with_midside_points(surface, self._domain, pattern)
+        area = _areas(surface, self._topology)
+        self._contact_points = np.flatnonzero(area > 0)
+        self.area, self._split_surface = area[self._contact_points], surface
+        means = self._means(surface)
+        turning = self._domain.comm.allreduce(len(surface.parents.rotating_nodes)) > 0
+        arms = self._arms(surface, pattern) if turning else csr_matrix(means.shape)
         self.columns, (means, arms) = _on_columns([means, arms])
-        middle = middles(made.points, made.parents)[self._touching]
-        out = made.points[self._touching] - middle
+        middle = middles(surface.points, surface.parents)[self._contact_points]
+        out = surface.points[self._contact_points] - middle
         self.at = SurfaceMap(means, middle, arms, out)
 
     def identity(self, points: Ints | None = None) -> Values:
-        """(k, 2 d + 1) rows that tell `points` (k,), or the copies `at.copies`, from all others, whatever breaks
-        (split.identity)."""
+        """(k, 2 d + 1) rows that identify `points` (k,), by default `at.copies`, as edges break.
+
+        See point_matching.point_identity.
+        """
         domain, which = self._domain, self.at.copies if points is None else points
-        return point_identity(self._made, self._touching[which], domain.node_input, domain.size)
+        return point_identity(self._split_surface, self._contact_points[which], domain.node_input, domain.size)
 
     def facets(self) -> tuple[Ints, Values]:
-        """(m, d) points of the elements that make up the areas of points, and their measures (m,), m^2 (2D: m)."""
-        elements, measure = _touched(self._made, self._skeleton)
+        """(m, d) points of the elements that `area` is the sum of, and (m,) their areas, m^2 (2D: lengths, m)."""
+        elements, measure = _contact_elements(self._split_surface, self._topology)
         real = measure > 0
-        return np.searchsorted(self._touching, elements[real]), measure[real]
+        return np.searchsorted(self._contact_points, elements[real]), measure[real]
 
-    def _means(self, made: SplitSurface) -> csr_matrix:
-        """(points, nodes of all ranks) means over the parents of each point."""
-        start, of = _parents_of(made, self._touching)
-        return self._wide(start, self._global(made.parents.parents[of]), _shares(start))
+    def _means(self, surface: SplitSurface) -> csr_matrix:
+        """(points, global nodes) matrix of the means over the parents of each point."""
+        start, entries = _parents_of(surface, self._contact_points)
+        return self._wide(start, self._global(surface.parents.parents[entries]), _shares(start))
 
-    def _arms(self, made: SplitSurface, pattern: npt.NDArray[np.uint8]) -> csr_matrix:
-        """(points, nodes of all ranks) arms times the averages of gradients, means over the parents (collective)."""
+    def _arms(self, surface: SplitSurface, pattern: npt.NDArray[np.uint8]) -> csr_matrix:
+        """(points, global nodes) matrix of the means over parents of arm times averaged gradient (collective)."""
         comm, d = self._domain.comm, self._domain.dim
-        start, of = _parents_of(made, self._touching)
-        parents, arm = made.parents.parents[of], made.parents.arm[of]
+        start, entries = _parents_of(surface, self._contact_points)
+        parents, arm = surface.parents.parents[entries], surface.parents.arm[entries]
         arms = self._wide(d * start, _by_axis(self._global(parents), d), (_shares(start)[:, None] * arm).reshape(-1), d)
         count = arms.shape[0]
         left = _assembled(comm, (count, d * self._domain.node_count), arms, offset(comm, count) + np.arange(count))
         right = self._gradients(pattern, parents[np.any(arm != 0, axis=1)])
         product = left.matMult(right)
         rows, nodes, values = product.getValuesCSR()
-        for used in (left, right, product):
-            used.destroy()
+        for matrix in (left, right, product):
+            matrix.destroy()
         return self._wide(rows, nodes, values)
 
     def _gradients(self, pattern: npt.NDArray[np.uint8], parents: Ints) -> PETSc.Mat:
-        """(d nodes, nodes) d/dX_j of a nodal field, averaged over the intact cells around each node that is one of the
-        `parents` on any rank (collective)."""
+        """(d nodes, nodes) matrix of d/dX_j of a nodal field, averaged over intact cells (collective).
+
+        Rows are right for nodes that are among the `parents` of any rank.
+        """
         domain, d = self._domain, self._domain.dim
         wanted = self._summed(parents, 1.0) > 0
         cells = np.flatnonzero(~is_split(d)[pattern] & wanted[domain.cell_nodes].any(axis=1))
         corners, volume = domain.cell_nodes[cells].astype(np.int64), domain.volumes[cells][:, None]
-        # sums around other nodes lack cells, and their rows are of no use
+        # sums at other nodes lack cells: their rows are not used
         around = np.maximum(self._summed(corners, volume), np.finfo(float).tiny)
         rows, columns, values = gradient_entries(domain.nodes[corners], volume / around[corners], corners)
         nodes = self._global(np.arange(len(domain.nodes)))
@@ -115,10 +119,10 @@ class LocalSurface:
         return _assembled(domain.comm, (d * domain.node_count, domain.node_count), entries, _by_axis(nodes, d))
 
     def _summed(self, nodes: Ints, values: Values | float) -> Values:
-        """(nodes,) sums of the values at each node, on all ranks (collective)."""
+        """(nodes,) sums over all ranks of `values` at `nodes` (collective)."""
         result = la.vector(self._domain.space.dofmap.index_map, 1, np.float64)
-        every = np.broadcast_to(values, nodes.shape).reshape(-1)
-        result.array[:] = np.bincount(nodes.reshape(-1), every, len(result.array))
+        weights = np.broadcast_to(values, nodes.shape).reshape(-1)
+        result.array[:] = np.bincount(nodes.reshape(-1), weights, len(result.array))
         result.scatter_reverse(la.InsertMode.add)
         result.scatter_forward()
         return np.asarray(result.array)
@@ -127,28 +131,30 @@ class LocalSurface:
         return self._domain.space.dofmap.index_map.local_to_global(nodes.astype(np.int32)).astype(np.int64)
 
     def _wide(self, start: Ints, columns: Ints, values: Values, width: int = 1) -> csr_matrix:
-        """Rows with `width` columns for each node of all ranks."""
+        """Sparse matrix with `width` columns for each global node."""
         shape = len(start) - 1, width * self._domain.space.dofmap.index_map.size_global
         return csr_matrix((values, columns, start), shape=shape)
 
 
 def _assembled(comm: MPI.Comm, owned: tuple[int, int], rows: csr_matrix, number: Ints) -> PETSc.Mat:
-    """A matrix with so many rows and columns of this rank: sums of the `rows`, of all ranks, with the same `number`
-    (collective)."""
+    """PETSc matrix with `owned` rows and columns on this rank: the sum of the `rows` of all ranks (collective).
+
+    `number`: global number of each row.
+    """
     matrix = PETSc.Mat().create(comm)
     matrix.setSizes(((owned[0], PETSc.DETERMINE), (owned[1], PETSc.DETERMINE)))
     matrix.setType(PETSc.Mat.Type.AIJ)
-    matrix.setUp()  # PETSc counts entries itself: rows of other ranks have them, too
+    matrix.setUp()  # without preallocation, since other ranks add entries
     used = np.flatnonzero(np.diff(rows.indptr))
     start = np.append(rows.indptr[used], rows.nnz)
-    indices = [each.astype(PETSc.IntType) for each in (start, rows.indices, number[used])]
+    indices = [numbers.astype(PETSc.IntType) for numbers in (start, rows.indices, number[used])]
     matrix.setValuesIJV(indices[0], indices[1], rows.data, PETSc.InsertMode.ADD_VALUES, indices[2])
     matrix.assemble()
     return matrix
 
 
 def _mesh_of(domain: Domain) -> MeshData:
-    """This rank's cells, and which of their facets are on the boundary of the body."""
+    """The cells of this rank as a mesh, with the boundary facets of the body as group OUTSIDE."""
     exterior = domain._exterior
     geometry = dolfinx.mesh.entities_to_geometry(domain.mesh, domain.dim - 1, exterior)
     of_geometry = np.empty(len(domain.mesh.geometry.x), np.int64)
@@ -157,91 +163,94 @@ def _mesh_of(domain: Domain) -> MeshData:
     return MeshData(domain.nodes, domain.cell_nodes.astype(np.int64), {OUTSIDE: facets})
 
 
-def _touched(made: SplitSurface, skeleton: EntityNumbering) -> tuple[Ints, Values]:
-    """(m, d) elements of cracks and of the body's own boundary, and their measures (m,)."""
-    outside = np.flatnonzero([OUTSIDE in name for name in skeleton.origins])
-    elements = made.elements[np.isin(made.origin, [CRACK, *outside])]
-    corners = made.points[elements]
-    if skeleton.dim == 2:
+def _contact_elements(surface: SplitSurface, topology: EntityNumbering) -> tuple[Ints, Values]:
+    """(m, d) elements of crack faces and of the boundary of the body, and (m,) their areas (2D: lengths)."""
+    outside = np.flatnonzero([OUTSIDE in name for name in topology.origins])
+    elements = surface.elements[np.isin(surface.origin, [CRACK, *outside])]
+    corners = surface.points[elements]
+    if topology.dim == 2:
         return elements, np.linalg.norm(corners[:, 1] - corners[:, 0], axis=1)
     spanned = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     return elements, np.linalg.norm(spanned, axis=1) / 2
 
 
-def _areas(made: SplitSurface, skeleton: EntityNumbering) -> Values:
-    """(points,) a d-th of the measure of the elements around each."""
-    elements, measure = _touched(made, skeleton)
-    shares = np.repeat(measure / skeleton.dim, skeleton.dim)
-    return np.asarray(np.bincount(elements.reshape(-1), shares, len(made.points)), np.float64)
+def _areas(surface: SplitSurface, topology: EntityNumbering) -> Values:
+    """(points,) 1 / d of the area of the elements around each point."""
+    elements, measure = _contact_elements(surface, topology)
+    shares = np.repeat(measure / topology.dim, topology.dim)
+    return np.asarray(np.bincount(elements.reshape(-1), shares, len(surface.points)), np.float64)
 
 
-def _parents_of(made: SplitSurface, points: Ints) -> tuple[Ints, Ints]:
-    """Of k points: (k + 1,) where the parents of each begin, and the places of these in `follow.parents`."""
-    begin, count = made.parents.start[points], np.diff(made.parents.start)[points]
+def _parents_of(surface: SplitSurface, points: Ints) -> tuple[Ints, Ints]:
+    """(k + 1,) start of the parents of each of the points (k,), and their positions in `surface.parents.parents`."""
+    begin, count = surface.parents.start[points], np.diff(surface.parents.start)[points]
     start = np.concatenate([[0], np.cumsum(count)])
     return start, np.repeat(begin - start[:-1], count) + np.arange(start[-1])
 
 
 def _shares(start: Ints) -> Values:
-    """1 / number of the parents of a point, for each of them."""
+    """(parents,) 1 / number of parents of the same point."""
     count = np.diff(start)
     return np.repeat(1.0 / count, count)
 
 
 def _by_axis(numbers: Ints, d: int) -> Ints:
-    """d n + j, of numbers n and axes j."""
+    """(d k,) d n + j for numbers n (k,) and axes j."""
     return (d * numbers[:, None] + np.arange(d)).reshape(-1)
 
 
 def _on_columns(matrices: list[csr_matrix]) -> tuple[Ints, list[csr_matrix]]:
-    """The columns that are used, and the matrices on them."""
+    """The columns that have entries, and the matrices restricted to them."""
     used = np.zeros(matrices[0].shape[1], bool)
-    for each in matrices:
-        used[each.indices] = True
-    columns, place = np.flatnonzero(used), np.cumsum(used) - 1
+    for matrix in matrices:
+        used[matrix.indices] = True
+    columns, number = np.flatnonzero(used), np.cumsum(used) - 1
     shape = matrices[0].shape[0], len(columns)
-    return columns, [csr_matrix((each.data, place[each.indices], each.indptr), shape=shape) for each in matrices]
+    return columns, [
+        csr_matrix((matrix.data, number[matrix.indices], matrix.indptr), shape=shape) for matrix in matrices
+    ]
 
 
 class ParentMatrix:
-    """Carries values between the nodes of a body, wherever they are, and the points of this rank's surface.
+    """The matrix from nodes of all ranks to the surface points of this rank, and its transpose.
 
     Attributes:
-        dim: of the body.    comm: its ranks.
+        dim: dimension of the body.
+        comm: communicator of the body.
     """
 
     def __init__(self, domain: Domain, surface: LocalSurface) -> None:
-        """For the surface as it is now (collective)."""
+        """For the present state of `surface` (collective)."""
         self._surface, self.dim, self.comm = surface, domain.dim, domain.comm
         self._nodes = PETSc.Vec().createMPI((domain.node_count * domain.dim, PETSc.DETERMINE), bsize=domain.dim,
                                             comm=domain.comm)  # fmt: skip
-        self._here = PETSc.Vec().createSeq(len(surface.columns) * domain.dim, bsize=domain.dim)
+        self._local = PETSc.Vec().createSeq(len(surface.columns) * domain.dim, bsize=domain.dim)
         columns = PETSc.IS().createBlock(domain.dim, surface.columns.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
-        self._scatter = PETSc.Scatter().create(self._nodes, columns, self._here, None)
+        self._scatter = PETSc.Scatter().create(self._nodes, columns, self._local, None)
         columns.destroy()
 
     def __call__(self, owned: Values) -> Values:
-        """(n, d) values at the points of a field given by its owned dofs (collective)."""
+        """(n, d) values at the points of a field with `owned` dofs (collective)."""
         return np.asarray(self._surface.at.weights @ self.nodal(owned))
 
     def nodal(self, owned: Values) -> Values:
-        """(columns, d) values at the nodes that the points follow (collective)."""
+        """(columns, d) values of a field at the nodes in the columns (collective)."""
         self._nodes.array_w[:] = owned
-        self._scatter.scatter(self._nodes, self._here, PETSc.InsertMode.INSERT, PETSc.ScatterMode.FORWARD)
-        return np.asarray(self._here.array_r.reshape(-1, self.dim))
+        self._scatter.scatter(self._nodes, self._local, PETSc.InsertMode.INSERT, PETSc.ScatterMode.FORWARD)
+        return np.asarray(self._local.array_r.reshape(-1, self.dim))
 
     def assemble_to_nodes(self, forces: Values) -> Values:
-        """(owned dofs,) nodal forces of forces (n, d) at the points, N (collective)."""
+        """(owned dofs,) nodal forces equivalent to `forces` (n, d) at the points, N (collective)."""
         return self.summed(self._surface.at.weights.T @ forces)
 
     def summed(self, parts: Values) -> Values:
-        """(owned dofs,) sums over ranks of their parts (columns, d) at the nodes that points follow (collective)."""
-        self._here.array_w[:] = parts.reshape(-1)
+        """(owned dofs,) sums over ranks of `parts` (columns, d) at the nodes in the columns (collective)."""
+        self._local.array_w[:] = parts.reshape(-1)
         self._nodes.set(0.0)
-        self._scatter.scatter(self._here, self._nodes, PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
+        self._scatter.scatter(self._local, self._nodes, PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
         return self._nodes.array_r.copy()
 
     def destroy(self) -> None:
-        """Give the memory of PETSc's objects back."""
-        for kept in (self._nodes, self._here, self._scatter):
-            kept.destroy()
+        """Free the PETSc objects."""
+        for petsc_object in (self._nodes, self._local, self._scatter):
+            petsc_object.destroy()

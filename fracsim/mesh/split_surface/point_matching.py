@@ -1,4 +1,4 @@
-"""Points of the split surface that are the same before and after edges broke."""
+"""Identification of the points of a split surface before and after edges break."""
 
 from __future__ import annotations
 
@@ -10,34 +10,33 @@ from .closed_surface import SplitSurface
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-GRID = 7.31e-9  # no mesh has its points half-way between two of its steps
+GRID = 7.31e-9  # of the size of the body: step of rounded coordinates; irregular, so that no point lies between two
 
 
-def point_identity(made: SplitSurface, which: Ints, number: Ints, size: float) -> Values:
-    """(k, 2 d + 1) rows of the points `which` (k,): the place of each, and the `number` (nodes,) of its parents,
-    descending, then -1.
+def point_identity(surface: SplitSurface, which: Ints, number: Ints, size: float) -> Values:
+    """(k, 2 d + 1) rows that identify the points `which` (k,): position, and numbers of parents, descending, then -1.
 
-    A copy at the same place whose group has lost nodes is another point. Places are in steps of GRID of the
-    body's `size`, m: with numbers of the input mesh rows are the same on all ranks.
+    `number`: (nodes,) numbers of nodes; with those of the input mesh, rows are equal on all ranks. A copy at the same
+    position whose group has lost nodes is another point. Positions are in steps of GRID times `size` (m).
     """
-    d, follow = made.points.shape[1], made.parents
+    d, follow = surface.points.shape[1], surface.parents
     count = np.diff(follow.start)[which]
     rows = np.repeat(np.arange(len(which)), count)
     within = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
     parents = np.full((len(which), d + 1), -1)
     parents[rows, within] = number[follow.parents[np.repeat(follow.start[:-1][which], count) + within]]
-    return np.concatenate([np.rint(made.points[which] / (GRID * size)), -np.sort(-parents, axis=1)], axis=1)
+    return np.concatenate([np.rint(surface.points[which] / (GRID * size)), -np.sort(-parents, axis=1)], axis=1)
 
 
 def match_points(old: Values, new: Values) -> Ints:
-    """(k,) which of the rows `new` (n, w) each of the rows `old` (k, w) is; -1: none."""
+    """(k,) the index in `new` (n, w) of each row of `old` (k, w); -1 if there is none."""
     if not len(old):
         return np.empty(0, np.int64)
-    lead = new.shape[1] // 2  # of the first parent
+    lead = new.shape[1] // 2  # column of the first parent
     near = np.flatnonzero(np.isin(new[:, lead], old[:, lead]))
-    both = np.concatenate([new[near], old])
-    _, first, place = np.unique(both, axis=0, return_index=True, return_inverse=True)
-    at = first[place.reshape(-1)[len(near) :]]
+    rows = np.concatenate([new[near], old])
+    _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+    match = first[inverse.reshape(-1)[len(near) :]]
     result = np.full(len(old), -1)
-    result[at < len(near)] = near[at[at < len(near)]]
+    result[match < len(near)] = near[match[match < len(near)]]
     return result

@@ -1,7 +1,6 @@
-"""Volume, centre and second moments of what closed surfaces enclose: exact for the polyhedra that pieces are.
+"""Volume, centre of volume and second moments of bodies with closed polyhedral surfaces, without quadrature error.
 
-With the cones of all elements (corners x_1 ... x_d, apex at the origin), signed by the side that they face, and
-s = sum x_i,
+Sums over the cones of all elements (corners x_1 ... x_d, apex at the origin), signed by orientation; s = sum x_i:
 
     V = sum det(x_1 .. x_d) / d!,   int x dV = sum V_e s / (d + 1),
     int x x^T dV = sum V_e (sum_i x_i x_i^T + s s^T) / ((d + 1) (d + 2)).
@@ -25,10 +24,11 @@ Values = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PolyhedronMoments:
-    """Of n bodies.
+    """Moments of n bodies.
 
     Attributes:
-        volume: (n,) m^3 (2D: m^2).    centre: (n, d) of volume, m; that of the points where there is no volume.
+        volume: (n,) m^3 (2D: m^2).
+        centre: (n, d) centre of volume, m; of a body without volume the mean of the points.
         second: (n, d, d) int (x - centre) (x - centre)^T dV, m^5 (2D: m^4).
     """
 
@@ -38,7 +38,7 @@ class PolyhedronMoments:
 
     @property
     def inertia(self) -> Values:
-        """(n, 3, 3) tensor of inertia about the centre per density, tr S 1 - S; 2D: (n, 1, 1), tr S."""
+        """(n, 3, 3) inertia tensor about the centre for density 1, tr(S) 1 - S; 2D: (n, 1, 1), tr(S); m^5 (2D: m^4)."""
         trace = np.einsum("nii->n", self.second)[:, None, None]
         return trace if self.second.shape[1] == 2 else trace * np.eye(3) - self.second
 
@@ -51,12 +51,14 @@ def cones(x: Values) -> Values:
 
 
 def moments(points: Values, elements: Ints, body: Ints, count: int) -> PolyhedronMoments:
-    """Moments of `count` bodies from the points (n, d) of their closed surfaces and the elements (m, d), each of the
-    body that `body` (m,) says."""
+    """Moments of `count` bodies with closed surfaces.
+
+    `points`: (n, d), m.    `elements`: (m, d) points of each element.    `body`: (m,) body of each element.
+    """
     d = points.shape[1]
-    given = [np.ascontiguousarray(points), *(np.ascontiguousarray(each, np.int64) for each in (elements, body))]
+    given = [np.ascontiguousarray(points), *(np.ascontiguousarray(numbers, np.int64) for numbers in (elements, body))]
     many, sizes = np.zeros(count, np.int64), (d, 1, d, d * d)
-    near, volume, first, second = (np.zeros((count, size)) for size in sizes)  # each about a point of its own
+    near, volume, first, second = (np.zeros((count, size)) for size in sizes)  # about one point of each body
     sums = load_library(SOURCE).sums
     sums(*map(c_int64, (len(elements), d, count)), *(*given, many, near, volume, first, second))
     arm = np.divide(first, (d + 1) * volume, out=np.zeros_like(first), where=volume > 0)

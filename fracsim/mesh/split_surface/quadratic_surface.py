@@ -1,8 +1,7 @@
-"""The surface of cells with quadratic displacement, for what touches it: the middles of edges are points of it too.
+"""The contact surface of cells with quadratic displacement: midside nodes are points of it too.
 
-On the straight cells alone the middles would be free of contact: between two plates they bulge by a twentieth of an
-edge, and a block is pressed with seven eighths of the force. A cell with broken edges has no middles that its parts
-could follow: they follow its corners.
+On the straight cells alone midside nodes would penetrate freely: by a twentieth of an edge between two plates, with 7/8
+of the force. The parts of a cell with broken edges follow its corners alone.
 """
 
 from __future__ import annotations
@@ -23,8 +22,8 @@ from .surface_motion import PointParents
 
 Ints = npt.NDArray[np.int64]
 
-# pairs of corners: (i, i) is a corner, (i, j) the middle between; the octahedron in a tetrahedron is cut along one axis
-SMALL = {
+# (i, i) is corner i, (i, j) the midside node between; the octahedron in a tetrahedron is divided along one axis
+SUBDIVISION = {
     1: [[(0, 0), (0, 1)], [(0, 1), (1, 1)]],
     2: [
         [(0, 0), (0, 1), (0, 2)], [(1, 1), (1, 2), (0, 1)], [(2, 2), (0, 2), (1, 2)], [(0, 1), (1, 2), (0, 2)],
@@ -38,32 +37,35 @@ SMALL = {
 }  # fmt: skip
 
 
-def with_midside_points(made: SplitSurface, domain: Domain, pattern: npt.NDArray[np.integer]) -> SplitSurface:
-    """The surface of this rank's straight cells with 2 segments (2D) or 4 triangles for each facet of the body's own
-    boundary whose cell is whole: the middles come after all its points, and follow themselves alone."""
-    on_boundary = (made.edge < 0) & (made.origin != CRACK) & (pattern[made.cell] == 0)
-    facets, cell = made.elements[on_boundary], made.cell[on_boundary]
+def with_midside_points(surface: SplitSurface, domain: Domain, pattern: npt.NDArray[np.integer]) -> SplitSurface:
+    """The surface with boundary facets of undamaged cells divided into 2 segments (2D) or 4 triangles (3D).
+
+    Midside nodes are numbered after all points of the surface. Each is its own only parent.
+    """
+    on_boundary = (surface.edge < 0) & (surface.origin != CRACK) & (pattern[surface.cell] == 0)
+    facets, cell = surface.elements[on_boundary], surface.cell[on_boundary]
     i, j = local_edges(domain.dim - 1).T
-    between = _middle_of(domain, cell, made.parents.first_parent[facets[:, i]], made.parents.first_parent[facets[:, j]])
-    nodes, place = np.unique(between, return_inverse=True)
-    smaller = _all_cut(_between(facets, len(made.points) + place.reshape(between.shape)))
-    rest, each = ~on_boundary, len(SMALL[domain.dim - 1])
-    count = np.concatenate([np.diff(made.parents.start), np.ones(len(nodes), np.int64)])
-    points = np.concatenate([made.points, domain.nodes[nodes]])
-    parents = np.concatenate([made.parents.parents, nodes])
+    parent = surface.parents.first_parent
+    between = _midside_nodes(domain, cell, parent[facets[:, i]], parent[facets[:, j]])
+    nodes, number = np.unique(between, return_inverse=True)
+    smaller = _divided(_between(facets, len(surface.points) + number.reshape(between.shape)))
+    unchanged, parts = ~on_boundary, len(SUBDIVISION[domain.dim - 1])
+    count = np.concatenate([np.diff(surface.parents.start), np.ones(len(nodes), np.int64)])
+    points = np.concatenate([surface.points, domain.nodes[nodes]])
+    parents = np.concatenate([surface.parents.parents, nodes])
     return replace(
-        made,
+        surface,
         points=points,
         parents=PointParents.of(parents, count, points, domain.nodes),
-        elements=np.concatenate([made.elements[rest], smaller]),
-        cell=np.concatenate([made.cell[rest], np.repeat(cell, each)]),
-        edge=np.concatenate([made.edge[rest], np.full(len(smaller), -1)]),
-        origin=np.concatenate([made.origin[rest], np.repeat(made.origin[on_boundary], each)]),
+        elements=np.concatenate([surface.elements[unchanged], smaller]),
+        cell=np.concatenate([surface.cell[unchanged], np.repeat(cell, parts)]),
+        edge=np.concatenate([surface.edge[unchanged], np.full(len(smaller), -1)]),
+        origin=np.concatenate([surface.origin[unchanged], np.repeat(surface.origin[on_boundary], parts)]),
     )
 
 
-def _middle_of(domain: Domain, cell: Ints, low: Ints, high: Ints) -> Ints:
-    """(m, n) nodes of the middles between the nodes `low` and `high` (m, n) of cells (m,)."""
+def _midside_nodes(domain: Domain, cell: Ints, low: Ints, high: Ints) -> Ints:
+    """(m, n) midside nodes between the nodes `low` and `high` (m, n) of the cells (m,)."""
     ends = domain.cell_nodes[cell][:, local_edges(domain.dim)]  # (m, edges, 2)
     pair = np.sort(np.stack([low, high], axis=-1), axis=-1)
     same = (pair[:, :, None] == np.sort(ends, axis=-1)[:, None]).all(axis=-1)
@@ -71,17 +73,19 @@ def _middle_of(domain: Domain, cell: Ints, low: Ints, high: Ints) -> Ints:
 
 
 def refined_input(domain: Domain) -> MeshData | None:
-    """The input mesh on rank 0, where displacement is quadratic with its cells cut up, without groups; its points are
-    those that `Domain.node_input` numbers. None elsewhere."""
+    """The input mesh on rank 0, None elsewhere; for quadratic displacement its cells are divided, without groups.
+
+    Its points are numbered by `Domain.node_input`.
+    """
     if domain.midside_nodes is None or domain.source is None:
         return domain.source
     whole = with_midside_nodes(domain.source, domain.midside_nodes, written=False)
-    cells = _all_cut(_between(*np.split(whole.cells, [domain.dim + 1], axis=1)))
+    cells = _divided(_between(*np.split(whole.cells, [domain.dim + 1], axis=1)))
     return MeshData(whole.points, oriented(whole.points, cells)[0])
 
 
 def _between(corners: npt.NDArray[np.integer], middles: npt.NDArray[np.integer]) -> Ints:
-    """(cells, d + 1, d + 1) the corner i of each cell at (i, i), the middle of the edge ij at (i, j)."""
+    """(cells, d + 1, d + 1) corner i of each cell at (i, i), the midside node of edge ij at (i, j)."""
     count = corners.shape[1]
     result = np.empty((len(corners), count, count), np.int64)
     result[:, range(count), range(count)] = corners
@@ -90,7 +94,7 @@ def _between(corners: npt.NDArray[np.integer], middles: npt.NDArray[np.integer])
     return result
 
 
-def _all_cut(between: Ints) -> Ints:
-    """(cells 2^d, d + 1) nodes of the parts of all simplices, those of one after another."""
-    parts = np.array(SMALL[between.shape[1] - 1])  # (2^d, d + 1, 2)
+def _divided(between: Ints) -> Ints:
+    """(cells 2^d, d + 1) nodes of the parts of all simplices, in the order of the simplices."""
+    parts = np.array(SUBDIVISION[between.shape[1] - 1])  # (2^d, d + 1, 2)
     return between[:, parts[..., 0], parts[..., 1]].reshape(-1, between.shape[1])

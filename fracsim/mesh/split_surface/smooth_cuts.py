@@ -1,12 +1,12 @@
-"""Where broken edges are cut so that the crack that is drawn is smooth, and not the cells around the nodes.
+"""Positions of cuts on broken edges that give a smooth crack surface in output.
 
-A crack is the zero of a field that has one sign at each end of every edge that it broke. The field is left open but for
-its zeros: of the cuts c_e = x_i + s_e (x_j - x_i) each is pulled towards the mean of those it shares a cell with,
+The crack surface separates the ends of each broken edge. The cut c_e = x_i + s_e (x_j - x_i) of an edge moves towards
+the mean of the cuts that share a cell with it:
 
-    s_e <- (1 - w) s_e + w (mean c - x_i) . (x_j - x_i) / |x_j - x_i|^2,        kept within [KEPT, 1 - KEPT],
+    s_e <- (1 - w) s_e + w (mean c - x_i) . (x_j - x_i) / |x_j - x_i|^2,        s_e in [MIN_SHARE, 1 - MIN_SHARE].
 
-a damped Laplacian along the edges: a surface that is nearly flat becomes flat, whatever the mesh. Closedness and volume
-of the split surface do not depend on where its edges are cut.
+This is damped Laplacian smoothing along the edges: a nearly planar surface becomes planar on any mesh. The surface
+stays closed and its volume is unchanged, whatever the cuts.
 """
 
 from __future__ import annotations
@@ -18,39 +18,40 @@ from scipy.sparse import coo_matrix
 from .entity_numbering import EntityNumbering
 
 Values = npt.NDArray[np.float64]
-KEPT = 0.15  # of an edge: what each end has of it at least
-DAMPING, TIMES = 0.5, 30
+MIN_SHARE = 0.15  # of an edge, between a cut and the nearer end
+DAMPING = 0.5  # w
+ITERATIONS = 30
 
 
-def smooth_cuts(skeleton: EntityNumbering, broken: npt.NDArray[np.bool_], cut: Values | None = None) -> Values:
-    """(E,) shares of edges from the lower node, NaN of whole ones; those that have a place in `cut` (E,) keep it."""
+def smooth_cuts(topology: EntityNumbering, broken: npt.NDArray[np.bool_], cut: Values | None = None) -> Values:
+    """(E,) cuts of broken edges as shares from the lower node, NaN for intact edges; values in `cut` (E,) are kept."""
     result = np.full(len(broken), np.nan)
     at = np.flatnonzero(broken)
     if not len(at):
         return result
-    ends = skeleton.points[skeleton.edges[at]]
+    ends = topology.points[topology.edges[at]]
     start, along = ends[:, 0], ends[:, 1] - ends[:, 0]
     share: Values = np.full(len(at), 0.5)
     free = np.ones(len(at), bool) if cut is None else np.isnan(cut[at])
     if cut is not None:
         share[~free] = cut[at][~free]
-    mean = _neighbours(skeleton, broken)
+    mean = _neighbours(topology, broken)
     per = 1.0 / np.einsum("ni,ni->n", along, along)
-    for _ in range(TIMES if free.any() else 0):
+    for _ in range(ITERATIONS if free.any() else 0):
         wanted = mean @ (start + share[:, None] * along)
         pulled = (1 - DAMPING) * share + DAMPING * per * np.einsum("ni,ni->n", wanted - start, along)
-        share = np.where(free, np.clip(pulled, KEPT, 1 - KEPT), share)
+        share = np.where(free, np.clip(pulled, MIN_SHARE, 1 - MIN_SHARE), share)
     result[at] = share
     return result
 
 
-def _neighbours(skeleton: EntityNumbering, broken: npt.NDArray[np.bool_]) -> coo_matrix:
-    """(n, n) rows are means over the broken edges that share a cell with a broken edge, itself among them."""
-    cells = np.flatnonzero(broken[skeleton.cell_edges].any(axis=1))
-    row, column = np.nonzero(broken[skeleton.cell_edges[cells]])
+def _neighbours(topology: EntityNumbering, broken: npt.NDArray[np.bool_]) -> coo_matrix:
+    """(n, n) matrix of means over the broken edges that share a cell with each broken edge, itself included."""
+    cells = np.flatnonzero(broken[topology.cell_edges].any(axis=1))
+    row, column = np.nonzero(broken[topology.cell_edges[cells]])
     place = np.cumsum(broken) - 1
-    edge = place[skeleton.cell_edges[cells[row], column]]
+    edge = place[topology.cell_edges[cells[row], column]]
     member = coo_matrix((np.ones(len(row)), (row, edge)), shape=(len(cells), int(broken.sum()))).tocsr()
     shared = member.T @ member
-    shared.data[:] = 1.0  # however many cells two of them share
+    shared.data[:] = 1.0  # independent of the number of shared cells
     return shared.multiply(1.0 / shared.sum(axis=1)).tocsr()

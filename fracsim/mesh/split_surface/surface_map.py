@@ -1,10 +1,10 @@
-"""Where points of a split surface are: linear in the nodes, and drawn in towards them as far as there is no room.
+"""Map from nodal displacements to the points of a split surface, linear, with reduced arms where contact needs it.
 
     x = mean over p of (x_p + s F_p (X - X_p)) = X_s + sum over nodes a of w_a u_a
 
-F_p as in `local`. With s = 1 the point is where the material is; with s < 1 it is nearer to the nodes that it follows,
-which is where a wall is put that comes to light inside something: nodes lie deeper in the body than its walls. Affine
-motions of the place X_s are reproduced, and sum w_a = 1, at any s.
+F_p as in local_surface. With s = 1 the point is the material point; with s < 1 it is nearer to the nodes p. A new crack
+face that would lie inside an obstacle starts with s < 1, since nodes lie deeper in the body than crack faces. For all s
+affine motions of the reference position X_s are reproduced, and sum w_a = 1.
 """
 
 from __future__ import annotations
@@ -25,39 +25,42 @@ Values = npt.NDArray[np.float64]
 
 
 class SurfaceMap:
-    """Where n points are, at shares of their arms; never changed.
+    """Immutable map from nodal displacements to n points with shares s of their arms.
 
     Attributes:
-        share: (n,) s.    rest: (n, d) X_s, m.
+        share: (n,) s.
+        rest: (n, d) reference positions X_s, m.
     """
 
     def __init__(
         self, mean: csr_matrix, middle: Values, arms: csr_matrix, out: Values, share: Values | None = None
     ) -> None:
-        """`mean` (n, nodes) over the parents, `middle` (n, d) theirs, m; `arms` (n, nodes) times gradients, `out`
-        (n, d) mean arm, m; `share` 1 where it is not given."""
+        """Matrices and vectors of the map.
+
+        `mean`: (n, nodes) means over the parents.    `middle`: (n, d) mean reference position of the parents, m.
+        `arms`: (n, nodes) means of arm times gradient.    `out`: (n, d) mean arm, m.    `share`: s, by default 1.
+        """
         self._mean, self._middle, self._arms, self._out = mean, middle, arms, out
         self.share = np.ones(len(middle)) if share is None else share
         self.rest: Values = middle + self.share[:, None] * out
 
     @cached_property
     def copies(self) -> Ints:
-        """(k,) points that have arms: also those in the middle of their nodes, whose arms cancel each other until the
-        body is deformed."""
+        """(k,) points that have arms, including points whose arms cancel in the reference configuration."""
         armed = np.asarray(abs(self._arms).sum(axis=1)).ravel() > 0
         return np.flatnonzero(np.any(self._out != 0, axis=1) | armed)
 
     @cached_property
     def weights(self) -> csr_matrix:
-        """(n, nodes) w."""
+        """(n, nodes) matrix of the weights w."""
         return (self._mean + diags(self.share) @ self._arms).tocsr()
 
     def with_arm_share(self, share: Values) -> SurfaceMap:
-        """The points with `share` (n,) of their arms."""
+        """The map with shares `share` (n,) of the arms."""
         return SurfaceMap(self._mean, self._middle, self._arms, self._out, share)
 
     def projected_onto(self, points: Ints, mean: csr_matrix, other: SurfaceMap) -> SurfaceMap:
-        """With `points` (k,) at means, rows (k, m), of the points of `other` once their arms are whole."""
+        """The map with `points` (k,) at means, rows (k, m), of the points of `other` with s = 1."""
         n = len(self.share)
         to = csr_matrix((np.ones(len(points)), (points, np.arange(len(points)))), shape=(n, len(points)))
         keep, out = diags(1.0 - np.bincount(points, minlength=n)), self._out.copy()
@@ -66,36 +69,35 @@ class SurfaceMap:
         return SurfaceMap(self._mean, self._middle, arms.tocsr(), out, self.share)
 
     def __call__(self, u: Values) -> Values:
-        """(n, d) x of nodal displacements (nodes, d), m."""
+        """(n, d) positions x for nodal displacements u (nodes, d), m."""
         return np.asarray(self.rest + self.weights @ u)
 
     def evaluate_points(self, u: Values, points: Ints, share: Values) -> Values:
-        """(k, d) x of some points at other shares (k,); u (nodes, d), m."""
+        """(k, d) positions x of `points` (k,) with other shares (k,); u (nodes, d), m."""
         middle = self._middle[points] + self._mean[points] @ u
         return np.asarray(middle + share[:, None] * (self._out[points] + self._arms[points] @ u))
 
 
 def middles(points: Values, follow: PointParents) -> Values:
-    """(n, d) means of the parents of reference `points` (n, d), m."""
+    """(n, d) mean reference positions of the parents of `points` (n, d), m."""
     start = follow.start
     result: Values = points - np.add.reduceat(follow.arm, start[:-1], axis=0) / np.diff(start)[:, None]
     return result
 
 
 def whole(
-    made: SplitSurface | SurfacePoints, skeleton: EntityNumbering, pattern: npt.NDArray[np.integer], places: Values
+    surface: SplitSurface | SurfacePoints, topology: EntityNumbering, pattern: npt.NDArray[np.integer], places: Values
 ) -> SurfaceMap:
-    """Points at reference `places` (n, d), which may be others than the surface's own; weights of all nodes, on a rank
-    that has the whole mesh."""
-    d, count, follow = skeleton.dim, len(places), made.parents
+    """The map of points at reference positions `places` (n, d), m, on a rank that holds the whole mesh."""
+    d, count, follow = topology.dim, len(places), surface.parents
     parents = np.diff(follow.start)
     rows = np.repeat(np.arange(count), parents)
-    share, arm = np.repeat(1.0 / parents, parents), places[rows] - skeleton.points[follow.parents]
+    share, arm = np.repeat(1.0 / parents, parents), places[rows] - topology.points[follow.parents]
     mean = csr_matrix((share, (rows, follow.parents)), shape=(count, follow.nodes))
     armed = np.zeros(follow.nodes, bool)
     armed[follow.parents[np.any(arm != 0, axis=1)]] = True
-    corners = skeleton.cells[~is_split(d)[pattern] & armed[skeleton.cells].any(axis=1)]
-    X = skeleton.points[corners]
+    corners = topology.cells[~is_split(d)[pattern] & armed[topology.cells].any(axis=1)]
+    X = topology.points[corners]
     volume = np.abs(np.linalg.det(X[:, 1:] - X[:, :1]))
     around = np.bincount(corners.reshape(-1), np.repeat(volume, d + 1), minlength=follow.nodes)
     at, of, values = gradient_entries(X, volume[:, None] / around[corners], corners)
@@ -103,12 +105,12 @@ def whole(
     of_arm = (d * follow.parents[:, None] + np.arange(d)).reshape(-1)
     arms = csr_matrix(((share[:, None] * arm).reshape(-1), (np.repeat(rows, d), of_arm)),
                       shape=(count, d * follow.nodes))  # fmt: skip
-    middle = np.asarray(mean @ skeleton.points)
+    middle = np.asarray(mean @ topology.points)
     return SurfaceMap(mean, middle, (arms @ gradients).tocsr(), places - middle)
 
 
 def gradient_entries(X: Values, share: Values, number: Ints) -> tuple[Ints, Ints, Values]:
-    """Entries (row, column, value) of the averages of d/dX_j around nodes: row d p + j, column a.
+    """Matrix entries (row, column, value) of the averages of d/dX_j around nodes: row d p + j, column a.
 
     `X` (cells, d + 1, d) corners, `number` (cells, d + 1) of their nodes, `share` (cells, d + 1) of each cell in the
     average around each of its nodes.

@@ -1,10 +1,10 @@
-"""Children follow parents: the points of the split surface as a map of the nodes of the mesh.
+"""Motion of the points of the split surface with their parents, the nodes of their groups.
 
     x = mean over p of (x_p + R_p (X - X_p))
 
-with p the nodes of the point's group and R_p the polar rotation of the average deformation around p, so that turning
-pieces do not shear (docs/theory.md#split-surface). With R held, the map is linear in the nodes and `weights` is its
-matrix: its transpose hands forces at the points down to the nodes, which is M22 section 4.2.
+with p the nodes of the group of the point and R_p the polar rotation of the average deformation gradient around p, so
+that rotating fragments do not shear (docs/theory.md#split-surface). For constant R the map is linear, with matrix
+`weights`. The transpose distributes forces at points to nodes. Source: Mandal et al. (2022), section 4.2.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ Values = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PointParents:
-    """Parents of n points, by rows.
+    """The parents of n points, row by row.
 
     Attributes:
         start: (n + 1,) the parents of point k are parents[start[k] : start[k + 1]], one or more.
-        parents: nodes.
-        arm: (parents, d) X - X_p, m: from the parent to the point in the reference configuration.
-        nodes: how many nodes the mesh has.
+        parents: (parents,) node numbers.
+        arm: (parents, d) X - X_p, m, from the parent to the point in the reference configuration.
+        nodes: number of nodes of the mesh.
     """
 
     start: Ints
@@ -45,63 +45,71 @@ class PointParents:
 
     @classmethod
     def of(cls, parents: Ints, count: Ints, points: Values, node_points: Values) -> PointParents:
-        """`count` (n,) of parents of each point, at `points` (n, d)."""
+        """Parents with their arms, from reference positions.
+
+        `count`: (n,) number of parents of each point.    `points`: (n, d), m.    `node_points`: (nodes, d), m.
+        """
         arm = np.repeat(points, count, axis=0) - node_points[parents]
         return cls(np.concatenate([[0], np.cumsum(count)]), parents, arm, len(node_points))
 
     @property
     def first_parent(self) -> Ints:
+        """(n,) first parent of each point."""
         return self.parents[self.start[:-1]]
 
     @cached_property
     def weights(self) -> csr_matrix:
-        """(n, nodes) each row is 1 / (number of parents) at the parents."""
-        from scipy.sparse import csr_matrix  # a body that is whole is drawn without SciPy, 0.13 s of a start
+        """(n, nodes) matrix with 1 / (number of parents) in the columns of the parents."""
+        # here, since output of an undamaged body does not need SciPy: 0.13 s of the start-up
+        from scipy.sparse import csr_matrix
 
         count = np.diff(self.start)
         return csr_matrix((np.repeat(1.0 / count, count), self.parents, self.start), shape=(len(count), self.nodes))
 
     @cached_property
     def rotating_nodes(self) -> Ints:
-        """Nodes whose rotation matters: parents of points that are not where the parent is."""
+        """Nodes whose rotation is needed: parents with a nonzero arm."""
         return np.unique(self.parents[np.any(self.arm != 0, axis=1)])
 
     def mean(self, nodal: Values) -> Values:
         """(n, ...) mean of nodal values (nodes, ...) over the parents."""
         return self._mean(nodal[self.parents])
 
-    def _mean(self, each: Values) -> Values:
+    def _mean(self, values: Values) -> Values:
         """(n, ...) mean over the parents of values (parents, ...)."""
-        count = np.diff(self.start).reshape(-1, *np.ones(each.ndim - 1, int))
-        result: Values = np.add.reduceat(each, self.start[:-1], axis=0) / count
+        count = np.diff(self.start).reshape(-1, *np.ones(values.ndim - 1, int))
+        result: Values = np.add.reduceat(values, self.start[:-1], axis=0) / count
         return result
 
     def displacement(self, u: Values, rotation: Values) -> Values:
-        """(n, d) x - X = mean of u_p + (R_p - 1)(X - X_p); `rotation` (turning, d, d), u (nodes, d) in m."""
-        place = np.full(self.nodes, -1)
-        place[self.rotating_nodes] = np.arange(len(self.rotating_nodes))
+        """(n, d) x - X = mean of u_p + (R_p - 1)(X - X_p), m.
+
+        `rotation`: (rotating_nodes, d, d).    `u`: (nodes, d), m.
+        """
+        row = np.full(self.nodes, -1)
+        row[self.rotating_nodes] = np.arange(len(self.rotating_nodes))
         entry = np.flatnonzero(np.any(self.arm != 0, axis=1))
         arm = self.arm[entry]
-        each = u[self.parents]
-        each[entry] += np.einsum("nij,nj->ni", rotation[place[self.parents[entry]]], arm) - arm
-        return self._mean(each)
+        displacement = u[self.parents]
+        displacement[entry] += np.einsum("nij,nj->ni", rotation[row[self.parents[entry]]], arm) - arm
+        return self._mean(displacement)
 
 
 class NodalRotations:
-    """R of some nodes: the polar rotation of the volume average of F over the whole (not split) cells around each.
+    """Rotations R of nodes: polar rotations of the volume average of F over the unsplit cells around each node.
 
-    A node that has none turns with those that it is joined to; where these have none either its fragment is smaller
-    than a cell and its rotation unknown: identity.
+    A node without such a cell has the rotation of the nearest node that has one, along intact edges. If there is none,
+    R is the identity: the fragment is smaller than a cell, and its rotation is unknown.
     """
 
-    def __init__(self, skeleton: EntityNumbering, pattern: npt.NDArray[np.integer], nodes: Ints) -> None:
-        d = skeleton.dim
-        nodes, self._of = np.unique(_turning_with(skeleton, pattern)[nodes], return_inverse=True)
-        place = np.full(len(skeleton.points), -1)
+    def __init__(self, topology: EntityNumbering, pattern: npt.NDArray[np.integer], nodes: Ints) -> None:
+        d = topology.dim
+        nodes, self._of = np.unique(_turning_with(topology, pattern)[nodes], return_inverse=True)
+        place = np.full(len(topology.points), -1)
         place[nodes] = np.arange(len(nodes))
-        around = np.any(place[skeleton.cells] >= 0, axis=1) & ~is_split(d)[pattern]
-        self._cells = skeleton.cells[around]
-        span = skeleton.points[self._cells]
+        around = np.any(place[topology.cells] >= 0, axis=1) & ~is_split(d)[pattern]
+        self._cells = topology.cells[around]
+        span = topology.points[self._cells]
         span = span[:, 1:] - span[:, :1]  # rows X_k - X_0
         self._inverse = np.linalg.inv(span) * np.abs(np.linalg.det(span))[:, None, None]  # d! V (X_k - X_0)^-1
         target = place[self._cells]
@@ -114,10 +122,10 @@ class NodalRotations:
 
             self._sum = csr_matrix((ones, (target[cell, corner], cell)), shape=(len(nodes), len(self._cells)))
             volume = self._sum @ np.abs(np.linalg.det(span))
-            self._per_volume = 1.0 / np.where(volume > 0, volume, 1.0)  # none: the mean is 0 and F the identity
+            self._per_volume = 1.0 / np.where(volume > 0, volume, 1.0)  # without cells the mean is 0 and F the identity
 
     def __call__(self, u: Values) -> Values:
-        """(nodes, d, d) from displacements (N, d) in m: F = 1 + mean of grad u."""
+        """(nodes, d, d) rotations R for displacements u (N, d), m, with F = 1 + mean of grad u."""
         d = len(self._identity)
         if self._sum is None:
             return np.empty((0, d, d))
@@ -129,18 +137,21 @@ class NodalRotations:
         return polar_rotation(F)[self._of]
 
 
-def _turning_with(skeleton: EntityNumbering, pattern: npt.NDArray[np.integer]) -> Ints:
-    """(nodes,) the node whose rotation each node has: its own where it has a whole cell, else that of the nearest one
-    with such a cell over intact edges, of these the first; its own, too, where there is none."""
-    result = np.arange(len(skeleton.points))
+def _turning_with(topology: EntityNumbering, pattern: npt.NDArray[np.integer]) -> Ints:
+    """(N,) the node whose rotation each node has.
+
+    That is the node itself if it has an unsplit cell or if no connected node has one. Otherwise it is the nearest such
+    node along intact edges, the lowest one of several.
+    """
+    result = np.arange(len(topology.points))
     whole = np.zeros(len(result), bool)
-    whole[skeleton.cells[~is_split(skeleton.dim)[pattern]]] = True
+    whole[topology.cells[~is_split(topology.dim)[pattern]]] = True
     if whole.all():
         return result
-    pairs = local_edges(skeleton.dim)
-    cells = np.flatnonzero(~whole[skeleton.cells].all(axis=1))
+    pairs = local_edges(topology.dim)
+    cells = np.flatnonzero(~whole[topology.cells].all(axis=1))
     intact = (np.asarray(pattern)[cells, None] >> np.arange(len(pairs))) & 1 == 0
-    ends = skeleton.cells[cells][:, pairs][intact]
+    ends = topology.cells[cells][:, pairs][intact]
     ends = np.concatenate([ends, ends[:, ::-1]])
     known = whole.copy()
     while len(new := np.flatnonzero(~known[ends[:, 0]] & known[ends[:, 1]])):
