@@ -1,19 +1,18 @@
-"""Failures that a user can mend: one message, one exit code, no traceback."""
+"""Errors that a user can correct: one message, one exit code, no traceback."""
 
 from __future__ import annotations
 
 import signal
 from enum import IntEnum
 
-MAX_MESSAGE_LENGTH = 1000  # characters of a message
-
-# What ends a run with a checkpoint. SIGHUP: its terminal was closed; SIGXCPU: its limit of processor time is reached.
+# Characters of a message; the middle of a longer one is left out.
+MAX_MESSAGE_LENGTH = 1000
+# Signals that end a run with a checkpoint. SIGHUP: the terminal was closed; SIGXCPU: the limit of processor time.
 STOP_SIGNALS = (
     signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP, signal.SIGQUIT, signal.SIGXCPU,
 )  # fmt: skip
-REPEATED_SIGNAL_INTERVAL = (
-    1.0  # s after such a signal in which another one is no second request: some senders send it twice
-)
+# Seconds after a signal in which another one is the same request, since some senders send it twice.
+REPEATED_SIGNAL_INTERVAL = 1.0
 
 
 class Exit(IntEnum):
@@ -28,38 +27,40 @@ class Exit(IntEnum):
 
 
 def one_line(text: str) -> str:
-    """A text of a user's file as a terminal may have it: one line of at most LONGEST characters, without control
-    characters."""
-    line = text if text.isprintable() else "".join(each if each.isprintable() else ascii(each)[1:-1] for each in text)
-    return (
-        line
-        if len(line) <= MAX_MESSAGE_LENGTH
-        else f"{line[: MAX_MESSAGE_LENGTH // 2]} ... {line[-MAX_MESSAGE_LENGTH // 2 :]}"
-    )
+    """Return a text of a user's file as one line for a terminal, without control characters and of limited length."""
+    line = text
+    if not text.isprintable():
+        line = "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)
+    if len(line) <= MAX_MESSAGE_LENGTH:
+        return line
+    return f"{line[: MAX_MESSAGE_LENGTH // 2]} ... {line[-MAX_MESSAGE_LENGTH // 2 :]}"
 
 
 class FracsimError(Exception):
-    """The message says what is wrong, where, what is allowed and what to do. Raised on all ranks alike."""
+    """Error with a message that says what is wrong, where, what is allowed and what to do.
+
+    It is raised on all ranks alike.
+    """
 
     exit_code = Exit.BAD_INPUT
 
     def __init__(self, message: str) -> None:
-        """`message` becomes one line of bearable length: values of a file may hold line breaks, or a million digits."""
+        """Keep the message as one line; values of a file may have line breaks, or a million digits."""
         super().__init__(one_line(message))
 
 
 class InputError(FracsimError):
-    """A study, a mesh or a command line that cannot be run."""
+    """Study, mesh or command line that cannot be run."""
 
 
 class NotConverged(FracsimError):
-    """The smallest allowed step failed; the message has the reason, the last good time and the checkpoint."""
+    """Failure of the smallest allowed step; the message has the reason, the last good time and the checkpoint."""
 
     exit_code = Exit.NOT_CONVERGED
 
 
 class Stopped(FracsimError):
-    """A signal or the wall-time limit ended the run, with a checkpoint."""
+    """End of a run by a signal or the limit of wall time, with a checkpoint."""
 
     exit_code = Exit.STOPPED
 
@@ -69,12 +70,12 @@ class StepAborted(Exception):
 
 
 class CannotWrite(FracsimError):
-    """Output could not be written in the middle of a run (disk full, folder gone); the message has what, and why."""
+    """Failure to write output during a run, such as a full disk; the message has what, and why."""
 
     exit_code = Exit.CANNOT_WRITE
 
 
 class FalseClaim(FracsimError):
-    """A report of the evidence was written, and a claim in it does not hold."""
+    """Claim in a report of the evidence that does not hold; the report was written."""
 
     exit_code = Exit.FALSE_CLAIM

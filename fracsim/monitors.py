@@ -1,7 +1,7 @@
-"""All that a run watches from step to step: what makes its result doubtful, what ends it early, what it has used.
+"""Monitors of a run: doubtful results, an early end, and resources used.
 
-Each is there only where it can tell anything. They go on with a restart, have their part of summary.json, and say their
-sentences at the end.
+A monitor exists only if the study needs it. Monitors continue after a restart, write a part of summary.json, and print
+notes at the end.
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ if TYPE_CHECKING:
 
 
 class Monitor(Protocol):
-    """Something that is watched in some runs only."""
+    """Monitor that only some runs have."""
 
     def to_checkpoint(self) -> dict[str, Any]:
-        """What a restart goes on from, for `restore` (collective)."""
+        """Return what a checkpoint stores (collective)."""
 
     def from_checkpoint(self, monitors: dict[str, Any]) -> None:
-        """Go on from `monitors`."""
+        """Restore what `to_checkpoint` returned."""
 
     def summary(self) -> dict[str, Any]:
-        """Its part of summary.json (rank 0)."""
+        """Return a part of summary.json (rank 0)."""
 
 
-# What every checkpoint of a deformable body says of the run so far.
+# Names in every checkpoint of a deformable body.
 CHECKPOINT_MONITORS = {
     *("smallest_J", "inverted_cells", "inverted_since", "energy_rise", "energy_scale", "energy_least"),
     *("peak_reactions", "trouble", "wall", "cpu", "memory", "seconds"),
@@ -43,34 +43,38 @@ CHECKPOINT_MONITORS = {
 
 
 class RunMonitors:
-    """What is watched.
+    """All monitors of a run.
 
     Attributes:
-        history: with the peaks of its columns.    meter: what the run has used.
-        inverted: cells crushed or turned inside out.    gained: energy from nowhere.
-        meetings: of obstacles with the body.    overlapping: of obstacles with one another.
-        passing: of pieces through each other.    drop: of the load; each of these four None where there is none.
+        history: rows of history.csv, with the peaks of its columns.
+        meter: time and memory used.
+        inverted: cells that are crushed or inverted.
+        energy_gain: energy that appears without work.
+        contact_monitor: contact of obstacles with the body; None without obstacles.
+        obstacle_overlap: overlap of obstacles with one another; None without several obstacles, one of them free.
+        interpenetration: of fragments; None with self-contact or without a surface.
+        load_drop: ends the run when the load has dropped; None without `time.until`.
     """
 
     def __init__(self, scene: Scene, history: History, meter: ResourceMeter) -> None:
-        """(collective)"""
+        """Make the monitors that the study needs (collective)."""
         study, stress = scene.study, scene.balance.stress
         self._study, self.history, self.meter = study, history, meter
         self.inverted = InvertedCellMonitor(stress, scene.fracture)
         floor = negligible_energy(stress)
         self.energy_gain = EnergyGainMonitor(at_rest=study.starts_at_rest, floor=floor, thickness=study.thickness)
-        self.contact_monitor, self.obstacle_overlap = _of_obstacles(scene)
-        self.interpenetration, self.load_drop = _passing(study), _load_drop(study)
-        those = (self.contact_monitor, self.obstacle_overlap, self.interpenetration, self.load_drop)
-        self._others: list[Monitor] = [each for each in those if each is not None]
+        self.contact_monitor, self.obstacle_overlap = _obstacle_monitors(scene)
+        self.interpenetration, self.load_drop = _interpenetration_monitor(study), _load_drop_monitor(study)
+        optional = (self.contact_monitor, self.obstacle_overlap, self.interpenetration, self.load_drop)
+        self._optional: list[Monitor] = [monitor for monitor in optional if monitor is not None]
 
     @property
     def load_dropped(self) -> bool:
-        """Whether the load has fallen as far as ends the run."""
+        """Whether the load has dropped so far that the run ends."""
         return self.load_drop is not None and self.load_drop.has_dropped
 
     def record_step(self, state: State, report: StepReport, figures: dict[str, float], broken: int) -> None:
-        """Note a step; `figures`: what was probed in it; `broken`: edges so far (collective)."""
+        """Record a step (collective); `figures`: values of the probes; `broken`: number of broken edges."""
         if self.contact_monitor is not None:
             self.contact_monitor.record_step(state, report.dt, figures)
         if self.load_drop is not None:
@@ -78,41 +82,41 @@ class RunMonitors:
         self.energy_gain.record_step(report, state)
 
     def record_frame(self, t: float) -> None:
-        """Note what is looked at in frames alone (collective)."""
+        """Record a frame (collective)."""
         self.inverted.record_frame(t)
         if self.obstacle_overlap is not None:
             self.obstacle_overlap.record_frame(t)
 
     def to_checkpoint(self) -> dict[str, Any]:
-        """For a checkpoint (collective)."""
-        watched: dict[str, Any] = self.inverted.to_checkpoint() | self.energy_gain.to_checkpoint()
-        watched |= {"peak_reactions": self.history.reaction_peaks, "worked": self.history.obstacle_work}
-        for monitor in self._others:
-            watched |= monitor.to_checkpoint()
-        return watched | self.meter.read_totals()
+        """Return what a checkpoint stores (collective)."""
+        result: dict[str, Any] = self.inverted.to_checkpoint() | self.energy_gain.to_checkpoint()
+        result |= {"peak_reactions": self.history.reaction_peaks, "worked": self.history.obstacle_work}
+        for monitor in self._optional:
+            result |= monitor.to_checkpoint()
+        return result | self.meter.read_totals()
 
     def from_checkpoint(self, saved: dict[str, Any]) -> None:
-        """Go on from those of a checkpoint."""
-        watched: list[Any] = [self.inverted, self.energy_gain, self.meter, *self._others]
-        for each in watched:
-            each.from_checkpoint(saved)
+        """Restore what `to_checkpoint` returned."""
+        monitors: list[Any] = [self.inverted, self.energy_gain, self.meter, *self._optional]
+        for monitor in monitors:
+            monitor.from_checkpoint(saved)
         self.history.reaction_peaks |= saved["peak_reactions"]
         self.history.obstacle_work |= saved.get("worked", {})
 
     def summary(self) -> dict[str, Any]:
-        """Their part of summary.json (collective)."""
+        """Return the part of summary.json (collective)."""
         used = self.meter.read_totals()
         return {
             **used["trouble"], "smallest_J": self.inverted.min_jacobian,
             "inverted_cells": self.inverted.inverted_count, "peak_reactions": self.history.reaction_peaks,
             "seconds": {key: round(value, 4) for key, value in used["seconds"].items()},
             "wall": round(used["wall"], 3), "cpu": round(used["cpu"], 4), "peak_memory_MiB": round(used["memory"], 1),
-            **{name: found for each in self._others for name, found in each.summary().items()},
+            **{name: value for monitor in self._optional for name, value in monitor.summary().items()},
             "ranks": self.history.comm.size, "versions": software_versions(self.history.comm),
         }  # fmt: skip
 
     def notes(self, *, done: bool) -> list[str]:
-        """Sentences on what makes the result doubtful; `done`: the run came to its end (collective)."""
+        """Return notes on doubtful results (collective); `done`: the run came to its end."""
         energy, time = self._study.material.energy, self._study.time
         trouble = describe_trouble(self.meter.read_totals()["trouble"])
         notes = [note for note in (trouble, self.inverted.note(energy), self.energy_gain.note(time.scheme)) if note]
@@ -126,14 +130,14 @@ class RunMonitors:
 
 
 def wants_surface(study: Study) -> bool:
-    """Whether the split surface is written: as the study says, or where something breaks or stands in the way."""
+    """Return whether the split surface is written; by default with fracture or obstacles."""
     if study.output.surface is None:
         return study.fracture is not None or bool(study.obstacle)
     return study.output.surface
 
 
-def _of_obstacles(scene: Scene) -> tuple[ObstacleContactMonitor | None, ObstacleOverlapMonitor | None]:
-    """Where there are any; that they lie in one another, where one of several moves freely."""
+def _obstacle_monitors(scene: Scene) -> tuple[ObstacleContactMonitor | None, ObstacleOverlapMonitor | None]:
+    """Return the monitors of obstacles; None for those that the study does not need."""
     obstacles = scene.study.obstacle
     if not obstacles:
         return None, None
@@ -141,15 +145,15 @@ def _of_obstacles(scene: Scene) -> tuple[ObstacleContactMonitor | None, Obstacle
     from .output.contact_checks import ObstacleContactMonitor, ObstacleOverlapMonitor
 
     terms = [term for term in scene.balance.terms if term.name in ("obstacles", "solids")]
-    meetings = ObstacleContactMonitor(cast("list[ObstacleContact]", terms))
-    watched = [term for term in terms if isinstance(term, ObstacleTerm)]
-    if not watched or len(obstacles) == 1 or not any(each.is_free for each in obstacles):
-        return meetings, None
-    return meetings, ObstacleOverlapMonitor(watched[0])
+    contact_monitor = ObstacleContactMonitor(cast("list[ObstacleContact]", terms))
+    obstacle_terms = [term for term in terms if isinstance(term, ObstacleTerm)]
+    if not obstacle_terms or len(obstacles) == 1 or not any(each.is_free for each in obstacles):
+        return contact_monitor, None
+    return contact_monitor, ObstacleOverlapMonitor(obstacle_terms[0])
 
 
-def _passing(study: Study) -> InterpenetrationMonitor | None:
-    """Where nothing keeps pieces apart, and their surface is made anyway."""
+def _interpenetration_monitor(study: Study) -> InterpenetrationMonitor | None:
+    """Return the monitor of interpenetration, if there is a surface and no self-contact."""
     if not wants_surface(study) or (study.contact is not None and study.contact.itself):
         return None
     from .output.result_checks import InterpenetrationMonitor
@@ -157,8 +161,8 @@ def _passing(study: Study) -> InterpenetrationMonitor | None:
     return InterpenetrationMonitor()
 
 
-def _load_drop(study: Study) -> LoadDropMonitor | None:
-    """What ends the run early."""
+def _load_drop_monitor(study: Study) -> LoadDropMonitor | None:
+    """Return the monitor that ends the run after a drop of the load."""
     if (until := study.time.until) is None:
         return None
     from .output.result_checks import LoadDropMonitor

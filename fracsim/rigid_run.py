@@ -1,4 +1,4 @@
-"""A run of rigid bodies: on rank 0, into the same output folder as any other; no fields.xdmf, for nothing deforms."""
+"""Run of rigid bodies, on rank 0. The output folder is that of other runs, without fields.xdmf."""
 
 from __future__ import annotations
 
@@ -46,16 +46,25 @@ if TYPE_CHECKING:
     from .rigid.instances import Instances
 
 ALONE = MPI.COMM_SELF
-CLOCK = ("t", "step", "work", "start")
-_MONITORS = {"blows", "loads", "frames"}
-_SOMETIMES = ("broken", "cut", "starts", "starts_of", "shape_of", "shape_points", "shape_yields")
+# Names in a checkpoint: of numbers, of monitors, and of arrays that only broken or dented bodies have.
+CLOCK_NAMES = ("t", "step", "work", "start")
+MONITOR_NAMES = {"blows", "loads", "frames"}
+OPTIONAL_ARRAYS = ("broken", "cut", "starts", "starts_of", "shape_of", "shape_points", "shape_yields")
 
 
 class RigidRun:
-    """A scene and its output folder; calling it runs to the end.
+    """Scene of rigid bodies and its output folder; a call runs to the end.
 
     Attributes:
-        state: where it has come to.    broken, blows, loads: edges and analyses so far.
+        scene: that is stepped.
+        folder: output folder.
+        text: of study.toml, without its head.
+        state: present state.
+        broken: number of broken edges.
+        blows: number of blows.
+        loads: number of loads.
+        history: rows of history.csv.
+        frames: surface files.
     """
 
     def __init__(
@@ -68,7 +77,20 @@ class RigidRun:
         restart: bool = False,
         progress: ProgressReporter | None = None,
     ) -> None:
-        """`text`: study.toml, without its head; `progress`: one that tells already."""
+        """Open the output folder.
+
+        Args:
+            scene: to be stepped.
+            folder: output folder.
+            text: of study.toml, without its head.
+            interrupt: signals and the limit of wall time.
+            restart: continue from the checkpoint in the folder.
+            progress: reporter that is in use already; None: a new one.
+
+        Raises:
+            InputError: the checkpoint does not fit.
+            CannotWrite: output failed.
+        """
         self._progress = progress or ProgressReporter(first=True, end=scene.study.time.end)
         self.scene, self.folder, self._interrupt, self.text = scene, folder, interrupt, text
         self.state, self._began, self._cpu = scene.initial_state, time.perf_counter(), time.process_time()
@@ -76,9 +98,10 @@ class RigidRun:
         self._start = scene.initial_state.bodies.kinetic_energy
         arrays = self._resume() if restart else None
         step, t = (self.state.step, self.state.t) if arrays is not None else (None, None)
-        self._saved_at = t  # s, of the last checkpoint
-        names = [f"contact_{each.name}_{axis}" for each in scene.obstacles for axis in "xyz"]
-        names += [f"work_{each.name}" for each in scene.obstacles] + scene.stepper.obstacles.columns()
+        # time of the last checkpoint, s
+        self._saved_at = t
+        names = [f"contact_{obstacle.name}_{axis}" for obstacle in scene.obstacles for axis in "xyz"]
+        names += [f"work_{obstacle.name}" for obstacle in scene.obstacles] + scene.stepper.obstacles.columns()
         if step is not None:
             read_earlier_rows(folder / "history.csv", history_columns(names), step)
             check_text_files(folder)
@@ -86,9 +109,9 @@ class RigidRun:
         make_output_folder(folder, text, restart=restart)
         self.history = History(ALONE, folder / "history.csv", names, step)
         density = float(scene.study.material.density)
-        where = folder / "surface.pvd"
-        self.frames = self._writing(
-            where, lambda: RigidFrames(folder, scene.instance_mesh, scene.poses, density, scene.obstacles, t)
+        self.frames = self._write(
+            folder / "surface.pvd",
+            lambda: RigidFrames(folder, scene.instance_mesh, scene.poses, density, scene.obstacles, t),
         )
         if arrays is not None:
             self.frames.resume(arrays["broken_at"])
@@ -97,19 +120,21 @@ class RigidRun:
                 zip(self.history.obstacle_work, map(float, arrays["worked"]), strict=True)
             )
             print_notes(
-                ALONE, [*self.history.notes, *missing_frame_notes(folder, self._had, self.frames.files.frame_counts)]
+                ALONE,
+                [*self.history.notes, *missing_frame_notes(folder, self._frame_counts, self.frames.files.frame_counts)],
             )
         self._clock = FrameSchedule(scene.study.output.every, scene.study.frame_interval)
         self._clock.record_frame(self.state.t)
         write_on_root(ALONE, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
 
-    def _writing[T](self, path: Path, work: Callable[[], T]) -> T:
+    def _write[T](self, path: Path, work: Callable[[], T]) -> T:
+        """Return the result of work that writes a file. Raises CannotWrite."""
         result = write_on_root(ALONE, path, work)
         assert result is not None
         return result
 
     def _resume(self) -> dict[str, npt.NDArray[Any]]:
-        """Be where the checkpoint is."""
+        """Restore the state of the checkpoint; return its arrays. Raises InputError."""
         stored, stepper = read_checkpoint_file(self.folder), self.scene.stepper
         check_mesh(stored, self.scene.mesh)
         arrays, clock, earlier = stored.arrays, stored.clock, stored.notes.monitors
@@ -120,13 +145,16 @@ class RigidRun:
             stepper.instances.damage()[1]
         ):
             raise restart_error(stored.path, "its bodies are not those that its broken edges leave")
-        self.blows, self.loads, self._had = earlier["blows"], earlier["loads"], earlier["frames"]
+        self.blows, self.loads, self._frame_counts = earlier["blows"], earlier["loads"], earlier["frames"]
         return arrays
 
     # --- a step, a frame, a checkpoint ---
 
     def step(self) -> RigidReport:
-        """Take a step and write its row. Raises NotConverged, CannotWrite, and Abandoned where the run is to stop."""
+        """Take a step and write its row of history.csv.
+
+        Raises NotConverged, CannotWrite, and StepAborted if the run is to stop.
+        """
         stepper = self.scene.stepper
         self._interrupt.begin_step()
         self.state, report = stepper.advance(self.state)
@@ -147,15 +175,16 @@ class RigidRun:
         return report
 
     def write_frame(self) -> None:
-        """The bodies as they are now. Raises CannotWrite."""
-        state, copies = self.state, self.scene.stepper.instances
-        damage, dented = copies.damage(), {number: each.points for number, each in copies.dented_shapes.items()}
+        """Write a frame of the present state. Raises CannotWrite."""
+        state, instances = self.state, self.scene.stepper.instances
+        damage, shapes = instances.damage(), instances.dented_shapes
+        dented = {number: shape.points for number, shape in shapes.items()}
         path, placed = self.folder / "surface.pvd", self.scene.stepper.obstacles.placed_shapes(state.t, state.bodies)
         write_on_root(ALONE, path, lambda: self.frames.write_frame(state.t, state.bodies, *damage, dented, placed))
         self._clock.record_frame(state.t)
 
     def checkpoint(self) -> Path:
-        """Write one of now: all states that a step ends with are finite; returns its path. Raises CannotWrite."""
+        """Write a checkpoint of the present state, which is finite, and return its path. Raises CannotWrite."""
         state, path = self.state, checkpoint_path(self.folder)
         arrays = self.scene.stepper.to_checkpoint(state) | {"broken_at": self.frames.broken_at}
         arrays["worked"] = np.array([*self.history.obstacle_work.values()])
@@ -169,7 +198,7 @@ class RigidRun:
     # --- to the end ---
 
     def __call__(self) -> dict[str, Any]:
-        """Run to the end; returns what summary.json says. Raises NotConverged, Stopped, CannotWrite."""
+        """Run to the end and return the contents of summary.json. Raises NotConverged, Stopped, CannotWrite."""
         try:
             with self._progress:
                 return self._run()
@@ -179,7 +208,7 @@ class RigidRun:
             self.history.close()
 
     def _run(self) -> dict[str, Any]:
-        """The loop, and a checkpoint where it does not end well."""
+        """Take all steps; write a checkpoint if the run does not come to its end."""
         try:
             self._progress.set_stage("the first step")
             if self.state.step == 0:
@@ -196,24 +225,29 @@ class RigidRun:
         return self._finish("done")
 
     def _saved(self, *, failed: bool) -> str:
-        """Write a checkpoint on the way out, and say where; none where a step `failed`: a blow in it would be lost."""
+        """Write a last checkpoint and return a sentence that names it.
+
+        After a step that `failed` none is written, since a blow in the step would be lost.
+        """
         if not failed:
             return f"Checkpoint: {self.checkpoint()}; go on with --restart"
         last = describe_last_checkpoint(self.folder, self._saved_at)
         return f"No checkpoint was written: a blow in the step that failed would be lost. {last}"
 
     def _rescued(self) -> str:
-        """Where to go on from after output failed: a checkpoint of now where there is room for it, or the last one."""
+        """Return a sentence on how to continue after output failed: from a new checkpoint or the last one."""
         with contextlib.suppress(CannotWrite):
             self._finish("could not write")
         try:
-            if self.history.last_step == self.state.step:  # a step without its row would leave a gap
+            # a step without its row would leave a gap
+            if self.history.last_step == self.state.step:
                 return self._saved(failed=False)
         except CannotWrite:
             pass
         return describe_last_checkpoint(self.folder, self._saved_at)
 
     def _loop(self) -> None:
+        """Take steps to the end of the study, with frames and checkpoints. Raises Stopped."""
         last, every = time.monotonic(), self.scene.study.output.checkpoint
         while not self.scene.ended(self.state):
             try:
@@ -223,83 +257,91 @@ class RigidRun:
             done = self.scene.ended(self.state)
             if done or self._clock.is_due(self.state.t, self.state.step):
                 self.write_frame()
-            self._tell(report)
+            self._report_progress(report)
             if every is not None and time.monotonic() - last > every:
                 self.checkpoint()
                 last = time.monotonic()
             if not done and self._interrupt.stop_reason():
                 raise self._stopped()
 
-    def _tell(self, report: RigidReport) -> None:
+    def _report_progress(self, report: RigidReport) -> None:
+        """Print the progress of the run."""
         state, pieces, dt = self.state, self.scene.stepper.fragment_count, self.scene.study.time.max_step
         more = f"analyses {report.blows + report.loads}  {report.seconds:.2g} s/step"
         self._progress.update(ProgressState(state.t, dt, state.step, self.broken, pieces, more))
 
     def _stopped(self, more: str = "") -> Stopped:
-        """What ends the run now."""
+        """Return the error that ends the run at the present state."""
         reason, state = self._interrupt.stop_reason(), self.state
         return Stopped(f"stopped by {reason} at t = {state.t:g} s after {state.step} steps{more}")
 
     def _finish(self, outcome: str) -> dict[str, Any]:
+        """Write summary.json and return its contents."""
         state, scene = self.state, self.scene
         kinetic = state.bodies.kinetic_energy
         summary = {
             "title": scene.study.title, "outcome": outcome, "time": state.t, "steps": state.step,
             "nodes": len(scene.mesh.points), "cells": len(scene.mesh.cells), "broken_edges": self.broken,
             "split_cells": scene.stepper.instances.split_cell_count, "pieces": scene.stepper.fragment_count,
-            **self._dust(),
+            **self._count_single_nodes(),
             "external_work": state.work, "dissipated": self._start + state.work - kinetic,
             "blows": self.blows, "loads": self.loads, "analyses": scene.stepper.instances.analyses,
-            "seconds": {name: round(each, 4) for name, each in scene.stepper.phases.seconds.items()},
+            "seconds": {name: round(value, 4) for name, value in scene.stepper.phases.seconds.items()},
             "wall": round(time.perf_counter() - self._began, 3), "cpu": round(time.process_time() - self._cpu, 4),
             "ranks": MPI.COMM_WORLD.size, "versions": software_versions(MPI.COMM_WORLD),
         }  # fmt: skip
         write_summary(ALONE, self.folder, summary)
         return summary
 
-    def _dust(self) -> dict[str, float]:
-        """How many pieces are single nodes, and their mass, kg."""
+    def _count_single_nodes(self) -> dict[str, float]:
+        """Return the number of single-node fragments and their mass, kg."""
         nodes = np.bincount(self.scene.stepper.shapes.node_fragment, minlength=self.scene.stepper.fragment_count)
         single = np.flatnonzero(nodes == 1)
         return {"dust": len(single), "dust_mass": float(self.state.bodies.mass[single].sum())}
 
 
 def print_mesh_notes(scene: RigidScene) -> None:
-    """Tell what was mended of the mesh while it was read."""
+    """Print the notes on the mesh, such as what was repaired while it was read."""
     print_notes(ALONE, list(scene.mesh.notes))
 
 
 def _check_stored(
-    stored: StoredCheckpoint, fresh: dict[str, npt.NDArray[Any]], obstacles: int, copies: Instances
+    stored: StoredCheckpoint, initial: dict[str, npt.NDArray[Any]], obstacles: int, instances: Instances
 ) -> None:
-    """InputError where a checkpoint lacks something that a run goes on from, or has it in another shape, or not finite.
+    """Raise InputError if a checkpoint lacks a value, or has one of another shape or that is not finite.
 
-    `fresh`: what the run would write at its start; `obstacles`: how many there are.
+    Args:
+        stored: the checkpoint.
+        initial: arrays that the run would store at its start.
+        obstacles: number of obstacles.
+        instances: of the mesh.
     """
     arrays, path = stored.arrays, stored.path
-    wanted = fresh | {"broken_at": np.empty(0), "worked": np.zeros(obstacles)}
-    check_names(arrays, set(wanted), {*wanted, *_SOMETIMES}, path)
-    check_names(stored.clock, set(CLOCK), set(CLOCK), path)
-    check_names(stored.notes.monitors, _MONITORS, _MONITORS, path)
+    expected = initial | {"broken_at": np.empty(0), "worked": np.zeros(obstacles)}
+    check_names(arrays, set(expected), {*expected, *OPTIONAL_ARRAYS}, path)
+    check_names(stored.clock, set(CLOCK_NAMES), set(CLOCK_NAMES), path)
+    check_names(stored.notes.monitors, MONITOR_NAMES, MONITOR_NAMES, path)
     bodies = len(arrays["body.mass"])
     for name, values in arrays.items():
         first = {"worked": (obstacles,)} | ({name: (bodies,)} if name.startswith("body.") else {})
         if values.ndim == 0:
             raise restart_error(path, f"{name} is one number")
-        right = (*first.get(name, values.shape[:1]), *wanted.get(name, values).shape[1:])
+        right = (*first.get(name, values.shape[:1]), *expected.get(name, values).shape[1:])
         if values.shape != right:
             raise restart_error(path, f"{name} has the shape {values.shape}, of this study it is {right}")
-        if name in ("overlap.depth", "broken_at"):  # without end; never
+        # infinite: an overlap that was not measured; an edge that is not broken
+        if name in ("overlap.depth", "broken_at"):
             values = np.where(values == np.inf, 0.0, values)
-        elif name == "cut":  # in the middle
+        # no number: cut in the middle
+        elif name == "cut":
             values = np.nan_to_num(values)
         if not float(np.max(np.abs(values), initial=0.0)) < CHECKPOINT_LIMITS.magnitude:
             raise restart_error(path, f"{name} is not finite")
     for group in (("broken", "cut"), ("starts", "starts_of"), ("shape_of", "shape_points", "shape_yields")):
         if len({len(arrays.get(name, ())) for name in group}) > 1:
             raise restart_error(path, f"{' and '.join(group)} do not belong together")
-    most = {"broken": len(copies) * copies.node_count, "starts_of": len(copies), "shape_of": len(copies)}
-    for name, count in most.items():
+    limits = {"broken": len(instances) * instances.node_count, "starts_of": len(instances), "shape_of": len(instances)}
+    for name, count in limits.items():
         numbers = arrays.get(name, np.empty(0, np.int64))
         if numbers.dtype.kind != "i" or np.any((numbers < 0) | (numbers >= count)):
             raise restart_error(path, f"{name} is not all from 0 to {count - 1}")

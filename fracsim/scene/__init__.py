@@ -39,9 +39,8 @@ from ..timestepping.initial_conditions import initial_velocity  # noqa: E402
 from ..timestepping.protocols import FractureProtocol, NoFracture, PlasticFlowProtocol  # noqa: E402
 from ..timestepping.state import State  # noqa: E402
 from ..timestepping.stepper import Stepper, StepSizes  # noqa: E402
-from .inelastic_updates import build_breaking, build_flow  # noqa: E402
-from .material_model import build_material  # noqa: E402
-from .terms import TERMS, TermInputs, build_balance  # noqa: E402
+from .inelastic_updates import build_flow, build_fracture_pass  # noqa: E402
+from .terms import TERMS, TermInputs, build_balance, build_material  # noqa: E402
 
 if TYPE_CHECKING:
     from ..fracture.fracture_pass import FracturePass as EdgeBreaking
@@ -136,7 +135,7 @@ def build_scene_on(
         check_supports(domain, balance.motion)
     stage("setting up what breaks and what solves")
     flow = build_flow(study, balance)
-    breaking = build_breaking(study, balance)
+    breaking = build_fracture_pass(study, balance)
     solver = NonlinearSolver(balance, study.solver) if scheme.implicit else None
     breaks, frames = breaking or NoFracture(balance, flow), study.frame_interval
     stepper = make_stepper(balance, study.time, flow, breaks, solver, frames)

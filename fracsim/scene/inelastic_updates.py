@@ -1,4 +1,4 @@
-"""What happens to the body of a study at the end of a step: it flows, then it breaks. Nothing is imported in vain."""
+"""Plastic flow and fracture of a study, which follow a step. Modules are imported only if the study needs them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..study import BrittleSettings, Study
 from ..study.conditions import fibre_direction, initial_cracks
 from ..study.length_checks import check_branching_dimension
 from ..timestepping.protocols import NoPlasticFlow, PlasticFlowProtocol
-from .material_model import per_cell
+from .terms import per_cell
 
 Values = npt.NDArray[np.float64]
 
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def build_flow(study: Study, balance: Balance) -> PlasticFlowProtocol:
-    """What flows."""
+    """Return the plastic flow of a study."""
     if study.plasticity is None:
         return NoPlasticFlow()
     from ..mechanics.return_mapping import ReturnMapping
@@ -38,8 +38,8 @@ def build_flow(study: Study, balance: Balance) -> PlasticFlowProtocol:
     return ReturnMapping(balance.stress)
 
 
-def build_breaking(study: Study, balance: Balance) -> FracturePass | None:
-    """What breaks; None without [fracture]."""
+def build_fracture_pass(study: Study, balance: Balance) -> FracturePass | None:
+    """Return the fracture pass of a study (collective); None without [fracture]."""
     if study.fracture is None:
         return None
     from ..fracture.fracture_pass import FracturePass
@@ -49,27 +49,27 @@ def build_breaking(study: Study, balance: Balance) -> FracturePass | None:
     passes = study.fracture.passes
     if passes is None and balance.scheme.inertia:
         passes = 1
-    opened = _opened(study, balance, graph)
+    cuts = _open_initial_cracks(study, balance, graph)
     if study.fracture.energy is not None:
-        breaking = _tearing(study, balance, graph, passes, opened)
+        fracture = _build_energy_pass(study, balance, graph, passes, cuts)
     else:
-        criterion = _criterion(study, balance.stress, graph)
-        joining = _joining(study, balance, graph, criterion.strength)
-        breaking = FracturePass(
-            balance.stress, graph, criterion, max_passes=passes, initial_cuts=opened, node_attachment=joining
+        criterion = _build_criterion(study, balance.stress, graph)
+        attachment = _build_node_attachment(study, balance, graph, criterion.strength)
+        fracture = FracturePass(
+            balance.stress, graph, criterion, max_passes=passes, initial_cuts=cuts, node_attachment=attachment
         )
-    if (cut := breaking.criterion.cut_positions) is not None:  # of a surface, or of a crack
+    if (cut := fracture.criterion.cut_positions) is not None:
         balance.contact.set_cuts(lambda: graph.gather_broken(cut[:, None]))
-    if opened is not None:
+    if cuts is not None:
         balance.edges_broke(graph.pattern)
         balance.damage_changed()
-    return breaking
+    return fracture
 
 
-def _tearing(
-    study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, opened: Values | None
+def _build_energy_pass(
+    study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, initial_cuts: Values | None
 ) -> FracturePass:
-    """What breaks where cracks take an energy."""
+    """Return the fracture pass for cracks with a fracture energy (collective)."""
     from ..fracture.degradation import CrackClosureDegradation, Degradation, SplitCellDegradation
     from ..fracture.energy.front_advance import FrontTipCriterion
     from ..fracture.energy.tip_criterion import TipCriterion
@@ -78,49 +78,58 @@ def _tearing(
     assert study.fracture is not None and study.fracture.energy is not None
     check_branching_dimension(study, balance.domain.dim)
     if study.fracture.law == "cohesive":
-        return _cohesive(study, balance, graph, passes, opened)
+        return _build_cohesive_pass(study, balance, graph, passes, initial_cuts)
     stress, strength = balance.stress, build_strength(study, balance.domain, graph)
     toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
-    given, moves = study.fracture.passes is not None, balance.scheme.inertia
-    rows = balance.domain.dim == 3 and not moves
-    criterion_type: type[TipCriterion] = FrontTipCriterion if rows else TipCriterion
+    inertia = balance.scheme.inertia
+    # quasi-static cracks in 3D advance along the whole front
+    has_front = balance.domain.dim == 3 and not inertia
+    criterion_type: type[TipCriterion] = FrontTipCriterion if has_front else TipCriterion
     if study.fracture.branching:
         from ..fracture.energy.crack_speed import RateDependentTipCriterion
 
         criterion_type = RateDependentTipCriterion
-    tips = criterion_type(stress, graph, strength, toughness, opened)
-    pace = tips.passes_per_second() if moves and not given else None
-    splitting: Degradation = SplitCellDegradation(stress, graph, tips.release_rate() if moves else None)
+    tips = criterion_type(stress, graph, strength, toughness, initial_cuts)
+    limits_passes = inertia and study.fracture.passes is None
+    passes_per_second = tips.passes_per_second() if limits_passes else None
+    degradation: Degradation = SplitCellDegradation(stress, graph, tips.release_rate() if inertia else None)
     if stress.cracks_close:
-        splitting = CrackClosureDegradation(splitting, stress, graph)
+        degradation = CrackClosureDegradation(degradation, stress, graph)
     criterion: TipCriterion | AttachedTipCriterion = tips
-    if (joining := _joining(study, balance, graph, strength)) is not None:
+    if (attachment := _build_node_attachment(study, balance, graph, strength)) is not None:
         from ..fracture.energy.tip_criterion import AttachedTipCriterion
 
-        criterion = AttachedTipCriterion(tips, graph, joining)
+        criterion = AttachedTipCriterion(tips, graph, attachment)
     return FracturePass(
-        stress, graph, criterion, max_passes=passes, initial_cuts=opened, degradation=splitting, passes_per_second=pace
+        stress,
+        graph,
+        criterion,
+        max_passes=passes,
+        initial_cuts=initial_cuts,
+        degradation=degradation,
+        passes_per_second=passes_per_second,
     )
 
 
-def _cohesive(
-    study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, opened: Values | None
+def _build_cohesive_pass(
+    study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, initial_cuts: Values | None
 ) -> FracturePass:
-    """What breaks where cracks hold on while they open."""
+    """Return the fracture pass for cohesive cracks (collective)."""
     from ..fracture.cohesive_cracks import CohesiveFracturePass, CohesiveSoftening, CohesiveTipCriterion
     from ..mesh.edge_graph import EdgeGraph
 
     assert study.fracture is not None
-    stress, cuts = balance.stress, EdgeGraph(balance.domain)
-    strength = build_strength(study, balance.domain, cuts)
+    # edges that cracks cut, beside those of `graph`, which have separated entirely
+    stress, cut_graph = balance.stress, EdgeGraph(balance.domain)
+    strength = build_strength(study, balance.domain, cut_graph)
     toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
-    tips = CohesiveTipCriterion(stress, cuts, strength, toughness, opened)
-    softening = CohesiveSoftening(stress, cuts, strength, toughness, tips.cut_positions)
-    return CohesiveFracturePass(stress, graph, cuts, tips, softening, max_passes=passes, initial_cuts=opened)
+    tips = CohesiveTipCriterion(stress, cut_graph, strength, toughness, initial_cuts)
+    softening = CohesiveSoftening(stress, cut_graph, strength, toughness, tips.cut_positions)
+    return CohesiveFracturePass(stress, graph, cut_graph, tips, softening, max_passes=passes, initial_cuts=initial_cuts)
 
 
-def _opened(study: Study, balance: Balance, graph: EdgeGraph) -> Values | None:
-    """[[crack]]: break its edges; where they are cut, None without any."""
+def _open_initial_cracks(study: Study, balance: Balance, graph: EdgeGraph) -> Values | None:
+    """Break the edges of [[crack]]; return where they are cut (collective), None without initial cracks."""
     if not study.crack:
         return None
     from ..fracture.initial_cracks import open_initial_cracks
@@ -130,8 +139,10 @@ def _opened(study: Study, balance: Balance, graph: EdgeGraph) -> Values | None:
     )
 
 
-def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> OverloadedEdges | CellRetention | BrittleSurfaces:
-    """Which edges fail."""
+def _build_criterion(
+    study: Study, stress: Stress, graph: EdgeGraph
+) -> OverloadedEdges | CellRetention | BrittleSurfaces:
+    """Return the criterion that selects edges (collective)."""
     from ..fracture.criterion import OverloadedEdges
 
     assert study.fracture is not None
@@ -145,11 +156,13 @@ def _criterion(study: Study, stress: Stress, graph: EdgeGraph) -> OverloadedEdge
         return CellRetention(failing, stress, graph)
     from ..fracture.brittle.surface_criterion import BrittleSurfaces
 
-    return BrittleSurfaces(stress, graph, strength, average, build_surface_rules(study.brittle))
+    return BrittleSurfaces(stress, graph, strength, average, build_surface_parameters(study.brittle))
 
 
-def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: EdgeStrength) -> NodeAttachment | None:
-    """What nodes without a whole cell stay joined by."""
+def _build_node_attachment(
+    study: Study, balance: Balance, graph: EdgeGraph, strength: EdgeStrength
+) -> NodeAttachment | None:
+    """Return what keeps nodes without an unsplit cell attached (collective); None if they are released."""
     table = study.fracture
     assert table is not None
     if not table.retains_nodes(study.material.energy):
@@ -162,7 +175,7 @@ def _joining(study: Study, balance: Balance, graph: EdgeGraph, strength: EdgeStr
 
 
 def build_average(study: Study, domain: Domain) -> CellAverage | None:
-    """The average that a study takes of its stress; None: it takes the stress as it is."""
+    """Return the average of the stress (collective); None for the local stress."""
     table = study.fracture
     if table is None:
         return None
@@ -177,24 +190,30 @@ def build_average(study: Study, domain: Domain) -> CellAverage | None:
     return NonlocalAverage(domain, table.radius, table.kernel)
 
 
-def build_strength(study: Study, domain: Domain, graph: EdgeGraph, copy: int = 0) -> EdgeStrength:
-    """Strength of edges by region, with scatter, another one in each `copy` of a mesh, and a fibre."""
+def build_strength(study: Study, domain: Domain, graph: EdgeGraph, instance: int = 0) -> EdgeStrength:
+    """Return the strength of edges, with regions, scatter and fibres (collective).
+
+    `instance`: number of an instance of the mesh, which has a scatter of its own.
+    """
     from ..fracture.strength import EdgeStrength, FibreAnisotropy, WeibullScatter
 
     table = study.fracture
     assert table is not None
-    scatter = None if (given := table.heterogeneity) is None else WeibullScatter(given.modulus, given.seed + copy)
+    scatter = None
+    if (weibull := table.heterogeneity) is not None:
+        scatter = WeibullScatter(weibull.modulus, weibull.seed + instance)
     direction = fibre_direction(study, domain.dim)
     fibre = FibreAnisotropy(direction, table.fibre.ratio) if direction is not None and table.fibre is not None else None
     of_cell = per_cell(study, domain, table, "strength")
     return EdgeStrength(graph, of_cell, tie_break=table.tie_break, scatter=scatter, fibre=fibre)
 
 
-def build_surface_rules(table: BrittleSettings, copy: int = 0) -> SurfaceParameters:
-    """[brittle] as numbers; seeds differ from `copy` to copy of a mesh."""
+def build_surface_parameters(table: BrittleSettings, instance: int = 0) -> SurfaceParameters:
+    """Return the parameters of [brittle]; `instance`: number of an instance of the mesh, which has seeds of its own."""
     from ..fracture.brittle.grains import GrainParameters, SurfaceParameters
 
-    given = table.grains
-    grains = None if given is None else GrainParameters(given.count, given.seed + copy, given.spread, given.mode)
+    grains = None
+    if (entry := table.grains) is not None:
+        grains = GrainParameters(entry.count, entry.seed + instance, entry.spread, entry.mode)
     curved = table.shape == "curved"
-    return SurfaceParameters(table.surfaces, table.spacing, curved, table.seed + copy, table.per_pass, grains)
+    return SurfaceParameters(table.surfaces, table.spacing, curved, table.seed + instance, table.per_pass, grains)

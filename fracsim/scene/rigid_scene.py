@@ -32,8 +32,8 @@ from ..study.check import build_checked_mesh
 from ..study.conditions import volume_loads
 from ..study.overlap_checks import body_placements
 from .contact_terms import build_rigid_obstacles
-from .inelastic_updates import build_average, build_strength, build_surface_rules
-from .material_model import build_material, per_cell
+from .inelastic_updates import build_average, build_strength, build_surface_parameters
+from .terms import build_material, per_cell
 
 try:
     from ..rigid.mujoco_model import ContactParameters
@@ -200,7 +200,7 @@ def _build_breakable(
     if study.brittle is not None:
         from ..fracture.brittle.surface_criterion import BrittleSurfaces
 
-        strength, rules = build_strength(study, domain, graph, number), build_surface_rules(study.brittle, number)
+        strength, rules = build_strength(study, domain, graph, number), build_surface_parameters(study.brittle, number)
         criterion = BrittleSurfaces(stiffness.stress, graph, strength, fragment_average, rules)
     return BreakableBody(stiffness, graph, criterion, fragment_average, study.solver, check_abort=check_abort)
 

@@ -1,9 +1,10 @@
-"""The balance of forces that a study asks for: which terms, and what they are made from."""
+"""Material, terms of the balance of forces, and the balance of a study."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from dolfinx import fem
@@ -14,24 +15,75 @@ from ..forms.schemes import Scheme
 from ..mechanics.balance import Balance
 from ..mechanics.inertia import ConsistentMass, Inertia, LumpedMass, MassMatrix
 from ..mechanics.loads import DeadLoads, OnFacets, Pressure, surface_area
-from ..mechanics.material_fields import MaterialFields, coefficient
+from ..mechanics.material_fields import MaterialFields, PerCell, coefficient, material_fields, parameter_by_region
 from ..mechanics.matrix_assembly import VectorAssembler
 from ..mechanics.prescribed_motion import PrescribedMotion
 from ..mechanics.stress import RESIDUAL_STIFFNESS, DegradationModel, Stress
 from ..mechanics.term import Term
 from ..mechanics.time_functions import TimeFunction
 from ..mesh.domain import Domain
+from ..mesh.selectors import check_regions
 from ..study import Study
 from ..study.conditions import BoundaryCondition, boundary_conditions, volume_loads
+
+# --- material ---
+
+
+def build_material(study: Study, domain: Domain) -> MaterialFields:
+    """Return the material of a study (collective). Raises InputError if the mesh lacks a region of it."""
+    table = study.material
+    check_regions(table.regions, domain.region_names)
+    young, poisson, density = (per_cell(study, domain, table, key) for key in ("young", "poisson", "density"))
+    plane_stress = table.plane == "stress"
+    material = material_fields(
+        domain, table.energy, young=young, poisson=poisson, density=density, plane_stress=plane_stress
+    )
+    return material if study.plasticity is None else _add_yield_law(study, domain, material)
+
+
+def _add_yield_law(study: Study, domain: Domain, material: MaterialFields) -> MaterialFields:
+    from ..mechanics.plasticity import YieldLaw, plastic_material
+
+    table = study.plasticity
+    assert table is not None
+    law = YieldLaw(
+        per_cell(study, domain, table, "yield_stress"),
+        frobenius=table.measure == "frobenius",
+        flow_rate=table.flow_rate,
+        hardening=table.hardening,
+        update=table.update,
+    )
+    return plastic_material(domain, law, material, implicit=study.time.scheme_class.implicit)
+
+
+def per_cell(study: Study, domain: Domain, table: Any, key: str, region_key: str | None = None) -> PerCell:
+    """Return a key of a table as one number, or as (cells,) if regions of the material have other values.
+
+    `region_key`: the key of the regions, if it is another one.
+    """
+    region_key, regions = region_key or key, study.material.regions.items()
+    values = {name: getattr(region, region_key) for name, region in regions}
+    by_name = {name: value for name, value in values.items() if value is not None}
+    return parameter_by_region(domain, float(getattr(table, key)), by_name)
+
+
+# --- terms ---
 
 
 @dataclass(frozen=True)
 class TermInputs:
-    """What terms of the balance are made from.
+    """Objects from which terms of the balance are made.
 
     Attributes:
-        u: the displacement.    density: kg/m^3, a UFL coefficient.    stress, mass, motion: see mechanics.balance.
-        conditions: the entries of [[boundary]].
+        study: that is built.
+        scheme: of time integration.
+        assembler: of vectors on the mesh.
+        u: displacement, m.
+        density: kg/m^3, as a UFL coefficient.
+        stress: term of the elastic forces.
+        mass: mass matrix.
+        motion: prescribed displacement.
+        conditions: entries of [[boundary]].
     """
 
     study: Study
@@ -46,100 +98,109 @@ class TermInputs:
 
     @property
     def domain(self) -> Domain:
+        """Distributed mesh."""
         return self.assembler.domain
 
     def on_facets(self, kind: str) -> list[OnFacets]:
-        """Facets and function of time of each condition of a kind."""
-        of_kind = [each for each in self.conditions if each.kind == kind]
-        return [(self.domain.select_facets(each.selector, f"{each.key}.on"), each.function) for each in of_kind]
+        """Return facets and function of time of every boundary condition of a kind (collective)."""
+        conditions = [condition for condition in self.conditions if condition.kind == kind]
+        facets = [self.domain.select_facets(condition.selector, f"{condition.key}.on") for condition in conditions]
+        return [(numbers, condition.function) for numbers, condition in zip(facets, conditions, strict=True)]
 
 
-def _viscosity(parts: TermInputs) -> Term | None:
-    damping = parts.study.damping
+def _viscosity(inputs: TermInputs) -> Term | None:
+    damping = inputs.study.damping
     if damping is None or not damping.stiffness:
         return None
     from ..mechanics.damping import Viscosity
 
-    return Viscosity(parts.assembler, parts.u, parts.stress, damping.stiffness)
+    return Viscosity(inputs.assembler, inputs.u, inputs.stress, damping.stiffness)
 
 
-def _pressure(parts: TermInputs) -> Term | None:
-    pressures = parts.on_facets("pressure")
-    linear = parts.stress.material.energy.linear
-    return Pressure(parts.assembler, parts.u, pressures, linear=linear) if pressures else None
+def _pressure(inputs: TermInputs) -> Term | None:
+    pressures = inputs.on_facets("pressure")
+    linear = inputs.stress.material.energy.linear
+    return Pressure(inputs.assembler, inputs.u, pressures, linear=linear) if pressures else None
 
 
-def _dead_loads(parts: TermInputs) -> Term | None:
-    tractions, on_volume = [*parts.on_facets("traction"), *_spread(parts)], volume_loads(parts.study, parts.domain.dim)
+def _dead_loads(inputs: TermInputs) -> Term | None:
+    tractions, on_volume = (
+        [*inputs.on_facets("traction"), *_force_tractions(inputs)],
+        volume_loads(inputs.study, inputs.domain.dim),
+    )
     if not tractions and not on_volume:
         return None
-    gravity = (parts.density, on_volume["gravity"]) if "gravity" in on_volume else None
+    gravity = (inputs.density, on_volume["gravity"]) if "gravity" in on_volume else None
     body_force = on_volume.get("body_force")
-    return DeadLoads(parts.assembler, parts.u, tractions=tractions, gravity=gravity, body_force=body_force)
+    return DeadLoads(inputs.assembler, inputs.u, tractions=tractions, gravity=gravity, body_force=body_force)
 
 
-def _spread(parts: TermInputs) -> list[OnFacets]:
-    """Forces as tractions on the area of their facets (collective)."""
-    return [(facets, _shared(force, surface_area(parts.domain, facets))) for facets, force in parts.on_facets("force")]
+def _force_tractions(inputs: TermInputs) -> list[OnFacets]:
+    """Return forces as tractions on the area of their facets (collective)."""
+    return [
+        (facets, _divide(force, surface_area(inputs.domain, facets))) for facets, force in inputs.on_facets("force")
+    ]
 
 
-def _shared(force: TimeFunction, area: float) -> TimeFunction:
+def _divide(force: TimeFunction, area: float) -> TimeFunction:
     return lambda t: np.asarray(force(t) / area)
 
 
-def _obstacles(parts: TermInputs) -> Term | None:
-    if all(each.shape == "mesh" for each in parts.study.obstacle):
+def _obstacles(inputs: TermInputs) -> Term | None:
+    if all(obstacle.shape == "mesh" for obstacle in inputs.study.obstacle):
         return None
     from .contact_terms import build_explicit_obstacle_term, build_obstacle_term
 
-    if not parts.scheme.implicit:
-        return build_explicit_obstacle_term(parts.study, parts.domain, parts.u, parts.stress, parts.mass.lumped)
-    return build_obstacle_term(parts.study, parts.domain, parts.u, parts.stress.material, parts.scheme)
+    if not inputs.scheme.implicit:
+        return build_explicit_obstacle_term(inputs.study, inputs.domain, inputs.u, inputs.stress, inputs.mass.lumped)
+    return build_obstacle_term(inputs.study, inputs.domain, inputs.u, inputs.stress.material, inputs.scheme)
 
 
-def _solids(parts: TermInputs) -> Term | None:
-    if not any(each.shape == "mesh" for each in parts.study.obstacle):
+def _solids(inputs: TermInputs) -> Term | None:
+    if not any(obstacle.shape == "mesh" for obstacle in inputs.study.obstacle):
         return None
     from .contact_terms import build_mesh_obstacle_term
 
-    return build_mesh_obstacle_term(parts.study, parts.domain, parts.u, parts.stress.material, parts.scheme)
+    return build_mesh_obstacle_term(inputs.study, inputs.domain, inputs.u, inputs.stress.material, inputs.scheme)
 
 
-def _contact(parts: TermInputs) -> Term | None:
-    if parts.study.contact is None or not parts.study.contact.itself:
+def _contact(inputs: TermInputs) -> Term | None:
+    if inputs.study.contact is None or not inputs.study.contact.itself:
         return None
     from .contact_terms import build_explicit_self_contact_term, build_self_contact_term
 
-    if not parts.scheme.implicit:
-        return build_explicit_self_contact_term(parts.study, parts.domain, parts.u, parts.stress, parts.mass.lumped)
-    return build_self_contact_term(parts.study, parts.domain, parts.u, parts.stress.material)
+    if not inputs.scheme.implicit:
+        return build_explicit_self_contact_term(
+            inputs.study, inputs.domain, inputs.u, inputs.stress, inputs.mass.lumped
+        )
+    return build_self_contact_term(inputs.study, inputs.domain, inputs.u, inputs.stress.material)
 
 
-def _tethers(parts: TermInputs) -> Term | None:
-    fracture = parts.study.fracture
-    if fracture is None or fracture.crumbs or fracture.approach != "chi" or parts.domain.order > 1:
+def _tethers(inputs: TermInputs) -> Term | None:
+    fracture = inputs.study.fracture
+    if fracture is None or fracture.crumbs or fracture.approach != "chi" or inputs.domain.order > 1:
         return None
     from ..mechanics.node_ties import NodeTies
 
-    domain = parts.domain
-    young = domain.comm.allreduce(float(np.max(parts.stress.material.young, initial=0.0)), op=MPI.MAX)
-    return NodeTies(domain, parts.u, young, parts.mass.lumped, parts.motion.prescribed_nodes)
+    domain = inputs.domain
+    young = domain.comm.allreduce(float(np.max(inputs.stress.material.young, initial=0.0)), op=MPI.MAX)
+    return NodeTies(domain, inputs.u, young, inputs.mass.lumped, inputs.motion.prescribed_nodes)
 
 
-def _inertia(parts: TermInputs) -> Term | None:
-    return Inertia(parts.u, parts.mass) if parts.scheme.inertia else None
+def _inertia(inputs: TermInputs) -> Term | None:
+    return Inertia(inputs.u, inputs.mass) if inputs.scheme.inertia else None
 
 
-def _drag(parts: TermInputs) -> Term | None:
-    damping = parts.study.damping
+def _drag(inputs: TermInputs) -> Term | None:
+    damping = inputs.study.damping
     if damping is None or not damping.mass:
         return None
     from ..mechanics.damping import Drag
 
-    return Drag(parts.u, parts.mass, damping.mass)
+    return Drag(inputs.u, inputs.mass, damping.mass)
 
 
-# What may add to the balance beside the stress, in this order. A new term has its line here.
+# Terms of the balance beside the stress, in their order. A new term gets a line here.
 TERMS: dict[str, Callable[[TermInputs], Term | None]] = {
     "viscosity": _viscosity,
     "pressure": _pressure,
@@ -154,21 +215,22 @@ TERMS: dict[str, Callable[[TermInputs], Term | None]] = {
 
 
 def build_balance(study: Study, domain: Domain, scheme: Scheme, material: MaterialFields) -> Balance:
-    """The balance of a body of this material (collective). InputError where a place selects nothing."""
+    """Return the balance of a body (collective). Raises InputError if a selector selects nothing."""
     assembler, u = VectorAssembler(domain), fem.Function(domain.space, name="displacement")
     entries = boundary_conditions(study, domain.dim)
-    moved = [each for each in entries if each.prescribes_motion]
-    nodes = [domain.select_nodes(each.selector, f"{each.key}.on") for each in moved]
-    motion = PrescribedMotion(
-        domain, [(at, each.components, each.function) for at, each in zip(nodes, moved, strict=True)]
-    )
+    prescribed = [
+        (domain.select_nodes(entry.selector, f"{entry.key}.on"), entry.components, entry.function)
+        for entry in entries
+        if entry.prescribes_motion
+    ]
+    motion = PrescribedMotion(domain, prescribed)
     density = coefficient(domain, material.density)
     mass: MassMatrix = LumpedMass(assembler, density)
     if study.time.mass == "consistent":
         mass = ConsistentMass(assembler, density, motion.bcs)
     fracture, floor = study.fracture, 0.0 if scheme.inertia else RESIDUAL_STIFFNESS
-    weakening = None if fracture is None else DegradationModel(fracture.approach, fracture.unilateral)
-    stress = Stress(assembler, u, material, weakening, floor=floor)
-    parts = TermInputs(study, scheme, assembler, u, density, stress, mass, motion, entries)
-    others = [term for make in TERMS.values() if (term := make(parts)) is not None]
-    return Balance(assembler, u, [stress, *others], motion, mass, scheme, study.time.max_step)
+    degradation = None if fracture is None else DegradationModel(fracture.approach, fracture.unilateral)
+    stress = Stress(assembler, u, material, degradation, floor=floor)
+    inputs = TermInputs(study, scheme, assembler, u, density, stress, mass, motion, entries)
+    terms = [term for make in TERMS.values() if (term := make(inputs)) is not None]
+    return Balance(assembler, u, [stress, *terms], motion, mass, scheme, study.time.max_step)
