@@ -95,7 +95,7 @@ class Asked:
                 os.kill(os.getpid(), signal.SIGTERM)
             return abandons(of)
 
-        monkeypatch.setattr(InterruptHandler, "abandons", counted)
+        monkeypatch.setattr(InterruptHandler, "must_abandon_step", counted)
         monkeypatch.setattr(interrupt, "MAX_UNINTERRUPTED_SECONDS", -1.0)  # every step is long
 
     def begin(self, number: int = 0) -> None:
@@ -315,13 +315,13 @@ ABANDONED = """
 import os, signal, sys
 from mpi4py import MPI
 from fracsim.output import interrupt
-interrupt.SHORT = -1.0
-asked, calls = interrupt.Interrupt.abandons, iter(range(1, 1000))
+interrupt.MAX_UNINTERRUPTED_SECONDS = -1.0
+asked, calls = interrupt.InterruptHandler.must_abandon_step, iter(range(1, 1000))
 def abandons(of):
     if next(calls) == 9 and MPI.COMM_WORLD.rank == 1:
         os.kill(os.getpid(), signal.SIGUSR1)
     return asked(of)
-interrupt.Interrupt.abandons = abandons
+interrupt.InterruptHandler.must_abandon_step = abandons
 sys.argv = ["fracsim", "run", {study!r}, "-o", {out!r}]
 from fracsim.cli import program
 program()

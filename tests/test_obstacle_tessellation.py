@@ -15,9 +15,9 @@ from fracsim.contact.obstacle_tessellation import ObstacleTessellation
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.shapes import HalfSpace, Sphere
 from fracsim.output.surface.vtk_files import read_pvd
-from fracsim.report.pictures.obstacle_meshes import COLOUR
 from fracsim.report.pictures.picture import render
 from fracsim.report.pictures.picture_options import PictureOptions
+from fracsim.report.pictures.renderer import OBSTACLE_COLOUR
 from fracsim.run import Run
 from fracsim.scene import build_scene
 from support.scenes import make_study
@@ -96,7 +96,7 @@ def test_a_picture_has_them(shown: Path, tmp_path: Path) -> None:
     from imageio.v3 import imread
 
     pixels = np.asarray(imread(render(shown, tmp_path / "picture.png", PictureOptions(zoom=0.6))))[..., :3].astype(int)
-    solid = np.abs(pixels - [int(COLOUR[i : i + 2], 16) for i in (1, 3, 5)]).max(axis=2) <= 2
+    solid = np.abs(pixels - [int(OBSTACLE_COLOUR[i : i + 2], 16) for i in (1, 3, 5)]).max(axis=2) <= 2
     floor = solid.mean(axis=1) > 0.5
     assert floor.any()
     rows, columns = np.nonzero(solid & ~floor[:, None])

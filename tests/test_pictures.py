@@ -18,11 +18,9 @@ from fracsim.output.fields_file import Field
 from fracsim.output.surface.body_surface import BodySurface
 from fracsim.output.surface.vtk_files import SurfaceFiles
 from fracsim.report.pictures.annotations import annotate, format_length, format_time, round_length
-from fracsim.report.pictures.material_looks import MATERIAL_LOOKS
-from fracsim.report.pictures.obstacle_meshes import COLOUR
 from fracsim.report.pictures.picture import GAP, render, tile_pictures
-from fracsim.report.pictures.picture_options import SIZE, PictureOptions, parse_limits, parse_size
-from fracsim.report.pictures.renderer import crack_opening
+from fracsim.report.pictures.picture_options import MATERIAL_LOOKS, SIZE, PictureOptions, parse_limits, parse_size
+from fracsim.report.pictures.renderer import OBSTACLE_COLOUR, crack_opening
 from fracsim.study.time_and_output import LOOKS
 from support.solids import lattice, patterns, separated
 
@@ -69,8 +67,8 @@ def of_hue(pixels: Pixels, channel: int) -> npt.NDArray[np.bool_]:
 def test_the_inside_has_its_own_colour_and_is_seen_in_the_gap(tmp_path: Path) -> None:
     """From aslant a wall of the open crack, green, between skins, red; nothing green before it is cut."""
     look = PictureOptions(view="1,-2,0.3", size=SMALL, material=FRONT.material, bare=True)
-    whole = shown(render(written(tmp_path / "whole", 0.0, cut=False), look=look))
-    torn = shown(render(written(tmp_path / "torn", 1.0), look=look))
+    whole = shown(render(written(tmp_path / "whole", 0.0, cut=False), options=look))
+    torn = shown(render(written(tmp_path / "torn", 1.0), options=look))
     assert of_hue(whole, 0).mean() > 0.05 and not of_hue(whole, 1).any()
     green, red = of_hue(torn, 1), of_hue(torn, 0)
     assert green.mean() > 0.003
@@ -80,7 +78,7 @@ def test_the_inside_has_its_own_colour_and_is_seen_in_the_gap(tmp_path: Path) ->
 
 def test_a_crack_that_opens_by_less_than_a_pixel_is_a_line(tmp_path: Path) -> None:
     """Dark pixels where the bar is cut, over its whole height, and nowhere else on it."""
-    pixels = shown(render(written(tmp_path, 1e-5), look=FRONT))
+    pixels = shown(render(written(tmp_path, 1e-5), options=FRONT))
     red = of_hue(pixels, 0)
     rows, columns = (np.flatnonzero(red.any(axis=axis)) for axis in (1, 0))
     inside = pixels[rows.min() + 3 : rows.max() - 2, columns.min() + 3 : columns.max() - 2]
@@ -89,7 +87,7 @@ def test_a_crack_that_opens_by_less_than_a_pixel_is_a_line(tmp_path: Path) -> No
     found = np.flatnonzero(dark.any(axis=0)) / (inside.shape[1] - 1) * 6
     assert dark.any(axis=1).mean() > 0.95
     assert found.min() > 2.9 and found.max() < 4.1  # the cut winds between the nodes at 3 and at 4
-    whole = shown(render(written(tmp_path / "whole", 0.0, cut=False), look=FRONT))
+    whole = shown(render(written(tmp_path / "whole", 0.0, cut=False), options=FRONT))
     bright = whole[rows.min() + 3 : rows.max() - 2, columns.min() + 3 : columns.max() - 2].max(axis=2)
     assert not (bright < 0.7 * np.median(bright)).any()
 
@@ -105,7 +103,7 @@ def test_magnified_displacements(tmp_path: Path) -> None:
     folder = written(tmp_path, 1e-3)
     pixels = shown(
         render(
-            folder, look=PictureOptions(view="front", size=SMALL, material=FRONT.material, bare=True, magnify=2000.0)
+            folder, options=PictureOptions(view="front", size=SMALL, material=FRONT.material, bare=True, magnify=2000.0)
         )
     )
     row = of_hue(pixels, 0)[SMALL[1] // 2]
@@ -125,7 +123,7 @@ def test_dust_is_hidden_on_request(tmp_path: Path) -> None:
     u[corner, 0] = -1.0
     SurfaceFiles(tmp_path, 3).write_frame(surface.make_frame(0.0, u, np.zeros_like(u)))
     far = PictureOptions(view="front", size=SMALL, material=FRONT.material, bare=True, zoom=0.6)
-    shown_all, without = (shown(render(tmp_path, look=each)) for each in (far, replace(far, dust=False)))
+    shown_all, without = (shown(render(tmp_path, options=each)) for each in (far, replace(far, dust=False)))
     with_dust, bar = (np.flatnonzero(of_hue(each, 0).any(axis=0)) for each in (shown_all, without))
     assert np.diff(with_dust).max() > 8 and np.diff(bar).max() == 1
 
@@ -159,12 +157,12 @@ def test_colours_in_2d_are_those_of_the_legend(
 ) -> None:
     """To a unit in 255, light or no light; zero between two signs is grey and the paper white."""
     folder = written(tmp_path, 0.0, cut=False, dim=2, fields=lambda x: [Field("heat", "Cell", np.full(len(x), value))])
-    pixels = shown(render(folder, look=PictureOptions("heat", size=SMALL, bare=True, limits=limits)))
+    pixels = shown(render(folder, options=PictureOptions("heat", size=SMALL, bare=True, limits=limits)))
     wanted = np.rint(255 * np.array(matplotlib.colormaps[colours](0.5)[:3]))
     inner = pixels[SMALL[1] // 2, SMALL[0] // 2]
     assert np.abs(inner - wanted).max() <= 1 and inner.min() < 240
     assert (pixels[0, 0] == 255).all()
-    legend = shown(render(folder, look=PictureOptions("heat", size=SIZE, limits=limits)))[
+    legend = shown(render(folder, options=PictureOptions("heat", size=SIZE, limits=limits)))[
         -120:
     ]  # the bar, in its middle
     assert np.abs(legend[:, SIZE[0] // 2] - wanted).max(axis=1).min() <= 2
@@ -188,7 +186,7 @@ def test_one_range_for_all_frames(tmp_path: Path) -> None:
 
 def test_the_scale_bar_is_as_long_as_it_says(tmp_path: Path) -> None:
     """Beside a bar of 6 m, in a flat picture: 1 m of a width of some 7."""
-    pixels = shown(render(written(tmp_path, 0.0, cut=False, dim=2), look=PictureOptions(size=SIZE)))
+    pixels = shown(render(written(tmp_path, 0.0, cut=False, dim=2), options=PictureOptions(size=SIZE)))
     ink = (np.abs(pixels - [34, 38, 44]).max(axis=2) < 4)[-60:, : SIZE[0] // 3]
     length = ink.sum(axis=1).max()
     body = np.flatnonzero(np.any(pixels[SIZE[1] // 2] < 250, axis=1))
@@ -234,7 +232,7 @@ def test_a_look_colours_skin_and_inside(tmp_path: Path) -> None:
     (folder / "study.toml").write_text('title = "x"\n[output]\nlook = "bread"\n')
     look = PictureOptions(view="1,-2,0.3", size=SMALL, bare=True)
     for name in ("bread", "jade"):
-        pixels = shown(render(folder, look=look if name == "bread" else replace(look, material=name)))
+        pixels = shown(render(folder, options=look if name == "bread" else replace(look, material=name)))
         skin, inside, back = (
             rgb_of(each)
             for each in (
@@ -272,7 +270,7 @@ def test_a_floor_has_the_shadow_of_what_stands_on_it(tmp_path: Path) -> None:
     folder = written(tmp_path, 0.0, cut=False)
     look = PictureOptions(view="0.3,-1.5,1.2", size=SMALL, material=FRONT.material, bare=True)
     plain, floor = (
-        shown(render(folder, look=each)) for each in (look, PictureOptions(**{**vars(look), "floor": True}))
+        shown(render(folder, options=each)) for each in (look, PictureOptions(**{**vars(look), "floor": True}))
     )
     backdrop = floor[0, 0]
 
@@ -300,8 +298,10 @@ def test_a_floor_is_where_the_obstacle_plane_is(tmp_path: Path) -> None:
     table = '[[obstacle]]\nname = "table"\nshape = "plane"\nnormal = [0.0, 0.0, 1.0]\n'
     (folder / "study.toml").write_text(wall + table)
     look = PictureOptions(view="0.3,-1.5,1.2", size=SMALL, material=FRONT.material, bare=True)
-    slab, floor = (shown(render(folder, look=each)) for each in (look, PictureOptions(**{**vars(look), "floor": True})))
-    solid = [int(COLOUR[i : i + 2], 16) for i in (1, 3, 5)]
+    slab, floor = (
+        shown(render(folder, options=each)) for each in (look, PictureOptions(**{**vars(look), "floor": True}))
+    )
+    solid = [int(OBSTACLE_COLOUR[i : i + 2], 16) for i in (1, 3, 5)]
     assert (np.abs(slab - solid).max(axis=2) < 60).mean() > (np.abs(floor - solid).max(axis=2) < 60).mean() + 0.02
     shadow = (floor.max(axis=2) < 0.93 * floor[0, 0].max()) & ~of_hue(floor, 0)
     body = of_hue(floor, 0)
@@ -350,7 +350,7 @@ def test_what_cannot_be_drawn_is_said(call: Callable[[Path], Any], message: str,
 
 def test_a_flat_body_has_no_floor(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--floor: a body in 2D has none"):
-        render(written(tmp_path, 0.0, dim=2), look=PictureOptions(floor=True, size=SMALL))
+        render(written(tmp_path, 0.0, dim=2), options=PictureOptions(floor=True, size=SMALL))
 
 
 def test_a_study_names_the_looks_that_there_are() -> None:

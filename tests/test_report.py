@@ -283,7 +283,7 @@ def test_names_in_a_plot_are_clear_of_one_another() -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    from fracsim.report.labels import label_points
+    from fracsim.report.plots import label_points
 
     random = np.random.default_rng(5)
     points = [*random.normal(0.0, 0.1, (12, 2)).tolist(), [-1.0, 1.0], [1.0, -1.0]]

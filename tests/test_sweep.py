@@ -16,7 +16,7 @@ import pytest
 from cases import BAR, command, fracsim, fracsim_here, mpirun, swept_here, write_study
 from fracsim.errors import InputError
 from fracsim.report import sweep
-from fracsim.report.exit_status import read_last_message
+from fracsim.report.runs import read_last_message
 from fracsim.report.sweep import case_folder_name, split_values, sweep_cases
 
 KEYS = ("--set", "mesh.h=0.25,0.125", "--set", "time.step=0.01,0.015")
@@ -170,7 +170,7 @@ def test_the_list_needs_no_clean_environment(name: str, tmp_path: Path, monkeypa
     alone may sweep, and its runs do not see them."""
     bar, out = write_study(tmp_path / "bar.toml", BAR), tmp_path / "out"
     monkeypatch.setenv(name, "0" if name == "PMIX_RANK" else "1")
-    assert "PMI" not in " ".join(sweep._environment()) and "OMPI_COMM" not in " ".join(sweep._environment())
+    assert "PMI" not in " ".join(sweep._run_environment()) and "OMPI_COMM" not in " ".join(sweep._run_environment())
     sweep._refuse_mpirun()
     monkeypatch.setenv(name, "1" if name == "PMIX_RANK" else "4")
     listed = fracsim("sweep", bar, *KEYS, "-o", out, "--list")

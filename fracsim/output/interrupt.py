@@ -22,7 +22,7 @@ class InterruptHandler:
     """Handler of stop signals and of the wall-time limit. The ranks agree on the reason to stop.
 
     The handler is a context manager that can be entered again inside. A second signal ends the process at once if it
-    comes `SAME_REQUEST` seconds after the first or later. Signals that were ignored before stay ignored.
+    comes `REPEATED_SIGNAL_INTERVAL` seconds after the first or later. Signals that were ignored before stay ignored.
 
     Attributes:
         comm: the ranks of the run.

@@ -1,13 +1,12 @@
-"""What is made of the folders of runs: pictures, sweeps, and one page that needs nothing else.
+"""Reports on finished runs, from the files in their output folders: pictures, sweeps, exports, and an HTML page.
 
-runs              a run folder as it is read
-pictures          `fracsim render`: the split surface off-screen
-export            `fracsim export`: surfaces for other programs
-html_report       `fracsim report`
-compare, pareto   sections about runs; which settings are worth their cost
-content           sections, tables, plots as plain data
-page, plots       sections to HTML; plots as SVG
-environment_info  machine and programs, for the foot of a page
-
-sweep, outcome      `fracsim sweep`: a run for each combination of values; how each ended
+compare       sections about runs: curves, energies, cost, references, error against run time
+content       sections, tables and plots as plain data
+export        `fracsim export`: split surfaces for other programs
+html_report   `fracsim report`: the page on runs or on the evidence
+page          sections to HTML and CSV files
+pictures      `fracsim render`: pictures, sheets and films
+plots         plots as SVG, and Pareto fronts
+runs          files of a run, and how it ended
+sweep         `fracsim sweep`: a run for each combination of values
 """

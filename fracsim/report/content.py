@@ -1,4 +1,4 @@
-"""What a page shows: sections of text, claims, tables, plots and pictures. Plain data, to JSON and back."""
+"""Content of a page: sections of text, claims, tables, plots and pictures, as plain data with conversion to JSON."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ TableCell = str | float | int | bool | None
 
 @dataclass(frozen=True)
 class Claim:
-    """Something that must hold, and what was measured; `holds` None: not run."""
+    """Claim about the program, with the measured value.
+
+    Attributes:
+        text: what must hold.
+        measured: measured value in words.
+        holds: result; None: not measured.
+    """
 
     text: str
     measured: str
@@ -19,12 +25,15 @@ class Claim:
 
 @dataclass(frozen=True)
 class ReportTable:
-    """Rows under named columns, also written as NAME.csv. Numbers stay numbers: the page rounds them, the CSV does not.
+    """Table of a page, also written as NAME.csv. The page rounds numbers, the CSV does not.
 
     Attributes:
         name: file name of the CSV: letters, digits, hyphens; unique in a page.
-        command: what reproduces it, run inside the folder of the trial; "" where every row is its own run.
-        marked: numbers of rows to be shown strongly (a recommended setting).
+        caption: caption.
+        columns: names of the columns.
+        rows: cells of each row.
+        command: command that reproduces the table, run in the folder of the trial; "" if each row is a run of its own.
+        marked: indices of emphasised rows, such as recommended settings.
     """
 
     name: str
@@ -37,12 +46,13 @@ class ReportTable:
 
 @dataclass(frozen=True)
 class Series:
-    """Points of one line of a plot; NaN and None leave a gap.
+    """Series of points of a plot; NaN and None leave a gap in the line.
 
     Attributes:
-        label: in the legend; "" for none.
+        label: text in the legend; "" for none.
+        x, y: coordinates of the points.
         style: "line", "points", "both" or "reference" (dashed and grey, for theory and experiments).
-        names: text beside each point, or empty.
+        names: label beside each point, or empty.
         spread: half-widths of error bars in y, or empty.
     """
 
@@ -56,13 +66,17 @@ class Series:
 
 @dataclass(frozen=True)
 class Plot:
-    """Series in one frame.
+    """Plot of several series.
 
     Attributes:
+        caption: caption.
+        x, y: labels of the axes.
+        series: the series.
         kind: "line" (both axes linear), "loglog", "logx" or "logy".
-        pareto: mark the points of all series that no other beats in both x and y (less is better).
-        slopes: orders of reference triangles, log-log only.
+        pareto: mark the Pareto front of all points; less is better in both coordinates.
+        slopes: orders of reference lines, for "loglog" only.
         levels: horizontal lines, such as 0.01 and 0.05 for errors of 1 % and 5 %.
+        command: command that reproduces the plot.
     """
 
     caption: str
@@ -78,7 +92,13 @@ class Plot:
 
 @dataclass(frozen=True)
 class Picture:
-    """A PNG, by its path inside the folder of the evidence or run; left out with a remark where it does not exist."""
+    """PNG of a page. A missing file is replaced by a remark.
+
+    Attributes:
+        caption: caption.
+        path: path relative to the folder of the evidence or run.
+        command: command that reproduces the picture.
+    """
 
     caption: str
     path: str
@@ -87,10 +107,13 @@ class Picture:
 
 @dataclass(frozen=True)
 class Section:
-    """A part of the page, in the order claims, text, tables, plots, pictures. Blank lines part paragraphs of `text`.
+    """Section of a page, in the order claims, text, tables, plots, pictures.
 
     Attributes:
-        first: on the first screen of the page, whichever group it is of.
+        title: title.
+        text: paragraphs, separated by blank lines.
+        claims, tables, plots, pictures: content.
+        first: show the section at the beginning of the page, whatever its group.
     """
 
     title: str
@@ -103,12 +126,12 @@ class Section:
 
 
 def to_data(sections: list[Section]) -> list[dict[str, Any]]:
-    """Sections as JSON data."""
+    """Sections as data for JSON."""
     return [asdict(section) for section in sections]
 
 
 def from_data(data: list[dict[str, Any]]) -> list[Section]:
-    """Sections from `to_data`, after JSON has made lists of the tuples."""
+    """Sections from the data of `to_data`, in which JSON has turned tuples into lists."""
     return [
         Section(
             part["title"],

@@ -1,4 +1,4 @@
-"""Run folders as the report sees them: settings, history and summary of each."""
+"""Runs as a report sees them: settings, history and summary of output folders, and how a run ended."""
 
 from __future__ import annotations
 
@@ -13,22 +13,31 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import InputError
+from ..errors import Exit, InputError
 from ..meshes.plain_files import check_readable
 
 Values = npt.NDArray[np.float64]
 PHASES = ("setup", "solve", "plasticity", "fracture", "energies", "output")
+OUTCOMES: dict[int, str] = {
+    Exit.DONE: "done",
+    Exit.BAD_INPUT: "refused",
+    Exit.NOT_CONVERGED: "not converged",
+    Exit.STOPPED: "stopped",
+    Exit.CANNOT_WRITE: "could not write",
+}
+MESSAGE_PREFIX = "fracsim: "  # begins each message of the program in a log
 
 
 @dataclass(frozen=True)
 class RunData:
-    """What one run left behind.
+    """Files of one run.
 
     Attributes:
-        name: how the page calls it.
-        settings: "table.key" -> value of the study as run.
-        history: column -> values, a number a step.
-        summary: of summary.json; empty where the run was killed.
+        name: name of the run on the page.
+        folder: output folder.
+        settings: values of the study by "table.key".
+        history: columns of history.csv, a value per step.
+        summary: values of summary.json; empty if the run was killed.
     """
 
     name: str
@@ -39,19 +48,21 @@ class RunData:
 
     @property
     def outcome(self) -> str:
+        """How the run ended; "unfinished" if it was killed."""
         return str(self.summary.get("outcome", "unfinished"))
 
     @property
     def ranks(self) -> int:
+        """Number of MPI ranks."""
         return int(self.summary.get("ranks", 1))
 
     @property
     def wall(self) -> float:
-        """Seconds of wall time; of an unfinished run those of its steps."""
+        """Wall time, s; of an unfinished run the sum over its steps."""
         return float(self.summary.get("wall", self.history["wall_step"].sum()))
 
     def quantity(self, name: str) -> float:
-        """A quantity by its name: peak_COLUMN, final_COLUMN, or a number of summary.json. InputError where unknown."""
+        """Quantity by name: peak_COLUMN, final_COLUMN, or a number of summary.json. Raises InputError if unknown."""
         kind, _, column = name.partition("_")
         if column in self.history and kind in ("peak", "final"):
             values = self.history[column]
@@ -65,7 +76,7 @@ class RunData:
         )
 
     def history_column(self, name: str, option: str) -> Values:
-        """A column of the history. InputError where there is none of that name."""
+        """Column of the history. Raises InputError, naming the command-line option, if there is none."""
         if name not in self.history:
             raise InputError(f"{option}: {self.name} has no column {name}; it has: {', '.join(self.history)}")
         return self.history[name]
@@ -76,43 +87,46 @@ def _is_number(value: Any) -> bool:
 
 
 def is_run(folder: Path) -> bool:
-    """Whether a run has begun there."""
+    """True if a folder has the study and the history of a run."""
     return (folder / "study.toml").is_file() and (folder / "history.csv").is_file()
 
 
 def find_runs(folders: list[Path]) -> list[RunData]:
-    """Runs of the folders given, those of a sweep's folder or of a job array's one by one. InputError for a folder
-    without any."""
-    found: list[Path] = []
+    """Runs in folders: output folders, or folders of sweeps and job arrays.
+
+    Raises:
+        InputError: a folder has no run.
+    """
+    paths: list[Path] = []
     for folder in folders:
-        inner = [path for path in _cases(folder) if is_run(path)]
-        if not inner and not is_run(folder):
+        cases = [path for path in _case_folders(folder) if is_run(path)]
+        if not cases and not is_run(folder):
             missing = "it has no study.toml with a history.csv, and no folder in it has"
             problem = missing if folder.is_dir() else "there is no such folder"
             raise InputError(f"{folder} is not the output folder of a run, a sweep or of evidence: {problem}")
-        found += inner or [folder]
-    return [read_run(path, name) for path, name in zip(found, _names(found), strict=True)]
+        paths += cases or [folder]
+    return [read_run(path, name) for path, name in zip(paths, _distinct_names(paths), strict=True)]
 
 
-def _cases(folder: Path) -> list[Path]:
-    """Folders of a sweep, in its order; where a job array ran it there is no table, and folders go by their names."""
+def _case_folders(folder: Path) -> list[Path]:
+    """Folders of the runs of a sweep, in its order; of a job array, which has no table, in the order of their names."""
     table = folder / "sweep.csv"
     if table.is_file():
         with table.open(newline="", encoding="utf-8") as file:
             return [folder / row["case"] for row in csv.DictReader(file) if row.get("case")]
     if is_run(folder) or not folder.is_dir():
         return []
-    return sorted((path for path in folder.iterdir() if path.is_dir()), key=_by_number)
+    return sorted((path for path in folder.iterdir() if path.is_dir()), key=_numeric_order)
 
 
-def _by_number(path: Path) -> list[tuple[float, str]]:
-    """A name by its parts, numbers by their value: h-0.02 before h-0.1, step-1e-3 before step-0.01."""
+def _numeric_order(path: Path) -> list[tuple[float, str]]:
+    """Sort key of a name in which numbers count by value: h-0.02 before h-0.1, step-1e-3 before step-0.01."""
     parts = re.split(r"(\d+(?:\.\d*)?(?:e[+-]?\d+)?)", path.name)
     return [(float(part), "") if part[:1].isdigit() else (0.0, part) for part in parts]
 
 
-def _names(folders: list[Path]) -> list[str]:
-    """The last parts of the paths, as many of them as tell the folders apart."""
+def _distinct_names(folders: list[Path]) -> list[str]:
+    """Last parts of the paths, as few as distinguish the folders. Raises InputError for equal folders."""
     parts = [folder.resolve().parts for folder in folders]
     for depth in range(1, max(map(len, parts), default=1) + 1):
         names = ["/".join(part[-depth:]) for part in parts]
@@ -122,10 +136,10 @@ def _names(folders: list[Path]) -> list[str]:
 
 
 def read_run(folder: Path, name: str) -> RunData:
-    """Read one run. InputError where its files are not what a run writes."""
+    """Files of a run in an output folder. Raises InputError if they are not those of a run."""
     try:
-        for each in ("study.toml", "history.csv", "summary.json"):
-            check_readable(folder / each)
+        for file in ("study.toml", "history.csv", "summary.json"):
+            check_readable(folder / file)
         study = tomllib.loads((folder / "study.toml").read_text(encoding="utf-8"))
         history = _read_history(folder / "history.csv")
         path = folder / "summary.json"
@@ -136,7 +150,7 @@ def read_run(folder: Path, name: str) -> RunData:
 
 
 def _read_history(path: Path) -> dict[str, Values]:
-    """Columns of history.csv; a last row that was cut short is left out."""
+    """Columns of history.csv; incomplete rows are left out. Raises ValueError."""
     with path.open(newline="", encoding="utf-8") as file:
         header, *rows = list(csv.reader(file)) or [[]]
     if not {"time", "step", "wall_step"} <= set(header):
@@ -146,7 +160,7 @@ def _read_history(path: Path) -> dict[str, Values]:
 
 
 def flatten_tables(data: Any, prefix: str = "") -> dict[str, Any]:
-    """Nested tables as "a.b.0.c" -> value; lists of plain values stay whole."""
+    """Values of nested tables by "a.b.0.c"; lists of plain values are one value."""
     if isinstance(data, list) and any(isinstance(item, dict) for item in data):
         data = dict(enumerate(data))
     if not isinstance(data, dict):
@@ -156,6 +170,26 @@ def flatten_tables(data: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def differing_settings(runs: list[RunData]) -> list[str]:
-    """Settings that are not the same in all runs, in the order of the study; titles left out."""
+    """Settings, except the title, that differ between runs, in the order of the study."""
     keys = list(dict.fromkeys(key for run in runs for key in run.settings))
     return [key for key in keys if key != "title" and len({repr(run.settings.get(key)) for run in runs}) > 1]
+
+
+# --- logs -------------------------------------------------------------------------------------------------------------
+
+
+def read_log_messages(log: Path) -> str:
+    """All messages of the program in a log, joined to one; "" if there are none."""
+    messages = [
+        line
+        for line in log.read_text(encoding="utf-8", errors="replace").splitlines()
+        if line.startswith(MESSAGE_PREFIX)
+    ]
+    return MESSAGE_PREFIX + "; ".join(line.removeprefix(MESSAGE_PREFIX) for line in messages) if messages else ""
+
+
+def read_last_message(log: Path) -> str:
+    """Last message of the program in a log, or else the last line; "" if the log is empty."""
+    lines = [line for line in log.read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    messages = [line for line in lines if line.startswith(MESSAGE_PREFIX)]
+    return (messages or lines or [""])[-1]

@@ -1,4 +1,4 @@
-"""Sweeps: a study run once for each combination of values, each run in processes and a folder of its own."""
+"""Sweep: a study run once for each combination of values, each run in a process and a folder of its own."""
 
 from __future__ import annotations
 
@@ -23,42 +23,61 @@ from ..output.file_ownership import check_ownership, has_resumable_run
 from ..output.lock import FolderLock, describe_lock_holder
 from ..study.check import check_study
 from ..study.reader import load_study, study_text
-from .exit_status import MESSAGE_PREFIX, OUTCOMES, read_last_message
+from .runs import MESSAGE_PREFIX, OUTCOMES, read_last_message
 
-MAX_FOLDER_NAME = 100
+_MAX_NAME_LENGTH = 100  # characters of a folder name, before a hash
 
 
 @dataclass(frozen=True)
 class SweepCase:
-    """One combination: its values as texts by key, and its folder."""
+    """One combination of values.
+
+    Attributes:
+        values: values as text, by key of the study.
+        folder: output folder.
+    """
 
     values: dict[str, str]
     folder: Path
 
     @property
     def overrides(self) -> list[str]:
+        """Texts "key=value" for the option --set."""
         return [f"{key}={value}" for key, value in self.values.items()]
 
 
 def run_sweep(
     study: str, path: Path, sets: list[str], out: Path, *, ranks: int, only_list: bool, overwrite: bool = False
 ) -> None:
-    """Run what has not ended well yet, one run after the other; or print the commands. Raises NotConverged at the end
-    where a run failed. `study` is what the user called it, `path` where it is; `overwrite`: runs of another study that
-    have not ended may be thrown away."""
+    """Run all cases that have not reached their end yet, one after the other, or print their commands.
+
+    Args:
+        study: name of the study, as the user gave it.
+        path: file of the study.
+        sets: texts "key=a,b,c" with the values of each key.
+        out: folder of the sweep.
+        ranks: MPI ranks of each run.
+        only_list: print the commands instead, one per line.
+        overwrite: unfinished runs of another study may be deleted.
+
+    Raises:
+        InputError: a case cannot be run; nothing was run.
+        NotConverged: a run failed; the others were run.
+        Stopped: the sweep was interrupted.
+    """
     if not only_list:
         _refuse_mpirun()
     cases = sweep_cases(sets, out)
-    studies = [_validated(path, case) for case in cases]
-    for case, text in zip(cases, studies, strict=True):
+    texts = [_checked_study(path, case) for case in cases]
+    for case, text in zip(cases, texts, strict=True):
         _check_folder(case, text, path, overwrite)
     if only_list:
-        for case, text in zip(cases, studies, strict=True):
-            print(shlex.join(_listed(study, case, text, ranks, overwrite=overwrite)))
+        for case, text in zip(cases, texts, strict=True):
+            print(shlex.join(_job_line(study, case, text, ranks, overwrite=overwrite)))
         return
     with FolderLock(out) as lock:
         lock.acquire(make=True)
-        outcomes = _run_all(study, list(zip(cases, studies, strict=True)), out, ranks)
+        outcomes = _run_all(study, list(zip(cases, texts, strict=True)), out, ranks)
     failed = [f"{name} ({outcome})" for name, outcome in outcomes.items() if not outcome.startswith("done")]
     print(f"settings and figures of all runs: {out / 'sweep.csv'}")
     if failed:
@@ -66,13 +85,23 @@ def run_sweep(
 
 
 def _run_all(study: str, cases: list[tuple[SweepCase, str]], out: Path, ranks: int) -> dict[str, str]:
-    """Outcomes in words of all cases, each with its study as text, by their names. Raises Stopped."""
+    """Outcomes in words, by name of the case.
+
+    Args:
+        study: name of the study.
+        cases: cases, each with the text of its study.
+        out: folder of the sweep.
+        ranks: MPI ranks of each run.
+
+    Raises:
+        Stopped: the sweep was interrupted.
+    """
     outcomes: dict[str, str] = {}
     for number, (case, text) in enumerate(cases, 1):
         print(f"[{number}/{len(cases)}] {case.folder.name}: ", end="", flush=True)
         outcomes[case.folder.name] = outcome = _run(study, case, text, ranks)
         print(one_line(outcome), flush=True)
-        write_sweep_table([each for each, _ in cases], outcomes, out)
+        write_sweep_table([entry for entry, _ in cases], outcomes, out)
         if outcome.startswith("interrupted"):
             raise Stopped(f"interrupted after {number - 1} of {len(cases)} runs; the same command goes on")
     return outcomes
@@ -82,16 +111,24 @@ def _run_all(study: str, cases: list[tuple[SweepCase, str]], out: Path, ranks: i
 
 
 def sweep_cases(sets: list[str], out: Path) -> list[SweepCase]:
-    """All combinations of the values given, the last key changing fastest. InputError where one comes up twice."""
+    """All combinations of the values, the last key changing fastest.
+
+    Args:
+        sets: texts "key=a,b,c" with the values of each key.
+        out: folder of the sweep.
+
+    Raises:
+        InputError: a text has another form, or a key or value is repeated.
+    """
     values: dict[str, list[str]] = {}
     for text in sets:
-        key, equals, rest = text.partition("=")
+        key, equals, listed = text.partition("=")
         key = key.strip()
         if not equals or not key:
             raise InputError(f"--set {text}: write key=a,b,c, for example --set mesh.h=0.02,0.01")
         if key in values:
             raise InputError(f"--set {text}: {key} is given twice; put all its values in one list")
-        values[key] = [part.strip() for part in split_values(rest)]
+        values[key] = [part.strip() for part in split_values(listed)]
         if "" in values[key]:
             raise InputError(f"--set {text}: there is an empty value in the list")
         if repeated := {value for value in values[key] if values[key].count(value) > 1}:
@@ -106,7 +143,7 @@ def sweep_cases(sets: list[str], out: Path) -> list[SweepCase]:
 
 
 def split_values(text: str) -> list[str]:
-    """Parts between the commas that are not inside brackets, braces or quotes."""
+    """Parts of a text between commas that are not inside brackets, braces or quotes."""
     parts, depth, quote = [""], 0, ""
     for character in text:
         if quote:
@@ -123,7 +160,7 @@ def split_values(text: str) -> list[str]:
 
 
 def short_keys(keys: list[str]) -> dict[str, str]:
-    """The last part of each key where that tells them apart, else the whole key."""
+    """Last part of each key if that is unique, otherwise the whole key."""
     last = [key.rpartition(".")[2] for key in keys]
     return {
         key: end if last.count(end) == 1 and not end.isdigit() else key for key, end in zip(keys, last, strict=True)
@@ -131,23 +168,23 @@ def short_keys(keys: list[str]) -> dict[str, str]:
 
 
 def case_folder_name(values: dict[str, str]) -> str:
-    """A folder name that can be read: h-0.02_scheme-newmark. A few digits of a hash where characters had to go."""
-    whole = "_".join(f"{key}-{value}" for key, value in values.items())
-    safe = "_".join(f"{key}-{_plain(value)}" for key, value in values.items())
-    if safe == whole and len(safe) <= MAX_FOLDER_NAME:
+    """Readable folder name such as h-0.02_scheme-newmark; with digits of a hash if characters were replaced."""
+    full = "_".join(f"{key}-{value}" for key, value in values.items())
+    safe = "_".join(f"{key}-{_safe_text(value)}" for key, value in values.items())
+    if safe == full and len(safe) <= _MAX_NAME_LENGTH:
         return safe
-    return f"{safe[:MAX_FOLDER_NAME]}-{hashlib.sha256(whole.encode()).hexdigest()[:6]}"
+    return f"{safe[:_MAX_NAME_LENGTH]}-{hashlib.sha256(full.encode()).hexdigest()[:6]}"
 
 
-def _plain(value: str) -> str:
-    """A value in characters that no file system or shell minds; a leading minus stays."""
+def _safe_text(value: str) -> str:
+    """Value in characters that need no quotes in file systems and shells; a leading minus stays."""
     if re.fullmatch(r"-?[A-Za-z0-9][A-Za-z0-9.+-]*", value):
         return value
     return re.sub(r"[^A-Za-z0-9.+]+", "-", value).strip("-.")
 
 
-def _validated(path: Path, case: SweepCase) -> str:
-    """The study of a case as its run would write it. InputError, with the combination, where it cannot be run."""
+def _checked_study(path: Path, case: SweepCase) -> str:
+    """Text of study.toml of a case. Raises InputError, with the combination, if it cannot be run."""
     try:
         study = load_study(path, case.overrides)
         check_study(study)
@@ -157,9 +194,16 @@ def _validated(path: Path, case: SweepCase) -> str:
 
 
 def _check_folder(case: SweepCase, study: str, path: Path, overwrite: bool) -> None:
-    """InputError where a run would meet, or its log replace, what a sweep of this study has not written."""
+    """Raise InputError if the folder of a case holds foreign files or an unfinished run of another study.
+
+    Args:
+        case: the case.
+        study: text of its study.toml.
+        path: file of the study.
+        overwrite: unfinished runs of another study may be deleted.
+    """
     check_ownership(case.folder, [path])
-    if _state(case, study) == "new" and has_resumable_run(case.folder) and not overwrite:
+    if _case_state(case, study) == "new" and has_resumable_run(case.folder) and not overwrite:
         raise InputError(
             f"--out {case.folder}: a run of another study that has not ended left a checkpoint there; throw it away "
             "with --overwrite, or give another folder. Nothing was run"
@@ -167,8 +211,8 @@ def _check_folder(case: SweepCase, study: str, path: Path, overwrite: bool) -> N
 
 
 def _refuse_mpirun() -> None:
-    """InputError where this process is one of several; one alone may have the variables of a launcher, as in a shell
-    that srun has started."""
+    """Raise InputError if this process is one of several MPI ranks."""
+    # a single process may have the variables of a launcher as well, as in a shell started by srun
     sizes = ["OMPI_COMM_WORLD_SIZE", "PMI_SIZE", *(["SLURM_STEP_NUM_TASKS"] if "PMIX_RANK" in os.environ else [])]
     if any(os.environ.get(name, "1") != "1" for name in sizes) or os.environ.get("PMIX_RANK", "0") != "0":
         raise InputError("a sweep starts its runs itself: call it without mpirun and say how many ranks with --ranks")
@@ -177,43 +221,43 @@ def _refuse_mpirun() -> None:
 # --- one run --------------------------------------------------------------------------------------------------------
 
 
-def run_command(study: str, case: SweepCase, ranks: int, how: str = "") -> list[str]:
-    """What runs one case; `how`: "restart", "overwrite" or ""."""
-    work = ["fracsim", "run", study]
+def run_command(study: str, case: SweepCase, ranks: int, mode: str = "") -> list[str]:
+    """Command that runs a case; `mode` is "restart", "overwrite" or ""."""
+    command = ["fracsim", "run", study]
     for override in case.overrides:
-        work += ["--set", override]
-    work += ["-o", str(case.folder), *([f"--{how}"] if how else [])]
-    return work if ranks == 1 else ["mpirun", "-n", str(ranks), *work]
+        command += ["--set", override]
+    command += ["-o", str(case.folder), *([f"--{mode}"] if mode else [])]
+    return command if ranks == 1 else ["mpirun", "-n", str(ranks), *command]
 
 
-def _listed(study: str, case: SweepCase, text: str, ranks: int, *, overwrite: bool) -> list[str]:
-    """The line of a case for a job array. A case that is done has one that does nothing: numbers of lines stay."""
-    state = _state(case, text)
+def _job_line(study: str, case: SweepCase, text: str, ranks: int, *, overwrite: bool) -> list[str]:
+    """Command of a case for a job array. A finished case has a command without effect, so that line numbers stay."""
+    state = _case_state(case, text)
     if state == "done":
         return ["true", f"{case.folder}: done before"]
     return run_command(study, case, ranks, "restart" if state == "begun" else "overwrite" if overwrite else "")
 
 
-def _environment() -> dict[str, str]:
-    """The environment of a run, without the variables by which a launcher tells this process which rank it is."""
-    heads = ("PMI_", "PMIX_", "OMPI_COMM_WORLD_")
-    return {name: value for name, value in os.environ.items() if not name.startswith(heads)}
+def _run_environment() -> dict[str, str]:
+    """Environment of a run, without the variables by which a launcher gives a process its rank."""
+    prefixes = ("PMI_", "PMIX_", "OMPI_COMM_WORLD_")
+    return {name: value for name, value in os.environ.items() if not name.startswith(prefixes)}
 
 
-def _state(case: SweepCase, study: str) -> str:
-    """ "done", "begun" (there is a checkpoint) or "new"; what is there of another study counts for nothing."""
+def _case_state(case: SweepCase, study: str) -> str:
+    """State of a case: "done", "begun" (with a checkpoint) or "new". Files of another study do not count."""
     try:
         if tomllib.loads((case.folder / "study.toml").read_text(encoding="utf-8")) != tomllib.loads(study):
             return "new"
     except (OSError, ValueError):
         return "new"
-    if _summary(case).get("outcome") == "done":
+    if _read_summary(case).get("outcome") == "done":
         return "done"
     return "begun" if (case.folder / "checkpoint" / "state.h5").is_file() else "new"
 
 
-def _summary(case: SweepCase) -> dict[str, Any]:
-    """summary.json of a case, empty where there is none."""
+def _read_summary(case: SweepCase) -> dict[str, Any]:
+    """Values of summary.json of a case; empty if it cannot be read."""
     try:
         return dict(json.loads((case.folder / "summary.json").read_text(encoding="utf-8")))
     except (OSError, ValueError):
@@ -221,25 +265,28 @@ def _summary(case: SweepCase) -> dict[str, Any]:
 
 
 def _run(study: str, case: SweepCase, text: str, ranks: int) -> str:
-    """The outcome in words, with the reason where it failed."""
-    state = _state(case, text)
+    """Run a case and return the outcome in words, with the reason of a failure."""
+    state = _case_state(case, text)
     if state == "done":
         return "done before"
-    if (words := describe_lock_holder(case.folder)) is not None:  # of a job array, or of a sweep that was killed
-        return f"refused: a run is going on there ({words})"
+    # a run of a job array, or of a sweep that was killed
+    if (holder := describe_lock_holder(case.folder)) is not None:
+        return f"refused: a run is going on there ({holder})"
     try:
         case.folder.mkdir(parents=True, exist_ok=True)
-        (case.folder / "summary.json").unlink(missing_ok=True)  # of an earlier run: it would be taken for this one's
+        (case.folder / "summary.json").unlink(missing_ok=True)  # otherwise an earlier one could be taken for this run's
     except OSError as error:
         raise InputError(f"--out {case.folder.parent}: cannot write there: {error.strerror}") from None
-    # what is there may be overwritten: _check_folder has looked
-    log, work = case.folder / "log.txt", run_command(study, case, ranks, "restart" if state == "begun" else "overwrite")
+    # _check_folder has allowed to overwrite what is in the folder
+    mode = "restart" if state == "begun" else "overwrite"
+    log, command = case.folder / "log.txt", run_command(study, case, ranks, mode)
     create(log).close()
-    with log.open("w", encoding="utf-8") as file, _Forwarding() as forwarding:
-        # in a session of its own: Ctrl-C would reach it beside the signal passed on, and mpirun kills its ranks at once
-        process = subprocess.Popen(work, stdout=file, stderr=file, start_new_session=True, env=_environment())
-        code = forwarding.wait_for(process)
-    if forwarding.asked is not None:
+    with log.open("w", encoding="utf-8") as file, _SignalForwarder() as forwarder:
+        # A session of its own: otherwise Ctrl-C would reach the run beside the forwarded signal, and mpirun would kill
+        # its ranks at once.
+        process = subprocess.Popen(command, stdout=file, stderr=file, start_new_session=True, env=_run_environment())
+        code = forwarder.wait_for(process)
+    if forwarder.first_signal is not None:
         return "interrupted"
     outcome = OUTCOMES.get(code, f"failed with exit code {code}")
     if code == Exit.DONE:
@@ -247,65 +294,73 @@ def _run(study: str, case: SweepCase, text: str, ranks: int) -> str:
     return f"{outcome}: {read_last_message(log).removeprefix(MESSAGE_PREFIX) or 'it said nothing'}"
 
 
-class _Forwarding:
-    """Passes on a signal that would end the sweep to the run, which ends first, with a checkpoint.
+class _SignalForwarder:
+    """Forwarder of stop signals to the run, which then ends with a checkpoint before the sweep ends.
 
-    SIGUSR1 is passed on in place of the others: mpirun passes it on, too, while it kills ranks at a SIGTERM. Who does
-    not want to wait for the checkpoint sends a second signal (SAME_REQUEST s later, for some senders send it twice).
+    The run receives SIGUSR1 in place of any signal: mpirun forwards that one, but kills its ranks at a SIGTERM. A
+    second signal, `REPEATED_SIGNAL_INTERVAL` seconds later or more, ends the run without a checkpoint; some senders
+    send a signal twice.
 
     Attributes:
-        asked: when the first signal came (s, monotonic); None: none came.
+        first_signal: time of the first signal (s, monotonic clock); None: there was none.
     """
 
     def __init__(self) -> None:
-        self.asked: float | None = None
+        self.first_signal: float | None = None
         self._process: subprocess.Popen[bytes] | None = None
-        self._before: dict[int, Any] = {}
+        self._previous_handlers: dict[int, Any] = {}
 
-    def __enter__(self) -> _Forwarding:
-        wanted = [number for number in STOP_SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
-        self._before = {number: signal.signal(number, self._pass_on) for number in wanted}
+    def __enter__(self) -> _SignalForwarder:
+        caught = [number for number in STOP_SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
+        self._previous_handlers = {number: signal.signal(number, self._forward) for number in caught}
         return self
 
     def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
+        for number, handler in self._previous_handlers.items():
             signal.signal(number, handler)
 
     def wait_for(self, process: subprocess.Popen[bytes]) -> int:
-        """The exit code of a run, once it has ended."""
+        """Exit code of a run, after it has ended."""
         self._process = process
-        if self.asked is not None:  # before the run was started
+        if self.first_signal is not None:  # it came before the run was started
             process.send_signal(signal.SIGUSR1)
         return process.wait()
 
-    def _pass_on(self, number: int, _: Any) -> None:
-        now, first = time.monotonic(), self.asked is None
-        if self.asked is not None and now < self.asked + REPEATED_SIGNAL_INTERVAL:
+    def _forward(self, number: int, _: Any) -> None:
+        clock, is_first = time.monotonic(), self.first_signal is None
+        if self.first_signal is not None and clock < self.first_signal + REPEATED_SIGNAL_INTERVAL:
             return
-        self.asked = now if self.asked is None else self.asked
+        self.first_signal = clock if self.first_signal is None else self.first_signal
         if self._process is not None and self._process.poll() is None:
-            self._process.send_signal(signal.SIGUSR1 if first else signal.SIGTERM)
+            self._process.send_signal(signal.SIGUSR1 if is_first else signal.SIGTERM)
 
 
 # --- the table ------------------------------------------------------------------------------------------------------
 
 
 def write_sweep_table(cases: list[SweepCase], outcomes: dict[str, str], out: Path) -> None:
-    """sweep.csv: settings, outcome and the figures of summary.json of every run so far; replaced in one go."""
+    """Write sweep.csv with settings, outcome and numbers of summary.json of each case.
+
+    Args:
+        cases: all cases.
+        outcomes: outcomes so far, by name of the case.
+        out: folder of the sweep.
+    """
     rows = []
     for case in cases:
-        figures = _figures(case) if case.folder.name in outcomes else {}
-        rows.append({"case": case.folder.name, **case.values, "outcome": outcomes.get(case.folder.name, "not run yet")})
-        rows[-1] |= figures
+        name = case.folder.name
+        row = {"case": name, **case.values, "outcome": outcomes.get(name, "not run yet")}
+        rows.append(row | (_summary_numbers(case) if name in outcomes else {}))
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    with replacing_all(out / "sweep.csv") as new, new.open("w", newline="", encoding="utf-8") as file:
+    with replacing_all(out / "sweep.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, restval="")
         writer.writeheader()
         writer.writerows(rows)
 
 
-def _figures(case: SweepCase) -> dict[str, Any]:
-    summary = _summary(case)
+def _summary_numbers(case: SweepCase) -> dict[str, Any]:
+    """Numbers of summary.json, with peak_NAME of the reactions and seconds_PHASE."""
+    summary = _read_summary(case)
     plain = {key: value for key, value in summary.items() if isinstance(value, int | float)}
     peaks = {f"peak_{key}": value for key, value in summary.get("peak_reactions", {}).items()}
     return plain | peaks | {f"seconds_{key}": value for key, value in summary.get("seconds", {}).items()}

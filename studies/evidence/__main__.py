@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from ...report.content import Section, to_data
-from ...report.environment_info import machine_info, program_versions
+from ...report.html_report import machine_info, program_versions
 from .runner import RECORD, fingerprint, folder_in, run_trial, time_again
 from .trial import Trial
 

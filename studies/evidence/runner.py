@@ -20,7 +20,7 @@ import tomli_w
 
 import fracsim as root
 from fracsim import forms, meshes
-from fracsim.report.exit_status import OUTCOMES, read_last_message, read_log_messages
+from fracsim.report.runs import OUTCOMES, read_last_message, read_log_messages
 
 from .trial import Trial
 

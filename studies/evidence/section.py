@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from ...report.content import Claim, Picture, Plot, ReportTable, Section, Series, TableCell
-from ...report.pareto import pareto_front
+from ...report.plots import pareto_front
 from .trial import Setting
 
 __all__ = [

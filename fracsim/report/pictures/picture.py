@@ -1,7 +1,4 @@
-"""Pictures, sheets and animations of runs, off-screen: their split surface where there is one, else their mesh.
-
-A screen for VTK on machines that have none.
-"""
+"""Pictures, sheets and films of runs, drawn off-screen: the split surface if there is one, otherwise the mesh."""
 
 from __future__ import annotations
 
@@ -27,15 +24,15 @@ from .picture_options import PictureOptions
 from .renderer import Renderer, field_range
 
 Pixels = npt.NDArray[np.uint8]
-FILMS = (".gif", ".mp4")
-FPS = 12
-TILE = 0.5  # of the size of a picture: one of several on a sheet
-GAP = 8  # pixels between pictures of a sheet
+FILM_SUFFIXES = (".gif", ".mp4")
+FPS = 12  # pictures per second of a film
+_SHEET_SCALE = 0.5  # size of a picture on a sheet, as a share of a single picture
+GAP = 8  # pixels between the pictures of a sheet
 
 
 @contextmanager
 def virtual_display() -> Iterator[None]:
-    """The screen there is, or a virtual one that ends with the picture."""
+    """Display for VTK: the present one, or an Xvfb server that ends with the context."""
     xvfb = shutil.which("Xvfb")
     if os.environ.get("DISPLAY") or xvfb is None:
         yield
@@ -43,7 +40,7 @@ def virtual_display() -> Iterator[None]:
     read, write = os.pipe()
     command = [xvfb, "-displayfd", str(write), "-screen", "0", "1600x1200x24", "-nolisten", "tcp"]
     quiet = subprocess.DEVNULL
-    # not in the working folder, where it looks for keyboards
+    # in "/": Xvfb looks for keyboard files in its working folder
     server = subprocess.Popen(command, pass_fds=[write], stdout=quiet, stderr=quiet, cwd="/")
     os.close(write)
     try:
@@ -59,123 +56,156 @@ def virtual_display() -> Iterator[None]:
 def render(
     folder: Path | Sequence[Path],
     target: Path | None = None,
-    look: PictureOptions | None = None,
+    options: PictureOptions | None = None,
     *,
     frame: int = -1,
     sheet: str = "",
     fps: int = FPS,
 ) -> Path:
-    """Draw one frame as a PNG, or all of them as a GIF, an MP4 or, where `target` has no suffix, PNGs in a folder;
-    returns what was written. Pictures of a film are evenly spaced in simulated time, those in a folder are the frames.
+    """Draw frames of a run and return the path of what was written.
 
-    Several folders: that frame of each, side by side.    `sheet`: so many frames of one folder, or which: "0,18,-1".
+    Pictures of a film are evenly spaced in simulated time; those in a folder are the frames.
+
+    Args:
+        folder: output folder. Several folders: that frame of each, side by side.
+        target: a .png for one picture or a sheet, a .gif or .mp4 for a film, a name without suffix for a folder of
+            pictures; None: last.png in the (first) output folder.
+        options: options of the pictures.
+        frame: number of the frame, -1 for the last.
+        sheet: number of frames on a sheet, or which, as in "0,18,-1".
+        fps: pictures per second of a film.
+
+    Raises:
+        InputError: there is no such frame, or the options do not fit.
     """
     folders = [folder] if isinstance(folder, Path) else list(folder)
-    target, look = target or folders[0] / "last.png", look or PictureOptions()
-    look.view_direction()
-    if target.suffix not in ("", ".png", *FILMS):
+    target, options = target or folders[0] / "last.png", options or PictureOptions()
+    options.view_direction()
+    if target.suffix not in ("", ".png", *FILM_SUFFIXES):
         raise InputError(f"-o {target}: pictures are .png, films .gif or .mp4, and a name without a suffix is a folder")
     if target.suffix:
         check_replaceable(target)  # before anything is drawn
-    every = [find_frames(each) for each in folders]
-    if target.suffix == ".png":
-        shots = select_frames(every, folders, frame, sheet)
+    run_frames = [find_frames(run) for run in folders]
+    is_picture = target.suffix == ".png"
+    if is_picture:
+        frames = select_frames(run_frames, folders, frame, sheet)
     elif sheet or len(folders) > 1:
         raise InputError(f"-o {target}: a sheet, or pictures of several runs, is a .png")
     else:
-        shots = every[0]
-    film = target.suffix in FILMS
-    counts = film_repetitions([shot.t for shot in shots]) if film else np.ones(len(shots), int)
-    shots, counts = [shot for shot, count in zip(shots, counts, strict=True) if count], counts[counts > 0]
-    single = target.suffix == ".png"
-    if len(shots) > 1:
-        look = replace(look, fine=look.fine and single)
-    if single and len(shots) > 1:
-        look = replace(look, size=(round(TILE * look.size[0]), round(TILE * look.size[1])))
+        frames = run_frames[0]
+    is_film = target.suffix in FILM_SUFFIXES
+    repetitions = film_repetitions([source.t for source in frames]) if is_film else np.ones(len(frames), int)
+    frames = [source for source, count in zip(frames, repetitions, strict=True) if count]
+    repetitions = repetitions[repetitions > 0]
+    if len(frames) > 1:
+        options = replace(options, fine=options.fine and is_picture)
+    if is_picture and len(frames) > 1:
+        width, height = options.size
+        options = replace(options, size=(round(_SHEET_SCALE * width), round(_SHEET_SCALE * height)))
     with virtual_display():
-        pictures = _shoot(shots, look, titled=len(folders) > 1)
+        pictures = _render_frames(frames, options, titled=len(folders) > 1)
         target.parent.mkdir(parents=True, exist_ok=True)
-        if single:
-            _save(target, tile_pictures(list(pictures)))
+        if is_picture:
+            _save_png(target, tile_pictures(list(pictures)))
         else:
-            _film(target, (each for each, n in zip(pictures, counts, strict=True) for _ in range(n)), fps)
+            repeated = zip(pictures, repetitions, strict=True)
+            _save_film(target, (picture for picture, count in repeated for _ in range(count)), fps)
     return target
 
 
-def select_frames(every: list[list[FrameSource]], folders: list[Path], frame: int, sheet: str) -> list[FrameSource]:
-    """The frames of a picture: one a folder, or those of a sheet."""
-    for frames, folder in zip(every, folders, strict=True):
+def select_frames(
+    run_frames: list[list[FrameSource]], folders: list[Path], frame: int, sheet: str
+) -> list[FrameSource]:
+    """Frames of a picture: one of each run, or those of a sheet of one run.
+
+    Args:
+        run_frames: frames of each run.
+        folders: output folders, for messages.
+        frame: number of the frame, -1 for the last.
+        sheet: "", number of frames on a sheet, or which.
+
+    Raises:
+        InputError: there is no such frame.
+    """
+    for frames, folder in zip(run_frames, folders, strict=True):
         if not -len(frames) <= frame < len(frames):
             raise InputError(f"--frame {frame}: {folder} has {len(frames)} frames, counted from 0 (-1 is the last)")
     if not sheet:
-        return [frames[frame] for frames in every]
-    if len(every) > 1:
+        return [frames[frame] for frames in run_frames]
+    if len(run_frames) > 1:
         raise InputError("--sheet: frames of one run; give one folder")
-    frames = every[0]
+    frames = run_frames[0]
     try:
-        which = [int(part) for part in sheet.split(",")]
+        numbers = [int(part) for part in sheet.split(",")]
     except ValueError:
         raise InputError(f"--sheet {sheet}: must be how many frames, or which: 0,18,-1") from None
-    if len(which) == 1:
-        if which[0] < 1:
+    if len(numbers) == 1:
+        if numbers[0] < 1:
             raise InputError(f"--sheet {sheet}: must be 1 or more")
-        count = min(which[0], len(frames))
-        which = np.unique(np.rint(np.linspace(0, len(frames) - 1, count)).astype(int)).tolist() if count > 1 else [-1]
-    if wrong := [each for each in which if not -len(frames) <= each < len(frames)]:
+        count = min(numbers[0], len(frames))
+        spaced = np.rint(np.linspace(0, len(frames) - 1, count)).astype(int)
+        numbers = np.unique(spaced).tolist() if count > 1 else [-1]
+    if wrong := [number for number in numbers if not -len(frames) <= number < len(frames)]:
         raise InputError(f"--sheet {sheet}: {folders[0]} has {len(frames)} frames, counted from 0, and no {wrong[0]}")
-    return [frames[each] for each in which]
+    return [frames[number] for number in numbers]
 
 
-def _shoot(shots: Sequence[FrameSource], look: PictureOptions, *, titled: bool) -> Iterator[Pixels]:
-    """All from one place, in one range of colours. `titled`: each by the name of its run."""
-    scope = merge_bounds([view_bounds(shot, look) for shot in shots])
-    limits = look.limits or merge_ranges([field_range(shot, look.colour) for shot in shots])
-    if look.floor and scope.is_flat:
+def _render_frames(frames: Sequence[FrameSource], options: PictureOptions, *, titled: bool) -> Iterator[Pixels]:
+    """Pictures of frames, from one camera position and with one range of colours.
+
+    Args:
+        frames: the frames.
+        options: options of the pictures.
+        titled: the title is the name of the run.
+    """
+    view = merge_bounds([view_bounds(frame, options) for frame in frames])
+    limits = options.limits or merge_ranges([field_range(frame, options.colour) for frame in frames])
+    if options.floor and view.is_flat:
         raise InputError("--floor: a body in 2D has none")
-    with Renderer(look, scope, limits, read_study(shots[0].folder)) as stage:
-        for shot in shots:
-            yield stage.render_frame(shot, shot.folder.name if titled else None)
+    with Renderer(options, view, limits, read_study(frames[0].folder)) as renderer:
+        for frame in frames:
+            yield renderer.render_frame(frame, frame.folder.name if titled else None)
 
 
 def tile_pictures(pictures: Sequence[Pixels]) -> Pixels:
-    """Up to three in a row, more of them in rows as long as there are."""
+    """Sheet of pictures of equal size: up to three in one row, more in a grid that is about square."""
     columns = len(pictures) if len(pictures) <= 3 else math.ceil(math.sqrt(len(pictures)))
     height, width, _ = pictures[0].shape
     rows = math.ceil(len(pictures) / columns)
     sheet = np.full((rows * (height + GAP) - GAP, columns * (width + GAP) - GAP, 3), 255, np.uint8)
-    for place, each in enumerate(pictures):
-        y, x = (height + GAP) * (place // columns), (width + GAP) * (place % columns)
-        sheet[y : y + height, x : x + width] = each
+    for number, picture in enumerate(pictures):
+        y, x = (height + GAP) * (number // columns), (width + GAP) * (number % columns)
+        sheet[y : y + height, x : x + width] = picture
     return sheet
 
 
-def _save(target: Path, pixels: Pixels) -> None:
-    """Write a PNG in one go: a run may draw the same one, and someone may look at it."""
+def _save_png(target: Path, pixels: Pixels) -> None:
+    """Write a PNG as a whole, since a viewer may show the previous one."""
     from PIL import Image
 
-    with replacing_all(target) as new:
-        Image.fromarray(pixels).save(new, "PNG", optimize=True)
+    with replacing_all(target) as temporary:
+        Image.fromarray(pixels).save(temporary, "PNG", optimize=True)
 
 
-def _film(target: Path, pictures: Iterator[Pixels], fps: int) -> None:
-    """All pictures, as the name says."""
+def _save_film(target: Path, pictures: Iterator[Pixels], fps: int) -> None:
+    """Write pictures as a film, or as PNGs to a folder if `target` has no suffix."""
     if target.suffix:
-        with replacing_all(target) as new, _writer(new, fps) as append:
-            for each in pictures:
-                append(each)
+        with replacing_all(target) as temporary, _FilmWriter(temporary, fps) as append:
+            for picture in pictures:
+                append(picture)
         return
     target.mkdir(parents=True, exist_ok=True)
-    for number, each in enumerate(pictures):
-        _save(target / f"frame_{number:06d}.png", each)
+    for number, picture in enumerate(pictures):
+        _save_png(target / f"frame_{number:06d}.png", picture)
 
 
-class _writer:
-    """A film as it is written; an MP4 has sides of even length, as its coding asks."""
+class _FilmWriter:
+    """Writer of a film. The sides of an MP4 are made even, as its codec requires."""
 
     def __init__(self, target: Path, fps: int) -> None:
         import imageio.v2
 
-        how: dict[str, Any] = {"duration": 1000 / fps, "loop": 0}
+        settings: dict[str, Any] = {"duration": 1000 / fps, "loop": 0}
         if target.suffix == ".mp4":
             try:
                 import imageio_ffmpeg  # noqa: F401
@@ -184,8 +214,8 @@ class _writer:
                     f"-o {target.name}: films in MP4 need imageio-ffmpeg (pip install imageio-ffmpeg); .gif does not"
                 )
                 raise InputError(message) from None
-            how = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2}
-        self._file = imageio.v2.get_writer(str(target), **how)
+            settings = {"fps": fps, "codec": "libx264", "quality": 8, "macro_block_size": 2}
+        self._file = imageio.v2.get_writer(str(target), **settings)
 
     def __enter__(self) -> Callable[[Pixels], None]:
         return self._file.append_data
