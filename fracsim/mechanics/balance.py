@@ -129,7 +129,8 @@ class Balance:
 
         Args:
             t: time, s.
-            u, v: (owned dofs,) displacement and velocity, m and m/s.
+            u: (owned dofs,) displacement, m.
+            v: (owned dofs,) velocity, m/s.
             a: (owned dofs,) acceleration, m/s^2; None: zero.
             dt: size of the step whose rates are used, s; None: that of the last step.
         """
@@ -192,7 +193,7 @@ class Balance:
     # --- residual ---
 
     def assemble_residual(self, b: PETSc.Vec) -> PETSc.Vec:
-        """r at the current u into b, N; rows of prescribed dofs hold their reactions (collective)."""
+        """Residual at the current u into b, N; rows of prescribed dofs hold their reactions (collective)."""
         return self._add_nodal_parts(self._assembler.assemble_into(b, self._work))
 
     def _add_nodal_parts(self, b: PETSc.Vec) -> PETSc.Vec:
@@ -216,7 +217,7 @@ class Balance:
         return result
 
     def assemble_free_residual(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
-        """r at x into b, zero on rows of prescribed dofs, which have their values in every iterate (collective)."""
+        """Residual at x into b, zero on rows of prescribed dofs (collective)."""
         # rows u - u_prescribed instead would mix metres with newtons in one norm, and leave prescribed dofs as inexact
         # as the Krylov solve
         self.set_iterate(x)
@@ -224,7 +225,7 @@ class Balance:
         b.array_w[self.motion.owned_dofs] = 0.0
 
     def assemble_extension_residual(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
-        """r + K (u_prescribed - u) into b, at an x whose prescribed dofs are not at their values yet (collective).
+        """Sum r + K (u_prescribed - u) into b, at an x whose prescribed dofs have other values (collective).
 
         Its solution extends a jump of the prescribed displacement linearly into the body. Cells at the boundary would
         otherwise take all of it and might invert.
@@ -236,7 +237,7 @@ class Balance:
         b.array_w[self.motion.owned_dofs] = 0.0
 
     def update_forces(self) -> Values:
-        """(owned dofs,) r at the current u, stored as `reactions` (collective)."""
+        """(owned dofs,) residual at the current u, stored as `reactions` (collective)."""
         np.copyto(self.reactions, self.assemble_residual(self._force_vector).array_r)
         return self.reactions
 

@@ -48,7 +48,7 @@ class BlockMatrix:
         self._ghosted = la.create_petsc_vector(columns, matrix.block_size[1]) if columns.comm.size > 1 else None
 
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = K x (collective)."""
+        """Product y = K x (collective)."""
         self._multiply_blocks(x, y)
         if self.ties:
             y_nodes, x_nodes = (vector.reshape(-1, self.matrix.block_size[0]) for vector in (y.array_w, x.array_r))

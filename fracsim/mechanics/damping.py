@@ -42,7 +42,7 @@ class Drag(Term):
 
     @property
     def mass_factor(self) -> float:
-        """a c_v, 1/s^2."""
+        """Factor a c_v, 1/s^2."""
         assert self._level is not None
         return self.a * self._level.c_v
 
@@ -53,7 +53,7 @@ class Drag(Term):
         return np.asarray(self.mass_factor * (self._u.x.array[: len(u_v)] - u_v))
 
     def potential(self) -> float:
-        """a c_v (u - u_v) . M (u - u_v) / 2, J."""
+        """Potential a c_v (u - u_v) . M (u - u_v) / 2, J."""
         a = self.acceleration()
         return float(a @ self._mass.multiply(a)) / (2 * self.mass_factor) if self.mass_factor else 0.0
 

@@ -143,33 +143,17 @@ class NodeTies(Term):
         """Tie nodes without an unsplit cell, and again those whose cell split; free nodes with an unsplit cell."""
         self._pattern, domain = pattern.copy(), self._domain
         without = self._around(~is_split(domain.dim)[pattern]) == 0
-        local_links, local_nodes = self._links(pattern, without)
+        local_links, local_nodes = _links(domain, pattern, without, self._prescribed)
         if not sum_over_ranks(domain.comm, len(local_nodes) + len(self.ties.cell))[0]:
             return
         links, nodes = (
             np.unique(np.concatenate(allgather(domain.comm, array)), axis=0) for array in (local_links, local_nodes)
         )
-        unchanged = np.isin(self.ties.nodes[:, 0], nodes) & self._is_unsplit(self.ties.cell)
+        unchanged = np.isin(self.ties.nodes[:, 0], nodes) & _is_unsplit(domain, pattern, self.ties.cell)
         self._dissipated += self._energy(~unchanged)
         remaining = self.ties.select(unchanged)
         new = nodes[~np.isin(nodes, remaining.nodes[:, 0])]
-        self._set_ties(remaining.merge(self._new_ties(new, *self._groups(links, nodes), without)))
-
-    def _links(self, pattern: Pattern, without: Flags) -> tuple[Ints, Ints]:
-        """(n, 2) input nodes of intact edges of this rank with an end `without` (nodes,) an unsplit cell, and (m,) such
-        ends that are not prescribed."""
-        domain, pairs = self._domain, local_edges(self._domain.dim)
-        cells = np.flatnonzero(without[domain.cell_nodes].any(axis=1))
-        ends = domain.cell_nodes[cells][:, pairs]  # (n, edges, 2)
-        intact = (pattern[cells, None] >> np.arange(len(pairs))) & 1 == 0
-        ends = ends[intact & without[ends].any(axis=2)]
-        detached = np.unique(ends[without[ends] & ~self._prescribed[ends]])
-        return np.sort(domain.node_input[ends], axis=1), domain.node_input[detached]
-
-    def _groups(self, links: Ints, nodes: Ints) -> tuple[Ints, Ints]:
-        """All nodes (k,) of links (m, 2) and of `nodes` (n,), and the connected component (k,) of each."""
-        linked, ends = np.unique(np.concatenate([links.reshape(-1), nodes]), return_inverse=True)
-        return linked, components(ends[: links.size].reshape(-1, 2), len(linked))[1]
+        self._set_ties(remaining.merge(self._new_ties(new, *_groups(links, nodes), without)))
 
     def _new_ties(self, new: Ints, linked: Ints, group: Ints, without: Flags) -> Ties:
         """Ties of input nodes (n,), each to the cell at its group's nodes that has the least sum |lambda| (collective).
@@ -191,7 +175,7 @@ class NodeTies(Term):
         groups, cell, corners, corner_x = (np.concatenate(parts) for parts in gathered)
         # pairs of a node and a candidate cell, ordered by node, sum |lambda|, and number of the cell
         row, column = np.nonzero(group[np.searchsorted(linked, new)][:, None] == groups)
-        weights = _barycentric(self._positions(new)[row], corner_x[column])
+        weights = _barycentric(self._gather_positions(new, *self._owned(new))[row], corner_x[column])
         weight_sum = np.where(np.isfinite(weights).all(axis=1), np.abs(weights).sum(axis=1), np.inf)
         order = np.lexsort((cell[column], weight_sum, row))
         _, first = np.unique(row[order], return_index=True)
@@ -200,18 +184,7 @@ class NodeTies(Term):
         nodes = np.concatenate([new[row[best], None], corners[column[best]]], axis=1)
         return Ties(nodes, cell[column[best]], np.concatenate([np.ones((len(best), 1)), -weights[best]], axis=1))
 
-    def _is_unsplit(self, cells: Ints) -> Flags:
-        """(n,) whether cells of the input mesh are unsplit (collective)."""
-        unsplit = self._domain.cell_input[~is_split(self._domain.dim)[self._pattern]] if len(cells) else cells
-        return (
-            sum_over_ranks(self._domain.comm, np.isin(cells, unsplit).astype(np.int64)) > 0 if len(cells) else cells > 0
-        )
-
     # --- contributions to the balance ---
-
-    def _positions(self, numbers: Ints) -> Values:
-        """(n, d) positions x of nodes of the input mesh, m (collective)."""
-        return self._gather_positions(numbers, *self._owned(numbers))
 
     def _gather_positions(self, numbers: Ints, own: Ints, local: Ints) -> Values:
         """(n, d) positions x, m, of nodes of which this rank owns those at the indices `own` (collective)."""
@@ -235,15 +208,6 @@ class NodeTies(Term):
         )
         np.add.at(forces.reshape(-1, self._domain.dim), self._local, tie_forces[self._own])
 
-    def _nodal(self) -> csr_matrix:
-        """(n, n) stiffness k w w^T along each axis, N/m, over the nodes of all ties."""
-        from scipy.sparse import csr_matrix
-
-        rows = np.repeat(np.arange(len(self.ties.cell)), self._domain.dim + 2)
-        shape = len(self.ties.cell), len(self._numbers)
-        W = csr_matrix((self.ties.weights.reshape(-1), (rows, self._index.reshape(-1))), shape=shape)
-        return csr_matrix(self.stiffness * (W.T @ W))
-
     def tie_matrix(self, free: Flags) -> TieMatrix | None:
         """Stiffness k w w^T of all ties, kept while they last."""
         if not len(self.ties.cell):
@@ -252,7 +216,13 @@ class NodeTies(Term):
             from .block_matrix import TieMatrix
 
             may_move = free.reshape(-1, self._domain.dim)[self._local].astype(float)
-            self._tie_matrix = TieMatrix(self._domain.comm, self._nodal(), self._own, self._local, may_move)
+            self._tie_matrix = TieMatrix(
+                self._domain.comm,
+                _stiffness(self.ties, self.stiffness, self._index, len(self._numbers)),
+                self._own,
+                self._local,
+                may_move,
+            )
         return self._tie_matrix
 
     def coupling_matrix(self) -> PETSc.Mat | None:
@@ -263,7 +233,7 @@ class NodeTies(Term):
             from scipy.sparse import csr_matrix, identity, kron
 
             n, d = len(self._numbers), self._domain.dim
-            K = csr_matrix(kron(self._nodal(), identity(d)))
+            K = csr_matrix(kron(_stiffness(self.ties, self.stiffness, self._index, len(self._numbers)), identity(d)))
             first = self._domain.space.dofmap.index_map.local_range[0]
             local_part = np.zeros(n, np.int64)
             local_part[self._own] = first + self._local
@@ -337,6 +307,42 @@ class NodeTies(Term):
     def destroy(self) -> None:
         """Free PETSc's matrix."""
         self._coupling.destroy()
+
+
+def _is_unsplit(domain: Domain, pattern: Pattern, cells: Ints) -> Flags:
+    """(n,) whether cells of the input mesh are unsplit (collective)."""
+    unsplit = domain.cell_input[~is_split(domain.dim)[pattern]] if len(cells) else cells
+    return sum_over_ranks(domain.comm, np.isin(cells, unsplit).astype(np.int64)) > 0 if len(cells) else cells > 0
+
+
+def _links(domain: Domain, pattern: Pattern, without: Flags, prescribed: Flags) -> tuple[Ints, Ints]:
+    """(n, 2) ends of intact edges with an end `without` (nodes,) an unsplit cell, and (m,) such ends.
+
+    Edges are those of this rank, nodes those of the input mesh. The (m,) ends are not prescribed.
+    """
+    pairs = local_edges(domain.dim)
+    cells = np.flatnonzero(without[domain.cell_nodes].any(axis=1))
+    ends = domain.cell_nodes[cells][:, pairs]  # (n, edges, 2)
+    intact = (pattern[cells, None] >> np.arange(len(pairs))) & 1 == 0
+    ends = ends[intact & without[ends].any(axis=2)]
+    detached = np.unique(ends[without[ends] & ~prescribed[ends]])
+    return np.sort(domain.node_input[ends], axis=1), domain.node_input[detached]
+
+
+def _groups(links: Ints, nodes: Ints) -> tuple[Ints, Ints]:
+    """All nodes (k,) of links (m, 2) and of `nodes` (n,), and the connected component (k,) of each."""
+    linked, ends = np.unique(np.concatenate([links.reshape(-1), nodes]), return_inverse=True)
+    return linked, components(ends[: links.size].reshape(-1, 2), len(linked))[1]
+
+
+def _stiffness(ties: Ties, k: float, index: Ints, nodes: int) -> csr_matrix:
+    """(nodes, nodes) stiffness k w w^T along each axis, N/m; `index`: (n, d + 2) nodes of each tie."""
+    from scipy.sparse import csr_matrix
+
+    rows = np.repeat(np.arange(len(ties.cell)), ties.weights.shape[1])
+    shape = len(ties.cell), nodes
+    W = csr_matrix((ties.weights.reshape(-1), (rows, index.reshape(-1))), shape=shape)
+    return csr_matrix(k * (W.T @ W))
 
 
 def _barycentric(x: Values, corners: Values) -> Values:

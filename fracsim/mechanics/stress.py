@@ -92,7 +92,11 @@ class Stress(Term):
         integrity: (edges of a cell,) numbers in [0, 1] in each cell, in the approach "edge" or with closing cracks.
         cracks_close: whether broken edges resist being shorter than at rest.
         energy: the energy that is assembled; material.energy is that of the undamaged body.
+        energy_multiplier: chi if it multiplies `energy`; None if `energy` has it, or nothing is degraded.
+        degradation_factor: chi or 1; with a floor in a quasi-static study, for a regular tangent.
+        energy_factor: factor of `energy`; 1 if `energy` has chi.
         rotation: polar rotation of the elastic part of F, for energies that need it.
+        rotation_field: its field.
     """
 
     name = "stress"
@@ -122,11 +126,19 @@ class Stress(Term):
         self.integrity: fem.Function | None = None
         self.cracks_close = degradation is not None and degradation.cracks_close
         self.energy: Energy = material.energy if degradation is None else self._damaged_energy(degradation)
-        self.rotation = PolarRotation(domain, self._elastic_part()) if material.energy.needs_rotation else None
+        self.energy_multiplier: fem.Function | None = self.chi if self.energy is material.energy else None
+        self.degradation_factor: Expr | float = _floored(self.chi, floor)
+        self.energy_factor: Expr | float = _floored(self.energy_multiplier, floor)
+        self.rotation = (
+            PolarRotation(domain, _elastic_part(u, material, domain.dim)) if material.energy.needs_rotation else None
+        )
+        self.rotation_field = None if self.rotation is None else self.rotation.field
         self.symmetric = material.plastic is None or not material.plastic.frobenius
         self.linear = self.energy.linear and not self.cracks_close and material.plastic is None
         dx = cell_measure(domain)
-        self._energy_form = compile_form(self._stored_energy(dx))
+        self._energy_form = compile_form(
+            elastic_energy(self.energy, u, dx, chi=self.energy_factor, rotation=self.rotation_field)
+        )
         self._kernel_of = KernelCache(self.kernels.functional)
         self._force_form = CellForm(self.virtual_work(ufl.TestFunction(domain.space), dx))
 
@@ -136,11 +148,11 @@ class Stress(Term):
         """Energy with damage; creates the fields of damage that the approach needs."""
         energy: Energy = self.material.energy
         if model.approach == "chi":
-            self.chi = self._undamaged_field("chi", 1)
+            self.chi = _undamaged_field(self.domain, "chi", 1)
             if not model.cracks_close:
                 return self.material.energy
         edges: list[list[int]] = np.asarray(local_edges(self.domain.dim)).tolist()  # type: ignore[assignment]
-        self.integrity = self._undamaged_field("integrity", len(edges))
+        self.integrity = _undamaged_field(self.domain, "integrity", len(edges))
         if model.approach == "edge":
             from ..forms.damage import EdgeProjectedEnergy, StrainEnergy
 
@@ -150,22 +162,10 @@ class Stress(Term):
         from ..forms.crack_closure import CrackClosureEnergy, midpoint_corrections
 
         share = 1.0 if self.chi is None else 1 - self.chi
-        bends = midpoint_corrections(self.u, self._reference_coordinates(), edges) if self.domain.order == 2 else None
-        return CrackClosureEnergy(energy, self._floored(self.chi), share, self.integrity, edges, bends)
-
-    def _reference_coordinates(self) -> fem.Function:
-        """Field of the (d,) coordinates in the reference cell."""
-        mesh, d = self.domain.mesh, self.domain.dim
-        field = fem.Function(fem.functionspace(mesh, ("DG", 1, (d,))), name="place")
-        field.x.array.reshape(-1, d + 1, d)[:] = basix.geometry(mesh.basix_cell())
-        return field
-
-    def _undamaged_field(self, name: str, components: int) -> fem.Function:
-        """DG0 field of ones."""
-        space = self.domain.cell_scalar if components == 1 else self.domain.cell_vector(components)
-        field = fem.Function(space, name=name)
-        field.x.array[:] = 1.0
-        return field
+        bends = (
+            midpoint_corrections(self.u, _reference_coordinates(self.domain), edges) if self.domain.order == 2 else None
+        )
+        return CrackClosureEnergy(energy, _floored(self.chi, self._floor), share, self.integrity, edges, bends)
 
     @property
     def damage_fields(self) -> list[fem.Function]:
@@ -179,45 +179,12 @@ class Stress(Term):
             field.x.array[:] = value
         return former
 
-    def _elastic_part(self) -> Expr:
-        """(d, d) F, or its elastic part in a body with plastic flow."""
-        F = deformation_gradient(self.u)
-        if self.material.plastic is None:
-            return F
-        part = self.material.energy.elastic_part(F)  # type: ignore[attr-defined]
-        return part if self.domain.dim == 3 else ufl.as_tensor([[part[i, j] for j in range(2)] for i in range(2)])
-
-    @property
-    def energy_multiplier(self) -> fem.Function | None:
-        """Field chi if it multiplies `energy`; None if `energy` has it, or nothing is degraded."""
-        return self.chi if self.energy is self.material.energy else None
-
     @property
     def dead_cells(self) -> Flags | None:
         """(owned cells,) flags of cells that have no stress any more; None if a broken cell keeps some of it."""
         if self.energy_multiplier is None or self._floor:
             return None
         return np.asarray(self.energy_multiplier.x.array[: self.domain.cell_count] == 0)
-
-    @property
-    def degradation_factor(self) -> Expr | float:
-        """Degradation chi, or 1; in a quasi-static study with a floor, for a regular tangent."""
-        return self._floored(self.chi)
-
-    @property
-    def energy_factor(self) -> Expr | float:
-        """Factor of `energy`: 1 if `energy` has chi."""
-        return self._floored(self.energy_multiplier)
-
-    def _floored(self, chi: Expr | None) -> Expr | float:
-        if chi is None:
-            return 1.0
-        return self._floor + (1 - self._floor) * chi if self._floor else chi
-
-    @property
-    def rotation_field(self) -> fem.Function | None:
-        """Field of `rotation`, if the energy needs it."""
-        return self.rotation.field if self.rotation is not None else None
 
     # --- as a term of the balance ---
 
@@ -240,9 +207,6 @@ class Stress(Term):
         """Virtual work and tangent with the flow of the step itself (`update = "implicit"`); None otherwise."""
         plastic = self.material.plastic
         return plastic.prediction.form if plastic is not None and plastic.prediction is not None else None
-
-    def _stored_energy(self, dx: ufl.Measure) -> ufl.Form:
-        return elastic_energy(self.energy, self.u, dx, chi=self.energy_factor, rotation=self.rotation_field)
 
     def virtual_work(self, w: Expr, dx: ufl.Measure) -> ufl.Form:
         """Virtual work of the stress, with plastic flow within the step, N m."""
@@ -333,3 +297,35 @@ class Stress(Term):
         nodes, d = self.domain.cell_nodes[cells], self.domain.dim
         corners = self.domain.nodes.take(nodes, axis=0)  # a third of the time of indexing
         return corners if self.energy.linear else corners + self.u.x.array.reshape(-1, d).take(nodes, axis=0)
+
+
+def _reference_coordinates(domain: Domain) -> fem.Function:
+    """Field of the (d,) coordinates in the reference cell."""
+    mesh, d = domain.mesh, domain.dim
+    field = fem.Function(fem.functionspace(mesh, ("DG", 1, (d,))), name="place")
+    field.x.array.reshape(-1, d + 1, d)[:] = basix.geometry(mesh.basix_cell())
+    return field
+
+
+def _undamaged_field(domain: Domain, name: str, components: int) -> fem.Function:
+    """DG0 field of ones."""
+    space = domain.cell_scalar if components == 1 else domain.cell_vector(components)
+    field = fem.Function(space, name=name)
+    field.x.array[:] = 1.0
+    return field
+
+
+def _floored(chi: Expr | None, floor: float) -> Expr | float:
+    """Degradation chi of which a floor is left; 1 without chi."""
+    if chi is None:
+        return 1.0
+    return floor + (1 - floor) * chi if floor else chi
+
+
+def _elastic_part(u: fem.Function, material: MaterialFields, dim: int) -> Expr:
+    """(d, d) F, or its elastic part in a body with plastic flow."""
+    F = deformation_gradient(u)
+    if material.plastic is None:
+        return F
+    part = material.energy.elastic_part(F)  # type: ignore[attr-defined]
+    return part if dim == 3 else ufl.as_tensor([[part[i, j] for j in range(2)] for i in range(2)])

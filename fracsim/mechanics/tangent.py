@@ -68,6 +68,7 @@ class Tangent:
             the owner of anything made for an earlier pattern has to make it again.
         low_rank_updates: U (owned dofs, k) and C (k, k): the assembled matrix lacks - U C U^T.
         stiff_couplings: couplings that the assembled matrix lacks.
+        may_be_incomplete: whether K may lack `low_rank_updates` or `stiff_couplings`.
         has_contact_coupling: whether terms coupled dofs of different cells in the last tangent, except by constants.
     """
 
@@ -85,6 +86,8 @@ class Tangent:
             [term for term in terms if isinstance(term, TieTerm)],
             [term for term in terms if isinstance(term, LowRankTerm)],
         )
+        self.may_be_incomplete = any(term.leaves_tangent_incomplete for term in terms)
+        self._linear = all(term.linear for term in terms)
         self._has_couplings = False  # whether a coupling has ever been added
         self._has_varying_couplings = False  # whether one that is no constant has
         self._with_contact = True
@@ -139,20 +142,11 @@ class Tangent:
         part.destroy()
         return result
 
-    @property
-    def may_be_incomplete(self) -> bool:
-        """Whether K may lack `low_rank_updates` or `stiff_couplings`."""
-        return any(term.leaves_tangent_incomplete for term in self._terms)
-
     def damage_changed(self) -> None:
         """Exclude cells without stress from integration (not collective)."""
-        self._exclude_dead_cells(self.form)
+        _exclude_dead_cells(self._stress, self.form)
         if self._psd is not None:
-            self._exclude_dead_cells(self._psd.form)
-
-    def _exclude_dead_cells(self, form: CellForm) -> None:
-        if (dead := self._stress.dead_cells) is not None:
-            form.exclude_cells(dead)
+            _exclude_dead_cells(self._stress, self._psd.form)
 
     def shrink(self, share: float) -> bool:
         """Drop entries of dead cells if at most a share of its cells are alive; returns whether it did (collective)."""
@@ -228,11 +222,8 @@ class Tangent:
             self._assembler(self._motion.bcs, psd_form)
             if factor:
                 self._mass.add_to(self.matrix, factor, more_entries=self._has_couplings)
-        self._assembled_at = (psd_tolerance, self._displacement.copy()) if self._depends_on_u_alone else None
-
-    @property
-    def _displacement(self) -> Values:
-        return np.asarray(self._u.x.array[: self._owned])
+        u = self._u.x.array[: self._owned]
+        self._assembled_at = (psd_tolerance, u.copy()) if self._depends_on_u_alone else None
 
     def _is_reusable(self, psd_tolerance: float | None) -> bool:
         """Whether the last K of this attempt is the body's part, and u has hardly changed since (collective).
@@ -247,7 +238,7 @@ class Tangent:
             return False
         if self._step_fraction < REUSE.max_fraction:
             return True
-        moved = float(np.abs(self._displacement - u).max(initial=0.0))
+        moved = float(np.abs(self._u.x.array[: self._owned] - u).max(initial=0.0))
         return bool(self.domain.comm.allreduce(moved, op=MPI.MAX) <= REUSE.max_move * self.domain.mean_edge_length)
 
     @cached_property
@@ -263,13 +254,9 @@ class Tangent:
             from .psd_projection import PsdProjection
 
             self._psd = PsdProjection(self._stress)
-            self._exclude_dead_cells(self._psd.form)
+            _exclude_dead_cells(self._stress, self._psd.form)
         self._psd.update(tolerance)
         return self._psd.form
-
-    @cached_property
-    def _linear(self) -> bool:
-        return all(term.linear for term in self._terms)
 
     def _is_assembled(self, psd_tolerance: float | None) -> bool:
         """Whether a linear K is up to date; where it is not, the caller assembles it (collective)."""
@@ -313,6 +300,11 @@ class Tangent:
     def destroy(self) -> None:
         """Free PETSc's objects."""
         self._assembler.destroy()
+
+
+def _exclude_dead_cells(stress: Stress, form: CellForm) -> None:
+    if (dead := stress.dead_cells) is not None:
+        form.exclude_cells(dead)
 
 
 def adds_single_entries(term: Term) -> bool:
