@@ -86,9 +86,9 @@ def facets_of_nodes(
 ) -> tuple[Ints, Ints]:
     """Local facets of (n, d) distinct sets of input nodes, each rank giving its share, and values (collective)."""
     dim = mesh.topology.dim
-    local, found = distribute_entity_data(mesh, dim - 1, nodes, values)
+    local, local_values = distribute_entity_data(mesh, dim - 1, nodes, values)
     mesh.topology.create_connectivity(dim - 1, 0)
-    tags = dolfinx.mesh.meshtags_from_entities(mesh, dim - 1, graph.adjacencylist(local), found)
+    tags = dolfinx.mesh.meshtags_from_entities(mesh, dim - 1, graph.adjacencylist(local), local_values)
     return tags.indices, tags.values
 
 
@@ -105,16 +105,16 @@ def keep_kernels() -> None:
     """Have FFCx look for a kernel once a process: it reads its folder for each, 1 ms where that holds 1,000 files. It
     loads whole ones alone: others are compiled once more."""
     look_up, load = jit.get_cached_module, jit._load_objects
-    kept: dict[tuple[str, tuple[str, ...], str], tuple[Any, Any]] = {}
+    cache: dict[tuple[str, tuple[str, ...], str], tuple[Any, Any]] = {}
 
     def looked_up_once(name: str, objects: Sequence[str], folder: Any, timeout: int) -> tuple[Any, Any]:
         key = name, tuple(objects), str(folder)
-        if key in kept:
-            return kept[key]
-        found = load_whole(lambda: look_up(name, objects, folder, timeout), Path(folder), name)
-        if found[0] is not None:  # None: it is compiled now
-            kept[key] = found
-        return found
+        if key in cache:
+            return cache[key]
+        compiled = load_whole(lambda: look_up(name, objects, folder, timeout), Path(folder), name)
+        if compiled[0] is not None:  # None: it is compiled now
+            cache[key] = compiled
+        return compiled
 
     def load_compiled(folder: Any, name: str, objects: Sequence[str]) -> tuple[Any, Any]:
         if (library := kernel_file(Path(folder), name)) is not None:
@@ -153,8 +153,8 @@ def source_of(expression: fem.Expression, mesh: dolfinx.mesh.Mesh, options: dict
     kernel = expression.ufl_expression, expression.X()
     scalar = {"scalar_type": expression.dtype}
     _, module, _ = dolfinx.jit.ffcx_jit(mesh.comm, kernel, form_compiler_options=scalar, jit_options=options)
-    made = Path(str(module.__file__))
-    return made.with_name(made.name.split(".")[0] + ".c")
+    source_file = Path(str(module.__file__))
+    return source_file.with_name(source_file.name.split(".")[0] + ".c")
 
 
 def constants_of(kind: fem.Form | fem.Expression) -> npt.NDArray[np.float64]:
@@ -180,16 +180,16 @@ class FormField:
 def form_fields(form: fem.Form) -> list[FormField]:
     """All of a form, in the order of its kernel."""
     compiled: Any = form._cpp_object
-    maps = ((each, each.function_space.dofmap) for each in compiled.coefficients)
-    return [FormField(np.asarray(dofmap.map()), dofmap.bs, each.x.array) for each, dofmap in maps]
+    maps = ((function, function.function_space.dofmap) for function in compiled.coefficients)
+    return [FormField(np.asarray(dofmap.map()), dofmap.bs, function.x.array) for function, dofmap in maps]
 
 
 def expression_fields(expression: fem.Expression) -> list[FormField]:
     """The same of an expression."""
     fields, kernel = extract_coefficients(expression.ufl_expression), expression.ufcx_expression
-    given = [fields[kernel.original_coefficient_positions[i]] for i in range(kernel.num_coefficients)]
-    maps = ((each, each.function_space.dofmap) for each in given)
-    return [FormField(dofmap.list, dofmap.bs, each.x.array) for each, dofmap in maps]
+    coefficients = [fields[kernel.original_coefficient_positions[i]] for i in range(kernel.num_coefficients)]
+    maps = ((function, function.function_space.dofmap) for function in coefficients)
+    return [FormField(dofmap.list, dofmap.bs, function.x.array) for function, dofmap in maps]
 
 
 def kernel_of(form: fem.Form) -> int:

@@ -51,8 +51,8 @@ def _meeting(lower: Values, upper: Values, count: Ints) -> tuple[Ints, Ints]:
     pairs = []
     rows = max(1, MAX_BOX_PAIRS // len(lower))
     for first in range(0, len(lower), rows):
-        some = slice(first, first + rows)
-        meets = ((lower[some, None] < upper) & (lower < upper[some, None])).all(axis=2)
+        batch = slice(first, first + rows)
+        meets = ((lower[batch, None] < upper) & (lower < upper[batch, None])).all(axis=2)
         i, j = np.nonzero(meets)
         pairs.append(np.stack([i + first, j])[:, i + first < j])
     i, j = np.concatenate(pairs, axis=1)

@@ -47,21 +47,21 @@ def _usable(folder: Path) -> Path:
     if _can_be_written(folder):
         _make_private(folder)
         return folder
-    other = Path(tempfile.gettempdir()) / f"fracsim-{os.getuid()}"
-    if not _can_be_written(other):
+    temporary = Path(tempfile.gettempdir()) / f"fracsim-{os.getuid()}"
+    if not _can_be_written(temporary):
         raise InputError(
-            f"compiled kernels cannot be kept: neither {folder} nor {other} can be written; name a folder that can, "
-            f"such as XDG_CACHE_HOME=/scratch/me"
+            f"compiled kernels cannot be kept: neither {folder} nor {temporary} can be written; name a "
+            f"folder that can, such as XDG_CACHE_HOME=/scratch/me"
         )
-    _make_private(other)
-    note(f"compiled kernels are kept in {other}: {folder} cannot be written; XDG_CACHE_HOME names another folder")
-    return other
+    _make_private(temporary)
+    note(f"compiled kernels are kept in {temporary}: {folder} cannot be written; XDG_CACHE_HOME names another folder")
+    return temporary
 
 
 def _can_be_written(folder: Path) -> bool:
     """Whether files can be made there, or the folder itself."""
-    there = next(path for path in (folder, *folder.parents) if os.path.lexists(path))
-    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
+    existing = next(path for path in (folder, *folder.parents) if os.path.lexists(path))
+    return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
 
 
 def _make_private(folder: Path) -> None:
@@ -157,8 +157,8 @@ def _write_seal(seal: Path, contents: Sequence[bytes]) -> None:
 
 def _digest(contents: Sequence[bytes]) -> bytes:
     digest = hashlib.sha256()
-    for each in contents:
-        digest.update(each)
+    for content in contents:
+        digest.update(content)
     return digest.hexdigest().encode()
 
 
@@ -167,9 +167,9 @@ def _is_elf(content: bytes) -> bool:
     if len(content) < 64 or content[:5] != b"\x7fELF\x02":
         return False
     order = "<" if content[5] == 1 else ">"
-    (at,) = struct.unpack_from(f"{order}Q", content, 0x28)
+    (section_offset,) = struct.unpack_from(f"{order}Q", content, 0x28)
     size, count = struct.unpack_from(f"{order}HH", content, 0x3A)
-    return at > 0 and len(content) >= at + size * count
+    return section_offset > 0 and len(content) >= section_offset + size * count
 
 
 # --- processes that compile at the same time ------------------------------------------------------------------------
@@ -182,7 +182,7 @@ def alone(folder: Path, name: str) -> Iterator[None]:
     A file system without locks, and a process that holds one for longer than PATIENCE, stop nobody: two compilations
     do no harm, they only take longer.
     """
-    place = int(hashlib.sha256(name.encode()).hexdigest()[:12], 16)
+    position = int(hashlib.sha256(name.encode()).hexdigest()[:12], 16)
     try:
         with not_for_others():
             lock = os.open(folder / "fracsim.lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
@@ -191,7 +191,7 @@ def alone(folder: Path, name: str) -> Iterator[None]:
         return
     try:
         deadline = time.monotonic() + PATIENCE
-        while not _locked(lock, place) and time.monotonic() < deadline:
+        while not _locked(lock, position) and time.monotonic() < deadline:
             time.sleep(0.02)
         yield
     finally:

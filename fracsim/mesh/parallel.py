@@ -29,11 +29,11 @@ def on_root[T](comm: MPI.Comm, work: Callable[[], T]) -> T | None:
             result = work()
         except (SystemExit, Exception) as error:
             failure = error
-    told = comm.bcast(_sendable(failure))
+    root_failure = comm.bcast(_sendable(failure))
     if failure is not None:
         raise failure
-    if told is not None:
-        raise told
+    if root_failure is not None:
+        raise root_failure
     return result
 
 
@@ -67,11 +67,11 @@ def who_failed(comm: MPI.Intracomm, patience: float) -> set[int]:
     Each rank that fails calls this function. Other ranks may be waiting in a collective operation. Therefore only
     messages between two ranks are used.
     """
-    others = [rank for rank in range(comm.size) if rank != comm.rank]
-    sent = [comm.isend(None, rank, _FAILED) for rank in others]
+    other_ranks = [rank for rank in range(comm.size) if rank != comm.rank]
+    sent = [comm.isend(None, rank, _FAILED) for rank in other_ranks]
     failed, deadline = {comm.rank}, time.monotonic() + patience
     while len(failed) < comm.size and time.monotonic() < deadline:
-        for rank in others:
+        for rank in other_ranks:
             if rank not in failed and comm.iprobe(rank, _FAILED):
                 comm.recv(source=rank, tag=_FAILED)
                 failed.add(rank)

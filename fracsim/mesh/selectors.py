@@ -83,11 +83,11 @@ class PointsOnPlane:
 type Selector = Group | PointsInBox | PointsOnPlane
 
 
-def check_group(name: str, known: Iterable[str], key: str) -> None:
+def check_group(name: str, groups: Iterable[str], key: str) -> None:
     """Raise InputError if the mesh has no facet group of that name; `key` of the study that names the group."""
-    known = sorted(known)
-    if name not in known:
-        raise InputError(f'{key} = "{name}": the mesh has no such facet group; it has: {", ".join(known) or "none"}')
+    names = sorted(groups)
+    if name not in names:
+        raise InputError(f'{key} = "{name}": the mesh has no such facet group; it has: {", ".join(names) or "none"}')
 
 
 def check_regions(names: Iterable[str], known: Sequence[str]) -> None:

@@ -45,9 +45,9 @@ class SurfacePoints:
         self._of_node[nodes] = np.arange(len(nodes))
         row, owner = self._copies.expand(pattern)
         self._first = np.searchsorted(owner, np.arange(len(damaged)))  # first copy of each damaged cell
-        number, one = _numbered(self._keys(row, damaged[owner], owner))
+        number, first_position = _numbered(self._keys(row, damaged[owner], owner))
         self._of_copy = np.append(number + len(nodes), -1)  # something to index where there is no copy
-        row, cell = row[one], damaged[owner[one]]
+        row, cell = row[first_position], damaged[owner[first_position]]
         self.cell, self.kind, self.entity = cell, self._copies.kind[row], self._copies.entity[row]
         self.first, self.group = len(nodes), (group := self._copies.group[row])
         parents = np.concatenate([nodes, topology.cells[cell][group]])
@@ -70,17 +70,17 @@ class SurfacePoints:
         topology, copies, d = self._topology, self._copies, self._topology.dim
         kind, entity, lead = copies.kind[row], copies.entity[row], copies.lead[row]
         keys = np.empty(len(row), np.int64)
-        at = np.flatnonzero(kind == EDGE)
-        edge = topology.cell_edges[cell[at], entity[at]]
-        keys[at] = 2 * edge + (topology.cells[cell[at], lead[at]] == topology.edges[edge, 1])
-        at = np.flatnonzero(kind == FACET)
-        facet = topology.cell_facets[cell[at], entity[at]]
-        group = np.where(copies.group[row[at]], topology.cells[cell[at]], len(topology.points))
+        selected = np.flatnonzero(kind == EDGE)
+        edge = topology.cell_edges[cell[selected], entity[selected]]
+        keys[selected] = 2 * edge + (topology.cells[cell[selected], lead[selected]] == topology.edges[edge, 1])
+        selected = np.flatnonzero(kind == FACET)
+        facet = topology.cell_facets[cell[selected], entity[selected]]
+        group = np.where(copies.group[row[selected]], topology.cells[cell[selected]], len(topology.points))
         rank = np.count_nonzero(topology.facets[facet] < group.min(axis=1)[:, None], axis=1)
         base = 2 * len(topology.edges)
-        keys[at] = base + d * facet + rank
-        at = np.flatnonzero(kind == CELL)
-        keys[at] = base + d * len(topology.facets) + (d + 1) * owner[at] + lead[at]
+        keys[selected] = base + d * facet + rank
+        selected = np.flatnonzero(kind == CELL)
+        keys[selected] = base + d * len(topology.facets) + (d + 1) * owner[selected] + lead[selected]
         return keys
 
     # --- reference positions ---
@@ -88,16 +88,16 @@ class SurfacePoints:
     def _places(self, row: Ints, cell: Ints) -> Values:
         topology, kind, entity = self._topology, self._copies.kind[row], self._copies.entity[row]
         result = np.empty((len(row), topology.dim))
-        at = kind == EDGE
-        result[at] = self._edge_points(topology.cell_edges[cell[at], entity[at]])
-        at = kind == FACET
-        if at.any():
-            nodes = topology.facets[topology.cell_facets[cell[at], entity[at]]]
+        selected = kind == EDGE
+        result[selected] = self._edge_points(topology.cell_edges[cell[selected], entity[selected]])
+        selected = kind == FACET
+        if selected.any():
+            nodes = topology.facets[topology.cell_facets[cell[selected], entity[selected]]]
             # ascending, so that all copies of a point have the same position to the last bit
-            edges = np.sort(topology.cell_edges[cell[at][:, None], _facet_edges()[entity[at]]], axis=1)
-            result[at] = self._centres(nodes, edges)
-        at = kind == CELL
-        result[at] = self._centres(topology.cells[cell[at]], topology.cell_edges[cell[at]])
+            edges = np.sort(topology.cell_edges[cell[selected][:, None], _facet_edges()[entity[selected]]], axis=1)
+            result[selected] = self._centres(nodes, edges)
+        selected = kind == CELL
+        result[selected] = self._centres(topology.cells[cell[selected]], topology.cell_edges[cell[selected]])
         return result
 
     def _edge_points(self, edges: Ints) -> Values:
@@ -111,10 +111,10 @@ class SurfacePoints:
         centre: Values = self._topology.points[nodes].mean(axis=1)
         if self._cut is not None:
             placed = ~np.isnan(self._cut[edges])
-            at = np.flatnonzero(placed.sum(axis=1) >= 2)
-            weight = placed[at] / placed[at].sum(axis=1, keepdims=True)
-            cuts = self._edge_points(edges[at].ravel()).reshape(*edges[at].shape, self._topology.dim)
-            centre[at] = np.einsum("ne,nei->ni", weight, cuts)
+            selected = np.flatnonzero(placed.sum(axis=1) >= 2)
+            weight = placed[selected] / placed[selected].sum(axis=1, keepdims=True)
+            cuts = self._edge_points(edges[selected].ravel()).reshape(*edges[selected].shape, self._topology.dim)
+            centre[selected] = np.einsum("ne,nei->ni", weight, cuts)
         return centre
 
 
@@ -132,9 +132,9 @@ def _numbered(keys: Ints) -> tuple[Ints, Ints]:
     used = np.zeros(int(keys.max(initial=-1)) + 1, bool)
     used[keys] = True
     number = np.cumsum(used)[keys] - 1
-    one = np.empty(np.count_nonzero(used), np.int64)
-    one[number[::-1]] = np.arange(len(keys))[::-1]
-    return number, one
+    first_position = np.empty(np.count_nonzero(used), np.int64)
+    first_position[number[::-1]] = np.arange(len(keys))[::-1]
+    return number, first_position
 
 
 @dataclass(frozen=True)
@@ -218,19 +218,19 @@ class _Builder:
     def _whole_facets(self) -> tuple[Ints, ...]:
         """(corners, cell, edge, origin) of boundary facets of undamaged cells."""
         boundary = self.topology.boundary
-        at = np.flatnonzero(self.place[boundary[:, 0]] < 0)
-        cell = boundary[at, 0]
-        corners = self.points.of_nodes(boundary_corners(self.topology, at))
-        return corners, cell, np.full(len(at), -1), self.topology.origin[at]
+        selected = np.flatnonzero(self.place[boundary[:, 0]] < 0)
+        cell = boundary[selected, 0]
+        corners = self.points.of_nodes(boundary_corners(self.topology, selected))
+        return corners, cell, np.full(len(selected), -1), self.topology.origin[selected]
 
     def _torn_facets(self) -> tuple[Ints, ...]:
         """(corners, cell, edge, origin) of boundary facets of damaged cells."""
         cell, facet = self.topology.boundary.T
-        at = np.flatnonzero(self.place[cell] >= 0)
-        place = self.place[cell[at]]
-        key = (self.topology.dim + 1) * self.pattern[place] + facet[at]
-        corners, owner, edge = self._expand(self.table.facets, key, place)
-        return corners, cell[at[owner]], edge, self.topology.origin[at[owner]]
+        selected = np.flatnonzero(self.place[cell] >= 0)
+        damaged_index = self.place[cell[selected]]
+        key = (self.topology.dim + 1) * self.pattern[damaged_index] + facet[selected]
+        corners, owner, edge = self._expand(self.table.facets, key, damaged_index)
+        return corners, cell[selected[owner]], edge, self.topology.origin[selected[owner]]
 
     def _walls(self) -> tuple[Ints, ...]:
         """(corners, cell, edge, origin) of crack faces, both sides."""

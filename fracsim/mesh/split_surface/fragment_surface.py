@@ -53,9 +53,9 @@ def has_same_fragments(topology: EntityNumbering, pattern: Patterns, before: Pat
         return False
     ends = np.zeros(len(topology.points), bool)
     ends[topology.edges[apart]] = True
-    at = ends[topology.cells].any(axis=1)
-    gone = is_split(topology.dim)
-    return np.array_equal(gone[pattern[at]], gone[before[at]])
+    affected = ends[topology.cells].any(axis=1)
+    split_patterns = is_split(topology.dim)
+    return np.array_equal(split_patterns[pattern[affected]], split_patterns[before[affected]])
 
 
 def open_edges(topology: EntityNumbering, pattern: Patterns) -> tuple[Flags, Flags, Ints]:
@@ -78,21 +78,21 @@ def patterns_of(topology: EntityNumbering, broken: Flags) -> Patterns:
 
 
 def project_onto_fragments(
-    at: SurfaceMap, topology: EntityNumbering, pattern: npt.NDArray[np.integer], flat: SurfaceMap
+    surface_map: SurfaceMap, topology: EntityNumbering, pattern: npt.NDArray[np.integer], flat: SurfaceMap
 ) -> SurfaceMap:
-    """The map `at` with points on crack faces between fragments projected onto the planar cuts `flat`.
+    """The `surface_map` with points on crack faces between fragments projected onto the planar cuts `flat`.
 
     Points beside a crack within the fragment lie there in the reference configuration, and move with their own nodes.
     Points of loose nodes are not projected.
     """
     drawn = build_surface_points(topology, pattern)
     points, mean, cracked = _on_flat(topology, pattern, drawn)
-    at = at.projected_onto(points[~cracked], mean[~cracked], flat)
+    surface_map = surface_map.projected_onto(points[~cracked], mean[~cracked], flat)
     if not cracked.any():
-        return at
+        return surface_map
     positions, beside = drawn.positions.copy(), points[cracked]
     positions[beside] = mean[cracked] @ flat.rest
-    return at.projected_onto(
+    return surface_map.projected_onto(
         beside, eye_array(len(positions), format="csr")[beside], whole(drawn, topology, pattern, positions)
     )
 
@@ -111,25 +111,25 @@ def _on_flat(
     same_fragment = np.where(loose[node], -1, piece[node]) == piece[lead][:, None]
     within = _within(drawn, topology.dim)
     same_side, opposite = within & same_fragment, within & ~same_fragment
-    at = np.flatnonzero(opposite.any(axis=1) & ~loose[lead])
+    between = np.flatnonzero(opposite.any(axis=1) & ~loose[lead])
     bits = 1 << np.arange(topology.dim + 1)
-    share = middles(topology.dim)[same_side[at] @ bits, opposite[at] @ bits]
+    share = middles(topology.dim)[same_side[between] @ bits, opposite[between] @ bits]
     row, i, j = np.nonzero(share)
-    ends = np.stack([node[at[row], i], node[at[row], j]], axis=1)
+    ends = np.stack([node[between[row], i], node[between[row], j]], axis=1)
     column = flat.first + np.searchsorted(_keys(topology, flat), _key(topology, ends))
-    shape = len(at), len(flat.positions)
-    cracked = (drawn.group != same_side)[at].any(axis=1)
-    return drawn.first + at, csr_matrix((share[row, i, j], (row, column)), shape=shape), cracked
+    shape = len(between), len(flat.positions)
+    cracked = (drawn.group != same_side)[between].any(axis=1)
+    return drawn.first + between, csr_matrix((share[row, i, j], (row, column)), shape=shape), cracked
 
 
 def _within(points: SurfacePoints, dim: int) -> Flags:
     """(copies, d + 1) flags of the nodes of the edge, facet or cell that each point is the centre of."""
     result = np.ones(points.group.shape, bool)
-    at = np.flatnonzero(points.kind == FACET)
-    result[at, points.entity[at]] = False
-    at = np.flatnonzero(points.kind == EDGE)
-    result[at] = False
-    result[at[:, None], local_edges(dim)[points.entity[at]]] = True
+    selected = np.flatnonzero(points.kind == FACET)
+    result[selected, points.entity[selected]] = False
+    selected = np.flatnonzero(points.kind == EDGE)
+    result[selected] = False
+    result[selected[:, None], local_edges(dim)[points.entity[selected]]] = True
     return result
 
 

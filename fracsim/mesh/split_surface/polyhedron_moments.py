@@ -56,12 +56,12 @@ def moments(points: Values, elements: Ints, body: Ints, count: int) -> Polyhedro
     `points`: (n, d), m.    `elements`: (m, d) points of each element.    `body`: (m,) body of each element.
     """
     d = points.shape[1]
-    given = [np.ascontiguousarray(points), *(np.ascontiguousarray(numbers, np.int64) for numbers in (elements, body))]
-    many, sizes = np.zeros(count, np.int64), (d, 1, d, d * d)
-    near, volume, first, second = (np.zeros((count, size)) for size in sizes)  # about one point of each body
+    arrays = [np.ascontiguousarray(points), *(np.ascontiguousarray(numbers, np.int64) for numbers in (elements, body))]
+    element_count, sizes = np.zeros(count, np.int64), (d, 1, d, d * d)
+    reference_point, volume, first, second = (np.zeros((count, size)) for size in sizes)  # about one point of each body
     sums = load_library(SOURCE).sums
-    sums(*map(c_int64, (len(elements), d, count)), *(*given, many, near, volume, first, second))
+    sums(*map(c_int64, (len(elements), d, count)), *(*arrays, element_count, reference_point, volume, first, second))
     arm = np.divide(first, (d + 1) * volume, out=np.zeros_like(first), where=volume > 0)
     across = volume[:, :, None] * arm[:, :, None] * arm[:, None, :]
     about = second.reshape(-1, d, d) / ((d + 1) * (d + 2)) - across
-    return PolyhedronMoments(volume[:, 0], near + arm, about)
+    return PolyhedronMoments(volume[:, 0], reference_point + arm, about)

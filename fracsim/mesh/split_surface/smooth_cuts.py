@@ -26,22 +26,22 @@ ITERATIONS = 30
 def smooth_cuts(topology: EntityNumbering, broken: npt.NDArray[np.bool_], cut: Values | None = None) -> Values:
     """(E,) cuts of broken edges as shares from the lower node, NaN for intact edges; values in `cut` (E,) are kept."""
     result = np.full(len(broken), np.nan)
-    at = np.flatnonzero(broken)
-    if not len(at):
+    broken_edges = np.flatnonzero(broken)
+    if not len(broken_edges):
         return result
-    ends = topology.points[topology.edges[at]]
+    ends = topology.points[topology.edges[broken_edges]]
     start, along = ends[:, 0], ends[:, 1] - ends[:, 0]
-    share: Values = np.full(len(at), 0.5)
-    free = np.ones(len(at), bool) if cut is None else np.isnan(cut[at])
+    share: Values = np.full(len(broken_edges), 0.5)
+    free = np.ones(len(broken_edges), bool) if cut is None else np.isnan(cut[broken_edges])
     if cut is not None:
-        share[~free] = cut[at][~free]
+        share[~free] = cut[broken_edges][~free]
     mean = _neighbours(topology, broken)
     per = 1.0 / np.einsum("ni,ni->n", along, along)
     for _ in range(ITERATIONS if free.any() else 0):
         wanted = mean @ (start + share[:, None] * along)
         pulled = (1 - DAMPING) * share + DAMPING * per * np.einsum("ni,ni->n", wanted - start, along)
         share = np.where(free, np.clip(pulled, MIN_SHARE, 1 - MIN_SHARE), share)
-    result[at] = share
+    result[broken_edges] = share
     return result
 
 
@@ -49,8 +49,8 @@ def _neighbours(topology: EntityNumbering, broken: npt.NDArray[np.bool_]) -> coo
     """(n, n) matrix of means over the broken edges that share a cell with each broken edge, itself included."""
     cells = np.flatnonzero(broken[topology.cell_edges].any(axis=1))
     row, column = np.nonzero(broken[topology.cell_edges[cells]])
-    place = np.cumsum(broken) - 1
-    edge = place[topology.cell_edges[cells[row], column]]
+    number = np.cumsum(broken) - 1
+    edge = number[topology.cell_edges[cells[row], column]]
     member = coo_matrix((np.ones(len(row)), (row, edge)), shape=(len(cells), int(broken.sum()))).tocsr()
     shared = member.T @ member
     shared.data[:] = 1.0  # independent of the number of shared cells

@@ -100,8 +100,8 @@ def whole(
     X = topology.points[corners]
     volume = np.abs(np.linalg.det(X[:, 1:] - X[:, :1]))
     around = np.bincount(corners.reshape(-1), np.repeat(volume, d + 1), minlength=follow.nodes)
-    at, of, values = gradient_entries(X, volume[:, None] / around[corners], corners)
-    gradients = csr_matrix((values, (at, of)), shape=(d * follow.nodes, follow.nodes))
+    matrix_rows, matrix_columns, values = gradient_entries(X, volume[:, None] / around[corners], corners)
+    gradients = csr_matrix((values, (matrix_rows, matrix_columns)), shape=(d * follow.nodes, follow.nodes))
     of_arm = (d * follow.parents[:, None] + np.arange(d)).reshape(-1)
     arms = csr_matrix(((share[:, None] * arm).reshape(-1), (np.repeat(rows, d), of_arm)),
                       shape=(count, d * follow.nodes))  # fmt: skip
@@ -119,6 +119,6 @@ def gradient_entries(X: Values, share: Values, number: Ints) -> tuple[Ints, Ints
     inverse = np.linalg.inv(X[:, 1:] - X[:, :1])  # of rows X_k - X_0: column k is the gradient of corner k + 1
     slope = np.concatenate([-inverse.sum(axis=2)[:, :, None], inverse], axis=2)  # cell, axis, corner
     entries = share[:, :, None, None] * slope[:, None]  # cell, corner, axis, corner
-    at = np.broadcast_to((d * number[:, :, None] + np.arange(d))[..., None], entries.shape)
-    of = np.broadcast_to(number[:, None, None, :], entries.shape)
-    return at.reshape(-1), of.reshape(-1), entries.reshape(-1)
+    rows = np.broadcast_to((d * number[:, :, None] + np.arange(d))[..., None], entries.shape)
+    columns = np.broadcast_to(number[:, None, None, :], entries.shape)
+    return rows.reshape(-1), columns.reshape(-1), entries.reshape(-1)

@@ -105,14 +105,14 @@ class NodalRotations:
     def __init__(self, topology: EntityNumbering, pattern: npt.NDArray[np.integer], nodes: Ints) -> None:
         d = topology.dim
         nodes, self._of = np.unique(_turning_with(topology, pattern)[nodes], return_inverse=True)
-        place = np.full(len(topology.points), -1)
-        place[nodes] = np.arange(len(nodes))
-        around = np.any(place[topology.cells] >= 0, axis=1) & ~is_split(d)[pattern]
+        row = np.full(len(topology.points), -1)
+        row[nodes] = np.arange(len(nodes))
+        around = np.any(row[topology.cells] >= 0, axis=1) & ~is_split(d)[pattern]
         self._cells = topology.cells[around]
         span = topology.points[self._cells]
         span = span[:, 1:] - span[:, :1]  # rows X_k - X_0
         self._inverse = np.linalg.inv(span) * np.abs(np.linalg.det(span))[:, None, None]  # d! V (X_k - X_0)^-1
-        target = place[self._cells]
+        target = row[self._cells]
         cell, corner = np.nonzero(target >= 0)
         ones = np.ones(len(cell))
         self._identity = np.eye(d)
@@ -153,10 +153,10 @@ def _turning_with(topology: EntityNumbering, pattern: npt.NDArray[np.integer]) -
     intact = (np.asarray(pattern)[cells, None] >> np.arange(len(pairs))) & 1 == 0
     ends = topology.cells[cells][:, pairs][intact]
     ends = np.concatenate([ends, ends[:, ::-1]])
-    known = whole.copy()
-    while len(new := np.flatnonzero(~known[ends[:, 0]] & known[ends[:, 1]])):
+    has_rotation = whole.copy()
+    while len(new := np.flatnonzero(~has_rotation[ends[:, 0]] & has_rotation[ends[:, 1]])):
         nearest = np.full(len(result), len(result))
         np.minimum.at(nearest, ends[new, 0], result[ends[new, 1]])
-        at = np.unique(ends[new, 0])
-        result[at], known[at] = nearest[at], True
+        reached = np.unique(ends[new, 0])
+        result[reached], has_rotation[reached] = nearest[reached], True
     return result
