@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -12,7 +13,7 @@ import pytest
 from hypothesis import settings
 
 from fracsim.meshes.data import MeshData
-from fracsim.study import MeshSettings, check
+from fracsim.study import MeshSettings, check, solver_options
 from repeats import REPEATS
 from support.ranks import Arrays, OnRanks, run_on_ranks
 
@@ -53,6 +54,15 @@ def meshes_built_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(check, "build_mesh", build_once)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def plain_where_asked() -> Iterator[None]:
+    """With FRACSIM_PLAIN=1 scenes of this process are solved and assembled as by `[solver] plain = true`."""
+    with pytest.MonkeyPatch.context() as patch:
+        if os.environ.get("FRACSIM_PLAIN") == "1":
+            patch.setattr(solver_options, "uses_plain_solver", lambda _: True)
         yield
 
 

@@ -32,7 +32,7 @@ from ..mesh.parallel import on_root  # noqa: E402
 from ..output.history import ProbeGroup, ProbeReader  # noqa: E402
 from ..solvers.nonlinear_solver import NonlinearSolver  # noqa: E402
 from ..solvers.weak_callbacks import collect_dropped_scenes  # noqa: E402
-from ..study import Study, TimeSettings  # noqa: E402
+from ..study import Study, TimeSettings, solver_options  # noqa: E402
 from ..study.check import build_checked_mesh  # noqa: E402
 from ..study.conditions import check_size, find_selector, initial_motion, obstacle_placements, step_size_function  # noqa: E402
 from ..timestepping.initial_conditions import initial_velocity  # noqa: E402
@@ -136,7 +136,10 @@ def build_scene_on(
     stage("setting up what breaks and what solves")
     flow = build_flow(study, balance)
     breaking = build_fracture_pass(study, balance)
-    solver = NonlinearSolver(balance, study.solver) if scheme.implicit else None
+    solver = None
+    if scheme.implicit:
+        options, plain = solver_options.without_plain(study.solver), solver_options.uses_plain_solver(study.solver)
+        solver = NonlinearSolver(balance, options, plain=plain)
     breaks, frames = breaking or NoFracture(balance, flow), study.frame_interval
     stepper = make_stepper(balance, study.time, flow, breaks, solver, frames)
     placements = obstacle_placements(study, domain.dim)

@@ -14,6 +14,7 @@ from ufl.core.expr import Expr
 from ..forms.schemes import Scheme
 from ..mechanics.balance import Balance
 from ..mechanics.inertia import ConsistentMass, Inertia, LumpedMass, MassMatrix
+from ..mechanics.kernel_selection import KernelSelection
 from ..mechanics.loads import DeadLoads, OnFacets, Pressure, surface_area
 from ..mechanics.material_fields import MaterialFields, PerCell, coefficient, material_fields, parameter_by_region
 from ..mechanics.matrix_assembly import VectorAssembler
@@ -23,7 +24,7 @@ from ..mechanics.term import Term
 from ..mechanics.time_functions import TimeFunction
 from ..mesh.domain import Domain
 from ..mesh.selectors import check_regions
-from ..study import Study
+from ..study import Study, solver_options
 from ..study.conditions import BoundaryCondition, boundary_conditions, volume_loads
 
 # --- material ---
@@ -216,7 +217,8 @@ TERMS: dict[str, Callable[[TermInputs], Term | None]] = {
 
 def build_balance(study: Study, domain: Domain, scheme: Scheme, material: MaterialFields) -> Balance:
     """Return the balance of a body (collective). Raises InputError if a selector selects nothing."""
-    assembler, u = VectorAssembler(domain), fem.Function(domain.space, name="displacement")
+    kernels = KernelSelection(plain=solver_options.uses_plain_solver(study.solver))
+    assembler, u = VectorAssembler(domain, kernels), fem.Function(domain.space, name="displacement")
     entries = boundary_conditions(study, domain.dim)
     prescribed = [
         (domain.select_nodes(entry.selector, f"{entry.key}.on"), entry.components, entry.function)

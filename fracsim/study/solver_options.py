@@ -29,6 +29,7 @@ _TARGETS = (
     "adios", "binary", "cgns", "draw", "exodusii", "glvis", "hdf5", "mathematica", "matlab", "pyvista", "saws",
     "socket", "string", "vtk", "vtu",
 )  # fmt: skip
+PLAIN = "plain"  # the one key of [solver] that is not PETSc's
 # words of keys that print
 _PRINT_WORDS = {"view", "monitor", "reason"}
 
@@ -54,8 +55,23 @@ def check_options(options: Options) -> None:
             or _value_error(str(value))
             or _preconditioner_error(key, str(value))
             or _tolerance_error(key, value)
+            or _plain_error(key, value)
         ):
             raise ValueError(f"solver.{_short(key)} = {_short(json.dumps(value))}: {wrong}")
+
+
+def uses_plain_solver(options: Options) -> bool:
+    """Whether PETSc and DOLFINx alone solve and assemble: `plain = true`."""
+    return options.get(PLAIN) is True
+
+
+def without_plain(options: Options) -> Options:
+    """Returns the options of PETSc alone."""
+    return {name: value for name, value in options.items() if name != PLAIN}
+
+
+def _plain_error(key: str, value: bool | int | float | str) -> str:
+    return "true or false" if key == PLAIN and not isinstance(value, bool) else ""
 
 
 def expand_print_options(options: Options) -> Options:
