@@ -189,6 +189,7 @@ class MaterialSettings(ElasticSettings):
     def _tables_are_regions(cls, data: Any) -> Any:
         if not isinstance(data, dict) or "regions" in data:
             return data
+        # a table inside [material] can only be a region: no key of it holds a table
         regions = {name: value for name, value in data.items() if isinstance(value, dict)}
         values = {name: value for name, value in data.items() if name not in regions}
         return values | ({"regions": regions} if regions else {})

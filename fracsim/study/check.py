@@ -44,6 +44,7 @@ def check_study(study: Study) -> list[str]:
     summary = summarise_source(study, open_surface(study.mesh)) or summarise_mesh(build_mesh(study.mesh))
     _check(study, summary)
     near = _find_near_obstacles(study, summary)
+    # small meshes are built for the area of loads and for obstacles that may overlap the body
     needs_mesh = near or facet_loads(study, summary.dim)
     if summary.mesh is None and needs_mesh and summary.cell_count <= LIMITS.max_built_cells:
         summary = summary.with_mesh(build_mesh(study.mesh))
@@ -130,6 +131,7 @@ def _check_dimensions(study: Study, summary: MeshSummary) -> None:
     if study.time.scheme == "rigid" and dim != 3:
         raise InputError(f'time.scheme = "rigid" is for bodies in space; this mesh has {dim} dimensions')
     _check_copies(study, summary.cell_count)
+    # each of these refuses vectors of another dimension
     boundary_conditions(study, dim)
     volume_loads(study, dim)
     initial_motion(study, dim)

@@ -159,10 +159,13 @@ def _condition(entry: BoundarySettings, dim: int, key: str, thickness: float) ->
         function, components = constant_function(np.zeros(dim)), _named(entry.fix, dim, key)
     else:
         function = table = time_function(value, f"{key}.{entry.kind}", 1 if entry.kind == "pressure" else dim)
+        # "free" is nan: such a component is not prescribed
         if entry.kind in MOTIONS:
             components = ~np.isnan(table.rows[0])
+        # a prescribed velocity is integrated exactly
         if entry.kind == "velocity":
             function = table.integral
+        # forces of 2D bodies are per metre of thickness in the balance
         if entry.kind == "force":
             function = TabulatedFunction(table.times, np.asarray(table.rows / thickness))
     return BoundaryCondition(key, entry.kind, selector, function, components)
@@ -259,6 +262,7 @@ def _free_motion(entry: ObstacleSettings, dim: int, key: str, gravity: Values, t
     if entry.hinge is not None:
         hinge = check_size(entry.hinge.point, dim, f"{key}.hinge.point")
         basis, rotations = _hinge_basis(entry.hinge, dim, f"{key}.hinge.axis"), 1
+    # the pose has translations first, then rotations
     rate = np.concatenate([velocity, check_size(spin, rotations, f"{key}.spin")])
     if entry.hinge is not None:
         rate = rate[dim:]

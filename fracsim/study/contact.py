@@ -114,6 +114,7 @@ class ObstacleSettings(StudyTable):
                     f"{present[0]} is for an obstacle that moves freely: give mass or density, or remove it"
                 )
             return self
+        # from here on the obstacle is free
         if self.mass is not None and self.density is not None:
             raise ValueError("give mass or density, not both")
         if self.shape == "plane":

@@ -82,6 +82,7 @@ def _sentence(error: Any) -> str:
         return _PATTERNS[context["pattern"]]
     if context.get("expected") == "'free'":
         return 'must be a number or "free"'
+    # other types of errors: the text of pydantic, in the words of the messages above
     text = str(error["msg"]).removeprefix("Input ").replace("should be", "must be")
     if kind == "literal_error" and isinstance(error["input"], str):
         allowed = context["expected"].replace(" or ", ", ").replace("'", "").split(", ")

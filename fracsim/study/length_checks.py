@@ -73,6 +73,7 @@ def small_strain_notes(study: Study) -> Iterator[str]:
     if material.energy == "linear" or study.time.scheme != "quasi-static" or strength is None or study.plasticity:
         return
     strain = strength / material.young
+    # regions with values of their own are left to the user
     uniform = not any(region.young or region.strength for region in material.regions.values())
     if strain < LIMITS.max_small_strain and uniform:
         yield f"note: strains stay below strength / young = {100 * strain:.2g} %, and energy = {material.energy} is one"
@@ -124,6 +125,7 @@ def _branching_notes(study: Study, h: float) -> Iterator[str]:
     """Yield whether steps are short enough for the branching of tips."""
     yield "cracks run at up to half of the Rayleigh speed; a tip that receives 2 G_c branches"
     material, step = study.material, study.time.breaking_step or study.time.max_step
+    # tips branch by the mean energy over the time of a Rayleigh wave through their domain
     shear = (material.young / (2 * (1 + material.poisson) * material.density)) ** 0.5
     wave = LIMITS.tip_radius * h / rayleigh_wave_speed(shear, material.poisson)
     if step > wave:

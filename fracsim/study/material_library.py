@@ -195,6 +195,7 @@ def _fill_material(data: dict[str, Any], material: dict[str, Any]) -> dict[str, 
     """[material] and its regions with the values of named materials."""
     result = dict(material)
     regions = result.get("regions") if isinstance(result.get("regions"), dict) else None
+    # regions are tables inside [material], or in `regions` once a study is validated
     inner = result if regions is None else dict(regions)
     for name, region in list(inner.items()):
         if isinstance(region, dict) and isinstance(region.get("like"), str) and name != "regions":

@@ -72,6 +72,7 @@ def _check_source(mesh: MeshSettings) -> None:
     """InputError for a key that the source does not have, a file that is missing, or a value out of range."""
     source = next(name for name in SOURCE_KEYS if getattr(mesh, name) is not None)
     keys = SOURCE_KEYS[source]
+    # the table accepts any key, since builders have parameters of their own
     for name in mesh.parameters:
         if name not in keys:
             raise InputError(

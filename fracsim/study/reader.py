@@ -47,6 +47,7 @@ def load_study(study: str | Path, overrides: Sequence[str] = ()) -> Study:
     """
     path = find_study(study) if isinstance(study, str) else study
     data = _parse(path)
+    # paths of the file are relative to it, those of --set to the working folder
     _resolve_paths(data, path.parent)
     for override in overrides:
         _apply_override(data, override)
@@ -76,6 +77,7 @@ def study_text(study: Study, comments: Iterable[str] = ()) -> str:
     import tomli_w
 
     data = study.model_dump(mode="json", exclude_none=True)
+    # regions are tables inside [material], parameters of a builder keys of [mesh]
     data["material"] |= data["material"].pop("regions")
     data["mesh"] |= _builder_parameters(study)
     return "".join(f"# {line}\n" for line in comments) + tomli_w.dumps(data)
@@ -148,6 +150,7 @@ def _apply_override(data: dict[str, Any], override: str) -> None:
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except ValueError:
+        # text without quotes
         value = text
     except RecursionError:
         raise InputError(f"--set {key.strip()}: {_TOO_DEEP}") from None

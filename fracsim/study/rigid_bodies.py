@@ -73,6 +73,7 @@ def check_rigid(study: Study) -> None:
         if rigid_keys:
             raise ValueError(f'{rigid_keys[0]} is for time.scheme = "rigid", not "{study.time.scheme}"; remove it')
         return
+    # rigid bodies have no boundary, no deformation to damp or probe, and velocities of their own
     tables = {"damping": study.damping, "boundary": study.boundary, "probe": study.probe, "initial": study.initial,
               "crack": study.crack}  # fmt: skip
     hints = {"boundary": "hold or drive bodies by obstacles", "initial": "give velocity and spin in [[body]]"}
@@ -84,6 +85,7 @@ def check_rigid(study: Study) -> None:
     if study.material.energy != "linear":
         raise ValueError(f'time.scheme = "rigid" solves linear analyses: material.energy = "linear", not '
                          f'"{study.material.energy}"')  # fmt: skip
+    # mass and inertia of a body are those of one density
     if any(region.density is not None for region in study.material.regions.values()):
         raise ValueError('with time.scheme = "rigid" a body has one density: remove density from regions of [material]')
     if study.fracture is not None and study.brittle is None:
@@ -99,6 +101,7 @@ def check_rigid(study: Study) -> None:
             raise ValueError(
                 f'contact.{compliant[0]} is not for time.scheme = "rigid", whose contacts are hard; remove it'
             )
+    # analyses are linear solves: there is no Newton iteration to control
     excess = [name for name in study.solver if not name.startswith(("ksp_", "pc_", "mg_"))]
     if excess:
         raise ValueError(
@@ -134,6 +137,7 @@ def _check_denting(study: Study) -> None:
             f'plasticity.hardening = {table.hardening:g}: with time.scheme = "rigid" it must be greater than 0 Pa; a '
             "blow is a force, under which what does not harden flows without end"
         )
+    # keys that differ from their defaults were given
     plain = type(table)(yield_stress=table.yield_stress, hardening=table.hardening)
     excess = [name for name in ("measure", "flow_rate", "update") if getattr(table, name) != getattr(plain, name)]
     if excess:

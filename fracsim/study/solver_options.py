@@ -49,6 +49,7 @@ def check_options(options: Options) -> None:
     Raises:
         ValueError: with the first option that would load code or name a file, or that is invalid.
     """
+    # the first reason that applies becomes the message
     for key, value in options.items():
         if (
             wrong := _key_error(key)

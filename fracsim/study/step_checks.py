@@ -67,6 +67,7 @@ def estimated_explicit_step(study: Study, dim: int, h: float, mesh: MeshData | N
     a, b = (table.mass, table.stiffness) if table is not None else (0.0, 0.0)
     factor = dim + 1.0 if study.mesh.order == 1 else LIMITS.quadratic_frequency_factor[dim]
     if mesh is not None:
+        # bound of the squared frequency of each cell
         squares = [
             _max_squared_frequency(study, dim, factor, mesh.points[mesh.cells[cells]], region)
             for region, cells in _cells_by_region(study, mesh)
@@ -74,6 +75,7 @@ def estimated_explicit_step(study: Study, dim: int, h: float, mesh: MeshData | N
         ]
         highest = float(np.sqrt(max(squares)))
     elif np.isfinite(h):
+        # no mesh: the fastest wave through a cell of size h
         lattice = study.mesh.builder == "box" and study.mesh.parameters.get("pattern", "structured") == "structured"
         shares = LIMITS.stable_share_lattice if lattice else LIMITS.stable_share_random
         share = shares[dim] * np.sqrt((dim + 1) / factor)

@@ -71,6 +71,7 @@ class Study(StudyTable):
     @model_validator(mode="after")
     def _fields_exist(self) -> Study:
         wanted = [name for name in self.output.fields or [] if name in FRACTURE_FIELDS]
+        # without [fracture] there is neither a graph nor a degradation to write
         if wanted and self.fracture is None:
             raise ValueError(f'output.fields has "{wanted[0]}", which needs a [fracture] table')
         return self
@@ -116,6 +117,7 @@ class Study(StudyTable):
             )
         for region in (RegionSettings(), *material.regions.values()):
             young, poisson, _ = material.elastic_constants(region)
+            # the tangent of plastic flow, 3 mu + K, must be positive
             if table.hardening <= (limit := -1.5 * young / (1 + poisson)):
                 raise ValueError(
                     f"plasticity.hardening = {table.hardening:g}: must be greater than -3 mu = {limit:.4g} Pa; a body "
@@ -154,6 +156,7 @@ class Study(StudyTable):
             self._check_cohesive(table)
         if table is None or table.energy is None:
             return self
+        # a crack with an energy has its own average, growth by cells and cuts
         conflicts = {
             "fracture.approach": (table.approach != "chi", 'cells that a crack cuts fade: choose approach = "chi"'),
             "fracture.radius": (table.radius > 0, "stress is averaged over 3 h, and tips go by energy: remove radius"),
@@ -199,6 +202,7 @@ class Study(StudyTable):
                 f'fracture.approach = "edge" is for the energies linear and corotated, not {self.material.energy}: '
                 'with a nonlinear strain split cells blow up; choose approach = "chi" or energy = "corotated"'
             )
+        # projected strain has no degradation of cells
         if "chi" in (self.output.fields or []):
             raise ValueError('output.fields has "chi", which fracture.approach = "edge" does not have; remove it')
         return self
@@ -263,6 +267,7 @@ class Study(StudyTable):
         if self.time.until is None:
             return self
         names, name = self._load_names(), self.time.until.of
+        # a single probe or obstacle needs no name
         if (len(names) == 1 and name is None) or name in names:
             return self
         which = f"of = {name!r} is none of them" if name is not None else "say which, of = NAME"

@@ -112,6 +112,7 @@ def _keys_of_schemes() -> dict[str, Any]:
     return keys
 
 
+# mypy sees the common keys; the table that is validated also has the parameters of all schemes
 if TYPE_CHECKING:
     TimeSettings = BaseTimeSettings
 else:
@@ -192,6 +193,7 @@ def frame_interval(timing: BaseTimeSettings, output: OutputSettings) -> float:
 def frame_notes(timing: BaseTimeSettings, output: OutputSettings) -> list[str]:
     """Returns a note if frames are not as far apart as the study asks."""
     interval = frame_interval(timing, output)
+    # round-off of the division by the step is no difference
     if output.interval is None or abs(interval - output.interval) <= 1e-6 * interval:
         return []
     steps = round(interval / timing.max_step)

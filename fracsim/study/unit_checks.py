@@ -50,6 +50,7 @@ def _material_questions(study: Study, prefix: str, region: RegionSettings) -> It
         yield f"question: {prefix}density = {density:g} kg/m^3: is it in {unit}? Then it is {si_density:.4g} kg/m^3"
     elif density > LIMITS.max_density:
         yield f"question: {prefix}density = {density:g} kg/m^3 is more than that of any metal: it is in kg/m^3"
+    # the speed of sound tells moduli in GPa or MPa from those in Pa
     speed = sqrt(young / si_density)
     soft = young < LIMITS.soft_young and (si_density > LIMITS.soft_density or speed < LIMITS.min_sound_speed)
     if soft:
@@ -78,5 +79,6 @@ def _guess_density(density: float, young: float) -> float:
     """Returns the density in kg/m^3, converted if the value looks like one in t/mm^3 or g/cm^3; `young` in Pa."""
     if density < 1e-3:
         return density * 1e12
+    # foams are as light as metals in g/cm^3, but not as stiff
     light = density < LIMITS.min_density or (density < LIMITS.metal_density and young > LIMITS.metal_young)
     return density * 1e3 if light else density
