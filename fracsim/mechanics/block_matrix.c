@@ -2,7 +2,7 @@
 
 #include <stdint.h>
 
-/* y = A x. starts: of rows; columns: of blocks, whose numbers come row by row. */
+/* y = A x. starts: (rows + 1,) first block of each row; columns: of the blocks, whose entries are stored by rows. */
 void multiply(int64_t rows, const int64_t* restrict starts, const int32_t* restrict columns,
     const double* restrict blocks, const double* restrict x, double* restrict y)
 {

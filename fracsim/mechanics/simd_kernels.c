@@ -1,7 +1,7 @@
-/* Cells of a form, LANES at a time (mechanics.simd_kernels, which puts FFCx's kernel where it says so below).
+/* Form over cells, LANES of them at a time (mechanics.simd_kernels, which inserts FFCx's kernel below).
 
-   RANK: 2 of a matrix, 1 of a vector, 0 of an expression.    NODES, D: nodes of a cell, dofs of a node; of an expression
-   its components, and 1.    CORNERS: points of a cell. */
+   RANK: 2 for a matrix, 1 for a vector, 0 for a functional or an expression.    NODES, D: nodes of a cell, dofs of a node;
+   for an expression its components, and 1.    CORNERS: geometry nodes of a cell. */
 
 #include <math.h>
 #include <stdbool.h>
@@ -16,13 +16,13 @@ static inline void kernel(real* restrict A, const real* restrict w, const real* 
     const real* restrict coordinate_dofs)
 // kernel
 
-/* A function: dofs (cells, nodes), and some numbers at each of them. */
+/* Field: dofs (cells, nodes), and the values at each of them. */
 typedef struct {
   const int32_t* dofs;
   const double* values;
 } Field;
 
-/* What a form is integrated over, and with: `width` numbers of its fields in a cell, and `size` constants. */
+/* Cells and coefficients of a form: `width` values of its fields in a cell, and `size` constants. */
 typedef struct {
   int64_t count, width, size;
   const int32_t *cells, *dofs, *corners;
@@ -30,8 +30,8 @@ typedef struct {
   const Field* fields;
 } Form;
 
-/* Numbers of a field in a cell, into one lane. */
-static inline double* taken(const Field* field, int nodes, int size, int64_t cell, double* lane)
+/* Copy the values of a field in a cell into one lane. */
+static inline double* copy_values(const Field* field, int nodes, int size, int64_t cell, double* lane)
 {
   for (int node = 0; node < nodes; ++node)
     for (int i = 0; i < size; ++i, lane += LANES)
@@ -39,10 +39,11 @@ static inline double* taken(const Field* field, int nodes, int size, int64_t cel
   return lane;
 }
 
-#define TAKE(number, nodes, size) lane = taken(form->fields + number, nodes, size, cell, lane);
+#define TAKE(number, nodes, size) lane = copy_values(form->fields + number, nodes, size, cell, lane);
 static inline void look_up(const Form* form, int64_t cell, double* lane) { FIELDS }
 
-/* A of LANES cells from the first on, the last of which may be one again; returns how many are not. */
+/* Results A of the kernel for LANES cells from `first` on; beyond the last cell `first` is repeated. Returns the number
+   of cells that are not. */
 static inline int values(const Form* form, int64_t first, const real* constants, real* numbers, real* A)
 {
   const int left = form->count - first < LANES ? (int)(form->count - first) : LANES;
@@ -61,7 +62,7 @@ static inline int values(const Form* form, int64_t first, const real* constants,
 }
 
 #if RANK == 0
-/* What the expression is in each cell, b: (count, SIZE). */
+/* Values of the expression, or of the integral, in each cell, b: (count, SIZE). */
 void fill(const Form* form, double* b)
 {
   real constants[form->size + 1], numbers[form->width + 1], A[SIZE];
@@ -74,7 +75,7 @@ void fill(const Form* form, double* b)
   }
 }
 #elif RANK == 1
-/* Add to b what cells give. */
+/* Add the integral over the cells to b (dofs,). */
 void add(const Form* form, double* b)
 {
   real constants[form->size + 1], numbers[form->width + 1], A[SIZE];
@@ -90,7 +91,7 @@ void add(const Form* form, double* b)
   }
 }
 #else
-/* Rows and columns of prescribed dofs are emptied; held: a bit for each prescribed axis of a node. */
+/* Set rows and columns of prescribed dofs to zero; held: a bit for each prescribed axis of a node. */
 static inline void empty(double* A, const int32_t* nodes, const uint8_t* held)
 {
   for (int i = 0; i < DOFS; ++i)
@@ -98,7 +99,7 @@ static inline void empty(double* A, const int32_t* nodes, const uint8_t* held)
       for (int j = 0; j < DOFS; ++j) A[LANES * (DOFS * i + j)] = A[LANES * (DOFS * j + i)] = 0.0;
 }
 
-/* Tell the processor what will be added to next. */
+/* Prefetch the entries that will be added to next. */
 static inline void fetch(const int32_t* places, const double* sum)
 {
   for (int i = 0; i < NODES * NODES; ++i)
@@ -108,7 +109,7 @@ static inline void fetch(const int32_t* places, const double* sum)
   }
 }
 
-/* A: lane after lane of DOFS^2 numbers. */
+/* Add the blocks of one cell; A: one lane of DOFS^2 vectors. */
 static inline void insert(const double* A, const int32_t* nodes, const int32_t* places, const int32_t* strides,
     double* sum)
 {
@@ -125,8 +126,8 @@ static inline void insert(const double* A, const int32_t* nodes, const int32_t* 
     }
 }
 
-/* Add the blocks of cells, rows of which are as far apart as their node's stride; returns 0, or the number, from 1 on,
-   of a cell that has no place. */
+/* Add the blocks of all cells; rows are as far apart as the stride of their node. Returns 0, or 1 + the number of a cell
+   that has no position in the matrix. */
 int64_t add_blocks(const Form* form, const int32_t* places, const int32_t* strides, const uint8_t* held, double* sum)
 {
   real constants[form->size + 1], numbers[form->width + 1], A[SIZE];
@@ -149,8 +150,8 @@ int64_t add_blocks(const Form* form, const int32_t* places, const int32_t* strid
   return 0;
 }
 
-/* The place of the first entry of each block of each cell, the first one -1 where a block has none. columns: of blocks
-   one after another (apart = 1), or of entries row by row (apart = D). */
+/* Position of the first entry of each block of each cell; -1 in the first if a block has none. columns: of blocks one
+   after another (apart = 1), or of entries by rows (apart = D). */
 void find(int64_t count, const int32_t* dofs, int64_t apart, const int64_t* starts, const int32_t* columns,
     int32_t* places)
 {
