@@ -15,7 +15,7 @@ from fracsim.contact.laws import Barrier, CoulombFriction
 from fracsim.contact.node_contact import ContactForces, evaluate_points, lag_contact, no_contact
 from fracsim.contact.obstacle_term import ObstacleTerm
 from fracsim.contact.pose import Pose, PosedShape, rotation_derivative
-from fracsim.contact.rigid_body import contact_wrench, point_pose_hessian, pose_derivatives
+from fracsim.contact.pose_derivatives import contact_wrench, point_pose_hessian, pose_derivatives
 from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylinder, Shape, Sphere
 from fracsim.contact.step_limit import safe_motion_fractions
 from support.scenes import each_step, make_scene, march

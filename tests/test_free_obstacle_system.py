@@ -12,7 +12,7 @@ from fracsim.contact.laws import Barrier
 from fracsim.contact.obstacle import RigidObstacle
 from fracsim.contact.obstacle_pairs import ObstaclePair
 from fracsim.contact.pose import Pose
-from fracsim.contact.rigid_body import mixed_pose_hessian
+from fracsim.contact.pose_derivatives import mixed_pose_hessian
 from fracsim.contact.rigid_obstacle_term import FreeObstacleTerm
 from fracsim.contact.shapes import Capsule, RoundedBox, RoundedCylinder, Shape, Sphere
 from support.scenes import Scene, Walk, each_step, make_scene, march

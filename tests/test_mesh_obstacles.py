@@ -15,7 +15,7 @@ from fracsim.contact.mesh_obstacles import AllMeshPairs, MeshObstacle
 from fracsim.contact.mesh_rigid_body import FreeMesh
 from fracsim.contact.mesh_rigid_term import FreeMeshTerm
 from fracsim.contact.pose import Pose
-from fracsim.contact.rigid_body import point_set_derivatives
+from fracsim.contact.pose_derivatives import point_set_derivatives
 from fracsim.contact.shapes import RoundedBox
 from fracsim.contact.triangle_mesh_shape import (
     TriangleMeshShape,

@@ -13,7 +13,8 @@ from fracsim.contact.laws import Barrier, CoulombFriction
 from fracsim.contact.node_contact import evaluate_points, lag_contact
 from fracsim.contact.obstacle import FreeObstacle
 from fracsim.contact.pose import PosedShape, left_jacobian, left_jacobian_derivative
-from fracsim.contact.rigid_body import PoseDerivatives, RigidStep, pose_derivatives
+from fracsim.contact.pose_derivatives import PoseDerivatives, pose_derivatives
+from fracsim.contact.rigid_body import RigidStep
 from fracsim.contact.shapes import Sphere, TranslatedShape
 from fracsim.forms.schemes import BackwardEuler, GeneralizedAlpha, Newmark, Scheme
 from fracsim.mechanics.contact_time_weights import ContactTimeWeights

@@ -16,7 +16,8 @@ Terms of the balance:
 Laws and geometry:
 
     laws                  barrier, penalty, mean force over a step, Coulomb friction
-    pose, obstacle        rigid poses and distances to shapes; obstacles, their motion, overlaps and tessellation
+    pose, obstacle        rigid poses and distances to shapes; obstacles, their motion and overlaps
+    obstacle_tessellation  tessellation of obstacles for output
     shape_base, shapes    signed distances, moments and tessellations of half space, sphere, capsule, box, cylinder
     triangle_mesh_shape   closed surfaces of triangles
     supporting_obstacles  obstacles that a body is set down on
@@ -30,13 +31,14 @@ Points and facets before analytic obstacles:
 
 Surfaces with ipctk:
 
-    ipc_surface, ipc_pairs, sample_points  split surface, pairs of elements, sample points
+    ipc_surface, ipc_pairs, sample_points  split surface, pairs of elements, sample points and friction at them
     mesh_obstacles        pairs of a body and a triangle-mesh obstacle
     penalty_point_facet   penalty between points and facets
 
 Free obstacles:
 
-    rigid_body            incremental potential of poses, derivatives of contact by a pose
+    rigid_body            incremental potential of poses
+    pose_derivatives      derivatives of contact by a pose
     rigid_pose, mesh_rigid_body  condensation of the pose of analytic and triangle-mesh obstacles
     obstacle_pairs        contact of free obstacles with others
 

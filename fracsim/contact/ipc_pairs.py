@@ -19,7 +19,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import ipctk
 import numpy as np
@@ -27,7 +26,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
 from .laws import BARRIER
-from .sample_points import Centroids, Vertices, measures
+from .sample_points import Centroids, IpcFriction, Vertices, measures, projection
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -435,72 +434,3 @@ def vertex_areas(x: Values, elements: Ints) -> Values:
     """(n,) share of each point in the measure of the elements around it, m^2 (2D: m)."""
     measure, d = measures(x, elements), x.shape[1]
     return np.asarray(np.bincount(elements.reshape(-1), np.repeat(measure / d, d), minlength=len(x)), float)
-
-
-class SlipFriction(Protocol):
-    """Lagged friction of a surface at positions x (n, d), m: a potential of the slip."""
-
-    def energy(self, x: Values) -> float:
-        """Potential, J."""
-
-    def gradient(self, x: Values) -> Values:
-        """(n, d) minus the forces on the points, N."""
-
-    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
-        """(n d, n d) second derivatives, N/m."""
-
-
-@dataclass(frozen=True)
-class IpcFriction:
-    """Lagged Coulomb friction of ipctk's pairs: a potential of the slip (Li et al. 2020, eq. 19).
-
-        E(x) = mu sum_k N_k f(|T_k^T (x - x_0)|),   f(y) = y for y > e, -y^3 / (3 e^2) + y^2 / e + e / 3 below
-
-    N_k is the normal force of a pair, N, T_k its tangents, e the slip that counts as sticking, m. The gradient is the
-    friction of a backward Euler step: against the slip, and at most mu N_k.
-
-    Attributes:
-        mesh: surface.
-        parts: sample points and pairs of each kind.
-        start: (n, d) x_0, m.
-        potential: of ipctk.
-    """
-
-    mesh: ipctk.CollisionMesh
-    parts: list[tuple[Vertices | Centroids, ipctk.TangentialCollisions]]
-    start: Values
-    potential: ipctk.FrictionPotential
-
-    def energy(self, x: Values) -> float:
-        """E(x), J: not stored, but the work of friction where the slip is longer than e."""
-        motion = self._motion(x)
-        return float(
-            sum(self.potential(pairs, samples.mesh, samples.positions(motion)) for samples, pairs in self.parts)
-        )
-
-    def gradient(self, x: Values) -> Values:
-        """(n, d) dE/dx, N: minus the forces on the points."""
-        motion = self._motion(x)
-        total = sum(
-            samples.gradient(self.potential.gradient(pairs, samples.mesh, samples.positions(motion)))
-            for samples, pairs in self.parts
-        )
-        return np.asarray(self.mesh.to_full_dof(total)).reshape(x.shape)
-
-    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
-        """(n d, n d) d2E/dx2, N/m; unless `exact`, each pair without its negative eigenvalues."""
-        motion, method = self._motion(x), projection(exact=exact)
-        total = sum(
-            samples.hessian(self.potential.hessian(pairs, samples.mesh, samples.positions(motion), method))
-            for samples, pairs in self.parts
-        )
-        return csr_matrix(self.mesh.to_full_dof(total))
-
-    def _motion(self, x: Values) -> Values:
-        motion: Values = self.mesh.vertices(x) - self.start
-        return motion
-
-
-def projection(*, exact: bool) -> ipctk.PSDProjectionMethod:
-    """Treatment of negative eigenvalues by ipctk: none if `exact`, else clamped to 0."""
-    return ipctk.PSDProjectionMethod.NONE if exact else ipctk.PSDProjectionMethod.CLAMP

@@ -27,7 +27,8 @@ from ..mesh.split_surface.fragment_surface import build_fragment_surface, has_sa
 from ..mesh.split_surface.point_matching import match_points, point_identity
 from ..mesh.split_surface.surface_map import SurfaceMap, whole
 from ..meshes.text import format_point
-from .ipc_pairs import IpcPairs, SlipFriction, max_length
+from .ipc_pairs import IpcPairs, max_length
+from .sample_points import SlipFriction
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -17,7 +17,6 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
@@ -31,7 +30,14 @@ from ..meshes.text import AXES
 from .ipc_pairs import max_length
 from .ipc_surface import SelfContactLaw
 from .laws import BARRIER
-from .mesh_obstacles import AllMeshPairs, MeshContactSurface, MeshFriction, MeshObstacle, MeshObstaclePairs
+from .mesh_obstacles import (
+    AllMeshPairs,
+    MeshContactSurface,
+    MeshFriction,
+    MeshObstacle,
+    MeshObstaclePairs,
+    ProximityTest,
+)
 from .obstacle import RigidObstacle
 from .obstacle_tessellation import ObstacleTessellations
 from .pose import Pose, PosedShape
@@ -44,10 +50,9 @@ Ints = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class MeshGuessPolicy:
-    """Tuned numbers of proximity tests and first guesses before triangle-mesh obstacles.
+    """Tuned numbers of first guesses before triangle-mesh obstacles.
 
     Attributes:
-        max_arm: distance of points of crack faces from the nodes that they follow, in longest edges.
         max_rounds: rounds in which points that depend on several nodes are stopped.
         max_pieces: pieces of a motion, each of an edge's length.
         min_weight: sum of weights of stopped points from which on a node is moved back.
@@ -55,7 +60,6 @@ class MeshGuessPolicy:
         max_search_edges: largest search distance for safe motions, in edges.
     """
 
-    max_arm: float = 2.0
     max_rounds: int = 5
     max_pieces: int = 50
     min_weight: float = 1e-3
@@ -64,52 +68,6 @@ class MeshGuessPolicy:
 
 
 GUESS = MeshGuessPolicy()
-
-
-class ProximityTest:
-    """Test by bounding boxes whether a body can be near an obstacle; nothing is gathered."""
-
-    def __init__(self, domain: Domain, obstacles: Sequence[RigidObstacle], distance: float) -> None:
-        """`distance`: of the barrier, m (collective)."""
-        corners = domain.nodes[domain.cell_nodes]
-        diameter = float(np.ptp(corners, axis=1).max(initial=0.0)) * np.sqrt(domain.dim)
-        self._reach = distance + GUESS.max_arm * float(domain.comm.allreduce(diameter, op=MPI.MAX))
-        self._comm, self._X = domain.comm, domain.nodes[: domain.node_count]
-        self._boxes = [_BoundingBox(obstacle.shape.tessellate()[0]) for obstacle in obstacles]
-
-    def is_far(self, displacements: Sequence[Values], poses: Sequence[tuple[Pose, Pose]]) -> bool:
-        """Whether no point of the body can be within the barrier of an obstacle (collective).
-
-        Args:
-            displacements: (owned dofs,) of the body, m; positions between them count as well.
-            poses: of each obstacle at the start and the end of its motion.
-        """
-        low, high = np.full(3, np.inf), np.full(3, -np.inf)
-        for u in displacements:
-            x = self._X + u.reshape(-1, 3)
-            low, high = np.minimum(low, x.min(axis=0, initial=np.inf)), np.maximum(high, x.max(axis=0, initial=-np.inf))
-        bounds = np.concatenate([low, -high])
-        self._comm.Allreduce(MPI.IN_PLACE, bounds, MPI.MIN)
-        low, high = bounds[:3] - self._reach, -bounds[3:] + self._reach
-        return not any(
-            np.all(low < box_high) and np.all(high > box_low)
-            for box_low, box_high in (box.swept(*ends) for box, ends in zip(self._boxes, poses, strict=True))
-        )
-
-
-class _BoundingBox:
-    """Bounding box of an obstacle in its own frame."""
-
-    def __init__(self, points: Values) -> None:
-        """`points`: (m, 3) in its own frame, m."""
-        self._low, self._high = points.min(axis=0), points.max(axis=0)
-        self._radius = float(np.linalg.norm(points, axis=1).max())
-
-    def swept(self, start: Pose, end: Pose) -> tuple[Values, Values]:
-        """(3,) corners of a box around the motion between two poses, m; with a rotation, around a sphere."""
-        rotated = not all(np.array_equal(pose.rotation, np.eye(3)) for pose in (start, end))
-        low, high = (-self._radius, self._radius) if rotated else (self._low, self._high)
-        return np.minimum(start.centre, end.centre) + low, np.maximum(start.centre, end.centre) + high
 
 
 def stop_before_meshes(

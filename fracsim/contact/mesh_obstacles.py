@@ -13,15 +13,19 @@ from dataclasses import dataclass
 import ipctk
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from ..errors import InputError
+from ..mesh.domain import Domain
 from ..mesh.split_surface.entity_numbering import EntityNumbering
-from .ipc_pairs import NO_PAIRS, IpcFriction, IpcPairs
+from .ipc_pairs import NO_PAIRS, IpcPairs
 from .ipc_surface import SelfContactLaw, SelfContactSurface
 from .laws import BARRIER
+from .obstacle import RigidObstacle
 from .pose import Pose
+from .sample_points import IpcFriction
 from .triangle_mesh_shape import penetration_depth
 
 Values = npt.NDArray[np.float64]
@@ -34,18 +38,66 @@ class MeshObstaclePolicy:
 
     Attributes:
         query_points: points nearest to an obstacle's bounding box that bound its distance first.
+        max_arm: distance of points of crack faces from the nodes that they follow, in longest edges.
         max_rotation: rotation of an obstacle in one piece of a motion, rad.
         min_fraction: of a piece, below which nothing moves.
         unlimited: part of the search distance from which on a safe distance counts as unlimited.
     """
 
     query_points: int = 500
+    max_arm: float = 2.0
     max_rotation: float = 0.3
     min_fraction: float = 1e-4
     unlimited: float = 0.999
 
 
 MESH = MeshObstaclePolicy()
+
+
+class ProximityTest:
+    """Test by bounding boxes whether a body can be near an obstacle; nothing is gathered."""
+
+    def __init__(self, domain: Domain, obstacles: Sequence[RigidObstacle], distance: float) -> None:
+        """`distance`: of the barrier, m (collective)."""
+        corners = domain.nodes[domain.cell_nodes]
+        diameter = float(np.ptp(corners, axis=1).max(initial=0.0)) * np.sqrt(domain.dim)
+        self._reach = distance + MESH.max_arm * float(domain.comm.allreduce(diameter, op=MPI.MAX))
+        self._comm, self._X = domain.comm, domain.nodes[: domain.node_count]
+        self._boxes = [_BoundingBox(obstacle.shape.tessellate()[0]) for obstacle in obstacles]
+
+    def is_far(self, displacements: Sequence[Values], poses: Sequence[tuple[Pose, Pose]]) -> bool:
+        """Whether no point of the body can be within the barrier of an obstacle (collective).
+
+        Args:
+            displacements: (owned dofs,) of the body, m; positions between them count as well.
+            poses: of each obstacle at the start and the end of its motion.
+        """
+        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        for u in displacements:
+            x = self._X + u.reshape(-1, 3)
+            low, high = np.minimum(low, x.min(axis=0, initial=np.inf)), np.maximum(high, x.max(axis=0, initial=-np.inf))
+        bounds = np.concatenate([low, -high])
+        self._comm.Allreduce(MPI.IN_PLACE, bounds, MPI.MIN)
+        low, high = bounds[:3] - self._reach, -bounds[3:] + self._reach
+        return not any(
+            np.all(low < box_high) and np.all(high > box_low)
+            for box_low, box_high in (box.swept(*ends) for box, ends in zip(self._boxes, poses, strict=True))
+        )
+
+
+class _BoundingBox:
+    """Bounding box of an obstacle in its own frame."""
+
+    def __init__(self, points: Values) -> None:
+        """`points`: (m, 3) in its own frame, m."""
+        self._low, self._high = points.min(axis=0), points.max(axis=0)
+        self._radius = float(np.linalg.norm(points, axis=1).max())
+
+    def swept(self, start: Pose, end: Pose) -> tuple[Values, Values]:
+        """(3,) corners of a box around the motion between two poses, m; with a rotation, around a sphere."""
+        rotated = not all(np.array_equal(pose.rotation, np.eye(3)) for pose in (start, end))
+        low, high = (-self._radius, self._radius) if rotated else (self._low, self._high)
+        return np.minimum(start.centre, end.centre) + low, np.maximum(start.centre, end.centre) + high
 
 
 class MeshObstacle:

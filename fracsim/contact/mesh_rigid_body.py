@@ -12,19 +12,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
-from .ipc_pairs import IpcFriction
 from .mesh_obstacles import MeshObstaclePairs
 from .obstacle import FreeObstacle, RigidMotion
 from .obstacle_pairs import ObstaclePairs
 from .pose import Pose, PosedShape
-from .rigid_body import (
-    PoseDerivatives,
-    PosePredictor,
-    RigidStep,
-    point_jacobian,
-    point_set_derivatives,
-    resultant,
-)
+from .pose_derivatives import PoseDerivatives, point_jacobian, point_set_derivatives, resultant
+from .rigid_body import PosePredictor, RigidStep
+from .sample_points import IpcFriction
 from .step_limit import PoseMotion
 
 Values = npt.NDArray[np.float64]

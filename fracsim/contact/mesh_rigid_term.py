@@ -26,11 +26,10 @@ from .laws import Barrier
 from .mesh_obstacle_term import MeshObstacleTerm, stop_before_meshes
 from .mesh_obstacles import MeshContactSurface
 from .mesh_rigid_body import FreeMesh, MeshSurroundings
-from .obstacle import FreeObstacle, RigidMotion, RigidObstacle
+from .obstacle import FreeMotions, FreeObstacle, RigidMotion, RigidObstacle
 from .obstacle_pairs import ObstaclePairs
 from .pose import Pose, PosedShape
 from .rigid_body import RigidStep
-from .rigid_obstacle_term import FreeMotions
 from .step_limit import PoseMotion
 from .triangle_mesh_shape import TriangleMeshShape
 
@@ -75,7 +74,7 @@ class FreeMeshTerm(MeshObstacleTerm):
         self.free = {number: FreeMesh(obstacle) for number, obstacle in items if isinstance(obstacle, FreeObstacle)}
         self._scheme, self._other_obstacles, self._in_equilibrium = scheme, analytic, True
         super().__init__(domain, u, obstacles, law)
-        self._motions = FreeMotions(self.free, self.comm)
+        self._motions = FreeMotions(self.free, self.comm.rank == 0)
         self._others_posed = self._others_start = {
             number: obstacle.posed_at(0.0) for number, obstacle in analytic.items()
         }

@@ -37,7 +37,8 @@ from .node_contact import ContactForces
 from .obstacle import FreeObstacle, RigidMotion, RigidObstacle
 from .obstacle_term import ObstacleTerm
 from .pose import PosedShape, min_distance, rotation_derivative
-from .rigid_body import contact_wrench, solve_matrix
+from .pose_derivatives import contact_wrench
+from .rigid_body import solve_matrix
 from .rigid_obstacle_term import FreeObstacleBase
 
 Values = npt.NDArray[np.float64]

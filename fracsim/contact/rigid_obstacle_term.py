@@ -15,9 +15,8 @@ Equations: docs/theory.md#rigid-obstacles.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
-from typing import Protocol, cast
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +28,7 @@ from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
 from .laws import ObstacleLaw
 from .node_contact import ContactForces
-from .obstacle import FreeObstacle, RigidMotion, RigidObstacle, column_names, motion_rows
+from .obstacle import FreeMotions, FreeObstacle, PlaceableObstacle, RigidMotion, RigidObstacle
 from .obstacle_pairs import ObstaclePairs
 from .obstacle_term import ObstacleTerm
 from .pose import PosedShape
@@ -40,97 +39,6 @@ Values = npt.NDArray[np.float64]
 
 # evaluations in which free obstacles are held back, before they are released whatever they press on
 MAX_HOLDS = 4
-
-
-# --- state of motion of free obstacles ---
-
-
-class MovingObstacle(Protocol):
-    """Free obstacle, with its state of motion at the start of a step until that is accepted."""
-
-    body: FreeObstacle
-    motion: RigidMotion
-
-
-class PlaceableObstacle(MovingObstacle, Protocol):
-    """Free obstacle with a pose in a step."""
-
-    def reset_pose(self) -> PosedShape:
-        """Return to the pose of the state of motion."""
-
-
-@dataclass(frozen=True)
-class FreeMotions:
-    """States of motion of free obstacles: history of a term, and columns of history.csv.
-
-    Attributes:
-        free: free obstacles by their numbers.
-        comm: ranks of the term.
-    """
-
-    free: Mapping[int, MovingObstacle]
-    comm: MPI.Intracomm
-
-    def snapshot(self) -> dict[int, RigidMotion]:
-        """State of motion of each, by its number."""
-        return {number: obstacle.motion for number, obstacle in self.free.items()}
-
-    def restore(self, motions: Mapping[int, RigidMotion]) -> None:
-        """Restore states of motion."""
-        for number, obstacle in self.free.items():
-            obstacle.motion = motions[number]
-
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Rows of numbers for a checkpoint."""
-        return {"flights": motion_rows(obstacle.motion for obstacle in self.free.values())}
-
-    def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set states of motion from the rows of a checkpoint."""
-        for row, obstacle in enumerate(self.free.values()):
-            obstacle.motion = obstacle.motion.from_array(saved["flights"][row])
-
-    def place(self, posed: list[PosedShape]) -> list[PosedShape]:
-        """All obstacles, by their numbers, with free ones at the poses of their states of motion."""
-        for number, obstacle in self.free.items():
-            posed[number] = PosedShape(posed[number].shape, obstacle.motion.pose)
-        return posed
-
-    def kinetic_energy(self) -> float:
-        """Kinetic energy of the free obstacles, on rank 0, J."""
-        if self.comm.rank:
-            return 0.0
-        return float(sum(obstacle.body.history_values(obstacle.motion)[-1] for obstacle in self.free.values()))
-
-    def columns(self) -> dict[str, Callable[[], Values]]:
-        """Columns of history.csv, each with a function that returns this rank's share, (1,).
-
-        position_NAME_x and velocity_NAME_x of the centre of mass, m and m/s; turn_NAME_z and spin_NAME_z, rad and
-        rad/s; kinetic_NAME, J.
-        """
-        return {
-            name: partial(reader, index)
-            for obstacle in self.free.values()
-            for reader in [_MotionReader(obstacle, self.comm)]
-            for index, name in enumerate(column_names(obstacle.body))
-        }
-
-
-class _MotionReader:
-    """Numbers of an obstacle for history.csv: read column by column, evaluated once for each state of motion."""
-
-    def __init__(self, obstacle: MovingObstacle, comm: MPI.Intracomm) -> None:
-        self._obstacle, self._is_root = obstacle, comm.rank == 0
-        self._motion: RigidMotion | None = None
-        self._values: Values = np.empty(0)
-
-    def __call__(self, index: int) -> Values:
-        """(1,) value of a column; 0 on other ranks than 0."""
-        if not self._is_root:
-            return np.zeros(1)
-        if self._motion is not self._obstacle.motion:
-            self._motion = self._obstacle.motion
-            self._values = self._obstacle.body.history_values(self._motion)
-        return self._values[index : index + 1]
 
 
 class FreeObstacleBase(ObstacleTerm):
@@ -144,7 +52,7 @@ class FreeObstacleBase(ObstacleTerm):
 
     @property
     def _motions(self) -> FreeMotions:
-        return FreeMotions(self.free, self.comm)
+        return FreeMotions(self.free, self.comm.rank == 0)
 
     def _prescribed_numbers(self) -> list[int]:
         return [number for number in super()._prescribed_numbers() if number not in self.free]

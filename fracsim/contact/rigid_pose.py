@@ -24,12 +24,8 @@ from .node_contact import ContactForces, LaggedContact
 from .obstacle import FreeObstacle, RigidMotion
 from .obstacle_pairs import ObstaclePair, ObstaclePairs
 from .pose import Pose, PosedShape
-from .rigid_body import (
+from .pose_derivatives import (
     PoseDerivatives,
-    PosePredictor,
-    RigidStep,
-    RigidSystem,
-    SystemDerivatives,
     carried_point_derivatives,
     contact_wrench,
     mixed_pose_hessian,
@@ -37,6 +33,7 @@ from .rigid_body import (
     pose_derivatives,
     resultant,
 )
+from .rigid_body import PosePredictor, RigidStep, RigidSystem, SystemDerivatives
 from .step_limit import PoseMotion, safe_motion_fractions
 
 Values = npt.NDArray[np.float64]

@@ -1,17 +1,18 @@
-"""Sample points of the barrier between the elements of a surface: vertices, or centroids of elements.
+"""Sample points of the barrier between the elements of a surface, vertices or centroids, and friction at them.
 
 With one point at the centroid of an element, weighted with the element's measure, the barrier between two parallel
 faces presses along their normal as long as no centroid overhangs. Points on the rim press outwards as soon as aligned
 rims are shifted by dx: their tangential force is F dx / g at a gap g. A stack of mass m without friction then slides
 apart, and the speed grows at a rate of sqrt(F / (m g)).
 
-Equations: docs/theory.md#barrier.
+Equations: docs/theory.md#barrier, docs/theory.md#friction.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import ipctk
 import numpy as np
@@ -150,3 +151,72 @@ def measures(x: Values, elements: Ints) -> Values:
     side = x[elements[:, 1:]] - x[elements[:, :1]]
     spanned = side[:, 0] if x.shape[1] == 2 else 0.5 * np.cross(side[:, 0], side[:, 1])
     return np.asarray(np.linalg.norm(spanned, axis=1))
+
+
+class SlipFriction(Protocol):
+    """Lagged friction of a surface at positions x (n, d), m: a potential of the slip."""
+
+    def energy(self, x: Values) -> float:
+        """Potential, J."""
+
+    def gradient(self, x: Values) -> Values:
+        """(n, d) minus the forces on the points, N."""
+
+    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
+        """(n d, n d) second derivatives, N/m."""
+
+
+@dataclass(frozen=True)
+class IpcFriction:
+    """Lagged Coulomb friction of ipctk's pairs: a potential of the slip (Li et al. 2020, eq. 19).
+
+        E(x) = mu sum_k N_k f(|T_k^T (x - x_0)|),   f(y) = y for y > e, -y^3 / (3 e^2) + y^2 / e + e / 3 below
+
+    N_k is the normal force of a pair, N, T_k its tangents, e the slip that counts as sticking, m. The gradient is the
+    friction of a backward Euler step: against the slip, and at most mu N_k.
+
+    Attributes:
+        mesh: surface.
+        parts: sample points and pairs of each kind.
+        start: (n, d) x_0, m.
+        potential: of ipctk.
+    """
+
+    mesh: ipctk.CollisionMesh
+    parts: list[tuple[Vertices | Centroids, ipctk.TangentialCollisions]]
+    start: Values
+    potential: ipctk.FrictionPotential
+
+    def energy(self, x: Values) -> float:
+        """E(x), J: not stored, but the work of friction where the slip is longer than e."""
+        motion = self._motion(x)
+        return float(
+            sum(self.potential(pairs, samples.mesh, samples.positions(motion)) for samples, pairs in self.parts)
+        )
+
+    def gradient(self, x: Values) -> Values:
+        """(n, d) dE/dx, N: minus the forces on the points."""
+        motion = self._motion(x)
+        total = sum(
+            samples.gradient(self.potential.gradient(pairs, samples.mesh, samples.positions(motion)))
+            for samples, pairs in self.parts
+        )
+        return np.asarray(self.mesh.to_full_dof(total)).reshape(x.shape)
+
+    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
+        """(n d, n d) d2E/dx2, N/m; unless `exact`, each pair without its negative eigenvalues."""
+        motion, method = self._motion(x), projection(exact=exact)
+        total = sum(
+            samples.hessian(self.potential.hessian(pairs, samples.mesh, samples.positions(motion), method))
+            for samples, pairs in self.parts
+        )
+        return csr_matrix(self.mesh.to_full_dof(total))
+
+    def _motion(self, x: Values) -> Values:
+        motion: Values = self.mesh.vertices(x) - self.start
+        return motion
+
+
+def projection(*, exact: bool) -> ipctk.PSDProjectionMethod:
+    """Treatment of negative eigenvalues by ipctk: none if `exact`, else clamped to 0."""
+    return ipctk.PSDProjectionMethod.NONE if exact else ipctk.PSDProjectionMethod.CLAMP

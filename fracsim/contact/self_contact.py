@@ -24,9 +24,9 @@ from ..mesh.domain import Domain
 from ..mesh.parallel import Gather, from_root, on_root, sum_over_ranks
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.surface_map import SurfaceMap
-from .ipc_pairs import SlipFriction
 from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface
 from .laws import stiffness_factor
+from .sample_points import SlipFriction
 
 if TYPE_CHECKING:
     from ..meshes.data import MeshData

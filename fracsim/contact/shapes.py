@@ -34,7 +34,7 @@ from .shape_base import (
 )
 
 __all__ = [
-    "SHAPES", "Capsule", "HalfSpace", "OffsetShape", "RoundedBox", "RoundedCylinder", "Shape", "Sphere",
+    "SHAPES", "Capsule", "HalfSpace", "RoundedBox", "RoundedCylinder", "Shape", "Sphere",
     "TranslatedShape",
 ]  # fmt: skip
 
@@ -394,11 +394,17 @@ class RoundedCylinder(ConvexBody):
 
 
 @dataclass(frozen=True, eq=False)
-class _ModifiedShape:
-    """Shape made of another one, of which it has the dimension and the kind of surface."""
+class TranslatedShape:
+    """Shape centred at an offset from its reference point, as of a pendulum about its hinge.
 
-    kind: ClassVar[str] = "modified shape"
+    Attributes:
+        shape: original shape.
+        offset: (d,) its centre, m.
+    """
+
+    kind: ClassVar[str] = "shape on a hinge"
     shape: Shape
+    offset: Values
 
     @property
     def dim(self) -> int:
@@ -407,7 +413,7 @@ class _ModifiedShape:
 
     @property
     def convex(self) -> bool:
-        """Whether the shape is convex."""
+        """Whether the original shape is convex."""
         return self.shape.convex
 
     @property
@@ -419,18 +425,6 @@ class _ModifiedShape:
     def volume(self) -> float:
         """Volume of the original shape, m^3 (2D: m^2)."""
         return self.shape.volume
-
-
-@dataclass(frozen=True, eq=False)
-class TranslatedShape(_ModifiedShape):
-    """Shape centred at an offset from its reference point, as of a pendulum about its hinge.
-
-    Attributes:
-        shape: original shape.
-        offset: (d,) its centre, m.
-    """
-
-    offset: Values
 
     @property
     def rotation_invariant(self) -> bool:
@@ -461,35 +455,6 @@ class TranslatedShape(_ModifiedShape):
         if self.dim == 2:
             return np.asarray(central + mass * (o @ o))
         return np.asarray(central + mass * ((o @ o) * np.eye(3) - np.outer(o, o)))
-
-
-@dataclass(frozen=True, eq=False)
-class OffsetShape(_ModifiedShape):
-    """All points within an offset of a shape: its distance minus the offset.
-
-    Attributes:
-        shape: original shape.
-        offset: m.
-    """
-
-    offset: float
-
-    @property
-    def rotation_invariant(self) -> bool:
-        """Whether no rotation about the reference point changes the shape."""
-        return self.shape.rotation_invariant
-
-    def distance(self, x: Values) -> Values:
-        """(n,) signed distances, m."""
-        return self.shape.distance(x) - self.offset
-
-    def normal(self, x: Values) -> Values:
-        """(n, d) gradients of the distance."""
-        return self.shape.normal(x)
-
-    def curvature(self, x: Values) -> Values:
-        """(n, d, d) Hessians of the distance, 1/m."""
-        return self.shape.curvature(x)
 
 
 # the name that a study gives -> class
