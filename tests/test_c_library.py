@@ -184,7 +184,7 @@ def test_a_folder_that_becomes_unusable_is_a_message(
 COMPILERS = [compiler for compiler in ("gcc", "clang") if shutil.which(compiler)]
 PACKAGE = Path(c_library.__file__).parents[1]
 SOURCES = sorted(PACKAGE.rglob("*.c"))
-# sizes that sources are compiled for; simd_kernels.c needs a kernel of FFCx, and is compiled in test_lanes
+# sizes that sources are compiled for; simd_kernels.c needs a kernel of FFCx, and is compiled in test_simd_kernels
 MACROS = {
     "block_matrix": ["-DD=3"], "psd_projection": ["-DN=9", "-DLANES=4"], "bcsr": ["-DR=3", "-DLANES=8"],
     "prolongation": ["-DR=3", "-DC=6"],

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import shutil
-from functools import partial
 
 import numpy as np
 import pytest
 from dolfinx import fem
 
-from fracsim.mechanics import matrix_assembly, simd_kernels
+from fracsim.mechanics import simd_kernels
 from fracsim.mechanics.jit import jit_options
 from fracsim.mechanics.kernel_selection import KernelSelection
 from fracsim.mechanics.matrix_assembly import TangentAssembler
@@ -23,6 +22,7 @@ from fracsim.mechanics.simd_kernels import (
 )
 from fracsim.mesh import c_library as compiling
 from fracsim.mesh.dolfinx_compat import evaluate, source_of
+from fracsim.scene import terms
 from support.scenes import Values, make_scene
 from test_dead_cells import damaged
 
@@ -129,7 +129,8 @@ def test_large_bodies_that_break_are_looked_at_several_cells_at_a_time(monkeypat
     """The same where the size of a body decides, and crushed cells are counted as before."""
     found = []
     for many in (1, 10**9):
-        monkeypatch.setattr(matrix_assembly, "KernelSelection", partial(KernelSelection, min_cells=many))
+        selection = KernelSelection(min_cells=many)
+        monkeypatch.setattr(terms, "KernelSelection", lambda selection=selection, **_: selection)
         scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 0.7], "h": 0.2}, fracture={"strength": 1.0})
         u = np.random.default_rng(5).uniform(-0.02, 0.02, scene.balance.owned_dof_count)
         u[3] = np.nan
@@ -225,8 +226,8 @@ def test_plain_selection_agrees(monkeypatch: pytest.MonkeyPatch) -> None:
     """DOLFINx alone gives the same forces, released forces, energy, tangent and positive moduli, to round-off."""
     results = []
     for plain in (False, True):
-        selection = partial(KernelSelection, plain=plain, min_dofs=1, min_cells=1)
-        monkeypatch.setattr(matrix_assembly, "KernelSelection", selection)
+        selection = KernelSelection(plain=plain, min_dofs=1, min_cells=1)
+        monkeypatch.setattr(terms, "KernelSelection", lambda selection=selection, **_: selection)
         balance = damaged("damped", 3, boundary=SIDE)[0].balance
         balance.set_displacement(np.random.default_rng(6).uniform(-0.2, 0.2, balance.owned_dof_count))
         stress = balance.stress
