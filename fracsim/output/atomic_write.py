@@ -119,7 +119,8 @@ def writable_hdf5(path: Path, size: int, *, new: bool = False) -> Iterator[Any]:
         _check_disk_space(path, size)
         with h5py.File(path, "r+") as file:
             yield file
-    except RuntimeError as error:  # raised by h5py if closing fails
+    # raised by h5py if closing fails
+    except RuntimeError as error:
         raise OSError(str(error)) from error
 
 

@@ -43,9 +43,11 @@ _CLOCK = ("t", "step", "dt", "dissipated", "work", "easy")
 _NODAL = ("u", "v", "a", "forces")
 _OPTIONAL_NODAL = ("drag", "out_of_balance")
 _EDGES = ("weakened", "integrity", "broken", "breaks")
-_REPLICATED = (*_EDGES, "starts")  # arrays that every rank needs as a whole
+# arrays that every rank needs as a whole
+_REPLICATED = (*_EDGES, "starts")
 _FRACTURE = {*_REPLICATED, "chi", "term.tethers"}
-_TERM_PREFIX = "term."  # before the names of the history variables of the terms
+# before the names of the history variables of the terms
+_TERM_PREFIX = "term."
 
 
 def write_checkpoint(
@@ -298,7 +300,8 @@ def _has_prefix(name: str, prefixes: set[str]) -> bool:
 
 def _clock_problem(clock: dict[str, Any], arrays: dict[str, npt.NDArray[Any]]) -> str:
     """Error text for the numbers of the time scheme, empty if they are in their range."""
-    if not clock["dt"] > 0 or clock["dt"] ** 2 == 0:  # schemes divide by dt squared
+    # schemes divide by dt squared
+    if not clock["dt"] > 0 or clock["dt"] ** 2 == 0:
         return f"dt is {clock['dt']}, not above 0, or too small"
     if clock["easy"] < 0 or clock["easy"] != int(clock["easy"]):
         return f"easy is {clock['easy']}, no number of steps"

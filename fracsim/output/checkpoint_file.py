@@ -28,7 +28,8 @@ from .file_ownership import CHECKPOINT_FILE
 
 Arrays = dict[str, npt.NDArray[Any]]
 
-DIGEST_MARK = b"\nfracsim checkpoint, SHA-256 "  # the last line of the file before its digest
+# the last line of the file before its digest
+DIGEST_MARK = b"\nfracsim checkpoint, SHA-256 "
 DIGEST_LINE_BYTES = len(DIGEST_MARK) + 2 * hashlib.sha256().digest_size + 1
 _NOTES = ("study", "monitors")
 # whatever h5py, NumPy, json and tomllib raise on a damaged file
@@ -119,7 +120,8 @@ def write_checkpoint_file(
     Raises:
         OSError: the file cannot be written.
     """
-    path.parent.mkdir(exist_ok=True)  # without parents: a deleted output folder is an error
+    # without parents: a deleted output folder is an error
+    path.parent.mkdir(exist_ok=True)
     with replacing(path) as temporary:
         with writable_hdf5(temporary, _file_size(arrays, notes), new=True) as file:
             for name, values in arrays.items():

@@ -16,8 +16,10 @@ from ..meshes.text import AXES
 
 Ints = npt.NDArray[np.integer]
 Values = npt.NDArray[np.float64]
-MIN_BARYCENTRIC = -1e-9  # a point with smaller barycentric coordinates is outside the cell (round-off)
-DIAGONAL_PAIRS = np.array([[0, 1, 2, 3], [0, 2, 1, 3], [0, 3, 1, 2]])  # of four corners in two diagonals
+# a point with smaller barycentric coordinates is outside the cell (round-off)
+MIN_BARYCENTRIC = -1e-9
+# the three pairings of four corners as two diagonals
+DIAGONAL_PAIRS = np.array([[0, 1, 2, 3], [0, 2, 1, 3], [0, 3, 1, 2]])
 
 
 class CrackExtent:
@@ -48,9 +50,12 @@ class CrackExtent:
         self.columns = ["crack_length" if d == 2 else "crack_area", *(f"tip_{axis}" for axis in AXES[:d])]
         self._edge_ends = edge_ends_in_input_order(graph)
         self.values = np.array([0.0] + d * [np.nan])
-        self._pattern = np.zeros_like(graph.pattern)  # broken edges of each cell at the last update
-        self._cut_size = np.zeros(len(self._pattern))  # length or area of the cut through each cell
-        self._segment_ends: dict[int, Values] = {}  # local cell -> end point of a segment of the study in it
+        # broken edges of each cell at the last update
+        self._pattern = np.zeros_like(graph.pattern)
+        # length or area of the cut through each cell
+        self._cut_size = np.zeros(len(self._pattern))
+        # local cell -> end point of a segment of the study in it
+        self._segment_ends: dict[int, Values] = {}
         for crack in cracks if d == 2 else ():
             for end in () if crack.corners is None else crack.corners:
                 self._locate_segment_end(end)

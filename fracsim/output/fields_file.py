@@ -19,13 +19,17 @@ from ..meshes.plain_files import data_elsewhere, replacing
 from .atomic_write import HDF5_OVERHEAD_BYTES, append_bytes, open_hdf5, replace_text, writable_hdf5
 
 Values = npt.NDArray[np.float64]
-TENSOR_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")  # symmetric tensor, in the order of VTK and ParaView
-EARLIER_TENSOR_COMPONENTS = ("xx", "xy", "xz", "yy", "yz", "zz")  # order in files without COMPONENTS_ATTRIBUTE
-COMPONENTS_ATTRIBUTE = "components"  # attribute of a symmetric tensor in fields.h5: names of its columns
+# symmetric tensor, in the order of VTK and ParaView
+TENSOR_COMPONENTS = ("xx", "yy", "zz", "xy", "yz", "xz")
+# order in files without COMPONENTS_ATTRIBUTE
+EARLIER_TENSOR_COMPONENTS = ("xx", "xy", "xz", "yy", "yz", "zz")
+# attribute of a symmetric tensor in fields.h5: names of its columns
+COMPONENTS_ATTRIBUTE = "components"
 # XDMF's own Tensor6 has another order, and ParaView's older reader expands it to 9 columns. A Matrix is read unchanged.
 # It has one row: that reader takes the last dimension for the columns in VTK 9.3, the last two in VTK 9.7.
 _ATTRIBUTE_TYPES = {1: "Scalar", 3: "Vector", len(TENSOR_COMPONENTS): "Matrix"}
-_TOPOLOGY_TYPES = {3: "Triangle", 4: "Tetrahedron", 6: "Triangle_6", 10: "Tetrahedron_10"}  # by nodes per cell
+# by nodes per cell
+_TOPOLOGY_TYPES = {3: "Triangle", 4: "Tetrahedron", 6: "Triangle_6", 10: "Tetrahedron_10"}
 _COMPONENT_NAMES = np.bytes_(" ".join(TENSOR_COMPONENTS))
 _TAIL = "    </Grid>\n  </Domain>\n</Xdmf>\n"
 _HEAD = (
@@ -189,7 +193,8 @@ def check_self_contained(h5: Path) -> None:
                 if name := data_elsewhere(file):
                     problem = f"has the data of '{name}' in another file"
         except (OSError, RuntimeError):
-            return  # read_frame_times reports an unreadable file
+            # read_frame_times reports an unreadable file
+            return
     if problem:
         raise InputError(f"--restart: {h5} {problem}; move it away to go on without its frames")
 

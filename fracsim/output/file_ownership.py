@@ -15,7 +15,8 @@ from pathlib import Path
 from ..errors import InputError
 from ..meshes.plain_files import MISSING, NEW, wrong_with
 
-STUDY_HEADER_WORDS = ("fracsim", "dolfinx", "petsc", "python", "ranks")  # first words of the comments in study.toml
+# first words of the comments in study.toml
+STUDY_HEADER_WORDS = ("fracsim", "dolfinx", "petsc", "python", "ranks")
 STUDY_FILE, CHECKPOINT_FILE = "study.toml", "checkpoint/state.h5"
 OUTPUT_FOLDERS = ("surface", "checkpoint")
 OUTPUT_FILES = (
@@ -24,7 +25,8 @@ OUTPUT_FILES = (
 FRAME_FILE_PATTERN = re.compile(r"(?:surface|obstacle_[A-Za-z][A-Za-z0-9-]*)_\d{6,}\.vtu")
 # Files that may exist before study.toml does: the log of a sweep, and a temporary file of a run killed at its start.
 ALLOWED_FOREIGN_FILES = ("log.txt", STUDY_FILE + NEW)
-_MAX_NAMED_FILES = 3  # foreign files listed in a message
+# foreign files listed in a message
+_MAX_NAMED_FILES = 3
 
 
 def own_files(folder: Path) -> Iterator[Path]:

@@ -33,13 +33,16 @@ HISTORY_COLUMNS = (
 
 VectorReading = Callable[[], npt.NDArray[np.float64]]
 ScalarReading = Callable[[], float]
-WORK_PREFIX = "work_"  # columns that are summed over the steps
-PROBE_PREFIXES = {"reaction": "reaction", "displacement": "probe"}  # quantity of a probe -> prefix of its columns
+# columns that are summed over the steps
+WORK_PREFIX = "work_"
+# quantity of a probe -> prefix of its columns
+PROBE_PREFIXES = {"reaction": "reaction", "displacement": "probe"}
 # Columns, and prefixes of columns, that are per metre of thickness in 2D before they are written.
 THICKNESS_PREFIXES = (
     "kinetic", "elastic", "dissipated", "external_work", "reaction_", "contact_", WORK_PREFIX, "kinetic_",
 )  # fmt: skip
-_MAX_NAMED_GAPS = 5  # ranges of missing rows listed in a note
+# ranges of missing rows listed in a note
+_MAX_NAMED_GAPS = 5
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,8 @@ from mpi4py import MPI
 
 from ..errors import REPEATED_SIGNAL_INTERVAL, STOP_SIGNALS, FracsimError, Stopped
 
-MAX_UNINTERRUPTED_SECONDS = 0.5  # a step that has taken no longer is finished before the run stops
+# a step that has taken no longer is finished before the run stops
+MAX_UNINTERRUPTED_SECONDS = 0.5
 _SOURCE = Path(__file__).with_name("signals.c")
 
 
@@ -44,7 +45,8 @@ class InterruptHandler:
         self._deadline = np.inf if wall_limit is None else time.monotonic() + wall_limit
         self._signal = 0
         self._step_began = -np.inf
-        self._depth = 0  # how often the context is entered
+        # how often the context is entered
+        self._depth = 0
         self._previous_handlers: dict[int, object] = {}
 
     def __enter__(self) -> InterruptHandler:
@@ -54,7 +56,8 @@ class InterruptHandler:
         code = _signal_library()
         for number in STOP_SIGNALS:
             if signal.getsignal(number) is signal.SIG_IGN:
-                signal.signal(number, signal.SIG_IGN)  # PETSc may have installed a handler since
+                # PETSc may have installed a handler since
+                signal.signal(number, signal.SIG_IGN)
                 continue
             self._previous_handlers[number] = signal.signal(number, self._on_signal)
             if code is not None:

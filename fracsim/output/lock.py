@@ -44,13 +44,15 @@ class _LockHandle:
         # a forked child shares the lock and must not end it
         if os.getpid() == self._process:
             with contextlib.suppress(OSError):
-                os.unlink(self._path)  # still locked here, so no other process can hold this very file
+                # still locked here, so no other process can hold this very file
+                os.unlink(self._path)
         with contextlib.suppress(OSError):
             os.close(self._descriptor)
         self._descriptor = -1
 
 
-_handles: WeakValueDictionary[Path, _LockHandle] = WeakValueDictionary()  # locks of this process by folder
+# locks of this process by folder
+_handles: WeakValueDictionary[Path, _LockHandle] = WeakValueDictionary()
 
 
 @atexit.register

@@ -79,13 +79,15 @@ class ProgressReporter:
         self._end, self._began = end, time.monotonic()
         self._stage = ""
         self._state: ProgressState | None = None
-        self._first_step_t, self._first_step_clock = 0.0, self._began  # simulated and wall time, start of first step
+        # simulated and wall time, start of first step
+        self._first_step_t, self._first_step_clock = 0.0, self._began
         self._last_write = -math.inf
         self._is_live, self._period, columns = _chosen_form() if first else (False, math.inf, 0)
         self._columns = columns - 1
         self._stop = threading.Event()
         self._thread: threading.Thread | None = None
-        self._depth = 0  # how often the context is entered
+        # how often the context is entered
+        self._depth = 0
 
     def __enter__(self) -> ProgressReporter:
         self._depth += 1

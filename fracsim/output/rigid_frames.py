@@ -30,7 +30,8 @@ from .surface.vtk_files import SurfaceFiles
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Patterns = npt.NDArray[np.integer]
-NEVER_BROKEN = np.inf  # time at which an intact edge breaks
+# time at which an intact edge breaks
+NEVER_BROKEN = np.inf
 
 
 class RigidFrames:
@@ -145,7 +146,8 @@ class InstanceSurface(BodySurface):
         self.mass = np.tile(group_sums(mesh.cells.ravel(), share, len(mesh.points)), count)
         self._pattern: Patterns = np.zeros(count * len(mesh.cells), np.uint8)
         self._instances = count * [build_split_surface(self.skeleton, self._pattern[: len(mesh.cells)])]
-        self._built_patterns = self._pattern.reshape(count, -1).copy()  # patterns of the surfaces in _instances
+        # patterns of the surfaces in _instances
+        self._built_patterns = self._pattern.reshape(count, -1).copy()
         self._dented: dict[int, Values] = {}
         self._build(None)
 

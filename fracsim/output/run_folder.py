@@ -33,7 +33,8 @@ CHANGEABLE_KEYS = (
 # Tables that a restart may add or remove while nothing has broken or yielded; the checkpoint is asked for that. Each
 # with the key of a material that is added or removed with it.
 OPTIONAL_TABLES = {"fracture": "strength", "plasticity": "yield_stress", "brittle": ""}
-_MAX_NAMED_KEYS = 4  # differing keys listed in a message
+# differing keys listed in a message
+_MAX_NAMED_KEYS = 4
 
 
 def check_same_study(path: Path, earlier: dict[str, Any], present: dict[str, Any]) -> None:
@@ -134,7 +135,8 @@ def check_output_folder(
     if restart:
         earlier = completed(read_notes(folder).study_tables())
         check_same_study(checkpoint_path(folder), earlier, tomllib.loads(study))
-        inputs = ()  # a restart may read study.toml of the run itself
+        # a restart may read study.toml of the run itself
+        inputs = ()
     check_ownership(folder, inputs)
     if not restart and not overwrite:
         check_not_resumable(folder)
@@ -224,7 +226,8 @@ class FrameSchedule:
             interval: simulated time between frames, s.
         """
         self._every, self._interval = every, interval
-        self._intervals_done = 0  # whole intervals at the last frame
+        # whole intervals at the last frame
+        self._intervals_done = 0
 
     def is_due(self, t: float, step: int) -> bool:
         """True if a frame is due at the end of a step, at time t in s."""

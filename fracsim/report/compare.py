@@ -21,7 +21,8 @@ from .runs import PHASES, RunData, Values, differing_settings
 ENERGY_LABELS = {
     "external_work": "external work", "elastic": "elastic", "kinetic": "kinetic", "dissipated": "dissipated",
 }  # fmt: skip
-MAX_CURVE_POINTS = 600  # points of a curve; more cannot be distinguished on the page
+# points of a curve; more cannot be distinguished on the page
+MAX_CURVE_POINTS = 600
 
 
 @dataclass(frozen=True)

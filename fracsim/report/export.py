@@ -33,7 +33,8 @@ from .pictures.picture_options import MaterialLook, material_look
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 EXPORT_FORMATS = ("ply", "obj", "glb", "usd")
-_USD_FRAMES_PER_SECOND = 24.0  # playback rate, on which time codes do not depend
+# playback rate, on which time codes do not depend
+_USD_FRAMES_PER_SECOND = 24.0
 
 
 @dataclass(frozen=True)

@@ -19,12 +19,14 @@ import numpy.typing as npt
 from .content import Plot, Series
 
 Values = npt.NDArray[np.float64]
-Box = tuple[float, float, float, float]  # left, bottom, right, top, pixels
+# left, bottom, right, top, pixels
+Box = tuple[float, float, float, float]
 
 # Colours that colour-blind readers can distinguish (Okabe and Ito), for light and for dark pages.
 SERIES_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6bb1", "#a6761d")
 MARKERS = "osD^vP*X"
-_INK, _FAINT = "#010203", "#888889"  # _INK is replaced by the text colour of the page
+# _INK is replaced by the text colour of the page
+_INK, _FAINT = "#010203", "#888889"
 _STYLE: dict[str, Any] = {
     "svg.fonttype": "none", "font.family": "sans-serif", "font.size": 10, "figure.constrained_layout.use": True,
     "text.color": _INK, "axes.edgecolor": _INK, "axes.labelcolor": _INK, "xtick.color": _INK, "ytick.color": _INK,
@@ -32,7 +34,8 @@ _STYLE: dict[str, Any] = {
     "legend.frameon": False, "legend.fontsize": 8.5, "lines.markersize": 5,
     "text.parse_math": False,
 }  # fmt: skip
-_MAX_INSIDE_LEGEND = 6  # series whose legend is inside the axes; a longer legend stands beside them
+# series whose legend is inside the axes; a longer legend stands beside them
+_MAX_INSIDE_LEGEND = 6
 
 
 @dataclass(frozen=True)
@@ -224,7 +227,8 @@ def label_points(
         points: all points of the plot.
     """
     style = LABEL_STYLE
-    axes.figure.draw_without_rendering()  # drawing computes the layout
+    # drawing computes the layout
+    axes.figure.draw_without_rendering()
     scale = axes.figure.dpi / 72
     frame: Box = tuple(axes.bbox.extents)
     radius = style.point_radius * scale

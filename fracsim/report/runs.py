@@ -25,7 +25,8 @@ OUTCOMES: dict[int, str] = {
     Exit.STOPPED: "stopped",
     Exit.CANNOT_WRITE: "could not write",
 }
-MESSAGE_PREFIX = "fracsim: "  # begins each message of the program in a log
+# begins each message of the program in a log
+MESSAGE_PREFIX = "fracsim: "
 
 
 @dataclass(frozen=True)

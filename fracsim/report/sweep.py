@@ -25,7 +25,8 @@ from ..study.check import check_study
 from ..study.reader import load_study, study_text
 from .runs import MESSAGE_PREFIX, OUTCOMES, read_last_message
 
-_MAX_NAME_LENGTH = 100  # characters of a folder name, before a hash
+# characters of a folder name, before a hash
+_MAX_NAME_LENGTH = 100
 
 
 @dataclass(frozen=True)
@@ -274,7 +275,8 @@ def _run(study: str, case: SweepCase, text: str, ranks: int) -> str:
         return f"refused: a run is going on there ({holder})"
     try:
         case.folder.mkdir(parents=True, exist_ok=True)
-        (case.folder / "summary.json").unlink(missing_ok=True)  # otherwise an earlier one could be taken for this run's
+        # otherwise an earlier one could be taken for this run's
+        (case.folder / "summary.json").unlink(missing_ok=True)
     except OSError as error:
         raise InputError(f"--out {case.folder.parent}: cannot write there: {error.strerror}") from None
     # _check_folder has allowed to overwrite what is in the folder
@@ -322,7 +324,8 @@ class _SignalForwarder:
     def wait_for(self, process: subprocess.Popen[bytes]) -> int:
         """Exit code of a run, after it has ended."""
         self._process = process
-        if self.first_signal is not None:  # it came before the run was started
+        # it came before the run was started
+        if self.first_signal is not None:
             process.send_signal(signal.SIGUSR1)
         return process.wait()
 

@@ -27,7 +27,8 @@ Arrays = dict[str, npt.NDArray[np.generic]]
 # Correction of drawn points, so that nothing is drawn inside an obstacle or another fragment: from the points, their
 # elements, the nodal displacement u and the time t.
 type PointCorrection = Callable[[SurfaceMap, Ints, Values, float], SurfaceMap]
-MAX_COORDINATE = float(np.finfo(np.float32).max)  # viewers use single precision
+# viewers use single precision
+MAX_COORDINATE = float(np.finfo(np.float32).max)
 
 
 @dataclass(frozen=True)
@@ -129,7 +130,8 @@ class BodySurface:
         )
         self._rotations = NodalRotations(self.skeleton, self._pattern, built.parents.rotating_nodes)
         self._name_of_point = self.fragment_names[fragment]
-        self._uncorrected: SurfaceMap | None = None  # map from nodal displacement to points, before corrections
+        # map from nodal displacement to points, before corrections
+        self._uncorrected: SurfaceMap | None = None
         self.build_count += 1
 
     def make_frame(

@@ -98,7 +98,8 @@ def enclosed_volumes(points: Values, elements: Ints, fragment: Ints, count: int)
         fragment: fragment (k,) of each element.
         count: number of fragments.
     """
-    x = (points - points.mean(axis=0))[elements]  # near the origin there is less cancellation
+    # near the origin there is less cancellation
+    x = (points - points.mean(axis=0))[elements]
     return group_sums(fragment, cones(x), count)
 
 
@@ -148,7 +149,8 @@ class FragmentNames:
 
 def _lighter_parts(names: Ints, mass: Values) -> Ints:
     """Fragments, ascending, that are not the heaviest with their name."""
-    rounded = np.round(mass / mass.sum(), 12)  # halves of a symmetric body count as equally heavy
+    # halves of a symmetric body count as equally heavy
+    rounded = np.round(mass / mass.sum(), 12)
     order = np.lexsort((np.arange(len(names)), -rounded, names))
     first = np.unique(names[order], return_index=True)[1]
     return np.sort(np.delete(order, first))

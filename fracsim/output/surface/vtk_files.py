@@ -32,12 +32,15 @@ Ints = npt.NDArray[np.integer]
 Values = npt.NDArray[np.float64]
 
 BODY_NAME = "body"
-SURFACE_FOLDER = "surface/"  # folder of the VTU files in the output folder
+# folder of the VTU files in the output folder
+SURFACE_FOLDER = "surface/"
 _PVD_HEAD = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
 _PVD_TAIL = "  </Collection>\n</VTKFile>\n"
 _PVD_ENTRY = re.compile(r'timestep="([^"]+)"(?: part="(\d+)" name="([^"]+)")? file="([^"]+)"')
-_VTK_TRIANGLE, _VTK_LINE = 5, 3  # VTK's numbers of cell types
-_VTU_HEAD_BYTES = 1 << 16  # more than the XML before the data takes
+# VTK's numbers of cell types
+_VTK_TRIANGLE, _VTK_LINE = 5, 3
+# more than the XML before the data takes
+_VTU_HEAD_BYTES = 1 << 16
 
 
 class SurfaceFiles:
@@ -63,7 +66,8 @@ class SurfaceFiles:
         self._folder, self._pvd, self._csv = folder, folder / "surface.pvd", folder / "pieces.csv"
         self._columns = fragment_columns(dim, turning=turning)
         self._entries = self._earlier_entries(resume_at) if resume_at is not None and self._pvd.exists() else []
-        self._last_obstacles: dict[str, tuple[SurfaceData, str]] = {}  # obstacle -> its last data, their file
+        # obstacle -> its last data, their file
+        self._last_obstacles: dict[str, tuple[SurfaceData, str]] = {}
         rows = self._earlier_rows() if self._entries else []
         (folder / "surface").mkdir(parents=True, exist_ok=True)
         listed = {entry.file for entry in self._entries}
@@ -244,7 +248,8 @@ def write_vtu(path: Path, grid: Any) -> None:
     writer.SetCompressorTypeToLZ4()
     if not writer.Write():
         raise OSError("VTK cannot write it")
-    data = writer.GetOutputString()  # bytes if the output is not valid text
+    # bytes if the output is not valid text
+    data = writer.GetOutputString()
     with create(path) as file:
         file.write(data if isinstance(data, bytes) else data.encode())
 
@@ -309,7 +314,8 @@ def reorder_tensors(grid: Any) -> bool:
             names = tuple(array.GetComponentName(number) for number in range(array.GetNumberOfComponents()))
             if names == EARLIER_TENSOR_COMPONENTS:
                 reordered = reorder_earlier_tensor(vtk_to_numpy(array))
-                data.AddArray(_vtk_array(reordered, array.GetName()))  # replaces the array of that name
+                # replaces the array of that name
+                data.AddArray(_vtk_array(reordered, array.GetName()))
                 changed = True
     return changed
 

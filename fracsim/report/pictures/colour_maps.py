@@ -15,10 +15,12 @@ Values = npt.NDArray[np.float64]
 UNITS = {
     "displacement": "m", "velocity": "m/s", "stress": "Pa", "von_mises": "Pa", "energy_density": "J/m³", "age": "s",
 }  # fmt: skip
-_PALETTE_SIZE = 20  # colours of fragments in matplotlib's tab20
+# colours of fragments in matplotlib's tab20
+_PALETTE_SIZE = 20
 # number of components -> their names
 COMPONENT_NAMES = {3: ("x", "y", "z"), len(TENSOR_COMPONENTS): TENSOR_COMPONENTS}
-HIDDEN = ("origin", "cell", "rest", "dust")  # arrays of the surface that are not fields
+# arrays of the surface that are not fields
+HIDDEN = ("origin", "cell", "rest", "dust")
 # Percentage of the values inside the range of the colours. Without a limit a few cells beside a crack would determine
 # the range.
 _SHOWN_PERCENT = 98.0

@@ -24,8 +24,10 @@ from ...output.surface.vtk_files import PvdEntry, read_pvd, reorder_tensors
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-VTK_LINE, VTK_TRIANGLE = 3, 5  # VTK's numbers of cell types
-CELL_TYPES = {3: "TRIANGLE", 4: "TETRA", 6: "QUADRATIC_TRIANGLE", 10: "QUADRATIC_TETRA"}  # by nodes per cell
+# VTK's numbers of cell types
+VTK_LINE, VTK_TRIANGLE = 3, 5
+# by nodes per cell
+CELL_TYPES = {3: "TRIANGLE", 4: "TETRA", 6: "QUADRATIC_TRIANGLE", 10: "QUADRATIC_TETRA"}
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,8 @@ class FilmTiming:
 
 
 FILM_TIMING = FilmTiming()
-_SHARP_ANGLE = 35.0  # degrees between facets from which shading is not smooth
+# degrees between facets from which shading is not smooth
+_SHARP_ANGLE = 35.0
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,12 @@ from .renderer import Renderer, field_range
 
 Pixels = npt.NDArray[np.uint8]
 FILM_SUFFIXES = (".gif", ".mp4")
-FPS = 12  # pictures per second of a film
-_SHEET_SCALE = 0.5  # size of a picture on a sheet, as a share of a single picture
-GAP = 8  # pixels between the pictures of a sheet
+# pictures per second of a film
+FPS = 12
+# size of a picture on a sheet, as a share of a single picture
+_SHEET_SCALE = 0.5
+# pixels between the pictures of a sheet
+GAP = 8
 
 
 @contextmanager
@@ -84,7 +87,8 @@ def render(
     if target.suffix not in ("", ".png", *FILM_SUFFIXES):
         raise InputError(f"-o {target}: pictures are .png, films .gif or .mp4, and a name without a suffix is a folder")
     if target.suffix:
-        check_replaceable(target)  # before anything is drawn
+        # before anything is drawn
+        check_replaceable(target)
     run_frames = [find_frames(run) for run in folders]
     is_picture = target.suffix == ".png"
     if is_picture:

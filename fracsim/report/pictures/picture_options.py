@@ -18,7 +18,8 @@ VIEWS = {
     "top": (0.0, -0.001, 1.0),
 }
 SIZE = (1400, 900)
-_SIDE_LIMITS = (16, 8192)  # least and largest side of a picture in pixels; graphics drivers give no more
+# least and largest side of a picture in pixels; graphics drivers give no more
+_SIDE_LIMITS = (16, 8192)
 # colours of the boundary and of cracks, if neither a material nor a field colours them
 BOUNDARY_COLOUR, CRACK_COLOUR = "#b4bac4", "#e0762b"
 _HEX_COLOUR = re.compile(r"#[0-9a-fA-F]{6}")

@@ -155,7 +155,8 @@ class Renderer:
         self.material = material_look(options.material or study.get("output", {}).get("look", "plain"))
         self._view, self._bounds = view, view.bounds
         self._size = float(np.linalg.norm(np.diff(view.bounds.reshape(3, 2))))
-        self._line_scale = SCENE_STYLE.supersampling if options.fine else 1  # window pixels per pixel of the picture
+        # window pixels per pixel of the picture
+        self._line_scale = SCENE_STYLE.supersampling if options.fine else 1
         self._plotter = pyvista.Plotter(off_screen=True, window_size=options.size, lighting="none")
         self._plotter.set_background(MATERIAL_LOOKS["plain"].backdrop if self._flat else self.material.backdrop)
         self._add_lights()
@@ -169,9 +170,11 @@ class Renderer:
     def render_frame(self, frame: FrameSource, title: str | None = None) -> Pixels:
         """Picture (height, width, 3) of a frame; `title` replaces that of the options."""
         plotter, options = self._plotter, self.options
-        plotter.suppress_rendering = True  # otherwise everything is drawn again with each addition
+        # otherwise everything is drawn again with each addition
+        plotter.suppress_rendering = True
         plotter.clear_actors()
-        aim_camera(plotter, self._view, options)  # first: the width of narrow cracks is in pixels
+        # first: the width of narrow cracks is in pixels
+        aim_camera(plotter, self._view, options)
         grid = prepare_grid(frame, options)
         self._add_body(frame_parts(grid))
         if not self._flat:
@@ -259,7 +262,8 @@ class Renderer:
             point = centre - ((centre - point) @ normal) * normal
         _add_floor_disc(self._plotter, point, normal, self._size, self.material.backdrop)
         light = self._main_light_direction()
-        light = light if light @ normal > 0.3 else normal  # a light near the horizon would cast endless shadows
+        # a light near the horizon would cast endless shadows
+        light = light if light @ normal > 0.3 else normal
         for part in parts.surfaces:
             _add_shadow(self._plotter, part, point, normal, light, self._size, rgb(self.material.backdrop))
         return [name for _, name in floors]
