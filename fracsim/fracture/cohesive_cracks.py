@@ -283,6 +283,7 @@ class CohesiveTipCriterion(TipCriterion):
         loaded = sigma >= cell_strength(self.strength, self._graph, tips.cell)
         if d == 3:
             is_front = np.linalg.norm(tips.ahead, axis=1) > TIP.min_front_advance * fields.disc_radius
+            # A cell beside the crack, through which no front passes, stays uncut.
             loaded &= is_front | ~tips.mature
         rows = np.flatnonzero(loaded & ~self._barred[tips.cell])
         cells, ahead, no = tips.cell[rows], tips.point[rows] - tips.behind[rows], np.zeros(len(rows), bool)
@@ -326,6 +327,7 @@ class CohesiveFracturePass(FracturePass):
         if not self._has_softened(release) and self._cut_cells(stress, psi, new_cracks=True):
             release = self._advance_tips(stress, psi)
         broken = 0
+        # Edges can only be released where a cell lost its last stress.
         if sum_over_ranks(self.graph.domain.comm, int(release.exhausted))[0]:
             broken = self.graph.break_edges(self.softening.find_released_edges())
             if broken:
@@ -353,6 +355,7 @@ class CohesiveFracturePass(FracturePass):
         flags[edges] = True
         if not self.cut_graph.break_edges(flags):
             return False
+        # Cut edges count as damaged, but they do not separate fragments.
         self.graph.weaken(np.where(self.cut_graph.broken, SOFTENING.cut_integrity, 1.0))
         self.mark_changed()
         return True

@@ -135,6 +135,7 @@ class EdgeProjectionDegradation:
     def __call__(self, broke: bool, stress: Values, psi: Values) -> EnergyRelease:
         """Update the integrity; the energy released is the difference at the present displacement."""
         before = self._edges.elastic_energy()
+        # Without a broken edge the projected energy did not change.
         if not broke:
             return EnergyRelease(0.0, before)
         self._edges.update_integrity()
@@ -174,6 +175,7 @@ class SplitCellDegradation:
         """Limit the release in the step from `t` of `dt`, s; a repeated step starts from the same chi."""
         if self._release_rate is None:
             return
+        # A repeated step starts from chi at its first attempt.
         if t != self._step_start:
             self._step_start, self._chi_at_start = t, self._chi[: len(self._volumes)].copy()
         self._min_chi = np.maximum(self._chi_at_start - self._release_rate * dt, 0.0)

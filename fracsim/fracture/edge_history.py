@@ -47,6 +47,7 @@ class EdgeHistory:
         weakened = (self.graph.integrity < 1) & ~self.graph.broken
         self.cut_positions[weakened] = cut[weakened]
         if tip_states is not None:
+            # The largest time of all ranks is the least negative one.
             negative_time = -np.nan_to_num(tip_states[:, -1], nan=-np.inf)
             latest = negative_time <= self.graph.min_over_ranks(negative_time)
             columns = [self.graph.min_over_ranks(np.where(latest, column, np.inf)) for column in tip_states.T]

@@ -164,6 +164,7 @@ class FracturePass:
         """Carry out one pass at the present displacement (collective)."""
         stress, psi = self.evaluate_undamaged_stress()
         broken, weakened = self._weaken_failing_edges(stress, psi) if self._is_due else (0, 0)
+        # Edges between split cells alone carry nothing any more.
         if broken and self.degradation.breaks_idle_edges:
             broken += self.graph.break_unloaded_edges()
         before = [damage.x.array.copy() for damage in self.stress.damage_fields] if broken else []
@@ -185,6 +186,7 @@ class FracturePass:
             flags = np.zeros(len(self.graph.broken), bool)
             flags[edges[integrity == 0]] = True
             return (self.graph.break_edges(flags),) * 2
+        # An edge that fails in several cells has the least integrity.
         lowered = np.ones(len(self.graph.broken))
         np.minimum.at(lowered, edges, integrity)
         return self.graph.weaken(lowered)
@@ -210,6 +212,7 @@ class FracturePass:
     def restore(self, saved: object) -> bool:
         """Restore the damage that `snapshot` returned; returns True if it changed."""
         assert isinstance(saved, DamageSnapshot)
+        # Nothing changed since this snapshot was taken.
         if saved is self._snapshot:
             return False
         self.graph.set_integrity(saved.integrity)

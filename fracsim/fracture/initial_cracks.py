@@ -33,6 +33,7 @@ def cut_edges(graph: EdgeGraph, crack: CrackPlane) -> Values:
     domain, tolerance = graph.domain, ON_PLANE_TOLERANCE * graph.domain.size
     ends = domain.nodes[edge_ends_in_input_order(graph)]
     height = (ends - crack.point) @ crack.normal
+    # Nodes on the plane count as above it, so that they are never cut.
     height[np.abs(height) <= tolerance] = 0.0
     crossed = (height[:, 0] >= 0) != (height[:, 1] >= 0)
     share = np.divide(height[:, 0], height[:, 0] - height[:, 1], out=np.zeros(len(height)), where=crossed)
@@ -85,6 +86,7 @@ def open_initial_cracks(graph: EdgeGraph, cracks: Sequence[CrackPlane], *, keep_
                 f"{crack.name} cuts no edge of the mesh: it lies outside the body, which spans {domain.extent()}, or "
                 "is shorter than the cells there"
             )
+        # An edge that several cracks cut has the position of the first.
         new = np.isnan(positions) & ~np.isnan(crack_positions)
         positions[new] = crack_positions[new]
         graph.break_edges(~np.isnan(crack_positions))

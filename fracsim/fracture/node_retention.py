@@ -121,6 +121,7 @@ class CellRetention:
         endangered = (self._cells_around(before) > 0) & (self._cells_around(after) == 0)
         cells = np.flatnonzero(before & endangered[graph.cell_nodes].any(axis=1))
         load = self._cell_load(cells, stress, cell_fails[cells])
+        # A cell under too large a load cannot retain a node.
         cells, load = cells[load < self._max_cell_load], load[load < self._max_cell_load]
         spared = np.zeros(len(fails), bool)
         spared[graph.cell_edges[self._choose_cells(cells, load, cell_fails[cells], endangered)]] = True
@@ -191,10 +192,12 @@ class NodeAttachment:
         if sum_over_ranks(graph.domain.comm, np.count_nonzero(fails))[0]:
             in_unsplit_cell = np.zeros(len(fails), bool)
             in_unsplit_cell[graph.cell_edges[~graph.split]] = True
+            # Intact edges without an unsplit cell attach nodes already.
             attaching = ~graph.broken & ~graph.any_over_ranks(in_unsplit_cell)
             spared = self._attaching_edges(fails, attaching, stress)
             retained = (self._is_prescribed_edge & ~fails) | attaching | spared
-            graph.retained, fails = retained, fails & ~retained
+            graph.retain_edges(retained)
+            fails &= ~retained
         return np.asarray(fails[edges])
 
     def _attaching_edges(self, fails: Flags, attaching: Flags, stress: Values) -> Flags:
@@ -206,6 +209,7 @@ class NodeAttachment:
             return np.zeros(len(fails), bool)
         candidates = np.flatnonzero(~graph.broken & without_cell[graph.edge_nodes].any(axis=1))
         load = self._edge_loads(candidates, without_cell, stress)
+        # An edge that a crack cuts attaches a node only if no other edge can.
         if self._cracks:
             load[fails[candidates]] = np.finfo(float).max
         load[attaching[candidates] | (self._is_prescribed_edge & ~fails)[candidates]] = ATTACHED
@@ -243,6 +247,7 @@ def _spanning_forest(keys: Ints, load: Values, without_cell: Flags, prescribed: 
     has_cell, is_prescribed = np.ones(len(nodes), bool), np.zeros(len(nodes), bool)
     has_cell[ends], is_prescribed[ends] = ~without_cell, prescribed
     chosen = load == ATTACHED
+    # Ranks order equal loads by their keys.
     rank = np.empty(len(load), np.int64)
     rank[np.argsort(load, kind="stable")] = np.arange(len(load))
     while True:
@@ -253,6 +258,7 @@ def _spanning_forest(keys: Ints, load: Values, without_cell: Flags, prescribed: 
         leads_out = (groups[:, 0] != groups[:, 1])[:, None] & unattached[groups]
         best = np.full(count, len(load))
         np.minimum.at(best, groups[leads_out], np.broadcast_to(rank[:, None], groups.shape)[leads_out])
+        # Each group adds its least loaded edge that leads out.
         new = ((best[groups] == rank[:, None]) & leads_out).any(axis=1)
         if not new.any():
             return np.asarray(keys[chosen])

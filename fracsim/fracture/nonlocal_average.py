@@ -90,6 +90,7 @@ class NonlocalAverage:
         """Average cell values (cells, n); inactive cells do not enter; 0 where no active cell is near (collective)."""
         self._weights.compute_all()
         n = values.shape[1]
+        # The flag is averaged as well: its sum is the weight of the active cells.
         if active is not None:
             values = np.column_stack([np.where(active[:, None], values, 0.0), active])
         near = self._exchange(values)
@@ -114,6 +115,7 @@ class NonlocalAverage:
             active: (cells,) cells that enter averages; None: all.
         """
         n = values.shape[1]
+        # No average exceeds the largest norm of all ranks.
         if max_over_ranks(self._comm, float(np.max(norms, initial=0.0))) < bound:
             return np.empty(0, np.int64), np.empty((0, n))
         near, near_norms = self._exchange(values), self._exchange(norms[:, None])[:, 0]
@@ -250,6 +252,7 @@ class _WeightMatrix:
             return
         centres, points = self._centres, self._near[near_flags[self._positions]]
         reach = self._radius * (1 + LIMITS.radius_round_off)
+        # A bounding box excludes most centres from the search.
         in_box = np.all((centres >= points.min(axis=0) - reach) & (centres <= points.max(axis=0) + reach), axis=1)
         cells = np.flatnonzero(self._missing & in_box)
         distance, _ = cKDTree(points).query(centres[cells], distance_upper_bound=reach)
@@ -332,6 +335,7 @@ class NeighbourAverage:
             return np.asarray(sum(nodal[corner] for corner in corners.T))
 
         weight = sum_over_neighbours(np.ones(len(cells)))
+        # A cell without active neighbours has sums of 0.
         weight[weight <= 0] = 1.0
         limit = bound * (1 - LIMITS.bound_round_off)
         near = np.flatnonzero(sum_over_neighbours(norms[cells]) / weight >= limit)
@@ -347,6 +351,7 @@ class NeighbourAverage:
         table = nodal.array.reshape(-1, n)
         for total, column in zip(table.T, values.T, strict=True):
             total += np.bincount(nodes.ravel(), np.repeat(column, nodes.shape[1]), minlength=len(table))
+        # Sums of ghost nodes are added to their owners, then copied back.
         nodal.scatter_reverse(la.InsertMode.add)
         nodal.scatter_forward()
         return np.asarray(table[nodes].sum(axis=1))

@@ -105,6 +105,7 @@ class EdgeStrength:
         if not self._tie_break:
             return np.zeros(edges.shape)
         result = self._noise[edges]
+        # Few edges are ever near their strength, so that the hash is computed on demand.
         if len(unknown := edges[np.isnan(result)]):
             self._noise[unknown] = hash_points(self._twice_midpoints(unknown))
             result = self._noise[edges]
@@ -160,6 +161,7 @@ def hash_points(points: Values, seed: int = 0) -> Values:
     positions = np.ascontiguousarray(points + 0.0, float)  # + 0.0: -0 and 0 have the same bits then
     bits: npt.NDArray[np.uint64] = positions.view(np.uint64)
     state: npt.NDArray[np.uint64] = np.full(len(points), seed, np.uint64)
+    # Each coordinate is mixed into the state of the one before.
     for column in bits.T:
         state = _mix(state ^ column)
     return (state >> np.uint64(11)).astype(float) * 2.0**-52 - 1.0

@@ -162,6 +162,10 @@ class EdgeGraph:
         result.scatter_forward()
         return np.asarray(result.array)
 
+    def retain_edges(self, retained: npt.NDArray[np.bool_]) -> None:
+        """Retain flagged edges (edges,): they do not break although all their cells are split."""
+        self.retained = retained
+
     def break_unloaded_edges(self) -> int:
         """Break the edges all of whose cells, on all ranks, are split, except retained ones (collective).
 

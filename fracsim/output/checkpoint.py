@@ -188,7 +188,7 @@ def read_checkpoint(
         record.graph.restore_integrity(replicated["weakened"], replicated["integrity"])
         record.from_checkpoint(replicated["broken"], replicated["breaks"])
     if surfaces is not None and replicated["starts"] is not None:
-        surfaces.starts = replicated["starts"]
+        surfaces.set_starts(replicated["starts"])
     if stress.chi is not None and "chi" in names:
         stress.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
     if plastic is not None and "plastic" in names:

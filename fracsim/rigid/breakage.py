@@ -205,7 +205,8 @@ class BreakableBody:
             return
         self.graph.break_edges(self.graph.flags_of_keys(arrays["broken"]))
         local, row = self.graph.find_keys(arrays["broken"])
-        self._criterion.cut_positions[local], self._criterion.starts = arrays["cut"][row, 0], arrays["starts"]
+        self._criterion.cut_positions[local] = arrays["cut"][row, 0]
+        self._criterion.set_starts(arrays["starts"])
         self._find_fragments()
 
     # --- loads ---
@@ -329,11 +330,13 @@ class BreakableBody:
             return self._find_dent(name, loads, energy)
         broken, starts = self.graph.broken.copy(), criterion.starts
         analyses, iterations = self.analyses, self.cg_iterations
-        criterion.reserved = criterion.remaining - max_surfaces
+        criterion.reserve(criterion.remaining - max_surfaces)
         try:
             self.break_fragments(self.fragment_of(name), loads)
         finally:
-            new_starts, criterion.starts, criterion.reserved = criterion.starts[len(starts) :], starts, 0
+            new_starts = criterion.starts[len(starts) :]
+            criterion.set_starts(starts)
+            criterion.reserve(0)
         edges = np.flatnonzero(self.graph.broken & ~broken)
         effort = self.analyses - analyses, self.cg_iterations - iterations
         self.analyses, self.cg_iterations = analyses, iterations
@@ -368,7 +371,7 @@ class BreakableBody:
             flags[local] = True
             self.graph.break_edges(flags)
             self._find_fragments()
-        criterion.starts = np.concatenate([criterion.starts, *(outcome.surface_starts for outcome in outcomes)])
+        criterion.set_starts(np.concatenate([criterion.starts, *(outcome.surface_starts for outcome in outcomes)]))
         self.analyses += sum(outcome.analyses for outcome in outcomes)
         self.cg_iterations += sum(outcome.cg_iterations for outcome in outcomes)
 

@@ -101,6 +101,7 @@ class CurvedLevelSet:
         unknown = np.isnan(self.phi) & wanted
         defined = np.flatnonzero(~np.isnan(self.phi))
         points, phi = self._mesh.points, self.phi.copy()
+        # Beyond the surface phi continues as the tangent plane.
         near = defined[cKDTree(points[defined]).query(points[unknown])[1]]
         phi[unknown] = phi[near] + np.einsum("ni,ni->n", self._normal[near], points[unknown] - points[near])
         return phi
@@ -114,6 +115,7 @@ class CurvedLevelSet:
         if not len(node):
             return node
         normal, phi = self._extend_behind_facets(node, facet)
+        # A node behind several facets gets the mean of their values.
         target, row, count = np.unique(node, return_inverse=True, return_counts=True)
         self.phi[target] = np.bincount(row, phi) / count
         for axis in range(self._mesh.dim):

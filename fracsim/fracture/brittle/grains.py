@@ -127,6 +127,7 @@ class GrainBoundaries:
 def draw_seeds(mesh: SurfaceCutMesh, parameters: GrainParameters) -> tuple[Values, Values]:
     """Draw points (n, d), m, uniformly from the body, and weights (n,) from 1 - spread to 1 + spread."""
     random = np.random.Generator(np.random.PCG64(parameters.seed))
+    # A cell is drawn by its volume, and a point in it by barycentric coordinates.
     share = np.cumsum(mesh.volumes)
     cell = np.searchsorted(share / share[-1], random.random(parameters.count), side="right")
     barycentric = random.dirichlet(np.ones(mesh.dim + 1), parameters.count)

@@ -40,7 +40,6 @@ class BrittleSurfaces:
         starts: (n, d) points where the surfaces started so far, m; the same on every rank.
         cut_positions: (edges,) cuts of local edges, 0 at the end that comes first in the input mesh to 1 at the other;
             NaN elsewhere.
-        reserved: number of surfaces that may not start at present.
     """
 
     tip_states = None
@@ -60,13 +59,21 @@ class BrittleSurfaces:
         self.spacing = spacing if spacing is not None else DEFAULT_SPACING * self._domain.mean_edge_length
         self.starts: Values = np.empty((0, self._domain.dim))
         self.cut_positions: Values = np.full(len(graph.broken), np.nan)
-        self.reserved = 0
+        self._reserved = 0
         self._surface_pass: SurfacePass | None = None
 
     @property
     def remaining(self) -> int:
         """Number of surfaces that may still start."""
-        return self._parameters.surfaces - len(self.starts) - self.reserved
+        return self._parameters.surfaces - len(self.starts) - self._reserved
+
+    def set_starts(self, starts: Values) -> None:
+        """Replace the points (n, d), m, where the surfaces started so far."""
+        self.starts = starts
+
+    def reserve(self, count: int) -> None:
+        """Reserve surfaces for later: `count` of the remaining ones may not start at present."""
+        self._reserved = count
 
     def __call__(self, stress: Values, psi: Values | None = None) -> tuple[Edges, Values]:
         """Find the local edges (n,) that new surfaces cut, with loads of 1 (collective).
@@ -154,12 +161,14 @@ class BrittleSurfaces:
 
     def _open_on_root(self, parts: Any, broken: Any, field: tuple[Any, ...] | None) -> OpenedSurfaces:
         """Open the surfaces of the pass, on rank 0, from the overloaded cells of all ranks."""
+        # The topology of the input mesh is built when the first surface starts.
         if self._surface_pass is None:
             assert self._domain.source is not None
             retain_nodes = self._stress.chi is not None
             self._surface_pass = SurfacePass(self._domain.source, self._parameters, self.spacing, retain_nodes)
         names = OverloadedCells.__annotations__
         load = OverloadedCells(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+        # In the order of the input mesh, whatever the ranks.
         order = np.argsort(load.cell)
         load = OverloadedCells(*(getattr(load, name)[order] for name in names))
         count = min(self.remaining, self._parameters.per_pass or self.remaining)

@@ -258,6 +258,7 @@ class CrossedCells:
         triangles = cell_triangles(dim)
         is_open = self.open[:, triangles]
         linking = np.count_nonzero(is_open, axis=2) == 2
+        # Each such triangle links its two open edges.
         links = number[:, triangles][linking][is_open[linking]].reshape(-1, 2)
         label = components(links, len(edges))[1]
         return edges[np.isin(label, label[np.isin(edges, seeds)])]
@@ -308,6 +309,7 @@ def reassign_isolated_nodes(mesh: SurfaceCutMesh, sides: Flags, usable: Flags, m
 
 def _reassign_in_cells(mesh: CellNodes, sides: Flags, usable: Flags, movable: Flags | None) -> Flags:
     """Return the sides as `reassign_isolated_nodes` does, for cells with any number of corners."""
+    # Only nodes of crossed cells can be isolated by the surface.
     near = np.zeros(len(sides), bool)
     near[mesh.cells[mesh.find_crossed(sides)]] = True
     if movable is not None:

@@ -114,6 +114,7 @@ class FrontReleaseRate:
         It is 0 for tips of no front, and for those whose advance would take energy: the force in their ball is that of
         tips on the crack's other side.
         """
+        # g . a of tips, 0 where there is no front.
         released = np.where(self._is_front, np.einsum("nk,nk->n", force, self._advance), 0.0)
         square = self._square
         if self._averaged:

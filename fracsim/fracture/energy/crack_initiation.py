@@ -96,6 +96,7 @@ def select_proposals(domain: Domain, *proposals: CutProposal) -> tuple[list[CutP
         return list(proposals), False
     parts = allgather(comm, rank)
     rows = np.concatenate(parts)
+    # By kind, then by stress, then by hash.
     remaining = list(np.lexsort(rows[:, 2::-1].T))
     selected = np.zeros(len(rows), bool)
     while remaining:
@@ -103,6 +104,7 @@ def select_proposals(domain: Domain, *proposals: CutProposal) -> tuple[list[CutP
         selected[first] = True
         distance = np.linalg.norm(rows[remaining, 3:-1] - rows[first, 3:-1], axis=1)
         remaining = [row for row, far in zip(remaining, distance > rows[first, -1], strict=True) if far]
+    # Every rank selects from all rows, and keeps its own.
     start = sum(len(part) for part in parts[: comm.rank])
     of_this_rank = selected[start : start + len(rank)]
     flags = np.split(of_this_rank, np.cumsum([len(proposal.rank) for proposal in proposals])[:-1])
@@ -143,6 +145,7 @@ class CrackInitiation:
         cells = cells[~(graph.damaged[cells] | barred[cells]) & (frobenius_norm(stress[cells], d) >= minimum)]
         cells = cells[principal_stress_bound(symmetric_tensors(stress[cells], d)) >= minimum]
         cut_cells = self._evaluator.cut_cells
+        # Near a crack the tip decides, not the stress of single cells.
         if len(cells) and len(cut_cells.number):
             distance = cut_cells.tree.query(self._evaluator.centres[cells])[0]
             cells = cells[distance > self._disc[cells]]

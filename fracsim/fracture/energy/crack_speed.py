@@ -103,7 +103,9 @@ class RateDependentTipCriterion(TipCriterion):
         """Return which tips (n,) have arrived at the end of their cell (in long steps: reach G_c), and which branch."""
         entry, rate = self._graph.cell_edges[tips.cell, self._entry_edges(tips.cell)], self._rate[tips.cell]
         slowness, remaining, flow, updated = self.tip_states[entry].T
+        # A tip without a state has just appeared.
         time = np.where(np.isnan(updated), 0.0, self._now - updated)
+        # Young tips, and tips with a force backwards, are at rest.
         relaxed = relax_slowness(slowness, size / toughness, rate * time)
         slowness = np.where(tips.mature & (size > 0), relaxed, 1.0)
         flow = relax(flow, size / toughness, rate * time)
@@ -126,6 +128,7 @@ class RateDependentTipCriterion(TipCriterion):
         self._arrived = np.zeros(len(fields.tips), bool)
         advances = super()._propose_advances(fields)
         cell = fields.tips.cell[self._arrived]
+        # A tip that arrived and is not allowed to cut the next cell stops.
         cell = cell[~np.isin(cell, advances.cells)]
         stopped = self._graph.cell_edges[cell, self._entry_edges(cell)]
         self.tip_states[stopped, TipState.SLOWNESS], self.tip_states[stopped, TipState.REMAINING] = AT_REST[:2]
@@ -139,6 +142,7 @@ class RateDependentTipCriterion(TipCriterion):
         states = self.tip_states[self._graph.cell_edges[cells, proposal.entry[cuts.row]]]
         ends = reference_corners(self._domain, cells)[np.arange(len(cells))[:, None], local_edges(2)[cuts.edge]]
         exit_point = ends[:, 0] + cuts.share[:, None] * (ends[:, 1] - ends[:, 0])
+        # The distance through the next cell adds to what remained.
         states[:, TipState.REMAINING] += np.linalg.norm(exit_point - proposal.point[cuts.row], axis=1)
         return np.column_stack([rows, states])
 

@@ -48,10 +48,12 @@ def cut_polygons() -> tuple[Ints, Ints]:
     sides, cut = corner_partitions()
     for pattern in range(64):
         intact = (pattern >> np.arange(6)) & 1 == 0
+        # A partition fits if it cuts no intact edge; a pattern without one does not split the cell.
         fits = np.flatnonzero(~cut[:, intact].any(axis=1))
         if not len(fits):
             continue
         side = sides[fits[0]]
+        # The smaller set has one corner (triangle) or two (quadrilateral).
         smaller, larger = sorted(([k for k in range(4) if side[k] == flag] for flag in (True, False)), key=len)
         ring = [
             {smaller[0], larger[0]}, {smaller[0], larger[1]}, {smaller[-1], larger[-1]}, {smaller[-1], larger[0]},
@@ -154,6 +156,7 @@ class CutCells:
         unchanged = self._rows[~np.isin(self.number, number)]
         table = np.concatenate([unchanged, rows[rows[:, 1] >= 0]])
         self._rows = table[np.argsort(table[:, 0], kind="stable")]
+        # The cached search tree belongs to the old rows.
         self.__dict__.pop("tree", None)
         return number, rows[:, 2 : 2 + self._d]
 

@@ -48,6 +48,7 @@ def plane_crossings(corners: Values, through: Values, normal: Values) -> tuple[F
         normal: (n, d) their normals.
     """
     first, second = local_edges(corners.shape[2]).T
+    # Signed distances of the corners from the line or plane.
     height = np.einsum("nci,ni->nc", corners - through[:, None], normal)
     a, b = height[:, first], height[:, second]
     crossed = (a >= 0) != (b >= 0)
@@ -80,6 +81,7 @@ def exit_cuts(
     """
     rows = np.arange(len(entry))[:, None]
     crossed, share = plane_crossings(corners, point, normal)
+    # The two other edges of the triangle.
     exits = np.stack([(entry + 1) % 3, (entry + 2) % 3], axis=1)
     progress = _progress(points_on_edges(corners, share)[rows, exits], point, ahead)
     end_shares = np.stack([np.full_like(share, end) for end in (MIN_CUT_SHARE, 1 - MIN_CUT_SHARE)])
@@ -117,6 +119,7 @@ def branching_cuts(
         direction = rotate(ahead[rows], angle)
         across = rotate(direction, np.pi / 2)
         branch_cuts.append(exit_cuts(corners[rows], entry[rows], point[rows], across, direction, split_beyond[rows]))
+    # Branches that leave by one edge would coincide.
     two = branch_cuts[0].edge != branch_cuts[1].edge
     is_single = np.ones(len(entry), bool)
     is_single[rows[two]] = False

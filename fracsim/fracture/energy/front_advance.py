@@ -49,6 +49,7 @@ class FrontTipCriterion(TipCriterion):
     def _find_critical_tips(self, size: Values, toughness: Values, tips: CrackTips) -> tuple[Flags, Flags]:
         """Return which tips (n,) reach G_c, or lack little in the ball of one that does; none branches (collective)."""
         critical = size >= toughness
+        # Leaders are mature tips of all ranks that reach G_c.
         leaders = tips.point[critical & tips.mature & ~self._barred[tips.cell]]
         leaders = np.concatenate(allgather(self._domain.comm, leaders))
         if not len(leaders):
@@ -61,6 +62,7 @@ class FrontTipCriterion(TipCriterion):
         advances = super()._propose_advances(fields)
         normals = self._normals(advances.stress, advances.cells)
         mature = fields.tips.mature[np.searchsorted(fields.tips.cell, advances.cells)]
+        # The plane of a tip passes through its point, across the first principal stress.
         planes = np.column_stack([advances.point, normals, -advances.rank[:, 1]])
         advances = replace(advances, ahead=planes, turns=mature)
         self._leading = advances.select(mature)
@@ -83,6 +85,7 @@ class FrontTipCriterion(TipCriterion):
         # Planes of cells, and of the edges that were cut in this pass.
         cell_planes = np.zeros((len(self._h), self.course_width))
         edge_planes = np.zeros((len(self.cut_positions), self.course_width))
+        # Cells of leading tips keep their own plane.
         leads_itself = np.zeros(len(self._h), bool)
         leads_itself[cells], cell_planes[cells] = True, self._leading.ahead
         while True:
@@ -118,6 +121,7 @@ class FrontTipCriterion(TipCriterion):
         unsplit = ~is_split(3)[cut @ (1 << np.arange(6))]
         cells, cut = cells[unsplit], cut[unsplit]
         points = self.field_evaluator.cut_points(self._graph.cell_edges[cells], self.cut_positions)
+        # A cell is reached once the mean of its cut points is near enough to the leading tip.
         middle = np.einsum("nk,nki->ni", cut, points) / cut.sum(axis=1, keepdims=True)
         near = np.linalg.norm(middle - planes[cells, :3], axis=1) <= TIP.lead_distance * self._h[cells]
         cells, middle = cells[near], middle[near]

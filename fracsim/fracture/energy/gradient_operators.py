@@ -46,10 +46,12 @@ class GradientOperators:
         """
         cells, self.count, width, self._d = gradients.shape
         rows = cells * self.count
+        # Columns are the nodes of these cells alone.
         unique_nodes, index = np.unique(nodes, return_inverse=True)
         index, size = np.repeat(index.reshape(cells, 1, width), self.count, axis=1).reshape(-1), len(unique_nodes)
         self._dofs = np.arange(self._d)[:, None] + self._d * unique_nodes
         # One block of rows for each axis.
+        # Row pointers are multiples of the number of nodes of a cell.
         by_axis = gradients.transpose(3, 0, 1, 2).ravel()
         self._gradients = csr_matrix(
             (by_axis, np.tile(index, self._d), width * np.arange(self._d * rows + 1)), (self._d * rows, size)

@@ -88,8 +88,10 @@ def intensity_contributions(fields: TipDiscFields) -> Values:
     mu, kappa = fields.mu, fields.kappa
     gradient = auxiliary_gradients(positions, mu, kappa)
     strain = (gradient + gradient.transpose(0, 1, 3, 2)) / 2
+    # lambda tr(eps) with lambda = mu (3 - kappa) / (kappa - 1).
     dilation = mu * (3 - kappa) / (kappa - 1) * np.einsum("pkii->kp", gradient)
     sigma = 2 * mu[:, None, None, None] * strain + dilation.T[..., None, None] * np.eye(2)
+    # The four terms of t . Sigma_k grad q and of the inertia, in axes along the crack.
     energy = np.einsum("pij,pkij->pk", stress, gradient) * slope[:, :1]
     energy -= np.einsum("pi,pkij,pj->pk", H[:, :, 0], sigma, slope)
     energy -= np.einsum("pki,pij,pj->pk", gradient[..., 0], stress, slope)
@@ -106,6 +108,7 @@ def rotate_back(angle: Values, stress: Values, F: Values, inertia_force: Values)
 
 def kink_angle(psi: Values) -> Values:
     """Return the kink angle (n,), rad, anti-clockwise from the tangent, at phase angles psi (n,)."""
+    # A closed crack has no K_I.
     first, second = np.maximum(np.cos(psi), 0.0), np.sin(psi)
     root = first + np.sqrt(first**2 + 8 * second**2)
     return np.asarray(-2 * np.arctan2(2 * second, root))

@@ -33,6 +33,7 @@ class RemoteCellValues:
             self.owned_cells: Ints = index
             return
         self._order = np.argsort(rank, kind="stable")
+        # Each rank learns which of its cells the others need.
         requested = alltoall(comm, [index[rank == owner] for owner in range(comm.size)])
         self.owned_cells = np.unique(np.concatenate(requested))
         self._send = [np.searchsorted(self.owned_cells, cells) for cells in requested]
@@ -62,6 +63,7 @@ def local_mesh_size(domain: Domain) -> Values:
     sums = la.vector(domain.space.dofmap.index_map, 2, np.float64)
     rows = sums.array.reshape(-1, 2)
     np.add.at(rows, nodes.ravel(), np.repeat(np.column_stack([volumes, np.ones(len(volumes))]), nodes.shape[1], axis=0))
+    # Sums of ghost nodes are added to their owners, then copied back.
     sums.scatter_reverse(la.InsertMode.add)
     sums.scatter_forward()
     at_corners = rows[nodes]
@@ -129,6 +131,7 @@ def find_pairs(tree: cKDTree, points: Values, radius: Values) -> NeighbourPairs:
         near = cKDTree(points[rows]).sparse_distance_matrix(tree, radius[rows].max(), output_type="ndarray")
         point_number = rows[near["i"]]
         inside = near["v"] < radius[point_number]
+        # A key that sorts by points, then by things.
         keys.append(point_number[inside] * len(tree_points) + near["j"][inside])
     point_number, thing = np.divmod(np.sort(np.concatenate(keys)), len(tree_points))
     apart = tree_points[thing] - points[point_number]

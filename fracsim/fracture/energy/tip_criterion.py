@@ -111,6 +111,7 @@ class TipCriterion:
             psi: (cells,) energy density of the undamaged material, J/m^3.
         """
         tips, candidates = self.find_tips(), self._initiation.find_cells(stress, self._barred)
+        # The counts of all ranks decide, since the evaluations are collective.
         tip_count, candidate_count = sum_over_ranks(self._domain.comm, np.array([len(tips), len(candidates)]))
         none = empty_proposal(self._domain.dim, self.course_width)
         advances = starts = none
@@ -147,6 +148,7 @@ class TipCriterion:
 
     def release_rate(self) -> Values:
         """Return c_R / R (cells,), 1/s: the inverse of the time of a Rayleigh wave through the disc of a tip."""
+        # Poisson's ratio from Lame's parameters.
         mu, lmbda = np.asarray(self._stress.material.mu), np.asarray(self._stress.material.lmbda)
         poisson = lmbda / (2 * (lmbda + mu))
         shear_speed = np.sqrt(mu / np.asarray(self._stress.material.density))
@@ -177,6 +179,7 @@ class TipCriterion:
         tips, d = fields.tips, self._domain.dim
         h = self._h[tips.cell]
         toughness = np.broadcast_to(self.toughness, len(self._h))[tips.cell]
+        # The force of young tips is not used: the crack behind them is shorter than the disc.
         force = fields.evaluate_forces()
         mature = tips.mature.copy()
         size, turns, branches = np.linalg.norm(force, axis=1), *np.zeros((2, len(tips)), bool)
@@ -194,6 +197,7 @@ class TipCriterion:
         if self.forks:
             branches = turns & forked
             ahead = np.where(branches[:, None], tips.course, ahead)
+        # A branch waits for the other unless there is enough energy for both.
         waits = (tips.waits & (size < TIP.branching_ratio * toughness)) | self._barred[tips.cell]
         candidates = np.flatnonzero((~mature | enough) & ~waits)
         if not len(candidates):
@@ -252,6 +256,7 @@ class TipCriterion:
         straight on, 0 for the others.
         """
         cells = proposal.cells[cuts.row]
+        # Edges are described by input nodes, which all ranks know.
         local_nodes = self._domain.cell_nodes[cells[:, None], local_edges(self._domain.dim)[cuts.edge]]
         ends = self._domain.node_input[local_nodes]
         position = np.where(ends[:, 0] > ends[:, 1], 1 - cuts.share, cuts.share)
@@ -293,6 +298,7 @@ class TipCriterion:
         graph, course = self._graph, np.zeros((len(self._graph.broken), self.course_width))
         course[edges] = courses
         entered = np.any(course[graph.cell_edges], axis=2)
+        # Cells with one cut edge, on the far side of a cut, are next on the course of the crack.
         is_next = (entered.sum(axis=1) == 1) & ~(graph.damaged | self._barred)
         cells = np.flatnonzero(is_next).astype(np.int64)
         entry, turns = np.argmax(entered[cells], axis=1), np.ones(len(cells), bool)
@@ -315,6 +321,7 @@ class TipCriterion:
         if self._domain.dim == 3:
             return plane_cuts(corners, ~self._graph.intact(cells), advances.point, normals)
         assert advances.turns is not None and advances.branches is not None
+        # A tip that kinks by its stress intensities is cut along that direction.
         normals = np.where(advances.turns[:, None], rotate(ahead, np.pi / 2), normals)
         split_beyond = split_cell_edges(self._graph)[self._graph.cell_edges[cells]]
         return branching_cuts(corners, advances.entry, advances.point, normals, ahead, split_beyond, advances.branches)
@@ -336,6 +343,7 @@ def kinked_release(psi: Values, tips: CrackTips, force: Values) -> tuple[Values,
     Only the force along the crack counts: the stress along the crack faces, and the waves in it, act across it besides.
     Without a crack behind the tip the size of the force is returned, and no direction.
     """
+    # Branches side by side keep straight on, at the branching angle.
     tangent, side_by_side = unit_or_zero(tips.point - tips.behind), np.any(tips.parts, axis=1)
     psi = np.where(side_by_side, 0.0, psi)
     along = release_rate(force, tips.ahead, tangent) * kink_gain(psi)
@@ -381,6 +389,7 @@ class AttachedTipCriterion:
             edges, load = self._tips(stress, psi)
             spared = np.zeros(len(graph.broken), bool)
             spared[edges[~self._node_attachment(edges, stress)]] = True
+            # A cell that would lose an edge which attaches a node is barred, and the pass is repeated without it.
             cells = self._tips.cells
             detaching = cells[spared[graph.cell_edges[cells]].any(axis=1)]
             if not sum_over_ranks(graph.domain.comm, len(detaching))[0]:

@@ -108,6 +108,7 @@ class TipFieldEvaluator:
         domain = self._domain = stress.domain
         self.centres: Values = domain.nodes[domain.cell_nodes].mean(axis=1)
         self._motion: tuple[Values, Values] | None = None
+        # All ranks search within the same radius.
         largest_radius = domain.comm.allreduce(float(np.max(radii.disc, initial=0.0)), op=MPI.MAX)
         self._nearby, self._geometry = NearbyCells(domain, largest_radius), CutGeometry(domain, graph)
         self.cut_cells = CutCells(graph, self._geometry, self.centres)
@@ -135,6 +136,7 @@ class TipFieldEvaluator:
 
     def update_tips(self, cut: Values) -> CrackTips:
         """Return the tips of this rank; `cut`: (edges,) cut positions (collective)."""
+        # Without a change the tips and the cells around them are those of the last pass.
         if self.cut_cells.has_changed():
             self.neighbourhoods.update(cut)
         return self.neighbourhoods.tips
@@ -165,11 +167,13 @@ class TipFieldEvaluator:
             v, a = map(self._domain.with_ghosts, self._motion)
             density = operators.repeat_at_points(density)
             kinetic, inertia, inertia_force = self._inertia_terms(density, H, operators, v, a)
+            # The kinetic energy density belongs to the energy of Eshelby's stress.
             for axis in range(self._domain.dim):
                 sigma[:, axis, axis] += kinetic
         sigma, inertia, H, inertia_force = map(operators.average_over_points, (sigma, inertia, H, inertia_force))
         if self._stress.cracks_close:
             sigma += self._closure_stress(cells, 1 - chi)
+        # Stress intensities are evaluated in 2D alone: 3D saves the exchange.
         in_plane = (H, inertia_force) if self._domain.dim == 2 else (np.empty((len(cells), 0)),) * 2
         remote_stress, sigma, inertia, H, inertia_force = exchange(cell_stress, sigma, inertia, *in_plane)
         elastic, rotates = (mu[tips.cell], kappa[tips.cell]), not self._stress.energy.linear
@@ -245,6 +249,7 @@ class TipFieldEvaluator:
 
     def _gradients_of_coordinates(self, cells: Ints) -> Values:
         """Return the gradients (n, d + 1, d) of the barycentric coordinates of cells (n,), 1/m."""
+        # Gradients of reference cells never change.
         new = cells[np.isnan(self._barycentric_gradients[cells, 0, 0])]
         if len(new):
             self._barycentric_gradients[new] = barycentric_gradients(self._domain.nodes[self._domain.cell_nodes[new]])

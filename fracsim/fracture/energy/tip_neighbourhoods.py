@@ -136,17 +136,20 @@ class TipNeighbourhoods:
 
     def update(self, cut: Values) -> None:
         """Update the neighbourhoods near changed cells; `cut`: (edges,) cut positions (collective)."""
+        # Cells that are no longer cut (after a repeated step) are unsplit again.
         number, centre = self._cut_cells.update_cells(cut)
         for cells, split in ((number, False), (self._cut_cells.number[self._cut_cells.split], True)):
             position, is_near = self._nearby.find_cells(cells)
             self._split[position[is_near]] = split
         new = self._find_tips(cut)
         self._update_cracks_behind(np.flatnonzero(new | self._flag_near(centre)))
+        # Only the cells around tips are requested from their ranks.
         needed = np.zeros(len(self._split), bool)
         needed[self._pair_cell] = True
         cells = np.flatnonzero(needed)
         self.remote_values = self._nearby.request_values(cells)
         index = np.cumsum(needed) - 1
+        # Row pointers of the matrices: pairs are ordered by tips.
         ends = np.concatenate([[0], np.cumsum(np.bincount(self._pair_tip, minlength=len(self.tips)))])
         self._shape, self._index, self._ends = (len(self.tips), len(cells)), index[self._pair_cell], ends
         self._matrices.clear()
@@ -207,6 +210,7 @@ class TipNeighbourhoods:
         """
         d = self._graph.domain.dim
         weights = self._weight_matrix(d + _Weight.UNIFORM)[rows]
+        # Eigenvalues are computed for the cells with a weight alone.
         cells = np.unique(weights.indices)
         squares = np.zeros(len(stress))
         squares[cells] = np.maximum(first_principal_stress(symmetric_tensors(stress[cells], d)), 0.0) ** 2
@@ -222,6 +226,7 @@ class TipNeighbourhoods:
             elastic: (n,) mu, Pa, and (n,) kappa.
             rotates: the mean rotation of the disc is removed first (large rotations).
         """
+        # The auxiliary field is that of intact material: split cells are left out.
         rows, tips, count = np.flatnonzero(~self._split[self._pair_cell]), self.tips, len(self.tips)
         tip, index, inside = self._pair_tip[rows], self._index[rows], self._weights[rows, 2 + _Weight.INSIDE]
         stress, H, inertia_force = (
@@ -247,6 +252,7 @@ class TipNeighbourhoods:
         """Return a column of the weights as a matrix (tips, requested), kept until the next update."""
         if column not in self._matrices:
             data = self._weights[:, column]
+            # V q counts in split cells as well, which have inertia; averages leave them out.
             if column > self._graph.domain.dim:
                 data = np.where(self._split[self._pair_cell], 0.0, data)
             self._matrices[column] = self._sparse_matrix(data)
@@ -342,6 +348,7 @@ class TipNeighbourhoods:
 
     def _mean_cut_point_behind(self, pairs: NeighbourPairs, cells: Ints, point: Values, disc: Values) -> Values:
         """Return the mean (n, d), m, of the cuts of split cells (pairs,) nearer than `disc` to points (n, d)."""
+        # Relative to the point, so that a tip without a crack behind it has the point itself.
         within = (pairs.distance < disc[pairs.place]).astype(float)
         back = within[:, None] * (self._cut_cells.cut_point[cells] - point[pairs.place])
         return point + weighted_mean(pairs.sum(back), pairs.sum(within)[:, None])
