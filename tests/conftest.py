@@ -76,8 +76,9 @@ def little_built(monkeypatch: pytest.MonkeyPatch) -> None:
 FIRST = (
     "test_restart", "test_meshes_builders", "test_studies", "test_obstacles", "test_free_obstacles",
     "test_plasticity", "test_obstacle_pairs", "test_stepping", "test_contact_time_weights", "test_sweep",
-    "test_ranks", "test_own_files", "test_facets", "test_closing", "test_brittle", "test_fracture", "test_meetings",
-    "test_bad_input", "test_cannot_write", "test_surface_run", "test_output", "test_self_contact", "test_apart",
+    "test_ranks", "test_file_ownership", "test_facets", "test_closing", "test_brittle", "test_fracture",
+    "test_contact_checks", "test_bad_input", "test_cannot_write", "test_surface_run", "test_output",
+    "test_self_contact", "test_apart",
 )  # fmt: skip
 
 

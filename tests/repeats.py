@@ -33,10 +33,10 @@ REPEATS = (
     # sweeps in processes of their own: one that is stopped
     "test_sweep.py::test_runs_on_two_ranks",
     # whose a folder is: on one process
-    "test_own_files.py::test_a_folder_of_the_users_is_left_alone[2]",
+    "test_file_ownership.py::test_a_folder_of_the_users_is_left_alone[2]",
     # a run that is killed as it sets up: before its first file, and after its last
-    "test_own_files.py::test_a_run_that_was_killed_is_recognised[monitors.InvertedCellMonitor]",
-    "test_own_files.py::test_a_run_that_was_killed_is_recognised[output.frame_files",
+    "test_file_ownership.py::test_a_run_that_was_killed_is_recognised[monitors.InvertedCellMonitor]",
+    "test_file_ownership.py::test_a_run_that_was_killed_is_recognised[output.frame_files",
     # studies on a figure: those on a vase run as they do
     "test_studies.py::test_a_coarse_version_runs[jelly-figure]",
     "test_studies.py::test_a_coarse_version_runs[hammered-figure]",
