@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import gc
 import math
 import os
 import sys
@@ -15,14 +14,12 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 from .errors import Exit, FracsimError, InputError, NotConverged, Stopped, one_line
 from .process import (
     INTERRUPTED,
-    exit_process,
     import_blocked,
     import_dolfinx,
     import_outside,
     is_first_rank,
     start_process,
     start_run,
-    start_work,
 )
 
 # typer imports rich where it is there, though `rich_markup_mode` is None: two thirds of what this module takes.
@@ -72,7 +69,6 @@ def run(
     import_dolfinx()
     from .run import run_study
 
-    start_work()
     start_run()
     how = {"restart": restart, "overwrite": overwrite}
     summary = run_study(comm, loaded, folder, **how, wall_limit=wall_limit, source=path)
@@ -163,7 +159,6 @@ def render(
     from .report.pictures.picture import render
     from .report.pictures.picture_options import PictureOptions, parse_limits, parse_size
 
-    start_work()
     _tell_of_runs(outs)
     how = PictureOptions(
         colour, explode, view, zoom, material=look, size=parse_size(size),
@@ -209,7 +204,6 @@ def report(
     import_outside("matplotlib")
     from .report.html_report import make_report
 
-    start_work()
     _tell_of_runs(outs)
     print(f"saved {make_report(outs, html, references=reference, quantity=quantity, exact=exact)}")
 
@@ -231,7 +225,6 @@ def sweep(
     from .report.sweep import run_sweep
     from .study.reader import find_study
 
-    start_work()
     path = find_study(study)
     folder = out or Path("out") / f"{path.stem}-sweep"
     run_sweep(study, path, set_, folder, ranks=ranks, only_list=list_, overwrite=overwrite)
@@ -300,12 +293,8 @@ def check_folder(folder: Path) -> None:
 
 
 def program() -> NoReturn:
-    """Entry point of the console script: main(), in a process of its own."""
-    gc.disable()  # what imports make stays; to look through it for garbage takes a tenth of a small run
-    try:
-        main(start_process)
-    except SystemExit as end:
-        exit_process(end.code)
+    """Run the command line in a process of its own; the entry point of the console script."""
+    main(start_process)
 
 
 def main(begin: Callable[[], None] | None = None) -> NoReturn:

@@ -1,98 +1,103 @@
-"""How the process of a command begins and ends.
+"""Process of a command: standard streams, signals, and imports that ignore the working folder.
 
-What no run needs is not imported, and nothing is taken apart that goes with the process anyway: a tenth of what a small
-job takes, or less. Standard streams that are closed, or that nobody reads any more, do not end a command. Signals are
-heeded from the first moment of a run, and a crash ends the process.
+A command continues if a standard stream is closed or nobody reads it. A run responds to signals from its first moment.
+A crash ends the process.
 """
 
 from __future__ import annotations
 
-import atexit
 import errno
-import gc
 import importlib
 import io
 import os
 import signal
 import sys
-import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from types import FrameType, ModuleType
-from typing import Any, NoReturn, TextIO
+from typing import TextIO, cast
 
 from .errors import STOP_SIGNALS, Exit, InputError
 
 DOLFINX = "0.9"
-INTERRUPTED = 130  # as typer and shells report SIGINT
-_READER_GONE = (errno.EPIPE, errno.EIO)  # EIO: of a terminal that was closed
-# control characters but for tabs and ends of lines, and those that turn the direction of writing
+# Exit code after SIGINT, as typer and shells have it.
+INTERRUPTED = 130
+# Errors of a stream without a reader; EIO: its terminal was closed.
+_READER_GONE = (errno.EPIPE, errno.EIO)
+# Control characters other than tabs and ends of lines, and those that change the direction of writing.
 _CONTROLS = {*range(0x20), *range(0x7F, 0xA0), 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)}
 _ESCAPES = {code: ascii(chr(code))[1:-1] for code in _CONTROLS - {*map(ord, "\t\n\r")}}
-_FIRST_RANK_SPEAKS = 0.3  # s that other ranks wait before they end: the launcher ends all ranks with the first
+# Seconds that other ranks wait before they end, since the launcher ends all ranks with the first one.
+_FIRST_RANK_DELAY = 0.3
 
 
-# --- its start ---
+# --- start ---
 
 
 def start_process() -> None:
-    """Prepare the process of a command line: streams, home folder, signals. Raises InputError."""
+    """Prepare streams, signals and the home folder of a command. Raises InputError."""
     global _own
     _own = True
     runs = sys.argv[1:2] == ["run"]
     _open_streams(None if runs else _READER_GONE)
     if runs:
-        _heed_signals()
+        _handle_signals()
     _check_surroundings()
 
 
-def _heed_signals() -> None:
-    """Until the run takes over, of a process that runs."""
+def _handle_signals() -> None:
+    """Handle the signals that end a run, until the run does so itself."""
     for number in STOP_SIGNALS if sys.argv[1:2] == ["run"] else ():
-        if signal.getsignal(number) is not signal.SIG_IGN:  # ignored: by nohup
-            signal.signal(number, _end_before_the_run)
+        if signal.getsignal(number) is not signal.SIG_IGN:
+            # others are ignored by nohup
+            signal.signal(number, _end_before_run)
 
 
 _PARENT = os.getppid()
-_RANK = ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK")  # variables that tell a process its rank
-_own = False  # whether this process was started as a command line
+# Environment variables with the rank of a process.
+_RANK = ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK")
+# Whether this process was started as a command, and whether its run handles signals.
+_own = False
 _run_begun = False
 
 
 def _open_streams(dropped: tuple[int, ...] | None) -> None:
-    """Open standard streams that are closed, on nothing: files of the run would take their numbers. `dropped`: numbers
-    of errors after which output is dropped; None: all, for a run is worth more than the words about it."""
+    """Open closed standard streams on the null device, so that files of the run do not take their numbers.
+
+    `dropped`: numbers of errors after which output is dropped; None: all, since a run is worth more than its messages.
+    """
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            os.open(os.devnull, os.O_RDWR)  # takes the lowest number that is free
+            # this takes the lowest free number
+            os.open(os.devnull, os.O_RDWR)
     sys.stdout = _open_stream(sys.stdout, 1, dropped)
     sys.stderr = _open_stream(sys.stderr, 2, None)
 
 
 def _open_stream(stream: TextIO | None, number: int, dropped: tuple[int, ...] | None) -> TextIO:
+    """Return a stream that drops text which cannot be written; the arguments are those of `_Stream`."""
     if stream is None:
         return open(os.devnull, "w", encoding="utf-8")
     return _Stream(stream, number, dropped) if isinstance(stream, io.TextIOWrapper) else stream
 
 
 class _Stream(io.TextIOWrapper):
-    """A standard stream whose text is dropped once it cannot be written: a command whose reader has gone goes on.
+    """Standard stream that drops text once it cannot be written, so that a command without a reader continues.
 
-    Control characters are written as escapes: a terminal would obey those in a name or title of a file, and in what a
-    traceback or a library says of one.
+    Control characters are written as escapes, since names and titles in files may have some that a terminal would obey.
     """
 
     def __init__(self, stream: io.TextIOWrapper, number: int, dropped: tuple[int, ...] | None) -> None:
-        """`number`: of its descriptor; `dropped`: numbers of errors after which text is dropped; None: all."""
+        """Wrap a stream; `number`: descriptor; `dropped`: errors after which text is dropped, None: all."""
         buffered = stream.line_buffering
         super().__init__(stream.buffer, stream.encoding, "backslashreplace", line_buffering=buffered)
         self._number, self._dropped = number, dropped
 
     def write(self, text: str) -> int:
-        """Write text; returns its length."""
+        """Write text and return its length."""
         try:
             super().write(text if text.isprintable() else text.translate(_ESCAPES))
             return len(text)
@@ -101,28 +106,31 @@ class _Stream(io.TextIOWrapper):
             return len(text)
 
     def flush(self) -> None:
-        """Hand on what is buffered."""
+        """Write the buffered text."""
         try:
             super().flush()
         except OSError as error:
             self._drop(error)
 
     def _drop(self, error: OSError) -> None:
+        """Connect the descriptor with the null device, or raise the error if it is not to be dropped."""
         if self._dropped is not None and error.errno not in self._dropped:
             raise error
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, self._number)
         os.close(nothing)
-        super().flush()  # what is still buffered
+        # the text that is still in the buffer
+        super().flush()
 
 
 def _check_surroundings() -> None:
-    """Raises InputError where the working folder is gone, or where there is no home folder for compiled kernels."""
+    """Raise InputError if the working folder was deleted, or if there is no home folder for compiled kernels."""
     try:
         os.getcwd()
     except OSError:
         raise InputError("the working folder has been deleted: change to another one, for example with cd ~") from None
-    if not os.environ.get("HOME"):  # MPI refuses to start
+    # MPI does not start without it
+    if not os.environ.get("HOME"):
         try:
             import pwd
 
@@ -134,8 +142,8 @@ def _check_surroundings() -> None:
             ) from None
 
 
-def _end_before_the_run(number: int, frame: FrameType | None) -> None:
-    """Ends the process: imports are under way, and nothing has been written."""
+def _end_before_run(number: int, frame: FrameType | None) -> None:
+    """End the process during imports, when nothing has been written; a signal handler."""
     if _run_begun:
         signal.signal(number, signal.SIG_DFL)
         os.kill(os.getpid(), number)
@@ -144,22 +152,22 @@ def _end_before_the_run(number: int, frame: FrameType | None) -> None:
         why = "interrupted" if number == signal.SIGINT else f"stopped by signal {signal.Signals(number).name}"
         os.write(2, f"fracsim: {why} before the first step; nothing was written\n".encode())
     else:
-        time.sleep(_FIRST_RANK_SPEAKS)
+        time.sleep(_FIRST_RANK_DELAY)
     os._exit(INTERRUPTED if number == signal.SIGINT else Exit.STOPPED)
 
 
 def is_first_rank() -> bool:
-    """Whether this process is rank 0, without starting MPI."""
+    """Return whether this process is rank 0, without starting MPI."""
     return all(os.environ.get(name, "0") == "0" for name in _RANK)
 
 
 def _is_rank() -> bool:
-    """Whether something started this process as a rank of a job."""
+    """Return whether a launcher started this process as a rank of a job."""
     return any(name in os.environ for name in _RANK)
 
 
 def start_run() -> None:
-    """The run takes over: it heeds signals itself, and a crash ends the process at once, telling where."""
+    """Leave signals to the run; from here on a crash ends the process at once, with the place in the program."""
     global _run_begun
     if not _own:
         return
@@ -167,10 +175,13 @@ def start_run() -> None:
 
     from petsc4py import PETSc
 
-    PETSc.Sys.popSignalHandler()  # it calls MPI_Abort, which may hang in a process that has crashed
+    # it calls MPI_Abort, which may hang in a process that has crashed
+    PETSc.Sys.popSignalHandler()
     for number in (signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV):
-        signal.signal(number, signal.SIG_DFL)  # Open MPI's own handler waits for ever where the heap is damaged
-    signal.signal(signal.SIGPIPE, signal.SIG_IGN)  # as Python has it, but PETSc has not
+        # the handler of Open MPI waits for ever if the heap is damaged
+        signal.signal(number, signal.SIG_DFL)
+    # as Python has it, but PETSc has not
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     faulthandler.enable()
     from .mesh.parallel import launcher
     from .output.interrupt import end_with_launcher
@@ -184,11 +195,12 @@ def start_run() -> None:
 
 
 @contextmanager
-def import_blocked(name: str, stand_in: ModuleType | None = None) -> Iterator[None]:
-    """While it lasts, importing a module finds nothing (or the stand-in), unless it is there already."""
+def import_blocked(name: str) -> Iterator[None]:
+    """Make imports of a module fail within the context, unless it has been imported before."""
     absent = name not in sys.modules
     if absent:
-        sys.modules[name] = stand_in  # type: ignore[assignment]
+        # an entry of None makes an import fail
+        cast("dict[str, ModuleType | None]", sys.modules)[name] = None
     try:
         yield
     finally:
@@ -198,12 +210,11 @@ def import_blocked(name: str, stand_in: ModuleType | None = None) -> Iterator[No
 
 @contextmanager
 def outside_working_folder() -> Iterator[None]:
-    """While it lasts, the process is in the root folder of the system, so that libraries read no settings of the
-    working folder as they start.
+    """Change to the root folder within the context, so that libraries read no settings of the working folder.
 
     PETSc (.petscrc), petsc4py (petsc.cfg) and UCX (ucx.conf, with Open MPI) load libraries that such a file names, or
     write files; DOLFINx, FFCx (*_options.json) and matplotlib (matplotlibrc) take paths from there. What is set in the
-    environment or the home folder holds. Not for several threads.
+    environment or the home folder holds. Not for use in several threads.
     """
     before = os.open(".", os.O_PATH | os.O_DIRECTORY)
     try:
@@ -215,37 +226,35 @@ def outside_working_folder() -> Iterator[None]:
 
 
 def import_outside(*names: str) -> None:
-    """Import modules that read settings of the working folder, without these."""
+    """Import modules without settings of the working folder."""
     if not all(name in sys.modules for name in names):
         with outside_working_folder():
             for name in names:
                 importlib.import_module(name)
 
 
-def import_dolfinx(*, whole: bool = False) -> None:
-    """Import DOLFINx without settings of the working folder. InputError: another version, or its settings are no JSON.
+def import_dolfinx() -> None:
+    """Import DOLFINx without settings of the working folder.
 
-    dolfinx.utils is left out unless `whole` asks for it: it is for callers of PETSc from Numba, and parses C
-    declarations as it is imported, 0.04 s.
+    Raises InputError if it is another version, or if the user's settings are no JSON.
     """
     if "dolfinx" in sys.modules:
         return
-    name = "dolfinx.utils"
-    with outside_working_folder(), nullcontext() if whole else import_blocked(name, ModuleType(name)):
-        if _own:  # PETSc's handlers would end what SIGHUP and SIGQUIT meet from here on by MPI_Abort
+    with outside_working_folder():
+        # the handlers of PETSc would answer SIGHUP and SIGQUIT by MPI_Abort
+        if _own:
             importlib.import_module("petsc4py").init([sys.argv[0], "-no_signal_handler"])
         dolfinx = importlib.import_module("dolfinx")
         _check_dolfinx(str(dolfinx.__version__))
         _read_settings("dolfinx", "jit")
         _read_settings("ffcx", "options")
+    # UCX, of Open MPI, has taken SIGHUP
     if _own:
-        _heed_signals()  # UCX, of Open MPI, has taken SIGHUP
-    if not whole:
-        del dolfinx.utils
+        _handle_signals()
 
 
 def _read_settings(library: str, module: str) -> None:
-    """Read the settings for compiling, which the library then keeps. InputError where the user's file is no JSON."""
+    """Read the settings for compiling, which the library keeps. Raises InputError if the user's file is no JSON."""
     try:
         importlib.import_module(f"{library}.{module}").get_options()
     except (OSError, ValueError, TypeError) as error:
@@ -258,45 +267,10 @@ def _read_settings(library: str, module: str) -> None:
 
 
 def _check_dolfinx(version: str) -> None:
-    """InputError where it is another version than the one that fracsim runs with."""
+    """Raise InputError if it is another version than the one that fracsim runs with."""
     if version.split(".")[:2] != DOLFINX.split("."):
         raise InputError(
             f"DOLFINx {version} is installed, and fracsim runs with {DOLFINX} (0.10 and later: not yet): install "
             f"python3-dolfinx {DOLFINX}, as Debian 13 has it, or start commands by ./env, which finds or makes an "
             "environment with it"
         )
-
-
-def start_work() -> None:
-    """Look for garbage from here on where it has not been, but not in what imports made: it stays."""
-    if not gc.isenabled():
-        gc.freeze()
-        gc.enable()
-
-
-def exit_process(code: Any) -> NoReturn:
-    """End the process as sys.exit does, but for taking apart all modules and objects, which frees their memory bit by
-    bit (0.04 s of a small job)."""
-    if not isinstance(code, int) or threading.active_count() > 1:
-        sys.exit(code)
-    atexit._run_exitfuncs()
-    try:
-        sys.stdout.flush()
-        sys.stderr.flush()
-    except (OSError, ValueError):  # no one reads any more: the interpreter has its own words for that
-        sys.exit(code)
-    _finalize()
-    os._exit(code)
-
-
-def _finalize() -> None:
-    """What Py_Finalize has called for PETSc and MPI, in this order (collective)."""
-    if "petsc4py.PETSc" in sys.modules:
-        from petsc4py import PETSc
-
-        PETSc._finalize()
-    if "mpi4py.MPI" in sys.modules:
-        from mpi4py import MPI
-
-        if not MPI.Is_finalized():
-            MPI.Finalize()

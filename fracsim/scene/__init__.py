@@ -19,7 +19,7 @@ from ..process import import_dolfinx, import_outside
 
 # A script that imports this room takes no settings of PETSc or DOLFINx from the working folder, as the command does.
 import_outside("mpi4py.MPI")
-import_dolfinx(whole=True)
+import_dolfinx()
 
 from mpi4py import MPI  # noqa: E402
 
