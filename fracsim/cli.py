@@ -1,4 +1,4 @@
-"""The command line. Light to import: each command imports what it needs."""
+"""Command line. Each command imports only the modules that it needs."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def run(
 
 
 def _dust(summary: dict[str, Any]) -> str:
-    """How many of the pieces are single nodes, and what leaves none."""
+    """Return words on the number of single-node fragments; nothing if there are none."""
     dust = summary.get("dust")
     return f", {dust} of them dust (single nodes; [fracture] crumbs = false leaves none)" if dust else ""
 
@@ -251,7 +251,7 @@ def list_(
 
 
 def _tell_of_runs(folders: list[Path]) -> None:
-    """A note on folders in which a run goes on: nobody is to take a part of it for the whole."""
+    """Print a note on folders in which a run continues, whose results are incomplete."""
     from .output.lock import describe_lock_holder
 
     for folder in folders:
@@ -263,7 +263,7 @@ def _tell_of_runs(folders: list[Path]) -> None:
 
 
 def _load(comm: MPI.Comm, path: Path, overrides: list[str], folder: Path) -> Study:
-    """Read on rank 0, so that ranks never disagree about a file that someone is editing."""
+    """Return the study, which rank 0 reads (collective): the file may be edited meanwhile."""
     from .mesh.parallel import from_root
     from .study import Study
     from .study.reader import load_study
@@ -278,7 +278,7 @@ def _load(comm: MPI.Comm, path: Path, overrides: list[str], folder: Path) -> Stu
 
 
 def check_folder(folder: Path) -> None:
-    """InputError where results cannot be written there; nothing is made yet."""
+    """Raise InputError if results cannot be written to a folder; nothing is created."""
     try:
         os.lstat(folder)
     except (FileNotFoundError, NotADirectoryError):
@@ -298,9 +298,12 @@ def program() -> NoReturn:
 
 
 def main(begin: Callable[[], None] | None = None) -> NoReturn:
-    """The command line: one message and an exit code for what a user can mend, on any number of ranks. `begin` comes
-    first."""
-    bare = len(sys.argv) == 1  # shows the help, and yet is bad usage
+    """Run the command line; an error of the user ends it with one message and an exit code, on any number of ranks.
+
+    `begin`: called first.
+    """
+    # without arguments the help is printed, and the usage is wrong all the same
+    bare = len(sys.argv) == 1
     if not is_first_rank() and (bare or "--help" in sys.argv):
         sys.exit(Exit.DONE)
 
@@ -318,6 +321,7 @@ def main(begin: Callable[[], None] | None = None) -> NoReturn:
 
 
 def _guarded(work: Callable[[], object]) -> int:
+    """Return the exit code of `work`, and print the message of an error."""
     try:
         code = work()
         if code == INTERRUPTED and is_first_rank():
@@ -333,7 +337,7 @@ def _guarded(work: Callable[[], object]) -> int:
 
 
 def _verdict(error: BaseException) -> tuple[int, str]:
-    """Exit code and message: one sentence of what a user can mend, a traceback of a fault of the program."""
+    """Return exit code and message: one sentence for an error of the user, a traceback for one of the program."""
     import click
 
     if isinstance(error, FracsimError):
@@ -354,12 +358,12 @@ def _verdict(error: BaseException) -> tuple[int, str]:
 
 
 def _is_of_user(path: object) -> bool:
-    """Whether a path is none of the program itself."""
+    """Return whether a path is outside of the program itself."""
     return bool(path) and not str(path).startswith((sys.prefix, str(Path(__file__).parent)))
 
 
 def _end_others(message: str, code: int, *, late: bool) -> None:
-    """Return where every rank has failed; where some have not, they wait for this one and are ended with it."""
+    """Return if every rank has failed; otherwise end the ranks that wait for this one."""
     if "mpi4py.MPI" not in sys.modules:
         return
     from mpi4py import MPI

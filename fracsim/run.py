@@ -1,4 +1,4 @@
-"""A run: steps a scene to its end and writes the output folder."""
+"""Run of a study: steps a scene to its end and writes the output folder."""
 
 from __future__ import annotations
 
@@ -54,13 +54,19 @@ if TYPE_CHECKING:
 
 
 class Run:
-    """A scene and its output folder: `run()` steps to the end; `run.step()` takes one step of it.
+    """Scene and its output folder: `run()` steps to the end, `run.step()` takes one step.
 
     Attributes:
-        scene, folder: what is stepped, and where it is written.    state: where it has come to.
-        history: the rows of history.csv.    frames: what is written from time to time.    breaks: the edges that broke.
-        watched: what makes a result doubtful, what ends the run early, and what it has used.
-        interrupt: what may end the run early.
+        scene: that is stepped.
+        folder: output folder.
+        comm: ranks of the run.
+        state: present state.
+        history: rows of history.csv.
+        frames: fields and surface.
+        breaks: log of the edges that broke.
+        front: extent of the cracks; None without [[crack]] and fracture energy.
+        monitors: doubtful results, an early end, resources used.
+        interrupt: signals and the limit of wall time.
     """
 
     def __init__(
@@ -75,11 +81,21 @@ class Run:
         progress: ProgressReporter | None = None,
         began: float | None = None,
     ) -> None:
-        """Start or resume; makes the output folder, once nothing stands in the way any more (collective).
+        """Check the input, then make the output folder (collective).
 
-        `overwrite`: throw away a run there that could go on; `wall_limit`: s from now; `interrupt`: in its place, one
-        that listens already; `progress`: one that tells already; `began`: when the work on the scene began
-        (perf_counter). Raises InputError, and Stopped where a signal came before anything was written.
+        Args:
+            scene: to be stepped.
+            folder: output folder.
+            restart: continue from the checkpoint in the folder.
+            overwrite: replace a run in the folder that could be continued.
+            wall_limit: s from now; None: no limit.
+            interrupt: handler that is in use already, in place of the limit.
+            progress: reporter that is in use already; None: a new one.
+            began: time.perf_counter() as the work on the scene began; None: now.
+
+        Raises:
+            InputError: folder or checkpoint do not fit.
+            Stopped: a signal came before anything was written.
         """
         self.scene, self.folder, self.comm = scene, folder, scene.domain.comm
         self.interrupt = interrupt or InterruptHandler(self.comm, wall_limit)
@@ -103,7 +119,7 @@ class Run:
             raise
 
     def _resume(self) -> CheckpointNotes:
-        """Take up the state of the checkpoint, and what it says beside it."""
+        """Restore the state of the checkpoint; return its notes (collective). Raises InputError."""
         scene, breaks, notes = self.scene, self.breaks, from_root(self.comm, lambda: read_notes(self.folder))
         if missing := sorted(CHECKPOINT_MONITORS - notes.monitors.keys()):
             raise restart_error(checkpoint_path(self.folder), f"notes/monitors has no {missing[0]}")
@@ -116,7 +132,7 @@ class Run:
         return notes
 
     def _prepare(self, notes: CheckpointNotes | None, check: Callable[[], None]) -> None:
-        """Open the output, of a run that goes on where there are notes of it; `check`: that it may be opened."""
+        """Open the output (collective); `notes`: of the checkpoint to continue from; `check`: of the output folder."""
         study, restart, folder = self.scene.study, notes is not None, self.folder
         step, t = (self.state.step, self.state.t) if restart else (None, None)
         self.front = self._crack_front()
@@ -149,7 +165,7 @@ class Run:
         write_on_root(self.comm, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
 
     def _crack_front(self) -> CrackExtent | None:
-        """Where cracks say where they cut: how long they are, and their tip."""
+        """Return the record of crack lengths and tips; None if cracks have no cut positions."""
         study = self.scene.study
         if study.fracture is None or not (study.crack or study.fracture.energy):
             return None
@@ -160,14 +176,16 @@ class Run:
 
     @property
     def ended(self) -> bool:
-        """Whether the run is at its end: that of the study, or that of `time.until`."""
+        """Whether the run is at the end of the study, or ended by `time.until`."""
         return self.scene.ended(self.state) or self.monitors.load_dropped
 
     # --- one step, one frame, one checkpoint ---
 
     def step(self) -> StepReport:
-        """Take a step and write its row of history.csv, but no frame. Raises NotConverged, CannotWrite, and Abandoned
-        where the run is to stop, with the state of before (collective)."""
+        """Take a step and write its row of history.csv, but no frame (collective).
+
+        Raises NotConverged, CannotWrite, and StepAborted if the run is to stop; the state is then that before the step.
+        """
         if self._forgets:
             self.scene.stepper.discard_unsaved_data()
             self._forgets = False
@@ -183,14 +201,13 @@ class Run:
         return report
 
     def record_breaks(self) -> None:
-        """Edges have broken since the last step, in it or by hand: when, where, and into how many pieces
-        (collective)."""
+        """Record edges that broke since the last step, in it or by hand (collective)."""
         self.breaks.record_breaks(self.state.t)
         if self.front is not None:
             self.front.update()
 
     def write_frame(self) -> None:
-        """Write the body as it is now, and look at its cells. Raises CannotWrite (collective)."""
+        """Write a frame of the present state, and check the cells (collective). Raises CannotWrite."""
         began = time.perf_counter()
         self.monitors.record_frame(self.state.t)
         self.frames.write_frame(self.state)
@@ -199,8 +216,10 @@ class Run:
         self._meter.output_seconds += time.perf_counter() - began
 
     def checkpoint(self) -> Path:
-        """Write a checkpoint of now, which the run goes on from as one that resumes does; returns its path. Raises
-        CannotWrite, and NotConverged where the state is not finite (collective)."""
+        """Write a checkpoint of the present state and return its path (collective).
+
+        The run continues as a restarted one does. Raises CannotWrite, and NotConverged if the state is not finite.
+        """
         began = time.perf_counter()
         domain, balance, breaks = self.scene.domain, self.scene.balance, self.breaks
         front = self.front.to_checkpoint() if self.front is not None else {}
@@ -216,8 +235,10 @@ class Run:
     # --- to the end ---
 
     def __call__(self) -> dict[str, Any]:
-        """Run to the end; returns what summary.json says. Raises NotConverged, Stopped or CannotWrite, with where to go
-        on from (collective)."""
+        """Run to the end and return the contents of summary.json (collective).
+
+        Raises NotConverged, Stopped or CannotWrite; the message says how to continue.
+        """
         with self._lock, self._progress:
             return self._run_and_draw()
 
@@ -236,7 +257,7 @@ class Run:
         return summary
 
     def _run(self) -> dict[str, Any]:
-        """The loop, and a checkpoint where it does not end well."""
+        """Take all steps; write a checkpoint if the run does not come to its end (collective)."""
         self.scene.stepper.set_stop_request(self.interrupt.must_abandon_step)
         try:
             try:
@@ -278,14 +299,14 @@ class Run:
         self._progress.update(ProgressState(self.state.t, report.dt, self.state.step, broken, pieces, more))
 
     def _stopped(self, more: str = "") -> Stopped:
-        """What ends the run now, with a frame of now (collective)."""
+        """Write a frame and return the error that ends the run at the present state (collective)."""
         if self._frame_of != self.state.step:
             self.write_frame()
         reason, t = self.interrupt.stop_reason(), self.state.t
         return Stopped(f"stopped by {reason} at t = {t:g} s after {self.state.step} steps{more}")
 
     def _finish(self, outcome: str) -> dict[str, Any]:
-        """summary.json; only on ways out that all ranks take, since it sums over them."""
+        """Write summary.json and return its contents (collective)."""
         summary = self._summary(outcome)
         write_summary(self.comm, self.folder, summary)
         print_notes(self.comm, self.monitors.notes(done=outcome == "done"))
@@ -308,14 +329,14 @@ class Run:
     # --- where to go on from ---
 
     def _saved(self) -> str:
-        """Write a checkpoint on the way out and say where; one of a body that went astray would spoil the last good."""
+        """Write a last checkpoint and return a sentence that names it; none if the state is not finite (collective)."""
         try:
             return f"Checkpoint: {self.checkpoint()}; go on with --restart"
         except NotConverged as error:
             return f"No checkpoint was written: {error}. {describe_last_checkpoint(self.folder, self._saved_at)}"
 
     def _rescued(self) -> str:
-        """Where to go on from after output failed: a checkpoint of now where there is room for it, or the last one."""
+        """Return a sentence on how to continue after output failed: from a new checkpoint or the last one."""
         with contextlib.suppress(CannotWrite):
             write_summary(self.comm, self.folder, self._summary("could not write"))
         try:
@@ -327,14 +348,14 @@ class Run:
 
 
 def wanted_fields(study: Study) -> list[str]:
-    """Fields of fields.xdmf: those that the study names, or by what it computes."""
+    """Return the names of the fields of fields.xdmf; by default those of the stress and the damage."""
     if study.output.fields is not None:
         return study.output.fields
     return ["damage", "von_mises"] if study.fracture is not None else ["von_mises"]
 
 
 def wants_smooth(study: Study) -> bool:
-    """Whether cracks are drawn smooth: as the study says, or where it has a look and nothing touches what is drawn."""
+    """Return whether cracks are drawn smooth; by default with a look and without contact."""
     if study.output.cut is None:
         return study.output.look != "plain" and study.contact is None and not study.obstacle
     return study.output.cut == "smooth"
@@ -350,10 +371,16 @@ def run_study(
     wall_limit: float | None = None,
     source: Path | None = None,
 ) -> dict[str, Any]:
-    """Build, run, draw the last frame; returns the summary (collective).
+    """Build the scene, run it, draw the last frame, and return the contents of summary.json (collective).
 
-    `overwrite`: a run in the folder that could go on may be thrown away; `wall_limit`: s from now; `source`: the study
-    file, which must not be written over.
+    Args:
+        comm: ranks of the run.
+        study: to be run.
+        folder: output folder.
+        restart: continue from the checkpoint in the folder.
+        overwrite: replace a run in the folder that could be continued.
+        wall_limit: s from now; None: no limit.
+        source: study file, which must not be overwritten.
     """
     began = time.perf_counter()
     print_notes(comm, study.frame_notes)
@@ -390,7 +417,7 @@ def _run_rigid(
     wall_limit: float | None,
     source: Path | None,
 ) -> dict[str, Any]:
-    """Rigid bodies move on rank 0, and are the same on any number of ranks, which analyse them (collective)."""
+    """Run rigid bodies on rank 0; the other ranks analyse bodies (collective). The arguments are those of run_study."""
     from .rigid.parallel_analyses import send_to_workers
     from .scene.rigid_scene import build_rigid_scene, serve_rigid_analyses
 
@@ -447,7 +474,7 @@ def _check(
 
 
 def _draw(folder: Path) -> None:
-    """A picture of the last frame; a machine that cannot draw loses the picture, not the run."""
+    """Draw the last frame; a failure is only reported."""
     try:
         import_outside("pyvista")
         from .report.pictures.picture import render
