@@ -246,8 +246,8 @@ def shell_convex_parts(
     # every point once for each of its clusters
     code = np.unique((cluster[:, None] * len(points) + triangles).ravel())
     point_cluster, x = code // len(points), points[code % len(points)]
-    kept = extreme_points(x, point_cluster)
-    point_cluster, x = point_cluster[kept], x[kept]
+    is_extreme = extreme_points(x, point_cluster)
+    point_cluster, x = point_cluster[is_extreme], x[is_extreme]
     corners = np.split(x, np.searchsorted(point_cluster, np.arange(1, len(owner))))
     parts: list[list[Values]] = [[] for _ in range(count)]
     for number, hull in zip(owner, corners, strict=True):

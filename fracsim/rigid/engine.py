@@ -196,12 +196,12 @@ class PreviousRound:
     Attributes:
         event: as it was found.
         exceeded: (n,) bodies that moved farther than expected; their contacts are searched for again.
-        kept: numbers of contacts at the beginning of the event that stay, which come first in the new list.
+        retained: numbers of contacts at the beginning of the event that stay, which come first in the new list.
     """
 
     event: ImpactEvent
     exceeded: Flags
-    kept: Ints
+    retained: Ints
 
 
 class ImpactStep:
@@ -243,15 +243,15 @@ class ImpactStep:
             conditions = EventConditions(self._parameters.gravity, self._overlaps)
         else:
             conditions = previous.conditions
-        event, kept = self._make_event(start, contacts, conditions, bounds, earlier)
+        event, retained = self._make_event(start, contacts, conditions, bounds, earlier)
         if event.is_last and self._needs_sequence(event):
             events = SETTINGS.max_crowded_events if has_many_contacts(event) else SETTINGS.max_events
-            event, kept = self._make_event(start, contacts, event.begin_sequence(events), bounds, earlier)
+            event, retained = self._make_event(start, contacts, event.begin_sequence(events), bounds, earlier)
         if previous:
             # start from the active contacts and the impulses of the previous round
-            event.active[: len(kept)] |= previous.active[kept]
+            event.active[: len(retained)] |= previous.active[retained]
             event.active &= ~event.postponed
-            event.impulse[: len(kept)] = previous.impulse[kept]
+            event.impulse[: len(retained)] = previous.impulse[retained]
         return event
 
     def find_next_event(self, event: ImpactEvent, bodies: Bodies) -> ImpactEvent | None:
@@ -260,9 +260,9 @@ class ImpactStep:
         present = bound_motion(model, parameters, bodies, rates, event.bounds.common_velocity)
         exceeded = event.bounds.exceeded_by(present)
         bounds = bound_motion(model, parameters, bodies, rates)
-        contacts, kept = self._update_contacts(bodies, bounds, event.contacts, exceeded)
+        contacts, retained = self._update_contacts(bodies, bounds, event.contacts, exceeded)
         conditions = event.conditions.following(event.elapsed, event.overlaps)
-        impacted = _carry_over(event.active & event.impacts, kept, len(contacts))
+        impacted = _carry_over(event.active & event.impacts, retained, len(contacts))
         constraints, _ = self._constrain(contacts, bodies, rates, conditions, event.elapsed, impacted)
         if not np.any(constraints.impact_speed):
             return None
@@ -298,17 +298,17 @@ class ImpactStep:
         time = self._parameters.time_step * (elapsed - conditions.elapsed_or_zero)
         velocity_gain = time[:, None] * conditions.gravity
         bodies = self._fly(start, time, velocity_gain) if np.any(flies) else start
-        contacts, kept = self._find_near(bodies, initial, bounds, elapsed, flies, earlier)
+        contacts, retained = self._find_near(bodies, initial, bounds, elapsed, flies, earlier)
         if np.any(flies):
             # bodies at rest sank into what supports them while they flew
             lift = sinking_corrections(initial, contacts, flies & conditions.is_first)
             bodies = replace(bodies, position=bodies.position + lift)
             falling = replace(bodies, velocity=bodies.velocity + velocity_gain)
             gaps = corrected_gaps(contacts, lift)
-            impacted = None if impacted is None else _carry_over(impacted, kept, len(contacts))
+            impacted = None if impacted is None else _carry_over(impacted, retained, len(contacts))
             past, lifted = elapsed if conditions.in_sequence else None, replace(contacts, gap=gaps)
             constraints, overlaps = self._constrain(lifted, falling, rates, conditions, past, impacted)
-        return ImpactEvent(conditions, bounds, initial, bodies, elapsed, contacts, constraints, overlaps), kept
+        return ImpactEvent(conditions, bounds, initial, bodies, elapsed, contacts, constraints, overlaps), retained
 
     def _flight_fractions(
         self, constraints: ContactConstraints, contacts: Contacts, conditions: EventConditions
@@ -336,7 +336,7 @@ class ImpactStep:
             return self._update_contacts(bodies, bounds, initial, flies)
         event = earlier.event
         if event.contacts is event.initial_contacts and not np.any(flies):
-            return initial, earlier.kept
+            return initial, earlier.retained
         return self._update_contacts(bodies, bounds, event.contacts, earlier.exceeded | (elapsed != event.elapsed))
 
     def _update_contacts(
@@ -349,10 +349,10 @@ class ImpactStep:
         if contacts is None:
             return self._search(bodies, bounds), np.empty(0, np.int64)
         unchanged = np.append(~changed, np.ones(len(bounds.obstacle_velocity), bool))
-        kept = np.flatnonzero(contacts.both_flagged(unchanged))
+        retained = np.flatnonzero(contacts.both_flagged(unchanged))
         if not np.any(changed):
-            return contacts, kept
-        return contacts.select(kept).concatenate(self._search(bodies, bounds, changed)), kept
+            return contacts, retained
+        return contacts.select(retained).concatenate(self._search(bodies, bounds, changed)), retained
 
     def _search(self, bodies: Bodies, bounds: MotionBounds, chosen: Flags | None = None) -> Contacts:
         """Return the contacts that may close in the step, of all bodies or of those `chosen` (n,)."""
@@ -389,10 +389,10 @@ class ImpactStep:
         )
 
 
-def _carry_over(flags: Flags, kept: Ints, count: int) -> Flags:
-    """Return flags (count,) of a new list of contacts, of which the first ones are those kept of the old list."""
+def _carry_over(flags: Flags, retained: Ints, count: int) -> Flags:
+    """Return flags (count,) of a new list of contacts, of which the first ones are those retained of the old list."""
     result = np.zeros(count, bool)
-    result[: len(kept)] = flags[kept]
+    result[: len(retained)] = flags[retained]
     return result
 
 

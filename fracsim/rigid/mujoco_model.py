@@ -218,12 +218,12 @@ class PlaneContacts:
             approach = -dt * np.einsum("ki,i->k", bodies.velocity_at(x, body), normal)
             limit = SETTINGS.approach_factor * approach + SETTINGS.reach_share * reach[body] + plane_reach
             soon = np.flatnonzero(gap < limit)
-            kept = _is_among_first(body, gap, SETTINGS.nearest_corners) | required[near]
-            kept[soon] |= _supporting_corners(body[soon], arms[soon], self.frames[number], (gap - approach)[soon])
-            is_checked[near[kept]] = True
+            selected = _is_among_first(body, gap, SETTINGS.nearest_corners) | required[near]
+            selected[soon] |= _supporting_corners(body[soon], arms[soon], self.frames[number], (gap - approach)[soon])
+            is_checked[near[selected]] = True
             # half-way between the corner and the plane
-            points = x[kept] - gap[kept, None] / 2 * normal
-            result.append((number, self.corner_geom[near[kept]], gap[kept], points))
+            points = x[selected] - gap[selected, None] / 2 * normal
+            result.append((number, self.corner_geom[near[selected]], gap[selected], points))
         return result
 
 

@@ -22,7 +22,7 @@ Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class LoadSettings:
+class PointLoadSettings:
     """Resolution of contact forces.
 
     Attributes:
@@ -40,7 +40,7 @@ class LoadSettings:
     max_pairs: int = 256
 
 
-SETTINGS = LoadSettings()
+SETTINGS = PointLoadSettings()
 GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 
