@@ -43,8 +43,7 @@ DEFAULT_OPTIONS: PetscOptions = {
     "ksp_rtol": 1e-5,  # 1e-3 is no direction of descent for a badly conditioned body: a cantilever fails
     "ksp_max_it": 500,
 }
-PLAIN_OPTIONS: PetscOptions = {"pc_type": "gamg"}
-PLAIN_DIRECT_OPTIONS: PetscOptions = {"ksp_type": "preonly", "pc_factor_mat_solver_type": "mumps"}
+MUMPS_OPTIONS: PetscOptions = {"pc_factor_mat_solver_type": "mumps"}
 
 
 class LinearStepCG:
@@ -329,10 +328,11 @@ def chosen_options(balance: Balance, given: PetscOptions, *, plain: bool = False
 def _plain_options(balance: Balance, given: PetscOptions, policy: SolverPolicy) -> PetscOptions:
     is_small = balance.work_vector.getSize() <= policy.max_plain_direct_dofs
     if is_small and _is_default_method(given) and PETSc.Sys.hasExternalPackage("mumps"):
-        method = PLAIN_DIRECT_OPTIONS | {"pc_type": "cholesky" if balance.symmetric else "lu"}
+        # CG takes one iteration with factors, and tells where a symmetric tangent is indefinite.
+        method: PetscOptions = {"pc_type": "cholesky" if balance.symmetric else "lu"} | MUMPS_OPTIONS
     else:
-        method = PLAIN_OPTIONS | {"ksp_type": "cg" if balance.symmetric else "gmres"}
-    return DEFAULT_OPTIONS | method | given
+        method = {"pc_type": "gamg"}
+    return DEFAULT_OPTIONS | {"ksp_type": "cg" if balance.symmetric else "gmres"} | method | given
 
 
 def steps_are_linear(balance: Balance, given: PetscOptions, method: str) -> bool:

@@ -386,6 +386,8 @@ class NonlinearSolver:
         A solution of K d = -r lowers |r| for short steps along d. So a line search that fails was given none: CG may
         stop on an indefinite tangent before it notices, which depends on round-off. A halved step must not.
         """
+        if not self.balance.scheme.inertia and self.linear.preconditioner.is_indefinite:
+            return True  # the balance that factors have found is unstable
         line_search = PETSc.SNES.ConvergedReason.DIVERGED_LINE_SEARCH
         return not result.converged and (self.snes.ksp.reason < 0 or self.snes.reason == line_search)
 

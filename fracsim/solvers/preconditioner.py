@@ -88,10 +88,14 @@ class Update(IntEnum):
 class Preconditioner:
     """The preconditioner of one KSP, which is kept from tangent to tangent while it serves.
 
+    CG tells by itself where a tangent is indefinite.
+
     Attributes:
         pc: PETSc's preconditioner of the whole body.
         serving: what is applied: `pc`, the V cycle copied from it, or deflation around one of these.
     """
+
+    is_indefinite = False
 
     def __init__(
         self,
@@ -374,9 +378,11 @@ class PlainPreconditioner:
 
     Attributes:
         pc, serving: PETSc's preconditioner.
+        is_indefinite: whether factors tell that the last tangent was indefinite.
     """
 
     fine_level: FineLevel | None = None
+    is_indefinite = False
 
     def __init__(self, ksp: PETSc.KSP) -> None:
         self._ksp = ksp
@@ -411,6 +417,9 @@ class PlainPreconditioner:
         """Set up for the tangent of the next solve (collective)."""
         operators.update_entries()
         operators.set_on(self._ksp, self.pc)
+        if self.pc.getType() == "cholesky" and self.pc.getFactorSolverType() == "mumps":
+            negative_pivots = self.pc.getFactorMatrix().getMumpsInfog(12)
+            self.is_indefinite = negative_pivots > 0
 
     def destroy(self) -> None:
         """Nothing is kept."""
