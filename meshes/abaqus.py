@@ -18,14 +18,14 @@ import numpy as np
 
 from .abaqus_deck import KeywordBlock, number
 from .abaqus_elements import facet_columns, shape_of
-from .abaqus_model import NO_INDICES, Component, Deck, NamedSet, SetEntry, label_key, some_of
-from .abaqus_part import LocalMesh, moved, place_in
+from .abaqus_model import NO_INDICES, Component, Deck, NamedSet, SetEntry, label_key, list_names
+from .abaqus_part import LocalMesh, find_in_sorted, moved
 from .data import Indices, Points
-from .mesh_conversion import DIMENSIONS, Block, Contents
+from .mesh_conversion import DIMENSIONS, Block, MeshFileContents
 from .topology import Mask, distinct_rows
 
 
-def read_abaqus(path: Path) -> Contents:
+def read_abaqus(path: Path) -> MeshFileContents:
     """Points, cells, sets and surfaces of an Abaqus input file.
 
     Element sets become sets of cells, node sets point sets, surfaces sets of facets. Where there are several instances
@@ -85,7 +85,7 @@ class _Placed:
             count = (last - first) // step + 1 - int(inside.sum())
             return places[begin:end][inside], max(0, count - _in_range(unused, first, last, step))
         assert entry.numbers is not None
-        place = place_in(ids, entry.numbers)
+        place = find_in_sorted(ids, entry.numbers)
         lost = entry.numbers[place < 0]
         return places[place[place >= 0]], len(lost) - int(np.isin(lost, unused).sum())
 
@@ -147,7 +147,7 @@ class _Assembled:
                 "they lie."
             )
         elif left := [part.name for key, part in deck.parts.items() if key not in {f[1] for f in found}]:
-            self.notes.append(f"Parts without an instance are left out: {some_of(left)}.")
+            self.notes.append(f"Parts without an instance are left out: {list_names(left)}.")
         for name, part, components, block in [*found, ("", "", [deck.assembly], None)]:
             own = components[-1]
             if own.nodes or own.elements or own.unused or not name:
@@ -199,7 +199,7 @@ class _Assembled:
 
     @staticmethod
     def _unknown(what: str, name: str, known: list[str]) -> str:
-        return f"there is no {what} '{name[:80]}'; known are: {some_of(known)}. Is the file cut or damaged?"
+        return f"there is no {what} '{name[:80]}'; known are: {list_names(known)}. Is the file cut or damaged?"
 
     def _enter(self, key: tuple[str, str, str], entry: SetEntry | None) -> None:
         if key in self._resolving or len(self._resolving) > 200:
@@ -354,13 +354,13 @@ class _Assembled:
         if apart:
             kind = what.replace("_", " ")
             self.notes.append(
-                f"Several parts, or a part and the assembly, have {kind} of the same name: {some_of(apart)}. Those of "
-                "parts are called by instance and name, as 'Part-1-1.Set-1'."
+                f"Several parts, or a part and the assembly, have {kind} of the same name: {list_names(apart)}. Those "
+                "of parts are called by instance and name, as 'Part-1-1.Set-1'."
             )
 
     # --- result ---
 
-    def contents(self) -> Contents:
+    def contents(self) -> MeshFileContents:
         """Everything as Contents; see read_abaqus."""
         blocks = [Block(kind, self.blocks[kind]) for kind in self.kinds]
         attached = self._attached()
@@ -409,16 +409,17 @@ class _Assembled:
         if self._lost:
             total = sum(self._lost.values())
             self.notes.append(
-                f"Sets name {total} nodes or elements that are not in the file: {some_of([*self._lost])}. Is it whole?"
+                f"Sets name {total} nodes or elements that are not in the file: {list_names([*self._lost])}. Is it "
+                "whole?"
             )
-        return Contents(np.concatenate(self.points), blocks, sets, points, notes=tuple(self.notes))
+        return MeshFileContents(np.concatenate(self.points), blocks, sets, points, notes=tuple(self.notes))
 
     @staticmethod
     def _nodes_of_unused(placed: _Placed) -> Iterator[Indices]:
         """Nodes that springs, beams and the like name: their elements are left out, but have not been lost."""
         for component in placed.mesh.components:
             for ids in component.unused_nodes:
-                places = place_in(placed.mesh.node_ids, ids)
+                places = find_in_sorted(placed.mesh.node_ids, ids)
                 yield placed.node_start + places[places >= 0]
 
     def _attached(self) -> Mask:
@@ -478,7 +479,7 @@ class _Assembled:
             if not useful:
                 empty.append(name)
         if empty:
-            self.notes.append(f"Surfaces that hold no facet of the body are not used: {some_of(empty)}.")
+            self.notes.append(f"Surfaces that hold no facet of the body are not used: {list_names(empty)}.")
         return facets
 
     def _note_unused(self, cells: dict[str, Indices], blocks: list[Block]) -> None:
@@ -497,5 +498,5 @@ class _Assembled:
             if level < self.dim and (unused := len(block.nodes) - named):
                 counts[kind] = counts.get(kind, 0) + unused
         if counts:
-            listed = some_of([f"{count} {name}" for name, count in counts.items()])
+            listed = list_names([f"{count} {name}" for name, count in counts.items()])
             self.notes.append(f"Elements that are not part of the body are not used: {listed}.")

@@ -21,8 +21,8 @@ import numpy as np
 import numpy.typing as npt
 
 from .data import Indices, MeshError
-from .plain_files import wrong_beside
-from .text_rows import SourceText, decoded
+from .plain_files import unreadable_reason_beside
+from .text_rows import SourceText, decode_text
 
 MAX_INCLUDES = 1000  # files that a deck includes, however deep
 _BLANKS = b" \t"
@@ -68,7 +68,7 @@ class KeywordBlock:
     def lines(self) -> Iterator[list[str]]:
         """Fields of the data lines; a comma at the end of a line ends no field."""
         for *_, line in self._lines():
-            fields = [unquoted(part) for part in split_fields(decoded(line))]
+            fields = [unquoted(part) for part in split_fields(decode_text(line))]
             yield fields[:-1] if len(fields) > 1 and not fields[-1] else fields
 
     def is_open(self) -> bool:
@@ -221,7 +221,7 @@ class _DeckReader:
             self.blocks[-1].pieces.append((source, begin, end))
         elif lines := source.text[begin:end].split():
             source.refuse(begin + source.text[begin:end].find(lines[0]), (
-                f"'{decoded(lines[0])[:40]}' stands before the first keyword; an Abaqus input file begins with a "
+                f"'{decode_text(lines[0])[:40]}' stands before the first keyword; an Abaqus input file begins with a "
                 "keyword such as *HEADING or *NODE. (The name of an AVS UCD file ends with .avs.)"
             ))  # fmt: skip
 
@@ -246,7 +246,7 @@ class _DeckReader:
 
     def _beside(self, block: KeywordBlock, name: str) -> SourceText:
         path = block.source.path.parent / name
-        wrong = wrong_beside(block.source.path, name)
+        wrong = unreadable_reason_beside(block.source.path, name)
         if not wrong and path.is_symlink():
             wrong = "is a link; put the file itself there"
         if not wrong and path.resolve() in self._open:
@@ -280,12 +280,12 @@ def _keyword_words(source: SourceText, star: int) -> tuple[str, int]:
             break
         if continued[:1] in b"+-.0123456789":
             source.refuse(end, (
-                f"the keyword line before ends with a comma, and so goes on here with '{decoded(continued)[:40]}', "
+                f"the keyword line before ends with a comma, and so goes on here with '{decode_text(continued)[:40]}', "
                 "which is no parameter. Take the comma away."
             ))  # fmt: skip
         lines.append(continued)
         end = after
-    return decoded(b"".join(lines)), end
+    return decode_text(b"".join(lines)), end
 
 
 def _block(words: str, source: SourceText, offset: int) -> KeywordBlock:

@@ -145,8 +145,8 @@ class Deck:
             if label_key(part) not in self.parts:
                 block.refuse(
                     f"instance '{name}' is of the part '{part}', which the file does not define before it (parts: "
-                    f"{some_of(p.name for p in self.parts.values())}). An instance from an earlier analysis cannot be "
-                    "read; export the whole model."
+                    f"{list_names(p.name for p in self.parts.values())}). An instance from an earlier analysis cannot "
+                    "be read; export the whole model."
                 )
             self.instances[label_key(name)] = component, label_key(part), block
         self._open.append((block, component))
@@ -309,7 +309,7 @@ def _element_rows(block: KeywordBlock, element_type: str, nodes: int) -> Indices
     return rows
 
 
-def some_of(names: Iterable[str]) -> str:
+def list_names(names: Iterable[str]) -> str:
     """The first few names, and dots where there are more."""
     listed = list(names)
     return ", ".join(listed[:SHOWN]) + (", ..." if len(listed) > SHOWN else "") if listed else "none"

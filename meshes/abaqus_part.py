@@ -57,7 +57,7 @@ class LocalMesh:
         self.node_ids, self.points = ids[kept], points[kept]
 
     def _indices(self, item: ElementBlock) -> Indices:
-        indices = place_in(self.node_ids, item.nodes)
+        indices = find_in_sorted(self.node_ids, item.nodes)
         if (missing := (indices < 0).any(axis=1)).any():
             row = int(missing.argmax())
             node = int(item.nodes[row][indices[row] < 0][0])
@@ -135,7 +135,7 @@ def _refuse_element(item: ElementBlock, row: int, message: str) -> None:
     item.block.refuse(message, int(np.searchsorted(ends, row * (item.nodes.shape[1] + 1), side="right")))
 
 
-def place_in(ids: Indices, wanted: Indices) -> Indices:
+def find_in_sorted(ids: Indices, wanted: Indices) -> Indices:
     """Place of each wanted number among sorted ids; -1 where it is not there."""
     if not len(ids):
         return np.full(wanted.shape, -1, np.int64)

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from .data import Indices, MeshError, Points
-from .text import middle_of
+from .text import format_midpoint
 from .topology import Floats, signed_measures
 
 # shape -> its faces by the places of their corners, normals outwards; the corners are in the order of VTK and Gmsh
@@ -26,7 +26,7 @@ FACES: dict[str, tuple[tuple[int, ...], ...]] = {
 PLURALS = {"hexahedron": "hexahedra", "wedge": "wedges", "pyramid": "pyramids", "quad": "quadrilaterals"}
 
 
-def triangles_of(quads: Indices) -> tuple[Indices, Indices]:
+def split_quads(quads: Indices) -> tuple[Indices, Indices]:
     """Triangles (m, 3) of quadrilaterals (k, 4), turned as these are, and the quadrilateral of each: (m,).
 
     A quadrilateral that names a node twice (a triangle written as one) gives one triangle.
@@ -34,7 +34,7 @@ def triangles_of(quads: Indices) -> tuple[Indices, Indices]:
     return _without_repeats(np.stack(_halves(quads), axis=1).reshape(-1, 3), np.repeat(np.arange(len(quads)), 2))
 
 
-def tetrahedra_of(shape: str, cells: Indices) -> tuple[Indices, Indices]:
+def split_into_tetrahedra(shape: str, cells: Indices) -> tuple[Indices, Indices]:
     """Tetrahedra (m, 4) of cells (k, 8, 6 or 5) of a shape of FACES, and the cell of each in rising order: (m,).
 
     A cell that names a node twice (a wedge written as a hexahedron) gives fewer. The tetrahedra have the orientation of
@@ -65,7 +65,9 @@ def _without_repeats(simplices: Indices, owner: Indices) -> tuple[Indices, Indic
     return simplices[whole], owner[whole]
 
 
-def oriented_parts(shape: str, cells: Indices, parts: Indices, owner: Indices, points: Points, source: str) -> Indices:
+def orient_simplices(
+    shape: str, cells: Indices, parts: Indices, owner: Indices, points: Points, source: str
+) -> Indices:
     """The simplices of cells, those of wedges turned where negative: programs order the nodes of wedges in two ways.
 
     Raises:
@@ -78,8 +80,9 @@ def oriented_parts(shape: str, cells: Indices, parts: Indices, owner: Indices, p
     if len(twisted):
         raise MeshError(
             f"{source}: {len(twisted)} of {len(cells)} {PLURALS[shape]} are folded, concave or strongly warped, the "
-            f"first near {middle_of(points, cells[twisted[0]])}, and cannot be cut into simplices. Mend these cells "
-            f"(are their nodes in order?), or mesh the body with {'triangles' if shape == 'quad' else 'tetrahedra'}."
+            f"first near {format_midpoint(points, cells[twisted[0]])}, and cannot be cut into simplices. Mend these "
+            f"cells (are their nodes in order?), or mesh the body with "
+            f"{'triangles' if shape == 'quad' else 'tetrahedra'}."
         )
     if shape != "wedge":
         return parts

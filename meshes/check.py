@@ -9,10 +9,10 @@ import numpy as np
 
 from .components import components
 from .data import Indices, MeshData, MeshError, Points
-from .joining import bodies_of, coincident_nodes, joined_bodies
+from .joining import coincident_nodes, join_bodies, label_bodies
 from .parameters import LONGEST, SHORTEST
-from .text import format_point, middle_of
-from .topology import Floats, Mask, distinct_rows, facets_of, oriented, signed_measures
+from .text import format_midpoint, format_point
+from .topology import Floats, Mask, distinct_rows, facets_of, orient_cells, signed_measures
 
 SHOWN = 5  # examples in a message
 
@@ -33,13 +33,13 @@ def check_mesh(mesh: MeshData, *, join: bool = False) -> MeshData:
     _check_arrays(mesh)
     _check_coordinates(mesh)
     mesh = _without_orphans(mesh)
-    mesh = joined_bodies(mesh) if join else mesh
+    mesh = join_bodies(mesh) if join else mesh
     mesh = _groups_once(_turned(mesh))
     _check_flat(mesh)
     _check_cells_once(mesh)
     table = _FacetTable(mesh.cells)
     _check_facets(mesh, table)
-    count, body = bodies_of(mesh)
+    count, body = label_bodies(mesh)
     notes = [
         *_check_groups(mesh, table),
         *_open_places(mesh, body),
@@ -125,7 +125,7 @@ def _check_flat(mesh: MeshData) -> None:
         measure = "volume" if mesh.dim == 3 else "area"
         raise MeshError(
             f"{len(flat)} cells have no {measure}: cell {_some(flat)}, the first near "
-            f"{middle_of(mesh.points, mesh.cells[flat[0]])}; remesh there, or merge its nodes."
+            f"{format_midpoint(mesh.points, mesh.cells[flat[0]])}; remesh there, or merge its nodes."
         )
 
 
@@ -154,7 +154,7 @@ def _check_cells_once(mesh: MeshData) -> None:
     if len(twice):
         raise MeshError(
             f"{len(twice)} cells have the same nodes as another cell: cell {_some(twice)}, the first near "
-            f"{middle_of(mesh.points, mesh.cells[twice[0]])}; remove the copies."
+            f"{format_midpoint(mesh.points, mesh.cells[twice[0]])}; remove the copies."
         )
 
 
@@ -179,7 +179,7 @@ def _refuse_facets(mesh: MeshData, facets: Indices, what: str) -> None:
         distinct = distinct_rows(np.sort(facets, axis=1))[0]
         raise MeshError(
             f"{len(distinct)} facets {what}, the first with nodes {distinct[0].tolist()} near "
-            f"{middle_of(mesh.points, distinct[0])}; mend the mesh there."
+            f"{format_midpoint(mesh.points, distinct[0])}; mend the mesh there."
         )
 
 
@@ -197,8 +197,8 @@ def _refuse_lost(mesh: MeshData, name: str, facets: Indices, lost: Indices) -> N
     if len(lost):
         raise MeshError(
             f"{len(lost)} of the {len(facets)} facets of group '{name}' are not facets of any cell, the first with "
-            f"nodes {facets[lost[0]].tolist()} near {middle_of(mesh.points, facets[lost[0]])}; the group and the body "
-            "were meshed apart."
+            f"nodes {facets[lost[0]].tolist()} near {format_midpoint(mesh.points, facets[lost[0]])}; the group and the "
+            "body were meshed apart."
         )
 
 
@@ -221,7 +221,7 @@ def _without_orphans(mesh: MeshData) -> MeshData:
 
 
 def _turned(mesh: MeshData) -> MeshData:
-    cells, count = oriented(mesh.points, mesh.cells)
+    cells, count = orient_cells(mesh.points, mesh.cells)
     if count == 0:
         return mesh
     note = f"{count} of {len(cells)} cells were inverted and have been turned (two nodes swapped)."

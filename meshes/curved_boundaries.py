@@ -11,7 +11,7 @@ from .topology import edges_of
 
 
 @dataclass(frozen=True)
-class Round:
+class CurvedBoundary:
     """Facets on a circle around the origin or on a cylinder around an axis through it.
 
     Attributes:
@@ -23,7 +23,7 @@ class Round:
     along: int | None = None
 
 
-def middles_on(mesh: MeshData, rounds: tuple[Round, ...]) -> Points:
+def curved_midside_points(mesh: MeshData, rounds: tuple[CurvedBoundary, ...]) -> Points:
     """(k, d) middles of `edges_of` the cells, m: those of round facets moved out to their radius."""
     edges = edges_of(mesh.cells)
     middles = mesh.points[edges].mean(axis=1)

@@ -14,14 +14,14 @@ import numpy as np
 
 from .data import Indices, MeshError
 from .gmsh_session import session
-from .mesh_conversion import Block, Contents
+from .mesh_conversion import Block, MeshFileContents
 from .text_rows import EXPORT_AGAIN
 
 SHAPES = {"Point": "vertex", "Line": "line", "Triangle": "triangle", "Tetrahedron": "tetra"}
 SHAPES |= {"Quadrilateral": "quad", "Hexahedron": "hexahedron", "Prism": "wedge", "Pyramid": "pyramid"}
 
 
-def read_with_gmsh(path: Path) -> Contents:
+def read_with_gmsh(path: Path) -> MeshFileContents:
     """Everything in a file that begins as Gmsh's own format: anything else gmsh takes for a script, and runs.
 
     Raises:
@@ -45,7 +45,7 @@ def _refuse(path: Path, why: str) -> NoReturn:
     raise MeshError(f"Mesh file '{path}' could not be read: {why.rstrip('.')}. {EXPORT_AGAIN}")
 
 
-def _contents_of_model(gmsh: Any) -> Contents:
+def _contents_of_model(gmsh: Any) -> MeshFileContents:
     tags, coordinates, _ = gmsh.model.mesh.getNodes()
     place = np.full(int(tags.max(initial=0)) + 1, -1, np.int64)
     place[tags] = np.arange(len(tags))
@@ -57,7 +57,7 @@ def _contents_of_model(gmsh: Any) -> Contents:
             shape = SHAPES.get(name.split()[0], name)
             blocks.append(Block(shape if order == 1 else f"{shape}{count}", place[nodes].reshape(-1, count)))
             owners.append(entity)
-    return Contents(coordinates.reshape(-1, 3), blocks, _physical_groups(gmsh, blocks, owners))
+    return MeshFileContents(coordinates.reshape(-1, 3), blocks, _physical_groups(gmsh, blocks, owners))
 
 
 def _physical_groups(gmsh: Any, blocks: list[Block], owners: list[tuple[int, int]]) -> dict[str, list[Indices]]:

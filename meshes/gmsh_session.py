@@ -11,8 +11,8 @@ import numpy as np
 from .data import Indices, MeshError, Points
 from .quality import POOR, radius_ratios
 from .random_points.faces import scatter_faces, scatter_plane
-from .sizing import INNER, Sizing
-from .topology import oriented
+from .sizing import INNER_SIZE_FACTOR, SizeField
+from .topology import orient_cells
 
 TRIANGLE, TETRAHEDRON = 2, 4  # gmsh's numbers for cell types
 DELAUNAY, HXT = 1, 10  # and for algorithms
@@ -48,10 +48,10 @@ def _is_of_gmsh(error: Exception) -> bool:
     return type(error) is Exception
 
 
-def meshed(
+def mesh_with_gmsh(
     draw: Callable[[Any], None],
     dim: int,
-    sizing: Sizing,
+    sizing: SizeField,
     move: Callable[[Points], Points] | None = None,
     seed: int = 1,
 ) -> tuple[Points, Indices]:
@@ -84,13 +84,13 @@ def _move_nodes(gmsh: Any, move: Callable[[Points], Points]) -> None:
         gmsh.model.mesh.setNode(tag, point, [])
 
 
-def fill_volumes(gmsh: Any, sizing: Sizing) -> None:
+def fill_volumes(gmsh: Any, sizing: SizeField) -> None:
     """Tetrahedra in the volumes of a model whose surfaces are meshed.
 
     By HXT (several times as fast as gmsh's Delaunay), by Delaunay where that fails; then cells of a radius ratio
     below 0.3 are mended, of which HXT leaves a few.
     """
-    sizing.apply(gmsh, INNER)
+    sizing.apply(gmsh, INNER_SIZE_FACTOR)
     for algorithm in (HXT, DELAUNAY):
         gmsh.option.setNumber("Mesh.Algorithm3D", algorithm)
         try:
@@ -104,15 +104,15 @@ def fill_volumes(gmsh: Any, sizing: Sizing) -> None:
 
 def _mended(gmsh: Any) -> tuple[Points, Indices]:
     """Points and tetrahedra; inner nodes are moved first where cells are poor, as a few at random points are."""
-    points, cells = cells_in(gmsh, 3)
+    points, cells = cells_of_model(gmsh, 3)
     if radius_ratios(points, cells).min() >= POOR:
         return points, cells
     gmsh.model.mesh.optimize("Relocate3D", True, 2)
     gmsh.model.mesh.optimize("", True)
-    return cells_in(gmsh, 3)
+    return cells_of_model(gmsh, 3)
 
 
-def cells_in(gmsh: Any, dim: int) -> tuple[Points, Indices]:
+def cells_of_model(gmsh: Any, dim: int) -> tuple[Points, Indices]:
     """Points (n, d) and positive cells (m, d + 1) of the current gmsh model, only the nodes that cells use."""
     tags, coordinates, _ = gmsh.model.mesh.getNodes()
     _, connectivity = gmsh.model.mesh.getElementsByType(TETRAHEDRON if dim == 3 else TRIANGLE)
@@ -122,5 +122,5 @@ def cells_in(gmsh: Any, dim: int) -> tuple[Points, Indices]:
     place[tags] = np.arange(len(tags))
     used, cells = np.unique(place[connectivity], return_inverse=True)
     points = np.ascontiguousarray(coordinates.reshape(-1, 3)[used, :dim])
-    cells, _ = oriented(points, cells.reshape(-1, dim + 1).astype(np.int64))
+    cells, _ = orient_cells(points, cells.reshape(-1, dim + 1).astype(np.int64))
     return points, cells

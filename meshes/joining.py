@@ -14,7 +14,7 @@ from .topology import edges_of
 SAME_PLACE = 1e-6  # nodes nearer than this share of the mesh's size coincide
 
 
-def bodies_of(mesh: MeshData) -> tuple[int, Indices]:
+def label_bodies(mesh: MeshData) -> tuple[int, Indices]:
     """The number of bodies, which share no node, and the body of each node: (n,)."""
     return components(edges_of(mesh.cells), len(mesh.points))
 
@@ -28,7 +28,7 @@ def coincident_nodes(mesh: MeshData, body: Indices) -> Indices:
     return pairs[body[pairs[:, 0]] != body[pairs[:, 1]]]
 
 
-def joined_bodies(mesh: MeshData) -> MeshData:
+def join_bodies(mesh: MeshData) -> MeshData:
     """The mesh with one node in place of the coincident nodes of different bodies, and a note.
 
     Nodes of one body at the same place stay apart, as along a crack.
@@ -36,7 +36,7 @@ def joined_bodies(mesh: MeshData) -> MeshData:
     Raises:
         MeshError: several bodies without coincident nodes, or nodes that coincide with two nodes of one other body.
     """
-    count, body = bodies_of(mesh)
+    count, body = label_bodies(mesh)
     if count == 1:
         return replace(mesh, notes=(*mesh.notes, "[mesh] join = true: the mesh is one body already."))
     pairs = coincident_nodes(mesh, body)
@@ -50,7 +50,7 @@ def joined_bodies(mesh: MeshData) -> MeshData:
     kept = np.unique(cluster, return_index=True)[1]
     groups = {name: cluster[facets] for name, facets in mesh.facet_groups.items()}
     joined = replace(mesh, points=mesh.points[kept], cells=cluster[mesh.cells], facet_groups=groups)
-    left = bodies_of(joined)[0]
+    left = label_bodies(joined)[0]
     note = (
         f"{len(mesh.points) - clusters} nodes were joined with coincident nodes of another body: {count} bodies are "
         f"{left} now."

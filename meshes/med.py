@@ -17,10 +17,10 @@ import h5py
 import numpy as np
 
 from .data import Indices, MeshError, Points
-from .mesh_conversion import Block, Contents
-from .plain_files import HDF5_SIGNATURE, data_elsewhere
+from .mesh_conversion import Block, MeshFileContents
+from .plain_files import HDF5_SIGNATURE, find_external_data
 from .tags import members_by_tag
-from .text_rows import decoded, shown
+from .text_rows import decode_text, shown
 
 KINDS = {
     "PO1": ("vertex", 1), "SE2": ("line", 2), "SE3": ("line3", 3), "SE4": ("line4", 4), "TR3": ("triangle", 3),
@@ -37,7 +37,7 @@ SUPPORTED = (
 )
 
 
-def read_med(path: Path) -> Contents:
+def read_med(path: Path) -> MeshFileContents:
     """Nodes, cells and groups of the one mesh of a MED file.
 
     Raises:
@@ -50,7 +50,7 @@ def read_med(path: Path) -> Contents:
     where = ["its HDF5"]
     try:
         with h5py.File(path) as file:
-            if name := data_elsewhere(file):
+            if name := find_external_data(file):
                 _refuse(path, f"the data of '{name}' lie in another file; save all in one")
             return _contents(path, file, where)
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError, IndexError, OverflowError) as error:
@@ -63,7 +63,7 @@ def _refuse(path: Path, why: str) -> NoReturn:
     raise MeshError(f"Mesh file '{path}' could not be read: {why}. Supported: {SUPPORTED}.")
 
 
-def _contents(path: Path, file: Any, where: list[str]) -> Contents:
+def _contents(path: Path, file: Any, where: list[str]) -> MeshFileContents:
     meshes = list(file["ENS_MAA"]) if "ENS_MAA" in file else []
     if len(meshes) != 1:
         many = f"{len(meshes)} meshes ({', '.join(meshes[:5])}); export one of them alone"
@@ -96,7 +96,7 @@ def _contents(path: Path, file: Any, where: list[str]) -> Contents:
     point_sets = dict(_groups(family, node_groups, "nodes"))
     if fields := list(file["CHA"]) if "CHA" in file else []:
         notes.append(f"Not used: results ({', '.join(fields)}).")
-    return Contents(points, blocks, sets, point_sets, notes=tuple(notes))
+    return MeshFileContents(points, blocks, sets, point_sets, notes=tuple(notes))
 
 
 def _points(path: Path, nodes: Any, dim: int) -> Points:
@@ -170,4 +170,4 @@ def _groups_of_families(file: Any, mesh: str) -> tuple[dict[int, list[str]], dic
 def _name(row: Any) -> str:
     """The name of a group: 80 bytes, or signed numbers of one byte."""
     data = bytes(row) if isinstance(row, bytes) else np.asarray(row).astype(np.int8).tobytes()
-    return decoded(data.split(b"\0")[0]).strip()
+    return decode_text(data.split(b"\0")[0]).strip()

@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 
 from .data import Indices, MeshError, Points
-from .mesh_conversion import Block, Contents
+from .mesh_conversion import Block, MeshFileContents
 from .tags import sets_by_tag
-from .text_rows import EXPORT_AGAIN, SourceText, not_whole, shown
+from .text_rows import EXPORT_AGAIN, SourceText, is_not_integer, shown
 
 KINDS = {
     "Edges": ("line", 2), "Triangles": ("triangle", 3), "Quadrilaterals": ("quad", 4), "Tetrahedra": ("tetra", 4),
@@ -31,7 +31,7 @@ _COMMENT = re.compile(rb"#[^\n]*")
 EXPORT = 'Supported is the text of Medit with Vertices; in FreeFem savemesh(Th, "part.mesh") writes it.'
 
 
-def read_medit(path: Path) -> Contents:
+def read_medit(path: Path) -> MeshFileContents:
     """Vertices, and cells with their labels as sets "tag-3"; the label 0 is none.
 
     Raises:
@@ -73,7 +73,7 @@ class _Medit:
             if name in SECOND_ORDER and self._holds(begin, end, KINDS[SECOND_ORDER[name]][1] + 1):
                 kind, size = KINDS[SECOND_ORDER[name]]
             rows = self._entries(name, at, begin, end, size + 1, NUMBERS)
-            if (wrong := not_whole(rows).any(axis=1)).any():
+            if (wrong := is_not_integer(rows).any(axis=1)).any():
                 self.source.damaged(at, f"entry {wrong.argmax() + 1} of {name} has a number that is not whole.")
             self.cells.setdefault(kind, []).append(rows.astype(np.int64))
         elif name == "End":
@@ -88,7 +88,7 @@ class _Medit:
         """(count, width) the numbers of a section; where one line lacks or has numbers the message has that line."""
         lines = self.source.rows(begin, end, needed)
         values = lines.values
-        count = int(values[0]) if len(values) and not not_whole(values[:1])[0] and values[0] >= 0 else -1
+        count = int(values[0]) if len(values) and not is_not_integer(values[:1])[0] and values[0] >= 0 else -1
         if len(values) != 1 + count * width:
             odd = np.flatnonzero(lines.counts[1:] != width)
             at = int(lines.offsets[1 + odd[0]]) if len(odd) else at
@@ -98,7 +98,7 @@ class _Medit:
             )
         return values[1:].reshape(count, width)
 
-    def contents(self) -> Contents:
+    def contents(self) -> MeshFileContents:
         if self.points is None:
             raise MeshError(f"Mesh file '{self.source.path}' could not be read: it has no section Vertices. {EXPORT}")
         blocks: list[Block] = []
@@ -115,4 +115,4 @@ class _Medit:
             labels_of.append(rows[:, -1])
         sets, notes = sets_by_tag(labels_of, lambda *_: "", "labels")
         note = () if self.ended else ("The file lacks the keyword End: if it was cut off, cells are missing.",)
-        return Contents(self.points, blocks, sets, notes=notes + note)
+        return MeshFileContents(self.points, blocks, sets, notes=notes + note)

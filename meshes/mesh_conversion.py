@@ -6,9 +6,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from .cell_cutting import FACES, PLURALS, oriented_parts, tetrahedra_of, triangles_of
+from .cell_cutting import FACES, PLURALS, orient_simplices, split_into_tetrahedra, split_quads
 from .data import Indices, MeshData, MeshError, Points
-from .topology import Mask, boundary_facets, distinct_rows, facets_where
+from .topology import Mask, boundary_facets, distinct_rows, facets_on_nodes
 
 CORNERS = {"vertex": 1, "line": 2, "triangle": 3, "quad": 4, "tetra": 4, "pyramid": 5, "wedge": 6, "hexahedron": 8}
 LAGRANGE = {
@@ -67,14 +67,14 @@ class Block:
         """
         if self.shape not in PLURALS or len(self.nodes) == 0:
             return self, None
-        parts, owner = triangles_of(self.corners) if self.dim == 2 else tetrahedra_of(self.shape, self.corners)
+        parts, owner = split_quads(self.corners) if self.dim == 2 else split_into_tetrahedra(self.shape, self.corners)
         if points is not None:
-            parts = oriented_parts(self.shape, self.corners, parts, owner, points, source)
+            parts = orient_simplices(self.shape, self.corners, parts, owner, points, source)
         return Block("triangle" if self.dim == 2 else "tetra", parts), owner
 
 
 @dataclass(frozen=True)
-class Contents:
+class MeshFileContents:
     """The arrays of a mesh file.
 
     Attributes:
@@ -163,7 +163,7 @@ class Contents:
             named[numbers[(numbers >= 0) & (numbers < len(named))]] = True
         return named
 
-    def _cut(self, points: Points, dim: int, source: str) -> tuple[Contents, tuple[str, ...]]:
+    def _cut(self, points: Points, dim: int, source: str) -> tuple[MeshFileContents, tuple[str, ...]]:
         """The same with simplices in place of all other cells, the sets following them, and notes."""
         if not any(block.shape in PLURALS for block in self.blocks):
             return self, ()
@@ -283,7 +283,7 @@ class Contents:
         for name, nodes in self.point_sets.items():
             marked = np.zeros(count, bool)
             marked[nodes] = True
-            facets = facets_where(boundary, marked)
+            facets = facets_on_nodes(boundary, marked)
             if len(facets):
                 groups[name] = facets
         return groups

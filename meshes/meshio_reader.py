@@ -20,10 +20,10 @@ import numpy as np
 import numpy.typing as npt
 
 from .data import Indices, MeshError
-from .mesh_conversion import Block, Contents
-from .plain_files import data_elsewhere, is_hdf5, wrong_beside
+from .mesh_conversion import Block, MeshFileContents
+from .plain_files import find_external_data, is_hdf5, unreadable_reason_beside
 from .tags import tag_sets
-from .text_rows import SourceText, decoded, shown
+from .text_rows import SourceText, decode_text, shown
 
 # Endings: the format, meshio's name of it where meshio reads it line by line, and whether it is text.
 FORMATS: dict[str, tuple[str, str, bool]] = {
@@ -62,10 +62,10 @@ MAX_GAPS, MAX_GAP_SHARE = 3, 0.01  # element numbers left out that are told of, 
 MAX_PLY_HEAD = 65536  # bytes
 MAX_PLY_FILLING = 8  # bytes behind the last face, too few for a face
 MAX_LINE_SEARCH = 1 << 26  # bytes of a file in which the line of a fault is looked for
-MOST_BEYOND = 1000  # times that a file is read beyond its end: no reader that comes to an end does so often
+MAX_READS_BEYOND_END = 1000  # times that a file is read beyond its end: no reader that comes to an end does so often
 
 
-def read_with_meshio(path: Path) -> Contents:
+def read_with_meshio(path: Path) -> MeshFileContents:
     """Everything in a file, for a process of its own: damaged files make some readers of meshio wait or ask for memory.
 
     Raises:
@@ -142,7 +142,7 @@ def _mesh(path: Path, position: list[int]) -> Any:
 # --- contents of meshio's mesh --------------------------------------------------------------------------------------
 
 
-def _contents(path: Path, mesh: Any) -> Contents:
+def _contents(path: Path, mesh: Any) -> MeshFileContents:
     points = np.asarray(mesh.points)
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise MeshError(f"Mesh file '{path}' holds points of shape {points.shape}; (n, 2) or (n, 3) is needed.")
@@ -153,7 +153,7 @@ def _contents(path: Path, mesh: Any) -> Contents:
     unused = [key for key in [*mesh.cell_data, *mesh.point_data] if key not in used and ":" not in key]
     if unused:
         notes += (f"Not used: the arrays {', '.join(unused)}.",)
-    return Contents(points.astype(np.float64), blocks, sets | named, nodes, notes=notes)
+    return MeshFileContents(points.astype(np.float64), blocks, sets | named, nodes, notes=notes)
 
 
 def _block(block: Any) -> Block:
@@ -262,7 +262,7 @@ def _ply_elements(head: bytes) -> list[_PlyElement]:
     """The elements that the head of a PLY file declares."""
     elements: list[_PlyElement] = []
     for line in head.splitlines():
-        words = decoded(line).split()
+        words = decode_text(line).split()
         if words[:1] == ["element"] and len(words) == 3 and words[2].isdigit():
             elements.append(_PlyElement(words[1], int(words[2]), []))
         elif words[:1] == ["property"] and len(words) > 2 and elements:
@@ -297,7 +297,7 @@ def _check_su2(path: Path) -> None:
     for head, after in zip(heads, [*heads[1:], None], strict=True):
         if head[1] not in (b"NPOIN", b"NELEM", b"MARKER_ELEMS") or not head[2]:
             continue
-        word = decoded(head[1])
+        word = decode_text(head[1])
         end = after.start() if after else len(source.text)
         rows = source.rows(head.end(), end, "the numbers of a point or an element")
         if word != "NPOIN" and len(rows):
@@ -371,7 +371,7 @@ def _with_known_head(data: bytes) -> bytes:
 
 
 def _check(path: Path, name: str) -> None:
-    if wrong := wrong_beside(path, name):
+    if wrong := unreadable_reason_beside(path, name):
         raise MeshError(f"Mesh file '{path}' could not be read: it names the file '{name}', which {wrong}.")
 
 
@@ -379,7 +379,7 @@ def _check_hdf5(path: Path, h5: Path) -> None:
     import h5py
 
     with h5py.File(h5) as file:
-        if name := data_elsewhere(file):
+        if name := find_external_data(file):
             raise MeshError(
                 f"Mesh file '{path}' could not be read: the data of '{name}' in {h5.name} lie in another file; save "
                 "all in one."
@@ -417,7 +417,7 @@ class _Ending(io.BufferedReader):
 
     def _checked(self, data: bytes) -> bytes:
         self._beyond = 0 if data else self._beyond + 1
-        if self._beyond > MOST_BEYOND:
+        if self._beyond > MAX_READS_BEYOND_END:
             raise EOFError("it ends in the middle of a section")
         return data
 

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from .data import Indices, MeshError, Points
-from .mesh_conversion import Block, Contents
+from .mesh_conversion import Block, MeshFileContents
 from .tags import sets_by_tag
-from .text_rows import EXPORT_AGAIN, SourceText, decoded, not_whole, numbered, shown
+from .text_rows import EXPORT_AGAIN, SourceText, decode_text, is_not_integer, numbered, shown
 
 SAVE = "Save it as MSH 4.1 or 2.2, for example by `gmsh -3 part.geo -o part.msh`"
 # Numbers of element types in MSH files: kind and number of nodes, corners first.
@@ -40,7 +40,7 @@ SILENT = {"MeshFormat", "Comments", "PhysicalNames", "Nodes", "ParametricNodes",
 _Group = tuple[Indices, Indices, Indices]  # element numbers, physical groups, (m, k) node numbers
 
 
-def read_msh2(path: Path) -> Contents:
+def read_msh2(path: Path) -> MeshFileContents:
     """Nodes, elements and physical groups.
 
     Raises:
@@ -115,7 +115,7 @@ class _Msh2:
 
     def _physical_names(self, begin: int, end: int) -> None:
         for entry in re.finditer(rb'^\s*(\d+)\s+(-?\d+)\s+"(.*)"\s*$', self.source.text[begin:end], re.MULTILINE):
-            self.names[int(entry[1]), abs(int(entry[2]))] = decoded(entry[3]).strip()
+            self.names[int(entry[1]), abs(int(entry[2]))] = decode_text(entry[3]).strip()
 
     def _count(self, begin: int, what: str) -> tuple[int, int]:
         """The number on the first line of a section, and where the next one begins."""
@@ -165,7 +165,7 @@ class _Msh2:
         return np.frombuffer(self.source.text, kind, count, begin)
 
     def _whole(self, values: Any, offsets: Indices, needed: str) -> Indices:
-        wrong = not_whole(values)
+        wrong = is_not_integer(values)
         if wrong.any():
             place = int(wrong.argmax())
             self.source.damaged(int(offsets[place]), f"{values[place]:g} is no whole number; {needed}.")
@@ -218,7 +218,7 @@ class _Msh2:
             yield type_, (values[:, 0], self._physical(values, 3, tag_count), values[:, 3 + tag_count :])
 
     def _whole_rows(self, values: Any, offsets: Indices) -> Indices:
-        if (wrong := not_whole(values).any(axis=1)).any():
+        if (wrong := is_not_integer(values).any(axis=1)).any():
             self.source.damaged(int(offsets[wrong.argmax()]), f"a number of this element is not whole; {ELEMENT}.")
         whole: Indices = values.astype(np.int64)
         return whole
@@ -245,7 +245,7 @@ class _Msh2:
 
     # --- result ---
 
-    def contents(self) -> Contents:
+    def contents(self) -> MeshFileContents:
         blocks: list[Block] = []
         parts: list[Indices] = []
         for type_, groups in self.groups.items():
@@ -263,4 +263,4 @@ class _Msh2:
         sets, notes = sets_by_tag(parts, lambda tag, i: self.names.get((blocks[i].dim, tag), ""), "physical groups")
         if self.unused:
             notes += (f"Not used: {', '.join(self.unused)}.",)
-        return Contents(self.points, blocks, sets, copies=True, notes=notes)
+        return MeshFileContents(self.points, blocks, sets, copies=True, notes=notes)

@@ -18,9 +18,9 @@ from typing import NoReturn
 import numpy as np
 
 from .data import Indices, MeshError
-from .mesh_conversion import Block, Contents
+from .mesh_conversion import Block, MeshFileContents
 from .tags import sets_by_tag
-from .text_rows import EXPORT_AGAIN, SourceText, decoded, numbered, shown
+from .text_rows import EXPORT_AGAIN, SourceText, decode_text, numbered, shown
 
 # Kinds of cells, by the number of nodes.
 SHAPES: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -48,7 +48,7 @@ _EXPONENT = re.compile(r"(?<=[0-9.])([-+]\d+)$")
 _NAME = re.compile(r"[A-Z][A-Z0-9]*\*?$")
 
 
-def read_nastran(path: Path) -> Contents:
+def read_nastran(path: Path) -> MeshFileContents:
     """Nodes, and elements with their properties as sets: named as pre-processors name them in comments, or "tag-7".
 
     Raises:
@@ -91,7 +91,7 @@ class _Bulk:
 
     def _bulk_lines(self) -> Iterator[tuple[int, str]]:
         """Numbers and text of the lines of bulk data, from BEGIN BULK to ENDDATA where they are there."""
-        lines = decoded(self.source.text).split("\n")
+        lines = decode_text(self.source.text).split("\n")
         first = next((i for i, line in enumerate(lines) if line[:12].upper().split()[:2] == ["BEGIN", "BULK"]), -1)
         self.begun = first >= 0
         for line in lines[: first + 1]:
@@ -210,7 +210,7 @@ class _Bulk:
 
     # --- result ---
 
-    def contents(self) -> Contents:
+    def contents(self) -> MeshFileContents:
         ids = np.array(list(self.grids), np.int64)
         points = np.array(list(self.grids.values()), np.float64)
         blocks: list[Block] = []
@@ -232,7 +232,7 @@ class _Bulk:
             owners.append(np.zeros(len(blocks[-1].nodes), np.int64))
         names = {number: name for number, (_, name) in self.names.items()}
         sets, notes = sets_by_tag(owners, lambda tag, _: names.get(tag, ""), "properties")
-        return Contents(points, blocks, sets, notes=(*notes, *self._notes()))
+        return MeshFileContents(points, blocks, sets, notes=(*notes, *self._notes()))
 
     def _notes(self) -> Iterator[str]:
         if self.left_out:

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from .data import Indices, MeshError
-from .mesh_conversion import Block, Contents
-from .text_rows import EXPORT_AGAIN, SourceText, not_whole, shown
+from .mesh_conversion import Block, MeshFileContents
+from .text_rows import EXPORT_AGAIN, SourceText, is_not_integer, shown
 
 KINDS = {3: "triangle", 4: "quad"}
 
 
-def read_obj(path: Path) -> Contents:
+def read_obj(path: Path) -> MeshFileContents:
     """Points (n, 3) and faces; sets of faces by the lines `g`, or where there are none by the lines `o`.
 
     An index k > 0 is the k-th point of the file, k < 0 the k-th from the last one before its line. What stands behind
@@ -55,7 +55,7 @@ def read_obj(path: Path) -> Contents:
         last, number = farthest
         raise MeshError(f"Mesh file '{path}', line {number}: there is no point {last + 1}, but {len(points)} in all.")
     found = [Block(KINDS.get(corners, "polygon"), np.array(faces, np.int64)) for corners, faces in blocks]
-    return Contents(np.array(points, np.float64).reshape(-1, 3), found, _sets(named["g"] or named["o"], found))
+    return MeshFileContents(np.array(points, np.float64).reshape(-1, 3), found, _sets(named["g"] or named["o"], found))
 
 
 def _sets(named: list[tuple[str, int, int]], blocks: list[Block]) -> dict[str, list[Indices]]:
@@ -99,7 +99,7 @@ _COMMENT = re.compile(rb"#[^\n]*")
 FACE = "a face is `number-of-corners corners...`, numbers from 0"
 
 
-def read_off(path: Path) -> Contents:
+def read_off(path: Path) -> MeshFileContents:
     """Points (n, 3) and faces of an OFF file in text; colours and normals are left out.
 
     Raises:
@@ -111,7 +111,7 @@ def read_off(path: Path) -> Contents:
         source.refuse(0, f"`{shown(source.text[:80])}` is not OFF, with which such a file begins. {EXPORT_AGAIN}")
     lines = source.rows(word.end(), len(source.text), "counts, coordinates, or corners of a face")
     counts = lines.columns([0], 2)[0] if len(lines) and lines.counts[0] in (2, 3) else np.array([-1.0])
-    if not_whole(counts).any() or counts.min() < 0:
+    if is_not_integer(counts).any() or counts.min() < 0:
         source.damaged(word.start(1), "no numbers of points and faces stand behind OFF: `8 6 0`.")
     points, faces = map(int, counts)
     if len(lines) != 1 + points + faces:
@@ -121,15 +121,15 @@ def read_off(path: Path) -> Contents:
         source.damaged(int(lines.offsets[1 + short.argmax()]), "a point has three coordinates: `0 0.5 1`.")
     rows = np.arange(1 + points, len(lines))
     corners = lines.columns(rows, 1)[:, 0]
-    if (wrong := (corners < 3) | not_whole(corners) | (corners >= lines.counts[rows])).any():
+    if (wrong := (corners < 3) | is_not_integer(corners) | (corners >= lines.counts[rows])).any():
         source.damaged(int(lines.offsets[rows[wrong.argmax()]]), f"the corners are too few or too many; {FACE}.")
     blocks = []
     for size in map(int, np.unique(corners)):
         same = rows[corners == size]
         nodes = lines.columns(same, 1 + size)[:, 1:]
-        if (wrong := ((nodes < 0) | (nodes >= points) | not_whole(nodes)).any(axis=1)).any():
+        if (wrong := ((nodes < 0) | (nodes >= points) | is_not_integer(nodes)).any(axis=1)).any():
             source.damaged(
                 int(lines.offsets[same[wrong.argmax()]]), f"a corner is none of the {points} points; {FACE}."
             )
         blocks.append(Block(KINDS.get(size, "polygon"), nodes.astype(np.int64)))
-    return Contents(lines.columns(np.arange(1, 1 + points), 3), blocks, {})
+    return MeshFileContents(lines.columns(np.arange(1, 1 + points), 3), blocks, {})

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from .data import MeshData, MeshError
 
 # A tetrahedral mesh of this size needs some 50 GB before anything is solved: surely a slip of units.
-MOST_CELLS = 200_000_000
+MAX_CELLS = 200_000_000
 SHORTEST, LONGEST = 1e-30, 1e30  # m
 
 
@@ -41,20 +41,20 @@ class Builder(Protocol):
 def positive(builder: str, **values: float) -> None:
     """Raise MeshError unless every value is a positive finite number."""
     for name, value in values.items():
-        if not (is_number(value) and value > 0):
+        if not (is_length(value) and value > 0):
             raise MeshError(f"{builder}: {name} = {value!r} must be a positive number (metres), at most {LONGEST:g}.")
         if value < SHORTEST:
             raise MeshError(f"{builder}: {name} = {value!r} m is out of reach; take {SHORTEST:g} m or more.")
 
 
-def not_negative(builder: str, **values: float) -> None:
+def require_not_negative(builder: str, **values: float) -> None:
     """Raise MeshError unless every value is a finite number of zero or more."""
     for name, value in values.items():
-        if not (is_number(value) and value >= 0):
+        if not (is_length(value) and value >= 0):
             raise MeshError(f"{builder}: {name} = {value!r} must be zero or a positive number (metres).")
 
 
-def one_of(builder: str, name: str, value: str, allowed: tuple[str, ...]) -> None:
+def require_one_of(builder: str, name: str, value: str, allowed: tuple[str, ...]) -> None:
     """Raise MeshError unless the value is one of the allowed words."""
     if value not in allowed:
         raise MeshError(f"{builder}: {name} = {value!r} is not one of {', '.join(allowed)}.")
@@ -66,11 +66,11 @@ def require(condition: bool, message: str) -> None:
         raise MeshError(message)
 
 
-def affordable(builder: str, h: float, cells: float, hint: str = "Lengths are in metres.") -> None:
+def require_affordable(builder: str, h: float, cells: float, hint: str = "Lengths are in metres.") -> None:
     """Raise MeshError where the mesh would be too large to hold; `hint` ends the message."""
-    if cells > MOST_CELLS:
+    if cells > MAX_CELLS:
         raise MeshError(
-            f"{builder}: h = {h!r} m would make about {cells:.1e} cells, more than {MOST_CELLS:.0e}; take a larger h. "
+            f"{builder}: h = {h!r} m would make about {cells:.1e} cells, more than {MAX_CELLS:.0e}; take a larger h. "
             f"{hint}"
         )
 
@@ -87,6 +87,6 @@ def check_extent(points: npt.NDArray[np.float64], what: str) -> None:
         raise MeshError(f"{what} is {size:g} m large, and {SHORTEST:g} m or more is needed; mend its scale.")
 
 
-def is_number(value: object) -> bool:
+def is_length(value: object) -> bool:
     """Whether it is one that lengths may have: finite, and far from where squares and cubes overflow."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LONGEST

@@ -29,7 +29,7 @@ NEW = ".new"  # ends the name of a file that is not whole yet
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
-def wrong_with(path: str | PathLike[str]) -> str:
+def unreadable_reason(path: str | PathLike[str]) -> str:
     """Why a file cannot be read, without opening it: "is a named pipe, not a file"; "" of a plain file."""
     try:
         mode = os.stat(path).st_mode
@@ -42,33 +42,33 @@ def wrong_with(path: str | PathLike[str]) -> str:
     return f"is {next((kind for is_kind, kind in _KINDS if is_kind(mode)), 'something else')}, not a file"
 
 
-class NotAFile(OSError):
+class NotAPlainFileError(OSError):
     """What has the name of a file is something else."""
 
     def __init__(self, path: Path, wrong: str) -> None:
-        """`wrong`: as of `wrong_with`."""
+        """`wrong`: as of `unreadable_reason`."""
         super().__init__(errno.EPERM, wrong, str(path))
 
     def __str__(self) -> str:
         return f"{self.filename} {self.strerror}"
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return NotAFile, (Path(self.filename), self.strerror)
+        return NotAPlainFileError, (Path(self.filename), self.strerror)
 
 
 def check_readable(path: Path) -> None:
-    """NotAFile where a folder, a pipe or a device has the name of a file to be read; nothing where there is none."""
-    if (wrong := wrong_with(path)) not in ("", MISSING):
-        raise NotAFile(path, wrong)
+    """Raise NotAPlainFileError where a folder, a pipe or a device has the name of a file to be read."""
+    if (wrong := unreadable_reason(path)) not in ("", MISSING):
+        raise NotAPlainFileError(path, wrong)
 
 
-def wrong_beside(path: Path, name: str) -> str:
-    """Why a file that the file `path` names cannot be read: it lies in another folder, or as of `wrong_with`."""
+def unreadable_reason_beside(path: Path, name: str) -> str:
+    """Why a file that the file `path` names cannot be read: it lies in another folder, or as of `unreadable_reason`."""
     folder = os.path.abspath(path.parent)
     inside = os.path.normpath(os.path.join(folder, name))
     if os.path.commonpath([folder, inside]) != folder:
         return f"lies outside the folder {folder}; put it beside {path.name}"
-    return wrong_with(inside)
+    return unreadable_reason(inside)
 
 
 def is_hdf5(path: Path) -> bool:
@@ -77,7 +77,7 @@ def is_hdf5(path: Path) -> bool:
         return file.read(len(HDF5_SIGNATURE)) == HDF5_SIGNATURE
 
 
-def data_elsewhere(file: Any) -> str:
+def find_external_data(file: Any) -> str:
     """The first name in an open h5py.File whose data lie in another file; "" where there is none.
 
     External links, data sets in external files, and virtual data sets. No other file is opened.
@@ -107,7 +107,7 @@ def data_elsewhere(file: Any) -> str:
 
 
 def check_replaceable(path: Path) -> None:
-    """NotAFile where a folder, a pipe or a device has the name of a file to be written."""
+    """Raise NotAPlainFileError where a folder, a pipe or a device has the name of a file to be written."""
     if not path.is_symlink():
         check_readable(path)
 
@@ -115,13 +115,13 @@ def check_replaceable(path: Path) -> None:
 def create(path: Path) -> BinaryIO:
     """A new file, to be written, in place of the file, link or pipe that has its name. Raises OSError."""
     if path.is_dir() and not path.is_symlink():
-        raise NotAFile(path, "is a folder, not a file")
+        raise NotAPlainFileError(path, "is a folder, not a file")
     path.unlink(missing_ok=True)
     return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666), "wb")
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def atomic_replacement(path: Path) -> Iterator[Path]:
     """A new file beside `path` that takes its place once it is whole; where that fails the old file stays. For one
     process at a time. Raises OSError."""
     check_replaceable(path)
@@ -137,7 +137,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def replacing_all(path: Path) -> Iterator[Path]:
+def atomic_replacement_of_all(path: Path) -> Iterator[Path]:
     """The same name in a new folder beside `path`: all files that are made there come to lie beside `path`, once they
     are whole. For programs that go by the ending of a name, or make several files of it. Raises OSError."""
     check_replaceable(path)

@@ -9,19 +9,19 @@ from pathlib import Path
 from .abaqus import read_abaqus
 from .data import MeshData, MeshError
 from .medit import read_medit
-from .mesh_conversion import Contents
+from .mesh_conversion import MeshFileContents
 from .meshio_reader import FORMATS, read_with_meshio
 from .msh2 import SAVE, read_msh2
 from .nastran import read_nastran
 from .obj import read_obj, read_off
-from .plain_files import wrong_with
+from .plain_files import unreadable_reason
 from .stl import read_stl
-from .time_limit import read_within
+from .time_limit import read_with_time_limit
 from .unv import read_unv
 from .vtk_readers import ENDINGS as VTK_ENDINGS
 from .vtk_readers import read_with_vtk
 
-OWN_READERS: dict[str, Callable[[Path], Contents]] = {
+OWN_READERS: dict[str, Callable[[Path], MeshFileContents]] = {
     ".inp": read_abaqus, ".mesh": read_medit, ".obj": read_obj, ".off": read_off, ".stl": read_stl, ".unv": read_unv,
     **dict.fromkeys((".bdf", ".nas", ".fem"), read_nastran), **dict.fromkeys(VTK_ENDINGS, read_with_vtk),
 }  # fmt: skip
@@ -43,13 +43,13 @@ def read_mesh(path: str | Path) -> MeshData:
     return read_contents(path).simplices(f"Mesh file '{path}'")
 
 
-def read_contents(path: Path) -> Contents:
+def read_contents(path: Path) -> MeshFileContents:
     """Everything in a mesh file.
 
     Raises:
         MeshError: the file is missing, of unknown kind or damaged.
     """
-    if wrong := wrong_with(path):
+    if wrong := unreadable_reason(path):
         raise MeshError(f"Mesh file '{path}' {wrong}.")
     if path.stat().st_size == 0:
         raise MeshError(f"Mesh file '{path}' is empty.")
@@ -78,8 +78,8 @@ def read_contents(path: Path) -> Contents:
     return _by_another_process(path, read_with_meshio, "meshio")
 
 
-def _by_another_process(path: Path, reader: Callable[[Path], Contents], program: str) -> Contents:
-    return read_within(path, reader, program, SECONDS + path.stat().st_size / SLOW)
+def _by_another_process(path: Path, reader: Callable[[Path], MeshFileContents], program: str) -> MeshFileContents:
+    return read_with_time_limit(path, reader, program, SECONDS + path.stat().st_size / SLOW)
 
 
 def _gmsh_version(path: Path) -> int:

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from .data import Indices, MeshData, MeshError, Points, Shell
-from .text import middle_of
+from .text import format_midpoint
 from .topology import Floats, boundary_facets, signed_measures
 
 LONGEST = 2.0  # times the thickness that a normal at a fold may be long
 
 
-def thickened(
+def extrude_shell(
     points: Points, triangles: Indices, thickness: float, source: str = "shell", notes: tuple[str, ...] = ()
 ) -> MeshData:
     """The shell of triangles (m, 3), turned alike, between points (n, 3), m. Groups: inner, outer, and rim where it is
@@ -41,7 +41,7 @@ def thickened(
     cells = cells.reshape(-1, 4)
     inside_out = np.flatnonzero(signed_measures(both, cells) <= 0)
     if len(inside_out):
-        where = middle_of(both, cells[inside_out[0]])
+        where = format_midpoint(both, cells[inside_out[0]])
         raise MeshError(f"{source}: {thickness:g} m is too thick for its folds near {where}: take a smaller thickness.")
     facets = boundary_facets(cells)
     above = (facets >= len(points)).sum(axis=1)
@@ -79,4 +79,4 @@ def read_shell(path: str | Path, thickness: float, scale: float = 1.0) -> MeshDa
     path = Path(path)
     source = f"Shell file '{path}'"
     points, triangles, notes = read_triangles(path, scale, source)
-    return thickened(points, triangles, thickness, source, notes)
+    return extrude_shell(points, triangles, thickness, source, notes)

@@ -16,11 +16,11 @@ SHARE = {2: 0.404, 3: 0.092}
 
 # Asked for h, gmsh makes surface edges of length h but inner edges of 1.3 h (its criterion is on the circumsphere).
 # Asked for this share of h inside, the median edge is h within 2 % (the same boxes, algorithm HXT).
-INNER = 0.7
+INNER_SIZE_FACTOR = 0.7
 
 
 @dataclass(frozen=True)
-class Sizing:
+class SizeField:
     """Cell size: `h`, or finer near a fine place, an axis-parallel rectangle (a line or a point where it is thin).
 
     size(x) = min(h, fine + growth * distance(x, place)); the distance is taken in the x-y plane of gmsh's model.
@@ -66,7 +66,9 @@ class Sizing:
         return f"{self.fine!r}+{self.growth!r}*sqrt({squares})"
 
 
-def cells_for(sizing: Sizing, low: tuple[float, ...], high: tuple[float, ...], filled: float = 1.0) -> int:
+def estimate_cells_in_box(
+    sizing: SizeField, low: tuple[float, ...], high: tuple[float, ...], filled: float = 1.0
+) -> int:
     """About how many cells gmsh makes of these sizes in a box of which the given share is filled.
 
     The integral of dx / (share * size^d), by the midpoint rule; `low` and `high` in metres.
@@ -79,7 +81,7 @@ def cells_for(sizing: Sizing, low: tuple[float, ...], high: tuple[float, ...], f
     return max(1, round(filled * float(np.prod(sides)) * density / SHARE[dim]))
 
 
-def cells_for_body(volume: float, wall: float, h: float) -> int:
+def estimate_cells_in_body(volume: float, wall: float, h: float) -> int:
     """About how many cells gmsh makes of size h in a body of this volume [m^3], solid (wall 0) or a shell.
 
     A wall no thicker than h has cells from one side to the other: three tetrahedra to a prism over a triangle of

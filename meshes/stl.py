@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from .data import MeshError
-from .mesh_conversion import Block, Contents
-from .text_rows import numbers_in
+from .mesh_conversion import Block, MeshFileContents
+from .text_rows import parse_numbers
 
 HEAD = 84  # bytes of a binary file before its triangles: 80 of text, 4 of their number
 TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -34,7 +34,7 @@ _END_SOLID = re.compile(rb"\s*end[ \t]*solid\b[^\n]*\s*", re.IGNORECASE)
 PART = 1 << 22  # bytes of a text that are read at a time
 
 
-def read_stl(path: Path) -> Contents:
+def read_stl(path: Path) -> MeshFileContents:
     """The triangles, each with three points of its own: STL repeats them.
 
     Raises:
@@ -66,7 +66,7 @@ def read_stl(path: Path) -> Contents:
             "damaged or no STL file; export it again."
         )
     triangles = np.arange(3 * len(corners)).reshape(-1, 3)
-    return Contents(corners.reshape(-1, 3), [Block("triangle", triangles)], {})
+    return MeshFileContents(corners.reshape(-1, 3), [Block("triangle", triangles)], {})
 
 
 def _of_plain_text(data: bytes) -> npt.NDArray[np.float64] | None:
@@ -80,7 +80,7 @@ def _of_plain_text(data: bytes) -> npt.NDArray[np.float64] | None:
         last = _END_FACET.search(data, begin + PART)
         facets = _FACET.findall(data, begin, last.end() if last else len(data))
         begin += sum(len(facet[0]) for facet in facets)
-        values = numbers_in(b"".join(vertex for facet in facets for vertex in facet[1:]))
+        values = parse_numbers(b"".join(vertex for facet in facets for vertex in facet[1:]))
         if not facets or (last and begin != last.end()) or values is None or len(values) != 9 * len(facets):
             return None
         corners.append(values.reshape(-1, 3, 3))

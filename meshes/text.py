@@ -14,6 +14,6 @@ def format_point(point: Iterable[float]) -> str:
     return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"
 
 
-def middle_of(points: Points, nodes: Indices) -> str:
+def format_midpoint(points: Points, nodes: Indices) -> str:
     """The middle of some of the points: "(0, 0.5, 1) m"."""
     return format_point(points[nodes].mean(axis=0)) + " m"

@@ -43,7 +43,7 @@ class SourceText:
         `needed`: what a line holds, for the message: "a node is `number x y z`".
         """
         text = self.text[begin:end]
-        values = numbers_in(text)
+        values = parse_numbers(text)
         starts = _token_starts(text)
         if values is None or len(values) != len(starts):
             self._refuse_row(begin, end, needed)
@@ -60,7 +60,7 @@ class SourceText:
             stop = self.text.find(b"\n", begin, end)
             stop = end if stop < 0 else stop
             line = self.text[begin:stop]
-            values = numbers_in(line)
+            values = parse_numbers(line)
             if values is None or len(values) != len(_token_starts(line)):
                 self.damaged(begin, f"`{shown(line)}` is not what stands here: {needed}.")
             begin = stop + 1
@@ -96,7 +96,7 @@ class Rows:
         return self.values[self.begins[rows][:, None] + np.arange(count)]
 
 
-def numbers_in(text: bytes) -> npt.NDArray[np.float64] | None:
+def parse_numbers(text: bytes) -> npt.NDArray[np.float64] | None:
     """All numbers of a text of blanks and numbers; None where something else stands there."""
     if not text.strip():
         return np.zeros(0)
@@ -120,7 +120,7 @@ def _token_starts(text: bytes) -> Indices:
     return starts
 
 
-def not_whole(values: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+def is_not_integer(values: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     """Which numbers are no whole numbers that 64 bits hold exactly; nan and inf are none."""
     wrong: npt.NDArray[np.bool_] = (values != np.rint(values)) | (np.abs(values) > 2**53)
     return wrong
@@ -131,7 +131,7 @@ def shown(line: bytes) -> str:
     return line.strip().split(b"\n")[0][:SHOWN].decode("utf-8", "replace").rstrip()
 
 
-def decoded(text: bytes) -> str:
+def decode_text(text: bytes) -> str:
     """Text in UTF-8, or else in Windows' Latin alphabet."""
     try:
         return text.decode()

@@ -21,7 +21,7 @@ MEMORY, MEMORY_PER_BYTE = 4 << 30, 64  # of a reader with its libraries; compres
 _PR_SET_PDEATHSIG = 1  # <sys/prctl.h>
 
 
-class Died(MeshError):
+class ProcessDiedError(MeshError):
     """A process that ended before its work was done."""
 
     def __init__(self, how: str, said: str = "") -> None:
@@ -37,7 +37,7 @@ def within[T](seconds: float, work: Callable[..., T], *arguments: Any, memory: i
 
     Raises:
         TimeoutError: it was not done after `seconds`.
-        Died: the process died of something else, such as a fault within a library or want of memory.
+        ProcessDiedError: the process died of something else, such as a fault within a library or want of memory.
     """
     command = [sys.executable, "-P", "-m", __name__]  # -P: not a folder of the same name that lies here
     task = pickle.dumps((max(1, ceil(seconds)), memory, os.getpid(), work, arguments))
@@ -49,14 +49,14 @@ def within[T](seconds: float, work: Callable[..., T], *arguments: Any, memory: i
         if done.returncode:
             said = done.stderr.decode(errors="replace").strip()[-300:]
             how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
-            raise Died(how, said)
+            raise ProcessDiedError(how, said)
         result, failure = _unpacked(answer)
     if failure is not None:
         raise failure
     return result
 
 
-def read_within[T](
+def read_with_time_limit[T](
     path: Path, reader: Callable[[Path], T], program: str, seconds: float, advice: str = "Export it again."
 ) -> T:
     """reader(path), done by another process for `seconds` at most; with 4 GiB and 64 times the file's size of memory.
@@ -66,7 +66,7 @@ def read_within[T](
     """
     try:
         return within(seconds, reader, path, memory=MEMORY + MEMORY_PER_BYTE * path.stat().st_size)
-    except Died as died:
+    except ProcessDiedError as died:
         why = f"{program} died ({died.how}); the file is damaged, or there is not enough memory"
     except TimeoutError:
         why = f"{program} did not end within {seconds:.0f} s; the file is damaged"

@@ -23,7 +23,7 @@ def signed_measures(points: Points, cells: npt.NDArray[np.integer]) -> Floats:
     return np.linalg.det(corners[:, 1:] - corners[:, :1]) / factorial(dim)
 
 
-def oriented(points: Points, cells: Indices) -> tuple[Indices, int]:
+def orient_cells(points: Points, cells: Indices) -> tuple[Indices, int]:
     """The cells with positive measure, the last two nodes swapped where it was negative; and how many were."""
     inverted = signed_measures(points, cells) < 0
     cells = cells.copy()
@@ -97,19 +97,21 @@ def boundary_facets(cells: Indices) -> Indices:
     return facets[counts[inverse] == 1]
 
 
-def facets_where(facets: Indices, nodes: Mask) -> Indices:
+def facets_on_nodes(facets: Indices, nodes: Mask) -> Indices:
     """The facets all of whose nodes are marked."""
     return facets[nodes[facets].all(axis=1)]
 
 
-def facets_except(facets: Indices, *others: Indices) -> Indices:
+def exclude_facets(facets: Indices, *others: Indices) -> Indices:
     """The facets that are in none of the others, whatever the order of their nodes."""
     rows = np.sort(np.concatenate([facets, *others]), axis=1)
     _, _, inverse = distinct_rows(rows)
     return facets[~np.isin(inverse[: len(facets)], inverse[len(facets) :])]
 
 
-def plane_groups(points: Points, facets: Indices, names: dict[str, tuple[int, float]]) -> dict[str, Indices]:
+def facet_groups_on_planes(points: Points, facets: Indices, names: dict[str, tuple[int, float]]) -> dict[str, Indices]:
     """Facet groups on planes: name -> (axis, coordinate [m]). Nodes count as on it within 1e-9 of the body's size."""
     tolerance = 1e-9 * float(np.ptp(points, axis=0).max())
-    return {name: facets_where(facets, np.abs(points[:, axis] - at) <= tolerance) for name, (axis, at) in names.items()}
+    return {
+        name: facets_on_nodes(facets, np.abs(points[:, axis] - at) <= tolerance) for name, (axis, at) in names.items()
+    }

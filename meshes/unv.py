@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 
 from .data import Indices, MeshError, Points
-from .mesh_conversion import Block, Contents
-from .text_rows import Rows, SourceText, decoded, not_whole, numbered, shown
+from .mesh_conversion import Block, MeshFileContents
+from .text_rows import Rows, SourceText, decode_text, is_not_integer, numbered, shown
 
 OLD_NODES, NODES = (15,), (781, 2411)
 ELEMENTS = (780, 2412)
@@ -47,7 +47,7 @@ GROUP_LINE = "a group has a line of eight whole numbers, a line with its name, t
 EXPORT = "Supported: nodes (2411), elements (2412) and groups (2467) of I-DEAS; in Salome File > Export > UNV."
 
 
-def read_unv(path: Path) -> Contents:
+def read_unv(path: Path) -> MeshFileContents:
     """Nodes, elements and groups.
 
     Raises:
@@ -122,7 +122,7 @@ class _Unv:
         self.points.append(np.ascontiguousarray(points))
 
     def _whole(self, values: Points, offsets: Indices, needed: str) -> Indices:
-        rows = not_whole(values).reshape(len(values), -1).any(axis=1) if values.size else np.zeros(0, bool)
+        rows = is_not_integer(values).reshape(len(values), -1).any(axis=1) if values.size else np.zeros(0, bool)
         if rows.any():
             self.source.damaged(int(offsets[rows.argmax()]), f"a number of this line is not whole; {needed}.")
         whole: Indices = values.astype(np.int64)
@@ -167,7 +167,7 @@ class _Unv:
                 f"{lines.counts[line]} numbers stand here instead of 6; {ELEMENT_LINE}.",
             )
         head = lines.columns([line], 6)[0]
-        if not_whole(head).any() or not 0 <= head[5] <= MAX_NODES:
+        if is_not_integer(head).any() or not 0 <= head[5] <= MAX_NODES:
             self.source.damaged(int(lines.offsets[line]), f"this is no head of an element; {ELEMENT_LINE}.")
         return head
 
@@ -197,7 +197,7 @@ class _Unv:
             head_end = text.find(b"\n", begin, end) + 1
             name_end = text.find(b"\n", head_end, end) + 1
             head = self.source.rows(begin, head_end or end, GROUP_LINE)
-            count = int(head.values[-1]) if len(head.values) and not not_whole(head.values).any() else -1
+            count = int(head.values[-1]) if len(head.values) and not is_not_integer(head.values).any() else -1
             if not head_end or not name_end or count < 0:
                 self.source.damaged(begin, f"this is no head of a group; {GROUP_LINE}.")
             stop = _after_tokens(text, name_end, end, width * count)
@@ -207,7 +207,7 @@ class _Unv:
             if len(values) != width * count:
                 self.source.damaged(begin, f"a group of {count} members has more numbers on its last line.")
             members = self._whole(values, np.full(len(values), name_end), GROUP_LINE).reshape(-1, width)
-            name = decoded(text[head_end:name_end]).strip() or f"group-{int(head.values[0])}"
+            name = decode_text(text[head_end:name_end]).strip() or f"group-{int(head.values[0])}"
             nodes, elements = (members[members[:, 0] == kind, 1] for kind in (7, 8))
             self.groups.append((name, nodes, elements))
             if other := len(members) - len(nodes) - len(elements):
@@ -216,7 +216,7 @@ class _Unv:
 
     # --- result ---
 
-    def contents(self) -> Contents:
+    def contents(self) -> MeshFileContents:
         if not self.points:
             raise MeshError(f"Mesh file '{self.source.path}' could not be read: it has no dataset of nodes. {EXPORT}")
         ids, points = np.concatenate(self.ids), np.concatenate(self.points)
@@ -240,7 +240,7 @@ class _Unv:
         sets, point_sets, lost = self._sets(ids, blocks, owners)
         if lost:
             notes.append(f"Groups name {lost} nodes or elements that are not in the file.")
-        return Contents(points, blocks, sets, point_sets, notes=tuple(notes))
+        return MeshFileContents(points, blocks, sets, point_sets, notes=tuple(notes))
 
     def _sets(
         self, ids: Indices, blocks: list[Block], owners: list[Indices]

@@ -18,11 +18,11 @@ import numpy as np
 import numpy.typing as npt
 
 from .data import Indices, MeshError, Points
-from .mesh_conversion import Block, Contents
+from .mesh_conversion import Block, MeshFileContents
 from .netcdf_size import missing_bytes
-from .plain_files import HDF5_SIGNATURE, data_elsewhere, wrong_beside
+from .plain_files import HDF5_SIGNATURE, find_external_data, unreadable_reason_beside
 from .tags import tag_sets
-from .text_rows import decoded
+from .text_rows import decode_text
 
 Array = npt.NDArray[Any]
 
@@ -51,16 +51,16 @@ KINDS: dict[int, tuple[str, int]] = {
 AROUND = {8: [0, 1, 3, 2], 11: [0, 1, 3, 2, 4, 5, 7, 6]}
 
 
-def read_with_vtk(path: Path) -> Contents:
+def read_with_vtk(path: Path) -> MeshFileContents:
     """Everything in a file of VTK's or an Exodus file.
 
     Raises:
         MeshError: the file is damaged, of another kind, or names a file that may not be read.
     """
-    from .time_limit import read_within
+    from .time_limit import read_with_time_limit
 
     seconds = SECONDS + SECONDS_PER_MB * path.stat().st_size / 1e6
-    return read_within(path, _read, "VTK's reader", seconds, _supported(path))
+    return read_with_time_limit(path, _read, "VTK's reader", seconds, _supported(path))
 
 
 def _refuse(path: Path, why: str) -> NoReturn:
@@ -80,7 +80,7 @@ def _supported(path: Path) -> str:
     return f"Supported: {advice}."
 
 
-def _read(path: Path) -> Contents:
+def _read(path: Path) -> MeshFileContents:
     """What `read_with_vtk` returns, in this process."""
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow
 
@@ -219,7 +219,7 @@ def _check_xml_sizes(path: Path, data: Any) -> None:
         counts = _xml_attributes(piece)
         stop = text.find(b"</Piece>", piece.end())
         for section in _XML_SECTION.finditer(text, piece.end(), stop if stop > 0 else len(text)):
-            word = decoded(section[1])
+            word = decode_text(section[1])
             declared = int(counts.get(f"NumberOf{word}", "0").strip() or 0)
             end = text.find(b"</" + section[1], section.end())
             for tag in _XML_ARRAY.finditer(text, section.end(), end if end > 0 else len(text)):
@@ -245,7 +245,7 @@ _XML_ARRAY = re.compile(rb"<DataArray\b[^>]*?(/?)>")
 
 def _xml_attributes(tag: re.Match[bytes] | None) -> dict[str, str]:
     pairs = re.findall(rb"(\w+)\s*=\s*[\"']([^\"']*)[\"']", tag[0]) if tag else []
-    return {decoded(key): decoded(value) for key, value in pairs}
+    return {decode_text(key): decode_text(value) for key, value in pairs}
 
 
 def _xml_values(text: bytes, array: dict[str, str], file: dict[str, str]) -> int | None:
@@ -282,7 +282,7 @@ def _hdf_grid(path: Path) -> _Grid:
         with h5py.File(path) as file:
             if not isinstance(file.get("VTKHDF"), h5py.Group):
                 _refuse(path, "it is HDF5 without the group 'VTKHDF'")
-            if name := data_elsewhere(file):
+            if name := find_external_data(file):
                 _refuse(path, f"the data of '{name}' lie in another file; save all in one")
             kind = file["VTKHDF"].attrs.get("Type", b"")
             kind = kind.decode(errors="replace") if isinstance(kind, bytes) else str(kind)
@@ -320,7 +320,7 @@ def _parallel_grids(path: Path) -> list[_Grid]:
         _refuse(path, "it names no pieces of an unstructured grid")
     grids = []
     for name in names:
-        wrong = wrong_beside(path, name) if name else "has no name"
+        wrong = unreadable_reason_beside(path, name) if name else "has no name"
         if not wrong and Path(str(name)).suffix.lower() != ".vtu":
             wrong = "is no .vtu"
         if wrong:
@@ -405,7 +405,7 @@ def _text(name: str | bytes | None) -> str:
 # --- from grids to contents -----------------------------------------------------------------------------------------
 
 
-def _contents(path: Path, grids: list[_Grid]) -> Contents:
+def _contents(path: Path, grids: list[_Grid]) -> MeshFileContents:
     """Grids as one, with sets by their arrays."""
     notes: list[str] = []
     grid = grids[0] if len(grids) == 1 else _appended(grids)
@@ -424,7 +424,7 @@ def _contents(path: Path, grids: list[_Grid]) -> Contents:
     ):
         if names:
             notes.append(f"Not used: the {where} arrays {', '.join(names)}.")
-    return Contents(grid.points, blocks, sets, point_sets, notes=(*said, *notes))
+    return MeshFileContents(grid.points, blocks, sets, point_sets, notes=(*said, *notes))
 
 
 def _marks(values: Array) -> bool:
@@ -533,7 +533,7 @@ def _join_pieces(path: Path, grid: _Grid, notes: list[str]) -> None:
 # --- Exodus ---------------------------------------------------------------------------------------------------------
 
 
-def _exodus(path: Path, head: bytes) -> Contents:
+def _exodus(path: Path, head: bytes) -> MeshFileContents:
     """Element blocks and element sets as sets of cells, side sets as sets of facets, node sets as sets of nodes."""
     _check_netcdf(path, head)
     try:
@@ -587,7 +587,7 @@ def _exodus(path: Path, head: bytes) -> Contents:
     notes = _exodus_unused(reader)
     if repeated := [name for name in point_sets if name in sets]:
         notes += (f"Node sets not used, because a block or a side set has the same name: {', '.join(repeated)}.",)
-    return Contents(points, blocks, sets, point_sets, notes=notes)
+    return MeshFileContents(points, blocks, sets, point_sets, notes=notes)
 
 
 def _exodus_name(reader: Any, kind: int, i: int, word: str) -> str:
@@ -624,7 +624,7 @@ def _check_netcdf(path: Path, head: bytes) -> None:
 
         try:
             with h5py.File(path) as file:
-                elsewhere = data_elsewhere(file)
+                elsewhere = find_external_data(file)
         except (OSError, KeyError, RuntimeError, ValueError):
             _refuse(path, "its HDF5 is damaged")
         if elsewhere:

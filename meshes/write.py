@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from .data import MeshData, MeshError
-from .plain_files import NotAFile, replacing_all
+from .plain_files import NotAPlainFileError, atomic_replacement_of_all
 
 
 def write_mesh(mesh: MeshData, path: Path) -> None:
@@ -35,9 +35,9 @@ def write_mesh(mesh: MeshData, path: Path) -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         options = {"file_format": "gmsh22"} if path.suffix == ".msh" else {}
-        with replacing_all(path) as new:  # XDMF and TetGen have two files
+        with atomic_replacement_of_all(path) as new:  # XDMF and TetGen have two files
             meshio.Mesh(points, blocks, cell_data=data, field_data=field_data).write(new, **options)
-    except NotAFile as error:
+    except NotAPlainFileError as error:
         raise MeshError(f"{path} {error.strerror}; give another name") from None
     except OSError as error:
         raise MeshError(f"cannot save the mesh as {path}: {error.strerror or 'it cannot be written there'}") from None

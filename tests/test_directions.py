@@ -14,7 +14,7 @@ from fracsim.meshes.directions import preferred
 from fracsim.meshes.quality import mesh_quality
 from fracsim.meshes.random_points.outline import Outline
 from fracsim.meshes.random_points.points import APART, scatter
-from fracsim.meshes.sizing import Sizing
+from fracsim.meshes.sizing import SizeField
 from fracsim.meshes.topology import boundary_facets, edges_of, signed_measures
 from fracsim.study.mesh_source import build_mesh
 from fracsim.study.reader import load_study
@@ -83,7 +83,7 @@ def test_flat_and_round_faces_have_none() -> None:
 def test_points_are_apart_and_leave_no_gap() -> None:
     """No edge is shorter than 0.75 h, no circle around a triangle larger: angles of 30 degrees, and area exact."""
     h = 0.05
-    points, cells = scatter(ring(*SQUARE, h=h), Sizing(h).at)
+    points, cells = scatter(ring(*SQUARE, h=h), SizeField(h).at)
     quality = mesh_quality(MeshData(points, cells))
     assert quality["edge_min"] >= APART * h * (1 - 1e-12)
     assert quality["edge_max"] <= 2 * APART * h * 1.001
@@ -94,7 +94,7 @@ def test_points_are_apart_and_leave_no_gap() -> None:
 def test_seeds() -> None:
     """The same seed, the same mesh; another seed, other points."""
     outline = ring(*SQUARE, h=0.1)
-    first, again, other = (scatter(outline, Sizing(0.1).at, seed)[0] for seed in (1, 1, 2))
+    first, again, other = (scatter(outline, SizeField(0.1).at, seed)[0] for seed in (1, 1, 2))
     np.testing.assert_array_equal(first, again)
     assert len(first) != len(other) or not np.allclose(first, other)
 
@@ -106,18 +106,18 @@ def test_holes_and_narrow_slits() -> None:
     slit = ring((0.6, 0.7), (0.83, 0.702), (0.6, 0.704), h=0.09, first=56)
     parts = [outer, hole, island, slit]
     outline = Outline(np.concatenate([p.points for p in parts]), np.concatenate([p.pieces for p in parts]))
-    points, cells = scatter(outline, Sizing(0.1).at)
+    points, cells = scatter(outline, SizeField(0.1).at)
     assert signed_measures(points, cells).sum() == pytest.approx(1 - 0.09 + 0.01 - 0.23 * 0.004 / 2, rel=1e-12)
 
 
 def test_an_outline_that_crosses_itself_is_refused() -> None:
     with pytest.raises(MeshError, match="the outline meets itself near"):
-        scatter(ring((0.0, 0.0), (1.0, 1.0), (1.0, 0.0), (0.0, 0.83), h=0.2), Sizing(0.2).at)
+        scatter(ring((0.0, 0.0), (1.0, 1.0), (1.0, 0.0), (0.0, 0.83), h=0.2), SizeField(0.2).at)
 
 
 def test_graded_meshes_are_as_fine_as_they_are_asked_to_be() -> None:
     """Median edges near the fine place and far from it are those asked for, within 15 %."""
-    sizing = Sizing(0.08, 0.01, (0.5, 0.5), (0.5, 0.5))
+    sizing = SizeField(0.08, 0.01, (0.5, 0.5), (0.5, 0.5))
     points, cells = scatter(ring(*SQUARE, h=0.08), sizing.at)
     edges = edges_of(cells)
     middle, length = points[edges].mean(axis=1), np.linalg.norm(np.diff(points[edges], axis=1)[:, 0], axis=1)

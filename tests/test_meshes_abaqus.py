@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fracsim.meshes import MeshData, MeshError
 from fracsim.meshes.check import check_mesh
-from fracsim.meshes.mesh_conversion import Contents
+from fracsim.meshes.mesh_conversion import MeshFileContents
 from fracsim.meshes.read import read_contents, read_mesh
 from fracsim.meshes.topology import signed_measures
 
@@ -50,7 +50,7 @@ def volume(mesh: MeshData, region: str | None = None) -> float:
     return float(signed_measures(mesh.points, cells).sum())
 
 
-def corners_of(contents: Contents, name: str) -> set[tuple[int, ...]]:
+def corners_of(contents: MeshFileContents, name: str) -> set[tuple[int, ...]]:
     """Facets of a group as node numbers of the file."""
     found = set()
     for block, rows in zip(contents.blocks, contents.sets[name], strict=True):

@@ -13,7 +13,7 @@ import pytest
 
 from fracsim.meshes import MeshError
 from fracsim.meshes.check import check_mesh
-from fracsim.meshes.mesh_conversion import Block, Contents
+from fracsim.meshes.mesh_conversion import Block, MeshFileContents
 from fracsim.meshes.read import read_mesh
 from fracsim.meshes.topology import signed_measures
 
@@ -83,7 +83,7 @@ def test_mixed_cells_fill_the_body_and_agree_at_every_face(seed: int) -> None:
         kind: [np.arange(len(rows)) if i == j else np.zeros(0, int) for j, rows in enumerate(cells.values())]
         for i, kind in enumerate(cells)
     }
-    mesh = check_mesh(Contents(points, blocks, regions).simplices("part"))
+    mesh = check_mesh(MeshFileContents(points, blocks, regions).simplices("part"))
     # the body's faces are plane, so that its volume is N^3 whatever the cut; each kind has its number of tetrahedra
     assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(N**3, rel=1e-12)
     assert not [note for note in mesh.notes if "cut into" not in note]
@@ -120,14 +120,14 @@ def test_one_cell_keeps_its_volume_in_any_order_of_its_nodes(kind: str, seed: in
     shuffled = np.empty_like(points)
     shuffled[number] = points
     block = Block(kind, _turned(kind, number, random)[None])
-    mesh = check_mesh(Contents(shuffled, [block], {}).simplices("part"))
+    mesh = check_mesh(MeshFileContents(shuffled, [block], {}).simplices("part"))
     assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(wanted, rel=1e-12)
 
 
 def test_wedge_written_as_a_hexahedron() -> None:
     points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 2], [1, 0, 2], [0, 1, 2]], float)
     block = Block("hexahedron", np.array([[0, 1, 2, 2, 3, 4, 5, 5]]))
-    mesh = check_mesh(Contents(points, [block], {}).simplices("part"))
+    mesh = check_mesh(MeshFileContents(points, [block], {}).simplices("part"))
     assert len(mesh.cells) == 3
     assert signed_measures(mesh.points, mesh.cells).sum() == pytest.approx(1.0)
 
@@ -135,14 +135,14 @@ def test_wedge_written_as_a_hexahedron() -> None:
 def test_hexahedron_with_nodes_out_of_order_is_refused() -> None:
     points = np.array([[x, y, z] for z in (0.0, 1) for y in (0.0, 1) for x in (0.0, 1)])
     with pytest.raises(MeshError, match=r"part: 1 of 1 hexahedra are folded, .*near \(0.5, 0.5, 0.5\) m.*in order"):
-        Contents(points, [Block("hexahedron", np.arange(8)[None])], {}).simplices("part")
+        MeshFileContents(points, [Block("hexahedron", np.arange(8)[None])], {}).simplices("part")
 
 
 def test_cells_with_nodes_that_do_not_exist_reach_the_check() -> None:
     points = np.array([[x, y, z] for z in (0.0, 1) for y in (0.0, 1) for x in (0.0, 1)])
     block = Block("hexahedron", np.array([[0, 1, 3, 2, 4, 5, 7, 60]]))
     with pytest.raises(MeshError, match="nodes that do not exist"):
-        check_mesh(Contents(points, [block], {}).simplices("part"))
+        check_mesh(MeshFileContents(points, [block], {}).simplices("part"))
 
 
 # --- files that gmsh writes -------------------------------------------------------------------------------------------

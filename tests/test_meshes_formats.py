@@ -28,7 +28,7 @@ from fracsim.meshes.check import check_mesh
 from fracsim.meshes.msh2 import KINDS
 from fracsim.meshes.read import read_contents, read_mesh
 from fracsim.meshes.surfaces.closed import read_surface
-from fracsim.meshes.time_limit import read_within
+from fracsim.meshes.time_limit import read_with_time_limit
 
 FILES = Path(__file__).parent / "meshes"
 BAR = 0.1 * 0.02 * 0.02
@@ -634,7 +634,7 @@ def test_a_reader_that_does_not_end_is_ended(tmp_path: Path) -> None:
     """Here one that waits for a pipe, which `read_mesh` would refuse before."""
     os.mkfifo(tmp_path / "part.xyz")
     with pytest.raises(MeshError, match=r"part.xyz' could not be read: it did not end within 1 s; the file is damaged"):
-        read_within(tmp_path / "part.xyz", Path.read_bytes, "it", 1)
+        read_with_time_limit(tmp_path / "part.xyz", Path.read_bytes, "it", 1)
     with pytest.raises(MeshError, match="is a named pipe, not a file"):
         read_mesh(tmp_path / "part.xyz")
 

@@ -15,7 +15,7 @@ from fracsim.meshes import MeshError
 from fracsim.meshes.data import Indices, Points
 from fracsim.meshes.surfaces import repair as repairing
 from fracsim.meshes.surfaces import self_intersection
-from fracsim.meshes.surfaces.closed import ClosedSurface, Repairable
+from fracsim.meshes.surfaces.closed import ClosedSurface, RepairableSurfaceError
 from fracsim.meshes.surfaces.fill import fill_surface
 from fracsim.meshes.surfaces.repair import read_body, repaired
 from fracsim.meshes.surfaces.self_intersection import crossing_triangles
@@ -130,7 +130,7 @@ def test_holes_are_filled(tmp_path: Path, ending: str) -> None:
     whole = sphere()
     damaged = without(whole, (0, 0, 1), (1, 0, 0), reach=0.25)
     path = as_blender(tmp_path / f"part.{ending}", damaged)
-    with pytest.raises(Repairable, match=r"is open: \d+ edges .* the first at \("):
+    with pytest.raises(RepairableSurfaceError, match=r"is open: \d+ edges .* the first at \("):
         read_body(path)
     surface = read_body(path, repair=True)
     assert_sound(surface)
@@ -164,7 +164,7 @@ def test_much_new_area_is_said_loudly(tmp_path: Path) -> None:
 def test_boxes_that_cross_are_one_body(tmp_path: Path, inside_out: bool) -> None:
     first, second = box((2, 1, 1)), box((1, 1, 1), (1, 0.3, 0.2))
     path = saved(tmp_path, joined(first, (second[0], second[1][:, ::-1]) if inside_out else second))
-    with pytest.raises(Repairable, match=r"(cut each other|pass through others), .*near \("):
+    with pytest.raises(RepairableSurfaceError, match=r"(cut each other|pass through others), .*near \("):
         read_body(path)
     surface = read_body(path, repair=True)
     assert_sound(surface)
@@ -189,7 +189,7 @@ def test_boxes_with_points_in_common(
 ) -> None:
     both = joined(box((1, 1, 1)), box(size, at))  # type: ignore[arg-type]
     path = as_blender(tmp_path / "part.obj", both)
-    with pytest.raises(Repairable, match=r"more than two triangles, the first at \("):
+    with pytest.raises(RepairableSurfaceError, match=r"more than two triangles, the first at \("):
         read_body(path)
     surface = read_body(path, repair=True)
     assert_sound(surface)
@@ -201,7 +201,7 @@ def test_boxes_with_points_in_common(
 def test_two_bars_through_each_other_were_two_bodies(tmp_path: Path) -> None:
     """No corner of one lies within the other: read as 6 m^3 before."""
     path = saved(tmp_path, joined(box((3, 1, 1), level=0), box((1, 3, 1), level=0)))
-    with pytest.raises(Repairable, match="cuts itself: 8 of its 24 triangles"):
+    with pytest.raises(RepairableSurfaceError, match="cuts itself: 8 of its 24 triangles"):
         read_body(path)
     surface = read_body(path, repair=True)
     assert_sound(surface)
@@ -225,7 +225,7 @@ def test_rods_through_a_ball_with_a_hole(tmp_path: Path) -> None:
 def test_a_dent_pushed_through_the_other_side(tmp_path: Path) -> None:
     """One part that cuts itself: what sticks out is cut off, the bounding box is the ball's again."""
     path = saved(tmp_path, pushed_through(2.08))
-    with pytest.raises(Repairable, match=r"cuts itself: \d+ of its 5120 triangles .* near \("):
+    with pytest.raises(RepairableSurfaceError, match=r"cuts itself: \d+ of its 5120 triangles .* near \("):
         read_body(path)
     surface = read_body(path, repair=True)
     assert_sound(surface)
@@ -340,7 +340,7 @@ def test_without_the_wheels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     ("failure", "message"),
     [
         (TimeoutError(), r"had not ended within 7 s \(1280 triangles\)|had not ended"),
-        (repairing.Died("signal 11"), "signal 11"),
+        (repairing.ProcessDiedError("signal 11"), "signal 11"),
     ],
 )
 def test_a_repair_that_hangs_or_crashes(

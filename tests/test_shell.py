@@ -15,7 +15,7 @@ from fracsim.fracture.brittle.grains import GrainParameters, SurfaceParameters
 from fracsim.fracture.principal_stress import symmetric_tensors
 from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
-from fracsim.meshes.shell import read_shell, thickened
+from fracsim.meshes.shell import extrude_shell, read_shell
 from fracsim.meshes.topology import signed_measures
 from fracsim.rigid.convex_decomposition import Polyhedron
 from fracsim.rigid.fragment_geometry import FragmentGeometry
@@ -31,7 +31,7 @@ H = 0.01
 def strip(count: int, seed: int = 1) -> MeshData:
     """1 m long, a fifth as wide, H thick."""
     points, triangles = pane(count, seed)
-    return thickened(points * [1.0, 0.2, 1.0], triangles, H)
+    return extrude_shell(points * [1.0, 0.2, 1.0], triangles, H)
 
 
 # --- meshes ---
@@ -50,7 +50,7 @@ def test_a_shell_encloses_its_area_times_its_thickness() -> None:
     flat, triangles = pane(4)
     flat[:, :2] = np.round(4 * flat[:, :2]) / 4
     beyond = np.maximum(flat[:, 0] - 0.5, 0.0)
-    corner = thickened(flat + beyond[:, None] * [-1.0, 0.0, 1.0], triangles, H)
+    corner = extrude_shell(flat + beyond[:, None] * [-1.0, 0.0, 1.0], triangles, H)
     assert signed_measures(corner.points, corner.cells).sum() == pytest.approx(H, rel=1e-3)
     crease = np.linalg.norm(np.diff(corner.points.reshape(2, -1, 3), axis=0)[0], axis=1)[flat[:, 0] == 0.5]
     assert np.allclose(crease, H * np.sqrt(2), rtol=0.02)
@@ -156,7 +156,7 @@ def test_stress_of_a_shell_does_not_depend_on_the_frame() -> None:
     Q = Rotation.from_rotvec([0.4, -0.7, 1.1]).as_matrix()
     shell = mesh.shell
     assert shell is not None
-    turned = thickened(shell.middle[: len(shell.middle) // 2] @ Q.T, shell.triangles, shell.thickness)
+    turned = extrude_shell(shell.middle[: len(shell.middle) // 2] @ Q.T, shell.triangles, shell.thickness)
     found = []
     for each, R in ((mesh, np.eye(3)), (turned, Q)):
         stiffness = shell_of(each)

@@ -55,7 +55,7 @@ def lies_still(file: str, plate: np.ndarray, dim: int, end: float) -> None:
     assert np.all((means[:, -1] < 0) & (means[:, -1] > -GAP * np.arange(1, len(means) + 1)))
 
 
-def bodies_of(mesh: MeshData) -> np.ndarray:
+def label_bodies(mesh: MeshData) -> np.ndarray:
     """The number of the connected body of each node."""
     ends = mesh.cells[:, [0, 1, 0, 2, 0, 3]].reshape(-1, 2).T
     return connected_components(coo_matrix((np.ones(ends.shape[1]), tuple(ends)), (len(mesh.points),) * 2))[1]
@@ -71,7 +71,7 @@ def test_a_stack_without_friction_lies_still(tmp_path: Path, dim: int, edges: li
 def test_four_plates_of_gmsh_lie_still() -> None:
     """In 0.5 s. Before, 306 um."""
     file = Path(__file__).parent / "meshes" / "stack.msh"
-    lies_still(str(file), bodies_of(read_mesh(file)), 3, 0.5)
+    lies_still(str(file), label_bodies(read_mesh(file)), 3, 0.5)
 
 
 @pytest.mark.ranks

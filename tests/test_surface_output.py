@@ -63,10 +63,10 @@ def test_the_same_surface_at_any_number_of_ranks(on_ranks: OnRanks, ranks: int) 
 def bar(cells: int = 6) -> MeshData:
     """A bar along x with named ends."""
     mesh = lattice(cells, 1, 1)
-    from fracsim.meshes.topology import boundary_facets, facets_where
+    from fracsim.meshes.topology import boundary_facets, facets_on_nodes
 
     facets = boundary_facets(mesh.cells)
-    ends = {name: facets_where(facets, mesh.points[:, 0] == at) for name, at in (("left", 0.0), ("right", cells))}
+    ends = {name: facets_on_nodes(facets, mesh.points[:, 0] == at) for name, at in (("left", 0.0), ("right", cells))}
     return MeshData(mesh.points, mesh.cells, ends | {"tip": ends["right"][:1]})
 
 

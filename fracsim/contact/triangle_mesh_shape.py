@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from ..meshes.surfaces.enclosed import AT_ONCE, enclosed_volumes, parts, windings
+from ..meshes.surfaces.enclosed import AT_ONCE, enclosed_volumes, parts, winding_numbers
 from ..meshes.topology import distinct_rows
 from .shape_base import Tessellation
 
@@ -194,7 +194,7 @@ def _tested_points(surface: ClosedSurface, *, cut: bool) -> Ints:
 
 def is_inside(x: Values, corners: Values) -> Flags:
     """(n,) whether triangles (k, 3, 3) wind around points x (n, 3) once or more."""
-    return windings(x, corners) > LIMITS.min_winding
+    return winding_numbers(x, corners) > LIMITS.min_winding
 
 
 def surface_distances(x: Values, corners: Values) -> Values:

@@ -13,11 +13,11 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..errors import InputError
-from ..mesh.connected_bodies import bodies_of, free_motion, not_held
+from ..mesh.connected_bodies import free_motion, label_bodies, not_held
 from ..mesh.domain import Domain, Ints
 from ..mesh.parallel import on_root
 from ..meshes.data import MeshData
-from ..meshes.text import middle_of
+from ..meshes.text import format_midpoint
 from .time_functions import TimeFunction
 
 Values = npt.NDArray[np.float64]
@@ -104,11 +104,11 @@ def check_supports(domain: Domain, motion: PrescribedMotion) -> None:
 
 def _check(mesh: MeshData | None, prescribed: npt.NDArray[np.bool_] | None) -> None:
     assert mesh is not None and prescribed is not None
-    bodies, body = bodies_of(mesh)
+    bodies, body = label_bodies(mesh)
     for number in range(bodies):
         nodes = body == number
         free = free_motion(mesh.points[nodes], prescribed[: len(body)][nodes])
         if free:
-            where = f"the body around {middle_of(mesh.points, nodes)}"
+            where = f"the body around {format_midpoint(mesh.points, nodes)}"
             which = f"{where} (one of {bodies})" if bodies > 1 else "the body"
             raise InputError(not_held(which, free))

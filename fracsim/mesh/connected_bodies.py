@@ -12,7 +12,7 @@ from ..meshes.text import AXES
 Values = npt.NDArray[np.float64]
 
 
-def bodies_of(mesh: MeshData) -> tuple[int, npt.NDArray[np.int64]]:
+def label_bodies(mesh: MeshData) -> tuple[int, npt.NDArray[np.int64]]:
     """The number of bodies that share no node, and (N,) the body of each node."""
     first = np.repeat(mesh.cells[:, 0], mesh.cells.shape[1] - 1)
     return components(np.stack([first, mesh.cells[:, 1:].reshape(-1)], axis=1), len(mesh.points))

@@ -14,7 +14,7 @@ from mpi4py import MPI
 
 from ..errors import CannotWrite
 from ..mesh.parallel import on_root
-from ..meshes.plain_files import MISSING, NotAFile, replacing, wrong_with
+from ..meshes.plain_files import MISSING, NotAPlainFileError, atomic_replacement, unreadable_reason
 
 # Bytes that HDF5 may need beside the values of one array. A text attribute takes most of them.
 HDF5_OVERHEAD_BYTES = 6 << 10
@@ -22,7 +22,7 @@ HDF5_OVERHEAD_BYTES = 6 << 10
 
 def replace_text(path: Path, text: str) -> None:
     """Write a text file (UTF-8) as a whole in place of the old one. Raises OSError."""
-    with replacing(path) as temporary:
+    with atomic_replacement(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="")
 
 
@@ -49,7 +49,7 @@ def write_on_root[T](comm: MPI.Comm, path: Path, work: Callable[[], T]) -> T | N
 
 def error_reason(error: Exception) -> str:
     """Reason of a failed file operation, in the words of the operating system."""
-    if isinstance(error, NotAFile):
+    if isinstance(error, NotAPlainFileError):
         return str(error.strerror)
     number = getattr(error, "errno", None)
     return os.strerror(number) if number else str(error)
@@ -110,8 +110,8 @@ def writable_hdf5(path: Path, size: int, *, new: bool = False) -> Iterator[Any]:
     """
     import h5py
 
-    if (problem := "is a link, not a file" if path.is_symlink() else wrong_with(path)) not in ("", MISSING):
-        raise NotAFile(path, problem)
+    if (problem := "is a link, not a file" if path.is_symlink() else unreadable_reason(path)) not in ("", MISSING):
+        raise NotAPlainFileError(path, problem)
     try:
         if new:
             h5py.File(path, "w").close()

@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from ..meshes.data import MeshData
-from ..meshes.plain_files import replacing
+from ..meshes.plain_files import atomic_replacement
 from .atomic_write import HDF5_OVERHEAD_BYTES, open_hdf5, writable_hdf5
 from .file_ownership import CHECKPOINT_FILE
 
@@ -122,7 +122,7 @@ def write_checkpoint_file(
     """
     # without parents: a deleted output folder is an error
     path.parent.mkdir(exist_ok=True)
-    with replacing(path) as temporary:
+    with atomic_replacement(path) as temporary:
         with writable_hdf5(temporary, _file_size(arrays, notes), new=True) as file:
             for name, values in arrays.items():
                 file[name] = values

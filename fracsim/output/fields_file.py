@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from ..meshes.data import MeshData
-from ..meshes.plain_files import data_elsewhere, replacing
+from ..meshes.plain_files import atomic_replacement, find_external_data
 from .atomic_write import HDF5_OVERHEAD_BYTES, append_bytes, open_hdf5, replace_text, writable_hdf5
 
 Values = npt.NDArray[np.float64]
@@ -86,7 +86,7 @@ class FieldsFile:
     def _create(self) -> None:
         """Create fields.h5 with the mesh and without frames."""
         size = 2 * self._mesh.points.nbytes + self._mesh.cells.nbytes + 3 * HDF5_OVERHEAD_BYTES
-        with replacing(self.h5) as temporary, writable_hdf5(temporary, size, new=True) as file:
+        with atomic_replacement(self.h5) as temporary, writable_hdf5(temporary, size, new=True) as file:
             file["points"] = pad_to_3d(self._mesh.points)
             file["cells"] = self._mesh.cells.astype(np.int32)
             file.create_group("frames")
@@ -108,7 +108,7 @@ class FieldsFile:
         """Replace fields.h5 by a file with these frames only, and with tensors in the order of `TENSOR_COMPONENTS`."""
         size = self.h5.stat().st_size
         with (
-            replacing(self.h5) as temporary,
+            atomic_replacement(self.h5) as temporary,
             open_hdf5(self.h5) as old,
             writable_hdf5(temporary, size, new=True) as file,
         ):
@@ -190,7 +190,7 @@ def check_self_contained(h5: Path) -> None:
     if not problem:
         try:
             with open_hdf5(h5) as file:
-                if name := data_elsewhere(file):
+                if name := find_external_data(file):
                     problem = f"has the data of '{name}' in another file"
         except (OSError, RuntimeError):
             # read_frame_times reports an unreadable file

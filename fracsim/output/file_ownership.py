@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from ..errors import InputError
-from ..meshes.plain_files import MISSING, NEW, wrong_with
+from ..meshes.plain_files import MISSING, NEW, unreadable_reason
 
 # first words of the comments in study.toml
 STUDY_HEADER_WORDS = ("fracsim", "dolfinx", "petsc", "python", "ranks")
@@ -61,7 +61,7 @@ def check_file_types(folder: Path) -> None:
                 "own there: delete it, or give another folder"
             )
     for name in (STUDY_FILE, *OUTPUT_FILES):
-        if (problem := wrong_with(folder / name)) not in ("", MISSING):
+        if (problem := unreadable_reason(folder / name)) not in ("", MISSING):
             raise InputError(f"--out {folder}: {folder / name} {problem}; delete it, or give another folder")
     for name in (STUDY_FILE + NEW, *(file + NEW for file in OUTPUT_FILES)):
         if (folder / name).is_dir() and not (folder / name).is_symlink():

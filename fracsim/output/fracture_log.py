@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.stress import Stress
-from ..mesh.connected_bodies import bodies_of
+from ..mesh.connected_bodies import label_bodies
 from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
 
@@ -127,4 +127,4 @@ class FractureLog:
 
 def _count_bodies(domain: Domain) -> int:
     """Number of bodies of the mesh that share no node (collective)."""
-    return int(domain.comm.bcast(bodies_of(domain.source)[0] if domain.source is not None else None))
+    return int(domain.comm.bcast(label_bodies(domain.source)[0] if domain.source is not None else None))

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..meshes.plain_files import replacing_all
+from ..meshes.plain_files import atomic_replacement_of_all
 from .pictures.colour_maps import rgb
 from .pictures.frames import (
     FILM_TIMING,
@@ -87,14 +87,14 @@ def export_surfaces(
     name = folder.resolve().name
     target.mkdir(parents=True, exist_ok=True)
     if kind == "usd":
-        with replacing_all(target / f"{name}.usdc") as temporary:
+        with atomic_replacement_of_all(target / f"{name}.usdc") as temporary:
             _write_usd(temporary, meshes, material, times)
         return [target / f"{name}.usdc"]
     write = {"ply": _write_ply, "obj": _write_obj, "glb": _write_glb}[kind]
     paths = []
     for number, fragments in meshes:
         paths.append(target / f"{name}_{number:06d}.{kind}")
-        with replacing_all(paths[-1]) as temporary:
+        with atomic_replacement_of_all(paths[-1]) as temporary:
             write(temporary, fragments, material, times[number])
     return paths
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..meshes.plain_files import check_replaceable, replacing_all
+from ..meshes.plain_files import atomic_replacement_of_all, check_replaceable
 from .content import Picture, ReportTable, Section, TableCell
 from .plots import draw_plot
 
@@ -58,7 +58,7 @@ def write_page(
         csv_folder.mkdir(parents=True, exist_ok=True)
         for table in (table for section in sections for table in section.tables):
             write_table_csv(csv_folder / f"{table.name}.csv", table)
-        with replacing_all(target) as temporary:
+        with atomic_replacement_of_all(target) as temporary:
             temporary.write_text(text, encoding="utf-8")
     except OSError as error:
         raise InputError(f"-o {target}: cannot write there: {error.strerror}") from None
@@ -67,7 +67,7 @@ def write_page(
 
 def write_table_csv(path: Path, table: ReportTable) -> None:
     """Write a table as CSV with all digits."""
-    with replacing_all(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    with atomic_replacement_of_all(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(table.columns)
         writer.writerows([["" if cell is None else cell for cell in row] for row in table.rows])

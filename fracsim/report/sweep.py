@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import REPEATED_SIGNAL_INTERVAL, STOP_SIGNALS, Exit, InputError, NotConverged, Stopped, one_line
-from ..meshes.plain_files import create, replacing_all
+from ..meshes.plain_files import atomic_replacement_of_all, create
 from ..output.file_ownership import check_ownership, has_resumable_run
 from ..output.lock import FolderLock, describe_lock_holder
 from ..study.check import check_study
@@ -355,7 +355,10 @@ def write_sweep_table(cases: list[SweepCase], outcomes: dict[str, str], out: Pat
         row = {"case": name, **case.values, "outcome": outcomes.get(name, "not run yet")}
         rows.append(row | (_summary_numbers(case) if name in outcomes else {}))
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    with replacing_all(out / "sweep.csv") as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+    with (
+        atomic_replacement_of_all(out / "sweep.csv") as temporary,
+        temporary.open("w", newline="", encoding="utf-8") as file,
+    ):
         writer = csv.DictWriter(file, columns, restval="")
         writer.writeheader()
         writer.writerows(rows)

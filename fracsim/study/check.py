@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..mesh.connected_bodies import not_held
 from ..mesh.selectors import Group, Selector, check_group, check_regions
 from ..meshes.data import MeshData
-from ..meshes.parameters import MOST_CELLS
+from ..meshes.parameters import MAX_CELLS
 from ..meshes.text import AXES
 from . import Study
 from .check_limits import LIMITS
@@ -152,7 +152,7 @@ def _check_dimensions(study: Study, summary: MeshSummary) -> None:
 def _check_copies(study: Study, cells: int) -> None:
     """Raises InputError if [[body]] asks for more bodies or cells than fit into memory."""
     copies = sum(prod(body.copies) for body in study.body)
-    limits = ((copies, LIMITS.max_bodies, "bodies"), (copies * cells, MOST_CELLS, "cells in all"))
+    limits = ((copies, LIMITS.max_bodies, "bodies"), (copies * cells, MAX_CELLS, "cells in all"))
     for count, limit, unit in limits:
         if count > limit:
             raise InputError(

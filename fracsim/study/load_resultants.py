@@ -11,7 +11,7 @@ from ..errors import InputError
 from ..mechanics.time_functions import TabulatedFunction
 from ..mesh.selectors import Group, Selector
 from ..meshes.data import MeshData
-from ..meshes.topology import boundary_facets, facets_where, signed_measures
+from ..meshes.topology import boundary_facets, facets_on_nodes, signed_measures
 from . import Study
 from .check_limits import LIMITS
 from .conditions import BoundaryCondition, boundary_conditions, volume_loads
@@ -72,7 +72,7 @@ def _facets(mesh: MeshData, place: Selector) -> npt.NDArray[np.int64]:
     if isinstance(place, Group):
         return mesh.facet_groups[place.name]
     size = float(np.linalg.norm(np.ptp(mesh.points, axis=0)))
-    return facets_where(boundary_facets(mesh.cells), place.selects(mesh.points, size))
+    return facets_on_nodes(boundary_facets(mesh.cells), place.selects(mesh.points, size))
 
 
 def _area_vectors(mesh: MeshData, facets: npt.NDArray[np.int64]) -> Values:

@@ -16,8 +16,8 @@ from pydantic import TypeAdapter, ValidationError
 from ..errors import InputError
 from ..meshes import BUILDERS
 from ..meshes.data import MeshData, MeshError
-from ..meshes.parameters import SHORTEST, check_extent, is_number
-from ..meshes.plain_files import MISSING, wrong_with
+from ..meshes.parameters import SHORTEST, check_extent, is_length
+from ..meshes.plain_files import MISSING, unreadable_reason
 from . import MeshSettings
 from .body import SOURCE_KEYS
 from .error_messages import unknown_key_message, validation_message
@@ -84,14 +84,14 @@ def _check_source(mesh: MeshSettings) -> None:
         if entry.boolean:
             valid = isinstance(value, bool)
         else:
-            valid = is_number(value) and value >= SHORTEST and (not entry.integer or isinstance(value, int))
+            valid = is_length(value) and value >= SHORTEST and (not entry.integer or isinstance(value, int))
         if (name in mesh.parameters or entry.required) and not valid:
             raise InputError(f"mesh.{name} = {value}: {entry.meaning}")
 
 
 def check_file(path: Path, key: str) -> None:
     """Raises InputError if a path of a study is not a plain file; `key` is its path in the study."""
-    if wrong := wrong_with(path):
+    if wrong := unreadable_reason(path):
         raise InputError(f'{key} = "{path}"{": there is no such file" if wrong == MISSING else f" {wrong}"}')
 
 
@@ -106,7 +106,7 @@ def open_surface(mesh: MeshSettings) -> ClosedSurface | None:
     """
     if mesh.surface is None:
         return None
-    from ..meshes.surfaces.closed import Repairable
+    from ..meshes.surfaces.closed import RepairableSurfaceError
     from ..meshes.surfaces.repair import read_body
 
     _check_source(mesh)
@@ -115,7 +115,7 @@ def open_surface(mesh: MeshSettings) -> ClosedSurface | None:
     with _mesh_errors():
         try:
             return read_body(mesh.surface, scale, repair=repair, time_limit=parameters.get("time_limit"))
-        except Repairable as error:
+        except RepairableSurfaceError as error:
             raise MeshError(str(error) if repair else f"{error} {REPAIR_HINT}") from None
 
 

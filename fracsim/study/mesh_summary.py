@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import InputError
-from ..mesh.connected_bodies import bodies_of
+from ..mesh.connected_bodies import label_bodies
 from ..meshes.data import MeshData, MeshError
 from ..meshes.text import format_point
 from ..meshes.topology import boundary_facets, edges_of, signed_measures
@@ -104,7 +104,7 @@ def summarise_source(study: Study, surface: ClosedSurface | None) -> MeshSummary
 
 def summarise_mesh(mesh: MeshData) -> MeshSummary:
     """Returns the summary of a mesh that was read or built."""
-    count = bodies_of(mesh)[0]
+    count = label_bodies(mesh)[0]
     size = f"{len(mesh.cells):,} cells, {len(mesh.points):,} nodes, {count} {'body' if count == 1 else 'bodies'}"
     lower, upper = (tuple(corner.tolist()) for corner in (mesh.points.min(axis=0), mesh.points.max(axis=0)))
     volume = float(signed_measures(mesh.points, mesh.cells).sum())

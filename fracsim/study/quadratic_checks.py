@@ -63,6 +63,6 @@ def with_curved_boundary(study: Study, mesh: MeshData, builder: Any) -> MeshData
     """
     if not has_curved_cells(study, builder):
         return mesh
-    from ..meshes.curved_boundaries import middles_on
+    from ..meshes.curved_boundaries import curved_midside_points
 
-    return replace(mesh, middles=middles_on(mesh, builder.rounds))
+    return replace(mesh, middles=curved_midside_points(mesh, builder.rounds))

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import BaseModel, ValidationError
 
 from ..errors import InputError
-from ..meshes.plain_files import MISSING, wrong_with
+from ..meshes.plain_files import MISSING, unreadable_reason
 from ..studies import folder as packaged_studies
 from . import MeshSettings, ObstacleSettings, Study
 from .error_messages import validation_message
@@ -100,7 +100,7 @@ def _builder_parameters(study: Study) -> dict[str, Any]:
 
 
 def _parse(path: Path) -> dict[str, Any]:
-    if (wrong := wrong_with(path)) == MISSING:
+    if (wrong := unreadable_reason(path)) == MISSING:
         raise InputError(f"there is no study file {path}; `fracsim list` shows those that come with fracsim")
     if wrong:
         raise InputError(f"the study file {path} {wrong}")

@@ -8,8 +8,8 @@ from typing import ClassVar
 import numpy as np
 
 from ..data import Indices, MeshData, Points
-from ..parameters import affordable, positive, require
-from ..shell import thickened
+from ..parameters import positive, require, require_affordable
+from ..shell import extrude_shell
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Boat:
         positive("boat", length=self.length, beam=self.beam, depth=self.depth, thickness=self.thickness, h=self.h)
         require(self.h <= self.beam / 2, f"boat: h = {self.h!r} must be at most half of beam = {self.beam!r}.")
         require(self.thickness < self.h, f"boat: thickness = {self.thickness!r} must be below h = {self.h!r}.")
-        affordable("boat", self.h, self.cells_estimate())
+        require_affordable("boat", self.h, self.cells_estimate())
 
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         points = self.build().points
@@ -58,7 +58,7 @@ class Boat:
         return 3 * (2 * (along - 2) * across + 2 * across)
 
     def build(self) -> MeshData:
-        return thickened(*self._surface(), self.thickness, "boat")
+        return extrude_shell(*self._surface(), self.thickness, "boat")
 
     def _surface(self) -> tuple[Points, Indices]:
         """The middle surface; its ends are one node each."""

@@ -9,10 +9,10 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from ..data import Indices, MeshData, MeshError, Points
-from ..gmsh_session import meshed
-from ..parameters import affordable, is_number, one_of, positive, require
-from ..sizing import Sizing, cells_for
-from ..topology import boundary_facets, plane_groups
+from ..gmsh_session import mesh_with_gmsh
+from ..parameters import is_length, positive, require, require_affordable, require_one_of
+from ..sizing import SizeField, estimate_cells_in_box
+from ..topology import boundary_facets, facet_groups_on_planes
 
 
 @dataclass(frozen=True)
@@ -49,14 +49,14 @@ class Box:
             raise MeshError(f"box: size = {list(self.size)} must have two entries (triangles) or three (tetrahedra).")
         positive("box", h=self.h, **{f"size[{i}]": length for i, length in enumerate(self.size)})
         require(
-            len(self.origin) in (0, len(self.size)) and all(is_number(x) for x in self.origin),
+            len(self.origin) in (0, len(self.size)) and all(is_length(x) for x in self.origin),
             f"box: origin = {list(self.origin)} must have as many numbers as size = {list(self.size)}.",
         )
-        one_of("box", "pattern", self.pattern, ("structured", "unstructured"))
+        require_one_of("box", "pattern", self.pattern, ("structured", "unstructured"))
         require(self.seed > 0, f"box: seed = {self.seed!r} must be 1 or more.")
         random = self.pattern == "unstructured"
         require(random or self.seed == 1, 'box: seed is of random points: give pattern = "unstructured" beside it.')
-        affordable("box", self.h, self.cells_estimate())
+        require_affordable("box", self.h, self.cells_estimate())
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -68,7 +68,7 @@ class Box:
 
     def cells_estimate(self) -> int:
         if self.pattern == "unstructured":
-            return cells_for(Sizing(self.h), (0.0,) * len(self.size), self.size)
+            return estimate_cells_in_box(SizeField(self.h), (0.0,) * len(self.size), self.size)
         return int(np.prod(self._steps(), dtype=float)) * (2 if len(self.size) == 2 else 6)
 
     def build(self) -> MeshData:
@@ -76,8 +76,8 @@ class Box:
             points, cells = lattice(self._steps())
             points = self._placed(points)
         else:
-            points, cells = meshed(self._draw, len(self.size), Sizing(self.h), seed=self.seed)
-        return MeshData(points, cells, plane_groups(points, boundary_facets(cells), self._planes()))
+            points, cells = mesh_with_gmsh(self._draw, len(self.size), SizeField(self.h), seed=self.seed)
+        return MeshData(points, cells, facet_groups_on_planes(points, boundary_facets(cells), self._planes()))
 
     def _steps(self) -> tuple[int, ...]:
         return tuple(max(1, round(length / self.h)) for length in self.size)

@@ -8,12 +8,12 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from ..curved_boundaries import Round
+from ..curved_boundaries import CurvedBoundary
 from ..data import MeshData
-from ..gmsh_session import meshed
-from ..parameters import affordable, one_of, positive, require
-from ..sizing import Sizing, cells_for
-from ..topology import boundary_facets, facets_except, plane_groups
+from ..gmsh_session import mesh_with_gmsh
+from ..parameters import positive, require, require_affordable, require_one_of
+from ..sizing import SizeField, estimate_cells_in_box
+from ..topology import boundary_facets, exclude_facets, facet_groups_on_planes
 from .profile import Profile
 
 
@@ -45,8 +45,8 @@ class Cylinder:
 
     def __post_init__(self) -> None:
         positive("cylinder", radius=self.radius, length=self.length, h=self.h)
-        one_of("cylinder", "axis", self.axis, ("x", "y", "z"))
-        affordable("cylinder", self.h, self.cells_estimate())
+        require_one_of("cylinder", "axis", self.axis, ("x", "y", "z"))
+        require_affordable("cylinder", self.h, self.cells_estimate())
 
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         along = "xyz".index(self.axis)
@@ -55,21 +55,21 @@ class Cylinder:
         return tuple(low), tuple(high)
 
     def cells_estimate(self) -> int:
-        return cells_for(Sizing(self.h), *self.bounds(), filled=pi / 4)
+        return estimate_cells_in_box(SizeField(self.h), *self.bounds(), filled=pi / 4)
 
     @property
-    def rounds(self) -> tuple[Round, ...]:
+    def rounds(self) -> tuple[CurvedBoundary, ...]:
         """The round side."""
-        return (Round(("side",), self.radius, "xyz".index(self.axis)),)
+        return (CurvedBoundary(("side",), self.radius, "xyz".index(self.axis)),)
 
     def build(self) -> MeshData:
-        points, cells = meshed(self._draw, 3, Sizing(self.h))
+        points, cells = mesh_with_gmsh(self._draw, 3, SizeField(self.h))
         along = "xyz".index(self.axis)
         # Drawn along z; turning the axes in a circle keeps every cell's orientation.
         points = np.roll(points, along - 2, axis=1)
         boundary = boundary_facets(cells)
-        ends = plane_groups(points, boundary, {"bottom": (along, 0.0), "top": (along, self.length)})
-        return MeshData(points, cells, ends | {"side": facets_except(boundary, *ends.values())})
+        ends = facet_groups_on_planes(points, boundary, {"bottom": (along, 0.0), "top": (along, self.length)})
+        return MeshData(points, cells, ends | {"side": exclude_facets(boundary, *ends.values())})
 
     def _draw(self, gmsh: Any) -> None:
         gmsh.model.occ.addCylinder(0.0, 0.0, 0.0, 0.0, 0.0, self.length, self.radius)
@@ -101,7 +101,7 @@ class Disk:
     def __post_init__(self) -> None:
         positive("disk", radius=self.radius, h=self.h)
         require(0 <= self.arc < 180, f"disk: arc = {self.arc!r} must be at least 0 and less than 180 degrees.")
-        affordable("disk", self.h, self.cells_estimate())
+        require_affordable("disk", self.h, self.cells_estimate())
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -111,16 +111,16 @@ class Disk:
         return (-self.radius,) * 2, (self.radius,) * 2
 
     def cells_estimate(self) -> int:
-        return cells_for(Sizing(self.h), *self.bounds(), filled=pi / 4)
+        return estimate_cells_in_box(SizeField(self.h), *self.bounds(), filled=pi / 4)
 
     @property
-    def rounds(self) -> tuple[Round, ...]:
+    def rounds(self) -> tuple[CurvedBoundary, ...]:
         """The rim."""
-        return (Round(self.groups, self.radius),)
+        return (CurvedBoundary(self.groups, self.radius),)
 
     def build(self) -> MeshData:
         draw = self._sectors().draw if self.arc else self._draw
-        points, cells = meshed(lambda gmsh: draw(gmsh, 0.0), 2, Sizing(self.h))
+        points, cells = mesh_with_gmsh(lambda gmsh: draw(gmsh, 0.0), 2, SizeField(self.h))
         boundary = boundary_facets(cells)
         if not self.arc:
             return MeshData(points, cells, {"rim": boundary})

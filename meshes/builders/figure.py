@@ -8,9 +8,9 @@ from typing import ClassVar
 import numpy as np
 
 from ..data import Indices, MeshData, Points
-from ..parameters import affordable, not_negative, positive, require
-from ..sizing import cells_for_body
-from ..topology import Floats, boundary_facets, facets_except, facets_where
+from ..parameters import positive, require, require_affordable, require_not_negative
+from ..sizing import estimate_cells_in_body
+from ..topology import Floats, boundary_facets, exclude_facets, facets_on_nodes
 
 Place = tuple[float, float, float]
 
@@ -102,7 +102,7 @@ class Figure:
 
     def __post_init__(self) -> None:
         positive("figure", height=self.height, h=self.h)
-        not_negative("figure", wall=self.wall)
+        require_not_negative("figure", wall=self.wall)
         thinnest = self.height * min(part.end_radius for part in PARTS)
         require(
             self.wall <= 0.75 * thinnest,
@@ -117,7 +117,7 @@ class Figure:
             self.h < 1.6 * thinnest,
             f"figure: h = {self.h!r} must be less than {1.6 * thinnest:.3g} m, 0.8 of the thinnest part.",
         )
-        affordable("figure", self.h, self.cells_estimate())
+        require_affordable("figure", self.h, self.cells_estimate())
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -140,7 +140,7 @@ class Figure:
         return tuple((self.height * low).tolist()), tuple((self.height * high).tolist())
 
     def cells_estimate(self) -> int:
-        return cells_for_body(self.volume(), self.wall, self.h)
+        return estimate_cells_in_body(self.volume(), self.wall, self.h)
 
     def volume(self, steps: int = 60) -> float:
         """Volume by the midpoint rule, `steps` points along each side of the bounds [m^3]."""
@@ -152,11 +152,11 @@ class Figure:
         return float(np.prod(high - low) * filled.mean())
 
     def build(self) -> MeshData:
-        from ..surfaces.closed import joined_shells
+        from ..surfaces.closed import combine_shells
         from ..surfaces.fill import fill_shells  # SciPy
 
         shells = [self._shell(0.0), self._shell(self.wall)] if self.wall else [self._shell(0.0)]
-        surface = joined_shells(shells, "figure")
+        surface = combine_shells(shells, "figure")
         parts = [surface.part(number) for number in range(int(surface.shell.max()) + 1)]
         points, cells, _ = fill_shells(parts, surface.bodies, self.h, "figure")
         return MeshData(points, cells, self._groups(points, boundary_facets(cells)))
@@ -175,10 +175,10 @@ class Figure:
         """Hands and feet: where their own parts are the deepest of all."""
         groups = {}
         if self.wall:
-            groups["inside"] = facets_where(boundary, self.depth(points)[0] > self.wall / 2)
-        outside = facets_except(boundary, *groups.values())
+            groups["inside"] = facets_on_nodes(boundary, self.depth(points)[0] > self.wall / 2)
+        outside = exclude_facets(boundary, *groups.values())
         depths = np.array([part.scaled(self.height).depth(points)[0] for part in PARTS])
         deepest = depths.argmax(axis=0)
         for name, part in HELD.items():
-            groups[name] = facets_where(outside, deepest == PARTS.index(part))
-        return groups | {"skin": facets_except(boundary, *groups.values())}
+            groups[name] = facets_on_nodes(outside, deepest == PARTS.index(part))
+        return groups | {"skin": exclude_facets(boundary, *groups.values())}

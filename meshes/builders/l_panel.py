@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ..parameters import affordable, not_negative, positive, require
-from ..sizing import Sizing, cells_for
+from ..parameters import positive, require, require_affordable, require_not_negative
+from ..sizing import SizeField, estimate_cells_in_box
 from .profile import CutRectangle, Profile
 
 
@@ -44,12 +44,12 @@ class LPanel(CutRectangle):
 
     def __post_init__(self) -> None:
         positive("l-panel", size=self.size, seat=self.seat, h=self.h, h_corner=self._fine)
-        not_negative("l-panel", thickness=self.thickness)
+        require_not_negative("l-panel", thickness=self.thickness)
         require(
             self.seat < self._middle,
             f"l-panel: seat = {self.seat!r} must be less than half of size = {self.size!r}: it is on the arm.",
         )
-        affordable("l-panel", min(self.h, self._fine), self.cells_estimate())
+        require_affordable("l-panel", min(self.h, self._fine), self.cells_estimate())
 
     @property
     def length(self) -> float:  # type: ignore[override]
@@ -68,15 +68,15 @@ class LPanel(CutRectangle):
         return self.h / 4 if self.h_corner is None else self.h_corner
 
     @property
-    def _sizing(self) -> Sizing:
+    def _sizing(self) -> SizeField:
         """Fine where a crack goes that rises by a third of its way."""
         middle = self._middle
-        return Sizing(self.h, min(self._fine, self.h), (0.0, middle), (middle, middle * 4 / 3))
+        return SizeField(self.h, min(self._fine, self.h), (0.0, middle), (middle, middle * 4 / 3))
 
     def cells_estimate(self) -> int:
         """Those of the square less those that would fill its lower right quarter."""
         middle, depth = self._middle, (self.thickness,) if self.thickness else ()
-        quarter = cells_for(self._sizing, (middle, 0.0, *(0.0 for _ in depth)), (self.size, middle, *depth))
+        quarter = estimate_cells_in_box(self._sizing, (middle, 0.0, *(0.0 for _ in depth)), (self.size, middle, *depth))
         return max(1, round(super().cells_estimate() - quarter))
 
     def _profile(self) -> Profile:

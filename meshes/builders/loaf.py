@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..data import MeshData, Points
-from ..gmsh_session import meshed
-from ..parameters import affordable, is_number, positive, require
-from ..sizing import Sizing, cells_for
-from ..topology import boundary_facets, facets_except, facets_where, plane_groups
+from ..gmsh_session import mesh_with_gmsh
+from ..parameters import is_length, positive, require, require_affordable
+from ..sizing import SizeField, estimate_cells_in_box
+from ..topology import boundary_facets, exclude_facets, facet_groups_on_planes, facets_on_nodes
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Loaf:
         positive("loaf", h=self.h, rounding=self.rounding, bottom_rounding=self.bottom_rounding, grip=self.grip)
         positive("loaf", **{f"size[{i}]": length for i, length in enumerate(self.size)})
         for name, share in (("dome", self.dome), ("flare", self.flare)):
-            require(is_number(share) and 0 <= share <= 1, f"loaf: {name} = {share!r} must lie between 0 and 1.")
+            require(is_length(share) and 0 <= share <= 1, f"loaf: {name} = {share!r} must lie between 0 and 1.")
         length, width, height = self._block
         require(
             self.bottom_rounding <= self.rounding
@@ -68,7 +68,7 @@ class Loaf:
             2 * self.grip < length,
             f"loaf: grip = {self.grip!r} must be less than half of the length {length!r}.",
         )
-        affordable("loaf", self.h, self.cells_estimate())
+        require_affordable("loaf", self.h, self.cells_estimate())
 
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         length, width, height = self.size
@@ -78,20 +78,20 @@ class Loaf:
         length, width, height = self._block
         lost = (4 - pi) * self.rounding**2 * (height + length + width) / (length * width * height)
         baked = (1 + self.flare / 2) * (1 + self.dome * 4 / 5 * 2 / 3)  # means of the factors on width and height
-        return cells_for(Sizing(self.h), (0.0,) * 3, self._block, filled=max(0.5, 1 - lost) * baked)
+        return estimate_cells_in_box(SizeField(self.h), (0.0,) * 3, self._block, filled=max(0.5, 1 - lost) * baked)
 
     def build(self) -> MeshData:
-        points, cells = meshed(self._draw, 3, Sizing(self.h), self._baked)
+        points, cells = mesh_with_gmsh(self._draw, 3, SizeField(self.h), self._baked)
         boundary = boundary_facets(cells)
-        bottom = plane_groups(points, boundary, {"bottom": (2, 0.0)})
+        bottom = facet_groups_on_planes(points, boundary, {"bottom": (2, 0.0)})
         reach = self.size[0] / 2 - self.grip * (1 - 1e-9)
         ends = {
-            "left": facets_where(boundary, points[:, 0] <= -reach),
-            "right": facets_where(boundary, points[:, 0] >= reach),
+            "left": facets_on_nodes(boundary, points[:, 0] <= -reach),
+            "right": facets_on_nodes(boundary, points[:, 0] >= reach),
         }
         for name, facets in ends.items():
             require(len(facets) > 0, f"loaf: no facet lies within grip = {self.grip!r} of the {name} end; enlarge it.")
-        return MeshData(points, cells, ends | bottom | {"crust": facets_except(boundary, bottom["bottom"])})
+        return MeshData(points, cells, ends | bottom | {"crust": exclude_facets(boundary, bottom["bottom"])})
 
     @property
     def _block(self) -> tuple[float, float, float]:

@@ -10,9 +10,9 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ..data import Indices, Points
-from ..parameters import affordable, is_number, not_negative, one_of, positive, require
-from ..sizing import Sizing
-from ..topology import facets_where
+from ..parameters import is_length, positive, require, require_affordable, require_not_negative, require_one_of
+from ..sizing import SizeField
+from ..topology import facets_on_nodes
 from .profile import CutRectangle, Point, Profile
 
 
@@ -64,13 +64,13 @@ class NotchedBar(CutRectangle):
     patch: float = 0.001
 
     def __post_init__(self) -> None:
-        one_of("notched-bar", "notch", self.notch, ("V", "U", "slit"))
+        require_one_of("notched-bar", "notch", self.notch, ("V", "U", "slit"))
         positive("notched-bar", length=self.length, height=self.height, notch_depth=self.notch_depth, h=self.h)
         positive("notched-bar", h_notch=self._fine, **({"patch": self.patch} if self.span else {}))
-        not_negative("notched-bar", thickness=self.thickness, refined=self.refined, span=self.span)
+        require_not_negative("notched-bar", thickness=self.thickness, refined=self.refined, span=self.span)
         self._check_notch()
         self._check_supports()
-        affordable("notched-bar", min(self.h, self._fine), self.cells_estimate())
+        require_affordable("notched-bar", min(self.h, self._fine), self.cells_estimate())
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -87,10 +87,10 @@ class NotchedBar(CutRectangle):
         return self.h / 4 if self.h_notch is None else self.h_notch
 
     @property
-    def _sizing(self) -> Sizing:
+    def _sizing(self) -> SizeField:
         middle, reach = self.length / 2, self._root_radius
         low, high = (middle - reach, self.notch_depth - reach), (middle + reach, self.notch_depth + self.refined)
-        return Sizing(self.h, min(self._fine, self.h), low, high)
+        return SizeField(self.h, min(self._fine, self.h), low, high)
 
     @property
     def _half_angle(self) -> float:
@@ -106,9 +106,9 @@ class NotchedBar(CutRectangle):
         elif self.notch == "U":
             positive("notched-bar", notch_radius=self.notch_radius)
         else:
-            not_negative("notched-bar", notch_radius=self.notch_radius)
+            require_not_negative("notched-bar", notch_radius=self.notch_radius)
             require(
-                is_number(self.notch_angle) and 0 < self.notch_angle < 180,
+                is_length(self.notch_angle) and 0 < self.notch_angle < 180,
                 f"notched-bar: notch_angle = {self.notch_angle!r} must lie between 0 and 180 degrees "
                 '(parallel flanks: notch = "U").',
             )
@@ -166,6 +166,6 @@ class NotchedBar(CutRectangle):
         middle, side, reach = self.length / 2, self.span / 2, self.patch / 2 + 1e-9 * self.length
         places = {"support-left": ("bottom", -side), "support-right": ("bottom", side), "load": ("top", 0.0)}
         return groups | {
-            name: facets_where(groups[face], np.abs(points[:, 0] - (middle + at)) <= reach)
+            name: facets_on_nodes(groups[face], np.abs(points[:, 0] - (middle + at)) <= reach)
             for name, (face, at) in places.items()
         }

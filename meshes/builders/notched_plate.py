@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ..parameters import affordable, not_negative, positive, require
-from ..sizing import Sizing
+from ..parameters import positive, require, require_affordable, require_not_negative
+from ..sizing import SizeField
 from .profile import CutRectangle, Profile
 
 
@@ -51,7 +51,9 @@ class NotchedPlate(CutRectangle):
     def __post_init__(self) -> None:
         positive("notched-plate", length=self.length, height=self.height, h=self.h, h_tip=self._fine)
         positive("notched-plate", notch_length=self.notch_length, notch_width=self.notch_width)
-        not_negative("notched-plate", thickness=self.thickness, refined=self.refined, notch_position=self._position)
+        require_not_negative(
+            "notched-plate", thickness=self.thickness, refined=self.refined, notch_position=self._position
+        )
         half = self.notch_width / 2
         require(
             half < self.notch_length < self.length,
@@ -63,7 +65,7 @@ class NotchedPlate(CutRectangle):
             f"notched-plate: a slit of notch_width = {self.notch_width!r} at notch_position = {self._position!r} does "
             f"not lie within height = {self.height!r}.",
         )
-        affordable("notched-plate", min(self.h, self._fine), self.cells_estimate())
+        require_affordable("notched-plate", min(self.h, self._fine), self.cells_estimate())
 
     @property
     def _fine(self) -> float:
@@ -74,10 +76,10 @@ class NotchedPlate(CutRectangle):
         return self.height / 2 if self.notch_position is None else self.notch_position
 
     @property
-    def _sizing(self) -> Sizing:
+    def _sizing(self) -> SizeField:
         tip = (self.notch_length, self._position)
         ahead = min(self.notch_length + self.refined, self.length)
-        return Sizing(self.h, min(self._fine, self.h), tip, (ahead, self._position))
+        return SizeField(self.h, min(self._fine, self.h), tip, (ahead, self._position))
 
     def _profile(self) -> Profile:
         half, at, tip = self.notch_width / 2, self._position, self.notch_length

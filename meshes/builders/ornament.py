@@ -9,8 +9,8 @@ from typing import ClassVar
 import numpy as np
 
 from ..data import Indices, MeshData, Points
-from ..parameters import affordable, positive, require
-from ..shell import thickened
+from ..parameters import positive, require, require_affordable
+from ..shell import extrude_shell
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class Ornament:
             self.thickness < 0.5 * self.radius, f"ornament: thickness = {self.thickness!r} must be below radius / 2."
         )
         require(self.h < self.radius, f"ornament: h = {self.h!r} must be below radius = {self.radius!r}.")
-        affordable("ornament", self.h, self.cells_estimate())
+        require_affordable("ornament", self.h, self.cells_estimate())
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -71,7 +71,7 @@ class Ornament:
 
     def build(self) -> MeshData:
         points, triangles = self._surface()
-        return thickened(points, triangles, self.thickness, "ornament")
+        return extrude_shell(points, triangles, self.thickness, "ornament")
 
     def _surface(self) -> tuple[Points, Indices]:
         """The middle surface: a ball whose top is drawn out to the neck."""

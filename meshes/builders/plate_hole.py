@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from math import pi
 from typing import ClassVar
 
-from ..curved_boundaries import Round
-from ..parameters import affordable, not_negative, positive, require
-from ..sizing import Sizing
+from ..curved_boundaries import CurvedBoundary
+from ..parameters import positive, require, require_affordable, require_not_negative
+from ..sizing import SizeField
 from .profile import CutRectangle, Profile
 
 
@@ -46,22 +46,22 @@ class PlateHole(CutRectangle):
 
     def __post_init__(self) -> None:
         positive("plate-hole", length=self.length, height=self.height, radius=self.radius, h=self.h, h_hole=self._fine)
-        not_negative("plate-hole", thickness=self.thickness)
+        require_not_negative("plate-hole", thickness=self.thickness)
         require(
             self.radius < min(self.length, self.height),
             f"plate-hole: radius = {self.radius!r} must be less than length = {self.length!r} and height = "
             f"{self.height!r}.",
         )
-        affordable("plate-hole", min(self.h, self._fine), self.cells_estimate())
+        require_affordable("plate-hole", min(self.h, self._fine), self.cells_estimate())
 
     def cells_estimate(self) -> int:
         """The hole is taken for filled with the cells beside it, less its own share of them."""
         return max(1, round(super().cells_estimate() - pi / 4 * self._cells_within(self.radius, self.radius)))
 
     @property
-    def rounds(self) -> tuple[Round, ...]:
+    def rounds(self) -> tuple[CurvedBoundary, ...]:
         """The hole."""
-        return (Round(("hole",), self.radius, 1 if self.thickness else None),)
+        return (CurvedBoundary(("hole",), self.radius, 1 if self.thickness else None),)
 
     def _profile(self) -> Profile:
         r, length, height = self.radius, self.length, self.height
@@ -72,6 +72,6 @@ class PlateHole(CutRectangle):
         return self.h / 4 if self.h_hole is None else self.h_hole
 
     @property
-    def _sizing(self) -> Sizing:
+    def _sizing(self) -> SizeField:
         reach = min(2 * self.radius, self.length), min(2 * self.radius, self.height)
-        return Sizing(self.h, min(self._fine, self.h), (0.0, 0.0), reach)
+        return SizeField(self.h, min(self._fine, self.h), (0.0, 0.0), reach)

@@ -9,9 +9,9 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..data import Indices, MeshData, Points
-from ..gmsh_session import meshed
-from ..sizing import Sizing, cells_for
-from ..topology import boundary_facets, facets_except, oriented, plane_groups
+from ..gmsh_session import mesh_with_gmsh
+from ..sizing import SizeField, estimate_cells_in_box
+from ..topology import boundary_facets, exclude_facets, facet_groups_on_planes, orient_cells
 
 Point = tuple[float, float]
 
@@ -44,13 +44,13 @@ class Profile:
             occ.extrude([(2, face)], 0.0, 0.0, thickness)
 
 
-def mesh_profile(profile: Profile, thickness: float, sizing: Sizing) -> tuple[Points, Indices]:
+def mesh_profile(profile: Profile, thickness: float, sizing: SizeField) -> tuple[Points, Indices]:
     """Points and positive cells of the profile in x-y (thickness 0), or of the solid with its thickness along y."""
     dim = 3 if thickness > 0 else 2
-    points, cells = meshed(lambda gmsh: profile.draw(gmsh, thickness), dim, sizing)
+    points, cells = mesh_with_gmsh(lambda gmsh: profile.draw(gmsh, thickness), dim, sizing)
     if dim == 3:
         points = np.ascontiguousarray(points[:, [0, 2, 1]])
-        cells, _ = oriented(points, cells)
+        cells, _ = orient_cells(points, cells)
     return points, cells
 
 
@@ -67,7 +67,7 @@ class CutRectangle(ABC):
 
     @property
     @abstractmethod
-    def _sizing(self) -> Sizing:
+    def _sizing(self) -> SizeField:
         """The size of cells from place to place."""
 
     @abstractmethod
@@ -88,7 +88,7 @@ class CutRectangle(ABC):
     def _cells_within(self, x: float, y: float) -> int:
         """About how many cells fill the rectangle from the origin to (x, y), over all the thickness."""
         high = (x, y, self.thickness) if self.thickness else (x, y)
-        return cells_for(self._sizing, (0.0,) * len(high), high)
+        return estimate_cells_in_box(self._sizing, (0.0,) * len(high), high)
 
     def build(self) -> MeshData:
         points, cells = mesh_profile(self._profile(), self.thickness, self._sizing)
@@ -101,5 +101,5 @@ class CutRectangle(ABC):
         if up == 2:
             planes |= {"front": (1, 0.0), "back": (1, self.thickness)}
         boundary = boundary_facets(cells)
-        groups = plane_groups(points, boundary, planes)
-        return groups | {self.cut: facets_except(boundary, *groups.values())}
+        groups = facet_groups_on_planes(points, boundary, planes)
+        return groups | {self.cut: exclude_facets(boundary, *groups.values())}

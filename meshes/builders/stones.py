@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..data import Indices, MeshData, Points
-from ..parameters import not_negative, positive, require
-from ..topology import boundary_facets, oriented
+from ..parameters import positive, require, require_not_negative
+from ..topology import boundary_facets, orient_cells
 
 MOST = 100_000
 ROOM = 1.05  # between the middles of neighbours, in diameters of the largest stone there may be
@@ -46,7 +46,7 @@ class Stones:
 
     def __post_init__(self) -> None:
         positive("stones", radius=self.radius)
-        not_negative("stones", spread=self.spread)
+        require_not_negative("stones", spread=self.spread)
         require(1 <= self.count <= MOST, f"stones: count = {self.count!r} must be from 1 to {MOST:,}.")
         within = min(self.aside) >= 1 and max(self.aside) <= MOST
         require(within, f"stones: aside = {list(self.aside)} must be two numbers of 1 or more, at most {MOST:,}.")
@@ -65,7 +65,7 @@ class Stones:
         one = np.column_stack([np.zeros(20, np.int64), 1 + _FACES])
         points = np.concatenate([self._middles()[:, None], corners], axis=1).reshape(-1, 3)
         each = 13 * np.arange(self.count)[:, None, None]
-        cells, _ = oriented(points, (one + each).reshape(-1, 4))
+        cells, _ = orient_cells(points, (one + each).reshape(-1, 4))
         return MeshData(points, cells, {"surface": boundary_facets(cells)})
 
     def _middles(self) -> Points:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.polynomial import Polynomial
 
 from ..data import MeshData
-from ..gmsh_session import meshed
-from ..parameters import affordable, not_negative, positive, require
-from ..sizing import Sizing, cells_for_body
-from ..topology import boundary_facets, facets_except, facets_where, plane_groups
+from ..gmsh_session import mesh_with_gmsh
+from ..parameters import positive, require, require_affordable, require_not_negative
+from ..sizing import SizeField, estimate_cells_in_body
+from ..topology import boundary_facets, exclude_facets, facet_groups_on_planes, facets_on_nodes
 
 # Heights of the control polygon of the profile are equal, so that r is a polynomial in z: a foot, a belly, a neck and a
 # lip. The unit is the radius of the belly.
@@ -50,13 +50,13 @@ class Vase:
 
     def __post_init__(self) -> None:
         positive("vase", height=self.height, radius=self.radius, h=self.h)
-        not_negative("vase", wall=self.wall)
+        require_not_negative("vase", wall=self.wall)
         neck = float(self.outline()(np.linspace(0, self.height, 400)).min())
         require(
             self.wall < neck and self.wall < self.height,
             f"vase: wall = {self.wall!r} must be less than the radius of the neck, {neck:.4g} m; 0 makes it solid.",
         )
-        affordable("vase", self.h, self.cells_estimate())
+        require_affordable("vase", self.h, self.cells_estimate())
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -83,20 +83,20 @@ class Vase:
         return (-self.radius, -self.radius, 0.0), (self.radius, self.radius, self.height)
 
     def cells_estimate(self) -> int:
-        return cells_for_body(self.volume(), self.wall, self.h)
+        return estimate_cells_in_body(self.volume(), self.wall, self.h)
 
     def build(self) -> MeshData:
-        from ..surfaces.fill import peeled
+        from ..surfaces.fill import remove_boundary_slivers
 
-        points, cells = meshed(self._draw, 3, Sizing(self.h))
-        cells = peeled(points, cells, FLAT)
+        points, cells = mesh_with_gmsh(self._draw, 3, SizeField(self.h))
+        cells = remove_boundary_slivers(points, cells, FLAT)
         boundary = boundary_facets(cells)
-        groups = plane_groups(points, boundary, {"base": (2, 0.0), "rim": (2, self.height)})
+        groups = facet_groups_on_planes(points, boundary, {"base": (2, 0.0), "rim": (2, self.height)})
         if self.wall:
             within = np.hypot(points[:, 0], points[:, 1]) < self.outline()(points[:, 2]) - self.wall / 2
-            inside = facets_where(boundary, within & (points[:, 2] > self.wall / 2))
-            groups["inside"] = facets_except(inside, groups["rim"])
-        return MeshData(points, cells, groups | {"side": facets_except(boundary, *groups.values())})
+            inside = facets_on_nodes(boundary, within & (points[:, 2] > self.wall / 2))
+            groups["inside"] = exclude_facets(inside, groups["rim"])
+        return MeshData(points, cells, groups | {"side": exclude_facets(boundary, *groups.values())})
 
     def _draw(self, gmsh: Any) -> None:
         """The half section, turned once around the axis."""

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..data import Indices, Points
-from ..sizing import Sizing
+from ..sizing import SizeField
 from ..topology import Floats
 from .outline import Outline
 from .points import scatter
@@ -21,13 +21,13 @@ TURN = 2 * np.pi
 FACES = 1_000_000  # seeds from one of a mesh to the next: each of its faces has its own
 
 
-def scatter_plane(gmsh: Any, sizing: Sizing, seed: int = 1) -> tuple[Points, Indices]:
+def scatter_plane(gmsh: Any, sizing: SizeField, seed: int = 1) -> tuple[Points, Indices]:
     """Points (n, 2) and positive triangles (m, 3) of a flat body whose curves are meshed; MeshError as of `scatter`."""
     nodes = _Curves.of(gmsh, [tag for _, tag in gmsh.model.getEntities(1)])
     return scatter(Outline(nodes.points[:, :2], nodes.pieces), sizing.at, seed)
 
 
-def scatter_faces(gmsh: Any, sizing: Sizing, seed: int = 1) -> None:
+def scatter_faces(gmsh: Any, sizing: SizeField, seed: int = 1) -> None:
     """Mesh the flat and cylindrical faces of a meshed surface anew; others stay as gmsh made them.
 
     Sizes are those at the first two coordinates of gmsh's model, as everywhere.
@@ -59,9 +59,9 @@ class _Curves:
         return cls(tags, points, pieces.reshape(-1, 2))
 
 
-def _mesh_anew(gmsh: Any, face: int, sizing: Sizing, seed: int) -> None:
+def _mesh_anew(gmsh: Any, face: int, sizing: SizeField, seed: int) -> None:
     """Lay the face out in a plane, scatter points there, and put them and their triangles in the place of gmsh's."""
-    sides = [tag for _, tag in gmsh.model.getBoundary([(2, face)], combined=False, oriented=False)]
+    sides = [tag for _, tag in gmsh.model.getBoundary([(2, face)], combined=False, orient_cells=False)]
     seams = {side for side in sides if sides.count(side) == 2}
     nodes = _Curves.of(gmsh, sorted(set(sides)))
     flat = _parameters(gmsh, face, nodes.points)

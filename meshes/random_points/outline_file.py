@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 
 from ..data import Indices, MeshData, MeshError, Points
-from ..parameters import affordable, check_extent, positive
-from ..plain_files import wrong_with
-from ..text_rows import decoded
+from ..parameters import check_extent, positive, require_affordable
+from ..plain_files import unreadable_reason
+from ..text_rows import decode_text
 from ..topology import Floats, boundary_facets, signed_measures
 from .outline import Outline
 from .points import scatter
 
-MOST_SIDES = 3000  # of which each is held against each
+MAX_CHECKED_SIDES = 3000  # of which each is held against each
 CELLS = 2.6  # triangles over area / h^2 that random points make
 
 
@@ -66,7 +66,7 @@ def read_outline(path: str | Path, scale: float = 1.0) -> Drawn:
     Raises:
         MeshError: the file cannot be read, or a polygon has fewer than three corners.
     """
-    if wrong := wrong_with(path):
+    if wrong := unreadable_reason(path):
         raise MeshError(f"outline file '{path}' {wrong}.")
     try:
         data = Path(path).read_bytes()
@@ -74,7 +74,7 @@ def read_outline(path: str | Path, scale: float = 1.0) -> Drawn:
         raise MeshError(f"outline file '{path}' cannot be read: {error.strerror}.") from None
     if b"\0" in data:
         raise MeshError(f"outline file '{path}' is no text; save it as plain text: a line `x, y` for each corner.")
-    lines = decoded(data).splitlines()
+    lines = decode_text(data).splitlines()
     loops: list[list[tuple[float, float, str]]] = [[]]
     for number, line in enumerate(lines, 1):
         if words := line.partition("#")[0].replace(",", " ").split():
@@ -115,7 +115,7 @@ def fill_outline(drawn: Drawn, h: float, seed: int = 1) -> MeshData:
     """
     positive("outline", h=h)
     _check_apart(drawn)
-    affordable("outline", h, drawn.cells_estimate(h))
+    require_affordable("outline", h, drawn.cells_estimate(h))
     outline = _in_parts(drawn, h)
     points, cells = scatter(outline, lambda at: np.full(len(at), h), seed)
     facets = boundary_facets(cells)
@@ -129,7 +129,7 @@ def fill_outline(drawn: Drawn, h: float, seed: int = 1) -> MeshData:
 
 def _check_apart(drawn: Drawn) -> None:
     """MeshError where two sides cross: each has the ends of the other on both hands. Points would find it late."""
-    if len(drawn.start) > MOST_SIDES:
+    if len(drawn.start) > MAX_CHECKED_SIDES:
         return
     a, b = drawn.start, drawn.end
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..data import Indices, MeshError, Points
-from ..topology import Floats, Mask, oriented
+from ..topology import Floats, Mask, orient_cells
 from .outline import Outline, delaunay
 
 APART = 0.75  # least distance of points over the cell size: the median edge is then 0.96 to 0.97 of the cell size
@@ -41,7 +41,7 @@ def scatter(outline: Outline, size: Size, seed: int = 1) -> tuple[Points, Indice
         new = new[_held(triangles, inside, new)]
         new = new[_first(new, APART * size(new))]
         if len(new) == 0:
-            return points, oriented(points, triangles.simplices[inside].astype(np.int64))[0]
+            return points, orient_cells(points, triangles.simplices[inside].astype(np.int64))[0]
         points = np.concatenate([points, new])
     raise MeshError("random points did not come to an end; take a larger h.")
 

@@ -11,16 +11,16 @@ from ..components import components
 from ..data import Indices, MeshError, Points
 from ..mesh_conversion import Block
 from ..parameters import LONGEST, SHORTEST
-from ..text import middle_of
+from ..text import format_midpoint
 from ..topology import Floats, Mask
-from .enclosed import enclosed_volumes, windings
-from .mending import EdgeTable, areas, flat_triangles, mended, mended_sheet
+from .enclosed import enclosed_volumes, winding_numbers
+from .mending import EdgeTable, areas, has_no_area, mend_open_surface, mended
 from .polygons import triangles_of_faces
 
 PROBES = 300  # points of a part that are looked up in another part
 
 
-class Repairable(MeshError):
+class RepairableSurfaceError(MeshError):
     """A surface that is open, cuts itself or has edges of more than two triangles, which `repair` may mend."""
 
 
@@ -76,26 +76,26 @@ def read_surface(path: str | Path, scale: float = 1.0) -> ClosedSurface:
             triangles without an area or points that are no numbers, or parts that cut each other.
     """
     path = Path(path)
-    return closed_surface(*triangles_as_given(path, scale, f"Surface file '{path}'"), f"Surface file '{path}'")
+    return closed_surface(*read_raw_triangles(path, scale, f"Surface file '{path}'"), f"Surface file '{path}'")
 
 
 def read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indices, tuple[str, ...]]:
     """Points [m] and triangles of a surface, closed or open, mended (see mending) and turned alike; notes of that.
     MeshError as of read_surface, beginning with `source`; an edge of more than two triangles."""
-    points, triangles = triangles_as_given(path, scale, source)
+    points, triangles = read_raw_triangles(path, scale, source)
     check_points(points, triangles, source)
-    points, triangles, notes, _, may_be_flat = mended_sheet(points, triangles)
+    points, triangles, notes, _, may_be_flat = mend_open_surface(points, triangles)
     if may_be_flat:
         check_areas(points, triangles, source)
     table = EdgeTable(triangles)
     check_edges(points, table, source, (2,))
-    triangles, _, turned = turned_alike(triangles, table, source)
+    triangles, _, turned = orient_consistently(triangles, table, source)
     if turned:
         notes = (*notes, f"{turned} of {len(triangles)} triangles of the shell faced the other way; turned.")
     return points, triangles, notes
 
 
-def triangles_as_given(path: Path, scale: float, source: str) -> tuple[Points, Indices]:
+def read_raw_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indices]:
     """Points [m] and triangles as they are in a file; `scale`: metres per unit of it. MeshError as of read_surface."""
     from ..read import read_contents  # the readers of all formats: a body of a builder needs none
 
@@ -108,7 +108,7 @@ def triangles_as_given(path: Path, scale: float, source: str) -> tuple[Points, I
     return scale * contents.points, triangles
 
 
-def joined_shells(shells: list[tuple[Points, Indices]], source: str) -> ClosedSurface:
+def combine_shells(shells: list[tuple[Points, Indices]], source: str) -> ClosedSurface:
     """Closed shells, one inside another or apart, as one surface."""
     starts = np.cumsum([0] + [len(points) for points, _ in shells])
     triangles = [shell + start for (_, shell), start in zip(shells, starts, strict=False)]
@@ -143,7 +143,7 @@ def closed_surface(points: Points, triangles: Indices, source: str) -> ClosedSur
         check_areas(points, triangles, source)
     table = EdgeTable(triangles)
     check_edges(points, table, source, (1, 2))
-    triangles, shell, turned = turned_alike(triangles, table, source)
+    triangles, shell, turned = orient_consistently(triangles, table, source)
     triangles, bodies, inside_out = _outwards(points, triangles, shell, source)
     notes = list(mends)
     if turned:
@@ -177,11 +177,11 @@ def check_points(points: Points, triangles: Indices, source: str) -> None:
 def check_areas(points: Points, triangles: Indices, source: str) -> None:
     if len(triangles) == 0:
         raise MeshError(f"{source} has no triangle that is larger than a point.")
-    flat = np.flatnonzero(flat_triangles(points, triangles))
+    flat = np.flatnonzero(has_no_area(points, triangles))
     if len(flat):
         raise MeshError(
             f"{source} has {len(flat)} triangles without an area, the first at "
-            f"{middle_of(points, triangles[flat[0]])}; remesh the surface there."
+            f"{format_midpoint(points, triangles[flat[0]])}; remesh the surface there."
         )
 
 
@@ -194,15 +194,15 @@ def check_edges(points: Points, table: EdgeTable, source: str, which: tuple[int,
     for kind in which:
         wrong, what = found[kind]
         if len(wrong):
-            refused = Repairable if 1 in which else MeshError
+            refused = RepairableSurfaceError if 1 in which else MeshError
             raise refused(
-                f"{source} {what.format(len(wrong))}, the first at {middle_of(points, wrong[0])}; "
+                f"{source} {what.format(len(wrong))}, the first at {format_midpoint(points, wrong[0])}; "
                 "close or mend it there (MeshLab: Filters > Remeshing > Close Holes; Blender: Mesh > Clean Up > Fill "
                 "Holes)."
             )
 
 
-def turned_alike(triangles: Indices, table: EdgeTable, source: str) -> tuple[Indices, Indices, int]:
+def orient_consistently(triangles: Indices, table: EdgeTable, source: str) -> tuple[Indices, Indices, int]:
     """Triangles turned so that neighbours face the same side; the connected part of each; how many were turned.
 
     Each triangle t has two states, as given (t) and turned (t + k). States of neighbours that agree are linked; the
@@ -258,10 +258,11 @@ def _holders(points: Points, triangles: Indices, shell: Indices, source: str) ->
     corners = [points[triangles[shell == j]] for j in range(count)]
     for i, j in _near(corners):
         probes = np.unique(corners[i].reshape(-1, 3), axis=0)
-        within = abs(windings(probes[:: 1 + len(probes) // PROBES], corners[j])) > 0.5
+        within = abs(winding_numbers(probes[:: 1 + len(probes) // PROBES], corners[j])) > 0.5
         if within.any() and not within.all():
-            raise Repairable(
-                f"{source} has parts that cut each other, near {middle_of(points, triangles[shell == i].ravel())}; "
+            raise RepairableSurfaceError(
+                f"{source} has parts that cut each other, near "
+                f"{format_midpoint(points, triangles[shell == i].ravel())}; "
                 "join them into one surface, or move them apart."
             )
         inside[i, j] = within.all()

@@ -16,7 +16,7 @@ def enclosed_volumes(points: Floats, triangles: npt.NDArray[np.integer]) -> Floa
     return np.asarray(np.einsum("ki,ki->k", a, np.cross(b, c)) / 6)
 
 
-def windings(x: Floats, corners: Floats) -> Floats:
+def winding_numbers(x: Floats, corners: Floats) -> Floats:
     """(n,) how often triangles (k, 3, 3) wind around points x (n, 3): the sums of their solid angles over 4 pi.
 
     tan(omega / 2) = a . (b x c) / (|a||b||c| + (a . b)|c| + (b . c)|a| + (c . a)|b|)   (Van Oosterom, Strackee 1983)

@@ -11,9 +11,9 @@ import numpy as np
 
 from ..check import check_mesh, flat_cells
 from ..data import Indices, MeshData, MeshError, Points
-from ..gmsh_session import TRIANGLE, cells_in, fill_volumes, session
-from ..parameters import affordable, positive, require
-from ..sizing import Sizing, cells_for_body
+from ..gmsh_session import TRIANGLE, cells_of_model, fill_volumes, session
+from ..parameters import positive, require, require_affordable
+from ..sizing import SizeField, estimate_cells_in_body
 from ..time_limit import within
 from ..topology import Floats, boundary_facets, distinct_rows, facets_of, signed_measures
 from .closed import ClosedSurface
@@ -81,8 +81,8 @@ def expected_cells(surface: ClosedSurface, h: float) -> int:
     units = f"The body measures {surface.extent}: a file in millimetres needs [mesh] scale = 1e-3."
     require(h <= max(surface.sides), f"surface: h = {h!r} m is larger than the whole body. {units}")
     wall = 2 * surface.volume / surface.area  # of a shell; of a solid body some third of its thickness, which is more
-    expected = cells_for_body(surface.volume, wall, h)
-    affordable("surface", h, expected, units)
+    expected = estimate_cells_in_body(surface.volume, wall, h)
+    require_affordable("surface", h, expected, units)
     return expected
 
 
@@ -101,7 +101,7 @@ def fill_shells(shells: list[Shell], bodies: list[list[int]], h: float, source: 
     points, cells = _filled(shells, bodies, _inner_size(shells, h), source)
     volume = float(signed_measures(points, cells).sum())
     _check_filled(shells, bodies, volume, source)
-    return points, peeled(points, cells), volume
+    return points, remove_boundary_slivers(points, cells), volume
 
 
 def _remeshed_shells(surface: ClosedSurface, h: float) -> tuple[list[Shell], tuple[str, ...]]:
@@ -124,7 +124,7 @@ def _remeshed(points: Points, triangles: Indices, h: float) -> Shell:
         _add_shell(gmsh, 1, unit.into(points), triangles)
         gmsh.model.mesh.classifySurfaces(SHARP, True, True, pi)
         gmsh.model.mesh.createGeometry()
-        Sizing(unit.length(h)).apply(gmsh)
+        SizeField(unit.length(h)).apply(gmsh)
         gmsh.model.mesh.generate(2)
         tags, coordinates, _ = gmsh.model.mesh.getNodes()
         _, nodes = gmsh.model.mesh.getElementsByType(TRIANGLE)
@@ -165,8 +165,8 @@ def _filled(shells: list[Shell], bodies: list[list[int]], h: float, source: str)
                 loops = [gmsh.model.geo.addSurfaceLoop([shell + 1]) for shell in body]
                 gmsh.model.geo.addVolume(loops)
             gmsh.model.geo.synchronize()
-            fill_volumes(gmsh, Sizing(h))
-            points, cells = cells_in(gmsh, 3)
+            fill_volumes(gmsh, SizeField(h))
+            points, cells = cells_of_model(gmsh, 3)
     except MeshError as error:
         raise MeshError(
             f"{source} could not be filled with tetrahedra ({error}) Does the surface cut itself? [mesh] repair "
@@ -210,7 +210,7 @@ def _add_shell(gmsh: Any, tag: int, points: Points, triangles: Indices) -> None:
     gmsh.model.mesh.addElementsByType(tag, TRIANGLE, [], numbers[triangles].ravel())
 
 
-def peeled(points: Points, cells: Indices, thin: float = SLIVER) -> Indices:
+def remove_boundary_slivers(points: Points, cells: Indices, thin: float = SLIVER) -> Indices:
     """Cells without the flat ones on the boundary: four nodes of one face, almost in a plane, that nobody misses.
 
     Without such a cell the face is cut along its other diagonal.

@@ -57,7 +57,7 @@ def mended(points: Points, triangles: Indices) -> Mended:
     return second._replace(notes=(note, *second.notes))
 
 
-def mended_sheet(points: Points, triangles: Indices) -> Mended:
+def mend_open_surface(points: Points, triangles: Indices) -> Mended:
     """The same of a surface that may be open: triangles given twice are taken once in any case."""
     return _mended(points, triangles, JOINED, sheet=True)
 
@@ -70,7 +70,7 @@ def _mended(points: Points, triangles: Indices, reach: float, copies: bool = Fal
     once = _once(triangles) | copies
     if not once.all():
         notes.append(f"{int((~once).sum())} surface triangles were given more than once, and are taken once.")
-    flat = flat_triangles(points, triangles)
+    flat = has_no_area(points, triangles)
     if flat.all():  # for `closed` to refuse
         return Mended(points, triangles, (), False, True)
     if flat.any():
@@ -164,7 +164,7 @@ def areas(points: Points, triangles: Indices) -> Floats:
     return np.asarray(np.sqrt(np.einsum("ki,ki->k", normals, normals)) / 2)
 
 
-def flat_triangles(points: Points, triangles: Indices) -> Mask:
+def has_no_area(points: Points, triangles: Indices) -> Mask:
     """(k,) whether each has no area: coordinates of single precision move a corner by up to 6e-8 of the size."""
     a, b, c = (points[column] for column in triangles.T)
     squares = [np.einsum("ki,ki->k", side, side) for side in (b - a, c - b, a - c)]

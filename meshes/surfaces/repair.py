@@ -15,21 +15,21 @@ import numpy as np
 
 from ..components import components
 from ..data import Indices, MeshError, Points
-from ..text import middle_of
-from ..time_limit import Died, within
+from ..text import format_midpoint
+from ..time_limit import ProcessDiedError, within
 from ..topology import Mask, distinct_rows
 from .closed import (
     ClosedSurface,
-    Repairable,
+    RepairableSurfaceError,
     check_areas,
     check_edges,
     check_points,
     closed_surface,
+    orient_consistently,
+    read_raw_triangles,
     read_surface,
-    triangles_as_given,
-    turned_alike,
 )
-from .enclosed import enclosed_volumes, windings
+from .enclosed import enclosed_volumes, winding_numbers
 from .mending import JOINED, EdgeTable, areas, directed_edges, mended, open_edges
 from .self_intersection import crossing_triangles
 
@@ -56,7 +56,7 @@ def read_body(
         time_limit: seconds that the repair may take; None: a minute and a millisecond for each triangle.
 
     Raises:
-        Repairable: open, or it cuts itself, and `repair` is off.
+        RepairableSurfaceError: open, or it cuts itself, and `repair` is off.
         MeshError: see read_surface; a repair that changes the shape grossly, fails or takes too long.
     """
     source = f"Surface file '{path}'"
@@ -64,7 +64,7 @@ def read_body(
         surface = read_surface(path, scale)
         _refuse_crossings(surface, source)
         return surface
-    points, triangles = triangles_as_given(Path(path), scale, source)
+    points, triangles = read_raw_triangles(Path(path), scale, source)
     check_points(points, triangles, source)
     seconds = SECONDS + SECONDS_A_TRIANGLE * len(triangles) if time_limit is None else time_limit
     try:
@@ -74,7 +74,7 @@ def read_body(
             f"{source}: the repair had not ended within {seconds:.0f} s ({len(triangles):,} triangles). Simplify the "
             "surface, or give more seconds with [mesh] time_limit."
         ) from None
-    except Died as died:
+    except ProcessDiedError as died:
         raise MeshError(f"{source}: the repair died ({died.how}). {BY_HAND}") from None
     after = f"{source}, repaired,"
     surface = closed_surface(points, triangles, after)
@@ -85,8 +85,8 @@ def read_body(
 def _refuse_crossings(surface: ClosedSurface, source: str, closed: bool = False) -> None:
     pairs = crossing_triangles(surface.points, surface.triangles, closed=closed)
     if len(pairs):
-        where = middle_of(surface.points, surface.triangles[pairs[0]].ravel())
-        raise Repairable(
+        where = format_midpoint(surface.points, surface.triangles[pairs[0]].ravel())
+        raise RepairableSurfaceError(
             f"{source} cuts itself: {len(np.unique(pairs))} of its {len(surface.triangles)} triangles pass through "
             f"others, the first near {where}. {BY_HAND}"
         )
@@ -100,7 +100,7 @@ def repaired(points: Points, triangles: Indices, source: str) -> tuple[Points, I
             manifold3d is not installed.
     """
     points, triangles, mends = _mended(points, triangles, source)
-    triangles, shell, _ = turned_alike(triangles, EdgeTable(triangles), source)
+    triangles, shell, _ = orient_consistently(triangles, EdgeTable(triangles), source)
     crossings = crossing_triangles(points, triangles, closed=True)
     own = np.unique(crossings[shell[crossings[:, 0]] == shell[crossings[:, 1]]])
     opened = np.unique(open_edges(triangles) // 3)
@@ -115,7 +115,7 @@ def repaired(points: Points, triangles: Indices, source: str) -> tuple[Points, I
             notes.append(change)
         parts.append(part)
     if dust.any():
-        first = middle_of(points, triangles[shell == np.argmax(dust)].ravel())
+        first = format_midpoint(points, triangles[shell == np.argmax(dust)].ravel())
         notes.append(
             f"Repair: {int(dust.sum())} open parts of the surface were left out, {area[dust].sum() / area.sum():.2g} "
             f"of its area, the first near {first}."
@@ -199,7 +199,7 @@ class _Holes:
         of_edge = middles[loop[numbered.reshape(-1, 2)[:, 0]]]
         lids = np.stack([points[edges[:, 1]], points[edges[:, 0]], of_edge], axis=1)
         longest = float(np.linalg.norm(points[edges[:, 1]] - points[edges[:, 0]], axis=1).max())
-        return cls(count, longest, middle_of(middles, np.array([0])), lids)
+        return cls(count, longest, format_midpoint(middles, np.array([0])), lids)
 
 
 def _fixed(points: Points, triangles: Indices, cut: int, source: str) -> tuple[Part, str]:
@@ -334,7 +334,7 @@ def _union(parts: list[Part], source: str) -> tuple[Part, str]:
     whole = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add).simplify(SLIVER * size)
     mesh = whole.to_mesh64()
     points, triangles = np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts, np.int64).reshape(-1, 3)
-    place = middle_of(parts[1][0], np.arange(len(parts[1][0])))
+    place = format_midpoint(parts[1][0], np.arange(len(parts[1][0])))
     bad = [solid.status().name for solid in (*solids, whole) if solid.status() != manifold3d.Error.NoError]
     given = np.abs(volumes)
     volume = float(enclosed_volumes(points, triangles).sum()) if len(triangles) else 0.0
@@ -351,9 +351,9 @@ def _refuse_cavities(parts: list[Part], source: str) -> None:
     """MeshError where one of the parts that are to be one body lies within another: a cavity, which would be filled."""
     for i, (points, _) in enumerate(parts):
         for j, (others, triangles) in enumerate(parts):
-            if i != j and (abs(windings(points[:: 1 + len(points) // 300], others[triangles])) > 0.5).all():
+            if i != j and (abs(winding_numbers(points[:: 1 + len(points) // 300], others[triangles])) > 0.5).all():
                 raise MeshError(
                     f"{source}: parts that cross have another part within them, near "
-                    f"{middle_of(points, np.arange(len(points)))}; whether it is a cavity is not known. Unite the "
-                    "parts by hand (Blender: Modifier > Boolean > Union; MeshLab: Mesh Boolean: Union)."
+                    f"{format_midpoint(points, np.arange(len(points)))}; whether it is a cavity is not known. Unite "
+                    "the parts by hand (Blender: Modifier > Boolean > Union; MeshLab: Mesh Boolean: Union)."
                 )

@@ -128,7 +128,7 @@ def structured(specimen: Specimen, h: float) -> Any:
     """A lattice of squares h in two triangles each, without those in the slit."""
     from ...meshes.builders.box import lattice
     from ...meshes.data import MeshData
-    from ...meshes.topology import boundary_facets, plane_groups
+    from ...meshes.topology import boundary_facets, facet_groups_on_planes
 
     points, cells = lattice(tuple(round(length / h) for length in specimen.size))
     points = points * np.array(specimen.size)
@@ -138,7 +138,7 @@ def structured(specimen: Specimen, h: float) -> Any:
     used, inverse = np.unique(cells, return_inverse=True)
     points, cells = points[used], inverse.reshape(cells.shape)
     sides = {"left": (0, 0.0), "right": (0, specimen.size[0]), "bottom": (1, 0.0), "top": (1, specimen.size[1])}
-    return MeshData(points, cells, plane_groups(points, boundary_facets(cells), sides))
+    return MeshData(points, cells, facet_groups_on_planes(points, boundary_facets(cells), sides))
 
 
 if __name__ == "__main__":

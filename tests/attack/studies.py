@@ -43,7 +43,7 @@ WALL = 1.0  # s that a run may take before it ends by its own limit
 def attack(number: int, chance: random.Random, place: Path) -> str:
     """One study."""
     os.chdir(place)
-    parameters.MOST_CELLS = 20_000  # type: ignore[misc]  # else a small h is a mesh that takes minutes, by right
+    parameters.MAX_CELLS = 20_000  # type: ignore[misc]  # else a small h is a mesh that takes minutes, by right
     name = chance.choice(sorted(STUDIES))
     path = place / "study.toml"
     path.write_bytes(mutated(STUDIES[name], chance))

@@ -14,7 +14,7 @@ from scipy.spatial import Delaunay
 from fracsim.mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
 from fracsim.meshes.data import MeshData
-from fracsim.meshes.topology import oriented, signed_measures
+from fracsim.meshes.topology import orient_cells, signed_measures
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -25,14 +25,14 @@ EPS = np.finfo(float).eps
 def one_cell(dim: int) -> MeshData:
     """A skew simplex."""
     points = np.vstack([np.zeros(dim), np.eye(dim)]) + 0.1 * np.arange(dim * (dim + 1)).reshape(-1, dim) ** 0.5
-    return MeshData(points, oriented(points, np.arange(dim + 1)[None])[0])
+    return MeshData(points, orient_cells(points, np.arange(dim + 1)[None])[0])
 
 
 def two_cells(dim: int) -> MeshData:
     """Two simplices with a facet in common."""
     points = np.vstack([np.zeros(dim), np.eye(dim), np.full(dim, 0.9)])
     cells = np.array([np.arange(dim + 1), np.arange(1, dim + 2)])
-    return MeshData(points, oriented(points, cells)[0])
+    return MeshData(points, orient_cells(points, cells)[0])
 
 
 def four_cells(dim: int) -> MeshData:
@@ -44,13 +44,13 @@ def four_cells(dim: int) -> MeshData:
     else:
         points = np.array([[0.1, 0.2, -1], [0, 0.1, 1], *([x, y, 0.1 * x] for x, y in ring)])
         cells = np.array([[0, 1, 2 + k, 2 + (k + 1) % 4] for k in range(4)])
-    return MeshData(points, oriented(points, cells)[0])
+    return MeshData(points, orient_cells(points, cells)[0])
 
 
 def cloud(dim: int, seed: int, nodes: int = 40) -> MeshData:
     """The Delaunay triangulation of random points: cells of every shape."""
     points = np.random.default_rng(seed).random((nodes, dim))
-    return MeshData(points, oriented(points, Delaunay(points).simplices.astype(np.int64))[0])
+    return MeshData(points, orient_cells(points, Delaunay(points).simplices.astype(np.int64))[0])
 
 
 def copies(mesh: MeshData, count: int) -> MeshData:
@@ -71,7 +71,7 @@ def lattice(*numbers: int, size: float = 1.0) -> MeshData:
                for order in permutations(range(dim))]  # fmt: skip
     cells = np.concatenate([number[tuple(np.moveaxis(corner, -1, 0))].T for corner in corners])
     points = grid * size
-    return MeshData(points.astype(float), oriented(points.astype(float), cells)[0])
+    return MeshData(points.astype(float), orient_cells(points.astype(float), cells)[0])
 
 
 def patterns(skeleton: EntityNumbering, broken: Flags) -> npt.NDArray[np.uint8]:

@@ -7,7 +7,7 @@ import numpy as np
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.data import Indices, MeshData, Points
 from fracsim.meshes.random_points.outline import Outline, delaunay
-from fracsim.meshes.topology import boundary_facets, oriented, plane_groups
+from fracsim.meshes.topology import boundary_facets, facet_groups_on_planes, orient_cells
 
 KINDS = ("structured", "alternating", "rotated", "unstructured")
 
@@ -17,9 +17,9 @@ def square(kind: str, n: int, side: float = 1.0) -> MeshData:
     if kind in ("structured", "unstructured"):
         return BUILDERS["box"](size=(side, side), h=side / n, pattern=kind).build()
     points, cells = (_alternating if kind == "alternating" else _rotated)(n)
-    cells, _ = oriented(points, cells)
+    cells, _ = orient_cells(points, cells)
     planes = {"left": (0, 0.0), "right": (0, 1.0), "bottom": (1, 0.0), "top": (1, 1.0)}
-    return MeshData(points * side, cells, plane_groups(points, boundary_facets(cells), planes))
+    return MeshData(points * side, cells, facet_groups_on_planes(points, boundary_facets(cells), planes))
 
 
 def _alternating(n: int) -> tuple[Points, Indices]:

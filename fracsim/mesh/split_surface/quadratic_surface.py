@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...meshes.data import MeshData
-from ...meshes.topology import oriented
+from ...meshes.topology import orient_cells
 from ..domain import Domain
 from ..midside_nodes import with_midside_nodes
 from ..simplices import local_edges
@@ -81,7 +81,7 @@ def refined_input(domain: Domain) -> MeshData | None:
         return domain.source
     whole = with_midside_nodes(domain.source, domain.midside_nodes, written=False)
     cells = _divided(_between(*np.split(whole.cells, [domain.dim + 1], axis=1)))
-    return MeshData(whole.points, oriented(whole.points, cells)[0])
+    return MeshData(whole.points, orient_cells(whole.points, cells)[0])
 
 
 def _between(corners: npt.NDArray[np.integer], middles: npt.NDArray[np.integer]) -> Ints:

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import InputError
-from ...meshes.plain_files import check_readable, create, replacing
+from ...meshes.plain_files import atomic_replacement, check_readable, create
 from ..atomic_write import append_bytes, replace_text
 from ..fields_file import EARLIER_TENSOR_COMPONENTS, TENSOR_COMPONENTS, pad_to_3d, reorder_earlier_tensor
 from ..file_ownership import FRAME_FILE_PATTERN
@@ -331,5 +331,5 @@ def update_tensor_order(path: Path) -> None:
     reader.SetFileName(str(path))
     reader.Update()
     if reorder_tensors(reader.GetOutput()):
-        with replacing(path) as temporary:
+        with atomic_replacement(path) as temporary:
             write_vtu(temporary, reader.GetOutput())

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import InputError
-from ...meshes.plain_files import check_readable, data_elsewhere
+from ...meshes.plain_files import check_readable, find_external_data
 from ...output.fields_file import read_field
 from ...output.surface.vtk_files import PvdEntry, read_pvd, reorder_tensors
 
@@ -84,7 +84,7 @@ def find_frames(folder: Path) -> list[FrameSource]:
     if not h5.exists():
         raise InputError(f"{folder} has no surface.pvd and no fields.h5: it is not the output folder of a run")
     with h5py.File(h5) as file:
-        if name := data_elsewhere(file):
+        if name := find_external_data(file):
             raise InputError(f"{h5} has the data of '{name}' in another file, which no run of fracsim does")
         times = [float(file["frames"][name].attrs["time"]) for name in sorted(file["frames"])]
     if not times:

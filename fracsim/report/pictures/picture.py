@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import InputError
-from ...meshes.plain_files import check_replaceable, replacing_all
+from ...meshes.plain_files import atomic_replacement_of_all, check_replaceable
 from .camera import merge_bounds, view_bounds
 from .colour_maps import merge_ranges
 from .frames import FrameSource, film_repetitions, find_frames, read_study
@@ -187,14 +187,14 @@ def _save_png(target: Path, pixels: Pixels) -> None:
     """Write a PNG as a whole, since a viewer may show the previous one."""
     from PIL import Image
 
-    with replacing_all(target) as temporary:
+    with atomic_replacement_of_all(target) as temporary:
         Image.fromarray(pixels).save(temporary, "PNG", optimize=True)
 
 
 def _save_film(target: Path, pictures: Iterator[Pixels], fps: int) -> None:
     """Write pictures as a film, or as PNGs to a folder if `target` has no suffix."""
     if target.suffix:
-        with replacing_all(target) as temporary, _FilmWriter(temporary, fps) as append:
+        with atomic_replacement_of_all(target) as temporary, _FilmWriter(temporary, fps) as append:
             for picture in pictures:
                 append(picture)
         return
