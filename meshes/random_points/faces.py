@@ -61,7 +61,7 @@ class _Curves:
 
 def _mesh_anew(gmsh: Any, face: int, sizing: SizeField, seed: int) -> None:
     """Lay the face out in a plane, scatter points there, and put them and their triangles in the place of gmsh's."""
-    sides = [tag for _, tag in gmsh.model.getBoundary([(2, face)], combined=False, orient_cells=False)]
+    sides = [tag for _, tag in gmsh.model.getBoundary([(2, face)], combined=False, oriented=False)]
     seams = {side for side in sides if sides.count(side) == 2}
     nodes = _Curves.of(gmsh, sorted(set(sides)))
     flat = _parameters(gmsh, face, nodes.points)
