@@ -187,3 +187,46 @@ def test_text_is_read_and_written_with_an_encoding() -> None:
             is_call = isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute)
             if is_call and node.func.attr in ("read_text", "write_text"):
                 assert any(key.arg == "encoding" for key in node.keywords), f"{path}, line {node.lineno}"
+
+
+# words that say nothing of a value; the name of a value says what the value is
+FILLERS = {
+    "each", "found", "made", "mine", "some", "rest", "those", "every", "these", "here", "there", "now", "then",
+    "own", "what", "way", "ways", "of", "known", "given", "seen", "kept", "more", "most", "least", "few", "many",
+    "one", "other", "others", "both", "place", "places", "at", "taken", "going", "goes", "comes", "gone", "held",
+    "told",
+}  # fmt: skip
+
+
+def package_modules() -> list[Path]:
+    """All modules of the package: fracsim, forms and meshes."""
+    paths = [path for top in (ROOT, FORMS, MESHES) for path in sorted(top.rglob("*.py"))]
+    assert len(paths) > 200
+    return paths
+
+
+def test_no_class_name_exists_twice() -> None:
+    modules: dict[str, set[str]] = {}
+    for path in package_modules():
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                modules.setdefault(node.name, set()).add(path.as_posix())
+    assert not {name: paths for name, paths in modules.items() if len(paths) > 1}
+
+
+def test_no_module_name_exists_twice() -> None:
+    names: dict[str, set[str]] = {}
+    for path in ROOT.rglob("*.py"):
+        if path.name != "__init__.py":
+            names.setdefault(path.stem, set()).add(path.as_posix())
+    assert not {name: paths for name, paths in names.items() if len(paths) > 1}
+
+
+def test_values_are_not_named_by_fillers() -> None:
+    fillers = [
+        f"{path.name}:{node.lineno}: {node.id}"
+        for path in package_modules()
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store) and node.id in FILLERS
+    ]
+    assert not fillers
