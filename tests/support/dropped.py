@@ -83,5 +83,7 @@ if __name__ == "__main__":
     import sys
 
     name, *numbers, often = sys.argv[1:]
-    weak_callbacks.OFTEN = int(often) or weak_callbacks.OFTEN
+    if int(often):
+        default = weak_callbacks.DEFAULT_POLICY
+        weak_callbacks.DEFAULT_POLICY = replace(default, scenes_between_collections=int(often))
     print(json.dumps(most_in_use(name, *map(int, numbers))))
