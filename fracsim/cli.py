@@ -184,8 +184,8 @@ def export(
     from .report.export import export_surfaces
 
     _tell_of_runs([out])
-    made = export_surfaces(out, kind, target, frame=frame, dust=dust, look=look)
-    print(f"saved {made[0]}" + (f" and {len(made) - 1} more" if len(made) > 1 else ""))
+    result = export_surfaces(out, kind, target, frame=frame, dust=dust, look=look)
+    print(f"saved {result[0]}" + (f" and {len(result) - 1} more" if len(result) > 1 else ""))
 
 
 @app.command()
@@ -285,11 +285,11 @@ def check_folder(folder: Path) -> None:
         pass
     except OSError as error:
         raise InputError(f"--out {folder}: {error.strerror}; give another one") from None
-    there = next(path for path in (folder.absolute(), *folder.absolute().parents) if os.path.lexists(path))
-    if not there.is_dir():
-        raise InputError(f"--out {folder}: {there} is not a folder; give another one")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise InputError(f"--out {folder}: no permission to write in {there}; give another one")
+    present = next(path for path in (folder.absolute(), *folder.absolute().parents) if os.path.lexists(path))
+    if not present.is_dir():
+        raise InputError(f"--out {folder}: {present} is not a folder; give another one")
+    if not os.access(present, os.W_OK | os.X_OK):
+        raise InputError(f"--out {folder}: no permission to write in {present}; give another one")
 
 
 def program() -> NoReturn:

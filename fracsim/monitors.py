@@ -147,7 +147,7 @@ def _obstacle_monitors(scene: Scene) -> tuple[ObstacleContactMonitor | None, Obs
     terms = [term for term in scene.balance.terms if term.name in ("obstacles", "solids")]
     contact_monitor = ObstacleContactMonitor(cast("list[ObstacleContact]", terms))
     obstacle_terms = [term for term in terms if isinstance(term, ObstacleTerm)]
-    if not obstacle_terms or len(obstacles) == 1 or not any(each.is_free for each in obstacles):
+    if not obstacle_terms or len(obstacles) == 1 or not any(item.is_free for item in obstacles):
         return contact_monitor, None
     return contact_monitor, ObstacleOverlapMonitor(obstacle_terms[0])
 

@@ -248,7 +248,7 @@ class RigidRun:
 
     def _loop(self) -> None:
         """Take steps to the end of the study, with frames and checkpoints. Raises Stopped."""
-        last, every = time.monotonic(), self.scene.study.output.checkpoint
+        last, interval = time.monotonic(), self.scene.study.output.checkpoint
         while not self.scene.ended(self.state):
             try:
                 report = self.step()
@@ -258,7 +258,7 @@ class RigidRun:
             if done or self._clock.is_due(self.state.t, self.state.step):
                 self.write_frame()
             self._report_progress(report)
-            if every is not None and time.monotonic() - last > every:
+            if interval is not None and time.monotonic() - last > interval:
                 self.checkpoint()
                 last = time.monotonic()
             if not done and self._interrupt.stop_reason():
@@ -267,8 +267,8 @@ class RigidRun:
     def _report_progress(self, report: RigidReport) -> None:
         """Print the progress of the run."""
         state, pieces, dt = self.state, self.scene.stepper.fragment_count, self.scene.study.time.max_step
-        more = f"analyses {report.blows + report.loads}  {report.seconds:.2g} s/step"
-        self._progress.update(ProgressState(state.t, dt, state.step, self.broken, pieces, more))
+        details = f"analyses {report.blows + report.loads}  {report.seconds:.2g} s/step"
+        self._progress.update(ProgressState(state.t, dt, state.step, self.broken, pieces, details))
 
     def _stopped(self, more: str = "") -> Stopped:
         """Return the error that ends the run at the present state."""

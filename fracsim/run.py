@@ -277,7 +277,7 @@ class Run:
             self.write_frame()
         if reason := self.interrupt.received_signal():
             raise Stopped(f"stopped by {reason} before the first step, at t = {self.state.t:g} s")
-        last, every = time.monotonic(), self.scene.study.output.checkpoint
+        last, interval = time.monotonic(), self.scene.study.output.checkpoint
         while not self.ended:
             try:
                 report = self.step()
@@ -287,7 +287,7 @@ class Run:
             if done or self._clock.is_due(self.state.t, self.state.step):
                 self.write_frame()
             self._tell(report)
-            if every is not None and self.comm.bcast(time.monotonic() - last > every):
+            if interval is not None and self.comm.bcast(time.monotonic() - last > interval):
                 self.checkpoint()
                 last = time.monotonic()
             if not done and self.interrupt.stop_reason():
@@ -295,8 +295,8 @@ class Run:
 
     def _tell(self, report: StepReport) -> None:
         broken, _, pieces = self.breaks.counts
-        more = f"Newton {report.solve.newton_iterations}  {report.seconds:.2g} s/step"
-        self._progress.update(ProgressState(self.state.t, report.dt, self.state.step, broken, pieces, more))
+        details = f"Newton {report.solve.newton_iterations}  {report.seconds:.2g} s/step"
+        self._progress.update(ProgressState(self.state.t, report.dt, self.state.step, broken, pieces, details))
 
     def _stopped(self, more: str = "") -> Stopped:
         """Write a frame and return the error that ends the run at the present state (collective)."""
@@ -401,8 +401,8 @@ def run_study(
             progress.end_line()
             print_notes(comm, list(scene.domain.source.notes))
         try:
-            ways: dict[str, Any] = {"interrupt": interrupt, "progress": progress, "began": began}
-            return Run(scene, folder, restart=restart, overwrite=overwrite, **ways)()
+            options: dict[str, Any] = {"interrupt": interrupt, "progress": progress, "began": began}
+            return Run(scene, folder, restart=restart, overwrite=overwrite, **options)()
         finally:
             scene.destroy()
 
@@ -466,7 +466,7 @@ def _check(
         study.mesh.surface,
         study.mesh.outline,
         study.mesh.shell,
-        *(each.file for each in study.obstacle),
+        *(item.file for item in study.obstacle),
     )
     check_output_folder(
         folder, text, restart=restart, overwrite=overwrite, inputs=inputs, completed=add_missing_defaults

@@ -41,8 +41,8 @@ class _Builders(Mapping[str, type[Builder]]):
 
     def __getitem__(self, name: str) -> type[Builder]:
         module, kind = self.classes[name].split(".")
-        found: type[Builder] = getattr(import_module(f".builders.{module}", __name__), kind)
-        return found
+        result: type[Builder] = getattr(import_module(f".builders.{module}", __name__), kind)
+        return result
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.classes)

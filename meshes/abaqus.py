@@ -74,7 +74,7 @@ class _Placed:
 
     def members(self, entry: SetEntry, nodes: bool) -> tuple[Indices, int]:
         """Nodes or cells that an entry gives by numbers or as a range, and how many of them are not in the file."""
-        ids, places = (
+        ids, positions = (
             (self.mesh.node_ids, self.node_start + np.arange(len(self.mesh.node_ids))) if nodes else self.elements
         )
         unused = NO_INDICES if nodes else self.unused_ids
@@ -83,11 +83,11 @@ class _Placed:
             begin, end = np.searchsorted(ids, [first, last + 1])
             inside = (ids[begin:end] - first) % step == 0
             count = (last - first) // step + 1 - int(inside.sum())
-            return places[begin:end][inside], max(0, count - _in_range(unused, first, last, step))
+            return positions[begin:end][inside], max(0, count - _in_range(unused, first, last, step))
         assert entry.numbers is not None
-        place = find_in_sorted(ids, entry.numbers)
-        lost = entry.numbers[place < 0]
-        return places[place[place >= 0]], len(lost) - int(np.isin(lost, unused).sum())
+        position = find_in_sorted(ids, entry.numbers)
+        lost = entry.numbers[position < 0]
+        return positions[position[position >= 0]], len(lost) - int(np.isin(lost, unused).sum())
 
 
 def _edges(kind: str) -> list[tuple[int, ...]]:
@@ -137,20 +137,20 @@ class _Assembled:
         deck, start = self.deck, 0
         meshes: dict[str, LocalMesh] = {}
         self.points: list[Points] = []
-        found: list[tuple[str, str, list[Component], KeywordBlock | None]] = [
-            (own.name, part, [deck.parts[part], own], block) for own, part, block in deck.instances.values()
+        result: list[tuple[str, str, list[Component], KeywordBlock | None]] = [
+            (owned.name, part, [deck.parts[part], owned], block) for owned, part, block in deck.instances.values()
         ]
         if not deck.instances and deck.parts:
-            found = [(part.name, key, [part], None) for key, part in deck.parts.items()]
+            result = [(part.name, key, [part], None) for key, part in deck.parts.items()]
             self.notes.append(
                 "The file has *PART and no *ASSEMBLY: if it was cut off, bodies are missing. Its parts are read where "
                 "they lie."
             )
-        elif left := [part.name for key, part in deck.parts.items() if key not in {f[1] for f in found}]:
+        elif left := [part.name for key, part in deck.parts.items() if key not in {f[1] for f in result}]:
             self.notes.append(f"Parts without an instance are left out: {list_names(left)}.")
-        for name, part, components, block in [*found, ("", "", [deck.assembly], None)]:
-            own = components[-1]
-            if own.nodes or own.elements or own.unused or not name:
+        for name, part, components, block in [*result, ("", "", [deck.assembly], None)]:
+            owned = components[-1]
+            if owned.nodes or owned.elements or owned.unused or not name:
                 mesh = LocalMesh(components)
                 mesh.check_nodes_used(deck.last)
             else:
@@ -263,8 +263,8 @@ class _Assembled:
         for surface in sets[key[1]]:
             for entry in surface.entries:
                 if surface.surface_kind == "UNION":
-                    more, points = self.surface(*self._named_surface(placed, entry))
-                    facets += more
+                    details, points = self.surface(*self._named_surface(placed, entry))
+                    facets += details
                     nodes.append(points)
                 elif surface.surface_kind == "NODE":
                     nodes.append(self._members(placed, "node_sets", surface, entry))
@@ -317,8 +317,8 @@ class _Assembled:
                     rows.append(np.sort(corners, axis=1))
         free: dict[str, list[tuple[tuple[int, ...], Mask]]] = {kind: [] for kind in self.kinds}
         if rows:
-            _, counts, place = distinct_rows(np.concatenate(rows))
-            single = np.split(counts[place] == 1, np.cumsum([len(r) for r in rows])[:-1])
+            _, counts, inverse = distinct_rows(np.concatenate(rows))
+            single = np.split(counts[inverse] == 1, np.cumsum([len(r) for r in rows])[:-1])
             for (kind, columns), is_free in zip(faces, single, strict=True):
                 free[kind].append((columns, is_free))
         return free
@@ -335,22 +335,22 @@ class _Assembled:
         holders: dict[str, list[tuple[_Placed, str]]] = {}
         for placed in self.placed:
             for key, named in self._sets_of(placed, what).items():
-                if not all(one.internal for one in named):
+                if not all(first.internal for first in named):
                     holders.setdefault(key, []).append((placed, named[0].name))
         apart = []
-        for held in holders.values():
-            own = [item for item in held if not item[0].name]
-            others = [item for item in held if item[0].name]
-            mixed = len({placed.part for placed, _ in others}) > 1
-            if own:
-                yield own[0][1], own
+        for entries in holders.values():
+            owned = [item for item in entries if not item[0].name]
+            remaining = [item for item in entries if item[0].name]
+            mixed = len({placed.part for placed, _ in remaining}) > 1
+            if owned:
+                yield owned[0][1], owned
             elif not mixed:
-                yield others[0][1], others
-            if mixed or len(others) > 1 or (own and others):
-                for placed, name in others:
+                yield remaining[0][1], remaining
+            if mixed or len(remaining) > 1 or (owned and remaining):
+                for placed, name in remaining:
                     yield f"{placed.name}.{name}", [(placed, name)]
-            if mixed or (own and others):
-                apart.append(held[0][1])
+            if mixed or (owned and remaining):
+                apart.append(entries[0][1])
         if apart:
             kind = what.replace("_", " ")
             self.notes.append(
@@ -365,34 +365,36 @@ class _Assembled:
         blocks = [Block(kind, self.blocks[kind]) for kind in self.kinds]
         attached = self._attached()
         cells = {}
-        for name, held in self._published("element_sets"):
-            members = np.unique(np.concatenate([self.resolve(placed, "element_sets", own) for placed, own in held]))
+        for name, entries in self._published("element_sets"):
+            members = np.unique(
+                np.concatenate([self.resolve(placed, "element_sets", owned) for placed, owned in entries])
+            )
             cells[name] = members[attached[members]]
         bodies = [placed for placed in self.placed if placed.name and placed.mesh.cells]
         if len(bodies) > 1:
             for placed in bodies:
                 cells.setdefault(placed.name, np.sort(placed.elements[1]))
         points = {
-            name: np.unique(np.concatenate([self.resolve(placed, "node_sets", own) for placed, own in held]))
-            for name, held in self._published("node_sets")
+            name: np.unique(np.concatenate([self.resolve(placed, "node_sets", owned) for placed, owned in entries]))
+            for name, entries in self._published("node_sets")
         }
         sets = {name: self._rows(members) for name, members in cells.items() if len(members)}
         self._note_unused(cells, blocks)
         facets = self._surfaces(points)
         for corners in (2, 3, 4):
-            names = {name: [f for f in found if f.shape[1] == corners] for name, found in facets.items()}
-            names = {name: found for name, found in names.items() if found}
+            names = {name: [f for f in result if f.shape[1] == corners] for name, result in facets.items()}
+            names = {name: result for name, result in names.items() if result}
             if (corners == 2) != (self.dim == 2) or not names:
                 continue
-            ends = np.cumsum([0] + [sum(map(len, found)) for found in names.values()])
-            rows = np.concatenate([np.concatenate(found) for found in names.values()])
+            ends = np.cumsum([0] + [sum(map(len, result)) for result in names.values()])
+            rows = np.concatenate([np.concatenate(result) for result in names.values()])
             blocks.append(Block({2: "line", 3: "triangle", 4: "quad"}[corners], rows))
             for name, begin, end in zip(names, ends, ends[1:], strict=False):
                 empty = [NO_INDICES] * (len(blocks) - 1)
                 before = sets.get(name, empty)
                 sets[name] = [*before, *empty[len(before) :], np.arange(begin, end)]
-        if others := [ids for placed in self.placed for ids in self._nodes_of_unused(placed)]:
-            blocks.append(Block("vertex", np.unique(np.concatenate(others))[:, None]))
+        if remaining := [ids for placed in self.placed for ids in self._nodes_of_unused(placed)]:
+            blocks.append(Block("vertex", np.unique(np.concatenate(remaining))[:, None]))
         sets = {name: [*parts, *[NO_INDICES] * (len(blocks) - len(parts))] for name, parts in sets.items()}
         for mesh in dict.fromkeys(placed.mesh for placed in self.placed):
             if mesh.ends_with(self.deck.last) and (unused := mesh.unused_nodes()):
@@ -419,8 +421,8 @@ class _Assembled:
         """Nodes that springs, beams and the like name: their elements are left out, but have not been lost."""
         for component in placed.mesh.components:
             for ids in component.unused_nodes:
-                places = find_in_sorted(placed.mesh.node_ids, ids)
-                yield placed.node_start + places[places >= 0]
+                positions = find_in_sorted(placed.mesh.node_ids, ids)
+                yield placed.node_start + positions[positions >= 0]
 
     def _attached(self) -> Mask:
         """Which cells are of the body, or lie on it.
@@ -439,10 +441,10 @@ class _Assembled:
         for kind in self.kinds:
             if level[kind] < self.dim:
                 rows, begin = self.blocks[kind], self.starts[kind]
-                there = of_body[rows].all(axis=1) & (level[kind] == self.dim - 1)
+                present = of_body[rows].all(axis=1) & (level[kind] == self.dim - 1)
                 if self.dim == 2:
-                    there[there] = self._are_edges(rows[there, :2])
-                attached[begin : begin + len(rows)] = there
+                    present[present] = self._are_edges(rows[present, :2])
+                attached[begin : begin + len(rows)] = present
         return attached
 
     def _are_edges(self, lines: Indices) -> Mask:
@@ -455,22 +457,22 @@ class _Assembled:
                 pairs = self.blocks[kind][:, columns]
                 edges.append(pairs[marked[pairs].all(axis=1)])
         pairs = np.sort(np.concatenate([*edges, lines]), axis=1)
-        _, _, place = distinct_rows(pairs)
-        known = len(pairs) - len(lines)
-        return np.isin(place[known:], place[:known])
+        _, _, inverse = distinct_rows(pairs)
+        allowed = len(pairs) - len(lines)
+        return np.isin(inverse[allowed:], inverse[:allowed])
 
     def _rows(self, cells: Indices) -> list[Indices]:
-        found = {kind: rows for kind, _, rows in self._by_kind(cells)}
-        return [found.get(kind, NO_INDICES) for kind in self.kinds]
+        result = {kind: rows for kind, _, rows in self._by_kind(cells)}
+        return [result.get(kind, NO_INDICES) for kind in self.kinds]
 
     def _surfaces(self, points: dict[str, Indices]) -> dict[str, list[Indices]]:
         """Facets by the surface's name; nodes of surfaces of nodes are added to `points`."""
         facets: dict[str, list[Indices]] = {}
         empty = []
-        for name, held in self._published("surfaces"):
+        for name, entries in self._published("surfaces"):
             useful = False
-            for placed, own in held:
-                rows, nodes = self.surface(placed, own)
+            for placed, owned in entries:
+                rows, nodes = self.surface(placed, owned)
                 rows = [row for row in rows if len(row) and (row.shape[1] == 2) == (self.dim == 2)]
                 facets.setdefault(name, []).extend(rows)
                 if len(nodes):

@@ -99,8 +99,8 @@ class KeywordBlock:
             for text in fields:
                 value = number(text, kind)
                 if value is None:
-                    what = "a whole number" if kind is np.int64 else "a number"
-                    self.refuse(f"'{text[:40]}' is not {what}, as the data of *{self.keyword} need.", i)
+                    description = "a whole number" if kind is np.int64 else "a number"
+                    self.refuse(f"'{text[:40]}' is not {description}, as the data of *{self.keyword} need.", i)
                 values.append(value)
             ends.append(len(values))
         return np.array(values, kind), np.array(ends, np.int64)
@@ -147,10 +147,10 @@ def split_fields(line: str) -> list[str]:
         return line.split(",")
     fields, position = [], 0
     while position <= len(line):
-        found = _FIELD.match(line, position)
-        assert found  # nothing matches as well
-        fields.append(found[0])
-        position = found.end() + 1
+        match = _FIELD.match(line, position)
+        assert match  # nothing matches as well
+        fields.append(match[0])
+        position = match.end() + 1
     return fields
 
 
@@ -182,9 +182,9 @@ def _source(path: Path) -> SourceText:
     if text.startswith((b"\xff\xfe", b"\xfe\xff")):
         text = text.decode("utf-16", errors="replace").encode()
     text = text.removeprefix(b"\xef\xbb\xbf")
-    if (place := text.find(b"\0")) >= 0:
+    if (position := text.find(b"\0")) >= 0:
         SourceText(path, text).refuse(
-            place, "a byte 0 stands here; the file is not text. Export the mesh as an Abaqus input file (.inp)."
+            position, "a byte 0 stands here; the file is not text. Export the mesh as an Abaqus input file (.inp)."
         )
     if b"\r" in text:
         text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n")

@@ -53,8 +53,8 @@ def kind_of(element_type: str) -> tuple[str, int] | None:
             "C3D10, or a plane section with CPE3 or CPS3."
         )
     for family, kinds in _FAMILIES:
-        if found := family.fullmatch(element_type):
-            nodes = next((int(digits) for digits in found.groups() if digits), 2)
+        if match := family.fullmatch(element_type):
+            nodes = next((int(digits) for digits in match.groups() if digits), 2)
             if nodes in kinds:
                 return kinds[nodes], nodes
     if _UNUSED.fullmatch(element_type):

@@ -134,8 +134,8 @@ class Deck:
             return
         if not name:
             block.refuse(f"*{kind} has no name; write *{kind}, NAME=...")
-        known = self.parts if kind == "PART" else self.instances
-        if label_key(name) in known:
+        allowed = self.parts if kind == "PART" else self.instances
+        if label_key(name) in allowed:
             block.refuse(f"there is a {kind.lower()} '{name}' already; names must differ.")
         component = Component(name, block)
         if kind == "PART":
@@ -289,8 +289,8 @@ def _element_rows(block: KeywordBlock, element_type: str, nodes: int) -> Indices
     values, ends = block.numbers(np.int64)
     width = nodes + 1
     wanted = np.arange(width, (len(values) // width) * width + 1, width)
-    place = np.searchsorted(ends, wanted)
-    aligned = ends[np.minimum(place, len(ends) - 1)] == wanted if len(ends) else np.zeros(0, bool)
+    position = np.searchsorted(ends, wanted)
+    aligned = ends[np.minimum(position, len(ends) - 1)] == wanted if len(ends) else np.zeros(0, bool)
     if len(values) % width or not aligned.all():
         first = int(np.flatnonzero(~aligned)[0]) if not aligned.all() else len(aligned)
         line = int(np.searchsorted(ends, first * width, side="right"))
@@ -304,7 +304,7 @@ def _element_rows(block: KeywordBlock, element_type: str, nodes: int) -> Indices
     if (bad := rows.min(axis=1, initial=1) < 1).any():
         block.refuse(
             f"element {rows[bad.argmax(), 0]} has a number below 1; numbers of elements and nodes begin with 1.",
-            int(place[bad.argmax()]),
+            int(position[bad.argmax()]),
         )
     return rows
 

@@ -45,16 +45,16 @@ class LocalMesh:
         order = np.argsort(self.node_ids, kind="stable")
         ids, points = self.node_ids[order], self.points[order]
         again = np.flatnonzero(np.diff(ids) == 0) + 1
-        if (other := (points[again] != points[again - 1]).any(axis=1)).any():
-            row = int(order[again[other.argmax()]])
+        if (second := (points[again] != points[again - 1]).any(axis=1)).any():
+            row = int(order[again[second.argmax()]])
             block = int(np.searchsorted(starts, row, side="right")) - 1
             blocks[block].refuse(
                 f"node {self.node_ids[row]} is defined a second time, at another place. Number nodes once; parts with "
                 "numbers of their own need *PART and *INSTANCE.",
                 row - int(starts[block]),
             )
-        kept = np.r_[True, np.diff(ids) > 0]
-        self.node_ids, self.points = ids[kept], points[kept]
+        retained = np.r_[True, np.diff(ids) > 0]
+        self.node_ids, self.points = ids[retained], points[retained]
 
     def _indices(self, item: ElementBlock) -> Indices:
         indices = find_in_sorted(self.node_ids, item.nodes)
@@ -100,14 +100,14 @@ class LocalMesh:
         missing = last - first + 1 - len(used)
         if not 0 < missing <= max(MAX_GAPS, MAX_GAP_SHARE * len(used)):
             return 0, 0
-        there = np.zeros(last - first + 1, bool)
-        there[used - first] = True
-        return int((~there).sum()), first + int((~there).argmax())
+        present = np.zeros(last - first + 1, bool)
+        present[used - first] = True
+        return int((~present).sum()), first + int((~present).argmax())
 
     def unused_nodes(self) -> int:
         """The number of nodes that no element has."""
-        others = [ids for component in self.components for ids in component.unused_nodes]
-        used = self.used | np.isin(self.node_ids, np.concatenate(others)) if others else self.used
+        remaining = [ids for component in self.components for ids in component.unused_nodes]
+        used = self.used | np.isin(self.node_ids, np.concatenate(remaining)) if remaining else self.used
         return int((~used).sum())
 
     def ends_with(self, last: KeywordBlock) -> bool:
@@ -142,8 +142,8 @@ def find_in_sorted(ids: Indices, wanted: Indices) -> Indices:
     first, last = int(ids[0]), int(ids[-1])
     if last - first == len(ids) - 1:  # numbered without gaps
         return np.where((wanted >= first) & (wanted <= last), wanted - first, -1)
-    place = np.minimum(np.searchsorted(ids, wanted), len(ids) - 1)
-    return np.where(ids[place] == wanted, place, -1)
+    position = np.minimum(np.searchsorted(ids, wanted), len(ids) - 1)
+    return np.where(ids[position] == wanted, position, -1)
 
 
 def moved(points: Points, block: KeywordBlock) -> Points:

@@ -41,9 +41,9 @@ def split_into_tetrahedra(shape: str, cells: Indices) -> tuple[Indices, Indices]
     their cell: positive where the normals of its FACES point outwards.
     """
     tetrahedra, owners = [], []
-    least = cells.argmin(axis=1)
+    minimum = cells.argmin(axis=1)
     for apex in range(cells.shape[1]):
-        chosen = np.flatnonzero(least == apex)
+        chosen = np.flatnonzero(minimum == apex)
         for face in (face for face in FACES[shape] if apex not in face):
             corners = cells[chosen][:, face]
             for triangles in (corners,) if len(face) == 3 else _halves(corners):

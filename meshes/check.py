@@ -65,10 +65,10 @@ class _FacetTable:
     def cells_at(self, groups: list[Indices]) -> list[Indices]:
         """Number of cells at each facet of each group; 0 where it is no facet of the mesh."""
         sizes = np.cumsum([len(self._distinct), *map(len, groups)])
-        _, _, place = distinct_rows(np.sort(np.concatenate([self._distinct, *groups]), axis=1))
-        counts = np.zeros(place.max() + 1, np.int64)
-        counts[place[: sizes[0]]] = self.counts
-        return np.split(counts[place[sizes[0] :]], sizes[1:-1] - sizes[0]) if groups else []
+        _, _, inverse = distinct_rows(np.sort(np.concatenate([self._distinct, *groups]), axis=1))
+        counts = np.zeros(inverse.max() + 1, np.int64)
+        counts[inverse[: sizes[0]]] = self.counts
+        return np.split(counts[inverse[sizes[0] :]], sizes[1:-1] - sizes[0]) if groups else []
 
     def pairs(self, nodes: int) -> Indices:
         """Cells that share a facet: (k, 2)."""
@@ -138,8 +138,8 @@ def flat_cells(points: Points, cells: Indices, share: float = 0.0) -> Mask:
     dim = points.shape[1]
     corners = points[cells]
     longest = _longest_edges(points, cells)
-    least = 2 * (dim + 1) * _precision(points) * np.abs(corners).max(axis=(1, 2)) * longest ** (dim - 1)
-    return np.abs(signed_measures(points, cells)) <= np.maximum(least, share * longest**dim)
+    minimum = 2 * (dim + 1) * _precision(points) * np.abs(corners).max(axis=(1, 2)) * longest ** (dim - 1)
+    return np.abs(signed_measures(points, cells)) <= np.maximum(minimum, share * longest**dim)
 
 
 def _precision(points: Points) -> float:
@@ -162,8 +162,8 @@ def _check_facets(mesh: MeshData, table: _FacetTable) -> None:
     """Each facet belongs to one cell or to two on its opposite sides."""
     _refuse_facets(mesh, table.facets[table.counts[table.place] > 2], "belong to more than two cells")
     # Outward normals of the two cells are opposite; a facet met twice with one normal has both cells on one side.
-    _, same, place = distinct_rows(_canonical(table.facets))
-    _refuse_facets(mesh, table.facets[same[place] > 1], "have two cells on the same side, so that the cells overlap")
+    _, same, inverse = distinct_rows(_canonical(table.facets))
+    _refuse_facets(mesh, table.facets[same[inverse] > 1], "have two cells on the same side, so that the cells overlap")
 
 
 def _canonical(facets: Indices) -> Indices:
@@ -232,8 +232,8 @@ def _groups_once(mesh: MeshData) -> MeshData:
     """Group facets that are listed several times are kept once; nobody needs to be told."""
     groups = {}
     for name, facets in mesh.facet_groups.items():
-        _, _, place = distinct_rows(np.sort(facets, axis=1))
-        groups[name] = facets[np.sort(np.unique(place, return_index=True)[1])]
+        _, _, inverse = distinct_rows(np.sort(facets, axis=1))
+        groups[name] = facets[np.sort(np.unique(inverse, return_index=True)[1])]
     return replace(mesh, facet_groups=groups)
 
 

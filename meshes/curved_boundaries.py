@@ -28,11 +28,11 @@ def curved_midside_points(mesh: MeshData, rounds: tuple[CurvedBoundary, ...]) ->
     edges = edges_of(mesh.cells)
     middles = mesh.points[edges].mean(axis=1)
     keys, count = edges[:, 0] * len(mesh.points) + edges[:, 1], len(mesh.points)
-    for each in rounds:
-        facets = np.concatenate([mesh.facet_groups[name] for name in each.groups])
+    for item in rounds:
+        facets = np.concatenate([mesh.facet_groups[name] for name in item.groups])
         of_facets = edges_of(facets)
-        found = np.searchsorted(keys, of_facets[:, 0] * count + of_facets[:, 1])
-        across = np.arange(mesh.dim) != (mesh.dim if each.along is None else each.along)
-        out = middles[found] * across
-        middles[found] += out * (each.radius / np.linalg.norm(out, axis=1, keepdims=True) - 1)
+        result = np.searchsorted(keys, of_facets[:, 0] * count + of_facets[:, 1])
+        across = np.arange(mesh.dim) != (mesh.dim if item.along is None else item.along)
+        out = middles[result] * across
+        middles[result] += out * (item.radius / np.linalg.norm(out, axis=1, keepdims=True) - 1)
     return middles

@@ -65,8 +65,8 @@ def _in_space(spans: Floats) -> float:
     up, turn = 1 - k / TRIED, np.pi * (1 + 5**0.5) * k  # a Fibonacci spiral
     tried = np.stack([np.cos(turn) * np.sqrt(1 - up**2), np.sin(turn) * np.sqrt(1 - up**2), up], axis=1)
     reach = 2 * np.sin(np.radians(CONE) / 2)
-    both = cKDTree(np.concatenate([unit, -unit]))
-    counts = both.query_ball_point(np.concatenate([tried, np.eye(3)]), reach, return_length=True)
+    combined = cKDTree(np.concatenate([unit, -unit]))
+    counts = combined.query_ball_point(np.concatenate([tried, np.eye(3)]), reach, return_length=True)
     return float(counts.max() / len(unit) / (1 - np.cos(np.radians(CONE))))
 
 

@@ -47,15 +47,15 @@ def _refuse(path: Path, why: str) -> NoReturn:
 
 def _contents_of_model(gmsh: Any) -> MeshFileContents:
     tags, coordinates, _ = gmsh.model.mesh.getNodes()
-    place = np.full(int(tags.max(initial=0)) + 1, -1, np.int64)
-    place[tags] = np.arange(len(tags))
+    position = np.full(int(tags.max(initial=0)) + 1, -1, np.int64)
+    position[tags] = np.arange(len(tags))
     blocks: list[Block] = []
     owners: list[tuple[int, int]] = []
     for entity in gmsh.model.getEntities():
         for kind, _, nodes in zip(*gmsh.model.mesh.getElements(*entity), strict=True):
             name, _, order, count, _, _ = gmsh.model.mesh.getElementProperties(kind)
             shape = SHAPES.get(name.split()[0], name)
-            blocks.append(Block(shape if order == 1 else f"{shape}{count}", place[nodes].reshape(-1, count)))
+            blocks.append(Block(shape if order == 1 else f"{shape}{count}", position[nodes].reshape(-1, count)))
             owners.append(entity)
     return MeshFileContents(coordinates.reshape(-1, 3), blocks, _physical_groups(gmsh, blocks, owners))
 

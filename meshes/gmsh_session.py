@@ -23,8 +23,8 @@ def session() -> Iterator[Any]:
     """gmsh with an empty model of its own; a failure inside gmsh is raised as MeshError with gmsh's reason."""
     import gmsh
 
-    mine = not gmsh.isInitialized()
-    if mine:
+    local = not gmsh.isInitialized()
+    if local:
         gmsh.initialize(readConfigFiles=False, interruptible=False)
     gmsh.option.setNumber("General.Terminal", 0)
     gmsh.option.setNumber("General.NumThreads", 1)
@@ -37,7 +37,7 @@ def session() -> Iterator[Any]:
             raise
         raise MeshError(f"gmsh could not make the mesh: {str(error).strip() or 'it gave no reason'}.") from error
     finally:
-        if mine:
+        if local:
             gmsh.finalize()
         else:
             gmsh.model.remove()
@@ -118,9 +118,9 @@ def cells_of_model(gmsh: Any, dim: int) -> tuple[Points, Indices]:
     _, connectivity = gmsh.model.mesh.getElementsByType(TETRAHEDRON if dim == 3 else TRIANGLE)
     if len(connectivity) == 0:
         raise MeshError("gmsh made no cells; is the body larger than zero and h small enough?")
-    place = np.zeros(int(tags.max()) + 1, np.int64)
-    place[tags] = np.arange(len(tags))
-    used, cells = np.unique(place[connectivity], return_inverse=True)
+    position = np.zeros(int(tags.max()) + 1, np.int64)
+    position[tags] = np.arange(len(tags))
+    used, cells = np.unique(position[connectivity], return_inverse=True)
     points = np.ascontiguousarray(coordinates.reshape(-1, 3)[used, :dim])
     cells, _ = orient_cells(points, cells.reshape(-1, dim + 1).astype(np.int64))
     return points, cells

@@ -47,9 +47,9 @@ def join_bodies(mesh: MeshData) -> MeshData:
         )
     clusters, cluster = components(pairs, len(mesh.points))
     _refuse_cracks(mesh, body, cluster)
-    kept = np.unique(cluster, return_index=True)[1]
+    retained = np.unique(cluster, return_index=True)[1]
     groups = {name: cluster[facets] for name, facets in mesh.facet_groups.items()}
-    joined = replace(mesh, points=mesh.points[kept], cells=cluster[mesh.cells], facet_groups=groups)
+    joined = replace(mesh, points=mesh.points[retained], cells=cluster[mesh.cells], facet_groups=groups)
     left = label_bodies(joined)[0]
     note = (
         f"{len(mesh.points) - clusters} nodes were joined with coincident nodes of another body: {count} bodies are "

@@ -66,8 +66,8 @@ def _refuse(path: Path, why: str) -> NoReturn:
 def _contents(path: Path, file: Any, where: list[str]) -> MeshFileContents:
     meshes = list(file["ENS_MAA"]) if "ENS_MAA" in file else []
     if len(meshes) != 1:
-        many = f"{len(meshes)} meshes ({', '.join(meshes[:5])}); export one of them alone"
-        _refuse(path, f"it holds {many if meshes else 'no mesh (no group ENS_MAA)'}")
+        count = f"{len(meshes)} meshes ({', '.join(meshes[:5])}); export one of them alone"
+        _refuse(path, f"it holds {count if meshes else 'no mesh (no group ENS_MAA)'}")
     (name,) = meshes
     mesh = file["ENS_MAA"][name]
     if int(mesh.attrs.get("TYP", 0)) != 0:
@@ -151,20 +151,20 @@ def _groups(family: Indices, names: dict[int, list[str]], word: str) -> Iterator
     for number, members in members_by_tag(family):
         for group in names.get(number) or [f"{word}-{abs(number)}"]:
             parts.setdefault(group, []).append(members)
-    for group, found in parts.items():
-        yield group, np.unique(np.concatenate(found))
+    for group, result in parts.items():
+        yield group, np.unique(np.concatenate(result))
 
 
 def _groups_of_families(file: Any, mesh: str) -> tuple[dict[int, list[str]], dict[int, list[str]]]:
     """Names of the groups of each family of cells, and of nodes; families without groups by their own names."""
-    found: tuple[dict[int, list[str]], dict[int, list[str]]] = {}, {}
+    result: tuple[dict[int, list[str]], dict[int, list[str]]] = {}, {}
     families = file["FAS"][mesh] if "FAS" in file and mesh in file["FAS"] else {}
-    for key, names in zip(("ELEME", "NOEUD"), found, strict=True):
+    for key, names in zip(("ELEME", "NOEUD"), result, strict=True):
         for family in families.get(key, ()):
             entry = families[key][family]
             groups = [_name(row) for row in entry["GRO"]["NOM"][()]] if "GRO" in entry else []
             names[int(entry.attrs["NUM"])] = [group for group in groups if group] or [family.strip()]
-    return found
+    return result
 
 
 def _name(row: Any) -> str:

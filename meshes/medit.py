@@ -84,17 +84,18 @@ class _Medit:
         values = self.source.rows(begin, end, NUMBERS).values
         return len(values) > 1 and len(values) == 1 + width * values[0]
 
-    def _entries(self, name: str, at: int, begin: int, end: int, width: int, needed: str) -> Points:
+    def _entries(self, name: str, position: int, begin: int, end: int, width: int, needed: str) -> Points:
         """(count, width) the numbers of a section; where one line lacks or has numbers the message has that line."""
         lines = self.source.rows(begin, end, needed)
         values = lines.values
         count = int(values[0]) if len(values) and not is_not_integer(values[:1])[0] and values[0] >= 0 else -1
         if len(values) != 1 + count * width:
             odd = np.flatnonzero(lines.counts[1:] != width)
-            at = int(lines.offsets[1 + odd[0]]) if len(odd) else at
-            found = max(len(values) - 1, 0) / width
+            position = int(lines.offsets[1 + odd[0]]) if len(odd) else position
+            result = max(len(values) - 1, 0) / width
             self.source.damaged(
-                at, f"the section {name} declares {count} entries of {width} numbers, and holds {found:.6g} of them."
+                position,
+                f"the section {name} declares {count} entries of {width} numbers, and holds {result:.6g} of them.",
             )
         return values[1:].reshape(count, width)
 

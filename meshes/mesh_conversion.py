@@ -111,10 +111,10 @@ class MeshFileContents:
         self._refuse_lost_nodes(source)
         points, notes = self._flattened(source) if dim == 2 else (self.points, ())
         cut, cut_notes = self._cut(points, dim, source)
-        mine = [i for i, block in enumerate(cut.blocks) if block.dim == dim and len(block.nodes)]
+        local = [i for i, block in enumerate(cut.blocks) if block.dim == dim and len(block.nodes)]
         below = [i for i, block in enumerate(cut.blocks) if block.shape == ("line" if dim == 2 else "triangle")]
-        cells = np.concatenate([cut.blocks[i].corners for i in mine])
-        regions = cut._cell_sets(mine)
+        cells = np.concatenate([cut.blocks[i].corners for i in local])
+        regions = cut._cell_sets(local)
         if self.copies:
             cells, regions = _each_once(cells, regions)
         groups = cut._node_groups(cells, len(points)) | cut._facet_sets(below)
@@ -177,11 +177,11 @@ class MeshFileContents:
         }
         blocks = [block for block, _ in pairs]
         notes = []
-        for level, made in ((dim, "tetrahedra" if dim == 3 else "triangles"), (dim - 1, "triangles")):
+        for level, result in ((dim, "tetrahedra" if dim == 3 else "triangles"), (dim - 1, "triangles")):
             cut = [i for i, block in enumerate(self.blocks) if block.shape in PLURALS and block.dim == level]
             if parts := sum(len(blocks[i].nodes) for i in cut):
                 where = "" if level == dim else " of the surface"
-                notes.append(f"{_counted([self.blocks[i] for i in cut])}{where} were cut into {parts} {made}.")
+                notes.append(f"{_counted([self.blocks[i] for i in cut])}{where} were cut into {parts} {result}.")
         return replace(self, blocks=blocks, sets=sets), tuple(notes)
 
     def _flattened(self, source: str) -> tuple[Points, tuple[str, ...]]:
@@ -227,13 +227,15 @@ class MeshFileContents:
         for width in {CORNERS[block.shape] for block in lower}:
             facets: list[Indices] = [np.zeros((0, width), np.int64)]
             for block in body:
-                for places in (places for places in FACETS[block.shape] if len(places) == width):
-                    rows = block.nodes[:, places]
+                for positions in (positions for positions in FACETS[block.shape] if len(positions) == width):
+                    rows = block.nodes[:, positions]
                     facets.append(rows[of_lower[rows].all(axis=1)])
-            known = np.concatenate(facets)
+            allowed = np.concatenate(facets)
             for block in (block for block in lower if CORNERS[block.shape] == width):
-                _, _, place = distinct_rows(np.sort(np.concatenate([known, block.corners]), axis=1))
-                is_facet = np.isin(place[len(known) :], place[: len(known)]) & (curved or block.kind == block.shape)
+                _, _, inverse = distinct_rows(np.sort(np.concatenate([allowed, block.corners]), axis=1))
+                is_facet = np.isin(inverse[len(allowed) :], inverse[: len(allowed)]) & (
+                    curved or block.kind == block.shape
+                )
                 if count := int(np.count_nonzero(~is_facet & of_body[block.corners].all(axis=1))):
                     stray[block.kind] = stray.get(block.kind, 0) + count
         if not stray:
@@ -307,8 +309,8 @@ def _without(mesh: MeshData, nodes: Mask) -> MeshData:
 
 def _each_once(cells: Indices, regions: dict[str, Indices]) -> tuple[Indices, dict[str, Indices]]:
     """Cells without copies, and the regions renumbered."""
-    _, _, place = distinct_rows(np.sort(cells, axis=1))
-    _, first, number = np.unique(place, return_index=True, return_inverse=True)
+    _, _, inverse = distinct_rows(np.sort(cells, axis=1))
+    _, first, number = np.unique(inverse, return_index=True, return_inverse=True)
     order = np.argsort(first)
     rank = np.empty(len(order), np.int64)
     rank[order] = np.arange(len(order))

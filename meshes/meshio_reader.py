@@ -107,12 +107,12 @@ def _mesh(path: Path, position: list[int]) -> Any:
     if ending in (".xdmf", ".xmf"):
         return _xdmf_reader(path).read()
     if ending in (".ele", ".node"):
-        other = path.stem + {".ele": ".node", ".node": ".ele"}[ending]
-        _check(path, other)
+        second = path.stem + {".ele": ".node", ".node": ".ele"}[ending]
+        _check(path, second)
         _check_begun(path)
-        _check_begun(path.parent / other)
+        _check_begun(path.parent / second)
         _check_tetgen(path)
-        _check_tetgen(path.parent / other)
+        _check_tetgen(path.parent / second)
     elif ending == ".ugrid":
         return _ugrid(path)
     elif is_hdf5(path):
@@ -186,7 +186,7 @@ def _gap_note(path: Path) -> tuple[str, ...]:
         return ()
     section, element = patterns
     data = path.read_bytes().replace(b"\r", b"\n")
-    numbers = [int(found[1]) for part in section.finditer(data) for found in element.finditer(data, *part.span())]
+    numbers = [int(match[1]) for part in section.finditer(data) for match in element.finditer(data, *part.span())]
     distinct = np.unique(numbers)
     missing = int(distinct[-1]) - len(distinct) if len(distinct) else 0
     if not 0 < missing <= max(MAX_GAPS, MAX_GAP_SHARE * len(distinct)):
@@ -214,23 +214,23 @@ def _check_ply(source: SourceText) -> None:
                 source.refuse(0, f"{why} are supported; save as text, or without colours of faces. {PLY_ADVICE}")
         return
     lines = source.rows(head.end(), len(text), "the numbers of a point or a face")
-    known = ", ".join(f"{element.count} {element.name}" for element in elements)
+    allowed = ", ".join(f"{element.count} {element.name}" for element in elements)
     declared = sum(element.count for element in elements)
     if len(lines) < declared:
-        why = f"the file ends after {len(lines)} lines of data, and declares {known}."
+        why = f"the file ends after {len(lines)} lines of data, and declares {allowed}."
         source.refuse(len(text) - 1, f"{why} {PLY_ADVICE}")
     first = 0
     for element in elements:
         rows = slice(first, first + element.count)
         wrong = element.widths(lines.values, lines.begins[rows], lines.ends[rows]) != lines.counts[rows]
         if wrong.any():
-            at = int(lines.offsets[rows][wrong.argmax()])
-            line = shown(text[at : at + 80])
+            position = int(lines.offsets[rows][wrong.argmax()])
+            line = shown(text[position : position + 80])
             why = f"`{line}` holds more or fewer numbers than a {element.name} has by the head and by its own counts."
-            source.refuse(at, f"{why} The file declares {known}. {PLY_ADVICE}")
+            source.refuse(position, f"{why} The file declares {allowed}. {PLY_ADVICE}")
         first += element.count
     if len(lines) > declared:
-        why = f"the file declares {known}, {declared} lines of data, and holds {len(lines)}."
+        why = f"the file declares {allowed}, {declared} lines of data, and holds {len(lines)}."
         source.refuse(int(lines.offsets[declared]), f"{why} {PLY_ADVICE}")
 
 
@@ -248,13 +248,13 @@ class _PlyElement:
 
     def widths(self, values: npt.NDArray[np.float64], begins: Indices, ends: Indices) -> Indices:
         """(n,) how many numbers each line of text has to hold: one a property; of a list, its count and as many."""
-        place = begins.copy()
+        position = begins.copy()
         for words in self.properties:
             if words[0] == "list":
-                counts = np.where(place < ends, values[np.minimum(place, len(values) - 1)], 0)
-                place += np.clip(np.nan_to_num(counts), 0, len(values)).astype(np.int64)
-            place += 1
-        widths: Indices = place - begins
+                counts = np.where(position < ends, values[np.minimum(position, len(values) - 1)], 0)
+                position += np.clip(np.nan_to_num(counts), 0, len(values)).astype(np.int64)
+            position += 1
+        widths: Indices = position - begins
         return widths
 
 
@@ -276,7 +276,7 @@ def _check_binary_ply(path: Path, data: bytes, mesh: Any) -> None:
     if not head or re.search(rb"^format\s+ascii\b", head[1], re.MULTILINE):
         return
     elements = _ply_elements(head[1])
-    known = ", ".join(f"{element.count} {element.name}" for element in elements)
+    allowed = ", ".join(f"{element.count} {element.name}" for element in elements)
     begin = f"Mesh file '{path}' could not be read: "
     end = head.end()
     for element in elements:
@@ -287,7 +287,7 @@ def _check_binary_ply(path: Path, data: bytes, mesh: Any) -> None:
             count, corner = _PLY_BYTES[lists[0][1]], _PLY_BYTES[lists[0][2]]
             end += sum(len(block.data) * (count + corner * block.data.shape[1]) for block in mesh.cells)
     if data[end:].strip(b"\0\r\n\t \x1a") or len(data) - end > MAX_PLY_FILLING:
-        raise MeshError(f"{begin}it declares {known}, and {len(data) - end} bytes are left behind them. {PLY_ADVICE}")
+        raise MeshError(f"{begin}it declares {allowed}, and {len(data) - end} bytes are left behind them. {PLY_ADVICE}")
 
 
 def _check_su2(path: Path) -> None:
@@ -305,11 +305,11 @@ def _check_su2(path: Path) -> None:
             nodes = np.array([SU2_NODES.get(type_, -9) for type_ in types])
             wrong = (rows.counts != nodes + 1) & (rows.counts != nodes + 2)
             if wrong.any():
-                place = int(wrong.argmax())
-                count = int(rows.counts[place]) - 1
+                position = int(wrong.argmax())
+                count = int(rows.counts[position]) - 1
                 supported = ", ".join(f"{type_} ({number} nodes)" for type_, number in SU2_NODES.items())
-                why = f"an element has the type {types[place]:g} and {count} numbers behind it"
-                source.refuse(int(rows.offsets[place]), f"{why}; supported are the types {supported}. {ADVICE}")
+                why = f"an element has the type {types[position]:g} and {count} numbers behind it"
+                source.refuse(int(rows.offsets[position]), f"{why}; supported are the types {supported}. {ADVICE}")
         if len(rows) != int(head[2]):
             source.damaged(head.start(1), f"{word}= {int(head[2])} is declared, and {len(rows)} lines stand there.")
 
@@ -346,8 +346,10 @@ def _check_tetgen(path: Path) -> None:
         source.damaged(int(rows.offsets[0]), f"{head[0]} lines are declared, and {len(rows) - 1} stand there.")
     wrong = rows.counts[1:] != width
     if wrong.any():
-        place = 1 + int(wrong.argmax())
-        source.damaged(int(rows.offsets[place]), f"{int(rows.counts[place])} numbers stand here instead of {width}.")
+        position = 1 + int(wrong.argmax())
+        source.damaged(
+            int(rows.offsets[position]), f"{int(rows.counts[position])} numbers stand here instead of {width}."
+        )
 
 
 def _without_comments(path: Path, mark: bytes) -> bytes:
@@ -358,7 +360,7 @@ def _without_comments(path: Path, mark: bytes) -> bytes:
 
 def _with_known_head(data: bytes) -> bytes:
     """A PLY file with the names of its head that meshio knows: of the corners of faces, and of types."""
-    head, mark, rest = data.partition(b"end_header")
+    head, mark, remaining = data.partition(b"end_header")
     if not mark or len(head) > MAX_PLY_HEAD:
         return data
     lines = [line.split() for line in head.splitlines()]
@@ -367,7 +369,7 @@ def _with_known_head(data: bytes) -> bytes:
             line[1:-1] = [_PLY_TYPES.get(word, word) for word in line[1:-1]]
             if line[1:2] == [b"list"] and line[-1] == b"vertex_index":
                 line[-1] = b"vertex_indices"
-    return b"\n".join(b" ".join(line) for line in lines if line) + b"\n" + mark + rest
+    return b"\n".join(b" ".join(line) for line in lines if line) + b"\n" + mark + remaining
 
 
 def _check(path: Path, name: str) -> None:

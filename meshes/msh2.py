@@ -108,8 +108,8 @@ class _Msh2:
                 begin, f"`{shown(text[:80])}` is not version, 0 for text or 1 for binary, and 8: `2.2 0 8`. {SAVE}."
             )
         if head[2] == b"1":
-            one = text[head.end() : head.end() + 4]
-            self.order = {b"\1\0\0\0": "<", b"\0\0\0\1": ">"}.get(one, "")
+            first = text[head.end() : head.end() + 4]
+            self.order = {b"\1\0\0\0": "<", b"\0\0\0\1": ">"}.get(first, "")
             if not self.order:
                 self.source.damaged(begin, "the number 1 does not stand behind the version of this binary file.")
 
@@ -121,8 +121,8 @@ class _Msh2:
         """The number on the first line of a section, and where the next one begins."""
         line = re.compile(rb"[ \t]*(\d{1,18})[ \t]*\r?\n").match(self.source.text, begin)
         if not line:
-            found = shown(self.source.text[begin : begin + 80].split(b"\n")[0])
-            self.source.damaged(begin, f"`{found}` is not the number of {what}.")
+            result = shown(self.source.text[begin : begin + 80].split(b"\n")[0])
+            self.source.damaged(begin, f"`{result}` is not the number of {what}.")
         return int(line[1]), line.end()
 
     def _section_end(self, begin: int, name: str) -> int:
@@ -148,8 +148,10 @@ class _Msh2:
             end = self._section_end(begin, "Nodes")
             lines = self.source.rows(begin, end, NODE)
             if len(lines) and (short := (lines.counts < 4) | (lines.counts > 4) & (not parametric)).any():
-                at = int(lines.offsets[short.argmax()])
-                self.source.damaged(at, f"this node has {int(lines.counts[short.argmax()]) - 1} coordinates; {NODE}.")
+                position = int(lines.offsets[short.argmax()])
+                self.source.damaged(
+                    position, f"this node has {int(lines.counts[short.argmax()]) - 1} coordinates; {NODE}."
+                )
             if len(lines) != count:
                 self.source.damaged(begin - 1, f"{count} nodes are declared, and {len(lines)} are there.")
             rows4 = lines.columns(slice(None), 4)
@@ -167,8 +169,8 @@ class _Msh2:
     def _whole(self, values: Any, offsets: Indices, needed: str) -> Indices:
         wrong = is_not_integer(values)
         if wrong.any():
-            place = int(wrong.argmax())
-            self.source.damaged(int(offsets[place]), f"{values[place]:g} is no whole number; {needed}.")
+            position = int(wrong.argmax())
+            self.source.damaged(int(offsets[position]), f"{values[position]:g} is no whole number; {needed}.")
         whole: Indices = values.astype(np.int64)
         return whole
 
@@ -177,12 +179,12 @@ class _Msh2:
     def _elements(self, begin: int) -> int:
         count, begin = self._count(begin, "elements")
         end = begin if self.order else self._section_end(begin, "Elements")
-        found = 0
+        result = 0
         for type_, group in self._binary_groups(begin, count) if self.order else self._text_groups(begin, end):
             self.groups.setdefault(type_, []).append(group)
-            found += len(group[0])
-        if found != count:
-            self.source.damaged(begin - 1, f"{count} elements are declared, and {found} are there.")
+            result += len(group[0])
+        if result != count:
+            self.source.damaged(begin - 1, f"{count} elements are declared, and {result} are there.")
         return self._binary_end if self.order else end
 
     def _kind(self, type_: int, offset: int) -> tuple[str, int]:
@@ -202,8 +204,8 @@ class _Msh2:
             self.source.damaged(int(lines.offsets[short.argmax()]), f"this element is cut short; {ELEMENT}.")
         types, tags = (self._whole(lines.values[lines.begins + i], lines.offsets, ELEMENT) for i in (1, 2))
         keys = np.stack([types, tags, lines.counts], axis=1)
-        distinct, first, place = np.unique(keys, axis=0, return_index=True, return_inverse=True)
-        place = place.ravel()
+        distinct, first, position = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+        position = position.ravel()
         for number in np.argsort(first):
             type_, tag_count, width = distinct[number].tolist()
             offset = int(lines.offsets[first[number]])
@@ -213,7 +215,7 @@ class _Msh2:
                     offset, f"an element of type {type_} with {tag_count} tags has {3 + tag_count + nodes} numbers, "
                     f"not {width}.",
                 )  # fmt: skip
-            rows = np.flatnonzero(place == number)
+            rows = np.flatnonzero(position == number)
             values = self._whole_rows(lines.columns(rows, width), lines.offsets[rows])
             yield type_, (values[:, 0], self._physical(values, 3, tag_count), values[:, 3 + tag_count :])
 
@@ -228,8 +230,8 @@ class _Msh2:
         return np.abs(values[:, column]) if tag_count else np.zeros(len(values), np.int64)
 
     def _binary_groups(self, begin: int, count: int) -> Iterator[tuple[int, _Group]]:
-        found = 0
-        while found < count:
+        result = 0
+        while result < count:
             type_, follow, tag_count = self._binary(begin, self.order + "i4", 3, f"{count} elements").tolist()
             nodes = self._kind(type_, begin)[1]
             if follow < 1 or not 0 <= tag_count <= MAX_TAGS:
@@ -239,7 +241,7 @@ class _Msh2:
             values = self._binary(begin, self.order + "i4", follow * width, f"{follow} elements")
             values = values.astype(np.int64).reshape(-1, width)
             begin += 4 * follow * width
-            found += follow
+            result += follow
             yield type_, (values[:, 0], self._physical(values, 1, tag_count), values[:, 1 + tag_count :])
         self._binary_end = begin
 
@@ -251,14 +253,14 @@ class _Msh2:
         for type_, groups in self.groups.items():
             kind = KINDS[type_][0]
             numbers, physical, nodes = (np.concatenate(column) for column in zip(*groups, strict=True))
-            places = numbered(self.ids, nodes)
-            if (missing := (places < 0).any(axis=1)).any():
+            positions = numbered(self.ids, nodes)
+            if (missing := (positions < 0).any(axis=1)).any():
                 row = int(missing.argmax())
                 raise MeshError(
                     f"Mesh file '{self.path}' could not be read: element {numbers[row]} has the node "
-                    f"{int(nodes[row][places[row] < 0][0])}, which is not in the file. {EXPORT_AGAIN}"
+                    f"{int(nodes[row][positions[row] < 0][0])}, which is not in the file. {EXPORT_AGAIN}"
                 )
-            blocks.append(Block(kind, places))
+            blocks.append(Block(kind, positions))
             parts.append(physical)
         sets, notes = sets_by_tag(parts, lambda tag, i: self.names.get((blocks[i].dim, tag), ""), "physical groups")
         if self.unused:

@@ -81,8 +81,10 @@ class _Bulk:
         if self.begun and not self.ended:
             self._refuse("the file ends without ENDDATA behind BEGIN BULK: it was cut off. Export it again.")
         if not self.grids or not self.elements:
-            what = "GRID" if not self.grids else "element"
-            raise MeshError(f"Mesh file '{source.path}' could not be read: it has no {what} of Nastran. {SUPPORTED}")
+            description = "GRID" if not self.grids else "element"
+            raise MeshError(
+                f"Mesh file '{source.path}' could not be read: it has no {description} of Nastran. {SUPPORTED}"
+            )
 
     def _refuse(self, message: str) -> NoReturn:
         raise MeshError(f"Mesh file '{self.source.path}', line {self.line}: {message}")
@@ -111,8 +113,8 @@ class _Bulk:
         if "NAME" not in line and "emap" not in line:
             return
         for rank, pattern in enumerate(NAMES):
-            if found := pattern.match(line):
-                *kind, number, name = found.groups()
+            if match := pattern.match(line):
+                *kind, number, name = match.groups()
                 rank += 3 * (kind == ["COMP"])  # names of properties count more
                 if name.strip() and rank <= self.names.get(int(number), (9, ""))[0]:
                     self.names[int(number)] = rank, name.strip()
@@ -217,18 +219,18 @@ class _Bulk:
         owners: list[Indices] = []
         for kind, (numbers, properties, nodes) in self.elements.items():
             table = np.array(nodes, np.int64)
-            places = numbered(ids, table)
-            if (missing := (places < 0).any(axis=1)).any():
+            positions = numbered(ids, table)
+            if (missing := (positions < 0).any(axis=1)).any():
                 row = int(missing.argmax())
                 raise MeshError(
                     f"Mesh file '{self.source.path}' could not be read: element {numbers[row]} has the node "
-                    f"{int(table[row][places[row] < 0][0])}, which is no GRID of the file. {EXPORT_AGAIN}"
+                    f"{int(table[row][positions[row] < 0][0])}, which is no GRID of the file. {EXPORT_AGAIN}"
                 )
-            blocks.append(Block(kind, places))
+            blocks.append(Block(kind, positions))
             owners.append(np.array(properties, np.int64))
         if self.middles:
-            places = numbered(ids, np.unique(self.middles))
-            blocks.append(Block("vertex", places[places >= 0][:, None]))
+            positions = numbered(ids, np.unique(self.middles))
+            blocks.append(Block("vertex", positions[positions >= 0][:, None]))
             owners.append(np.zeros(len(blocks[-1].nodes), np.int64))
         names = {number: name for number, (_, name) in self.names.items()}
         sets, notes = sets_by_tag(owners, lambda tag, _: names.get(tag, ""), "properties")

@@ -39,29 +39,31 @@ def read_obj(path: Path) -> MeshFileContents:
                 x, y, z, *_ = map(float, values)
                 points.append([x, y, z])
             elif word in named:
-                at = (len(blocks) - 1, len(blocks[-1][1])) if blocks else (0, 0)
-                named[word].append((" ".join(values), *at))
+                position = (len(blocks) - 1, len(blocks[-1][1])) if blocks else (0, 0)
+                named[word].append((" ".join(values), *position))
             elif word == "f":
                 face = [_place(value, len(points)) for value in values]
-                farthest = max(farthest, (max(face), number), key=lambda found: found[0])
+                farthest = max(farthest, (max(face), number), key=lambda result: result[0])
                 if not blocks or blocks[-1][0] != len(face):
                     blocks.append((len(face), []))
                 blocks[-1][1].append(face)
         except ValueError:
-            what = "three coordinates: v 0 0.5 1" if word == "v" else "points that are there before it: f 1 2 3"
+            description = "three coordinates: v 0 0.5 1" if word == "v" else "points that are there before it: f 1 2 3"
             line = " ".join([word, *values])[:80]
-            raise MeshError(f"Mesh file '{path}', line {number}: `{line}` does not name {what}.") from None
+            raise MeshError(f"Mesh file '{path}', line {number}: `{line}` does not name {description}.") from None
     if farthest[0] >= len(points):
         last, number = farthest
         raise MeshError(f"Mesh file '{path}', line {number}: there is no point {last + 1}, but {len(points)} in all.")
-    found = [Block(KINDS.get(corners, "polygon"), np.array(faces, np.int64)) for corners, faces in blocks]
-    return MeshFileContents(np.array(points, np.float64).reshape(-1, 3), found, _sets(named["g"] or named["o"], found))
+    result = [Block(KINDS.get(corners, "polygon"), np.array(faces, np.int64)) for corners, faces in blocks]
+    return MeshFileContents(
+        np.array(points, np.float64).reshape(-1, 3), result, _sets(named["g"] or named["o"], result)
+    )
 
 
 def _sets(named: list[tuple[str, int, int]], blocks: list[Block]) -> dict[str, list[Indices]]:
     """Sets of faces from the places at which their names stand; a face is in the set of the last name before it."""
     sets: dict[str, list[Indices]] = {}
-    ends = [tuple(place) for _, *place in named[1:]]
+    ends = [tuple(position) for _, *position in named[1:]]
     for (name, *begin), end in zip(named, [*ends, (len(blocks), 0)], strict=False):
         for i, block in enumerate(blocks):
             first = begin[1] if i == begin[0] else 0
@@ -86,10 +88,10 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 def _place(text: str, count: int) -> int:
     """Index from 0 of an index as it is written after `count` points. ValueError where it can be none."""
     index = int(text.partition("/")[0])
-    place = index - 1 if index > 0 else count + index
-    if index == 0 or place < 0:
+    position = index - 1 if index > 0 else count + index
+    if index == 0 or position < 0:
         raise ValueError(text)
-    return place
+    return position
 
 
 # --- OFF ------------------------------------------------------------------------------------------------------------

@@ -84,7 +84,7 @@ def find_external_data(file: Any) -> str:
     """
     import h5py
 
-    todo, seen = [file], set()
+    todo, visited = [file], set()
     while todo:
         group = todo.pop()
         for name in group:
@@ -97,8 +97,8 @@ def find_external_data(file: Any) -> str:
             entry = group[name]
             if isinstance(entry, h5py.Dataset) and (entry.is_virtual or entry.external):
                 return where
-            if isinstance(entry, h5py.Group) and (address := h5py.h5o.get_info(entry.id).addr) not in seen:
-                seen.add(address)
+            if isinstance(entry, h5py.Group) and (address := h5py.h5o.get_info(entry.id).addr) not in visited:
+                visited.add(address)
                 todo.append(entry)
     return ""
 
@@ -143,7 +143,7 @@ def atomic_replacement_of_all(path: Path) -> Iterator[Path]:
     check_replaceable(path)
     with TemporaryDirectory(prefix=f".{path.name[:50]}-", dir=path.parent) as folder:
         yield Path(folder) / path.name
-        for made in sorted(Path(folder).iterdir()):
-            check_replaceable(path.parent / made.name)
-        for made in sorted(Path(folder).iterdir()):
-            os.replace(made, path.parent / made.name)
+        for result in sorted(Path(folder).iterdir()):
+            check_replaceable(path.parent / result.name)
+        for result in sorted(Path(folder).iterdir()):
+            os.replace(result, path.parent / result.name)

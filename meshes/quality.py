@@ -63,8 +63,8 @@ def radius_ratios(points: Points, cells: Indices) -> Floats:
 def _height_vectors(points: Points, cells: Indices) -> Floats:
     """Gradients of the barycentric coordinates: along the heights, of one over their length [1/m]: (m, d + 1, d)."""
     spans = points[cells[:, 1:]] - points[cells[:, :1]]
-    others = np.linalg.inv(spans).transpose(0, 2, 1)
-    return np.concatenate([-others.sum(axis=1, keepdims=True), others], axis=1)
+    remaining = np.linalg.inv(spans).transpose(0, 2, 1)
+    return np.concatenate([-remaining.sum(axis=1, keepdims=True), remaining], axis=1)
 
 
 def _angles(gradients: Floats) -> Floats:

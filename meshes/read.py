@@ -68,9 +68,10 @@ def read_contents(path: Path) -> MeshFileContents:
     if version:
         return read_msh2(path)
     if ending not in FORMATS:
-        known = sorted({*OWN_READERS, *FORMATS, ".med"})
+        allowed = sorted({*OWN_READERS, *FORMATS, ".med"})
         raise MeshError(
-            f"Mesh file '{path}' is of no known kind; known endings: {', '.join(known)}. Export it as MSH 4.1 (gmsh), "
+            f"Mesh file '{path}' is of no known kind; known endings: {', '.join(allowed)}. "
+            "Export it as MSH 4.1 (gmsh), "
             "VTU (ParaView), MED (Salome) or Abaqus (.inp)."
         )
     if ending == ".dat" and _NASTRAN.search(path.read_bytes()):
@@ -101,8 +102,8 @@ def _gmsh_version(path: Path) -> int:
             f"Mesh file '{path}' could not be read: it is no mesh of Gmsh, for it begins with {head[:16]!a}, not with "
             f"$MeshFormat.{freefem} {SAVE}."
         )
-    _, found, rest = head.partition(b"$MeshFormat")
-    number = re.match(rb"\s*(\d{1,3})(\.\d*)?\s", rest) if found else None
+    _, result, remaining = head.partition(b"$MeshFormat")
+    number = re.match(rb"\s*(\d{1,3})(\.\d*)?\s", remaining) if result else None
     if not number or int(number[1]) < 1:
         raise MeshError(
             f"Mesh file '{path}' could not be read: no version stands behind $MeshFormat: `4.1 0 8`. {SAVE}."

@@ -30,18 +30,18 @@ def extrude_shell(
         MeshError: folds leave no room for the thickness; the message begins with `source`.
     """
     normal = _normals(points, triangles)
-    both = np.concatenate([points - thickness / 2 * normal, points + thickness / 2 * normal])
+    combined = np.concatenate([points - thickness / 2 * normal, points + thickness / 2 * normal])
     order = np.argsort(triangles, axis=1)
     odd = np.linalg.det(np.eye(3)[order]) < 0
     a, b, c = np.take_along_axis(triangles, order, axis=1).T
-    A, B, C = (each + len(points) for each in (a, b, c))
+    A, B, C = (item + len(points) for item in (a, b, c))
     prism = [[a, b, c, C], [a, b, C, B], [a, A, B, C]]
-    cells = np.stack([np.stack(each, axis=1) for each in prism], axis=1)
+    cells = np.stack([np.stack(item, axis=1) for item in prism], axis=1)
     cells[odd] = cells[odd][:, :, [0, 1, 3, 2]]
     cells = cells.reshape(-1, 4)
-    inside_out = np.flatnonzero(signed_measures(both, cells) <= 0)
+    inside_out = np.flatnonzero(signed_measures(combined, cells) <= 0)
     if len(inside_out):
-        where = format_midpoint(both, cells[inside_out[0]])
+        where = format_midpoint(combined, cells[inside_out[0]])
         raise MeshError(f"{source}: {thickness:g} m is too thick for its folds near {where}: take a smaller thickness.")
     facets = boundary_facets(cells)
     above = (facets >= len(points)).sum(axis=1)
@@ -49,7 +49,7 @@ def extrude_shell(
     if len(rim := facets[(above > 0) & (above < 3)]):
         groups["rim"] = rim
     shell = Shell(np.concatenate([points, points]), triangles, thickness)
-    return MeshData(both, cells, groups, notes=notes, shell=shell)
+    return MeshData(combined, cells, groups, notes=notes, shell=shell)
 
 
 def _normals(points: Points, triangles: Indices) -> Floats:

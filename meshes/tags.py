@@ -42,8 +42,8 @@ def tag_sets(
     chosen = _chosen(arrays)
     if chosen is None:
         return {}, (), ()
-    others = [key for key in arrays if key != chosen]
-    notes = (f"Groups come from the cell array '{chosen}'; not used: {', '.join(others)}.",) if others else ()
+    remaining = [key for key in arrays if key != chosen]
+    notes = (f"Groups come from the cell array '{chosen}'; not used: {', '.join(remaining)}.",) if remaining else ()
     top = max((block.dim for block in blocks if len(block.nodes)), default=0)
     sets: dict[str, list[Indices]] = {}
     for i, (block, tags) in enumerate(zip(blocks, arrays[chosen], strict=True)):
@@ -113,5 +113,5 @@ def sets_by_tag(
     if len(unnamed) <= MAX_TAGS:
         return sets, ()
     numbers = {f"tag-{tag}" for tag in unnamed}
-    kept = {name: parts for name, parts in sets.items() if name not in numbers}
-    return kept, (f"Not used: {len(unnamed)} {what} without a name, too many to mean groups of cells.",)
+    retained = {name: parts for name, parts in sets.items() if name not in numbers}
+    return retained, (f"Not used: {len(unnamed)} {what} without a name, too many to mean groups of cells.",)

@@ -144,6 +144,6 @@ def numbered(ids: Indices, wanted: Indices) -> Indices:
     if not len(ids):
         return np.full(wanted.shape, -1, np.int64)
     order = np.argsort(ids, kind="stable") if (np.diff(ids) <= 0).any() else np.arange(len(ids))
-    place = np.minimum(np.searchsorted(ids, wanted, sorter=order), len(ids) - 1)
-    found: Indices = order[place]
-    return np.where(ids[found] == wanted, found, -1)
+    position = np.minimum(np.searchsorted(ids, wanted, sorter=order), len(ids) - 1)
+    result: Indices = order[position]
+    return np.where(ids[result] == wanted, result, -1)

@@ -77,13 +77,13 @@ def _pack(answer: Any, file: BinaryIO) -> None:
     """Write an object: its arrays, each from a whole page on, then its pickle, then where these begin."""
     arrays: list[pickle.PickleBuffer] = []
     stream = pickle.dumps(answer, protocol=5, buffer_callback=arrays.append)
-    places = []
-    for each in arrays:
+    positions = []
+    for item in arrays:
         file.seek(-file.tell() % mmap.PAGESIZE, os.SEEK_CUR)
-        places.append((file.tell(), file.write(each.raw())))
+        positions.append((file.tell(), file.write(item.raw())))
     begin = file.tell()
     file.write(stream)
-    pickle.dump((begin, places), file)
+    pickle.dump((begin, positions), file)
     file.write((file.tell() - begin - len(stream)).to_bytes(8))
 
 
@@ -92,8 +92,10 @@ def _unpacked(file: BinaryIO) -> tuple[Any, Any]:
     pages = memoryview(mmap.mmap(file.fileno(), 0, mmap.MAP_PRIVATE, mmap.PROT_READ | mmap.PROT_WRITE))
     end = len(pages) - 8
     end -= int.from_bytes(pages[end:])
-    begin, places = pickle.loads(pages[end:])
-    answer: tuple[Any, Any] = pickle.loads(pages[begin:end], buffers=[pages[at : at + size] for at, size in places])
+    begin, positions = pickle.loads(pages[end:])
+    answer: tuple[Any, Any] = pickle.loads(
+        pages[begin:end], buffers=[pages[point : point + size] for point, size in positions]
+    )
     return answer
 
 

@@ -39,11 +39,11 @@ def facets_of(cells: Indices) -> Indices:
     nodes = cells.shape[1]
     rows = []
     for opposite in range(nodes):
-        kept = [node for node in range(nodes) if node != opposite]
+        retained = [node for node in range(nodes) if node != opposite]
         # Dropping node i keeps the outward order for even i in 3D and in 2D; for odd i two nodes change places.
         if opposite % 2 == 1:
-            kept[0], kept[1] = kept[1], kept[0]
-        rows.append(cells[:, kept])
+            retained[0], retained[1] = retained[1], retained[0]
+        rows.append(cells[:, retained])
     return np.stack(rows, axis=1)
 
 
@@ -113,5 +113,6 @@ def facet_groups_on_planes(points: Points, facets: Indices, names: dict[str, tup
     """Facet groups on planes: name -> (axis, coordinate [m]). Nodes count as on it within 1e-9 of the body's size."""
     tolerance = 1e-9 * float(np.ptp(points, axis=0).max())
     return {
-        name: facets_on_nodes(facets, np.abs(points[:, axis] - at) <= tolerance) for name, (axis, at) in names.items()
+        name: facets_on_nodes(facets, np.abs(points[:, axis] - position) <= tolerance)
+        for name, (axis, position) in names.items()
     }

@@ -110,9 +110,11 @@ class _Unv:
             self.source.damaged(int(lines.offsets[-1]), f"the last node has no coordinates; {NODE_LINE}.")
         for i, width in enumerate(widths):
             if (wrong := counts[i::step] != width).any():
-                at = int(lines.offsets[i::step][wrong.argmax()])
+                position = int(lines.offsets[i::step][wrong.argmax()])
                 count = int(counts[i::step][wrong.argmax()])
-                self.source.damaged(at, f"this line of a node has {count} numbers instead of {width}; {NODE_LINE}.")
+                self.source.damaged(
+                    position, f"this line of a node has {count} numbers instead of {width}; {NODE_LINE}."
+                )
         if not len(lines):
             return
         heads = lines.columns(slice(0, None, step), widths[0])
@@ -210,8 +212,8 @@ class _Unv:
             name = decode_text(text[head_end:name_end]).strip() or f"group-{int(head.values[0])}"
             nodes, elements = (members[members[:, 0] == kind, 1] for kind in (7, 8))
             self.groups.append((name, nodes, elements))
-            if other := len(members) - len(nodes) - len(elements):
-                self.left_out["members of groups that are neither nodes nor elements"] = other
+            if second := len(members) - len(nodes) - len(elements):
+                self.left_out["members of groups that are neither nodes nor elements"] = second
             begin = stop
 
     # --- result ---
@@ -227,14 +229,14 @@ class _Unv:
         owners: list[Indices] = []
         for kind, parts in self.elements.items():
             numbers, nodes = (np.concatenate(column) for column in zip(*parts, strict=True))
-            places = numbered(ids, nodes)
-            if (missing := (places < 0).any(axis=1)).any():
+            positions = numbered(ids, nodes)
+            if (missing := (positions < 0).any(axis=1)).any():
                 row = int(missing.argmax())
                 self.source.damaged(
-                    0, f"element {numbers[row]} has the node {nodes[row][places[row] < 0][0]}, which is not among the "
-                    f"{len(ids)} nodes of the file.",
+                    0, f"element {numbers[row]} has the node {nodes[row][positions[row] < 0][0]}, which is not among "
+                    f"the {len(ids)} nodes of the file.",
                 )  # fmt: skip
-            blocks.append(Block(kind, places))
+            blocks.append(Block(kind, positions))
             owners.append(numbers)
         notes = self._notes()
         sets, point_sets, lost = self._sets(ids, blocks, owners)
@@ -256,24 +258,28 @@ class _Unv:
             self.source.damaged(0, f"element {again} is given twice.")
         for name, nodes, elements in self.groups:
             if len(nodes):
-                places = numbered(ids, nodes)
-                lost += int((places < 0).sum())
-                point_sets[name] = np.union1d(point_sets.get(name, places[:0]), places[places >= 0]).astype(np.int64)
+                positions = numbered(ids, nodes)
+                lost += int((positions < 0).sum())
+                point_sets[name] = np.union1d(point_sets.get(name, positions[:0]), positions[positions >= 0]).astype(
+                    np.int64
+                )
             if not len(elements):
                 continue
-            places = numbered(numbers, elements)
-            lost += int((places < 0).sum())
-            places = np.unique(places[places >= 0])
+            positions = numbered(numbers, elements)
+            lost += int((positions < 0).sum())
+            positions = np.unique(positions[positions >= 0])
             members = sets.setdefault(name, [np.zeros(0, np.int64) for _ in blocks])
             for i, (begin, end) in enumerate(pairwise(starts)):
-                part = places[(places >= begin) & (places < end)] - begin
+                part = positions[(positions >= begin) & (positions < end)] - begin
                 members[i] = np.union1d(members[i], part).astype(np.int64)
         return sets, point_sets, lost
 
     def _notes(self) -> list[str]:
         notes = []
         if self.left_out:
-            notes.append(f"Not used: {', '.join(f'{count} {what}' for what, count in self.left_out.items())}.")
+            notes.append(
+                f"Not used: {', '.join(f'{count} {description}' for description, count in self.left_out.items())}."
+            )
         if self.unused:
             notes.append(f"Datasets of the universal file that are not used: {', '.join(self.unused)}.")
         return notes

@@ -111,7 +111,7 @@ def _read(path: Path) -> MeshFileContents:
 
 def _refuse_errors(path: Path, said: str) -> None:
     """Refuse a file with errors or warnings, but for the warning that its version is newer than the reader."""
-    errors = _messages(said, "ERROR") + [each for each in _messages(said, "Warning") if "higher than" not in each]
+    errors = _messages(said, "ERROR") + [item for item in _messages(said, "Warning") if "higher than" not in item]
     if errors:
         _refuse(path, f"VTK's reader says: {'; '.join(errors)[:MAX_WORDS].rstrip('.')}")
 
@@ -119,11 +119,11 @@ def _refuse_errors(path: Path, said: str) -> None:
 def _messages(said: str, kind: str) -> list[str]:
     """What VTK said of a kind, each once, without the places in VTK's source."""
     text = r"(?:Generic )?" + kind + r": In .*?, line \d+\n(?:\w+ \((?:0x)?[0-9a-fA-F]+\): ?)?(.*?)\n\n"
-    found = [" ".join(each.split()) for each in re.findall(text, said + "\n\n", re.DOTALL)]
-    if not found and kind in said:
-        found = [" ".join(said.split())]
-    told = [each.rstrip(".") for each in found if not each.startswith("Algorithm vtk")]  # that repeats what failed
-    return list(dict.fromkeys(told or found))
+    result = [" ".join(item.split()) for item in re.findall(text, said + "\n\n", re.DOTALL)]
+    if not result and kind in said:
+        result = [" ".join(said.split())]
+    messages = [item.rstrip(".") for item in result if not item.startswith("Algorithm vtk")]  # that repeats what failed
+    return list(dict.fromkeys(messages or result))
 
 
 # --- grids of VTK ---------------------------------------------------------------------------------------------------
@@ -235,8 +235,10 @@ def _check_xml_sizes(path: Path, data: Any) -> None:
                     values = _xml_values(text[tag.end() : end_tag], array, file)
                 if values is not None and values > declared * (3 if word == "Points" else 1):
                     name = array.get("Name", word)
-                    one = " (3 a point)" if word == "Points" else ""
-                    _refuse(path, f"it declares {declared} {word}, and its array '{name}' holds {values} numbers{one}")
+                    first = " (3 a point)" if word == "Points" else ""
+                    _refuse(
+                        path, f"it declares {declared} {word}, and its array '{name}' holds {values} numbers{first}"
+                    )
 
 
 _XML_SECTION = re.compile(rb"<(Points|Cells|Verts|Lines|Strips|Polys)>")
@@ -472,9 +474,9 @@ def _appended(grids: list[_Grid]) -> _Grid:
     offsets = [grid.offsets[1:] + end for grid, end in zip(grids, ends, strict=False)]
 
     def common(data: list[dict[str, Array]]) -> dict[str, Array]:
-        names = [name for name in data[0] if all(name in each for each in data)]
-        names = [name for name in names if len({each[name].shape[1:] for each in data}) == 1]
-        return {name: np.concatenate([each[name] for each in data]) for name in names}
+        names = [name for name in data[0] if all(name in item for item in data)]
+        names = [name for name in names if len({item[name].shape[1:] for item in data}) == 1]
+        return {name: np.concatenate([item[name] for item in data]) for name in names}
 
     return _Grid(
         np.concatenate([grid.points for grid in grids]),
@@ -558,10 +560,10 @@ def _exodus(path: Path, head: bytes) -> MeshFileContents:
     blocks: list[Block] = []
     owners: list[tuple[str, int]] = []
     point_sets: dict[str, Indices] = {}
-    for place, (kind, word) in zip((0, 4, 7), zip(kinds, ("block", "side", "nodes"), strict=True), strict=True):
+    for position, (kind, word) in zip((0, 4, 7), zip(kinds, ("block", "side", "nodes"), strict=True), strict=True):
         for i in range(reader.GetNumberOfObjects(kind)):
             name = _exodus_name(reader, kind, i, word)
-            grid = _member(reader.GetOutput(), place, i)
+            grid = _member(reader.GetOutput(), position, i)
             declared = reader.GetNumberOfEntriesInObject(kind, i)
             read = 0 if grid is None else grid.GetNumberOfCells()
             if kind == vtkExodusIIReader.ELEM_BLOCK and read != declared:

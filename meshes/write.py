@@ -42,7 +42,7 @@ def write_mesh(mesh: MeshData, path: Path) -> None:
     except OSError as error:
         raise MeshError(f"cannot save the mesh as {path}: {error.strerror or 'it cannot be written there'}") from None
     except (SystemExit, Exception):  # meshio raises whatever its writers raise
-        known = ", ".join(sorted(meshio.extension_to_filetypes))
+        allowed = ", ".join(sorted(meshio.extension_to_filetypes))
         is_known = any(path.name.lower().endswith(ending) for ending in meshio.extension_to_filetypes)
-        why = "this mesh does not fit that format" if is_known else f"its ending is of no known format ({known})"
+        why = "this mesh does not fit that format" if is_known else f"its ending is of no known format ({allowed})"
         raise MeshError(f"cannot save the mesh as {path}: {why}; save it as .msh, .vtu or .xdmf") from None

@@ -220,7 +220,7 @@ def test_what_lies_near_is_found() -> None:
     pairs = find_pairs(cKDTree(points), places, radius)
     distance = np.linalg.norm(points[None] - places[:, None], axis=2)
     place, other = np.nonzero(distance < radius[:, None])
-    np.testing.assert_array_equal(np.column_stack([pairs.place, pairs.other]), np.column_stack([place, other]))
+    np.testing.assert_array_equal(np.column_stack([pairs.first, pairs.second]), np.column_stack([place, other]))
     np.testing.assert_allclose(pairs.distance, distance[place, other])
     np.testing.assert_allclose(pairs.sum(pairs.apart)[3], (points[other] - places[place])[place == 3].sum(axis=0))
     assert find_pairs(cKDTree(points), places[:0], radius[:0]).sum(np.empty((0, 3))).shape == (0, 3)

@@ -229,14 +229,14 @@ class ObstacleTerm(ContactState, Term):
         """Each obstacle at the time t of the state, s (not collective)."""
         return [obstacle.posed_at(t) for obstacle in self.obstacles]
 
-    def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
+    def separate_surface(self, position: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
         """Retract points of a surface for output that would lie in an obstacle, as those of contact are."""
         posed = self.posed_obstacles(t)
-        at = retract_from_obstacles(at, u, partial(min_distance, posed))
+        position = retract_from_obstacles(position, u, partial(min_distance, posed))
         if not self._facet_obstacles:
-            return at
+            return position
         facets, curved = self.surface.facets_from(elements), [posed[number] for number in self._facet_obstacles]
-        return retract_cut_elements(at, u, elements, lambda x: ~facets.are_open(curved, x))
+        return retract_cut_elements(position, u, elements, lambda x: ~facets.are_open(curved, x))
 
     def output_surfaces(self, t: float) -> dict[str, SurfaceData]:
         """Tessellation of each obstacle at time t, s, by its name."""

@@ -67,8 +67,8 @@ class ObstacleContactMonitor:
             figures: columns of history.csv by name; gap_NAME is used.
         """
         closings = [closing for contact in self._contacts for closing in contact.closing_distances()]
-        for (name, least), closing in zip(self.least_gap.items(), closings, strict=True):
-            if figures[f"gap_{name}"] < least[0]:
+        for (name, minimum), closing in zip(self.least_gap.items(), closings, strict=True):
+            if figures[f"gap_{name}"] < minimum[0]:
                 self.least_gap[name] = figures[f"gap_{name}"], state.t
             if closing > self.largest_closing[name][0]:
                 self.largest_closing[name] = closing, state.t, dt

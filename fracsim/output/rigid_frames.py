@@ -225,7 +225,7 @@ def join_surfaces(instances: Sequence[SplitSurface], skeleton: EntityNumbering, 
 
     points, nodes = [len(instance.points) for instance in instances], len(skeleton.points)
     posed = list(zip(instances, poses.rotation, poses.position, strict=True))
-    x = [instance.points @ turn.T + place for instance, turn, place in posed]
+    x = [instance.points @ turn.T + position for instance, turn, position in posed]
     parents = [instance.parents.parents + nodes * number for number, instance in enumerate(instances)]
     starts = np.cumsum([0, *(len(rows) for rows in parents)])
     start = [instance.parents.start[:-1] + first for instance, first in zip(instances, starts, strict=False)]

@@ -239,7 +239,7 @@ def label_points(
         position = axes.transData.transform((x, y))
         for side, height in ((side, height) for height in style.heights for side in (1, -1)):
             box = _label_box(position, name, side, height, scale)
-            if _is_inside(box, frame) and not any(_overlap(box, other) for other in occupied):
+            if _is_inside(box, frame) and not any(_overlap(box, second) for second in occupied):
                 occupied.append(box)
                 axes.annotate(
                     name, (x, y), textcoords="offset points", xytext=(style.offset * side, height),

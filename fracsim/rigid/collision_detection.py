@@ -49,7 +49,7 @@ class MotionBounds:
     def exceeded_by(self, present: MotionBounds) -> Flags:
         """Return (n,) flags of bodies whose `present` bounds are much larger than these."""
         pairs = zip(present.reach, self.reach, strict=True)
-        return np.any([now > EXCESS_REACH_RATIO * before for now, before in pairs], axis=0)
+        return np.any([current > EXCESS_REACH_RATIO * before for current, before in pairs], axis=0)
 
     def widen(self, exceeded: Flags, present: MotionBounds) -> MotionBounds:
         """Return bounds that also cover the `present` motion of the bodies flagged in `exceeded` (n,)."""

@@ -163,8 +163,8 @@ def joint_flight_fractions(constraints: ContactConstraints, pairs: Ints, elapsed
     groups, fraction = group_of_body[np.minimum(pairs[rows], count)], constraints.impact_fraction[rows]
     earliest = _earliest(groups, fraction, count)
     # an impact happens now only if it is the first one of both groups
-    now = fraction <= earliest[groups].min(axis=1) + LAW.simultaneity
-    first = _earliest(groups[now], fraction[now], count)[group_of_body[:-1]]
+    current = fraction <= earliest[groups].min(axis=1) + LAW.simultaneity
+    first = _earliest(groups[current], fraction[current], count)[group_of_body[:-1]]
     return np.where(np.isfinite(first), np.maximum(first, elapsed), elapsed)
 
 

@@ -217,17 +217,17 @@ class CoreContact:
         chosen, count = np.searchsorted(distances.code, ordered @ [n, 1]), len(ordered)
         rotation = np.ascontiguousarray(bodies.rotation[:n] @ self._rotation)
         position = np.ascontiguousarray(bodies.position)
-        found, node = np.zeros(count, np.int64), np.zeros((count, SETTINGS.max_nodes), np.int64)
+        result, node = np.zeros(count, np.int64), np.zeros((count, SETTINGS.max_nodes), np.int64)
         depth, normal = np.zeros((count, SETTINGS.max_nodes)), np.zeros((count, SETTINGS.max_nodes, 3))
         fragments = [rotation, position, self._centre, self._first_node, self._nodes]
         grid = [self._boxes, self._first_in_box, self._face_in_box, self._faces, self._is_crack_face, self._first_face]
         lengths = c_double(self._side), c_double(tolerance), c_double(SETTINGS.search_radius * self._edge)
-        state, results = [distances.position, distances.face, distances.first], [found, node, depth, normal]
+        state, results = [distances.position, distances.face, distances.first], [result, node, depth, normal]
         load_library(SOURCE).find_deepest(
             c_int64(count), chosen, distances.pairs, *fragments, *grid, *lengths,
             c_int64(SETTINGS.max_nodes), *state, *results,
         )  # fmt: skip
-        row, rank = np.nonzero(np.arange(SETTINGS.max_nodes) < found[:, None])
+        row, rank = np.nonzero(np.arange(SETTINGS.max_nodes) < result[:, None])
         touching = ordered[row]
         outwards = np.einsum("kij,kj->ki", rotation[touching[:, 0]], normal[row, rank])
         return touching, node[row, rank], depth[row, rank], outwards

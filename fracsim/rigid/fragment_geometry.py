@@ -144,11 +144,11 @@ class FragmentGeometry:
             centre = fragment_moments.centre[k]
             extreme = hull_corners(solids[k].points if self._uses_clusters(surface) else np.concatenate(parts))
             shapes[k] = solids[k].content_key, [corners - centre for corners in parts], extreme - centre
-        found = [shape for shape in shapes if shape is not None]
-        self._collision_shapes[number] = dict(zip(map(int, names), found, strict=True))
+        result = [shape for shape in shapes if shape is not None]
+        self._collision_shapes[number] = dict(zip(map(int, names), result, strict=True))
         has_cores = surface.fragment_count > 1 and not self._uses_clusters(surface)
         core = CoreGeometry.from_split_surface(surface, self.numbering) if has_cores else CoreGeometry.empty()
-        parts_of_all, hull_points = [shape[1] for shape in found], [shape[2] for shape in found]
+        parts_of_all, hull_points = [shape[1] for shape in result], [shape[2] for shape in result]
         return _InstanceShapes(
             points, pattern, names, fragment_moments, surface.node_fragment, parts_of_all, hull_points, core
         )

@@ -151,12 +151,12 @@ def would_hit_next(
     behind = same_direction & (partner[later] != partner[earlier])
     if family is None or not np.any(behind):
         return bool(np.any(behind))
-    own, screen, beyond = (
+    owned, screen, beyond = (
         _families(numbers[behind], count, family) for numbers in (body[earlier], partner[earlier], partner[later])
     )
     # a fragment that cannot break is hit aside by bodies of no family alone
-    gives_way = (screen >= 0) | ((screen < -1) & (own == -1))
-    return bool(np.any(gives_way & (screen != own) & (screen != beyond)))
+    gives_way = (screen >= 0) | ((screen < -1) & (owned == -1))
+    return bool(np.any(gives_way & (screen != owned) & (screen != beyond)))
 
 
 def _families(numbers: Ints, count: int, family: FamilyFunction) -> Ints:

@@ -138,8 +138,8 @@ class Instances:
         """Break edges and change shapes as analyses on any rank found."""
         numbers = [outcome.body_name // self.node_count for outcome in outcomes]
         for number in dict.fromkeys(numbers):
-            own = [outcome for outcome, owner in zip(outcomes, numbers, strict=True) if owner == number]
-            self.get(number).apply_outcomes(own)
+            owned = [outcome for outcome, owner in zip(outcomes, numbers, strict=True) if owner == number]
+            self.get(number).apply_outcomes(owned)
         for number, outcome in zip(numbers, outcomes, strict=True):
             if outcome.shape is not None:
                 self._change_shape(number, outcome.shape)

@@ -90,10 +90,10 @@ def _supporting_corners(body: Ints, arm: Values, axes: Values, later_gap: Values
     x, y = arm @ axes[:, 0], arm @ axes[:, 1]
     sector = np.floor((np.arctan2(x, y) / (2 * np.pi) + 0.5) * SETTINGS.sectors).astype(np.int64)
     group = SETTINGS.sectors * body + np.minimum(sector, SETTINGS.sectors - 1)
-    few = np.bincount(body) <= SETTINGS.sectors * (SETTINGS.lowest_corners + SETTINGS.outermost_corners)
+    has_few = np.bincount(body) <= SETTINGS.sectors * (SETTINGS.lowest_corners + SETTINGS.outermost_corners)
     lowest = _is_among_first(group, later_gap, SETTINGS.lowest_corners)
     outermost = _is_among_first(group, -np.hypot(x, y), SETTINGS.outermost_corners)
-    return np.asarray(lowest | outermost | few[body])
+    return np.asarray(lowest | outermost | has_few[body])
 
 
 @dataclass

@@ -95,9 +95,9 @@ class PhaseTimes:
 
     def add(self, phase: str, began: float) -> float:
         """Add the time since `began`, s, to a phase; return the present time."""
-        now = time.perf_counter()
-        self.seconds[phase] += now - began
-        return now
+        current = time.perf_counter()
+        self.seconds[phase] += current - began
+        return current
 
 
 class RigidStepper:
@@ -231,9 +231,9 @@ class RigidStepper:
         _check_finite(bodies, state.t)
         self._broken_instances.clear()
         moved, impulses = self._move(state, bodies)
-        found = self.impact_detector.find_loads(impulses, bodies, self.body_names)
+        result = self.impact_detector.find_loads(impulses, bodies, self.body_names)
         clock = self.phases.add("motion", clock)
-        if loads := self._select_loads(found, impulses):
+        if loads := self._select_loads(result, impulses):
             snapshot.instances = self.instances.snapshot(load.body_name for load in loads)
         broken_by_name = self.analyses(loads)
         clock = self.phases.add("analysis", clock)
@@ -254,10 +254,10 @@ class RigidStepper:
         lost = gravity_work + bodies.kinetic_energies - moved.kinetic_energies
         obstacle_work[self.obstacles.free_numbers] = lost[self.fragment_count :]
         after = RigidState(state.t + self._parameters.time_step, state.step + 1, moved, work)
-        blows = sum(load.speed > 0 for load in found)
+        blows = sum(load.speed > 0 for load in result)
         cg_iterations, seconds = self.instances.cg_iterations - iterations, time.perf_counter() - began
         return after, RigidReport(
-            broken, blows, len(found) - blows, moved.kinetic_energy, forces, obstacle_work, cg_iterations, seconds
+            broken, blows, len(result) - blows, moved.kinetic_energy, forces, obstacle_work, cg_iterations, seconds
         )
 
     def _move(self, state: RigidState, bodies: Bodies) -> tuple[Bodies, ContactImpulses]:
@@ -314,14 +314,14 @@ class RigidStepper:
 
     # --- analyses and fracture ---
 
-    def _select_loads(self, found: list[BodyLoad], impulses: ContactImpulses) -> list[ImpactLoads]:
+    def _select_loads(self, loads: list[BodyLoad], impulses: ContactImpulses) -> list[ImpactLoads]:
         """Return the loads that could break a fragment or make it yield."""
-        found = [load for load in found if load.body_number < self.fragment_count]
-        if not found:
+        loads = [load for load in loads if load.body_number < self.fragment_count]
+        if not loads:
             return []
         energies = impulses.impact_energies(self.fragment_count, self._parameters.restitution)
         result = []
-        for load in found:
+        for load in loads:
             name = int(self.shapes.names[load.body_number])
             total_force = float(np.linalg.norm(load.force, axis=1).sum())
             if self.instances.may_break(name, total_force):

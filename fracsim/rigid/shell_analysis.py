@@ -282,8 +282,8 @@ class ShellBody:
         dof_mass = np.repeat(mass[:, None], 6, axis=1) * np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])
         self.inertia_relief = InertiaRelief(dof_mass, _shell_rigid_modes(stiffness.nodes[self.nodes]))
         # the heaviest node is held
-        held = np.arange(6 * int(mass.argmax()), 6 * int(mass.argmax()) + 6)
-        self._free = np.setdiff1d(np.arange(6 * len(self.nodes)), held)
+        fixed_dofs = np.arange(6 * int(mass.argmax()), 6 * int(mass.argmax()) + 6)
+        self._free = np.setdiff1d(np.arange(6 * len(self.nodes)), fixed_dofs)
         self._factors = self._factorise(self.matrix[self._free][:, self._free])
 
     def _factorise(self, matrix: csc_matrix) -> object:

@@ -242,8 +242,9 @@ def _check_overlaps(stepper: RigidStepper, state: RigidState, obstacles: list[Ri
         return f"obstacle {obstacles[stepper.obstacles.obstacle_of[number - count]].name}"
 
     first, second, depth = max(overlaps, key=lambda pair: pair[2])
-    more = f" (one of {len(overlaps)} such pairs)" if len(overlaps) > 1 else ""
+    details = f" (one of {len(overlaps)} such pairs)" if len(overlaps) > 1 else ""
     raise InputError(
-        f"{describe(first)} lies in {describe(second)} at the start, by {depth:.3g} m as convex parts of them go{more}"
+        f"{describe(first)} lies in {describe(second)} at the start, "
+        f"by {depth:.3g} m as convex parts of them go{details}"
         ": move them apart (body.N.position, spacing, or `at` of the obstacle)"
     )

@@ -74,29 +74,29 @@ class DeflatedPreconditioner:
         nodes = domain.space.dofmap.index_map
         first, size = d * nodes.local_range[0], d * nodes.size_global
         self._at: Ints = (d * self._nodes[:, None] + np.arange(d)).reshape(-1)
-        there = np.broadcast_to((columns >= 0)[:, None], values.shape)
-        row, column = (np.broadcast_to(each, values.shape)[there] for each in
+        present = np.broadcast_to((columns >= 0)[:, None], values.shape)
+        row, column = (np.broadcast_to(item, values.shape)[present] for item in
                        (first + self._at.reshape(-1, d, 1), columns[:, None]))  # fmt: skip
-        Z = csr_matrix((values[there], (row, column)), shape=(size, width))
+        Z = csr_matrix((values[present], (row, column)), shape=(size, width))
         self._Z = Z[first + self._at]
         self._Zt = self._Z.T.tocsr()
         ZtK = _summed(comm, self._Zt @ self._balance.tangent.owned_rows(self._nodes))
         E = ZtK @ _summed(comm, Z)
         self._solve = splu(E.tocsc()).solve
-        own = ZtK[:, first : first + d * nodes.size_local].T.tocsr()
-        self._near = np.flatnonzero(np.diff(own.indptr))
-        self._KZ = own[self._near]
+        owned = ZtK[:, first : first + d * nodes.size_local].T.tocsr()
+        self._near = np.flatnonzero(np.diff(owned.indptr))
+        self._KZ = owned[self._near]
         self._KZt = self._KZ.T.tocsr()
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """y = P x (collective)."""
-        comm, at, near, rest = self._balance.domain.comm, self._at, self._near, self._rest
-        x.copy(rest)
-        moved = self._solve(sum_over_ranks(comm, self._Zt @ rest.array_r[at]))
-        rest.array_w[near] -= self._KZ @ moved
-        self.base_pc.apply(rest, y)
+        comm, position, near, remaining = self._balance.domain.comm, self._at, self._near, self._rest
+        x.copy(remaining)
+        moved = self._solve(sum_over_ranks(comm, self._Zt @ remaining.array_r[position]))
+        remaining.array_w[near] -= self._KZ @ moved
+        self.base_pc.apply(remaining, y)
         moved -= self._solve(sum_over_ranks(comm, self._KZt @ y.array_r[near]))
-        y.array_w[at] += self._Z @ moved
+        y.array_w[position] += self._Z @ moved
 
     def destroy(self) -> None:
         """Give the memory of PETSc's objects back."""
@@ -125,11 +125,11 @@ def _join_tied(balance: Balance, part: Ints) -> None:
     for tied in filter(
         None, (term.tie_matrix(balance.motion.free_dofs) for term in balance.terms if isinstance(term, TieTerm))
     ):
-        known = np.zeros(tied.K.shape[0], np.int64)
-        known[tied.indices] = part[tied.nodes] + 1
-        known = sum_over_ranks(balance.domain.comm, known)
-        smallest, K = known.copy(), tied.K.tocoo()
-        np.maximum.at(smallest, K.row, known[K.col])
+        allowed = np.zeros(tied.K.shape[0], np.int64)
+        allowed[tied.indices] = part[tied.nodes] + 1
+        allowed = sum_over_ranks(balance.domain.comm, allowed)
+        smallest, K = allowed.copy(), tied.K.tocoo()
+        np.maximum.at(smallest, K.row, allowed[K.col])
         alone = part[tied.nodes] < 0
         part[tied.nodes[alone]] = smallest[tied.indices[alone]] - 1
 
@@ -148,10 +148,10 @@ def _motions(
     gram = np.zeros((count, B.shape[2], B.shape[2]))
     np.add.at(gram, part, np.einsum("ndi,ndj->nij", B, B))
     values, vectors = np.linalg.eigh(sum_over_ranks(comm, gram))
-    kept = values > policy.dependent_motion * np.maximum(values[:, -1:], 1.0)
-    scaled = np.where(kept, 1 / np.sqrt(np.where(kept, values, 1.0)), 0.0)
-    columns = np.where(kept, np.cumsum(kept).reshape(kept.shape) - 1, -1)
-    return columns[part], np.einsum("ndi,nij,nj->ndj", B, vectors[part], scaled[part]), int(kept.sum())
+    retained = values > policy.dependent_motion * np.maximum(values[:, -1:], 1.0)
+    scaled = np.where(retained, 1 / np.sqrt(np.where(retained, values, 1.0)), 0.0)
+    columns = np.where(retained, np.cumsum(retained).reshape(retained.shape) - 1, -1)
+    return columns[part], np.einsum("ndi,nij,nj->ndj", B, vectors[part], scaled[part]), int(retained.sum())
 
 
 def _rigid(r: Values) -> Values:
@@ -171,5 +171,5 @@ def _summed(comm: MPI.Comm, part: csr_matrix) -> csr_matrix:
         return csr_matrix(part)
     entries = part.tocoo()
     rows, columns, values = zip(*allgather(comm, (entries.row, entries.col, entries.data)), strict=True)
-    every = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return csr_matrix(every, shape=part.shape)
+    total = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return csr_matrix(total, shape=part.shape)

@@ -275,10 +275,10 @@ class NewtonSolver:
                 raise StepAborted
             if solve == self._policy.max_linear_solves:
                 break
-            made = self.linear.solve_linear_step(self._norm_of_solution(norm), self._eigenvalue_floor())
-            if made is None:
+            result = self.linear.solve_linear_step(self._norm_of_solution(norm), self._eigenvalue_floor())
+            if result is None:
                 break
-            norm, krylov = made[0], krylov + made[1]
+            norm, krylov = result[0], krylov + result[1]
             x.axpy(-1.0, self.linear.correction)
             balance.set_iterate(x)
             balance.update_reactions()

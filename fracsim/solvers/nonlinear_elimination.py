@@ -59,23 +59,23 @@ def steihaug_step(
     z, r = np.zeros_like(g), g.copy()
     y = np.einsum("nij,nj->ni", inverse, r)
     p, size = -y, sums(r * y)
-    enough, going = policy.trust_cg_rtol**2 * size, size > 0
+    enough, active = policy.trust_cg_rtol**2 * size, size > 0
     for _ in range(policy.max_trust_cg_iterations):
-        if not going.any():
+        if not active.any():
             break
         q = (K @ p.reshape(-1)).reshape(p.shape)
         curved, long, along = sums(p * q), sums(p * p), sums(z * p)
         border = np.sqrt(along**2 + long * np.maximum(radius**2 - sums(z * z), 0.0)) - along
         border = np.divide(border, long, out=np.zeros_like(long), where=long > 0)
-        share = np.divide(size, curved, out=border.copy(), where=going & (curved > 0))
+        share = np.divide(size, curved, out=border.copy(), where=active & (curved > 0))
         out = share >= border
-        share = np.where(going, np.minimum(share, border), 0.0)[of, None]
+        share = np.where(active, np.minimum(share, border), 0.0)[of, None]
         z, r = z + share * p, r + share * q
         y = np.einsum("nij,nj->ni", inverse, r)
         before, size = size, sums(r * y)
-        going &= ~out & (size > enough)
-        turned = np.divide(size, before, out=np.zeros_like(size), where=going)
-        p = np.where(going[of, None], turned[of, None] * p - y, 0.0)
+        active &= ~out & (size > enough)
+        turned = np.divide(size, before, out=np.zeros_like(size), where=active)
+        p = np.where(active[of, None], turned[of, None] * p - y, 0.0)
     return z, -0.5 * sums((g + r) * z)
 
 
@@ -87,8 +87,8 @@ def sum_by_patch(of: Ints, values: Values, count: int) -> Values:
 def create_elimination(balance: Balance, policy: SolverPolicy = DEFAULT_POLICY) -> NonlinearElimination | None:
     """Those of a balance that has what they come to rest by: a potential, of which all parts but the stress of each
     cell are constant forces, inertia and ties; None: it has not (collective)."""
-    others = [term for term in balance.terms if term is not balance.stress]
-    bent = any(type(term).tangent_form is not Term.tangent_form or adds_single_entries(term) for term in others)
+    remaining = [term for term in balance.terms if term is not balance.stress]
+    bent = any(type(term).tangent_form is not Term.tangent_form or adds_single_entries(term) for term in remaining)
     whole = balance.domain.order == 1 and balance.stress.rotation is None
     lumped = balance.mass.is_diagonal and balance.scheme.inertia
     fit = whole and lumped and not bent and not balance.contact.limits_newton_steps and balance.conservative
@@ -128,16 +128,16 @@ class NonlinearElimination:
         not hold LEAST_HELD (collective)."""
         comm, d = self._balance.domain.comm, self._balance.domain.dim
         squares = np.square((self._balance.reactions * self._free).reshape(-1, d)).sum(axis=1)
-        most, own = int(self._policy.max_relaxed_nodes * self._count), np.flatnonzero(squares)
-        if len(own) > most:
-            own = own[np.argpartition(-squares[own], most)[: most + 1]]
+        maximum, owned = int(self._policy.max_relaxed_nodes * self._count), np.flatnonzero(squares)
+        if len(owned) > maximum:
+            owned = owned[np.argpartition(-squares[owned], maximum)[: maximum + 1]]
         of_all = sum_over_ranks(comm, np.sum(squares))[0]
-        names, parts = map(np.concatenate, zip(*allgather(comm, (self._names[own], squares[own])), strict=True))
-        falling = np.sort(parts)[::-1][:most]
-        held = np.cumsum(falling)
-        if not len(held) or held[-1] < self._policy.min_relaxed_share * of_all:
+        names, parts = map(np.concatenate, zip(*allgather(comm, (self._names[owned], squares[owned])), strict=True))
+        falling = np.sort(parts)[::-1][:maximum]
+        cumulative = np.cumsum(falling)
+        if not len(cumulative) or cumulative[-1] < self._policy.min_relaxed_share * of_all:
             return np.asarray(names[:0])
-        last = min(int(np.searchsorted(held, self._policy.relaxed_share * of_all)), len(held) - 1)
+        last = min(int(np.searchsorted(cumulative, self._policy.relaxed_share * of_all)), len(cumulative) - 1)
         return np.asarray(names[parts >= falling[last]])
 
     def _around(self, nodes: Ints) -> _Region:
@@ -148,16 +148,16 @@ class NonlinearElimination:
         touched = np.unique(domain.cell_nodes[self._flags(nodes)[domain.cell_nodes].any(axis=1) & alive])
         chosen = self._flags(np.concatenate([*allgather(comm, self._names[touched]), nodes]))
         cells = np.flatnonzero(chosen[domain.cell_nodes].any(axis=1) & alive).astype(np.int32)
-        own = np.flatnonzero(chosen[: domain.node_count])
+        owned = np.flatnonzero(chosen[: domain.node_count])
         inertia = sum(term.mass_factor for term in balance.terms) * balance.mass.lumped
-        rows = (each.reshape(-1, domain.dim)[own] for each in (inertia, balance.reactions, self._free))
-        given = allgather(comm, (self._names[own], *rows, self._names[domain.cell_nodes[cells]]))
-        names, inertia, r, free, corners = map(np.concatenate, zip(*given, strict=True))
+        rows = (item.reshape(-1, domain.dim)[owned] for item in (inertia, balance.reactions, self._free))
+        original = allgather(comm, (self._names[owned], *rows, self._names[domain.cell_nodes[cells]]))
+        names, inertia, r, free, corners = map(np.concatenate, zip(*original, strict=True))
         order = np.argsort(names)
-        names, here = names[order], np.flatnonzero(chosen)
-        of_here, at = np.searchsorted(names, self._names[here]), _places(corners, names)
+        names, local = names[order], np.flatnonzero(chosen)
+        of_here, position = np.searchsorted(names, self._names[local]), _places(corners, names)
         forces = inertia[order], r[order], free[order], self._ties(names)
-        return _Region(balance, self._energy, cells, here, of_here, at, *forces, policy=self._policy)
+        return _Region(balance, self._energy, cells, local, of_here, position, *forces, policy=self._policy)
 
     def _ties(self, names: Ints) -> coo_array:
         """(n, n) K of what ties nodes of global numbers, rising, the same along each axis, N/m (collective)."""
@@ -168,9 +168,14 @@ class NonlinearElimination:
         ):
             numbers = np.zeros(tied.K.shape[0], np.int64)
             numbers[tied.indices] = self._names[tied.nodes]
-            at, each = _places(sum_over_ranks(balance.domain.comm, numbers), names), tied.K.tocoo()
-            inside = (at[each.row] >= 0) & (at[each.col] >= 0)
-            K = K + coo_array((each.data[inside], (at[each.row][inside], at[each.col][inside])), shape=(n, n)).tocsr()
+            position, ties = _places(sum_over_ranks(balance.domain.comm, numbers), names), tied.K.tocoo()
+            inside = (position[ties.row] >= 0) & (position[ties.col] >= 0)
+            K = (
+                K
+                + coo_array(
+                    (ties.data[inside], (position[ties.row][inside], position[ties.col][inside])), shape=(n, n)
+                ).tocsr()
+            )
         return K.tocoo()
 
     def _flags(self, nodes: Ints) -> Flags:
@@ -182,8 +187,8 @@ class NonlinearElimination:
 
 def _places(numbers: Ints, names: Ints) -> Ints:
     """Where numbers are among names, which rise; -1: they are not."""
-    at = np.minimum(np.searchsorted(names, numbers), len(names) - 1)
-    return np.asarray(np.where(names[at] == numbers, at, -1))
+    position = np.minimum(np.searchsorted(names, numbers), len(names) - 1)
+    return np.asarray(np.where(names[position] == numbers, position, -1))
 
 
 class _Region:
@@ -216,9 +221,9 @@ class _Region:
         self.count, self.of = connected_components(links, directed=False)
         self.of_cell = self.of[at.max(axis=1)]
         self._constant: Values = np.zeros((n, d))
-        found = self.look(np.zeros((n, d)))
-        self._constant = r - found.forces
-        self.at_first = found._replace(forces=r * free)
+        result = self.look(np.zeros((n, d)))
+        self._constant = r - result.forces
+        self.at_first = result._replace(forces=r * free)
 
     def put(self, w: Values) -> None:
         """Nodes of this rank, ghosts too, are w (n, d) from where they began (not collective)."""
@@ -227,8 +232,8 @@ class _Region:
     def look(self, w: Values) -> _Look:
         """The patches there (collective)."""
         self.put(w)
-        found = allgather(self._comm, self._energy(self._cells))
-        energy, forces, stiffness = map(np.concatenate, zip(*found, strict=True))
+        result = allgather(self._comm, self._energy(self._cells))
+        energy, forces, stiffness = map(np.concatenate, zip(*result, strict=True))
         linear, inside = self._inertia * w + self._ties @ w, self._at >= 0
         work = ((linear / 2 + self._constant) * w).sum(axis=1)
         sums = linear + self._constant
@@ -239,9 +244,9 @@ class _Region:
     @cached_property
     def _pattern(self) -> _Pattern:
         n = len(self._inertia)
-        every = np.arange(n)
-        rows = np.concatenate([self._rows, self._ties.row, every])
-        columns = np.concatenate([self._columns, self._ties.col, every])
+        nodes = np.arange(n)
+        rows = np.concatenate([self._rows, self._ties.row, nodes])
+        columns = np.concatenate([self._columns, self._ties.col, nodes])
         free = self._free[rows, :, None] * self._free[columns, None, :]
         order = np.argsort(rows * n + columns, kind="stable")
         keys = (rows * n + columns)[order]
@@ -252,20 +257,20 @@ class _Region:
     @cached_property
     def _inertia_and_ties(self) -> Values:
         """Blocks (of entries of the pattern that are not of cells)."""
-        every = np.eye(self._inertia.shape[1])
-        return np.concatenate([self._ties.data[:, None, None] * every, self._inertia[:, :, None] * every])
+        identity = np.eye(self._inertia.shape[1])
+        return np.concatenate([self._ties.data[:, None, None] * identity, self._inertia[:, :, None] * identity])
 
     def tangent(self, stiffness: Values) -> tuple[bsr_array, Values]:
         """K of the nodes, and the inverses of its blocks on the diagonal, made positive."""
         n, d = self._inertia.shape
-        made = self._pattern
-        blocks = np.concatenate([stiffness.reshape(-1, d, d)[self._both], self._inertia_and_ties]) * made.free
-        data = np.add.reduceat(blocks[made.order], made.first)
-        values, vectors = np.linalg.eigh(data[made.diagonal])
+        result = self._pattern
+        blocks = np.concatenate([stiffness.reshape(-1, d, d)[self._both], self._inertia_and_ties]) * result.free
+        data = np.add.reduceat(blocks[result.order], result.first)
+        values, vectors = np.linalg.eigh(data[result.diagonal])
         largest = abs(values).max(axis=1, keepdims=True)
         values = np.maximum(abs(values), np.where(largest > 0, self._policy.min_block_eigenvalue * largest, 1.0))
         inverse = (vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1)
-        return bsr_array((data, made.columns, made.starts), shape=(n * d, n * d)), inverse
+        return bsr_array((data, result.columns, result.starts), shape=(n * d, n * d)), inverse
 
     def norms(self, forces: Values) -> Values:
         """(count,) |r| of each patch, N."""
@@ -305,30 +310,32 @@ class _Look(NamedTuple):
     def where(self, taken: Flags, other: _Look, region: _Region) -> _Look:
         """Of those patches, and the other's of all else."""
         choices = taken, taken, taken[region.of, None], taken[region.of_cell, None, None, None, None]
-        return _Look(*(np.where(*each) for each in zip(choices, self, other, strict=True)))
+        return _Look(*(np.where(*item) for item in zip(choices, self, other, strict=True)))
 
 
 def _settle(region: _Region, little: float, edge: float, policy: SolverPolicy) -> bool:
     """Each patch goes down to a minimum, or as far as it gets; whether any moved (collective)."""
     w = np.zeros(region.shape)
-    now = region.at_first
-    enough = np.maximum(policy.patch_rtol * region.norms(now.forces), policy.patch_residual * little)
+    current = region.at_first
+    enough = np.maximum(policy.patch_rtol * region.norms(current.forces), policy.patch_residual * little)
     radius = np.full(region.count, policy.first_trust_radius * edge)
     for _ in range(policy.max_trust_steps):
-        norms = region.norms(now.forces)
-        going = (norms > enough) & (radius > policy.last_trust_radius * edge)
-        if not going.any():
+        norms = region.norms(current.forces)
+        active = (norms > enough) & (radius > policy.last_trust_radius * edge)
+        if not active.any():
             break
-        pulled = np.where(going[region.of, None], now.forces, 0.0)
-        step, promised = steihaug_step(*region.tangent(now.stiffness), pulled, region.of, radius, policy)
-        there = region.look(w + step)
-        fell, slack = now.potential - there.potential, policy.potential_round_off * now.size
+        pulled = np.where(active[region.of, None], current.forces, 0.0)
+        step, promised = steihaug_step(*region.tangent(current.stiffness), pulled, region.of, radius, policy)
+        trial = region.look(w + step)
+        fell, slack = current.potential - trial.potential, policy.potential_round_off * current.size
         gain = np.divide(fell, promised, out=np.zeros_like(fell), where=promised > 0)
-        taken = going & ((gain > policy.poor_decrease) | ((abs(fell) <= slack) & (region.norms(there.forces) < norms)))
+        accepted = active & (
+            (gain > policy.poor_decrease) | ((abs(fell) <= slack) & (region.norms(trial.forces) < norms))
+        )
         long = region.norms(step)
-        longer = taken & (gain > policy.good_decrease) & (long > 0.9 * radius)
-        radius = np.where(longer, 2 * radius, np.where(taken | ~going, radius, long / 4))
-        w = np.where(taken[region.of, None], w + step, w)
-        now = there.where(taken, now, region)
+        longer = accepted & (gain > policy.good_decrease) & (long > 0.9 * radius)
+        radius = np.where(longer, 2 * radius, np.where(accepted | ~active, radius, long / 4))
+        w = np.where(accepted[region.of, None], w + step, w)
+        current = trial.where(accepted, current, region)
     region.put(w)
     return bool(w.any())

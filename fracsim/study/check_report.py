@@ -182,9 +182,9 @@ def _rigid_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
 
 def _frame_lines(study: Study) -> Iterator[str]:
     """Time between frames, in steps and s."""
-    every, interval = study.output.every, study.frame_interval
-    if every is not None:
-        yield f"{_INDENT}a frame every {f'{every} steps' if every > 1 else 'step'}"
+    steps_between, interval = study.output.every, study.frame_interval
+    if steps_between is not None:
+        yield f"{_INDENT}a frame every {f'{steps_between} steps' if steps_between > 1 else 'step'}"
         return
     steps = round(interval / study.time.max_step) if study.time.has_constant_steps else 0
     yield f"{_INDENT}a frame every {interval:g} s" + (f", {steps} step{'s'[: steps != 1]}" if steps else "")

@@ -162,12 +162,12 @@ class FrameCount(NamedTuple):
 
     Attributes:
         target: frames that are aimed at.
-        least, most: range in which a number of steps per frame divides the number of constant steps, if there is one.
+        minimum, maximum: bounds of a number of steps per frame that divides the number of constant steps, if any.
     """
 
     target: int = 50
-    least: int = 34
-    most: int = 75
+    minimum: int = 34
+    maximum: int = 75
 
 
 FRAMES = FrameCount()
@@ -208,7 +208,7 @@ def _steps_per_frame(steps: int) -> int:
     # with many steps the last frame is too little early to be seen
     if steps > 100 * FRAMES.target:
         return round(steps / FRAMES.target)
-    candidates = range(math.ceil(steps / FRAMES.most), max(1, steps // FRAMES.least) + 1)
+    candidates = range(math.ceil(steps / FRAMES.maximum), max(1, steps // FRAMES.minimum) + 1)
     return min(candidates, key=lambda count: (steps % count > 0, abs(math.log(steps / count / FRAMES.target))))
 
 

@@ -34,11 +34,11 @@ def balanced_forces(balance: Balance, *, lumped: bool) -> tuple[Values, Values |
 
     Without the inertia of prescribed dofs where mass is `lumped` (`work_done`).
     """
-    own = balance.motion.owned_dofs
+    owned = balance.motion.owned_dofs
     forces = balance.energies.applied_forces()
-    forces[own] += balance.reactions[own]
+    forces[owned] += balance.reactions[owned]
     if lumped:
-        forces[own] -= balance.mass.lumped[own] * balance.rates()[1][own]
+        forces[owned] -= balance.mass.lumped[owned] * balance.rates()[1][owned]
     return forces, balance.energies.damping_forces()
 
 
@@ -54,10 +54,10 @@ def step_work(
     The inertia of prescribed dofs, whose velocity may jump, is not among the forces where mass is `lumped`: what moves
     them is the gain of their kinetic energy.
     """
-    late, own, increment = balance.scheme.alpha_f, balance.motion.owned_dofs, u - start.u
+    late, owned, increment = balance.scheme.alpha_f, balance.motion.owned_dofs, u - start.u
     gained = 0.0
     if lumped:
-        gained = 0.5 * float(balance.mass.lumped[own] @ (v[own] ** 2 - start.v[own] ** 2))
+        gained = 0.5 * float(balance.mass.lumped[owned] @ (v[owned] ** 2 - start.v[owned] ** 2))
     work = float(((0.5 + late) * forces + (0.5 - late) * start.forces) @ increment) + gained
     viscous = 0.0
     if drag is not None:
@@ -79,11 +79,11 @@ def released_state(
     balance; the end of a step of generalized-alpha is an extrapolation. `response`: displacement that forces (owned
     dofs,) cause in a step, linearly; None where steps resolve all motion (explicit ones).
     """
-    own, forces = balance.motion.owned_dofs, end.forces.copy()
-    reactions = balance.reactions[own]
+    owned, forces = balance.motion.owned_dofs, end.forces.copy()
+    reactions = balance.reactions[owned]
     balance.update_reactions()
     if not balance.scheme.carries_acceleration:
-        forces[own] += balance.reactions[own] - reactions
+        forces[owned] += balance.reactions[owned] - reactions
         return replace(end, forces=forces)
     free = balance.motion.free_dofs
     if response is None:  # forces balance at the end of the step, where the body is
@@ -92,11 +92,11 @@ def released_state(
     else:
         balance.set_displacement(solved)
         lost = balance.stress.assemble_released_forces(before)
-        now = balance.stress.exchange_damage(before)
+        current = balance.stress.exchange_damage(before)
         if any(isinstance(term, SurfaceSeparator) for term in balance.terms):
             balance.set_displacement(end.u)  # gaps are open at the step's end, and need not be where forces balance
         change = balance.c_a * response(np.where(free, lost, 0.0))
-        balance.stress.exchange_damage(now)
+        balance.stress.exchange_damage(current)
         balance.set_displacement(end.u)
-    forces[own] -= lost[own]
+    forces[owned] -= lost[owned]
     return replace(end, forces=forces, a=end.a + change)

@@ -77,17 +77,17 @@ class ExplicitStepper(BalanceStepper):
     def _attempt(self, state: State, dt: float) -> SolveResult:
         """u by v and a of the start, then a from the forces there."""
         began = time.perf_counter()
-        balance, own = self.balance, self.balance.motion.owned_dofs
+        balance, owned = self.balance, self.balance.motion.owned_dofs
         half = state.v + dt / 2 * state.a
         u = state.u + dt * half
-        u[own] = balance.motion.displacements_at(state.t + dt)[: len(own)]
-        half[own] = (u[own] - state.u[own]) / dt
+        u[owned] = balance.motion.displacements_at(state.t + dt)[: len(owned)]
+        half[owned] = (u[owned] - state.u[owned]) / dt
         self._begin(state, dt)  # rates of the step: (u - u_n) / dt is the velocity half-way
         balance.set_displacement(u)
         unbalanced = balance.update_forces()
         # mass damping at the velocity of the end, not of half-way: second order
         a: Values = np.asarray(-unbalanced / (balance.mass.lumped * (1 + self._a * dt / 2)), np.float64)
-        a[own] = 0.0
+        a[owned] = 0.0
         self._arrival = u, half + dt / 2 * a, a
         self.phases["solve"] += time.perf_counter() - began
         finite = self.comm.allreduce(bool(np.isfinite(unbalanced).all()), op=MPI.LAND)

@@ -129,9 +129,9 @@ class QuasiStaticStepper(ImplicitStepper):
             self._damage_changed(result)
             balance = self.balance
             residual = balance.update_forces().copy()
-            own, free = balance.motion.owned_dofs, balance.motion.free_dofs
+            owned, free = balance.motion.owned_dofs, balance.motion.free_dofs
             path.forces = path.forces.copy()
-            path.forces[own] = balance.energies.applied_forces()[own] + residual[own]
+            path.forces[owned] = balance.energies.applied_forces()[owned] + residual[owned]
             path.out_of_balance = np.where(free, residual, 0.0)
         self.phases[self.breaking.phase] += self.clock() - began
         return result

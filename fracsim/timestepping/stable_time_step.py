@@ -43,9 +43,11 @@ def quadratic_gain(dim: int) -> float:
     corners, edges = np.eye(dim + 1), local_edges(dim)
     points, weights = map(np.asarray, basix.make_quadrature(CELL[dim], 2))
     rows = []
-    for at, w in zip(np.column_stack([1 - points.sum(axis=1), points]), weights / weights.sum(), strict=True):
-        of_corners = (4 * at - 1)[:, None] * corners
-        of_middles = 4 * (at[edges[:, 0], None] * corners[edges[:, 1]] + at[edges[:, 1], None] * corners[edges[:, 0]])
+    for point, w in zip(np.column_stack([1 - points.sum(axis=1), points]), weights / weights.sum(), strict=True):
+        of_corners = (4 * point - 1)[:, None] * corners
+        of_middles = 4 * (
+            point[edges[:, 0], None] * corners[edges[:, 1]] + point[edges[:, 1], None] * corners[edges[:, 0]]
+        )
         slopes = np.concatenate([of_corners, of_middles])
         rows.append(np.sqrt(w) * (slopes - slopes.mean(axis=1, keepdims=True)))
     corner, middle = HRZ_FRACTIONS[dim]

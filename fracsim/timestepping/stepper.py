@@ -338,28 +338,28 @@ class BalanceStepper:
         stiffened = balance.contact.stiffen()
         work, lost, elastic = work + worked + stiffened, lost + rubbed, elastic + stiffened
         kinetic = balance.energies.kinetic_energy(end.v) if balance.scheme.inertia else 0.0
-        work, lost, kinetic, every = map(float, sum_over_ranks(self.comm, np.array([work, lost, kinetic, elastic])))
+        work, lost, kinetic, total = map(float, sum_over_ranks(self.comm, np.array([work, lost, kinetic, elastic])))
         end = replace(
             end, elastic=elastic, work=end.work + work, dissipated=end.dissipated + lost, history=self._memory()
         )
-        return self._grown(end, broken), StepReport(dt, solve, broken, kinetic, every, time.perf_counter() - began)
+        return self._grown(end, broken), StepReport(dt, solve, broken, kinetic, total, time.perf_counter() - began)
 
     def _check_finite(self, end: State, energies: float) -> None:
         """Raise NotFinite where the end of a step is not finite, or squares of it are not (collective)."""
-        squares = sum(float(np.vdot(each, each)) for each in (end.u, end.v, end.a, end.forces))
+        squares = sum(float(np.vdot(item, item)) for item in (end.u, end.v, end.a, end.forces))
         if not self.comm.allreduce(math.isfinite(squares + energies), op=MPI.LAND):
             raise NonFiniteState
 
     def _arrive(self, state: State, dt: float) -> tuple[Values, Values, Values]:
         """(u, v, a) at the end of the step; forces and reactions are brought there where they were balanced inside."""
-        balance, scheme, own = self.balance, self.balance.scheme, self.balance.motion.owned_dofs
+        balance, scheme, owned = self.balance, self.balance.scheme, self.balance.motion.owned_dofs
         balance.accept_step()
         x = balance.u.x.array[: balance.owned_dof_count].copy()
         u, v, a = scheme.complete_step(dt, x, state.u, state.v, state.a)
         if scheme.carries_acceleration:
             a = balance.carried_acceleration(dt, a)
-        if (led := scheme.prescribed_dof_rates(dt, u[own], state.u[own], state.v[own])) is not None:
-            v[own], a[own] = led
+        if (led := scheme.prescribed_dof_rates(dt, u[owned], state.u[owned], state.v[owned])) is not None:
+            v[owned], a[owned] = led
         if scheme.alpha_f:
             self.flow.begin_step(dt)
             balance.evaluate_at(state.t + dt, u, v, a)

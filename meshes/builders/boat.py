@@ -78,4 +78,4 @@ class Boat:
             np.stack([np.full(across, stern), rows[0, 1:], rows[0, :-1]], axis=1),
             np.stack([np.full(across, bow), rows[-1, :-1], rows[-1, 1:]], axis=1),
         ]
-        return np.concatenate([points, ends]), np.concatenate([*(each.reshape(-1, 3) for each in quads), *fans])
+        return np.concatenate([points, ends]), np.concatenate([*(item.reshape(-1, 3) for item in quads), *fans])

@@ -93,7 +93,11 @@ class Box:
         if len(self.size) == 2:
             del sides[1]
         pairs = enumerate(sides)
-        return {name: (axis, at[axis]) for axis, pair in pairs for name, at in zip(pair, (low, high), strict=True)}
+        return {
+            name: (axis, position[axis])
+            for axis, pair in pairs
+            for name, position in zip(pair, (low, high), strict=True)
+        }
 
     def _draw(self, gmsh: Any) -> None:
         low, _ = self.bounds()

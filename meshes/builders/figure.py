@@ -25,7 +25,7 @@ class RoundCone:
     end_radius: float
 
     def scaled(self, scale: float) -> RoundCone:
-        start, end = (tuple(scale * x for x in place) for place in (self.start, self.end))
+        start, end = (tuple(scale * x for x in position) for position in (self.start, self.end))
         return RoundCone(start, end, scale * self.start_radius, scale * self.end_radius)  # type: ignore[arg-type]
 
     def depth(self, points: Points) -> tuple[Floats, Floats]:
@@ -125,8 +125,8 @@ class Figure:
 
     def depth(self, points: Points) -> tuple[Floats, Floats]:
         """How far points lie inside the outer surface, negative outside (n,) [m], and the gradient (n, 3)."""
-        found = [part.scaled(self.height).depth(points) for part in PARTS]
-        depths, gradients = np.array([d for d, _ in found]), np.array([g for _, g in found])
+        result = [part.scaled(self.height).depth(points) for part in PARTS]
+        depths, gradients = np.array([d for d, _ in result]), np.array([g for _, g in result])
         blend, deepest = BLEND * self.height, depths.max(axis=0)
         weights = np.exp((depths - deepest) / blend)
         sums = weights.sum(axis=0)

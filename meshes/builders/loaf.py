@@ -114,5 +114,5 @@ class Loaf:
         rise = self.dome * (1 - (2 * x / length) ** 4) * (1 - (2 * y / width) ** 2)
         raised = np.stack([x, y * (1 + self.flare * z / height), z * (1 + rise)], axis=1)
         low, high = (np.array(corner) for corner in self.bounds())
-        least, most = raised.min(axis=0), raised.max(axis=0)
-        return low + (raised - least) / (most - least) * (high - low)
+        minimum, maximum = raised.min(axis=0), raised.max(axis=0)
+        return low + (raised - minimum) / (maximum - minimum) * (high - low)

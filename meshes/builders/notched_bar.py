@@ -112,11 +112,11 @@ class NotchedBar(CutRectangle):
                 f"notched-bar: notch_angle = {self.notch_angle!r} must lie between 0 and 180 degrees "
                 '(parallel flanks: notch = "U").',
             )
-        least = self.notch_width / 2 if self.notch == "slit" else self._root_radius * (1 - sin(self._half_angle))
+        minimum = self.notch_width / 2 if self.notch == "slit" else self._root_radius * (1 - sin(self._half_angle))
         require(
-            least < self.notch_depth < self.height,
+            minimum < self.notch_depth < self.height,
             f"notched-bar: notch_depth = {self.notch_depth!r} must be less than height = {self.height!r} and more than "
-            f"the {least:.3g} m that the root of the notch takes.",
+            f"the {minimum:.3g} m that the root of the notch takes.",
         )
 
     def _check_supports(self) -> None:
@@ -164,8 +164,8 @@ class NotchedBar(CutRectangle):
         if not self.span:
             return groups
         middle, side, reach = self.length / 2, self.span / 2, self.patch / 2 + 1e-9 * self.length
-        places = {"support-left": ("bottom", -side), "support-right": ("bottom", side), "load": ("top", 0.0)}
+        positions = {"support-left": ("bottom", -side), "support-right": ("bottom", side), "load": ("top", 0.0)}
         return groups | {
-            name: facets_on_nodes(groups[face], np.abs(points[:, 0] - (middle + at)) <= reach)
-            for name, (face, at) in places.items()
+            name: facets_on_nodes(groups[face], np.abs(points[:, 0] - (middle + position)) <= reach)
+            for name, (face, position) in positions.items()
         }

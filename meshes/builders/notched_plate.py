@@ -82,7 +82,7 @@ class NotchedPlate(CutRectangle):
         return SizeField(self.h, min(self._fine, self.h), tip, (ahead, self._position))
 
     def _profile(self) -> Profile:
-        half, at, tip = self.notch_width / 2, self._position, self.notch_length
+        half, y, tip = self.notch_width / 2, self._position, self.notch_length
         outside = [(0.0, 0.0), (self.length, 0.0), (self.length, self.height), (0.0, self.height)]
-        slit = [(0.0, at + half), (tip - half, at + half), (tip, at), (tip - half, at - half), (0.0, at - half)]
+        slit = [(0.0, y + half), (tip - half, y + half), (tip, y), (tip - half, y - half), (0.0, y - half)]
         return Profile(outside + slit, {})

@@ -97,21 +97,23 @@ def _rings(step: float, opening: float) -> Points:
     angles = opening + (pi - opening) * np.arange(count + 1) / count
     rings = []
     for number, angle in enumerate(angles):
-        many = max(round(2 * pi * np.sin(angle) / step), 1)
+        segments = max(round(2 * pi * np.sin(angle) / step), 1)
         if number == 0 and opening:
-            many = max(many, 8)
-        turn = 2 * pi * (np.arange(many) + 0.618 * number) / many
-        ring = np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.full(many, np.cos(angle))], 1)
-        rings.append(ring if many > 1 else np.array([[0.0, 0.0, np.cos(angle)]]))
+            segments = max(segments, 8)
+        turn = 2 * pi * (np.arange(segments) + 0.618 * number) / segments
+        ring = np.stack(
+            [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.full(segments, np.cos(angle))], 1
+        )
+        rings.append(ring if segments > 1 else np.array([[0.0, 0.0, np.cos(angle)]]))
     return np.concatenate(rings)
 
 
 def _with_neck(points: Points, triangles: Indices, ring: Indices, height: float, h: float) -> tuple[Points, Indices]:
     """A tube upwards from a ring of points about the z axis."""
     ring = ring[np.argsort(np.arctan2(points[ring, 1], points[ring, 0]))]
-    layers, many, first = max(round(height / h), 1), len(ring), len(points)
+    layers, count, first = max(round(height / h), 1), len(ring), len(points)
     above = [points[ring] + [0.0, 0.0, height * (k + 1) / layers] for k in range(layers)]
-    rows = np.concatenate([ring[None], first + np.arange(layers * many).reshape(layers, many)])
+    rows = np.concatenate([ring[None], first + np.arange(layers * count).reshape(layers, count)])
     a, b, c, d = rows[:-1], np.roll(rows[:-1], -1, axis=1), np.roll(rows[1:], -1, axis=1), rows[1:]
     tube = np.concatenate([np.stack([a, b, c], axis=2), np.stack([a, c, d], axis=2)]).reshape(-1, 3)
     return np.concatenate([points, *above]), np.concatenate([triangles, tube])

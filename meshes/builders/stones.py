@@ -62,10 +62,10 @@ class Stones:
 
     def build(self) -> MeshData:
         corners = self._corners()
-        one = np.column_stack([np.zeros(20, np.int64), 1 + _FACES])
+        first = np.column_stack([np.zeros(20, np.int64), 1 + _FACES])
         points = np.concatenate([self._middles()[:, None], corners], axis=1).reshape(-1, 3)
-        each = 13 * np.arange(self.count)[:, None, None]
-        cells, _ = orient_cells(points, (one + each).reshape(-1, 4))
+        item = 13 * np.arange(self.count)[:, None, None]
+        cells, _ = orient_cells(points, (first + item).reshape(-1, 4))
         return MeshData(points, cells, {"surface": boundary_facets(cells)})
 
     def _middles(self) -> Points:
@@ -87,7 +87,7 @@ def _icosahedron() -> tuple[Points, Indices]:
     """12 corners on the unit sphere, and the 20 triples of them that are nearest to one another."""
     golden = (1 + 5**0.5) / 2
     signs: list[Any] = [(0.0, a, b * golden) for a in (-1, 1) for b in (-1, 1)]
-    corners = np.array([np.roll(each, shift) for each in signs for shift in range(3)]) / np.hypot(1, golden)
+    corners = np.array([np.roll(item, shift) for item in signs for shift in range(3)]) / np.hypot(1, golden)
     apart = np.linalg.norm(corners[:, None] - corners, axis=2)
     side = apart[apart > 0].min() * (1 + 1e-9)
     near = [

@@ -48,8 +48,8 @@ class Outline:
     def _lost(self, simplices: Indices) -> Mask:
         """Which pieces are no edges of the triangles: (k,)."""
         edges = np.sort(facets_of(simplices).reshape(-1, 2), axis=1)
-        _, _, place = distinct_rows(np.concatenate([np.sort(self.pieces, axis=1), edges]))
-        return ~np.isin(place[: len(self.pieces)], place[len(self.pieces) :])
+        _, _, inverse = distinct_rows(np.concatenate([np.sort(self.pieces, axis=1), edges]))
+        return ~np.isin(inverse[: len(self.pieces)], inverse[len(self.pieces) :])
 
     def _halved(self, chosen: Mask) -> Outline:
         """The outline with the chosen pieces cut at their middles."""
@@ -65,12 +65,12 @@ class Outline:
         Triangles that are joined across edges that are no pieces lie on the same side.
         """
         edges = np.sort(facets_of(simplices).reshape(-1, 2), axis=1)
-        rows, _, place = distinct_rows(np.concatenate([np.sort(self.pieces, axis=1), edges]))
+        rows, _, position = distinct_rows(np.concatenate([np.sort(self.pieces, axis=1), edges]))
         wall = np.zeros(len(rows), bool)
-        wall[place[: len(self.pieces)]] = True
-        place = place[len(self.pieces) :]
-        order = np.argsort(place, kind="stable")
-        same = np.flatnonzero((np.diff(place[order]) == 0) & ~wall[place[order][:-1]])
+        wall[position[: len(self.pieces)]] = True
+        position = position[len(self.pieces) :]
+        order = np.argsort(position, kind="stable")
+        same = np.flatnonzero((np.diff(position[order]) == 0) & ~wall[position[order][:-1]])
         _, part = components(np.stack([order[same], order[same + 1]], axis=1) // 3, len(simplices))
         area = np.abs(signed_measures(points, simplices))
         ranked = np.lexsort((-area, part))
@@ -84,8 +84,8 @@ class Outline:
         x, y = points[:, :1], points[:, 1:]
         spans = (start[:, 1] > y) != (end[:, 1] > y)
         rise = np.where(end[:, 1] == start[:, 1], 1.0, end[:, 1] - start[:, 1])
-        at = start[:, 0] + (y - start[:, 1]) / rise * (end[:, 0] - start[:, 0])
-        return np.asarray((spans & (at > x)).sum(axis=1) % 2 == 1)
+        position = start[:, 0] + (y - start[:, 1]) / rise * (end[:, 0] - start[:, 0])
+        return np.asarray((spans & (position > x)).sum(axis=1) % 2 == 1)
 
 
 def delaunay(points: Points) -> Any:

@@ -86,7 +86,7 @@ def read_outline(path: str | Path, scale: float = 1.0) -> Drawn:
         raise MeshError(f"outline file '{path}': a polygon needs three corners or more, a line `x, y` each.")
     corners = [scale * np.array([corner[:2] for corner in loop]) for loop in loops]
     check_extent(np.concatenate(corners), f"outline file '{path}'")
-    start, end = np.concatenate(corners), np.concatenate([np.roll(each, -1, axis=0) for each in corners])
+    start, end = np.concatenate(corners), np.concatenate([np.roll(item, -1, axis=0) for item in corners])
     return Drawn(start, end, tuple(corner[2] for loop in loops for corner in loop))
 
 

@@ -187,16 +187,16 @@ def check_areas(points: Points, triangles: Indices, source: str) -> None:
 
 def check_edges(points: Points, table: EdgeTable, source: str, which: tuple[int, ...]) -> None:
     """MeshError where edges belong to one triangle only (1) or to more than two (2)."""
-    found = {
+    result = {
         1: (table.edges[table.counts == 1], "is open: {} edges belong to one triangle only"),
         2: (table.edges[table.counts > 2], "is not the surface of a body: {} edges belong to more than two triangles"),
     }
     for kind in which:
-        wrong, what = found[kind]
+        wrong, description = result[kind]
         if len(wrong):
             refused = RepairableSurfaceError if 1 in which else MeshError
             raise refused(
-                f"{source} {what.format(len(wrong))}, the first at {format_midpoint(points, wrong[0])}; "
+                f"{source} {description.format(len(wrong))}, the first at {format_midpoint(points, wrong[0])}; "
                 "close or mend it there (MeshLab: Filters > Remeshing > Close Holes; Blender: Mesh > Clean Up > Fill "
                 "Holes)."
             )

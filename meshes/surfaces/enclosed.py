@@ -26,7 +26,7 @@ def winding_numbers(x: Floats, corners: Floats) -> Floats:
 
 def _windings(x: Floats, corners: Floats) -> Floats:
     a, b, c = (corners[None] - x[:, None, None]).transpose(2, 0, 1, 3)
-    la, lb, lc = (np.linalg.norm(each, axis=2) for each in (a, b, c))
+    la, lb, lc = (np.linalg.norm(item, axis=2) for item in (a, b, c))
     ab, bc, ca = (np.einsum("nki,nki->nk", *pair) for pair in ((a, b), (b, c), (c, a)))
     above = np.einsum("nki,nki->nk", a, np.cross(b, c))
     return np.asarray(np.arctan2(above, la * lb * lc + ab * lc + bc * la + ca * lb).sum(axis=1) / (2 * np.pi))

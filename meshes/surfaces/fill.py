@@ -59,14 +59,14 @@ def fill_closed(surface: ClosedSurface, h: float, source: str, time_limit: float
     expected = expected_cells(surface, h)
     seconds = 60 + 1e-3 * (expected + len(surface.triangles)) if time_limit is None else time_limit
     try:
-        made = within(seconds, _made, surface, h, source)
+        result = within(seconds, _made, surface, h, source)
     except TimeoutError:
         raise MeshError(
             f"{source}: gmsh had not filled it within {seconds:.0f} s (about {expected:,} cells of h = {h:g} m in a "
             f"body of {surface.extent}). Take a larger h, mend or simplify the surface, or give gmsh more seconds with "
             "[mesh] time_limit."
         ) from None
-    checked = check_mesh(made)
+    checked = check_mesh(result)
     # The surface's own notes tell of separate bodies already.
     return replace(checked, notes=tuple(note for note in checked.notes if "share no node" not in note))
 
@@ -128,9 +128,9 @@ def _remeshed(points: Points, triangles: Indices, h: float) -> Shell:
         gmsh.model.mesh.generate(2)
         tags, coordinates, _ = gmsh.model.mesh.getNodes()
         _, nodes = gmsh.model.mesh.getElementsByType(TRIANGLE)
-    place = np.zeros(int(tags.max()) + 1, np.int64)
-    place[tags] = np.arange(len(tags))
-    used, new = np.unique(place[nodes], return_inverse=True)
+    position = np.zeros(int(tags.max()) + 1, np.int64)
+    position[tags] = np.arange(len(tags))
+    used, new = np.unique(position[nodes], return_inverse=True)
     return _same_body(points, triangles, unit.back(coordinates.reshape(-1, 3)[used]), new.reshape(-1, 3))
 
 
@@ -217,8 +217,8 @@ def remove_boundary_slivers(points: Points, cells: Indices, thin: float = SLIVER
     """
     while True:
         facets = np.sort(facets_of(cells), axis=2)
-        _, counts, place = distinct_rows(facets.reshape(-1, 3))
-        outside = (counts[place].reshape(-1, 4) == 1).any(axis=1)
+        _, counts, inverse = distinct_rows(facets.reshape(-1, 3))
+        outside = (counts[inverse].reshape(-1, 4) == 1).any(axis=1)
         peel = outside & flat_cells(points, cells, thin)
         if not peel.any():
             return cells

@@ -47,8 +47,8 @@ def _lattice(low: Floats, high: Floats, step: float) -> tuple[Points, Indices]:
     origin = (low + high) / 2 - step * count / 2
     corner = np.arange(np.prod(count + 1)).reshape(count + 1)
     centre = np.arange(np.prod(count)).reshape(count) + corner.size
-    places = [np.indices(shape).reshape(3, -1).T for shape in (tuple(count + 1), tuple(count))]
-    nodes = origin + step * np.concatenate([places[0], places[1] + 0.5])
+    positions = [np.indices(shape).reshape(3, -1).T for shape in (tuple(count + 1), tuple(count))]
+    nodes = origin + step * np.concatenate([positions[0], positions[1] + 0.5])
     tets = []
     for axis in range(3):
         cells, faces = np.moveaxis(centre, axis, 0), np.moveaxis(corner, axis, 0)[1:-1]
@@ -72,7 +72,7 @@ def _cut(sign: Indices, tets: Indices) -> Indices:
 
     A node on the surface is the pair of itself. Faces that lie on the surface count for the cell inside, once.
     """
-    found = []
+    result = []
     patterns, which = np.unique(sign[tets], axis=0, return_inverse=True)
     for number, pattern in enumerate(patterns):
         inside, on, outside = ([int(i) for i in np.flatnonzero(pattern == s)] for s in (1, 0, -1))
@@ -82,14 +82,14 @@ def _cut(sign: Indices, tets: Indices) -> Indices:
         if len(inside) == len(outside) == 2:
             ring[2], ring[3] = ring[3], ring[2]
         fan = [(ring[0], ring[k], ring[k + 1]) for k in range(1, len(ring) - 1)]
-        found.append(tets[which.ravel() == number][:, np.array(fan)].reshape(-1, 3, 2))
-    return np.sort(np.concatenate(found), axis=2)
+        result.append(tets[which.ravel() == number][:, np.array(fan)].reshape(-1, 3, 2))
+    return np.sort(np.concatenate(result), axis=2)
 
 
 def _single(triangles: Indices) -> Indices:
     """Without those that occur twice, from both sides: the body has no thickness there."""
-    _, counts, place = distinct_rows(np.sort(triangles, axis=1))
-    return triangles[counts[place] == 1]
+    _, counts, inverse = distinct_rows(np.sort(triangles, axis=1))
+    return triangles[counts[inverse] == 1]
 
 
 def _projected(depth: Depth, points: Points) -> Points:

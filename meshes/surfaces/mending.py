@@ -64,7 +64,7 @@ def mend_open_surface(points: Points, triangles: Indices) -> Mended:
 
 def _mended(points: Points, triangles: Indices, reach: float, copies: bool = False, sheet: bool = False) -> Mended:
     """The same with a given reach of points that are one, as a share of the size; `copies`: kept."""
-    given = points, triangles
+    original = points, triangles
     points, triangles = joined(points, triangles, reach)
     notes = []
     once = _once(triangles) | copies
@@ -75,10 +75,10 @@ def _mended(points: Points, triangles: Indices, reach: float, copies: bool = Fal
         return Mended(points, triangles, (), False, True)
     if flat.any():
         notes.append(f"{int(flat.sum())} surface triangles without an area were left out.")
-    kept = once & ~flat
-    triangles, divided, is_open = _divided(points, triangles if kept.all() else triangles[kept], reach)
+    retained = once & ~flat
+    triangles, divided, is_open = _divided(points, triangles if retained.all() else triangles[retained], reach)
     if is_open and not once.all() and not sheet:
-        return _mended(*given, reach, copies=True)  # open without them: sheets of no thickness
+        return _mended(*original, reach, copies=True)  # open without them: sheets of no thickness
     if divided:
         notes.append(f"{divided} edges of the surface had corners of other triangles on them and were divided there.")
     return Mended(points, triangles, tuple(notes), is_open, divided > 0)
@@ -126,12 +126,12 @@ def _distinct_points(points: Points) -> tuple[Points, Indices]:
     group[order] = np.cumsum(first) - 1
     distinct = points[representative]
     if not np.array_equal(distinct[group], points):  # different points of the same hash
-        distinct, places = np.unique(points, axis=0, return_inverse=True)
-        return distinct, places.ravel().astype(np.int64)
+        distinct, positions = np.unique(points, axis=0, return_inverse=True)
+        return distinct, positions.ravel().astype(np.int64)
     rising = np.lexsort(distinct.T[::-1])
-    place = np.empty(len(rising), np.int64)
-    place[rising] = np.arange(len(rising))
-    return distinct[rising], place[group]
+    position = np.empty(len(rising), np.int64)
+    position[rising] = np.arange(len(rising))
+    return distinct[rising], position[group]
 
 
 def _hashes(rows: Indices) -> Indices:
@@ -202,9 +202,9 @@ def open_edges(triangles: Indices) -> Indices:
 
 def _once(triangles: Indices) -> Mask:
     """(k,) whether each is the first with its three corners, whichever way it faces."""
-    _, _, place = distinct_rows(np.sort(triangles, axis=1))
+    _, _, inverse = distinct_rows(np.sort(triangles, axis=1))
     first = np.zeros(len(triangles), bool)
-    first[np.unique(place, return_index=True)[1]] = True
+    first[np.unique(inverse, return_index=True)[1]] = True
     return first
 
 
@@ -214,19 +214,19 @@ def _divided(points: Points, triangles: Indices, reach: float) -> tuple[Indices,
     total = 0
     length = reach * float(np.ptp(points, axis=0).max())
     for _ in range(MAX_ROUNDS):
-        places = open_edges(triangles)
-        if not 0 < len(places) <= MAX_OPEN_EDGES:
-            return triangles, total, len(places) > 0
-        splits = _nodes_on_edges(points, directed_edges(triangles)[places], length)
+        positions = open_edges(triangles)
+        if not 0 < len(positions) <= MAX_OPEN_EDGES:
+            return triangles, total, len(positions) > 0
+        splits = _nodes_on_edges(points, directed_edges(triangles)[positions], length)
         new, replaced = [], np.zeros(len(triangles), bool)
-        for place, nodes in zip(places, splits, strict=True):
-            number, side = divmod(int(place), 3)
+        for position, nodes in zip(positions, splits, strict=True):
+            number, side = divmod(int(position), 3)
             if not nodes or replaced[number]:
                 continue
             a, b, c = (int(node) for node in np.roll(triangles[number], -side))
             chain = [a, *nodes, b]
             if c not in nodes:
-                new += [[one, other, c] for one, other in pairwise(chain)]
+                new += [[first, second, c] for first, second in pairwise(chain)]
                 replaced[number] = True
         if not new:
             return triangles, total, True
@@ -242,7 +242,7 @@ def _nodes_on_edges(points: Points, edges: Indices, length: float) -> list[list[
 
     nodes = np.unique(edges)
     tree = cKDTree(points[nodes])
-    found = []
+    result = []
     for a, b in edges:
         span = points[b] - points[a]
         size = float(np.linalg.norm(span))
@@ -250,5 +250,5 @@ def _nodes_on_edges(points: Points, edges: Indices, length: float) -> list[list[
         along = (points[near] - points[a]) @ span / size
         off = np.linalg.norm(points[near] - points[a] - np.outer(along / size, span), axis=1)
         on = (off <= length) & (along > length) & (along < size - length)
-        found.append(near[on][np.argsort(along[on])].tolist())
-    return found
+        result.append(near[on][np.argsort(along[on])].tolist())
+    return result

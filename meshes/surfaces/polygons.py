@@ -18,10 +18,10 @@ def triangles_of_faces(points: Points, faces: Indices) -> Indices:
     ahead, behind = np.roll(corners, -1, axis=1) - corners, corners - np.roll(corners, 1, axis=1)
     convex = (np.einsum("mki,mi->mk", np.cross(behind, ahead), normals) >= 0).all(axis=1)
     fan = [[0, i, i + 1] for i in range(1, faces.shape[1] - 1)]
-    places = np.tile(np.array(fan, np.int64), (len(faces), 1, 1))
+    positions = np.tile(np.array(fan, np.int64), (len(faces), 1, 1))
     for face in np.flatnonzero(~convex):
-        places[face] = _ears(corners[face], normals[face])
-    return np.take_along_axis(faces, places.reshape(len(faces), -1), axis=1).reshape(-1, 3)
+        positions[face] = _ears(corners[face], normals[face])
+    return np.take_along_axis(faces, positions.reshape(len(faces), -1), axis=1).reshape(-1, 3)
 
 
 def _ears(corners: Floats, normal: Floats) -> list[list[int]]:
@@ -40,6 +40,6 @@ def _is_ear(corners: Floats, normal: Floats, left: list[int], i: int) -> bool:
     a, b, c = corners[ear]
     if np.cross(b - a, c - b) @ normal <= 0:
         return False
-    others = corners[[node for node in left if node not in ear]]
-    sides = [np.cross(end - start, others - start) @ normal for start, end in ((a, b), (b, c), (c, a))]
+    remaining = corners[[node for node in left if node not in ear]]
+    sides = [np.cross(end - start, remaining - start) @ normal for start, end in ((a, b), (b, c), (c, a))]
     return not (np.array(sides) >= 0).all(axis=0).any()

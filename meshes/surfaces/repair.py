@@ -102,16 +102,16 @@ def repaired(points: Points, triangles: Indices, source: str) -> tuple[Points, I
     points, triangles, mends = _mended(points, triangles, source)
     triangles, shell, _ = orient_consistently(triangles, EdgeTable(triangles), source)
     crossings = crossing_triangles(points, triangles, closed=True)
-    own = np.unique(crossings[shell[crossings[:, 0]] == shell[crossings[:, 1]]])
+    owned = np.unique(crossings[shell[crossings[:, 0]] == shell[crossings[:, 1]]])
     opened = np.unique(open_edges(triangles) // 3)
     area = np.bincount(shell, areas(points, triangles))
-    cut, torn = (np.bincount(shell[which], minlength=len(area)) > 0 for which in (own, opened))
+    cut, torn = (np.bincount(shell[which], minlength=len(area)) > 0 for which in (owned, opened))
     dust = torn & (area < DUST * area.sum())
     parts, notes = [], list(mends)
     for number in np.flatnonzero(~dust):
         part = _part(points, triangles[shell == number])
         if cut[number] or torn[number]:
-            part, change = _fixed(*part, int(np.count_nonzero(shell[own] == number)), source)
+            part, change = _fixed(*part, int(np.count_nonzero(shell[owned] == number)), source)
             notes.append(change)
         parts.append(part)
     if dust.any():
@@ -131,15 +131,15 @@ def _mended(points: Points, triangles: Indices, source: str) -> tuple[Points, In
 
     Parts that cross or touch may have points at the same place, as two boxes with a common face.
     """
-    whole, given = mended(points, triangles), (points, triangles)
+    whole, original = mended(points, triangles), (points, triangles)
     points, triangles, notes = whole[:3]
     if _crowded(triangles):
-        _, part = components(np.concatenate([given[1][:, :2], given[1][:, 1:]]), len(given[0]))
-        of_triangle = part[given[1][:, 0]]
+        _, part = components(np.concatenate([original[1][:, :2], original[1][:, 1:]]), len(original[0]))
+        of_triangle = part[original[1][:, 0]]
         numbers = np.unique(of_triangle)
         if 1 < len(numbers) <= MAX_PARTS:
-            parts = [mended(*_part(given[0], given[1][of_triangle == number])) for number in numbers]
-            apart = _together([(own_points, own) for own_points, own, *_ in parts])
+            parts = [mended(*_part(original[0], original[1][of_triangle == number])) for number in numbers]
+            apart = _together([(own_points, owned) for own_points, owned, *_ in parts])
             # STL does not say which triangles are connected: each would be a part, and open
             if not _crowded(apart[1]) and len(open_edges(apart[1])) <= len(open_edges(triangles)):
                 points, triangles = apart
@@ -210,7 +210,7 @@ def _fixed(points: Points, triangles: Indices, cut: int, source: str) -> tuple[P
     new_points, new = _by_meshfix(points, triangles, clean=cut > 0)
     if cut == 0 and len(crossing_triangles(new_points, new)):
         new_points, new = _by_meshfix(points, triangles, clean=True)
-    what = " and ".join(
+    description = " and ".join(
         (
             [f"{holes.count} holes (longest edge {holes.longest:.3g} m, the first near {holes.where})"]
             if holes.count
@@ -219,7 +219,7 @@ def _fixed(points: Points, triangles: Indices, cut: int, source: str) -> tuple[P
         + ([f"{cut} triangles that pass through others"] if cut else [])
     )
     if len(new) == 0 or len(open_edges(new)):
-        raise MeshError(f"{source}: repair failed to mend {what}. {BY_HAND}")
+        raise MeshError(f"{source}: repair failed to mend {description}. {BY_HAND}")
     after, share = _volume(new_points, new), _new_share(points, triangles, new_points, new)
     size = float(np.ptp(points, axis=0).max())
     moved = max(
@@ -229,13 +229,13 @@ def _fixed(points: Points, triangles: Indices, cut: int, source: str) -> tuple[P
     if abs(after - before) > MAX_CHANGE * before or moved > MAX_CHANGE or share > MAX_NEW:
         shell = " An open surface may be a shell: [mesh] shell = ..., with a thickness." if holes.count else ""
         raise MeshError(
-            f"{source}: repair would change the shape grossly. A part has {what}; repaired, {figures}, and its "
+            f"{source}: repair would change the shape grossly. A part has {description}; repaired, {figures}, and its "
             f"bounding box has moved by {moved:.2g} of its size. Allowed are {MAX_CHANGE:g} of the volume and of the "
             f"box, and {MAX_NEW:g} of the area. {BY_HAND}{shell}"
         )
     loudly = "LOOK AT THE SHAPE: " if share > TOLD_NEW else ""
     closed_with = " (before: each hole closed with a lid from its middle)" if holes.count else ""
-    return (new_points, new), f"{loudly}Repair: a part of the surface had {what}; {figures}{closed_with}."
+    return (new_points, new), f"{loudly}Repair: a part of the surface had {description}; {figures}{closed_with}."
 
 
 def _volume(points: Points, triangles: Indices) -> float:
@@ -246,9 +246,9 @@ def _new_share(points: Points, triangles: Indices, new_points: Points, new: Indi
     """Share of the new triangles' area that was not in the old ones."""
     number, same = _like(points, new_points)
     number = np.where(same, number, len(points) + np.arange(len(new_points)))
-    _, counts, place = distinct_rows(np.sort(np.concatenate([triangles, number[new]]), axis=1))
+    _, counts, inverse = distinct_rows(np.sort(np.concatenate([triangles, number[new]]), axis=1))
     area = areas(new_points, new)
-    return float(area[counts[place[len(triangles) :]] == 1].sum() / area.sum())
+    return float(area[counts[inverse[len(triangles) :]] == 1].sum() / area.sum())
 
 
 def _like(points: Points, new_points: Points) -> tuple[Indices, Mask]:
@@ -268,8 +268,8 @@ def _by_meshfix(points: Points, triangles: Indices, clean: bool) -> Part:
     fixer.fill_small_boundaries(0, False)
     if clean:
         fixer.clean(10, 3)
-    made, new = fixer.return_arrays()
-    new_points = np.array(made, np.float64) * size + low
+    result, new = fixer.return_arrays()
+    new_points = np.array(result, np.float64) * size + low
     if len(new):
         number, same = _like(points, new_points)
         new_points[same] = points[number[same]]  # `clean` rounds to single precision
@@ -334,15 +334,15 @@ def _union(parts: list[Part], source: str) -> tuple[Part, str]:
     whole = manifold3d.Manifold.batch_boolean(solids, manifold3d.OpType.Add).simplify(SLIVER * size)
     mesh = whole.to_mesh64()
     points, triangles = np.array(mesh.vert_properties)[:, :3], np.array(mesh.tri_verts, np.int64).reshape(-1, 3)
-    place = format_midpoint(parts[1][0], np.arange(len(parts[1][0])))
+    position = format_midpoint(parts[1][0], np.arange(len(parts[1][0])))
     bad = [solid.status().name for solid in (*solids, whole) if solid.status() != manifold3d.Error.NoError]
-    given = np.abs(volumes)
+    original = np.abs(volumes)
     volume = float(enclosed_volumes(points, triangles).sum()) if len(triangles) else 0.0
-    if bad or not (1 - UNITED) * given.max() <= volume <= (1 + UNITED) * given.sum():
-        raise MeshError(f"{source}: {len(parts)} parts cross near {place}, and their union failed. {BY_HAND}")
+    if bad or not (1 - UNITED) * original.max() <= volume <= (1 + UNITED) * original.sum():
+        raise MeshError(f"{source}: {len(parts)} parts cross near {position}, and their union failed. {BY_HAND}")
     note = (
         f"Repair: {len(parts)} closed parts of the surface that cross or touch were made one; their volumes, "
-        f"{given.sum():.4g} m^3 together, became {volume:.4g} m^3. Names of the parts are not kept."
+        f"{original.sum():.4g} m^3 together, became {volume:.4g} m^3. Names of the parts are not kept."
     )
     return (points, triangles), note
 
@@ -350,8 +350,8 @@ def _union(parts: list[Part], source: str) -> tuple[Part, str]:
 def _refuse_cavities(parts: list[Part], source: str) -> None:
     """MeshError where one of the parts that are to be one body lies within another: a cavity, which would be filled."""
     for i, (points, _) in enumerate(parts):
-        for j, (others, triangles) in enumerate(parts):
-            if i != j and (abs(winding_numbers(points[:: 1 + len(points) // 300], others[triangles])) > 0.5).all():
+        for j, (remaining, triangles) in enumerate(parts):
+            if i != j and (abs(winding_numbers(points[:: 1 + len(points) // 300], remaining[triangles])) > 0.5).all():
                 raise MeshError(
                     f"{source}: parts that cross have another part within them, near "
                     f"{format_midpoint(points, np.arange(len(points)))}; whether it is a cavity is not known. Unite "

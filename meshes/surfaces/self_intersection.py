@@ -50,12 +50,12 @@ def crossing_triangles(points: Points, triangles: Indices, *, closed: bool = Fal
     tolerance = TOUCHING * float((high.max(axis=0) - low.min(axis=0)).max())
     graph = _graph_nodes(corners, triangles, len(points))
     columns = np.ascontiguousarray(triangles.T)
-    found: list[Indices] = [np.zeros((0, 2), np.int64)]
+    result: list[Indices] = [np.zeros((0, 2), np.int64)]
     for first, second in _near_pairs(low, high):
         pairs = np.stack(_without_neighbours(columns, first, second, graph), axis=1)
         crossed = _crossed(points, triangles, pairs, tolerance, -MARGIN if closed else MARGIN)
-        found.append(np.sort(order[pairs[crossed]], axis=1))
-    pairs = np.concatenate(found)
+        result.append(np.sort(order[pairs[crossed]], axis=1))
+    pairs = np.concatenate(result)
     return pairs[np.lexsort(pairs.T[::-1])]
 
 
@@ -80,17 +80,17 @@ def _near_pairs(low: Points, high: Points) -> Iterator[tuple[Indices, Indices]]:
                 "through one another: too many are near each other. Remove doubled parts, or make the surface "
                 "coarser, for example in MeshLab: Filters > Remeshing > Quadric Edge Collapse Decimation."
             )
-        depth, first, other = stack.pop()
+        depth, first, partner = stack.pop()
         if len(first) > AT_ONCE:
             half = len(first) // 2
-            stack += [(depth, first[:half], None if other is None else other[:half])]
-            stack += [(depth, first[half:], None if other is None else other[half:])]
+            stack += [(depth, first[:half], None if partner is None else partner[:half])]
+            stack += [(depth, first[half:], None if partner is None else partner[half:])]
             continue
-        second = first if other is None else other
+        second = first if partner is None else partner
         lower, upper = (bounds.reshape(-1, 2) for bounds in levels[depth + 1])
         low_first, high_first, low_second, high_second = lower[first], upper[first], lower[second], upper[second]
         children: list[tuple[Indices, Indices]] = []
-        for i, j in ((0, 1),) if other is None else ((0, 0), (0, 1), (1, 0), (1, 1)):
+        for i, j in ((0, 1),) if partner is None else ((0, 0), (0, 1), (1, 0), (1, 1)):
             compared += len(first)
             # a guard bit is left where the upper bound is no less than the lower one
             above = (high_second[:, j] - low_first[:, i]) & (high_first[:, i] - low_second[:, j])
@@ -199,12 +199,12 @@ def _crossed(points: Points, triangles: Indices, pairs: Indices, tolerance: floa
     """(k,) whether an edge of one triangle of each pair passes through the other."""
     crossed = np.zeros(len(pairs), bool)
     reaching = np.zeros(len(pairs), bool)
-    for one, other in ((0, 1), (1, 0)):  # to both sides of the other's plane: few neighbours do
-        heights = _heights(points[triangles[pairs[:, one]]], points[triangles[pairs[:, other]]])
+    for first, second in ((0, 1), (1, 0)):  # to both sides of the other's plane: few neighbours do
+        heights = _heights(points[triangles[pairs[:, first]]], points[triangles[pairs[:, second]]])
         reaching |= (heights.min(axis=1) < -tolerance) & (heights.max(axis=1) > tolerance)
     straddling = np.flatnonzero(reaching)
-    for one, other in ((0, 1), (1, 0)):
-        edges, faces = triangles[pairs[straddling, one]], triangles[pairs[straddling, other]]
+    for first, second in ((0, 1), (1, 0)):
+        edges, faces = triangles[pairs[straddling, first]], triangles[pairs[straddling, second]]
         for side in range(3):
             edge = edges[:, [side, (side + 1) % 3]]
             free = ~(edge[:, :, None] == faces[:, None, :]).any(axis=(1, 2)) & ~crossed[straddling]

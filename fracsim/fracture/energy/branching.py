@@ -43,7 +43,7 @@ def shared_advance(pairs: NeighbourPairs, directions: Values, radius: Values) ->
     `pairs` are those of points and the tips in their discs, the tip at the point included, which advance along
     `directions` (pairs, 2).
     """
-    return pairs.sum(plateau(pairs.distance, radius[pairs.place])[:, None] * unit_or_zero(directions))
+    return pairs.sum(plateau(pairs.distance, radius[pairs.first])[:, None] * unit_or_zero(directions))
 
 
 def release_rate(force: Values, advance: Values, tangent: Values) -> Values:
@@ -70,14 +70,14 @@ def branch_directions(
         other_directions: (pairs, 2) direction of the other tip.
         radius: (n,) R, m.
     """
-    mean, disc = unit_or_zero(directions + other_directions), radius[pairs.place]
+    mean, disc = unit_or_zero(directions + other_directions), radius[pairs.first]
     left = -np.einsum("ni,ni->n", pairs.apart, rotate(mean, np.pi / 2))
     lead = -np.einsum("ni,ni->n", pairs.apart, mean)
     side_by_side = (pairs.distance < disc) & (np.abs(lead) <= TIP.side_by_side * disc)
     side_by_side &= (np.einsum("ni,ni->n", directions, other_directions) > 0) & (left != 0)
     rows = np.flatnonzero(side_by_side)
-    rows = rows[np.lexsort([pairs.distance[rows], pairs.place[rows]])]
-    tip, first = np.unique(pairs.place[rows], return_index=True)
+    rows = rows[np.lexsort([pairs.distance[rows], pairs.first[rows]])]
+    tip, first = np.unique(pairs.first[rows], return_index=True)
     rows = rows[first]
     result, waits = np.zeros((pairs.count, 2)), np.zeros(pairs.count, bool)
     result[tip] = rotate(mean[rows], np.sign(left[rows]) * TIP.branching_angle)

@@ -102,10 +102,10 @@ class FrontReleaseRate:
         tips = tips[self._order]
         pairs = find_pairs(cKDTree(tips[:, 1:4]), point, radius)
         # Tips of a front that advances in the opposite direction do not count.
-        same_front = np.einsum("nk,nk->n", advance[pairs.place], tips[pairs.other, 4:7]) > 0
-        weight = np.where(same_front, 1 - pairs.distance / radius[pairs.place], 0.0)
-        ends = np.concatenate([[0], np.cumsum(np.bincount(pairs.place, minlength=len(point)))])
-        self._weights = csr_matrix((weight, pairs.other, ends), shape=(len(point), len(tips)))
+        same_front = np.einsum("nk,nk->n", advance[pairs.first], tips[pairs.second, 4:7]) > 0
+        weight = np.where(same_front, 1 - pairs.distance / radius[pairs.first], 0.0)
+        ends = np.concatenate([[0], np.cumsum(np.bincount(pairs.first, minlength=len(point)))])
+        self._weights = csr_matrix((weight, pairs.second, ends), shape=(len(point), len(tips)))
         self._averaged_square = self._weights @ tips[:, 7]
 
     def __call__(self, force: Values) -> Values:

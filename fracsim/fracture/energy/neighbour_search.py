@@ -86,18 +86,18 @@ def surface_vectors(domain: Domain) -> tuple[Values, Values]:
 
 @dataclass(frozen=True)
 class NeighbourPairs:
-    """Pairs of points and things near them, ordered by points, then by things.
+    """Pairs of query points and their neighbours, ordered by query point, then by neighbour.
 
     Attributes:
-        place: (pairs,) number of the point.
-        other: (pairs,) number of the thing.
-        apart: (pairs, d) from the point to the thing, m.
-        distance: (pairs,) their distance, m.
-        count: number of points.
+        first: (pairs,) number of the query point.
+        second: (pairs,) number of the neighbour.
+        apart: (pairs, d) vector from the query point to the neighbour, m.
+        distance: (pairs,) length of that vector, m.
+        count: number of query points.
     """
 
-    place: Ints
-    other: Ints
+    first: Ints
+    second: Ints
     apart: Values
     distance: Values
     count: int
@@ -105,13 +105,13 @@ class NeighbourPairs:
     def sum(self, values: Values) -> Values:
         """Return the sums (points, ...) of values (pairs, ...), added in order."""
         flat = values.reshape(len(values), int(np.prod(values.shape[1:])))
-        sums = [np.bincount(self.place, weights=column, minlength=self.count) for column in flat.T]
+        sums = [np.bincount(self.first, weights=column, minlength=self.count) for column in flat.T]
         # Sums of no pair are integers: convert.
         return np.asarray(sums, float).T.reshape(self.count, *values.shape[1:])
 
     def any(self, flags: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
         """Return whether a point (points,) has any flagged pair (pairs,)."""
-        return np.bincount(self.place[flags], minlength=self.count) > 0
+        return np.bincount(self.first[flags], minlength=self.count) > 0
 
 
 def find_pairs(tree: cKDTree, points: Values, radius: Values) -> NeighbourPairs:

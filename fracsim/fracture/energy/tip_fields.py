@@ -201,10 +201,10 @@ class TipFieldEvaluator:
         """
         average = self._radii.average[cells]
         pairs = self._nearby.find_pairs(self.centres[cells], average)
-        needed, index = np.unique(pairs.other, return_inverse=True)
+        needed, index = np.unique(pairs.second, return_inverse=True)
         exchange = self._nearby.request_values(needed)
         (near,) = exchange(stress[exchange.owned_cells])
-        weight = self._nearby.volumes[pairs.other] * (1 - pairs.distance / average[pairs.place])
+        weight = self._nearby.volumes[pairs.second] * (1 - pairs.distance / average[pairs.first])
         mean = weighted_mean(pairs.sum(weight[:, None] * near[index]), pairs.sum(weight)[:, None])
         return symmetric_tensors(mean, self._domain.dim)
 

@@ -310,14 +310,14 @@ class TipNeighbourhoods:
         """
         disc, average = self._radii.disc[cell], self._radii.average[cell]
         pairs = self._nearby.find_pairs(point, disc)
-        volume, r, R = self._nearby.volumes[pairs.other], pairs.distance, disc[pairs.place]
+        volume, r, R = self._nearby.volumes[pairs.second], pairs.distance, disc[pairs.first]
         slope = volume[:, None] * plateau_gradient(pairs.apart, R)
-        share = 1 - r / average[pairs.place]
+        share = 1 - r / average[pairs.first]
         columns = [plateau(r, R), np.maximum(share, 0.0), share > 0]
         weights = np.column_stack([slope, *(volume * column for column in columns)])
-        distance = np.linalg.norm(self._nearby.surface_points[pairs.other] - point[pairs.place], axis=1)
-        surface_weights = plateau(distance, R)[:, None] * self._nearby.surface_vectors[pairs.other]
-        return pairs.place, pairs.other, weights, surface_weights
+        distance = np.linalg.norm(self._nearby.surface_points[pairs.second] - point[pairs.first], axis=1)
+        surface_weights = plateau(distance, R)[:, None] * self._nearby.surface_vectors[pairs.second]
+        return pairs.first, pairs.second, weights, surface_weights
 
     def _flag_near(self, changed: Values) -> Flags:
         """Return whether tips (n,) depend on any of the changed cells with centroids (m, d)."""
@@ -336,12 +336,12 @@ class TipNeighbourhoods:
         mature_radius, split = disc + self._radii.beyond[tips.cell[rows]], np.flatnonzero(cut_cells.split)
         reach = np.maximum(mature_radius, disc * (1 + 1 / TIP.min_disc_radius))
         pairs = find_pairs(cKDTree(cut_cells.centre[split]), point, reach)
-        cells, r = split[pairs.other], disc[pairs.place]
+        cells, r = split[pairs.second], disc[pairs.first]
         tips.behind[rows] = self._mean_cut_point_behind(pairs, cells, point, disc)
-        tips.mature[rows] = pairs.any((pairs.distance >= r) & (pairs.distance < mature_radius[pairs.place]))
+        tips.mature[rows] = pairs.any((pairs.distance >= r) & (pairs.distance < mature_radius[pairs.first]))
         if point.shape[1] == 3:
             near = np.flatnonzero(pairs.distance < r * (1 + 1 / TIP.min_disc_radius))
-            advance = advance_vectors(cut_cells.polygon, (pairs.place[near], cells[near]), point, disc)
+            advance = advance_vectors(cut_cells.polygon, (pairs.first[near], cells[near]), point, disc)
             tips.ahead[rows] = project_on_surface(advance, tips.surface[rows], disc)
         else:
             self._update_shared_advance(rows, disc)
@@ -349,8 +349,8 @@ class TipNeighbourhoods:
     def _mean_cut_point_behind(self, pairs: NeighbourPairs, cells: Ints, point: Values, disc: Values) -> Values:
         """Return the mean (n, d), m, of the cuts of split cells (pairs,) nearer than `disc` to points (n, d)."""
         # Relative to the point, so that a tip without a crack behind it has the point itself.
-        within = (pairs.distance < disc[pairs.place]).astype(float)
-        back = within[:, None] * (self._cut_cells.cut_point[cells] - point[pairs.place])
+        within = (pairs.distance < disc[pairs.first]).astype(float)
+        back = within[:, None] * (self._cut_cells.cut_point[cells] - point[pairs.first])
         return point + weighted_mean(pairs.sum(back), pairs.sum(within)[:, None])
 
     def _update_shared_advance(self, rows: Ints, disc: Values) -> None:
@@ -358,18 +358,18 @@ class TipNeighbourhoods:
         tips, cut_cells = self.tips, self._cut_cells
         all_tips = np.flatnonzero(~cut_cells.split)
         pairs = find_pairs(cKDTree(cut_cells.cut_point[all_tips]), tips.point[rows], (1 + self._forks) * disc)
-        other_points = cut_cells.cut_point[all_tips[pairs.other]]
-        directions = self._direction_from_crack(other_points, disc[pairs.place])
+        other_points = cut_cells.cut_point[all_tips[pairs.second]]
+        directions = self._direction_from_crack(other_points, disc[pairs.first])
         tips.ahead[rows] = branching.shared_advance(pairs, directions, disc)
         if self._forks:
-            tips.alone[rows] = np.bincount(pairs.place, minlength=len(rows)) == 1
+            tips.alone[rows] = np.bincount(pairs.first, minlength=len(rows)) == 1
             tips.course[rows] = course = self._direction_from_crack(tips.point[rows], 2 * disc)
-            other_course = self._direction_from_crack(other_points, 2 * disc[pairs.place])
-            parts, waits = branching.branch_directions(pairs, course[pairs.place], other_course, disc)
+            other_course = self._direction_from_crack(other_points, 2 * disc[pairs.first])
+            parts, waits = branching.branch_directions(pairs, course[pairs.first], other_course, disc)
             tips.parts[rows], tips.waits[rows] = parts, waits
 
     def _direction_from_crack(self, point: Values, radius: Values) -> Values:
         """Return vectors (n, d), m, from the mean of the crack nearer than radius (n,) to points (n, d)."""
         split = np.flatnonzero(self._cut_cells.split)
         pairs = find_pairs(cKDTree(self._cut_cells.centre[split]), point, radius)
-        return point - self._mean_cut_point_behind(pairs, split[pairs.other], point, radius)
+        return point - self._mean_cut_point_behind(pairs, split[pairs.second], point, radius)

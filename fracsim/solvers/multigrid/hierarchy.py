@@ -54,14 +54,14 @@ def copy_levels(body: PETSc.PC, finest: IndexMap) -> list[LevelData]:
     between = [None, *(_Entries(body.getMGInterpolation(level)) for level in range(1, count))]
     result: list[LevelData] = []
     for level, (matrix, size) in enumerate(zip(matrices, sizes, strict=True)):
-        own = _Entries(matrix) if 0 < level < count - 1 else None
-        read = [each.columns // size for each in (own, between[level + 1]) if each] if level < count - 1 else []
+        owned = _Entries(matrix) if 0 < level < count - 1 else None
+        read = [item.columns // size for item in (owned, between[level + 1]) if item] if level < count - 1 else []
         nodes = _nodes(matrix, size, read) if read else finest
         diagonal, to = la.vector(nodes, size), between[level]
         diagonal.array[: nodes.size_local * size] = matrix.getDiagonal().array_r
         diagonal.scatter_forward()
         result.append(LevelData(
-            nodes, size, diagonal.array.copy(), own.in_blocks((size, size), nodes) if own else None,
+            nodes, size, diagonal.array.copy(), owned.in_blocks((size, size), nodes) if owned else None,
             to.in_blocks((size, sizes[level - 1]), result[-1].nodes) if to else None,
         ))  # fmt: skip
     return result
@@ -88,7 +88,7 @@ class _Entries:
 def _nodes(matrix: PETSc.Mat, size: int, read: list[Ints]) -> IndexMap:
     """Those of the rows of a matrix; ghosts are what else is `read`, by global numbers (collective)."""
     first, last = (end // size for end in matrix.getOwnershipRange())
-    ghosts = np.unique(np.concatenate([each[(each < first) | (each >= last)] for each in read])).astype(np.int64)
+    ghosts = np.unique(np.concatenate([item[(item < first) | (item >= last)] for item in read])).astype(np.int64)
     owners = np.searchsorted(matrix.getOwnershipRanges() // size, ghosts, side="right") - 1
     return IndexMap(matrix.comm.tompi4py(), last - first, ghosts, owners.astype(np.int32))
 

@@ -133,8 +133,8 @@ class SmoothedLevel:
 
     def rhs_norm(self) -> float:
         """|b| (collective)."""
-        own = self.b.array[: self._owned]
-        return float(np.sqrt(sum_over_ranks(self._comm, np.vdot(own, own))[0]))
+        owned = self.b.array[: self._owned]
+        return float(np.sqrt(sum_over_ranks(self._comm, np.vdot(owned, owned))[0]))
 
     def _multiply(self) -> None:
         """residual = A' x (collective)."""
