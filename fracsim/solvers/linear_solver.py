@@ -329,7 +329,7 @@ def _plain_options(balance: Balance, given: PetscOptions, policy: SolverPolicy) 
     is_small = balance.work_vector.getSize() <= policy.max_plain_direct_dofs
     if is_small and _is_default_method(given) and PETSc.Sys.hasExternalPackage("mumps"):
         # CG takes one iteration with factors, and tells where a symmetric tangent is indefinite.
-        method: PetscOptions = {"pc_type": "cholesky" if balance.symmetric else "lu"} | MUMPS_OPTIONS
+        method: PetscOptions = MUMPS_OPTIONS | {"pc_type": "cholesky" if balance.symmetric else "lu"}
     else:
         method = {"pc_type": "gamg"}
     return DEFAULT_OPTIONS | {"ksp_type": "cg" if balance.symmetric else "gmres"} | method | given
