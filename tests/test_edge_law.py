@@ -74,7 +74,7 @@ def test_a_checkpoint_holds_the_numbers(tmp_path: Path) -> None:
     graph = going.scene.fracture.graph
     graph.weaken(np.random.default_rng(3).choice([0.0, 0.25, 0.5, 1.0], len(graph.integrity)))
     going.scene.fracture.damage_restored()
-    going.state = going.scene.stepper.remember(going.state)
+    going.state = going.scene.stepper.with_current_history(going.state)
     going.checkpoint()
     again = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path, restart=True)
     np.testing.assert_array_equal(again.scene.fracture.graph.integrity, graph.integrity)

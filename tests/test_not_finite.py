@@ -126,7 +126,7 @@ def test_rigid_bodies_that_go_astray(tmp_path: Path, monkeypatch: pytest.MonkeyP
     def astray(self: Any, *rest: Any) -> Any:
         moved, touches = advance(self, *rest)
         if next(count) == 3:
-            moved.place[0, 0] = np.nan
+            moved.position[0, 0] = np.nan
         return moved, touches
 
     monkeypatch.setattr(engine.Engine, "advance", astray)
