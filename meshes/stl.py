@@ -17,12 +17,6 @@ from .text_rows import parse_numbers
 
 HEAD = 84  # bytes of a binary file before its triangles: 80 of text, 4 of their number
 TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-_NUMBERS = rb"[ \t]*+\n\s*+vertex[ \t]++(\S++[ \t]++\S++[ \t]++\S++)"
-_FACET = re.compile(
-    rb"facet[^\n]*+\n\s*+outer[ \t]*+loop" + 3 * _NUMBERS + rb"\s*+end[ \t]*+loop\s*+end[ \t]*+facet\b", re.IGNORECASE
-)
-_END = re.compile(rb"end[ \t]*facet\b", re.IGNORECASE)
-PART = 1 << 22  # bytes of a text that are read at a time
 _WORDS = re.compile(rb"^[ \t]*(vertex|end[ \t]*facet|end[ \t]*loop)\b", re.IGNORECASE | re.MULTILINE)
 _VERTEX = rb"\s*+vertex([ \t]++\S++[ \t]++\S++[ \t]++\S++)[ \t]*+\n"
 _FACET = re.compile(
