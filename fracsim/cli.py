@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 from .errors import Exit, FracsimError, InputError, NotConverged, Stopped, one_line
 from .process import (
     INTERRUPTED,
+    end_process,
     import_blocked,
     import_dolfinx,
     import_outside,
@@ -295,19 +296,13 @@ def check_folder(folder: Path) -> None:
 
 def program() -> NoReturn:
     """Run the command line in a process of its own; the entry point of the console script."""
-    writes_nothing = sys.argv[1:2] in (["list"], ["check"])
-    if writes_nothing:
-        # garbage collection among imports takes a twentieth of these commands
+    if sys.argv[1:2] in (["list"], ["check"], ["run"]):
+        # garbage collection among imports takes a twentieth of list and check; start_run enables it again
         gc.disable()
     try:
         main(start_process)
     except SystemExit as end:
-        # Python's finalisation takes a tenth of them, and has no file, lock or MPI to end
-        if not writes_nothing or "mpi4py" in sys.modules or not isinstance(end.code, int | None):
-            raise
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(end.code or 0)
+        end_process(end.code)
 
 
 def main(begin: Callable[[], None] | None = None) -> NoReturn:
