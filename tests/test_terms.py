@@ -164,3 +164,11 @@ def test_any_solver_options_are_forgotten() -> None:
     march(scene, state, 1)
     scene.destroy()
     assert dict(PETSc.Options().getAll()) == before
+
+
+def test_a_step_is_read_in_few_files() -> None:
+    """One implicit step without contact crosses files fewer than 150 times (a goal of the structure)."""
+    from fracsim.studies.file_crossings import STUDY, crossings
+
+    calls = crossings(STUDY)
+    assert 0 < sum(calls.values()) < 150, calls.most_common(20)

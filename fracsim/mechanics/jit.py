@@ -65,23 +65,16 @@ class CellForm(fem.Form):
     def __init__(self, form: ufl.Form) -> None:
         compiled = compile_form(form)
         self._all_cells: Any = compiled._cpp_object
-        self._pending: npt.NDArray[np.bool_] | None = None  # excluded cells to which kernels are not bound yet
         self._excluded: npt.NDArray[np.bool_] | None = None
         self._remaining: npt.NDArray[np.int64] | None = None
         super().__init__(compiled._cpp_object, compiled.ufcx_form, compiled.code, compiled.module)
         self._constants = [constant._cpp_object for constant in form.constants()]
 
-    @property
+    @cached_property
     def _cpp_object(self) -> Any:
         """C++ form that DOLFINx uses, over the remaining cells."""
-        if self._pending is not None:
-            excluded, self._pending = self._pending, None  # first, since binding asks for the C++ form, too
-            self._bound = self._over(~excluded)
-        return self._bound
-
-    @_cpp_object.setter
-    def _cpp_object(self, bound: Any) -> None:
-        self._bound = bound
+        assert self._excluded is not None  # without excluded cells it is the compiled form
+        return self._over(~self._excluded)
 
     @property
     def all_cells_form(self) -> Any:
@@ -102,8 +95,8 @@ class CellForm(fem.Form):
 
     def exclude_cells(self, dead: npt.NDArray[np.bool_]) -> None:
         """Integrate from now on over the cells of the measure that are not flagged (cells,) (not collective)."""
-        self._pending = self._excluded = dead
-        self._remaining = None
+        self._excluded, self._remaining = dead, None
+        self.__dict__.pop("_cpp_object", None)  # kernels are bound to the remaining cells when it is asked for
 
     def _over(self, chosen: npt.NDArray[np.bool_]) -> Any:
         return bind_to_cells(self, self._all_cells, self._constants, lambda cells: cells[chosen[cells]])

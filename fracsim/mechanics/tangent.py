@@ -28,7 +28,7 @@ from .jit import CellForm, cell_measure
 from .matrix_assembly import TangentAssembler
 from .prescribed_motion import PrescribedMotion
 from .stress import Stress
-from .term import Term, sum_of_forms
+from .term import Term, overriding, sum_of_forms
 from .term_protocols import LowRankTerm, StepLimiter, TieTerm
 
 if TYPE_CHECKING:
@@ -86,6 +86,8 @@ class Tangent:
             [term for term in terms if isinstance(term, TieTerm)],
             [term for term in terms if isinstance(term, LowRankTerm)],
         )
+        self._inert = overriding(terms, Term.mass_factor)
+        self._stiff = overriding(terms, Term.add_stiffness, Term.coupling_matrix)
         self.may_be_incomplete = any(term.leaves_tangent_incomplete for term in terms)
         self._linear = all(term.linear for term in terms)
         self._has_couplings = False  # whether a coupling has ever been added
@@ -121,7 +123,7 @@ class Tangent:
         if self._has_couplings and self._assembler.entries_outdated:
             self.matrix.zeroEntries()  # entries beyond the blocks
         if self._assembler.update_entries() and self._with_contact:
-            for coupling in [term.coupling_matrix() for term in self._terms]:
+            for coupling in [term.coupling_matrix() for term in self._stiff]:
                 if coupling is not None:
                     self._couple(coupling, constant=True)
 
@@ -195,7 +197,7 @@ class Tangent:
             ties = [term.tie_matrix(self._motion.free_dofs) for term in self._tied_terms] if self._with_contact else []
             blocks.ties = [tie for tie in ties if tie is not None]
             return
-        for term in self._terms:
+        for term in self._stiff:
             term.add_stiffness(self.matrix)
             if not self._with_contact or (coupling := term.coupling_matrix()) is None:
                 continue
@@ -214,7 +216,7 @@ class Tangent:
         if self._has_couplings:
             self.matrix.zeroEntries()  # entries beyond the pattern of the cells
         psd_form = None if psd_tolerance is None else self._psd_form(psd_tolerance)
-        factor = sum(term.mass_factor for term in self._terms)
+        factor = sum(term.mass_factor for term in self._inert)
         if self._assembler.blocks is not None:
             mass = self._mass.block_values(self._assembler, factor) if factor else None
             self._assembler(self._motion.bcs, psd_form, mass)
@@ -244,7 +246,7 @@ class Tangent:
     @cached_property
     def _depends_on_u_alone(self) -> bool:
         """Whether terms add only couplings to K, and its other part is a function of u alone (collective)."""
-        adds_entries = any(type(term).add_stiffness is not Term.add_stiffness for term in self._terms)
+        adds_entries = bool(overriding(self._terms, Term.add_stiffness))
         limited = any(isinstance(term, StepLimiter) for term in self._terms)
         return limited and all([term.potential() is not None for term in self._terms]) and not adds_entries
 
@@ -261,7 +263,7 @@ class Tangent:
     def _is_assembled(self, psd_tolerance: float | None) -> bool:
         """Whether a linear K is up to date; where it is not, the caller assembles it (collective)."""
         fields = [field.x.array for field in self._stress.damage_fields]
-        factor = sum(term.mass_factor for term in self._terms)
+        factor = sum(term.mass_factor for term in self._inert)
         rates = self.matrix.handle, psd_tolerance, factor, self.c_v, self._with_contact
         last = self._last
         same = last is not None and last[0] == rates and all(map(np.array_equal, last[1], fields))

@@ -11,8 +11,9 @@ What only contact has to tell is in the protocols of `term_protocols`.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -176,6 +177,12 @@ class Term:
 
     def destroy(self) -> None:
         """Free PETSc's objects."""
+
+
+def overriding(terms: Iterable[Term], *methods: Any) -> list[Term]:
+    """Terms whose classes override one of these methods of Term; the others contribute nothing to them."""
+    names = [(method.fget if isinstance(method, property) else method).__name__ for method in methods]
+    return [term for term in terms if any(getattr(type(term), name) is not getattr(Term, name) for name in names)]
 
 
 def sum_of_forms(forms: list[Form]) -> Form:

@@ -137,7 +137,7 @@ def bind_to_cells(form: fem.Form, whole: Any, constants: Sequence[Any], keep: Ca
     }
     domains[cell] = [(number, keep(cells)) for number, cells in domains.get(cell, [])]
     kernels = module.ffi.cast("uintptr_t", module.ffi.addressof(form.ufcx_form))
-    bind = fem.form_cpp_class(form.dtype)
+    bind = fem.form_cpp_class(whole.dtype)
     return bind(kernels, whole.function_spaces, whole.coefficients, constants, domains, {}, whole.mesh)
 
 
