@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .data import Indices, MeshError, Points
-from .text import format_midpoint
+from .data import Indices, MeshError, Points, format_midpoint
 from .topology import Floats, signed_measures
 
 # shape -> its faces by the places of their corners, normals outwards; the corners are in the order of VTK and Gmsh

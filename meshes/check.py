@@ -7,12 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from .components import components
-from .data import Indices, MeshData, MeshError, Points
+from .data import Indices, MeshData, MeshError, Points, format_midpoint, format_point
 from .joining import coincident_nodes, join_bodies, label_bodies
 from .parameters import LONGEST, SHORTEST
-from .text import format_midpoint, format_point
-from .topology import Floats, Mask, distinct_rows, facets_of, orient_cells, signed_measures
+from .topology import Floats, Mask, components, distinct_rows, facets_of, orient_cells, signed_measures
 
 SHOWN = 5  # examples in a message
 

@@ -1,7 +1,8 @@
-"""What every mesh builder and mesh reader returns: plain arrays, before any partition."""
+"""The simplex mesh that builders and readers return, its error, and coordinates as text for messages."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy.typing as npt
 
 Points = npt.NDArray[np.float64]
 Indices = npt.NDArray[np.int64]
+AXES = "xyz"
 
 
 class MeshError(ValueError):
@@ -55,3 +57,13 @@ class MeshData:
     @property
     def dim(self) -> int:
         return int(self.points.shape[1])
+
+
+def format_point(point: Iterable[float]) -> str:
+    """A point [m] as text: "(0, 0.5, 1)"."""
+    return "(" + ", ".join(f"{value:.4g}" for value in point) + ")"
+
+
+def format_midpoint(points: Points, nodes: Indices) -> str:
+    """The centroid of the given nodes as text: "(0, 0.5, 1) m"."""
+    return format_point(points[nodes].mean(axis=0)) + " m"

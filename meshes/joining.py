@@ -6,10 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from .components import components
-from .data import Indices, MeshData, MeshError
-from .text import format_point
-from .topology import edges_of
+from .data import Indices, MeshData, MeshError, format_point
+from .topology import components, edges_of
 
 SAME_PLACE = 1e-6  # nodes nearer than this share of the mesh's size coincide
 

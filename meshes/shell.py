@@ -13,8 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .data import Indices, MeshData, MeshError, Points, Shell
-from .text import format_midpoint
+from .data import Indices, MeshData, MeshError, Points, Shell, format_midpoint
 from .topology import Floats, boundary_facets, signed_measures
 
 LONGEST = 2.0  # times the thickness that a normal at a fold may be long

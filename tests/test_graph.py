@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from fracsim.mesh.edge_graph import EdgeGraph, Incidence
 from fracsim.mesh.simplices import is_split, local_edges, node_groups
-from fracsim.meshes.components import components
+from fracsim.meshes.topology import components
 from support.ranks import OnRanks
 from support.scenes import make_scene
 

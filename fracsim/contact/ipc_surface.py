@@ -26,7 +26,7 @@ from ..mesh.split_surface.entity_numbering import CRACK, EntityNumbering
 from ..mesh.split_surface.fragment_surface import build_fragment_surface, has_same_fragments, project_onto_fragments
 from ..mesh.split_surface.point_matching import match_points, point_identity
 from ..mesh.split_surface.surface_map import SurfaceMap, whole
-from ..meshes.text import format_point
+from ..meshes.data import format_point
 from .ipc_pairs import IpcPairs, max_length
 from .sample_points import SlipFriction
 

@@ -26,7 +26,7 @@ from ..mechanics.term_protocols import SurfaceData
 from ..mesh.domain import Domain
 from ..mesh.parallel import from_root, on_root
 from ..mesh.split_surface.surface_map import SurfaceMap
-from ..meshes.text import AXES
+from ..meshes.data import AXES
 from .ipc_pairs import max_length
 from .ipc_surface import SelfContactLaw
 from .laws import BARRIER

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mechanics.time_functions import TimeFunction
-from ..meshes.text import AXES
+from ..meshes.data import AXES
 from .pose import Pose, PosedShape, Values, rotation_derivative, rotation_second_derivative
 from .shape_base import Shape
 

@@ -25,7 +25,7 @@ from ..mechanics.term import Term
 from ..mechanics.term_protocols import SurfaceData
 from ..mesh.domain import Domain
 from ..mesh.split_surface.surface_map import SurfaceMap
-from ..meshes.text import AXES
+from ..meshes.data import AXES
 from .contact_state import ContactState
 from .contact_surface import retract_cut_elements, retract_from_obstacles
 from .laws import ObstacleLaw

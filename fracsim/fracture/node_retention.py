@@ -21,7 +21,7 @@ from ..mesh.edge_graph import EdgeGraph
 from ..mesh.node_cells import NodeCellCount
 from ..mesh.parallel import allgather, sum_over_ranks
 from ..mesh.simplices import is_split, local_edges
-from ..meshes.components import components
+from ..meshes.topology import components
 from .criterion import OverloadedEdges
 from .edge_stress import EdgeStressOperator
 from .strength import EdgeStrength

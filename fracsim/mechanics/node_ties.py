@@ -26,7 +26,7 @@ from ..mesh.domain import Domain
 from ..mesh.node_cells import NodeCellCount
 from ..mesh.parallel import allgather, sum_over_ranks
 from ..mesh.simplices import is_split, local_edges
-from ..meshes.components import components
+from ..meshes.topology import components
 from .extra_couplings import CouplingBuilder
 from .term import Term
 

@@ -16,8 +16,7 @@ from ..errors import InputError
 from ..mesh.connected_bodies import free_motion, label_bodies, not_held
 from ..mesh.domain import Domain, Ints
 from ..mesh.parallel import on_root
-from ..meshes.data import MeshData
-from ..meshes.text import format_midpoint
+from ..meshes.data import MeshData, format_midpoint
 from .time_functions import TimeFunction
 
 Values = npt.NDArray[np.float64]

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ..meshes.components import components
-from ..meshes.data import MeshData
-from ..meshes.text import AXES
+from ..meshes.data import AXES, MeshData
+from ..meshes.topology import components
 
 Values = npt.NDArray[np.float64]
 

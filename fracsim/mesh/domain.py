@@ -13,8 +13,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..errors import InputError
-from ..meshes.data import MeshData
-from ..meshes.text import format_point
+from ..meshes.data import MeshData, format_point
 from ..meshes.topology import distinct_rows, signed_measures
 from .dolfinx_compat import KeptCell, coordinate_element, create_mesh, facets_of_nodes
 from .parallel import Gather, GatherSubset, bcast, sum_over_ranks

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import la
 
-from ..meshes.components import components
+from ..meshes.topology import components
 from .domain import Domain
 from .edge_graph import EdgeGraph
 from .parallel import allgather, offset

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import la
 
-from ..meshes.components import components
+from ..meshes.topology import components
 from .domain import Domain
 from .parallel import allgather, offset
 

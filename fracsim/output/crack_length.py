@@ -12,7 +12,7 @@ from ..fracture.edge_history import EdgeHistory
 from ..fracture.initial_cracks import edge_ends_in_input_order
 from ..mesh.crack_planes import CrackPlane
 from ..mesh.parallel import concatenate_over_ranks, sum_over_ranks
-from ..meshes.text import AXES
+from ..meshes.data import AXES
 
 Ints = npt.NDArray[np.integer]
 Values = npt.NDArray[np.float64]

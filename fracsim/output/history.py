@@ -21,7 +21,7 @@ from ..mechanics.term_protocols import HistoryColumns
 from ..mechanics.time_functions import TimeFunction
 from ..mesh.domain import Ints
 from ..mesh.parallel import sum_over_ranks
-from ..meshes.text import AXES
+from ..meshes.data import AXES
 from ..timestepping.state import State
 from ..timestepping.stepper import StepReport
 from .atomic_write import open_to_append, replace_text, write_all, write_on_root

@@ -15,7 +15,7 @@ from mpi4py import MPI
 
 from ..mechanics.stress import Stress
 from ..mesh.parallel import sum_over_ranks
-from ..meshes.text import format_point
+from ..meshes.data import format_point
 from ..timestepping.state import State
 from ..timestepping.stepper import StepReport
 

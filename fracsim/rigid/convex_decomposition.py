@@ -24,7 +24,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
 from ..mesh.split_surface.polyhedron_moments import PolyhedronMoments, cones, moments
-from ..meshes.components import components
+from ..meshes.topology import components
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]

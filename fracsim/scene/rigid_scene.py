@@ -18,8 +18,7 @@ from ..mechanics.stress import DegradationModel, Stress
 from ..mesh.domain import distribute
 from ..mesh.edge_graph import EdgeGraph
 from ..mesh.input_topology import MeshTopology
-from ..meshes.data import MeshData
-from ..meshes.text import format_point
+from ..meshes.data import MeshData, format_point
 from ..rigid.breakage import BreakableBody, FragmentAverage, StiffnessOperator
 from ..rigid.fragment_geometry import FragmentGeometry
 from ..rigid.free_body_analysis import SolidStiffness

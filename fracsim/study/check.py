@@ -13,9 +13,8 @@ import numpy as np
 from ..errors import InputError
 from ..mesh.connected_bodies import not_held
 from ..mesh.selectors import Group, Selector, check_group, check_regions
-from ..meshes.data import MeshData
+from ..meshes.data import AXES, MeshData
 from ..meshes.parameters import MAX_CELLS
-from ..meshes.text import AXES
 from . import Study
 from .check_limits import LIMITS
 from .check_report import report_lines

@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..mechanics.time_functions import TabulatedFunction, TimeFunction, Values, constant_function
 from ..mesh.crack_planes import CrackPlane, plane, polygon, segment
 from ..mesh.selectors import Group, PointsInBox, PointsOnPlane, Selector
-from ..meshes.text import AXES
+from ..meshes.data import AXES
 from . import (
     MOTIONS,
     BoundarySettings,

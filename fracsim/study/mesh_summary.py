@@ -11,8 +11,7 @@ import numpy as np
 
 from ..errors import InputError
 from ..mesh.connected_bodies import label_bodies
-from ..meshes.data import MeshData, MeshError
-from ..meshes.text import format_point
+from ..meshes.data import MeshData, MeshError, format_point
 from ..meshes.topology import boundary_facets, edges_of, signed_measures
 from . import Study
 from .check_limits import LIMITS

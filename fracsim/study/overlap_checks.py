@@ -15,8 +15,7 @@ from ..contact.obstacle import find_overlaps, free_pairs
 from ..contact.pose import Pose, PosedShape
 from ..contact.shapes import SHAPES, Shape
 from ..errors import InputError
-from ..meshes.data import MeshData
-from ..meshes.text import format_point
+from ..meshes.data import MeshData, format_point
 from ..meshes.topology import boundary_facets, edges_of
 from .check_limits import LIMITS
 from .conditions import ObstaclePlacement, obstacle_placements

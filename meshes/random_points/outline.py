@@ -7,9 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..components import components
 from ..data import Indices, MeshError, Points
-from ..topology import Mask, distinct_rows, facets_of, signed_measures
+from ..topology import Mask, components, distinct_rows, facets_of, signed_measures
 
 ROUNDS = 40  # most times that pieces are halved before the outline is given up
 FLAT = 1e-9  # area over squared longest edge of the triangles between points of one straight line: they are no cells

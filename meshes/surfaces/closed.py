@@ -7,12 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..components import components
-from ..data import Indices, MeshError, Points
+from ..data import Indices, MeshError, Points, format_midpoint
 from ..mesh_conversion import Block
 from ..parameters import LONGEST, SHORTEST
-from ..text import format_midpoint
-from ..topology import Floats, Mask
+from ..topology import Floats, Mask, components
 from .enclosed import enclosed_volumes, winding_numbers
 from .mending import EdgeTable, areas, has_no_area, mend_open_surface, mended
 from .polygons import triangles_of_faces

@@ -11,9 +11,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..components import components
 from ..data import Indices, Points
-from ..topology import Floats, Mask, distinct_rows
+from ..topology import Floats, Mask, components, distinct_rows
 
 JOINED = 1e-6  # points nearer than this share of the surface's size are one
 JOINED_OPEN = 2e-5  # the same where a surface is open otherwise, and no triangle collapses by it

@@ -13,11 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ..components import components
-from ..data import Indices, MeshError, Points
-from ..text import format_midpoint
+from ..data import Indices, MeshError, Points, format_midpoint
 from ..time_limit import ProcessDiedError, within
-from ..topology import Mask, distinct_rows
+from ..topology import Mask, components, distinct_rows
 from .closed import (
     ClosedSurface,
     RepairableSurfaceError,

@@ -19,9 +19,8 @@ from scipy.sparse import csr_matrix
 
 from ...mesh.input_topology import MeshTopology
 from ...mesh.simplices import is_split, local_edges
-from ...meshes.components import components
 from ...meshes.data import MeshData
-from ...meshes.topology import signed_measures
+from ...meshes.topology import components, signed_measures
 
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]

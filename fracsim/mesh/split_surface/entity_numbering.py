@@ -8,9 +8,8 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from ...meshes.components import components
 from ...meshes.data import MeshData
-from ...meshes.topology import distinct_rows, facets_of
+from ...meshes.topology import components, distinct_rows, facets_of
 from ..input_topology import MeshTopology
 
 Ints = npt.NDArray[np.int64]
