@@ -59,7 +59,7 @@ bench:
 
 # Seconds per step of the nine scenes of Mandal et al. (2022), table 2; hours. `make table small=1`: a third of the cells.
 table:
-	./env python3 -m fracsim.studies.table -o out/table --ranks $(ranks) $(if $(small),--small --limit 60)
+	./env python3 -m fracsim.studies.paper_table -o out/table --ranks $(ranks) $(if $(small),--small --limit 60)
 
 # The evidence: short trials in under 15 minutes on two cores, or all of them. What has been run is not run again.
 report:

@@ -30,7 +30,7 @@ EVENTS = {
 OPTIONS: dict[str, Any] = {"snes_type": "ksponly", "ksp_rtol": 1e-6}
 
 
-def study(n: int) -> dict[str, Any]:
+def bench_study(n: int) -> dict[str, Any]:
     """The scene with n cells along a metre: 24 n^3 tetrahedra. It is never stressed enough to break."""
     return {
         "title": f"bench {24 * n**3} tetrahedra",
@@ -48,7 +48,7 @@ def study(n: int) -> dict[str, Any]:
 # --- one case, run under mpirun -------------------------------------------------------------------------------------
 
 
-def case(n: int, bare: bool) -> dict[str, Any]:
+def run_case(n: int, bare: bool) -> dict[str, Any]:
     """Figures of one box on the ranks of this process (collective)."""
     import numpy as np
     from mpi4py import MPI
@@ -61,16 +61,16 @@ def case(n: int, bare: bool) -> dict[str, Any]:
     PETSc.Log.begin()
     comm = MPI.COMM_WORLD
     with tempfile.TemporaryDirectory() as folder:
-        run = Run(build_scene(comm, validate(study(n), "bench")), Path(comm.bcast(folder)))
-        loop = Bare(n, run.scene.domain) if bare else None
+        run = Run(build_scene(comm, validate(bench_study(n), "bench")), Path(comm.bcast(folder)))
+        loop = BareLoop(n, run.scene.domain) if bare else None
         stage = PETSc.Log.Stage("fracsim")
         times: dict[str, list[float]] = {name: [] for name in ("step", "bare", "fracture", *EVENTS)}
         for _ in range(WARM + STEPS):
             _timed_step(run, stage, times)
             if loop is not None:
-                times["bare"].append(timed(comm, loop.step))
+                times["bare"].append(time_call(comm, loop.step))
         figures = {name: float(np.median(values[WARM:])) for name, values in times.items() if values}
-        figures["output"] = timed(comm, run.write_frame)
+        figures["output"] = time_call(comm, run.write_frame)
         figures["after_fracture"] = _after_fracture(run, stage)
     memory = comm.allreduce(_peak_memory())
     return {"tetrahedra": 24 * n**3, "ranks": comm.size, "peak_memory_GiB": memory, **figures}
@@ -83,14 +83,14 @@ def _timed_step(run: Any, stage: Any, times: dict[str, list[float]]) -> None:
     before = {name: event.getPerfInfo(stage)["time"] for name, event in events.items()}
     fracture = run.scene.stepper.phases["fracture"]
     stage.push()
-    times["step"].append(timed(run.comm, run.step))
+    times["step"].append(time_call(run.comm, run.step))
     stage.pop()
     for name, event in events.items():
         times[name].append(event.getPerfInfo(stage)["time"] - before[name])
     times["fracture"].append(run.scene.stepper.phases["fracture"] - fracture)
 
 
-def break_now(run: Any, flags: Any) -> None:
+def break_edges(run: Any, flags: Any) -> None:
     """Break the flagged edges, and what follows from it, as the fracture pass does (collective)."""
     fracture = run.scene.fracture
     fracture.graph.break_edges(flags)
@@ -107,14 +107,14 @@ def _after_fracture(run: Any, stage: Any) -> float:
     """Median step once every edge is broken."""
     import numpy as np
 
-    break_now(run, np.ones(len(run.scene.fracture.graph.broken), bool))
+    break_edges(run, np.ones(len(run.scene.fracture.graph.broken), bool))
     times: dict[str, list[float]] = {name: [] for name in ("step", "fracture", *EVENTS)}
     for _ in range(WARM + STEPS):
         _timed_step(run, stage, times)
     return float(np.median(times["step"][WARM:]))
 
 
-def timed(comm: Any, work: Any) -> float:
+def time_call(comm: Any, work: Any) -> float:
     comm.Barrier()
     began = time.perf_counter()
     work()
@@ -128,7 +128,7 @@ def _peak_memory() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
 
 
-class Bare:
+class BareLoop:
     """Assemble, solve, move on: the same scene in DOLFINx and PETSc alone."""
 
     def __init__(self, n: int, domain: Any, *, records: bool = False, in_lanes: bool = False) -> None:
@@ -147,7 +147,7 @@ class Bare:
         from ..solvers.preconditioner import GAMG_OPTIONS
         from ..solvers.tangent_operators import near_nullspace
 
-        scene = study(n)
+        scene = bench_study(n)
         V, mesh = domain.space, domain.mesh
         self.dt, self.petsc, self.fem_petsc, self.PETSc = scene["time"]["step"], fem_petsc, fem_petsc, PETSc
         self.u, self.g = fem.Function(V), fem.Function(V)
@@ -224,7 +224,7 @@ class Bare:
 # --- all cases ------------------------------------------------------------------------------------------------------
 
 
-def launch(n: int, ranks: int, bare: bool) -> dict[str, Any]:
+def launch_case(n: int, ranks: int, bare: bool) -> dict[str, Any]:
     """Run one case in processes of its own."""
     command = ["mpirun", "-n", str(ranks), sys.executable, "-m", "fracsim.studies.bench", "--case", str(n)]
     output = subprocess.run(
@@ -235,7 +235,7 @@ def launch(n: int, ranks: int, bare: bool) -> dict[str, Any]:
     return result
 
 
-def table(cases: list[dict[str, Any]]) -> str:
+def format_table(cases: list[dict[str, Any]]) -> str:
     """The figures on screen: seconds, then ratios."""
     parts = ("step", "bare", *EVENTS, "fracture", "output", "after_fracture")
     ratios = {
@@ -266,20 +266,20 @@ def main() -> None:
     if given.case is not None:
         from mpi4py import MPI
 
-        figures = case(given.case, given.bare)
+        figures = run_case(given.case, given.bare)
         if MPI.COMM_WORLD.rank == 0:
             print(json.dumps(figures), flush=True)
         return
     cases = []
     for n in given.boxes:
         for ranks in given.ranks:
-            row = launch(n, ranks, bare=True)
-            row["peak_memory_GiB"] = launch(n, ranks, bare=False)["peak_memory_GiB"]  # of the program alone
+            row = launch_case(n, ranks, bare=True)
+            row["peak_memory_GiB"] = launch_case(n, ranks, bare=False)["peak_memory_GiB"]  # of the program alone
             cases.append(row)
-            print(table([row]), flush=True)
+            print(format_table([row]), flush=True)
     given.out.parent.mkdir(parents=True, exist_ok=True)
     given.out.write_text(json.dumps(cases, indent=2) + "\n")
-    print(f"\nseconds per step, medians of {STEPS} steps (table in {given.out})\n{table(cases)}")
+    print(f"\nseconds per step, medians of {STEPS} steps (table in {given.out})\n{format_table(cases)}")
 
 
 if __name__ == "__main__":

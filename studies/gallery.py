@@ -32,7 +32,7 @@ on one rank; pieces are those in the end, and none is a single node but where it
 
 
 @dataclass(frozen=True)
-class Entry:
+class GalleryEntry:
     """A picture.
 
     Attributes:
@@ -48,9 +48,9 @@ class Entry:
     film: bool = False
 
 
-def one(study: str, text: str, render: str) -> Entry:
+def packaged_entry(study: str, text: str, render: str) -> GalleryEntry:
     """A picture of a study as it comes."""
-    return Entry(study, text, ((study, study),), render)
+    return GalleryEntry(study, text, ((study, study),), render)
 
 
 CUTS = "--set mesh.h=0.012 --set time.end=0.2 --set output.cut="
@@ -60,88 +60,93 @@ NVE36 = (
 )
 AVERAGED = "doormat --set fracture.radius=0.05 --set fracture.strength=2e5 --set time.step=4e-4"
 ENTRIES = (
-    one("loaf", "A loaf of bread, held by its two ends and torn.", "--sheet 0,14,18,-1 --floor"),
-    Entry(
+    packaged_entry("loaf", "A loaf of bread, held by its two ends and torn.", "--sheet 0,14,18,-1 --floor"),
+    GalleryEntry(
         "cuts", "Edges cut in the middle, by nodal forces, and so that the crack is smooth (M22 fig. 12).",
         tuple((f"cut-{item}", f"loaf {CUTS}{item}") for item in ("middle", "forces", "smooth")),
         "--view 1.1,-1.0,0.5 --size 1400x1100",
     ),
-    Entry(
+    GalleryEntry(
         "loaf-frames", "The loaf as it tears, from left to right and down (M22 fig. 13).", (("loaf", "loaf"),),
         "--sheet 4,12,14,16,18,20,24,29,-1 --floor --size 1200x800",
     ),
-    one("bread", "Bread that flows before it tears (M22 fig. 15).", "--sheet 0,36,48,-1 --floor"),
-    one("bar-2d", "Stress in a strip pulled apart.", "--field stress:xx --sheet 15,30 --size 1600x700"),
-    Entry(
+    packaged_entry("bread", "Bread that flows before it tears (M22 fig. 15).", "--sheet 0,36,48,-1 --floor"),
+    packaged_entry("bar-2d", "Stress in a strip pulled apart.", "--field stress:xx --sheet 15,30 --size 1600x700"),
+    GalleryEntry(
         "bar-2d-stress", "Shear stress as it tears: fading energy, and strain projected on intact edges (M22 fig. 9).",
         (("bar-chi", "bar-2d --set time.end=0.11"),
          ("bar-edge", "bar-2d --set time.end=0.096 --set material.energy=linear --set fracture.approach=edge")),
         "--field stress:xy --size 1100x600",
     ),
-    one("notched-bar", "A bar bent over its notch, displacements ten times as large.", "--magnify 10"),
-    one("cylinder", "Granite snapped beside its grips, cracks as lines that hardly open.", "--view 0.6,-1.6,0.5"),
-    Entry(
+    packaged_entry("notched-bar", "A bar bent over its notch, displacements ten times as large.", "--magnify 10"),
+    packaged_entry("cylinder", "Granite snapped beside its grips, cracks as lines that hardly open.",
+                   "--view 0.6,-1.6,0.5"),
+    GalleryEntry(
         "doormat", "A doormat torn by a local criterion, and by stress averaged over 5 cm (M22 fig. 6).",
         (("doormat", "doormat"), ("doormat-averaged", AVERAGED)), "--view=-1.2,-0.5,0.35 --size 900x700",
     ),
-    one("jelly-figure", "A figure of jelly pulled by its limbs: before and after.", "--sheet 0,-1 --view 0.3,-1.6,0.4"),
-    one("struck-figure", "A figure of jade, struck on its chest; pieces moved apart.", "--field piece --explode 0.2"),
-    one("struck-vase", "A porcelain vase, struck on its belly: at most 150 surfaces.", "--floor"),
-    Entry(
+    packaged_entry("jelly-figure", "A figure of jelly pulled by its limbs: before and after.",
+                   "--sheet 0,-1 --view 0.3,-1.6,0.4"),
+    packaged_entry("struck-figure", "A figure of jade, struck on its chest; pieces moved apart.",
+                   "--field piece --explode 0.2"),
+    packaged_entry("struck-vase", "A porcelain vase, struck on its belly: at most 150 surfaces.", "--floor"),
+    GalleryEntry(
         "vase-50-150-300", "At most 50, 150 and 300 surfaces (M22 fig. 16).",
         (("vase-50", "struck-vase --set brittle.surfaces=50"), ("struck-vase", "struck-vase"),
          ("vase-300", "struck-vase --set brittle.surfaces=300")), "--size 700x700",
     ),
-    one("wall", "A wall of adobe, struck and broken along its grains.", "--view 0.5,-1.6,0.5 --floor"),
-    one("hammered-vase", "The vase on a table, struck by a ball.", "--view 0.55,-1.2,0.35 --floor"),
-    one("dropped-vase", "A vase dropped on a table that stands aslant.", "--view 0.4,-1.5,0.3"),
-    one("platens", "The Brazilian test by edges, by piece.", "--field piece"),
-    one("bent-bar", "A bar of glass, struck over two anvils.", "--view 0.3,-1.6,0.25"),
-    one("hammered-figure", "A figure of jade, a hammer in its belly.", "--view 0.75,-1.2,0.35"),
-    Entry(
+    packaged_entry("wall", "A wall of adobe, struck and broken along its grains.", "--view 0.5,-1.6,0.5 --floor"),
+    packaged_entry("hammered-vase", "The vase on a table, struck by a ball.", "--view 0.55,-1.2,0.35 --floor"),
+    packaged_entry("dropped-vase", "A vase dropped on a table that stands aslant.", "--view 0.4,-1.5,0.3"),
+    packaged_entry("platens", "The Brazilian test by edges, by piece.", "--field piece"),
+    packaged_entry("bent-bar", "A bar of glass, struck over two anvils.", "--view 0.3,-1.6,0.25"),
+    packaged_entry("hammered-figure", "A figure of jade, a hammer in its belly.", "--view 0.75,-1.2,0.35"),
+    GalleryEntry(
         "punched-slab", "A ball shot through a slab of metal, from below.",
         (("punched-slab", "punched-slab --set mesh.h=0.008"),), "--view=0.5,-1.1,-0.45",
     ),
-    one("table-loaf", "A loaf torn over a table, and chunks that fell on it.", "--view 0.35,-1.3,0.45"),
-    one("bowl", "Fifty stones in a bowl.", "--view 0.3,-1.0,0.9"),
-    one(
+    packaged_entry("table-loaf", "A loaf torn over a table, and chunks that fell on it.", "--view 0.35,-1.3,0.45"),
+    packaged_entry("bowl", "Fifty stones in a bowl.", "--view 0.3,-1.0,0.9"),
+    packaged_entry(
         "rigid-wall", "A wall of adobe as rigid bodies, from behind, 40, 120 and 240 ms after a ball set out.",
         "--view 0.6,1.4,0.5 --sheet 1,3,6 --floor",
     ),
-    one("rigid-slab", "A slab of metal shot through, rigid.", "--view 0.5,-1.1,0.6 --sheet 1,3,8"),
-    one("rigid-rods", "Rods of steel, bent and dented.", "--sheet 0,5,-1 --floor --view 0.25,-1.3,0.45"),
-    one("rigid-vase", "A vase dropped on a floor, after 0, 40, 100 and 200 ms.", "--sheet 0,4,10,-1 --floor"),
-    Entry(
+    packaged_entry("rigid-slab", "A slab of metal shot through, rigid.", "--view 0.5,-1.1,0.6 --sheet 1,3,8"),
+    packaged_entry("rigid-rods", "Rods of steel, bent and dented.", "--sheet 0,5,-1 --floor --view 0.25,-1.3,0.45"),
+    packaged_entry("rigid-vase", "A vase dropped on a floor, after 0, 40, 100 and 200 ms.",
+                   "--sheet 0,4,10,-1 --floor"),
+    GalleryEntry(
         "rigid-vase-film", "The same as a film, twenty times as slow.", (("rigid-vase", "rigid-vase"),),
         "--floor --size 520x340 --fps 5", film=True,
     ),
-    one(
+    packaged_entry(
         "rigid-figure", "A jade figure thrown at a wall, after 20, 60 and 100 ms.",
         "--sheet 1,3,5 --view=-1,-1.2,0.6 --floor",
     ),
-    one("rigid-ornament", "A glass ball, a shell, dropped on its neck.", "--sheet 0,2,8,-1 --floor"),
-    one("rigid-ornaments", "Eighteen of them, closed.", "--sheet 0,2,-1 --floor --view 0.9,-1.3,0.6"),
-    one("rigid-boats", "Rowing boats dropped in a heap.", "--sheet 0,6,-1 --floor --view 0.9,-1.3,0.6"),
-    Entry(
+    packaged_entry("rigid-ornament", "A glass ball, a shell, dropped on its neck.", "--sheet 0,2,8,-1 --floor"),
+    packaged_entry("rigid-ornaments", "Eighteen of them, closed.", "--sheet 0,2,-1 --floor --view 0.9,-1.3,0.6"),
+    packaged_entry("rigid-boats", "Rowing boats dropped in a heap.", "--sheet 0,6,-1 --floor --view 0.9,-1.3,0.6"),
+    GalleryEntry(
         "rigid-beside", "The same vase dropped as a body that deforms, after 1 ms, and as a rigid one, after 32 ms.",
         (("dropped-vase", "dropped-vase"), ("rigid-dropped-vase", "rigid-dropped-vase")),
         "--frame 16 --field piece --view 0.4,-1.5,0.3 --size 1100x800",
     ),
-    Entry(
+    GalleryEntry(
         "rigid-trials", "A bar cracked by snapshots of a penalty, strained by three pins; strain of rotations.", (),
         "fracsim.studies.rigid_trials",
     ),
-    one("brazilian", "A disk of granite split between platens.", "--field stress:xx"),
-    one("granite-cylinder", "A cylinder of granite split between platens: as its load falls, and in the end.",
+    packaged_entry("brazilian", "A disk of granite split between platens.", "--field stress:xx"),
+    packaged_entry("granite-cylinder",
+                   "A cylinder of granite split between platens: as its load falls, and in the end.",
         "--sheet=-13,-1 --view top --magnify 20 --size 1400x700"),
-    Entry(
+    GalleryEntry(
         "steels", "Charpy and Izod bars of steel A516 at -40 C, which snap, and of NVE 36 at 23 C, which bend.",
         (("charpy-A516", "charpy"), ("charpy-NVE36", f"charpy {NVE36}"),
          ("izod-A516", "izod"), ("izod-NVE36", f"izod {NVE36}")), "--size 1400x600",
     ),
-    one("kalthoff", "A plate of steel struck below its notch: stress upwards.", "--field stress:yy"),
-    one("l-panel", "What a cracked panel of concrete still holds.", "--field chi --magnify 40"),
-    one("branching", "A pane of glass whose crack branches.", "--view top --field piece"),
+    packaged_entry("kalthoff", "A plate of steel struck below its notch: stress upwards.", "--field stress:yy"),
+    packaged_entry("l-panel", "What a cracked panel of concrete still holds.", "--field chi --magnify 40"),
+    packaged_entry("branching", "A pane of glass whose crack branches.", "--view top --field piece"),
 )  # fmt: skip
 
 
@@ -157,32 +162,34 @@ def main() -> None:
     wanted = [entry for entry in ENTRIES if not asked.names or entry.name in asked.names]
     runs = dict(run for entry in wanted for run in entry.runs)
     with ThreadPoolExecutor(asked.jobs) as pool:
-        list(pool.map(lambda run: simulate(*run, again=asked.again), runs.items()))
-        list(pool.map(draw, wanted))
-    PAGE.write_text(HEAD + "".join(text_of(entry) for entry in ENTRIES if picture_of(entry).exists()), encoding="utf-8")
+        list(pool.map(lambda run: run_study(*run, again=asked.again), runs.items()))
+        list(pool.map(draw_picture, wanted))
+    PAGE.write_text(
+        HEAD + "".join(page_section(entry) for entry in ENTRIES if picture_path(entry).exists()), encoding="utf-8"
+    )
     for folder in runs:
-        count, single = pieces_of(RUNS / folder)
+        count, single = count_fragments(RUNS / folder)
         if single > MOST_SINGLE * count:
             sys.exit(f"{folder}: {single} of {count} pieces are single nodes, more than {MOST_SINGLE:.0%}")
 
 
-def simulate(folder: str, arguments: str, *, again: bool) -> None:
+def run_study(folder: str, arguments: str, *, again: bool) -> None:
     """A run, where there is none that has ended."""
     if again or not has_ended(RUNS / folder):
         command = ["fracsim", "run", *shlex.split(arguments), "-o", str(RUNS / folder), "--overwrite"]
         subprocess.run([*command, "--set", "output.picture=false"], check=True)
 
 
-def draw(entry: Entry) -> None:
+def draw_picture(entry: GalleryEntry) -> None:
     """Its picture."""
-    target = picture_of(entry)
+    target = picture_path(entry)
     if entry.runs:
         folders = [str(RUNS / folder) for folder, _ in entry.runs]
         subprocess.run(["fracsim", "render", *folders, "-o", str(target), *shlex.split(entry.render)], check=True)
     else:
         subprocess.run([sys.executable, "-m", entry.render, str(target)], check=True)
     if not entry.film:
-        make_small(target)
+        reduce_colours(target)
 
 
 def has_ended(folder: Path) -> bool:
@@ -193,7 +200,7 @@ def has_ended(folder: Path) -> bool:
         return False
 
 
-def make_small(path: Path) -> None:
+def reduce_colours(path: Path) -> None:
     """In 256 colours where it is larger than LARGEST."""
     from PIL import Image
 
@@ -203,25 +210,25 @@ def make_small(path: Path) -> None:
         small.save(path, optimize=True)
 
 
-def picture_of(entry: Entry) -> Path:
+def picture_path(entry: GalleryEntry) -> Path:
     """Beside the page."""
     return PAGE.parent / "gallery" / f"{entry.name}.{'gif' if entry.film else 'png'}"
 
 
-def text_of(entry: Entry) -> str:
+def page_section(entry: GalleryEntry) -> str:
     """Its part of the page."""
     lines = [f"    ./env fracsim run {arguments} -o {RUNS / folder}" for folder, arguments in entry.runs]
     folders = " ".join(str(RUNS / folder) for folder, _ in entry.runs)
-    file = picture_of(entry).name
+    file = picture_path(entry).name
     last = f"python3 -m {entry.render} {file}"
     if entry.runs:
         last = f"fracsim render {folders} {entry.render}" + (f" -o {file}" if entry.film else "")
     body = "\n".join([*lines, f"    ./env {last}"])
-    said = f"{entry.text} {figures(entry)}".rstrip()
+    said = f"{entry.text} {run_figures(entry)}".rstrip()
     return f"## {entry.name}\n\n![{entry.text}](gallery/{file})\n\n{said}\n\n{body}\n\n"
 
 
-def figures(entry: Entry) -> str:
+def run_figures(entry: GalleryEntry) -> str:
     """Seconds and pieces of its runs; what the page has of them where they are not all here."""
     folders = [RUNS / folder for folder, _ in entry.runs]
     if not all(map(has_ended, folders)):
@@ -230,12 +237,12 @@ def figures(entry: Entry) -> str:
         results = re.search(r" (\d+ s[.;].*)$", of_it, re.MULTILINE)
         return results[1] if results else ""
     seconds = sum(json.loads((folder / "summary.json").read_text(encoding="utf-8"))["cpu"] for folder in folders)
-    counts = [pieces_of(folder) for folder in folders]
+    counts = [count_fragments(folder) for folder in folders]
     parts = ", ".join(f"{count} ({single} of one node)" if single else str(count) for count, single in counts if count)
     return (f"{seconds:.0f} s" + (f"; pieces: {parts}" if parts else "") + ".") if entry.runs else ""
 
 
-def pieces_of(folder: Path) -> tuple[int, int]:
+def count_fragments(folder: Path) -> tuple[int, int]:
     """Pieces in the end of a run that has broken, and those of a single node."""
     path = folder / "pieces.csv"
     rows = list(csv.DictReader(path.open(encoding="utf-8"))) if path.exists() else []

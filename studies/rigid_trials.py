@@ -26,15 +26,15 @@ from ..scene.rigid_scene import build_rigid_scene
 from ..study import Study
 
 Values = npt.NDArray[np.float64]
-STEPS = (4e-4, 2e-4, 1e-4, 5e-5)  # s
-SPEED, MASS, RATE = 4.0, 48.0, 2e8  # m/s, kg; N/m of the penalty
-SIZE = (0.6, 0.2, 0.2)  # m
-PUSH = 1e4  # N
+TIME_STEPS = (4e-4, 2e-4, 1e-4, 5e-5)  # s
+IMPACT_SPEED, MASS, PENALTY = 4.0, 48.0, 2e8  # m/s, kg; N/m of the penalty
+BAR_SIZE = (0.6, 0.2, 0.2)  # m
+END_FORCE = 1e4  # N
 ANGLES = np.radians([1, 3, 10, 30, 60])
-CORNER = np.array([[0.0, 0.1, 0.0]])  # where the bar comes down, its middle a quarter of its length off
-TABLES = {
+IMPACT_POINT = np.array([[0.0, 0.1, 0.0]])  # where the bar comes down, its middle a quarter of its length off
+BAR_STUDY = {
     "title": "A bar that comes down askew",
-    "mesh": {"builder": "box", "size": list(SIZE), "h": 0.05},
+    "mesh": {"builder": "box", "size": list(BAR_SIZE), "h": 0.05},
     "material": {"energy": "linear", "young": 1e10, "poisson": 0.2, "density": 2000.0},
     "fracture": {"strength": 2.5e6, "kernel": "neighbours"},
     "brittle": {"surfaces": 12},
@@ -42,37 +42,37 @@ TABLES = {
 }
 
 
-def bar() -> BreakableBody:
+def falling_bar() -> BreakableBody:
     """Whole, as the scheme has it."""
-    scene = build_rigid_scene(Study.model_validate(TABLES), MPI.COMM_SELF)
+    scene = build_rigid_scene(Study.model_validate(BAR_STUDY), MPI.COMM_SELF)
     return scene.stepper.instances.get(0)
 
 
-def crack(force: float) -> npt.NDArray[np.bool_]:
+def broken_edges(force: float) -> npt.NDArray[np.bool_]:
     """(edges,) which break under a push (N) upwards at the corner."""
-    body = bar()
-    body.break_fragments(0, body.distribute_forces(0, CORNER, np.array([[0.0, 0.0, force]])))
+    body = falling_bar()
+    body.break_fragments(0, body.distribute_forces(0, IMPACT_POINT, np.array([[0.0, 0.0, force]])))
     return body.graph.broken.copy()
 
 
-def snapshot(step: float, gap: float = 3e-5) -> float:
+def penalty_force(step: float, gap: float = 3e-5) -> float:
     """Force of the penalty at the end of the first step in which the bar, a gap above the floor, is in touch, N."""
     depth = -gap
     while depth <= 0:
-        depth += SPEED * step
-    return RATE * depth
+        depth += IMPACT_SPEED * step
+    return PENALTY * depth
 
 
-def blow() -> float:
+def impulse_force() -> float:
     """J / tau of the same spring: it gives m v twice over pi sqrt(m / k)."""
-    return float(2 * MASS * SPEED / (np.pi * np.sqrt(MASS / RATE)))
+    return float(2 * MASS * IMPACT_SPEED / (np.pi * np.sqrt(MASS / PENALTY)))
 
 
-def stresses() -> tuple[Values, Values, Values]:
+def bar_stresses() -> tuple[Values, Values, Values]:
     """Places x (cells,) along the bar, m, and the largest principal stress (cells,) with inertia relief and with
     pins, Pa."""
-    body = bar()
-    loads = body.distribute_forces(0, np.array([[0.0, 0.1, 0.1]]), np.array([[PUSH, 0.0, 0.0]]))
+    body = falling_bar()
+    loads = body.distribute_forces(0, np.array([[0.0, 0.1, 0.1]]), np.array([[END_FORCE, 0.0, 0.0]]))
     domain, free = body.graph.domain, body._stiffness.whole_body()
     force = loads.nodal_forces(len(domain.nodes))
     share = np.ones(domain.cell_count)
@@ -118,36 +118,36 @@ def solve_pinned(matrix: PETSc.Mat, nodes: Values, force: Values) -> Values:
     return np.asarray(u).reshape(nodes.shape)
 
 
-def turned() -> tuple[Values, Values]:
+def rotation_strains() -> tuple[Values, Values]:
     """1 - cos a, the linear strain of a true rotation; sqrt(1 + a^2) - 1, by which a linearised one stretches."""
     return np.asarray(1 - np.cos(ANGLES)), np.asarray(np.hypot(1, ANGLES) - 1)
 
 
 def main() -> None:
     """The figures, and the picture where one is asked for."""
-    true = crack(blow())
-    pushes = [snapshot(step) for step in STEPS]
-    cracks = [crack(push) for push in pushes]
-    print(f"blow: {blow():.3g} N, {true.sum()} edges broken, at any step")
-    for step, push, item in zip(STEPS, pushes, cracks, strict=True):
+    true = broken_edges(impulse_force())
+    pushes = [penalty_force(step) for step in TIME_STEPS]
+    cracks = [broken_edges(push) for push in pushes]
+    print(f"blow: {impulse_force():.3g} N, {true.sum()} edges broken, at any step")
+    for step, push, item in zip(TIME_STEPS, pushes, cracks, strict=True):
         alike = (item & true).sum() / max((item | true).sum(), 1)
         print(f"snapshot at {step:g} s: {push:.3g} N, {item.sum()} edges broken, {alike:.0%} of both alike")
-    x, relieved, held = stresses()
-    far = x > SIZE[0] / 2
+    x, relieved, held = bar_stresses()
+    far = x > BAR_SIZE[0] / 2
     print(f"far from the push: at most {relieved[far].max():.3g} Pa with relief, {held[far].max():.3g} Pa with pins")
-    for angle, strain, swell in zip(ANGLES, *turned(), strict=True):
+    for angle, strain, swell in zip(ANGLES, *rotation_strains(), strict=True):
         print(f"turned by {np.degrees(angle):.0f} degrees: strain {strain:.2g}; linearised: {swell:.2g} longer")
     if len(sys.argv) > 1:
-        draw(Path(sys.argv[1]), [int(item.sum()) for item in cracks], int(true.sum()), (x, relieved, held))
+        draw_picture(Path(sys.argv[1]), [int(item.sum()) for item in cracks], int(true.sum()), (x, relieved, held))
 
 
-def draw(path: Path, snapshots: list[int], true: int, stress: tuple[Values, Values, Values]) -> None:
+def draw_picture(path: Path, snapshots: list[int], true: int, stress: tuple[Values, Values, Values]) -> None:
     """Three panels."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 3.4), layout="constrained")
     first, second, third = figure.subplots(1, 3)
-    first.bar([f"{1e3 * step:g}" for step in STEPS], snapshots, color="#b0835c")
+    first.bar([f"{1e3 * step:g}" for step in TIME_STEPS], snapshots, color="#b0835c")
     first.axhline(true, color="#222222", label="blow, any step")
     first.set(
         ylim=(0, 1.3 * max(*snapshots, true)),
@@ -159,7 +159,7 @@ def draw(path: Path, snapshots: list[int], true: int, stress: tuple[Values, Valu
     second.semilogy(x, held, ".", ms=3, color="#b0835c", label="three points pinned")
     second.semilogy(x, relieved, ".", ms=3, color="#222222", label="inertia relief")
     second.set(xlabel="x / m", ylabel="largest principal stress, size, Pa", title="Pushed at x = 0", ylim=(1e2, None))
-    strain, swell = turned()
+    strain, swell = rotation_strains()
     third.loglog(np.degrees(ANGLES), strain, "o-", color="#b0835c", label="linear strain of a rotation")
     third.loglog(np.degrees(ANGLES), swell, "s--", color="#222222", label="stretch of a linearised one")
     third.set(xlabel="angle / degrees", title="Rotations and linear strain")

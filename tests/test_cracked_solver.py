@@ -19,7 +19,7 @@ from fracsim.scene import Scene, build_scene
 from fracsim.solvers import preconditioner
 from fracsim.solvers.nonlinear_solver import NonlinearSolver
 from fracsim.solvers.policy import DEFAULT_POLICY
-from fracsim.studies.evidence.growth import random_planes
+from fracsim.studies.evidence.crack_count_cost import random_planes
 from support.scenes import Walk
 from support.solver_policy import set_policy
 

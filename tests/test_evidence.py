@@ -17,10 +17,23 @@ from fracsim.mesh.simplices import local_edges, node_groups
 from fracsim.meshes.builders.box import lattice
 from fracsim.meshes.topology import facets_of, signed_measures
 from fracsim.studies.evidence import __main__ as program
-from fracsim.studies.evidence import faces, growth, ladder, solvers, steps
-from fracsim.studies.evidence.section import Point, Section, fitted_order, pareto_front, recommended, timed
+from fracsim.studies.evidence import (
+    crack_count_cost,
+    feature_cost,
+    fracture_step_cost,
+    self_contact_cost,
+    solver_comparison,
+)
+from fracsim.studies.evidence.report_section import (
+    CostPoint,
+    Section,
+    cheapest_point,
+    fitted_order,
+    median_and_half_range,
+    pareto_front,
+)
 from fracsim.studies.evidence.trial import Trial
-from fracsim.studies.evidence.virtual_nodes import Duplicated, duplicate
+from fracsim.studies.evidence.virtual_nodes import DuplicatedMesh, duplicate_cut_cells
 from fracsim.study.check import build_mesh
 from fracsim.study.reader import validate
 
@@ -58,15 +71,15 @@ def test_the_order_is_that_of_least_squares() -> None:
 
 @given(POINTS, st.integers(0, 6))
 def test_the_recommended_setting_is_the_cheapest_that_is_good_enough(points: list[tuple[int, int]], limit: int) -> None:
-    given_ = [Point(float(a), float(b)) for a, b in points]
-    found = recommended(given_, limit)
+    given_ = [CostPoint(float(a), float(b)) for a, b in points]
+    found = cheapest_point(given_, limit)
     good = [point for point in given_ if point.error <= limit]
     assert (found is None) == (not good)
     assert found is None or (found in good and all(found.cost <= point.cost for point in good))
 
 
 def test_timings_are_medians_with_half_their_range() -> None:
-    assert timed([3.0, 1.0, 1.5]) == (1.5, 1.0)
+    assert median_and_half_range([3.0, 1.0, 1.5]) == (1.5, 1.0)
 
 
 # --- virtual nodes --------------------------------------------------------------------------------------------------
@@ -89,7 +102,7 @@ def pieces_of(cells: Any, nodes: int) -> int:
     return int(connected_components(coo_array((np.ones(len(a)), (a, b)), (nodes, nodes)))[0])
 
 
-def check_laws(points: Any, cells: Any, new: Duplicated) -> None:
+def check_laws(points: Any, cells: Any, new: DuplicatedMesh) -> None:
     """What holds for any cut: copies lie where their cell lies, material is neither lost nor made, the mesh is one."""
     np.testing.assert_array_equal(new.node[new.cells], cells[new.cell])
     np.testing.assert_allclose(np.bincount(new.cell, new.share), 1.0, rtol=1e-15)
@@ -103,7 +116,7 @@ def check_laws(points: Any, cells: Any, new: Duplicated) -> None:
 
 def test_a_whole_body_is_left_as_it_is() -> None:
     points, cells = block((3, 2, 2))
-    new = duplicate(cells, np.zeros_like(cells), len(points))
+    new = duplicate_cut_cells(cells, np.zeros_like(cells), len(points))
     np.testing.assert_array_equal(new.node[new.cells], cells)
     assert len(new.node) == len(points) and new.share.min() == 1.0 and len(new.cells) == len(cells)
 
@@ -113,7 +126,7 @@ def test_a_plane_through_doubles_the_nodes_beside_it() -> None:
     cell between them a twin: 3 x 2 cubes of 6 cells."""
     points, cells = block((4, 3, 2))
     groups = groups_after(cells, lambda a, b: (points[a, 0] < 1.5) != (points[b, 0] < 1.5))
-    new = duplicate(cells, groups, len(points))
+    new = duplicate_cut_cells(cells, groups, len(points))
     check_laws(points, cells, new)
     assert len(new.node) == len(points) + 2 * 12
     assert len(new.cells) == len(cells) + 3 * 2 * 6
@@ -128,7 +141,7 @@ def test_a_cut_that_ends_inside_leaves_one_body() -> None:
         across = (points[a, 0] < 1.5) != (points[b, 0] < 1.5)
         return across & (points[a, 1] < 4.5) & (points[b, 1] < 4.5)
 
-    new = duplicate(cells, groups_after(cells, broken), len(points))
+    new = duplicate_cut_cells(cells, groups_after(cells, broken), len(points))
     check_laws(points, cells, new)
     assert pieces_of(new.cells, len(new.node)) == 1
     copies = np.bincount(new.node)
@@ -145,7 +158,7 @@ def test_pieces_are_those_of_the_graph(share: float, seed: int) -> None:
     count = len(points)
     cut = np.random.default_rng(seed).random((count, count)) < share
     cut |= cut.T
-    new = duplicate(cells, groups_after(cells, lambda a, b: cut[a, b]), count)
+    new = duplicate_cut_cells(cells, groups_after(cells, lambda a, b: cut[a, b]), count)
     check_laws(points, cells, new)
     pairs = cells[:, local_edges(3)].reshape(-1, 2)
     a, b = pairs[~cut[pairs[:, 0], pairs[:, 1]]].T
@@ -159,8 +172,8 @@ def test_pieces_are_those_of_the_graph(share: float, seed: int) -> None:
 def test_growth_of_a_small_body(monkeypatch: pytest.MonkeyPatch) -> None:
     """One plane halves the body for both methods; only the baseline has more unknowns for it, and both move alike."""
     mesh = {"builder": "box", "size": [0.6, 0.2, 0.2], "h": 0.1}
-    monkeypatch.setitem(growth.SCENES, "small", mesh)
-    figures = growth.measure("small", [0, 1], baseline=True)
+    monkeypatch.setitem(crack_count_cost.SCENES, "small", mesh)
+    figures = crack_count_cost.measure("small", [0, 1], baseline=True)
     before, after = figures["stages"]
     assert (before["pieces"], after["pieces"]) == (1, 2) and before["broken_edges"] == 0 < after["broken_edges"]
     assert before["unknowns"] == after["unknowns"] == before["baseline_unknowns"] == 3 * figures["nodes"]
@@ -171,7 +184,7 @@ def test_growth_of_a_small_body(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_sections_show_what_failed() -> None:
     """Groups make their sections from records of trials that failed, and say so."""
-    for module in (growth, ladder):
+    for module in (crack_count_cost, feature_cost):
         records = [
             {
                 "group": trial.group, "case": trial.case, "name": trial.name, "settings": trial.settings, "ranks": 1,
@@ -189,7 +202,7 @@ def test_sections_show_what_failed() -> None:
 def test_faces_lie_on_each_other_or_cross_in_edges() -> None:
     """By the height of the lower cube and what of the upper is nearest: a face of it, or an edge of 2 nodes or more."""
     for kind, top, nearest in (("flat", 0.5, 9), ("edge", 0.5**0.5, 3)):
-        x = faces.bodies(kind, 1, 0.1).points
+        x = self_contact_cost.two_cubes(kind, 1, 0.1).points
         lower, upper = x[:8, 2], x[8:, 2]
         assert lower.max() == pytest.approx(top) and upper.min() == pytest.approx(top + 0.1)
         assert (upper < upper.min() + 1e-9).sum() == nearest
@@ -197,27 +210,29 @@ def test_faces_lie_on_each_other_or_cross_in_edges() -> None:
 
 def test_flat_on_flat_is_held_against_edge_on_edge() -> None:
     def record(kind: str, step: float) -> dict[str, Any]:
-        figures = {"triangles": 1, "touching": 1, "newton": 2.0, "step": step} | dict.fromkeys(faces.OF_PAIRS, 1e-3)
+        figures = {"triangles": 1, "touching": 1, "newton": 2.0, "step": step} | dict.fromkeys(
+            self_contact_cost.PAIR_OPERATIONS, 1e-3
+        )
         return {"name": kind, "figures": figures, "outcome": "done", "message": ""}
 
     for step, holds in ((1.2, True), (1.5, False)):
-        section = faces.section([record("flat", step), record("edge", 1.0)])
+        section = self_contact_cost.section([record("flat", step), record("edge", 1.0)])
         assert section.claims[0].holds is holds and len(section.tables[0].rows) == 2
 
 
 def test_modules_of_other_features_are_noticed() -> None:
     edges, average = "fracsim.mesh.edge_graph", "fracsim.fracture.nonlocal_average"
     modules = ["fracsim.run", "fracsim.output.surface", "fracsim.fracture.edge_history", edges, average]
-    assert ladder.strangers("elastic", 10, modules) == sorted(modules[1:])
-    assert ladder.strangers("damage", 10, [edges, average]) == [average]
-    assert ladder.strangers("average", 10, [edges, average]) == []
+    assert feature_cost.unused_feature_modules("elastic", 10, modules) == sorted(modules[1:])
+    assert feature_cost.unused_feature_modules("damage", 10, [edges, average]) == [average]
+    assert feature_cost.unused_feature_modules("average", 10, [edges, average]) == []
 
 
 def test_every_rung_is_a_study() -> None:
     from fracsim.study.reader import validate
 
-    for name in ladder.rungs(4):
-        assert validate(ladder.rung_study(name, 4), name).title.startswith("bench")
+    for name in feature_cost.feature_scenes(4):
+        assert validate(feature_cost.feature_study(name, 4), name).title.startswith("bench")
 
 
 # --- running --------------------------------------------------------------------------------------------------------
@@ -265,7 +280,7 @@ def test_what_a_group_doubts_is_run_again_and_kept(tmp_path: Path) -> None:
         trials = staticmethod(lambda: [Trial("precision", "a", name, script=("json.tool", "--help")) for name in "xy"])
 
         @staticmethod
-        def to_time_again(records: list[dict[str, Any]]) -> set[tuple[str, str]]:
+        def trials_to_repeat(records: list[dict[str, Any]]) -> set[tuple[str, str]]:
             return {("a", "y")} if len(records[1]["wall"]) < 3 else set()
 
     found = program._run("precision", Group, tmp_path, full=False)
@@ -291,23 +306,26 @@ def test_hard_steps_are_held_against_their_bounds() -> None:
     def pane(share: float) -> dict[str, Any]:
         return record("explicit", cells=9000, steps=100, breaking=60, share=share, whole=2.0, all=2.0 * (1 + share))
 
-    quick, slow = (record(name, worst=worst) for name, worst in (("pulled", 1.5), ("bent", 2 * steps.WORST)))
-    collapse, breaking, _ = steps.section([quick, pane(0.9)]).claims
+    quick, slow = (
+        record(name, worst=worst)
+        for name, worst in (("pulled", 1.5), ("bent", 2 * fracture_step_cost.MAX_STEP_SECONDS))
+    )
+    collapse, breaking, _ = fracture_step_cost.section([quick, pane(0.9)]).claims
     assert collapse.holds and collapse.measured == "1.5 s (pulled)"
     assert breaking.holds and breaking.measured.startswith("0.90 of it: 3.8 s beside 2.0 s of 100 steps")
-    collapse, breaking, _ = steps.section([quick, slow, pane(1.1)]).claims
+    collapse, breaking, _ = fracture_step_cost.section([quick, slow, pane(1.1)]).claims
     assert collapse.holds is False and "bent" in collapse.measured and breaking.holds is False
     for share, holds in ((0.04, True), (0.06, False)):
-        *_, waits = steps.section([record("front", cells=192000, steps=60, share=share)]).claims
+        *_, waits = fracture_step_cost.section([record("front", cells=192000, steps=60, share=share)]).claims
         assert waits.holds is holds and waits.measured == f"{share:.1%} of one of 192,000 tetrahedra"
-    assert [claim.holds for claim in steps.section([]).claims] == [None, None, None]
+    assert [claim.holds for claim in fracture_step_cost.section([]).claims] == [None, None, None]
 
 
 def test_scenes_of_hard_steps_are_what_they_are_called() -> None:
     """Lattices of 5,280 triangles with a notch in one, and as many trials as scenes."""
-    for name, data in steps.COLLAPSES.items():
+    for name, data in fracture_step_cost.COLLAPSES.items():
         assert len(build_mesh(validate(data, name).mesh).cells) == 5280
-    assert len({trial.name for trial in steps.trials()}) == len(steps.COLLAPSES) + 2
+    assert len({trial.name for trial in fracture_step_cost.trials()}) == len(fracture_step_cost.COLLAPSES) + 2
 
 
 def test_the_default_solver_is_held_against_the_better_of_two() -> None:
@@ -317,6 +335,6 @@ def test_the_default_solver_is_held_against_the_better_of_two() -> None:
         figures = {"dofs": 10} | {way: counts | {"seconds": each} for way, each in seconds.items()}
         return {"settings": {"of": name}, "figures": figures, "outcome": "done", "message": ""}
 
-    claim = solvers.section([record("a", 1.2), record("b", 0.9)]).claims[0]
+    claim = solver_comparison.section([record("a", 1.2), record("b", 0.9)]).claims[0]
     assert claim.holds and claim.measured.startswith("1.20 at most (a), of 2")
-    assert solvers.section([record("a", 1.2), record("b", 1.4)]).claims[0].holds is False
+    assert solver_comparison.section([record("a", 1.2), record("b", 1.4)]).claims[0].holds is False

@@ -11,25 +11,25 @@ from mpi4py import MPI
 from fracsim.errors import InputError
 from fracsim.run import run_study
 from fracsim.studies.evidence import (
-    closed_forms,
-    contacts,
-    dependence,
+    block_stretch,
+    contact_studies,
+    custom_meshes,
+    diametral_cracks,
     experiments,
-    extremes,
-    failed,
-    published,
-    results,
-    slit,
-    splitting,
+    mesh_dependence,
+    published_results,
+    rejected_approaches,
+    run_results,
+    slit_specimens,
     stability,
-    survival,
-    written,
+    stability_measures,
+    stability_studies,
 )
 from fracsim.studies.evidence.trial import Trial
 from fracsim.study.check import check_study
 from fracsim.study.reader import validate
 
-TRIALS = [*stability.trials(), *dependence.trials()]
+TRIALS = [*stability.trials(), *mesh_dependence.trials()]
 
 
 def test_trials_have_places_of_their_own() -> None:
@@ -48,7 +48,7 @@ def test_each_case_is_run_five_times_in_full() -> None:
     assert len(runs) == 10 and sorted(t.name for t in runs if not t.full) == [
         "cylinder-neo-hookean-r1", "cylinder-neo-hookean-r2",
     ]  # fmt: skip
-    assert len({str(t.study) for t in runs}) == 1 and len({stability._place({"name": t.name}) for t in runs}) == 1
+    assert len({str(t.study) for t in runs}) == 1 and len({stability._study_name({"name": t.name}) for t in runs}) == 1
 
 
 ONCE = [t for t in TRIALS if t.study and t.ranks == 1 and "." not in t.name.rpartition("-r")[2]]
@@ -66,7 +66,9 @@ def test_studies_are_valid(trial: Trial) -> None:
 
 
 def test_measures_exist() -> None:
-    modules = {"survival": survival, "dependence": dependence, "contacts": contacts}
+    modules = {
+        module.__name__.rpartition(".")[2]: module for module in (stability_measures, mesh_dependence, contact_studies)
+    }
     for trial in TRIALS:
         if trial.measure:
             module, _, name = trial.measure.partition(":")
@@ -79,7 +81,7 @@ def test_measures_exist() -> None:
 @pytest.mark.parametrize("energy", ["linear", "corotated", "stvk", "neo-hookean"])
 def test_principal_stress_is_the_derivative_of_the_energy(energy: str) -> None:
     """P_1 = d psi / d l_1 and P_t = (1/2) d psi / d l_t, psi in principal stretches, by central differences."""
-    material = extremes.RUBBER | {"energy": energy}
+    material = stability_studies.RUBBER | {"energy": energy}
     mu, lmbda = 1e6 / 2.6, 3e5 / (1.3 * 0.4)
 
     def psi(l1: float, lt: float) -> float:
@@ -93,7 +95,7 @@ def test_principal_stress_is_the_derivative_of_the_energy(energy: str) -> None:
         return float(mu * strain @ strain + lmbda / 2 * strain.sum() ** 2)
 
     l1, lt, step = 1.7, 0.8, 1e-6
-    P = closed_forms.principal_stress(material, l1, lt)
+    P = block_stretch.principal_stress(material, l1, lt)
     along = (psi(l1 + step, lt) - psi(l1 - step, lt)) / (2 * step)
     across = (psi(l1, lt + step) - psi(l1, lt - step)) / (4 * step)
     assert pytest.approx((along, across), rel=1e-6) == P  # eps psi / step
@@ -101,10 +103,10 @@ def test_principal_stress_is_the_derivative_of_the_energy(energy: str) -> None:
 
 def test_lateral_stretch_of_hooke_is_poissons() -> None:
     """l_t = 1 - nu (l_1 - 1); and where that is not positive there is no answer."""
-    material = extremes.RUBBER | {"energy": "linear"}
-    assert closed_forms.lateral_stretch(material, 1.2) == pytest.approx(1 - 0.3 * 0.2, rel=1e-12)
+    material = stability_studies.RUBBER | {"energy": "linear"}
+    assert block_stretch.lateral_stretch(material, 1.2) == pytest.approx(1 - 0.3 * 0.2, rel=1e-12)
     with pytest.raises(ValueError):
-        closed_forms.lateral_stretch(material, 5.0)
+        block_stretch.lateral_stretch(material, 5.0)
 
 
 # --- measures -------------------------------------------------------------------------------------------------------
@@ -121,7 +123,7 @@ def test_volume_ratios_are_determinants(dim: int) -> None:
         u = np.zeros((len(points), 3))
         u[:, :dim] = points @ map_.T + 5.0 - points
         padded = np.pad(points, ((0, 0), (0, 3 - dim)))
-        assert np.allclose(survival.volume_ratios(padded, cells, u), np.linalg.det(map_), rtol=1e-12)
+        assert np.allclose(stability_measures.volume_ratios(padded, cells, u), np.linalg.det(map_), rtol=1e-12)
 
 
 def rows(**columns: list[float]) -> dict[str, Any]:
@@ -132,21 +134,21 @@ def rows(**columns: list[float]) -> dict[str, Any]:
 def test_energy_growth() -> None:
     """A rise of the balance counts against the largest energy; a loss does not, nor what was there at first."""
     lossy = rows(kinetic=[1.0, 0.5, 0.4], external_work=[1.0, 1.0, 1.0])
-    assert survival.energy_growth(lossy, moving_at_start=False) == 0
+    assert stability_measures.energy_growth(lossy, moving_at_start=False) == 0
     grown = rows(kinetic=[1.0, 0.5, 3.0], external_work=[1.0, 1.0, 1.0])
-    assert survival.energy_growth(grown, moving_at_start=False) == pytest.approx(2.5 / 3.0)
+    assert stability_measures.energy_growth(grown, moving_at_start=False) == pytest.approx(2.5 / 3.0)
     thrown = rows(kinetic=[1.0, 1.0, 1.0])
-    assert survival.energy_growth(thrown, moving_at_start=True) == 0
-    assert survival.energy_growth(thrown, moving_at_start=False) == 1
+    assert stability_measures.energy_growth(thrown, moving_at_start=True) == 0
+    assert stability_measures.energy_growth(thrown, moving_at_start=False) == 1
     static = rows(elastic=[1.0, 2.0, 1.0], dissipated=[0.0, -0.5, 1.0], external_work=[1.0, 1.5, 2.0])
-    assert survival.energy_growth(static, moving_at_start=False) == pytest.approx(0.25)
+    assert stability_measures.energy_growth(static, moving_at_start=False) == pytest.approx(0.25)
 
 
 def test_what_is_measured_of_a_run(tmp_path: Path) -> None:
     """A block stretched until all its edges along x break at once: the closed form and the counts."""
-    study = extremes.block(1.2, steps=8, strength=1e5, material={"energy": "corotated"})
+    study = stability_studies.stretched_block(1.2, steps=8, strength=1e5, material={"energy": "corotated"})
     run_study(MPI.COMM_WORLD, validate(study, "x"), tmp_path / "run")
-    figures = survival.pulled(tmp_path / "run")
+    figures = stability_measures.measure_stretch(tmp_path / "run")
     assert figures["finite"] and figures["error"] < 1e-6 and figures["break_off_by"] == 0
     # 8 x 2 x 2 cubes have 8 x 3 x 3 edges along x; others follow where stress is left
     assert figures["broken_in_a_step"] >= 72 and figures["steps"] == 8
@@ -154,27 +156,27 @@ def test_what_is_measured_of_a_run(tmp_path: Path) -> None:
 
 
 def test_a_wrong_force_is_an_error(tmp_path: Path) -> None:
-    study = extremes.block(1.2, steps=2) | {"solver": {"snes_rtol": 1e-8}}
+    study = stability_studies.stretched_block(1.2, steps=2) | {"solver": {"snes_rtol": 1e-8}}
     run_study(MPI.COMM_WORLD, validate(study, "x"), tmp_path / "run")
-    history = results.history(tmp_path / "run")
+    history = run_results.history(tmp_path / "run")
     history["reaction_pull_x"] *= 1.01
-    error = closed_forms.stretch_error(results.study(tmp_path / "run"), history)["error"]
+    error = block_stretch.stretch_error(run_results.study(tmp_path / "run"), history)["error"]
     assert error == pytest.approx(0.01, rel=1e-4)
 
 
 def test_a_stiff_fall_has_the_impulse_of_its_momentum(tmp_path: Path) -> None:
     """At 1e11 Pa the first guess, cut at the floor, is off by more than all forces of the step (with a tolerance that
     looks at it the impulse was 4 % off). A force that is 1 % off, and a floor that was passed, are found."""
-    study = contacts.fallen(1e-3, young=1e11, speed=1.0, steps=5)
+    study = contact_studies.falling_bar(1e-3, young=1e11, speed=1.0, steps=5)
     run = tmp_path / "run"
     run_study(MPI.COMM_WORLD, validate(study, "x"), run)
-    figures = contacts.fell(run)
+    figures = contact_studies.measure_fall(run)
     assert figures["error"] < 1e-3 and figures["passed"] == 0 and figures["newton_max"] > 3
-    force = results.history(run)["contact_floor_z"]
-    assert contacts._impulse_error(run, -1.01 * force) == pytest.approx(0.01, rel=0.1)
+    force = run_results.history(run)["contact_floor_z"]
+    assert contact_studies._impulse_error(run, -1.01 * force) == pytest.approx(0.01, rel=0.1)
     stated = (run / "study.toml").read_text()
     (run / "study.toml").write_text(stated.replace("-0.0011", "0.1"))
-    assert contacts.fell(run)["passed"] > 0
+    assert contact_studies.measure_fall(run)["passed"] > 0
 
 
 def test_nodes_of_one_body_inside_another(tmp_path: Path) -> None:
@@ -190,37 +192,39 @@ def test_nodes_of_one_body_inside_another(tmp_path: Path) -> None:
             file["points"], file["cells"] = points, np.concatenate([one.cells, one.cells + 8])
             file["frames/000001/displacement"] = np.outer(np.arange(16) >= 8, [0.0, 0.0, shift])
             file["frames/000001"].attrs["time"] = 1.0
-        assert contacts.inside_one_another(tmp_path) == inside
+        assert contact_studies.count_penetrating_nodes(tmp_path) == inside
 
 
 def test_nothing_is_measured_of_a_refusal(tmp_path: Path) -> None:
-    assert survival.survived(tmp_path) == {} and survival.pulled(tmp_path / "run") == {}
+    assert stability_measures.measure_run(tmp_path) == {} and stability_measures.measure_stretch(tmp_path / "run") == {}
 
 
 def test_crack_of_a_bar_in_two(tmp_path: Path) -> None:
     """A bar that came apart: its crack is at least as long as the ligament of 7 mm, and it carries nothing."""
-    study = slit.study(slit.BAR, slit.unstructured(slit.BAR, 1e-3), 0.0)
+    study = slit_specimens.specimen_study(
+        slit_specimens.BAR, slit_specimens.unstructured_mesh(slit_specimens.BAR, 1e-3), 0.0
+    )
     run_study(MPI.COMM_WORLD, validate(study, "x"), tmp_path / "run")
-    figures = dependence.broken_bar(tmp_path / "run")
+    figures = mesh_dependence.measure_bar(tmp_path / "run")
     assert figures["broken_area"] >= 7e-3 and figures["left"] < 1e-3
     assert 0 <= figures["stray"] < 20e-3 and figures["dissipated"] > 0
 
 
 def test_structured_slit_has_the_same_outline() -> None:
-    for specimen in slit.SPECIMENS.values():
+    for specimen in slit_specimens.SPECIMENS.values():
         for h in (5e-4, 2.5e-4):
-            mesh = slit.structured(specimen, h)
+            mesh = slit_specimens.structured_mesh(specimen, h)
             corners = mesh.points[mesh.cells]
             area = np.linalg.det(corners[:, 1:] - corners[:, :1]).sum() / 2
             cut = np.prod(np.subtract(*specimen.slit[::-1]))
             assert area == pytest.approx(np.prod(specimen.size) - cut, rel=1e-12)
 
 
-@pytest.mark.parametrize("name", list(written.MESHES))
+@pytest.mark.parametrize("name", list(custom_meshes.CUSTOM_STUDIES))
 def test_written_studies_fit_their_meshes(name: str, tmp_path: Path) -> None:
     from fracsim.meshes.write import write_mesh
 
-    mesh, study = written.MESHES[name]()
+    mesh, study = custom_meshes.CUSTOM_STUDIES[name]()
     write_mesh(mesh, tmp_path / "mesh.msh")
     study["mesh"] = {"file": str(tmp_path / "mesh.msh")}
     assert check_study(validate(study, "x"))
@@ -229,10 +233,10 @@ def test_written_studies_fit_their_meshes(name: str, tmp_path: Path) -> None:
 # --- the failed approaches ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("approach", failed.APPROACHES)
+@pytest.mark.parametrize("approach", rejected_approaches.APPROACHES)
 def test_force_and_tangent_of_an_undamaged_bar(approach: str) -> None:
     """All approaches agree while nothing is broken: f is the derivative of the energy, K that of f."""
-    bar = failed.lattice_bar(approach)
+    bar = rejected_approaches.lattice_bar(approach)
     u = np.random.default_rng(2).normal(size=bar.points.shape) * 0.01
     f, K = bar.force_and_tangent(u)
     way, step = np.random.default_rng(3).normal(size=u.shape), 1e-6
@@ -243,10 +247,14 @@ def test_force_and_tangent_of_an_undamaged_bar(approach: str) -> None:
 
 
 def test_two_approaches_fail_and_chi_holds() -> None:
-    assert failed.judged(failed.simulate("chi")) == "holds"
-    projected = failed.simulate("projected-stress")
-    assert projected["loop"] > 0.1 and projected["peak"] > 10 and "energy from nowhere" in failed.judged(projected)
-    inverse = failed.simulate("pseudo-inverse")
+    assert rejected_approaches.judge(rejected_approaches.simulate("chi")) == "holds"
+    projected = rejected_approaches.simulate("projected-stress")
+    assert (
+        projected["loop"] > 0.1
+        and projected["peak"] > 10
+        and "energy from nowhere" in rejected_approaches.judge(projected)
+    )
+    inverse = rejected_approaches.simulate("pseudo-inverse")
     assert inverse["rest_stress"] > 0.1 and inverse["lowest"] < -0.01 and inverse["jump"] > 1
 
 
@@ -312,7 +320,7 @@ def test_runs_that_nobody_vouches_for_may_end_unlike_and_are_named() -> None:
 
 def test_iterations_with_contact_stand_beside_those_without() -> None:
     counts = {"newton_mean": 4.0, "newton_max": 9, "krylov_mean": 80.0, "krylov_max": 200}
-    name, alone = next(iter(stability.ALONE.items()))
+    name, alone = next(iter(stability.WITHOUT_CONTACT.items()))
     assert {name, alone} <= {t.settings["of"] for t in stability.trials() if t.case == "contact"}
     less = {"newton_mean": 1.0, "newton_max": 2, "krylov_mean": 5.0, "krylov_max": 6}
     records = [record("contact", name, 1, figures={"finite": True} | counts),
@@ -330,12 +338,12 @@ def test_section_of_the_failed_approaches() -> None:
 def test_section_of_dependence() -> None:
     """Spread (max - min) / mean: (3 - 1) / 2 = 1; a run that failed stays in the table."""
     records = []
-    for number, (pattern, h) in enumerate(dependence.MESHES[:3]):
-        figures = dict.fromkeys(dependence.FIGURES, 1.0 + number)
+    for number, (pattern, h) in enumerate(mesh_dependence.MESHES[:3]):
+        figures = dict.fromkeys(mesh_dependence.FIGURES, 1.0 + number)
         settings = {"h": h, "pattern": pattern, "radius": 0.0}
         records.append(record("bar-local", str(number), 1, figures=figures, settings=settings))
     records.append(record("bar-local", "3", 1, outcome="out of time", figures={}, settings=settings))
-    (section,) = dependence.sections(records)
+    (section,) = mesh_dependence.sections(records)
     spread, every = section.tables
     assert spread.rows == (("bar-local", 3, 1.0, 1.0, 1.0, 1.0),)
     assert len(every.rows) == 4 and every.rows[3][3] == "out of time"
@@ -344,14 +352,14 @@ def test_section_of_dependence() -> None:
 
 def test_plates_before_and_with_an_energy() -> None:
     """One figure of what they carry, one of their cracks, from side to side, without that of the average."""
-    line = dependence.path(np.array([0.3, 0.1, 0.2]), np.array([3.0, 1.0, 2.0]))
+    line = mesh_dependence.crack_path(np.array([0.3, 0.1, 0.2]), np.array([3.0, 1.0, 2.0]))
     assert line == [[0.1, 1.0], [0.2, 2.0], [0.3, 3.0]]
-    assert len(dependence.path(np.arange(1001.0), np.zeros(1001))) <= dependence.PLACES
+    assert len(mesh_dependence.crack_path(np.arange(1001.0), np.zeros(1001))) <= mesh_dependence.MAX_PATH_POINTS
     settings, records = {"h": 1e-3, "pattern": "unstructured", "radius": 0.0}, []
     for number, case in enumerate(("plate-local", "plate-averaged", "plate-energy")):
-        figures = dict.fromkeys(dependence.FIGURES, 1.0 + number) | {"path": line}
+        figures = dict.fromkeys(mesh_dependence.FIGURES, 1.0 + number) | {"path": line}
         records.append(record(case, "1-mm", 1, figures=figures, settings=settings))
-    *_, peaks, paths = dependence.sections(records)[0].plots
+    *_, peaks, paths = mesh_dependence.sections(records)[0].plots
     assert [each.y for each in peaks.series] == [(1.0,), (2.0,), (3.0,)]
     assert [each.label for each in paths.series] == ["plate-local, 1 mm", "plate-energy, 1 mm"]
     assert paths.series[0].y == (1.0, 2.0, 3.0)
@@ -376,11 +384,11 @@ def test_the_second_peak_is_the_top_of_the_longest_rise_after_the_first() -> Non
     assert experiments.second_peak(load) == 7.0
     assert experiments.second_peak(np.array([0.0, 3.0, 2.0, 1.0])) == 3.0  # there is none
     rows = {"contact_striker_y": -load, "motion_striker_y": -np.arange(10.0), "work_striker": load, "pieces": load}
-    found = experiments.figures(rows, "striker", "y")
+    found = experiments.load_figures(rows, "striker", "y")
     assert (found["peak"], found["at"], found["second"], found["last"], found["travel"]) == (10.0, 1.0, 7.0, 1.0, 8.0)
     assert found["plateau"] == 6.5  # of the ways 5 to 9: 3, 7, 6.5, 6.9, 1
     assert max(found["curve"][1]) == 10.0 and len(found["curve"][0]) == 10
-    held = experiments.figures(
+    held = experiments.load_figures(
         rows | {"reaction_striker_y": load, "motion_striker_y": np.arange(1.0, 11.0)}, "striker", "y"
     )
     assert (held["at"], held["travel"], held["curve"][0][0]) == (
@@ -395,21 +403,21 @@ def test_angle_of_kalthoffs_crack(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     tips = 0.05 + 0.045 * np.cos(1.1) * np.array([0.0, 0.5, 1.0, 2.0]), 0.025 + 0.045 * np.sin(1.1) * np.arange(4) / 2
     rows = {"tip_x": tips[0], "tip_y": tips[1], "pieces": np.ones(4)}
     study = {"crack": [{"segment": [[-0.01, 0.025], [0.05, 0.025]]}]}
-    monkeypatch.setattr(experiments.results, "history", lambda run: rows)
-    monkeypatch.setattr(experiments.results, "study", lambda run: study)
-    assert experiments.measured_kalthoff(tmp_path)["angle"] == pytest.approx(np.degrees(1.1))
+    monkeypatch.setattr(experiments.run_results, "history", lambda run: rows)
+    monkeypatch.setattr(experiments.run_results, "study", lambda run: study)
+    assert experiments.measure_kalthoff(tmp_path)["angle"] == pytest.approx(np.degrees(1.1))
 
 
 def test_the_branches_of_a_crack() -> None:
     """A straight crack, from 20 mm on two at 20 and 30 degrees, with a short one aside; none where there is one."""
     x, aside = np.arange(0.0, 0.05, 2e-4), np.column_stack([np.arange(5.0), np.arange(5.0)]) * 2e-4 + [0.01, 0.0]
     arms = [np.column_stack([x, np.maximum(x - 0.02, 0) * slope]) for slope in np.tan(np.radians([20, -30]))]
-    where, upper, lower = experiments.branches(np.concatenate([*arms, aside]), 2e-3) or (0.0, 0.0, 0.0)
+    where, upper, lower = experiments.branch_angles(np.concatenate([*arms, aside]), 2e-3) or (0.0, 0.0, 0.0)
     assert (where, upper, lower) == (pytest.approx(0.02, abs=1e-3), pytest.approx(20, abs=1), pytest.approx(30, abs=1))
-    assert experiments.branches(arms[0], 2e-3) is None
+    assert experiments.branch_angles(arms[0], 2e-3) is None
     stopped = np.concatenate([arms[0], arms[1][x < 0.03]])
-    assert experiments.branches(stopped, 2e-3) is None
-    first = experiments.branches(stopped, 2e-3, experiments.FIRST)
+    assert experiments.branch_angles(stopped, 2e-3) is None
+    first = experiments.branch_angles(stopped, 2e-3, experiments.FIRST)
     assert first is not None and first[0] == pytest.approx(0.02, abs=1e-3)
 
 
@@ -417,18 +425,20 @@ def test_only_branches_that_run_on_from_the_first_fork_count() -> None:
     """A pane whose first two branches part by 3 degrees holds; one that is measured at a later fork does not."""
     figures = {"first": 0.063, "fork": 0.064, "upper": 30.0, "lower": 27.0, "peak": 645.0, "angle": 70.0}
     records = [{"case": case, "outcome": "done", "figures": dict(figures)} for case in ("branching",) * 3]
-    (claim,) = (each for each in experiments._of_notches(records) if "branches" in each.text)
+    (claim,) = (each for each in experiments._notch_claims(records) if "branches" in each.text)
     assert claim.holds is True
     records[1]["figures"]["fork"] = 0.079  # type: ignore[index]
-    (claim,) = (each for each in experiments._of_notches(records) if "branches" in each.text)
+    (claim,) = (each for each in experiments._notch_claims(records) if "branches" in each.text)
     assert claim.holds is False
 
 
 def test_a_curve_that_begins_late_is_read_from_where_its_line_does() -> None:
     """2 N/m from - 1 m on, to 20 N, then a drop; and no table of a plate that was not run."""
     way = [*np.linspace(0, 9, 10), 9.5]
-    assert published.read(way, [*(2 * (np.array(way[:-1]) + 1)), 1.0]) == pytest.approx((20.0, 10.0, 2.0))
-    assert published.table([]) == ()
+    assert published_results.curve_figures(way, [*(2 * (np.array(way[:-1]) + 1)), 1.0]) == pytest.approx(
+        (20.0, 10.0, 2.0)
+    )
+    assert published_results.table([]) == ()
 
 
 def test_section_of_experiments() -> None:
@@ -451,11 +461,13 @@ def test_how_much_of_a_section_is_covered() -> None:
     """A triangle with half of it, two that overlap, whichever way round; nothing by none."""
     low, high = np.array([-1.0, 0.0]), np.array([1.0, 1.0])
     half = np.array([[[-1.0, 0.0], [1.0, 0.0], [-1.0, 1.0]]])
-    assert splitting.covered(half, low, high) == pytest.approx(0.5, abs=0.02)
+    assert diametral_cracks.covered_fraction(half, low, high) == pytest.approx(0.5, abs=0.02)
     left = np.array([[[-1.0, 0.0], [0.0, 1.0], [0.0, 0.0]], [[-1.0, 0.0], [0.0, 1.0], [-1.0, 1.0]]])
-    assert splitting.covered(left, low, high) == pytest.approx(0.5, abs=0.02)
-    assert splitting.covered(np.concatenate([half, left[:1]]), low, high) == pytest.approx(13 / 24, abs=0.02)
-    assert splitting.covered(half[:0], low, high) == 0.0
+    assert diametral_cracks.covered_fraction(left, low, high) == pytest.approx(0.5, abs=0.02)
+    assert diametral_cracks.covered_fraction(np.concatenate([half, left[:1]]), low, high) == pytest.approx(
+        13 / 24, abs=0.02
+    )
+    assert diametral_cracks.covered_fraction(half[:0], low, high) == 0.0
 
 
 def test_where_the_cracks_of_a_cylinder_are() -> None:
@@ -463,25 +475,25 @@ def test_where_the_cracks_of_a_cylinder_are() -> None:
     sides = np.array([[[-0.2, 0.0], [0.2, 0.0], [0.2, 0.1]], [[-0.2, 0.0], [0.2, 0.1], [-0.2, 0.1]]])
     middle = np.concatenate([np.zeros((2, 3, 1)), sides], axis=2)
     beside = middle[:1] + np.array([0.05, 0.0, 0.0])
-    found = splitting.along(np.concatenate([middle, middle, beside, beside]), 0.2, 0.1)
+    found = diametral_cracks.diametral_figures(np.concatenate([middle, middle, beside, beside]), 0.2, 0.1)
     assert found == pytest.approx({"along": 2 / 3, "covered": 1.0, "area": 1.5})
-    assert splitting.along(middle[:0], 0.2, 0.1) == {"along": 0.0, "covered": 0.0, "area": 0.0}
+    assert diametral_cracks.diametral_figures(middle[:0], 0.2, 0.1) == {"along": 0.0, "covered": 0.0, "area": 0.0}
 
 
 def test_a_cylinder_that_splits_and_is_crushed_says_so() -> None:
     """A peak 4 % over, half of it left; what was one plane is not in the end."""
     split = {"split_along": 0.9, "split_covered": 0.7, "split_area": 1.0}
     figures = {"peak": 104.0, "last": 50.0, "end_along": 0.3, "end_covered": 0.9, "end_area": 9.0, "pieces": 6.0}
-    held = [claim.holds for claim in splitting.claims([split | figures] * 3, 100.0, 0.1)]
+    held = [claim.holds for claim in diametral_cracks.claims([split | figures] * 3, 100.0, 0.1)]
     assert held == [True, True, True, True, False]
-    assert {claim.holds for claim in splitting.claims([split | figures] * 2, 100.0, 0.1)} == {None}
-    (table,) = splitting.table([{"settings": {"h": 0.01}, "figures": split | figures}])
-    assert table.rows == ((0.01, 0.9, 0.7, 1.0, 0.3, 0.9, 9.0, 6.0),) and splitting.table([]) == ()
+    assert {claim.holds for claim in diametral_cracks.claims([split | figures] * 2, 100.0, 0.1)} == {None}
+    (table,) = diametral_cracks.table([{"settings": {"h": 0.01}, "figures": split | figures}])
+    assert table.rows == ((0.01, 0.9, 0.7, 1.0, 0.3, 0.9, 9.0, 6.0),) and diametral_cracks.table([]) == ()
 
 
 def test_a_measured_curve_lies_beside_the_runs() -> None:
     """Its greatest load is the reference's, and three panels 5 % above it are within a tenth."""
-    panel, (way, load) = experiments.BY_CASE["l-panel"], published.MEASURED["l-panel"]
+    panel, (way, load) = experiments.BY_CASE["l-panel"], published_results.MEASURED["l-panel"]
     assert max(load) == pytest.approx(panel.peak, rel=1e-3) and sorted(way) == list(way)
     figures = {"peak": 1.05 * panel.peak, "curve": [[0.0, 1e-3], [0.0, panel.peak]]}
     records = [record("l-panel", f"{h}", 1, figures=figures, settings={"h": h}) for h in panel.sizes[1]]

@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from fracsim.run import run_study
 from fracsim.scene import build_scene
-from fracsim.studies.evidence import extremes
+from fracsim.studies.evidence import stability_studies
 from fracsim.study.reader import validate
 from support.ranks import Arrays, OnRanks
 from support.scenes import Walk
@@ -21,7 +21,7 @@ def test_a_fast_body_flies_on_in_short_steps(velocity: float, step: float) -> No
     """No force acts: v stays, u = v t. The round-off of M u / dt^2 is more than all that Newton has to balance; taken
     for a residual it cannot be lowered, and halving the step makes it four times as large.
     """
-    study = extremes.flying(velocity, step, 20)
+    study = stability_studies.flying_block(velocity, step, 20)
     study["time"]["adapt"] = False
     scene = build_scene(MPI.COMM_WORLD, validate(study, "flying"))
     state = Walk(scene)
@@ -39,7 +39,7 @@ def collapsed(energy: str) -> dict[str, Any]:
     """Saint Venant-Kirchhoff in uniaxial tension: E_t = -nu E_1, so that l_t^2 = 1 - nu (l_1^2 - 1) is negative beyond
     l_1 = 2.08 for nu = 0.3: there is no such body.
     """
-    study = extremes.block(3.0, material={"energy": energy}, steps=10)
+    study = stability_studies.stretched_block(3.0, material={"energy": energy}, steps=10)
     return study | {"output": study["output"] | {"every": 1}}
 
 
@@ -54,7 +54,7 @@ def test_a_body_without_volume_is_told(tmp_path: Path, capfd: pytest.CaptureFixt
 
 def test_a_sound_body_is_not_accused(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """The least J is that of the closed form: the neo-Hookean block's, whose lateral stretch is found by bisection."""
-    from fracsim.studies.evidence.closed_forms import lateral_stretch
+    from fracsim.studies.evidence.block_stretch import lateral_stretch
 
     study = collapsed("neo-hookean")
     study["boundary"][-1]["displacement"]["value"][1][0] = -0.5
@@ -70,7 +70,7 @@ def test_factors_where_iterations_fail() -> None:
     """
     results = []
     for options in ({"ksp_rtol": 1e-10}, {"ksp_max_it": 3, "ksp_rtol": 1e-10}):
-        study = extremes.block(1.5, steps=2) | {"solver": options}
+        study = stability_studies.stretched_block(1.5, steps=2) | {"solver": options}
         scene = build_scene(MPI.COMM_WORLD, validate(study, "x"))
         state = Walk(scene)
         state.advance()

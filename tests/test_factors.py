@@ -10,7 +10,7 @@ import pytest
 from petsc4py import PETSc
 
 from fracsim.solvers.direct_solver import DirectSolver
-from fracsim.studies.evidence import solvers
+from fracsim.studies.evidence import solver_comparison
 from support.reference import dense_tangent
 from support.scenes import displacement, make_scene
 
@@ -32,8 +32,10 @@ def pressed(**more: Any) -> Any:
 def test_a_body_that_cg_is_dear_for_is_factorised() -> None:
     """Nearly incompressible, in the plane: the same displacement, a fifth of the iterations. Who asks for CG has it."""
     found = {}
-    for way, solver in solvers.WAYS.items():
-        study = solvers.loaded([2.0, 1.0], 0.1, solvers.RUBBER | {"poisson": 0.4999}, [1e5, -2e4], 2)
+    for way, solver in solver_comparison.SOLVERS.items():
+        study = solver_comparison.loaded_box(
+            [2.0, 1.0], 0.1, solver_comparison.RUBBER | {"poisson": 0.4999}, [1e5, -2e4], 2
+        )
         tight = solver | {"snes_rtol": 1e-9}
         scene, walk = make_scene(**{key: study[key] for key in TABLES}, solver=tight)
         krylov = sum(walk.advance().solve.krylov_iterations for _ in range(2))
@@ -46,9 +48,9 @@ def test_a_body_that_cg_is_dear_for_is_factorised() -> None:
 
 def test_a_body_that_cg_is_cheap_for_keeps_it() -> None:
     """Compact, in space: of the answer that CG gives not a bit is other."""
-    study = solvers.loaded([1.0] * 3, 0.25, solvers.RUBBER, [1e5, 0.0, -2e4], 2)
+    study = solver_comparison.loaded_box([1.0] * 3, 0.25, solver_comparison.RUBBER, [1e5, 0.0, -2e4], 2)
     found = []
-    for solver in (solvers.WAYS["default"], solvers.WAYS["CG"]):
+    for solver in (solver_comparison.SOLVERS["default"], solver_comparison.SOLVERS["CG"]):
         scene, walk = make_scene(**{key: study[key] for key in TABLES}, solver=solver)
         found.append([walk.advance().solve.krylov_iterations for _ in range(2)])
         assert scene.solver is not None and scene.solver.selector.remaining == 0

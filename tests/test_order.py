@@ -19,7 +19,7 @@ from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.split_surface.local_surface import LocalSurface
 from fracsim.output.fracture_log import FractureLog
 from fracsim.run import run_study
-from fracsim.studies.evidence.precision.manufactured import errors, solved
+from fracsim.studies.evidence.precision.manufactured_solution import relative_errors, solve
 from fracsim.study.check import check_study
 from fracsim.timestepping.stable_time_step import cell_frequencies
 from support.scenes import make_scene, make_study, march
@@ -29,7 +29,7 @@ Values = npt.NDArray[np.float64]
 
 def orders(energy: str, order: int, dim: int, cells: tuple[int, int]) -> list[float]:
     """Of the displacement and of its gradient, between two meshes."""
-    coarse, fine = (errors(solved(energy, order, dim, 1 / n)) for n in cells)
+    coarse, fine = (relative_errors(solve(energy, order, dim, 1 / n)) for n in cells)
     found: list[float] = (np.log(coarse / fine) / np.log(cells[1] / cells[0])).tolist()
     return found
 

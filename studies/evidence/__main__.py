@@ -11,17 +11,26 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from datetime import date
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from ...report.content import Section, to_data
 from ...report.html_report import machine_info, program_versions
-from .runner import RECORD, fingerprint, folder_in, run_trial, time_again
 from .trial import Trial
+from .trial_runner import RECORD, fingerprint, repeat_timing, run_trial, trial_folder
 
 UNTIMED = ("stability", "dependence", "experiments")  # what counts there is not time: runs of one rank go two at a time
-GROUPS = ("precision", "peers", "stability", "ladder", "growth", "rows", "dependence", "experiments")
+# group -> its module; also the order of the report
+GROUPS = {
+    "precision": "precision",
+    "peers": "peers",
+    "stability": "stability",
+    "ladder": "feature_cost",
+    "growth": "crack_count_cost",
+    "rows": "paper_table_rows",
+    "dependence": "mesh_dependence",
+    "experiments": "experiments",
+}
 Records = list[dict[str, Any]]
 
 
@@ -29,9 +38,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(prog="python -m fracsim.studies.evidence", description=__doc__)
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of the evidence; what is there is not run again")
     parser.add_argument("--full", action="store_true", help="the long trials too")
-    parser.add_argument("--only", nargs="+", choices=GROUPS, default=GROUPS, metavar="GROUP", help=", ".join(GROUPS))
+    parser.add_argument(
+        "--only", nargs="+", choices=GROUPS, default=list(GROUPS), metavar="GROUP", help=", ".join(GROUPS)
+    )
     given = parser.parse_args()
-    modules = {name: importlib.import_module(f".{name}", __package__) for name in given.only if _exists(name)}
+    modules = {name: importlib.import_module(f".{GROUPS[name]}", __package__) for name in given.only}
     records = {name: _run(name, module, given.out, given.full) for name, module in modules.items()}
     path = write_evidence(given.out, records, {name: module.sections for name, module in modules.items()})
     failed = [record for group in records.values() for record in group if record["outcome"] != "done"]
@@ -40,13 +51,9 @@ def main() -> None:
     )
 
 
-def _exists(group: str) -> bool:
-    return find_spec(f".{group}", __package__) is not None
-
-
 def _run(group: str, module: Any, out: Path, full: bool) -> Records:
     """Records of a group; of the long trials only those that are there already, unless `full`."""
-    chosen = [trial for trial in module.trials() if full or not trial.full or recorded(trial, out)]
+    chosen = [trial for trial in module.trials() if full or not trial.full or is_recorded(trial, out)]
     began, number = time.monotonic(), itertools.count(1)
 
     def run(trial: Trial) -> dict[str, Any]:
@@ -59,24 +66,24 @@ def _run(group: str, module: Any, out: Path, full: bool) -> Records:
     with ThreadPoolExecutor(2 if group in UNTIMED and (os.cpu_count() or 1) > 1 else 1) as pool:
         alone = [pool.submit(run, trial) if trial.ranks == 1 else None for trial in chosen]
     records = [one.result() if one is not None else run(trial) for one, trial in zip(alone, chosen, strict=True)]
-    if doubtful := getattr(module, "to_time_again", None):
-        _time_again(doubtful, list(zip(chosen, records, strict=True)), out)
+    if doubtful := getattr(module, "trials_to_repeat", None):
+        _repeat_timings(doubtful, list(zip(chosen, records, strict=True)), out)
     print(f"{group}: {time.monotonic() - began:.0f} s", flush=True)
     return records
 
 
-def _time_again(doubtful: Any, runs: list[tuple[Trial, dict[str, Any]]], out: Path) -> None:
+def _repeat_timings(doubtful: Any, runs: list[tuple[Trial, dict[str, Any]]], out: Path) -> None:
     """Run what the group wants timed once more until it wants no more: each time that may be something else."""
     while wanted := doubtful([record for _, record in runs]):
         for trial, record in runs:
             if (trial.case, trial.name) in wanted:
-                time_again(trial, out, record)
+                repeat_timing(trial, out, record)
                 print(f"{trial.group} {trial.case}/{trial.name}: once more, {record['wall'][-1]:.1f} s", flush=True)
 
 
-def recorded(trial: Trial, out: Path) -> bool:
+def is_recorded(trial: Trial, out: Path) -> bool:
     """Whether this very trial has been run before."""
-    path = folder_in(out, trial) / RECORD
+    path = trial_folder(out, trial) / RECORD
     return path.exists() and json.loads(path.read_text(encoding="utf-8"))["digest"] == fingerprint(trial)
 
 

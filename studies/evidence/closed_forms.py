@@ -1,70 +1,253 @@
-"""Exact force and stress of a block that is pulled along x, between smooth sides (uniaxial) or stiff ones (confined).
+"""Closed forms that the report compares with: each with its source or derivation, SI units, none of fracsim's code.
 
-With principal stretches l1 (given) and lt (both lateral ones), J = l1 lt^2 and I = l1^2 + 2 lt^2:
-
-    neo-hookean  P_i = m (1 - 1 / (I + 1)) l_i + l (J - alpha) J / l_i      (M22 eq. 25)
-    stvk         P_i = l_i (2 mu E_i + lambda tr E),  E_i = (l_i^2 - 1) / 2
-    corotated    P_i = 2 mu (l_i - 1) + lambda tr(U - I);   linear: the same while nothing turns
-
-Uniaxial: P_t = 0 gives lt. Written by hand from the principal stretches: nothing here is shared with the program.
+tests/test_evidence_precision.py checks them against what they solve: equations of motion, balances, energies.
 """
 
 from __future__ import annotations
 
+from math import cos as cosine
+from math import cosh, pi, sin, sinh, sqrt, tan
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from scipy.optimize import brentq
 
-Values = npt.NDArray[np.float64]
+Values = npt.NDArray[Any]
 
 
-def principal_stress(material: dict[str, Any], l1: float, lt: float) -> tuple[float, float]:
-    """(P_1, P_t) in Pa."""
-    young, nu = material["young"], material["poisson"]
-    mu, lmbda = young / (2 * (1 + nu)), young * nu / ((1 + nu) * (1 - 2 * nu))
-    stretches = np.array([l1, lt, lt])
-    if material["energy"] == "neo-hookean":
-        m, volumetric = 4 / 3 * mu, lmbda + 5 / 6 * mu
-        alpha, trace = 1 + 3 / 4 * m / volumetric, float(stretches @ stretches)
-        cofactors = np.array([lt * lt, l1 * lt, l1 * lt])
-        P = m * (1 - 1 / (trace + 1)) * stretches + volumetric * (l1 * lt * lt - alpha) * cofactors
-    elif material["energy"] == "stvk":
-        E = (stretches**2 - 1) / 2
-        P = stretches * (2 * mu * E + lmbda * E.sum())
-    else:
-        P = 2 * mu * (stretches - 1) + lmbda * (stretches - 1).sum()
-    return float(P[0]), float(P[1])
+# --- beams ---
 
 
-def lateral_stretch(material: dict[str, Any], l1: float) -> float:
-    """lt for which the sides are free of stress. ValueError where no positive one is: the energy has no answer."""
-    least = 1e-6 * min(1.0, l1**-0.5)
-    most = 2 * max(1.0, l1**-0.5)
-    return float(brentq(lambda lt: principal_stress(material, l1, lt)[1], least, most, xtol=1e-15, rtol=1e-14))
+def timoshenko_deflection(
+    force: float, length: float, width: float, depth: float, young: float, poisson: float
+) -> float:
+    """w = P L^3 / (3 E I) + P L / (kappa G A) in m of a cantilever under a force at its end.
 
-
-def stretch_error(study: dict[str, Any], rows: dict[str, Values]) -> dict[str, float]:
-    """Largest error of the pulling force before the first break, over the largest force; and of the break, in steps.
-
-    The study is one of `extremes.block`.
+    kappa = 10 (1 + nu) / (12 + 11 nu) for a rectangle (Cowper 1966).
     """
-    sides, material, right = study["mesh"]["size"], study["material"], study["boundary"][-1]["displacement"]
-    free = all(entry["on"] != "top" for entry in study["boundary"])
-    shift = np.interp(rows["time"], right["time"], [value[0] for value in right["value"]])
-    stretches = 1 + shift / sides[0]
-    try:
-        lateral = np.array([lateral_stretch(material, l1) if free else 1.0 for l1 in stretches])
-    except ValueError:
-        return {}  # no such body: there is nothing to be near to
-    P = np.array([principal_stress(material, *pair)[0] for pair in zip(stretches, lateral, strict=True)])
-    true = P if material["energy"] == "linear" else P / lateral**2
-    strength = study.get("fracture", {}).get("strength", np.inf)
-    breaks = int(np.argmax(true >= strength)) if (true >= strength).any() else len(true)
-    broke = int(np.argmax(rows["broken_edges"] > 0)) if rows["broken_edges"].any() else len(true)
-    whole = slice(0, min(breaks, broke) + 1)
-    difference = rows["reaction_pull_x"][whole] - (P * sides[1] * sides[2])[whole]
-    largest = np.abs(P[whole]).max() * sides[1] * sides[2]
-    error = float(np.abs(difference[: max(1, breaks)]).max() / largest) if breaks else 0.0
-    return {"error": error, "break_off_by": abs(broke - breaks) if np.isfinite(strength) else 0}
+    area, inertia = width * depth, width * depth**3 / 12
+    kappa, shear = 10 * (1 + poisson) / (12 + 11 * poisson), young / (2 * (1 + poisson))
+    return force * length**3 / (3 * young * inertia) + force * length / (kappa * shear * area)
+
+
+def euler_frequency(length: float, depth: float, young: float, density: float) -> float:
+    """f1 in Hz of a cantilever of Euler and Bernoulli; I / A = depth^2 / 12.
+
+    beta L = 1.8751 is the first root of cos cosh = -1, f1 = (beta L)^2 / (2 pi) sqrt(E I / (rho A L^4)).
+    """
+    root = brentq(lambda b: cosine(b) * cosh(b) + 1, 1.0, 2.5)
+    return root**2 / (2 * pi) * sqrt(young * depth**2 / 12 / density) / length**2
+
+
+def timoshenko_frequency(length: float, depth: float, young: float, poisson: float, density: float) -> float:
+    """f1 in Hz of Timoshenko's cantilever, shear and rotary inertia counted, kappa after Cowper.
+
+    Han, Benaroya and Wei (1999), J. Sound Vib. 225, eq. for the clamped-free beam. With x in units of L,
+    s^2 = E I / (kappa G A L^2), r^2 = I / (A L^2), b^2 = rho A L^4 omega^2 / (E I), the transverse motion is
+    exp(i a x), a^2 = b^2 (r^2 + s^2)/2 +- sqrt(b^4 (r^2 - s^2)^2 / 4 + b^2); clamped at 0, free at 1. The frequency is
+    the first zero of the determinant of the four end conditions, which is set up here rather than expanded.
+    """
+    kappa = 10 * (1 + poisson) / (12 + 11 * poisson)
+    radius2 = depth**2 / 12 / length**2
+    shear2 = radius2 * 2 * (1 + poisson) / kappa
+    unit = sqrt(young * depth**2 / 12 / density) / length**2  # omega per b, 1/s
+    guess = 1.8751**2
+    b = brentq(lambda b: _timoshenko_determinant(b, radius2, shear2), 0.7 * guess, 1.05 * guess)
+    return float(b * unit / (2 * pi))
+
+
+def _timoshenko_determinant(b: float, r2: float, s2: float) -> float:
+    """Deflection y and turn psi of the section: y = C ch(p x) + S sh(p x) + c cos(q x) + d sin(q x).
+
+    Balance of forces, y'' - psi' = -s^2 b^2 y, gives psi = m (C sh + S ch) + n (d cos - c sin).
+    Ends: y = psi = 0 at 0, psi' = 0 and y' - psi = 0 at 1.
+    """
+    half, root = b**2 * (r2 + s2) / 2, sqrt(b**4 * (r2 - s2) ** 2 / 4 + b**2)
+    p, q = sqrt(root - half), sqrt(root + half)
+    m, n = (p**2 + s2 * b**2) / p, (q**2 - s2 * b**2) / q
+    rows = [
+        [1, 0, 1, 0],
+        [0, m, 0, n],
+        [m * p * cosh(p), m * p * sinh(p), -n * q * cosine(q), -n * q * sin(q)],
+        [(p - m) * sinh(p), (p - m) * cosh(p), (n - q) * sin(q), (q - n) * cosine(q)],
+    ]
+    return float(np.linalg.det(np.array(rows, float)))
+
+
+# --- bars ---
+
+
+def pulse(t: Values, duration: float) -> Values:
+    """sin^4(pi t / duration) from 0 to `duration`, 0 outside: smooth enough (three derivatives) for second order."""
+    inside = (t > 0) & (t < duration)
+    return np.where(inside, np.sin(pi * t / duration) ** 4, 0.0)
+
+
+def pulse_integral(t: Values, duration: float) -> Values:
+    """Integral of `pulse` from 0 to t, s: sin^4 a = 3/8 - cos(2 a)/2 + cos(4 a)/8."""
+    t = np.clip(t, 0.0, duration)
+    k = 2 * pi / duration
+    return 3 / 8 * t - np.sin(k * t) / (2 * k) + np.sin(2 * k * t) / (16 * k)
+
+
+def bar_velocity(x: Values, t: float, duration: float) -> Values:
+    """d'Alembert: v = p(t - (1 - x)) on the bar 0 < x < 1 with E = rho = 1, pulled at x = 1 by the unit pulse p(t).
+
+    A traction sends stress p and velocity p / (rho c0) inwards; valid until the wave returns from x = 0.
+    """
+    return pulse(t - (1 - x), duration)
+
+
+def bar_displacement(x: Values, t: float, duration: float) -> Values:
+    """u = int v dt of `bar_velocity`."""
+    return pulse_integral(t - (1 - x), duration)
+
+
+def clamp_stress(t: Values, force: Values) -> Values:
+    """Stress at the clamp of a bar of unit L, E, rho under a uniform body force given at the (equally spaced) times t.
+
+    The force b(t) starts waves everywhere at once. A body force of unit impulse gives every point the velocity 1,
+    which the clamp at x = 0 stops with the stress rho c0 = 1 until the wave has gone to the free end and back (t = 2),
+    then with -1 for as long, and so on: sigma(t) = int b(s) q(t - s) ds, q the square wave of period 4; by the
+    trapezoidal rule.
+    """
+    step = t[1] - t[0]
+    half = np.concatenate([[0.0], np.cumsum((force[1:] + force[:-1]) / 2) * step])  # int b
+    result = half.copy()
+    for turn in range(1, int(t[-1] / 2) + 1):
+        result += 2 * (-1) ** turn * np.interp(t - 2 * turn, t, half, left=0.0)
+    return result
+
+
+# --- finite strain ---
+
+
+def lame(young: float, poisson: float) -> tuple[float, float]:
+    """(mu, lambda) in Pa."""
+    return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
+
+
+def stvk_stress(F: Values, young: float, poisson: float) -> Values:
+    """P = F (2 mu E + lambda tr(E) I), E = (F^T F - I) / 2, in Pa."""
+    mu, lmbda = lame(young, poisson)
+    E = (F.T @ F - np.eye(3)) / 2
+    return np.asarray(F @ (2 * mu * E + lmbda * np.trace(E) * np.eye(3)))
+
+
+def neo_hookean_stress(F: Values, young: float, poisson: float) -> Values:
+    """P = m F (1 - 1/(I_C + 1)) + l (J - alpha) cof F, Smith et al. 2018 eq. 18 (docs/theory.md#elastic-energies)."""
+    mu, lmbda = lame(young, poisson)
+    m, volumetric = 4 / 3 * mu, lmbda + 5 / 6 * mu
+    alpha = 1 + m / volumetric - m / (4 * volumetric)
+    J = np.linalg.det(F)
+    cofactor = J * np.linalg.inv(F).T
+    return np.asarray(m * F * (1 - 1 / (np.sum(F * F) + 1)) + volumetric * (J - alpha) * cofactor)
+
+
+STRESSES = {"stvk": stvk_stress, "neo-hookean": neo_hookean_stress}
+
+
+def uniaxial(energy: str, stretch: float, young: float, poisson: float) -> tuple[float, float]:
+    """(lateral stretch, P11 in Pa) of a bar that is free sideways: P22 = 0."""
+    stress = STRESSES[energy]
+
+    def state(side: float) -> Values:
+        return stress(np.diag([stretch, side, side]), young, poisson)
+
+    side = float(brentq(lambda s: state(s)[1, 1], 0.5, 1.2, xtol=1e-15))
+    return side, float(state(side)[0, 0])
+
+
+# --- plate with a hole ---
+
+
+def howland_factor(ratio: float) -> float:
+    """Peak stress at a hole of diameter `ratio` times the width of a long strip, over the mean stress far away.
+
+    Peterson's fit of Howland's (1930) series, net section: 2 + 0.284 a - 0.600 a^2 + 1.32 a^3, a = 1 - ratio; over a
+    for the gross section. 3 in an infinite plate (Kirsch 1898).
+    """
+    a = 1 - ratio
+    return (2 + 0.284 * a - 0.600 * a**2 + 1.32 * a**3) / a
+
+
+# --- Brazilian disk ---
+
+
+def hondros(r: Values, radius: float, half_arc: float, pressure: float) -> tuple[Values, Values]:
+    """(sigma_x, sigma_y) in Pa at height r on the loaded diameter of a disk; tension positive (Hondros 1959).
+
+    Uniform radial pressure acts on two arcs of angle 2 `half_arc` (radians) around the y axis.
+    """
+    q, a = (np.asarray(r) / radius) ** 2, half_arc
+    first = (1 - q) * sin(2 * a) / (1 - 2 * q * np.cos(2 * a) + q**2)
+    second = np.arctan((1 + q) / (1 - q) * tan(a))
+    return 2 * pressure / pi * (first - second), -2 * pressure / pi * (first + second)
+
+
+def disk_stress(x: Values, y: Values, radius: float, half_arc: float, pressure: float, points: int = 200) -> Values:
+    """(n, 3) sigma_xx, sigma_yy, sigma_xy in Pa anywhere in the same disk.
+
+    Sum over the arcs of the field of two opposite radial forces q per thickness at the ends of a diameter along the
+    unit vector e (Michell 1900; Timoshenko and Goodier, section 41): with r1, r2 the vectors from the points of
+    action, sigma = -(2 q / pi) ((r1 . e)/|r1|^4 r1 x r1 + (r2 . -e)/|r2|^4 r2 x r2) + q / (pi R) I, where r1 starts
+    at the end from which the force pushes along e. Gauss rule over the angle.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(points)
+    result = np.zeros((len(x), 3))
+    X = np.column_stack([x, y])
+    for node, weight in zip(nodes, weights, strict=True):
+        angle = half_arc * node
+        outward = np.array([sin(angle), cosine(angle)])
+        force = pressure * radius * half_arc * weight
+        for end in (outward, -outward):
+            ray = X - radius * end
+            factor = -2 * force / pi * (ray @ -end) / np.sum(ray**2, axis=1) ** 2
+            result += factor[:, None] * np.column_stack([ray[:, 0] ** 2, ray[:, 1] ** 2, ray[:, 0] * ray[:, 1]])
+        result[:, :2] += force / (pi * radius)
+    return result
+
+
+def brazilian_peak(diameter: float, strength: float) -> float:
+    """pi D sigma_t / 2 in N per metre of thickness: the load at which the centre of the disk reaches the strength."""
+    return pi * diameter * strength / 2
+
+
+# --- non-local average ---
+
+
+def kernel_moment(kernel: str) -> float:
+    """<q^2> = int g q^2 dA / int g dA over the unit disk: what the average of x^2 exceeds x^2 by is R^2 <q^2> / 2.
+
+    hat: (1/4 - 1/5) / (1/2 - 1/3) = 3/10; constant: (1/4) / (1/2) = 1/2; gaussian exp(-k q^2) with k = 4.5, with
+    s = q^2: int_0^1 s exp(-k s) ds / int_0^1 exp(-k s) ds = 1/k - 1/(exp(k) - 1).
+    """
+    k = 4.5
+    return {"linear": 3 / 10, "constant": 1 / 2, "gaussian": 1 / k - 1 / (np.exp(k) - 1)}[kernel]
+
+
+# --- plasticity ---
+
+
+def bilinear_stress(strain: float, young: float, yield_stress: float, hardening: float) -> float:
+    """Stress in Pa of a pulled bar: E e up to the yield stress, then the slope E K / (E + K)."""
+    if young * strain <= yield_stress:
+        return young * strain
+    return yield_stress + (strain - yield_stress / young) * young * hardening / (young + hardening)
+
+
+def flowing_stress(strain: float, strain_rate: float, elastic: tuple[float, float], flow: Values) -> float:
+    """The same with flow at a finite rate; `elastic` = (E, nu), `flow` = (yield stress, K, rate in 1/s).
+
+    Held at a fixed deformation, the excess f = s - (Y + K e_p) falls by exp(-rate dt): a flow e_p' takes 3 G e_p' from
+    the von Mises stress then, so that e_p' = rate f / (3 G + K). A bar is free sideways, s = E (e - e_p):
+    f' = E e' - f / T with T = (3 G + K) / (rate (E + K)), hence f = E e' T (1 - exp(-t / T)) at a time t after yield,
+    and with e_p = (E e - Y - f) / (E + K) the stress is the bilinear one plus f E / (E + K).
+    """
+    young, poisson = elastic
+    yield_stress, hardening, rate = flow
+    fall = (3 * lame(young, poisson)[0] + hardening) / (rate * (young + hardening))  # T, s
+    since = max(strain - yield_stress / young, 0.0) / strain_rate
+    excess = young * strain_rate * fall * (1 - np.exp(-since / fall))
+    return float(bilinear_stress(strain, young, yield_stress, hardening) + excess * young / (young + hardening))

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from .. import folder as packaged
-from . import published, results, splitting
-from .dependence import crack_faces, spread
-from .section import Claim, Picture, Plot, ReportTable, Section, Series, TableCell, folder_of
+from . import diametral_cracks, published_results, run_results
+from .mesh_dependence import crack_faces, relative_range
+from .report_section import Claim, Picture, Plot, ReportTable, Section, Series, TableCell, record_folder
 from .trial import Trial
 
 GROUP = "experiments"
@@ -24,7 +24,7 @@ Record = dict[str, Any]
 Values = npt.NDArray[np.float64]
 Changes = dict[str, Any]
 
-DUCTILE: Changes = {
+NVE36: Changes = {
     "material": {"like": "steel NVE 36 at 23 C", "energy": "corotated"},
     "fracture": {"energy": False, "radius": 8e-4},
     "plasticity": {"update": "implicit"},
@@ -53,15 +53,15 @@ class Experiment:
     within: float | None = None
 
 
-PULLED: Changes = {
+TENSION: Changes = {
     "boundary": [
         {"on": "bottom", "fix": "xy"},
         {"on": "top", "displacement": {"time": [0.0, 1.0], "value": [[0.0, 0.0], [0.0, 8e-6]]}},
     ],
     "time": {"breaking_step": 0.001},  # one of 0.01 is 1.8 % of the peak, told by the last before it
 }
-PLATES = ("h", (3e-5, 2e-5, 1.25e-5))
-NOTCHED = ("h_notch", (4e-4, 3e-4, 2.2e-4))
+PLATE_SIZES = ("h", (3e-5, 2e-5, 1.25e-5))
+BAR_SIZES = ("h_notch", (4e-4, 3e-4, 2.2e-4))
 EXPERIMENTS = (
     Experiment(
         "brazilian", "brazilian", ("h", (0.01, 0.008, 0.0065)), "upper", "y", 6.007e5, "pi D t f_t / 2", {}, within=0.1
@@ -71,30 +71,30 @@ EXPERIMENTS = (
         {}, within=0.1,
     ),
     Experiment(
-        "charpy-A516", "charpy", NOTCHED, "striker", "y", 8.51e3, "static, sharp notch, ASTM E399", {}
+        "charpy-A516", "charpy", BAR_SIZES, "striker", "y", 8.51e3, "static, sharp notch, ASTM E399", {}
     ),
     Experiment(
-        "charpy-NVE36", "charpy", NOTCHED, "striker", "y", 1.93e3,
+        "charpy-NVE36", "charpy", BAR_SIZES, "striker", "y", 1.93e3,
         "limit load in plane strain without hardening, 1.26 x 1.155 yield b^2 B / S (Green and Hundy 1956)",
-        DUCTILE | {"time": DUCTILE["time"] | {"end": 8e-4}},
+        NVE36 | {"time": NVE36["time"] | {"end": 8e-4}},
     ),
     Experiment(
-        "izod-A516", "izod", NOTCHED, "striker", "y", 3.63e3, "static, sharp notch in bending, K_c (Tada)", {}
+        "izod-A516", "izod", BAR_SIZES, "striker", "y", 3.63e3, "static, sharp notch in bending, K_c (Tada)", {}
     ),
     Experiment(
-        "izod-NVE36", "izod", NOTCHED, "striker", "y", 8.8e2, "limit load, as of charpy-NVE36",
-        DUCTILE | {"time": DUCTILE["time"] | {"end": 1.2e-3, "step": 2e-5, "breaking_step": 2e-5}},
+        "izod-NVE36", "izod", BAR_SIZES, "striker", "y", 8.8e2, "limit load, as of charpy-NVE36",
+        NVE36 | {"time": NVE36["time"] | {"end": 1.2e-3, "step": 2e-5, "breaking_step": 2e-5}},
     ),
     Experiment(
         "charpy-klst", "charpy-klst", ("h_notch", (1.6e-4, 1.2e-4, 0.9e-4)), "striker", "y", 2.43e3,
         "measured: SRM 2216, NIST SP 260-180 (1.59 J absorbed)", {},
     ),
     Experiment(
-        "notched-tension", "notched-shear", PLATES, "grip", "y", 645.0,
-        "Griffith, -u^2 k'(a) / 2 = G_c (Miehe et al. 2010's plate)", PULLED, within=0.03,
+        "notched-tension", "notched-shear", PLATE_SIZES, "grip", "y", 645.0,
+        "Griffith, -u^2 k'(a) / 2 = G_c (Miehe et al. 2010's plate)", TENSION, within=0.03,
     ),
     Experiment(
-        "notched-shear", "notched-shear", PLATES, "grip", "x", 400.0,
+        "notched-shear", "notched-shear", PLATE_SIZES, "grip", "x", 400.0,
         "start of a kink at 70.5 degrees, -u^2 k'(a) / 2 = 3/4 G_c; peaks may come later", {},
     ),
     Experiment(
@@ -116,7 +116,7 @@ def trials() -> list[Trial]:
     return [_trial(experiment, h) for experiment in EXPERIMENTS for h in experiment.sizes[1]]
 
 
-def study_of(experiment: Experiment, h: float) -> dict[str, Any]:
+def experiment_study(experiment: Experiment, h: float) -> dict[str, Any]:
     """The packaged study with the changes of an experiment, on one of its meshes."""
     data = tomllib.loads((packaged() / f"{experiment.study}.toml").read_text(encoding="utf-8"))
     for table, values in deepcopy(experiment.changes).items():
@@ -127,73 +127,76 @@ def study_of(experiment: Experiment, h: float) -> dict[str, Any]:
 
 def _trial(experiment: Experiment, h: float) -> Trial:
     return Trial(
-        GROUP, experiment.case, f"{h * 1e3:g}-mm", study=study_of(experiment, h), settings={"h": h}, limit=600.0,
-        measure=f"experiments:measured_{experiment.study.replace('-', '_')}",
+        GROUP, experiment.case, f"{h * 1e3:g}-mm", study=experiment_study(experiment, h), settings={"h": h},
+        limit=600.0,
+        measure=f"experiments:measure_{experiment.study.replace('-', '_')}",
     )  # fmt: skip
 
 
 # --- what is measured -----------------------------------------------------------------------------------------------
 
 
-def measured_brazilian(run: Path) -> Record:
+def measure_brazilian(run: Path) -> Record:
     """Figures of the disk, and how much of its loaded diameter the cracks follow within a tenth of the radius."""
-    rows = results.history(run)
+    rows = run_results.history(run)
     size, centres = crack_faces(run)
-    radius = float(results.study(run)["mesh"]["radius"])
+    radius = float(run_results.study(run)["mesh"]["radius"])
     near = np.abs(centres[:, 0]) < 0.1 * radius
     bins = np.unique(np.floor(20 * (centres[near, 1] / radius + 1) / 2))
-    return figures(rows, "upper", "y") | {"along": len(bins) / 20, "crack": float(size.sum() / 2)}
+    return load_figures(rows, "upper", "y") | {"along": len(bins) / 20, "crack": float(size.sum() / 2)}
 
 
-def measured_granite_cylinder(run: Path) -> Record:
+def measure_granite_cylinder(run: Path) -> Record:
     """Figures of the cylinder, and where its cracks are."""
-    rows = results.history(run)
-    return figures(rows, "upper", "y") | splitting.measured(run, rows["time"], np.abs(rows["contact_upper_y"]))
+    rows = run_results.history(run)
+    return load_figures(rows, "upper", "y") | diametral_cracks.measure_cracks(
+        run, rows["time"], np.abs(rows["contact_upper_y"])
+    )
 
 
-def measured_charpy(run: Path) -> Record:
+def measure_charpy(run: Path) -> Record:
     """Figures of a bar."""
-    return _of_bar(run)
+    return _measure_bar(run)
 
 
-def measured_izod(run: Path) -> Record:
+def measure_izod(run: Path) -> Record:
     """Figures of a bar."""
-    return _of_bar(run)
+    return _measure_bar(run)
 
 
-def measured_charpy_klst(run: Path) -> Record:
+def measure_charpy_klst(run: Path) -> Record:
     """Figures of a bar."""
-    return _of_bar(run)
+    return _measure_bar(run)
 
 
-def measured_notched_shear(run: Path) -> Record:
+def measure_notched_shear(run: Path) -> Record:
     """Figures of a plate pulled or pushed along the axis along which its grip moved farther."""
-    rows = results.history(run)
+    rows = run_results.history(run)
     way = {axis: float(np.abs(rows[f"motion_grip_{axis}"]).max()) for axis in "xy"}
-    return figures(rows, "grip", max(way, key=way.__getitem__))
+    return load_figures(rows, "grip", max(way, key=way.__getitem__))
 
 
-def measured_l_panel(run: Path) -> Record:
+def measure_l_panel(run: Path) -> Record:
     """Figures of a panel that is pushed up."""
-    return figures(results.history(run), "seat", "y")
+    return load_figures(run_results.history(run), "seat", "y")
 
 
-def measured_kalthoff(run: Path) -> Record:
+def measure_kalthoff(run: Path) -> Record:
     """Angle of the crack over the first 40 mm from its notch, degrees."""
-    rows, (x, y) = results.history(run), results.study(run)["crack"][0]["segment"][1]
+    rows, (x, y) = run_results.history(run), run_results.study(run)["crack"][0]["segment"][1]
     apart = np.column_stack([rows["tip_x"] - x, rows["tip_y"] - y])
     far = np.flatnonzero(np.linalg.norm(apart, axis=1) >= 0.04)
     angle = float(np.degrees(np.arctan2(*apart[far[0], ::-1]))) if len(far) else None
     return {"angle": angle, "pieces": float(rows["pieces"][-1])}
 
 
-def measured_branching(run: Path) -> Record:
+def measure_branching(run: Path) -> Record:
     """Where and when the crack of a pane branched for good, the angles of both branches over FORK, degrees, its speed
     before that, over c_R, and where it branched at first: one of those branches may have stopped."""
     size, centres = crack_faces(run)
-    (x0, y0), rows = results.study(run)["crack"][0]["segment"][1], results.history(run)
+    (x0, y0), rows = run_results.study(run)["crack"][0]["segment"][1], run_results.history(run)
     places, apart = centres[:, :2] - [x0, y0], MANY * float(np.median(size))
-    outcome, first = branches(places, apart), branches(places, apart, FIRST)
+    outcome, first = branch_angles(places, apart), branch_angles(places, apart, FIRST)
     if outcome is None or first is None:
         return {"fork": None, "pieces": float(rows["pieces"][-1])}
     x, upper, lower = outcome
@@ -205,7 +208,7 @@ def measured_branching(run: Path) -> Record:
     return figures | {"speed": x / float(there - begun) / rayleigh, "pieces": float(rows["pieces"][-1])}
 
 
-def branches(places: Values, apart: float, over: float = FORK) -> tuple[float, float, float] | None:
+def branch_angles(places: Values, apart: float, over: float = FORK) -> tuple[float, float, float] | None:
     """Where the outermost crack faces (n, 2), along x from a notch at 0, part for good, and their angles, degrees.
 
     They have parted where they are `apart` (m) and more, `over` as much (m); lines through the outermost, by least
@@ -224,21 +227,21 @@ def branches(places: Values, apart: float, over: float = FORK) -> tuple[float, f
     return float((low - high) / (up - down)), float(np.degrees(np.arctan(up))), float(-np.degrees(np.arctan(down)))
 
 
-def _of_bar(run: Path) -> Record:
+def _measure_bar(run: Path) -> Record:
     """With how high over the notch edges are broken, m."""
-    mesh = results.study(run)["mesh"]
+    mesh = run_results.study(run)["mesh"]
     size, centres = crack_faces(run)
     top = float(centres[:, 1].max()) - float(mesh["notch_depth"]) if len(size) else 0.0
-    return figures(results.history(run), "striker", "y") | {
+    return load_figures(run_results.history(run), "striker", "y") | {
         "torn": top,
         "ligament": mesh["height"] - mesh["notch_depth"],
     }
 
 
-def figures(rows: dict[str, Values], pushed: str, axis: str) -> Record:
+def load_figures(rows: dict[str, Values], pushed: str, axis: str) -> Record:
     """Peak and way there; `second`: the load that the body comes up to after the first peak, which is inertia where it
     is struck; `plateau`: the median over the second half of the way; what is left; what has been absorbed."""
-    load, way, touched = course(rows, pushed, axis)
+    load, way, touched = load_path(rows, pushed, axis)
     return {
         "peak": float(load.max()),
         "at": float(way[load.argmax()]) - touched,
@@ -248,11 +251,11 @@ def figures(rows: dict[str, Values], pushed: str, axis: str) -> Record:
         "absorbed": float(rows[f"work_{pushed}" if f"work_{pushed}" in rows else "external_work"][-1]),
         "travel": float(way[-1]) - touched,
         "pieces": float(rows["pieces"][-1]),
-        "curve": [[float(value) for value in item] for item in thinned(way, load)],
+        "curve": [[float(value) for value in item] for item in downsample(way, load)],
     }
 
 
-def course(rows: dict[str, Values], pushed: str, axis: str) -> tuple[Values, Values, float]:
+def load_path(rows: dict[str, Values], pushed: str, axis: str) -> tuple[Values, Values, float]:
     """Load, N, and way of what is pushed, m, and its way when it touches: of a grip 0, of an obstacle as far as it is
     from where it was at first."""
     held, way = f"reaction_{pushed}_{axis}", np.abs(rows[f"motion_{pushed}_{axis}"])
@@ -268,7 +271,7 @@ def second_peak(load: Values) -> float:
     return float(after[int(np.argmax(after - np.minimum.accumulate(after)))])
 
 
-def thinned(way: Values, load: Values, most: int = 150) -> tuple[Values, Values]:
+def downsample(way: Values, load: Values, most: int = 150) -> tuple[Values, Values]:
     """A curve in so many points or a few more; its peak is among them."""
     rows = np.unique([*np.arange(0, len(load), max(1, len(load) // most)), int(load.argmax()), len(load) - 1])
     return way[rows], load[rows]
@@ -280,7 +283,7 @@ COLUMNS = (
     "experiment", "h, m", "outcome", "first peak, N", "second, N", "plateau, N", "last, N", "over reference",
     "absorbed, J", "way of what pushes, m", "pieces",
 )  # fmt: skip
-SPREADS = ("experiment", "meshes", "peak, N", "spread", "reference, N", "off by", "source")
+RANGE_COLUMNS = ("experiment", "meshes", "peak, N", "spread", "reference, N", "off by", "source")
 TEXT = (
     "Each on three meshes, all but one in 2D with the thickness of the specimen. The disk splits along its loaded"
     " diameter at pi D t f_t / 2. Charpy and Izod bars in plane strain: A516 takes a fracture energy and snaps; "
@@ -310,21 +313,21 @@ def sections(records: list[Record]) -> list[Section]:
     """Tables, claims, curves and pictures."""
     tables = (
         ReportTable("experiments", "All runs", COLUMNS, tuple(_row(record) for record in records)),
-        ReportTable("experiments-spread", "Mean over the meshes and spread, (max - min) / mean", SPREADS,
-              tuple(_spreads(records))),
-        *splitting.table([r for r in records if r["case"] == "granite-cylinder" and r["outcome"] == "done"]),
-        *published.table(records),
+        ReportTable("experiments-spread", "Mean over the meshes and spread, (max - min) / mean", RANGE_COLUMNS,
+              tuple(_range_rows(records))),
+        *diametral_cracks.table([r for r in records if r["case"] == "granite-cylinder" and r["outcome"] == "done"]),
+        *published_results.table(records),
     )  # fmt: skip
-    plots = tuple(_plot(records, case) for case in BY_CASE if any(_drawn(record, case) for record in records))
+    plots = tuple(_load_plot(records, case) for case in BY_CASE if any(_has_curve(record, case) for record in records))
     pictures = tuple(
-        Picture(f"{r['case']}, {r['name']}", f"{folder_of(r)}/run/last.png")
+        Picture(f"{r['case']}, {r['name']}", f"{record_folder(r)}/run/last.png")
         for r in records
         if r["outcome"] == "done" and r["settings"]["h"] == BY_CASE[r["case"]].sizes[1][1]
     )
     return [Section("Experiments", TEXT, claims=_claims(records), tables=tables, plots=plots, pictures=pictures)]
 
 
-def _compared(record: Record) -> float | None:
+def _compared_load(record: Record) -> float | None:
     """The load that the reference is of: of what snaps the one after the inertia, of what bends that which stays."""
     key = {"A516": "second", "NVE36": "plateau"}.get(record["case"].rpartition("-")[2], "peak")
     outcome: float | None = record["figures"].get(key)
@@ -332,42 +335,45 @@ def _compared(record: Record) -> float | None:
 
 
 def _row(record: Record) -> tuple[TableCell, ...]:
-    outcome, peak = record["figures"], _compared(record)
+    outcome, peak = record["figures"], _compared_load(record)
     over = None if peak is None or not BY_CASE[record["case"]].peak else peak / BY_CASE[record["case"]].peak
     loads, others = ("peak", "second", "plateau", "last"), ("absorbed", "travel", "pieces")
     return (record["case"], record["settings"]["h"], record["outcome"], *(outcome.get(key) for key in loads), over,
             *(outcome.get(key) for key in others))  # fmt: skip
 
 
-def _spreads(records: list[Record]) -> list[tuple[TableCell, ...]]:
+def _range_rows(records: list[Record]) -> list[tuple[TableCell, ...]]:
     outcome: list[tuple[TableCell, ...]] = []
     for case, experiment in BY_CASE.items():
-        peaks = [p for r in records if r["case"] == case and r["outcome"] == "done" and (p := _compared(r)) is not None]
+        peaks = [
+            p for r in records if r["case"] == case and r["outcome"] == "done" and (p := _compared_load(r)) is not None
+        ]
         if peaks:
             mean = sum(peaks) / len(peaks)
             off = mean / experiment.peak - 1
-            outcome.append((case, len(peaks), mean, spread(peaks), experiment.peak, off, experiment.source))
+            outcome.append((case, len(peaks), mean, relative_range(peaks), experiment.peak, off, experiment.source))
     return outcome
 
 
 def _claims(records: list[Record]) -> tuple[Claim, ...]:
     disks = [r for r in records if r["case"] == "brazilian" and r["outcome"] == "done"]
     bars = {steel: [r for r in records if steel in r["case"] and r["outcome"] == "done"] for steel in ("A516", "NVE36")}
-    cylinders = _of_cylinders([r for r in records if r["case"] == "granite-cylinder" and r["outcome"] == "done"])
-    return (*_of_disks(disks), *cylinders, *_of_steels(**bars), *_of_notches(records), _of_panels(records))
+    cylinders = _cylinder_claims([r for r in records if r["case"] == "granite-cylinder" and r["outcome"] == "done"])
+    return (*_disk_claims(disks), *cylinders, *_steel_claims(**bars), *_notch_claims(records), _panel_claim(records))
 
 
-def _of_panels(records: list[Record]) -> Claim:
+def _panel_claim(records: list[Record]) -> Claim:
     panel = BY_CASE["l-panel"]
     outcome = [r["figures"] for r in records if r["case"] == panel.case and r["outcome"] == "done"]
     off = [item["peak"] / panel.peak - 1 for item in outcome]
     return Claim(
         "A panel of concrete carries at most a tenth more or less than was measured, on three meshes",
-        _said(off, "{:+.1%}"), all(abs(item) <= (panel.within or 0.0) for item in off) if len(off) == 3 else None,
+        _format_values(off, "{:+.1%}"),
+        all(abs(item) <= (panel.within or 0.0) for item in off) if len(off) == 3 else None,
     )  # fmt: skip
 
 
-def _of_notches(records: list[Record]) -> tuple[Claim, ...]:
+def _notch_claims(records: list[Record]) -> tuple[Claim, ...]:
     plate = BY_CASE["notched-tension"]
     done = {case: [r["figures"] for r in records if r["case"] == case and r["outcome"] == "done"]
             for case in (plate.case, "kalthoff", "branching")}  # fmt: skip
@@ -377,65 +383,67 @@ def _of_notches(records: list[Record]) -> tuple[Claim, ...]:
     askew = [outcome["upper"] - outcome["lower"] if runs else np.inf for outcome, runs in zip(forks, on, strict=True)]
     angles = [outcome["angle"] for outcome in done["kalthoff"] if outcome["angle"] is not None]
     return (
-        Claim("A notched plate in tension breaks within 3 % of Griffith's load on three meshes", _said(off, "{:+.1%}"),
+        Claim("A notched plate in tension breaks within 3 % of Griffith's load on three meshes",
+              _format_values(off, "{:+.1%}"),
               all(abs(item) <= (plate.within or 0.0) for item in off) if len(off) == 3 else None),
-        Claim("Kalthoff's crack goes at 65 to 75 degrees on three meshes", _said(angles, "{:.0f}"),
+        Claim("Kalthoff's crack goes at 65 to 75 degrees on three meshes", _format_values(angles, "{:.0f}"),
               all(65 <= angle <= 75 for angle in angles) if len(angles) == 3 else None),
         Claim("A pane's crack branches on three meshes, symmetric within 10 degrees (inf: one branch stops)",
-              _said(askew, "{:+.0f}"),
+              _format_values(askew, "{:+.0f}"),
               all(abs(item) <= 10 for item in askew) and len(forks) == 3 if len(done["branching"]) == 3 else None),
     )  # fmt: skip
 
 
-def _of_disks(disks: list[Record]) -> tuple[Claim, ...]:
+def _disk_claims(disks: list[Record]) -> tuple[Claim, ...]:
     limit = BY_CASE["brazilian"].within or 0.0
     off = [record["figures"]["peak"] / BY_CASE["brazilian"].peak - 1 for record in disks]
     left = [record["figures"]["last"] / record["figures"]["peak"] for record in disks]
     along = [record["figures"]["along"] for record in disks]
     many = len(disks) == 3
     return (
-        Claim("The Brazilian peak is within 10 % of pi D t f_t / 2 on three meshes", _said(off, "{:+.1%}"),
+        Claim("The Brazilian peak is within 10 % of pi D t f_t / 2 on three meshes", _format_values(off, "{:+.1%}"),
               all(abs(item) <= limit for item in off) if many else None),
-        Claim("Its load falls by half after the peak", _said(left, "{:.2f} left"),
+        Claim("Its load falls by half after the peak", _format_values(left, "{:.2f} left"),
               all(item <= 0.5 for item in left) if many else None),
-        Claim("Cracks follow half of the loaded diameter, within a tenth of the radius", _said(along, "{:.0%}"),
+        Claim("Cracks follow half of the loaded diameter, within a tenth of the radius",
+              _format_values(along, "{:.0%}"),
               all(item >= 0.5 for item in along) if many else None),
     )  # fmt: skip
 
 
-def _of_cylinders(cylinders: list[Record]) -> tuple[Claim, ...]:
+def _cylinder_claims(cylinders: list[Record]) -> tuple[Claim, ...]:
     cylinder = BY_CASE["granite-cylinder"]
-    return splitting.claims([record["figures"] for record in cylinders], cylinder.peak, cylinder.within or 0.0)
+    return diametral_cracks.claims([record["figures"] for record in cylinders], cylinder.peak, cylinder.within or 0.0)
 
 
-def _of_steels(A516: list[Record], NVE36: list[Record]) -> tuple[Claim, ...]:
+def _steel_claims(A516: list[Record], NVE36: list[Record]) -> tuple[Claim, ...]:
     left = [record["figures"]["last"] / record["figures"]["second"] for record in A516]
     stays = [record["figures"]["last"] / record["figures"]["plateau"] for record in NVE36]
     both = len(A516) == 6 and len(NVE36) == 6
     return (
-        Claim("A516 drops below 0.4 of what it has carried, Charpy and Izod", _said(left, "{:.2f}"),
+        Claim("A516 drops below 0.4 of what it has carried, Charpy and Izod", _format_values(left, "{:.2f}"),
               all(item <= 0.4 for item in left) if both else None),
-        Claim("NVE 36 bends, and goes on carrying 0.8 of it and more", _said(stays, "{:.2f}"),
+        Claim("NVE 36 bends, and goes on carrying 0.8 of it and more", _format_values(stays, "{:.2f}"),
               all(stay > 0.8 for stay in stays) if both else None),
     )  # fmt: skip
 
 
-def _said(values: list[float], form: str) -> str:
+def _format_values(values: list[float], form: str) -> str:
     return ", ".join(form.format(value) for value in values) or "not run"
 
 
-def _drawn(record: Record, case: str) -> bool:
+def _has_curve(record: Record, case: str) -> bool:
     return bool(record["case"] == case and record["outcome"] == "done" and "curve" in record["figures"])
 
 
-def _plot(records: list[Record], case: str) -> Plot:
+def _load_plot(records: list[Record], case: str) -> Plot:
     """Load over the way of what pushes, a line a mesh, and the reference: measured, or across."""
     experiment, series, farthest = BY_CASE[case], [], 0.0
     for record in records:
-        if _drawn(record, case):
+        if _has_curve(record, case):
             way, load = record["figures"]["curve"]
             series.append(Series(record["name"], tuple(way), tuple(load), style="line"))
             farthest = max(farthest, way[-1])
-    way, load = published.MEASURED.get(case, ((0.0, farthest), (experiment.peak, experiment.peak)))
+    way, load = published_results.MEASURED.get(case, ((0.0, farthest), (experiment.peak, experiment.peak)))
     line = Series(experiment.source, way, load, style="reference")
     return Plot(f"{case}: load over the way of the {experiment.pushed}", "m", "N", (*series, line))

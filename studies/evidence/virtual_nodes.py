@@ -22,7 +22,7 @@ Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Duplicated:
+class DuplicatedMesh:
     """The mesh with copies.
 
     Attributes:
@@ -40,7 +40,7 @@ class Duplicated:
     share: npt.NDArray[np.float64]
 
 
-def duplicate(cells: npt.NDArray[np.integer], groups: npt.NDArray[np.integer], nodes: int) -> Duplicated:
+def duplicate_cut_cells(cells: npt.NDArray[np.integer], groups: npt.NDArray[np.integer], nodes: int) -> DuplicatedMesh:
     """Copies of `cells` (m, d + 1) by `groups` (m, d + 1): the lowest local node that each local node is joined to."""
     corners: Ints = np.asarray(cells, np.int64)
     joined: Ints = np.asarray(groups, np.int64)
@@ -49,18 +49,18 @@ def duplicate(cells: npt.NDArray[np.integer], groups: npt.NDArray[np.integer], n
     of_node: Ints = np.take_along_axis(number, joined, axis=1)  # (m, d + 1) the copy that owns each local node
     cell, lead = np.nonzero(leads)
     owned = joined[cell] == lead[:, None]
-    own, shared = _owners(corners, of_node, nodes), _across_faces(corners, joined, of_node, nodes)
+    own, shared = _owned_pairs(corners, of_node, nodes), _shared_face_pairs(corners, joined, of_node, nodes)
     alone = np.zeros(len(cell), bool)
     while True:
         kept = shared[:, ~alone[(shared - nodes) // corners.shape[1]].any(axis=0)]
-        places, source = _joined(np.concatenate([own, kept], axis=1), nodes, corners[cell])
-        results = _third_cells(places, owned, cell) & ~alone
+        places, source = _merge_nodes(np.concatenate([own, kept], axis=1), nodes, corners[cell])
+        results = _third_cells_of_faces(places, owned, cell) & ~alone
         if not results.any():
-            return Duplicated(places, owned, cell, source, owned.mean(axis=1))
+            return DuplicatedMesh(places, owned, cell, source, owned.mean(axis=1))
         alone |= results
 
 
-def _joined(pairs: Ints, nodes: int, originals: Ints) -> tuple[Ints, Ints]:
+def _merge_nodes(pairs: Ints, nodes: int, originals: Ints) -> tuple[Ints, Ints]:
     """New nodes of the copies, (copies, d + 1), and what each is a copy of: places that pairs connect are one node."""
     total = nodes + originals.size
     graph = coo_array((np.ones(pairs.shape[1], bool), (pairs[0], pairs[1])), (total, total))
@@ -72,7 +72,7 @@ def _joined(pairs: Ints, nodes: int, originals: Ints) -> tuple[Ints, Ints]:
     return places, source
 
 
-def _third_cells(places: Ints, owned: npt.NDArray[np.bool_], cell: Ints) -> npt.NDArray[np.bool_]:
+def _third_cells_of_faces(places: Ints, owned: npt.NDArray[np.bool_], cell: Ints) -> npt.NDArray[np.bool_]:
     """(copies,) those that share a whole face with another copy of their cell, and own less of it."""
     result, width = np.zeros(len(cell), bool), places.shape[1]
     for apart in range(1, width):  # copies of a cell follow each other
@@ -86,15 +86,15 @@ def _third_cells(places: Ints, owned: npt.NDArray[np.bool_], cell: Ints) -> npt.
     return result
 
 
-def _owners(cells: Ints, of_node: Ints, nodes: int) -> Ints:
+def _owned_pairs(cells: Ints, of_node: Ints, nodes: int) -> Ints:
     """(2, n) pairs: the place of each owned node in its copy, and the node itself."""
     width = cells.shape[1]
     return np.stack([(nodes + of_node * width + np.arange(width)).ravel(), cells.ravel()])
 
 
-def _across_faces(cells: Ints, groups: Ints, of_node: Ints, nodes: int) -> Ints:
+def _shared_face_pairs(cells: Ints, groups: Ints, of_node: Ints, nodes: int) -> Ints:
     """(2, n) pairs of places that copies in neighbouring cells share, because they own a common node of the face."""
-    first, second, at_first, at_second = _common_faces(cells, np.any(groups != 0, axis=1))
+    first, second, at_first, at_second = _faces_of_cut_cells(cells, np.any(groups != 0, axis=1))
     width, pairs = cells.shape[1], []
     for own in range(width - 1):
         a = of_node[first, at_first[:, own]]
@@ -106,7 +106,7 @@ def _across_faces(cells: Ints, groups: Ints, of_node: Ints, nodes: int) -> Ints:
     return np.concatenate(pairs, axis=1)
 
 
-def _common_faces(cells: Ints, cut: npt.NDArray[np.bool_]) -> tuple[Ints, Ints, Ints, Ints]:
+def _faces_of_cut_cells(cells: Ints, cut: npt.NDArray[np.bool_]) -> tuple[Ints, Ints, Ints, Ints]:
     """Cells on both sides of the inner faces at which a cut cell lies, and the local nodes of the face in each of them.
 
     (n,), (n,), (n, d), (n, d): column k is the same node on both sides.

@@ -7,7 +7,7 @@ from mpi4py import MPI
 
 from fracsim.output.result_checks import InvertedCellMonitor
 from fracsim.scene import Scene, build_scene
-from fracsim.studies.evidence import extremes
+from fracsim.studies.evidence import stability_studies
 from fracsim.study.reader import validate
 
 from .scenes import Walk
@@ -28,8 +28,8 @@ def nearly_incompressible(scheme: str) -> list[float]:
     """(attempts that failed, broken edges, elastic energy in J, energy from nowhere over work) of a bar torn at
     nu = 0.4999.
     """
-    study = extremes.torn(
-        extremes.BAR,
+    study = stability_studies.torn_body(
+        stability_studies.BAR,
         speed=1.0,
         step=1e-2,
         steps=12,
@@ -45,7 +45,7 @@ def nearly_incompressible(scheme: str) -> list[float]:
 
 def crushed() -> list[float]:
     """(cells, smallest J, s) that are told of a block mirrored along x."""
-    scene, state, _ = stepped(extremes.block(-1.0, steps=1, confined=True), 1)
+    scene, state, _ = stepped(stability_studies.stretched_block(-1.0, steps=1, confined=True), 1)
     watch = InvertedCellMonitor(scene.balance.stress)
     watch.record_frame(state.t)
     return [watch.inverted_count, watch.min_jacobian, watch.first_time]
@@ -53,7 +53,7 @@ def crushed() -> list[float]:
 
 def flown() -> list[float]:
     """(attempts that failed, kinetic energy in J) of a fast body in short steps."""
-    scene, _, report = stepped(extremes.flying(1e3, 1e-6), 20)
+    scene, _, report = stepped(stability_studies.flying_block(1e3, 1e-6), 20)
     return [scene.stepper.failures.steps_failed, report.kinetic]
 
 

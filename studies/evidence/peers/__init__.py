@@ -6,7 +6,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-from ..section import Section
+from ..report_section import Section
 from ..trial import Trial
 
 FAMILIES = (

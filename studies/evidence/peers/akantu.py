@@ -17,22 +17,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .interpreters import able
+from .interpreters import working_python
 
 VARIABLE = "AKANTU_PYTHON"
 ABSENT = f"Akantu is not installed here ({VARIABLE} names no Python that can import it)."
 WORKER = Path(__file__).with_name("akantu_worker.py")
-CORNERS = {2: ((0, 1), (1, 2), (2, 0)), 3: ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))}  # of its middles
+MIDPOINT_CORNERS = {2: ((0, 1), (1, 2), (2, 0)), 3: ((0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3))}  # of its middles
 Values = npt.NDArray[np.float64]
 
 
 @cache
-def interpreter() -> str | None:
+def akantu_python() -> str | None:
     """A Python that can import Akantu, where there is one."""
-    return able(VARIABLE, "import akantu")
+    return working_python(VARIABLE, "import akantu")
 
 
-def problem_of(scene: Any, step: float) -> dict[str, Any]:
+def problem_arrays(scene: Any, step: float) -> dict[str, Any]:
     """A linear scene on one rank as arrays: what is held stays at 0, `force` is that at the end, N.
 
     `step`: s; 0: statics.
@@ -45,13 +45,13 @@ def problem_of(scene: Any, step: float) -> dict[str, Any]:
     force = np.where(held, 0.0, -balance.update_forces())
     material = study.material
     return {
-        "points": domain.nodes, "cells": in_their_order(domain), "held": held.reshape(-1, size),
+        "points": domain.nodes, "cells": akantu_cell_nodes(domain), "held": held.reshape(-1, size),
         "force": force.reshape(-1, size), "step": step, "plane_stress": material.plane == "stress" and size == 2,
         "young": material.young, "poisson": material.poisson, "density": material.density,
     }  # fmt: skip
 
 
-def in_their_order(domain: Any) -> npt.NDArray[np.int64]:
+def akantu_cell_nodes(domain: Any) -> npt.NDArray[np.int64]:
     """(cells, n) nodes of each cell as Akantu wants them: of positive volume, middles after corners."""
     from ....mesh.simplices import local_edges
 
@@ -64,7 +64,7 @@ def in_their_order(domain: Any) -> npt.NDArray[np.int64]:
     def row(turned: list[int]) -> list[int]:
         if cells.shape[1] == size + 1:
             return turned
-        return turned + [middle(turned[a], turned[b]) for a, b in CORNERS[size]]
+        return turned + [middle(turned[a], turned[b]) for a, b in MIDPOINT_CORNERS[size]]
 
     straight = list(range(size + 1))
     corners = domain.nodes[cells[:, : size + 1]]
@@ -72,7 +72,7 @@ def in_their_order(domain: Any) -> npt.NDArray[np.int64]:
     return np.where(inside_out[:, None], cells[:, row([1, 0, *straight[2:]])], cells[:, row(straight)])
 
 
-class Akantu:
+class AkantuProcess:
     """A body in Akantu, stepped from here.
 
     Attributes:
@@ -81,7 +81,7 @@ class Akantu:
 
     def __init__(self, problem: dict[str, Any], folder: Path) -> None:
         """`folder`: for what goes to and fro. RuntimeError where Akantu is not installed."""
-        python = interpreter()
+        python = akantu_python()
         if python is None:
             raise RuntimeError(ABSENT)
         self.wall: list[float] = []

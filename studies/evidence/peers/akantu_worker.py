@@ -19,13 +19,13 @@ from typing import Any
 import akantu
 import numpy as np
 
-KINDS = {(2, 3): "_triangle_3", (2, 6): "_triangle_6", (3, 4): "_tetrahedron_4", (3, 10): "_tetrahedron_10"}
+ELEMENT_TYPES = {(2, 3): "_triangle_3", (2, 6): "_triangle_6", (3, 4): "_tetrahedron_4", (3, 10): "_tetrahedron_10"}
 
 
 def main() -> None:
     problem = dict(np.load(sys.argv[1]))
-    mesh = mesh_of(problem["points"], problem["cells"])
-    model = model_of(mesh, problem)
+    mesh = build_mesh(problem["points"], problem["cells"])
+    model = build_model(mesh, problem)
     force, whole = model.getExternalForce(), problem["force"]
     solver = "" if problem["step"] else "linear"  # "" is that of the analysis
     for line in sys.stdin:
@@ -37,8 +37,8 @@ def main() -> None:
     np.savez(sys.argv[2], displacement=np.array(model.getDisplacement()))
 
 
-def mesh_of(points: Any, cells: Any) -> Any:
-    kind = getattr(akantu, KINDS[points.shape[1], cells.shape[1]])
+def build_mesh(points: Any, cells: Any) -> Any:
+    kind = getattr(akantu, ELEMENT_TYPES[points.shape[1], cells.shape[1]])
     mesh = akantu.Mesh(points.shape[1])
     into = akantu.MeshAccessor(mesh)
     into.resizeNodes(len(points))
@@ -50,7 +50,7 @@ def mesh_of(points: Any, cells: Any) -> Any:
     return mesh
 
 
-def model_of(mesh: Any, problem: dict[str, Any]) -> Any:
+def build_model(mesh: Any, problem: dict[str, Any]) -> Any:
     """Statics where the step is 0; else the trapezoidal rule with a consistent mass."""
     young, poisson, density, step = (float(problem[key]) for key in ("young", "poisson", "density", "step"))
     words = f"material elastic [\n name = body\n rho = {density!r}\n E = {young!r}\n nu = {poisson!r}\n"

@@ -6,7 +6,7 @@ import os
 import subprocess
 
 
-def able(variable: str, asked: str) -> str | None:
+def working_python(variable: str, asked: str) -> str | None:
     """The Python that a variable names, where it gets through what is `asked` of it; None where there is none."""
     given = os.environ.get(variable)
     if not given:

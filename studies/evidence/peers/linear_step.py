@@ -19,41 +19,41 @@ from typing import Any
 
 import numpy as np
 
-from ..section import Claim, ReportTable, Section, again
+from ..report_section import Claim, ReportTable, Section, rerun_hint
 from ..trial import Trial
-from .akantu import ABSENT, Akantu, interpreter, problem_of
+from .akantu import ABSENT, AkantuProcess, akantu_python, problem_arrays
 
 SIZES = (10, 20)  # 24k and 192k tetrahedra
 WARM, STEPS = 2, 28
-STEP, PULL = 5e-3, 1e3  # s, Pa
-LIMIT, SAME = 0.8, 1e-4  # of Akantu's step; of the displacement
-WAYS: dict[str, dict[str, Any]] = {
+TIME_STEP, TRACTION = 5e-3, 1e3  # s, Pa
+MAX_TIME_RATIO, MAX_DIFFERENCE = 0.8, 1e-4  # of Akantu's step; of the displacement
+SCHEMES: dict[str, dict[str, Any]] = {
     "newmark, consistent mass": {"scheme": "newmark", "mass": "consistent"},
     "newmark": {"scheme": "newmark"},
     "the defaults": {},
 }
-FIRST = next(iter(WAYS))  # the one with Akantu's equations
+SAME_EQUATIONS = next(iter(SCHEMES))  # the one with Akantu's equations
 
 
-def study(n: int, way: str) -> dict[str, Any]:
+def block_study(n: int, way: str) -> dict[str, Any]:
     """With n cells along a metre."""
-    end = (WARM + STEPS) * STEP
+    end = (WARM + STEPS) * TIME_STEP
     return {
         "title": f"a linear block of {24 * n**3} tetrahedra",
         "mesh": {"builder": "box", "size": [1.0, 1.0, 4.0], "h": 1 / n},
         "material": {"energy": "linear", "young": 1e7, "poisson": 0.35, "density": 1000.0},
         "boundary": [
             {"on": "bottom", "fix": "xyz"},
-            {"on": "top", "traction": {"time": [0.0, end], "value": [[0.0] * 3, [PULL, 0.0, 0.0]]}},
+            {"on": "top", "traction": {"time": [0.0, end], "value": [[0.0] * 3, [TRACTION, 0.0, 0.0]]}},
         ],
-        "time": {"step": STEP, "end": end} | WAYS[way],
+        "time": {"step": TIME_STEP, "end": end} | SCHEMES[way],
         "output": {"every": 1_000_000, "fields": [], "picture": False},
     }
 
 
 def trials() -> list[Trial]:
     """Both sizes; none where Akantu is not there."""
-    if interpreter() is None:
+    if akantu_python() is None:
         return []
     return [_trial(n) for n in SIZES]
 
@@ -63,12 +63,12 @@ def _trial(n: int) -> Trial:
     return Trial("peers", "linear-step", f"n-{n}", script=script, settings={"n": n, "peer": "Akantu"}, limit=45.0 * n)
 
 
-def beside(n: int) -> dict[str, Any]:
+def compare(n: int) -> dict[str, Any]:
     """Seconds per step of Akantu and of each of our ways, and how far apart the displacements are at the end."""
     with tempfile.TemporaryDirectory() as folder:
-        runs = {way: _started(n, way, Path(folder, str(place))) for place, way in enumerate(WAYS)}
-        theirs = Akantu(problem_of(runs[FIRST].scene, STEP), Path(folder))
-        times: dict[str, list[tuple[float, float]]] = {way: [] for way in WAYS}
+        runs = {way: _start_run(n, way, Path(folder, str(place))) for place, way in enumerate(SCHEMES)}
+        theirs = AkantuProcess(problem_arrays(runs[SAME_EQUATIONS].scene, TIME_STEP), Path(folder))
+        times: dict[str, list[tuple[float, float]]] = {way: [] for way in SCHEMES}
         for number in range(WARM + STEPS):
             theirs.step((number + 1) / (WARM + STEPS))
             for way, run in runs.items():
@@ -76,26 +76,26 @@ def beside(n: int) -> dict[str, Any]:
                 run.step()
                 times[way].append((time.perf_counter() - wall, time.process_time() - cpu))
         exact = theirs.end()
-    ours = runs[FIRST].state.u.reshape(exact.shape)
+    ours = runs[SAME_EQUATIONS].state.u.reshape(exact.shape)
     return {
-        "cells": runs[FIRST].scene.domain.cell_count,
+        "cells": runs[SAME_EQUATIONS].scene.domain.cell_count,
         "apart": float(np.abs(ours - exact).max() / np.abs(exact).max()),
         "akantu": {"wall": median(theirs.wall[WARM:]), "cpu": median(theirs.cpu[WARM:]), "first": theirs.cpu[0]},
-        "ours": {way: _of(pairs) for way, pairs in times.items()},
+        "ours": {way: _median_times(pairs) for way, pairs in times.items()},
     }
 
 
-def _started(n: int, way: str, folder: Path) -> Any:
+def _start_run(n: int, way: str, folder: Path) -> Any:
     from mpi4py import MPI
 
     from ....run import Run
     from ....scene import build_scene
     from ....study.reader import validate
 
-    return Run(build_scene(MPI.COMM_WORLD, validate(study(n, way), way)), folder)
+    return Run(build_scene(MPI.COMM_WORLD, validate(block_study(n, way), way)), folder)
 
 
-def _of(pairs: list[tuple[float, float]]) -> dict[str, float]:
+def _median_times(pairs: list[tuple[float, float]]) -> dict[str, float]:
     wall, cpu = zip(*pairs[WARM:], strict=True)
     return {"wall": median(wall), "cpu": median(cpu), "first": pairs[0][1]}
 
@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=SIZES[0])
     parser.add_argument("-o", "--out", type=Path, required=True)
     given = parser.parse_args()
-    given.out.write_text(json.dumps(beside(given.n), indent=1) + "\n")
+    given.out.write_text(json.dumps(compare(given.n), indent=1) + "\n")
 
 
 # --- the section ----------------------------------------------------------------------------------------------------
@@ -120,10 +120,12 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     if not done:
         return [Section(TITLE, results[0]["message"] if results else ABSENT)]
     text = (
-        f"Block of 24 n^3 tetrahedra, {STEPS} steps of {STEP:g} s after the first {WARM}, in turn, one process and "
-        f"thread each; medians. '{FIRST}' solves Akantu's equations. Akantu keeps the factors of a direct solver, we "
+        f"Block of 24 n^3 tetrahedra, {STEPS} steps of {TIME_STEP:g} s after the first {WARM}, in turn, one "
+        f"process and "
+        f"thread each; medians. '{SAME_EQUATIONS}' solves Akantu's equations. Akantu keeps the factors of a "
+        f"direct solver, we "
         "keep multigrid and begin CG from earlier solutions. First: the first step, with what is made in it."
-        f"{again(results)}"
+        f"{rerun_hint(results)}"
     )
     columns = ("tetrahedra", "program", "wall s a step", "core-seconds a step", "over Akantu's", "first, core-seconds")
     rows = tuple(row for figures in done for row in _rows(figures))
@@ -140,18 +142,18 @@ def _rows(figures: dict[str, Any]) -> list[tuple[Any, ...]]:
 
 
 def _claims(done: list[dict[str, Any]]) -> tuple[Claim, ...]:
-    ratios = {figures["cells"]: figures["ours"][FIRST]["cpu"] / figures["akantu"]["cpu"] for figures in done}
+    ratios = {figures["cells"]: figures["ours"][SAME_EQUATIONS]["cpu"] / figures["akantu"]["cpu"] for figures in done}
     apart = {figures["cells"]: figures["apart"] for figures in done}
     return (
         Claim(
-            f"A linear step takes at most {LIMIT:g} of Akantu's core-seconds",
+            f"A linear step takes at most {MAX_TIME_RATIO:g} of Akantu's core-seconds",
             ", ".join(f"{ratio:.2f} at {cells:,} tetrahedra" for cells, ratio in ratios.items()),
-            all(ratio <= LIMIT for ratio in ratios.values()),
+            all(ratio <= MAX_TIME_RATIO for ratio in ratios.values()),
         ),
         Claim(
-            f"Both end at the same displacement, to {SAME:g} of the greatest",
+            f"Both end at the same displacement, to {MAX_DIFFERENCE:g} of the greatest",
             ", ".join(f"{item:.1e} at {cells:,} tetrahedra" for cells, item in apart.items()),
-            all(item <= SAME for item in apart.values()),
+            all(item <= MAX_DIFFERENCE for item in apart.values()),
         ),
     )
 

@@ -26,24 +26,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..section import ReportTable, Section, TableCell
+from ..report_section import ReportTable, Section, TableCell
 from ..trial import Trial
-from .interpreters import able
+from .interpreters import working_python
 
 VARIABLE = "PHASEFIELDX_PYTHON"
 ABSENT = f"PhaseFieldX is not installed here ({VARIABLE} names no Python that can import it)."
 WORKER = Path(__file__).with_name("phase_field_worker.py")
 SIZES = (40, 80)  # cells along a side: 3,200 and 12,800 triangles
-SIDE, YOUNG, POISSON, ENERGY = 1e-3, 2.1e11, 0.3, 2700.0  # m, Pa, J/m^2 (Miehe et al. 2010)
-SCALE = 2.0  # length scale over h
-GRIFFITH = 645.0  # N, of a sharp crack (experiments)
-MM = 1e3
-RING = 0.08e-3, 0.25e-3  # m from the notch: where the direction of a crack is looked at
+SIDE, YOUNG, POISSON, FRACTURE_ENERGY = 1e-3, 2.1e11, 0.3, 2700.0  # m, Pa, J/m^2 (Miehe et al. 2010)
+LENGTH_SCALE = 2.0  # length scale over h
+GRIFFITH_LOAD = 645.0  # N, of a sharp crack (experiments)
+MM_PER_M = 1e3
+DIRECTION_RADII = 0.08e-3, 0.25e-3  # m from the notch: where the direction of a crack is looked at
 Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Pull:
+class GripMotion:
     """Which way the upper side is moved (0: across, 1: up), how far, m, and in how many steps."""
 
     axis: int
@@ -56,16 +56,16 @@ class Pull:
         return self.way * np.arange(1.0, self.steps + 1) / self.steps
 
 
-PULLS = {"tension": Pull(1, 6.5e-6, 65), "shear": Pull(0, 1.5e-5, 75)}
+GRIP_MOTIONS = {"tension": GripMotion(1, 6.5e-6, 65), "shear": GripMotion(0, 1.5e-5, 75)}
 
 
 @cache
-def interpreter() -> str | None:
+def phasefieldx_python() -> str | None:
     """A Python that can import PhaseFieldX, where there is one."""
-    return able(VARIABLE, "from phasefieldx.Element.Phase_Field_Fracture.solver.solver import solve")
+    return working_python(VARIABLE, "from phasefieldx.Element.Phase_Field_Fracture.solver.solver import solve")
 
 
-def study(n: int, pull: Pull) -> dict[str, Any]:
+def plate_study(n: int, pull: GripMotion) -> dict[str, Any]:
     """Ours, with n cells along a side."""
     moved = [0.0, 0.0]
     moved[pull.axis] = pull.way
@@ -74,7 +74,7 @@ def study(n: int, pull: Pull) -> dict[str, Any]:
         "title": f"a notched plate of {2 * n * n} triangles",
         "mesh": {"builder": "box", "size": [SIDE, SIDE], "h": SIDE / n},
         "material": {"energy": "linear", "young": YOUNG, "poisson": POISSON, "density": 7850.0, "thickness": SIDE},
-        "fracture": {"strength": 2e10, "energy": ENERGY},
+        "fracture": {"strength": 2e10, "energy": FRACTURE_ENERGY},
         "crack": [{"segment": [[-SIDE, at], [SIDE / 2, at]]}],
         "boundary": [
             {"on": "bottom", "fix": "xy"},
@@ -86,7 +86,7 @@ def study(n: int, pull: Pull) -> dict[str, Any]:
     }
 
 
-def slit(points: Values, cells: npt.NDArray[np.int64]) -> tuple[Values, npt.NDArray[np.int64]]:
+def double_slit_nodes(points: Values, cells: npt.NDArray[np.int64]) -> tuple[Values, npt.NDArray[np.int64]]:
     """A square of side 1 whose nodes from the left to the middle of its middle row are there twice."""
     parted = np.flatnonzero((np.abs(points[:, 1] - 0.5) < 1e-9) & (points[:, 0] < 0.5 - 1e-9))
     other = np.arange(len(points))
@@ -98,7 +98,7 @@ def slit(points: Values, cells: npt.NDArray[np.int64]) -> tuple[Values, npt.NDAr
 def trials() -> list[Trial]:
     """Both sizes in tension, the larger one in shear; none where PhaseFieldX is not there."""
     asked = [*((n, "tension") for n in SIZES), (SIZES[-1], "shear")]
-    return [] if interpreter() is None else [_trial(n, pull) for n, pull in asked]
+    return [] if phasefieldx_python() is None else [_trial(n, pull) for n, pull in asked]
 
 
 def _trial(n: int, pull: str) -> Trial:
@@ -107,13 +107,18 @@ def _trial(n: int, pull: str) -> Trial:
     return Trial("peers", "notched-plate", f"{pull}-n-{n}", script=script, settings=settings, limit=15.0 * n)
 
 
-def beside(n: int, pull: str) -> dict[str, Any]:
+def compare(n: int, pull: str) -> dict[str, Any]:
     """Peak load, N, motion there, m, direction of the crack and processor time of both. RuntimeError where PhaseFieldX
     is not installed."""
-    return {"cells": 2 * n * n, "pull": pull, "ours": _ours(n, PULLS[pull]), "theirs": _theirs(n, pull)}
+    return {
+        "cells": 2 * n * n,
+        "pull": pull,
+        "ours": _run_fracsim(n, GRIP_MOTIONS[pull]),
+        "theirs": _run_phasefieldx(n, pull),
+    }
 
 
-def _ours(n: int, pull: Pull) -> dict[str, float]:
+def _run_fracsim(n: int, pull: GripMotion) -> dict[str, float]:
     from mpi4py import MPI
 
     from ....fracture.energy.tip_criterion import TipCriterion
@@ -122,7 +127,7 @@ def _ours(n: int, pull: Pull) -> dict[str, float]:
     from ....study.reader import validate
 
     with tempfile.TemporaryDirectory() as folder:
-        run = Run(build_scene(MPI.COMM_WORLD, validate(study(n, pull), "notched plate")), Path(folder, "ours"))
+        run = Run(build_scene(MPI.COMM_WORLD, validate(plate_study(n, pull), "notched plate")), Path(folder, "ours"))
         column, began = run.scene.probes.columns.index(f"reaction_grip_{'xy'[pull.axis]}"), time.process_time()
         load, solves = [], 0
         for _ in range(pull.steps):
@@ -138,41 +143,42 @@ def _ours(n: int, pull: Pull) -> dict[str, float]:
     return _figures(np.array(load), pull.course, crack, seconds, solves)
 
 
-def _theirs(n: int, pull: str) -> dict[str, float]:
+def _run_phasefieldx(n: int, pull: str) -> dict[str, float]:
     from ....meshes.builders.box import Box
 
-    python, given = interpreter(), PULLS[pull]
+    python, given = phasefieldx_python(), GRIP_MOTIONS[pull]
     if python is None:
         raise RuntimeError(ABSENT)
     mesh = Box(size=(1.0, 1.0), h=1 / n).build()
-    points, cells = slit(mesh.points, np.asarray(mesh.cells, np.int64))
+    points, cells = double_slit_nodes(mesh.points, np.asarray(mesh.cells, np.int64))
     with tempfile.TemporaryDirectory() as folder:
         problem, result = Path(folder, "problem.npz"), Path(folder, "result.npz")
         np.savez(
-            problem, points=points * SIDE * MM, cells=cells, course=given.course * MM, young=YOUNG * 1e-9,
-            poisson=POISSON, energy=ENERGY * 1e-6, length=SCALE * SIDE * MM / n, axis=given.axis, split=pull == "shear",
+            problem, points=points * SIDE * MM_PER_M, cells=cells, course=given.course * MM_PER_M, young=YOUNG * 1e-9,
+            poisson=POISSON, energy=FRACTURE_ENERGY * 1e-6, length=LENGTH_SCALE * SIDE * MM_PER_M / n, axis=given.axis,
+            split=pull == "shear",
         )  # fmt: skip
         done = subprocess.run([python, str(WORKER), str(problem), str(result)], capture_output=True, text=True)
         if done.returncode:
             raise RuntimeError(f"PhaseFieldX ended with code {done.returncode}: {done.stderr[-500:]}")
         said = json.loads(done.stdout.splitlines()[-1])
         with np.load(result) as results:  # kN for a thickness of 1 mm
-            crack = results["crack"] / MM - SIDE / 2
+            crack = results["crack"] / MM_PER_M - SIDE / 2
             return _figures(results["load"] * 1e3, given.course, crack, said["cpu"], said["solves"])
 
 
-def direction(crack: Values) -> float:
+def crack_direction(crack: Values) -> float:
     """Degrees, below straight ahead, of what lies (n, 2), m, off the end of the notch within RING; NaN where nothing
     does."""
     apart = np.linalg.norm(crack, axis=1)
-    near = crack[(apart > RING[0]) & (apart < RING[1]) & (crack[:, 0] > 0)]
+    near = crack[(apart > DIRECTION_RADII[0]) & (apart < DIRECTION_RADII[1]) & (crack[:, 0] > 0)]
     return float(np.degrees(np.arctan2(-near[:, 1].mean(), near[:, 0].mean()))) if len(near) else float("nan")
 
 
 def _figures(load: Values, course: Values, crack: Values, seconds: float, solves: int) -> dict[str, float]:
     at = int(load.argmax())
     return {
-        "peak": float(load[at]), "at": float(course[at]), "turn": direction(crack), "seconds": seconds,
+        "peak": float(load[at]), "at": float(course[at]), "turn": crack_direction(crack), "seconds": seconds,
         "solves": float(solves),
     }  # fmt: skip
 
@@ -180,10 +186,10 @@ def _figures(load: Values, course: Values, crack: Values, seconds: float, solves
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n", type=int, default=SIZES[0])
-    parser.add_argument("--pull", choices=PULLS, default="tension")
+    parser.add_argument("--pull", choices=GRIP_MOTIONS, default="tension")
     parser.add_argument("-o", "--out", type=Path, required=True)
     given = parser.parse_args()
-    given.out.write_text(json.dumps(beside(given.n, given.pull), indent=1) + "\n")
+    given.out.write_text(json.dumps(compare(given.n, given.pull), indent=1) + "\n")
 
 
 # --- the section ----------------------------------------------------------------------------------------------------
@@ -192,7 +198,8 @@ TITLE = "A notched plate beside a phase field's"
 TEXT = (
     "Single-edge notched plates on one lattice: PhaseFieldX 0.1.4 (AT2, history field, length scale of two cells, each "
     "step solved in turn to a change of 1e-4; in shear hybrid, by positive principal strains) and this program, as "
-    f"many steps each, one process. In tension a sharp crack breaks at {GRIFFITH:g} N; in shear a kink can start at "
+    f"many steps each, one process. In tension a sharp crack breaks at {GRIFFITH_LOAD:g} N; in shear a kink can "
+    f"start at "
     "400 N, at 70.5 degrees. Direction: of the crack 0.08 to 0.25 mm from the notch, below straight ahead. "
     "Core-seconds are those of all steps, without reading the mesh and compiling."
 )

@@ -26,8 +26,11 @@ from mpi4py import MPI
 from phasefieldx.Element.Phase_Field_Fracture.Input import Input
 from phasefieldx.Element.Phase_Field_Fracture.solver.solver import solve
 
-BROKEN = 0.95  # phase
-ENOUGH, MOST = 1e-4, 500  # relative change at which a step's alternate solves end, and how many there may be
+BROKEN_PHASE = 0.95  # phase
+STAGGERED_TOLERANCE, MAX_STAGGERED_ITERATIONS = (
+    1e-4,
+    500,
+)  # relative change at which a step's alternate solves end, and how many there may be
 
 
 def main() -> None:
@@ -39,13 +42,13 @@ def main() -> None:
     V, W = fem.functionspace(mesh, ("Lagrange", 1, (2,))), fem.functionspace(mesh, ("Lagrange", 1))
     phase: list[Any] = []
     height, moved = points[:, 1].max(), fem.Constant(mesh, np.zeros(2))
-    foot = fem.dirichletbc(fem.Constant(mesh, np.zeros(2)), _nodes(V, 0.0), V)
-    grip = fem.dirichletbc(moved, _nodes(V, height), V)
+    foot = fem.dirichletbc(fem.Constant(mesh, np.zeros(2)), _dofs_at_height(V, 0.0), V)
+    grip = fem.dirichletbc(moved, _dofs_at_height(V, height), V)
 
     def pull(_: Any, t: float) -> tuple[float, float, float]:
         moved.value[axis] = course[round(t)]
         if not phase:
-            phase.append(_found("phi"))
+            phase.append(_find_field("phi"))
         return float(moved.value[0]), float(moved.value[1]), 0.0
 
     with tempfile.TemporaryDirectory() as folder:
@@ -57,16 +60,17 @@ def main() -> None:
         began = time.process_time()
         solve(
             data, mesh, len(course) - 0.5, V, W, bc_list_u=[foot, grip], update_boundary_conditions=pull, path=folder,
-            bcs_list_u_names=["foot", "grip"], max_stagger_iter=MOST, stagger_error_tol=ENOUGH,
+            bcs_list_u_names=["foot", "grip"], max_stagger_iter=MAX_STAGGERED_ITERATIONS,
+            stagger_error_tol=STAGGERED_TOLERANCE,
         )  # fmt: skip
         seconds = time.process_time() - began
         load = np.loadtxt(Path(folder, "results", "grip.reaction"))[:, 1 + axis]
         solves = np.loadtxt(Path(folder, "results", "phasefieldx.conv"))[:, 1]
-    np.savez(sys.argv[2], load=np.abs(load), crack=_cracked(W, phase[0]))
+    np.savez(sys.argv[2], load=np.abs(load), crack=_crack_points(W, phase[0]))
     print(json.dumps({"cpu": seconds, "solves": int(solves.sum())}))
 
 
-def _found(name: str) -> Any:
+def _find_field(name: str) -> Any:
     """A field of the solver that runs, which gives it to nobody."""
     return next(
         get_object
@@ -75,12 +79,12 @@ def _found(name: str) -> Any:
     )
 
 
-def _cracked(W: Any, phase: Any) -> Any:
+def _crack_points(W: Any, phase: Any) -> Any:
     """(n, 2) mm, where the phase is nearly 1."""
-    return W.tabulate_dof_coordinates()[phase.x.array > BROKEN, :2]
+    return W.tabulate_dof_coordinates()[phase.x.array > BROKEN_PHASE, :2]
 
 
-def _nodes(V: Any, y: float) -> Any:
+def _dofs_at_height(V: Any, y: float) -> Any:
     return fem.locate_dofs_geometrical(V, lambda x: np.isclose(x[1], y))
 
 

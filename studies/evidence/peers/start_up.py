@@ -21,64 +21,66 @@ from typing import Any
 
 import numpy as np
 
-from ..section import Claim, ReportTable, Section, again
+from ..report_section import Claim, ReportTable, Section, rerun_hint
 from ..trial import Trial
-from .akantu import ABSENT, WORKER, interpreter, problem_of
-from .linear_step import STEP, study
+from .akantu import ABSENT, WORKER, akantu_python, problem_arrays
+from .linear_step import TIME_STEP, block_study
 
-RUNS, STEPS, LIMIT = 7, 10, 0.7  # LIMIT: s
-WAYS: dict[str, dict[str, Any]] = {
+RUNS, STEPS, MAX_SECONDS = 7, 10, 0.7  # LIMIT: s
+JOBS: dict[str, dict[str, Any]] = {
     "linear": {},
     "neo-hookean": {"material": {"energy": "neo-hookean", "young": 1e7, "poisson": 0.35, "density": 1000.0}},
     "linear, and may break": {"fracture": {"strength": 1e8}},
 }
 
 
-def job(way: str) -> dict[str, Any]:
+def job_study(way: str) -> dict[str, Any]:
     """Ten steps of the block with 3,000 tetrahedra."""
-    results = study(5, "newmark, consistent mass") | WAYS[way]
-    return results | {"time": results["time"] | {"end": STEPS * STEP}}
+    results = block_study(5, "newmark, consistent mass") | JOBS[way]
+    return results | {"time": results["time"] | {"end": STEPS * TIME_STEP}}
 
 
 def trials() -> list[Trial]:
     """One, with Akantu where it is there."""
     script = ("fracsim.studies.evidence.peers.start_up",)
-    return [Trial("peers", "start-up", "3k", script=script, settings={"peer": "Akantu" if interpreter() else "none"})]
+    return [Trial("peers", "start-up", "3k", script=script, settings={"peer": "Akantu" if akantu_python() else "none"})]
 
 
-def measured() -> dict[str, float]:
+def measure() -> dict[str, float]:
     """Median processor seconds of each way, and of Akantu where it is there."""
     with tempfile.TemporaryDirectory() as folder:
-        commands = {way: _ours(way, Path(folder, f"way-{place}")) for place, way in enumerate(WAYS)}
-        if interpreter():
-            commands["Akantu"] = _theirs(Path(folder))
+        commands = {way: _fracsim_command(way, Path(folder, f"way-{place}")) for place, way in enumerate(JOBS)}
+        if akantu_python():
+            commands["Akantu"] = _akantu_command(Path(folder))
         for command in commands.values():
             command()  # compiles
         seconds: dict[str, list[float]] = {name: [] for name in commands}
         for _ in range(RUNS):
             for name, command in commands.items():
-                seconds[name].append(_cost(command))
+                seconds[name].append(_processor_seconds(command))
     return {name: median(results) for name, results in seconds.items()}
 
 
-def _ours(way: str, folder: Path) -> Callable[[], None]:
+def _fracsim_command(way: str, folder: Path) -> Callable[[], None]:
     import tomli_w
 
     path = folder.with_suffix(".toml")
-    path.write_text(tomli_w.dumps(job(way)))
+    path.write_text(tomli_w.dumps(job_study(way)))
     command = ["fracsim", "run", str(path), "-o", str(folder), "--overwrite"]
     return lambda: _run(command)
 
 
-def _theirs(folder: Path) -> Callable[[], None]:
+def _akantu_command(folder: Path) -> Callable[[], None]:
     from mpi4py import MPI
 
     from ....scene import build_scene
     from ....study.reader import validate
 
-    python, files = interpreter(), [str(folder / name) for name in ("problem.npz", "result.npz")]
+    python, files = akantu_python(), [str(folder / name) for name in ("problem.npz", "result.npz")]
     assert python is not None
-    np.savez(files[0], **problem_of(build_scene(MPI.COMM_WORLD, validate(job("linear"), "linear")), STEP))
+    np.savez(
+        files[0], **problem_arrays(build_scene(MPI.COMM_WORLD, validate(job_study("linear"), "linear")), TIME_STEP)
+    )
     shares = "".join(f"{(number + 1) / STEPS}\n" for number in range(STEPS))
     return lambda: _run([python, "-I", str(WORKER), *files], shares)
 
@@ -88,7 +90,7 @@ def _run(command: list[str], given: str = "") -> None:
     subprocess.run(command, input=given, text=True, check=True, capture_output=True, timeout=120, env=kept)
 
 
-def _cost(command: Callable[[], None]) -> float:
+def _processor_seconds(command: Callable[[], None]) -> float:
     began = os.times()
     command()
     ended = os.times()
@@ -99,7 +101,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--out", type=Path, required=True)
     given = parser.parse_args()
-    given.out.write_text(json.dumps(measured(), indent=1) + "\n")
+    given.out.write_text(json.dumps(measure(), indent=1) + "\n")
 
 
 # --- the section ----------------------------------------------------------------------------------------------------
@@ -113,11 +115,11 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     figures = results["figures"]
     text = (
         f"3,000 tetrahedra, {STEPS} steps, from the command to its end: processor seconds, medians of {RUNS} runs in "
-        f"turn.{'' if 'Akantu' in figures else f' {ABSENT}'}{again([results])}"
+        f"turn.{'' if 'Akantu' in figures else f' {ABSENT}'}{rerun_hint([results])}"
     )
-    worst = max(figures[way] for way in WAYS)
+    worst = max(figures[way] for way in JOBS)
     shown = ", ".join(f"{name} {seconds:.2f}" for name, seconds in figures.items())
-    claim = Claim(f"A small job takes at most {LIMIT:g} s of processor time", shown, worst <= LIMIT)
+    claim = Claim(f"A small job takes at most {MAX_SECONDS:g} s of processor time", shown, worst <= MAX_SECONDS)
     table = ReportTable("peers-start-up", "Start-up", ("job", "processor seconds"), tuple(figures.items()))
     return [Section("Start-up", text, (claim,), (table,))]
 

@@ -4,13 +4,35 @@ from __future__ import annotations
 
 from typing import Any
 
-from ..section import Section
+from ..report_section import Section
 from ..trial import Trial
-from . import average, beam, brazilian, finite, fracture, plastic, smooth, solver, statics, wave
-from .page import in_doubt, section
-from .short import summary
+from . import (
+    averaging_error,
+    bar_fracture,
+    bar_wave,
+    brazilian_disk,
+    convergence_orders,
+    finite_strain,
+    linear_statics,
+    plastic_bar,
+    solver_settings,
+    vibrating_beam,
+)
+from .accuracy_summary import summary_sections
+from .case_section import doubtful_trials, section
 
-FAMILIES = (statics, smooth, beam, wave, finite, fracture, plastic, brazilian, average, solver)
+FAMILIES = (
+    linear_statics,
+    convergence_orders,
+    vibrating_beam,
+    bar_wave,
+    finite_strain,
+    bar_fracture,
+    plastic_bar,
+    brazilian_disk,
+    averaging_error,
+    solver_settings,
+)
 
 
 def trials() -> list[Trial]:
@@ -18,12 +40,14 @@ def trials() -> list[Trial]:
     return [trial for family in FAMILIES for trial in family.trials()]
 
 
-def to_time_again(records: list[dict[str, Any]]) -> set[tuple[str, str]]:
+def trials_to_repeat(records: list[dict[str, Any]]) -> set[tuple[str, str]]:
     """(case, name) of trials whose seconds decide something by more than noise, and were measured but once or twice."""
-    return {(case.name, name) for family in FAMILIES for case in family.CASES for name in in_doubt(case, records)}
+    return {
+        (case.name, name) for family in FAMILIES for case in family.CASES for name in doubtful_trials(case, records)
+    }
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
     """The first screen, and a section for each case."""
     cases = [case for family in FAMILIES for case in family.CASES]
-    return [*summary(cases, records), *(section(case, records) for case in cases)]
+    return [*summary_sections(cases, records), *(section(case, records) for case in cases)]

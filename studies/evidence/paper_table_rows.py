@@ -1,0 +1,88 @@
+"""The rows of M22's table 2 beside the paper's seconds (studies.paper_table), each a run at the paper's cells and step.
+
+python -m fracsim.studies.evidence.paper_table_rows ROW [--limit 600] -o figures.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from ..paper_table import COLUMNS, SCENES, run_row
+from .report_section import Claim, ReportTable, Section, TableCell, rerun_hint
+from .trial import Trial
+
+RANKS = 2
+LONG_LIMITS = {"loaf": 600.0, "doormat": 900.0, "jelly-figure": 200.0}  # s, of rows that are left to `make report-full`
+TIME_LIMIT = 30.0  # s, of the others
+SMALLEST_SCENE, MAX_STEP_SECONDS = "jade-figure", 15e-3  # the smallest body, and s that a step of it may take
+TEXT = (
+    "Bodies that tear, snap and shatter at the paper's cells (within a seventh), materials and steps, on two ranks; "
+    "the paper has 12 threads at 2.6 GHz. Medians over the steps of a run, which ends with its scene or at a limit."
+)
+
+
+def trials() -> list[Trial]:
+    """One for each row; the three large ones are long."""
+    return [
+        Trial(
+            "rows", "paper", name, script=("fracsim.studies.evidence.paper_table_rows", name, "--limit", f"{limit:g}"),
+            settings={"ranks": RANKS}, limit=limit + 120.0, full=name in LONG_LIMITS,
+        )
+        for name, limit in ((name, LONG_LIMITS.get(name, TIME_LIMIT)) for name in SCENES)
+    ]  # fmt: skip
+
+
+def sections(records: list[dict[str, Any]]) -> list[Section]:
+    """The table, and whether each row is at or below the paper's seconds."""
+    done = {record["name"]: record["figures"] for record in records if record["outcome"] == "done"}
+    rows = tuple(_row(record) for record in records)
+    table = ReportTable("paper-rows", "M22's table 2; s: of a step", (*COLUMNS, "outcome"), rows)
+    return [
+        Section(
+            "The paper's table",
+            TEXT + rerun_hint(records),
+            (_paper_claim(done, len(records)), _smallest_scene_claim(done)),
+            (table,),
+        )
+    ]
+
+
+def _row(record: dict[str, Any]) -> tuple[TableCell, ...]:
+    figures = record["figures"] if record["outcome"] == "done" else {"scene": record["name"]}
+    return (*(figures.get(column) for column in COLUMNS), record["outcome"])
+
+
+def _paper_claim(done: dict[str, dict[str, Any]], tried: int) -> Claim:
+    shares = {name: figures["median / paper's"] for name, figures in done.items()}
+    measured = ", ".join(f"{name} {share:.2f}" for name, share in shares.items()) or "nothing"
+    holds = len(done) == tried and max(shares.values()) <= 1 if shares else None
+    return Claim("Every row takes at most the paper's seconds a step (median)", measured, holds)
+
+
+def _smallest_scene_claim(done: dict[str, dict[str, Any]]) -> Claim:
+    text = f"A body of 4.7k tetrahedra takes at most {1e3 * MAX_STEP_SECONDS:.0f} ms a step (median)"
+    if SMALLEST_SCENE not in done:
+        return Claim(text, "nothing", None)
+    seconds = done[SMALLEST_SCENE]["median s"]
+    return Claim(
+        text, f"{1e3 * seconds:.1f} ms, {done[SMALLEST_SCENE]['cells']:,.0f} tetrahedra", seconds <= MAX_STEP_SECONDS
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m fracsim.studies.evidence.paper_table_rows", description=__doc__)
+    parser.add_argument("row", choices=SCENES)
+    parser.add_argument("--limit", type=float, default=600.0, help="seconds of the run")
+    parser.add_argument("-o", "--out", type=Path, required=True)
+    given = parser.parse_args()
+    results = run_row(given.row, given.out.parent, small=False, ranks=RANKS, limit=given.limit)
+    if "failed" in results:
+        raise SystemExit(f"{given.row}: {' '.join(results['failed'])}")
+    given.out.write_text(json.dumps(results, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()
