@@ -34,6 +34,12 @@ from .tangent import Tangent
 from .term import Term, TimeLevel, Values, overriding, sum_of_forms
 from .term_protocols import ContactTerms, RigidMotionTerm, TermHistories
 
+# methods of terms that are called in every step, of those terms alone that override them
+_STEP_METHODS = (
+    "begin_step", "update_displacement", "accept_step", "add_nodal_forces", "acceleration", "applied_forces",
+    "damping_forces", "reference_forces", "step_work", "edges_broke", "damage_changed",
+)  # fmt: skip
+
 
 class Balance:
     """Equations of a body, and the displacement at which they are evaluated.
@@ -43,6 +49,7 @@ class Balance:
         u: displacement, m: the unknown.
         owned_dof_count: number of dofs of u on this rank.
         terms: terms of the balance, in this order.
+        terms_with: the terms that override a method of Term, by its name.
         stress: the one among them that damage acts on.
         motion: prescribed displacements.
         mass: mass matrix.
@@ -90,14 +97,7 @@ class Balance:
         self.motion, self.mass, self.scheme = motion, mass, scheme
         self.contact_weights = ContactTimeWeights.for_scheme(scheme)
         self.contact, self.histories = ContactTerms(domain.comm, terms), TermHistories(terms)
-        # only these are called in a step
-        self._timed, self._accepting = overriding(terms, Term.begin_step), overriding(terms, Term.accept_step)
-        self._displaced = overriding(terms, Term.update_displacement)
-        self._nodal, self._accelerated = (
-            overriding(terms, Term.add_nodal_forces),
-            overriding(terms, Term.acceleration),
-        )
-        self._broken, self._damaged = overriding(terms, Term.edges_broke), overriding(terms, Term.damage_changed)
+        self.terms_with = {name: overriding(terms, name) for name in _STEP_METHODS}
         self.linear = all(term.linear for term in terms)
         self.symmetric = all(term.symmetric for term in terms)
         self.c_a, self.c_v = scheme.rate_coefficients(step)
@@ -157,12 +157,12 @@ class Balance:
         self.motion.set_values(prescribed)
         if self.scheme.implicit:
             self.tangent.c_v = level.c_v
-        for term in self._timed:
+        for term in self.terms_with["begin_step"]:
             term.begin_step(level)
 
     def accept_step(self) -> None:
         """Accept the current u as the solution of the step (collective)."""
-        for term in self._accepting:
+        for term in self.terms_with["accept_step"]:
             term.accept_step()
 
     def set_displacement(self, u: Values) -> None:
@@ -175,7 +175,7 @@ class Balance:
         self.displacement_version += 1
         self.u.x.array[: self.owned_dof_count] = u
         self.u.x.scatter_forward()
-        for term in self._displaced:
+        for term in self.terms_with["update_displacement"]:
             term.update_displacement()
 
     def set_iterate(self, x: PETSc.Vec, *, prescribed: bool = True) -> None:
@@ -209,11 +209,11 @@ class Balance:
     def _add_nodal_parts(self, b: PETSc.Vec) -> PETSc.Vec:
         """Add the parts of r that no form has: nodal forces, and M times the sum of accelerations."""
         r = b.array_w
-        for term in self._nodal:
+        for term in self.terms_with["add_nodal_forces"]:
             term.add_nodal_forces(r)
         if (contact_forces := self.contact.forces()) is not None:
             r -= self._weighted(contact_forces)
-        accelerations = [a for term in self._accelerated if (a := term.acceleration()) is not None]
+        accelerations = [a for term in self.terms_with["acceleration"] if (a := term.acceleration()) is not None]
         if accelerations:
             r += self.mass.multiply(sum(accelerations[1:], accelerations[0]))
         return b
@@ -286,12 +286,12 @@ class Balance:
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Tell all terms of broken edges: (cells,) patterns, bit k for local edge k of a cell (collective)."""
-        for term in self._broken:
+        for term in self.terms_with["edges_broke"]:
             term.edges_broke(pattern)
 
     def damage_changed(self) -> None:
         """Tell all terms of a lower stiffness; cells without stress are not integrated any more (not collective)."""
-        for term in self._damaged:
+        for term in self.terms_with["damage_changed"]:
             term.damage_changed()
         if (dead := self.stress.dead_cells) is not None:
             self._work.exclude_cells(dead)
@@ -321,10 +321,7 @@ class EnergySums:
 
     def __init__(self, balance: Balance) -> None:
         self._balance, self._comm = balance, balance.domain.comm
-        terms = balance.terms
-        self._rigid_motion = [term for term in terms if isinstance(term, RigidMotionTerm)]
-        self._working, self._loading = overriding(terms, Term.step_work), overriding(terms, Term.applied_forces)
-        self._damping, self._referring = overriding(terms, Term.damping_forces), overriding(terms, Term.reference_forces)
+        self._rigid_motion = [term for term in balance.terms if isinstance(term, RigidMotionTerm)]
 
     def kinetic_energy(self, v: Values) -> float:
         """Kinetic energy of the body and of rigid obstacles, part of this rank, J; v: (owned dofs,), m/s."""
@@ -350,17 +347,21 @@ class EnergySums:
 
     def step_work(self) -> tuple[float, float]:
         """(work, dissipated) external work of the last step that no nodal force shows, of this rank, J (collective)."""
-        works = [term.step_work() for term in self._working]
+        works = [term.step_work() for term in self._balance.terms_with["step_work"]]
         return sum(work for work, _ in works), sum(dissipated for _, dissipated in works)
 
     def applied_forces(self) -> Values:
         """(owned dofs,) external forces on the body at the current u, N; a copy (collective)."""
-        forces = [force for term in self._loading if (force := term.applied_forces()) is not None]
+        forces = [
+            force for term in self._balance.terms_with["applied_forces"] if (force := term.applied_forces()) is not None
+        ]
         return sum(forces[1:], forces[0].copy()) if forces else np.zeros(self._balance.owned_dof_count)
 
     def damping_forces(self) -> Values | None:
         """(owned dofs,) forces whose work is dissipated, N; None without damping (collective)."""
-        forces = [force for term in self._damping if (force := term.damping_forces()) is not None]
+        forces = [
+            force for term in self._balance.terms_with["damping_forces"] if (force := term.damping_forces()) is not None
+        ]
         return sum(forces[1:], forces[0]) if forces else None
 
     def force_scale(self) -> tuple[float, float]:
@@ -372,7 +373,9 @@ class EnergySums:
         """
         balance = self._balance
         u = balance.u.x.array[: balance.owned_dof_count]
-        references = [forces for term in self._referring if (forces := term.reference_forces()) is not None]
+        references = [
+            forces for term in balance.terms_with["reference_forces"] if (forces := term.reference_forces()) is not None
+        ]
         inertia = balance.mass.lumped * u if balance.c_a else 0.0
         parts = (*references, balance.reactions[balance.motion.owned_dofs], u, inertia)
         *loads, moved, carried = np.sqrt(

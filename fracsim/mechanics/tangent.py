@@ -86,8 +86,8 @@ class Tangent:
             [term for term in terms if isinstance(term, TieTerm)],
             [term for term in terms if isinstance(term, LowRankTerm)],
         )
-        self._inert = overriding(terms, Term.mass_factor)
-        self._stiff = overriding(terms, Term.add_stiffness, Term.coupling_matrix)
+        self._inertial = overriding(terms, "mass_factor")
+        self._stiff = overriding(terms, "add_stiffness", "coupling_matrix")
         self.may_be_incomplete = any(term.leaves_tangent_incomplete for term in terms)
         self._linear = all(term.linear for term in terms)
         self._has_couplings = False  # whether a coupling has ever been added
@@ -216,7 +216,7 @@ class Tangent:
         if self._has_couplings:
             self.matrix.zeroEntries()  # entries beyond the pattern of the cells
         psd_form = None if psd_tolerance is None else self._psd_form(psd_tolerance)
-        factor = sum(term.mass_factor for term in self._inert)
+        factor = sum(term.mass_factor for term in self._inertial)
         if self._assembler.blocks is not None:
             mass = self._mass.block_values(self._assembler, factor) if factor else None
             self._assembler(self._motion.bcs, psd_form, mass)
@@ -246,7 +246,7 @@ class Tangent:
     @cached_property
     def _depends_on_u_alone(self) -> bool:
         """Whether terms add only couplings to K, and its other part is a function of u alone (collective)."""
-        adds_entries = bool(overriding(self._terms, Term.add_stiffness))
+        adds_entries = bool(overriding(self._terms, "add_stiffness"))
         limited = any(isinstance(term, StepLimiter) for term in self._terms)
         return limited and all([term.potential() is not None for term in self._terms]) and not adds_entries
 
@@ -263,7 +263,7 @@ class Tangent:
     def _is_assembled(self, psd_tolerance: float | None) -> bool:
         """Whether a linear K is up to date; where it is not, the caller assembles it (collective)."""
         fields = [field.x.array for field in self._stress.damage_fields]
-        factor = sum(term.mass_factor for term in self._inert)
+        factor = sum(term.mass_factor for term in self._inertial)
         rates = self.matrix.handle, psd_tolerance, factor, self.c_v, self._with_contact
         last = self._last
         same = last is not None and last[0] == rates and all(map(np.array_equal, last[1], fields))

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -179,10 +179,9 @@ class Term:
         """Free PETSc's objects."""
 
 
-def overriding(terms: Iterable[Term], *methods: Any) -> list[Term]:
+def overriding(terms: Iterable[Term], *methods: str) -> list[Term]:
     """Terms whose classes override one of these methods of Term; the others contribute nothing to them."""
-    names = [(method.fget if isinstance(method, property) else method).__name__ for method in methods]
-    return [term for term in terms if any(getattr(type(term), name) is not getattr(Term, name) for name in names)]
+    return [term for term in terms if any(getattr(type(term), name) is not getattr(Term, name) for name in methods)]
 
 
 def sum_of_forms(forms: list[Form]) -> Form:
