@@ -1,8 +1,8 @@
-"""Studies that come with fracsim: one TOML each."""
+"""Packaged studies, one TOML file each, and the programs that measure them."""
 
 from pathlib import Path
 
 
 def folder() -> Path:
-    """Where the study files are, in a checkout and in an installed package."""
+    """Folder of the packaged study files, in a checkout and in an installed package."""
     return Path(__file__).parent

@@ -1,12 +1,13 @@
-"""Seconds per step of fracsim beside the same loop written bare, for boxes of 24k, 192k and 648k tetrahedra.
+"""Seconds per step of fracsim beside the same loop in DOLFINx alone, for boxes of 24k, 192k and 648k tetrahedra.
 
     python -m fracsim.studies.bench [-o bench.json] [--boxes 10 20 30] [--ranks 1 2]
 
-A box of 1 x 1 x 4 m of neo-Hookean rubber (10 MPa) hangs from one end and is pulled at the other by backward Euler with
-steps of 5 ms, one Newton iteration each, CG to 1e-6. Both loops run in one process, step by step in turn, with the same
-solver options, kernels compiled with the same flags, and the same policy for the preconditioner (made once: nothing in
-the body changes), so that the machine's moods hit both. The bare one assembles as a user of DOLFINx does, by
-dolfinx.fem.petsc. Figures are medians over the steps.
+A box of 1 x 1 x 4 m of neo-Hookean rubber (10 MPa) hangs from one end and is pulled at the other. Scheme: backward
+Euler with steps of 5 ms, one Newton iteration each, CG to 1e-6.
+
+Both loops run in one process, one step of each in turn, so that disturbances of the machine affect both. They share
+solver options, compiler flags and the preconditioner's policy (built once, since the body does not change). The bare
+loop assembles as a user of DOLFINx does, by dolfinx.fem.petsc. Figures are medians over the steps.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ OPTIONS: dict[str, Any] = {"snes_type": "ksponly", "ksp_rtol": 1e-6}
 
 
 def bench_study(n: int) -> dict[str, Any]:
-    """The scene with n cells along a metre: 24 n^3 tetrahedra. It is never stressed enough to break."""
+    """Study with n cells along a metre: 24 n^3 tetrahedra. The stress stays below the strength."""
     return {
         "title": f"bench {24 * n**3} tetrahedra",
         "mesh": {"builder": "box", "size": [1.0, 1.0, 4.0], "h": 1 / n},
@@ -77,6 +78,7 @@ def run_case(n: int, bare: bool) -> dict[str, Any]:
 
 
 def _timed_step(run: Any, stage: Any, times: dict[str, list[float]]) -> None:
+    """Append the seconds of one step and of its phases to `times`."""
     from petsc4py import PETSc
 
     events = {name: PETSc.Log.Event(event) for name, event in EVENTS.items()}
@@ -91,7 +93,7 @@ def _timed_step(run: Any, stage: Any, times: dict[str, list[float]]) -> None:
 
 
 def break_edges(run: Any, flags: Any) -> None:
-    """Break the flagged edges, and what follows from it, as the fracture pass does (collective)."""
+    """Break the flagged edges and update all that depends on them, as a fracture pass does (collective)."""
     fracture = run.scene.fracture
     fracture.graph.break_edges(flags)
     fracture.graph.break_unloaded_edges()
@@ -104,7 +106,7 @@ def break_edges(run: Any, flags: Any) -> None:
 
 
 def _after_fracture(run: Any, stage: Any) -> float:
-    """Median step once every edge is broken."""
+    """Median seconds of a step with all edges broken."""
     import numpy as np
 
     break_edges(run, np.ones(len(run.scene.fracture.graph.broken), bool))
@@ -115,6 +117,7 @@ def _after_fracture(run: Any, stage: Any) -> float:
 
 
 def time_call(comm: Any, work: Any) -> float:
+    """Wall time of `work()` in s, between two barriers (collective)."""
     comm.Barrier()
     began = time.perf_counter()
     work()
@@ -123,17 +126,24 @@ def time_call(comm: Any, work: Any) -> float:
 
 
 def _peak_memory() -> float:
+    """Peak resident memory of this process, GiB."""
     import resource
 
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024**2
 
 
 class BareLoop:
-    """Assemble, solve, move on: the same scene in DOLFINx and PETSc alone."""
+    """Time loop of the same scene in DOLFINx and PETSc alone: assemble, solve, update."""
 
     def __init__(self, n: int, domain: Any, *, records: bool = False, in_lanes: bool = False) -> None:
-        """`records`: evaluate the elastic energy of each step, too, as every run does for history.csv; `in_lanes`:
-        assemble the tangent as fracsim does (mechanics.matrix_assembly), by single entries."""
+        """Compile forms and set up matrix, vectors and solver.
+
+        Args:
+            n: cells along a metre.
+            domain: distributed mesh.
+            records: evaluate the elastic energy of each step, as every run does for history.csv.
+            in_lanes: assemble the tangent as fracsim does, by single entries (mechanics.matrix_assembly).
+        """
         import numpy as np
         import ufl
         from dolfinx import fem
@@ -185,7 +195,7 @@ class BareLoop:
         self.t, self.v, self.u_n = 0.0, np.zeros_like(self.mass), np.zeros_like(self.mass)
 
     def step(self) -> None:
-        """One backward Euler step with one Newton iteration."""
+        """Advance by one backward Euler step with one Newton iteration."""
         PETSc, n = self.PETSc, len(self.mass)
         self.t += self.dt
         self.g.x.array.reshape(-1, 3)[self.top, 2] = self.t
@@ -213,6 +223,7 @@ class BareLoop:
             self.energy = self.integrate(self.stored)
 
     def _assemble(self) -> None:
+        """Assemble the tangent."""
         if self.assembly is not None:
             self.assembly(self.bcs)
             return
@@ -225,7 +236,7 @@ class BareLoop:
 
 
 def launch_case(n: int, ranks: int, bare: bool) -> dict[str, Any]:
-    """Run one case in processes of its own."""
+    """Run one case in separate processes and return its figures."""
     command = ["mpirun", "-n", str(ranks), sys.executable, "-m", "fracsim.studies.bench", "--case", str(n)]
     output = subprocess.run(
         [*command, *(["--bare"] if bare else [])], check=True, capture_output=True, timeout=1800, text=True
@@ -236,7 +247,7 @@ def launch_case(n: int, ranks: int, bare: bool) -> dict[str, Any]:
 
 
 def format_table(cases: list[dict[str, Any]]) -> str:
-    """The figures on screen: seconds, then ratios."""
+    """Table of seconds and ratios as text."""
     parts = ("step", "bare", *EVENTS, "fracture", "output", "after_fracture")
     ratios = {
         "step/bare": ("step", "bare"),
@@ -256,6 +267,7 @@ def format_table(cases: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
+    """Run one case, or all of them, and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--out", type=Path, default=Path("out/bench.json"))
     parser.add_argument("--boxes", type=int, nargs="+", default=[10, 20, 30])

@@ -1,9 +1,9 @@
-"""Calls that cross from one file of fracsim to another in an implicit step without contact: a measure of how many
-modules a reader has to follow.
+"""Count calls from one file of fracsim to another in an implicit step without contact.
 
     python -m fracsim.studies.cross_file_calls [--plain] [--list]
 
-A block of rubber hangs from one face and is pulled at the other. The first two steps, which set up, are not counted.
+The count measures how many modules a reader has to follow. A block of rubber hangs from one face and is pulled at the
+other. The first two steps, which set up the solver, are not counted.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ STUDY: dict[str, Any] = {
 
 
 def count_calls(study: dict[str, Any]) -> Counter[tuple[str, str]]:
-    """(file that calls, file that is called) -> calls in the third step of a study."""
+    """(calling file, called file) -> number of calls in the third step of a study."""
     from mpi4py import MPI
 
     from ..scene import build_scene
@@ -57,6 +57,7 @@ def count_calls(study: dict[str, Any]) -> Counter[tuple[str, str]]:
 
 
 def main() -> None:
+    """Print the number of calls and, if asked, the calls from file to file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--plain", action="store_true", help="with [solver] plain = true")
     parser.add_argument("--list", action="store_true", help="the calls from file to file as well")

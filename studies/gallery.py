@@ -1,8 +1,8 @@
-"""The gallery: pictures of studies, made by the commands that stand below them. `make gallery` makes all of them again.
+"""Pictures of docs/gallery.md and the page itself, which `make gallery` makes.
 
     python3 -m fracsim.studies.gallery [NAME ...] [--again] [--jobs N]
 
-A run that is there and has ended is not run again, unless --again says so.
+A run that has ended is not repeated, unless --again is given.
 """
 
 from __future__ import annotations
@@ -33,11 +33,13 @@ on one rank; pieces are those in the end, and none is a single node but where it
 
 @dataclass(frozen=True)
 class GalleryEntry:
-    """A picture.
+    """A picture of the gallery.
 
     Attributes:
-        name: of its file.    text: what is seen.    runs: arguments of `fracsim run` with the name of the folder first.
-        render: arguments of `fracsim render` but for its folders and files; without runs a module that draws the file.
+        name: stem of the file.
+        text: caption.
+        runs: (output folder, arguments of `fracsim run`) of each run shown.
+        render: arguments of `fracsim render` without folders and output; without runs, a module that draws the file.
         film: all frames, as a GIF.
     """
 
@@ -49,7 +51,7 @@ class GalleryEntry:
 
 
 def packaged_entry(study: str, text: str, render: str) -> GalleryEntry:
-    """A picture of a study as it comes."""
+    """Entry of a packaged study with its own settings."""
     return GalleryEntry(study, text, ((study, study),), render)
 
 
@@ -151,7 +153,7 @@ ENTRIES = (
 
 
 def main() -> None:
-    """Run what has not run, draw, and write the page."""
+    """Run missing studies, draw their pictures, and write the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="NAME", help=f"{', '.join(entry.name for entry in ENTRIES)}")
     parser.add_argument("--again", action="store_true", help="also what has run")
@@ -174,14 +176,14 @@ def main() -> None:
 
 
 def run_study(folder: str, arguments: str, *, again: bool) -> None:
-    """A run, where there is none that has ended."""
+    """Run a study, unless its output folder holds a run that has ended."""
     if again or not has_ended(RUNS / folder):
         command = ["fracsim", "run", *shlex.split(arguments), "-o", str(RUNS / folder), "--overwrite"]
         subprocess.run([*command, "--set", "output.picture=false"], check=True)
 
 
 def draw_picture(entry: GalleryEntry) -> None:
-    """Its picture."""
+    """Draw the picture of an entry."""
     target = picture_path(entry)
     if entry.runs:
         folders = [str(RUNS / folder) for folder, _ in entry.runs]
@@ -193,7 +195,7 @@ def draw_picture(entry: GalleryEntry) -> None:
 
 
 def has_ended(folder: Path) -> bool:
-    """A run is there, to its end."""
+    """Return whether the folder holds a run that has ended."""
     try:
         return bool(json.loads((folder / "summary.json").read_text(encoding="utf-8"))["outcome"] == "done")
     except (OSError, ValueError, KeyError):
@@ -201,7 +203,7 @@ def has_ended(folder: Path) -> bool:
 
 
 def reduce_colours(path: Path) -> None:
-    """In 256 colours where it is larger than LARGEST."""
+    """Reduce a picture larger than LARGEST to 256 colours."""
     from PIL import Image
 
     if path.stat().st_size > LARGEST:
@@ -211,12 +213,12 @@ def reduce_colours(path: Path) -> None:
 
 
 def picture_path(entry: GalleryEntry) -> Path:
-    """Beside the page."""
+    """File of the picture, in the folder beside the page."""
     return PAGE.parent / "gallery" / f"{entry.name}.{'gif' if entry.film else 'png'}"
 
 
 def page_section(entry: GalleryEntry) -> str:
-    """Its part of the page."""
+    """Section of the page for an entry, in Markdown."""
     lines = [f"    ./env fracsim run {arguments} -o {RUNS / folder}" for folder, arguments in entry.runs]
     folders = " ".join(str(RUNS / folder) for folder, _ in entry.runs)
     file = picture_path(entry).name
@@ -229,7 +231,7 @@ def page_section(entry: GalleryEntry) -> str:
 
 
 def run_figures(entry: GalleryEntry) -> str:
-    """Seconds and pieces of its runs; what the page has of them where they are not all here."""
+    """Processor time and fragments of the entry's runs; the page's old text if a run is missing."""
     folders = [RUNS / folder for folder, _ in entry.runs]
     if not all(map(has_ended, folders)):
         page = PAGE.read_text(encoding="utf-8") if PAGE.exists() else ""
@@ -243,7 +245,7 @@ def run_figures(entry: GalleryEntry) -> str:
 
 
 def count_fragments(folder: Path) -> tuple[int, int]:
-    """Pieces in the end of a run that has broken, and those of a single node."""
+    """(fragments, single-node fragments) at the end of a run; (0, 0) if nothing broke."""
     path = folder / "pieces.csv"
     rows = list(csv.DictReader(path.open(encoding="utf-8"))) if path.exists() else []
     last = [row for row in rows if row["time"] == rows[-1]["time"]]

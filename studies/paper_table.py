@@ -1,11 +1,12 @@
-"""Seconds per step of Mandal et al. (2022), table 2: their cells, materials and steps, beside their seconds.
+"""Seconds per step of table 2 of Mandal et al. (2022): the paper's cells, materials and steps, beside its seconds.
 
     python -m fracsim.studies.paper_table [-o OUT] [--rows jade-figure ...] [--small] [--ranks 2] [--limit 600]
 
-Theirs are of 12 threads at 2.6 GHz. Steps are theirs, 5e-3 s, and loads slow enough for them, but for the bodies that
-are struck: nothing holds them, and a blow of microseconds has steps of its own. Averages reach over fewer cells than
-theirs where they would have thousands of millions of weights (the heads of the studies say so). A run that reaches the
-limit of seconds gives the steps it has taken. --small: cells half as large again, a third of them, for a look.
+The paper's seconds are of 12 threads at 2.6 GHz. Steps are the paper's, 5e-3 s, with loads slow enough for them. Bodies
+under impact have shorter steps, since a contact of microseconds has to be resolved. Averaging radii are smaller than
+the paper's where those would need billions of weights (see the comments in the studies).
+
+A run that reaches its time limit reports the steps it has taken. --small: cells larger by half, a third as many.
 """
 
 from __future__ import annotations
@@ -23,11 +24,14 @@ from typing import Any
 
 @dataclass(frozen=True)
 class PaperScene:
-    """A row: a study of the package with what differs, and the paper's figures.
+    """A row of the table: a packaged study with its changes, and the paper's figures.
 
     Attributes:
-        h: keys of the sizes of cells, m.    options: other keys.
-        cells, seconds: the paper's thousands of tetrahedra, and seconds a step.
+        study: name of the packaged study.
+        h: key -> cell size, m.
+        options: other keys of the study that change.
+        cells: thousands of tetrahedra in the paper.
+        seconds: seconds per step in the paper.
     """
 
     study: str
@@ -64,14 +68,14 @@ COLUMNS = ("scene", "cells", "paper's cells", "step s", "steps", "median s", "wo
 
 
 def overrides(scene: PaperScene, *, small: bool) -> list[str]:
-    """What --set takes."""
+    """Arguments of --set for a row."""
     factor = 1.5 if small and scene.cells > 10 else 1.0  # the jade figure has no cell to spare
     given = {key: factor * size for key, size in scene.h.items()} | scene.options
     return [f"{key}={json.dumps(value)}" for key, value in given.items()] + ["output.picture=false"]
 
 
 def run_row(name: str, out: Path, *, small: bool, ranks: int, limit: float) -> dict[str, Any]:
-    """A row of the table from a run in processes of its own."""
+    """Row of the table, from a run in separate processes."""
     scene, folder = SCENES[name], out / name
     sets = [word for override in overrides(scene, small=small) for word in ("--set", override)]
     command = [shutil.which("fracsim") or "fracsim", "run", scene.study, *sets, "-o", str(folder), "--overwrite",
@@ -85,7 +89,7 @@ def run_row(name: str, out: Path, *, small: bool, ranks: int, limit: float) -> d
 
 
 def read_row(name: str, folder: Path) -> dict[str, Any]:
-    """The figures of a run, in the order of COLUMNS."""
+    """Figures of a finished run, in the order of COLUMNS."""
     with (folder / "history.csv").open(newline="", encoding="utf-8") as file:
         steps = list(csv.DictReader(file))
     seconds, paper = [float(step["wall_step"]) for step in steps], SCENES[name].seconds
@@ -97,7 +101,7 @@ def read_row(name: str, folder: Path) -> dict[str, Any]:
 
 
 def format_table(rows: list[dict[str, Any]]) -> str:
-    """The table on screen."""
+    """Table as text."""
     lines = [list(COLUMNS)]
     ran = [item for item in rows if "failed" not in item]
     lines += [[item["scene"], *(f"{item[key]:.4g}" for key in COLUMNS[1:])] for item in ran]
@@ -107,6 +111,7 @@ def format_table(rows: list[dict[str, Any]]) -> str:
 
 
 def main() -> None:
+    """Run the rows, print the table and write table.json."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--out", type=Path, default=Path("out/table"))
     parser.add_argument("--rows", nargs="+", choices=SCENES, default=[*SCENES], metavar="ROW", help=", ".join(SCENES))

@@ -1,11 +1,11 @@
-"""Three experiments beside the rigid scheme, after Bao et al. 2007: what it would do otherwise.
+"""Three comparisons with the rigid scheme, after Bao et al. (2007).
 
     python3 -m fracsim.studies.rigid_trials [PICTURE.png]
 
-1. (Figs. 9, 10) A bar comes down askew on a floor. Its crack under the force of a penalty spring as it is at the end of
-   the first step in touch, for several steps, and under the blow J / tau of the scheme.
-2. (Sec. 5) The same bar pushed at one end: stress with three points pinned, and with inertia relief.
-3. (Fig. 7) What linear strain makes of a rotation, and by how much a linearised rotation swells a body.
+1. (Figs. 9, 10) A bar falls on a floor at an angle. Its crack under a penalty force, sampled at the end of the first
+   step in contact, for several steps; and under the impulse force J / tau of the scheme.
+2. (Sec. 5) The same bar pushed at one end: stress with three pinned nodes, and with inertia relief.
+3. (Fig. 7) Linear strain of a finite rotation, and stretch of a linearised rotation.
 """
 
 from __future__ import annotations
@@ -43,20 +43,20 @@ BAR_STUDY = {
 
 
 def falling_bar() -> BreakableBody:
-    """Whole, as the scheme has it."""
+    """The unbroken bar as a breakable body of the rigid scheme."""
     scene = build_rigid_scene(Study.model_validate(BAR_STUDY), MPI.COMM_SELF)
     return scene.stepper.instances.get(0)
 
 
 def broken_edges(force: float) -> npt.NDArray[np.bool_]:
-    """(edges,) which break under a push (N) upwards at the corner."""
+    """(edges,) flags of the edges that break under an upward force (N) at the impact point."""
     body = falling_bar()
     body.break_fragments(0, body.distribute_forces(0, IMPACT_POINT, np.array([[0.0, 0.0, force]])))
     return body.graph.broken.copy()
 
 
 def penalty_force(step: float, gap: float = 3e-5) -> float:
-    """Force of the penalty at the end of the first step in which the bar, a gap above the floor, is in touch, N."""
+    """Penalty force (N) at the end of the first step in contact, for a bar that starts `gap` m above the floor."""
     depth = -gap
     while depth <= 0:
         depth += IMPACT_SPEED * step
@@ -64,13 +64,16 @@ def penalty_force(step: float, gap: float = 3e-5) -> float:
 
 
 def impulse_force() -> float:
-    """J / tau of the same spring: it gives m v twice over pi sqrt(m / k)."""
+    """Impulse force J / tau of the same spring, N: 2 m v / (pi sqrt(m / k))."""
     return float(2 * MASS * IMPACT_SPEED / (np.pi * np.sqrt(MASS / PENALTY)))
 
 
 def bar_stresses() -> tuple[Values, Values, Values]:
-    """Places x (cells,) along the bar, m, and the largest principal stress (cells,) with inertia relief and with
-    pins, Pa."""
+    """Largest principal stress along the bar.
+
+    Returns:
+        Positions x (cells,) in m; stress (cells,) in Pa with inertia relief; stress (cells,) in Pa with pinned nodes.
+    """
     body = falling_bar()
     loads = body.distribute_forces(0, np.array([[0.0, 0.1, 0.1]]), np.array([[END_FORCE, 0.0, 0.0]]))
     domain, free = body.graph.domain, body._stiffness.whole_body()
@@ -85,10 +88,10 @@ def bar_stresses() -> tuple[Values, Values, Values]:
 
 
 def pin_constraints(nodes: Values) -> Values:
-    """Return rows (k, n d), one a pin, of the components that three pinned nodes hold: k = 3 in 2D, 6 in 3D.
+    """Constraint rows (k, n d) of three pinned nodes: k = 3 in 2D, 6 in 3D, one component a row.
 
-    Of the nodes (n, d), node a is the farthest from the centre, b the farthest from a, c the farthest from the line
-    ab. Node a is held in all directions, b across ab, c out of the plane abc (B07, section 5).
+    Of the nodes (n, d), node a is the farthest from the centre, b the farthest from a, c the farthest from the line ab.
+    Node a is fixed in all directions, b normal to ab, c normal to the plane abc (B07, section 5).
     """
     n, d = nodes.shape
     a = int(np.argmax(np.linalg.norm(nodes - nodes.mean(axis=0), axis=1)))
@@ -109,7 +112,7 @@ def pin_constraints(nodes: Values) -> Values:
 
 
 def solve_pinned(matrix: PETSc.Mat, nodes: Values, force: Values) -> Values:
-    """Return displacements (n, d) of nodes (n, d) with K u = f and three nodes pinned, by factors (one rank)."""
+    """Displacements (n, d) of nodes (n, d) with K u = f and three pinned nodes, by a direct solver (one rank)."""
     constraints = pin_constraints(nodes)
     start, columns, entries = matrix.getValuesCSR()
     K, C = csr_matrix((entries, columns, start), shape=matrix.size), csr_matrix(constraints)
@@ -119,12 +122,12 @@ def solve_pinned(matrix: PETSc.Mat, nodes: Values, force: Values) -> Values:
 
 
 def rotation_strains() -> tuple[Values, Values]:
-    """1 - cos a, the linear strain of a true rotation; sqrt(1 + a^2) - 1, by which a linearised one stretches."""
+    """1 - cos a, linear strain of a rotation; and sqrt(1 + a^2) - 1, stretch of a linearised rotation."""
     return np.asarray(1 - np.cos(ANGLES)), np.asarray(np.hypot(1, ANGLES) - 1)
 
 
 def main() -> None:
-    """The figures, and the picture where one is asked for."""
+    """Print the figures; draw the picture if a file is given."""
     true = broken_edges(impulse_force())
     pushes = [penalty_force(step) for step in TIME_STEPS]
     cracks = [broken_edges(push) for push in pushes]
@@ -142,7 +145,7 @@ def main() -> None:
 
 
 def draw_picture(path: Path, snapshots: list[int], true: int, stress: tuple[Values, Values, Values]) -> None:
-    """Three panels."""
+    """Draw the three comparisons as panels of one picture."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(12, 3.4), layout="constrained")

@@ -228,7 +228,7 @@ def test_modules_of_other_features_are_noticed() -> None:
     assert feature_cost.unused_feature_modules("average", 10, [edges, average]) == []
 
 
-def test_every_rung_is_a_study() -> None:
+def test_every_feature_scene_is_a_study() -> None:
     from fracsim.study.reader import validate
 
     for name in feature_cost.feature_scenes(4):

@@ -320,7 +320,7 @@ MADE = case_section.AccuracyCase(
     "made", "Made up", lambda records: "words", ("scheme", "dt"), case_section.measured_errors("e"), ("e",),
     (case_section.ExpectedOrder("e", "dt", 1.0, ("a", "b", "c")),
      case_section.ExpectedOrder("e", "dt", 2.0, ("a", "b", "c"))),
-    split="scheme", apart=("explicit",),
+    split="scheme", excluded=("explicit",),
 )  # fmt: skip
 EULER = [
     record(name, 0.2 * dt, 1 / dt, scheme="generalized-alpha", dt=dt)

@@ -1,7 +1,8 @@
-"""The evidence behind the report: trials that anyone can run again, each recorded beside its results.
+"""Trials behind the report of the evidence, which anyone can run again; each is recorded beside its results.
 
     python -m fracsim.studies.evidence OUT [--full] [--only GROUP]
 
-Groups: precision (error against run time), stability (stiff and extreme cases), ladder (cost of what is not used),
-growth (cost against cracks), dependence (on the mesh). `fracsim report OUT` makes the page.
+Groups: precision (error against run time), peers (other programs), stability (stiff and extreme cases), ladder (cost of
+features), growth (cost against the number of cracks), rows (the paper's table), dependence (on the mesh), experiments
+(measured and published loads). `fracsim report OUT` makes the page.
 """

@@ -1,4 +1,4 @@
-"""Run trials and gather what the page shows: python -m fracsim.studies.evidence OUT [--full] [--only GROUP ...]."""
+"""Run trials and collect the page's sections: python -m fracsim.studies.evidence OUT [--full] [--only GROUP ...]."""
 
 from __future__ import annotations
 
@@ -35,6 +35,7 @@ Records = list[dict[str, Any]]
 
 
 def main() -> None:
+    """Run the trials of the groups and write evidence.json."""
     parser = argparse.ArgumentParser(prog="python -m fracsim.studies.evidence", description=__doc__)
     parser.add_argument("out", type=Path, metavar="OUT", help="folder of the evidence; what is there is not run again")
     parser.add_argument("--full", action="store_true", help="the long trials too")
@@ -52,7 +53,7 @@ def main() -> None:
 
 
 def _run(group: str, module: Any, out: Path, full: bool) -> Records:
-    """Records of a group; of the long trials only those that are there already, unless `full`."""
+    """Records of a group. Without `full`, long trials are included only if they have been recorded before."""
     chosen = [trial for trial in module.trials() if full or not trial.full or is_recorded(trial, out)]
     began, number = time.monotonic(), itertools.count(1)
 
@@ -73,7 +74,7 @@ def _run(group: str, module: Any, out: Path, full: bool) -> Records:
 
 
 def _repeat_timings(doubtful: Any, runs: list[tuple[Trial, dict[str, Any]]], out: Path) -> None:
-    """Run what the group wants timed once more until it wants no more: each time that may be something else."""
+    """Repeat the trials whose timing the group doubts, until it doubts none; the set may change each time."""
     while wanted := doubtful([record for _, record in runs]):
         for trial, record in runs:
             if (trial.case, trial.name) in wanted:
@@ -82,15 +83,15 @@ def _repeat_timings(doubtful: Any, runs: list[tuple[Trial, dict[str, Any]]], out
 
 
 def is_recorded(trial: Trial, out: Path) -> bool:
-    """Whether this very trial has been run before."""
+    """Return whether a record of this trial, with the same program, exists."""
     path = trial_folder(out, trial) / RECORD
     return path.exists() and json.loads(path.read_text(encoding="utf-8"))["digest"] == fingerprint(trial)
 
 
 def write_evidence(out: Path, records: dict[str, Records], makers: dict[str, Any]) -> Path:
-    """OUT/evidence.json: the sections of each group as data, and where each number comes from.
+    """Write OUT/evidence.json: sections of each group as data, with the origin of each number.
 
-    Groups that were left out this time keep their place. A group whose section cannot be made says so in its place.
+    Groups that were not run keep their sections. If a section cannot be made, a section with the error takes its place.
     """
     path = out / "evidence.json"
     groups = json.loads(path.read_text(encoding="utf-8"))["groups"] if path.exists() else {}
@@ -103,6 +104,7 @@ def write_evidence(out: Path, records: dict[str, Records], makers: dict[str, Any
 
 
 def _sections(make: Any, records: Records) -> list[dict[str, Any]]:
+    """Sections of a group as data; a section with the error if they cannot be made."""
     try:
         return to_data(make(records))
     except Exception as error:

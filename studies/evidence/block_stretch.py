@@ -1,12 +1,12 @@
-"""Exact force and stress of a block that is pulled along x, between smooth sides (uniaxial) or stiff ones (confined).
+"""Exact force and stress of a block that is pulled along x with free (uniaxial) or fixed (confined) lateral sides.
 
-With principal stretches l1 (given) and lt (both lateral ones), J = l1 lt^2 and I = l1^2 + 2 lt^2:
+With principal stretches l1 (given) and lt (both lateral), J = l1 lt^2 and I = l1^2 + 2 lt^2:
 
     neo-hookean  P_i = m (1 - 1 / (I + 1)) l_i + l (J - alpha) J / l_i      (M22 eq. 25)
     stvk         P_i = l_i (2 mu E_i + lambda tr E),  E_i = (l_i^2 - 1) / 2
-    corotated    P_i = 2 mu (l_i - 1) + lambda tr(U - I);   linear: the same while nothing turns
+    corotated    P_i = 2 mu (l_i - 1) + lambda tr(U - I);   linear: the same without rotation
 
-Uniaxial: P_t = 0 gives lt. Written by hand from the principal stretches: nothing here is shared with the program.
+Uniaxial: P_t = 0 gives lt. The formulas are written from the principal stretches and share no code with the program.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Values = npt.NDArray[np.float64]
 
 
 def principal_stress(material: dict[str, Any], l1: float, lt: float) -> tuple[float, float]:
-    """(P_1, P_t) in Pa."""
+    """Principal stresses (P_1, P_t) in Pa."""
     young, nu = material["young"], material["poisson"]
     mu, lmbda = young / (2 * (1 + nu)), young * nu / ((1 + nu) * (1 - 2 * nu))
     stretches = np.array([l1, lt, lt])
@@ -39,16 +39,21 @@ def principal_stress(material: dict[str, Any], l1: float, lt: float) -> tuple[fl
 
 
 def lateral_stretch(material: dict[str, Any], l1: float) -> float:
-    """lt for which the sides are free of stress. ValueError where no positive one is: the energy has no answer."""
+    """Lateral stretch lt of the uniaxial state, P_t = 0.
+
+    Raises:
+        ValueError: no positive solution exists.
+    """
     least = 1e-6 * min(1.0, l1**-0.5)
     most = 2 * max(1.0, l1**-0.5)
     return float(brentq(lambda lt: principal_stress(material, l1, lt)[1], least, most, xtol=1e-15, rtol=1e-14))
 
 
 def stretch_error(study: dict[str, Any], rows: dict[str, Values]) -> dict[str, float]:
-    """Largest error of the pulling force before the first break, over the largest force; and of the break, in steps.
+    """Relative error of the pulling force before the first break, and error of the break in steps.
 
-    The study is one of `stability_studies.stretched_block`.
+    The force error is divided by the largest force. The study is one of `stability_studies.stretched_block`. Empty if
+    no lateral stretch solves P_t = 0.
     """
     sides, material, right = study["mesh"]["size"], study["material"], study["boundary"][-1]["displacement"]
     free = all(entry["on"] != "top" for entry in study["boundary"])

@@ -1,6 +1,6 @@
-"""Closed forms that the report compares with: each with its source or derivation, SI units, none of fracsim's code.
+"""Closed forms that the report compares with, each with its source or derivation; SI units, no code of fracsim.
 
-tests/test_evidence_precision.py checks them against what they solve: equations of motion, balances, energies.
+tests/test_evidence_precision.py checks them against the equations that they solve: motion, balance, energy.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ Values = npt.NDArray[Any]
 def timoshenko_deflection(
     force: float, length: float, width: float, depth: float, young: float, poisson: float
 ) -> float:
-    """w = P L^3 / (3 E I) + P L / (kappa G A) in m of a cantilever under a force at its end.
+    """Deflection (m) of a cantilever under a force at its end: w = P L^3 / (3 E I) + P L / (kappa G A).
 
     kappa = 10 (1 + nu) / (12 + 11 nu) for a rectangle (Cowper 1966).
     """
@@ -32,7 +32,7 @@ def timoshenko_deflection(
 
 
 def euler_frequency(length: float, depth: float, young: float, density: float) -> float:
-    """f1 in Hz of a cantilever of Euler and Bernoulli; I / A = depth^2 / 12.
+    """First frequency (Hz) of an Euler-Bernoulli cantilever; I / A = depth^2 / 12.
 
     beta L = 1.8751 is the first root of cos cosh = -1, f1 = (beta L)^2 / (2 pi) sqrt(E I / (rho A L^4)).
     """
@@ -41,12 +41,12 @@ def euler_frequency(length: float, depth: float, young: float, density: float) -
 
 
 def timoshenko_frequency(length: float, depth: float, young: float, poisson: float, density: float) -> float:
-    """f1 in Hz of Timoshenko's cantilever, shear and rotary inertia counted, kappa after Cowper.
+    """First frequency (Hz) of a Timoshenko cantilever with shear and rotary inertia, kappa after Cowper.
 
-    Han, Benaroya and Wei (1999), J. Sound Vib. 225, eq. for the clamped-free beam. With x in units of L,
-    s^2 = E I / (kappa G A L^2), r^2 = I / (A L^2), b^2 = rho A L^4 omega^2 / (E I), the transverse motion is
-    exp(i a x), a^2 = b^2 (r^2 + s^2)/2 +- sqrt(b^4 (r^2 - s^2)^2 / 4 + b^2); clamped at 0, free at 1. The frequency is
-    the first zero of the determinant of the four end conditions, which is set up here rather than expanded.
+    Han, Benaroya and Wei (1999), J. Sound Vib. 225, clamped-free beam. With x in units of L, s^2 = E I / (kappa G A
+    L^2), r^2 = I / (A L^2), b^2 = rho A L^4 omega^2 / (E I), the transverse motion is exp(i a x), a^2 = b^2 (r^2 +
+    s^2)/2 +- sqrt(b^4 (r^2 - s^2)^2 / 4 + b^2); clamped at 0, free at 1. The frequency is the first zero of the
+    determinant of the four end conditions, which is set up here instead of expanded.
     """
     kappa = 10 * (1 + poisson) / (12 + 11 * poisson)
     radius2 = depth**2 / 12 / length**2
@@ -58,10 +58,10 @@ def timoshenko_frequency(length: float, depth: float, young: float, poisson: flo
 
 
 def _timoshenko_determinant(b: float, r2: float, s2: float) -> float:
-    """Deflection y and turn psi of the section: y = C ch(p x) + S sh(p x) + c cos(q x) + d sin(q x).
+    """Determinant of the end conditions for y = C ch(p x) + S sh(p x) + c cos(q x) + d sin(q x) and the rotation psi.
 
-    Balance of forces, y'' - psi' = -s^2 b^2 y, gives psi = m (C sh + S ch) + n (d cos - c sin).
-    Ends: y = psi = 0 at 0, psi' = 0 and y' - psi = 0 at 1.
+    Balance of forces, y'' - psi' = -s^2 b^2 y, gives psi = m (C sh + S ch) + n (d cos - c sin). Ends: y = psi = 0 at 0,
+    psi' = 0 and y' - psi = 0 at 1.
     """
     half, root = b**2 * (r2 + s2) / 2, sqrt(b**4 * (r2 - s2) ** 2 / 4 + b**2)
     p, q = sqrt(root - half), sqrt(root + half)
@@ -79,7 +79,7 @@ def _timoshenko_determinant(b: float, r2: float, s2: float) -> float:
 
 
 def pulse(t: Values, duration: float) -> Values:
-    """sin^4(pi t / duration) from 0 to `duration`, 0 outside: smooth enough (three derivatives) for second order."""
+    """sin^4(pi t / duration) from 0 to `duration`, 0 outside. Three continuous derivatives give order 2."""
     inside = (t > 0) & (t < duration)
     return np.where(inside, np.sin(pi * t / duration) ** 4, 0.0)
 
@@ -92,7 +92,7 @@ def pulse_integral(t: Values, duration: float) -> Values:
 
 
 def bar_velocity(x: Values, t: float, duration: float) -> Values:
-    """d'Alembert: v = p(t - (1 - x)) on the bar 0 < x < 1 with E = rho = 1, pulled at x = 1 by the unit pulse p(t).
+    """Velocity v = p(t - (1 - x)) of d'Alembert's solution on 0 < x < 1 with E = rho = 1, pulled at x = 1 by p(t).
 
     A traction sends stress p and velocity p / (rho c0) inwards; valid until the wave returns from x = 0.
     """
@@ -100,17 +100,16 @@ def bar_velocity(x: Values, t: float, duration: float) -> Values:
 
 
 def bar_displacement(x: Values, t: float, duration: float) -> Values:
-    """u = int v dt of `bar_velocity`."""
+    """Displacement int v dt of `bar_velocity`."""
     return pulse_integral(t - (1 - x), duration)
 
 
 def clamp_stress(t: Values, force: Values) -> Values:
-    """Stress at the clamp of a bar of unit L, E, rho under a uniform body force given at the (equally spaced) times t.
+    """Stress at the clamp of a bar of unit L, E, rho under a uniform body force at the (equally spaced) times t.
 
-    The force b(t) starts waves everywhere at once. A body force of unit impulse gives every point the velocity 1,
-    which the clamp at x = 0 stops with the stress rho c0 = 1 until the wave has gone to the free end and back (t = 2),
-    then with -1 for as long, and so on: sigma(t) = int b(s) q(t - s) ds, q the square wave of period 4; by the
-    trapezoidal rule.
+    A body force of unit impulse gives every point the velocity 1. The clamp at x = 0 stops it with the stress rho c0 =
+    1 until the wave has returned from the free end (t = 2), then with -1 for as long, and so on. Hence sigma(t) = int
+    b(s) q(t - s) ds with the square wave q of period 4; by the trapezoidal rule.
     """
     step = t[1] - t[0]
     half = np.concatenate([[0.0], np.cumsum((force[1:] + force[:-1]) / 2) * step])  # int b
@@ -124,12 +123,12 @@ def clamp_stress(t: Values, force: Values) -> Values:
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
-    """(mu, lambda) in Pa."""
+    """Lame parameters (mu, lambda) in Pa."""
     return young / (2 * (1 + poisson)), young * poisson / ((1 + poisson) * (1 - 2 * poisson))
 
 
 def stvk_stress(F: Values, young: float, poisson: float) -> Values:
-    """P = F (2 mu E + lambda tr(E) I), E = (F^T F - I) / 2, in Pa."""
+    """First Piola-Kirchhoff stress P = F (2 mu E + lambda tr(E) I), E = (F^T F - I) / 2, in Pa."""
     mu, lmbda = lame(young, poisson)
     E = (F.T @ F - np.eye(3)) / 2
     return np.asarray(F @ (2 * mu * E + lmbda * np.trace(E) * np.eye(3)))
@@ -149,7 +148,7 @@ STRESSES = {"stvk": stvk_stress, "neo-hookean": neo_hookean_stress}
 
 
 def uniaxial(energy: str, stretch: float, young: float, poisson: float) -> tuple[float, float]:
-    """(lateral stretch, P11 in Pa) of a bar that is free sideways: P22 = 0."""
+    """(lateral stretch, P11 in Pa) of a bar with free sides: P22 = 0."""
     stress = STRESSES[energy]
 
     def state(side: float) -> Values:
@@ -178,7 +177,7 @@ def howland_factor(ratio: float) -> float:
 def hondros(r: Values, radius: float, half_arc: float, pressure: float) -> tuple[Values, Values]:
     """(sigma_x, sigma_y) in Pa at height r on the loaded diameter of a disk; tension positive (Hondros 1959).
 
-    Uniform radial pressure acts on two arcs of angle 2 `half_arc` (radians) around the y axis.
+    A uniform radial pressure acts on two arcs of angle 2 `half_arc` (radians) around the y axis.
     """
     q, a = (np.asarray(r) / radius) ** 2, half_arc
     first = (1 - q) * sin(2 * a) / (1 - 2 * q * np.cos(2 * a) + q**2)
@@ -187,12 +186,12 @@ def hondros(r: Values, radius: float, half_arc: float, pressure: float) -> tuple
 
 
 def disk_stress(x: Values, y: Values, radius: float, half_arc: float, pressure: float, points: int = 200) -> Values:
-    """(n, 3) sigma_xx, sigma_yy, sigma_xy in Pa anywhere in the same disk.
+    """Stress (n, 3) sigma_xx, sigma_yy, sigma_xy in Pa anywhere in the disk of `hondros`.
 
     Sum over the arcs of the field of two opposite radial forces q per thickness at the ends of a diameter along the
-    unit vector e (Michell 1900; Timoshenko and Goodier, section 41): with r1, r2 the vectors from the points of
-    action, sigma = -(2 q / pi) ((r1 . e)/|r1|^4 r1 x r1 + (r2 . -e)/|r2|^4 r2 x r2) + q / (pi R) I, where r1 starts
-    at the end from which the force pushes along e. Gauss rule over the angle.
+    unit vector e (Michell 1900; Timoshenko and Goodier, section 41). With r1, r2 the vectors from the points of action,
+    sigma = -(2 q / pi) ((r1 . e)/|r1|^4 r1 x r1 + (r2 . -e)/|r2|^4 r2 x r2) + q / (pi R) I, where r1 starts at the end
+    from which the force pushes along e. Gauss rule over the angle.
     """
     nodes, weights = np.polynomial.legendre.leggauss(points)
     result = np.zeros((len(x), 3))
@@ -210,7 +209,7 @@ def disk_stress(x: Values, y: Values, radius: float, half_arc: float, pressure: 
 
 
 def brazilian_peak(diameter: float, strength: float) -> float:
-    """pi D sigma_t / 2 in N per metre of thickness: the load at which the centre of the disk reaches the strength."""
+    """Load pi D sigma_t / 2 (N per metre of thickness) at which the centre of a disk reaches the strength."""
     return pi * diameter * strength / 2
 
 
@@ -218,10 +217,10 @@ def brazilian_peak(diameter: float, strength: float) -> float:
 
 
 def kernel_moment(kernel: str) -> float:
-    """<q^2> = int g q^2 dA / int g dA over the unit disk: what the average of x^2 exceeds x^2 by is R^2 <q^2> / 2.
+    """<q^2> = int g q^2 dA / int g dA over the unit disk; the average of x^2 is x^2 + R^2 <q^2> / 2.
 
-    hat: (1/4 - 1/5) / (1/2 - 1/3) = 3/10; constant: (1/4) / (1/2) = 1/2; gaussian exp(-k q^2) with k = 4.5, with
-    s = q^2: int_0^1 s exp(-k s) ds / int_0^1 exp(-k s) ds = 1/k - 1/(exp(k) - 1).
+    hat: (1/4 - 1/5) / (1/2 - 1/3) = 3/10; constant: (1/4) / (1/2) = 1/2; gaussian exp(-k q^2) with k = 4.5, with s =
+    q^2: int_0^1 s exp(-k s) ds / int_0^1 exp(-k s) ds = 1/k - 1/(exp(k) - 1).
     """
     k = 4.5
     return {"linear": 3 / 10, "constant": 1 / 2, "gaussian": 1 / k - 1 / (np.exp(k) - 1)}[kernel]
@@ -231,19 +230,19 @@ def kernel_moment(kernel: str) -> float:
 
 
 def bilinear_stress(strain: float, young: float, yield_stress: float, hardening: float) -> float:
-    """Stress in Pa of a pulled bar: E e up to the yield stress, then the slope E K / (E + K)."""
+    """Stress (Pa) of a pulled bar: E e up to the yield stress, then the slope E K / (E + K)."""
     if young * strain <= yield_stress:
         return young * strain
     return yield_stress + (strain - yield_stress / young) * young * hardening / (young + hardening)
 
 
 def flowing_stress(strain: float, strain_rate: float, elastic: tuple[float, float], flow: Values) -> float:
-    """The same with flow at a finite rate; `elastic` = (E, nu), `flow` = (yield stress, K, rate in 1/s).
+    """Stress (Pa) of a pulled bar with viscoplastic flow; `elastic` = (E, nu), `flow` = (yield stress, K, rate in 1/s).
 
-    Held at a fixed deformation, the excess f = s - (Y + K e_p) falls by exp(-rate dt): a flow e_p' takes 3 G e_p' from
-    the von Mises stress then, so that e_p' = rate f / (3 G + K). A bar is free sideways, s = E (e - e_p):
-    f' = E e' - f / T with T = (3 G + K) / (rate (E + K)), hence f = E e' T (1 - exp(-t / T)) at a time t after yield,
-    and with e_p = (E e - Y - f) / (E + K) the stress is the bilinear one plus f E / (E + K).
+    At constant strain the overstress f = s - (Y + K e_p) decays as exp(-rate dt). A flow e_p' reduces the von Mises
+    stress by 3 G e_p', hence e_p' = rate f / (3 G + K). In a bar with free sides s = E (e - e_p): f' = E e' - f / T
+    with T = (3 G + K) / (rate (E + K)), and f = E e' T (1 - exp(-t / T)) at a time t after yield. With e_p = (E e - Y -
+    f) / (E + K) the stress is the bilinear one plus f E / (E + K).
     """
     young, poisson = elastic
     yield_stress, hardening, rate = flow

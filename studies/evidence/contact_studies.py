@@ -1,7 +1,7 @@
-"""Contact driven to extremes: studies as TOML data, and what is measured of their runs.
+"""Studies of contact at extremes of step, stiffness, mass and shape, as TOML data, and measures of their runs.
 
-What is known of each: the impulse that stops a fall, the momentum of a pair, Hooke's law in a press, and that forces
-pass through a stack; and in no frame is a point of one body inside of another.
+Known results: the impulse of a fall, the momentum of two bodies, Hooke's law in a press, and equal forces through a
+stack. In no frame may a point of one body lie inside another.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def falling_bar(
     step: float, *, young: float = SOFT_MODULUS, speed: float = 10.0, gravity: float = 9.81, steps: int = 100,
     scheme: str = "backward-euler",
 ) -> stability_studies.Data:  # fmt: skip
-    """A bar that falls flat on a floor."""
+    """Study of a bar that falls flat on a floor."""
     study = stability_studies.base_study("a bar falls on a floor", stability_studies.BAR, {"young": young}, steps)
     study["load"] = {"gravity": [0.0, 0.0, -gravity]}
     study["initial"] = {"velocity": [0.0, 0.0, -speed]}
@@ -49,7 +49,7 @@ def falling_bar(
 def bar_hit_by_ball(
     ratio: float, *, step: float = 1e-4, young: float = SOFT_MODULUS, steps: int = 100, scheme: str = "backward-euler"
 ) -> stability_studies.Data:
-    """A free bar, struck aside of its middle by a free ball of `ratio` times its mass at 10 m/s."""
+    """Study of a free bar hit beside its middle by a free ball of `ratio` times its mass at 10 m/s."""
     study = stability_studies.base_study("a bar struck by a ball", stability_studies.BAR, {"young": young}, steps)
     ball = {
         "name": "ball",
@@ -62,7 +62,7 @@ def bar_hit_by_ball(
 
 
 def pressed_shell(thickness: float, *, young: float = SOFT_MODULUS) -> stability_studies.Data:
-    """A shell of a square metre between two rigid blocks, pressed by some 10 % of its thickness; nu = 0."""
+    """Study of a shell of 1 m^2 between two rigid blocks, pressed by about 10 % of its thickness; nu = 0."""
     mesh = {"builder": "box", "size": [1.0, 1.0, thickness], "h": 0.05}
     study = stability_studies.base_study(
         "a shell between blocks", mesh, {"young": young, "energy": "linear", "poisson": 0.0}, 20
@@ -80,7 +80,7 @@ def pressed_shell(thickness: float, *, young: float = SOFT_MODULUS) -> stability
 
 
 def solid_stack() -> stability_studies.Data:
-    """The stack of 4 mm as one block."""
+    """Study of the stack with a shell of 4 mm as one solid block."""
     _, study = shell_between_blocks(4e-3, 4e-3)
     way = {"time": [0.0, 1.0], "value": [[0.0, 0.0, 0.0], [0.0, 0.0, -4e-3]]}
     block = {"mesh": {"builder": "box", "size": [0.5, 0.5, 0.504], "h": 0.125}}
@@ -89,7 +89,7 @@ def solid_stack() -> stability_studies.Data:
 
 
 def without_contact(study: stability_studies.Data) -> stability_studies.Data:
-    """The same body alone."""
+    """The same study without obstacles and contact."""
     alone = {key: table for key, table in study.items() if key not in ("obstacle", "contact", "probe")}
     return alone | {"output": study["output"] | {"surface": True}}
 
@@ -97,7 +97,7 @@ def without_contact(study: stability_studies.Data) -> stability_studies.Data:
 def shell_between_blocks(
     thickness: float, gap: float, *, young: float = SOFT_MODULUS
 ) -> tuple[Any, stability_studies.Data]:
-    """Two blocks with a shell between them, all soft and `gap` apart: pressed until they have stood still."""
+    """Mesh and study of a deformable shell between two deformable blocks, `gap` apart, pressed until at rest."""
     upper = 0.25 + 2 * gap + thickness
     mesh = _join_meshes(
         _box((0.5, 0.5, 0.25), 0.125),
@@ -117,7 +117,7 @@ def shell_between_blocks(
 
 
 def block_on_block(step: float, *, young: float, speed: float, steps: int = 100) -> tuple[Any, stability_studies.Data]:
-    """A block that falls flat on a held one, their meshes not alike: contact by `[contact]` alone."""
+    """Mesh and study of a block that falls flat on a fixed one with another mesh: contact by `[contact]` alone."""
     mesh = _join_meshes(
         _box((0.5, 0.5, 0.25), 0.125), _box((0.4, 0.4, 0.25), 0.1, (0.03, 0.04, 0.25 + 1.1 * BARRIER_DISTANCE))
     )
@@ -131,19 +131,21 @@ def block_on_block(step: float, *, young: float, speed: float, steps: int = 100)
 
 
 def _with_time(study: stability_studies.Data, step: float, steps: int, scheme: str) -> stability_studies.Data:
+    """The study with a scheme, a step and outputs."""
     study["contact"] = {"itself": False, "distance": BARRIER_DISTANCE}
     study["time"] = {"scheme": scheme, "step": step, "end": steps * step}
     return study
 
 
 def _box(size: tuple[float, ...], h: float, origin: tuple[float, ...] = ()) -> Any:
+    """Mesh of a box of the given size, m, with cells of size h."""
     from ...meshes.builders.box import Box
 
     return Box(size=size, h=h, origin=origin).build()
 
 
 def _join_meshes(*made: Any) -> Any:
-    """Bodies that share no node as one mesh."""
+    """One mesh of bodies that share no node."""
     from ...meshes.data import MeshData
 
     first = np.cumsum([0, *(len(item.points) for item in made)])
@@ -164,8 +166,11 @@ MESH_STUDIES = {
 
 
 def measure_fall(run: Path) -> Figures:
-    """As `survived`; the error of m v - m v_0 = sum dt f - m g t by the floor's force, a share of its impulse, where
-    the scheme keeps that in each step; and points below the floor."""
+    """Figures of `measure_run`, error of the momentum balance along z, and number of points below the floor.
+
+    The error of m v - m v_0 = sum dt f - m g t with the floor's force is relative to its impulse. It is computed for
+    backward Euler, which satisfies the balance in each step.
+    """
     if not (run / "history.csv").exists():
         return {}
     study, rows = run_results.study(run), run_results.history(run)
@@ -178,7 +183,7 @@ def measure_fall(run: Path) -> Figures:
 
 
 def measure_block_fall(run: Path) -> Figures:
-    """The same by the force of what holds the anvil, which begins at rest; and nodes of one block inside the other."""
+    """Figures as of `measure_fall`, with the reaction of the fixed block, and nodes of one block inside the other."""
     if not (run / "history.csv").exists():
         return {}
     error = _impulse_error(run, run_results.history(run)["reaction_anvil_z"])
@@ -186,8 +191,11 @@ def measure_block_fall(run: Path) -> Figures:
 
 
 def measure_impact(run: Path) -> Figures:
-    """As `survived`; the error of the momentum of bar and ball, a share of what they exchanged; and points of the bar
-    in the ball, deeper than chords are."""
+    """Figures of `measure_run`, error of the momentum of bar and ball, and points of the bar inside the ball.
+
+    The error is relative to the momentum exchanged. Points that lie less than a chord's height inside the ball are not
+    counted.
+    """
     if not (run / "history.csv").exists():
         return {}
     (ball,), rows, pieces = (
@@ -211,7 +219,7 @@ def measure_impact(run: Path) -> Figures:
 
 
 def measure_press(run: Path) -> Figures:
-    """As `survived`, and the error of F = E A strain, the strain that of the shell between the gaps that are left."""
+    """Figures of `measure_run`, and error of F = E A strain; the strain follows from the remaining gaps."""
     if not (run / "history.csv").exists():
         return {}
     study, rows = run_results.study(run), run_results.history(run)
@@ -227,7 +235,7 @@ def measure_press(run: Path) -> Figures:
 
 
 def measure_stack(run: Path) -> Figures:
-    """As `survived`, the error of the force that goes through the stack, and nodes of a part inside another."""
+    """Figures of `measure_run`, error of the force through the stack, and nodes of one part inside another."""
     if not (run / "history.csv").exists():
         return {}
     rows = run_results.history(run)
@@ -236,9 +244,9 @@ def measure_stack(run: Path) -> Figures:
 
 
 def _impulse_error(run: Path, force: Values) -> float:
-    """Of m v - m v_0 = sum dt f - m g t along z, as a share of the impulse of f (steps,), N on the body.
+    """Error of m v - m v_0 = sum dt f - m g t along z, relative to the impulse of f (steps,), N, on the body.
 
-    A body that is held begins at rest.
+    A fixed body starts at rest.
     """
     study, rows, pieces = run_results.study(run), run_results.history(run), run_results.columns(run / "pieces.csv")
     t = pieces["time"]
@@ -249,7 +257,7 @@ def _impulse_error(run: Path, force: Values) -> float:
 
 
 def surface_points(run: Path) -> Iterator[tuple[float, Values]]:
-    """(s, (n, 3) m) the points of the split surface in each frame."""
+    """Yield (time in s, points (n, 3) in m) of the split surface for each frame."""
     from ...output.surface.vtk_files import read_body_frames
     from .stability_measures import read_surface
 
@@ -258,7 +266,7 @@ def surface_points(run: Path) -> Iterator[tuple[float, Values]]:
 
 
 def count_penetrating_nodes(run: Path) -> int:
-    """Nodes of the last frame that lie in a cell of another body, by barycentric coordinates of all pairs."""
+    """Number of nodes in the last frame inside a cell of another body, by barycentric coordinates of all pairs."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 

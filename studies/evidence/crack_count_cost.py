@@ -1,14 +1,14 @@
-"""Growth: seconds per step against the number of cracks, this method beside one that adds unknowns at each.
+"""Seconds per step against the number of cracks, beside a method that adds unknowns at each crack.
 
     python -m fracsim.studies.evidence.crack_count_cost CASE [--cuts 0 1 10 100] [--no-baseline] -o figures.json
 
-A body is held at one end and drawn at the other while planes cut it: all edges across a plane break at once. After 0,
-1, 10 and 100 planes three loops are timed step by step in turn, so that the machine's moods hit them alike: the body
-before any cut, the same body cut (this program, its unknowns unchanged), and the cells duplicated with virtual nodes
-(virtual_nodes.py; the same forms, solver and stepper, and no fracture pass), which is built anew after each cut.
+A body is fixed at one end and pulled at the other. Planes cut it: all edges across a plane break at once. After 0, 1,
+10 and 100 planes three loops are timed, one step of each in turn, so that disturbances of the machine affect all. The
+loops are the uncut body, the cut body (same unknowns), and cells duplicated with virtual nodes (virtual_nodes.py; same
+forms, solver and stepper, no fracture pass), built again after each cut.
 
-One Newton iteration a step and CG to 1e-6 for all, as in `make bench`: how many iterations a step takes depends on how
-the pieces move, which is not what is compared.
+One Newton iteration a step and CG to 1e-6 for all, as in `make bench`. The number of iterations depends on the motion
+of the fragments, which is not compared here.
 """
 
 from __future__ import annotations
@@ -57,11 +57,12 @@ PUBLISHED = (
 
 
 def trials() -> list[Trial]:
-    """Growth on 1 and 2 ranks, and the loaf at three resolutions."""
+    """Trials on 1 and 2 ranks, and of the loaf at three resolutions."""
     return [*(_trial(case, ranks) for case in SCENES for ranks in (1, 2)), *map(_loaf_trial, LOAF_SIZES)]
 
 
 def _trial(case: str, ranks: int) -> Trial:
+    """Trial of a case on some ranks."""
     large = case.startswith("box")
     options = ["--no-baseline"] if ranks > 1 else ["--cuts", "0", "1", "10"] if case == "box-648k-tets" else []
     script = ("fracsim.studies.evidence.crack_count_cost", case, *options)
@@ -72,6 +73,7 @@ def _trial(case: str, ranks: int) -> Trial:
 
 
 def _loaf_trial(name: str) -> Trial:
+    """Trial of the loaf at one resolution."""
     from .. import folder
 
     study = tomllib.loads((folder() / "loaf.toml").read_text(encoding="utf-8"))
@@ -85,7 +87,7 @@ def _loaf_trial(name: str) -> Trial:
 
 
 def scene_study(case: str) -> dict[str, Any]:
-    """A soft bar held at one end and drawn at the other; its strength is never reached, so that only planes cut it."""
+    """Study of a soft bar fixed at one end and pulled at the other. Only planes cut it, as its strength is huge."""
     mesh = copy.deepcopy(SCENES[case])
     held, drawn = ENDS[mesh["builder"]]
     return {
@@ -105,6 +107,7 @@ def scene_study(case: str) -> dict[str, Any]:
 
 
 def main() -> None:
+    """Measure one case and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("case", choices=SCENES)
     parser.add_argument("--cuts", type=int, nargs="+", default=CUT_COUNTS)
@@ -119,7 +122,7 @@ def main() -> None:
 
 
 def measure(case: str, cuts: list[int], *, baseline: bool) -> dict[str, Any]:
-    """Figures of one case on the ranks of this process (collective); the baseline is for one rank."""
+    """Figures of one case on the ranks of this process (collective); the baseline needs one rank."""
     from mpi4py import MPI
 
     from ...mesh.parallel import sum_over_ranks
@@ -145,7 +148,7 @@ def measure(case: str, cuts: list[int], *, baseline: bool) -> dict[str, Any]:
 
 
 def random_planes(count: int, lower: npt.NDArray[np.float64], upper: npt.NDArray[np.float64]) -> list[Any]:
-    """(normal, point) of planes: the first across the middle, the others anywhere in the body; always the same."""
+    """(normal, point) of planes, always the same: the first across the middle, the others anywhere in the body."""
     random = np.random.default_rng(1)
     normals = random.normal(size=(count, 3))
     points = lower + (upper - lower) * random.uniform(0.05, 0.95, (count, 3))
@@ -156,7 +159,7 @@ def random_planes(count: int, lower: npt.NDArray[np.float64], upper: npt.NDArray
 
 
 def break_planes(run: Any, planes: list[Any]) -> None:
-    """Break every edge across the planes (collective)."""
+    """Break all edges across the planes (collective)."""
     if not planes:
         return
     fracture, domain = run.scene.fracture, run.scene.domain
@@ -168,11 +171,13 @@ def break_planes(run: Any, planes: list[Any]) -> None:
 
 
 class VirtualNodeBaseline:
-    """The baseline: cut cells duplicated, everything that hangs on the mesh built anew, the motion taken over."""
+    """Baseline with duplicated cut cells on a new mesh, with the motion transferred."""
 
     def __init__(self, run: Any, whole: Any) -> None:
-        """`run` has the cuts; the motion is that of the `whole` body: nodes that a cut set loose are no part of a cell
-        any more, and would turn the cells inside out that the copies are."""
+        """Duplicate the cut cells of `run` and transfer the motion of the `whole` body.
+
+        The motion of the cut body is not used: nodes that a cut detaches from all cells would invert the copies.
+        """
         from ...mesh.domain import distribute
         from ...mesh.simplices import node_groups
         from ...scene import build_material, build_scene_on, make_stepper
@@ -190,12 +195,12 @@ class VirtualNodeBaseline:
         scene.balance.stress.chi.x.array[: len(share)] = share
         self.stepper = make_stepper(scene.balance, study.time, NoPlasticFlow(), NoFracture(scene.balance), scene.solver)
         self.state = scene.start()
-        self._take_over(whole.state, domain)
+        self._transfer_motion(whole.state, domain)
         self.unknowns = 3 * len(self.new.node)
         self.rebuild = time.perf_counter() - began
 
     def _mesh(self, old: Any) -> Any:
-        """The mesh with copies, and the facets of its groups: those of copies that own a node of them."""
+        """Mesh with copies; a facet group contains the facets of copies that own a node of them."""
         from ...meshes.data import MeshData
 
         new, groups = self.new, {}
@@ -208,19 +213,20 @@ class VirtualNodeBaseline:
             groups[name] = faces[owned & np.isin(keys, wanted)]
         return MeshData(old.nodes[new.node], new.cells, groups)
 
-    def _take_over(self, state: Any, domain: Any) -> None:
-        """Displacement and velocity of the old nodes for all copies of them."""
+    def _transfer_motion(self, state: Any, domain: Any) -> None:
+        """Transfer displacement and velocity of the original nodes to all copies."""
         source = self.new.node[domain.node_input]
         u, v = (x.reshape(-1, 3)[source].ravel().copy() for x in (state.u, state.v))
         self.state = self.stepper.with_forces(replace(self.state, u=u, v=v, t=state.t, step=state.step))
 
     def step(self) -> Any:
+        """Advance by one step and return its report."""
         self.state, report = self.stepper.advance(self.state)
         return report
 
 
 def _facet_nodes(domain: Any, facets: Any) -> Any:
-    """(n, 3) nodes of local facets."""
+    """Nodes (n, 3) of local facets."""
     topology = domain.mesh.topology
     topology.create_connectivity(2, 0)
     topology.create_connectivity(3, 0)
@@ -273,12 +279,13 @@ def _time_stage(whole: Any, cut: Any, other: VirtualNodeBaseline | None) -> dict
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
-    """Growth with cracks, and the loaf's resolution study."""
+    """Sections on the cost of cracks and on the resolution of the loaf."""
     cuts = [record for record in records if record["case"] != "loaf"]
     return [_cost_section(cuts), _resolution_section([record for record in records if record["case"] == "loaf"])]
 
 
 def _cost_section(records: list[dict[str, Any]]) -> Section:
+    """Section on the cost of a step against the number of cracks."""
     columns = (
         "scene", "ranks", "tets", "nodes", "cuts", "broken edges", "split cells", "pieces",
         "s a step", "±", "over uncut", "CG", "CG uncut", "unknowns",
@@ -304,10 +311,12 @@ def _cost_section(records: list[dict[str, Any]]) -> Section:
 
 
 def _stages(record: dict[str, Any]) -> list[dict[str, Any]]:
+    """Stages of a record; empty if it failed."""
     return list(record["figures"].get("stages", []))
 
 
 def _table_rows(record: dict[str, Any]) -> list[tuple[TableCell, ...]]:
+    """Rows of a record, one a stage."""
     figures = record["figures"]
     head = (record["case"], record["ranks"], figures.get("tets"), figures.get("nodes"))
     keys = (
@@ -320,6 +329,7 @@ def _table_rows(record: dict[str, Any]) -> list[tuple[TableCell, ...]]:
 
 
 def _claim(records: list[dict[str, Any]]) -> Claim:
+    """Claim on the cost of a step after the last cut."""
     last = {f"{record['case']} on {record['ranks']}": _stages(record)[-1] for record in records if _stages(record)}
     worst = [f"{name} {stage['cut_ratio']:.2f}" for name, stage in last.items()]
     beside = [f"{name} {stage['baseline_ratio']:.2f}" for name, stage in last.items() if "baseline_ratio" in stage]
@@ -354,11 +364,13 @@ def _plots(records: list[dict[str, Any]]) -> list[Plot]:
 
 
 def _size_series(records: list[dict[str, Any]], key: str, label: str) -> Series:
+    """Seconds per step over the number of tetrahedra."""
     points = sorted((record["figures"]["tets"], _stages(record)[-1].get(key)) for record in records)
     return Series(label, tuple(float(x) for x, _ in points), tuple(y for _, y in points))
 
 
 def _resolution_section(records: list[dict[str, Any]]) -> Section:
+    """Section on the loaf at three resolutions."""
     columns = (
         "loaf", "h m", "tets", "ranks", "steps", "s a step", "wall s", "broken edges", "pieces", "peak memory MiB",
         "outcome",
@@ -382,6 +394,7 @@ def _resolution_section(records: list[dict[str, Any]]) -> Section:
 
 
 def _loaf_row(record: dict[str, Any]) -> tuple[TableCell, ...]:
+    """Row of a loaf."""
     summary = record["summary"] or {}
     steps = summary.get("steps")
     seconds = record["stepping"][-1] / steps if steps and record["stepping"] else None

@@ -1,7 +1,6 @@
 """Runs on meshes that no builder makes: python -m fracsim.studies.evidence.custom_meshes NAME -o figures.json.
 
-Writes mesh.msh and trial.toml into the folder it is started in, then does what
-`fracsim run trial.toml -o run --overwrite` does.
+Writes mesh.msh and trial.toml into the current folder, then does what `fracsim run trial.toml -o run --overwrite` does.
 """
 
 from __future__ import annotations
@@ -20,24 +19,24 @@ MESH_TABLE: dict[str, Any] = {"file": "mesh.msh"}
 
 
 def triangle() -> tuple[Any, dict[str, Any]]:
-    """One cell of 2D, pulled at a corner until it breaks."""
+    """Mesh and study of one 2D cell, pulled at a corner until it breaks."""
     return _single_cell_mesh(2), _single_cell_study(2)
 
 
 def tetrahedron() -> tuple[Any, dict[str, Any]]:
-    """One cell of 3D, pulled at a corner until it breaks."""
+    """Mesh and study of one 3D cell, pulled at a corner until it breaks."""
     return _single_cell_mesh(3), _single_cell_study(3)
 
 
 def two_densities() -> tuple[Any, dict[str, Any]]:
-    """A bar with one half 1e4 times as dense as the other, thrown by its light end and torn."""
+    """Mesh and study of a bar, one half 1e4 times as dense as the other, pulled at its light end until it breaks."""
     study = stability_studies.accelerated_bar(2e-3, steps=100)
     study["material"]["heavy"] = {"density": 1e7}
     return _two_density_mesh(), study | {"mesh": dict(MESH_TABLE)}
 
 
 def two_densities_hanging() -> tuple[Any, dict[str, Any]]:
-    """The same bar hanging from its side: the support has to carry the weight."""
+    """Mesh and study of the same bar hanging from its side; the support carries the weight."""
     study = stability_studies.hanging_body(MESH_TABLE, {"young": 1e9})
     study["material"]["heavy"] = {"density": 1e7}
     return _two_density_mesh(), study
@@ -53,6 +52,7 @@ CUSTOM_STUDIES: dict[str, Callable[[], tuple[Any, dict[str, Any]]]] = {
 
 
 def _single_cell_mesh(d: int) -> Any:
+    """Mesh of one simplex in d dimensions."""
     from ...meshes.data import MeshData
     from ...meshes.topology import facets_of
 
@@ -63,6 +63,7 @@ def _single_cell_mesh(d: int) -> Any:
 
 
 def _single_cell_study(d: int) -> dict[str, Any]:
+    """Study of one simplex in d dimensions."""
     corner: list[float | str] = [0.0] * (d - 1)
     study = stability_studies.base_study("one cell pulled apart", MESH_TABLE, None, 20)
     study["boundary"] = [
@@ -74,6 +75,7 @@ def _single_cell_study(d: int) -> dict[str, Any]:
 
 
 def _two_density_mesh() -> Any:
+    """Mesh of a bar with the regions heavy and light."""
     from ...meshes.builders.box import Box
 
     made = Box(size=(1.0, 0.25, 0.25), h=0.125).build()

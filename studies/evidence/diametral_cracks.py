@@ -1,4 +1,4 @@
-"""Where the cracks of a cylinder pressed along its diameter are: when it has split, and when half its load is gone."""
+"""Position of the cracks in a diametrically compressed cylinder, when it has split and at the end."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SPLIT_LOAD = 0.9  # of the peak, after it
 
 
 def measure_cracks(run: Path, time: Values, load: Values) -> Record:
-    """What `diametral_figures` says of the frame at which the load, N, has fallen to SPLIT, and of the last."""
+    """Figures of `diametral_figures` at the frame where the load (N) has fallen to SPLIT_LOAD, and at the last."""
     fallen = np.flatnonzero((np.arange(len(load)) > load.argmax()) & (load <= SPLIT_LOAD * load.max()))
     mesh = run_results.study(run)["mesh"]
     outcome: Record = {}
@@ -31,8 +31,12 @@ def measure_cracks(run: Path, time: Values, load: Values) -> Record:
 
 
 def diametral_figures(corners: Values, radius: float, length: float) -> Record:
-    """Of crack faces (n, 3, 3), both sides, m, in a cylinder from 0 along z that is pressed along y: what share of them
-    lies along the loaded diameter, what share of the section they cover there, and their area over that of it."""
+    """Position of crack faces (n, 3, 3), m, both sides, in a cylinder along z from 0 that is compressed along y.
+
+    Returns:
+        `along`: share of their area near the loaded diameter. `covered`: share of the diametral section that these
+        cover. `area`: their total area over that of the section.
+    """
     size = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / 2
     near = np.abs(corners[:, :, 0].mean(axis=1)) < DIAMETER_DISTANCE * radius
     section = np.array([[-radius, 0.0], [radius, length]])
@@ -44,7 +48,7 @@ def diametral_figures(corners: Values, radius: float, length: float) -> Record:
 
 
 def covered_fraction(triangles: Values, low: Values, high: Values, places: int = 2000) -> float:
-    """Share of a rectangle that triangles (n, 3, 2) cover, at about so many places."""
+    """Share of a rectangle covered by triangles (n, 3, 2), sampled at about `places` points."""
     step = np.sqrt((high - low).prod() / places)
     axes = [np.arange(a + step / 2, b, step) for a, b in zip(low, high, strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -65,7 +69,7 @@ COLUMNS = (
 
 
 def table(records: list[Record]) -> tuple[ReportTable, ...]:
-    """A row a mesh; none where nothing was run."""
+    """Table with a row a mesh; empty if nothing was run."""
     keys = [f"{name}_{key}" for name in ("split", "end") for key in ("along", "covered", "area")]
     rows: tuple[tuple[TableCell, ...], ...] = tuple(
         (r["settings"]["h"], *(r["figures"][key] for key in (*keys, "pieces"))) for r in records
@@ -75,7 +79,7 @@ def table(records: list[Record]) -> tuple[ReportTable, ...]:
 
 
 def claims(figures: list[Record], peak: float, within: float) -> tuple[Claim, ...]:
-    """What three meshes are to show; `peak`, N, in closed form, and `within` which share of it."""
+    """Claims on three meshes; `peak` (N) is the closed form, `within` the admissible relative error."""
 
     def said(text: str, form: str, values: list[float], least: float, most: float = np.inf) -> Claim:
         words: str = ", ".join(form.format(value) for value in values) or "not run"

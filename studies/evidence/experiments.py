@@ -1,4 +1,4 @@
-"""Experiments of papers and handbooks: load over displacement and energy on three meshes, beside what is known."""
+"""Experiments of papers and handbooks: load, displacement and energy on three meshes, beside reference values."""
 
 from __future__ import annotations
 
@@ -37,9 +37,15 @@ class Experiment:
     """A packaged study on three meshes.
 
     Attributes:
-        changes: of its tables.    sizes: (key of [mesh], values in m, the coarsest first).
-        pushed: obstacle whose force and way are the curve.    axis: along which.
-        peak: reference, N, and `source` in words.    within: how far off it may be; None: what is told, not claimed.
+        case: name of the case.
+        study: name of the packaged study.
+        sizes: (key of [mesh], values in m, the coarsest first).
+        pushed: obstacle or grip whose force and displacement make the curve.
+        axis: axis of that force.
+        peak: reference load, N.
+        source: origin of the reference.
+        changes: tables of the study that change.
+        within: admissible relative error; None if no claim is made.
     """
 
     case: str
@@ -112,12 +118,12 @@ BY_CASE = {item.case: item for item in EXPERIMENTS}
 
 
 def trials() -> list[Trial]:
-    """Each experiment on its meshes."""
+    """Trials of all experiments on their meshes."""
     return [_trial(experiment, h) for experiment in EXPERIMENTS for h in experiment.sizes[1]]
 
 
 def experiment_study(experiment: Experiment, h: float) -> dict[str, Any]:
-    """The packaged study with the changes of an experiment, on one of its meshes."""
+    """Packaged study with the changes of an experiment, on one of its meshes."""
     data = tomllib.loads((packaged() / f"{experiment.study}.toml").read_text(encoding="utf-8"))
     for table, values in deepcopy(experiment.changes).items():
         data[table] = values if isinstance(values, list) else data.get(table, {}) | values
@@ -126,6 +132,7 @@ def experiment_study(experiment: Experiment, h: float) -> dict[str, Any]:
 
 
 def _trial(experiment: Experiment, h: float) -> Trial:
+    """Trial of an experiment with cells of size h."""
     return Trial(
         GROUP, experiment.case, f"{h * 1e3:g}-mm", study=experiment_study(experiment, h), settings={"h": h},
         limit=600.0,
@@ -137,7 +144,7 @@ def _trial(experiment: Experiment, h: float) -> Trial:
 
 
 def measure_brazilian(run: Path) -> Record:
-    """Figures of the disk, and how much of its loaded diameter the cracks follow within a tenth of the radius."""
+    """Load figures of the disk, and share of the loaded diameter with a crack within a tenth of the radius."""
     rows = run_results.history(run)
     size, centres = crack_faces(run)
     radius = float(run_results.study(run)["mesh"]["radius"])
@@ -147,7 +154,7 @@ def measure_brazilian(run: Path) -> Record:
 
 
 def measure_granite_cylinder(run: Path) -> Record:
-    """Figures of the cylinder, and where its cracks are."""
+    """Load figures of the cylinder, and position of its cracks."""
     rows = run_results.history(run)
     return load_figures(rows, "upper", "y") | diametral_cracks.measure_cracks(
         run, rows["time"], np.abs(rows["contact_upper_y"])
@@ -155,29 +162,29 @@ def measure_granite_cylinder(run: Path) -> Record:
 
 
 def measure_charpy(run: Path) -> Record:
-    """Figures of a bar."""
+    """Load and crack figures of the bar."""
     return _measure_bar(run)
 
 
 def measure_izod(run: Path) -> Record:
-    """Figures of a bar."""
+    """Load and crack figures of the bar."""
     return _measure_bar(run)
 
 
 def measure_charpy_klst(run: Path) -> Record:
-    """Figures of a bar."""
+    """Load and crack figures of the bar."""
     return _measure_bar(run)
 
 
 def measure_notched_shear(run: Path) -> Record:
-    """Figures of a plate pulled or pushed along the axis along which its grip moved farther."""
+    """Load figures of the plate, along the axis with the larger motion of the grip."""
     rows = run_results.history(run)
     way = {axis: float(np.abs(rows[f"motion_grip_{axis}"]).max()) for axis in "xy"}
     return load_figures(rows, "grip", max(way, key=way.__getitem__))
 
 
 def measure_l_panel(run: Path) -> Record:
-    """Figures of a panel that is pushed up."""
+    """Load figures of the panel."""
     return load_figures(run_results.history(run), "seat", "y")
 
 
@@ -191,8 +198,10 @@ def measure_kalthoff(run: Path) -> Record:
 
 
 def measure_branching(run: Path) -> Record:
-    """Where and when the crack of a pane branched for good, the angles of both branches over FORK, degrees, its speed
-    before that, over c_R, and where it branched at first: one of those branches may have stopped."""
+    """Position and time of the final branching, angles of both branches (degrees) over FORK, and crack speed over c_R.
+
+    `first` is the position of the first branching, of which one branch may have arrested.
+    """
     size, centres = crack_faces(run)
     (x0, y0), rows = run_results.study(run)["crack"][0]["segment"][1], run_results.history(run)
     places, apart = centres[:, :2] - [x0, y0], MANY * float(np.median(size))
@@ -209,10 +218,16 @@ def measure_branching(run: Path) -> Record:
 
 
 def branch_angles(places: Values, apart: float, over: float = FORK) -> tuple[float, float, float] | None:
-    """Where the outermost crack faces (n, 2), along x from a notch at 0, part for good, and their angles, degrees.
+    """Position and angles (degrees) of the final branching of crack faces (n, 2) from a notch at 0 along x.
 
-    They have parted where they are `apart` (m) and more, `over` as much (m); lines through the outermost, by least
-    squares, meet where the crack has branched. None: it has not.
+    Args:
+        places: centres of crack faces, m.
+        apart: distance at which the outermost faces count as branches, m.
+        over: length over which that distance must persist, m.
+
+    Returns:
+        (x, upper angle, lower angle): least-squares lines through the outermost faces, and their intersection. None
+        without branching.
     """
     every = np.arange(0.0, places[:, 0].max(), apart / 2)
     strips = [places[np.abs(places[:, 0] - x) < apart / 2, 1] for x in every]
@@ -228,7 +243,7 @@ def branch_angles(places: Values, apart: float, over: float = FORK) -> tuple[flo
 
 
 def _measure_bar(run: Path) -> Record:
-    """With how high over the notch edges are broken, m."""
+    """Load figures of a bar, and height of broken edges above the notch, m."""
     mesh = run_results.study(run)["mesh"]
     size, centres = crack_faces(run)
     top = float(centres[:, 1].max()) - float(mesh["notch_depth"]) if len(size) else 0.0
@@ -239,8 +254,11 @@ def _measure_bar(run: Path) -> Record:
 
 
 def load_figures(rows: dict[str, Values], pushed: str, axis: str) -> Record:
-    """Peak and way there; `second`: the load that the body comes up to after the first peak, which is inertia where it
-    is struck; `plateau`: the median over the second half of the way; what is left; what has been absorbed."""
+    """Figures of the load-displacement curve: peaks, plateau, final load, absorbed energy and number of fragments.
+
+    `second`: load after the first peak, which is inertia under impact. `plateau`: median over the second half of the
+    displacement. `at` and `travel`: displacement since contact at the peak and at the end, m.
+    """
     load, way, touched = load_path(rows, pushed, axis)
     return {
         "peak": float(load.max()),
@@ -256,8 +274,10 @@ def load_figures(rows: dict[str, Values], pushed: str, axis: str) -> Record:
 
 
 def load_path(rows: dict[str, Values], pushed: str, axis: str) -> tuple[Values, Values, float]:
-    """Load, N, and way of what is pushed, m, and its way when it touches: of a grip 0, of an obstacle as far as it is
-    from where it was at first."""
+    """Load (N), displacement (m), and displacement at first contact.
+
+    For a grip that displacement is 0. For an obstacle, displacements count from its initial position.
+    """
     held, way = f"reaction_{pushed}_{axis}", np.abs(rows[f"motion_{pushed}_{axis}"])
     if held in rows:
         return np.abs(rows[held]), way, 0.0
@@ -266,13 +286,13 @@ def load_path(rows: dict[str, Values], pushed: str, axis: str) -> tuple[Values, 
 
 
 def second_peak(load: Values) -> float:
-    """The load at the top of the longest rise after the greatest one."""
+    """Load at the top of the largest rise after the maximum."""
     after = load[int(load.argmax()) :]
     return float(after[int(np.argmax(after - np.minimum.accumulate(after)))])
 
 
 def downsample(way: Values, load: Values, most: int = 150) -> tuple[Values, Values]:
-    """A curve in so many points or a few more; its peak is among them."""
+    """About `most` points of a curve, with its peak and its end."""
     rows = np.unique([*np.arange(0, len(load), max(1, len(load) // most)), int(load.argmax()), len(load) - 1])
     return way[rows], load[rows]
 
@@ -310,7 +330,7 @@ TEXT = (
 
 
 def sections(records: list[Record]) -> list[Section]:
-    """Tables, claims, curves and pictures."""
+    """Section with tables, claims, curves and pictures."""
     tables = (
         ReportTable("experiments", "All runs", COLUMNS, tuple(_row(record) for record in records)),
         ReportTable("experiments-spread", "Mean over the meshes and spread, (max - min) / mean", RANGE_COLUMNS,
@@ -328,13 +348,14 @@ def sections(records: list[Record]) -> list[Section]:
 
 
 def _compared_load(record: Record) -> float | None:
-    """The load that the reference is of: of what snaps the one after the inertia, of what bends that which stays."""
+    """Load that corresponds to the reference: second peak of brittle bars, plateau of ductile bars, else the peak."""
     key = {"A516": "second", "NVE36": "plateau"}.get(record["case"].rpartition("-")[2], "peak")
     outcome: float | None = record["figures"].get(key)
     return outcome
 
 
 def _row(record: Record) -> tuple[TableCell, ...]:
+    """Row of the table of runs."""
     outcome, peak = record["figures"], _compared_load(record)
     over = None if peak is None or not BY_CASE[record["case"]].peak else peak / BY_CASE[record["case"]].peak
     loads, others = ("peak", "second", "plateau", "last"), ("absorbed", "travel", "pieces")
@@ -343,6 +364,7 @@ def _row(record: Record) -> tuple[TableCell, ...]:
 
 
 def _range_rows(records: list[Record]) -> list[tuple[TableCell, ...]]:
+    """Rows of the mean and range over the meshes."""
     outcome: list[tuple[TableCell, ...]] = []
     for case, experiment in BY_CASE.items():
         peaks = [
@@ -356,6 +378,7 @@ def _range_rows(records: list[Record]) -> list[tuple[TableCell, ...]]:
 
 
 def _claims(records: list[Record]) -> tuple[Claim, ...]:
+    """Claims of all experiments."""
     disks = [r for r in records if r["case"] == "brazilian" and r["outcome"] == "done"]
     bars = {steel: [r for r in records if steel in r["case"] and r["outcome"] == "done"] for steel in ("A516", "NVE36")}
     cylinders = _cylinder_claims([r for r in records if r["case"] == "granite-cylinder" and r["outcome"] == "done"])
@@ -363,6 +386,7 @@ def _claims(records: list[Record]) -> tuple[Claim, ...]:
 
 
 def _panel_claim(records: list[Record]) -> Claim:
+    """Claim on the peak load of the L-shaped panel."""
     panel = BY_CASE["l-panel"]
     outcome = [r["figures"] for r in records if r["case"] == panel.case and r["outcome"] == "done"]
     off = [item["peak"] / panel.peak - 1 for item in outcome]
@@ -374,6 +398,7 @@ def _panel_claim(records: list[Record]) -> Claim:
 
 
 def _notch_claims(records: list[Record]) -> tuple[Claim, ...]:
+    """Claims on the notched plate, Kalthoff's angle and branching."""
     plate = BY_CASE["notched-tension"]
     done = {case: [r["figures"] for r in records if r["case"] == case and r["outcome"] == "done"]
             for case in (plate.case, "kalthoff", "branching")}  # fmt: skip
@@ -395,6 +420,7 @@ def _notch_claims(records: list[Record]) -> tuple[Claim, ...]:
 
 
 def _disk_claims(disks: list[Record]) -> tuple[Claim, ...]:
+    """Claims on the Brazilian disk."""
     limit = BY_CASE["brazilian"].within or 0.0
     off = [record["figures"]["peak"] / BY_CASE["brazilian"].peak - 1 for record in disks]
     left = [record["figures"]["last"] / record["figures"]["peak"] for record in disks]
@@ -412,11 +438,13 @@ def _disk_claims(disks: list[Record]) -> tuple[Claim, ...]:
 
 
 def _cylinder_claims(cylinders: list[Record]) -> tuple[Claim, ...]:
+    """Claims on the granite cylinder."""
     cylinder = BY_CASE["granite-cylinder"]
     return diametral_cracks.claims([record["figures"] for record in cylinders], cylinder.peak, cylinder.within or 0.0)
 
 
 def _steel_claims(A516: list[Record], NVE36: list[Record]) -> tuple[Claim, ...]:
+    """Claims on the brittle and the ductile steel."""
     left = [record["figures"]["last"] / record["figures"]["second"] for record in A516]
     stays = [record["figures"]["last"] / record["figures"]["plateau"] for record in NVE36]
     both = len(A516) == 6 and len(NVE36) == 6
@@ -429,15 +457,17 @@ def _steel_claims(A516: list[Record], NVE36: list[Record]) -> tuple[Claim, ...]:
 
 
 def _format_values(values: list[float], form: str) -> str:
+    """Values as text; "not run" if there are none."""
     return ", ".join(form.format(value) for value in values) or "not run"
 
 
 def _has_curve(record: Record, case: str) -> bool:
+    """Return whether a record of the case has a load curve."""
     return bool(record["case"] == case and record["outcome"] == "done" and "curve" in record["figures"])
 
 
 def _load_plot(records: list[Record], case: str) -> Plot:
-    """Load over the way of what pushes, a line a mesh, and the reference: measured, or across."""
+    """Load over displacement, a line a mesh, with the reference curve or level."""
     experiment, series, farthest = BY_CASE[case], [], 0.0
     for record in records:
         if _has_curve(record, case):

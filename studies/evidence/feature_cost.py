@@ -1,11 +1,11 @@
-"""The ladder: what each feature costs where it is used, and that it costs nothing where it is not.
+"""Cost of each feature: where it is used, and that it costs nothing where it is not.
 
-    python -m fracsim.studies.evidence.feature_cost RUNG [--n 10] -o figures.json
+    python -m fracsim.studies.evidence.feature_cost SCENE [--n 10] -o figures.json
 
-Each rung is the bar of `make bench` (24 n^3 tetrahedra, one Newton iteration and CG to 1e-6 a step) with one feature
-more. It is timed step by step in turn with the elastic bar in one process; the elastic bar itself in turn with the bare
-loop of bench.py, which knows no features at all, with fracsim's assembly of the tangent. Start-up,
-modules, fields and memory: in a process of its own.
+Each scene is the bar of `make bench` (24 n^3 tetrahedra, one Newton iteration and CG to 1e-6 a step) with one feature
+more. It is timed in turn with the elastic bar in one process. The elastic bar is timed in turn with the bare loop of
+bench.py, which has no features but fracsim's assembly of the tangent. Start-up, modules, fields and memory are measured
+in a separate process.
 """
 
 from __future__ import annotations
@@ -63,16 +63,16 @@ YIELDING = 1.30  # what flow everywhere may cost over the elastic bar
 
 @dataclass(frozen=True)
 class FeatureScene:
-    """One scene.
+    """A scene with one feature.
 
     Attributes:
-        tables: what differs from the elastic bar; None takes a table away.
-        uses: modules of `OPTIONAL` that it may import (with what lies inside them).
-        cut: whether a plane across the middle is broken before the first step.
-        plane: whether it is the 2D bar, of about as many triangles.
-        after: name of the rung that it is compared with; "" for the bare loop, "recorded" for the bare loop with the
-            elastic energy of each step, which every run writes to history.csv.
-        needs: table of the study file without which the program has no such rung.
+        tables: changes from the elastic bar; None removes a table.
+        uses: modules of `OPTIONAL` that the scene may import (with their submodules).
+        cut: break a plane through the middle before the first step.
+        plane: the 2D bar, with about as many triangles.
+        baseline: name of the scene it is compared with. "": the bare loop. "recorded": the bare loop with the elastic
+            energy of each step, which every run writes to history.csv.
+        needs: table of the study file that the scene requires.
         first: steps before the timed ones.
     """
 
@@ -80,18 +80,18 @@ class FeatureScene:
     uses: tuple[str, ...] = ()
     cut: bool = False
     plane: bool = False
-    after: str = "elastic"
+    baseline: str = "elastic"
     needs: str = ""
     first: int = WARM
 
 
 def feature_scenes(n: int) -> dict[str, FeatureScene]:
-    """All rungs by name, those that this version of the program has."""
+    """All scenes by name that this version of the program supports."""
     near = {"fracture": DAMAGE["fracture"] | {"radius": 2 / n}}
     average = (*FRACTURE_MODULES, AVERAGE)
-    every = {
-        "elastic": FeatureScene(after=""),
-        "elastic-recorded": FeatureScene(after="recorded"),
+    scenes = {
+        "elastic": FeatureScene(baseline=""),
+        "elastic-recorded": FeatureScene(baseline="recorded"),
         "linear": FeatureScene({"material": {"energy": "linear"}}),
         "corotated": FeatureScene({"material": {"energy": "corotated"}}),
         "damage": FeatureScene(DAMAGE, FRACTURE_MODULES),
@@ -102,45 +102,46 @@ def feature_scenes(n: int) -> dict[str, FeatureScene]:
         # all with as many Newton iterations as they need; every cell yields after a few steps
         "newton": FeatureScene({"solver": None}),
         "tangents": FeatureScene(EXACT),
-        "plasticity": FeatureScene(YIELDING_EVERYWHERE | EXACT, PLASTIC_MODULES, after="tangents"),
+        "plasticity": FeatureScene(YIELDING_EVERYWHERE | EXACT, PLASTIC_MODULES, baseline="tangents"),
         # the forces of the elastic bar, which its residual is measured by, grow: it comes to keep its tangent, and to
         # need one iteration only
-        "plasticity-later": FeatureScene(YIELDING_EVERYWHERE, PLASTIC_MODULES, after="newton", first=30),
+        "plasticity-later": FeatureScene(YIELDING_EVERYWHERE, PLASTIC_MODULES, baseline="newton", first=30),
         "brittle": FeatureScene(
             DAMAGE | {"brittle": {"surfaces": 10}}, (*FRACTURE_MODULES, BRITTLE), needs="brittle"
         ),
-        "obstacle": FeatureScene({"solver": None, "obstacle": [BALL]}, CONTACT_MODULES, after="newton"),
+        "obstacle": FeatureScene({"solver": None, "obstacle": [BALL]}, CONTACT_MODULES, baseline="newton"),
         "obstacle-free": FeatureScene({"solver": None, "obstacle": [BALL | {"mass": 1.0}]}, CONTACT_MODULES,
-                                      after="newton"),
+                                      baseline="newton"),
         "plane": FeatureScene(plane=True),
-        "plane-damage": FeatureScene(DAMAGE, FRACTURE_MODULES, plane=True, after="plane"),
+        "plane-damage": FeatureScene(DAMAGE, FRACTURE_MODULES, plane=True, baseline="plane"),
     }  # fmt: skip
-    return {name: rung for name, rung in every.items() if not rung.needs or rung.needs in Study.model_fields}
+    return {name: scene for name, scene in scenes.items() if not scene.needs or scene.needs in Study.model_fields}
 
 
 def trials() -> list[Trial]:
-    """Every rung at 24k tetrahedra, and at 192k in full; and what stands by itself."""
+    """Trials of all scenes at 24k tetrahedra, at 192k in the full report, and of the other cases."""
     rung_by_rung = (_trial(name, n) for n in (SMALL_N, LARGE_N) for name in feature_scenes(n))
     return [*rung_by_rung, *(trial for part in OTHER_CASES.values() for trial in part.trials())]
 
 
 def _trial(name: str, n: int) -> Trial:
+    """Trial of a scene with n cells along a metre."""
     script = ("fracsim.studies.evidence.feature_cost", name, "--n", str(n))
-    settings: dict[str, Any] = {"rung": name, "n": n}
+    settings: dict[str, Any] = {"scene": name, "n": n}
     return Trial("ladder", f"n-{n}", name, script=script, settings=settings, limit=60.0 * n / 2, full=n > SMALL_N)
 
 
 def feature_study(name: str, n: int) -> dict[str, Any]:
-    """The study of a rung."""
-    rung, data = feature_scenes(n)[name], bench_study(n)
+    """Study of a scene."""
+    scene, data = feature_scenes(n)[name], bench_study(n)
     del data["fracture"]
     data["output"] |= {"surface": False}
-    if rung.plane:
+    if scene.plane:
         h = 1 / round((3 * n**3) ** 0.5)  # 8 / h^2 triangles
         data["mesh"] = {"builder": "box", "size": [1.0, 4.0], "h": h}
         data["boundary"] = [{"on": "bottom", "fix": "xy"}, {"on": "top", "velocity": [0.0, 1.0]}]
         data["load"] = {"gravity": [0.0, -9.81]}
-    for key, table in rung.tables.items():
+    for key, table in scene.tables.items():
         if table is None:
             data.pop(key, None)
         else:
@@ -152,23 +153,24 @@ def feature_study(name: str, n: int) -> dict[str, Any]:
 
 
 def main() -> None:
+    """Time a scene, measure it in a separate process, and write the figures."""
     began = time.perf_counter()
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("rung")
+    parser.add_argument("scene")
     parser.add_argument("--n", type=int, default=SMALL_N)
     parser.add_argument("--alone", action="store_true", help=argparse.SUPPRESS)
     parser.add_argument("-o", "--out", type=Path, required=True)
     given = parser.parse_args()
     if given.alone:
-        given.out.write_text(json.dumps(measure_alone(given.rung, given.n, began)))
+        given.out.write_text(json.dumps(measure_alone(given.scene, given.n, began)))
         return
-    figures = time_in_turn(given.rung, given.n)  # first, so that its kernels are compiled before a start-up is timed
+    figures = time_in_turn(given.scene, given.n)  # first, so that its kernels are compiled before a start-up is timed
     part = given.out.with_name("alone.json")
     command = [
         sys.executable,
         "-m",
         "fracsim.studies.evidence.feature_cost",
-        given.rung,
+        given.scene,
         "--n",
         str(given.n),
         "--alone",
@@ -178,7 +180,7 @@ def main() -> None:
 
 
 def start_run(name: str, n: int, folder: Path) -> Any:
-    """The run of a rung, ready to step."""
+    """Run of a scene before its first timed step."""
     from mpi4py import MPI
 
     from ...run import Run
@@ -195,7 +197,7 @@ def start_run(name: str, n: int, folder: Path) -> Any:
 
 
 def measure_alone(name: str, n: int, began: float) -> dict[str, Any]:
-    """Start-up, modules, fields and memory of a rung by itself."""
+    """Start-up time, modules, fields and memory of a scene in this process."""
     from ... import run, scene  # noqa: F401  what every run imports: memory is counted from here
 
     before = _process_memory("VmRSS")
@@ -222,13 +224,13 @@ def measure_alone(name: str, n: int, began: float) -> dict[str, Any]:
 
 
 def _process_memory(which: str) -> float:
-    """Bytes that this process holds (VmRSS) or has held at most (VmHWM); ru_maxrss would start from its parent's."""
+    """Resident memory (VmRSS) or its peak (VmHWM), bytes. ru_maxrss would start from the parent's value."""
     lines = Path("/proc/self/status").read_text(encoding="utf-8").splitlines()
     return 1024 * float(next(line for line in lines if line.startswith(which)).split()[1])
 
 
 def _function_memory() -> dict[str, int]:
-    """DOLFINx functions that are alive, and their bytes."""
+    """Number of live DOLFINx functions, and their bytes."""
     import gc
 
     from dolfinx import fem
@@ -240,7 +242,7 @@ def _function_memory() -> dict[str, int]:
 
 
 def time_in_turn(name: str, n: int) -> dict[str, Any]:
-    """Seconds per step of a rung and of what it is compared with, one step of each in turn."""
+    """Seconds per step of a scene and of the scene it is compared with, one step of each in turn."""
     pairs: list[tuple[float, float]] = []
     ratio, spread = 1.0, float("inf")
     while spread > STEADY / 2 * ratio and len(pairs) < MOST:
@@ -249,7 +251,7 @@ def time_in_turn(name: str, n: int) -> dict[str, Any]:
         ratios = [a / b for a, b in pairs]
         ratio, spread = median(ratios), _half_quartile_range(ratios)
     return {
-        "after": feature_scenes(n)[name].after or "bare", "steps": len(pairs), "newton": newton,
+        "after": feature_scenes(n)[name].baseline or "bare", "steps": len(pairs), "newton": newton,
         "step": median(a for a, _ in pairs), "step_spread": _half_quartile_range([a for a, _ in pairs]),
         "ratio": ratio, "ratio_spread": spread,
     }  # fmt: skip
@@ -257,25 +259,25 @@ def time_in_turn(name: str, n: int) -> dict[str, Any]:
 
 def _time_block(name: str, n: int) -> tuple[list[tuple[float, float]], str]:
     """Pairs of seconds of the timed steps, always the same ones from the start, and Newton iterations of the last."""
-    rung = feature_scenes(n)[name]
+    scene = feature_scenes(n)[name]
     with tempfile.TemporaryDirectory() as folder:
-        runs = [start_run(name, n, Path(folder, "rung"))]
+        runs = [start_run(name, n, Path(folder, "scene"))]
         runs[0].write_frame()  # for its kernels
         steps = [runs[0].step]
-        if rung.after in feature_scenes(n):
-            runs.append(start_run(rung.after, n, Path(folder, "other")))
+        if scene.baseline in feature_scenes(n):
+            runs.append(start_run(scene.baseline, n, Path(folder, "other")))
             steps.append(runs[1].step)
         else:
             from ..bench import BareLoop
 
-            steps.append(BareLoop(n, runs[0].scene.domain, records=bool(rung.after), in_lanes=True).step)
-        pairs = [_time_pair(runs[0].comm, steps, number) for number in range(rung.first + STEPS)]
+            steps.append(BareLoop(n, runs[0].scene.domain, records=bool(scene.baseline), in_lanes=True).step)
+        pairs = [_time_pair(runs[0].comm, steps, number) for number in range(scene.first + STEPS)]
         newton = " / ".join(str(run.scene.stepper.solver.snes.its) for run in runs)
-    return pairs[rung.first :], newton
+    return pairs[scene.first :], newton
 
 
 def _time_pair(comm: Any, both: list[Any], number: int) -> tuple[float, float]:
-    """Seconds of a step of each, each first in half of the turns: what runs second finds the other's data in caches."""
+    """Seconds of a step of each. Each is first in half of the pairs, since the second finds filled caches."""
     if number % 2:
         second = time_call(comm, both[1])
         return time_call(comm, both[0]), second
@@ -294,18 +296,19 @@ def _half_quartile_range(values: list[float]) -> float:
 
 
 def unused_feature_modules(name: str, n: int, modules: list[str]) -> list[str]:
-    """Modules of features that a rung imported without using them."""
+    """Modules of features that a scene imported without using them."""
     optional = {module for module in modules for part in OPTIONAL if _is_inside(module, part)}
     allowed = {module for module in modules for part in feature_scenes(n)[name].uses if _is_inside(module, part)}
     return sorted(optional - allowed)
 
 
 def _is_inside(module: str, part: str) -> bool:
+    """Return whether a module is `part` or inside it."""
     return f"{module}.".startswith(f"fracsim.{part}.")
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
-    """Table, bars of ratios, and the claims; and what stands by itself."""
+    """Sections with table, ratios and claims, and of the other cases."""
     by_itself = {case: [record for record in records if record["case"] == case] for case in OTHER_CASES}
     records = [record for record in records if record["case"] not in OTHER_CASES]
     columns = (
@@ -340,11 +343,13 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
 
 
 def _modules_of_elastic(records: list[dict[str, Any]]) -> set[str]:
+    """Modules that the elastic scene imported."""
     elastic = (record["figures"].get("modules", []) for record in records if record["name"] == "elastic")
     return {module for modules in elastic for module in modules}
 
 
 def _row(record: dict[str, Any], base: set[str]) -> tuple[TableCell, ...]:
+    """Row of the table."""
     get, cells = record["figures"].get, record["figures"].get("cells")
     modules = get("modules", [])
     beyond = ", ".join(sorted(name.removeprefix("fracsim.") for name in set(modules) - base))
@@ -357,6 +362,7 @@ def _row(record: dict[str, Any], base: set[str]) -> tuple[TableCell, ...]:
 
 
 def _bars(records: list[dict[str, Any]]) -> tuple[Series, ...]:
+    """Series of ratios, one a mesh size."""
     result = []
     for n in (SMALL_N, LARGE_N):
         shown = [record for record in records if record["settings"]["n"] == n and "ratio" in record["figures"]]
@@ -369,6 +375,7 @@ def _bars(records: list[dict[str, Any]]) -> tuple[Series, ...]:
 
 
 def _claims(records: list[dict[str, Any]]) -> tuple[Claim, ...]:
+    """Claims on the ratios and the imports."""
     results = {
         record["name"]: unused_feature_modules(record["name"], record["settings"]["n"], record["figures"]["modules"])
         for record in records
@@ -399,9 +406,9 @@ def _claims(records: list[dict[str, Any]]) -> tuple[Claim, ...]:
     )
 
 
-def _ratio_claim(text: str, records: list[dict[str, Any]], rung: str, limit: float) -> Claim:
-    """Whether a rung costs at most `limit` times what it is compared with."""
-    results = [record["figures"] for record in records if record["name"] == rung and "ratio" in record["figures"]]
+def _ratio_claim(text: str, records: list[dict[str, Any]], scene: str, limit: float) -> Claim:
+    """Claim that a scene costs at most `limit` times the scene it is compared with."""
+    results = [record["figures"] for record in records if record["name"] == scene and "ratio" in record["figures"]]
     measured = ", ".join(
         f"{figures['ratio']:.3f} at {figures['cells']:,} tets (Newton iterations: {figures['newton']})"
         for figures in results

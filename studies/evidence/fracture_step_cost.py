@@ -1,10 +1,10 @@
-"""Steps that are hard for what breaks in them: those of a quasi-static collapse, and explicit ones.
+"""Cost of steps dominated by fracture: quasi-static collapse, explicit steps, and a stationary crack front.
 
     python -m fracsim.studies.evidence.fracture_step_cost NAME -o figures.json
 
-A collapse: processor seconds of every step of a lattice of 5,280 triangles that is loaded until it comes apart.
-Explicit: those of a pane of 9,000 triangles in as many steps, whole and with [fracture], in turn in one process.
-Front: those of a column of 192,000 tetrahedra with [fracture] energy, whole and with a crack that does not get on.
+Collapse: processor seconds of each step of a lattice of 5,280 triangles loaded until it separates. Explicit: as many
+steps of a pane of 9,000 triangles, with and without [fracture], in turn in one process. Front: steps of a column of
+192,000 tetrahedra with [fracture] energy, with and without a crack that does not advance.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ HELD = {side: {"on": side, "fix": "xy"} for side in ("left", "bottom")}
 
 
 def collapse_study(energy: str, load: Data, held: str, fracture: Data) -> Data:
-    """A lattice of 66 x 40 squares of 1 mm in two triangles each, with a notch, under a load that grows in 20 steps."""
+    """Lattice of 66 x 40 squares of 1 mm in two triangles each, with a notch, under a load that grows in 20 steps."""
     return {
         "title": "a lattice that comes apart",
         "mesh": {"builder": "box", "size": [0.066, 0.04], "h": 1e-3, "pattern": "structured"},
@@ -80,7 +80,7 @@ MAX_FRONT_SHARE = 0.05  # of a step
 
 
 def trials() -> list[Trial]:
-    """One for each."""
+    """One trial for each name."""
     script = "fracsim.studies.evidence.fracture_step_cost"
     return [
         Trial("ladder", "steps", name.replace(", ", "-").replace(" ", "-"), script=(script, name),
@@ -90,7 +90,7 @@ def trials() -> list[Trial]:
 
 
 def measure_collapse(name: str) -> Data:
-    """Processor seconds of the steps, and what broke."""
+    """Processor seconds of the steps, Newton iterations and broken edges."""
     with tempfile.TemporaryDirectory() as folder:
         run = _start_run(COLLAPSES[name], name, Path(folder))
         seconds, newton = [], 0
@@ -105,17 +105,17 @@ def measure_collapse(name: str) -> Data:
 
 
 def measure_explicit() -> Data:
-    """Processor seconds of as many steps of the whole pane and of the one that breaks, and in how many edges broke."""
+    """Processor seconds of equal numbers of steps of the pane without and with fracture."""
     return _time_in_turn(PANE_STUDY, PANE_FRACTURE, TURNS, BLOCK)
 
 
 def measure_front() -> Data:
-    """Processor seconds of as many steps of the column, whole and with a front."""
+    """Processor seconds of equal numbers of steps of the column without and with a crack front."""
     return _time_in_turn(COLUMN_STUDY, COLUMN_CRACK, STEPS, 1)
 
 
 def _time_in_turn(study: Data, more: Data, turns: int, block: int) -> Data:
-    """Blocks of steps of a study, and of the same with more in it."""
+    """Time blocks of steps of a study, and of the same study with the tables `more`."""
     with tempfile.TemporaryDirectory() as folder:
         runs = [
             _start_run(item, "in turn", Path(folder) / name)
@@ -139,6 +139,7 @@ def _time_in_turn(study: Data, more: Data, turns: int, block: int) -> Data:
 
 
 def _start_run(study: Data, name: str, folder: Path) -> Any:
+    """Run of a study before its first step."""
     from mpi4py import MPI
 
     from ...run import Run
@@ -149,13 +150,14 @@ def _start_run(study: Data, name: str, folder: Path) -> Any:
 
 
 def _time_steps(run: Any, count: int) -> tuple[float, list[Any]]:
-    """Processor seconds of steps, and their reports."""
+    """Processor seconds of `count` steps, and their reports."""
     began = time.process_time()
     reports = [run.step() for _ in range(count)]
     return time.process_time() - began, reports
 
 
 def main() -> None:
+    """Measure one name and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("name", choices=(*COLLAPSES, EXPLICIT, FRONT))
     parser.add_argument("-o", "--out", type=Path, required=True)
@@ -169,7 +171,7 @@ def main() -> None:
 
 
 def section(records: list[Data]) -> Section:
-    """Tables and claims."""
+    """Section with table and claims."""
     done = {record["settings"]["of"]: record["figures"] for record in records if record["figures"]}
     results = {name: figures for name, figures in done.items() if name in COLLAPSES}
     text = (
@@ -206,6 +208,7 @@ def section(records: list[Data]) -> Section:
 
 
 def _ratio_text(pane: Data) -> str:
+    """Cost of breaking relative to the unbroken pane, as text."""
     return (
         f"{pane['share']:.2f} of it: {pane['all']:.1f} s beside {pane['whole']:.1f} s of {pane['steps']:,} steps of "
         f"{pane['cells']:,} triangles, edges breaking in {pane['breaking']}"
@@ -213,6 +216,7 @@ def _ratio_text(pane: Data) -> str:
 
 
 def _row(record: Data) -> tuple[Any, ...]:
+    """Row of the table."""
     figures = record["figures"].get
     words = record["outcome"] if record["outcome"] == "done" else f"{record['outcome']}: {record['message']}"
     measured = (figures(key) for key in ("cells", "steps", "worst", "all", "whole", "newton", "broken"))

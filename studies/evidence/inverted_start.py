@@ -1,7 +1,7 @@
-"""A body that starts turned inside out: python -m fracsim.studies.evidence.inverted_start ENERGY -o figures.json.
+"""A body that starts inverted: python -m fracsim.studies.evidence.inverted_start ENERGY -o figures.json.
 
-No study file can state such a start: F = -diag(0.9, 1, 1.1) in every cell, by a displacement about the middle. Then
-backward Euler with the body free: it should turn itself right, or say that it cannot.
+No study file can describe this initial state: F = -diag(0.9, 1, 1.1) in every cell, by a displacement about the centre.
+Backward Euler then advances the free body, which should recover J = 1 or report a failure.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from . import stability_studies
 
 
 def main() -> None:
-    """Advance until the end, write what was found."""
+    """Advance until the end and write the figures."""
     parser = argparse.ArgumentParser()
     parser.add_argument("energy")
     parser.add_argument("-o", dest="out", type=Path)
@@ -39,7 +39,7 @@ def main() -> None:
 
 
 def advance_inverted_body(comm: Any, energy: str, steps: int = 400) -> dict[str, Any]:
-    """Figures of the run; the smallest J is that at the end, and has to come back to 1 (collective)."""
+    """Figures of the run; the smallest J is taken at the end and should be 1 (collective)."""
     from ...mesh.parallel import sum_over_ranks
     from ...output.result_checks import InvertedCellMonitor
     from ...scene import build_scene

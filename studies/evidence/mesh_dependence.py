@@ -1,4 +1,4 @@
-"""How far the answer depends on the mesh: a bar and a plate with a slit on five meshes, by edges and by energy."""
+"""Dependence of results on the mesh: a bar and a plate with a slit on five meshes, by strength and by energy."""
 
 from __future__ import annotations
 
@@ -27,8 +27,10 @@ Record = dict[str, Any]
 
 
 def trials() -> list[Trial]:
-    """Two specimens, two radii, five meshes, and the plate with a fracture energy; the finest mesh is of the full
-    version."""
+    """Trials of two specimens with two averaging radii on five meshes, and of the plate with a fracture energy.
+
+    The finest mesh is left to the full report.
+    """
     by_edges = [
         _strength_trial(name, pattern, h, radius)
         for name in slit_specimens.SPECIMENS
@@ -39,6 +41,7 @@ def trials() -> list[Trial]:
 
 
 def _energy_trial(pattern: str, h: float) -> Trial:
+    """Trial of the plate with a fracture energy."""
     return Trial(
         GROUP, "plate-energy", f"{h * 1e3:g}-mm-{pattern}", limit=600.0,
         study=slit_specimens.cracked_specimen_study(slit_specimens.PLATE, pattern, h),
@@ -47,6 +50,7 @@ def _energy_trial(pattern: str, h: float) -> Trial:
 
 
 def _strength_trial(name: str, pattern: str, h: float, radius: float) -> Trial:
+    """Trial of a specimen with a strength and an averaging radius."""
     study: dict[str, Any] | None = None
     script: tuple[str, ...] = ()
     if pattern == "structured":
@@ -77,7 +81,7 @@ def measure_plate(run: Path) -> Record:
 
 
 def measure_specimen(run: Path, specimen: slit_specimens.Specimen) -> Record:
-    """Peak load, new surface, energy and path of the crack, all for a thickness of 1 m."""
+    """Peak load, new surface, energy and path of the crack for a thickness of 1 m."""
     rows = run_results.history(run)
     area, centres = crack_faces(run)
     stray = np.abs(centres[:, specimen.axis] - specimen.plane)
@@ -95,15 +99,15 @@ def measure_specimen(run: Path, specimen: slit_specimens.Specimen) -> Record:
 
 
 def crack_path(along: npt.NDArray[np.float64], off: npt.NDArray[np.float64]) -> list[list[float]]:
-    """At most PLACES places of new surface, from one side to the other: how far along the slit, how far off it, m."""
+    """At most MAX_PATH_POINTS points of the crack, ordered: position along the slit and distance from its plane, m."""
     order = np.argsort(along, kind="stable")[:: max(1, -(-len(along) // MAX_PATH_POINTS))]
     return [[float(item) for item in row] for row in np.column_stack([along, off])[order]]
 
 
 def crack_faces(run: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """(n,) sizes of the faces that breaking opened, both sides, as they lay at rest, and their (n, 3) centres.
+    """Sizes (n,) and centres (n, 3) of the crack faces in the reference configuration, both sides.
 
-    Lengths in 2D (m^2 for a thickness of 1 m), areas in 3D, of the last frame of the split surface.
+    Sizes are lengths in 2D (m^2 for a thickness of 1 m) and areas in 3D, of the last frame of the split surface.
     """
     corners = crack_corners(run)
     d = corners[:, 1:] - corners[:, :1]
@@ -113,7 +117,10 @@ def crack_faces(run: Path) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.floa
 
 
 def crack_corners(run: Path, time: float | None = None) -> npt.NDArray[np.float64]:
-    """(n, 2 or 3, 3) ends or corners of those faces at rest, m; of the last frame, or of that nearest to a time, s."""
+    """Corners (n, 2 or 3, 3) of the crack faces in the reference configuration, m.
+
+    Taken from the last frame, or from the one nearest to `time`, s.
+    """
     from fracsim.mesh.split_surface.entity_numbering import CRACK
     from fracsim.output.surface.vtk_files import read_body_frames
 
@@ -143,7 +150,7 @@ COLUMNS = (
 
 
 def sections(records: list[Record]) -> list[Section]:
-    """Tables of all runs and of the spreads, curves over h, and what it looks like."""
+    """Section with tables of all runs and of their range, curves over h, and pictures."""
     rows = tuple(_row(record) for record in records)
     text = (
         "A bar pulled along its length and a plate pulled upwards, both with a slit, in plane strain and for a "
@@ -170,17 +177,19 @@ def sections(records: list[Record]) -> list[Section]:
 
 
 def _row(record: Record) -> tuple[TableCell, ...]:
+    """Row of the table of runs."""
     figures, settings = record["figures"], record["settings"]
     measured = (figures.get(key) for key in (*FIGURES, "left"))
     return (record["case"], settings["h"], settings["pattern"], record["outcome"], *measured)
 
 
 def relative_range(values: list[float]) -> float:
-    """(max - min) / mean."""
+    """(max - min) / mean; 0 if all values are 0."""
     return (max(values) - min(values)) / (sum(values) / len(values)) if any(values) else 0.0
 
 
 def _range_rows(records: list[Record]) -> list[tuple[TableCell, ...]]:
+    """Rows of the table of ranges, one a case."""
     outcome: list[tuple[TableCell, ...]] = []
     for case in dict.fromkeys(record["case"] for record in records):
         done = [record["figures"] for record in records if record["case"] == case and record["outcome"] == "done"]
@@ -190,7 +199,7 @@ def _range_rows(records: list[Record]) -> list[tuple[TableCell, ...]]:
 
 
 def _plate_plots(records: list[Record]) -> list[Plot]:
-    """The plate by edges, averaged and with a fracture energy beside one another: what it carries, and its crack."""
+    """Peak load and crack path of the plate by strength, averaged strength and energy."""
     done = [r for r in records if r["case"].startswith("plate") and r["outcome"] == "done" and "path" in r["figures"]]
     if not done:
         return []
@@ -207,14 +216,14 @@ def _plate_plots(records: list[Record]) -> list[Plot]:
 
 
 def _crack_series(record: Record) -> Series:
-    """Its path."""
+    """Path of the crack as a line."""
     x, y = np.array(record["figures"]["path"]).T
     label = f"{record['case']}, {record['settings']['h'] * 1e3:g} mm"
     return Series(label, tuple(x.tolist()), tuple(y.tolist()), "line")
 
 
 def _plot(records: list[Record], key: str) -> Plot:
-    """One figure over h, a line for each specimen and radius, each over its value on the coarsest mesh."""
+    """One figure over h, relative to its value on the coarsest mesh; a line for each specimen and radius."""
     words = f"{key.replace('_', ' ')} over that of the coarsest mesh"
     series = []
     for case in dict.fromkeys(record["case"] for record in records):

@@ -1,4 +1,4 @@
-"""The rows of M22's table 2 beside the paper's seconds (studies.paper_table), each a run at the paper's cells and step.
+"""Trials of M22's table 2 beside the paper's seconds (studies.paper_table), with the paper's cells and steps.
 
 python -m fracsim.studies.evidence.paper_table_rows ROW [--limit 600] -o figures.json
 """
@@ -25,7 +25,7 @@ TEXT = (
 
 
 def trials() -> list[Trial]:
-    """One for each row; the three large ones are long."""
+    """One trial for each row; the three largest are left to the full report."""
     return [
         Trial(
             "rows", "paper", name, script=("fracsim.studies.evidence.paper_table_rows", name, "--limit", f"{limit:g}"),
@@ -36,7 +36,7 @@ def trials() -> list[Trial]:
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
-    """The table, and whether each row is at or below the paper's seconds."""
+    """Section with the table and its claims."""
     done = {record["name"]: record["figures"] for record in records if record["outcome"] == "done"}
     rows = tuple(_row(record) for record in records)
     table = ReportTable("paper-rows", "M22's table 2; s: of a step", (*COLUMNS, "outcome"), rows)
@@ -51,11 +51,13 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
 
 
 def _row(record: dict[str, Any]) -> tuple[TableCell, ...]:
+    """Row of the table."""
     figures = record["figures"] if record["outcome"] == "done" else {"scene": record["name"]}
     return (*(figures.get(column) for column in COLUMNS), record["outcome"])
 
 
 def _paper_claim(done: dict[str, dict[str, Any]], tried: int) -> Claim:
+    """Claim that no row takes longer than the paper's."""
     shares = {name: figures["median / paper's"] for name, figures in done.items()}
     measured = ", ".join(f"{name} {share:.2f}" for name, share in shares.items()) or "nothing"
     holds = len(done) == tried and max(shares.values()) <= 1 if shares else None
@@ -63,6 +65,7 @@ def _paper_claim(done: dict[str, dict[str, Any]], tried: int) -> Claim:
 
 
 def _smallest_scene_claim(done: dict[str, dict[str, Any]]) -> Claim:
+    """Claim on the seconds per step of the smallest body."""
     text = f"A body of 4.7k tetrahedra takes at most {1e3 * MAX_STEP_SECONDS:.0f} ms a step (median)"
     if SMALLEST_SCENE not in done:
         return Claim(text, "nothing", None)
@@ -73,6 +76,7 @@ def _smallest_scene_claim(done: dict[str, dict[str, Any]]) -> Claim:
 
 
 def main() -> None:
+    """Run one row and write its figures."""
     parser = argparse.ArgumentParser(prog="python -m fracsim.studies.evidence.paper_table_rows", description=__doc__)
     parser.add_argument("row", choices=SCENES)
     parser.add_argument("--limit", type=float, default=600.0, help="seconds of the run")

@@ -1,7 +1,7 @@
-"""What others have computed and measured, beside ours.
+"""Published computations and measurements beside fracsim's results.
 
-A plate that many have computed: single-edge notched tension (Miehe, Hofacker and Welschinger 2010). A panel of concrete
-that was measured: Winkler (2001), fig. 7.12, series A, as github.com/PSAAPGroupLinder/lShapedPanelBenchmark has it.
+Single-edge notched tension (Miehe, Hofacker and Welschinger 2010), which many have computed. A concrete panel that was
+measured: Winkler (2001), fig. 7.12, series A, as github.com/PSAAPGroupLinder/lShapedPanelBenchmark has it.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MEASURED = {"l-panel": (tuple(way * 1e-3 for way, _ in PANEL_CURVE), tuple(load 
 
 
 def table(records: list[Record]) -> tuple[ReportTable, ...]:
-    """Peak, the grip's motion there and the stiffness before it; none where the plate was not run."""
+    """Table of peak, displacement at the peak and initial stiffness; empty if the plate was not run."""
     done = [r for r in records if r["case"] == CASE and r["outcome"] == "done" and "curve" in r["figures"]]
     ours = [(f"{CASE}, {r['name']}", r["settings"]["h"], *curve_figures(*r["figures"]["curve"])) for r in done]
     return (
@@ -45,8 +45,10 @@ def table(records: list[Record]) -> tuple[ReportTable, ...]:
 
 
 def curve_figures(way: list[float], load: list[float]) -> tuple[float, float, float]:
-    """Peak in N, the motion there in m, from where the line through the rise to half of it starts, whose slope in N/m
-    is the stiffness."""
+    """Peak (N), displacement at the peak (m) and stiffness (N/m) of a load curve.
+
+    The stiffness is the slope of a line fitted up to half the peak. Displacements count from the zero of that line.
+    """
     moved, borne = np.array(way), np.array(load)
     rise = np.flatnonzero((np.arange(len(borne)) < borne.argmax()) & (borne < borne.max() / 2))
     slope, offset = np.polyfit(moved[rise], borne[rise], 1)

@@ -1,18 +1,21 @@
-"""M22's two failed ways to take broken edges out of a nonlinear energy (its supplement, section 6), seen failing.
+"""M22's two rejected ways to remove broken edges from a nonlinear energy (its supplement, section 6), reproduced.
 
     python -m fracsim.studies.evidence.rejected_approaches APPROACH -o figures.json
 
-A 2D bar of Saint Venant-Kirchhoff rubber is pulled, half of a cross-section is broken, then all of it, and the load is
-taken away. From there on nothing does work on it: the kinetic energy cannot exceed what was stored. In each cell
+A 2D bar of Saint Venant-Kirchhoff rubber is pulled. Half of a cross-section is broken, then all of it, and the load is
+removed. No work is done from then on: the kinetic energy cannot exceed the stored energy. In each cell
 
     C = sum_l tau_l^2 R_l,  tau_l = l / L of edge l,  E = (C - I) / 2,  S = A E,  f = V sum_l (R_l . S) / 2 d tau_l^2/du
 
 pseudo-inverse     R_l = [sum Q x Q]^+ Q_l over the intact edges alone (M22s eq. 7); A = D of Hooke
-projected-stress   R_l of the whole cell; A = T^-1 diag(integrity) T D (M22s eq. 26): symmetric no more, so no energy
-projected-strain   R_l of the whole cell, intact edges alone, on tau_l^2 - 1: `edge` with Green's strain (refused)
-chi                R_l of the whole cell; A = chi D: what fracsim does
 
-Backward Euler and Newton in dense NumPy; nothing is shared with the program but the lattice of points.
+projected-stress   R_l of the whole cell; A = T^-1 diag(integrity) T D (M22s eq. 26): not symmetric, hence no energy
+
+projected-strain   R_l of the whole cell, intact edges alone, on tau_l^2 - 1: `edge` with Green's strain (refused)
+
+chi                R_l of the whole cell; A = chi D: fracsim's approach
+
+Backward Euler and Newton in dense NumPy. Only the lattice of points is shared with the program.
 """
 
 from __future__ import annotations
@@ -38,7 +41,7 @@ IDENTITY = np.array([1.0, 1.0, 0.0])  # Mandel's notation: c11, c22, sqrt(2) c12
 
 
 def plane_strain_stiffness() -> Values:
-    """(3, 3) plane strain, Pa."""
+    """Hooke's matrix (3, 3) for plane strain in Mandel's notation, Pa."""
     mu, lmbda = YOUNG / (2 * (1 + POISSON)), YOUNG * POISSON / ((1 + POISSON) * (1 - 2 * POISSON))
     return 2 * mu * np.eye(3) + lmbda * np.outer(IDENTITY, IDENTITY)
 
@@ -48,8 +51,13 @@ class DamagedBar:
     """Triangles with broken edges.
 
     Attributes:
-        points: (n, 2) m. cells: (m, 3). intact: (m, 3) of the edges of each cell.
-        R: (m, 3, 3), R[c, l] of edge l. A: (m, 3, 3) Pa. target: (m, 3), what E is measured from.
+        points: (n, 2) m.
+        cells: (m, 3) nodes.
+        approach: how broken edges are removed, of APPROACHES.
+        intact: (m, 3) flags of the edges of each cell.
+        R: (m, 3, 3), R[c, l] of edge l.
+        A: (m, 3, 3) Pa.
+        target: (m, 3), reference of E.
     """
 
     points: Values
@@ -65,18 +73,20 @@ class DamagedBar:
         self.area = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 2
         self.intact = np.ones((len(self.cells), 3), bool)
         self.chi: Values = np.ones(len(self.cells))
-        self._weaken(np.zeros_like(self.points))
+        self._update_operators(np.zeros_like(self.points))
 
     def _edges(self, x: Values) -> Values:
+        """Edge vectors (m, 3, 2) of cells at positions x (n, 2)."""
         corners = x[self.cells]
         return corners[:, EDGES[:, 1]] - corners[:, EDGES[:, 0]]
 
-    def break_where(self, crossing: npt.NDArray[np.bool_], u: Values) -> None:
-        """Break the (m, 3) edges; their cells are weakened at the displacement u."""
+    def break_edges(self, crossing: npt.NDArray[np.bool_], u: Values) -> None:
+        """Break the (m, 3) edges and update the operators at the displacement u."""
         self.intact &= ~crossing
-        self._weaken(u)
+        self._update_operators(u)
 
-    def _weaken(self, u: Values) -> None:
+    def _update_operators(self, u: Values) -> None:
+        """Set R, A and target from the intact edges."""
         whole = np.linalg.inv(self.Q).transpose(0, 2, 1)
         kept, D = self.intact[:, :, None], plane_strain_stiffness()
         self.R, self.A = whole, np.broadcast_to(D, (len(self.cells), 3, 3))
@@ -89,31 +99,31 @@ class DamagedBar:
             self.R = whole * kept
             self.target = self.R.sum(axis=1)
         else:
-            self.chi = np.minimum(self.chi, self._share(u))
+            self.chi = np.minimum(self.chi, self._intact_share(u))
             self.A = self.chi[:, None, None] * D
 
-    def _share(self, u: Values) -> Values:
-        """chi: what intact edges carry of the sum of |stress| over all edges; 0 in split cells (two broken edges)."""
+    def _intact_share(self, u: Values) -> Values:
+        """chi: sum of |stress| over intact edges, relative to all edges; 0 in split cells (two broken edges)."""
         load = np.abs(np.einsum("clj,cj->cl", self.Q, self.stress(u)))
         whole = load.sum(axis=1)
         share = np.divide((load * self.intact).sum(axis=1), whole, out=np.ones(len(whole)), where=whole > 0)
         return np.asarray(np.where((~self.intact).sum(axis=1) >= 2, 0.0, share))
 
     def stress(self, u: Values) -> Values:
-        """(m, 3) S = A E, Pa."""
+        """Second Piola-Kirchhoff stress S = A E (m, 3), Pa."""
         return np.einsum("cij,cj->ci", self.A, self.strain(u))
 
     def strain(self, u: Values) -> Values:
-        """(m, 3) E = (sum_l tau_l^2 R_l - target) / 2."""
+        """Strain E = (sum_l tau_l^2 R_l - target) / 2 (m, 3)."""
         stretch2 = (self._edges(self.points + u) ** 2).sum(axis=2) / self.length2
         return (np.einsum("cl,cli->ci", stretch2, self.R) - self.target) / 2
 
     def energy(self, u: Values) -> float:
-        """J per m of thickness; with projected stress no more than a number."""
+        """Energy, J per m of thickness. Projected stress has no energy; the number is formal."""
         return float(0.5 * self.area @ np.einsum("ci,ci->c", self.strain(u), self.stress(u)))
 
     def force_and_tangent(self, u: Values) -> tuple[Values, Values]:
-        """(2n,) N/m and (2n, 2n), both exact."""
+        """Internal force (2n,) in N/m and exact tangent (2n, 2n)."""
         gradients = 2 * self._edges(self.points + u) / self.length2[:, :, None]
         signs = np.zeros((3, 3))
         signs[np.arange(3), EDGES[:, 0]], signs[np.arange(3), EDGES[:, 1]] = -1.0, 1.0
@@ -124,9 +134,10 @@ class DamagedBar:
         f = self.area[:, None] * np.einsum("cl,cla->ca", weight, g)
         K = np.einsum("cla,clm,cmb->cab", g, inner, g)
         K += np.einsum("cl,lab->cab", 2 * weight / self.length2, second)
-        return self._gathered(f, self.area[:, None, None] * K)
+        return self._assemble(f, self.area[:, None, None] * K)
 
-    def _gathered(self, f: Values, K: Values) -> tuple[Values, Values]:
+    def _assemble(self, f: Values, K: Values) -> tuple[Values, Values]:
+        """Assembled force and tangent of cell vectors f and matrices K."""
         dofs = (2 * self.cells[:, :, None] + np.arange(2)).reshape(len(self.cells), 6)
         size = self.points.size
         force, tangent = np.zeros(size), np.zeros((size, size))
@@ -136,7 +147,7 @@ class DamagedBar:
 
 
 def lattice_bar(approach: str) -> DamagedBar:
-    """A bar of 1 x 0.25 m with 9 x 3 squares, so that a plane of no nodes lies in the middle."""
+    """Bar of 1 x 0.25 m with 9 x 3 squares; its middle plane contains no nodes."""
     from ...meshes.builders.box import lattice
 
     points, cells = lattice((9, 3))
@@ -144,7 +155,7 @@ def lattice_bar(approach: str) -> DamagedBar:
 
 
 def simulate(approach: str) -> dict[str, Any]:
-    """Figures of the experiment."""
+    """Figures of the experiment with one approach."""
     bar = lattice_bar(approach)
     motion = _BackwardEuler(bar)
     load = np.zeros_like(bar.points)
@@ -157,7 +168,7 @@ def simulate(approach: str) -> dict[str, Any]:
     for number in range(STEPS):
         if number in (0, STEPS // 4):
             before = bar.energy(motion.u)
-            bar.break_where(_crossing_edges(bar, 0.125 if number == 0 else 1.0), motion.u)
+            bar.break_edges(_crossing_edges(bar, 0.125 if number == 0 else 1.0), motion.u)
             figures["jump"] = max(figures["jump"], bar.energy(motion.u) / before)
             figures["rest_stress"] = float(np.abs(bar.stress(np.zeros_like(bar.points))).max() / YOUNG)
         if not motion.step(np.zeros_like(load)):
@@ -170,7 +181,7 @@ def simulate(approach: str) -> dict[str, Any]:
 
 
 class _BackwardEuler:
-    """Backward Euler with the left end held; plain Newton."""
+    """Backward Euler with plain Newton; the left end is fixed."""
 
     def __init__(self, bar: DamagedBar) -> None:
         self.bar = bar
@@ -182,10 +193,11 @@ class _BackwardEuler:
         self.free = np.repeat(bar.points[:, 0] > 0, 2)
 
     def kinetic(self) -> float:
+        """Kinetic energy, J per m of thickness."""
         return float(0.5 * self.mass @ self.v.ravel() ** 2)
 
     def step(self, load: Values) -> bool:
-        """Whether Newton converged in 50 iterations; if so the state is that at the end of the step."""
+        """Advance one step. Returns False, with the state unchanged, if Newton did not converge in 50 iterations."""
         free, start = self.free, self.u.ravel() + STEP * self.v.ravel()
         x: Values = np.where(free, start, 0.0)
         scale = TRACTION * 0.25
@@ -205,24 +217,25 @@ class _BackwardEuler:
 
 
 def _crossing_edges(bar: DamagedBar, height: float) -> npt.NDArray[np.bool_]:
-    """(m, 3) edges that cross the plane x = 1/2 below a height, m."""
+    """Flags (m, 3) of edges that cross the plane x = 1/2 below a height, m."""
     ends = bar.points[bar.cells][:, EDGES]
     middle = ends.mean(axis=2)
     return np.asarray((np.sign(ends[:, :, :, 0] - 0.5).prod(axis=2) < 0) & (middle[:, :, 1] < height))
 
 
 def cell_with_broken_edge(approach: str) -> DamagedBar:
-    """A cell with one of its three edges broken, under no load."""
+    """A cell without load, one of its three edges broken."""
     bar = DamagedBar(np.array([[0.0, 0.0], [1.0, 0.0], [0.2, 0.9]]), np.array([[0, 1, 2]]), approach)
     stretched = bar.points @ np.array([[0.1, 0.0], [0.0, -0.03]])
-    bar.break_where(np.array([[True, False, False]]), stretched)
+    bar.break_edges(np.array([[True, False, False]]), stretched)
     return bar
 
 
 def cycle_work(approach: str, turns: int = 4000) -> float:
-    """Work of a closed cycle of strain on a cell with a broken edge, over the largest energy in it: 0 where it has one.
+    """Work of a closed strain cycle on a cell with a broken edge, relative to its largest energy.
 
-    u = X (s1 cos a, s2 sin a) stretches the cell in x and y in turn; mid-points, a periodic smooth integrand.
+    u = X (s1 cos a, s2 sin a) stretches the cell in x and y in turn; midpoint rule of a smooth periodic integrand. The
+    work is 0 if the force derives from an energy.
     """
     bar, work, most = cell_with_broken_edge(approach), 0.0, 0.0
     angle = (np.arange(turns) + 0.5) * 2 * np.pi / turns
@@ -235,7 +248,7 @@ def cycle_work(approach: str, turns: int = 4000) -> float:
 
 
 def lowest_eigenvalue(approach: str) -> float:
-    """Least eigenvalue of the symmetric part of K over its largest, one edge broken, at rest: 0 is stable."""
+    """Smallest eigenvalue of sym K over its largest, at rest with a broken edge; a negative value is unstable."""
     bar = cell_with_broken_edge(approach)
     K = bar.force_and_tangent(np.zeros_like(bar.points))[1]
     values = np.linalg.eigvalsh((K + K.T) / 2)
@@ -243,7 +256,7 @@ def lowest_eigenvalue(approach: str) -> float:
 
 
 def section(records: list[dict[str, Any]]) -> Section:
-    """What became of each approach."""
+    """Section with the figures and verdict of each approach."""
     columns = (
         "approach", "elastic energy after a break / before", "kinetic energy / stored", "stress at rest / Y",
         "work of a closed cycle / energy", "lowest eigenvalue of K / largest", "Newton failed at, s", "largest |u|, m",
@@ -267,7 +280,7 @@ def section(records: list[dict[str, Any]]) -> Section:
 
 
 def judge(figures: dict[str, Any]) -> str:
-    """fails where energy came from nowhere or Newton's method had no answer."""
+    """Verdict "fails" with its reasons (energy created, no Newton solution, ...), or "holds"."""
     if not figures:
         return "not run to its end"
     reasons = []
@@ -285,7 +298,7 @@ def judge(figures: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Simulate, write the figures."""
+    """Simulate and write the figures."""
     parser = argparse.ArgumentParser()
     parser.add_argument("approach", choices=APPROACHES)
     parser.add_argument("-o", dest="out", type=Path)

@@ -1,17 +1,17 @@
-"""What a group of trials hands to the page, and the arithmetic that all groups share.
+"""Parts of the page that a group of trials returns, and arithmetic that groups share.
 
-Each group module has
+A group is a module with
 
     def trials() -> list[Trial]
     def sections(records: list[dict[str, Any]]) -> list[Section]
 
-`sections` gets the records of its own group, those of failed trials too (`record["outcome"] != "done"`: they stay in
-the tables as failed). A record has group, case, name, settings, ranks, command, outcome, message, wall, stepping, cpu
-(lists of s, one a run), summary (of the run, or None) and figures (of `Trial.measure` or the script). The folder of the
-trial is OUT/group/case/name; `folder_of(record)` is its path inside OUT, as `Picture.path` wants it.
+`sections` receives the records of its own group, including failed trials (`record["outcome"] != "done"`), which stay in
+the tables. A record has group, case, name, settings, ranks, command, outcome, message, wall, stepping, cpu (lists of s,
+one a run), summary (of the run, or None) and figures (of `Trial.measure` or the script). The folder of the trial is
+OUT/group/case/name; `record_folder(record)` is its path inside OUT, as `Picture.path` expects it.
 
-The page's pieces (Section, Claim, Table, Plot, Series, Picture) are frozen dataclasses of fracsim/report/content.py;
-they go into evidence.json, from which `fracsim report` makes the page without running or importing a study.
+Section, Claim, ReportTable, Plot, Series and Picture are frozen dataclasses of fracsim/report/content.py. They are
+stored in evidence.json, from which `fracsim report` makes the page without importing a study.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class CostPoint:
-    """One setting: what it costs (s, or core-seconds) and how far off it is (relative)."""
+    """A setting with its cost (s, or core-seconds) and its relative error."""
 
     cost: float
     error: float
@@ -50,13 +50,13 @@ def fitted_order(h: Sequence[float], error: Sequence[float]) -> float:
 
 
 def cheapest_point(points: Sequence[CostPoint], limit: float) -> CostPoint | None:
-    """The cheapest point with an error of at most `limit`; None where there is none."""
+    """The cheapest point with an error of at most `limit`; None if there is none."""
     good = sorted((point.cost, point.error, number) for number, point in enumerate(points) if point.error <= limit)
     return points[good[0][2]] if good else None
 
 
 def rerun_hint(records: Sequence[dict[str, Any]]) -> str:
-    """How a reader runs a trial once more: the first one's command, in its folder. Empty where there is none."""
+    """Sentence that says how to repeat the first trial: its command and folder. Empty if there is no trial."""
     commands = [(record["command"], record_folder(record)) for record in records if "command" in record]
     if not commands:
         return ""
@@ -70,5 +70,5 @@ def median_and_half_range(seconds: Sequence[float]) -> tuple[float, float]:
 
 
 def record_folder(record: dict[str, Any]) -> str:
-    """The folder of a trial inside OUT."""
+    """Folder of a trial inside OUT."""
     return f"{record['group']}/{record['case']}/{record['name']}"

@@ -1,4 +1,4 @@
-"""Reading what a run wrote: history.csv and other tables, frames of fields.h5, study.toml."""
+"""Read the output of a run: history.csv and other tables, frames of fields.h5, study.toml."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ def last_frame(run: Path) -> dict[str, Any]:
 
 
 def study(run: Path) -> dict[str, Any]:
-    """The study as it was run, every default written out."""
+    """The study of the run with all defaults."""
     return tomllib.loads((run / "study.toml").read_text(encoding="utf-8"))
 
 
 def first_break(run: Path) -> float:
-    """Time in s of the first step that broke an edge; NaN where none did."""
+    """Time in s of the first step that broke an edge; NaN if none did."""
     rows = history(run)
     broken = np.flatnonzero(rows["broken_edges"] > 0)
     return float(rows["time"][broken[0]]) if len(broken) else float("nan")

@@ -1,8 +1,10 @@
-"""Flat on flat beside edge on edge: python -m fracsim.studies.evidence.self_contact_cost KIND [--n 8] -o figures.json.
+"""Cost of face-to-face and edge-to-edge self-contact.
 
-Two cubes pressed on each other, face to face or edge to edge (turned by 45 degrees, their edges crossing), their meshes
-not alike. What touches is another number of pairs, so that the cost is given by the step and by the pair: parallel
-faces are what detection of collisions finds hardest (docs/theory.md#step-limits).
+    python -m fracsim.studies.evidence.self_contact_cost KIND [--n 8] -o figures.json
+
+Two cubes with different meshes are pressed together, face to face or edge to edge (turned by 45 degrees, with crossing
+edges). The numbers of contact pairs differ, so that the cost is given by step and by pair operation. Parallel faces are
+the hardest case of continuous collision detection (docs/theory.md#step-limits).
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ COS_45 = np.sqrt(0.5)
 
 
 def trials() -> list[Trial]:
-    """One of each kind."""
+    """One trial of each kind of contact."""
     script = "fracsim.studies.evidence.self_contact_cost"
     return [
         Trial("ladder", "faces", kind, script=(script, kind), settings={"of": kind}, limit=180.0)
@@ -39,7 +41,7 @@ def trials() -> list[Trial]:
 
 
 def two_cubes(kind: str, n: int, gap: float) -> Any:
-    """Two cubes of side 1 m with n and n + 1 cells along it, the upper `gap` (m) above the lower."""
+    """Mesh of two cubes of side 1 m with n and n + 1 cells along it, the upper one `gap` (m) above the lower."""
     from ...meshes.builders.box import Box
     from ...meshes.data import MeshData
 
@@ -57,7 +59,7 @@ _TURNED_ABOUT_Y = np.array([[COS_45, 0, COS_45], [0, 1, 0], [-COS_45, 0, COS_45]
 
 
 def pressed_cubes(kind: str, n: int) -> dict[str, Any]:
-    """The study: the upper cube laid on the lower by a heavy gravity; h at the start as wide as the barrier."""
+    """Study of the upper cube pressed on the lower by a large gravity. Initial gap: the barrier's distance."""
     study = stability_studies.base_study(kind, {"file": "mesh.msh"}, None, 1000)
     study["boundary"] = [{"on": {"box": [[-2.0, -2.0, -2.0], [2.0, 2.0, -0.3]]}, "fix": "xyz"}]
     study["load"] = {"gravity": [0.0, 0.0, -50.0]}
@@ -67,7 +69,7 @@ def pressed_cubes(kind: str, n: int) -> dict[str, Any]:
 
 
 def measure(kind: str, n: int) -> dict[str, Any]:
-    """Processor time of a step in touch, the mean, and of what is asked of pairs where the steps have ended, s."""
+    """Mean processor time of a step in contact, and median times of the pair operations at the end, s."""
     from mpi4py import MPI
 
     from ...meshes.write import write_mesh
@@ -88,7 +90,7 @@ def measure(kind: str, n: int) -> dict[str, Any]:
 
 
 def _time_contact_steps(run: Any, contact: Any) -> list[tuple[float, int]]:
-    """Processor time, s, and Newton iterations of each of the first STEPS steps that end in touch."""
+    """Processor time (s) and Newton iterations of the first STEPS steps that end in contact."""
     results: list[tuple[float, int]] = []
     while len(results) < STEPS:
         began = time.process_time()
@@ -99,7 +101,7 @@ def _time_contact_steps(run: Any, contact: Any) -> list[tuple[float, int]]:
 
 
 def time_pair_operations(surface: Any, x: Any) -> dict[str, Any]:
-    """Processor time of each question, s, with the surface at x (n, d); the long way is half of the body."""
+    """Median processor time of each pair operation, s, at positions x (n, d); long displacement: half the body."""
     pairs = surface.pairs
     upper = (x[:, 2] > np.median(x[:, 2]))[:, None]
     short, long = (x - upper * np.array([0.0, 0.0, way]) for way in (1e-5, 0.5))
@@ -116,6 +118,8 @@ def time_pair_operations(surface: Any, x: Any) -> dict[str, Any]:
 
 
 def _timer(work: Callable[[int], Any]) -> Callable[[int], float]:
+    """Function that returns the processor time of `work(number)`."""
+
     def once(number: int) -> float:
         began = time.process_time()
         work(number)
@@ -125,7 +129,7 @@ def _timer(work: Callable[[int], Any]) -> Callable[[int], float]:
 
 
 def section(records: list[dict[str, Any]]) -> Section:
-    """Both kinds side by side, and the claim of it."""
+    """Section with both kinds side by side, and the claim on their ratio."""
     times = tuple(f"{name}, ms" for name in PAIR_OPERATIONS)
     counts = ("triangles", "pairs in touch", "Newton a step", "s a step")
     columns = ("scene", *counts, *times, "outcome")
@@ -141,6 +145,7 @@ def section(records: list[dict[str, Any]]) -> Section:
 
 
 def _row(record: dict[str, Any]) -> tuple[Any, ...]:
+    """Row of the table."""
     figures = record["figures"]
     milliseconds = (1e3 * figures[of_pair] if of_pair in figures else None for of_pair in PAIR_OPERATIONS)
     outcome = record["outcome"] if record["outcome"] == "done" else f"{record['outcome']}: {record['message']}"
@@ -149,6 +154,7 @@ def _row(record: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _claims(figures: dict[str, Any]) -> tuple[Claim, ...]:
+    """Claim on the ratio of step times; empty if a kind is missing."""
     if not all(figures.get(kind) for kind in CONTACT_KINDS):
         return ()
     flat, edge = (figures[kind] for kind in CONTACT_KINDS)
@@ -159,7 +165,7 @@ def _claims(figures: dict[str, Any]) -> tuple[Claim, ...]:
 
 
 def main() -> None:
-    """Measure, write the figures."""
+    """Measure and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("kind", choices=CONTACT_KINDS)
     parser.add_argument("--n", type=int, default=8)

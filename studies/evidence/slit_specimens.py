@@ -2,7 +2,7 @@
 
     python -m fracsim.studies.evidence.slit_specimens SPECIMEN H RADIUS -o figures.json
 
-runs a structured mesh: a lattice less the slit.
+runs a specimen on a structured mesh without the cells in the slit.
 """
 
 from __future__ import annotations
@@ -22,14 +22,17 @@ LOAD_STEPS = 40
 
 @dataclass(frozen=True)
 class Specimen:
-    """A rectangle with a slit, in 2D plane strain, pulled until it is in two.
+    """A rectangle with a slit in 2D plane strain, pulled until it separates.
 
     Attributes:
-        size: m. slit: lower and upper corner of what is cut out, m; it divides into cells of 1 mm and its halves.
-        axis: of the normal of the slit's plane (0: x, 1: y), along which the crack strays.
+        size: m.
+        slit: lower and upper corner of the slit, m; a multiple of cells of 1 mm and of their halves.
+        axis: of the normal of the slit's plane (0: x, 1: y).
         builder: the unstructured mesh of the same outline (its slit ends in a point).
-        held, loaded: conditions that hold it, and the group that moves.
-        moved: components of its motion, times `travel`, m.
+        held: conditions that fix the specimen.
+        loaded: group that moves.
+        moved: components of its motion, times `travel`.
+        travel: m.
     """
 
     size: tuple[float, float]
@@ -85,7 +88,7 @@ SPECIMENS = {"bar": BAR, "plate": PLATE}
 
 
 def specimen_study(specimen: Specimen, mesh: Data, radius: float) -> Data:
-    """Slow loading to separation; each step is repeated until nothing new breaks, so that its size matters little."""
+    """Study of slow loading to separation. Each step is repeated until nothing breaks; its size hardly matters."""
     end = [part if isinstance(part, str) else part * specimen.travel for part in specimen.moved]
     start = [part if isinstance(part, str) else 0.0 for part in specimen.moved]
     moved = {"time": [0.0, 1.0], "value": [start, end]}
@@ -105,8 +108,10 @@ FRACTURE_ENERGY = 350.0  # G_c in J/m^2: PMMA
 
 
 def cracked_specimen_study(specimen: Specimen, pattern: str, h: float) -> Data:
-    """The same of a whole rectangle with a crack in place of the slit, which takes a fracture energy. The crack lies
-    off the rows of nodes of a lattice."""
+    """Study of the full rectangle with a fracture energy and a crack in place of the slit.
+
+    The crack does not pass through the nodes of a lattice.
+    """
     at = specimen.plane + 0.2 * MM
     low, high = specimen.slit
     ends = [list(low), list(high)]
@@ -121,13 +126,13 @@ def cracked_specimen_study(specimen: Specimen, pattern: str, h: float) -> Data:
 
 
 def unstructured_mesh(specimen: Specimen, h: float) -> Data:
-    """The [mesh] table of gmsh's mesh with cells of one size."""
+    """Table [mesh] of an unstructured mesh with uniform cell size."""
     fine = "h_notch" if specimen is BAR else "h_tip"
     return specimen.builder | {"h": h, fine: h}
 
 
 def structured_mesh(specimen: Specimen, h: float) -> Any:
-    """A lattice of squares h in two triangles each, without those in the slit."""
+    """Mesh of squares of side h in two triangles each, without those in the slit."""
     from ...meshes.builders.box import lattice
     from ...meshes.data import MeshData
     from ...meshes.topology import boundary_facets, facet_groups_on_planes

@@ -1,4 +1,4 @@
-"""What survives and what does not: extremes of step, stiffness, shape and damage, on 1 and 2 ranks."""
+"""Runs at extremes of step, stiffness, shape and damage on 1 and 2 ranks, and the verdict on each."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_ENERGY_GROWTH, MAX_ERROR = 0.05, 0.02  # more energy from nowhere, or a larg
 
 
 def trials() -> list[Trial]:
-    """Every case on 1 and on 2 ranks, once always and five times in full: a crack must not hang on the last digits."""
+    """Trials on 1 and 2 ranks: once, and five times in the full report, since round-off must not decide a crack."""
     cases = chain(
         _steps(), _stiffness(), _poisson(), _densities(), _stretches(), _inverted(), _slivers(), _shells(),
         _strengths(), _mass_breaking(), _one_cell(), _lengths(), _long_steps(), _edge_approach(), _contacts(),
@@ -33,12 +33,13 @@ def trials() -> list[Trial]:
 
 
 def _on_ranks(trial: Trial, ranks: int, time: int) -> Trial:
-    """The run of a trial on some ranks, for the first or a further time."""
+    """Trial on some ranks, for the first or a further time."""
     again = f".{time}" if time else ""
     return replace(trial, name=f"{trial.name}-r{ranks}{again}", ranks=ranks, full=trial.full or time > 0)
 
 
 def _trial(case: str, name: str, study: scenes.Data, measure: str = "measure_run", limit: float = 60.0) -> Trial:
+    """Trial of a study."""
     setting: dict[str, Setting] = {"of": name}
     return Trial(
         GROUP,
@@ -55,6 +56,7 @@ def _trial(case: str, name: str, study: scenes.Data, measure: str = "measure_run
 def _script(
     case: str, name: str, module: str, *arguments: str, measure: str = "stability_measures:measure_run"
 ) -> Trial:
+    """Trial of a script."""
     script = (f"fracsim.studies.evidence.{module}", *arguments)
     return Trial(GROUP, case, name, script=script, settings={"of": name}, measure=measure, always=True, limit=60.0)
 
@@ -63,6 +65,7 @@ def _script(
 
 
 def _steps() -> list[Trial]:
+    """Trials over the time step."""
     long = [_trial("dt", f"{step:.0e}-s", scenes.accelerated_bar(step), "measure_momentum") for step in TIME_STEPS]
     long += [_trial("dt", "1e-06-s-flying", scenes.flying_block(1e3, 1e-6), "measure_momentum_drift")]
     second = "generalized-alpha"
@@ -77,6 +80,7 @@ def _steps() -> list[Trial]:
 
 
 def _stiffness() -> list[Trial]:
+    """Trials over Young's modulus."""
     return [
         _trial(
             "young",
@@ -89,6 +93,7 @@ def _stiffness() -> list[Trial]:
 
 
 def _poisson() -> list[Trial]:
+    """Trials over Poisson's ratio."""
     results = []
     for nu in (-0.9, 0.0, 0.49, 0.499, 0.4999):
         results.append(
@@ -99,6 +104,7 @@ def _poisson() -> list[Trial]:
 
 
 def _densities() -> list[Trial]:
+    """Trials with two densities."""
     return [
         _script(
             "density-ratio",
@@ -118,6 +124,7 @@ def _densities() -> list[Trial]:
 
 
 def _stretches() -> list[Trial]:
+    """Trials of large tension and compression."""
     results = []
     for energy in ("linear", "corotated", "stvk", "neo-hookean"):
         material = {"energy": energy, "poisson": 0.05}
@@ -130,7 +137,7 @@ def _stretches() -> list[Trial]:
 
 
 def _inverted() -> list[Trial]:
-    """Bodies that start inside out, and one whose right face is pushed through the left one in one step."""
+    """Bodies that start inverted, and one whose right face is pushed through the left one in one step."""
     energies = ("corotated", "stvk", "neo-hookean")
     results = [_script("inverted", energy, "inverted_start", energy, measure="") for energy in energies]
     results.append(
@@ -141,6 +148,7 @@ def _inverted() -> list[Trial]:
 
 
 def _slivers() -> list[Trial]:
+    """Trials of cells with large aspect ratios."""
     results = []
     for ratio in (1e2, 1e3, 1e4):
         mesh = {"builder": "box", "size": [4.0, 4.0, 1 / ratio], "h": 1.0}
@@ -168,6 +176,7 @@ def _slivers() -> list[Trial]:
 
 
 def _shells() -> list[Trial]:
+    """Trials of thin plates."""
     mesh = {"builder": "box", "size": [1.0, 1.0, 1e-3], "h": 0.05}
     blown = scenes.torn_body(mesh, speed=0.5, step=5e-3, steps=60, strength=2e5)
     lifted = scenes.torn_body(mesh, speed=2.0, step=5e-3, steps=60, strength=1e5, axis=2)
@@ -181,6 +190,7 @@ def _shells() -> list[Trial]:
 
 
 def _strengths() -> list[Trial]:
+    """Trials over the strength."""
     results = []
     for strength in (0.0, 1e-45, 1e-3, 1e3, 1e30, float("inf")):
         study = scenes.torn_body(scenes.BAR, speed=1.0, step=1e-2, steps=40, strength=strength)
@@ -194,6 +204,7 @@ def _strengths() -> list[Trial]:
 
 
 def _mass_breaking() -> list[Trial]:
+    """Trials in which many edges break in a step."""
     mesh = {"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.05}
     cube = {"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.1}
     return [
@@ -214,10 +225,12 @@ def _mass_breaking() -> list[Trial]:
 
 
 def _one_cell() -> list[Trial]:
+    """Trials of a single cell."""
     return [_script("one-cell", name, "custom_meshes", name) for name in ("triangle", "tetrahedron")]
 
 
 def _lengths() -> list[Trial]:
+    """Trials over the unit of length."""
     results = []
     for name, unit in (("micrometres", 1e-6), ("kilometres", 1e3)):
         mesh = {"builder": "box", "size": [unit, 0.25 * unit, 0.25 * unit], "h": 0.125 * unit}
@@ -244,7 +257,7 @@ def _long_steps() -> list[Trial]:
 
 
 def _edge_approach() -> list[Trial]:
-    """The approach is for small strains: what a strength that allows 30 % does to it."""
+    """The `edge` approach, which assumes small strains, at a strength that allows 30 %."""
     results = []
     for energy in ("linear", "corotated"):
         study = scenes.torn_body(
@@ -255,7 +268,7 @@ def _edge_approach() -> list[Trial]:
 
 
 def _contacts() -> list[Trial]:
-    """Falls on a floor, blows of light and heavy balls, a press, and bodies that touch one another."""
+    """Falls on a floor, impacts of light and heavy balls, a press, and contact between bodies."""
     fell, struck = "contact_studies:measure_fall", "contact_studies:measure_impact"
     results = [
         _trial("contact", f"dt-{step:.0e}-s", contact_studies.falling_bar(step), fell)
@@ -293,6 +306,7 @@ WITHOUT_CONTACT = {"young-1e+07-Pa": "young-1e+07-Pa-alone", "shell-in-a-stack":
 
 
 def _without_contact() -> list[Trial]:
+    """The same bodies without contact."""
     fall = contact_studies.without_contact(contact_studies.falling_bar(5e-3, speed=0.3, gravity=0.0))
     return [
         _trial("contact", "young-1e+07-Pa-alone", fall),
@@ -301,7 +315,7 @@ def _without_contact() -> list[Trial]:
 
 
 def _rejected() -> list[Trial]:
-    """M22s section 6, as an experiment of its own (rejected_approaches.py)."""
+    """M22's section 6 as an experiment (rejected_approaches.py)."""
     from .rejected_approaches import APPROACHES
 
     return [_script("failed", name, "rejected_approaches", name, measure="") for name in APPROACHES]
@@ -311,7 +325,7 @@ def _rejected() -> list[Trial]:
 
 
 def verdict(record: Record) -> str:
-    """How a run ended, in words: right, stable, warned, refused, not converged, or WRONG."""
+    """Outcome of a run: right, stable, warned, refused, not converged, or WRONG."""
     figures, outcome, message = record["figures"], record["outcome"], record["message"].removeprefix("fracsim: ")
     if outcome in ("refused", "not converged"):
         return f"{outcome}: {message}" if message else f"WRONG: {outcome} without a word"
@@ -332,7 +346,7 @@ def verdict(record: Record) -> str:
 
 
 def sections(records: list[Record]) -> list[Section]:
-    """The table, what must hold of it, and M22's two failed approaches."""
+    """Sections with the table and its claims, contact iterations, and M22's two rejected approaches."""
     from .rejected_approaches import section
 
     table = [record for record in records if record["case"] != "failed"]
@@ -351,6 +365,7 @@ def sections(records: list[Record]) -> list[Section]:
 
 
 def _claims(records: list[Record]) -> tuple[Claim, ...]:
+    """Claims over all runs."""
     wrong = [f"{r['case']}/{r['name']}" for r in records if verdict(r).startswith("WRONG")]
     endless = [f"{r['case']}/{r['name']}" for r in records if r["outcome"] == "out of time"]
     infinite = [f"{r['case']}/{r['name']}" for r in records if r["figures"].get("finite") is False]
@@ -367,16 +382,18 @@ def _claims(records: list[Record]) -> tuple[Claim, ...]:
 
 
 def _claim(text: str, against: Sequence[str], records: list[Record], aside: str = "") -> Claim:
+    """Claim that holds if no run stands against it."""
     measured = f"{len(records)} runs; against it: {', '.join(against) or 'none'}{aside}"
     return Claim(text, measured, not against if records else None)
 
 
 def _study_name(record: Record) -> str:
+    """Name of the study, without ranks and repetition."""
     return str(record["name"]).rpartition("-r")[0]
 
 
 def _group_by_study(records: list[Record]) -> list[list[Record]]:
-    """Runs of one study on different ranks, fewest first."""
+    """Runs of each study on different ranks, fewest ranks first."""
     places: dict[tuple[str, str], list[Record]] = {}
     for record in sorted(records, key=lambda record: record["ranks"]):
         places.setdefault((record["case"], _study_name(record)), []).append(record)
@@ -385,17 +402,20 @@ def _group_by_study(records: list[Record]) -> list[list[Record]]:
 
 
 def _label(runs: list[Record]) -> str:
+    """Case and study of the runs."""
     return f"{runs[0]['case']}/{_study_name(runs[0])}"
 
 
 def _is_trusted(record: Record) -> bool:
-    """Whether the program stands by what it found: no warning, no refusal, no giving up. A motion that it does not
-    stand by (a body pushed through itself, say) is one of many, and round-off may choose."""
+    """Return whether the run ended without warning, refusal or failure to converge.
+
+    A motion with a warning (a body pushed through itself, say) is one of several, and round-off may decide which.
+    """
     return not verdict(record).startswith(("warned", "refused", "not converged"))
 
 
 def _agree(one: Record, *others: Record) -> bool:
-    """Whether runs ended alike, with as many broken edges and pieces."""
+    """Return whether runs have the same outcome, broken edges and fragments."""
     return all(
         one["outcome"] == other["outcome"]
         and all(one["figures"].get(key) == other["figures"].get(key) for key in ("broken", "pieces"))
@@ -404,7 +424,7 @@ def _agree(one: Record, *others: Record) -> bool:
 
 
 def _iterations(records: list[Record]) -> Section | None:
-    """Newton's and CG's iterations with contact beside those without."""
+    """Section on Newton and CG iterations with and without contact; None if there is no run."""
     figures = {
         _study_name(record): record["figures"]
         for record in records
@@ -434,6 +454,7 @@ def _iterations(records: list[Record]) -> Section | None:
 
 
 def _iteration_row(name: str, *both: Record) -> tuple[TableCell, ...]:
+    """Row of the table of iterations."""
     results = [[item.get(key) for key in ITERATION_FIGURES] for item in both]
     each_time = [counts[2] / counts[0] if counts[0] else None for counts in results]
     return name, *results[0], each_time[0], *results[1], each_time[1]
@@ -449,11 +470,13 @@ FIGURES = ("error", "growth", "newton_mean", "newton_max", "krylov_mean", "small
 
 
 def _table(records: list[Record]) -> ReportTable:
+    """Table of all runs."""
     rows = tuple(_row(one, others) for one, *others in _group_by_study(records))
     return ReportTable("stability", "What survives, and what does not", COLUMNS, rows)
 
 
 def _row(one: Record, others: list[Record]) -> tuple[TableCell, ...]:
+    """Row of a study; `others` are its runs on more ranks."""
     figures, summary = one["figures"], one["summary"] or {}
     words = list(dict.fromkeys(verdict(record) for record in (one, *others)))
     return (
@@ -465,5 +488,5 @@ def _row(one: Record, others: list[Record]) -> tuple[TableCell, ...]:
 
 
 def _verdicts_differ(words: list[str]) -> bool:
-    """Whether verdicts differ in their first word: messages carry figures that may differ in the last digits."""
+    """Return whether verdicts differ in their first word; figures in messages may differ in the last digits."""
     return len({word.partition(":")[0] for word in words}) > 1

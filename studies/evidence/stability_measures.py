@@ -1,4 +1,4 @@
-"""What is measured of a run however it ended: is all of it finite, did energy come from nowhere, what did it take."""
+"""Figures of a run with any outcome: finite values, energy balance, iterations, broken edges."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Figures = dict[str, float | int | bool]
 
 
 def measure_run(run: Path) -> Figures:
-    """Figures of an output folder; of a study that was refused there is none, and no figure."""
+    """Figures of an output folder; empty if the study was refused."""
     if not (run / "history.csv").exists():
         return {}
     rows, frames = run_results.history(run), _check_frames(run)
@@ -41,7 +41,7 @@ def measure_run(run: Path) -> Figures:
 
 
 def measure_stretch(run: Path) -> Figures:
-    """As `measure_run`, and the error of a uniaxial or confined stretch against its closed form."""
+    """Figures of `measure_run`, and error of a uniaxial or confined stretch against its closed form."""
     return (
         measure_run(run) | block_stretch.stretch_error(run_results.study(run), run_results.history(run))
         if run.exists()
@@ -50,7 +50,7 @@ def measure_stretch(run: Path) -> Figures:
 
 
 def measure_momentum(run: Path) -> Figures:
-    """As `measure_run`, and the error of the momentum, p = F t with a dead load F on a free body, whatever breaks."""
+    """Figures of `measure_run`, and error of the momentum p = F t of a free body under a dead load F."""
     if not run.exists():
         return {}
     study = run_results.study(run)
@@ -63,7 +63,7 @@ def measure_momentum(run: Path) -> Figures:
 
 
 def measure_weight(run: Path) -> Figures:
-    """As `measure_run`, and the error of the force at the support against the weight of the body."""
+    """Figures of `measure_run`, and error of the support reaction against the weight of the body."""
     if not run.exists():
         return {}
     pieces, rows = run_results.columns(run / "pieces.csv"), run_results.history(run)
@@ -72,7 +72,7 @@ def measure_weight(run: Path) -> Figures:
 
 
 def measure_momentum_drift(run: Path) -> Figures:
-    """As `measure_run`, and the momentum that a force-free body gains, over its mass times its fastest speed."""
+    """Figures of `measure_run`, and momentum gained by a force-free body, over mass times its largest speed."""
     if not run.exists():
         return {}
     start, pieces = (
@@ -89,16 +89,16 @@ def measure_momentum_drift(run: Path) -> Figures:
 
 
 def moves_at_start(study: dict[str, Any]) -> bool:
-    """Whether body or free obstacles bring energy of motion."""
+    """Return whether the body or a free obstacle has initial kinetic energy."""
     free = (item for item in study.get("obstacle", []) if "mass" in item or "density" in item)
     return "initial" in study or any("velocity" in item or "spin" in item for item in free)
 
 
 def energy_growth(rows: dict[str, Values], *, moving_at_start: bool) -> float:
-    """Largest rise of elastic + kinetic + dissipated - work above what it was before, as a share of the energy at play.
+    """Largest rise of elastic + kinetic + dissipated - work above an earlier minimum, relative to the largest energy.
 
-    Schemes may lose energy, never make it. In a quasi-static run the balance is closed by `dissipated`, which has to
-    grow: a fall of it is energy from nowhere. Trapezoidal work over large steps has an error of its own.
+    A scheme may lose energy but not create it. In a quasi-static run `dissipated` closes the balance and has to grow,
+    so that a fall of it counts as created energy. The trapezoidal rule of the work has an error over large steps.
     """
     held = rows["elastic"] + rows["kinetic"]
     balance = held + rows["dissipated"] - rows["external_work"]
@@ -111,7 +111,7 @@ def energy_growth(rows: dict[str, Values], *, moving_at_start: bool) -> float:
 
 
 def _check_frames(run: Path) -> tuple[bool, float]:
-    """(all fields finite, smallest J of any cell that carries) over the frames of fields.h5."""
+    """(all fields finite, smallest J of cells that carry load) over the frames of fields.h5."""
     finite, least = True, np.inf
     with h5py.File(run / "fields.h5") as file:
         points, cells = file["points"][()], file["cells"][()]
@@ -124,14 +124,14 @@ def _check_frames(run: Path) -> tuple[bool, float]:
 
 
 def _load_bearing_cells(frame: Any, cells: int) -> npt.NDArray[np.bool_]:
-    """(m,) cells whose J matters: those that broken edges have not taken apart."""
+    """Flags (m,) of the cells that broken edges have not separated."""
     if "chi" in frame:
         return np.asarray(frame["chi"][()] > 0)
     return np.asarray(frame["damage"][()] == 0) if "damage" in frame else np.ones(cells, bool)
 
 
 def volume_ratios(points: Values, cells: npt.NDArray[np.integer], u: Values) -> Values:
-    """(m,) J = det(x_1 - x_0, ...) / det(X_1 - X_0, ...) of each simplex; points and u (n, 3), 2D in their plane."""
+    """Volume ratio J (m,) = det(x_1 - x_0, ...) / det(X_1 - X_0, ...) of each simplex; points and u (n, 3)."""
     d = cells.shape[1] - 1
 
     def measure(x: Values) -> Values:
@@ -142,7 +142,7 @@ def volume_ratios(points: Values, cells: npt.NDArray[np.integer], u: Values) -> 
 
 
 def surface_is_finite(run: Path) -> bool:
-    """Whether every point of the last frame of the split surface is a number, where there is a surface."""
+    """Return whether all points of the last split surface are finite; True without a surface."""
     if not (run / "surface.pvd").exists():
         return True
     from fracsim.output.surface.vtk_files import read_body_frames

@@ -1,4 +1,4 @@
-"""Studies of the stability table as TOML data: small scenes whose right answer is known, driven to extremes."""
+"""Studies of the stability table as TOML data: small scenes with known results at extremes of their parameters."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def stretched_block(
     confined: bool = False,
     strength: float | None = None,
 ) -> Data:
-    """A block whose right face moves to `stretch` times its length, quasi-statically, between smooth or stiff sides.
+    """Block whose right face moves to `stretch` times its length, quasi-statically, with free or fixed lateral sides.
 
-    Its strain is the same everywhere on any mesh, so that force and break are known (block_stretch.stretch_error).
+    The strain is homogeneous on any mesh, so that force and break are known (block_stretch.stretch_error).
     """
     sides = {"front": ["free", 0.0, "free"], "bottom": ["free", "free", 0.0]}
     if confined:
@@ -39,7 +39,7 @@ def stretched_block(
 def accelerated_bar(
     step: float, *, scheme: str = "backward-euler", steps: int = 40, material: Data | None = None
 ) -> Data:
-    """A free bar pulled by a dead load on one end, which tears it where the steps are long enough to let waves run."""
+    """Free bar under a dead load on one end, which breaks it if the steps are long enough for waves to travel."""
     study = base_study("a free bar thrown by one end", BAR, material, steps)
     study["boundary"] = [{"on": "right", "traction": [5e4, 0.0, 0.0]}]
     study["time"] = {"scheme": scheme, "step": step, "end": steps * step}
@@ -50,7 +50,7 @@ def torn_body(
     mesh: Data, *, speed: float, step: float, steps: int, strength: float, ends: tuple[str, str] = ("left", "right"),
     material: Data | None = None, approach: str = "chi", axis: int = 0, scheme: str = "generalized-alpha",
 ) -> Data:  # fmt: skip
-    """A body held at one end and pulled at the other until it tears, with inertia."""
+    """Body fixed at one end and pulled at the other until it breaks, with inertia."""
     study = base_study("a body torn", mesh, material, steps)
     velocity = [0.0, 0.0, 0.0]
     velocity[axis] = speed
@@ -60,7 +60,7 @@ def torn_body(
 
 
 def flying_block(speed: float, step: float, steps: int = 40) -> Data:
-    """A free block that flies fast and turns: in short steps the round-off of its inertia is larger than any force."""
+    """Free block with a high velocity and spin. In short steps round-off of the inertia exceeds the elastic forces."""
     study = base_study("a block flying", BAR, None, steps)
     study["initial"] = {"velocity": [speed, 0.0, 0.0], "spin": [0.0, 0.0, 1.0]}
     study["time"] = {"step": step, "end": steps * step}
@@ -68,7 +68,7 @@ def flying_block(speed: float, step: float, steps: int = 40) -> Data:
 
 
 def spinning_block(mesh: Data, *, spin: float, step: float, steps: int, strength: float) -> Data:
-    """A free block that spins until it flies apart."""
+    """Free block that spins until it breaks."""
     study = base_study("a block spun to pieces", mesh, None, steps)
     study["initial"] = {"spin": [0.0, 0.0, spin]}
     study["time"] = {"step": step, "end": steps * step}
@@ -76,7 +76,7 @@ def spinning_block(mesh: Data, *, spin: float, step: float, steps: int, strength
 
 
 def hanging_body(mesh: Data, material: Data) -> Data:
-    """A body that hangs from its left end by its own weight, lying along x: what it weighs is known."""
+    """Body along x that hangs from its top side; its weight is known."""
     study = base_study("a body hanging by its weight", mesh, material, 10)
     study["boundary"] = [{"on": "top", "fix": "xyz"}]
     study["load"] = {"gravity": [0.0, 0.0, -9.81]}
@@ -87,7 +87,7 @@ def hanging_body(mesh: Data, material: Data) -> Data:
 
 
 def with_fracture(study: Data, strength: float, approach: str = "chi") -> Data:
-    """With [fracture], and the field that tells which cells still carry."""
+    """The study with [fracture] and the field that marks cells without load."""
     fields = ["chi"] if approach == "chi" else ["damage"]
     return study | {
         "fracture": {"strength": strength, "approach": approach},
@@ -96,7 +96,7 @@ def with_fracture(study: Data, strength: float, approach: str = "chi") -> Data:
 
 
 def base_study(title: str, mesh: Data, material: Data | None, steps: int) -> Data:
-    """Without boundary or time; a frame every quarter of the steps."""
+    """Study without boundary conditions and time; a frame every quarter of the steps."""
     return {
         "title": title,
         "mesh": dict(mesh),

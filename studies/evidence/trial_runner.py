@@ -1,4 +1,4 @@
-"""Running trials: each in processes of its own with a time limit, recorded in record.json, and not run twice."""
+"""Run trials in separate processes with a time limit, and record each in record.json."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PHASES = ("solve", "fracture", "energies", "plasticity")
 
 
 def run_trial(trial: Trial, out: Path) -> dict[str, Any]:
-    """The record of a trial; taken from OUT/group/case/name/record.json where the same trial has been run before."""
+    """Record of a trial; read from OUT/group/case/name/record.json if the same trial has run before."""
     folder = trial_folder(out, trial)
     path = folder / RECORD
     digest = fingerprint(trial)
@@ -47,7 +47,7 @@ def run_trial(trial: Trial, out: Path) -> dict[str, Any]:
 
 
 def repeat_timing(trial: Trial, out: Path, record: dict[str, Any]) -> None:
-    """Run a trial that is recorded once more and add its times, whatever they are, to the record."""
+    """Run a recorded trial again and append its times to the record."""
     folder = trial_folder(out, trial)
     again = _merge_runs([_run_once(_command(trial, folder), folder, trial.limit)])
     for key in TIMES:
@@ -58,23 +58,24 @@ def repeat_timing(trial: Trial, out: Path, record: dict[str, Any]) -> None:
 
 
 def trial_folder(out: Path, trial: Trial) -> Path:
-    """Where a trial is run and recorded."""
+    """Folder in which a trial is run and recorded."""
     return out / trial.group / trial.case / trial.name
 
 
 def _save(record: dict[str, Any], folder: Path) -> None:
+    """Write the record to its folder."""
     (folder / RECORD).write_text(json.dumps(record, indent=1) + "\n")
 
 
 def fingerprint(trial: Trial) -> str:
-    """Name of a run: it changes with any part of the trial and with the program (and the script) that is run."""
+    """Digest of a run; it changes with the trial, with the program and with the script."""
     code = program_digest() + (evidence_digest() if trial.script else "")
     return hashlib.sha256((json.dumps(asdict(trial), sort_keys=True) + code).encode()).hexdigest()[:16]
 
 
 @cache
 def program_digest() -> str:
-    """Name of the code that a study runs through: the page that is made of it afterwards is not part of it."""
+    """Digest of the code that a study runs through, without the report and the studies."""
     package = Path(root.__file__).parent
     sources = (path for kind in ("*.py", "*.c") for path in package.rglob(kind))
     modules = [path for path in sources if not {"report", "studies"} & set(path.parts[-3:])]
@@ -85,11 +86,12 @@ def program_digest() -> str:
 
 @cache
 def evidence_digest() -> str:
-    """Name of the code of the evidence: what was measured by an older one is measured again, from the same run."""
+    """Digest of the evidence's code. A run that older code measured is measured again."""
     return _digest_of(list(Path(__file__).parent.rglob("*.py")))
 
 
 def _digest_of(modules: list[Path]) -> str:
+    """Digest of the text of modules."""
     digest = hashlib.sha256()
     for path in sorted(modules):
         digest.update(path.read_bytes())
@@ -97,12 +99,13 @@ def _digest_of(modules: list[Path]) -> str:
 
 
 def _trial_data(trial: Trial, command: list[str]) -> dict[str, Any]:
+    """Description of the trial in its record."""
     keys = ("group", "case", "name", "settings", "ranks", "repeats", "limit")
     return {key: getattr(trial, key) for key in keys} | {"command": shlex.join(command)}
 
 
 def _command(trial: Trial, folder: Path) -> list[str]:
-    """What is run, inside `folder`; also what a reader of the report runs again."""
+    """Command that runs the trial inside `folder`; the report shows it to readers."""
     if trial.study is not None:
         (folder / "trial.toml").write_text(tomli_w.dumps(trial.study))
         work = ["fracsim", "run", "trial.toml", "-o", "run", "--overwrite"]  # a trial cut short begins anew
@@ -114,7 +117,7 @@ def _command(trial: Trial, folder: Path) -> list[str]:
 
 
 def _run_once(command: list[str], folder: Path, limit: float) -> dict[str, Any]:
-    """One run: outcome, wall time in s, the last thing it said, and summary.json where there is one."""
+    """Run once: outcome, wall time in s, last message, and summary.json if it exists."""
     for name in ("figures.json", "run/summary.json"):  # those of an earlier run would be taken for this one's
         (folder / name).unlink(missing_ok=True)
     began = time.perf_counter()
@@ -137,8 +140,10 @@ def _run_once(command: list[str], folder: Path, limit: float) -> dict[str, Any]:
 
 
 def _merge_runs(runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Worst outcome, last summary, and the times of all runs, s: `wall` of the process; inside it `stepping`, and `cpu`
-    of all ranks there."""
+    """Worst outcome, last summary and the times of all runs, s.
+
+    `wall`: of the process. `stepping`: of the time steps. `cpu`: processor time of all ranks in the time steps.
+    """
     summaries = [run["summary"] for run in runs if run["summary"] is not None]
     return {
         "outcome": next((run["outcome"] for run in runs if run["outcome"] != "done"), "done"),
@@ -151,7 +156,7 @@ def _merge_runs(runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _measure(trial: Trial, folder: Path, record: dict[str, Any]) -> None:
-    """Figures of the run into the record; a measurement that fails makes the trial a failed one, not a hole."""
+    """Add the figures of the run to its record. An error of the measurement makes the outcome "not measured"."""
     record["figures"], record["measured by"] = {}, evidence_digest()
     if record["outcome"] == "not measured":
         record["outcome"] = "done"

@@ -1,12 +1,15 @@
-"""Duplication of cut cells with virtual nodes: what methods that open a crack by new unknowns have to solve.
+"""Duplication of cut cells with virtual nodes: the equations of methods that represent a crack by added unknowns.
 
 The baseline of the report, after Molino, Bao and Fedkiw (2004), A virtual node algorithm for changing mesh topology
-during simulation; Bao et al. (2007) fracture with it, and the unknowns are those that an extended finite element method
-with shifted Heaviside functions adds. Each cut cell becomes one copy for each group of nodes that its intact edges
-still join. A copy owns the nodes of its group and gets virtual ones for the rest. Copies in cells with a common face
-are one material where they own a common node of that face: there they share all three nodes of it, so that the
-displacement is continuous. At the tip of a crack two copies of one cell may come to share a whole face this way, which
-then has three cells; DOLFINx has no such meshes, and the copy that owns less of the face keeps its virtual nodes there.
+during simulation; Bao et al. (2007) use it for fracture. The unknowns are those that an extended finite element method
+with shifted Heaviside functions adds.
+
+A cut cell becomes one copy for each group of nodes that its intact edges connect. A copy owns the nodes of its group;
+its other nodes are virtual. Copies in neighbouring cells belong to the same material if they own a common node of the
+shared face. They then share all nodes of that face, so that the displacement is continuous.
+
+At a crack tip two copies of a cell may then share a whole face, which would have three cells. DOLFINx does not support
+such meshes: the copy that owns fewer nodes of the face keeps its virtual nodes there.
 """
 
 from __future__ import annotations
@@ -23,14 +26,14 @@ Ints = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class DuplicatedMesh:
-    """The mesh with copies.
+    """Mesh with copies of cut cells.
 
     Attributes:
         cells: (copies, d + 1) new nodes.
         owned: (copies, d + 1) whether the copy owns the node; the others are virtual.
-        cell: (copies,) the cell that each is a copy of.
-        node: (new nodes,) the node that each is a copy of.
-        share: (copies,) part of the cell's material: owned nodes over d + 1. They sum to 1 over the copies of a cell.
+        cell: (copies,) original cell of each copy.
+        node: (new nodes,) original node of each.
+        share: (copies,) share of the cell's material: owned nodes over d + 1. Sums to 1 over the copies of a cell.
     """
 
     cells: Ints
@@ -41,7 +44,7 @@ class DuplicatedMesh:
 
 
 def duplicate_cut_cells(cells: npt.NDArray[np.integer], groups: npt.NDArray[np.integer], nodes: int) -> DuplicatedMesh:
-    """Copies of `cells` (m, d + 1) by `groups` (m, d + 1): the lowest local node that each local node is joined to."""
+    """Copies of `cells` (m, d + 1) by `groups` (m, d + 1), the lowest local node connected to each local node."""
     corners: Ints = np.asarray(cells, np.int64)
     joined: Ints = np.asarray(groups, np.int64)
     leads = joined == np.arange(corners.shape[1])  # a copy for each group, named by its lowest node
@@ -61,7 +64,7 @@ def duplicate_cut_cells(cells: npt.NDArray[np.integer], groups: npt.NDArray[np.i
 
 
 def _merge_nodes(pairs: Ints, nodes: int, originals: Ints) -> tuple[Ints, Ints]:
-    """New nodes of the copies, (copies, d + 1), and what each is a copy of: places that pairs connect are one node."""
+    """New nodes (copies, d + 1) and the original of each; nodes of copies that `pairs` connect become one."""
     total = nodes + originals.size
     graph = coo_array((np.ones(pairs.shape[1], bool), (pairs[0], pairs[1])), (total, total))
     count, label = connected_components(graph, directed=False)
@@ -73,7 +76,7 @@ def _merge_nodes(pairs: Ints, nodes: int, originals: Ints) -> tuple[Ints, Ints]:
 
 
 def _third_cells_of_faces(places: Ints, owned: npt.NDArray[np.bool_], cell: Ints) -> npt.NDArray[np.bool_]:
-    """(copies,) those that share a whole face with another copy of their cell, and own less of it."""
+    """Flags (copies,) of copies that share a face with another copy of their cell and own fewer of its nodes."""
     result, width = np.zeros(len(cell), bool), places.shape[1]
     for apart in range(1, width):  # copies of a cell follow each other
         a = np.flatnonzero(cell[apart:] == cell[:-apart])
@@ -87,13 +90,13 @@ def _third_cells_of_faces(places: Ints, owned: npt.NDArray[np.bool_], cell: Ints
 
 
 def _owned_pairs(cells: Ints, of_node: Ints, nodes: int) -> Ints:
-    """(2, n) pairs: the place of each owned node in its copy, and the node itself."""
+    """Pairs (2, n): position of each owned node in its copy, and the original node."""
     width = cells.shape[1]
     return np.stack([(nodes + of_node * width + np.arange(width)).ravel(), cells.ravel()])
 
 
 def _shared_face_pairs(cells: Ints, groups: Ints, of_node: Ints, nodes: int) -> Ints:
-    """(2, n) pairs of places that copies in neighbouring cells share, because they own a common node of the face."""
+    """Pairs (2, n) of positions that neighbouring copies share, since they own a common node of the face."""
     first, second, at_first, at_second = _faces_of_cut_cells(cells, np.any(groups != 0, axis=1))
     width, pairs = cells.shape[1], []
     for own in range(width - 1):
@@ -107,9 +110,9 @@ def _shared_face_pairs(cells: Ints, groups: Ints, of_node: Ints, nodes: int) -> 
 
 
 def _faces_of_cut_cells(cells: Ints, cut: npt.NDArray[np.bool_]) -> tuple[Ints, Ints, Ints, Ints]:
-    """Cells on both sides of the inner faces at which a cut cell lies, and the local nodes of the face in each of them.
+    """Cells on both sides of the inner faces of cut cells, and the local nodes of the face in each.
 
-    (n,), (n,), (n, d), (n, d): column k is the same node on both sides.
+    Shapes (n,), (n,), (n, d), (n, d): column k is the same node on both sides.
     """
     width = cells.shape[1]
     local = np.array([[k for k in range(width) if k != face] for face in range(width)])

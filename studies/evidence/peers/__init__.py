@@ -1,5 +1,7 @@
-"""Other programs beside this one, on the same mesh and the same machine, in turn; each is left out where it is not
-installed, and the page says so."""
+"""Other programs beside fracsim on the same mesh and machine, in turn.
+
+A program that is not installed is left out, and the page says so.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +19,15 @@ FAMILIES = (
 
 
 def _families() -> list[Any]:
+    """Modules of the group."""
     return [import_module(f".{name}", __package__) for name in FAMILIES]
 
 
 def trials() -> list[Trial]:
-    """Every trial of the group whose other program is there."""
+    """Trials of the group whose other program is installed."""
     return [trial for family in _families() for trial in family.trials()]
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
-    """A section for each program, also where it is not installed."""
+    """Section for each program, even if it is not installed."""
     return [section for family in _families() for section in family.sections(records)]

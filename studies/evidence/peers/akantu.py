@@ -1,9 +1,9 @@
-"""Akantu beside us: it has a Python of its own, which environment variable AKANTU_PYTHON names.
+"""Akantu as a separate process; environment variable AKANTU_PYTHON names its Python.
 
     python3.11 -m venv DIR && DIR/bin/pip install akantu scipy && export AKANTU_PYTHON=DIR/bin/python
 
-Its wheel (5.0.7) is for Python 3.8 to 3.11 and has a serial MUMPS. What it gets is a mesh, which dofs are held and the
-forces on nodes; stiffness and mass are its own.
+Its wheel (5.0.7) is for Python 3.8 to 3.11 and includes a serial MUMPS. Akantu receives mesh, constrained dofs and
+nodal forces, and assembles stiffness and mass itself.
 """
 
 from __future__ import annotations
@@ -28,15 +28,12 @@ Values = npt.NDArray[np.float64]
 
 @cache
 def akantu_python() -> str | None:
-    """A Python that can import Akantu, where there is one."""
+    """Python that can import Akantu; None if there is none."""
     return working_python(VARIABLE, "import akantu")
 
 
 def problem_arrays(scene: Any, step: float) -> dict[str, Any]:
-    """A linear scene on one rank as arrays: what is held stays at 0, `force` is that at the end, N.
-
-    `step`: s; 0: statics.
-    """
+    """A linear scene on one rank as arrays: constrained dofs stay 0, `force` (N) is that at the end."""
     domain, balance, study = scene.domain, scene.balance, scene.study
     rest, size = np.zeros(balance.owned_dof_count), domain.dim
     balance.evaluate_at(study.time.end, rest, rest)
@@ -52,7 +49,7 @@ def problem_arrays(scene: Any, step: float) -> dict[str, Any]:
 
 
 def akantu_cell_nodes(domain: Any) -> npt.NDArray[np.int64]:
-    """(cells, n) nodes of each cell as Akantu wants them: of positive volume, middles after corners."""
+    """Nodes (cells, n) in Akantu's order: positive volume, edge midpoints after corners."""
     from ....mesh.simplices import local_edges
 
     size, cells = domain.dim, np.asarray(domain.all_cell_nodes, np.int64)
@@ -73,14 +70,18 @@ def akantu_cell_nodes(domain: Any) -> npt.NDArray[np.int64]:
 
 
 class AkantuProcess:
-    """A body in Akantu, stepped from here.
+    """A body in an Akantu process.
 
     Attributes:
         wall, cpu: seconds of each step.
     """
 
     def __init__(self, problem: dict[str, Any], folder: Path) -> None:
-        """`folder`: for what goes to and fro. RuntimeError where Akantu is not installed."""
+        """Start the process on a problem; `folder` is for the files exchanged.
+
+        Raises:
+            RuntimeError: Akantu is not installed.
+        """
         python = akantu_python()
         if python is None:
             raise RuntimeError(ABSENT)
@@ -92,7 +93,7 @@ class AkantuProcess:
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
     def step(self, share: float) -> None:
-        """A step to this share of the load."""
+        """Advance by a step to this share of the load."""
         assert self._process.stdin is not None and self._process.stdout is not None
         print(share, file=self._process.stdin, flush=True)
         for line in self._process.stdout:
@@ -104,7 +105,7 @@ class AkantuProcess:
         raise RuntimeError(f"Akantu ended with code {self._process.wait()}")
 
     def end(self) -> Values:
-        """(nodes, d) displacement at the end, m; Akantu is left."""
+        """End the process and return its displacement (nodes, d), m."""
         self._process.communicate()
         if self._process.returncode:
             raise RuntimeError(f"Akantu ended with code {self._process.returncode}")

@@ -1,4 +1,4 @@
-"""Akantu on the meshes of the linear static cases, linear and quadratic cells: what it takes for how good an answer.
+"""Akantu on the meshes of the linear static cases, with linear and quadratic cells: accuracy and processor time.
 
     python -m fracsim.studies.evidence.peers.akantu_statics --case cantilever --h 0.025 --order 1 -o figures.json
 
@@ -23,13 +23,14 @@ CASES = ("cantilever", "plate", "disk")
 
 
 def case_study(case: str, h: float, order: int) -> dict[str, Any]:
+    """Study of a case with cells of size h and elements of some order."""
     if case == "disk":
         return brazilian_disk.pressed_disk(round(brazilian_disk.RADIUS / h), order)
     return linear_statics.STUDIES[case](h, order=order)
 
 
 def case_figures(case: str, problem: dict[str, Any], u: Values) -> dict[str, float]:
-    """Of the displacement (nodes, d), m, as precision/ measures them."""
+    """Figures of the displacement (nodes, d), m, as the group precision measures them."""
     if case == "disk":
         frame = {"points": problem["points"], "cells": problem["cells"], "displacement": u}
         return brazilian_disk.centre_errors(frame | {"stress": plane_stress(problem, u)})
@@ -43,7 +44,7 @@ def case_figures(case: str, problem: dict[str, Any], u: Values) -> dict[str, flo
 
 
 def plane_stress(problem: dict[str, Any], u: Values) -> Values:
-    """(cells, 4) stress xx, xy, yx, yy, Pa, in plane stress: of the corners, and so of linear cells."""
+    """Plane stress (cells, 4) xx, xy, yx, yy, Pa, from the corners of cells, exact for linear cells."""
     X, values = (item[problem["cells"][:, :3]] for item in (problem["points"], u))
     gradient = np.linalg.solve(X[:, 1:] - X[:, :1], values[:, 1:] - values[:, :1]).swapaxes(1, 2)
     strain = (gradient + gradient.swapaxes(1, 2)) / 2
@@ -54,6 +55,7 @@ def plane_stress(problem: dict[str, Any], u: Values) -> Values:
 
 
 def main() -> None:
+    """Solve one case and write the figures."""
     from mpi4py import MPI
 
     from ....scene import build_scene

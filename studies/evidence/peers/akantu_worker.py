@@ -1,10 +1,10 @@
-"""Steps of Akantu (Richart et al. 2024, JOSS 9, 5253), run by the Python that has it; nothing of fracsim is imported.
+"""Time steps in Akantu (Richart et al. 2024, JOSS 9, 5253), run by its Python; nothing of fracsim is imported.
 
     PYTHON -I akantu_worker.py problem.npz result.npz
 
-Reads shares of the load from stdin, one a line, and answers each with the seconds of the step that took the body there:
-{"wall": s, "cpu": s}. The stiffness of a linear body does not change: MUMPS factorises it in the first step, and Akantu
-keeps the factors by itself. Displacements go to result.npz at the end.
+Reads shares of the load from stdin, one a line, and answers each with the seconds of a step: {"wall": s, "cpu": s}. The
+stiffness of a linear body is constant: MUMPS factorises it in the first step, and Akantu keeps the factors.
+Displacements are written to result.npz at the end.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ ELEMENT_TYPES = {(2, 3): "_triangle_3", (2, 6): "_triangle_6", (3, 4): "_tetrahe
 
 
 def main() -> None:
+    """Read the problem, answer each share of the load with a step, and write the displacement."""
     problem = dict(np.load(sys.argv[1]))
     mesh = build_mesh(problem["points"], problem["cells"])
     model = build_model(mesh, problem)
@@ -38,6 +39,7 @@ def main() -> None:
 
 
 def build_mesh(points: Any, cells: Any) -> Any:
+    """Akantu mesh of points and cells."""
     kind = getattr(akantu, ELEMENT_TYPES[points.shape[1], cells.shape[1]])
     mesh = akantu.Mesh(points.shape[1])
     into = akantu.MeshAccessor(mesh)
@@ -51,7 +53,7 @@ def build_mesh(points: Any, cells: Any) -> Any:
 
 
 def build_model(mesh: Any, problem: dict[str, Any]) -> Any:
-    """Statics where the step is 0; else the trapezoidal rule with a consistent mass."""
+    """Akantu model: statics for step 0, else the trapezoidal rule with a consistent mass."""
     young, poisson, density, step = (float(problem[key]) for key in ("young", "poisson", "density", "step"))
     words = f"material elastic [\n name = body\n rho = {density!r}\n E = {young!r}\n nu = {poisson!r}\n"
     words += " Plane_Stress = true\n]\n" if problem["plane_stress"] else "]\n"

@@ -1,4 +1,4 @@
-"""Where other programs are: each has a Python of its own, which an environment variable names."""
+"""Pythons of other programs, each named by an environment variable."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import subprocess
 
 
 def working_python(variable: str, asked: str) -> str | None:
-    """The Python that a variable names, where it gets through what is `asked` of it; None where there is none."""
+    """Python that a variable names, if it runs the code `asked` without error; else None."""
     given = os.environ.get(variable)
     if not given:
         return None

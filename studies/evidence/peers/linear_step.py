@@ -1,10 +1,11 @@
-"""A step of a linear body by one solve with what is kept of the stiffness: this program's beside Akantu's.
+"""One step of a linear body beside Akantu's: a single solve with a kept factorisation or preconditioner.
 
     python -m fracsim.studies.evidence.peers.linear_step --n 10 -o figures.json
 
-The block of `make bench`, of 24 n^3 tetrahedra, linear, drawn aside by a force on its end that grows. Both by the
-trapezoidal rule with consistent mass: the equations are the same, and so must the answer be. Steps in turn, so that the
-machine's moods hit both; the first ones, in which Akantu factorises and we set up multigrid, are told by themselves.
+The block of `make bench` with 24 n^3 tetrahedra, linear, under a growing lateral force on its end. Both programs use
+the trapezoidal rule with consistent mass, so that equations and solution are the same. Steps alternate, so that
+disturbances of the machine affect both. The first steps, with Akantu's factorisation and fracsim's set-up of multigrid,
+are reported separately.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ SAME_EQUATIONS = next(iter(SCHEMES))  # the one with Akantu's equations
 
 
 def block_study(n: int, way: str) -> dict[str, Any]:
-    """With n cells along a metre."""
+    """Study with n cells along a metre."""
     end = (WARM + STEPS) * TIME_STEP
     return {
         "title": f"a linear block of {24 * n**3} tetrahedra",
@@ -52,19 +53,20 @@ def block_study(n: int, way: str) -> dict[str, Any]:
 
 
 def trials() -> list[Trial]:
-    """Both sizes; none where Akantu is not there."""
+    """Trials of both sizes; empty if Akantu is not installed."""
     if akantu_python() is None:
         return []
     return [_trial(n) for n in SIZES]
 
 
 def _trial(n: int) -> Trial:
+    """Trial with n cells along a metre."""
     script = ("fracsim.studies.evidence.peers.linear_step", "--n", str(n))
     return Trial("peers", "linear-step", f"n-{n}", script=script, settings={"n": n, "peer": "Akantu"}, limit=45.0 * n)
 
 
 def compare(n: int) -> dict[str, Any]:
-    """Seconds per step of Akantu and of each of our ways, and how far apart the displacements are at the end."""
+    """Seconds per step of Akantu and of fracsim's schemes, and relative difference of the displacements at the end."""
     with tempfile.TemporaryDirectory() as folder:
         runs = {way: _start_run(n, way, Path(folder, str(place))) for place, way in enumerate(SCHEMES)}
         theirs = AkantuProcess(problem_arrays(runs[SAME_EQUATIONS].scene, TIME_STEP), Path(folder))
@@ -86,6 +88,7 @@ def compare(n: int) -> dict[str, Any]:
 
 
 def _start_run(n: int, way: str, folder: Path) -> Any:
+    """Run of a study before its first step."""
     from mpi4py import MPI
 
     from ....run import Run
@@ -96,11 +99,13 @@ def _start_run(n: int, way: str, folder: Path) -> Any:
 
 
 def _median_times(pairs: list[tuple[float, float]]) -> dict[str, float]:
+    """Median wall and processor times after the first steps, and processor time of the first."""
     wall, cpu = zip(*pairs[WARM:], strict=True)
     return {"wall": median(wall), "cpu": median(cpu), "first": pairs[0][1]}
 
 
 def main() -> None:
+    """Compare and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--n", type=int, default=SIZES[0])
     parser.add_argument("-o", "--out", type=Path, required=True)
@@ -114,7 +119,7 @@ TITLE = "A linear step beside Akantu's"
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
-    """Table and claims; a sentence where Akantu is not there."""
+    """Section with table and claims; a sentence if Akantu is not installed."""
     results = [record for record in records if record["case"] == "linear-step"]
     done = [record["figures"] for record in results if record["figures"]]
     if not done:
@@ -133,6 +138,7 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
 
 
 def _rows(figures: dict[str, Any]) -> list[tuple[Any, ...]]:
+    """Rows of one size, one a program."""
     theirs = figures["akantu"]
     programs = {"Akantu": theirs} | {f"fracsim, {way}": item for way, item in figures["ours"].items()}
     return [
@@ -142,6 +148,7 @@ def _rows(figures: dict[str, Any]) -> list[tuple[Any, ...]]:
 
 
 def _claims(done: list[dict[str, Any]]) -> tuple[Claim, ...]:
+    """Claims on the time ratio and the displacements."""
     ratios = {figures["cells"]: figures["ours"][SAME_EQUATIONS]["cpu"] / figures["akantu"]["cpu"] for figures in done}
     apart = {figures["cells"]: figures["apart"] for figures in done}
     return (

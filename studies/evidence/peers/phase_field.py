@@ -1,14 +1,16 @@
-"""Single-edge notched plates in tension and in shear by PhaseFieldX and by us, on the triangles of one lattice.
+"""Single-edge notched plates in tension and in shear by PhaseFieldX and by fracsim, on the triangles of one lattice.
 
     python3 -m venv --system-site-packages DIR && DIR/bin/pip install "phasefieldx==0.1.4" "scifem<0.5" pandas
     export PHASEFIELDX_PYTHON=DIR/bin/python
     python -m fracsim.studies.evidence.peers.phase_field --n 40 [--pull shear] -o figures.json
 
-PhaseFieldX is a library on DOLFINx; 0.1.4 goes with DOLFINx 0.9, 0.4 does not. Its notch is a slit, along a row of
-nodes that are there twice; ours cuts the row of cells above it, since a node at the tip is a hinge
+PhaseFieldX is a library on DOLFINx; 0.1.4 works with DOLFINx 0.9, 0.4 does not. Its notch is a slit along a row of
+doubled nodes. fracsim's crack cuts the row of cells above it, since a node at the tip is a hinge
 (docs/theory.md#cell-cutting).
-Its length scale is two cells, the least that is taken for resolved. In tension all of the energy opens its crack; in
-shear that of principal strains that are positive does (hybrid: Ambati et al. 2015), without which cracks go both ways.
+
+The length scale is two cells, the smallest that counts as resolved. In tension the whole energy drives the crack. In
+shear only the energy of positive principal strains does (hybrid: Ambati et al. 2015); otherwise cracks grow in both
+directions.
 """
 
 from __future__ import annotations
@@ -44,7 +46,13 @@ Values = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class GripMotion:
-    """Which way the upper side is moved (0: across, 1: up), how far, m, and in how many steps."""
+    """Motion of the upper side.
+
+    Attributes:
+        axis: 0 tangential, 1 normal.
+        way: final displacement, m.
+        steps: number of steps.
+    """
 
     axis: int
     way: float
@@ -52,7 +60,7 @@ class GripMotion:
 
     @property
     def course(self) -> Values:
-        """(steps,) motion of the grip at the end of each, m."""
+        """Displacement of the grip at the end of each step (steps,), m."""
         return self.way * np.arange(1.0, self.steps + 1) / self.steps
 
 
@@ -61,12 +69,12 @@ GRIP_MOTIONS = {"tension": GripMotion(1, 6.5e-6, 65), "shear": GripMotion(0, 1.5
 
 @cache
 def phasefieldx_python() -> str | None:
-    """A Python that can import PhaseFieldX, where there is one."""
+    """Python that can import PhaseFieldX; None if there is none."""
     return working_python(VARIABLE, "from phasefieldx.Element.Phase_Field_Fracture.solver.solver import solve")
 
 
 def plate_study(n: int, pull: GripMotion) -> dict[str, Any]:
-    """Ours, with n cells along a side."""
+    """Study for fracsim with n cells along a side."""
     moved = [0.0, 0.0]
     moved[pull.axis] = pull.way
     at = SIDE * (0.5 + 0.5 / n)
@@ -87,7 +95,7 @@ def plate_study(n: int, pull: GripMotion) -> dict[str, Any]:
 
 
 def double_slit_nodes(points: Values, cells: npt.NDArray[np.int64]) -> tuple[Values, npt.NDArray[np.int64]]:
-    """A square of side 1 whose nodes from the left to the middle of its middle row are there twice."""
+    """Mesh of a unit square with doubled nodes on its middle row, from the left side to the centre."""
     parted = np.flatnonzero((np.abs(points[:, 1] - 0.5) < 1e-9) & (points[:, 0] < 0.5 - 1e-9))
     other = np.arange(len(points))
     other[parted] = len(points) + np.arange(len(parted))
@@ -96,20 +104,24 @@ def double_slit_nodes(points: Values, cells: npt.NDArray[np.int64]) -> tuple[Val
 
 
 def trials() -> list[Trial]:
-    """Both sizes in tension, the larger one in shear; none where PhaseFieldX is not there."""
+    """Trials of both sizes in tension and the larger one in shear; empty if PhaseFieldX is not installed."""
     asked = [*((n, "tension") for n in SIZES), (SIZES[-1], "shear")]
     return [] if phasefieldx_python() is None else [_trial(n, pull) for n, pull in asked]
 
 
 def _trial(n: int, pull: str) -> Trial:
+    """Trial with n cells along a side."""
     script = ("fracsim.studies.evidence.peers.phase_field", "--n", str(n), "--pull", pull)
     settings: dict[str, Any] = {"n": n, "pull": pull, "peer": "PhaseFieldX"}
     return Trial("peers", "notched-plate", f"{pull}-n-{n}", script=script, settings=settings, limit=15.0 * n)
 
 
 def compare(n: int, pull: str) -> dict[str, Any]:
-    """Peak load, N, motion there, m, direction of the crack and processor time of both. RuntimeError where PhaseFieldX
-    is not installed."""
+    """Peak load (N), displacement there (m), crack direction and processor time of both programs.
+
+    Raises:
+        RuntimeError: PhaseFieldX is not installed.
+    """
     return {
         "cells": 2 * n * n,
         "pull": pull,
@@ -119,6 +131,7 @@ def compare(n: int, pull: str) -> dict[str, Any]:
 
 
 def _run_fracsim(n: int, pull: GripMotion) -> dict[str, float]:
+    """Figures of fracsim."""
     from mpi4py import MPI
 
     from ....fracture.energy.tip_criterion import TipCriterion
@@ -144,6 +157,7 @@ def _run_fracsim(n: int, pull: GripMotion) -> dict[str, float]:
 
 
 def _run_phasefieldx(n: int, pull: str) -> dict[str, float]:
+    """Figures of PhaseFieldX."""
     from ....meshes.builders.box import Box
 
     python, given = phasefieldx_python(), GRIP_MOTIONS[pull]
@@ -168,14 +182,17 @@ def _run_phasefieldx(n: int, pull: str) -> dict[str, float]:
 
 
 def crack_direction(crack: Values) -> float:
-    """Degrees, below straight ahead, of what lies (n, 2), m, off the end of the notch within RING; NaN where nothing
-    does."""
+    """Angle (degrees) below straight ahead of crack points (n, 2), m, relative to the end of the notch.
+
+    Points count at distances within DIRECTION_RADII; NaN without any.
+    """
     apart = np.linalg.norm(crack, axis=1)
     near = crack[(apart > DIRECTION_RADII[0]) & (apart < DIRECTION_RADII[1]) & (crack[:, 0] > 0)]
     return float(np.degrees(np.arctan2(-near[:, 1].mean(), near[:, 0].mean()))) if len(near) else float("nan")
 
 
 def _figures(load: Values, course: Values, crack: Values, seconds: float, solves: int) -> dict[str, float]:
+    """Figures of one program."""
     at = int(load.argmax())
     return {
         "peak": float(load[at]), "at": float(course[at]), "turn": crack_direction(crack), "seconds": seconds,
@@ -184,6 +201,7 @@ def _figures(load: Values, course: Values, crack: Values, seconds: float, solves
 
 
 def main() -> None:
+    """Compare and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n", type=int, default=SIZES[0])
     parser.add_argument("--pull", choices=GRIP_MOTIONS, default="tension")
@@ -209,7 +227,7 @@ COLUMNS = (
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
-    """A table; a sentence where PhaseFieldX is not there."""
+    """Section with a table; a sentence if PhaseFieldX is not installed."""
     results = [record for record in records if record["case"] == "notched-plate"]
     done = [record["figures"] for record in results if record["figures"]]
     if not done:
@@ -219,6 +237,7 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
 
 
 def _rows(figures: dict[str, Any]) -> list[tuple[TableCell, ...]]:
+    """Rows of a comparison, one a program."""
     programs = {"PhaseFieldX": figures["theirs"], "fracsim": figures["ours"]}
     return [
         (figures["pull"], figures["cells"], name, *(item[key] for key in ("peak", "at", "turn", "seconds", "solves")))

@@ -1,11 +1,10 @@
-"""A notched plate by PhaseFieldX (Castillon 2025, JOSS 10, 7307), run by the Python that has it; nothing of fracsim is
-imported.
+"""A notched plate in PhaseFieldX (Castillon 2025, JOSS 10, 7307), run by its Python; fracsim is not imported.
 
     PYTHON phase_field_worker.py problem.npz result.npz
 
-The history field of Miehe et al. (2010), AT2. With `split` cracks are driven by the energy of positive principal
-strains, while all of the stress fades (hybrid: Ambati et al. 2015); without, by all of the energy.
-Lengths in mm and forces in kN, as its examples have them: its solvers stop at a residual of 1e-9.
+History field of Miehe et al. (2010), AT2. With `split` the energy of positive principal strains drives the crack while
+the whole stress degrades (hybrid: Ambati et al. 2015); without, the whole energy drives it. Lengths in mm and forces in
+kN, as in its examples: its solvers stop at an absolute residual of 1e-9.
 """
 
 from __future__ import annotations
@@ -34,6 +33,7 @@ STAGGERED_TOLERANCE, MAX_STAGGERED_ITERATIONS = (
 
 
 def main() -> None:
+    """Read the problem, solve all steps, and write load and crack."""
     problem = dict(np.load(sys.argv[1]))
     points, cells, course, axis = problem["points"], problem["cells"], problem["course"], int(problem["axis"])
     split = {"degradation": "hybrid", "split_energy": "spectral"} if problem["split"] else {}
@@ -71,7 +71,7 @@ def main() -> None:
 
 
 def _find_field(name: str) -> Any:
-    """A field of the solver that runs, which gives it to nobody."""
+    """Field of the running solver, which offers no access to it."""
     return next(
         get_object
         for get_object in gc.get_objects()
@@ -80,11 +80,12 @@ def _find_field(name: str) -> Any:
 
 
 def _crack_points(W: Any, phase: Any) -> Any:
-    """(n, 2) mm, where the phase is nearly 1."""
+    """Points (n, 2), mm, where the phase is almost 1."""
     return W.tabulate_dof_coordinates()[phase.x.array > BROKEN_PHASE, :2]
 
 
 def _dofs_at_height(V: Any, y: float) -> Any:
+    """Dofs at height y."""
     return fem.locate_dofs_geometrical(V, lambda x: np.isclose(x[1], y))
 
 

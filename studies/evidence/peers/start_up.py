@@ -1,10 +1,10 @@
-"""A small job from the command to its end: this program's processor time beside Akantu's.
+"""Processor time of a small job from command to end, beside Akantu's.
 
     python -m fracsim.studies.evidence.peers.start_up -o figures.json
 
-3,000 tetrahedra and ten steps, where next to nothing is computed: what it takes is imports, reading, building and
-writing. Akantu gets its mesh as arrays and writes one. Processor time of the whole process and its children, in turn;
-kernels and bytecode are compiled before.
+3,000 tetrahedra and ten steps with little computation: the time is that of imports, reading, building and writing.
+Akantu receives its mesh as arrays and writes one. Processor time includes child processes; programs alternate; kernels
+and bytecode are compiled beforehand.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ JOBS: dict[str, dict[str, Any]] = {
 
 
 def job_study(way: str) -> dict[str, Any]:
-    """Ten steps of the block with 3,000 tetrahedra."""
+    """Study of ten steps of the block with 3,000 tetrahedra."""
     results = block_study(5, "newmark, consistent mass") | JOBS[way]
     return results | {"time": results["time"] | {"end": STEPS * TIME_STEP}}
 
 
 def trials() -> list[Trial]:
-    """One, with Akantu where it is there."""
+    """One trial, with Akantu if it is installed."""
     script = ("fracsim.studies.evidence.peers.start_up",)
     return [Trial("peers", "start-up", "3k", script=script, settings={"peer": "Akantu" if akantu_python() else "none"})]
 
 
 def measure() -> dict[str, float]:
-    """Median processor seconds of each way, and of Akantu where it is there."""
+    """Median processor seconds of each job, and of Akantu if it is installed."""
     with tempfile.TemporaryDirectory() as folder:
         commands = {way: _fracsim_command(way, Path(folder, f"way-{place}")) for place, way in enumerate(JOBS)}
         if akantu_python():
@@ -62,6 +62,7 @@ def measure() -> dict[str, float]:
 
 
 def _fracsim_command(way: str, folder: Path) -> Callable[[], None]:
+    """Function that runs a job of fracsim."""
     import tomli_w
 
     path = folder.with_suffix(".toml")
@@ -71,6 +72,7 @@ def _fracsim_command(way: str, folder: Path) -> Callable[[], None]:
 
 
 def _akantu_command(folder: Path) -> Callable[[], None]:
+    """Function that runs the job in Akantu."""
     from mpi4py import MPI
 
     from ....scene import build_scene
@@ -86,11 +88,13 @@ def _akantu_command(folder: Path) -> Callable[[], None]:
 
 
 def _run(command: list[str], given: str = "") -> None:
+    """Run a command with text on its stdin."""
     kept = os.environ | {"PYTHONDONTWRITEBYTECODE": ""}  # modules are compiled once, whatever the machine says
     subprocess.run(command, input=given, text=True, check=True, capture_output=True, timeout=120, env=kept)
 
 
 def _processor_seconds(command: Callable[[], None]) -> float:
+    """Processor seconds of the child processes of `command`."""
     began = os.times()
     command()
     ended = os.times()
@@ -98,6 +102,7 @@ def _processor_seconds(command: Callable[[], None]) -> float:
 
 
 def main() -> None:
+    """Measure and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("-o", "--out", type=Path, required=True)
     given = parser.parse_args()
@@ -108,7 +113,7 @@ def main() -> None:
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
-    """Table and claim."""
+    """Section with table and claim; empty if it was not run."""
     results = next((record for record in records if record["case"] == "start-up"), None)
     if results is None or not results["figures"]:
         return []

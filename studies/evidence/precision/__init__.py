@@ -36,18 +36,18 @@ FAMILIES = (
 
 
 def trials() -> list[Trial]:
-    """Every trial of the group."""
+    """All trials of the group."""
     return [trial for family in FAMILIES for trial in family.trials()]
 
 
 def trials_to_repeat(records: list[dict[str, Any]]) -> set[tuple[str, str]]:
-    """(case, name) of trials whose seconds decide something by more than noise, and were measured but once or twice."""
+    """(case, name) of trials whose timing decides a claim by more than noise and was measured once or twice."""
     return {
         (case.name, name) for family in FAMILIES for case in family.CASES for name in doubtful_trials(case, records)
     }
 
 
 def sections(records: list[dict[str, Any]]) -> list[Section]:
-    """The first screen, and a section for each case."""
+    """Sections: the summary, and one for each case."""
     cases = [case for family in FAMILIES for case in family.CASES]
     return [*summary_sections(cases, records), *(section(case, records) for case in cases)]

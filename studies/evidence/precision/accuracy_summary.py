@@ -1,4 +1,4 @@
-"""The first screen: for each case the cheapest setting for 5 % and for 1 %, its seconds, and other programs'."""
+"""Summary of all cases: the cheapest setting for 5 % and for 1 %, its seconds, and those of other programs."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ PEERS = {"quadratic": "DOLFINx alone, quadratic"}  # by the setting `elements` o
 
 
 def summary_sections(cases: list[AccuracyCase], records: Records) -> list[Section]:
-    """The section, where any case has rows."""
-    results = [(case, rows) for case in cases if case.priced and (rows := case_rows(case, records))]
+    """Section with table and plot; empty if no case has rows."""
+    results = [(case, rows) for case in cases if case.compare_cost and (rows := case_rows(case, records))]
     if not results:
         return []
     peers = sorted({peer for _, rows in results for row in rows if (peer := other_program(row.record))})
@@ -46,12 +46,13 @@ def summary_sections(cases: list[AccuracyCase], records: Records) -> list[Sectio
 
 
 def other_program(record: dict[str, Any]) -> str | None:
-    """The program of a trial that is not ours."""
+    """Name of the other program of a trial; None for fracsim."""
     elements = record["settings"].get("elements")
     return None if elements is None else PEERS.get(str(elements), str(elements))
 
 
 def _case_row(case: AccuracyCase, rows: list[AccuracyRow], peers: list[str]) -> tuple[TableCell, ...]:
+    """Row of a case: cheapest settings and seconds, and seconds of other programs."""
     ours = [row for row in rows if is_comparable(case, row)]
     cells: list[TableCell] = [case.title, case.errors[0]]
     for limit in ERROR_LIMITS:
@@ -66,13 +67,13 @@ def _case_row(case: AccuracyCase, rows: list[AccuracyRow], peers: list[str]) -> 
 
 
 def _setting_name(row: AccuracyRow) -> str:
-    """The setting; a solver by its name alone: its options are where its case is."""
+    """Setting as text; a solver by its name, since its options are listed with its case."""
     settings = row.record["settings"]
     return f"solver = {settings['solver']}" if "solver" in settings else describe_setting(row)
 
 
 def _pareto_series(case: AccuracyCase, rows: list[AccuracyRow]) -> Series:
-    """Settings that no other beats in both, the cheapest first."""
+    """Pareto-optimal settings in cost and error, the cheapest first."""
     points = [(row.core_seconds, max(row.errors[case.errors[0]], FINEST)) for row in rows if is_comparable(case, row)]
     best = sorted(points[place] for place in pareto_front(points))
     return Series(case.title, tuple(x for x, _ in best), tuple(y for _, y in best))

@@ -1,9 +1,9 @@
-"""The non-local average of a known field against its integral.
+"""Error of the non-local average of a known field against its integral.
 
     python -m fracsim.studies.evidence.precision.averaging_error --parts 8 -o figures.json
 
-s = (x/R)^2 + y/R on a unit square of gmsh's triangles of size R / parts. Over a whole disk of radius R its average is
-s + <q^2>/2 (closed_forms.kernel_moment); cells nearer than R to the boundary are left out.
+s = (x/R)^2 + y/R on a unit square of unstructured triangles of size R / parts. Over a disk of radius R its average is s
++ <q^2>/2 (closed_forms.kernel_moment). Cells nearer than R to the boundary are excluded.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ KERNELS = ("linear", "constant", "gaussian")
 
 
 def trials() -> list[Trial]:
-    """h / R with every kernel."""
+    """Trials over h / R, with all kernels."""
     return [
         script_trial(
             "average",
@@ -40,7 +40,7 @@ def trials() -> list[Trial]:
 
 
 def measure(parts: int) -> dict[str, float]:
-    """Root mean square errors by kernel, over that of the average itself; s to build and to use."""
+    """Relative root mean square error of each kernel, and seconds to build and to apply the average."""
     import numpy as np
     from mpi4py import MPI
 
@@ -67,6 +67,7 @@ def measure(parts: int) -> dict[str, float]:
 
 
 def _text(records: Records) -> str:
+    """Text of the section."""
     return (
         "Root mean square error over the cells that have a whole disk of radius R = 0.2 m. The average is a sum over "
         "centroids weighted with volumes, of second order at least where the kernel is continuous, as the hat (the "
@@ -77,6 +78,7 @@ def _text(records: Records) -> str:
 
 
 def main() -> None:
+    """Measure one mesh and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--parts", type=int, required=True, help="R / h")
     parser.add_argument("-o", type=Path, default=Path("figures.json"))

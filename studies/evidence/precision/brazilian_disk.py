@@ -1,8 +1,8 @@
-"""A Brazilian disk of granite (M22: E 45 GPa, nu 0.33, rho 2750 kg/m^3, strength 9.56 MPa), plane stress.
+"""Brazilian disk of granite (M22: E 45 GPa, nu 0.33, rho 2750 kg/m^3, strength 9.56 MPa), plane stress.
 
-Elastic: uniform pressure on two arcs of 10 degrees; means of the stress over cells around the centre against those of
-the closed form over the same cells. Peak: two rigid, smooth platens of the same arcs driven
-together; the force at which the crack runs along the diameter against pi D t sigma_t / 2.
+Elastic: uniform pressure on two arcs of 10 degrees; mean stresses of cells around the centre against the closed form
+over the same cells. Peak: two rigid, smooth platens of the same arcs approach each other; the force at which the crack
+follows the diameter is compared with pi D t sigma_t / 2.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ STEPS = 100
 
 
 def _fixed_rim_nodes(*at: tuple[float, float, str]) -> list[dict[str, Any]]:
-    """Single nodes on the rim, at multiples of the radius."""
+    """Conditions that fix single nodes on the rim, at multiples of the radius."""
     small = 1e-6 * RADIUS
 
     def around(x: float, y: float) -> dict[str, Any]:
@@ -41,11 +41,12 @@ def _fixed_rim_nodes(*at: tuple[float, float, str]) -> list[dict[str, Any]]:
 
 
 def _disk_mesh(parts: int, order: int = 1) -> dict[str, Any]:
+    """Table [mesh] of the disk."""
     return {"builder": "disk", "radius": RADIUS, "h": RADIUS / parts, "arc": ARC, "order": order}
 
 
 def pressed_disk(parts: int, order: int = 1) -> Study:
-    """Pressure on both arcs; ends of the diameters are held where symmetry holds them."""
+    """Study with pressure on both arcs; ends of the diameters are fixed as symmetry requires."""
     return {
         "title": "A disk between two pressures",
         "mesh": _disk_mesh(parts, order),
@@ -61,7 +62,7 @@ def pressed_disk(parts: int, order: int = 1) -> Study:
 
 
 def split_disk(parts: int, radius: float) -> Study:
-    """Platens driven together; `radius` of the non-local average in m, 0 for none."""
+    """Study with approaching platens; `radius` of the non-local average in m, 0 for none."""
     closing = {"time": [0.0, 1.0], "value": [["free", 0.0], ["free", -CLOSING]]}
     return {
         "title": "A Brazilian disk split",
@@ -80,7 +81,7 @@ def split_disk(parts: int, radius: float) -> Study:
 
 
 def trials() -> list[Trial]:
-    """h for both; the peak with and without an average."""
+    """Trials over h for both studies; the peak with and without an average."""
     results = [
         study_trial(
             "disk",
@@ -110,18 +111,18 @@ def trials() -> list[Trial]:
 
 
 def measure_centre(run: Path) -> dict[str, float]:
-    """Relative errors: of sigma_xx, sigma_yy and both as means near the centre, and of the stress in L2."""
+    """Relative errors of the mean stress near the centre, and of the stress in L2."""
     return centre_errors(last_frame(run))
 
 
 def centre_errors(frame: dict[str, Any]) -> dict[str, float]:
-    """The same of a frame: points, cells, displacement, and the stress of linear cells."""
+    """Errors of `measure_centre` from a frame: points, cells, displacement, and the stress of linear cells."""
     corners = frame["points"][frame["cells"]][:, :3, :2]  # of 3 or 6 nodes
     if frame["cells"].shape[1] == 3:
         stress = frame["stress"][:, None, [TENSOR_COMPONENTS.index(name) for name in ("xx", "yy", "xy")]]
     else:
         stress = plane_stress(frame, GRANITE["young"], GRANITE["poisson"], EDGE_MIDPOINTS)  # type: ignore[arg-type]
-    fourth, half = (_compare_near_centre(corners, stress, RADIUS * share) for share in (1 / 4, 1 / 2))
+    fourth, half = (_compare_near_centre(corners, stress, RADIUS * fraction) for fraction in (1 / 4, 1 / 2))
     (results, exact), (wide, wide_exact) = fourth[:2], half[:2]
     return {
         "sigma_x": abs(float(results[0] / exact[0]) - 1),
@@ -133,9 +134,10 @@ def centre_errors(frame: dict[str, Any]) -> dict[str, float]:
 
 
 def _compare_near_centre(corners: Values, stress: Values, radius: float) -> tuple[Values, Values, float]:
-    """(mean stress, mean of the closed form, relative L2 error) of the cells around the centre; three points a cell.
+    """(mean stress, mean of the closed form, relative L2 error) of the cells within `radius` of the centre.
 
-    `stress`: (cells, 1 or 3, 3) Pa, of the whole cell or at the middles of its edges.
+    `stress`: (cells, 1 or 3, 3) Pa, of the cell or at its edge midpoints. The rule with three points is exact for
+    quadratic polynomials.
     """
     near = np.linalg.norm(corners.mean(axis=1), axis=1) < radius
     corners, stress = corners[near], stress[near]
@@ -145,16 +147,16 @@ def _compare_near_centre(corners: Values, stress: Values, radius: float) -> tupl
         middles[..., 0].ravel(), middles[..., 1].ravel(), RADIUS, np.radians(ARC / 2), PRESSURE
     ).reshape(-1, 3, 3)
     square = (((exact - stress) ** 2).sum(axis=1) @ [1, 1, 2], (exact**2).sum(axis=1) @ [1, 1, 2])
-    share = area / area.sum()
+    weights = area / area.sum()
     return (
-        share @ stress.mean(axis=1),
-        share @ exact.mean(axis=1),
+        weights @ stress.mean(axis=1),
+        weights @ exact.mean(axis=1),
         float(np.sqrt(area @ square[0] / (area @ square[1]))),
     )
 
 
 def measure_peak(run: Path) -> dict[str, float]:
-    """Forces over pi D sigma_t / 2: at the first break, in the step that broke most edges, the greatest, its fall."""
+    """Forces over pi D sigma_t / 2: at the first break, at the largest break, maximum, and fall from a maximum."""
     rows = history(run)
     force = np.abs(rows["reaction_platen_y"]) / brazilian_peak(2 * RADIUS, STRENGTH)
     burst = np.diff(rows["broken_edges"], prepend=0.0)
@@ -173,11 +175,12 @@ def measure_peak(run: Path) -> dict[str, float]:
 
 
 def _force_at_break(force: Values, step: int) -> float:
-    """Force at the end of a step or, where the break has lowered it, before."""
+    """Larger of the forces at the end of a step and before it, since the break lowers the force."""
     return max(float(force[step]), float(force[step - 1]))
 
 
 def _text(records: Records) -> str:
+    """Text of the section on the stress."""
     x, y = hondros(np.zeros(1), RADIUS, np.radians(ARC / 2), 1.0)
     return (
         f"Hondros (1959) at the centre: sigma_x = {float(x[0]):.5f} p, sigma_y = {float(y[0]):.5f} p. Compared is the "
@@ -187,6 +190,7 @@ def _text(records: Records) -> str:
 
 
 def _peak_text(records: Records) -> str:
+    """Text of the section on the peak."""
     forces = "; ".join(_forces(record) for record in records if record["figures"])
     return (
         f"Forces over pi D t sigma_t / 2: {forces}.\n\nNo theory gives an order: an edge feels all of the tension only "
@@ -199,6 +203,7 @@ def _peak_text(records: Records) -> str:
 
 
 def _forces(record: dict[str, Any]) -> str:
+    """Forces of a record as text."""
     figures = record["figures"]
     parts = ", ".join(f"{name} {figures[name]:.3f}" for name in ("first break", "crack", "greatest", "fall"))
     return f"{record['name']}: {parts}, {figures['pieces']:.0f} piece(s)"

@@ -1,4 +1,4 @@
-"""From the records of a case to its section: errors against seconds, the front, fitted orders, recommended settings."""
+"""Section of a case from its records: errors against seconds, fitted orders, recommended settings."""
 
 from __future__ import annotations
 
@@ -33,28 +33,42 @@ ERROR_LIMITS = (0.05, 0.01)
 
 @dataclass(frozen=True)
 class ExpectedOrder:
-    """A fit over trials: error = C variable^theory."""
+    """Expected order of convergence over some trials: error = C variable^theory.
+
+    Attributes:
+        error: name of the error.
+        variable: key of the settings.
+        theory: exponent.
+        names: trials in the asymptotic range.
+        of: description of the fit, if the error's name is not enough.
+        least: `theory` is a lower bound.
+    """
 
     error: str
-    variable: str  # key of the settings
+    variable: str
     theory: float
-    names: tuple[str, ...]  # trials in the asymptotic range
-    of: str = ""  # what is fitted, where the error alone does not say
-    least: bool = False  # the order of theory is the least to expect
+    names: tuple[str, ...]
+    of: str = ""
+    least: bool = False
 
 
 @dataclass(frozen=True)
 class AccuracyCase:
-    """How the records of a case become a section.
+    """Description of how the records of a case become a section.
 
     Attributes:
-        text: words from the records.    columns: settings that are shown.
-        compare: trial name -> error name -> relative error.    errors: names of errors; the first one is the target.
-        orders: fits.    split: a setting whose values are series of the plots.
-        apart: values of settings that are no candidates for a default (explicit steps, a Newton step without a test).
-        share: of a limit that the error may take; less than 1 where errors of mesh and step come on top.
-        claims: what else must hold.
-        priced: whether seconds for an error are compared; not where settings are bodies that have nothing in common.
+        name: name of the case in its records.
+        title: title of the section.
+        text: records -> text of the section.
+        columns: settings shown in the table.
+        compare: records -> trial name -> error name -> relative error.
+        errors: names of errors; the first one is the target.
+        orders: expected orders of convergence.
+        split: setting whose values are series of the plots.
+        excluded: values of settings that cannot be defaults (explicit steps, a Newton step without a test).
+        limit_share: share of an error limit that the case may use; less than 1 if mesh and step add their errors.
+        claims: records -> further claims.
+        compare_cost: compare the cost of errors; False if the settings are unrelated bodies.
     """
 
     name: str
@@ -65,15 +79,15 @@ class AccuracyCase:
     errors: tuple[str, ...]
     orders: tuple[ExpectedOrder, ...] = ()
     split: str = ""
-    apart: tuple[Setting, ...] = ()
-    share: float = 1.0
+    excluded: tuple[Setting, ...] = ()
+    limit_share: float = 1.0
     claims: Callable[[Records], tuple[Claim, ...]] = lambda records: ()
-    priced: bool = True
+    compare_cost: bool = True
 
 
 @dataclass(frozen=True)
 class AccuracyRow:
-    """A trial in the table."""
+    """A trial in the table, with its relative errors."""
 
     record: dict[str, Any]
     errors: dict[str, float]
@@ -85,15 +99,19 @@ class AccuracyRow:
 
     @property
     def core_seconds(self) -> float:
-        """Processor seconds of all ranks in the loop over steps; a script: seconds in its work.
+        """Processor seconds of all ranks in the time steps; for a script, seconds of its work.
 
-        Processor time feels less of what else a machine does than wall time in steps times ranks would.
+        Processor time depends less on other load of the machine than wall time times ranks.
         """
         return median(self.record["cpu"] or [self.record["figures"].get("seconds", 0.0)])
 
 
 def trial_figure(records: Records, name: str, key: str) -> float:
-    """A figure of one trial; KeyError names it where it was not measured."""
+    """Figure of one trial.
+
+    Raises:
+        KeyError: the figure was not measured.
+    """
     figures: dict[str, float] = next((record["figures"] for record in records if record["name"] == name), {})
     if key not in figures:
         raise KeyError(f"{name} has no {key}")
@@ -106,7 +124,7 @@ def relative_error(value: float, exact: float) -> float:
 
 
 def measured_errors(*keys: str) -> Errors:
-    """Errors that the measurement itself took against a closed form."""
+    """Function that returns the errors that the measurement itself took against a closed form."""
     return lambda records: {
         record["name"]: {key: float(record["figures"][key]) for key in keys if key in record["figures"]}
         for record in records
@@ -114,38 +132,38 @@ def measured_errors(*keys: str) -> Errors:
 
 
 def section(case: AccuracyCase, records: Records) -> Section:
-    """The section of one case; where its reference is missing, a section that says so."""
-    mine = [record for record in records if record["case"] == case.name]
+    """Section of a case; a section that says so if its reference is missing."""
+    own_records = [record for record in records if record["case"] == case.name]
     try:
-        errors, text = case.compare(mine), case.text(mine)
-        claims = case.claims(mine)
+        errors, text = case.compare(own_records), case.text(own_records)
+        claims = case.claims(own_records)
     except (KeyError, StopIteration) as error:
         return Section(
-            case.title, f"Not run, or its reference is missing: {error}.", tables=(_outcome_table(case, mine),)
+            case.title, f"Not run, or its reference is missing: {error}.", tables=(_outcome_table(case, own_records),)
         )
-    rows = [AccuracyRow(record, errors.get(record["name"], {})) for record in mine]
-    advice, marked = _recommend(case, rows) if case.priced else ([], [])
+    rows = [AccuracyRow(record, errors.get(record["name"], {})) for record in own_records]
+    advice, marked = _recommend(case, rows) if case.compare_cost else ([], [])
     orders = tuple(_order_claim(order, rows) for order in case.orders)
     tables = (_error_table(case, rows, marked),)
-    words = f"{text}\n\n{_recommendation_text(advice, case)}" if case.priced else text
-    words += rerun_hint(mine)
+    words = f"{text}\n\n{_recommendation_text(advice, case)}" if case.compare_cost else text
+    words += rerun_hint(own_records)
     return Section(case.title, words, (*orders, *claims, *_default_claims(case, advice)),
                    tables, _plots(case, rows))  # fmt: skip
 
 
 def case_rows(case: AccuracyCase, records: Records) -> list[AccuracyRow]:
-    """The trials of a case with their errors; none where its reference is missing."""
-    mine = [record for record in records if record["case"] == case.name]
+    """Trials of a case with their errors; empty if its reference is missing."""
+    own_records = [record for record in records if record["case"] == case.name]
     try:
-        errors = case.compare(mine)
+        errors = case.compare(own_records)
     except (KeyError, StopIteration):
         return []
-    return [AccuracyRow(record, errors.get(record["name"], {})) for record in mine]
+    return [AccuracyRow(record, errors.get(record["name"], {})) for record in own_records]
 
 
 def doubtful_trials(case: AccuracyCase, records: Records) -> set[str]:
-    """Names of trials to be timed again: a default, and what came out cheaper by more than noise, perhaps by chance."""
-    if not case.priced or not (rows := case_rows(case, records)):
+    """Names of trials to time again: a default and a setting that seems cheaper by more than noise."""
+    if not case.compare_cost or not (rows := case_rows(case, records)):
         return set()
     advice, _ = _recommend(case, rows)
     rivals = [
@@ -159,6 +177,7 @@ def doubtful_trials(case: AccuracyCase, records: Records) -> set[str]:
 
 
 def _order_claim(order: ExpectedOrder, rows: list[AccuracyRow]) -> Claim:
+    """Claim that the fitted order agrees with theory."""
     chosen = [row for row in rows if row.record["name"] in order.names and order.error in row.errors]
     what = " ".join(word for word in (order.of, order.error) if word)
     words = f"at least {order.theory:.3g}" if order.least else f"{order.theory:.3g}"
@@ -180,7 +199,14 @@ def _order_claim(order: ExpectedOrder, rows: list[AccuracyRow]) -> Claim:
 
 @dataclass(frozen=True)
 class Recommendation:
-    """What to take for a limit: the cheapest setting, or the cheapest default one where it costs hardly more."""
+    """Recommended setting for an error limit.
+
+    Attributes:
+        limit: relative error.
+        chosen: the cheapest setting, or the cheapest default if it costs hardly more.
+        candidate: the cheapest setting that could be a default.
+        default: the cheapest setting with the program's defaults.
+    """
 
     limit: float
     chosen: AccuracyRow | None
@@ -189,17 +215,19 @@ class Recommendation:
 
 
 def _recommend(case: AccuracyCase, rows: list[AccuracyRow]) -> tuple[list[Recommendation], list[int]]:
+    """Recommendations for all limits, and the rows that they choose."""
     usable = [row for row in rows if is_comparable(case, row)]
     results = [_recommend_for_limit(case, usable, limit) for limit in ERROR_LIMITS]
     return results, sorted({rows.index(item.chosen) for item in results if item.chosen is not None})
 
 
 def is_comparable(case: AccuracyCase, row: AccuracyRow) -> bool:
-    """Reference runs and failed ones are not recommended."""
+    """Return whether a run succeeded and is not a reference."""
     return row.record["outcome"] == "done" and case.errors[0] in row.errors and "elements" not in row.record["settings"]
 
 
 def _recommend_for_limit(case: AccuracyCase, rows: list[AccuracyRow], limit: float) -> Recommendation:
+    """Recommendation for one limit."""
     best = cheapest_row(case, rows, limit)
     candidate = cheapest_row(case, [row for row in rows if not _is_excluded(case, row)], limit)
     default = cheapest_row(case, [row for row in rows if is_default(row.record["settings"])], limit)
@@ -208,29 +236,33 @@ def _recommend_for_limit(case: AccuracyCase, rows: list[AccuracyRow], limit: flo
 
 
 def _costs_no_more(row: AccuracyRow, other: AccuracyRow | None) -> bool:
+    """Return whether a row costs at most TIMING_NOISE times another."""
     return other is not None and row.core_seconds <= TIMING_NOISE * other.core_seconds
 
 
 def _is_excluded(case: AccuracyCase, row: AccuracyRow) -> bool:
-    """No candidate for a default: of the case's own; a looser CG, which fails on slender bodies, or a
-    looser Newton, which takes the first guess for the answer on slivers (both of case "solver")."""
+    """Return whether a row cannot be a default.
+
+    Excluded are values named by the case, looser CG tolerances (they fail on slender bodies), and looser Newton
+    tolerances (they accept the first guess on slivers; both in case "solver").
+    """
     settings, known = row.record["settings"], defaults()
     if any(settings.get(key, 0.0) > known[key] for key in ("ksp_rtol", "snes_rtol")):
         return True
-    return any(value in case.apart for value in row.record["settings"].values() if isinstance(value, str))
+    return any(value in case.excluded for value in row.record["settings"].values() if isinstance(value, str))
 
 
 def cheapest_row(case: AccuracyCase, rows: list[AccuracyRow], limit: float) -> AccuracyRow | None:
-    """Of those whose error is at most its share of a limit."""
+    """The cheapest row with an error of at most its share of a limit."""
     points = [
         CostPoint(row.core_seconds, row.errors[case.errors[0]], {"row": number}) for number, row in enumerate(rows)
     ]
-    best = cheapest_point(points, limit * case.share)
+    best = cheapest_point(points, limit * case.limit_share)
     return None if best is None else rows[int(best.settings["row"])]
 
 
 def defaults() -> dict[str, Any]:
-    """Settings that trials vary and for which the program has a default."""
+    """Default values of the settings that trials vary."""
     from ....solvers.linear_solver import DEFAULT_OPTIONS
     from ....solvers.preconditioner import GAMG_OPTIONS
     from ....study import PlasticitySettings, TimeSettings
@@ -242,17 +274,18 @@ def defaults() -> dict[str, Any]:
 
 
 def is_default(settings: dict[str, Any]) -> bool:
-    """Whether every setting that has a default is at it."""
+    """Return whether all settings that have a default are at it."""
     known = defaults()
     return all(value == known[key] for key, value in settings.items() if key in known)
 
 
 def _recommendation_text(advice: list[Recommendation], case: AccuracyCase) -> str:
+    """Recommendations and exclusions as text."""
     why = ""
-    if case.share < 1:
-        why = f" The solver may take {case.share:.0%} of a limit: errors of mesh and step come on top."
-    if case.apart:
-        why += f" No candidate for a default: {', '.join(map(str, case.apart))}."
+    if case.limit_share < 1:
+        why = f" The solver may take {case.limit_share:.0%} of a limit: errors of mesh and step come on top."
+    if case.excluded:
+        why += f" No candidate for a default: {', '.join(map(str, case.excluded))}."
     if "ksp_rtol" in case.columns:
         why += (
             " Nor is a looser CG, which fails on slender bodies (ksp-1e-3-slender among the solver settings), nor a "
@@ -262,6 +295,7 @@ def _recommendation_text(advice: list[Recommendation], case: AccuracyCase) -> st
 
 
 def _recommendation_sentence(advice: Recommendation, case: AccuracyCase) -> str:
+    """Recommendation for one limit as text."""
     head = f"For {advice.limit:.0%} of {case.errors[0]}:"
     if advice.chosen is None:
         return f"{head} no setting here is good enough."
@@ -272,13 +306,13 @@ def _recommendation_sentence(advice: Recommendation, case: AccuracyCase) -> str:
 
 
 def describe_setting(row: AccuracyRow) -> str:
-    """In words."""
+    """Settings of a row as text."""
     settings = row.record["settings"].items()
     return ", ".join(f"{key} = {f'{value:.4g}' if isinstance(value, float) else value}" for key, value in settings)
 
 
 def _default_claims(case: AccuracyCase, advice: list[Recommendation]) -> tuple[Claim, ...]:
-    """Where a case varies what has a default: whether the default is what is recommended."""
+    """Claims that the default is the recommended setting, if the case varies a setting with a default."""
     known = defaults()
     if not any(column in known for column in case.columns):
         return ()
@@ -286,6 +320,7 @@ def _default_claims(case: AccuracyCase, advice: list[Recommendation]) -> tuple[C
 
 
 def _default_claim(case: AccuracyCase, advice: Recommendation) -> Claim:
+    """Claim that the default is the recommended setting for one limit."""
     text = f"{case.title}: what is recommended for {advice.limit:.0%} of {case.errors[0]} is the program's default"
     if advice.candidate is None:
         return Claim(text, "no setting reaches it", None)
@@ -303,6 +338,7 @@ def _default_claim(case: AccuracyCase, advice: Recommendation) -> Claim:
 
 
 def _error_table(case: AccuracyCase, rows: list[AccuracyRow], marked: list[int]) -> ReportTable:
+    """Table of errors and times."""
     front = _pareto_rows(case, rows)
     columns = ("trial", *case.columns, "ranks", *(f"error of {name}" for name in case.errors),
                "wall s", "core-seconds", "front", "outcome")  # fmt: skip
@@ -312,6 +348,7 @@ def _error_table(case: AccuracyCase, rows: list[AccuracyRow], marked: list[int])
 
 
 def _table_cells(case: AccuracyCase, row: AccuracyRow, best: bool) -> tuple[TableCell, ...]:
+    """Cells of a row."""
     record = row.record
     settings = (record["settings"].get(key) for key in case.columns)
     errors = (row.errors.get(name) for name in case.errors)
@@ -320,18 +357,21 @@ def _table_cells(case: AccuracyCase, row: AccuracyRow, best: bool) -> tuple[Tabl
 
 
 def _outcome_table(case: AccuracyCase, records: Records) -> ReportTable:
+    """Table of outcomes and messages, for a case without reference."""
     rows = tuple((record["name"], record["outcome"], record["message"]) for record in records)
     return ReportTable(f"precision-{case.name}", case.title, ("trial", "outcome", "message"), rows)
 
 
 def _pareto_rows(case: AccuracyCase, rows: list[AccuracyRow]) -> set[int]:
+    """Numbers of the Pareto-optimal rows."""
     numbers = [number for number, row in enumerate(rows) if is_comparable(case, row)]
     points = [(rows[number].core_seconds, rows[number].errors[case.errors[0]]) for number in numbers]
     return {numbers[place] for place in pareto_front(points)}
 
 
 def _plots(case: AccuracyCase, rows: list[AccuracyRow]) -> tuple[Plot, ...]:
-    usable = [row for row in rows if case.priced and is_comparable(case, row)]
+    """Plots of the error over wall time and core-seconds."""
+    usable = [row for row in rows if case.compare_cost and is_comparable(case, row)]
     if not usable:
         return ()
     return tuple(
@@ -342,6 +382,7 @@ def _plots(case: AccuracyCase, rows: list[AccuracyRow]) -> tuple[Plot, ...]:
 
 
 def _series(case: AccuracyCase, rows: list[AccuracyRow], cost: str) -> tuple[Series, ...]:
+    """Series of a plot, one for each value of `split`."""
     groups: dict[str, list[AccuracyRow]] = {}
     for row in sorted(rows, key=lambda row: float(getattr(row, cost))):
         groups.setdefault(str(row.record["settings"].get(case.split, "")), []).append(row)

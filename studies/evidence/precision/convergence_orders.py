@@ -1,4 +1,4 @@
-"""Orders of convergence for a smooth displacement that is known (manufactured_solution.py), linear and quadratic."""
+"""Convergence of linear and quadratic cells to a smooth manufactured solution (manufactured_solution.py)."""
 
 from __future__ import annotations
 
@@ -13,11 +13,12 @@ KINDS = [*((2, energy) for energy in ENERGIES), (3, "neo-hookean")]
 
 
 def _trial_name(dim: int, energy: str, order: int, cells: int) -> str:
+    """Name of a trial."""
     return f"{energy}-{dim}d-order-{order}-{cells}"
 
 
 def trials() -> list[Trial]:
-    """Every energy in the plane, the one of large strains in space, too."""
+    """Trials of all energies in 2D, and of the neo-Hookean one in 3D."""
     return [
         script_trial("smooth", _trial_name(dim, energy, order, cells), "manufactured_solution",
                {"energy": energy, "dim": dim, "order": order, "h": 1 / cells},
@@ -27,12 +28,14 @@ def trials() -> list[Trial]:
 
 
 def _expected_order(dim: int, energy: str, order: int, error: str) -> ExpectedOrder:
+    """Expected order of one error."""
     names = tuple(_trial_name(dim, energy, order, cells) for cells in CELLS[dim])
     theory = order + (error == "displacement")
     return ExpectedOrder(error, "h", theory, names, of=f"{energy} in {dim}D, cells of order {order}:")
 
 
 def _text(records: Records) -> str:
+    """Text of the section."""
     return (
         "A square or cube of 1 m with strains of 0.3 and rotations of 0.2, under the load that makes them: errors in "
         "L2 of the displacement and of its gradient."
@@ -44,6 +47,6 @@ CASES = [
         "smooth", "A smooth displacement", _text, ("energy", "dim", "order", "h"), measured_errors(*ERRORS), ERRORS,
         tuple(_expected_order(dim, energy, order, error) for dim,
               energy in KINDS for order in (1, 2) for error in ERRORS),
-        split="order", priced=False,
+        split="order", compare_cost=False,
     )
 ]  # fmt: skip

@@ -1,4 +1,4 @@
-"""Both orders of the displacement in one case: the stress of quadratic cells, and what each order costs for 1 %."""
+"""Linear and quadratic elements in one case: stress of quadratic cells, and cost of an error of 1 %."""
 
 from __future__ import annotations
 
@@ -20,8 +20,10 @@ _EDGE_ENDS = [(0, 1), (1, 2), (2, 0)]  # of the middles of a cell, as files have
 
 
 def plane_stress(frame: dict[str, Any], young: float, poisson: float, at: Values) -> Values:
-    """(cells, n, 3) sigma_xx, sigma_yy, sigma_xy in Pa at barycentric points (n, 3) of cells of 6 nodes, from the
-    displacement of a frame: Hooke's law in plane stress."""
+    """Plane stress (cells, n, 3) sigma_xx, sigma_yy, sigma_xy in Pa at barycentric points (n, 3) of cells of 6 nodes.
+
+    From the displacement of a frame by Hooke's law.
+    """
     cells = frame["cells"]
     slopes = np.stack([_shape_derivatives(point) for point in at])  # (n, 6, 2)
     X, u = (frame[name][cells][:, :, :2] for name in ("points", "displacement"))
@@ -33,7 +35,7 @@ def plane_stress(frame: dict[str, Any], young: float, poisson: float, at: Values
 
 
 def _shape_derivatives(point: Values) -> Values:
-    """(6, 2) derivatives of the shape functions l_i (2 l_i - 1) and 4 l_i l_j with l_1 and l_2."""
+    """Derivatives (6, 2) of the shape functions l_i (2 l_i - 1) and 4 l_i l_j by l_1 and l_2."""
     of_corners = (4 * point - 1)[:, None] * CORNERS
     of_middles = [4 * (point[i] * CORNERS[j] + point[j] * CORNERS[i]) for i, j in _EDGE_ENDS]
     with_all = np.vstack([of_corners, of_middles])
@@ -41,7 +43,7 @@ def _shape_derivatives(point: Values) -> Values:
 
 
 def order_claim(records: Records, errors: dict[str, dict[str, float]], key: str) -> Claim:
-    """Whether order 2 reaches 1 % of an error in a fifth of the processor seconds of order 1, in the steps."""
+    """Claim that order 2 reaches an error of 1 % in a fifth of the processor seconds of order 1."""
     text = f"order 2 takes at most {MAX_TIME_SHARE:g} of order 1's core-seconds for {ERROR_LIMIT:.0%} of {key}"
     cheapest: dict[int, tuple[float, str]] = {}
     for record in records:

@@ -32,7 +32,7 @@ LONG_REPORT_SIZES = {"cantilever": 0.004, "plate": 0.00075}  # this size is for 
 
 
 def cantilever(h: float, energy: str = "linear", order: int = 1) -> Study:
-    """1 x 0.1 x 0.1 m of steel, clamped at x = 0, a shear traction on its end."""
+    """Study of 1 x 0.1 x 0.1 m of steel, clamped at x = 0, with a shear traction on its end."""
     return {
         "title": "A cantilever under a force at its end",
         "mesh": {"builder": "box", "size": [LENGTH, DEPTH, DEPTH], "h": h, "order": order},
@@ -44,7 +44,7 @@ def cantilever(h: float, energy: str = "linear", order: int = 1) -> Study:
 
 
 def plate(h: float, order: int = 1) -> Study:
-    """A quarter of a 0.1 x 0.1 m plate with a hole of 0.02 m in plane stress, pulled along x."""
+    """Study of a quarter of a 0.1 x 0.1 m plate with a hole of 0.02 m in plane stress, pulled along x."""
     return {
         "title": "A plate with a hole",
         "mesh": {"builder": "plate-hole", "length": SIDE, "height": SIDE, "radius": RADIUS, "h": h, "order": order},
@@ -63,7 +63,7 @@ STUDIES: dict[str, Callable[..., Study]] = {"cantilever": cantilever, "plate": p
 
 
 def trials() -> list[Trial]:
-    """Both cases over h; the cantilever with every energy and on two ranks too."""
+    """Trials of both cases over h; the cantilever also with all energies and on two ranks."""
     results = [
         study_trial(
             case,
@@ -106,16 +106,17 @@ def trials() -> list[Trial]:
 
 
 def _settings(h: float, energy: str = "linear", order: int = 1) -> dict[str, str | float | int | bool]:
+    """Settings of a trial."""
     return {"h": h, "energy": energy, "order": order}
 
 
 def measure_cantilever(run: Path) -> dict[str, float]:
-    """Deflection of the end under its force, m: put on from nothing, the force has worked over half of it."""
+    """Deflection of the end, m, from the work of a force that grows from 0: half of force times deflection."""
     return {"deflection": float(2 * history(run)["external_work"][-1] / (TRACTION * DEPTH**2))}
 
 
 def measure_plate(run: Path) -> dict[str, float]:
-    """Mean displacement of the pulled edge, m, and the greatest sigma_xx over the traction."""
+    """Mean displacement of the pulled edge, m, and largest sigma_xx over the traction."""
     frame = last_frame(run)
     stress = frame["stress"][:, 0]
     if frame["cells"].shape[1] == 6:  # the field has means over cells, which are larger
@@ -135,11 +136,12 @@ def _references(records: Records, key: str) -> list[tuple[float, float]]:
 
 
 def _converged_value(records: Records, key: str) -> float:
+    """Figure of the finest reference."""
     return _references(records, key)[-1][1]
 
 
 def _convergence_text(records: Records, key: str) -> str:
-    """The reference, and how far it is from converged, in words."""
+    """Reference and its change over the last refinement, as text."""
     (coarse, before), (fine, value) = _references(records, key)[-2:]
     return (
         f"{value:.6g}, which moves by {relative_error(before, value):.1e} of itself from h = {coarse:g} to {fine:g} m"
@@ -147,13 +149,14 @@ def _convergence_text(records: Records, key: str) -> str:
 
 
 def _cantilever_errors(records: Records) -> dict[str, dict[str, float]]:
+    """Relative error of the deflection by trial."""
     exact = _converged_value(records, "deflection")
     measured = {record["name"]: record["figures"]["deflection"] for record in records if record["figures"]}
     return {name: {"deflection": relative_error(value, exact)} for name, value in measured.items()}
 
 
 def _plate_errors(records: Records) -> dict[str, dict[str, float]]:
-    """The error of the stress in the energy norm, squared, is the energy that is missing: a(u, u) - a(u_h, u_h)."""
+    """Errors by trial; the squared energy-norm error of the stress is a(u, u) - a(u_h, u_h)."""
     exact, peak = (_converged_value(records, key) for key in ("deflection", "peak"))
     results = {}
     for record in records:
@@ -166,6 +169,7 @@ def _plate_errors(records: Records) -> dict[str, dict[str, float]]:
 
 
 def _cantilever_text(records: Records) -> str:
+    """Text of the section on the cantilever."""
     beam = timoshenko_deflection(TRACTION * DEPTH**2, LENGTH, DEPTH, DEPTH, YOUNG, POISSON)
     return (
         f"Reference: quadratic elements, {_convergence_text(records, 'deflection')}. Timoshenko's beam, "
@@ -178,6 +182,7 @@ def _cantilever_text(records: Records) -> str:
 
 
 def _plate_text(records: Records) -> str:
+    """Text of the section on the plate."""
     strip, peak = howland_factor(RADIUS / SIDE), _converged_value(records, "peak")
     return (
         f"Reference: quadratic elements, peak stress over traction {_convergence_text(records, 'peak')}; "

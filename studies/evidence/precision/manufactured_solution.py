@@ -1,4 +1,4 @@
-r"""A body with a smooth displacement that is known: its own stress is put on it as a load.
+r"""A body with a smooth manufactured displacement u_m, whose stress is applied as a load.
 
     python -m fracsim.studies.evidence.precision.manufactured_solution --energy linear --dim 2 --order 2 --h 0.125 \
         -o F.json
@@ -36,14 +36,14 @@ AMPLITUDE = 0.15  # of the displacement, m: strains of 0.3, rotations of 0.2
 
 
 def exact_displacement(x: Any, m: Any = np) -> list[Any]:
-    """u_m of coordinates, by the functions of NumPy or UFL."""
+    """Manufactured displacement u_m at coordinates, by the functions of NumPy or UFL."""
     if len(x) == 2:
         return [AMPLITUDE * m.sin(x[0] + 2 * x[1]), AMPLITUDE * m.cos(2 * x[0] - x[1])]
     return [AMPLITUDE * m.sin(x[0] + 2 * x[1]), AMPLITUDE * m.cos(2 * x[1] - x[2]), AMPLITUDE * m.sin(x[2] + x[0])]
 
 
 class ManufacturedLoad(Term):
-    """-int P(u_m) : grad w dX."""
+    """Load -int P(u_m) : grad w dX."""
 
     name = "load"
     linear = True
@@ -61,14 +61,14 @@ class ManufacturedLoad(Term):
 
 
 def plane_rotation(F: Expr) -> Expr:
-    """R of F = R U in the plane: that of F11 + F22 and F21 - F12."""
+    """Rotation R of F = R U in the plane, from F11 + F22 and F21 - F12."""
     a, b = F[0, 0] + F[1, 1], F[1, 0] - F[0, 1]
     return ufl.as_tensor([[a, -b], [b, a]]) / ufl.sqrt(a**2 + b**2)
 
 
 @contextmanager
 def with_manufactured_load() -> Iterator[None]:
-    """Scenes that are built meanwhile have the load."""
+    """Context in which scenes are built with the manufactured load."""
     TERMS["load"] = ManufacturedLoad
     try:
         yield
@@ -77,7 +77,7 @@ def with_manufactured_load() -> Iterator[None]:
 
 
 def solve(energy: str, order: int, dim: int, h: float) -> Scene:
-    """A square or cube of 1 m with its solution in u."""
+    """Scene of a square or cube of 1 m with its solution in u."""
     sides = ["left", "right", "bottom", "top", "front", "back"]
     study = {
         "title": "a smooth displacement",
@@ -97,7 +97,7 @@ def solve(energy: str, order: int, dim: int, h: float) -> Scene:
 
 
 def relative_errors(scene: Scene) -> Values:
-    """(|u - u_m|, |grad(u - u_m)|) in L2, over those of u_m."""
+    """L2 errors of displacement and gradient, relative to u_m."""
     domain, u = scene.domain, scene.balance.u
     x = ufl.SpatialCoordinate(domain.mesh)
     exact = ufl.as_vector(exact_displacement([x[i] for i in range(domain.dim)], ufl))
@@ -110,6 +110,7 @@ def relative_errors(scene: Scene) -> Values:
 
 
 def main() -> None:
+    """Solve and write the errors."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--energy", choices=ENERGIES, required=True)
     parser.add_argument("--dim", type=int, choices=(2, 3), required=True)

@@ -1,6 +1,6 @@
-"""A pulled elastoplastic bar with linear hardening: the bilinear curve E, E K / (E + K), and flow at a finite rate.
+"""Pulled elastoplastic bar with linear hardening: bilinear curve E, E K / (E + K), and viscoplastic flow.
 
-Strains stay below 0.1 %, so that the force over the undeformed section is the true stress to that.
+Strains stay below 0.1 %, so that the force over the undeformed section is the true stress to that accuracy.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ STEPS = {  # by flow rate and update
 
 
 def bar_study(steps: int, rate: float | None, update: str = "extrapolated") -> Study:
-    """A bar between planes of symmetry, free sideways, pulled in one second; `rate` None: independent of the rate."""
+    """Study of a bar between symmetry planes with free sides, pulled in one second; `rate` None: rate-independent."""
     flow = {} if rate is None else {"flow_rate": rate}
     pull = {"time": [0.0, 1.0], "value": [[0.0, "free", "free"], [STRAIN, "free", "free"]]}
     return {
@@ -51,7 +51,7 @@ def bar_study(steps: int, rate: float | None, update: str = "extrapolated") -> S
 
 
 def trials() -> list[Trial]:
-    """dt by flow rate and update; none where the program has no plasticity."""
+    """Trials over dt by flow rate and update; empty if the program has no plasticity."""
     from ....study import Study as Schema
 
     if "plasticity" not in Schema.model_fields:
@@ -66,7 +66,7 @@ def trials() -> list[Trial]:
 
 
 def measure(run: Path) -> dict[str, float]:
-    """Relative error of the stress at the end: force over the undeformed section."""
+    """Relative error of the stress at the end, force over the undeformed section."""
     rate = study(run)["plasticity"].get("flow_rate", inf)
     stress = abs(float(history(run)["reaction_grip_x"][-1])) / 0.25**2
     exact = (
@@ -78,6 +78,7 @@ def measure(run: Path) -> dict[str, float]:
 
 
 def _text(records: Records) -> str:
+    """Text of the section."""
     return (
         "Stress at four times the strain at yield. Independent of the rate: the bilinear curve. Steps solved with "
         "their own flow (implicit) meet it at any size, steps solved with the flow of the step before (extrapolated) "

@@ -1,4 +1,4 @@
-"""What the studies of this group share."""
+"""Trials and settings that the cases of the group share."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ Settings = dict[str, Setting]
 
 
 def study_trial(case: str, name: str, study: Study, measure: str, settings: Settings, **more: Any) -> Trial:
-    """A run of a study; `measure` is a function of this group as "module:function"."""
+    """Trial of a study; `measure` is a function of this group as "module:function"."""
     return Trial(GROUP, case, name, study=study, settings=settings, measure=f"precision.{measure}", **more)
 
 
 def script_trial(
     case: str, name: str, module: str, arguments: dict[str, Any], settings: Settings, **more: Any
 ) -> Trial:
-    """A run of a script of this group that writes figures.json; `arguments` as --key value."""
+    """Trial of a script of this group that writes figures.json; `arguments` as --key value."""
     words = [str(word) for key, value in arguments.items() for word in (f"--{key}", value)]
     return Trial(GROUP, case, name, script=(f"{SCRIPTS}.{module}", *words), settings=settings, **more)
 
 
 def akantu_trials(case: str, h: float, order: int, full: bool = False) -> list[Trial]:
-    """The mesh of a static case solved by Akantu; nothing where it is not installed."""
+    """Trial of a static case solved by Akantu on the same mesh; empty if Akantu is not installed."""
     if akantu_python() is None:
         return []
     words = ("fracsim.studies.evidence.peers.akantu_statics", "--case", case, "--h", str(h), "--order", str(order))

@@ -1,8 +1,8 @@
-"""Quadratic elements on the mesh of a study of linear elasticity: a reference with forms and a solver of its own.
+"""Reference with quadratic elements on the mesh of a study of linear elasticity, with separate forms and solver.
 
     python -m fracsim.studies.evidence.precision.quadratic_reference --case cantilever --h 0.025 -o figures.json
 
-Writes what the measurements of linear_statics.py and vibrating_beam.py write, and `seconds`.
+Writes the figures of linear_statics.py and vibrating_beam.py, and `seconds`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ STUDIES = linear_statics.STUDIES | {"frequency": vibrating_beam.static_study}
 
 
 def assemble_system(study: dict[str, Any]) -> tuple[Any, ...]:
-    """(domain, displacement, stress of it, forms K, M, f of the study with P2 displacements, conditions)."""
+    """(domain, displacement u, stress of u, forms K, M, f, Dirichlet conditions) of the study in P2."""
     import ufl
     from dolfinx import fem
     from mpi4py import MPI
@@ -95,7 +95,7 @@ def deflection(case: str, h: float) -> dict[str, float]:
 
 
 def frequency(h: float) -> dict[str, float]:
-    """f1 in Hz of the beam, from K and the consistent M."""
+    """First frequency (Hz) of the beam, from K and the consistent M."""
     from dolfinx import fem
     from dolfinx.fem import petsc as fem_petsc
     from scipy.sparse import csr_matrix
@@ -115,6 +115,7 @@ def frequency(h: float) -> dict[str, float]:
 
 
 def main() -> None:
+    """Solve and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--case", choices=STUDIES, required=True)
     parser.add_argument("--h", type=float, required=True, help="cell size, m")
