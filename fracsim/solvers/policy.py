@@ -101,7 +101,7 @@ class SolverPolicy:
     # Dofs up to which `[solver] plain = true` preconditions by factors: 3.7 s for 14,000 dofs in space, GAMG above.
     max_plain_direct_dofs: int = 5_000
 
-    # --- fallbacks (nonlinear_solver) ---
+    # --- fallbacks (strategies) ---
     # Restart length of GMRES. With PETSc's 30 it stalls on nearly incompressible bodies.
     gmres_restart: int = 200
     # Solves that begin with positive tangents after exact first tangents have failed in two solves in a row.
