@@ -13,7 +13,8 @@ import pytest
 from hypothesis import settings
 
 from fracsim.meshes.data import MeshData
-from fracsim.study import MeshSettings, check, solver_options
+from fracsim.study import MeshSettings, check
+from fracsim.study.solver_options import PLAIN_VARIABLE
 from repeats import REPEATS
 from support.ranks import Arrays, OnRanks, run_on_ranks
 
@@ -57,15 +58,6 @@ def meshes_built_once() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def plain_where_asked() -> Iterator[None]:
-    """With FRACSIM_PLAIN=1 scenes of this process are solved and assembled as by `[solver] plain = true`."""
-    with pytest.MonkeyPatch.context() as patch:
-        if os.environ.get("FRACSIM_PLAIN") == "1":
-            patch.setattr(solver_options, "uses_plain_solver", lambda _: True)
-        yield
-
-
 @pytest.fixture
 def little_built(monkeypatch: pytest.MonkeyPatch) -> None:
     """`check` measures the loads of small meshes alone: it builds those of up to 60,000 cells."""
@@ -92,6 +84,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if item.nodeid.removeprefix("tests/").startswith(REPEATS):
             item.add_marker("slow")
+        about_fast = item.get_closest_marker("fast_solver_only")
+        if about_fast is not None and os.environ.get(PLAIN_VARIABLE) == "1":
+            item.add_marker(pytest.mark.skip(f"of the fast solver: {about_fast.args[0]}"))
         if item.get_closest_marker("xdist_group") is None:
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
 

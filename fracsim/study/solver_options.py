@@ -9,6 +9,7 @@ target.
 from __future__ import annotations
 
 import json
+import os
 import re
 from typing import Annotated, Any
 
@@ -30,6 +31,7 @@ _TARGETS = (
     "socket", "string", "vtk", "vtu",
 )  # fmt: skip
 PLAIN = "plain"  # the one key of [solver] that is not PETSc's
+PLAIN_VARIABLE = "FRACSIM_PLAIN"  # for tests: see docs/development.md
 # words of keys that print
 _PRINT_WORDS = {"view", "monitor", "reason"}
 
@@ -62,8 +64,11 @@ def check_options(options: Options) -> None:
 
 
 def uses_plain_solver(options: Options) -> bool:
-    """Whether PETSc and DOLFINx alone solve and assemble: `plain = true`."""
-    return options.get(PLAIN) is True
+    """Whether PETSc and DOLFINx alone solve and assemble: `plain = true`.
+
+    Without the key the environment variable FRACSIM_PLAIN decides, which also reaches processes that a test starts.
+    """
+    return options.get(PLAIN, os.environ.get(PLAIN_VARIABLE) == "1") is True
 
 
 def without_plain(options: Options) -> Options:
