@@ -4,7 +4,7 @@ ranks := 2
 export PYTHONDONTWRITEBYTECODE :=
 sources := fracsim forms meshes studies tests
 
-.PHONY: demo test test-all attack readers paraview bench table report report-full study-file gallery lint format clean
+.PHONY: demo test test-plain test-all attack readers paraview bench table report report-full study-file gallery lint format clean
 
 # Tear a loaf of bread in two.
 demo:
@@ -23,6 +23,10 @@ on_ranks = $(shell grep -l "mark.ranks" $(wildcard tests/test_*.py))
 test: readers
 	./env pytest $(parallel) -m "not slow and not ranks"
 	./env pytest -m "not slow and ranks" $(on_ranks)
+
+# The same tests, of PETSc and DOLFINx alone.
+test-plain: export FRACSIM_PLAIN := 1
+test-plain: test
 
 test-all: readers paraview
 	./env pytest $(parallel) -m "not ranks"

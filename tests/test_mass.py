@@ -43,6 +43,7 @@ def test_consistent_mass_is_the_integral(dim: int) -> None:
     np.testing.assert_allclose(inertia.solve((M @ a).reshape(-1), free), a.reshape(-1), atol=1e-10)
 
 
+@pytest.mark.fast_solver_only("blocks of a node")
 @pytest.mark.parametrize("dim", (2, 3))
 def test_a_tangent_in_blocks_has_it(dim: int) -> None:
     """K + c_a M of cells a third of which carry nothing, and were left out before there were blocks: dense, of free

@@ -76,9 +76,11 @@ def test_a_step_that_exact_tangents_do_not_get_through_is_taken() -> None:
     assert scene.solver is not None and scene.solver._newton._second_modified is not None
 
 
-def test_a_first_guess_that_is_inside_out_gives_way_to_the_start_of_the_step() -> None:
+def test_a_first_guess_that_is_inside_out_gives_way_to_the_start_of_the_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """A block whose nodes fly at random by a fifth of its size in a step, with a pressure of nothing on it, which takes
     its potential away: the step is taken whole, momentum is kept, and no cell ends inside out."""
+    # Factors solve even with the tangents of such a guess: Newton's method runs out of iterations, the step is halved.
+    set_policy(monkeypatch, max_plain_direct_dofs=0)
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.34}, solver={},
         material={"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 1.0},
