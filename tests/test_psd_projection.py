@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
-from fracsim.mechanics.psd_projection import psd_correction
+from fracsim.mechanics.psd_projection import plain_psd_correction, psd_correction
 from fracsim.solvers.policy import DEFAULT_POLICY
 from support.reference import dense_tangent
 from support.scenes import displacement, make_scene, positions
@@ -14,9 +16,10 @@ from support.solver_policy import set_policy
 RANDOM = np.random.default_rng(3)
 
 
+@pytest.mark.parametrize("correct", [psd_correction, plain_psd_correction])
 @pytest.mark.parametrize("size", [4, 9])
 @pytest.mark.parametrize("small", [0.0, 0.05])
-def test_matrices_are_made_positive(size: int, small: float) -> None:
+def test_matrices_are_made_positive(correct: Callable[..., None], size: int, small: float) -> None:
     """By their negative eigenvalues (LAPACK's), where one of them is below - small of their mean; one of nothing and
     one with equal eigenvalues are among them."""
     roots = RANDOM.normal(size=(203, size, size))
@@ -29,7 +32,7 @@ def test_matrices_are_made_positive(size: int, small: float) -> None:
     expected = (vectors * -np.minimum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1) * lifted[:, None, None]
     found, filled = np.full((len(A) + 1, size, size), 7.0), np.ones(len(A), np.uint8)
     for order in (slice(None), slice(None, None, -1)):  # once more with what the first time has left
-        psd_correction(np.ascontiguousarray(A[order]), small, found, filled)
+        correct(np.ascontiguousarray(A[order]), small, found[:-1], filled)
         np.testing.assert_allclose(found[:-1], expected[order], atol=1e-10)
         np.testing.assert_array_equal(filled, lifted[order])
     assert (found[-1] == 7.0).all()

@@ -1,7 +1,8 @@
 """Selection of how forms are assembled and expressions are evaluated: by DOLFINx, or by faster kernels in C.
 
-This is the one place that chooses. Every kernel has a plain counterpart in DOLFINx, which is used where a method here
-returns None: with `plain`, for small bodies, without a compiler, or for forms that the kernels do not support.
+This is the one place that chooses. Every kernel has a plain counterpart in DOLFINx or NumPy, which is used where a
+method here returns None: with `plain`, for small bodies, without a compiler, or for forms that the kernels do not
+support.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
 
     from .cell_subset_assembly import CellSubsetAssembler
     from .jit import CellForm
+    from .psd_projection import Flags, Values
     from .simd_kernels import SimdBilinearForm, SimdExpression, SimdFunctional, SimdLinearForm
 
 
@@ -91,6 +93,14 @@ class KernelSelection:
         from .block_matrix import compile_block_product
 
         return compile_block_product(comm, size)
+
+    def psd_correction(self) -> Callable[[Values, float, Values, Flags], None] | None:
+        """Function that corrects moduli with negative eigenvalues, see psd_projection."""
+        if self.plain:
+            return None
+        from .psd_projection import psd_correction
+
+        return psd_correction
 
     def cell_subset(self, form: CellForm) -> CellSubsetAssembler | None:
         """Assembler of a linear form over a subset of its cells."""

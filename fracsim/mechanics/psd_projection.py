@@ -27,6 +27,7 @@ from .jit import CellForm, cell_measure, point_expression, point_field
 from .stress import Stress
 
 Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.uint8]
 
 SOURCE = Path(__file__).with_suffix(".c")
 LANES = 4  # matrices at a time: doubles in a vector register of AVX2
@@ -47,7 +48,8 @@ class PsdProjection:
         P = stress.energy_factor * ufl.diff(stress.energy.psi(F, stress.rotation_field), F)
         self._moduli = point_expression(domain, ufl.diff(P, F), kernels=stress.kernels)
         self._field = point_field(domain, (d * d, d * d), "correction of moduli")
-        self._size, self._cells, self._plain = d * d, domain.cell_count, stress.kernels.plain
+        self._size, self._cells = d * d, domain.cell_count
+        self._correct = stress.kernels.psd_correction() or plain_psd_correction
         self._nonzero = np.zeros(len(self._field.x.array) // d**4, np.uint8)
         v, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
         components = [(i, j) for i in range(d) for j in range(d)]
@@ -68,21 +70,19 @@ class PsdProjection:
             cells = np.arange(first, min(first + BLOCK, self._cells), dtype=np.int32)
             block = slice(points * first, points * (first + len(cells)))
             moduli = self._moduli.evaluate_at_points(cells).reshape(-1, n, n)
-            if self._plain:
-                C[block] = plain_psd_correction(moduli, tolerance)
-            else:
-                psd_correction(moduli, tolerance, C[block], self._nonzero[block])
+            self._correct(moduli, tolerance, C[block], self._nonzero[block])
 
 
-def plain_psd_correction(A: Values, tolerance: float) -> Values:
-    """(k, n, n) corrections of symmetric matrices A (k, n, n) by LAPACK; see psd_correction."""
+def plain_psd_correction(A: Values, tolerance: float, C: Values, nonzero: Flags) -> None:
+    """Put the corrections of matrices A into C by LAPACK; see psd_correction."""
     eigenvalues, vectors = np.linalg.eigh(A)
     corrected = eigenvalues[:, 0] < -tolerance * eigenvalues.mean(axis=1)
     negative = np.where(corrected[:, None], np.minimum(eigenvalues, 0.0), 0.0)
-    return np.asarray(-(vectors * negative[:, None]) @ vectors.transpose(0, 2, 1))
+    C[:] = -(vectors * negative[:, None]) @ vectors.transpose(0, 2, 1)
+    nonzero[:] = negative.any(axis=1)
 
 
-def psd_correction(A: Values, tolerance: float, C: Values, nonzero: npt.NDArray[np.uint8]) -> None:
+def psd_correction(A: Values, tolerance: float, C: Values, nonzero: Flags) -> None:
     """Put the corrections of matrices A into C, in a tenth to a third of the time of one LAPACK call a matrix.
 
     Args:
