@@ -168,7 +168,7 @@ def test_any_solver_options_are_forgotten() -> None:
 
 def test_a_step_is_read_in_few_files() -> None:
     """One implicit step without contact crosses files fewer than 150 times (a goal of the structure)."""
-    from fracsim.studies.file_crossings import STUDY, crossings
+    from fracsim.studies.cross_file_calls import STUDY, count_calls
 
-    calls = crossings(STUDY)
+    calls = count_calls(STUDY)
     assert 0 < sum(calls.values()) < 150, calls.most_common(20)

@@ -17,8 +17,7 @@ from .linear_solver import LinearSolver
 from .newton import NewtonSolver, SolveResult
 from .petsc_options import PetscOptions, option_errors
 from .policy import SolverPolicy
-from .solver_selector import PositiveTangentSpell, SolverSelector
-from .strategies import ITERATIVE_NAMES, STRATEGIES, Solvers, Task, try_in_turn
+from .strategies import ITERATIVE_NAMES, STRATEGIES, PositiveTangentSpell, Solvers, SolverSelector, Task, try_in_turn
 
 Values = npt.NDArray[np.float64]
 
@@ -49,13 +48,14 @@ class NonlinearSolver:
         self.balance, self._given, self._plain = balance, given, plain
         self._policy = policies.DEFAULT_POLICY if policy is None else policy
         self._earlier_failures = 0  # linear solves that failed before `rebuild`
-        self._stop_requested: Callable[[], bool] = lambda: False
+        self._stop_requested: Callable[[], bool] | None = None
         self._create_solvers()
 
     def _create_solvers(self) -> None:
         balance, policy = self.balance, self._policy
         newton = self._newton = NewtonSolver(balance, self._given, policy, plain=self._plain)
-        newton.set_stop_request(self._stop_requested)
+        if self._stop_requested is not None:
+            newton.set_stop_request(self._stop_requested)
         self.attempts: list[str] = []
         is_default = not any(key.startswith(("ksp_type", "pc_", "mg_")) for key in self._given)
         direct_is_cheap = newton.linear.may_factorise(policy.max_direct_before_gmres(balance.domain.dim))
