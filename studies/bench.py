@@ -99,7 +99,7 @@ def break_edges(run: Any, flags: Any) -> None:
     fracture.graph.break_unloaded_edges()
     fracture.degradation(True, *fracture.evaluate_undamaged_stress())
     fracture.mark_changed()
-    run.state = run.scene.stepper.with_current_history(run.state)
+    run.state = run.scene.stepper.inelastic.with_snapshot(run.state)
     run.record_breaks()
     run.scene.balance.damage_changed()
     run.scene.solver.edges_broke(None)

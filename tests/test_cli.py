@@ -145,7 +145,7 @@ for scheme in {schemes}:
     assert scene.balance.stress.chi is None and scene.fracture is None
 parts = ("mesh.edge_graph", "mesh.fragments", "mesh.split_surface", "fracture", "report", "mechanics.plasticity")
 parts += ("mechanics.plasticity", "mechanics.return_mapping", "mechanics.tensor_functions", "forms.plasticity")
-parts += ("timestepping.stable_time_step_damaged", "forms.crack_closure", "forms.damage", "rigid", "scene.rigid_scene")
+parts += ("forms.crack_closure", "forms.damage", "rigid", "scene.rigid_scene")
 absent = ("scipy", "mujoco", "fracsim.rigid")
 contact = ("fracsim.contact", "fracsim.scene.contact")
 absent = [name for name in sys.modules if name.startswith(contact) or name in absent]

@@ -14,7 +14,7 @@ from fracsim.forms.crack_closure import spring_modulus
 from fracsim.forms.energies import lame
 from fracsim.mesh.simplices import local_edges
 from fracsim.scene import Scene
-from fracsim.timestepping.stable_time_step_damaged import projected_frequencies, spring_frequencies
+from fracsim.timestepping.stable_time_step import projected_frequencies, spring_frequencies
 from fracsim.timestepping.state import State
 from support.reference import gradients, stiffness
 from support.scenes import deform, each_step, make_scene, march

@@ -46,7 +46,7 @@ def test_a_law_that_softens_weakens_cells_by_degrees() -> None:
     is (3/4 + 1/2) / (1 + 1/2) = 5/6, as the diagonals carry half of the stress along the load (test_fracture)."""
     scene, state = make_scene(**PULL)
     part = scene.fracture
-    scene.stepper.breaking = FracturePass(part.stress, part.graph, part.criterion, Softening(), max_passes=1)
+    scene.stepper.inelastic.fracture = FracturePass(part.stress, part.graph, part.criterion, Softening(), max_passes=1)
     march(scene, state, 5)
     graph = part.graph
     aligned = np.ptp(scene.domain.nodes[graph.edge_nodes][:, :, 1], axis=1) < 1e-9
@@ -74,7 +74,7 @@ def test_a_checkpoint_holds_the_numbers(tmp_path: Path) -> None:
     graph = going.scene.fracture.graph
     graph.weaken(np.random.default_rng(3).choice([0.0, 0.25, 0.5, 1.0], len(graph.integrity)))
     going.scene.fracture.damage_restored()
-    going.state = going.scene.stepper.with_current_history(going.state)
+    going.state = going.scene.stepper.inelastic.with_snapshot(going.state)
     going.checkpoint()
     again = Run(build_scene(MPI.COMM_SELF, make_study(**tables)), tmp_path, restart=True)
     np.testing.assert_array_equal(again.scene.fracture.graph.integrity, graph.integrity)

@@ -11,7 +11,7 @@ from scipy.linalg import eigh
 from fracsim.forms.energies import lame
 from fracsim.mechanics.stability_limit import SAFETY, stable_step
 from fracsim.scene import Scene
-from fracsim.timestepping import stable_time_step_damaged
+from fracsim.timestepping import stable_time_step
 from fracsim.timestepping.explicit import ExplicitStepper
 from fracsim.timestepping.stable_time_step import cell_frequencies, damaged_frequencies
 from fracsim.timestepping.state import State
@@ -109,8 +109,8 @@ def test_the_stable_step_follows_every_break(approach: str, unilateral: bool, mo
         time={"scheme": "explicit", "step": 1.0, "end": 100.0},
         output={"every": 100},  # no step is shortened for a frame
     )
-    evaluate, evaluations = stable_time_step_damaged.edge_frequencies, []
-    monkeypatch.setattr(stable_time_step_damaged, "edge_frequencies", lambda e: evaluations.append(e) or evaluate(e))
+    evaluate, evaluations = stable_time_step.edge_frequencies, []
+    monkeypatch.setattr(stable_time_step, "edge_frequencies", lambda e: evaluations.append(e) or evaluate(e))
     broke, steps = 1, []
     for _ in range(80):
         stress = scene.balance.stress

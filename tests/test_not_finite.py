@@ -47,7 +47,7 @@ def test_a_step_that_ends_so_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyP
     for _ in range(2):
         run.step()
     path, good = run.checkpoint(), run.state
-    book, failed = stepper._booked, []
+    book, failed = stepper._close_step, []
 
     def astray(end: Any, *rest: Any) -> Any:
         which = "u" if name == "quasi-static" else "v"
@@ -56,7 +56,7 @@ def test_a_step_that_ends_so_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyP
         failed.append(end.t)
         return book(replace(end, **{which: values}), *rest)
 
-    monkeypatch.setattr(stepper, "_booked", astray)
+    monkeypatch.setattr(stepper, "_close_step", astray)
     with pytest.raises(NotConverged) as end:
         run()
     assert len(set(failed)) > 5  # each half of the last one

@@ -164,8 +164,8 @@ def test_a_step_is_solved_with_the_last_flow_once_more(energy: str) -> None:
     plastic, random = scene.balance.stress.material.plastic, np.random.default_rng(5)
     before = np.eye(3) + 0.1 * random.uniform(-1, 1, (3, 3))
     deform(scene, before)
-    scene.stepper.flow.begin_step(0.1)
-    scene.stepper.flow()
+    scene.stepper.inelastic.flow.begin_step(0.1)
+    scene.stepper.inelastic.flow()
     rows = plastic.inverse_rows.copy()
     G = rows[0].reshape(3, 3)
     F, H = before + 0.1 * random.uniform(-1, 1, (3, 3)), random.uniform(-1, 1, (3, 3))
@@ -192,8 +192,8 @@ def test_a_stretch_never_turns_over() -> None:
     """Flow that took nearly all of a deviator, then a step ten times as long: the stand-in keeps det F_p = 1."""
     scene, _ = homogeneous("neo-hookean", yield_stress=1e-4)
     deform(scene, np.diag([3.0, 1.0, 0.3]))
-    scene.stepper.flow.begin_step(0.1)
-    scene.stepper.flow()
+    scene.stepper.inelastic.flow.begin_step(0.1)
+    scene.stepper.inelastic.flow()
     plastic = scene.balance.stress.material.plastic
     G = plastic.inverse_rows[0].reshape(3, 3).copy()
     plastic.begin_step(1.0)
@@ -208,10 +208,10 @@ def test_the_energy_known_from_flow_is_the_assembled_one(energy: str, measure: s
     for size in (0.02, 0.3) if measure == "von-mises" else (0.02,):  # pressure does not flow
         scene, _ = homogeneous(energy, yield_stress=0.01, hardening=0.02, measure=measure)
         deform(scene, np.eye(3) + size * np.random.default_rng(2).uniform(-1, 1, (3, 3)))
-        scene.stepper.flow.begin_step(0.1)
-        scene.stepper.flow()
+        scene.stepper.inelastic.flow.begin_step(0.1)
+        scene.stepper.inelastic.flow()
         assert plastic_strain(scene).all()
-        assert scene.stepper.flow.elastic_energy == pytest.approx(
+        assert scene.stepper.inelastic.flow.elastic_energy == pytest.approx(
             scene.balance.stress.stored_energy(), rel=10 * POLICY.tolerance
         )
 
@@ -270,7 +270,7 @@ def test_the_return_is_that_of_a_dense_solver(energy: str, measure: str) -> None
     Y, K, share = 0.05, 0.2, 0.7
     rate = -np.log(1 - share) / 0.1
     scene, _ = homogeneous(energy, yield_stress=Y, hardening=K, measure=measure, flow_rate=rate)
-    random, flow = np.random.default_rng(3), scene.stepper.flow
+    random, flow = np.random.default_rng(3), scene.stepper.inelastic.flow
     F, law = np.eye(3) + 0.25 * random.uniform(-1, 1, (3, 3)), law_of(ENERGIES[energy](MU, LAMBDA), 3)
     F *= 1.01 / np.cbrt(np.linalg.det(F))  # little pressure: the Frobenius norm can come down to yield
     G = np.eye(3) + 0.2 * random.uniform(-1, 1, (3, 3))
@@ -306,8 +306,8 @@ def test_stress_beyond_yield_decays_with_the_flow_rate(energy: str) -> None:
         scene, state = homogeneous(energy, yield_stress=Y, flow_rate=rate)
         deform(scene, F)
         for _ in range(round(0.5 / dt)):
-            scene.stepper.flow.begin_step(dt)
-            scene.stepper.flow()
+            scene.stepper.inelastic.flow.begin_step(dt)
+            scene.stepper.inelastic.flow()
         found = FieldEvaluator(scene.balance.stress, ["von_mises"])(state, None)[1].values
         np.testing.assert_allclose(found, Y + (q_0 - Y) * np.exp(-rate * 0.5), rtol=20 * POLICY.tolerance)
 
@@ -319,8 +319,8 @@ def led(scene: Scene, path: Any, steps: int) -> None:
     """Lead the body through the deformation gradients path(t), t in [0, 1]."""
     for n in range(1, steps + 1):
         deform(scene, path(n / steps))
-        scene.stepper.flow.begin_step(1 / steps)
-        scene.stepper.flow()
+        scene.stepper.inelastic.flow.begin_step(1 / steps)
+        scene.stepper.inelastic.flow()
 
 
 def winding(t: float) -> Values:

@@ -14,7 +14,7 @@ from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study.check import check_study
 from fracsim.study.reader import validate
-from fracsim.timestepping.stepper import StepSizes
+from fracsim.timestepping.step_sizes import StepSizes
 from support.scenes import make_study
 
 TABLE = {"time": [0.0, 0.1, 0.15, 0.3, 0.301], "value": [0.02, 0.02, 0.05, 0.05, 0.01]}

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from ..fracture.brittle.surface_criterion import BrittleSurfaces
     from ..fracture.edge_history import EdgeHistory
 
-_CLOCK = ("t", "step", "dt", "dissipated", "work", "easy")
+_CLOCK = ("t", "step", "dt", "dissipated", "work")
 _NODAL = ("u", "v", "a", "forces")
 _OPTIONAL_NODAL = ("drag", "out_of_balance")
 _EDGES = ("weakened", "integrity", "broken", "breaks")
@@ -78,7 +78,7 @@ def write_checkpoint(
     terms = balance.histories.to_checkpoint()
     nodal = {name: getattr(state, name) for name in (*_NODAL, *_OPTIONAL_NODAL)}
     clock: dict[str, Any] = {name: getattr(state, name) for name in _CLOCK}
-    clock |= {"elastic": float(sum_over_ranks(comm, state.elastic)[0]), "dt_before": 0.0}
+    clock |= {"easy": state.easy_steps, "elastic": float(sum_over_ranks(comm, state.elastic)[0]), "dt_before": 0.0}
     if state.previous_increment is not None:
         nodal["u_before"], clock["dt_before"] = state.previous_increment
     nodal = {name: values for name, values in nodal.items() if values is not None}
@@ -195,6 +195,7 @@ def read_checkpoint(
         rows = scattered(domain.gather_cells, "plastic")
         plastic.restore(rows.reshape(-1, rows.shape[-1]))
     values: dict[str, Any] = {name: clock[name] for name in _CLOCK} | nodal
+    values["easy_steps"] = clock["easy"]
     # the energy is a sum over the ranks: rank 0 takes all of it
     values["elastic"] = 0.0 if comm.rank else clock["elastic"]
     values["previous_increment"] = None if before is None else (before, clock["dt_before"])
@@ -235,7 +236,7 @@ class _ContentChecks:
         dropped = {name for name in arrays if name.startswith("term.tethers") and not self.fracture}
         allowed = {*self.shapes, *optional, *dropped}
         check_names(arrays, {name for name in self.shapes if not _has_prefix(name, added)}, allowed, path)
-        numbers = {*_CLOCK, "elastic", "dt_before"}
+        numbers = {*_CLOCK, "easy", "elastic", "dt_before"}
         check_names(stored.clock, numbers, numbers, path)
         for name, values in arrays.items():
             if problem := self._shape_problem(name, values) or self._value_problem(name, values):

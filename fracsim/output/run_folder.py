@@ -19,7 +19,7 @@ from petsc4py import PETSc
 
 from .. import __version__
 from ..errors import InputError
-from ..timestepping.stepper import count_intervals
+from ..timestepping.step_sizes import count_intervals
 from .atomic_write import error_reason, replace_text
 from .checkpoint_file import checkpoint_path, read_notes
 from .fields_file import check_self_contained, read_frame_times

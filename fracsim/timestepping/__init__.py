@@ -1,13 +1,13 @@
-"""From one state to the next.
+"""Time stepping: from the state of a body at one time to the state at the next.
 
-state                     what a run carries from step to step; damage and flow as values in the state
-stepper                   what a stepper is; attempts, halved steps, arrival and books, as all schemes share them
-implicit                  steps of schemes with inertia that solve a system
-quasi_static              load steps: balance and breaking in turn until nothing changes
-explicit                  steps without a system
-protocols                 what flows and breaks at the end of a step; empty parts where nothing does
-energy_balance            work and viscous loss of a step; what broken edges no longer hold
-stable_time_step          bounds on how fast cells vibrate, for explicit steps
-stable_time_step_damaged  the same of cells with broken edges
-initial_conditions        velocity at the start
+state             state of a body between two steps, and its initial velocity
+stepper           interface of a stepper, and the parts of a step that all schemes share
+implicit          steps of schemes with inertia that solve a nonlinear system
+quasi_static      load steps without inertia: equilibrium and fracture in turn
+explicit          steps without a system of equations
+step_sizes        bounds of the step, reduction after a failure, growth after success
+stable_time_step  bounds of the eigenfrequencies of cells, for explicit steps
+inelastic_update  plastic flow, fracture and history variables of a body
+protocols         interfaces of plastic flow and of fracture, and implementations of a body without them
+energy_balance    work, dissipation and stored energy of a step; forces released by fracture
 """

@@ -1,38 +1,51 @@
-"""External work and viscous dissipation of a step, for the energy balance of history.csv.
+"""Energy balance of a step: work, dissipation and stored energy; forces and acceleration after fracture.
 
-Equations: docs/theory.md#energy-balance.
-
-What broken edges no longer hold, of reactions and of accelerations, from which the next step starts.
-
-M a of before would push for a part of it once more, with energy that is counted as dissipated. The acceleration
-changes by c_a (c_a M + K)^-1 f of the forces f that the breaks released, K of the body before them: M^-1 f for motion
-that steps resolve, with an error of second order, and as good as nothing for what is over long before the step's end.
-M^-1 f itself, or K after the breaks, sets slivers and cells that hang by an edge ringing: energy that was kept to 1 %
-doubled. Contact is not in K: blows (mechanics.contact_time_weights) are no part of the acceleration that is carried,
-and what it loses by breaks inside a body has no resultant.
-
-Equations: docs/theory.md#time-integration.
+Equations: docs/theory.md#energy-balance, docs/theory.md#time-integration.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from ..mechanics.balance import Balance
 from ..mechanics.term_protocols import SurfaceSeparator
+from ..mesh.parallel import sum_over_ranks
 from .state import State
 
 Values = npt.NDArray[np.float64]
 
 
-def balanced_forces(balance: Balance, *, lumped: bool) -> tuple[Values, Values | None]:
-    """(loads and reactions, damping forces) at the level of the step where they balance; (owned dofs,), N.
+class NonFiniteState(Exception):
+    """The state at the end of a step is not finite (on all ranks)."""
 
-    Without the inertia of prescribed dofs where mass is `lumped` (`work_done`).
+
+@dataclass(frozen=True)
+class StepEnergies:
+    """Energies of a step on this rank, J.
+
+    Attributes:
+        work: external work.
+        dissipated: energy lost to fracture, plastic flow and damping.
+        elastic: elastic energy of the body at the end of the step.
+    """
+
+    work: float
+    dissipated: float
+    elastic: float
+
+
+def balanced_forces(balance: Balance, *, lumped: bool) -> tuple[Values, Values | None]:
+    """Return loads and reactions, and damping forces, at the level where the step balances them, (owned dofs,), N.
+
+    Args:
+        balance: after the solve of a step.
+        lumped: leave out the inertia of prescribed dofs, as `step_work` needs it with a lumped mass.
     """
     owned = balance.motion.owned_dofs
     forces = balance.energies.applied_forces()
@@ -45,20 +58,27 @@ def balanced_forces(balance: Balance, *, lumped: bool) -> tuple[Values, Values |
 def step_work(
     balance: Balance, start: State, u: Values, v: Values, forces: Values, drag: Values | None, *, lumped: bool
 ) -> tuple[float, float]:
-    """External work and viscous dissipation of a step from `start` to u, v on this rank, J.
+    """Return external work and viscous dissipation of a step on this rank, J.
 
-    Forces change linearly in time: those of this step (`forces`, `drag`) belong to t + (1 - alpha_f) dt, those of the
-    last one to t - alpha_f dt; their line is taken at t + dt/2. Forces at the end of a step of generalized-alpha would
-    not do, since they balance nothing: the pressure of a nearly incompressible body is off there by lambda |grad du|^2.
+    Forces are linear in time. Those of this step belong to t + (1 - alpha_f) dt, those of the last one to t - alpha_f
+    dt; their line is evaluated at t + dt/2.
 
-    The inertia of prescribed dofs, whose velocity may jump, is not among the forces where mass is `lumped`: what moves
-    them is the gain of their kinetic energy.
+    Args:
+        balance: gives scheme, mass and prescribed dofs.
+        start: state at the start of the step.
+        u: displacement at its end, m.
+        v: velocity at its end, m/s.
+        forces: loads and reactions of this step, N.
+        drag: its damping forces, N; None without damping.
+        lumped: the work that moves prescribed dofs is the gain of their kinetic energy, since their velocity may jump.
     """
+    # Forces at the end of a step of generalized-alpha balance nothing: the pressure of a nearly incompressible body is
+    # wrong there by lambda |grad du|^2.
     late, owned, increment = balance.scheme.alpha_f, balance.motion.owned_dofs, u - start.u
-    gained = 0.0
+    kinetic_gain = 0.0
     if lumped:
-        gained = 0.5 * float(balance.mass.lumped[owned] @ (v[owned] ** 2 - start.v[owned] ** 2))
-    work = float(((0.5 + late) * forces + (0.5 - late) * start.forces) @ increment) + gained
+        kinetic_gain = 0.5 * float(balance.mass.lumped[owned] @ (v[owned] ** 2 - start.v[owned] ** 2))
+    work = float(((0.5 + late) * forces + (0.5 - late) * start.forces) @ increment) + kinetic_gain
     viscous = 0.0
     if drag is not None:
         earlier = start.drag if start.drag is not None else 0.0
@@ -66,18 +86,60 @@ def step_work(
     return work, viscous
 
 
+def add_step_energies(balance: Balance, end: State, step: StepEnergies) -> tuple[State, float, float]:
+    """Return the state at the end of a step with its energies, and kinetic and stored energy, J (collective).
+
+    Args:
+        balance: its terms give their energies and work.
+        end: state at the end of the step, with the energies of its start.
+        step: energies of the step without those of the terms.
+
+    Raises:
+        NonFiniteState: the state or its energies are not finite.
+    """
+    _check_finite(balance.domain.comm, end, step.work + step.dissipated + step.elastic)
+    elastic = step.elastic
+    elastic += sum(term.stored_energy() for term in balance.terms if term is not balance.stress)
+    term_work, friction_loss = balance.energies.step_work()
+    # Energy that contact stores because its stiffness rises, which does external work.
+    stiffening_work = balance.contact.stiffen()
+    work = step.work + term_work + stiffening_work
+    dissipated, elastic = step.dissipated + friction_loss, elastic + stiffening_work
+    kinetic = balance.energies.kinetic_energy(end.v) if balance.scheme.inertia else 0.0
+    sums = sum_over_ranks(balance.domain.comm, np.array([work, dissipated, kinetic, elastic]))
+    work, dissipated, kinetic, stored = map(float, sums)
+    end = replace(end, elastic=elastic, work=end.work + work, dissipated=end.dissipated + dissipated)
+    return end, kinetic, stored
+
+
+def _check_finite(comm: MPI.Comm, end: State, energies: float) -> None:
+    """Raise NonFiniteState if the end of a step, or the squares of its values, are not finite (collective)."""
+    squares = sum(float(np.vdot(values, values)) for values in (end.u, end.v, end.a, end.forces))
+    if not comm.allreduce(math.isfinite(squares + energies), op=MPI.LAND):
+        raise NonFiniteState
+
+
 def released_state(
     balance: Balance,
     end: State,
     solved: Values,
-    before: Sequence[Values],
+    previous_damage: Sequence[Values],
     response: Callable[[Values], Values] | None,
 ) -> State:
-    """The end of a step with the forces and the acceleration that belong to the damage of now (collective).
+    """Return the end of a step with the forces and the acceleration after its edges broke (collective).
 
-    `before`: the fields of damage as they were. `solved`: (owned dofs,) displacement at which the step's forces
-    balance; the end of a step of generalized-alpha is an extrapolation. `response`: displacement that forces (owned
-    dofs,) cause in a step, linearly; None where steps resolve all motion (explicit ones).
+    The acceleration changes by c_a (c_a M + K)^-1 f, f the forces that the breaks released and K the tangent before
+    them. This is M^-1 f for motion that steps resolve, with an error of second order, and almost 0 for motion that is
+    much faster.
+
+    Args:
+        balance: at the end of the step.
+        end: state before the release.
+        solved: (owned dofs,) displacement at which the forces of the step balance, m. The end of a step of
+            generalized-alpha is an extrapolation.
+        previous_damage: damage fields before the breaks.
+        response: linear displacement response of a step to forces (owned dofs,), m; None for explicit steps, which
+            resolve all motion.
     """
     owned, forces = balance.motion.owned_dofs, end.forces.copy()
     reactions = balance.reactions[owned]
@@ -86,17 +148,23 @@ def released_state(
         forces[owned] += balance.reactions[owned] - reactions
         return replace(end, forces=forces)
     free = balance.motion.free_dofs
-    if response is None:  # forces balance at the end of the step, where the body is
-        lost = balance.stress.assemble_released_forces(before)
-        change = balance.mass.solve(np.where(free, lost, 0.0), free)
+    if response is None:
+        # Forces balance at the end of the step, where the body is.
+        released = balance.stress.assemble_released_forces(previous_damage)
+        change = balance.mass.solve(np.where(free, released, 0.0), free)
     else:
         balance.set_displacement(solved)
-        lost = balance.stress.assemble_released_forces(before)
-        current = balance.stress.exchange_damage(before)
+        released = balance.stress.assemble_released_forces(previous_damage)
+        # K is that before the breaks. With K after them, or with M^-1 f, slivers and cells that are attached by one
+        # edge begin to vibrate: the error of the energy balance was twice the energy where it is 1 % now.
+        current = balance.stress.exchange_damage(previous_damage)
         if any(isinstance(term, SurfaceSeparator) for term in balance.terms):
-            balance.set_displacement(end.u)  # gaps are open at the step's end, and need not be where forces balance
-        change = balance.c_a * response(np.where(free, lost, 0.0))
+            # New crack faces are apart at the end of the step, and may not be where its forces balance.
+            balance.set_displacement(end.u)
+        # The response leaves contact out: contact forces are not part of the acceleration that is carried on
+        # (mechanics.contact_time_weights), and a break inside a body changes no resultant of them.
+        change = balance.c_a * response(np.where(free, released, 0.0))
         balance.stress.exchange_damage(current)
         balance.set_displacement(end.u)
-    forces[owned] -= lost[owned]
+    forces[owned] -= released[owned]
     return replace(end, forces=forces, a=end.a + change)

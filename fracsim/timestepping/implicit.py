@@ -1,120 +1,113 @@
-"""Implicit steps: a nonlinear solve, then the passes of fracture, each of which may solve the step again."""
+"""Implicit steps with inertia: a nonlinear solve, then fracture passes, each of which may be followed by a solve."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.balance import Balance
-from ..mesh.parallel import sum_over_ranks
 from ..solvers.newton import SolveResult
 from ..solvers.nonlinear_solver import NonlinearSolver
 from .energy_balance import released_state
 from .protocols import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
 from .state import State
-from .stepper import BalanceStepper, StepSizes
+from .step_sizes import StepSizes
+from .stepper import BalanceStepper
 
 Values = npt.NDArray[np.float64]
 
 
 class ImplicitStepper(BalanceStepper):
-    """Steps of a scheme with inertia that solves for the displacement."""
+    """Stepper of a scheme with inertia that solves for the displacement.
+
+    Attributes:
+        solver: solves r(u) = 0 of a step.
+    """
 
     def __init__(
         self,
         balance: Balance,
         sizes: StepSizes,
         flow: PlasticFlowProtocol,
-        breaking: FractureProtocol,
+        fracture: FractureProtocol,
         solver: NonlinearSolver,
     ) -> None:
-        super().__init__(balance, sizes, flow, breaking)
+        super().__init__(balance, sizes, flow, fracture, solver)
         self.solver = solver
 
     def set_stop_request(self, stop_requested: Callable[[], bool]) -> None:
-        """Ask `abandons` (collective) between Newton iterations whether the step is to be abandoned."""
+        """Ask `stop_requested` (collective) between Newton iterations whether the step is to be aborted."""
         self.solver.set_stop_request(stop_requested)
 
     def failure_counts(self) -> dict[str, int]:
-        """Counts by name of what failed on the way, over all ranks (collective)."""
+        """Return the numbers of failures by name, over all ranks (collective)."""
         return super().failure_counts() | {"linear_failures": self.solver.linear_failures}
 
-    def _recalled(self) -> None:
-        super()._recalled()
-        self._tell_solver()
-
-    def _tell_solver(self) -> None:
-        """Tell the solver of the damage that there is, whenever that came about."""
-        pattern = self.breaking.broken_edge_patterns
-        torn = pattern is not None and sum_over_ranks(self.comm, np.count_nonzero(pattern))[0] > 0
-        self.solver.edges_broke(None if torn else 0)
-
     def discard_unsaved_data(self) -> None:
-        """Forget tangent, preconditioner, factors, and what earlier solves have told of the next one (collective)."""
+        """Discard tangent, preconditioner, factors and estimates from earlier solves (collective)."""
         self.balance.clear_search()
         self.solver.rebuild()
-        self._tell_solver()
+        self.inelastic.tell_listener()
 
     def _attempt(self, state: State, dt: float) -> SolveResult:
         return self._solve(state, dt, self._guess(state, dt))
 
     def _solve(self, state: State, dt: float, guess: Values) -> SolveResult:
-        began = time.perf_counter()
-        self._begin(state, dt)
-        result = self.solver.solve(guess)
-        self.phases["solve"] += time.perf_counter() - began
-        return result
+        """Begin the step and solve it from a guess (owned dofs,), m (collective)."""
+        with self._timer.measure("solve"):
+            self.inelastic.begin_step(state, dt)
+            return self.solver.solve(guess)
 
     def _guess(self, state: State, dt: float) -> Values:
-        """Where the body would go by itself."""
+        """Return the displacement of motion at constant velocity, (owned dofs,), m."""
         return np.asarray(state.u + (1 - self.balance.scheme.alpha_f) * dt * state.v)
 
-    def _passes(self, state: State, dt: float, solve: SolveResult) -> tuple[SolveResult, int, float]:
-        """Break, solve the step again from its start, until nothing new breaks or the passes are used up.
+    def _repeat_with_fracture(self, state: State, dt: float, solve: SolveResult) -> tuple[SolveResult, int, float]:
+        """Break edges and solve the step again from its start, until no edge breaks or no passes are left.
 
-        Where the weakened body has no solution the last one stands, and the next step takes up what is out of balance.
+        If the weakened body has no solution, the last solution stays, and the next step starts out of balance.
         """
-        broken, released = 0, 0.0
-        for _ in range((self.breaking.max_passes or UNLIMITED) - 1):
-            solved = self.balance.u.x.array[: self.balance.owned_dof_count].copy()
-            _, v, a = self._arrive(state, dt)
-            self._let_flow()
-            self.breaking.set_rates(v, a)
-            result = self._broken_in(dt)
+        inelastic, broken, released = self.inelastic, 0, 0.0
+        for _ in range(inelastic.max_passes - 1):
+            solved = self._solution()
+            _, v, a = self._complete_step(state, dt)
+            self._flow()
+            inelastic.fracture.set_rates(v, a)
+            result = inelastic.fracture_pass(dt)
             if not result.broken_edges:
                 self._return_to(solved, state, dt)
                 break
             broken, released = broken + result.broken_edges, released + result.released_energy
-            self._damage_changed(result)
+            inelastic.damage_changed(result)
             again = self._attempt(state, dt)
-            solve = SolveResult(
-                True,
-                solve.newton_iterations + again.newton_iterations,
-                solve.krylov_iterations + again.krylov_iterations,
-                "",
-            )
+            solve = sum_of_iterations(solve, again)
             if not again.converged:
                 self.failures.unbalanced_steps += 1
                 self._return_to(solved, state, dt)
                 break
         return solve, broken, released
 
+    def _solution(self) -> Values:
+        """Return a copy of the displacement of the balance, (owned dofs,), m."""
+        return self.balance.u.x.array[: self.balance.owned_dof_count].copy()
+
     def _return_to(self, solved: Values, state: State, dt: float) -> None:
-        """The solution of the step once more."""
-        self._begin(state, dt)
+        """Restore the solution `solved` (owned dofs,), m, of the step (collective)."""
+        self.inelastic.begin_step(state, dt)
         self.balance.set_displacement(solved)
         self.balance.update_reactions()
 
-    def _released(self, end: State, solved: Values, result: PassResultProtocol) -> State:
+    def _release(self, end: State, solved: Values, result: PassResultProtocol) -> State:
         return released_state(self.balance, end, solved, result.previous_damage, self.solver.linear_response)
 
-    def _damage_changed(self, result: PassResultProtocol) -> None:
-        super()._damage_changed(result)
-        if result.broken_edges:
-            self.solver.edges_broke(result.broken_edges)
 
-
-UNLIMITED = 10_000  # passes: there is no body with more left to break in one step
+def sum_of_iterations(first: SolveResult, second: SolveResult) -> SolveResult:
+    """Return a converged result with the iterations of two solves of a step."""
+    return SolveResult(
+        True,
+        first.newton_iterations + second.newton_iterations,
+        first.krylov_iterations + second.krylov_iterations,
+        "",
+    )

@@ -1,4 +1,4 @@
-"""What happens to a body at the end of a step: it flows, then it breaks. Where a study has neither, empty parts do."""
+"""Interfaces of plastic flow and of fracture at the end of a step, and implementations of a body without them."""
 
 from __future__ import annotations
 
@@ -15,96 +15,110 @@ Values = npt.NDArray[np.float64]
 
 
 class PassResultProtocol(Protocol):
-    """What one pass did.
-
-    Attributes:
-        broken: edges that broke, on all ranks.    loss: most that chi of a cell of this rank lost.
-        released: elastic energy that went with them on this rank, J.    elastic: what is left of it, J.
-        died: whether cells of this rank lost the last of their stress.
-        before: copies of the fields of damage before the pass, where edges broke.
-    """
+    """Interface of the result of one fracture pass."""
 
     @property
-    def broken_edges(self) -> int: ...
+    def broken_edges(self) -> int:
+        """Number of edges that broke, on all ranks."""
+
     @property
-    def largest_chi_loss(self) -> float: ...
+    def largest_chi_loss(self) -> float:
+        """Largest decrease of chi in a cell of this rank."""
+
     @property
-    def released_energy(self) -> float: ...
+    def released_energy(self) -> float:
+        """Elastic energy released on this rank, J."""
+
     @property
-    def elastic_energy(self) -> float: ...
+    def elastic_energy(self) -> float:
+        """Elastic energy left on this rank, J."""
+
     @property
-    def cells_died(self) -> bool: ...
+    def cells_died(self) -> bool:
+        """Whether chi of some cell of this rank fell to 0."""
+
     @property
-    def previous_damage(self) -> list[Values]: ...
+    def previous_damage(self) -> list[Values]:
+        """Copies of the damage fields before the pass, if edges broke."""
 
 
 class FractureProtocol(HistoryVariables, Protocol):
-    """What breaks."""
+    """Interface of the fracture of a body.
 
-    max_passes: int | None  # most passes in a step; None: until nothing changes
-    phase: str  # what its seconds are counted under
+    Attributes:
+        max_passes: largest number of passes in a step; None: until nothing changes.
+        phase: name of the phase to which the time of a pass counts.
+    """
+
+    max_passes: int | None
+    phase: str
 
     @property
     def nonfinite_cells(self) -> int:
-        """Cells whose stress was no number when it was looked at, summed over the passes of this rank."""
+        """Number of evaluations on this rank of cells whose stress was not finite."""
 
     @property
     def broken_edge_patterns(self) -> npt.NDArray[np.uint8] | None:
-        """(cells,) broken edges of each cell (mesh.edge_graph); None where nothing can break."""
+        """(cells,) broken edges of each cell, one bit each (mesh.edge_graph); None without edges."""
 
     def begin_step(self, t: float, dt: float) -> None:
-        """A step of dt (s) from t on is solved, for the first time or once more: its passes are of that time."""
+        """Prepare the passes of a step of dt (s) from t (s); a step may begin repeatedly."""
 
     def set_rates(self, v: Values, a: Values) -> None:
-        """The body that the next pass looks at moves so: (owned dofs,) in m/s and m/s^2."""
+        """Store velocity (owned dofs,), m/s, and acceleration, m/s^2, for the next pass."""
 
     def __call__(self) -> PassResultProtocol:
-        """A pass on the current displacement (collective)."""
+        """Carry out one pass at the present displacement (collective)."""
 
     def damage_restored(self) -> None:
-        """Damage was read from a checkpoint: what follows from it is brought to it."""
+        """Recompute the damage fields from edges and chi that were read from a checkpoint."""
 
 
 class PlasticFlowProtocol(HistoryVariables, Protocol):
-    """What flows.
+    """Interface of the plastic flow of a body.
 
     Attributes:
-        stored: elastic energy after the last flow, without damage, this rank's share, J; None where there is no flow.
+        elastic_energy: elastic energy of the undamaged body after the last flow, J, on this rank; None without flow.
     """
 
     elastic_energy: float | None
 
     def begin_step(self, dt: float) -> None:
-        """The flow to come is that of a step of dt (s)."""
+        """Prepare the flow of a step of dt (s)."""
 
     def __call__(self) -> float:
-        """Let the body flow; returns the energy lost to it on this rank, J."""
+        """Let the body flow at the present displacement; return the dissipated energy on this rank, J."""
 
 
 class NoPlasticFlow:
-    """A body that does not flow."""
+    """Plastic flow of an elastic body."""
 
     elastic_energy: float | None = None
 
     def begin_step(self, dt: float) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def __call__(self) -> float:
-        """Nothing is lost."""
+        """Return 0: nothing is dissipated."""
         return 0.0
 
     def snapshot(self) -> object:
-        """None."""
+        """Return None: there are no history variables."""
         return None
 
     def restore(self, saved: object) -> bool:
-        """Nothing."""
+        """Return False: there are no history variables."""
         return False
 
 
 @dataclass(frozen=True)
-class _Whole:
-    """The result of a pass over a body that does not break."""
+class ElasticPassResult:
+    """Result of a pass on a body that does not break (`PassResultProtocol`).
+
+    Attributes:
+        elastic_energy: on this rank, J.
+        broken_edges, largest_chi_loss, released_energy, cells_died, previous_damage: none.
+    """
 
     elastic_energy: float
     broken_edges: int = 0
@@ -115,7 +129,7 @@ class _Whole:
 
 
 class NoFracture:
-    """A body that does not break."""
+    """Fracture of a body that does not break: a pass evaluates the elastic energy."""
 
     max_passes: int | None = 1
     nonfinite_cells = 0
@@ -126,23 +140,23 @@ class NoFracture:
         self._balance, self._flow = balance, flow or NoPlasticFlow()
 
     def begin_step(self, t: float, dt: float) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def set_rates(self, v: Values, a: Values) -> None:
-        """Nothing."""
+        """Do nothing."""
 
     def __call__(self) -> PassResultProtocol:
-        """The elastic energy is all there is to tell."""
+        """Return the elastic energy; the plastic flow has evaluated it already where there is any."""
         stored = self._flow.elastic_energy
-        return _Whole(self._balance.stress.stored_energy() if stored is None else stored)
+        return ElasticPassResult(self._balance.stress.stored_energy() if stored is None else stored)
 
     def snapshot(self) -> object:
-        """None."""
+        """Return None: there are no history variables."""
         return None
 
     def restore(self, saved: object) -> bool:
-        """Nothing."""
+        """Return False: there are no history variables."""
         return False
 
     def damage_restored(self) -> None:
-        """Nothing."""
+        """Do nothing."""

@@ -1,10 +1,4 @@
-"""What a run carries from one step to the next.
-
-Parts of a body that remember: what they are between two steps is a value in the state.
-
-A step begins with recalling that value, so that a trial which fails, is repeated or starts from an earlier state finds
-the body as it was, whatever was tried in between.
-"""
+"""State of a body between two time steps, and its initial velocity."""
 
 from __future__ import annotations
 
@@ -14,26 +8,34 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from ..mechanics.balance import Balance
+from ..mesh.parallel import sum_over_ranks
+
 Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class State:
-    """A body at time t; arrays are of the owned dofs, and are not written to once they are here.
+    """State of a body at time t. Arrays have the owned dofs and are never written to.
 
     Attributes:
-        t: s.        step: steps taken.        dt: size of the next step, s.
-        u, v, a: (owned dofs,) displacement, velocity, acceleration in m, m/s, m/s^2.
-        dissipated: energy lost to fracture, flow and damping, J.    work: external work, J (both summed over ranks).
-        easy: steps in a row that went without halving.
-        elastic: stored energy at t on this rank, J.
-        forces: loads and reactions where the last step balanced them, N.    drag: damping forces there, N.
-        memory: what parts of the body remember of their past, by name (damage, flow, terms): see timestepping.state.
-        out_of_balance: (owned dofs,) residual that the last step ended with, N; None: none but the solver's tolerance.
-        before: (displacement a step ago, size of that step), from which a quasi-static load path is extrapolated; None:
-            unknown, or not needed.
-        frequencies: (cells,) bounds of omega^2 of undamaged cells, 1/s^2, from which explicit steps take their size;
-            None: the scheme has no such limit.
+        u: displacement, m.
+        v: velocity, m/s.
+        a: acceleration, m/s^2.
+        t: time, s.
+        step: number of steps taken.
+        dt: size of the next step, s.
+        dissipated: energy lost to fracture, plastic flow and damping, J, summed over the ranks.
+        work: external work, J, summed over the ranks.
+        easy_steps: successive steps without a reduction of the step size.
+        elastic: stored energy, J, on this rank.
+        forces: loads and reactions, N, at the level at which the last step balanced them.
+        drag: damping forces at that level, N; None without damping.
+        history: history variables by owner: "damage", "flow", "terms".
+        out_of_balance: residual at the end of the last step, N; None if it is within the tolerance of the solver.
+        previous_increment: displacement one step earlier, m, and the size of that step, s, for the extrapolation of a
+            quasi-static load path; None if it is not known or not needed.
+        frequencies: (cells,) bounds of omega^2 of undamaged cells, 1/s^2, for explicit steps; None in other schemes.
     """
 
     u: Values
@@ -44,7 +46,7 @@ class State:
     dt: float = 0.0
     dissipated: float = 0.0
     work: float = 0.0
-    easy: int = 0
+    easy_steps: int = 0
     elastic: float = 0.0
     forces: Values = field(default_factory=lambda: np.empty(0))
     drag: Values | None = None
@@ -55,13 +57,37 @@ class State:
 
 
 class HistoryVariables(Protocol):
-    """A part with a past, such as damage or plastic flow."""
+    """Interface of an object with history variables, such as damage or plastic flow.
+
+    Every step begins with `restore`, so that a repeated or reduced step starts from the values of its state.
+    """
 
     def snapshot(self) -> object:
-        """What it is now, never to be written to again; the same object as before where nothing has changed."""
+        """Return the present values. They are never written to; the object is the same while nothing changes."""
 
     def restore(self, saved: object) -> bool:
-        """Be again what `memory` gave, which costs nothing where that is what it is; whether it was anything else.
+        """Restore the values that `snapshot` returned; return True if they changed.
 
-        Not collective, but the same on all ranks.
+        Not collective; the result is the same on all ranks.
         """
+
+
+def initial_velocity(balance: Balance, velocity: Values | None, spin: Values | None) -> Values:
+    """Return v = velocity + spin x (X - centre of mass), (owned dofs,), m/s (collective).
+
+    Args:
+        balance: gives nodes and mass.
+        velocity: (d,), m/s.
+        spin: (1,) in 2D, (3,) in 3D, rad/s.
+    """
+    domain = balance.domain
+    d, X = domain.dim, domain.nodes[: domain.node_count]
+    v = np.zeros_like(X)
+    if velocity is not None:
+        v += velocity
+    if spin is not None:
+        mass = balance.mass.lumped.reshape(-1, d)[:, :1]
+        sums = sum_over_ranks(domain.comm, np.concatenate([(mass * X).sum(axis=0), mass.sum(axis=0)]))
+        arm = X - sums[:d] / sums[d]
+        v += np.cross(spin, arm) if d == 3 else spin * np.column_stack([-arm[:, 1], arm[:, 0]])
+    return v.reshape(-1)

@@ -50,7 +50,7 @@ CONTACT_MODULES = ("contact", "scene.contact_terms", "solvers.low_rank", *SURFAC
 BALL: dict[str, Any] = {"name": "ball", "shape": "sphere", "radius": 0.5, "at": [5.0, 0.5, 2.0]}  # far from the bar
 OPTIONAL = (
     *FRACTURE_MODULES, *CONTACT_MODULES, *PLASTIC_MODULES, AVERAGE, BRITTLE, "forms.damage", "forms.crack_closure",
-    "timestepping.stable_time_step_damaged", "report",
+    "report",
 )  # fmt: skip
 NEAR_NOTHING = 1.03  # what an obstacle that touches nothing may cost, at 192k tetrahedra
 OTHER_CASES = {

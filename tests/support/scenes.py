@@ -61,7 +61,7 @@ class Walk:
         """The body was damaged by hand: go on from there."""
         scene = vars(self)["scene"]
         scene.fracture.mark_changed()
-        self.state = scene.stepper.with_current_history(self.state)
+        self.state = scene.stepper.inelastic.with_snapshot(self.state)
 
     def settle(self) -> None:
         """Forces and accelerations that belong to the displacement and the velocity."""
