@@ -397,9 +397,9 @@ def run_study(
         check = partial(_check, folder, study, study_text(study), source, restart=restart, overwrite=overwrite)
         on_root(comm, lambda: lock_checked_folder(lock, check))  # at once, not after a mesh of minutes
         scene = build_scene(comm, study, stage)
-        if scene.domain.source is not None and scene.domain.source.notes:
+        if scene.domain.input_mesh is not None and scene.domain.input_mesh.notes:
             progress.end_line()
-            print_notes(comm, list(scene.domain.source.notes))
+            print_notes(comm, list(scene.domain.input_mesh.notes))
         try:
             options: dict[str, Any] = {"interrupt": interrupt, "progress": progress, "began": began}
             return Run(scene, folder, restart=restart, overwrite=overwrite, **options)()

@@ -175,7 +175,7 @@ class BareLoop:
         mass.ghostUpdate(PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
         self.mass = mass.array_r.copy()
         self.weight = self.mass * np.tile([0.0, 0.0, -9.81], len(self.mass) // 3)
-        bottom, top = (fem.locate_dofs_topological(V, 2, domain.facets[name]) for name in ("bottom", "top"))
+        bottom, top = (fem.locate_dofs_topological(V, 2, domain.facets.groups[name]) for name in ("bottom", "top"))
         self.top = top
         self.bcs = [fem.dirichletbc(self.g, np.sort(np.concatenate([bottom, top])).astype(np.int32))]
         rows, owned = self.bcs[0].dof_indices()

@@ -91,7 +91,7 @@ def test_what_is_tied_comes_to_rest_with_its_ties(monkeypatch: pytest.MonkeyPatc
     balance = scene.balance
     balance.begin_step(10.0, 10.0, state.u, np.zeros(balance.owned_dof_count), np.zeros(balance.owned_dof_count))
     u = state.u.reshape(-1, dim).copy()
-    node = int(np.flatnonzero(scene.domain.node_input == tethers.ties.nodes[0, 0])[0])
+    node = int(np.flatnonzero(scene.domain.input_numbering.nodes == tethers.ties.nodes[0, 0])[0])
     u[node] += 2.0
     balance.set_displacement(u.reshape(-1))
     before, high, stored = (

@@ -16,6 +16,7 @@ from fracsim.mechanics.prescribed_motion import PrescribedMotion
 from fracsim.mechanics.stress import Stress
 from fracsim.mechanics.time_functions import constant_function
 from fracsim.mesh.domain import distribute
+from fracsim.mesh.selection import select_nodes
 from fracsim.mesh.selectors import Group
 from fracsim.meshes.builders.box import Box
 from fracsim.solvers.nonlinear_solver import NonlinearSolver
@@ -41,7 +42,7 @@ def test_a_bar_swings_in_its_first_mode() -> None:
     domain = distribute(MPI.COMM_SELF, Box(size=(LENGTH, 0.1), h=0.05).build())
     assembler, u = VectorAssembler(domain), fem.Function(domain.space)
     material = material_fields(domain, "linear", young=YOUNG, poisson=0.0, density=DENSITY)
-    left, right = domain.select_nodes(Group("left")), domain.select_nodes(Group("right"))
+    left, right = select_nodes(domain, Group("left")), select_nodes(domain, Group("right"))
     motion = PrescribedMotion(domain, [(left, np.array([True, True]), constant_function([0.0, 0.0]))])
     mass = LumpedMass(assembler, coefficient(domain, DENSITY))
     terms = [Stress(assembler, u, material), Inertia(u, mass)]

@@ -167,7 +167,7 @@ def shattered(
     scene = build_scene(MPI.COMM_SELF, data)
     state = Walk(scene)
     state.advance()
-    cut(scene, random_planes(planes, scene.domain.lower, scene.domain.upper))
+    cut(scene, random_planes(planes, scene.domain.bounds.lower, scene.domain.bounds.upper))
     return scene, [state.advance().solve.krylov_iterations for _ in range(steps)]
 
 

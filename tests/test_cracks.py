@@ -37,7 +37,7 @@ def cut_points(scene: Scene) -> np.ndarray:
     assert breaking is not None and breaking.initial_cuts is not None
     broken = np.flatnonzero(breaking.graph.broken)
     ends = breaking.graph.edge_nodes[broken]
-    nodes, number = scene.domain.nodes, scene.domain.node_input[ends]
+    nodes, number = scene.domain.nodes, scene.domain.input_numbering.nodes[ends]
     ends = np.where((number[:, 0] > number[:, 1])[:, None], ends[:, ::-1], ends)
     share = breaking.initial_cuts[broken, None]
     return np.asarray(nodes[ends[:, 0]] + share * (nodes[ends[:, 1]] - nodes[ends[:, 0]]))

@@ -45,7 +45,7 @@ def flowing(mesh: MeshData, yields: float, hardening: float = HARDENING) -> Brea
 
 def pulled(body: BreakableBody, stress: float) -> PointLoads:
     """A bar along x, pulled at both ends, Pa: forces at the middles of the facets there."""
-    mesh = body.graph.domain.source
+    mesh = body.graph.domain.input_mesh
     assert mesh is not None
     facets = facets_of(mesh.cells).reshape(-1, 3)
     X = mesh.points[facets]

@@ -283,13 +283,13 @@ def test_no_facet_is_cut(dim: int, radius: float) -> None:
     are far from it: by dense sampling of the boundary of the mesh. The base carries what the ball presses with, and the
     work of that is stored."""
     scene, state = make_scene(**pressed(dim, radius, 0.06))
-    data = scene.domain.source
+    data = scene.domain.input_mesh
     assert data is not None
     top = data.facet_groups["top"]
     shares = np.stack(np.meshgrid(*[np.arange(31)] * dim, indexing="ij"), axis=-1).reshape(-1, dim) / 30
     shares = shares[abs(shares.sum(axis=1) - 1) < 1e-9]
     for report in each_step(scene, state):  # noqa: B007
-        u = scene.domain.gather_nodes(state.u.reshape(-1, dim))
+        u = scene.domain.input_numbering.gather_nodes(state.u.reshape(-1, dim))
         assert u is not None
         x = (data.points + u)[top]
         centre = np.array(scene.study.obstacle[0].at) - [*[0.0] * (dim - 1), 0.08 * state.t]

@@ -261,15 +261,15 @@ def test_a_free_ball_smaller_than_a_facet_is_felt_between_its_corners(dim: int, 
                    "velocity": [*[0.3] * (dim - 1), -4.0]}],
         time={"scheme": scheme, "step": 4e-3, "end": 0.048},
     )  # fmt: skip
-    assert scene.domain.source is not None
-    top = scene.domain.source.facet_groups["top"]
+    assert scene.domain.input_mesh is not None
+    top = scene.domain.input_mesh.facet_groups["top"]
     shares = np.stack(np.meshgrid(*[np.arange(31)] * dim, indexing="ij"), axis=-1).reshape(-1, dim) / 30
     shares = shares[abs(shares.sum(axis=1) - 1) < 1e-9]
     before, least, energy = momenta(scene, state)[0], np.inf, 0.5 * 0.5 * (16 + 0.09 * (dim - 1))
     for report in each_step(scene, state):
-        u = scene.domain.gather_nodes(state.u.reshape(-1, dim))
+        u = scene.domain.input_numbering.gather_nodes(state.u.reshape(-1, dim))
         assert u is not None
-        x, centre = (scene.domain.source.points + u)[top], contact_of(scene).free[0].motion.pose.centre
+        x, centre = (scene.domain.input_mesh.points + u)[top], contact_of(scene).free[0].motion.pose.centre
         least = min(least, np.linalg.norm(np.einsum("sc,kcd->ksd", shares, x) - centre, axis=2).min() - 0.05)
         assert np.linalg.norm(x - centre, axis=2).min() > 0.1  # no corner is near
         np.testing.assert_allclose(momenta(scene, state)[0], before, atol=1e-9 * 2)

@@ -25,5 +25,7 @@ def test_groups_that_overlap_have_their_facets_each() -> None:
     nodes = mesh.entities_to_geometry(domain.mesh, 2, np.arange(domain.mesh.topology.index_map(2).size_local))
     given = np.sort(domain.mesh.geometry.input_global_indices[nodes], axis=1)
     for name, facets in groups.items():
-        assert {tuple(row) for row in given[domain.facets[name]]} == {tuple(row) for row in np.sort(facets, axis=1)}
-        assert len(domain.facets[name]) == len(facets)
+        assert {tuple(row) for row in given[domain.facets.groups[name]]} == {
+            tuple(row) for row in np.sort(facets, axis=1)
+        }
+        assert len(domain.facets.groups[name]) == len(facets)

@@ -286,7 +286,7 @@ def test_ties_come_back_with_a_state_and_from_a_checkpoint() -> None:
     was, memory, saved = tethers.ties, tethers.snapshot(), tethers.to_checkpoint()
     wanted = force_at(scene, tethers, u * 1.1)
     graph = scene.fracture.graph
-    cell = int(np.flatnonzero(np.isin(scene.domain.cell_input, was.cell))[0])
+    cell = int(np.flatnonzero(np.isin(scene.domain.input_numbering.cells, was.cell))[0])
     more = graph.pattern.copy()
     more[cell] = (1 << graph.cell_edges.shape[1]) - 1
     tethers.edges_broke(more)
@@ -314,7 +314,7 @@ def test_ties_are_in_the_tangent_once(monkeypatch: pytest.MonkeyPatch) -> None:
     added = tethers.coupling_matrix()
     assert added is not None
     # a node and a corner of its cell that share no cell: nothing but the tie is there
-    node, *corners = (int(np.flatnonzero(scene.domain.node_input == n)[0]) for n in tethers.ties.nodes[0])
+    node, *corners = (int(np.flatnonzero(scene.domain.input_numbering.nodes == n)[0]) for n in tethers.ties.nodes[0])
     apart = [c for c in corners if not (scene.domain.cell_nodes[:, :, None] == [node, c]).any(axis=1).all(axis=1).any()]
     assert apart
     for corner in apart:
@@ -329,7 +329,7 @@ def test_what_a_tie_stored_is_booked_as_lost_when_its_cell_comes_apart() -> None
     scene.balance.set_displacement(state.u + 0.05 * np.random.default_rng(4).standard_normal(len(state.u)))
     stored, graph = tethers.stored_energy(), scene.fracture.graph
     more = graph.pattern.copy()
-    more[np.isin(scene.domain.cell_input, tethers.ties.cell)] = 7
+    more[np.isin(scene.domain.input_numbering.cells, tethers.ties.cell)] = 7
     tethers.edges_broke(more)
     assert stored > 1e-6
     assert (
@@ -365,7 +365,7 @@ def test_a_part_that_hangs_takes_along_what_is_tied_to_it(dim: int) -> None:
     scene, walk, tethers = tied(dim, time={"scheme": "backward-euler", "step": 1e3, "end": 1e4})
     domain, balance = scene.domain, scene.balance
     assert balance.stress.chi is not None
-    cell = int(np.flatnonzero(domain.cell_input == tethers.ties.cell[0])[0])
+    cell = int(np.flatnonzero(domain.input_numbering.cells == tethers.ties.cell[0])[0])
     shared = np.isin(domain.cell_nodes, domain.cell_nodes[cell]).sum(axis=1)
     balance.stress.chi.x.array[: domain.cell_count][shared == dim] = 0.0
     balance.damage_changed()
@@ -376,13 +376,15 @@ def test_a_part_that_hangs_takes_along_what_is_tied_to_it(dim: int) -> None:
     jacobi.setOperators(balance.tangent.matrix)
     _, part = node_components(domain, balance.stress.chi.x.array[: domain.cell_count] > 0)
     own = int(part[domain.cell_nodes[cell]].max())
-    node = np.flatnonzero(domain.node_input == tethers.ties.nodes[0, 0])
+    node = np.flatnonzero(domain.input_numbering.nodes == tethers.ties.nodes[0, 0])
     assert own > 0 and part[node] == -1
     loose = create_deflation(balance, jacobi)
     assert loose is not None and loose.update_operator(balance.tangent.matrix)
     x = domain.nodes + walk.state.u.reshape(-1, dim)
     spin = np.array([[0.0, -3.0, 2.0], [3.0, 0.0, -1.0], [-2.0, 1.0, 0.0]])[:dim, :dim]
-    goes = (part == own) | np.isin(domain.node_input, tethers.ties.nodes[tethers.ties.cell == tethers.ties.cell[0], 0])
+    goes = (part == own) | np.isin(
+        domain.input_numbering.nodes, tethers.ties.nodes[tethers.ties.cell == tethers.ties.cell[0], 0]
+    )
     moved = np.where(goes[:, None], x @ spin.T + 0.5, 0.0)
     assert goes[node] and (part == own).any()
     a, b = balance.work_vector.duplicate(), balance.work_vector.duplicate()

@@ -50,7 +50,7 @@ def test_each_neighbour_counts_with_its_volume_for_every_node_it_shares(numbers:
 def test_bodies_side_by_side_do_not_know_of_one_another() -> None:
     """Two bodies in one place: each keeps its own constant."""
     domain = distribute(MPI.COMM_SELF, copies(lattice(2, 2), 2))
-    which = (domain.cell_input >= domain.cell_count // 2).astype(float)[:, None]
+    which = (domain.input_numbering.cells >= domain.cell_count // 2).astype(float)[:, None]
     assert np.allclose(NeighbourAverage(domain)(which), which, atol=1e-15)
 
 

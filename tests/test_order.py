@@ -63,7 +63,9 @@ def test_round_faces_are_round() -> None:
     assert scene.balance.mass.lumped.sum() / 2 == pytest.approx(np.pi, rel=s**4 / 90)
     assert straight < np.pi * (1 - 0.015)
     radius = np.linalg.norm(scene.domain.nodes, axis=1)
-    assert np.count_nonzero(np.abs(radius - 1) < 1e-12) == 2 * len(np.concatenate([*scene.domain.facets.values()]))
+    assert np.count_nonzero(np.abs(radius - 1) < 1e-12) == 2 * len(
+        np.concatenate([*scene.domain.facets.groups.values()])
+    )
 
 
 def test_a_force_on_a_round_face_is_the_force_given() -> None:
@@ -237,8 +239,8 @@ def test_cells_with_broken_edges_are_touched_by_their_corners() -> None:
         if order == 2:
             touched = surface.columns[abs(surface.at.weights).max(axis=0).toarray().ravel() > 1e-12]
             cells = np.flatnonzero(graph.pattern)
-            of_whole = domain.cell_midside_nodes[np.flatnonzero(graph.pattern == 0)]
-            only_broken = np.setdiff1d(domain.cell_midside_nodes[cells], of_whole)
+            of_whole = domain.cell_midside_nodes.of_edges[np.flatnonzero(graph.pattern == 0)]
+            only_broken = np.setdiff1d(domain.cell_midside_nodes.of_edges[cells], of_whole)
             assert len(only_broken) and not np.isin(only_broken, touched).any()
             assert np.isin(of_whole, touched).any()
     assert area[2] == pytest.approx(area[1], rel=1e-12)
@@ -308,6 +310,6 @@ def test_dust_is_what_has_one_corner() -> None:
     graph = scene.fracture.graph
     graph.break_edges(np.ones(len(graph.broken), bool))
     breaks = FractureLog(scene.balance.stress, scene.fracture)
-    corners = len(scene.domain.source.points)
+    corners = len(scene.domain.input_mesh.points)
     assert breaks.counts[2] == corners
     assert breaks.count_single_nodes(scene.domain.volumes) == (corners, pytest.approx(1.0))

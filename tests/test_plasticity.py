@@ -237,7 +237,7 @@ def test_regions_yield_each_at_their_own(tmp_path: Path) -> None:
         time={"scheme": "quasi-static", "step": 0.5, "end": 1.0},
     )
     march(scene, state)
-    stiff, strain = scene.domain.region == scene.domain.region_names.index("stiff"), plastic_strain(scene)
+    stiff, strain = scene.domain.cell_region == scene.domain.region_names.index("stiff"), plastic_strain(scene)
     assert 0 < np.count_nonzero(stiff) < len(stiff)
     assert not strain[stiff].any() and strain[~stiff].all()
 

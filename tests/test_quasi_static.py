@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from fracsim.mesh.selection import select_nodes
 from fracsim.mesh.selectors import Group
 from fracsim.scene import Scene
 from fracsim.timestepping.stepper import StepReport
@@ -39,7 +40,7 @@ def torn_plate(**tables: Any) -> tuple[Scene, Walk]:
 
 def grip(scene: Scene) -> float:
     """Reaction of the upper edge along y, N."""
-    top = scene.domain.select_nodes(Group("top"))
+    top = select_nodes(scene.domain, Group("top"))
     return float(scene.balance.reactions.reshape(-1, 2)[top, 1].sum())
 
 

@@ -33,7 +33,7 @@ def some_load(domain: Domain, seed: int = 0) -> Values:
     of_mesh = np.zeros_like(domain.nodes)
     rng = np.random.default_rng(seed)
     of_mesh[rng.choice(len(of_mesh), 4, replace=False)] = rng.normal(size=(4, domain.dim))
-    return of_mesh[domain.node_input]
+    return of_mesh[domain.input_numbering.nodes]
 
 
 @pytest.mark.parametrize("numbers", [(3, 5), (2, 2, 3)])
@@ -82,7 +82,7 @@ def test_stress_does_not_depend_on_the_frame(numbers: tuple[int, ...]) -> None:
         stiffness, body, domain = whole_body(each)
         u = body(some_load(domain) @ R.T)
         sigma = symmetric_tensors(stiffness.cell_stress(u, body.cell_fractions), mesh.dim)
-        found.append((R.T @ sigma @ R)[np.argsort(domain.cell_input)])
+        found.append((R.T @ sigma @ R)[np.argsort(domain.input_numbering.cells)])
     assert np.allclose(*found, atol=1e-9 * np.abs(found[0]).max())
 
 
@@ -144,7 +144,7 @@ def test_a_slow_push_gives_the_mean_stress_of_the_motion() -> None:
     )
     (load,) = [term for term in scene.balance.terms if term.name == "dead loads"]
     domain, rows, loads = scene.domain, [], []
-    stiffness = stiffness_of(scene.domain.source, young=1.0)  # type: ignore[arg-type]
+    stiffness = stiffness_of(scene.domain.input_mesh, young=1.0)  # type: ignore[arg-type]
     for _ in range(120):
         march(scene, state, 1)
         rows.append(stiffness.cell_stress(state.u.reshape(-1, 2), np.ones(domain.cell_count)))

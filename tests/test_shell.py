@@ -163,10 +163,10 @@ def test_stress_of_a_shell_does_not_depend_on_the_frame() -> None:
         domain, body = stiffness.stress.domain, stiffness.whole_body()
         force = np.zeros((len(mesh.points), 3))
         force[[3, 40, 77]] = [[1.0, -2.0, 0.5], [0.3, 0.1, 2.0], [0.0, 1.0, 1.0]]
-        u = body((force @ R.T)[domain.node_input])
+        u = body((force @ R.T)[domain.input_numbering.nodes])
         found.append(
             (R.T @ symmetric_tensors(stiffness.cell_stress(u, body.cell_fractions), 3) @ R)[
-                np.argsort(domain.cell_input)
+                np.argsort(domain.input_numbering.cells)
             ]
         )
     assert np.allclose(*found, atol=1e-6 * np.abs(found[0]).max())
@@ -185,7 +185,7 @@ def test_cracks_go_through_the_whole_thickness(grains: GrainParameters | None) -
     force = np.array([[0.0, 0.0, -2.0], [0.0, 0.0, 1.0], [0.0, 0.0, 1.0]])
     assert body.break_fragments(0, body.distribute_forces(0, points, force, np.full(3, 0.01))) > 0
     of_input = np.empty(len(mesh.points), int)
-    of_input[body.graph.domain.node_input] = body.fragments.node_fragment
+    of_input[body.graph.domain.input_numbering.nodes] = body.fragments.node_fragment
     below, above = np.split(of_input, 2)
     assert body.fragments.count > 2 and np.array_equal(below, above)
     assert moments_of(body).volume.sum() == pytest.approx(0.2 * H, rel=1e-9)

@@ -24,6 +24,7 @@ from ..mechanics.extra_couplings import StiffCoupling
 from ..mechanics.term import TimeLevel
 from ..mechanics.term_protocols import SurfaceData
 from ..mesh.domain import Domain
+from ..mesh.ghost_exchange import with_straight_edges
 from ..mesh.parallel import from_root, on_root
 from ..mesh.split_surface.surface_map import SurfaceMap
 from ..meshes.data import AXES
@@ -148,7 +149,7 @@ class MeshObstacleTerm(SelfContact):
             InputError: if an obstacle overlaps the body at rest.
         """
         self.obstacles, edge = tuple(obstacles.values()), domain.mean_edge_length
-        self._drawings = ObstacleTessellations(self.obstacles, domain.lower, domain.upper)
+        self._drawings = ObstacleTessellations(self.obstacles, domain.bounds.lower, domain.bounds.upper)
         # on rank 0 alone
         self._meshes = on_root(domain.comm, lambda: [_build_mesh(*item, edge) for item in obstacles.items()]) or []
         self._start_poses = [obstacle.posed_at(0.0).pose for obstacle in self.obstacles]
@@ -347,7 +348,7 @@ class MeshObstacleTerm(SelfContact):
             return u
         change: Values = np.asarray(self._gather.scatter(correction)).reshape(-1)
         if self.law.corners_only:
-            change = self._domain.with_straight_edges(change)
+            change = with_straight_edges(self._domain, change)
         return np.asarray(u + level.fraction * change)
 
     def _first_guess(self, surface: MeshContactSurface, start: Values, end: Values) -> Values:

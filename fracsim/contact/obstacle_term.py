@@ -67,7 +67,7 @@ class ObstacleTerm(ContactState, Term):
         """Raise InputError where the body at rest overlaps an obstacle (collective)."""
         super().__init__(domain, u, obstacles, law)
         self._coupling = CouplingBuilder(domain)
-        self._drawings = ObstacleTessellations(obstacles, domain.lower, domain.upper)
+        self._drawings = ObstacleTessellations(obstacles, domain.bounds.lower, domain.bounds.upper)
         # of the last step: work of each obstacle, J, dissipation by friction, J, and forces on each, N
         self._obstacle_work, self._friction_loss = [0.0] * len(self.obstacles), 0.0
         self._force_readings: list[Values] | None = None  # None: no step yet

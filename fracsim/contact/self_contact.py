@@ -56,7 +56,7 @@ class SelfContact(Term):
         self._coupling = CouplingBuilder(domain)
         # m^(d-2), times a stiffness in Pa
         self._stiff_threshold = SURFACE.stiff_ratio * domain.mean_edge_length ** (domain.dim - 2)
-        mesh = _refined(domain) if self._is_refined(law) else domain.source
+        mesh = _refined(domain) if self._is_refined(law) else domain.input_mesh
         self._skeleton = None if mesh is None else EntityNumbering(mesh)
         self._gather = node_gather(domain, law)
         first = domain.space.dofmap.index_map.local_range[0]
@@ -95,7 +95,7 @@ class SelfContact(Term):
 
     def _gathered_pattern(self) -> npt.NDArray[np.uint8] | None:
         """(cells,) broken edges of the skeleton's cells, on rank 0; subdivided quadratic cells do not break."""
-        pattern = self._domain.gather_cells(self._pattern)
+        pattern = self._domain.input_numbering.gather_cells(self._pattern)
         parts = 2**self._domain.dim if self._is_refined(self.law) else 1
         return None if pattern is None else np.repeat(pattern, parts)
 
@@ -340,7 +340,7 @@ class SelfContact(Term):
 
 def node_gather(domain: Domain, law: SelfContactLaw) -> Gather:
     """Gathering of the nodes that the surface depends on."""
-    return domain.gather_corners if law.corners_only else domain.gather_nodes
+    return domain.input_numbering.gather_corners if law.corners_only else domain.input_numbering.gather_nodes
 
 
 def _refined(domain: Domain) -> MeshData | None:

@@ -143,7 +143,7 @@ def _gaps_to_nodes(domain: Domain, obstacles: Sequence[RigidObstacle]) -> Values
     posed = [obstacle.posed_at(0.0) for obstacle in obstacles]
     gaps = np.array([float(shape.distance(domain.nodes).min(initial=np.inf)) for shape in posed])
     domain.comm.Allreduce(MPI.IN_PLACE, gaps, MPI.MIN)
-    return np.where(gaps < -SET_DOWN.round_off * domain.size, np.inf, gaps)
+    return np.where(gaps < -SET_DOWN.round_off * domain.bounds.diagonal, np.inf, gaps)
 
 
 def _lower_to_others(gaps: Values, obstacles: Sequence[RigidObstacle]) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mesh.edge_graph import EdgeGraph
+from ..mesh.ghost_exchange import min_over_ranks
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -48,9 +49,9 @@ class EdgeHistory:
         self.cut_positions[weakened] = cut[weakened]
         if tip_states is not None:
             # The largest time of all ranks is the least negative one.
-            negative_time = -np.nan_to_num(tip_states[:, -1], nan=-np.inf)
-            latest = negative_time <= self.graph.min_over_ranks(negative_time)
-            columns = [self.graph.min_over_ranks(np.where(latest, column, np.inf)) for column in tip_states.T]
+            edges, negative_time = self.graph.index_map, -np.nan_to_num(tip_states[:, -1], nan=-np.inf)
+            latest = negative_time <= min_over_ranks(edges, negative_time)
+            columns = [min_over_ranks(edges, np.where(latest, column, np.inf)) for column in tip_states.T]
             self.tip_states = np.column_stack(columns)
 
     def gather_broken(self) -> tuple[Ints, Values] | None:

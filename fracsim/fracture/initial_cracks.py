@@ -30,7 +30,7 @@ def cut_edges(graph: EdgeGraph, crack: CrackPlane) -> Values:
     that it crosses, so that it ends where it enters its last cell. In 3D it cuts whole cells: a cell with some of its
     crossed edges cut would not be split, and the crack would be about 0.4 h short along its front.
     """
-    domain, tolerance = graph.domain, ON_PLANE_TOLERANCE * graph.domain.size
+    domain, tolerance = graph.domain, ON_PLANE_TOLERANCE * graph.domain.bounds.diagonal
     ends = domain.nodes[edge_ends_in_input_order(graph)]
     height = (ends - crack.point) @ crack.normal
     # Nodes on the plane count as above it, so that they are never cut.
@@ -62,7 +62,7 @@ def _edges_of_cut_cells(cell_edges: Ints, crossed: Flags, points: Values, crack:
 def edge_ends_in_input_order(graph: EdgeGraph) -> npt.NDArray[np.int32]:
     """Return the nodes (edges, 2) of owned and ghost edges, the lower node of the input mesh first."""
     ends = graph.edge_nodes
-    swap = graph.domain.node_input[ends[:, 0]] > graph.domain.node_input[ends[:, 1]]
+    swap = graph.domain.input_numbering.nodes[ends[:, 0]] > graph.domain.input_numbering.nodes[ends[:, 1]]
     return np.where(swap[:, None], ends[:, ::-1], ends)
 
 
@@ -83,7 +83,7 @@ def open_initial_cracks(graph: EdgeGraph, cracks: Sequence[CrackPlane], *, keep_
         crack_positions = cut_edges(graph, crack)
         if not sum_over_ranks(domain.comm, np.count_nonzero(~np.isnan(crack_positions)))[0]:
             raise InputError(
-                f"{crack.name} cuts no edge of the mesh: it lies outside the body, which spans {domain.extent()}, or "
+                f"{crack.name} cuts no edge of the mesh: it lies outside the body, which spans {domain.bounds}, or "
                 "is shorter than the cells there"
             )
         # An edge that several cracks cut has the position of the first.

@@ -18,6 +18,7 @@ import numpy.typing as npt
 
 from ..mechanics.stress import Stress
 from ..mesh.edge_graph import EdgeGraph
+from ..mesh.ghost_exchange import min_over_ranks
 from ..mesh.node_cells import NodeCellCount
 from ..mesh.parallel import allgather, sum_over_ranks
 from ..mesh.simplices import is_split, local_edges
@@ -142,7 +143,7 @@ class CellRetention:
         key = np.where(endangered[nodes], across + 0.5 * share[:, None], np.inf)
         is_best = np.isfinite(key) & (key == self._least_at_nodes(nodes, key)[nodes])
         # Of cells with equal keys the first of the input mesh is chosen.
-        number = np.where(is_best, self._graph.domain.cell_input[cells][:, None].astype(float), np.inf)
+        number = np.where(is_best, self._graph.domain.input_numbering.cells[cells][:, None].astype(float), np.inf)
         is_first = number == self._least_at_nodes(nodes, number)[nodes]
         return np.asarray(cells[(is_best & is_first).any(axis=1)])
 
@@ -150,7 +151,7 @@ class CellRetention:
         """Return the least (nodes,) of `values` (n, d + 1) at `nodes` (n, d + 1) over all ranks."""
         result = np.full(self._node_map.size_local + self._node_map.num_ghosts, np.inf)
         np.minimum.at(result, nodes, values)
-        return self._graph.min_over_ranks(result, self._node_map)
+        return min_over_ranks(self._node_map, result)
 
 
 class NodeAttachment:
@@ -214,7 +215,7 @@ class NodeAttachment:
             load[fails[candidates]] = np.finfo(float).max
         load[attaching[candidates] | (self._is_prescribed_edge & ~fails)[candidates]] = ATTACHED
         keys, ends = graph.edge_keys(candidates), graph.edge_nodes[candidates]
-        swapped = graph.domain.node_input[ends[:, 0]] != keys[:, 0]
+        swapped = graph.domain.input_numbering.nodes[ends[:, 0]] != keys[:, 0]
         ends[swapped] = ends[swapped, ::-1]
         parts = allgather(graph.domain.comm, (keys, load, without_cell[ends], self._prescribed[ends]))
         return graph.flags_of_keys(_spanning_forest(*(np.concatenate(column) for column in zip(*parts, strict=True))))

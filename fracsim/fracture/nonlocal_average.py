@@ -83,7 +83,7 @@ class NonlocalAverage:
         near = self._exchange(centroids)
         volumes = self._exchange(domain.volumes[:, None])[:, 0]
         # Sums in the order of the input mesh are the same to the last bit on any number of ranks.
-        order = np.argsort(self._exchange(domain.cell_input[:, None].astype(float))[:, 0], kind="stable")
+        order = np.argsort(self._exchange(domain.input_numbering.cells[:, None].astype(float))[:, 0], kind="stable")
         self._weights = _WeightMatrix(centroids, near[order], volumes[order], order, radius, kernel)
 
     def __call__(self, values: Values, active: Flags | None = None) -> Values:

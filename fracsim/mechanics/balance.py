@@ -391,7 +391,7 @@ class EnergySums:
         domain = self._balance.domain
         dofs = domain.space.dofmap.index_map.size_global * domain.dim
         young = self._comm.allreduce(float(np.max(self._balance.stress.material.young, initial=0.0)), op=MPI.MAX)
-        return float(young * domain.mean_edge_length ** (domain.dim - 2)), float(domain.size * np.sqrt(dofs))
+        return float(young * domain.mean_edge_length ** (domain.dim - 2)), float(domain.bounds.diagonal * np.sqrt(dofs))
 
 
 def _virtual_work(domain: Domain, terms: Sequence[Term], cells: npt.NDArray[np.int32] | None = None) -> CellForm:

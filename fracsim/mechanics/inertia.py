@@ -240,14 +240,14 @@ def _hrz_lumped_mass(assembler: VectorAssembler, density: Expr) -> Values:
     Hinton, Rock and Zienkiewicz (1976), A note on mass lumping and related processes in the finite element method.
     """
     domain = assembler.domain
-    volumes = fem.Function(domain.cell_scalar)
-    mass = compile_form(density * ufl.TestFunction(domain.cell_scalar) * ufl.dx(domain=domain.mesh))
+    volumes = fem.Function(domain.scalar_cell_space)
+    mass = compile_form(density * ufl.TestFunction(domain.scalar_cell_space) * ufl.dx(domain=domain.mesh))
     volumes.x.array[:] = 0.0
     fem.assemble_vector(volumes.x.array, mass)
     cell_mass, (corner, midside) = volumes.x.array[: domain.cell_count, None], HRZ_FRACTIONS[domain.dim]
     result = fem.Function(domain.space)
     nodes = result.x.array.reshape(-1, domain.dim)
     np.add.at(nodes, domain.cell_nodes, (corner * cell_mass)[:, :, None])
-    np.add.at(nodes, domain.cell_midside_nodes, (midside * cell_mass)[:, :, None])
+    np.add.at(nodes, domain.cell_midside_nodes.of_edges, (midside * cell_mass)[:, :, None])
     result.x.scatter_reverse(la.InsertMode.add)
     return np.asarray(result.x.array[: assembler.owned_dof_count])

@@ -64,7 +64,7 @@ def parameter_by_region(domain: Domain, base: float, region_values: Mapping[str,
         return base
     values = np.full(domain.cell_count, base)
     for name, value in region_values.items():
-        values[domain.region == domain.region_names.index(name)] = value
+        values[domain.cell_region == domain.region_names.index(name)] = value
     return values
 
 
@@ -72,6 +72,6 @@ def coefficient(domain: Domain, value: PerCell) -> Any:
     """Parameter as a UFL coefficient: a constant, or a field that is constant in each cell."""
     if np.ndim(value) == 0:
         return fem.Constant(domain.mesh, np.float64(value))
-    field = fem.Function(domain.cell_scalar)
+    field = fem.Function(domain.scalar_cell_space)
     field.x.array[: domain.cell_count] = value
     return field

@@ -115,7 +115,7 @@ class NodeTies(Term):
         self._pattern: Pattern = np.zeros(domain.cell_count, np.uint8)
         self._coupling, self._around = CouplingBuilder(domain), NodeCellCount(domain)
         self._dissipated = 0.0
-        input_of = domain.node_input[: domain.node_count]
+        input_of = domain.input_numbering.nodes[: domain.node_count]
         self._order = np.argsort(input_of)
         self._sorted = input_of[self._order]
         self._set_ties(Ties.empty(domain.dim))
@@ -165,12 +165,17 @@ class NodeTies(Term):
             without: (nodes,) local nodes without an unsplit cell.
         """
         domain, d = self._domain, self._domain.dim
-        number = domain.node_input[domain.cell_nodes]
+        number = domain.input_numbering.nodes[domain.cell_nodes]
         position = np.minimum(np.searchsorted(linked, number), len(linked) - 1)
         corner_group = np.where((linked[position] == number) & ~without[domain.cell_nodes], group[position], -1)
         cells, corner = np.nonzero((corner_group >= 0) & ~is_split(d)[self._pattern][:, None])
         x = domain.nodes + self._u.x.array.reshape(-1, d)
-        local = corner_group[cells, corner], domain.cell_input[cells], number[cells], x[domain.cell_nodes[cells]]
+        local = (
+            corner_group[cells, corner],
+            domain.input_numbering.cells[cells],
+            number[cells],
+            x[domain.cell_nodes[cells]],
+        )
         gathered = zip(*allgather(domain.comm, local), strict=True)
         groups, cell, corners, corner_x = (np.concatenate(parts) for parts in gathered)
         # pairs of a node and a candidate cell, ordered by node, sum |lambda|, and number of the cell
@@ -311,7 +316,7 @@ class NodeTies(Term):
 
 def _is_unsplit(domain: Domain, pattern: Pattern, cells: Ints) -> Flags:
     """(n,) whether cells of the input mesh are unsplit (collective)."""
-    unsplit = domain.cell_input[~is_split(domain.dim)[pattern]] if len(cells) else cells
+    unsplit = domain.input_numbering.cells[~is_split(domain.dim)[pattern]] if len(cells) else cells
     return sum_over_ranks(domain.comm, np.isin(cells, unsplit).astype(np.int64)) > 0 if len(cells) else cells > 0
 
 
@@ -326,7 +331,7 @@ def _links(domain: Domain, pattern: Pattern, without: Flags, prescribed: Flags) 
     intact = (pattern[cells, None] >> np.arange(len(pairs))) & 1 == 0
     ends = ends[intact & without[ends].any(axis=2)]
     detached = np.unique(ends[without[ends] & ~prescribed[ends]])
-    return np.sort(domain.node_input[ends], axis=1), domain.node_input[detached]
+    return np.sort(domain.input_numbering.nodes[ends], axis=1), domain.input_numbering.nodes[detached]
 
 
 def _groups(links: Ints, nodes: Ints) -> tuple[Ints, Ints]:

@@ -97,8 +97,8 @@ def check_supports(domain: Domain, motion: PrescribedMotion) -> None:
     """
     prescribed = np.zeros(domain.node_count * domain.dim, bool)
     prescribed[motion.owned_dofs] = True
-    flags = domain.gather_nodes(prescribed.reshape(-1, domain.dim))
-    on_root(domain.comm, lambda: _check(domain.source, flags))
+    flags = domain.input_numbering.gather_nodes(prescribed.reshape(-1, domain.dim))
+    on_root(domain.comm, lambda: _check(domain.input_mesh, flags))
 
 
 def _check(mesh: MeshData | None, prescribed: npt.NDArray[np.bool_] | None) -> None:

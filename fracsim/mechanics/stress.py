@@ -309,7 +309,7 @@ def _reference_coordinates(domain: Domain) -> fem.Function:
 
 def _undamaged_field(domain: Domain, name: str, components: int) -> fem.Function:
     """DG0 field of ones."""
-    space = domain.cell_scalar if components == 1 else domain.cell_vector(components)
+    space = domain.scalar_cell_space if components == 1 else domain.vector_cell_space(components)
     field = fem.Function(space, name=name)
     field.x.array[:] = 1.0
     return field

@@ -1,9 +1,12 @@
 """The distributed mesh of a run: domain, edge damage, fragments, split surface.
 
 parallel                    collective operations; errors that reach every rank; halos of cells
-domain                      the partitioned mesh with its named groups, function spaces, and maps to the input mesh
+domain                      the partitioned mesh: nodes, cells, function spaces, and numbers in the input mesh
+facets                      named groups of facets, the boundary, neighbouring cells
+midside_nodes               nodes of quadratic displacement
+ghost_exchange              values of nodes, edges and facets that ranks share
 input_topology              cells and edges of the input mesh, numbered once
-selectors                   groups and regions by name; boxes and planes
+selectors, selection        groups and regions by name, boxes and planes; the nodes and facets that they select
 simplices                   edges of a triangle or tetrahedron; tables of patterns of broken edges
 small_matrices              arrays of 2 x 2 and 3 x 3 matrices
 edge_graph                  the edges of the mesh, their integrity, and the cells at an edge

@@ -12,10 +12,10 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 from dolfinx import la
-from dolfinx.common import IndexMap
 
 from .domain import Domain, Ints
-from .parallel import allgather, gather, sum_over_ranks
+from .ghost_exchange import min_over_ranks
+from .parallel import gather, sum_over_ranks
 from .simplices import intact_edges, is_split, local_edges
 
 
@@ -118,7 +118,7 @@ class EdgeGraph:
 
         Returns the number of edges that broke, and of edges whose integrity decreased, over all ranks.
         """
-        reduced = np.minimum(self.integrity, self.min_over_ranks(integrity))
+        reduced = np.minimum(self.integrity, min_over_ranks(self.index_map, integrity))
         less, new = reduced < self.integrity, (reduced == 0) & ~self.broken
         self.integrity[:] = reduced
         self._note_broken(new)
@@ -145,22 +145,6 @@ class EdgeGraph:
         # a copy, since others compare with the array of the state before
         self.split = self.split.copy()
         self.split[touched] = is_split(self.domain.dim)[self.pattern[touched]]
-
-    def min_over_ranks(
-        self, values: npt.NDArray[np.float64], index_map: IndexMap | None = None
-    ) -> npt.NDArray[np.float64]:
-        """(n,) minimum over ranks of the values of edges, or of entities of another index map (collective)."""
-        if self.domain.comm.size == 1:
-            return values
-        index_map = index_map or self.index_map
-        ghost_rows, first = allgather(self.domain.comm, values[index_map.size_local :]), index_map.local_range[0]
-        result = la.vector(index_map, 1, np.float64)
-        result.array[:] = values
-        for ghosts, ghost_values in zip(allgather(self.domain.comm, index_map.ghosts), ghost_rows, strict=True):
-            owned = (ghosts >= first) & (ghosts < first + index_map.size_local)
-            np.minimum.at(result.array, ghosts[owned] - first, ghost_values[owned])
-        result.scatter_forward()
-        return np.asarray(result.array)
 
     def retain_edges(self, retained: npt.NDArray[np.bool_]) -> None:
         """Retain flagged edges (edges,): they do not break although all their cells are split."""
@@ -197,7 +181,7 @@ class EdgeGraph:
 
     def edge_keys(self, edges: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
         """(n, 2) input-mesh nodes of local edges, the lower first: a key that does not depend on the partition."""
-        return np.sort(self.domain.node_input[self.edge_nodes[edges]], axis=1)
+        return np.sort(self.domain.input_numbering.nodes[self.edge_nodes[edges]], axis=1)
 
     def gather_broken(
         self, values: npt.NDArray[np.float64] | None = None

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import la
 
 from ..meshes.topology import components
 from .domain import Domain
 from .edge_graph import EdgeGraph
+from .ghost_exchange import owner_values
 from .parallel import allgather, offset
 
 
@@ -39,10 +39,11 @@ def find_fragments(graph: EdgeGraph) -> Fragments:
     first = offset(domain.comm, local_count)
     label = local + first
     ghosts = slice(domain.node_count, None)
-    links = np.stack([label[ghosts], _owners_label(domain, label)[ghosts]], axis=1)
+    owners_label = owner_values(domain.space.dofmap.index_map, label)
+    links = np.stack([label[ghosts], owners_label[ghosts]], axis=1)
     all_links = np.concatenate(allgather(domain.comm, np.unique(links, axis=0)))
     lowest = np.full(local_count, np.iinfo(np.int64).max)
-    np.minimum.at(lowest, local, domain.node_input)
+    np.minimum.at(lowest, local, domain.input_numbering.nodes)
     lowest = np.concatenate(allgather(domain.comm, lowest))
     count, joined = components(all_links, len(lowest))
     lowest_joined = np.full(count, np.iinfo(np.int64).max)
@@ -59,8 +60,9 @@ def midside_parents(domain: Domain) -> tuple[npt.NDArray[np.int32], npt.NDArray[
     That is the end which comes first in the input mesh. The edge may be broken, so that the midside node alone does not
     tell the fragment.
     """
-    between, ends = domain.midside_edges
-    return between, ends[np.arange(len(ends)), np.argmin(domain.node_input[ends], axis=1)]
+    midside = domain.cell_midside_nodes.of_edges
+    ends = midside.ends
+    return midside.nodes, ends[np.arange(len(ends)), np.argmin(domain.input_numbering.nodes[ends], axis=1)]
 
 
 def _links(graph: EdgeGraph) -> npt.NDArray[np.int32]:
@@ -69,11 +71,3 @@ def _links(graph: EdgeGraph) -> npt.NDArray[np.int32]:
     return (
         edges if graph.domain.order == 1 else np.concatenate([edges, np.stack(midside_parents(graph.domain), axis=1)])
     )
-
-
-def _owners_label(domain: Domain, label: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """(nodes,) the label of each node on the rank that owns the node (collective)."""
-    vector = la.vector(domain.space.dofmap.index_map, 1, np.int64)
-    vector.array[:] = label
-    vector.scatter_forward()
-    return vector.array.copy()

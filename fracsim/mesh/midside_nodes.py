@@ -11,6 +11,7 @@ Equations: docs/theory.md#quadratic-displacement.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +21,9 @@ from ..meshes.data import MeshData
 from ..meshes.topology import edges_of
 from .parallel import bcast
 from .simplices import local_edges
+
+if TYPE_CHECKING:
+    from .domain import Domain
 
 Ints = npt.NDArray[np.int64]
 
@@ -48,6 +52,27 @@ class MidsideNodes:
         return self.points + np.searchsorted(self.keys, ends.min(axis=-1) * self.points + ends.max(axis=-1))
 
 
+class CellMidsideNodes:
+    """Midside nodes of the owned cells, in the numbering of this rank; none if displacement is linear.
+
+    Attributes:
+        of_edges: (cells, 3 or 6) node on each local edge of each cell; (cells, 0) for linear displacement.
+        nodes: (m,) distinct midside nodes, ghosts included.
+        ends: (m, 2) corners at the ends of the edge of each of them.
+    """
+
+    def __init__(self, cell_nodes: npt.NDArray[np.int32], dim: int) -> None:
+        """`cell_nodes`: (cells, n) corners, then midside nodes; `dim`: 2 or 3."""
+        corners = cell_nodes[:, : dim + 1]
+        self.of_edges = np.ascontiguousarray(cell_nodes[:, dim + 1 :])
+        self.nodes, first = np.unique(self.of_edges, return_index=True)
+        self.ends = corners[:, local_edges(dim)].reshape(-1, 2)[first]
+
+    def straighten_edges(self, values: npt.NDArray[np.float64]) -> None:
+        """Set values (nodes, d) at midside nodes to the mean of the ends of their edges."""
+        values[self.nodes] = values[self.ends].mean(axis=1)
+
+
 # local edges in the order of the midside nodes of VTK and XDMF: (0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)
 FILE_EDGE_ORDER = {2: [2, 0, 1], 3: [5, 2, 4, 3, 1, 0]}
 
@@ -61,6 +86,13 @@ def with_midside_nodes(data: MeshData, middles: MidsideNodes, *, written: bool) 
     ends = data.cells[:, local_edges(data.dim)[FILE_EDGE_ORDER[data.dim] if written else slice(None)]]
     cells = np.hstack([data.cells, middles.index_between(ends)])
     return replace(data, points=np.concatenate([data.points, between]), cells=cells)
+
+
+def mesh_of_nodes(domain: Domain) -> MeshData | None:
+    """The input mesh on rank 0, with midside nodes for quadratic displacement; None elsewhere."""
+    if domain.midside_nodes is None or domain.input_mesh is None:
+        return domain.input_mesh
+    return with_midside_nodes(domain.input_mesh, domain.midside_nodes, written=True)
 
 
 def find_midside_nodes(comm: MPI.Comm, data: MeshData | None) -> MidsideNodes:

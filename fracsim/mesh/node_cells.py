@@ -8,6 +8,7 @@ from dolfinx import la
 
 from ..meshes.topology import components
 from .domain import Domain
+from .ghost_exchange import min_over_ranks, owner_values
 from .parallel import allgather, offset
 
 Values = npt.NDArray[np.float64]
@@ -42,7 +43,7 @@ def node_components(domain: Domain, flags: Flags) -> tuple[int, Ints]:
     count, component = _local_components(domain, cells)
     lowest: Ints = np.full(count, np.iinfo(np.int64).max)
     size: Ints = np.bincount(component, minlength=count)
-    np.minimum.at(lowest, component, domain.cell_input[cells])
+    np.minimum.at(lowest, component, domain.input_numbering.cells[cells])
     joined, size, lowest = _join_over_ranks(domain, cells, component, count, size, lowest)
     number = np.empty(len(size), np.int64)
     number[np.lexsort((lowest, -size))] = np.arange(len(size))
@@ -53,7 +54,7 @@ def _local_components(domain: Domain, cells: Ints) -> tuple[int, Ints]:
     """The number of components on this rank, and (n,) that of each of the cells (n,)."""
     index = np.full(domain.cell_count, -1)
     index[cells] = np.arange(len(cells))
-    links = index[domain.facet_neighbours]
+    links = index[domain.facets.neighbours]
     return components(links[(links >= 0).all(axis=1)], len(cells))
 
 
@@ -68,13 +69,11 @@ def _join_over_ranks(
     comm = domain.comm
     if comm.size == 1:
         return np.arange(count), size, lowest
-    first, facets = offset(comm, count), domain.mesh.topology.index_map(domain.dim - 1)
-    label = la.vector(facets, 1, np.int64)
-    label.array[:] = -1
-    label.array[domain.cell_facets[cells]] = (first + component)[:, None]
-    local = label.array[facets.size_local :].copy()
-    label.scatter_forward()
-    links = np.stack([local, label.array[facets.size_local :]], axis=1)
+    first, index_map = offset(comm, count), domain.mesh.topology.index_map(domain.dim - 1)
+    label = np.full(index_map.size_local + index_map.num_ghosts, -1)
+    label[domain.facets.cell_facets[cells]] = (first + component)[:, None]
+    ghosts = slice(index_map.size_local, None)
+    links = np.stack([label[ghosts], owner_values(index_map, label)[ghosts]], axis=1)
     links = np.concatenate(allgather(comm, links[(links >= 0).all(axis=1)]))
     sizes, lowest_cells = (np.concatenate(allgather(comm, values)) for values in (size, lowest))
     total, joined = components(links, len(sizes))
@@ -90,12 +89,5 @@ def _lowest_number(domain: Domain, cells: Ints, number: Ints) -> Ints:
     lowest = np.full(len(domain.nodes), none)
     nodes = domain.all_cell_nodes[cells]
     np.minimum.at(lowest, nodes.reshape(-1), np.repeat(number, nodes.shape[1]))
-    if domain.comm.size > 1:
-        index_map = domain.space.dofmap.index_map
-        ghosts, numbers = (
-            np.concatenate(allgather(domain.comm, values)) for values in (index_map.ghosts, lowest[owned:])
-        )
-        local = ghosts - index_map.local_range[0]
-        is_owned = (local >= 0) & (local < owned)
-        np.minimum.at(lowest, local[is_owned], numbers[is_owned])
-    return np.where(lowest[:owned] == none, -1, lowest[:owned])
+    of_owned = min_over_ranks(domain.space.dofmap.index_map, lowest)[:owned]
+    return np.where(of_owned == none, -1, of_owned)

@@ -95,15 +95,15 @@ def write_checkpoint(
     if name := _first_not_finite(comm, [nodal | cells | edges, clock, replicated]):
         raise NotConverged(f"the state at t = {state.t:g} s is not finite ({name}): it was not written")
     arrays: dict[str, Any] = {f"{_TERM_PREFIX}{name}": values for name, values in terms.items()}
-    arrays |= {name: domain.gather_nodes(values.reshape(-1, d)) for name, values in nodal.items()}
-    arrays |= {name: domain.gather_cells(values) for name, values in cells.items()}
+    arrays |= {name: domain.input_numbering.gather_nodes(values.reshape(-1, d)) for name, values in nodal.items()}
+    arrays |= {name: domain.input_numbering.gather_cells(values) for name, values in cells.items()}
     if record is not None:
         arrays["weakened"], arrays["integrity"] = record.graph.gather_weakened() or (None, None)
         arrays["broken"], arrays["breaks"] = record.to_checkpoint() or (None, None)
     if surfaces is not None:
         arrays["starts"] = surfaces.starts
     path = checkpoint_path(folder)
-    write_on_root(comm, path, lambda: write_checkpoint_file(path, arrays, clock, domain.source, notes))
+    write_on_root(comm, path, lambda: write_checkpoint_file(path, arrays, clock, domain.input_mesh, notes))
     return path
 
 
@@ -181,7 +181,9 @@ def read_checkpoint(
         return gather.scatter(arrays.get(name))
 
     nodal_names = (*_NODAL, *_OPTIONAL_NODAL, "u_before")
-    nodal = {name: scattered(domain.gather_nodes, name).reshape(-1) for name in nodal_names if name in names}
+    nodal = {
+        name: scattered(domain.input_numbering.gather_nodes, name).reshape(-1) for name in nodal_names if name in names
+    }
     before = nodal.pop("u_before", None)
     if record is not None and replicated["weakened"] is not None:
         _check_edges(comm, record, replicated["weakened"], checkpoint_path(folder))
@@ -190,9 +192,9 @@ def read_checkpoint(
     if surfaces is not None and replicated["starts"] is not None:
         surfaces.set_starts(replicated["starts"])
     if stress.chi is not None and "chi" in names:
-        stress.chi.x.array[: domain.cell_count] = scattered(domain.gather_cells, "chi")
+        stress.chi.x.array[: domain.cell_count] = scattered(domain.input_numbering.gather_cells, "chi")
     if plastic is not None and "plastic" in names:
-        rows = scattered(domain.gather_cells, "plastic")
+        rows = scattered(domain.input_numbering.gather_cells, "plastic")
         plastic.restore(rows.reshape(-1, rows.shape[-1]))
     values: dict[str, Any] = {name: clock[name] for name in _CLOCK} | nodal
     values["easy_steps"] = clock["easy"]
@@ -200,7 +202,7 @@ def read_checkpoint(
     values["elastic"] = 0.0 if comm.rank else clock["elastic"]
     values["previous_increment"] = None if before is None else (before, clock["dt_before"])
     if "frequencies" in names:
-        values["frequencies"] = scattered(domain.gather_cells, "frequencies")
+        values["frequencies"] = scattered(domain.input_numbering.gather_cells, "frequencies")
     history = {key.removeprefix(_TERM_PREFIX): rows for key, rows in replicated.items() if key.startswith(_TERM_PREFIX)}
     return replace(state, **values, history={"saved": history})
 
@@ -314,7 +316,7 @@ def _clock_problem(clock: dict[str, Any], arrays: dict[str, npt.NDArray[Any]]) -
 def _read_checked(folder: Path, domain: Domain, checks: _ContentChecks) -> StoredCheckpoint:
     """Checkpoint that passed all checks (rank 0). Raises InputError."""
     stored = read_checkpoint_file(folder)
-    check_mesh(stored, domain.source)
+    check_mesh(stored, domain.input_mesh)
     checks(stored)
     return stored
 

@@ -112,7 +112,7 @@ class CrackExtent:
 
     def _input_nodes(self, edges: Ints) -> Values:
         """Input nodes (n, 2) of edges."""
-        return np.asarray(self._domain.node_input[self._edge_ends[edges]], float)
+        return np.asarray(self._domain.input_numbering.nodes[self._edge_ends[edges]], float)
 
     def _locate_segment_end(self, end: Values) -> None:
         """Find the cell, not split, in which a segment of the study ends at the point `end` (d,) in m (collective)."""
@@ -124,7 +124,11 @@ class CrackExtent:
         barycentric = np.linalg.solve(sides, (end - corners[:, 0])[:, :, None])[:, :, 0]
         cells = cells[(barycentric.min(axis=1) > MIN_BARYCENTRIC) & (barycentric.sum(axis=1) < 1 - MIN_BARYCENTRIC)]
         candidates = [
-            (float(np.linalg.norm(end - self._segment_entry(cell))), -int(self._domain.cell_input[cell]), int(cell))
+            (
+                float(np.linalg.norm(end - self._segment_entry(cell))),
+                -int(self._domain.input_numbering.cells[cell]),
+                int(cell),
+            )
             for cell in cells
         ]
         farthest = max(candidates, default=(-1.0, 0, -1))

@@ -10,6 +10,7 @@ import numpy.typing as npt
 from ..mechanics.stress import Stress
 from ..mesh.connected_bodies import label_bodies
 from ..mesh.domain import Domain
+from ..mesh.ghost_exchange import with_ghosts
 from ..mesh.parallel import sum_over_ranks
 
 if TYPE_CHECKING:
@@ -107,7 +108,9 @@ class FractureLog:
         if self.fragments is None:
             return 0, 0.0
         domain, of_node = self._domain, self.fragments.node_fragment
-        size = sum_over_ranks(domain.comm, np.bincount(of_node[domain.owned_corners], minlength=self.fragments.count))
+        size = sum_over_ranks(
+            domain.comm, np.bincount(of_node[domain.input_numbering.owned_corners], minlength=self.fragments.count)
+        )
         single = (size == 1)[of_node]
         # each corner has an equal share of the mass of its cells
         share = np.count_nonzero(single[domain.cell_nodes], axis=1) / (domain.dim + 1)
@@ -119,12 +122,12 @@ class FractureLog:
 
         assert self.record is not None
         domain, ends = self._domain, self.record.graph.edge_nodes
-        force = domain.with_ghosts(self._stress.assemble_forces()).reshape(-1, domain.dim)
+        force = with_ghosts(domain, self._stress.assemble_forces()).reshape(-1, domain.dim)
         # ends in the order of the input mesh, so that a cut does not depend on the partition
-        swap = domain.node_input[ends[:, 0]] > domain.node_input[ends[:, 1]]
+        swap = domain.input_numbering.nodes[ends[:, 0]] > domain.input_numbering.nodes[ends[:, 1]]
         return cut_positions_from_forces(force, np.where(swap[:, None], ends[:, ::-1], ends))
 
 
 def _count_bodies(domain: Domain) -> int:
     """Number of bodies of the mesh that share no node (collective)."""
-    return int(domain.comm.bcast(label_bodies(domain.source)[0] if domain.source is not None else None))
+    return int(domain.comm.bcast(label_bodies(domain.input_mesh)[0] if domain.input_mesh is not None else None))

@@ -17,6 +17,7 @@ from ..mechanics.balance import Balance
 from ..mechanics.jit import CellExpression
 from ..mechanics.stress import Stress
 from ..mechanics.term_protocols import OutputSurfaces, SurfaceSeparator
+from ..mesh.midside_nodes import mesh_of_nodes
 from ..timestepping.state import State
 from .atomic_write import write_on_root
 from .fields_file import TENSOR_COMPONENTS, Field, FieldsFile
@@ -60,17 +61,17 @@ class FieldEvaluator:
                     self._nodal_field(name, fragments.node_fragment[: self._domain.node_count].astype(np.int32))
                 )
             else:
-                fields.append(Field(name, "Cell", self._domain.gather_cells(self._cell_values(name))))
+                fields.append(Field(name, "Cell", self._domain.input_numbering.gather_cells(self._cell_values(name))))
         return fields
 
     def _nodal_field(self, name: str, owned: Values) -> Field:
         """Nodal field from the values at the nodes that this rank owns (collective)."""
-        return Field(name, "Node", self._domain.gather_nodes(owned))
+        return Field(name, "Node", self._domain.input_numbering.gather_nodes(owned))
 
     def _cell_values(self, name: str) -> Values:
         """Values of a cell field on the cells of this rank, (cells,) or (cells, components)."""
         if name == "region":
-            return self._domain.region.astype(np.int32)
+            return self._domain.cell_region.astype(np.int32)
         if name == "plastic_strain":
             plastic = self._stress.material.plastic
             strain: Values = plastic.cell_means(plastic.accumulated_strain)
@@ -183,7 +184,7 @@ class FrameFiles:
         """
         stress = balance.stress
         self._comm, self._path, self._breaks = stress.domain.comm, folder / "fields.xdmf", breaks
-        self._evaluate, mesh = FieldEvaluator(stress, fields, breaking), stress.domain.mesh_of_nodes()
+        self._evaluate, mesh = FieldEvaluator(stress, fields, breaking), mesh_of_nodes(stress.domain)
         self.fields = write_on_root(
             self._comm, self._path, lambda: FieldsFile(folder, mesh, resume_at) if mesh else None
         )

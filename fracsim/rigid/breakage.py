@@ -171,7 +171,7 @@ class BreakableBody:
         self._corners = np.ascontiguousarray(self._domain.cell_nodes.T)
         # analyses by the lowest node of the fragment
         self._bodies: dict[int, BodyAnalysis] = {}
-        self._node_of_input = np.argsort(self._domain.node_input)
+        self._node_of_input = np.argsort(self._domain.input_numbering.nodes)
         self._find_fragments()
 
     def _find_fragments(self) -> None:
@@ -182,10 +182,10 @@ class BreakableBody:
 
     def input_damage(self) -> tuple[npt.NDArray[np.uint8], Values]:
         """Return patterns (C,) of cells and cut positions (E,) of edges, in the order of the input mesh."""
-        domain, source = self._domain, self._domain.source
+        domain, source = self._domain, self._domain.input_mesh
         assert source is not None
         pattern = np.empty(domain.cell_count, np.uint8)
-        pattern[domain.cell_input] = self.graph.pattern
+        pattern[domain.input_numbering.cells] = self.graph.pattern
         edges = np.arange(len(self.graph.broken))
         cut = np.full(len(edges), np.nan)
         if self._criterion is not None:

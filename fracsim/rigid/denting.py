@@ -99,7 +99,7 @@ class PlasticDenting:
         yields = (q > self._yield_stress) & (body.cell_fractions > 0)
         if not np.any(yields):
             return None
-        domain, source = self._domain, self._domain.source
+        domain, source = self._domain, self._domain.input_mesh
         assert source is not None
         cells = np.flatnonzero(body.cell_fractions)
         nodes = domain.cell_nodes[cells]
@@ -117,7 +117,7 @@ class PlasticDenting:
         F = finite_gradient(gradient)
         at_rest, corners, volumes = domain.nodes[body.nodes], row_of_node[nodes], domain.volumes[cells]
         points = source.points.copy()
-        points[domain.node_input[body.nodes]] = remove_rigid_motion(
+        points[domain.input_numbering.nodes[body.nodes]] = remove_rigid_motion(
             at_rest, fit_positions(at_rest, corners, gradients, volumes, F), corners, volumes
         )
         crushed = np.linalg.eigvalsh(gradient + np.swapaxes(gradient, 1, 2))[:, 0] <= -2
@@ -129,7 +129,7 @@ class PlasticDenting:
                 f"raise plasticity.hardening ({self._hardening:g} Pa) or yield_stress, or strike less hard"
             )
         yield_stress = np.empty_like(q)
-        yield_stress[domain.cell_input] = np.where(yields, q, self._yield_stress)
+        yield_stress[domain.input_numbering.cells] = np.where(yields, q, self._yield_stress)
         return DentedShape(points, yield_stress)
 
     def _affordable_factor(self, stress: Values, q: Values, energy: float) -> float:

@@ -106,7 +106,7 @@ class SolidStiffness:
         result = np.zeros((len(cell_fractions), self._cauchy_stress.width))
         if largest := float(np.abs(u).max()):
             # stress is linear in u: with a large u, F - 1 does not lose digits
-            factor = self.stress.domain.size / largest
+            factor = self.stress.domain.bounds.diagonal / largest
             self.stress.u.x.array[:] = factor * u.reshape(-1)
             cells = np.flatnonzero(cell_fractions).astype(np.int32)
             result[cells] = self._cauchy_stress(cells) / factor

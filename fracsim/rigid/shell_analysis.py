@@ -191,10 +191,10 @@ class ShellStiffness:
         self._stress_recovery = self.triangles.stress_recovery(young, poisson, shell.thickness)
         self.triangle_mass = density * shell.thickness * self.triangles.area
         domain = stress.domain
-        assert domain.source is not None
+        assert domain.input_mesh is not None
         count = len(self.nodes)
         # the first half of the nodes of the mesh is on the lower face, the second half on the upper one
-        director = domain.source.points[count:] - domain.source.points[:count]
+        director = domain.input_mesh.points[count:] - domain.input_mesh.points[:count]
         self._half_thickness: Values = director / np.linalg.norm(director, axis=1)[:, None] * shell.thickness / 2
         self._whole_body: ShellBody | None = None
 
@@ -217,7 +217,7 @@ class ShellStiffness:
     def triangle_fractions(self, cell_values: Values) -> Values:
         """Return the means (triangles,) of values (cells,) over the three cells of each triangle."""
         of_input = np.empty_like(cell_values)
-        of_input[self.stress.domain.cell_input] = cell_values
+        of_input[self.stress.domain.input_numbering.cells] = cell_values
         return np.asarray(of_input.reshape(-1, 3).mean(axis=1))
 
     def assemble_matrix(self, triangles: Ints, fractions: Values, row_of_node: Ints) -> csc_matrix:
@@ -231,7 +231,7 @@ class ShellStiffness:
     def mid_surface_forces(self, force: Values) -> Values:
         """Return forces and moments (n, 6) on the middle surface, N and N m, of forces (nodes of the mesh, 3), N."""
         of_input = np.empty_like(force)
-        of_input[self.stress.domain.node_input] = force
+        of_input[self.stress.domain.input_numbering.nodes] = force
         lower, upper = np.split(of_input, 2)
         return np.concatenate([lower + upper, np.cross(self._half_thickness, upper - lower)], axis=1)
 
@@ -248,7 +248,7 @@ class ShellStiffness:
         sigma = np.einsum("nai,nab,nbj->nij", axes, tensor, axes)
         result = np.zeros((len(self.triangles.area), 6))
         result[chosen] = np.stack([sigma[:, i, j] for i, j in SYMMETRIC_COMPONENTS[3]], axis=1)
-        cells = np.repeat(result, 3, axis=0)[self.stress.domain.cell_input]
+        cells = np.repeat(result, 3, axis=0)[self.stress.domain.input_numbering.cells]
         cells[cell_fractions == 0] = 0.0
         return np.asarray(cells)
 

@@ -29,6 +29,7 @@ from ..mechanics.material_fields import MaterialFields  # noqa: E402
 from ..mechanics.prescribed_motion import check_supports  # noqa: E402
 from ..mesh.domain import Domain, distribute  # noqa: E402
 from ..mesh.parallel import on_root  # noqa: E402
+from ..mesh.selection import nearest_node, select_nodes  # noqa: E402
 from ..output.history import ProbeGroup, ProbeReader  # noqa: E402
 from ..solvers.nonlinear_solver import NonlinearSolver  # noqa: E402
 from ..solvers.weak_callbacks import collect_dropped_scenes  # noqa: E402
@@ -194,10 +195,10 @@ def _probes(study: Study, domain: Domain) -> list[ProbeGroup]:
     for i, entry in enumerate(study.probe):
         if entry.point is not None:
             key = f"probe.{i}.point"
-            nodes = domain.nearest_node(check_size(entry.point, domain.dim, key), key)
+            nodes = nearest_node(domain, check_size(entry.point, domain.dim, key), key)
         else:
             assert entry.on is not None
             key = f"probe.{i}.on"
-            nodes = domain.select_nodes(find_selector(entry.on, domain.dim, key), key)
+            nodes = select_nodes(domain, find_selector(entry.on, domain.dim, key), key)
         probes.append(ProbeGroup(entry.name, entry.quantity, nodes))
     return probes

@@ -276,7 +276,7 @@ def _build_self_contact(
         contact.distance or distance_ratio * domain.mean_edge_length,
         contact.stiffness or DEFAULTS.self_stiffness * _max_young(domain, material),
         contact.friction,
-        contact.creep or DEFAULTS.creep * domain.size,
+        contact.creep or DEFAULTS.creep * domain.bounds.diagonal,
         0.0 if contact.creep else DEFAULTS.creep_ratio,
         contact.itself == "pieces",
         _uses_corners_only(study),
@@ -320,7 +320,7 @@ def _obstacle_law(
     """Return the law of obstacles with a barrier or a penalty (collective)."""
     distance = contact.distance or DEFAULTS.distance * domain.mean_edge_length
     stiffness = contact.stiffness or DEFAULTS.stiffness * _max_young(domain, material)
-    return ObstacleLaw(barrier(stiffness, distance), contact.creep or DEFAULTS.creep * domain.size)
+    return ObstacleLaw(barrier(stiffness, distance), contact.creep or DEFAULTS.creep * domain.bounds.diagonal)
 
 
 def _max_young(domain: Domain, material: MaterialFields) -> float:

@@ -180,7 +180,7 @@ def _build_yielding(
     if shape is None:
         yield_stress = np.broadcast_to(per_cell(study, domain, table, "yield_stress"), domain.cell_count)
     else:
-        yield_stress = shape.yield_stress[domain.cell_input]
+        yield_stress = shape.yield_stress[domain.input_numbering.cells]
     denting, average = (
         PlasticDenting(stiffness, yield_stress, table.hardening),
         FragmentAverage(None, domain.cell_count),

@@ -23,6 +23,7 @@ from ..mechanics.stress import RESIDUAL_STIFFNESS, DegradationModel, Stress
 from ..mechanics.term import Term
 from ..mechanics.time_functions import TimeFunction
 from ..mesh.domain import Domain
+from ..mesh.selection import select_facets, select_nodes
 from ..mesh.selectors import check_regions
 from ..study import Study, solver_options
 from ..study.conditions import BoundaryCondition, boundary_conditions, volume_loads
@@ -105,7 +106,7 @@ class TermInputs:
     def on_facets(self, kind: str) -> list[OnFacets]:
         """Return facets and function of time of every boundary condition of a kind (collective)."""
         conditions = [condition for condition in self.conditions if condition.kind == kind]
-        facets = [self.domain.select_facets(condition.selector, f"{condition.key}.on") for condition in conditions]
+        facets = [select_facets(self.domain, condition.selector, f"{condition.key}.on") for condition in conditions]
         return [(numbers, condition.function) for numbers, condition in zip(facets, conditions, strict=True)]
 
 
@@ -221,7 +222,7 @@ def build_balance(study: Study, domain: Domain, scheme: Scheme, material: Materi
     assembler, u = VectorAssembler(domain, kernels), fem.Function(domain.space, name="displacement")
     entries = boundary_conditions(study, domain.dim)
     prescribed = [
-        (domain.select_nodes(entry.selector, f"{entry.key}.on"), entry.components, entry.function)
+        (select_nodes(domain, entry.selector, f"{entry.key}.on"), entry.components, entry.function)
         for entry in entries
         if entry.prescribes_motion
     ]

@@ -168,4 +168,6 @@ class TangentOperators:
 
 def near_nullspace(domain: Domain) -> PETSc.NullSpace:
     """The rigid body modes of a body about its centre (collective)."""
-    return rigid_body_nullspace(domain.comm, domain.nodes[: domain.node_count] - (domain.lower + domain.upper) / 2)
+    return rigid_body_nullspace(
+        domain.comm, domain.nodes[: domain.node_count] - (domain.bounds.lower + domain.bounds.upper) / 2
+    )

@@ -136,7 +136,7 @@ def measure(case: str, cuts: list[int], *, baseline: bool) -> dict[str, Any]:
         inside = Path(comm.bcast(folder))
         whole, cut = (Run(build_scene(comm, study), inside / name) for name in ("whole", "cut"))
         domain = whole.scene.domain
-        planes = random_planes(max(cuts), domain.lower, domain.upper)
+        planes = random_planes(max(cuts), domain.bounds.lower, domain.bounds.upper)
         sizes = sum_over_ranks(comm, np.array([domain.cell_count, domain.node_count]))
         stages, done = [], 0
         for count in cuts:
@@ -188,7 +188,7 @@ class VirtualNodeBaseline:
         old, study, graph = run.scene.domain, run.scene.study, run.scene.fracture.graph
         self.new = duplicate_cut_cells(old.cell_nodes, node_groups(old.dim)[graph.pattern], old.node_count)
         domain = distribute(old.comm, self._mesh(old))
-        share = self.new.share[domain.cell_input]
+        share = self.new.share[domain.input_numbering.cells]
         material = build_material(study, domain)
         scene = build_scene_on(domain, study, replace(material, density=share * material.density))
         assert scene.balance.stress.chi is not None
@@ -207,7 +207,7 @@ class VirtualNodeBaseline:
         local = np.array([[k for k in range(4) if k != face] for face in range(4)])
         faces, owned = new.cells[:, local].reshape(-1, 3), new.owned[:, local].reshape(-1, 3).any(axis=1)
         keys = np.sort(new.node[faces], axis=1) @ (old.node_count ** np.arange(3, dtype=np.int64))
-        for name, facets in old.facets.items():
+        for name, facets in old.facets.groups.items():
             geometry = _facet_nodes(old, facets)
             wanted = np.sort(geometry, axis=1) @ (old.node_count ** np.arange(3, dtype=np.int64))
             groups[name] = faces[owned & np.isin(keys, wanted)]
@@ -215,7 +215,7 @@ class VirtualNodeBaseline:
 
     def _transfer_motion(self, state: Any, domain: Any) -> None:
         """Transfer displacement and velocity of the original nodes to all copies."""
-        source = self.new.node[domain.node_input]
+        source = self.new.node[domain.input_numbering.nodes]
         u, v = (x.reshape(-1, 3)[source].ravel().copy() for x in (state.u, state.v))
         self.state = self.stepper.with_forces(replace(self.state, u=u, v=v, t=state.t, step=state.step))
 

@@ -192,7 +192,9 @@ def start_run(name: str, n: int, folder: Path) -> Any:
         from .crack_count_cost import break_planes
 
         # through the middle, askew and off the nodes of the lattice
-        break_planes(run, [((0.02, 0.03, 1.0), 0.5013 * (run.scene.domain.lower + run.scene.domain.upper))])
+        break_planes(
+            run, [((0.02, 0.03, 1.0), 0.5013 * (run.scene.domain.bounds.lower + run.scene.domain.bounds.upper))]
+        )
     return run
 
 

@@ -50,7 +50,7 @@ def advance_inverted_body(comm: Any, energy: str, steps: int = 400) -> dict[str,
     study["time"] = {"scheme": "backward-euler", "step": 0.01, "end": steps * 0.01}  # it has to come to rest
     scene = build_scene(comm, validate(study, "inverted"))
     domain, stepper = scene.domain, scene.stepper
-    middle = (domain.lower + domain.upper) / 2
+    middle = (domain.bounds.lower + domain.bounds.upper) / 2
     u = (-np.array([1.9, 2.0, 2.1]) * (domain.nodes[: domain.node_count] - middle)).reshape(-1)
     state = stepper.with_forces(replace(scene.start(), u=u))
     energies, newton = [sum_over_ranks(comm, scene.balance.stress.stored_energy())[0]], []

@@ -93,11 +93,11 @@ def enclosed(made: SplitSurface) -> Values:
 
 def scene_surface(scene: Scene) -> SplitSurface:
     """The split surface of a scene as it stands (serial)."""
-    assert scene.domain.source is not None
-    skeleton, graph = EntityNumbering(scene.domain.source), scene.fracture.graph
+    assert scene.domain.input_mesh is not None
+    skeleton, graph = EntityNumbering(scene.domain.input_mesh), scene.fracture.graph
     own = np.flatnonzero(graph.broken)
     cut = skeleton.of_edges(graph.edge_keys(own), scene.fracture.criterion.cut_positions[own])
-    pattern = scene.domain.gather_cells(graph.pattern)
+    pattern = scene.domain.input_numbering.gather_cells(graph.pattern)
     assert pattern is not None
     return build_split_surface(skeleton, pattern, cut)
 

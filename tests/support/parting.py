@@ -32,11 +32,11 @@ def broken_bit_by_bit(dim: int, h: float, order: int) -> npt.NDArray[np.int64]:
     for last in np.arange(0, turn[-1] + AT_ONCE, AT_ONCE):
         graph.break_edges(turn[:-1] <= last)
         pieces = find_fragments(graph)
-        of_node = graph.domain.gather_nodes(pieces.node_fragment[: graph.domain.node_count])
+        of_node = graph.domain.input_numbering.gather_nodes(pieces.node_fragment[: graph.domain.node_count])
         keys = graph.broken_keys()
         if keys is not None:
             assert of_node is not None
-            same = np.array_equal(of_node[: len(graph.domain.source.points)], _by_scipy(graph, keys))
+            same = np.array_equal(of_node[: len(graph.domain.input_mesh.points)], _by_scipy(graph, keys))
             rows.append((same, pieces.count))
     return np.array(rows)
 
@@ -55,7 +55,7 @@ def _turns(graph: EdgeGraph) -> npt.NDArray[np.int64]:
 
 def _by_scipy(graph: EdgeGraph, broken: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """(points,) components of the input mesh without the edges `broken` (n, 2), numbered by their lowest point."""
-    source = graph.domain.source
+    source = graph.domain.input_mesh
     assert source is not None
     first, second = np.triu_indices(source.cells.shape[1], 1)
     pairs = np.sort(np.stack([source.cells[:, first].ravel(), source.cells[:, second].ravel()], axis=1), axis=1)

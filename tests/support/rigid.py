@@ -76,9 +76,9 @@ def density_of(bodies: PolyhedronMoments) -> Values:
 def moments_of(body: BreakableBody) -> PolyhedronMoments:
     """Of the pieces, from the split surface of the mesh at rest."""
     domain = body.graph.domain
-    assert domain.source is not None
-    skeleton = EntityNumbering(domain.source)
+    assert domain.input_mesh is not None
+    skeleton = EntityNumbering(domain.input_mesh)
     pattern = np.empty(domain.cell_count, np.uint8)
-    pattern[domain.cell_input] = body.graph.pattern
+    pattern[domain.input_numbering.cells] = body.graph.pattern
     made = build_split_surface(skeleton, pattern)
     return moments(made.points, made.elements, made.point_fragment[made.elements[:, 0]], made.fragment_count)

@@ -87,8 +87,8 @@ def march(scene: Scene, state: Walk, steps: int | None = None) -> list[StepRepor
 
 def mesh_of(scene: Scene) -> MeshData:
     """The mesh as it was built (serial)."""
-    assert scene.domain.source is not None
-    return scene.domain.source
+    assert scene.domain.input_mesh is not None
+    return scene.domain.input_mesh
 
 
 def positions(scene: Scene) -> Values:

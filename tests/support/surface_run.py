@@ -35,14 +35,16 @@ class WrittenSurface:
     def result(self, name: str) -> dict[str, npt.NDArray[Any]]:
         """The last frame, on rank 0 (collective)."""
         domain = self._scene.domain
-        of_node = domain.gather_nodes(find_fragments(self._scene.fracture.graph).node_fragment[: domain.node_count])
-        ours = domain.gather_cells(domain.node_input[domain.cell_nodes])
+        of_node = domain.input_numbering.gather_nodes(
+            find_fragments(self._scene.fracture.graph).node_fragment[: domain.node_count]
+        )
+        ours = domain.input_numbering.gather_cells(domain.input_numbering.nodes[domain.cell_nodes])
         if self._output.surface_and_files is None:
             return {}
         surface, _ = self._output.surface_and_files
         made, follow = surface.split, surface.split.parents
-        assert domain.source is not None
-        assert np.array_equal(ours, domain.source.cells)  # patterns are in the local order of the input cells
+        assert domain.input_mesh is not None
+        assert np.array_equal(ours, domain.input_mesh.cells)  # patterns are in the local order of the input cells
         arrays = {
             "elements": made.elements, "cell": made.cell, "edge": made.edge, "origin": made.origin,
             "points": made.points, "start": follow.start, "parents": follow.parents, "fill": made.fill,

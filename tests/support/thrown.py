@@ -51,7 +51,7 @@ def compared() -> Found:
         scene, state = thrown()
     nonlinear_elimination.NonlinearElimination.relax_nodes = rest  # type: ignore[method-assign]
     return {
-        "thrown-u": scene.domain.gather_nodes(state.u.reshape(-1, 3)),
+        "thrown-u": scene.domain.input_numbering.gather_nodes(state.u.reshape(-1, 3)),
         "thrown-rested": np.array([len(rested)]),
-        "thrown-held": scene.domain.gather_nodes(_held_back(scene)),
+        "thrown-held": scene.domain.input_numbering.gather_nodes(_held_back(scene)),
     }

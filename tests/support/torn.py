@@ -93,8 +93,8 @@ def averages(domain: Domain, name: str) -> Found:
     found: Found = {}
     for kernel in KERNELS:
         average = NonlocalAverage(domain, RADIUS[name], kernel)
-        found[f"average-{name}-{kernel}"] = domain.gather_cells(average(values))
-        found[f"active-{name}-{kernel}"] = domain.gather_cells(average(values, active))
+        found[f"average-{name}-{kernel}"] = domain.input_numbering.gather_cells(average(values))
+        found[f"active-{name}-{kernel}"] = domain.input_numbering.gather_cells(average(values, active))
     return found
 
 
@@ -108,8 +108,8 @@ def pieces(label: str) -> Found:
     count = graph.break_edges(ends[:, 0] != ends[:, 1])
     bodies = find_fragments(graph)
     d = domain.dim
-    piece = domain.gather_nodes(bodies.node_fragment[: domain.node_count])
-    mass = domain.gather_nodes(scene.balance.mass.lumped[::d])
+    piece = domain.input_numbering.gather_nodes(bodies.node_fragment[: domain.node_count])
+    mass = domain.input_numbering.gather_nodes(scene.balance.mass.lumped[::d])
     return {
         f"pieces-{label}": np.array([bodies.count, count]),
         f"piece-{label}": piece,
@@ -121,7 +121,7 @@ def edges(domain: Domain) -> Found:
     """Edges broken from the side of single cells, and the hashed number of every edge's mid-point."""
     graph = EdgeGraph(domain)
     flags = np.zeros(len(graph.broken), bool)
-    flags[graph.cell_edges[domain.cell_input % 7 == 0]] = True
+    flags[graph.cell_edges[domain.input_numbering.cells % 7 == 0]] = True
     count = graph.break_edges(flags)
     ends = domain.nodes[graph.edge_nodes[: graph.edge_count]]
     keys = graph.edge_keys(np.arange(graph.edge_count))
@@ -129,7 +129,7 @@ def edges(domain: Domain) -> Found:
     found = {
         "edges-broken": graph.broken_keys(),
         "edges-count": np.array([count, sum_over_ranks(domain.comm, graph.broken_count)[0]]),
-        "edges-patterns": domain.gather_cells(graph.pattern.astype(np.int64)),
+        "edges-patterns": domain.input_numbering.gather_cells(graph.pattern.astype(np.int64)),
     }
     if every is not None:
         keys, noise = (np.concatenate(parts) for parts in zip(*every, strict=True))
@@ -158,7 +158,9 @@ def weakened(comm: MPI.Intracomm) -> tuple[npt.NDArray[Any] | None, int]:
     domain = build_scene(comm, make_study(mesh=mesh)).domain
     graph = EdgeGraph(domain)
     values = np.ones(len(graph.integrity))
-    np.minimum.at(values, graph.cell_edges, (domain.cell_input % 5 / 4)[:, None])  # each cell says its own number
+    np.minimum.at(
+        values, graph.cell_edges, (domain.input_numbering.cells % 5 / 4)[:, None]
+    )  # each cell says its own number
     count = graph.weaken(values)[0]
     assert graph.weaken(np.ones(len(values))) == (0, 0)  # never rises
     found = graph.gather_weakened()
@@ -169,7 +171,9 @@ def weaken(scene: Scene) -> None:
     """Give the cells a chi that follows from their place in the input: 0 in one of three, anything in the others."""
     domain, chi = scene.domain, scene.balance.stress.chi
     assert chi is not None
-    chi.x.array[: domain.cell_count] = np.where(domain.cell_input % 3, np.cos(domain.cell_input) ** 2, 0.0)
+    chi.x.array[: domain.cell_count] = np.where(
+        domain.input_numbering.cells % 3, np.cos(domain.input_numbering.cells) ** 2, 0.0
+    )
 
 
 def integrated_cells(scene: Scene) -> npt.NDArray[np.int32]:
@@ -195,8 +199,9 @@ def dead_cells(mass: str, *ways: str) -> Found:
         blocks = balance.tangent.switch_to_blocks() if name.startswith(("blocks", "brought")) else None
         balance.tangent.assemble(blocks_only=name.startswith("blocks"))
         (balance.tangent.matrix if blocks is None or name.startswith("brought") else blocks).mult(x, y)
-        found[f"tangent-{name}-dead"] = domain.gather_nodes(y.array_r.reshape(-1, domain.dim))
-        found[f"residual-{name}-dead"] = domain.gather_nodes(balance.update_forces().reshape(-1, domain.dim))
+        gather_nodes = domain.input_numbering.gather_nodes
+        found[f"tangent-{name}-dead"] = gather_nodes(y.array_r.reshape(-1, domain.dim))
+        found[f"residual-{name}-dead"] = gather_nodes(balance.update_forces().reshape(-1, domain.dim))
         found[f"cells-{name}-dead"] = sum_over_ranks(domain.comm, len(integrated_cells(scene)))
         balance.damage_changed()
     return {f"{mass}-{key}": values for key, values in found.items()}
@@ -216,7 +221,7 @@ def hanging() -> Found:
         time={"scheme": "backward-euler", "step": 1e3, "end": 1e4}, solver=TIGHT,
     )  # fmt: skip
     domain, balance = scene.domain, scene.balance
-    whole, chi = some_whole(domain.cell_input), balance.stress.chi
+    whole, chi = some_whole(domain.input_numbering.cells), balance.stress.chi
     assert chi is not None
     chi.x.array[: domain.cell_count] = whole
     balance.begin_step(1e3, 1e3, state.u, state.v, state.a)
@@ -238,21 +243,26 @@ def hanging() -> Found:
     found = {"hanging-turned": turned, "hanging-found": a.array_r.reshape(-1, 3).copy(), "hanging-part": part}
     loose.pc.apply(b, a)
     found |= {"hanging-any": a.array_r.reshape(-1, 3).copy()}
-    return {name: domain.gather_nodes(each) for name, each in found.items()} | {"hanging-count": np.array(count)}
+    gather_nodes = domain.input_numbering.gather_nodes
+    return {name: gather_nodes(each) for name, each in found.items()} | {"hanging-count": np.array(count)}
 
 
 def result_of(name: str, scene: Scene, state: State, rows: list[list[float]]) -> Found:
     """Everything that must not depend on the partition."""
     domain, found = scene.domain, {f"{name}-history": np.array(rows)}
-    found[f"{name}-u"] = domain.gather_nodes(state.u.reshape(-1, domain.dim))
-    found[f"{name}-v"] = domain.gather_nodes(state.v.reshape(-1, domain.dim))
+    found[f"{name}-u"] = domain.input_numbering.gather_nodes(state.u.reshape(-1, domain.dim))
+    found[f"{name}-v"] = domain.input_numbering.gather_nodes(state.v.reshape(-1, domain.dim))
     found[f"{name}-energy"] = np.array([state.work, state.dissipated])
-    found[f"{name}-mass"] = domain.gather_nodes(scene.balance.mass.lumped.reshape(-1, domain.dim))
+    found[f"{name}-mass"] = domain.input_numbering.gather_nodes(scene.balance.mass.lumped.reshape(-1, domain.dim))
     if scene.balance.stress.material.plastic is not None:
         memory = scene.balance.stress.material.plastic.snapshot()
-        found[f"{name}-plastic"] = domain.gather_cells(memory.reshape(domain.cell_count, -1, memory.shape[1]))
+        found[f"{name}-plastic"] = domain.input_numbering.gather_cells(
+            memory.reshape(domain.cell_count, -1, memory.shape[1])
+        )
     if scene.fracture is not None and scene.balance.stress.chi is not None:
-        found[f"{name}-chi"] = domain.gather_cells(scene.balance.stress.chi.x.array[: domain.cell_count])
+        found[f"{name}-chi"] = domain.input_numbering.gather_cells(
+            scene.balance.stress.chi.x.array[: domain.cell_count]
+        )
     if scene.fracture is not None:
         found[f"{name}-broken"] = scene.fracture.graph.broken_keys()
         found[f"{name}-pieces"] = np.array([find_fragments(scene.fracture.graph).count])
@@ -408,7 +418,10 @@ def squeezed() -> Found:
     state.remember()
     at_once = scene.balance.histories.to_checkpoint()
     next(steps), next(steps)
-    later, u = scene.balance.histories.to_checkpoint(), scene.domain.gather_nodes(state.u.reshape(-1, 2))
+    later, u = (
+        scene.balance.histories.to_checkpoint(),
+        scene.domain.input_numbering.gather_nodes(state.u.reshape(-1, 2)),
+    )
     walls = {f"squeezed-{when}-{name.removeprefix('contact.')}": np.array(values)
              for when, saved in (("at-once", at_once), ("later", later)) for name, values in saved.items()}  # fmt: skip
     return walls | {"squeezed-u": u}

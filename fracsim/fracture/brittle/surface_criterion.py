@@ -120,7 +120,7 @@ class BrittleSurfaces:
         overloaded = np.flatnonzero(load >= 1)
         cells = cells[overloaded]
         return OverloadedCells(
-            self._domain.cell_input[cells], load[overloaded], stress[overloaded], self._gradients(cells)
+            self._domain.input_numbering.cells[cells], load[overloaded], stress[overloaded], self._gradients(cells)
         )
 
     def _cell_strength(self, cells: Cells) -> Values:
@@ -146,7 +146,7 @@ class BrittleSurfaces:
         """
         domain, d = self._domain, self._domain.dim
         x = domain.nodes + self._stress.u.x.array.reshape(-1, d)
-        midside, share = x[domain.cell_midside_nodes[cells]], 4 / (d + 1)
+        midside, share = x[domain.cell_midside_nodes.of_edges[cells]], 4 / (d + 1)
         result: Values = (share - 1) * x[domain.cell_nodes[cells]]
         for number, ends in enumerate(local_edges(d)):
             result[:, ends] += share * midside[:, number, None]
@@ -157,15 +157,15 @@ class BrittleSurfaces:
         cells = np.arange(self._domain.cell_count)
         stress = symmetric_tensors(averaged, self._domain.dim)
         fields = stress, self._gradients(cells), self._cell_strength(cells)
-        return tuple(self._domain.gather_cells(values) for values in fields)
+        return tuple(self._domain.input_numbering.gather_cells(values) for values in fields)
 
     def _open_on_root(self, parts: Any, broken: Any, field: tuple[Any, ...] | None) -> OpenedSurfaces:
         """Open the surfaces of the pass, on rank 0, from the overloaded cells of all ranks."""
         # The topology of the input mesh is built when the first surface starts.
         if self._surface_pass is None:
-            assert self._domain.source is not None
+            assert self._domain.input_mesh is not None
             retain_nodes = self._stress.chi is not None
-            self._surface_pass = SurfacePass(self._domain.source, self._parameters, self.spacing, retain_nodes)
+            self._surface_pass = SurfacePass(self._domain.input_mesh, self._parameters, self.spacing, retain_nodes)
         names = OverloadedCells.__annotations__
         load = OverloadedCells(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
         # In the order of the input mesh, whatever the ranks.

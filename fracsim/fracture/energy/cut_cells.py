@@ -92,7 +92,7 @@ class CutGeometry:
         """Return polygons (n, POLYGON_WIDTH) of split cells: four corners, m, and 1 for each side inside the body."""
         corners, facets = (table[self._graph.pattern[cells]] for table in cut_polygons())
         edges = self._graph.cell_edges[cells[:, None], corners]
-        inside = ~self._domain.boundary_sides[cells[:, None], facets]
+        inside = ~self._domain.facets.boundary_sides[cells[:, None], facets]
         return np.concatenate([self.cut_points(edges, cut).reshape(len(cells), 12), inside], axis=1)
 
 
@@ -165,7 +165,11 @@ class CutCells:
         graph, d = self._graph, self._d
         split = np.where(graph.pattern[cells] > 0, graph.split[cells].astype(float), -1.0)
         rows = np.zeros((len(cells), self._rows.shape[1]))
-        rows[:, 0], rows[:, 1], rows[:, 2 : 2 + d] = graph.domain.cell_input[cells], split, self._centroids[cells]
+        rows[:, 0], rows[:, 1], rows[:, 2 : 2 + d] = (
+            graph.domain.input_numbering.cells[cells],
+            split,
+            self._centroids[cells],
+        )
         is_cut = np.flatnonzero(split >= 0)
         rows[is_cut, 2 + d : 2 + 2 * d] = self._geometry.mean_cut_points(cells[is_cut], cut)
         if d == 3:

@@ -76,7 +76,7 @@ def surface_vectors(domain: Domain) -> tuple[Values, Values]:
 
     n is the outward normal; the middle is the mean of the centroids of these facets, m.
     """
-    corners, outside = domain.nodes[domain.cell_nodes], domain.boundary_sides
+    corners, outside = domain.nodes[domain.cell_nodes], domain.facets.boundary_sides
     areas = -domain.dim * domain.volumes[:, None, None] * barycentric_gradients(corners)
     facet_centroids = (corners.sum(axis=1, keepdims=True) - corners) / domain.dim
     count = np.maximum(outside.sum(axis=1), 1)[:, None]
@@ -159,7 +159,7 @@ class NearbyCells:
         centroids = domain.nodes[domain.cell_nodes].mean(axis=1)
         halo, self._comm = RankHalo(domain.comm, centroids, reach), domain.comm
         rank, index = np.full(len(centroids), float(domain.comm.rank)), np.arange(float(len(centroids)))
-        columns = [domain.cell_input, rank, index, domain.volumes, centroids, *surface_vectors(domain)]
+        columns = [domain.input_numbering.cells, rank, index, domain.volumes, centroids, *surface_vectors(domain)]
         rows = halo(np.column_stack(columns))
         rows = rows[np.argsort(rows[:, 0], kind="stable")]
         self.number, self._rank, self._index = rows[:, :3].T.astype(np.int64)

@@ -258,7 +258,7 @@ class TipCriterion:
         cells = proposal.cells[cuts.row]
         # Edges are described by input nodes, which all ranks know.
         local_nodes = self._domain.cell_nodes[cells[:, None], local_edges(self._domain.dim)[cuts.edge]]
-        ends = self._domain.node_input[local_nodes]
+        ends = self._domain.input_numbering.nodes[local_nodes]
         position = np.where(ends[:, 0] > ends[:, 1], 1 - cuts.share, cuts.share)
         course = np.zeros((len(cells), self.course_width))
         ahead = proposal.ahead
@@ -334,7 +334,7 @@ def reference_corners(domain: Domain, cells: Ints) -> Values:
 
 def input_numbers(domain: Domain, cells: Ints) -> Values:
     """Return the numbers (n, 1) of cells in the input mesh, to be hashed: two tips may be at one point."""
-    return np.asarray(domain.cell_input[cells, None], float)
+    return np.asarray(domain.input_numbering.cells[cells, None], float)
 
 
 def kinked_release(psi: Values, tips: CrackTips, force: Values) -> tuple[Values, Values]:

@@ -11,6 +11,7 @@ from mpi4py import MPI
 from ...forms.crack_closure import spring_modulus
 from ...mechanics.stress import Stress
 from ...mesh.edge_graph import EdgeGraph
+from ...mesh.ghost_exchange import with_ghosts
 from ...mesh.simplices import local_edges
 from ...mesh.small_matrices import barycentric_gradients
 from ..effective_stress import UndamagedStress
@@ -164,7 +165,7 @@ class TipFieldEvaluator:
         if self._motion is not None:
             # Cells without stiffness carry no inertia either, unless they carry pressure.
             density = np.where(self._stress.cracks_close | (chi > 0), self._density[cells], 0.0)
-            v, a = map(self._domain.with_ghosts, self._motion)
+            v, a = (with_ghosts(self._domain, owned) for owned in self._motion)
             density = operators.repeat_at_points(density)
             kinetic, inertia, inertia_force = self._inertia_terms(density, H, operators, v, a)
             # The kinetic energy density belongs to the energy of Eshelby's stress.

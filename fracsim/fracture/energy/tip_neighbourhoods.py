@@ -156,7 +156,7 @@ class TipNeighbourhoods:
         self._force_matrices = None
         if self.tips.point.shape[1] == 3:
             cell, domain = self.tips.cell, self._graph.domain
-            number, radius = domain.cell_input[cell], self._radii.disc[cell]
+            number, radius = domain.input_numbering.cells[cell], self._radii.disc[cell]
             self.front_release_rate.update(number, self.tips.point, self.tips.ahead, radius)
 
     # --- sums around tips; `requested` counts the cells of `remote_values` ---

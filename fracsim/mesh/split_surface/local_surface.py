@@ -73,7 +73,9 @@ class LocalSurface:
         See point_matching.point_identity.
         """
         domain, which = self._domain, self.at.copies if points is None else points
-        return point_identity(self._split_surface, self._contact_points[which], domain.node_input, domain.size)
+        return point_identity(
+            self._split_surface, self._contact_points[which], domain.input_numbering.nodes, domain.bounds.diagonal
+        )
 
     def facets(self) -> tuple[Ints, Values]:
         """(m, d) points of the elements that `area` is the sum of, and (m,) their areas, m^2 (2D: lengths, m)."""
@@ -155,7 +157,7 @@ def _assembled(comm: MPI.Comm, owned: tuple[int, int], rows: csr_matrix, number:
 
 def _mesh_of(domain: Domain) -> MeshData:
     """The cells of this rank as a mesh, with the boundary facets of the body as group OUTSIDE."""
-    exterior = domain._exterior
+    exterior = domain.facets.boundary
     geometry = dolfinx.mesh.entities_to_geometry(domain.mesh, domain.dim - 1, exterior)
     of_geometry = np.empty(len(domain.mesh.geometry.x), np.int64)
     of_geometry[domain.corner_geometry] = domain.cell_nodes

@@ -69,17 +69,19 @@ def _midside_nodes(domain: Domain, cell: Ints, low: Ints, high: Ints) -> Ints:
     ends = domain.cell_nodes[cell][:, local_edges(domain.dim)]  # (m, edges, 2)
     pair = np.sort(np.stack([low, high], axis=-1), axis=-1)
     same = (pair[:, :, None] == np.sort(ends, axis=-1)[:, None]).all(axis=-1)
-    return np.asarray(np.take_along_axis(domain.cell_midside_nodes[cell], same.argmax(axis=-1), axis=1), np.int64)
+    return np.asarray(
+        np.take_along_axis(domain.cell_midside_nodes.of_edges[cell], same.argmax(axis=-1), axis=1), np.int64
+    )
 
 
 def refined_input(domain: Domain) -> MeshData | None:
     """The input mesh on rank 0, None elsewhere; for quadratic displacement its cells are divided, without groups.
 
-    Its points are numbered by `Domain.node_input`.
+    Its points are numbered by `Domain.input_numbering.nodes`.
     """
-    if domain.midside_nodes is None or domain.source is None:
-        return domain.source
-    whole = with_midside_nodes(domain.source, domain.midside_nodes, written=False)
+    if domain.midside_nodes is None or domain.input_mesh is None:
+        return domain.input_mesh
+    whole = with_midside_nodes(domain.input_mesh, domain.midside_nodes, written=False)
     cells = _divided(_between(*np.split(whole.cells, [domain.dim + 1], axis=1)))
     return MeshData(whole.points, orient_cells(whole.points, cells)[0])
 

@@ -63,13 +63,15 @@ class SurfaceOutput:
         """
         self._domain, self.record, self._corrections = domain, record, apart
         self._obstacle_terms, self._interpenetration = beside, passing
-        cell_density = domain.gather_cells(np.broadcast_to(np.asarray(density, float), domain.cell_count))
+        cell_density = domain.input_numbering.gather_cells(
+            np.broadcast_to(np.asarray(density, float), domain.cell_count)
+        )
         broken = self.record.gather_broken() if self.record is not None else None
 
         def open_files() -> tuple[BodySurface, SurfaceFiles]:
-            assert domain.source is not None and cell_density is not None
+            assert domain.input_mesh is not None and cell_density is not None
             files = SurfaceFiles(folder, domain.dim, resume_at)
-            surface = BodySurface(domain.source, cell_density, smooth=smooth)
+            surface = BodySurface(domain.input_mesh, cell_density, smooth=smooth)
             if broken is not None and resume_at is not None:
                 edges, history = broken
                 surface.replay_fragment_names(surface.skeleton.of_edges(edges, history[:, 0]), files.times)
@@ -89,8 +91,10 @@ class SurfaceOutput:
             CannotWrite: a file cannot be written.
         """
         domain, d = self._domain, self._domain.dim
-        gathered: list[Any] = [domain.gather_nodes(values.reshape(-1, d)) for values in (state.u, state.v)]
-        pattern = domain.gather_cells(self.record.graph.pattern) if self.record is not None else None
+        gathered: list[Any] = [
+            domain.input_numbering.gather_nodes(values.reshape(-1, d)) for values in (state.u, state.v)
+        ]
+        pattern = domain.input_numbering.gather_cells(self.record.graph.pattern) if self.record is not None else None
         broken = self.record.gather_broken() if self.record is not None else None
 
         def write() -> None:
@@ -116,8 +120,8 @@ class SurfaceOutput:
 
     def _corner_values(self, gathered: list[Any], fields: list[Field]) -> tuple[list[Any], list[Field]]:
         """Nodal values at the corners of quadratic cells only: the surface has straight cells (rank 0)."""
-        source = self._domain.source
-        if self._domain.midside_nodes is None or source is None:
+        source = self._domain.input_mesh
+        if self._domain.order == 1 or source is None:
             return gathered, fields
         count = len(source.points)
         nodal = [replace(field, values=field.values[:count]) if field.centre == "Node" else field for field in fields]

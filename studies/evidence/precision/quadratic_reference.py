@@ -28,6 +28,7 @@ def assemble_system(study: dict[str, Any]) -> tuple[Any, ...]:
 
     from ....mechanics.loads import surface_measures
     from ....mesh.domain import distribute
+    from ....mesh.selection import select_facets
     from ....mesh.selectors import Group
     from ....study.check import build_checked_mesh
     from ....study.reader import validate
@@ -47,7 +48,7 @@ def assemble_system(study: dict[str, Any]) -> tuple[Any, ...]:
         return 2 * mu * strain + lmbda * ufl.tr(strain) * ufl.Identity(d)
 
     loads = [entry for entry in checked.boundary if entry.kind == "traction"]
-    measures = surface_measures(domain, [domain.select_facets(Group(str(entry.on))) for entry in loads])
+    measures = surface_measures(domain, [select_facets(domain, Group(str(entry.on))) for entry in loads])
     zero: Any = fem.Constant(domain.mesh, np.zeros(d))
     force = ufl.inner(zero, w) * ufl.dx
     for entry, ds in zip(loads, measures, strict=True):
@@ -56,7 +57,7 @@ def assemble_system(study: dict[str, Any]) -> tuple[Any, ...]:
     for entry in checked.boundary:
         for axis in entry.fix or "":
             part = V.sub("xyz".index(axis))
-            held = fem.locate_dofs_topological(part, d - 1, domain.facets[str(entry.on)])
+            held = fem.locate_dofs_topological(part, d - 1, domain.facets.groups[str(entry.on)])
             bcs.append(fem.dirichletbc(np.float64(0.0), held, part))  # type: ignore[arg-type]
     K = ufl.inner(stress(v), ufl.sym(ufl.grad(w))) * ufl.dx
     M = material.density * ufl.inner(v, w) * ufl.dx
