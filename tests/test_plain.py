@@ -9,7 +9,8 @@ import pytest
 
 from fracsim.errors import InputError
 from fracsim.scene import Scene
-from fracsim.solvers.preconditioner import PlainPreconditioner, Preconditioner
+from fracsim.solvers.plain_solver import PlainPreconditioner
+from fracsim.solvers.preconditioner import Preconditioner
 from fracsim.study.reader import validate
 from support.scenes import Walk, make_scene
 from support.solver_policy import set_policy

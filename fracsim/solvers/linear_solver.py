@@ -21,8 +21,9 @@ from ..mechanics.balance import Balance
 from .direct_solver import DirectSolver
 from .forcing_terms import ContractionForcing, EisenstatWalkerForcing
 from .petsc_options import PetscOptions, PetscOptionSet, call_petsc
+from .plain_solver import PlainPreconditioner, plain_method
 from .policy import SolverPolicy
-from .preconditioner import GAMG_OPTIONS, PlainPreconditioner, Preconditioner, Update
+from .preconditioner import GAMG_OPTIONS, Preconditioner, Update
 from .tangent_operators import TangentOperators
 
 Values = npt.NDArray[np.float64]
@@ -43,7 +44,6 @@ DEFAULT_OPTIONS: PetscOptions = {
     "ksp_rtol": 1e-5,  # 1e-3 is no direction of descent for a badly conditioned body: a cantilever fails
     "ksp_max_it": 500,
 }
-MUMPS_OPTIONS: PetscOptions = {"pc_factor_mat_solver_type": "mumps"}
 
 
 class LinearStepCG:
@@ -312,9 +312,9 @@ class LinearSolver:
 
 
 def chosen_options(balance: Balance, given: PetscOptions, *, plain: bool = False, policy: SolverPolicy) -> PetscOptions:
-    """The options of a study over the defaults; `plain`: GAMG as PETSc has it, or MUMPS for small systems."""
+    """Options of a study over the defaults; `plain`: over those of plain_solver."""
     if plain:
-        return _plain_options(balance, given, policy)
+        return DEFAULT_OPTIONS | plain_method(balance, given, policy) | given
     multigrid = given.get("pc_type", "gamg") == "gamg"
     chosen = DEFAULT_OPTIONS | (GAMG_OPTIONS if multigrid else {})
     if multigrid and balance.scheme.inertia:
@@ -323,16 +323,6 @@ def chosen_options(balance: Balance, given: PetscOptions, *, plain: bool = False
     if not balance.symmetric:
         chosen |= {"ksp_type": "gmres"}
     return chosen | given
-
-
-def _plain_options(balance: Balance, given: PetscOptions, policy: SolverPolicy) -> PetscOptions:
-    is_small = balance.work_vector.getSize() <= policy.max_plain_direct_dofs
-    if is_small and _is_default_method(given) and PETSc.Sys.hasExternalPackage("mumps"):
-        # CG takes one iteration with factors, and tells where a symmetric tangent is indefinite.
-        method: PetscOptions = MUMPS_OPTIONS | {"pc_type": "cholesky" if balance.symmetric else "lu"}
-    else:
-        method = {"pc_type": "gamg"}
-    return DEFAULT_OPTIONS | {"ksp_type": "cg" if balance.symmetric else "gmres"} | method | given
 
 
 def steps_are_linear(balance: Balance, given: PetscOptions, method: str) -> bool:
@@ -359,8 +349,3 @@ def _forcing(
 def _is_default_preconditioner(given: PetscOptions) -> bool:
     """Whether the study chooses no preconditioner."""
     return not any(key.startswith(("pc_", "mg_")) for key in given)
-
-
-def _is_default_method(given: PetscOptions) -> bool:
-    """Whether the study chooses neither a Krylov method nor a preconditioner."""
-    return _is_default_preconditioner(given) and "ksp_type" not in given
