@@ -48,11 +48,11 @@ def test_a_thrown_corner_comes_to_rest_by_itself(monkeypatch: pytest.MonkeyPatch
     set_policy(monkeypatch, max_relaxed_nodes=0.2)
     scene, state = thrown()
     u, tangents = state.u.copy(), len(made)
-    assert scene.solver is not None and scene.solver._newton._elimination is not None
+    assert scene.solver is not None and scene.solver._newton._convergence._elimination is not None
     made.clear()
     monkeypatch.setattr(nonlinear_solver.NonlinearSolver, "edges_broke", lambda *_: None)
     scene, state = thrown()
-    assert scene.solver is not None and scene.solver._newton._elimination is None
+    assert scene.solver is not None and scene.solver._newton._convergence._elimination is None
     np.testing.assert_allclose(u, state.u, atol=1e-7 * np.abs(state.u).max())
     assert tangents < len(made)
 

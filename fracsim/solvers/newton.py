@@ -32,13 +32,13 @@ _KSP = {value: name for name, value in vars(PETSc.KSP.ConvergedReason).items() i
 
 @dataclass(frozen=True)
 class SolveResult:
-    """The end of a nonlinear solve.
+    """Result of a nonlinear solve.
 
     Attributes:
         converged: whether r(u) = 0 to the tolerance.
-        newton_iterations, krylov_iterations: those that it took.
-        reason: a sentence where it did not converge.
-        stopped_for_cost: whether it was ended because its Krylov iterations cost more than they may.
+        newton_iterations, krylov_iterations: numbers of iterations.
+        reason: a sentence if it did not converge.
+        stopped_for_cost: whether it was ended because its Krylov iterations cost too much.
     """
 
     converged: bool
@@ -59,21 +59,138 @@ class CostLimit:
 UNLIMITED_COST = CostLimit()
 
 
-class NewtonSolver:
-    """SNES objects on a `Balance`, which share one linear solver.
+class ConvergenceTest:
+    """Convergence test of SNES: |r| <= rtol max(|r_0|, |forces|), or below round-off.
 
-    The first SNES goes down |r|, or the incremental potential where contact limits its steps. A second one with
-    tangents made positive (`ModifiedNewton`) is made when it is first asked for.
+    PETSc's own test against |r_0| alone requires more digits as the first guess gets better. An attempt is also ended
+    if it costs too much, if its line search makes no progress, or if a stop was requested.
 
     Attributes:
-        snes: the SNES of the last attempt.
-        linear: the linear solver.
+        solved_norm: largest |r| of a solution, N.
+        stopped_for_cost: whether the last attempt was ended because of its cost.
+        aborted: whether the last solve was ended by a request to stop.
+    """
+
+    def __init__(self, balance: Balance, rtol: float, policy: SolverPolicy) -> None:
+        """`rtol`: relative tolerance of the residual."""
+        self._balance, self._policy, self._asked_rtol = balance, policy, rtol
+        self._rtol, self._first_norm = rtol, 0.0
+        self._stop_requested: Callable[[], bool] = lambda: False
+        self._elimination: NonlinearElimination | None = None  # of a body with broken edges
+        self._norms: list[float] = []  # |r| of the iterates of the attempt
+        self._eliminations = 0
+        self._modified: ModifiedNewton | None = None
+        self._limit: CostLimit = UNLIMITED_COST
+        self._is_second = False
+        self.solved_norm, self.stopped_for_cost, self.aborted = 0.0, False, False
+
+    def set_stop_request(self, stop_requested: Callable[[], bool]) -> None:
+        """Set a function (collective) called between iterations; a solve ends where it is true."""
+        self._stop_requested = stop_requested
+
+    def allow_elimination(self) -> None:
+        """Relax nodes that hold most of the residual separately from now on (collective)."""
+        if self._elimination is None:
+            from .nonlinear_elimination import create_elimination
+
+            self._elimination = create_elimination(self._balance, self._policy)
+
+    def begin_attempt(self, limit: CostLimit, modified: ModifiedNewton | None, *, is_second: bool) -> None:
+        """Begin an attempt.
+
+        Args:
+            limit: bound on its cost.
+            modified: merit function and tangents of its SNES; None: |r| and exact tangents.
+            is_second: whether it is by the second SNES.
+        """
+        self._limit, self._modified, self._is_second = limit, modified, is_second
+        self._norms, self._eliminations, self.stopped_for_cost = [], 0, False
+
+    def begin_solve(self, *, intermediate: bool) -> None:
+        """Begin a solve of the attempt; `intermediate`: with a part of the obstacles' motion alone."""
+        self._rtol = self._policy.intermediate_rtol if intermediate else self._asked_rtol
+        self.aborted = False
+
+    def crawls(self, snes: PETSc.SNES) -> bool:
+        """Whether the line search on |r| has made the last steps too short.
+
+        The residual of one cell that is nearly flat grows before it decreases. The incremental potential, where there
+        is one that this attempt does not use, allows whole steps. Without inertia factors replace slow attempts.
+        """
+        norms, balance, count = self._norms, self._balance, self._policy.crawl_iterations
+        is_slow = len(norms) > count and norms[-1] > norms[-1 - count] / 2
+        has_other_merit = self._modified is None and balance.conservative and balance.scheme.inertia
+        return is_slow and has_other_merit and snes.ksp.getType() == "cg"
+
+    def reason_to_end(self, snes: PETSc.SNES, its: int, norms: tuple[float, float, float]) -> int:
+        """Reason for SNES to end after `its` iterations, 0 to continue; `norms`: |x|, |dx| and |r| (collective)."""
+        reason = PETSc.SNES.ConvergedReason
+        if not np.isfinite(norms[2]):
+            return int(reason.DIVERGED_FNORM_NAN)
+        if self.is_solved(norms[2], its) or self._is_solved_by_elimination(snes, its):
+            return int(reason.CONVERGED_FNORM_RELATIVE)
+        if self._stop_requested():  # SNES ends its solve, and can be used again
+            self.aborted = True
+            return int(reason.DIVERGED_INNER)
+        krylov = snes.getLinearSolveIterations()
+        self.stopped_for_cost = self._limit.is_exceeded(krylov, its, modified=self._is_second)
+        if self.stopped_for_cost:
+            return int(reason.DIVERGED_INNER)
+        has_inertia = self._balance.scheme.inertia
+        if self._modified is not None and has_inertia and self._modified.has_stalled(snes.getFunctionNorm(), its):
+            return int(reason.DIVERGED_MAX_IT)  # half the step is solved in a few iterations
+        self._norms.append(snes.getFunctionNorm())
+        return int(reason.DIVERGED_LINE_SEARCH if self.crawls(snes) else reason.ITERATING)
+
+    def _is_solved_by_elimination(self, snes: PETSc.SNES, its: int) -> bool:
+        """Relax the few nodes that hold most of the residual; whether the balance is solved then (collective).
+
+        SNES continues from there, with the norm of the residual there.
+        """
+        may_relax = self._modified is not None or self._eliminations < self._policy.max_eliminations
+        if self._elimination is None or not its or not may_relax:
+            return False
+        if snes.getFunctionNorm() < self._policy.fast_reduction * self._norms[-1]:
+            return False
+        if not self._elimination.relax_nodes(self.solved_norm):
+            return False
+        self._eliminations += 1
+        if self._modified is not None:
+            self._modified.merit.note_elimination()
+        x, r = snes.getSolution(), snes.getFunction()[0]
+        x.array_w[:] = self._balance.u.x.array[: self._balance.owned_dof_count]
+        snes.computeFunction(x, r)
+        snes.setFunctionNorm(r.norm())
+        return self.is_solved(snes.getFunctionNorm(), its)
+
+    def is_solved(self, norm: float, its: int) -> bool:
+        """Whether |r| = `norm`, N, after `its` iterations is that of a solution (collective)."""
+        if its == 0:
+            # a first guess that contact has cut is off by more than any force of the step, however stiff the body
+            self._first_norm = 0.0 if self._balance.contact.limits_newton_steps else norm
+        return norm <= self.norm_of_solution(self._first_norm if its else 0.0)
+
+    def norm_of_solution(self, first_norm: float) -> float:
+        """Largest |r| of a solution, N, where the first guess has `first_norm`, N (collective)."""
+        scale, round_off = self._balance.energies.force_scale()
+        self.solved_norm = max(self._rtol * max(first_norm, scale), round_off)
+        return self.solved_norm
+
+
+class NewtonSolver:
+    """Newton's method for a `Balance`: SNES objects that share one linear solver.
+
+    The line search of the first SNES minimises |r|, or the incremental potential where contact limits its steps. A
+    second SNES with tangents made positive (`ModifiedNewton`) is created at its first use.
+
+    Attributes:
+        snes: SNES of the last attempt.
+        linear: linear solver.
     """
 
     def __init__(self, balance: Balance, given: PetscOptions, policy: SolverPolicy, *, plain: bool = False) -> None:
-        """`given`: PETSc options of the study, over the defaults. InputError where PETSc does not take one."""
+        """`given`: PETSc options of the study. Raises InputError if PETSc does not accept one."""
         self.balance, self._policy, self._plain = balance, policy, plain
-        self._stop_requested: Callable[[], bool] = lambda: False
         chosen = chosen_options(balance, given, plain=plain, policy=policy)
         self._options = PetscOptionSet(chosen)
         snes = self.snes = self._first = PETSc.SNES().create(balance.domain.comm)
@@ -88,7 +205,8 @@ class NewtonSolver:
             self._options.remove()
             raise
         self._set_jacobians()
-        snes.setConvergenceTest(weak_callback(self._test_convergence))
+        self._convergence = ConvergenceTest(balance, float(chosen["snes_rtol"]), policy)
+        snes.setConvergenceTest(weak_callback(self._convergence.reason_to_end))
         self._first_modified: ModifiedNewton | None = None  # the merit of the first SNES; None: |r|
         self._second_modified: ModifiedNewton | None = None
         if balance.contact.limits_newton_steps:
@@ -97,29 +215,21 @@ class NewtonSolver:
                 from .line_search import ModifiedNewton
 
                 self._first_modified = ModifiedNewton(balance, snes, policy)
-        self._rtol = self._asked_rtol = float(chosen["snes_rtol"])
         self._is_single_solve = chosen["snes_type"] == "ksponly"
         self._has_line_search = chosen["snes_type"] == "newtonls"
-        self._elimination: NonlinearElimination | None = None  # of a body that breaks
-        # --- of the last attempt ---
-        self._modified = self._first_modified
-        self._limit: CostLimit = UNLIMITED_COST
-        self._aborted = self._stopped_for_cost = False
-        self._first_norm = self._solved_norm = 0.0
-        self._norms: list[float] = []  # |r| of its iterates
-        self._eliminations = 0
+        self._modified = self._first_modified  # of the last attempt
+        self._stop_requested: Callable[[], bool] = lambda: False
 
     def set_stop_request(self, stop_requested: Callable[[], bool]) -> None:
-        """Ask `stop_requested` (collective) between iterations; once it is true an attempt raises StepAborted."""
+        """Set a function (collective) called between iterations; where it is true an attempt raises StepAborted."""
         self._stop_requested = stop_requested
+        self._convergence.set_stop_request(stop_requested)
 
     def edges_broke(self, count: int | None) -> None:
-        """So many edges broke on all ranks, whose cells lost stiffness; None: an unknown number (collective)."""
+        """React to the number of edges that broke on all ranks; None: an unknown number (collective)."""
         self.linear.edges_broke(count)
-        if count != 0 and self._elimination is None and self._has_line_search and not self._plain:
-            from .nonlinear_elimination import create_elimination
-
-            self._elimination = create_elimination(self.balance, self._policy)
+        if count != 0 and self._has_line_search and not self._plain:
+            self._convergence.allow_elimination()
 
     # --- the last attempt ---
 
@@ -130,43 +240,35 @@ class NewtonSolver:
 
     @property
     def descended_potential(self) -> bool:
-        """Whether the line search of the last attempt went down the incremental potential."""
+        """Whether the line search of the last attempt minimised the incremental potential."""
         return self._modified is not None
 
     @property
     def crawls(self) -> bool:
-        """Whether the line search of the last attempt cut the last steps to next to nothing, as |r| is no merit of
-        them.
-
-        The residual of one cell that is all but flat grows before it falls. The incremental potential would let steps
-        be whole, if there is one that this attempt does not use. (Without inertia factors see to slow attempts.)
-        """
-        norms, balance, count = self._norms, self.balance, self._policy.crawl_iterations
-        is_slow = len(norms) > count and norms[-1] > norms[-1 - count] / 2
-        has_other_merit = not self.descended_potential and balance.conservative and balance.scheme.inertia
-        return is_slow and has_other_merit and self.snes.ksp.getType() == "cg"
+        """Whether the line search on |r| made the last steps too short (ConvergenceTest.crawls)."""
+        return self._convergence.crawls(self.snes)
 
     # --- the tangent ---
 
     def _set_jacobians(self) -> None:
-        """Let all SNES objects linearise into the matrix that the balance has now."""
+        """Set the present tangent of the balance as the Jacobian of all SNES objects."""
         tangent = self.linear.operators
         for snes in self._all_snes:
             snes.setJacobian(weak_callback(self._linearise), tangent.operator, tangent.matrix)
 
     def _linearise(self, *_: object) -> None:
-        self.linear.linearise(self.snes.getFunctionNorm(), self._solved_norm, self._eigenvalue_floor())
+        self.linear.linearise(self.snes.getFunctionNorm(), self._convergence.solved_norm, self._eigenvalue_floor())
 
     def _eigenvalue_floor(self) -> float | None:
         return None if self._modified is None else self._modified.eigenvalue_floor()
 
     def shrink_tangent(self) -> None:
-        """Take a smaller tangent where damage has made one possible (collective)."""
+        """Replace the tangent by a smaller one if enough cells are without stress (collective)."""
         if self.linear.shrink():
             self._set_jacobians()
 
     def _second(self) -> ModifiedNewton:
-        """The second SNES, which has the linear solver of the first; the first where that goes down a potential."""
+        """Second SNES, with the linear solver of the first; the first where that one minimises a potential."""
         if self._first_modified is not None:
             return self._first_modified
         if self._second_modified is None:
@@ -180,7 +282,7 @@ class NewtonSolver:
             self._set_jacobians()
             snes.setLineSearchPreCheck(weak_callback(self._limit_step))
             snes.setFromOptions()
-            snes.setConvergenceTest(weak_callback(self._test_convergence))
+            snes.setConvergenceTest(weak_callback(self._convergence.reason_to_end))
         return self._second_modified
 
     # --- an attempt ---
@@ -188,17 +290,22 @@ class NewtonSolver:
     def attempt(
         self, guess: Values | None, modification: TangentModification | None = None, limit: CostLimit = UNLIMITED_COST
     ) -> SolveResult:
-        """Newton's method from `guess`, (owned dofs,) m; None: from where the last attempt ended (collective).
+        """Attempt a solve (collective).
 
-        `modification`: tangents made positive, by the second SNES; None: exact ones, by the first. Raises StepAborted.
+        Args:
+            guess: (owned dofs,) first guess of u, m; None: the last iterate.
+            modification: how tangents are made positive, by the second SNES; None: exact tangents, by the first.
+            limit: bound on the cost of Krylov iterations.
+
+        Raises:
+            StepAborted: if a stop was requested.
         """
         if modification is None:
             self.snes, self._modified = self._first, self._first_modified
         else:
             self._modified = self._second()
             self.snes = self._modified.snes
-        self._limit, self._norms, self._eliminations = limit, [], 0
-        self._stopped_for_cost = False
+        self._convergence.begin_attempt(limit, self._modified, is_second=self.used_second_snes)
         if self._modified is not None:
             self._modified.use_modification(modification)
         try:
@@ -221,24 +328,26 @@ class NewtonSolver:
         krylov += extended
         if is_jammed:
             reason = f"Obstacles are jammed: not there in {self._policy.max_obstacle_solves} solves"
-            return SolveResult(False, newton, krylov, reason, self._stopped_for_cost)
-        return SolveResult(converged, newton, krylov, "" if converged else self._failure(), self._stopped_for_cost)
+            return SolveResult(False, newton, krylov, reason, self._convergence.stopped_for_cost)
+        reason = "" if converged else self._failure()
+        return SolveResult(converged, newton, krylov, reason, self._convergence.stopped_for_cost)
 
     def _start_from(self, guess: Values) -> int:
-        """Set x to a first guess that Newton's method may start from; returns Krylov iterations (collective)."""
+        """Set x to a feasible first guess; returns the number of Krylov iterations (collective)."""
         self._x.array_w[:] = guess
         jumps = self.balance.motion.max_deviation(guess) > self._policy.max_support_jump
         extended = self.linear.extend(self._x, self._eigenvalue_floor()) if jumps else 0
         if self.balance.contact.limits_newton_steps:
             self._x.array_w[:] = self.balance.feasible_guess(self._x.array_r.copy())
-            self.balance.set_iterate(self._x)  # terms look there for what is held back
+            self.balance.set_iterate(self._x)  # restricted obstacles are advanced from there
         return extended
 
     def _advance_obstacles(self) -> tuple[int, int, bool]:
-        """Solve from x, once more each time that obstacles which were held back have advanced (collective).
+        """Solve from x, and again each time that obstacles with a restricted motion have advanced (collective).
 
-        Returns all Newton and Krylov iterations, and whether obstacles are still held back: for good, as far as the
-        last advance tells.
+        Returns:
+            Numbers of all Newton and Krylov iterations, and whether obstacles are jammed: the last advances were too
+            short to complete the motion in the solves that are left.
         """
         policy, newton, krylov, remaining = self._policy, 0, 0, 1.0
         for solve in range(policy.max_obstacle_solves):
@@ -246,14 +355,13 @@ class NewtonSolver:
             solves_to_come = policy.max_obstacle_solves - solve
             if solve >= policy.min_obstacle_solves and remaining > solves_to_come * (before - remaining):
                 break
-            self._rtol = policy.intermediate_rtol if remaining else self._asked_rtol
+            self._convergence.begin_solve(intermediate=bool(remaining))
             if self._modified is not None:
                 self._modified.merit.begin_solve()
             if self.linear.forcing is not None:
                 self.linear.forcing.begin_attempt()
-            self._aborted = False
             self.snes.solve(None, self._x)
-            if self._aborted:
+            if self._convergence.aborted:
                 raise StepAborted
             newton, krylov = newton + self.snes.its, krylov + self.snes.getLinearSolveIterations()
             if self.snes.reason <= 0 or not remaining:
@@ -262,20 +370,20 @@ class NewtonSolver:
         return newton, krylov, True
 
     def _solve_linear_step(self) -> SolveResult | None:
-        """Solve a linear balance from x; None: a few solves were not enough, and Newton's method takes over."""
+        """Solve a linear balance from x; returns None if a few solves were not enough, for Newton's method."""
         balance, x, krylov, norm = self.balance, self._x, 0, np.inf
         for solve in range(self._policy.max_linear_solves + 1):
-            if not (solved := np.isfinite(norm) and self._is_solved(norm, solve)):
+            if not (solved := np.isfinite(norm) and self._convergence.is_solved(norm, solve)):
                 balance.assemble_free_residual(x, balance.work_vector)
                 norm = balance.work_vector.norm()
-                solved = self._is_solved(norm, solve)
+                solved = self._convergence.is_solved(norm, solve)
             if solved:
                 return SolveResult(True, solve, krylov, "")
             if self._stop_requested():
                 raise StepAborted
             if solve == self._policy.max_linear_solves:
                 break
-            result = self.linear.solve_linear_step(self._norm_of_solution(norm), self._eigenvalue_floor())
+            result = self.linear.solve_linear_step(self._convergence.norm_of_solution(norm), self._eigenvalue_floor())
             if result is None:
                 break
             norm, krylov = result[0], krylov + result[1]
@@ -296,65 +404,7 @@ class NewtonSolver:
         if share < 1:
             y.scale(share)
 
-    # --- convergence ---
-
-    def _test_convergence(self, snes: PETSc.SNES, its: int, norms: tuple[float, float, float]) -> int:
-        """SNES's convergence test: |r| <= rtol max(|r_0|, |forces|), or below round-off; see `_norm_of_solution`.
-
-        PETSc's own test against |r_0| alone asks for more digits as the first guess gets better.
-        """
-        reason = PETSc.SNES.ConvergedReason
-        if not np.isfinite(norms[2]):
-            return int(reason.DIVERGED_FNORM_NAN)
-        if self._is_solved(norms[2], its) or self._is_solved_by_elimination(snes, its):
-            return int(reason.CONVERGED_FNORM_RELATIVE)
-        if self._stop_requested():  # SNES ends its solve, and can be used again
-            self._aborted = True
-            return int(reason.DIVERGED_INNER)
-        modified = self.used_second_snes
-        self._stopped_for_cost = self._limit.is_exceeded(snes.getLinearSolveIterations(), its, modified=modified)
-        if self._stopped_for_cost:
-            return int(reason.DIVERGED_INNER)
-        has_inertia = self.balance.scheme.inertia
-        if self._modified is not None and has_inertia and self._modified.has_stalled(snes.getFunctionNorm(), its):
-            return int(reason.DIVERGED_MAX_IT)  # half the step is solved in a few iterations
-        self._norms.append(snes.getFunctionNorm())
-        return int(reason.DIVERGED_LINE_SEARCH if self.crawls else reason.ITERATING)
-
-    def _is_solved_by_elimination(self, snes: PETSc.SNES, its: int) -> bool:
-        """Relax the few nodes that hold most of the residual of an iterate; whether that solves the balance
-        (collective).
-
-        SNES goes on from there, with the norm of the residual there.
-        """
-        has_others = self._modified is not None or self._eliminations < self._policy.max_eliminations
-        if self._elimination is None or not its or not has_others:
-            return False
-        if snes.getFunctionNorm() < self._policy.fast_reduction * self._norms[-1]:  # nothing holds it up
-            return False
-        if not self._elimination.relax_nodes(self._solved_norm):
-            return False
-        self._eliminations += 1
-        if self._modified is not None:
-            self._modified.merit.note_elimination()
-        x, r = snes.getSolution(), snes.getFunction()[0]
-        x.array_w[:] = self.balance.u.x.array[: self.balance.owned_dof_count]
-        snes.computeFunction(x, r)
-        snes.setFunctionNorm(r.norm())
-        return self._is_solved(snes.getFunctionNorm(), its)
-
-    def _is_solved(self, norm: float, its: int) -> bool:
-        """Whether |r| = `norm`, N, after so many iterations is that of a solution (collective)."""
-        if its == 0:
-            # A first guess that contact has cut is off by more than any force of the step, however stiff the body.
-            self._first_norm = 0.0 if self.balance.contact.limits_newton_steps else norm
-        return norm <= self._norm_of_solution(self._first_norm if its else 0.0)
-
-    def _norm_of_solution(self, first_norm: float) -> float:
-        """Largest |r| of a solution, N, where the first guess has `first_norm`, N (collective)."""
-        scale, round_off = self.balance.energies.force_scale()
-        self._solved_norm = max(self._rtol * max(first_norm, scale), round_off)
-        return self._solved_norm
+    # --- end ---
 
     def _failure(self) -> str:
         reason = _SNES.get(self.snes.reason, str(self.snes.reason)).lower()
@@ -365,7 +415,7 @@ class NewtonSolver:
         return f"Newton's method stopped after {self.snes.its} iterations: {text}"
 
     def destroy(self) -> None:
-        """Give back PETSc's objects and take the options out of its database; nothing may be solved any more."""
+        """Free PETSc's objects and remove the options from its database; the solver cannot be used any more."""
         self._options.remove()
         for owned in (self.linear, *self._all_snes, self._x):
             owned.destroy()
