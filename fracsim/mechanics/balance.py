@@ -37,7 +37,7 @@ from .term_protocols import ContactTerms, RigidMotionTerm, TermHistories
 # methods of terms that are called in every step, of those terms alone that override them
 _STEP_METHODS = (
     "begin_step", "update_displacement", "accept_step", "add_nodal_forces", "acceleration", "applied_forces",
-    "damping_forces", "reference_forces", "step_work", "edges_broke", "damage_changed",
+    "damping_forces", "reference_forces", "stored_energy", "step_work", "edges_broke", "damage_changed",
 )  # fmt: skip
 
 

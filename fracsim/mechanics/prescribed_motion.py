@@ -31,6 +31,7 @@ class PrescribedMotion:
         dofs: sorted unrolled local dofs (node * d + component), ghosts included.
         owned_dofs: those of `dofs` that this rank owns; they come first.
         free_dofs: (owned dofs,) flags of all others.
+        values: (owned_dofs,) prescribed displacements of `owned_dofs`, m.
         bcs: Dirichlet condition with the values of `set_values`; empty if no dof of any rank is prescribed.
     """
 
@@ -51,6 +52,7 @@ class PrescribedMotion:
         self.free_dofs: Flags = np.ones(owned, bool)
         self.free_dofs[self.owned_dofs] = False
         self._values = fem.Function(domain.space)
+        self.values: Values = np.zeros(len(self.owned_dofs))
         self.bcs = [self._condition()] if domain.comm.allreduce(len(self.dofs)) else []
 
     def _condition(self) -> fem.DirichletBC:
@@ -67,6 +69,7 @@ class PrescribedMotion:
     def set_values(self, values: Values) -> None:
         """Set the prescribed displacements (dofs,), m, of `bcs` and `values`."""
         self._values.x.array[self.dofs] = values
+        self.values = values[: len(self.owned_dofs)]
 
     @property
     def prescribed_nodes(self) -> Flags:
@@ -74,12 +77,6 @@ class PrescribedMotion:
         prescribed = np.zeros(len(self._domain.nodes), bool)
         prescribed[self.dofs // self._domain.dim] = True
         return prescribed
-
-    @property
-    def values(self) -> Values:
-        """(owned_dofs,) prescribed displacements of `owned_dofs`, m."""
-        result: Values = self._values.x.array[self.owned_dofs]
-        return result
 
     def max_deviation(self, u: Values) -> float:
         """Largest deviation of u (owned dofs,), m, from a prescribed value, in mean edge lengths (collective)."""

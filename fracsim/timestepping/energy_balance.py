@@ -99,7 +99,7 @@ def add_step_energies(balance: Balance, end: State, step: StepEnergies) -> tuple
     """
     _check_finite(balance.domain.comm, end, step.work + step.dissipated + step.elastic)
     elastic = step.elastic
-    elastic += sum(term.stored_energy() for term in balance.terms if term is not balance.stress)
+    elastic += sum(term.stored_energy() for term in balance.terms_with["stored_energy"] if term is not balance.stress)
     term_work, friction_loss = balance.energies.step_work()
     # Energy that contact stores because its stiffness rises, which does external work.
     stiffening_work = balance.contact.stiffen()
