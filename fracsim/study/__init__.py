@@ -8,7 +8,8 @@ contact                schema of [[obstacle]], [contact]
 rigid_bodies           schema of [[body]], and the limits of rigid studies
 time_and_output        schema of [time], [[probe]], [output]
 solver_options         schema of [solver]
-study                  schema of a whole study, and conditions between its tables
+study                  schema of a whole study
+table_checks           conditions between the tables of a study
 values                 types of values, and the documentation of a key
 material_library       named materials with their sources
 documentation          docs/study-file.md, written from the schema

@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 Vector3 = Annotated[list[Finite], Len(3, 3)]
 Counts = Annotated[list[Annotated[int, Strict(), Ge(1)]], Len(3, 3)]
 Distances = Annotated[list[Annotated[Finite, Ge(0)]], Len(3, 3)]
-MAX_ROTATION_PER_STEP = 1e3  # rad, of a given spin; larger angles lose their digits
 
 
 def _zeros() -> list[float]:
