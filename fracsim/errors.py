@@ -5,8 +5,6 @@ from __future__ import annotations
 import signal
 from enum import IntEnum
 
-# Characters of a message; the middle of a longer one is left out.
-MAX_MESSAGE_LENGTH = 1000
 # Signals that end a run with a checkpoint. SIGHUP: the terminal was closed; SIGXCPU: the limit of processor time.
 STOP_SIGNALS = (
     signal.SIGINT, signal.SIGTERM, signal.SIGUSR1, signal.SIGUSR2, signal.SIGHUP, signal.SIGQUIT, signal.SIGXCPU,
@@ -31,9 +29,8 @@ def one_line(text: str) -> str:
     line = text
     if not text.isprintable():
         line = "".join(char if char.isprintable() else ascii(char)[1:-1] for char in text)
-    if len(line) <= MAX_MESSAGE_LENGTH:
-        return line
-    return f"{line[: MAX_MESSAGE_LENGTH // 2]} ... {line[-MAX_MESSAGE_LENGTH // 2 :]}"
+    # the middle of a long text is left out
+    return line if len(line) <= 1000 else f"{line[:500]} ... {line[-500:]}"
 
 
 class FracsimError(Exception):

@@ -116,7 +116,7 @@ def test_rigid_bodies_that_go_astray(tmp_path: Path, monkeypatch: pytest.MonkeyP
             "output": {"every": 10, "picture": False, "checkpoint": 1e-9},
         })  # fmt: skip
 
-    monkeypatch.setattr(values, "LARGEST", 1e300)  # of what a study may give
+    monkeypatch.setattr(values, "MAX_MAGNITUDE", 1e300)  # of what a study may give
     with pytest.raises(NotConverged, match=r"not finite at t = 0 s; look at velocities.*No checkpoint was written"):
         run_study(MPI.COMM_SELF, thrown(1e200), tmp_path / "fast")
     assert rows(tmp_path / "fast") == []
@@ -143,7 +143,7 @@ def test_rigid_bodies_that_go_astray(tmp_path: Path, monkeypatch: pytest.MonkeyP
 def test_a_study_that_overflows_ends_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scheme: str) -> None:
     """A body that is thrown at, or drawn by, 1e200 m: finite numbers whose energies are none. Studies refuse so much;
     what a run meets on its way may still be as large."""
-    monkeypatch.setattr(values, "LARGEST", 1e300)
+    monkeypatch.setattr(values, "MAX_MAGNITUDE", 1e300)
     data = study(changed(
         BAR, time={"scheme": scheme, "adapt": False},
         boundary=[{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [1e200, 0.0, 0.0]}],

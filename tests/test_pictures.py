@@ -18,8 +18,14 @@ from fracsim.output.fields_file import Field
 from fracsim.output.surface.body_surface import BodySurface
 from fracsim.output.surface.vtk_files import SurfaceFiles
 from fracsim.report.pictures.annotations import annotate, format_length, format_time, round_length
-from fracsim.report.pictures.picture import GAP, render, tile_pictures
-from fracsim.report.pictures.picture_options import MATERIAL_LOOKS, SIZE, PictureOptions, parse_limits, parse_size
+from fracsim.report.pictures.picture import SHEET_GAP, render, tile_pictures
+from fracsim.report.pictures.picture_options import (
+    DEFAULT_SIZE,
+    MATERIAL_LOOKS,
+    PictureOptions,
+    parse_limits,
+    parse_size,
+)
 from fracsim.report.pictures.renderer import OBSTACLE_COLOUR, crack_opening
 from fracsim.study.time_and_output import LOOKS
 from support.solids import lattice, patterns, separated
@@ -162,10 +168,10 @@ def test_colours_in_2d_are_those_of_the_legend(
     inner = pixels[SMALL[1] // 2, SMALL[0] // 2]
     assert np.abs(inner - wanted).max() <= 1 and inner.min() < 240
     assert (pixels[0, 0] == 255).all()
-    legend = shown(render(folder, options=PictureOptions("heat", size=SIZE, limits=limits)))[
+    legend = shown(render(folder, options=PictureOptions("heat", size=DEFAULT_SIZE, limits=limits)))[
         -120:
     ]  # the bar, in its middle
-    assert np.abs(legend[:, SIZE[0] // 2] - wanted).max(axis=1).min() <= 2
+    assert np.abs(legend[:, DEFAULT_SIZE[0] // 2] - wanted).max(axis=1).min() <= 2
 
 
 def test_one_range_for_all_frames(tmp_path: Path) -> None:
@@ -177,8 +183,8 @@ def test_one_range_for_all_frames(tmp_path: Path) -> None:
     )  # fmt: skip
     look = PictureOptions("heat", size=(2 * SMALL[0], 2 * SMALL[1]), bare=True)
     sheet = shown(render(folder, tmp_path / "sheet.png", look, sheet="0,1"))
-    assert sheet.shape == (SMALL[1], 2 * SMALL[0] + GAP, 3)
-    quarter, step = SMALL[0] // 3, SMALL[0] + GAP
+    assert sheet.shape == (SMALL[1], 2 * SMALL[0] + SHEET_GAP, 3)
+    quarter, step = SMALL[0] // 3, SMALL[0] + SHEET_GAP
     row = sheet[SMALL[1] // 2]
     assert (row[quarter] == row[quarter + step]).all()
     assert (row[quarter] == row[2 * quarter]).all() and (row[quarter + step] != row[2 * quarter + step]).any()
@@ -186,10 +192,10 @@ def test_one_range_for_all_frames(tmp_path: Path) -> None:
 
 def test_the_scale_bar_is_as_long_as_it_says(tmp_path: Path) -> None:
     """Beside a bar of 6 m, in a flat picture: 1 m of a width of some 7."""
-    pixels = shown(render(written(tmp_path, 0.0, cut=False, dim=2), options=PictureOptions(size=SIZE)))
-    ink = (np.abs(pixels - [34, 38, 44]).max(axis=2) < 4)[-60:, : SIZE[0] // 3]
+    pixels = shown(render(written(tmp_path, 0.0, cut=False, dim=2), options=PictureOptions(size=DEFAULT_SIZE)))
+    ink = (np.abs(pixels - [34, 38, 44]).max(axis=2) < 4)[-60:, : DEFAULT_SIZE[0] // 3]
     length = ink.sum(axis=1).max()
-    body = np.flatnonzero(np.any(pixels[SIZE[1] // 2] < 250, axis=1))
+    body = np.flatnonzero(np.any(pixels[DEFAULT_SIZE[1] // 2] < 250, axis=1))
     assert length == pytest.approx(np.ptp(body) / 6, abs=2.5)
 
 
@@ -255,11 +261,11 @@ def test_a_sheet_is_read_from_left_to_right_and_down() -> None:
     """Five pictures: three and two, and paper where there is no sixth; up to three stand in one row."""
     pictures = [np.full((4, 6, 3), 10 * k, np.uint8) for k in range(1, 6)]
     sheet = tile_pictures(pictures)
-    assert sheet.shape == (2 * 4 + GAP, 3 * 6 + 2 * GAP, 3)
-    down, along = 4 + GAP, 6 + GAP
+    assert sheet.shape == (2 * 4 + SHEET_GAP, 3 * 6 + 2 * SHEET_GAP, 3)
+    down, along = 4 + SHEET_GAP, 6 + SHEET_GAP
     assert [sheet[0, 0, 0], sheet[0, along, 0], sheet[0, 2 * along, 0]] == [10, 20, 30]
     assert [sheet[down, 0, 0], sheet[down, along, 0], sheet[down, 2 * along, 0]] == [40, 50, 255]
-    assert tile_pictures(pictures[:3]).shape == (4, 3 * 6 + 2 * GAP, 3)
+    assert tile_pictures(pictures[:3]).shape == (4, 3 * 6 + 2 * SHEET_GAP, 3)
 
 
 # --- floor ---
@@ -317,7 +323,7 @@ def test_a_folder_of_pictures_and_runs_side_by_side(tmp_path: Path) -> None:
     made = render(first, tmp_path / "frames", look)
     assert [path.name for path in sorted(made.iterdir())] == ["frame_000000.png", "frame_000001.png"]
     both = shown(render([first, second], tmp_path / "both.png", look))
-    assert both.shape == (SMALL[1] // 2, SMALL[0] + GAP, 3)
+    assert both.shape == (SMALL[1] // 2, SMALL[0] + SHEET_GAP, 3)
     assert np.any(both[:, : SMALL[0] // 2] != both[:, -(SMALL[0] // 2) :])
 
 

@@ -16,10 +16,6 @@ from ..meshes.data import AXES
 
 Ints = npt.NDArray[np.integer]
 Values = npt.NDArray[np.float64]
-# a point with smaller barycentric coordinates is outside the cell (round-off)
-MIN_BARYCENTRIC = -1e-9
-# the three pairings of four corners as two diagonals
-DIAGONAL_PAIRS = np.array([[0, 1, 2, 3], [0, 2, 1, 3], [0, 3, 1, 2]])
 
 
 class CrackExtent:
@@ -122,7 +118,8 @@ class CrackExtent:
         corners = self._domain.nodes[graph.cell_nodes[cells]]
         sides = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
         barycentric = np.linalg.solve(sides, (end - corners[:, 0])[:, :, None])[:, :, 0]
-        cells = cells[(barycentric.min(axis=1) > MIN_BARYCENTRIC) & (barycentric.sum(axis=1) < 1 - MIN_BARYCENTRIC)]
+        # points outside by round-off count as inside
+        cells = cells[(barycentric.min(axis=1) > -1e-9) & (barycentric.sum(axis=1) < 1 + 1e-9)]
         candidates = [
             (
                 float(np.linalg.norm(end - self._segment_entry(cell))),
@@ -190,5 +187,7 @@ def _quadrilateral_areas(corners: Values) -> Values:
 
     The area is half the norm of the cross product of the diagonals, the pairing for which that is largest.
     """
-    a, b, c, e = np.moveaxis(corners[:, DIAGONAL_PAIRS], 2, 0)
+    # the three pairings of four corners as two diagonals
+    pairs = np.array([[0, 1, 2, 3], [0, 2, 1, 3], [0, 3, 1, 2]])
+    a, b, c, e = np.moveaxis(corners[:, pairs], 2, 0)
     return np.asarray(np.linalg.norm(np.cross(b - a, e - c), axis=2).max(axis=1, initial=0.0) / 2)

@@ -22,8 +22,6 @@ from weakref import WeakValueDictionary
 from ..errors import InputError
 
 LOCK_FILE = ".fracsim.lock"
-# How long a lock is tried for. A process that only asks whether a run is active holds the lock for a moment.
-LOCK_WAIT_SECONDS = 0.3
 # error numbers of file systems without locks, such as NFS or Lustre mounted without them
 _UNSUPPORTED = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
 
@@ -153,7 +151,8 @@ def _take_lock(folder: Path, name: Path) -> _LockHandle:
     """
     if (shared := _handles.get(folder)) is not None:
         return shared
-    path, deadline = folder / LOCK_FILE, time.monotonic() + LOCK_WAIT_SECONDS
+    # 0.3 s, since a process that only asks whether a run is active holds the lock for a moment
+    path, deadline = folder / LOCK_FILE, time.monotonic() + 0.3
     while True:
         descriptor = _open_lock_file(path, name)
         try:

@@ -21,8 +21,6 @@ from .runs import PHASES, RunData, Values, differing_settings
 ENERGY_LABELS = {
     "external_work": "external work", "elastic": "elastic", "kinetic": "kinetic", "dissipated": "dissipated",
 }  # fmt: skip
-# points of a curve; more cannot be distinguished on the page
-MAX_CURVE_POINTS = 600
 
 
 @dataclass(frozen=True)
@@ -94,12 +92,13 @@ def _to_cell(value: Any) -> TableCell:
 
 
 def history_series(run: RunData, x: str, y: str, label: str) -> Series:
-    """Curve of two columns of a run. Beyond `MAX_CURVE_POINTS` it is thinned; its extrema are kept."""
+    """Curve of two columns of a run. A long curve is thinned, but keeps its extrema."""
+    max_points = 600  # more cannot be distinguished on the page
     x_values, y_values = run.history[x], run.history[y]
     chosen = np.arange(len(x_values))
-    if len(x_values) > MAX_CURVE_POINTS:
+    if len(x_values) > max_points:
         extrema = [int(np.argmin(y_values)), int(np.argmax(y_values))]
-        chosen = np.unique([*np.linspace(0, len(x_values) - 1, MAX_CURVE_POINTS).astype(int), *extrema])
+        chosen = np.unique([*np.linspace(0, len(x_values) - 1, max_points).astype(int), *extrema])
     return Series(label, tuple(x_values[chosen].tolist()), tuple(y_values[chosen].tolist()), style="line")
 
 

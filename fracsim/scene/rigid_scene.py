@@ -48,9 +48,6 @@ if TYPE_CHECKING:
 
 Values = npt.NDArray[np.float64]
 
-# Bodies that overlap at the start by more than this share of the mean edge are refused.
-MAX_OVERLAP_RATIO = 0.01
-
 
 @dataclass
 class RigidScene:
@@ -230,7 +227,8 @@ def _check_masses(state: RigidState) -> None:
 
 def _check_overlaps(stepper: RigidStepper, state: RigidState, obstacles: list[RigidObstacle], edge: float) -> None:
     """Raise InputError if bodies overlap one another or an obstacle at the start; `edge`: mean edge, m."""
-    overlaps = [pair for pair in stepper.find_penetrations(state) if pair[2] > MAX_OVERLAP_RATIO * edge]
+    # up to 1 % of the mean edge is admitted
+    overlaps = [pair for pair in stepper.find_penetrations(state) if pair[2] > 0.01 * edge]
     if not overlaps:
         return
 

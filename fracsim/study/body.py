@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, field_validator, model_validator
 
-from .values import MAX_REGION_NAME, NonNegative, Poisson, Positive, Strength, StudyTable, key
+from .values import NonNegative, Poisson, Positive, Strength, StudyTable, key
 
 SOURCES = ("builder", "file", "surface", "outline", "shell")
 
@@ -197,10 +197,11 @@ class MaterialSettings(ElasticSettings):
     @field_validator("regions")
     @classmethod
     def _names_are_short(cls, regions: dict[str, RegionSettings]) -> dict[str, RegionSettings]:
+        # mesh generators choose these names
         for name in regions:
-            if len(name) > MAX_REGION_NAME or not name.isprintable():
+            if len(name) > 100 or not name.isprintable():
                 raise ValueError(
-                    f"the name of a region has {MAX_REGION_NAME} letters or fewer, and no control characters; this one "
+                    f"the name of a region has 100 letters or fewer, and no control characters; this one "
                     f'has not: "{name}"'
                 )
         return regions

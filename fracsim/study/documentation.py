@@ -77,7 +77,6 @@ COMMENTS = {
     "mesh.pattern": "Pattern of the builder box: unstructured has random points, without preferred directions.",
     "solver.ksp_rtol": "Relative tolerance of the linear solver.",
 }
-WIDTH = 100  # characters of a comment line
 LINK = re.compile(r" \(\[[^]]*\]\([^)]*\)\)")  # a link in parentheses
 
 
@@ -300,7 +299,7 @@ def _comment(path: str, documented: dict[str, Key]) -> Iterator[str]:
         text += f" [{entry.unit}]" if entry.unit else ""
     line = "#"
     for word in text.split():
-        if len(line) + len(word) >= WIDTH:
+        if len(line) + len(word) >= 100:
             yield line
             line = "#"
         line += f" {word}"

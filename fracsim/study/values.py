@@ -29,19 +29,19 @@ from pydantic_core.core_schema import no_info_plain_validator_function
 # Strict: "3" is not accepted for 3, nor true for 1. Tags of unions are in <>: they name no key of the file.
 # No Field() in types: it would be shared by all keys of a type, and the default of one would become that of all.
 # Bounds of given numbers in any unit: products of a few of them stay within double precision.
-LARGEST, SMALLEST = 1e50, 1e-50
+MAX_MAGNITUDE, MIN_POSITIVE = 1e50, 1e-50
 
 
 def _not_too_large(value: float) -> float:
     # types that do not accept inf refuse it themselves
-    if abs(value) > LARGEST and not math.isinf(value):
-        raise ValueError(f"{value:g} is out of reach; allowed are {-LARGEST:g} to {LARGEST:g}")
+    if abs(value) > MAX_MAGNITUDE and not math.isinf(value):
+        raise ValueError(f"{value:g} is out of reach; allowed are {-MAX_MAGNITUDE:g} to {MAX_MAGNITUDE:g}")
     return value
 
 
 def _not_too_small(value: float) -> float:
-    if 0 < value < SMALLEST:
-        raise ValueError(f"{value:g} is out of reach; allowed are {SMALLEST:g} to {LARGEST:g}")
+    if 0 < value < MIN_POSITIVE:
+        raise ValueError(f"{value:g} is out of reach; allowed are {MIN_POSITIVE:g} to {MAX_MAGNITUDE:g}")
     return value
 
 
@@ -56,10 +56,7 @@ Seed = Annotated[int, Strict(), Ge(0)]
 Flag = Annotated[bool, Strict()]
 Vector = Annotated[list[Finite], Len(2, 3)]
 # Letters of the name of an obstacle or probe, which is part of names of files (255 letters), columns and arrays.
-MAX_NAME = 64
-Name = Annotated[str, StringConstraints(pattern="^[A-Za-z][A-Za-z0-9-]*$", max_length=MAX_NAME)]
-# Letters of the name of a region, which mesh generators choose.
-MAX_REGION_NAME = 100
+Name = Annotated[str, StringConstraints(pattern="^[A-Za-z][A-Za-z0-9-]*$", max_length=64)]
 
 
 def _within_reach(time: float) -> float:

@@ -25,12 +25,10 @@ from .renderer import Renderer, field_range
 
 Pixels = npt.NDArray[np.uint8]
 FILM_SUFFIXES = (".gif", ".mp4")
-# pictures per second of a film
-FPS = 12
 # size of a picture on a sheet, as a share of a single picture
 _SHEET_SCALE = 0.5
 # pixels between the pictures of a sheet
-GAP = 8
+SHEET_GAP = 8
 
 
 @contextmanager
@@ -63,7 +61,7 @@ def render(
     *,
     frame: int = -1,
     sheet: str = "",
-    fps: int = FPS,
+    fps: int = 12,
 ) -> Path:
     """Draw frames of a run and return the path of what was written.
 
@@ -176,9 +174,11 @@ def tile_pictures(pictures: Sequence[Pixels]) -> Pixels:
     columns = len(pictures) if len(pictures) <= 3 else math.ceil(math.sqrt(len(pictures)))
     height, width, _ = pictures[0].shape
     rows = math.ceil(len(pictures) / columns)
-    sheet = np.full((rows * (height + GAP) - GAP, columns * (width + GAP) - GAP, 3), 255, np.uint8)
+    sheet = np.full(
+        (rows * (height + SHEET_GAP) - SHEET_GAP, columns * (width + SHEET_GAP) - SHEET_GAP, 3), 255, np.uint8
+    )
     for number, picture in enumerate(pictures):
-        y, x = (height + GAP) * (number // columns), (width + GAP) * (number % columns)
+        y, x = (height + SHEET_GAP) * (number // columns), (width + SHEET_GAP) * (number % columns)
         sheet[y : y + height, x : x + width] = picture
     return sheet
 

@@ -17,7 +17,7 @@ VIEWS = {
     "right": (1.0, 0.0, 0.0),
     "top": (0.0, -0.001, 1.0),
 }
-SIZE = (1400, 900)
+DEFAULT_SIZE = (1400, 900)
 # least and largest side of a picture in pixels; graphics drivers give no more
 _SIDE_LIMITS = (16, 8192)
 # colours of the boundary and of cracks, if neither a material nor a field colours them
@@ -51,7 +51,7 @@ class PictureOptions:
     view: str = "iso"
     zoom: float = 1.0
     material: str = ""
-    size: tuple[int, int] = SIZE
+    size: tuple[int, int] = DEFAULT_SIZE
     limits: tuple[float, float] | None = None
     magnify: float = 1.0
     floor: bool = False
