@@ -13,9 +13,6 @@ from typing import ClassVar
 
 from .scheme import Array, EndOfStepScheme, prescribed_rates
 
-# Rounding error of beta and gamma when they are compared with the limit of stability.
-STABILITY_ROUND_OFF = 1e-12
-
 
 @dataclass(frozen=True)
 class Newmark(EndOfStepScheme):
@@ -48,7 +45,8 @@ class Newmark(EndOfStepScheme):
         Raises:
             ValueError: beta < gamma / 2, for which only short steps are stable.
         """
-        if 2 * self.beta < self.gamma - STABILITY_ROUND_OFF:
+        # 1e-12: rounding errors of beta and gamma as they are written.
+        if 2 * self.beta < self.gamma - 1e-12:
             raise ValueError("newmark is stable for every step where beta >= gamma / 2; raise beta")
 
     def rate_coefficients(self, dt: float) -> tuple[float, float]:

@@ -11,9 +11,6 @@ from ..mesh.ghost_exchange import min_over_ranks
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-# Cut positions derived from nodal forces are kept this share of an edge away from its ends, against sliver triangles.
-MIN_FORCE_CUT_SHARE = 0.1
-
 
 class EdgeHistory:
     """Break times and cut positions of the edges of a rank, owned and ghost.
@@ -89,4 +86,5 @@ def cut_positions_from_forces(force: Values, ends: npt.NDArray[np.integer]) -> V
     size = np.linalg.norm(force, axis=1)[ends]
     total = size.sum(axis=1)
     share = np.divide(size[:, 1], total, out=np.full(len(total), 0.5), where=total > 0)
-    return np.clip(share, MIN_FORCE_CUT_SHARE, 1 - MIN_FORCE_CUT_SHARE)
+    # Away from the ends of the edge, against sliver triangles of the split surface.
+    return np.clip(share, 0.1, 0.9)

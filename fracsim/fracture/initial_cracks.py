@@ -19,8 +19,6 @@ Values = npt.NDArray[np.float64]
 
 # Least share of an edge between a cut and its ends, against sliver triangles of the split surface.
 MIN_CUT_SHARE = 0.02
-# Nodes nearer to the plane of a crack than this share of the body's size count as nodes on one side of it.
-ON_PLANE_TOLERANCE = 1e-9
 
 
 def cut_edges(graph: EdgeGraph, crack: CrackPlane) -> Values:
@@ -30,7 +28,7 @@ def cut_edges(graph: EdgeGraph, crack: CrackPlane) -> Values:
     that it crosses, so that it ends where it enters its last cell. In 3D it cuts whole cells: a cell with some of its
     crossed edges cut would not be split, and the crack would be about 0.4 h short along its front.
     """
-    domain, tolerance = graph.domain, ON_PLANE_TOLERANCE * graph.domain.bounds.diagonal
+    domain, tolerance = graph.domain, 1e-9 * graph.domain.bounds.diagonal
     ends = domain.nodes[edge_ends_in_input_order(graph)]
     height = (ends - crack.point) @ crack.normal
     # Nodes on the plane count as above it, so that they are never cut.

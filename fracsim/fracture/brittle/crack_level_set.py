@@ -32,9 +32,6 @@ Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
 
-# Cosine below which a direction is turned round: directions at right angles, but for rounding, keep their sign.
-MIN_COSINE = -1e-9
-
 
 def plane_distance(points: Values, origin: Values, normal: Values) -> Values:
     """Return the signed distances (nodes,) of points (nodes, d) from a plane, m."""
@@ -144,7 +141,8 @@ class CurvedLevelSet:
         """Return normals (n, d) and phi (n,) at nodes (n,) behind facets (n, d nodes)."""
         ahead = unit_or_first_axis(self._normal[facet].sum(axis=1))
         direction, weight = self._field.direction[node], self._field.weight[node][:, None]
-        sign = np.where(np.einsum("ni,ni->n", direction, ahead) >= MIN_COSINE, 1.0, -1.0)[:, None]
+        # Directions that are at right angles but for rounding keep their sign.
+        sign = np.where(np.einsum("ni,ni->n", direction, ahead) >= -1e-9, 1.0, -1.0)[:, None]
         normal = unit_or_first_axis(weight * sign * direction + (1 - weight) * ahead)
         step = self._mesh.points[node][:, None] - self._mesh.points[facet]
         mean = (self._normal[facet] + normal[:, None]) / 2

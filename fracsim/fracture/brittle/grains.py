@@ -21,9 +21,6 @@ Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
 
-# Distances between points and seeds held at once: 32 MiB.
-DISTANCES_AT_ONCE = 1 << 22
-
 
 @dataclass(frozen=True)
 class GrainParameters:
@@ -138,7 +135,8 @@ def draw_seeds(mesh: SurfaceCutMesh, parameters: GrainParameters) -> tuple[Value
 def assign_to_seeds(points: Values, seeds: Values, weights: Values) -> tuple[Ints, Values]:
     """Return for each point (N, d) the seed of least energy k_i |x - p_i|, the first of equal ones, and the energy."""
     label, energy = np.empty(len(points), np.int64), np.empty(len(points))
-    rows = max(DISTANCES_AT_ONCE // len(seeds), 1)
+    # 32 MiB of distances between points and seeds at once.
+    rows = max((1 << 22) // len(seeds), 1)
     for first in range(0, len(points), rows):
         part = slice(first, first + rows)
         energies = cdist(points[part], seeds) * weights

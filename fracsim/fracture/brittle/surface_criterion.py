@@ -25,9 +25,6 @@ from .surface_pass import OpenedSurfaces, OverloadedCells, SurfacePass
 Cells = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-# Default distance between starts over the side of a cube of the mean cell's volume: about two mesh edges.
-DEFAULT_SPACING = 4.0
-
 
 class BrittleSurfaces:
     """Criterion: a surface starts where the averaged first principal stress of a cell reaches its strength.
@@ -56,7 +53,8 @@ class BrittleSurfaces:
         self._domain = stress.domain
         self._carried = IntactEdgeStress(stress, graph, average, whole_tensor=True)
         spacing = parameters.spacing
-        self.spacing = spacing if spacing is not None else DEFAULT_SPACING * self._domain.mean_edge_length
+        # The mean edge is the side of a cube of the mean cell's volume: 4 of them are about two mesh edges.
+        self.spacing = spacing if spacing is not None else 4.0 * self._domain.mean_edge_length
         self.starts: Values = np.empty((0, self._domain.dim))
         self.cut_positions: Values = np.full(len(graph.broken), np.nan)
         self._reserved = 0

@@ -27,9 +27,6 @@ Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-# Share of the spacing within which no surface starts again after one that could not cut anything.
-FAILED_START_SPACING = 0.5
-
 
 class StartCandidates:
     """Cells at which a surface of one pass may start.
@@ -140,8 +137,8 @@ class SurfacePass:
                 candidates.exclude_near(points[start])
                 candidates.discard(damage.touched[load.cell])
             elif self.grains is None:
-                # There is no room for two sides with unsplit cells.
-                candidates.exclude_near(points[start], FAILED_START_SPACING)
+                # There is no room for two sides with unsplit cells: no surface starts within half of the spacing.
+                candidates.exclude_near(points[start], 0.5)
             else:
                 # All edges around this grain are broken.
                 candidates.discard(self.grains.cell_grain[load.cell] == self.grains.cell_grain[cell])
