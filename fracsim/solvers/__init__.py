@@ -1,12 +1,20 @@
 """Newton's method, linear solvers and preconditioners.
 
-low_rank          a tangent less what terms have eliminated; few stiff pairs beside what a preconditioner knows
-newton            one nonlinear solve, and what is tried where it fails
-nonlinear_solver  iterations or factors: what a solve begins with; factors: what they cost
-forcing_terms     how exactly its linear systems are solved
-linear_solver     steps that are one linear solve
-line_search       what its line search goes down, with moduli made positive where it would go up
-preconditioner    when multigrid is made anew, and what takes over from it, and what decides
-rigid_body_modes  its near null space; deflation: the same of parts that hang by a node or an edge
-petsc_options     options of one solver
+nonlinear_solver       solve of a step by a sequence of strategies
+strategies             strategies, the order in which they are tried, and which one begins
+newton                 one attempt of Newton's method (PETSc's SNES)
+line_search            merit function of the line search, positive tangents, clipped corrections
+nonlinear_elimination  separate solve for the few nodes that hold most of the residual
+forcing_terms          tolerances of inexact Newton
+linear_solver          systems with the tangent: options, Krylov method, steps that are one linear solve
+direct_solver          factors of the tangent (MUMPS), and their cost
+preconditioner         multigrid or SSOR: when it is rebuilt, and from what
+plain_solver           linear solver of `plain = true`: PETSc alone
+deflation              two-level preconditioner for fragments that are hardly attached
+low_rank               updates of low rank of the tangent and of its inverse
+tangent_operators      tangent as the matrices that a KSP takes
+multigrid              V cycle in single precision
+policy                 tuned numbers
+petsc_options          options of one solver in PETSc's database
+weak_callbacks         callbacks of PETSc's objects that do not keep their owner alive
 """

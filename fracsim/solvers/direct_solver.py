@@ -1,8 +1,9 @@
-"""Factors of the tangent in place of Krylov iterations, and what they cost.
+"""Direct solver (MUMPS) in place of Krylov iterations, and its cost in iterations.
 
-Factors serve where no Krylov method converges (fragments that hang by a thread, nearly incompressible bodies), where a
-shorter step would be no easier, and where CG takes more iterations than factors cost. MUMPS counts the operations of
-its elimination, from which the number of iterations that take as long is known (`SolverPolicy.flops_per_iteration`).
+It serves where no Krylov method converges (fragments that are hardly attached, nearly incompressible bodies), where a
+shorter step would be no easier, and where CG takes more iterations than a factorisation costs. MUMPS counts the
+operations of its elimination, from which the number of iterations of the same time follows
+(`SolverPolicy.flops_per_iteration`).
 
 Equations: docs/theory.md#linear-systems.
 """
@@ -22,30 +23,37 @@ if TYPE_CHECKING:
 
 
 class DirectSolver:
-    """Factors of the tangent by MUMPS, which serve a KSP in place of its preconditioner.
+    """Factors of the tangent, which serve a KSP in place of its preconditioner.
 
     Symmetric tangents are factorised as L D L^T, at half the operations; D tells whether they are positive definite.
-    The ordering of the unknowns, a third of the time in the plane, is kept until the pattern changes or `release`.
 
     Attributes:
-        equivalent_iterations: iterations of CG that take as long as the factors of one tangent, as far as is known.
-        trial_iterations: iterations of an attempt from which on it may go on with factors.
+        equivalent_iterations: CG iterations that take as long as one factorisation, as far as is known.
+        trial_iterations: iterations of an attempt, above which it may continue with factors.
         is_positive: whether the last tangent was positive definite; True where it is not symmetric.
-        serves: whether the KSP solves by factors now.
+        serves: whether the KSP solves by factors at present.
     """
 
     def __init__(self, *, symmetric: bool, dofs: int, dim: int, policy: SolverPolicy = DEFAULT_POLICY) -> None:
-        """`symmetric`: all tangents are; `dofs`, `dim`: of the body."""
+        """Prepare the solver; nothing is factorised yet.
+
+        Args:
+            symmetric: all tangents are symmetric.
+            dofs: number of dofs of the body.
+            dim: dimension of the body.
+            policy: costs.
+        """
         self._policy, self._symmetric = policy, symmetric
         self.equivalent_iterations, self.is_positive = float(policy.assumed_direct_cost), True
         compact = dofs * policy.compact_direct_cost if dim == 3 else 0.0
         self.trial_iterations = max(policy.tangents_on_trial * policy.assumed_direct_cost, compact)
         self.serves = False
+        # MUMPS keeps the ordering of the unknowns, a third of the time in 2D, until the pattern changes.
         self._pc: PETSc.PC | None = None
 
     @contextmanager
     def serving(self, ksp: PETSc.KSP, afterwards: PETSc.PC) -> Iterator[None]:
-        """Solve by factors within the block, with the preconditioner `afterwards` after it (collective)."""
+        """Solve by factors within the block, and with the preconditioner `afterwards` after it (collective)."""
         method = ksp.getType()
         ksp.setType("preonly")
         self.serves = True
@@ -56,11 +64,12 @@ class DirectSolver:
             ksp.setType(method)
             ksp.setPC(afterwards)
             if ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_PCSETUP_FAILED:
-                self.release()  # PETSc takes failed factors for made the next time
+                # PETSc would take failed factors as valid in the next solve.
+                self.release()
 
     @property
     def pc(self) -> PETSc.PC:
-        """The factors as a preconditioner."""
+        """Factors as a preconditioner."""
         assert self._pc is not None
         return self._pc
 
@@ -74,15 +83,13 @@ class DirectSolver:
         operators.set_on(ksp, self._pc)
 
     def pattern_changed(self) -> None:
-        """The tangent has entries at other places: factors of the old ones would be written past their arrays."""
+        """Forget the pattern: factors of the old one would be written past their arrays."""
         if self._pc is not None:
             self._pc.reset()
 
     def measure_cost(self, ksp: PETSc.KSP) -> None:
-        """Learn what the factors that served last cost, and whether the tangent is positive definite (collective).
-
-        The KSP's own preconditioner may be another one, which corrects these factors for springs (low_rank).
-        """
+        """Measure the cost of the last factorisation, and whether the tangent is positive definite (collective)."""
+        # The preconditioner of the KSP may be another one, which corrects these factors for stiff springs (low_rank).
         factors, entries = self.pc.getFactorMatrix(), ksp.getOperators()[1].getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)
         operations = factors.getMumpsRinfog(3)
         self.equivalent_iterations = operations / (self._policy.flops_per_iteration * entries["nz_used"])
@@ -91,7 +98,7 @@ class DirectSolver:
         self.is_positive = not self._symmetric or negative_pivots == 0
 
     def release(self) -> None:
-        """Give the memory of the factors back (collective)."""
+        """Free the memory of the factors (collective)."""
         if self._pc is not None:
             self._pc.destroy()
             self._pc = None

@@ -1,4 +1,4 @@
-"""Inexact Newton: the relative tolerance of each linear solve, and whether the last tangent is kept for it.
+"""Inexact Newton: relative tolerance of each linear solve, and whether it may use the tangent of the iterate before.
 
 Equations: docs/theory.md#inexact-newton.
 """
@@ -17,26 +17,26 @@ class EisenstatWalkerForcing:
     eta_k = min(eta_max, max(rtol, 0.9 (|r_k| / |r_{k-1}|)^2, |r|_solution / (10 |r_k|)))
 
     The second choice of S. C. Eisenstat and H. F. Walker, Choosing the forcing terms in an inexact Newton method, 1996.
-    While Newton's method finds out what touches, digits of a correction are worth nothing.
+    While the contact pairs change from iterate to iterate, an exact correction is of no use.
     """
 
     def __init__(self, rtol: float, policy: SolverPolicy = DEFAULT_POLICY) -> None:
-        """`rtol`: the tolerance of solves that are exact enough for anything."""
+        """Begin without a residual; `rtol` is the tight tolerance."""
         self._rtol = self._used = rtol
         self._policy = policy
         self._last_norm = 0.0
 
     def begin_attempt(self) -> None:
-        """An attempt begins: no residual is known."""
+        """Forget the residuals of earlier attempts."""
         self._last_norm = 0.0
 
     def tight_tolerance(self) -> float:
-        """The tolerance where no contact acts."""
+        """Return the tolerance where no contact acts."""
         self._last_norm, self._used = 0.0, self._rtol
         return self._used
 
     def tolerance_for(self, norm: float, solved_norm: float) -> float:
-        """eta_k at |r_k| = `norm`, N, where a solution has |r| = `solved_norm`, N."""
+        """Return eta_k at |r_k| = `norm` (N), where a solution has |r| = `solved_norm` (N)."""
         reduction = (norm / self._last_norm) ** 2 if self._last_norm else 1.0
         enough = 0.1 * solved_norm / norm if norm else 1.0
         self._last_norm = norm
@@ -44,40 +44,41 @@ class EisenstatWalkerForcing:
         return self._used
 
     def equivalent_iterations(self, its: int) -> int:
-        """Iterations of a solve to the tight tolerance at the same rate, where the last solve took `its`."""
+        """Return the iterations of a solve to the tight tolerance at the rate of the last solve, which took `its`."""
         return round(its * math.log(self._rtol) / math.log(self._used))
 
 
 class ContractionForcing:
     """Tolerances of the linear solves of an attempt without contact.
 
-    CG leaves a share of what the tangent leaves anyhow, q_k = |r_{k+1}| / |r_k|, or little against a solution. The
-    tangent is kept where it, too, gets there: it leaves 2 q_k of r then, a new one q_k^2.
-
-    CG stops by the preconditioned residual, and under a load on an end leaves fifteen times that share of r. So the
-    first solve goes by what CG left of r in the last attempt. Taken for the tangent's share, it would let CG stop
-    earlier from step to step.
+    CG may leave a share of what the linearisation leaves, q_k^2 of r with q_k = |r_{k+1}| / |r_k|, or a small share of
+    the residual of a solution. The last tangent is used again where it suffices, and leaves 2 q_k of r.
 
     Attributes:
-        rtol: the tolerance of solves that are exact enough for anything.
+        rtol: tight tolerance.
     """
 
     def __init__(self, rtol: float, policy: SolverPolicy = DEFAULT_POLICY) -> None:
+        """Begin without a residual; `rtol` is the tight tolerance."""
         self.rtol = self._used = rtol
         self._policy = policy
-        # Of the first iteration of the last attempt: share of r that it left, and what CG left of r, as a multiple of
-        # what it was to leave of the preconditioned residual.
+        # Of the first iteration of the last attempt: its contraction of r, and the share of r that CG left over the
+        # tolerance. CG stops by the preconditioned residual, and under a load on an end leaves fifteen times that share
+        # of r. Counted as contraction, this would let CG stop earlier from step to step.
         self._first_left, self._first_excess = 0.0, 1.0
         self.begin_attempt()
 
     def begin_attempt(self) -> None:
-        """An attempt begins: no residual is known."""
+        """Forget the residuals of earlier attempts."""
         self._norms: list[float] = []
 
     def record_iterate(self, norm: float, solved_norm: float, left_by_cg: Callable[[], float]) -> bool:
-        """Record an iterate with |r| = `norm`, N; returns whether the last tangent suffices for it.
+        """Record an iterate; return True if the last tangent suffices for the solve from there.
 
-        `solved_norm`: |r| of a solution, N; `left_by_cg`: evaluates what CG has left of r on the way there, N.
+        Args:
+            norm: |r| there, N.
+            solved_norm: |r| of a solution, N.
+            left_by_cg: evaluates the residual that CG has left in the linear system of the last solve, N.
         """
         policy = self._policy
         self._norms.append(norm)
@@ -89,7 +90,7 @@ class ContractionForcing:
         return len(self._norms) > 1 and 2 * self._contraction * norm <= policy.kept_tangent_share * solved_norm
 
     def tolerance_for(self, solved_norm: float, *, kept: bool) -> float:
-        """The tolerance of the solve from the last iterate; `kept`: with the tangent of the iterate before."""
+        """Return the tolerance of the solve from the last iterate; `kept`: with the tangent of the iterate before."""
         policy, norm = self._policy, self._norms[-1]
         enough = policy.cg_share_of_solution * solved_norm / norm if norm else 1.0
         if len(self._norms) == 1:
@@ -101,17 +102,20 @@ class ContractionForcing:
         return self._used
 
     def tight_tolerance(self) -> float:
-        """The tolerance of a single solve."""
+        """Return the tolerance of a single solve."""
         self._used = self.rtol
         return self._used
 
     @property
     def _contraction(self) -> float:
-        """Share of r that the last iteration has left, q_k."""
+        """|r_{k+1}| / |r_k| of the last iteration, q_k."""
         return self._norms[-1] / self._norms[-2] if self._norms[-2] else 1.0
 
     def equivalent_iterations(self, its: int) -> int:
-        """Iterations of a solve to the tight tolerance, where the last solve took `its`; 0: too few to tell."""
+        """Return the iterations of a solve to the tight tolerance, where the last solve took `its`.
+
+        0 if these are too few.
+        """
         if its < self._policy.min_rate_iterations:
             return 0
         return round(its * math.log(self.rtol) / math.log(self._used))

@@ -1,4 +1,4 @@
-"""The line search of Newton's method: its merit function, tangents made positive, and clipped corrections.
+"""Line search of Newton's method: merit function, positive tangents, and clipped corrections.
 
 Equations: docs/theory.md#newtons-method.
 """
@@ -17,14 +17,15 @@ from ..mesh.parallel import sum_over_ranks
 from .policy import DEFAULT_POLICY, SolverPolicy
 from .weak_callbacks import weak_callback
 
-TAKEN_AT_ONCE = -1e100  # J: a merit so low that the step is accepted
+# Merit, J, so low that every line search accepts the step.
+ACCEPTED_MERIT = -1e100
 
 
 class MeritFunction:
-    """The merit function of a SNES: rise of the incremental potential since the start of the iteration, J.
+    """Merit function of a SNES: rise of the incremental potential since the start of the iteration, J.
 
-    On |r|, which a barrier makes steep, a line search cuts good steps to nothing. Where no contact acts at either end
-    of a step a fall of |r| is accepted as well: its residual is asked for next anyway, and no energy has to be summed.
+    A line search on |r|, which a barrier makes steep, cuts good steps to almost nothing. Where no contact acts at
+    either end of a step, a decrease of |r| is accepted as well, which saves the sum of the energies.
     """
 
     def __init__(self, balance: Balance, snes: PETSc.SNES, policy: SolverPolicy = DEFAULT_POLICY) -> None:
@@ -33,24 +34,26 @@ class MeritFunction:
         self.begin_solve()
 
     def begin_solve(self) -> None:
-        """A solve begins: nothing is known of it."""
+        """Forget the values of earlier solves."""
         self._whole_step_rise: float | None = None  # J, of the first trial of an iteration
-        # Values are known by the version of the displacement that they belong to.
-        self._potential_known, self._potential_version, self._residual_version = (0.0, 0.0), -1, -1
+        # The last potential and residual are valid for one version of the displacement each.
+        self._last_potential, self._potential_version, self._residual_version = (0.0, 0.0), -1, -1
         self._start_potential, self._start_norm = 0.0, 0.0
         self._at_start, self._by_norm, self._eliminated = True, False, False
 
     def begin_line_search(self) -> None:
-        """The direction of an iteration is known: PETSc asks for the merit of its start next."""
+        """Note that PETSc evaluates the start of an iteration next."""
         self._at_start = True
 
     def note_elimination(self) -> None:
-        """Nodes were relaxed separately, where the residual of others may rise: from here on |r| is no merit, or what
-        they gained would be given back in each iteration."""
+        """Note that nodes were relaxed separately: |r| is no merit in the remaining iterations.
+
+        |r| of other nodes may rise in an elimination, so that a line search on |r| would undo it.
+        """
         self._eliminated = True
 
     def evaluate_residual(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
-        """r at x into b (collective)."""
+        """Evaluate r at x into b (collective)."""
         self._balance.set_iterate(x)
         if self._residual_version == self._balance.displacement_version:
             self._residual.copy(b)
@@ -58,27 +61,26 @@ class MeritFunction:
             self._balance.assemble_free_residual(x, b)
 
     def __call__(self, x: PETSc.Vec) -> float:
-        """The merit at x, J (collective).
-
-        Near the solution potentials differ by round-off alone: such a whole step counts as a descent. A step that was
-        cut until it made no difference does not: its direction rises.
-        """
+        """Return the merit at x, J (collective)."""
         self._balance.set_iterate(x)
         if self._at_start:
             self._start_from(x)
             return 0.0
         if self._by_norm:
             if not self._balance.contact.is_active() and self._norm_at(x) < self._start_norm:
-                return TAKEN_AT_ONCE
+                return ACCEPTED_MERIT
             self._evaluate_start(x)
         potential, size = self._potential()
         rise, slack = potential - self._start_potential, self._policy.potential_round_off * size
         if self._whole_step_rise is None:
             self._whole_step_rise = rise
+        # Near the solution potentials differ by round-off alone, and a whole step is accepted. A step that was
+        # shortened until it makes no difference is not: its direction rises.
         is_near = self._whole_step_rise <= self._policy.near_solution * slack
         return -slack if abs(rise) <= slack and is_near else rise
 
     def _start_from(self, x: PETSc.Vec) -> None:
+        """Take x as the start of the iteration (collective)."""
         self._at_start, self._whole_step_rise = False, None
         self._by_norm = not self._eliminated and not self._balance.contact.is_active()
         if self._by_norm:
@@ -88,61 +90,68 @@ class MeritFunction:
             self._start_potential = self._potential()[0]
 
     def _potential(self) -> tuple[float, float]:
-        """Potential and the size of its summands, J; mostly asked for where the line search has just been."""
+        """Return the potential and the sum of the absolute values of its summands, J (collective)."""
+        # Newton's method asks for it mostly where the line search has evaluated it already.
         if self._potential_version != self._balance.displacement_version:
-            self._potential_known = self._balance.energies.incremental_potential()
+            self._last_potential = self._balance.energies.incremental_potential()
             self._potential_version = self._balance.displacement_version
-        return self._potential_known
+        return self._last_potential
 
     def _norm_at(self, x: PETSc.Vec) -> float:
-        """|r| at x, N."""
+        """Return |r| at x, N (collective)."""
         self._balance.assemble_free_residual(x, self._residual)
         self._residual_version = self._balance.displacement_version
         return float(self._residual.norm())
 
     def _evaluate_start(self, x: PETSc.Vec) -> None:
-        """Compare potentials after all."""
+        """Evaluate the potential at the start of the iteration, and return to x (collective)."""
         self._balance.set_iterate(self._start)
         self._start_potential, self._by_norm = self._potential()[0], False
         self._balance.set_iterate(x)
 
     def destroy(self) -> None:
-        """Give the memory of PETSc's objects back."""
+        """Free PETSc's objects."""
         self._start.destroy()
         self._residual.destroy()
 
 
 def clip_correction(domain: Domain, y: PETSc.Vec, r: PETSc.Vec, policy: SolverPolicy = DEFAULT_POLICY) -> None:
-    """Shorten a correction x <- x - y, m, of nodes that it moves by more than a mean edge (collective).
+    """Shorten a correction x <- x - y (m) at nodes that it moves by more than a mean edge (collective).
 
-    With tangents made positive a cell that is all but flat, or hangs by one node, has next to no stiffness in some
-    direction. The correction throws its nodes tens of edges far, for whose sake the line search would cut those of all
-    nodes. At most `max_clipped_nodes` of them are clipped: what a whole part does is its motion. The correction stays
-    as it is where the clipped one is no descent of a potential with the gradient `r`, N.
+    With positive tangents a cell that is almost flat or is attached by one node has almost no stiffness in some
+    direction. Its nodes would be moved by tens of edges, and the line search would shorten the correction of all nodes.
+    The correction is not changed if the clipped one is no direction of descent.
+
+    Args:
+        domain: gives mean edge and nodes.
+        y: correction, changed in place.
+        r: gradient of the potential, N.
+        policy: share of the nodes that may be clipped.
     """
-    moves = y.array_r.reshape(-1, domain.dim)
-    lengths, limit = np.sqrt((moves * moves).sum(axis=1)), domain.mean_edge_length
+    increments = y.array_r.reshape(-1, domain.dim)
+    lengths, limit = np.sqrt((increments * increments).sum(axis=1)), domain.mean_edge_length
     allowed = policy.max_clipped_nodes * domain.space.dofmap.index_map.size_global
+    # A longer correction of more nodes is the motion of a whole fragment.
     while (clipped := sum_over_ranks(domain.comm, np.count_nonzero(lengths > limit))[0]) > allowed:
         limit *= 2
     if not clipped:
         return
-    whole = y.copy()
-    y.array_w[:] = (moves * np.minimum(1.0, limit / np.maximum(lengths, limit))[:, None]).reshape(-1)
+    original = y.copy()
+    y.array_w[:] = (increments * np.minimum(1.0, limit / np.maximum(lengths, limit))[:, None]).reshape(-1)
     if y.dot(r) <= 0:
-        whole.copy(y)
-    whole.destroy()
+        original.copy(y)
+    original.destroy()
 
 
 class TangentModification(NamedTuple):
-    """How tangents are made positive in an attempt.
+    """Modification by which tangents are made positive in an attempt.
 
     Attributes:
         name: of the strategy.
-        exact_below: share of the largest |r| of the attempt below which tangents are exact.
-        eigenvalue_floor: negative eigenvalues that are kept otherwise, in mean moduli of a cell.
+        exact_below: share of the largest |r| of the attempt, below which tangents are exact.
+        eigenvalue_floor: magnitude of the negative eigenvalues that stay otherwise, in mean moduli of a cell.
         rebuild_preconditioner: whether preconditioners are set up for each tangent.
-        from_last_iterate: whether it starts where the last attempt ended.
+        from_last_iterate: whether the attempt starts where the last one ended.
     """
 
     name: str
@@ -152,7 +161,7 @@ class TangentModification(NamedTuple):
     from_last_iterate: bool = False
 
 
-# Tried in turn. The second and the third go on from where exact tangents have misled the one before.
+# Tried in turn. The second and the third continue from the last iterate of the one before.
 POSITIVE_TANGENTS = (
     TangentModification("positive tangents", DEFAULT_POLICY.exact_below, DEFAULT_POLICY.eigenvalue_floor),
     TangentModification("strictly positive tangents", DEFAULT_POLICY.exact_below, 0.0, from_last_iterate=True),
@@ -163,14 +172,15 @@ EXACT_TANGENTS = TangentModification("exact tangents, descent of the potential",
 
 
 class ModifiedNewton:
-    """A SNES whose line search goes down the incremental potential, with tangents that may be made positive.
+    """A SNES whose line search decreases the incremental potential, with tangents that may be made positive.
 
     Exact tangents of a body that tears, buckles or is squeezed are indefinite: CG stops, and other methods may find a
-    direction that rises. With positive moduli directions descend from anywhere. Near the solution tangents are exact
-    again, where Newton's method converges quadratically.
+    direction in which the potential rises. With positive moduli all directions descend. Near the solution tangents are
+    exact again, so that Newton's method converges quadratically.
 
     Attributes:
-        snes: the SNES.    merit: its merit function.
+        snes: the SNES.
+        merit: its merit function.
     """
 
     def __init__(self, balance: Balance, snes: PETSc.SNES, policy: SolverPolicy = DEFAULT_POLICY) -> None:
@@ -183,12 +193,15 @@ class ModifiedNewton:
         self.use_modification(None)
 
     def use_modification(self, modification: TangentModification | None) -> None:
-        """An attempt begins: with tangents of this kind; None: exact ones."""
+        """Begin an attempt with a modification of its tangents; None: with exact ones."""
         self._modification, self._largest_norm = modification, 0.0
         self._smallest_norm, self._smallest_at = math.inf, 0
 
     def eigenvalue_floor(self) -> float | None:
-        """Negative eigenvalues that the tangent at the present iterate keeps, in mean moduli; None: it is exact."""
+        """Return the magnitude of negative eigenvalues that stay in the tangent at the present iterate, in mean moduli.
+
+        None: the tangent is exact.
+        """
         if self._modification is None:
             return None
         norm = self.snes.getFunctionNorm()
@@ -197,21 +210,25 @@ class ModifiedNewton:
         return None if is_exact else self._modification.eigenvalue_floor
 
     def clip_correction(self, y: PETSc.Vec) -> None:
-        """Clip a correction from a tangent that was made positive (collective).
-
-        Not without inertia: nothing tells then where a part moves that hangs by a thread.
-        """
+        """Clip a correction from a positive tangent (collective)."""
+        # Without inertia nothing but the correction tells where a part moves that is hardly attached.
         if self._balance.scheme.inertia and self.eigenvalue_floor() is not None:
             clip_correction(self._balance.domain, y, self.snes.getFunction()[0], self._policy)
 
     def has_stalled(self, norm: float, its: int) -> bool:
-        """Whether the attempt cycles: exact tangents that are indefinite, though CG does not notice, lead past the
-        solution again and again. |r| is `norm`, N, after `its` iterations."""
+        """Return True if the attempt cycles between iterates.
+
+        Exact tangents that are indefinite without being noticed by CG lead past the solution again and again.
+
+        Args:
+            norm: |r|, N.
+            its: number of iterations.
+        """
         if norm < self._smallest_norm or not its:
             self._smallest_norm, self._smallest_at = norm, its
         is_exact = self._modification is not None and self.eigenvalue_floor() is None
         return is_exact and its - self._smallest_at >= self._policy.max_stalled_iterations
 
     def destroy(self) -> None:
-        """Give the memory of PETSc's objects back."""
+        """Free PETSc's objects."""
         self.merit.destroy()

@@ -1,8 +1,7 @@
-"""Linear systems with the tangent of a balance: one KSP, its preconditioner, and factors in their place.
+"""Linear systems with the tangent of a balance: one KSP, its preconditioner, and a direct solver in their place.
 
-Newton's method asks for the tangent at its iterates (`LinearSolver.linearise`); single solves are made here. A step of
-a linear balance is one solve by CG, which starts from the combination of earlier solutions that is nearest in energy
-(P. F. Fischer, Projection techniques for iterative solution of Ax = b with successive right-hand sides, 1998).
+Newton's method asks for the tangent at its iterates (`LinearSolver.linearise`). A step of a linear balance is one solve
+by CG, which starts from the combination of earlier solutions that is nearest in energy (Fischer 1998).
 
 Equations: docs/theory.md#linear-systems.
 """
@@ -35,22 +34,27 @@ SINGLE_SOLVE_OPTIONS = ("snes_rtol", "ksp_rtol", "ksp_type")
 DEFAULT_OPTIONS: PetscOptions = {
     "snes_type": "newtonls",
     "snes_linesearch_type": "bt",
-    "snes_max_it": 50,  # near a limit the last digits would decide whether a step is halved
-    "snes_rtol": 1e-6,  # 1e-4 takes the first guess for the solution where cells are slivers
+    # Far above the usual number: near a limit the last digits would decide whether a step is halved.
+    "snes_max_it": 50,
+    # With 1e-4 the first guess counts as a solution where cells are slivers.
+    "snes_rtol": 1e-6,
     "snes_stol": 0.0,
-    "snes_lag_preconditioner": -2,  # SNES never sets it up: the preconditioner decides for itself
+    # SNES never sets the preconditioner up, which decides for itself.
+    "snes_lag_preconditioner": -2,
     "snes_lag_preconditioner_persists": True,
     "ksp_type": "cg",
-    "ksp_rtol": 1e-5,  # 1e-3 is no direction of descent for a badly conditioned body: a cantilever fails
+    # With 1e-3 corrections of a badly conditioned body are no directions of descent: a cantilever fails.
+    "ksp_rtol": 1e-5,
     "ksp_max_it": 500,
 }
 
 
 class LinearStepCG:
-    """CG for solves that end a step, down to a given residual.
+    """CG for steps of a linear balance, down to a given residual.
 
     Attributes:
-        iterations: of the last solve.    residual_norm: |r| after it, N.
+        iterations: of the last solve.
+        residual_norm: |r| after it, N.
     """
 
     def __init__(self, comm: object, max_iterations: int, policy: SolverPolicy) -> None:
@@ -65,9 +69,10 @@ class LinearStepCG:
         self.iterations, self.residual_norm = 0, 0.0
 
     def solve(self, A: PETSc.Mat, K: PETSc.Mat, pc: PETSc.PC, b: PETSc.Vec, x: PETSc.Vec, tolerance: float) -> bool:
-        """Solve K x = b down to |r| = `tolerance`, N; A is K for products.
+        """Solve K x = b down to |r| = `tolerance`, N; A is K for products (collective).
 
-        Returns whether it is solved (collective).
+        Returns:
+            Whether it is solved.
         """
         ksp = self._ksp
         pc.setReusePreconditioner(True)
@@ -79,40 +84,59 @@ class LinearStepCG:
         return bool(ksp.reason > 0)
 
     def equivalent_iterations(self, rtol: float) -> int:
-        """Iterations that the last solve would have taken to reduce |r| by `rtol`; 0: too few to tell."""
+        """Return the iterations in which the last solve would have reduced |r| by `rtol`.
+
+        0 if its iterations are too few.
+        """
         first = self._ksp.getConvergenceHistory()[:1]
         if self.iterations < self._policy.min_rate_iterations or not 0 < self.residual_norm < first[0]:
             return 0
         return round(self.iterations * math.log(rtol) / math.log(self.residual_norm / first[0]))
 
     def destroy(self) -> None:
-        """Give back PETSc's objects, and take the options out of its database."""
+        """Free PETSc's objects, and remove the options from its database."""
         self._options.remove()
         self._ksp.destroy()
 
 
 class LinearSolver:
-    """Solves systems with the tangent of a balance, and tells preconditioner and factors the facts they decide by.
+    """Solver of systems with the tangent, which tells preconditioner and direct solver the facts by which they decide.
 
     Attributes:
-        operators: K as matrices.    tangent: K as the balance assembles it.
-        ksp: the Krylov method of Newton's method.    preconditioner, direct: what it solves with.
-        forcing: the tolerances of Newton's method; None: always the same one.
+        operators: K as matrices.
+        tangent: K as the balance assembles it.
+        ksp: Krylov method of Newton's method.
+        preconditioner: preconditioner of `ksp`.
+        direct: direct solver.
+        forcing: tolerances of Newton's method; None: always the same one.
         is_iterative: whether the method of the study is a Krylov method.
         steps_are_linear: whether a step is a single solve.
         correction: solution of the last solve that SNES did not ask for.
-        failures: solves that failed outright and were taken as no correction.
+        failures: number of failed solves whose correction was left out.
     """
 
     def __init__(
         self, balance: Balance, ksp: PETSc.KSP, options: PetscOptionSet, given: PetscOptions, chosen: PetscOptions,
         policy: SolverPolicy, *, plain: bool = False,
     ) -> None:  # fmt: skip
-        """`given`: options of the study; `chosen`: with the defaults; `plain`: PETSc alone. InputError where PETSc does
-        not take an option (collective)."""
+        """Set up the solver (collective).
+
+        Args:
+            balance: balance of forces.
+            ksp: Krylov method of a SNES.
+            options: options of that SNES in PETSc's database.
+            given: options of the study.
+            chosen: options of the study over the defaults.
+            policy: tuned numbers.
+            plain: use PETSc alone.
+
+        Raises:
+            InputError: PETSc refuses an option.
+        """
         self.balance, self.tangent, self.ksp, self._policy = balance, balance.tangent, ksp, policy
         self.failures = 0
-        self._equivalent: int | None = None  # of the last solve to full accuracy; None: as many as the KSP took
+        # Iterations of the last solve to the tight tolerance; None: those of the KSP.
+        self._equivalent: int | None = None
         self.correction = balance.work_vector.duplicate()
         self.operators = TangentOperators(
             balance, policy, for_multigrid=chosen["pc_type"] in ("gamg", "ml", "hypre"),
@@ -139,6 +163,7 @@ class LinearSolver:
         self.operators.tell_of_pattern(self.preconditioner, self.direct)
 
     def _set_up_at_rest(self) -> None:
+        """Assemble the tangent at rest and set up the KSP (collective)."""
         self.operators.assemble(None)
         self.operators.update_entries()
         self.ksp.setOperators(self.tangent.matrix)
@@ -147,20 +172,25 @@ class LinearSolver:
     # --- facts ---
 
     def edges_broke(self, count: int | None) -> None:
-        """So many edges broke on all ranks; None: an unknown number."""
+        """Note that `count` edges broke on all ranks; None: an unknown number."""
         self.preconditioner.edges_broke(count)
 
     def _tell_of_last_solve(self) -> None:
+        """Tell the preconditioner of the iterations of the last solve."""
         iterations = int(self.ksp.its)
         self.preconditioner.solved(iterations, iterations if self._equivalent is None else self._equivalent)
 
     def shrink(self) -> bool:
-        """Take a smaller tangent where damage has made one possible and the preconditioner is due anyway; whether there
-        is a new matrix (collective)."""
+        """Remove the entries of dead cells, if the preconditioner is to be updated anyway (collective).
+
+        Returns:
+            Whether there is a new matrix.
+        """
         self._tell_of_last_solve()
         update = self.preconditioner.next_update()
         if self.direct.serves:
-            update = max(update, Update.REFRESH)  # factors are made for each tangent
+            # Each tangent is factorised anew.
+            update = max(update, Update.REFRESH)
         if update == Update.NONE:
             return False
         return self.operators.shrink(1.0 if update == Update.REBUILD else self._policy.shrink_below)
@@ -168,9 +198,12 @@ class LinearSolver:
     # --- the tangent of Newton's method ---
 
     def linearise(self, norm: float, solved_norm: float, eigenvalue_floor: float | None) -> None:
-        """Bring the tangent, its preconditioner and the tolerance of the KSP to an iterate of Newton's method.
+        """Update tangent, preconditioner and tolerance of the KSP to an iterate of Newton's method (collective).
 
-        `norm`: |r| there, `solved_norm`: that of a solution, N; `eigenvalue_floor`: see TangentOperators (collective).
+        Args:
+            norm: |r| there, N.
+            solved_norm: |r| of a solution, N.
+            eigenvalue_floor: see `TangentOperators`.
         """
         forcing = self.forcing
         if forcing is None:
@@ -179,8 +212,8 @@ class LinearSolver:
         self._equivalent = forcing.equivalent_iterations(self.ksp.its)
         if isinstance(forcing, EisenstatWalkerForcing):
             self._prepare(eigenvalue_floor)
-            touches = self.tangent.has_contact_coupling
-            rtol = forcing.tolerance_for(norm, solved_norm) if touches else forcing.tight_tolerance()
+            in_contact = self.tangent.has_contact_coupling
+            rtol = forcing.tolerance_for(norm, solved_norm) if in_contact else forcing.tight_tolerance()
         else:
             keeps_tangent = forcing.record_iterate(norm, solved_norm, self._residual_left_by_cg)
             keeps_tangent = keeps_tangent and self.operators.eigenvalue_floor == eigenvalue_floor
@@ -192,33 +225,34 @@ class LinearSolver:
         self.ksp.setTolerances(rtol=rtol)
 
     def _residual_left_by_cg(self) -> float:
-        """|r| that the last solve of CG has left of the linear system, N; 0 of other methods (collective)."""
+        """Return |r| that the last solve of CG has left of the linear system, N; 0 of other methods (collective)."""
         return float(self.ksp.buildResidual(self.correction).norm()) if self.ksp.getType() == "cg" else 0.0
 
     def _prepare(self, eigenvalue_floor: float | None) -> None:
-        """Assemble the tangent, and bring what solves with it to it (collective)."""
+        """Assemble the tangent, and update preconditioner or factors to it (collective)."""
         self.operators.assemble(eigenvalue_floor)
         self.operators.update_products()
         self._tell_of_last_solve()
         tangent = self.tangent
         if (tangent.low_rank_updates or tangent.stiff_couplings) and self.ksp.getType() == "preonly":
-            self.ksp.setType("gmres")  # factors are of the matrix alone
+            # Factors leave out the low-rank updates.
+            self.ksp.setType("gmres")
         if self.direct.serves:
             self.direct.update(self.ksp, self.operators)
         else:
             self.preconditioner.update(self.operators)
-        self._add_springs(self.direct.pc if self.direct.serves else self.preconditioner.serving)
+        self._add_stiff_couplings(self.direct.pc if self.direct.serves else self.preconditioner.serving)
 
-    def _add_springs(self, base: PETSc.PC) -> None:
-        """Precondition with the springs of the balance as well, where it has any (collective)."""
-        springs = [spring for spring in self.tangent.stiff_couplings if len(spring.stiffness)]
-        if not springs:
+    def _add_stiff_couplings(self, base: PETSc.PC) -> None:
+        """Add the stiff couplings of the balance to the preconditioner (collective)."""
+        couplings = [coupling for coupling in self.tangent.stiff_couplings if len(coupling.stiffness)]
+        if not couplings:
             self.ksp.setPC(base)
             return
         from .low_rank import WoodburyPreconditioner
 
         base.setReusePreconditioner(True)
-        context = WoodburyPreconditioner(base, springs, self.balance.work_vector)
+        context = WoodburyPreconditioner(base, couplings, self.balance.work_vector)
         pc = PETSc.PC().createPython(context, comm=self.ksp.comm)
         self.ksp.setPC(pc)
         pc.destroy()
@@ -226,7 +260,7 @@ class LinearSolver:
     # --- single solves ---
 
     def may_factorise(self, max_dofs: int | None = None) -> bool:
-        """Whether a system of at most so many dofs may be factorised; None: as many as the policy allows."""
+        """Return True if a system may be factorised: of at most `max_dofs` dofs, or as many as the policy allows."""
         limit = self._policy.max_direct_dofs if max_dofs is None else max_dofs
         dofs = self.balance.work_vector.getSize()
         return self.is_iterative and dofs <= limit and bool(PETSc.Sys.hasExternalPackage("mumps"))
@@ -241,11 +275,15 @@ class LinearSolver:
             self.preconditioner.bypassed()
 
     def response(self, force: Values, *, directly: bool) -> Values:
-        """Linear displacement response of a step to a force on free dofs, (owned dofs,) m; nothing touches the body.
+        """Return the linear displacement response of a step without contact, (owned dofs,), m (collective).
 
-        Tangents of nearly incompressible bodies may be indefinite: factors are taken where iterations fail, with
-        `directly` at once. The response is 0 where neither solves, which is counted (collective).
+        0, with a count of the failure, if no method solves.
+
+        Args:
+            force: on free dofs, (owned dofs,), N.
+            directly: factorise at once, rather than where iterations fail.
         """
+        # Tangents of nearly incompressible bodies may be indefinite, so that iterations fail.
         methods: list[Callable[[], AbstractContextManager[None]]] = [nullcontext]
         if self.may_factorise():
             methods.append(self.factors)
@@ -259,9 +297,13 @@ class LinearSolver:
         return np.zeros_like(force)
 
     def extend(self, x: PETSc.Vec, eigenvalue_floor: float | None) -> int:
-        """Carry a jump of the prescribed displacement into the body linearly; returns the Krylov iterations."""
+        """Extend a jump of the prescribed displacement into the body; return the Krylov iterations (collective).
+
+        `x` is the displacement, changed in place.
+        """
         self.balance.assemble_extension_residual(x, self.balance.work_vector)
-        if not self.balance.work_vector.norm():  # nothing is free to move
+        # Without a force on a free dof there is nothing to extend.
+        if not self.balance.work_vector.norm():
             return 0
         if not self.solve(eigenvalue_floor):
             self.failures += 1
@@ -269,8 +311,10 @@ class LinearSolver:
         return int(self.ksp.its)
 
     def solve(self, eigenvalue_floor: float | None = None) -> bool:
-        """Solve K correction = balance.work_vector at the present displacement; returns whether it is solved
-        (collective)."""
+        """Solve K correction = balance.work_vector at the present displacement.
+
+        Return True if it is solved (collective).
+        """
         ksp = self.ksp
         self._prepare(eigenvalue_floor)
         self._equivalent = None
@@ -281,9 +325,14 @@ class LinearSolver:
         return bool(ksp.reason > 0)
 
     def solve_linear_step(self, solved_norm: float, eigenvalue_floor: float | None) -> tuple[float, int] | None:
-        """Solve K correction = balance.work_vector down to a residual norm of `solved_norm`, N, or as the study asks.
+        """Solve K correction = balance.work_vector for a step of a linear balance (collective).
 
-        Returns |r| that is left, infinite where it is unknown, and iterations; None: it was not solved (collective).
+        Args:
+            solved_norm: |r| of a solution, N; a tolerance of the study may be smaller.
+            eigenvalue_floor: see `TangentOperators`.
+
+        Returns:
+            |r| that is left, inf if it is unknown, and iterations; None if it was not solved.
         """
         if self._step_cg is None or self.ksp.getType() != "cg":
             return (np.inf, self.ksp.its) if self.solve(eigenvalue_floor) else None
@@ -298,11 +347,11 @@ class LinearSolver:
         return (cg.residual_norm, cg.iterations) if solved else None
 
     def linear_step_failed(self) -> None:
-        """Newton's method takes over: from here on the iterations of its KSP count."""
+        """Note that Newton's method takes over: the iterations of its KSP count."""
         self._equivalent = None
 
     def destroy(self) -> None:
-        """Give back PETSc's objects."""
+        """Free PETSc's objects."""
         self.direct.release()
         self.preconditioner.destroy()
         self.correction.destroy()
@@ -312,7 +361,7 @@ class LinearSolver:
 
 
 def chosen_options(balance: Balance, given: PetscOptions, *, plain: bool = False, policy: SolverPolicy) -> PetscOptions:
-    """Options of a study over the defaults; `plain`: over those of plain_solver."""
+    """Return the options of a study over the defaults; `plain`: over those of plain_solver."""
     if plain:
         return DEFAULT_OPTIONS | plain_method(balance, given, policy) | given
     multigrid = given.get("pc_type", "gamg") == "gamg"
@@ -326,9 +375,9 @@ def chosen_options(balance: Balance, given: PetscOptions, *, plain: bool = False
 
 
 def steps_are_linear(balance: Balance, given: PetscOptions, method: str) -> bool:
-    """Whether a step is a single solve: of a linear balance by CG or factors, as the study asks for no other way."""
+    """Return True if a step is one linear solve: of a linear balance, by CG or factors, without other options."""
     allowed = all(key in SINGLE_SOLVE_OPTIONS or key.startswith(("pc_", "mg_")) for key in given)
-    # Without inertia a fragment hangs by 1e-8 of its stiffness: a small residual leaves its position open.
+    # Without inertia a small residual leaves the position of a fragment open (`_forcing`).
     has_fragments = balance.stress.chi is not None and not balance.scheme.inertia
     holds = method == "preonly" or (method == "cg" and not has_fragments)
     return allowed and balance.linear and balance.symmetric and holds
@@ -337,8 +386,8 @@ def steps_are_linear(balance: Balance, given: PetscOptions, method: str) -> bool
 def _forcing(
     balance: Balance, chosen: PetscOptions, policy: SolverPolicy
 ) -> EisenstatWalkerForcing | ContractionForcing | None:
-    """The tolerances of Newton's method; None: `ksp_rtol` always, as without inertia fragments hang by next to nothing
-    and a small residual leaves their position open."""
+    """Return the tolerances of Newton's method; None: `ksp_rtol` in every solve."""
+    # Without inertia a fragment is attached by 1e-8 of its stiffness: a small residual leaves its position open.
     rtol = float(chosen["ksp_rtol"])
     if balance.contact.limits_newton_steps:
         return EisenstatWalkerForcing(rtol, policy) if balance.conservative else None
@@ -347,5 +396,5 @@ def _forcing(
 
 
 def _is_default_preconditioner(given: PetscOptions) -> bool:
-    """Whether the study chooses no preconditioner."""
+    """Return True if the study chooses no preconditioner."""
     return not any(key.startswith(("pc_", "mg_")) for key in given)

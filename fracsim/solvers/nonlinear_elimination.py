@@ -1,25 +1,19 @@
-"""Few nodes that hold Newton's method up are brought to rest by themselves, with everything else at its place.
+"""Nonlinear elimination: the few nodes that hold most of the residual are solved for separately, with all others fixed.
 
-Where a body tears, single cells are all but flat, turn over, or hang by a node. A few nodes hold nearly all of the
-residual then, and Newton's method solves for the whole body, again and again, for their sake: 29 times in one step,
-4 times with patches. So where an iteration has not cut |r| to a tenth, nodes that hold nearly all of |r|^2, and their
-neighbours, go down to a minimum of the incremental potential in which only they move,
+Where a body tears, single cells are almost flat, turn over, or are attached by one node, and Newton's method iterates
+on the whole body for their sake. If an iteration has not reduced |r| to a tenth, the nodes that hold nearly all of
+|r|^2, with their neighbours, move to a minimum of the incremental potential of these nodes,
 
     min  sum V (psi(u + w) - psi(u))  +  w (m c_a + k) w / 2  +  (r - f(u)) w,    k: of ties (mechanics.node_ties)
 
-(nonlinear elimination: Lanzkron, Rose and Wilkes, SIAM J. Sci. Comput. 17, 1996; Cai and Keyes, 24, 2002). What bends
-there is exact, by trust regions with exact tangents (nonlinear_elimination): a patch snaps through at once, and at its
-minimum the body's exact tangent is positive, too. The step ends where r = 0 as it would.
+Connected nodes make a *patch*. A trust-region method with exact tangents finds the minima of all patches at once, also
+through a snap-through; at a minimum the exact tangent of the body is positive, too. The solution of the step is the
+same. Every rank does the same computation; only cells are evaluated by their owners.
 
-Patches are what is left of the mesh's graph there. Every rank goes through the same motions; what cells say is found
-where they are.
+Sources: Lanzkron, Rose and Wilkes, SIAM J. Sci. Comput. 17, 1996; Cai and Keyes, 24, 2002; Steihaug, SIAM J. Numer.
+Anal. 20, 1983.
 
 Equations: docs/theory.md#newtons-method.
-
-A step of a trust region, of several problems at once: conjugate gradients that go to the border of where the model
-is trusted once they leave it, or once it has no minimum in there (Steihaug, SIAM J. Numer. Anal. 20, 1983).
-
-    min  g z + z K z / 2   over   |z| <= radius
 """
 
 from __future__ import annotations
@@ -46,15 +40,26 @@ Flags = npt.NDArray[np.bool_]
 
 
 def steihaug_step(
-    K: sparray, inverse: Values, g: Values, of: Ints, radius: Values, policy: SolverPolicy = DEFAULT_POLICY
+    K: sparray, inverse: Values, g: Values, patch: Ints, radius: Values, policy: SolverPolicy = DEFAULT_POLICY
 ) -> tuple[Values, Values]:
-    """Steps z (n, d) of problems that share no entry of K, and by how much each lowers its model (p,).
+    """Return trust-region steps of independent problems, min g z + z K z / 2 over |z| <= radius.
 
-    `inverse`: (n, d, d) blocks to precondition with; `g`: (n, d); `of`: (n,) the problem of each node; `radius`: (p,).
+    Conjugate gradients stop at the boundary of the region, when they leave it or when the model has no minimum.
+
+    Args:
+        K: no entry couples two problems.
+        inverse: (n, d, d) blocks for preconditioning.
+        g: (n, d) gradient.
+        patch: (n,) problem of each node.
+        radius: (p,) trust radius of each problem.
+        policy: tolerance and iterations.
+
+    Returns:
+        Steps z (n, d), and the decrease of the model of each problem (p,).
     """
 
     def sums(values: Values) -> Values:
-        return sum_by_patch(of, values.sum(axis=1), len(radius))
+        return sum_by_patch(patch, values.sum(axis=1), len(radius))
 
     z, r = np.zeros_like(g), g.copy()
     y = np.einsum("nij,nj->ni", inverse, r)
@@ -64,185 +69,212 @@ def steihaug_step(
         if not active.any():
             break
         q = (K @ p.reshape(-1)).reshape(p.shape)
-        curved, long, along = sums(p * q), sums(p * p), sums(z * p)
-        border = np.sqrt(along**2 + long * np.maximum(radius**2 - sums(z * z), 0.0)) - along
-        border = np.divide(border, long, out=np.zeros_like(long), where=long > 0)
-        share = np.divide(size, curved, out=border.copy(), where=active & (curved > 0))
-        out = share >= border
-        share = np.where(active, np.minimum(share, border), 0.0)[of, None]
+        curvature, square, along = sums(p * q), sums(p * p), sums(z * p)
+        boundary = np.sqrt(along**2 + square * np.maximum(radius**2 - sums(z * z), 0.0)) - along
+        boundary = np.divide(boundary, square, out=np.zeros_like(square), where=square > 0)
+        share = np.divide(size, curvature, out=boundary.copy(), where=active & (curvature > 0))
+        leaves = share >= boundary
+        share = np.where(active, np.minimum(share, boundary), 0.0)[patch, None]
         z, r = z + share * p, r + share * q
         y = np.einsum("nij,nj->ni", inverse, r)
         before, size = size, sums(r * y)
-        active &= ~out & (size > enough)
-        turned = np.divide(size, before, out=np.zeros_like(size), where=active)
-        p = np.where(active[of, None], turned[of, None] * p - y, 0.0)
+        active &= ~leaves & (size > enough)
+        beta = np.divide(size, before, out=np.zeros_like(size), where=active)
+        p = np.where(active[patch, None], beta[patch, None] * p - y, 0.0)
     return z, -0.5 * sums((g + r) * z)
 
 
-def sum_by_patch(of: Ints, values: Values, count: int) -> Values:
-    """(count,) sums of values (n,), each `of` (n,) a problem."""
-    return np.asarray(np.bincount(of, values, count), np.float64)
+def sum_by_patch(patch: Ints, values: Values, count: int) -> Values:
+    """Return the sums (count,) of values (n,) over each `patch` (n,)."""
+    return np.asarray(np.bincount(patch, values, count), np.float64)
 
 
 def create_elimination(balance: Balance, policy: SolverPolicy = DEFAULT_POLICY) -> NonlinearElimination | None:
-    """Those of a balance that has what they come to rest by: a potential, of which all parts but the stress of each
-    cell are constant forces, inertia and ties; None: it has not (collective)."""
-    remaining = [term for term in balance.terms if term is not balance.stress]
-    bent = any(type(term).tangent_form is not Term.tangent_form or adds_single_entries(term) for term in remaining)
-    whole = balance.domain.order == 1 and balance.stress.rotation is None
-    lumped = balance.mass.is_diagonal and balance.scheme.inertia
-    fit = whole and lumped and not bent and not balance.contact.limits_newton_steps and balance.conservative
-    return NonlinearElimination(balance, policy) if fit else None
+    """Return the nonlinear elimination of a balance; None if it has no suitable potential (collective).
+
+    All its parts but the stress of each cell have to be constant forces, inertia and ties.
+    """
+    remaining_terms = [term for term in balance.terms if term is not balance.stress]
+    are_constant = not any(
+        type(term).tangent_form is not Term.tangent_form or adds_single_entries(term) for term in remaining_terms
+    )
+    has_cell_energy = balance.domain.order == 1 and balance.stress.rotation is None
+    has_lumped_inertia = balance.mass.is_diagonal and balance.scheme.inertia
+    has_potential = balance.conservative and not balance.contact.limits_newton_steps
+    is_suitable = has_cell_energy and has_lumped_inertia and are_constant and has_potential
+    return NonlinearElimination(balance, policy) if is_suitable else None
 
 
 class NonlinearElimination:
-    """Those of a balance."""
+    """Nonlinear elimination on a balance."""
 
     def __init__(self, balance: Balance, policy: SolverPolicy) -> None:
         self._balance, self._policy = balance, policy
         numbers = balance.domain.space.dofmap.index_map
         self._count = numbers.size_global
-        self._names = numbers.local_to_global(np.arange(numbers.size_local + numbers.num_ghosts))
+        self._global_numbers = numbers.local_to_global(np.arange(numbers.size_local + numbers.num_ghosts))
         self._free = np.ones(balance.owned_dof_count)
         self._free[balance.motion.owned_dofs] = 0.0
 
     @cached_property
     def _energy(self) -> CellEnergy:
-        """Compiled where it is first asked for (collective)."""
+        """Energy of single cells, compiled at first use (collective)."""
         return CellEnergy(self._balance.stress)
 
-    def relax_nodes(self, little: float) -> bool:
-        """Bring the few nodes that hold most of the residual to rest, down to `little`, N, as it counts for the whole
-        body; whether any moved (collective)."""
-        nodes = self._heavy()
+    def relax_nodes(self, solved_norm: float) -> bool:
+        """Relax the few nodes that hold most of the residual (collective).
+
+        Args:
+            solved_norm: |r| of a solution of the body, N.
+
+        Returns:
+            Whether any node has moved.
+        """
+        nodes = self._dominant_nodes()
         if not len(nodes):
             return False
-        region = self._around(nodes)
-        moved = _settle(region, little, self._balance.domain.mean_edge_length, self._policy)
+        region = self._make_region(nodes)
+        moved = minimise_patches(region, solved_norm, self._balance.domain.mean_edge_length, self._policy)
         u = self._balance.u.x.array[: self._balance.owned_dof_count].copy()
         self._balance.set_displacement(u)
         return moved
 
-    def _heavy(self) -> Ints:
-        """Global numbers of the nodes that hold HELD of |r|^2, or of the FEW that hold most of it; none where these do
-        not hold LEAST_HELD (collective)."""
+    def _dominant_nodes(self) -> Ints:
+        """Return the global numbers of the nodes that hold `relaxed_share` of |r|^2 (collective).
+
+        Not more than `max_relaxed_nodes`; none if these hold less than `min_relaxed_share`.
+        """
         comm, d = self._balance.domain.comm, self._balance.domain.dim
         squares = np.square((self._balance.reactions * self._free).reshape(-1, d)).sum(axis=1)
         maximum, owned = int(self._policy.max_relaxed_nodes * self._count), np.flatnonzero(squares)
         if len(owned) > maximum:
             owned = owned[np.argpartition(-squares[owned], maximum)[: maximum + 1]]
-        of_all = sum_over_ranks(comm, np.sum(squares))[0]
-        names, parts = map(np.concatenate, zip(*allgather(comm, (self._names[owned], squares[owned])), strict=True))
-        falling = np.sort(parts)[::-1][:maximum]
-        cumulative = np.cumsum(falling)
-        if not len(cumulative) or cumulative[-1] < self._policy.min_relaxed_share * of_all:
-            return np.asarray(names[:0])
-        last = min(int(np.searchsorted(cumulative, self._policy.relaxed_share * of_all)), len(cumulative) - 1)
-        return np.asarray(names[parts >= falling[last]])
+        total = sum_over_ranks(comm, np.sum(squares))[0]
+        by_rank = allgather(comm, (self._global_numbers[owned], squares[owned]))
+        numbers, squares = map(np.concatenate, zip(*by_rank, strict=True))
+        descending = np.sort(squares)[::-1][:maximum]
+        cumulative = np.cumsum(descending)
+        if not len(cumulative) or cumulative[-1] < self._policy.min_relaxed_share * total:
+            return np.asarray(numbers[:0])
+        last = min(int(np.searchsorted(cumulative, self._policy.relaxed_share * total)), len(cumulative) - 1)
+        return np.asarray(numbers[squares >= descending[last]])
 
-    def _around(self, nodes: Ints) -> _Region:
-        """Those of global numbers and their neighbours, with all cells of these (collective)."""
+    def _make_region(self, nodes: Ints) -> PatchRegion:
+        """Return the region of nodes of these global numbers and their neighbours (collective)."""
         balance, domain = self._balance, self._balance.domain
         comm, dead = domain.comm, balance.stress.dead_cells
         alive = np.ones(domain.cell_count, bool) if dead is None else ~dead
-        touched = np.unique(domain.cell_nodes[self._flags(nodes)[domain.cell_nodes].any(axis=1) & alive])
-        chosen = self._flags(np.concatenate([*allgather(comm, self._names[touched]), nodes]))
+        touched = np.unique(domain.cell_nodes[self._flag_nodes(nodes)[domain.cell_nodes].any(axis=1) & alive])
+        chosen = self._flag_nodes(np.concatenate([*allgather(comm, self._global_numbers[touched]), nodes]))
         cells = np.flatnonzero(chosen[domain.cell_nodes].any(axis=1) & alive).astype(np.int32)
         owned = np.flatnonzero(chosen[: domain.node_count])
         inertia = sum(term.mass_factor for term in balance.terms) * balance.mass.lumped
         rows = (item.reshape(-1, domain.dim)[owned] for item in (inertia, balance.reactions, self._free))
-        original = allgather(comm, (self._names[owned], *rows, self._names[domain.cell_nodes[cells]]))
-        names, inertia, r, free, corners = map(np.concatenate, zip(*original, strict=True))
-        order = np.argsort(names)
-        names, local = names[order], np.flatnonzero(chosen)
-        of_here, position = np.searchsorted(names, self._names[local]), _places(corners, names)
-        forces = inertia[order], r[order], free[order], self._ties(names)
-        return _Region(balance, self._energy, cells, local, of_here, position, *forces, policy=self._policy)
+        by_rank = allgather(comm, (self._global_numbers[owned], *rows, self._global_numbers[domain.cell_nodes[cells]]))
+        numbers, inertia, r, free, corners = map(np.concatenate, zip(*by_rank, strict=True))
+        order = np.argsort(numbers)
+        numbers, local = numbers[order], np.flatnonzero(chosen)
+        of_local, positions = np.searchsorted(numbers, self._global_numbers[local]), _positions_in(corners, numbers)
+        forces = inertia[order], r[order], free[order], self._ties(numbers)
+        return PatchRegion(balance, self._energy, cells, local, of_local, positions, *forces, policy=self._policy)
 
-    def _ties(self, names: Ints) -> coo_array:
-        """(n, n) K of what ties nodes of global numbers, rising, the same along each axis, N/m (collective)."""
-        balance, n = self._balance, len(names)
+    def _ties(self, region: Ints) -> coo_array:
+        """Return the stiffness (n, n) of ties between nodes, N/m, the same along each axis (collective).
+
+        `region`: global numbers of the nodes, increasing.
+        """
+        balance, n = self._balance, len(region)
         K = coo_array((n, n)).tocsr()
         for tied in filter(
             None, (term.tie_matrix(balance.motion.free_dofs) for term in balance.terms if isinstance(term, TieTerm))
         ):
             numbers = np.zeros(tied.K.shape[0], np.int64)
-            numbers[tied.indices] = self._names[tied.nodes]
-            position, ties = _places(sum_over_ranks(balance.domain.comm, numbers), names), tied.K.tocoo()
+            numbers[tied.indices] = self._global_numbers[tied.nodes]
+            position, ties = _positions_in(sum_over_ranks(balance.domain.comm, numbers), region), tied.K.tocoo()
             inside = (position[ties.row] >= 0) & (position[ties.col] >= 0)
-            K = (
-                K
-                + coo_array(
-                    (ties.data[inside], (position[ties.row][inside], position[ties.col][inside])), shape=(n, n)
-                ).tocsr()
-            )
+            entries = position[ties.row][inside], position[ties.col][inside]
+            K = K + coo_array((ties.data[inside], entries), shape=(n, n)).tocsr()
         return K.tocoo()
 
-    def _flags(self, nodes: Ints) -> Flags:
-        """(nodes,) of this rank, ghosts too, that are among global numbers."""
+    def _flag_nodes(self, nodes: Ints) -> Flags:
+        """Return flags (nodes,) of the nodes of this rank, with ghosts, that are among global numbers."""
         flags = np.zeros(self._count, bool)
         flags[nodes] = True
-        return np.asarray(flags[self._names])
+        return np.asarray(flags[self._global_numbers])
 
 
-def _places(numbers: Ints, names: Ints) -> Ints:
-    """Where numbers are among names, which rise; -1: they are not."""
-    position = np.minimum(np.searchsorted(names, numbers), len(names) - 1)
-    return np.asarray(np.where(names[position] == numbers, position, -1))
+def _positions_in(numbers: Ints, increasing: Ints) -> Ints:
+    """Return the positions of numbers in an increasing array, -1 for others."""
+    position = np.minimum(np.searchsorted(increasing, numbers), len(increasing) - 1)
+    return np.asarray(np.where(increasing[position] == numbers, position, -1))
 
 
-class _Region:
-    """Nodes that move, by themselves, and the patches that they make.
+class PatchRegion:
+    """Nodes that move, and the patches that they form.
 
     Attributes:
-        of, of_cell: the patch of each node and of each cell.    count: of patches.
-        at_first: they where nothing has moved.
+        patch_of_node: (n,) patch of each node.
+        patch_of_cell: (cells of all ranks,) patch of each cell.
+        count: number of patches.
+        initial: patches at w = 0.
     """
 
     def __init__(
-        self, balance: Balance, energy: CellEnergy, cells: npt.NDArray[np.int32], here: Ints, of_here: Ints, at: Ints,
-        inertia: Values, r: Values, free: Values, ties: coo_array, *, policy: SolverPolicy,
+        self, balance: Balance, energy: CellEnergy, cells: npt.NDArray[np.int32], local: Ints, of_local: Ints,
+        corners: Ints, inertia: Values, r: Values, free: Values, ties: coo_array, *, policy: SolverPolicy,
     ) -> None:  # fmt: skip
-        """`cells`: owned cells of this rank; `here`: its nodes, of which `of_here` tells the place among all; and of
-        all ranks `at`: (k, c) such places of the corners of cells, -1 of those that stay, `inertia`: (n, d) m c_a, N/m,
-        `r`: (n, d) the residual, N, `free`: (n, d) 0 where motion is prescribed, and `ties`: (n, n) K of what ties
-        nodes, N/m."""
+        """Gather the region from all ranks (collective).
+
+        Args:
+            balance: gives the displacement.
+            energy: energy of single cells.
+            cells: owned cells of this rank.
+            local: nodes of this rank.
+            of_local: positions of these among all nodes of the region.
+            corners: (cells of all ranks, corners) positions of the corners, -1 for nodes that stay.
+            inertia: (n, d) m c_a, N/m.
+            r: (n, d) residual, N.
+            free: (n, d) 0 where the displacement is prescribed, else 1.
+            ties: (n, n) stiffness of ties, N/m.
+            policy: eigenvalues of blocks.
+        """
         n, d = self.shape = r.shape
         self._policy = policy
         self._comm, self._energy, self._u = balance.domain.comm, energy, balance.u.x.array.reshape(-1, d)
-        self._cells, self._here, self._of_here, self._at = cells, here, of_here, at
-        self._start, self._inertia, self._free = self._u[here].copy(), inertia, free
-        rows, columns = np.repeat(at, at.shape[1], axis=1).ravel(), np.tile(at, at.shape[1]).ravel()
-        self._both = (rows >= 0) & (columns >= 0)
-        self._rows, self._columns = rows[self._both], columns[self._both]
+        self._cells, self._local, self._of_local, self._corners = cells, local, of_local, corners
+        self._start, self._inertia, self._free = self._u[local].copy(), inertia, free
+        rows, columns = np.repeat(corners, corners.shape[1], axis=1).ravel(), np.tile(corners, corners.shape[1]).ravel()
+        self._is_inside = (rows >= 0) & (columns >= 0)
+        self._rows, self._columns = rows[self._is_inside], columns[self._is_inside]
         self._ties = ties
         joined = np.concatenate([self._rows, ties.row]), np.concatenate([self._columns, ties.col])
         links = coo_array((np.ones(len(joined[0])), joined), shape=(n, n))
-        self.count, self.of = connected_components(links, directed=False)
-        self.of_cell = self.of[at.max(axis=1)]
+        self.count, self.patch_of_node = connected_components(links, directed=False)
+        self.patch_of_cell = self.patch_of_node[corners.max(axis=1)]
         self._constant: Values = np.zeros((n, d))
-        result = self.look(np.zeros((n, d)))
-        self._constant = r - result.forces
-        self.at_first = result._replace(forces=r * free)
+        start = self.evaluate(np.zeros((n, d)))
+        self._constant = r - start.forces
+        self.initial = start._replace(forces=r * free)
 
-    def put(self, w: Values) -> None:
-        """Nodes of this rank, ghosts too, are w (n, d) from where they began (not collective)."""
-        self._u[self._here] = self._start + w[self._of_here]
+    def displace(self, w: Values) -> None:
+        """Move the nodes of this rank, with ghosts, by w (n, d), m, from their start."""
+        self._u[self._local] = self._start + w[self._of_local]
 
-    def look(self, w: Values) -> _Look:
-        """The patches there (collective)."""
-        self.put(w)
+    def evaluate(self, w: Values) -> PatchValues:
+        """Evaluate the patches at w (n, d), m (collective)."""
+        self.displace(w)
         result = allgather(self._comm, self._energy(self._cells))
         energy, forces, stiffness = map(np.concatenate, zip(*result, strict=True))
-        linear, inside = self._inertia * w + self._ties @ w, self._at >= 0
+        linear, inside = self._inertia * w + self._ties @ w, self._corners >= 0
         work = ((linear / 2 + self._constant) * w).sum(axis=1)
         sums = linear + self._constant
-        np.add.at(sums, self._at[inside], forces[inside])
-        parts = sum_by_patch(self.of_cell, energy, self.count), sum_by_patch(self.of, work, self.count)
-        return _Look(parts[0] + parts[1], abs(parts[0]) + abs(parts[1]), sums * self._free, stiffness)
+        np.add.at(sums, self._corners[inside], forces[inside])
+        parts = sum_by_patch(self.patch_of_cell, energy, self.count), sum_by_patch(self.patch_of_node, work, self.count)
+        return PatchValues(parts[0] + parts[1], abs(parts[0]) + abs(parts[1]), sums * self._free, stiffness)
 
     @cached_property
-    def _pattern(self) -> _Pattern:
+    def _pattern(self) -> BlockPattern:
+        """Sparsity pattern of the tangent."""
         n = len(self._inertia)
         nodes = np.arange(n)
         rows = np.concatenate([self._rows, self._ties.row, nodes])
@@ -252,38 +284,41 @@ class _Region:
         keys = (rows * n + columns)[order]
         first = np.flatnonzero(np.diff(keys, prepend=-1))
         rows, columns = np.divmod(keys[first], n)
-        return _Pattern(order, first, free, columns, np.searchsorted(rows, np.arange(n + 1)), rows == columns)
+        return BlockPattern(order, first, free, columns, np.searchsorted(rows, np.arange(n + 1)), rows == columns)
 
     @cached_property
     def _inertia_and_ties(self) -> Values:
-        """Blocks (of entries of the pattern that are not of cells)."""
+        """Blocks of the ties and of the inertia, in the order of the pattern."""
         identity = np.eye(self._inertia.shape[1])
         return np.concatenate([self._ties.data[:, None, None] * identity, self._inertia[:, :, None] * identity])
 
     def tangent(self, stiffness: Values) -> tuple[bsr_array, Values]:
-        """K of the nodes, and the inverses of its blocks on the diagonal, made positive."""
+        """Return K of the nodes, and the inverses of its diagonal blocks, made positive."""
         n, d = self._inertia.shape
-        result = self._pattern
-        blocks = np.concatenate([stiffness.reshape(-1, d, d)[self._both], self._inertia_and_ties]) * result.free
-        data = np.add.reduceat(blocks[result.order], result.first)
-        values, vectors = np.linalg.eigh(data[result.diagonal])
+        pattern = self._pattern
+        blocks = np.concatenate([stiffness.reshape(-1, d, d)[self._is_inside], self._inertia_and_ties]) * pattern.free
+        data = np.add.reduceat(blocks[pattern.order], pattern.first)
+        values, vectors = np.linalg.eigh(data[pattern.diagonal])
         largest = abs(values).max(axis=1, keepdims=True)
         values = np.maximum(abs(values), np.where(largest > 0, self._policy.min_block_eigenvalue * largest, 1.0))
         inverse = (vectors / values[:, None, :]) @ vectors.transpose(0, 2, 1)
-        return bsr_array((data, result.columns, result.starts), shape=(n * d, n * d)), inverse
+        return bsr_array((data, pattern.columns, pattern.starts), shape=(n * d, n * d)), inverse
 
     def norms(self, forces: Values) -> Values:
-        """(count,) |r| of each patch, N."""
-        return np.asarray(np.sqrt(sum_by_patch(self.of, np.square(forces).sum(axis=1), self.count)))
+        """Return |r| (count,) of each patch, N."""
+        return np.asarray(np.sqrt(sum_by_patch(self.patch_of_node, np.square(forces).sum(axis=1), self.count)))
 
 
-class _Pattern(NamedTuple):
-    """Where blocks that are summed go.
+class BlockPattern(NamedTuple):
+    """Sparsity pattern of a sum of blocks.
 
     Attributes:
-        order: of blocks, by where they go.    first: (nonzeros,) of each place, in that order.
-        free: what blocks are multiplied with: 0 where motion is prescribed.    columns, starts: of the matrix.
-        diagonal: (nonzeros,) places on it.
+        order: order of the blocks by position in the matrix.
+        first: (nonzeros,) first block of each position in that order.
+        free: factors of the blocks, 0 where the displacement is prescribed.
+        columns: (nonzeros,) columns of the matrix.
+        starts: (n + 1,) starts of its rows.
+        diagonal: (nonzeros,) flags of diagonal positions.
     """
 
     order: Ints
@@ -294,11 +329,13 @@ class _Pattern(NamedTuple):
     diagonal: Flags
 
 
-class _Look(NamedTuple):
-    """What patches are like at some w.
+class PatchValues(NamedTuple):
+    """Patches at some displacement w.
 
     Attributes:
-        potential: (count,) J.    size: (count,) of what that is the sum of, J.    forces: (n, d) its derivative, N.
+        potential: (count,) J.
+        size: (count,) sum of the absolute values of its summands, J.
+        forces: (n, d) its gradient, N.
         stiffness: blocks of all cells, N/m.
     """
 
@@ -307,35 +344,42 @@ class _Look(NamedTuple):
     forces: Values
     stiffness: Values
 
-    def where(self, taken: Flags, other: _Look, region: _Region) -> _Look:
-        """Of those patches, and the other's of all else."""
-        choices = taken, taken, taken[region.of, None], taken[region.of_cell, None, None, None, None]
-        return _Look(*(np.where(*item) for item in zip(choices, self, other, strict=True)))
+    def where(self, chosen: Flags, other: PatchValues, region: PatchRegion) -> PatchValues:
+        """Return these values for the `chosen` patches, those of `other` for the rest."""
+        of_nodes, of_cells = chosen[region.patch_of_node, None], chosen[region.patch_of_cell, None, None, None, None]
+        flags = chosen, chosen, of_nodes, of_cells
+        return PatchValues(*(np.where(*item) for item in zip(flags, self, other, strict=True)))
 
 
-def _settle(region: _Region, little: float, edge: float, policy: SolverPolicy) -> bool:
-    """Each patch goes down to a minimum, or as far as it gets; whether any moved (collective)."""
+def minimise_patches(region: PatchRegion, solved_norm: float, edge: float, policy: SolverPolicy) -> bool:
+    """Move each patch to a minimum of its potential, or as far as it gets (collective).
+
+    Returns:
+        Whether any node has moved.
+    """
     w = np.zeros(region.shape)
-    current = region.at_first
-    enough = np.maximum(policy.patch_rtol * region.norms(current.forces), policy.patch_residual * little)
+    current = region.initial
+    enough = np.maximum(policy.patch_rtol * region.norms(current.forces), policy.patch_residual * solved_norm)
     radius = np.full(region.count, policy.first_trust_radius * edge)
     for _ in range(policy.max_trust_steps):
         norms = region.norms(current.forces)
         active = (norms > enough) & (radius > policy.last_trust_radius * edge)
         if not active.any():
             break
-        pulled = np.where(active[region.of, None], current.forces, 0.0)
-        step, promised = steihaug_step(*region.tangent(current.stiffness), pulled, region.of, radius, policy)
-        trial = region.look(w + step)
-        fell, slack = current.potential - trial.potential, policy.potential_round_off * current.size
-        gain = np.divide(fell, promised, out=np.zeros_like(fell), where=promised > 0)
+        gradient = np.where(active[region.patch_of_node, None], current.forces, 0.0)
+        tangent, inverse = region.tangent(current.stiffness)
+        step, predicted = steihaug_step(tangent, inverse, gradient, region.patch_of_node, radius, policy)
+        trial = region.evaluate(w + step)
+        decrease, slack = current.potential - trial.potential, policy.potential_round_off * current.size
+        ratio = np.divide(decrease, predicted, out=np.zeros_like(decrease), where=predicted > 0)
         accepted = active & (
-            (gain > policy.poor_decrease) | ((abs(fell) <= slack) & (region.norms(trial.forces) < norms))
+            (ratio > policy.poor_decrease) | ((abs(decrease) <= slack) & (region.norms(trial.forces) < norms))
         )
-        long = region.norms(step)
-        longer = accepted & (gain > policy.good_decrease) & (long > 0.9 * radius)
-        radius = np.where(longer, 2 * radius, np.where(accepted | ~active, radius, long / 4))
-        w = np.where(accepted[region.of, None], w + step, w)
+        length = region.norms(step)
+        # The radius grows only if the step has used it up.
+        grows = accepted & (ratio > policy.good_decrease) & (length > 0.9 * radius)
+        radius = np.where(grows, 2 * radius, np.where(accepted | ~active, radius, length / 4))
+        w = np.where(accepted[region.patch_of_node, None], w + step, w)
         current = trial.where(accepted, current, region)
-    region.put(w)
+    region.displace(w)
     return bool(w.any())

@@ -1,6 +1,6 @@
-"""The tuned numbers of the solver: one frozen dataclass, each field with its unit, what it bounds, and its evidence.
+"""Tuned numbers of the solvers: each with its unit, the quantity that it bounds, and the evidence for its value.
 
-`DEFAULT_POLICY` is read once by each solver that is made; another policy can be handed to `NonlinearSolver`.
+A solver reads its policy when it is built: `DEFAULT_POLICY`, or the one that `NonlinearSolver` is given.
 """
 
 from __future__ import annotations
@@ -12,21 +12,21 @@ import numpy as np
 
 @dataclass(frozen=True)
 class SolverPolicy:
-    """Numbers that decide how systems are solved, not what their solution is.
+    """Numbers that change how systems are solved, but not their solution.
 
     A field without a unit is a ratio. "Measured" names the bodies on which the value was chosen.
     """
 
     # --- Newton's method (newton) ---
-    # Mean edges. Longest jump of prescribed dofs that Newton's method starts from without a linear extension into the
-    # body; cells at a support that takes a longer jump alone may turn inside out.
+    # Mean edges. Longest jump of prescribed dofs without a linear extension into the body. A longer jump at a support
+    # alone may invert its cells.
     max_support_jump: float = 0.01
     # Share of |r| that an iteration leaves. Below it the method converges by itself and no nodes are relaxed
     # separately.
     fast_reduction: float = 0.1
-    # Eliminations in an attempt that is judged by |r|, which may rise in each of them: bounds a cycle.
+    # Eliminations in an attempt with the merit function |r|, which may rise in each of them: bounds a cycle.
     max_eliminations: int = 4
-    # Iterations in which |r| has to be halved where it is the merit function; a crawling attempt is given up.
+    # Iterations in which |r| has to be halved where it is the merit function; a slower attempt is given up.
     crawl_iterations: int = 2
     # Linear solves of a step with a linear balance, before Newton's method takes over. One is the rule.
     max_linear_solves: int = 3
@@ -41,7 +41,7 @@ class SolverPolicy:
     potential_round_off: float = 1e4 * float(np.finfo(float).eps)
     # Multiples of that round-off. Whole steps whose potential rises by no more are taken as steps near the solution.
     near_solution: float = 1e3
-    # Share of all nodes whose correction may be clipped. Clipping more would brake the motion of a whole part.
+    # Share of all nodes whose correction may be clipped. Clipping more would slow the motion of a whole fragment.
     max_clipped_nodes: float = 0.03
     # Iterations with exact tangents without a smaller |r|, after which an attempt is given up: it cycles.
     max_stalled_iterations: int = 10
@@ -53,12 +53,12 @@ class SolverPolicy:
     # --- inexact Newton (forcing_terms) ---
     # Largest relative tolerance of CG while contact acts. CG takes four times as many iterations with contact.
     loosest_with_contact: float = 1e-2
-    # Shares of what the tangent leaves of r, which CG may leave: in its own norm, and in the norm of r.
+    # Shares of the residual left by the linearisation, which CG may leave: in the preconditioned norm, and in |r|.
     cg_share: float = 0.1
     cg_share_of_residual: float = 0.3
-    # Share of the residual of a solution that CG may leave. Ranks differ by it.
+    # Share of the residual of a solution that CG may leave. Results on other numbers of ranks differ by it.
     cg_share_of_solution: float = 1e-2
-    # Share of the residual of a solution that a tangent which is kept may leave.
+    # Share of the residual of a solution that the tangent of an earlier iterate may leave.
     kept_tangent_share: float = 0.3
     # Largest relative tolerance of a correction, and of a last one. A rougher correction of a slender body may not
     # be a direction of descent.
@@ -71,10 +71,10 @@ class SolverPolicy:
     # Share of the residual of a solution that a linear step without inertia leaves: loads that grow in proportion are
     # extrapolated to a solution then, which takes no iteration.
     static_residual: float = 0.3
-    # Share of the cells of a matrix that are alive, below which a smaller matrix is made.
+    # Share of the cells of a matrix that are alive, below which a smaller matrix takes its place.
     shrink_below: float = 0.9
     # c_a rho h^2 / Y. Above it CG multiplies with the tangent in single precision: rounding takes 6e-8 of a stiffness
-    # where neighbours move apart, less than the inertia of what hangs by one node.
+    # where neighbours move apart, less than the inertia of a part that is attached by one node.
     min_single_precision_inertia: float = 1e-6
     # Dofs from which on products in blocks of a node are used. Smaller matrices stay in the cache.
     min_block_dofs: int = 10_000
@@ -82,17 +82,17 @@ class SolverPolicy:
     # --- direct solver (direct_solver) ---
     # Dofs up to which a system is factorised where no Krylov method converges: seconds, and a few GB at most.
     max_direct_dofs: int = 100_000
-    # Dofs up to which factors take no longer than GMRES takes to fail: in the plane, in space.
+    # Dofs up to which a factorisation takes no longer than GMRES takes to fail: in 2D, in 3D.
     max_direct_before_gmres_2d: int = 100_000
     max_direct_before_gmres_3d: int = 10_000
-    # Iterations of CG for one tangent, which factors are taken to cost until their cost is known.
+    # Cost of a factorisation in iterations of CG, until it is measured.
     assumed_direct_cost: int = 40
     # Operations of MUMPS for each entry of the tangent that take as long as an iteration of CG. Measured 4 to 16 on 13
     # bodies: plane and solid, slender and compact, linear and quadratic, 600 to 100,000 dofs.
     flops_per_iteration: float = 11.0
-    # Tangents whose factors an attempt may cost in iterations, before it goes on with factors on trial.
+    # Factorisations that the iterations of an attempt may cost, before it continues with factors on trial.
     tangents_on_trial: int = 4
-    # Iterations for each dof that factors cost at most in space: a compact body of n dofs takes n / 16.
+    # Largest cost of a factorisation in 3D, iterations for each dof: a compact body of n dofs takes n / 16.
     compact_direct_cost: float = 1 / 16
     # Solves that start with factors after iterations have failed: the first time, and at most.
     first_direct_spell: int = 8
@@ -108,7 +108,8 @@ class SolverPolicy:
     positive_spell: int = 8
 
     # --- preconditioner ---
-    # c_a rho h^2 / Y. Above it inertia holds what hangs by a node or an edge, and no deflation is needed.
+    # c_a rho h^2 / Y. Above it inertia resists the motion of parts that are attached by a node or an edge, and no
+    # deflation is needed.
     held_by_inertia: float = 1e-3
     # c_a rho h^2 / Y. Above it SSOR alone serves a body in fragments. Measured on a porcelain figure that shatters
     # (46,000 tetrahedra, a sixth): 2.5 times the iterations, half the time.
@@ -117,8 +118,8 @@ class SolverPolicy:
     # aggregates may take. Measured: 38 iterations for 77 on a sheet of 234,000 tetrahedra, nu = 0.45.
     slow_iterations: int = 25
     strong_link_gain: float = 0.9
-    # Iterations as a multiple of those of a fresh set-up, plus 2, above which coarse spaces are made anew; second:
-    # without smoothing of aggregates, whose set-up is a fifth.
+    # Iterations as a multiple of those after a set-up, plus 2, above which coarse spaces are set up again; second:
+    # without smoothing of aggregates, whose set-up takes a fifth.
     rebuild_ratio: float = 1.3
     rebuild_ratio_fragments: float = 1.1
     # Iterations of a fresh set-up as a multiple of those of the whole body, plus 2, above which aggregates are not

@@ -1,4 +1,4 @@
-"""The tangent of a balance as the matrices that a KSP takes: for products and for setting preconditioners up."""
+"""Tangent of a balance as the matrices that a KSP takes, for products and for the set-up of preconditioners."""
 
 from __future__ import annotations
 
@@ -18,25 +18,30 @@ if TYPE_CHECKING:
 
 
 class PatternListener(Protocol):
-    """Whoever keeps factors, coarse spaces or copies of a matrix."""
+    """Interface of an object with factors, coarse spaces or copies of a matrix."""
 
     def pattern_changed(self) -> None:
-        """The matrix is another one, or has got entries at other places."""
+        """Note that the matrix is another one, or has entries at other positions."""
 
 
 class TangentOperators:
     """K of a balance at the present displacement, in one matrix or several.
 
     Attributes:
-        operator: K for the products of a Krylov method, with all that terms keep beside their entries.
-        products: K for products without what terms keep beside it; None: they are with `matrix`.
-        blocks: products with K assembled in blocks of a node's dofs; None where it is not.
+        operator: K for the products of a Krylov method, with low-rank updates.
+        products: K for products without low-rank updates; None: `matrix` serves.
         eigenvalue_floor: that of the last assembly (mechanics.psd_projection); None: the tangent is exact.
     """
 
     def __init__(self, balance: Balance, policy: SolverPolicy, *, for_multigrid: bool, may_use_blocks: bool) -> None:
-        """`for_multigrid`: rigid body modes are attached to the matrix; `may_use_blocks`: products may be with blocks
-        (collective)."""
+        """Set up the matrices (collective).
+
+        Args:
+            balance: balance of forces.
+            policy: size from which blocks pay off.
+            for_multigrid: attach rigid body modes to the matrix.
+            may_use_blocks: products may be with node blocks.
+        """
         self._balance, self._tangent, self._policy = balance, balance.tangent, policy
         self._may_use_blocks = may_use_blocks
         self._near_nullspace = near_nullspace(balance.domain) if for_multigrid else None
@@ -51,20 +56,21 @@ class TangentOperators:
 
     @property
     def matrix(self) -> PETSc.Mat:
-        """Entries of K, which may be behind its blocks until `update_entries`."""
+        """Entries of K, which may be older than its blocks until `update_entries`."""
         return self._tangent.matrix
 
     @property
     def block_operator(self) -> BlockOperator | None:
-        """The context of `products`."""
+        """Context of `products`; None without blocks."""
         return self._block_operator
 
     @property
     def blocks(self) -> BlockMatrix | None:
-        """BlockMatrix with K as it is assembled in blocks."""
+        """Blocks in which K is assembled; None if it is not."""
         return None if self._block_operator is None else self._block_operator.assembled
 
     def _make_operators(self) -> None:
+        """Set up the matrices for the present pattern (collective)."""
         self._release_operators()
         tangent = self._tangent
         self.products: PETSc.Mat | None = None
@@ -81,16 +87,17 @@ class TangentOperators:
         self._attach_nullspace()
 
     def _attach_nullspace(self) -> None:
-        """Attach the rigid body modes to the matrix.
-
-        PETSc's sum of matrices of two patterns loses them; multigrid would know translations alone.
-        """
+        """Attach the rigid body modes to the matrix."""
+        # PETSc's sum of two matrices with different patterns loses them; multigrid would use translations alone.
         if self._near_nullspace is not None and not self.matrix.getNearNullSpace():
             self.matrix.setNearNullSpace(self._near_nullspace)
 
     def shrink(self, share: float) -> bool:
-        """Make smaller matrices without the entries of dead cells, where at most `share` of the cells are alive;
-        whether they are new (collective)."""
+        """Remove the entries of dead cells, if at most the `share` of the cells is alive (collective).
+
+        Returns:
+            Whether there are new matrices.
+        """
         if not self._tangent.shrink(share):
             return False
         self._make_operators()
@@ -99,17 +106,18 @@ class TangentOperators:
     # --- values ---
 
     def assemble(self, eigenvalue_floor: float | None) -> None:
-        """K at the present displacement, in blocks where there are any (collective)."""
+        """Assemble K at the present displacement, in blocks if there are any (collective)."""
         self.multiply_by(None)
         self.eigenvalue_floor = eigenvalue_floor
         self._tangent.assemble(psd_tolerance=eigenvalue_floor, blocks_only=True)
         self._check_pattern()
 
     def tell_of_pattern(self, *listeners: PatternListener) -> None:
-        """Tell these from here on when the matrix is another one, or has got entries at other places."""
+        """Tell these listeners of every change of the pattern."""
         self._listeners += listeners
 
     def _check_pattern(self) -> None:
+        """Tell the listeners if the pattern has changed."""
         if self._known_pattern == self._tangent.pattern_version:
             return
         self._known_pattern = self._tangent.pattern_version
@@ -119,30 +127,29 @@ class TangentOperators:
             listener.pattern_changed()
 
     def update_products(self) -> None:
-        """Bring products and rigid body modes to the tangent that was assembled last (collective)."""
+        """Update products and rigid body modes to the last tangent (collective)."""
         if self._block_operator is not None:
             self._block_operator.update_copy()
         self._attach_nullspace()
 
     def update_entries(self) -> None:
-        """Bring `matrix` to where the blocks are (collective)."""
+        """Update the entries of `matrix` to the blocks (collective)."""
         self._tangent.update_entries()
-        self._check_pattern()  # ties beside the blocks may be new
+        # Ties are not part of the blocks, and may be new.
+        self._check_pattern()
         self._attach_nullspace()
 
     def multiply_by(self, fine_level: FineLevel | None) -> None:
-        """Multiply with this copy of the tangent in single precision; None: in double precision.
-
-        Only where inertia is more than what rounding takes from a stiffness (collective).
-        """
+        """Multiply with this copy of the tangent in single precision; None: in double precision (collective)."""
         if self._block_operator is None:
             return
+        # Inertia has to exceed the rounding error of the stiffness.
         if fine_level is not None and mass_stiffness_ratio(self._balance) <= self._policy.min_single_precision_inertia:
             fine_level = None
         self._block_operator.multiply_by(fine_level)
 
     def set_on(self, ksp: PETSc.KSP, pc: PETSc.PC) -> None:
-        """Let a KSP with this preconditioner take the tangent, and set both up (collective)."""
+        """Give the tangent to a KSP with this preconditioner, and set both up (collective)."""
         ksp.setPC(pc)
         pc.setReusePreconditioner(False)
         pc.setUseAmat(self.products is not None)
@@ -152,6 +159,7 @@ class TangentOperators:
     # --- end ---
 
     def _release_operators(self) -> None:
+        """Free the matrices for products."""
         if self._block_operator is not None:
             self._block_operator.release_copy()
             self._block_operator = None
@@ -160,14 +168,14 @@ class TangentOperators:
             self._low_rank_operator = None
 
     def destroy(self) -> None:
-        """Give back PETSc's objects."""
+        """Free PETSc's objects."""
         self._release_operators()
         if self._near_nullspace is not None:
             self._near_nullspace.destroy()
 
 
 def near_nullspace(domain: Domain) -> PETSc.NullSpace:
-    """The rigid body modes of a body about its centre (collective)."""
+    """Return the rigid body modes of a body about its centre (collective)."""
     return rigid_body_nullspace(
         domain.comm, domain.nodes[: domain.node_count] - (domain.bounds.lower + domain.bounds.upper) / 2
     )

@@ -1,7 +1,7 @@
-"""Callbacks and contexts of PETSc's objects that do not keep the owner of these objects alive.
+"""Callbacks of PETSc's objects that do not keep the owner of these objects alive.
 
-Python's garbage collector cannot look into PETSc: an object that owns a solver of PETSc and is called back by it would
-never be freed, nor would the communicators of the solver, of which MPI has few.
+Python's garbage collector does not see references held by PETSc. An object that owns a PETSc solver and is called back
+by it would never be freed, nor would the communicators of the solver, whose number MPI limits.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _scenes = itertools.count(1)
 
 
 def weak_callback[**P, R](method: Callable[P, R]) -> Callable[P, R]:
-    """A function that calls a bound method for as long as another one keeps the object of the method."""
+    """Return a function that calls a bound method as long as the object of the method exists."""
     reference, name = WeakMethod(method), getattr(method, "__qualname__", "a method")
 
     def call(*args: P.args, **named: P.kwargs) -> R:
@@ -33,20 +33,25 @@ def weak_callback[**P, R](method: Callable[P, R]) -> Callable[P, R]:
 
 
 class ApplyContext:
-    """The context of a preconditioner of PETSc that its owner applies."""
+    """Context of a PETSc preconditioner that is applied by its owner.
+
+    Attributes:
+        apply: weak callback of the owner's method.
+    """
 
     def __init__(self, apply: Callable[[PETSc.PC, PETSc.Vec, PETSc.Vec], None]) -> None:
-        """`apply`: a bound method of the owner."""
+        """Take a bound method of the owner."""
         self.apply = weak_callback(apply)
 
 
 def collect_dropped_scenes(comm: MPI.Comm) -> None:
-    """A scene is built: every so often, free what was dropped without `destroy` (collective).
+    """Free scenes that were dropped without `destroy`, once in several scenes (collective).
 
-    Python looks for garbage when its own objects have piled up, and knows nothing of communicators; on several ranks
-    PETSc keeps what Python has freed until all of them free it together.
+    Python collects garbage by the number of its own objects, not of communicators. On several ranks PETSc keeps freed
+    objects until all ranks free them together.
     """
     if next(_scenes) % DEFAULT_POLICY.scenes_between_collections == 0:
-        for _ in range(2):  # contexts of matrices are freed with these, and hold others
+        # The contexts of matrices are freed in the first pass, and what they hold in the second.
+        for _ in range(2):
             gc.collect()
             PETSc.garbage_cleanup(comm)

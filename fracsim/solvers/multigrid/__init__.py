@@ -1,6 +1,9 @@
-"""Multigrid's cycle in single precision, on rows of blocks.
+"""Multigrid V cycle in single precision, on block CSR matrices.
 
-block_operator  products with the tangent in blocks of a node's dofs
-vcycle          multigrid's cycle in single precision; hierarchy: PETSc's, copied; smoother: how they are smoothed
-fine_level      its finest level, which CG goes by, too; bcsr: products on levels and between them in C
+vcycle          V cycle as a preconditioner
+hierarchy       levels copied from PETSc's multigrid
+smoother        a level and its Chebyshev smoother
+fine_level      finest level, whose products serve CG as well
+bcsr            products with block CSR matrices and prolongations (C)
+block_operator  products with the tangent in node blocks, in double precision
 """

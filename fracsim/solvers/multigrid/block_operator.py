@@ -1,9 +1,9 @@
 """Products with the tangent in blocks of the d dofs of a node.
 
-An index is read for d^2 values instead of for d, so a product takes half the time; CG with multigrid makes some six of
-them on the finest level in an iteration. Where only cells, mass and ties contribute, K is assembled in blocks, and the
-matrix of single entries, which smoothed aggregation needs, follows when multigrid is set up. Where terms add single
-entries the blocks are a copy of them.
+One index is read for d^2 values instead of for d, so that a product takes half the time. CG with multigrid computes
+some six of them on the finest level in an iteration. Where only cells, mass and ties contribute, K is assembled in
+blocks, and the matrix of single entries, which smoothed aggregation needs, is updated for a set-up of multigrid. Where
+terms add single entries the blocks are a copy of these.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 
 class BlockOperator:
-    """The context of a PETSc matrix for products with the tangent.
+    """Context of a PETSc matrix for products with the tangent.
 
     Attributes:
-        tangent: the matrix of single entries.
-        assembled: products with the blocks that K is assembled in; None where these are a copy.
+        tangent: matrix of single entries.
+        assembled: blocks in which K is assembled; None if they are a copy.
     """
 
     def __init__(self, tangent: PETSc.Mat, assembled: BlockMatrix | None) -> None:
@@ -33,7 +33,7 @@ class BlockOperator:
 
     @property
     def fine_level(self) -> FineLevel | None:
-        """The copy of the tangent in single precision that products are made with; None: in double precision."""
+        """Copy of the tangent in single precision that products use; None: double precision."""
         return self._fine_level
 
     def multiply_by(self, fine_level: FineLevel | None) -> None:
@@ -41,18 +41,18 @@ class BlockOperator:
         self._fine_level = fine_level
 
     def pattern_changed(self) -> None:
-        """The tangent has entries at other places."""
+        """Discard the copy: the tangent has entries at other positions."""
         self.release_copy()
 
     def update_copy(self) -> None:
-        """Bring the blocks to the tangent as it is now (collective)."""
+        """Update the copy to the present tangent (collective)."""
         if self.assembled is not None or self._copied_state == (state := self.tangent.stateGet()):
             return
         self._copy = self.tangent.convert(PETSc.Mat.Type.BAIJ, self._copy or PETSc.Mat())
         self._copied_state = state
 
     def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = K x (collective)."""
+        """Evaluate y = K x (collective)."""
         if self._fine_level is not None:
             self._fine_level.multiply(x, y)
             return
@@ -61,13 +61,13 @@ class BlockOperator:
         blocks.mult(x, y)
 
     def to_petsc(self) -> PETSc.Mat:
-        """The operator as a matrix of PETSc."""
+        """Return the operator as a PETSc matrix."""
         result: Any = PETSc.Mat().createPython(self.tangent.getSizes(), self, comm=self.tangent.comm)
         result.setUp()
         return result
 
     def release_copy(self) -> None:
-        """Give the memory of PETSc's objects back."""
+        """Free the memory of the copy."""
         if self._copy is not None:
             self._copy.destroy()
             self._copy = None
@@ -75,5 +75,5 @@ class BlockOperator:
 
 
 def blocks_pay_off(tangent: PETSc.Mat, min_dofs: int) -> bool:
-    """Whether products in blocks are faster: small matrices stay in the cache."""
+    """Return True if products in blocks are faster; small matrices stay in the cache in any form."""
     return tangent.getBlockSize() > 1 and tangent.getSize()[0] >= min_dofs

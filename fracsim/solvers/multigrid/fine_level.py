@@ -1,13 +1,13 @@
-"""The finest level of the V cycle: the present tangent in single precision, with which CG may multiply as well.
+"""Finest level of the V cycle: the present tangent in single precision, which CG may multiply with as well.
 
-A' = S A S has half the bytes of A, and products with it read what the cycle has just brought to the cache. Rounding
-takes 6e-8 of each block. Rigid motions are resisted by the sum of the blocks of a row alone, so each row gets back what
-it has lost in all:
+A' = S A S has half the bytes of A, and products with it read what the cycle has just brought into the cache. Rounding
+changes each block by 6e-8. Rigid motions are resisted by the sum of the blocks of a row alone; the loss of this sum is
+added again:
 
     A x ~ S^-1 A' S^-1 x + L x,    L_i = sym sum_j (A_ij - S_i^-1 A'_ij S_j^-1)
 
-The energy of x is off by sum of x_i . E_ij (x_j - x_i), E the loss of each block: 6e-8 of a stiffness where neighbours
-move apart, and nothing where they move together.
+The error of the energy of x is the sum of x_i . E_ij (x_j - x_i) with the loss E of each block. It vanishes where
+neighbours move together.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ Values = npt.NDArray[np.float64]
 
 
 class FineLevel(SmoothedLevel):
-    """The level of the tangent."""
+    """Level of the tangent."""
 
     def __init__(
         self, data: LevelData, pattern: BlockCSRData, code: CDLL, policy: SolverPolicy = DEFAULT_POLICY
     ) -> None:
-        """As any level."""
+        """Allocate the level (see `SmoothedLevel`)."""
         super().__init__(data, pattern, code, policy)
         nodes, size = data.nodes, data.size
         self._unscale = 1 / self.scale
@@ -45,12 +45,12 @@ class FineLevel(SmoothedLevel):
         self._lost = np.zeros((nodes.size_local, size, size), np.float32)
 
     def assign_values(self, values: Values, ties: Sequence[TieMatrix] = ()) -> None:
-        """Take the blocks of A and its ties, and evaluate what rounding takes from the blocks (collective)."""
+        """Assign the blocks of A and its ties, and compute the rounding loss of the blocks (collective)."""
         super().assign_values(values, ties)
         self._matrix.compute_rounding_loss(values, self._unscale, self._unscale, self._lost)
 
     def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = A x, in double precision but for A' and L (collective)."""
+        """Compute y = A x, in double precision but for A' and L (collective)."""
         values, product, n = x.array_r, y.array_w, self._owned
         np.multiply(values, self._unscale[:n], out=self._unscaled_x.array[:n])
         self._unscaled_x.update_ghosts()

@@ -1,12 +1,12 @@
-/* What carries between two levels (solvers.multigrid.bcsr): rows of blocks in single precision.    R, C: rows and columns of a
-   block, whose numbers come row by row. starts: of rows; columns: of blocks. */
+/* Prolongation between two levels (solvers.multigrid.bcsr): block CSR matrix in single precision.
+   R, C: rows and columns of a block, which is stored by rows. starts: of rows; columns: of blocks. */
 
 #include <stdint.h>
 
 typedef float four __attribute__((vector_size(16), aligned(4), may_alias));
 typedef float two __attribute__((vector_size(8), aligned(4), may_alias));
 
-enum { IN_FOURS = C / 4 * 4, IN_TWOS = C / 2 * 2 };  // columns that are taken so many at a time
+enum { IN_FOURS = C / 4 * 4, IN_TWOS = C / 2 * 2 };  // columns in groups of four and of two
 
 /* to = left A right, left and right diagonal; A in double precision. */
 void scale(int64_t rows, const int64_t* starts, const int32_t* columns, const double* blocks, const double* left,
@@ -46,7 +46,7 @@ void add(int64_t rows, const int64_t* starts, const int32_t* columns, const floa
   }
 }
 
-/* to += (rows of A)^T x, where a type takes some of the columns from s on. */
+/* to += (rows of A)^T x, for the columns from s on that fit into the type. */
 #define ADD(type)                                                                        \
   {                                                                                      \
     type sum = *(const type*)(to + s);                                                   \

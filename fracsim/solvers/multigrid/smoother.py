@@ -1,8 +1,8 @@
 """A level of the V cycle in single precision, and its smoother.
 
-The smoother is Chebyshev's polynomial (first kind) of B A' within a range below its largest eigenvalue; B has the
-inverses of the nodes' blocks on the diagonal of A'. Where cells are all but flat a node is held in one direction, along
-no axis: Jacobi's smoother, by single entries, has to reach eigenvalues of 6 to 9 there, block Jacobi 4.3.
+The smoother is Chebyshev's polynomial (first kind) of B A' on a range below its largest eigenvalue. B has the inverses
+of the diagonal node blocks of A'. At almost flat cells a node is stiff in one direction, along no axis: the largest
+eigenvalue is 6 to 9 with Jacobi's smoother by single entries, 4.3 with block Jacobi.
 
 Equations: docs/theory.md#linear-systems.
 """
@@ -32,12 +32,12 @@ Single = npt.NDArray[np.float32]
 
 
 class SmoothingParameters(NamedTuple):
-    """How much a level is smoothed.
+    """Amount of smoothing on a level.
 
     Attributes:
-        steps: of the polynomial, before and after the coarser levels.
-        lower_bound: share of the largest eigenvalue down to which errors are smoothed.
-        cycles: through the coarser levels, each time.
+        steps: degree of the polynomial, before and after the coarser levels.
+        lower_bound: share of the largest eigenvalue above which errors are smoothed.
+        cycles: number of cycles through the coarser levels.
     """
 
     steps: int
@@ -45,7 +45,8 @@ class SmoothingParameters(NamedTuple):
     cycles: int = 1
 
 
-DEFAULT_SMOOTHING = SmoothingParameters(2, 0.1)  # as PETSc's multigrid
+# Defaults of PETSc's multigrid.
+DEFAULT_SMOOTHING = SmoothingParameters(2, 0.1)
 
 
 class SmoothedLevel:
@@ -54,18 +55,28 @@ class SmoothedLevel:
     Its matrix is A' = S A S, S = diag(A)^(-1/2) of the set-up, so that its entries are about 1.
 
     Attributes:
-        b, x: right-hand side and solution, scaled.    residual: b - A' x.
-        scale: (dofs, ghosts too) S.
-        ties: what is added to the blocks of A.    smoothing: how much it is smoothed.
+        b: scaled right-hand side.
+        x: scaled solution.
+        residual: b - A' x.
+        scale: (dofs with ghosts,) S.
+        ties: ties, which are added to the blocks of A.
+        smoothing: amount of smoothing.
     """
 
     def __init__(
         self, data: LevelData, pattern: BlockCSRData, code: CDLL, policy: SolverPolicy = DEFAULT_POLICY
     ) -> None:
-        """`pattern`: where the blocks of A are, which `assign_values` brings; `code`: of `compile_block_csr`."""
+        """Allocate the level.
+
+        Args:
+            data: the level of PETSc's multigrid.
+            pattern: pattern of A, whose values `assign_values` assigns.
+            code: of `compile_block_csr`.
+            policy: tuned numbers.
+        """
         nodes, size = data.nodes, data.size
-        large = np.abs(data.diagonal)
-        self.scale: Values = 1 / np.sqrt(np.where(large > 0, large, 1.0))
+        diagonal = np.abs(data.diagonal)
+        self.scale: Values = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         self._comm, self._owned, self._size, self._policy = nodes.comm, nodes.size_local * size, size, policy
         self.ties: Sequence[TieMatrix] = ()
         self._matrix = BlockCSR(code, size, pattern.starts, pattern.columns)
@@ -77,7 +88,7 @@ class SmoothedLevel:
         self._on_diagonal = np.flatnonzero(pattern.columns == self._row)
 
     def assign_values(self, values: Values, ties: Sequence[TieMatrix] = ()) -> None:
-        """Take the blocks of A, (blocks, size^2), and what is added to them, and smooth for these (collective)."""
+        """Assign the blocks (blocks, size^2) of A and its ties, and set up the smoother (collective)."""
         self.ties = ties
         self._matrix.assign_scaled(values, self.scale, self.scale)
         self._inverse.assign_inverse(self._diagonal_blocks())
@@ -85,13 +96,13 @@ class SmoothedLevel:
         self.set_smoothing(self.smoothing)
 
     def set_smoothing(self, smoothing: SmoothingParameters) -> None:
-        """Smooth so much from here on."""
+        """Set the amount of smoothing."""
         self.smoothing = smoothing
         upper = self._policy.chebyshev_upper
         self._weights = chebyshev(self._largest_eigenvalue, smoothing.steps, smoothing.lower_bound, upper)
 
     def _diagonal_blocks(self) -> Single:
-        """(owned nodes, size, size) blocks of A' on the diagonal, with the ties."""
+        """Return the diagonal blocks of A' with the ties, (owned nodes, size, size)."""
         D = np.zeros_like(self._inverse.blocks)
         D[self._row[self._on_diagonal]] = self._matrix.blocks[self._on_diagonal].reshape(-1, *D.shape[1:])
         for tie in self.ties:
@@ -100,10 +111,7 @@ class SmoothedLevel:
         return D
 
     def _estimate_largest_eigenvalue(self) -> float:
-        """About the largest eigenvalue of B A', from below, by Lanczos' method in the norm of B (collective).
-
-        It is 1 at least, as the diagonal blocks say.
-        """
+        """Estimate the largest eigenvalue of B A' from below by Lanczos' method in the norm of B (collective)."""
         b, x, n = self.b.array, self.x.array, self._owned
         self.set_random_rhs()
         last_vector = np.zeros(n, np.float32)
@@ -112,7 +120,8 @@ class SmoothedLevel:
         for _ in range(self._policy.lanczos_products):
             self._inverse.first_step(1.0, self.b, self._direction, self.x)
             off_diagonal.append(float(np.sqrt(sum_over_ranks(self._comm, np.vdot(b[:n], x[:n]))[0])))
-            if off_diagonal[-1] < 1e-5:  # round-off alone is left
+            # Below round-off in single precision.
+            if off_diagonal[-1] < 1e-5:
                 break
             x[:n] /= np.float32(off_diagonal[-1])
             vector = b[:n] / np.float32(off_diagonal[-1])
@@ -123,21 +132,22 @@ class SmoothedLevel:
             diagonal.append(float(sum_over_ranks(self._comm, np.vdot(b[:n], x[:n]))[0]))
             b[:n] -= np.float32(diagonal[-1]) * vector
             last_vector = vector
-        beside = off_diagonal[1 : len(diagonal)]
-        T = np.diag(diagonal) + np.diag(beside, 1) + np.diag(beside, -1)
+        off_diagonal = off_diagonal[1 : len(diagonal)]
+        T = np.diag(diagonal) + np.diag(off_diagonal, 1) + np.diag(off_diagonal, -1)
+        # The diagonal blocks alone give 1.
         return max(float(np.linalg.eigvalsh(T)[-1]), 1.0)
 
     def set_random_rhs(self) -> None:
-        """Make b random, the same in each run on as many ranks."""
+        """Assign random numbers to b, the same in every run on as many ranks."""
         self.b.array[: self._owned] = np.random.default_rng(self._comm.rank).uniform(-1.0, 1.0, self._owned)
 
     def rhs_norm(self) -> float:
-        """|b| (collective)."""
+        """Return |b| (collective)."""
         owned = self.b.array[: self._owned]
         return float(np.sqrt(sum_over_ranks(self._comm, np.vdot(owned, owned))[0]))
 
     def _multiply(self) -> None:
-        """residual = A' x (collective)."""
+        """Compute residual = A' x (collective)."""
         self.x.update_ghosts()
         self.residual.array[: self._owned] = 0.0
         self._matrix.add_product(self.x, self.residual)
@@ -145,21 +155,24 @@ class SmoothedLevel:
             self._by_nodes(self.residual)[nodes] += product
 
     def _compute_residual(self) -> None:
+        """Compute residual = b - A' x (collective)."""
         self.x.update_ghosts()
         self._matrix.compute_residual(self.b, self.x, self.residual)
         for nodes, product in self._tie_products():
             self._by_nodes(self.residual)[nodes] -= product
 
     def _tie_products(self) -> Iterator[tuple[Ints, Values]]:
-        """Nodes, and the product of x with the ties there."""
+        """Yield the nodes of each tie matrix, and its product with x."""
         for tie in self.ties:
             scale = self._scale_at(tie.nodes)
             yield tie.nodes, scale * tie.multiply(scale * self._by_nodes(self.x)[tie.nodes])
 
     def _scale_at(self, nodes: Ints) -> Values:
+        """Return S at nodes, (n, size)."""
         return self.scale[: self._owned].reshape(-1, self._size)[nodes]
 
     def _by_nodes(self, vector: GhostedVector) -> Single:
+        """Return the owned part of a vector as (nodes, size)."""
         return vector.array[: self._owned].reshape(-1, self._size)
 
     def pre_smooth(self) -> None:
@@ -180,11 +193,12 @@ class SmoothedLevel:
         self.x, self._previous_x = self._previous_x, self.x
 
     def add_previous_cycle(self) -> None:
-        """Add the solution that `restart_from_residual` has kept to x, not that of ghosts."""
+        """Add the solution that `restart_from_residual` kept to x, without ghosts."""
         assert self._previous_x is not None
         self.x.array[: self._owned] += self._previous_x.array[: self._owned]
 
     def _smooth(self, weights: list[tuple[float, float]]) -> None:
+        """Apply steps with these weights (keep, take) (collective)."""
         for keep, take in weights:
             self.x.update_ghosts()
             self._matrix.smoothing_step(self._inverse, keep, take, self.b, self.x, self._direction, self._next_x)
@@ -196,14 +210,19 @@ class SmoothedLevel:
 
 
 def chebyshev(largest: float, steps: int, lower: float, upper: float) -> list[tuple[float, float]]:
-    """The weights (keep, take) of each step d <- keep d + take B r, x <- x + d of Chebyshev's iteration.
+    """Return the weights (keep, take) of the steps d <- keep d + take B r, x <- x + d of Chebyshev's iteration.
 
-    `lower`, `upper`: the range of eigenvalues that is smoothed, as shares of the `largest`. (Y. Saad, Iterative methods
-    for sparse linear systems, 2003, section 12.1)
+    Y. Saad, Iterative methods for sparse linear systems, 2003, section 12.1.
+
+    Args:
+        largest: largest eigenvalue.
+        steps: number of steps.
+        lower: lower end of the smoothed range, as a share of the largest eigenvalue.
+        upper: its upper end.
     """
-    middle, half = (upper + lower) / 2 * largest, (upper - lower) / 2 * largest
-    rho, weights = half / middle, [(0.0, 1 / middle)]
+    centre, half = (upper + lower) / 2 * largest, (upper - lower) / 2 * largest
+    rho, weights = half / centre, [(0.0, 1 / centre)]
     for _ in range(steps - 1):
-        last, rho = rho, 1 / (2 * middle / half - rho)
+        last, rho = rho, 1 / (2 * centre / half - rho)
         weights.append((rho * last, 2 * rho / half))
     return weights

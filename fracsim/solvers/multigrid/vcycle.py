@@ -1,17 +1,17 @@
-"""A multigrid cycle in single precision: the levels of PETSc's smoothed aggregation, copied in blocks of a node's dofs.
+"""Multigrid V cycle in single precision: the levels of PETSc's smoothed aggregation, copied in blocks of a node's dofs.
 
-CG with multigrid is bound by memory: five products with the finest level an iteration, four of them in the cycle, where
-six digits suffice. Floats in blocks are 40 bytes for nine entries, doubles as single entries 108. From x = 0 the cycle
-is
+CG with multigrid is bound by memory bandwidth: five products with the finest level an iteration, four of them in the
+cycle, where six digits suffice. A 3 x 3 block takes 40 bytes in single precision, 108 as single entries in double
+precision. From x = 0 the cycle is
 
     M = 2 p - p A' p + (1 - p A') C (1 - A' p),    C = P' A'_coarse^-1 P'^T,    A' = S A S,  P' = S_fine^-1 P S_coarse
 
-with Chebyshev's smoother p = q(B A') B (smoother). It is symmetric, and positive definite where p A' is within (0, 2),
-whatever rounding has made of A' where it is almost singular. The finest level is the present tangent: the smoother of
-an earlier one may be unstable for cells that have become stiffer.
+with Chebyshev's smoother p = q(B A') B (smoother). It is symmetric, and positive definite if the eigenvalues of p A'
+are within (0, 2), whatever the rounding errors of an almost singular A'.
 
-Where cycles from the second finest level down converge slowly, thin and torn bodies, coarse levels have more steps that
-reach further down, and C is two cycles (a W cycle). They have a twelfth of the numbers of the finest level and less.
+Where cycles from the second finest level down converge slowly, as in thin and torn bodies, coarse levels have more
+smoothing steps on a wider range, and C is two cycles (a W cycle). Coarse levels have less than a twelfth of the numbers
+of the finest.
 
 Equations: docs/theory.md#linear-systems.
 """
@@ -42,28 +42,36 @@ Values = npt.NDArray[np.float64]
 # By the size of a level's blocks; by the sizes of the finer level's and the coarser's for prolongations.
 type CompiledProducts = dict[tuple[int, ...], CDLL]
 
-SMOOTHED = ("chebyshev", "jacobi", 2)  # the smoother of PETSc's levels that these replace
-# Where coarse levels converge slowly: the smoothing of the second finest level, of the next, and of all that follow,
-# which have so few numbers that they cost what calling costs.
+# Smoother of PETSc's levels that the cycle replaces: Krylov method, preconditioner, steps.
+PETSC_SMOOTHER = ("chebyshev", "jacobi", 2)
+# Smoothing of the second finest level, of the next, and of all coarser ones, if coarse levels converge slowly. The
+# coarsest have so few numbers that more steps cost nothing but calls.
 THOROUGH_SMOOTHING = (
     SmoothingParameters(2, 0.08, 2), SmoothingParameters(4, 0.03, 2), SmoothingParameters(8, 0.03)
 )  # fmt: skip
 
 
 class SinglePrecisionVCycle:
-    """The context of a PETSc preconditioner that applies the cycle.
+    """Context of a PETSc preconditioner that applies the cycle.
 
     Attributes:
-        gamg: PETSc's multigrid.    pc: the preconditioner.
-        fine_level: the level of the tangent.
+        gamg: PETSc's multigrid.
+        pc: the preconditioner.
+        fine_level: level of the tangent.
         has_thorough_smoothing: whether coarse levels are smoothed more, and take as long as the finest.
     """
 
     def __init__(
         self, gamg: PETSc.PC, blocks: BlockMatrix, codes: CompiledProducts, policy: SolverPolicy = DEFAULT_POLICY
     ) -> None:
-        """`gamg`: of the kind that `create_vcycle` takes; `blocks`: the tangent, which `update_operator` takes over;
-        `codes`: for the sizes of its blocks (collective)."""
+        """Copy the levels (collective).
+
+        Args:
+            gamg: multigrid as `create_vcycle` requires it.
+            blocks: the tangent, whose values `update_operator` assigns.
+            codes: compiled code for the sizes of the blocks.
+            policy: tuned numbers.
+        """
         self.gamg, self._blocks, self._tangent, self._policy = gamg, blocks, blocks.matrix, policy
         coarsest, *finer = copy_levels(gamg, self._tangent.index_map(1))
         starts = self._tangent.indptr[: self._tangent.index_map(0).size_local + 1]
@@ -73,12 +81,14 @@ class SinglePrecisionVCycle:
         coarser = coarsest
         scale: Values = np.ones(len(coarsest.diagonal))
         for data in finer:
-            square = codes[data.size,]
+            block_code = codes[data.size,]
             if data.matrix:
-                level = SmoothedLevel(data, data.matrix, square, policy)
+                level = SmoothedLevel(data, data.matrix, block_code, policy)
                 level.assign_values(data.matrix.values)
             else:
-                level = self.fine_level = FineLevel(data, pattern, square, policy)
+                # The present tangent, not that of the set-up: its smoother could be unstable for cells that have become
+                # stiffer.
+                level = self.fine_level = FineLevel(data, pattern, block_code, policy)
             self._levels.append(level)
             assert data.prolongation is not None
             code = codes[data.size, coarser.size]
@@ -90,7 +100,8 @@ class SinglePrecisionVCycle:
         self._coarsest_solver = gamg.getMGCoarseSolve()
         self._coarsest_vectors = self._coarsest_solver.getOperators()[1].createVecs()
         self.pc = PETSc.PC().createPython(ApplyContext(self.apply), comm=gamg.comm)
-        self.pc.setOperators(*gamg.getOperators())  # it may serve a KSP that has no other
+        # The preconditioner may serve a KSP that has no other operators.
+        self.pc.setOperators(*gamg.getOperators())
         self.has_thorough_smoothing = len(self._levels) > 1 and self.converges_slowly()
         if self.has_thorough_smoothing:
             smoothings = chain(THOROUGH_SMOOTHING, repeat(THOROUGH_SMOOTHING[-1]))
@@ -98,9 +109,9 @@ class SinglePrecisionVCycle:
                 level.set_smoothing(smoothing)
 
     def converges_slowly(self) -> bool:
-        """Whether cycles from the second finest level down reduce a random residual slowly (collective).
+        """Return True if cycles from the second finest level down reduce a random residual slowly (collective).
 
-        Not where they diverge, of a tangent that is indefinite.
+        False if they diverge, as for an indefinite tangent.
         """
         number, level = len(self._levels) - 2, self._levels[-2]
         level.set_random_rhs()
@@ -113,18 +124,19 @@ class SinglePrecisionVCycle:
 
     @property
     def _values(self) -> Values:
-        """(blocks, size^2) values of the tangent's blocks."""
+        """(blocks, size^2) values of the tangent."""
         return np.asarray(self._tangent.data, np.float64)
 
     def update_operator(self) -> None:
-        """Take the tangent as it is now for the finest level (collective)."""
+        """Assign the present tangent to the finest level (collective)."""
         self.fine_level.assign_values(self._values, self._blocks.ties)
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """y = M x (collective)."""
+        """Evaluate y = M x (collective)."""
         finest, n = self.fine_level, x.getLocalSize()
         b, result = finest.b.array[:n], y.array_w
-        b[:] = x.array_r  # a product of two types of number would take three times as long
+        # A product of numbers of two types would take three times as long.
+        b[:] = x.array_r
         b *= self._scale
         self._apply_cycle(len(self._levels) - 1)
         result[:] = finest.x.array[:n]
@@ -139,7 +151,7 @@ class SinglePrecisionVCycle:
         self._prolongations[number].add_transposed_product(level.residual, b)
         b.add_ghosts_to_owners()
         if number:
-            self._correct(number - 1)
+            self._apply_coarse_cycles(number - 1)
         else:
             self._solve_coarsest()
         x = self._levels[number - 1].x if number else self._coarsest_x
@@ -147,8 +159,8 @@ class SinglePrecisionVCycle:
         self._prolongations[number].add_product(x, level.x)
         level.post_smooth()
 
-    def _correct(self, number: int) -> None:
-        """Apply the cycles of a coarser level, each to the residual of the one before (collective)."""
+    def _apply_coarse_cycles(self, number: int) -> None:
+        """Apply the cycles of a coarser level, each to the residual of the last (collective)."""
         level = self._levels[number]
         self._apply_cycle(number)
         for _ in range(level.smoothing.cycles - 1):
@@ -157,6 +169,7 @@ class SinglePrecisionVCycle:
             level.add_previous_cycle()
 
     def _solve_coarsest(self) -> None:
+        """Solve on the coarsest level (collective)."""
         b, x = self._coarsest_vectors
         n = b.getLocalSize()
         b.array_w[:] = self._coarsest_b.array[:n]
@@ -164,7 +177,7 @@ class SinglePrecisionVCycle:
         self._coarsest_x.array[:n] = x.array_r
 
     def destroy(self) -> None:
-        """Give the memory of PETSc's objects back."""
+        """Free PETSc's objects."""
         for owned in (*self._coarsest_vectors, self.pc):
             owned.destroy()
 
@@ -172,14 +185,14 @@ class SinglePrecisionVCycle:
 def create_vcycle(
     gamg: PETSc.PC, blocks: BlockMatrix, policy: SolverPolicy = DEFAULT_POLICY
 ) -> SinglePrecisionVCycle | None:
-    """The cycle of multigrid that was set up from a tangent in these blocks (collective).
+    """Return the cycle of a multigrid that was set up from a tangent in these blocks (collective).
 
-    None where it is of another kind than PETSc's default for smoothed aggregation, or there is no compiler.
+    None if it is not PETSc's default smoothed aggregation, or without a compiler.
     """
     if gamg.getType() != "gamg" or gamg.getMGLevels() < 2:
         return None
     smoothers = [gamg.getMGSmoother(level) for level in range(gamg.getMGLevels())]
-    if any((ksp.getType(), ksp.getPC().getType(), ksp.max_it) != SMOOTHED for ksp in smoothers[1:]):
+    if any((ksp.getType(), ksp.getPC().getType(), ksp.max_it) != PETSC_SMOOTHER for ksp in smoothers[1:]):
         return None
     sizes = [ksp.getOperators()[1].getBlockSize() for ksp in smoothers]
     codes = _compile_products(gamg.comm.tompi4py(), sizes)
@@ -187,8 +200,10 @@ def create_vcycle(
 
 
 def _compile_products(comm: MPI.Comm, sizes: list[int]) -> CompiledProducts | None:
-    """Compiled code for levels with so many dofs of a node, from the coarsest on; None without a compiler
-    (collective)."""
+    """Return compiled code for levels with so many dofs of a node, from the coarsest on.
+
+    None without a compiler (collective).
+    """
     codes: dict[tuple[int, ...], CDLL | None] = {
         (size,): bcsr.compile_block_csr(comm, size) for size in sorted(set(sizes[1:]))
     }
