@@ -60,7 +60,7 @@ def midside_parents(domain: Domain) -> tuple[npt.NDArray[np.int32], npt.NDArray[
     That is the end which comes first in the input mesh. The edge may be broken, so that the midside node alone does not
     tell the fragment.
     """
-    midside = domain.cell_midside_nodes.of_edges
+    midside = domain.cell_midside_nodes
     ends = midside.ends
     return midside.nodes, ends[np.arange(len(ends)), np.argmin(domain.input_numbering.nodes[ends], axis=1)]
 
