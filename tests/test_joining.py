@@ -211,7 +211,7 @@ def test_ties_beside_blocks_are_in_products_and_in_the_cycle(dim: int, monkeypat
     scene, _, tethers = tied(dim, mesh=finer, solver={"snes_type": "ksponly", "ksp_rtol": 1e-8})
     linear, stiffness = scene.solver.linear, scene.balance.tangent  # type: ignore[union-attr]
     assert linear.solve()
-    made, pc = linear.preconditioner._vcycle, linear.preconditioner.pc
+    made, pc = linear.preconditioner.applied.vcycle, linear.preconditioner.pc
     assert made is not None
     A = [dense(pc.getMGSmoother(level).getOperators()[1]) for level in range(pc.getMGLevels())]
     P = [dense(pc.getMGInterpolation(level)) for level in range(1, len(A))]

@@ -1,7 +1,8 @@
-"""The preconditioner of the tangent: of which kind it is, and when it is set up anew.
+"""Preconditioner of the tangent: its kind, and the decision when it is set up again.
 
-A `Preconditioner` is told facts (`edges_broke`, `pattern_changed`, `solved`, `solve_failed`, `bypassed`) and decides in
-`_decide` alone whether it is kept, refreshed (new operators and smoothers on the same coarse spaces) or rebuilt.
+Facts are told to a `Preconditioner` (`edges_broke`, `pattern_changed`, `solved`, `solve_failed`, `bypassed`). Its
+method `_decide` alone decides whether it is reused, refreshed (new operators and smoothers on the same coarse spaces)
+or rebuilt.
 
 Equations: docs/theory.md#linear-systems.
 """
@@ -85,14 +86,105 @@ class Update(IntEnum):
     REBUILD = 2  # coarse spaces too
 
 
-class Preconditioner:
-    """The preconditioner of one KSP, which is kept from tangent to tangent while it serves.
-
-    CG tells by itself where a tangent is indefinite.
+class AppliedPreconditioner:
+    """PETSc's preconditioner of a KSP, and what is applied in its place.
 
     Attributes:
         pc: PETSc's preconditioner of the whole body.
-        serving: what is applied: `pc`, the V cycle copied from it, or deflation around one of these.
+        serving: preconditioner that is applied: `pc`, the V cycle copied from it, or deflation around one of these.
+        vcycle: V cycle in single precision, copied from `pc`; None: PETSc's own is applied.
+    """
+
+    def __init__(
+        self, ksp: PETSc.KSP, options: PetscOptionSet, balance: Balance, policy: SolverPolicy, *, is_default: bool
+    ) -> None:
+        """`is_default`: whether the study chooses no preconditioner."""
+        self._ksp, self._options, self._balance, self._policy = ksp, options, balance, policy
+        self._is_default = is_default
+        self.pc = self.serving = ksp.getPC()
+        self.vcycle: SinglePrecisionVCycle | None = None
+        self._deflation: DeflatedPreconditioner | None = None
+
+    def change_kind(self, options: PetscOptions) -> None:
+        """Change options of `pc`, which has to be rebuilt after this."""
+        self._options.change(options)
+        self.pc.reset()
+        self.pc.setFromOptions()
+
+    def set_up(self, operators: TangentOperators, *, rebuild: bool, by_node_blocks: bool) -> None:
+        """Set up for the tangent of the next solve (collective).
+
+        Args:
+            operators: tangent.
+            rebuild: whether coarse spaces are made anew.
+            by_node_blocks: whether the finest level of PETSc's multigrid is smoothed by blocks of a node's dofs.
+        """
+        if rebuild:
+            self.pc.reset()
+        self.release_vcycle()
+        operators.set_on(self._ksp, self.pc)
+        if self._is_default and operators.blocks is not None:
+            from .multigrid.vcycle import create_vcycle
+
+            self.vcycle = create_vcycle(self.pc, operators.blocks, self._policy)
+        if self.vcycle is None and by_node_blocks and self.pc.getType() == "gamg":
+            self._smooth_by_node_blocks()
+
+    def _smooth_by_node_blocks(self) -> None:
+        # most products of a large body are with the finest level
+        finest = self.pc.getMGSmoother(self.pc.getMGLevels() - 1)
+        options = PETSc.Options(finest.getOptionsPrefix())
+        for key, value in NODE_BLOCK_OPTIONS.items():
+            options[key] = value
+        finest.setFromOptions()
+        for key in NODE_BLOCK_OPTIONS:
+            options.delValue(key)
+
+    @property
+    def may_deflate(self) -> bool:
+        """Whether fragments may be deflated: without inertia they hang by a residual stiffness."""
+        return self._is_default and self._balance.scheme.inertia and self.pc.getType() == "gamg"
+
+    def serve(self, operators: TangentOperators, *, new_fragments: bool) -> None:
+        """Choose `serving` for the tangent of the next solve (collective).
+
+        `new_fragments`: whether rigid motions of the present fragments are deflated, unless inertia holds them.
+        """
+        base = self.serving = self.pc if self.vcycle is None else self.vcycle.pc
+        if self.vcycle is not None:
+            self.vcycle.update_operator()
+        if new_fragments:
+            self.release_deflation()
+            if mass_stiffness_ratio(self._balance) <= self._policy.held_by_inertia:
+                from .deflation import create_deflation
+
+                self._deflation = create_deflation(self._balance, base, self._policy)
+        deflation = self._deflation
+        if deflation is None or deflation.base_pc is not base:
+            return
+        if deflation.update_operator(operators.matrix):
+            self.pc.setReusePreconditioner(True)
+            self.serving = deflation.pc
+
+    def release_vcycle(self) -> None:
+        """Free the V cycle."""
+        if self.vcycle is not None:
+            self.vcycle.destroy()
+            self.vcycle = None
+
+    def release_deflation(self) -> None:
+        """Free the deflation of fragments."""
+        if self._deflation is not None:
+            self._deflation.destroy()
+            self._deflation = None
+
+
+class Preconditioner:
+    """Preconditioner of a KSP that is reused for later tangents as long as iterations stay few.
+
+    Attributes:
+        applied: PETSc's objects.
+        is_indefinite: whether the last tangent was indefinite; CG detects that by itself.
     """
 
     is_indefinite = False
@@ -108,30 +200,36 @@ class Preconditioner:
         keeps: bool,
         has_block_products: bool,
     ) -> None:
-        """`is_default`: the study chooses no preconditioner; `keeps`: it serves more than one tangent, as factors do
-        not; `has_block_products`: products with the finest level are most of the work (collective)."""
-        self._ksp, self._options, self._balance, self._policy = ksp, options, balance, policy
-        self.pc = self.serving = ksp.getPC()
+        """Create the preconditioner (collective).
+
+        Args:
+            ksp: Krylov solver.
+            options: options of the solver.
+            balance: equations.
+            policy: tuned numbers.
+            is_default: whether the study chooses no preconditioner.
+            keeps: whether it is reused for later tangents, unlike factors.
+            has_block_products: whether products with the finest level are most of the work.
+        """
+        self._comm, self._balance, self._policy = ksp.comm, balance, policy
+        self.applied = AppliedPreconditioner(ksp, options, balance, policy, is_default=is_default)
         self._node_count = balance.domain.space.dofmap.index_map.size_global
-        self._is_default = is_default
         self._has_block_products = has_block_products
-        self._deflation: DeflatedPreconditioner | None = None
-        self._vcycle: SinglePrecisionVCycle | None = None
-        # --- facts that were told ---
-        self._iterations = self._equivalent = 0  # of the last solve, and those of one to full accuracy
+        # --- facts ---
+        self._iterations = self._equivalent = 0  # of the last solve, and of one to full accuracy
         self._edges_since_update = 0
         self._edges_since_rebuild = False
         self._ever_broken = False
         self._pattern_is_new = False
         self._looks_for_fragments = False  # before the next solve
-        # --- what they have led to ---
+        # --- decisions ---
         self._due, self._keeps = Update.REBUILD, keeps
         self._solves = 0  # since it was rebuilt
         self._fresh_iterations = 0  # of a solve when it was fresh; 0: unknown
         self._whole_iterations = 0  # of a fresh set-up while the body was whole
         self._extra_iterations = 0.0  # beyond the fresh ones since it was rebuilt
         self._extra_at_refresh = 0.0
-        # multigrid of another kind may take over for a body in fragments, which inertia has to hold
+        # whether multigrid of another kind is used for a body in fragments, which inertia has to hold
         self._may_suit_fragments = is_default and balance.scheme.inertia
         # iterations with aggregates of all links, while strong ones are on trial; 0: unknown; None: settled
         self._all_links_iterations: int | None = 0 if self._may_suit_fragments else None
@@ -142,34 +240,36 @@ class Preconditioner:
     # --- facts ---
 
     def edges_broke(self, count: int | None) -> None:
-        """So many edges broke on all ranks; None: an unknown number, as after a restart."""
+        """Record the number of edges that broke on all ranks; None: an unknown number, as after a restart."""
         self._ever_broken = self._looks_for_fragments = True
         self._edges_since_update += self._node_count if count is None else count
         self._edges_since_rebuild = self._edges_since_rebuild or count != 0
 
     def pattern_changed(self) -> None:
-        """The tangent is another matrix or has entries at other places."""
+        """Record that the tangent is another matrix or has another nonzero pattern."""
         self._pattern_is_new = True
 
     def solved(self, iterations: int, equivalent: int) -> None:
-        """The last solve took so many iterations; `equivalent`: a solve to full accuracy; 0: unknown.
+        """Record the iterations of the last solve, which may be told repeatedly.
 
-        May be told again of the same solve.
+        Args:
+            iterations: number of iterations.
+            equivalent: that of a solve to full accuracy; 0: unknown.
         """
         self._iterations, self._equivalent = iterations, equivalent
 
     def solve_failed(self) -> None:
-        """A solve failed. Smoothers of an older tangent need not be positive for this one."""
+        """Record that a solve failed: smoothers of an older tangent need not be positive for this one."""
         self._due = Update.REBUILD
 
     def bypassed(self) -> None:
-        """Another solver served meanwhile, and the tangent is another one."""
+        """Record that another solver was used, and that the tangent has changed since."""
         self._due = Update.REBUILD
-        self._release_vcycle()
+        self.applied.release_vcycle()
 
     @contextmanager
     def updated_for_each_tangent(self) -> Iterator[None]:
-        """Rebuilt for the first tangent, and refreshed for each that follows."""
+        """Context in which it is rebuilt for the first tangent and refreshed for each later one."""
         keeps, self._due, self._keeps = self._keeps, Update.REBUILD, False
         try:
             yield
@@ -179,27 +279,26 @@ class Preconditioner:
     # --- the decision ---
 
     def next_update(self) -> Update:
-        """What the facts so far ask for before the next solve; asking again gives the same answer (collective)."""
+        """Update that is due before the next solve; does not change the state (collective)."""
         return self._decide(counts_solve=False)
 
     def _decide(self, *, counts_solve: bool) -> Update:
-        """Decide what is done before the next solve, the only place where that is done (collective).
+        """Update that is due before the next solve: the only place that decides it (collective).
 
-        `counts_solve`: the solve is next, so that iterations of the last one are added to those since the set-up.
+        `counts_solve`: whether the solve follows, so that iterations of the last one are added to the sums.
         """
         policy, equivalent = self._policy, self._equivalent
         # Many edges broke.
         if self._edges_since_update > policy.refresh_edges * self._node_count:
             self._due = max(self._due, Update.REFRESH)
         if self._due == Update.NONE:
-            # SSOR is always set up, others where they serve one tangent; strong links or no smoothing may take over.
             self._learn_from_solve(equivalent)
-            if self._vcycle is not None and self._solves < policy.fresh_solves:
+            if self.applied.vcycle is not None and self._solves < policy.fresh_solves:
                 self._fresh_iterations = max(self._fresh_iterations, equivalent)
         # Too many iterations. Also where a refresh is due: coarse spaces from before a crack carry the motion of one
         # side to the other.
         fresh = self._fresh_iterations
-        if self._vcycle is None and fresh and equivalent > self._rebuild_ratio * fresh + 2:
+        if self.applied.vcycle is None and fresh and equivalent > self._rebuild_ratio * fresh + 2:
             self._due = Update.REBUILD
         # Factors and coarse spaces of another pattern would be written past the end of their arrays.
         if self._pattern_is_new:
@@ -208,7 +307,7 @@ class Preconditioner:
             return self._due
         # Iterations beyond the fresh ones have added up to what an update costs.
         self._solves += 1
-        if self._vcycle is None:
+        if self.applied.vcycle is None:
             if self._edges_since_update:
                 self._extra_iterations += max(equivalent - fresh, 0)
             if self._extra_iterations > policy.refresh_cost:
@@ -216,7 +315,7 @@ class Preconditioner:
         else:
             if equivalent > fresh > 0:
                 self._extra_iterations += self._iterations * (1 - fresh / equivalent)
-            factor = policy.thorough_cost_factor if self._vcycle.has_thorough_smoothing else 1.0
+            factor = policy.thorough_cost_factor if self.applied.vcycle.has_thorough_smoothing else 1.0
             if self._extra_iterations > factor * policy.vcycle_setup_cost:
                 self._due = Update.REBUILD
             elif (
@@ -225,13 +324,15 @@ class Preconditioner:
             ):
                 self._due = max(self._due, Update.REFRESH)
         # The step size calls for sweeps or for multigrid.
-        if self._uses_ssor is not None and self._uses_ssor != (self._inertia() > policy.sweeps_suffice):
+        if self._uses_ssor is not None and self._uses_ssor != (
+            mass_stiffness_ratio(self._balance) > policy.sweeps_suffice
+        ):
             self._uses_ssor, self._fresh_iterations = not self._uses_ssor, 0
             self._change_kind(SSOR_OPTIONS if self._uses_ssor else MULTIGRID_OPTIONS)
         return self._due
 
     def _learn_from_solve(self, equivalent: int) -> None:
-        """Learn from iterations of a solve since the last update how it serves, and change its kind if need be."""
+        """Change the kind of multigrid if the iterations of a solve since the last update were many (collective)."""
         if self._uses_ssor:
             self._due = Update.REFRESH
             return
@@ -247,8 +348,11 @@ class Preconditioner:
             self._due = max(self._due, Update.REFRESH)
 
     def _tries_other_links(self, equivalent: int) -> bool:
-        """Take strong links for a whole body that is slow to solve, all links again where these are no better; whether
-        the kind has changed."""
+        """Aggregate over strong links if an unbroken body is slow to solve, and undo that where it is no better.
+
+        Returns:
+            Whether the kind of aggregation has changed.
+        """
         all_links = self._all_links_iterations
         if all_links is None or not equivalent:
             return False
@@ -257,15 +361,14 @@ class Preconditioner:
         self._all_links_iterations = equivalent if is_worse and not all_links else (None if all_links else 0)
         if is_worse:
             self._uses_node_blocks = self._has_block_products
-            strong = STRONG_LINKS if self._ksp.comm.size == 1 else STRONG_LINKS_ON_RANKS
+            strong = STRONG_LINKS if self._comm.size == 1 else STRONG_LINKS_ON_RANKS
             self._change_kind(ALL_LINKS if all_links else strong)
             self._fresh_iterations = 0
         return is_worse
 
     def _suit_fragments(self) -> None:
-        """Aggregate without smoothing from here on, where inertia holds what hangs by a node or an edge
-        (collective)."""
-        if self._inertia() <= self._policy.held_by_inertia:
+        """Aggregate without smoothing from now on, if inertia holds fragments that hang by a node (collective)."""
+        if mass_stiffness_ratio(self._balance) <= self._policy.held_by_inertia:
             return
         self._may_suit_fragments = self._uses_node_blocks = self._uses_ssor = False
         self._rebuild_ratio = self._policy.rebuild_ratio_fragments
@@ -273,101 +376,50 @@ class Preconditioner:
 
     def _change_kind(self, options: PetscOptions) -> None:
         self._due = Update.REBUILD
-        self._options.change(options)
-        self.pc.reset()
-        self.pc.setFromOptions()
-
-    def _inertia(self) -> float:
-        return mass_stiffness_ratio(self._balance)
+        self.applied.change_kind(options)
 
     # --- setting up ---
 
     def update(self, operators: TangentOperators) -> None:
-        """Bring the preconditioner to the tangent of the next solve (collective).
-
-        SNES is not asked: it knows a fixed number of tangents between two set-ups only.
-        """
+        """Update the preconditioner to the tangent of the next solve (collective)."""
+        # SNES only knows a fixed number of tangents between two set-ups
         if self._decide(counts_solve=True) != Update.NONE:
-            operators.update_entries()  # which may tell of a new pattern
+            operators.update_entries()  # which may change the pattern
             self._set_up(operators, self._decide(counts_solve=False))
-        self._serve(operators)
+        new_fragments = self._looks_for_fragments and self.applied.may_deflate
+        self._looks_for_fragments = self._looks_for_fragments and not new_fragments
+        self.applied.serve(operators, new_fragments=new_fragments)
 
     def _set_up(self, operators: TangentOperators, update: Update) -> None:
-        if update == Update.REBUILD:
-            self.pc.reset()
+        rebuild = update == Update.REBUILD
+        if rebuild:
             self._fresh_iterations = self._solves = 0
             self._edges_since_rebuild = False
-        self._release_vcycle()
-        operators.set_on(self._ksp, self.pc)
-        self._vcycle = self._create_vcycle(operators)
-        if self._vcycle is None and self._uses_node_blocks and self.pc.getType() == "gamg":
-            self._smooth_by_node_blocks()
-        if update == Update.REBUILD or self._vcycle is None:
+        self.applied.set_up(operators, rebuild=rebuild, by_node_blocks=self._uses_node_blocks)
+        if rebuild or self.applied.vcycle is None:
             self._extra_iterations = 0.0
         self._extra_at_refresh = self._extra_iterations
         self._due, self._edges_since_update, self._pattern_is_new = Update.NONE, 0, False
         self._looks_for_fragments = self._ever_broken
 
-    def _create_vcycle(self, operators: TangentOperators) -> SinglePrecisionVCycle | None:
-        """The V cycle in single precision; None where PETSc's own is applied."""
-        if not self._is_default or operators.blocks is None:
-            return None
-        from .multigrid.vcycle import create_vcycle
-
-        return create_vcycle(self.pc, operators.blocks, self._policy)
-
-    def _smooth_by_node_blocks(self) -> None:
-        """Smooth the finest level by blocks of a node's dofs: most products of a large body are with that level."""
-        finest = self.pc.getMGSmoother(self.pc.getMGLevels() - 1)
-        options = PETSc.Options(finest.getOptionsPrefix())
-        for key, value in NODE_BLOCK_OPTIONS.items():
-            options[key] = value
-        finest.setFromOptions()
-        for key in NODE_BLOCK_OPTIONS:
-            options.delValue(key)
-
-    def _serve(self, operators: TangentOperators) -> None:
-        """Choose what is applied to the tangent of the next solve (collective)."""
-        base = self.pc if self._vcycle is None else self._vcycle.pc
-        self.serving = base
-        if self._vcycle is not None:
-            self._vcycle.update_operator()
-        if self._looks_for_fragments and self._may_deflate and self.pc.getType() == "gamg":
-            self.release_deflation()
-            self._looks_for_fragments = False
-            if self._inertia() <= self._policy.held_by_inertia:
-                from .deflation import create_deflation
-
-                self._deflation = create_deflation(self._balance, base, self._policy)
-        deflation = self._deflation
-        if deflation is None or deflation.base_pc is not base:
-            return
-        if deflation.update_operator(operators.matrix):
-            self.pc.setReusePreconditioner(True)
-            self.serving = deflation.pc
+    # --- the solver's side ---
 
     @property
-    def _may_deflate(self) -> bool:
-        """Whether fragments may be solved for by themselves: without inertia they hang by a residual stiffness."""
-        return self._is_default and self._balance.scheme.inertia
+    def pc(self) -> PETSc.PC:
+        """PETSc's preconditioner of the whole body."""
+        return self.applied.pc
+
+    @property
+    def serving(self) -> PETSc.PC:
+        """Preconditioner that is applied."""
+        return self.applied.serving
 
     @property
     def fine_level(self) -> FineLevel | None:
-        """The tangent of the next solve in single precision; None: it is not kept so."""
-        return None if self._vcycle is None else self._vcycle.fine_level
+        """Tangent of the next solve in single precision; None: there is none."""
+        return None if self.applied.vcycle is None else self.applied.vcycle.fine_level
 
     def destroy(self) -> None:
-        """Give back what was made of `pc`."""
-        self.release_deflation()
-        self._release_vcycle()
-
-    def _release_vcycle(self) -> None:
-        if self._vcycle is not None:
-            self._vcycle.destroy()
-            self._vcycle = None
-
-    def release_deflation(self) -> None:
-        """Give the memory of deflation back."""
-        if self._deflation is not None:
-            self._deflation.destroy()
-            self._deflation = None
+        """Free what was made of `pc`."""
+        self.applied.release_deflation()
+        self.applied.release_vcycle()
