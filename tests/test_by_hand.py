@@ -21,7 +21,7 @@ from fracsim.mesh.selectors import Group
 from fracsim.meshes.builders.box import Box
 from fracsim.solvers.nonlinear_solver import NonlinearSolver
 from fracsim.timestepping.implicit import ImplicitStepper
-from fracsim.timestepping.protocols import NoFracture, NoPlasticFlow
+from fracsim.timestepping.inelastic_update import NoFracture, NoPlasticFlow
 from fracsim.timestepping.step_sizes import StepSizes
 
 LENGTH, YOUNG, DENSITY = 2.0, 8.0, 2.0  # m, Pa, kg/m^3: waves of 2 m/s

@@ -80,7 +80,7 @@ class DamageSnapshot:
 
 
 class FracturePass:
-    """Weakens the edges that a criterion finds, and degrades their cells (timestepping.protocols).
+    """Weakens the edges that a criterion finds, and degrades their cells (timestepping.inelastic_update).
 
     Attributes:
         stress: stress of the body, with its damage fields.

@@ -55,7 +55,7 @@ POLICY = ReturnMappingPolicy()
 
 
 class ReturnMapping:
-    """Plastic flow of a step whose displacement is known (a protocol of timestepping.protocols).
+    """Plastic flow of a step whose displacement is known (a protocol of timestepping.inelastic_update).
 
     Attributes:
         stored: stored energy int psi dX after it, without damage, part of this rank, J.

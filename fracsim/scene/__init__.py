@@ -36,7 +36,7 @@ from ..solvers.weak_callbacks import collect_dropped_scenes  # noqa: E402
 from ..study import Study, TimeSettings, solver_options  # noqa: E402
 from ..study.check import build_checked_mesh  # noqa: E402
 from ..study.conditions import check_size, find_selector, initial_motion, obstacle_placements, step_size_function  # noqa: E402
-from ..timestepping.protocols import FractureProtocol, NoFracture, PlasticFlowProtocol  # noqa: E402
+from ..timestepping.inelastic_update import FractureProtocol, NoFracture, PlasticFlowProtocol  # noqa: E402
 from ..timestepping.state import State, initial_velocity  # noqa: E402
 from ..timestepping.step_sizes import StepSizes  # noqa: E402
 from ..timestepping.stepper import Stepper  # noqa: E402

@@ -13,7 +13,7 @@ from ..mesh.domain import Domain
 from ..study import BrittleSettings, Study
 from ..study.conditions import fibre_direction, initial_cracks
 from ..study.length_checks import check_branching_dimension
-from ..timestepping.protocols import NoPlasticFlow, PlasticFlowProtocol
+from ..timestepping.inelastic_update import NoPlasticFlow, PlasticFlowProtocol
 from .terms import per_cell
 
 Values = npt.NDArray[np.float64]

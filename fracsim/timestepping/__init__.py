@@ -7,7 +7,6 @@ quasi_static      load steps without inertia: equilibrium and fracture in turn
 explicit          steps without a system of equations
 step_sizes        bounds of the step, reduction after a failure, growth after success
 stable_time_step  bounds of the eigenfrequencies of cells, for explicit steps
-inelastic_update  plastic flow, fracture and history variables of a body
-protocols         interfaces of plastic flow and of fracture, and implementations of a body without them
+inelastic_update  plastic flow and fracture at the end of a step, their interfaces, history variables
 energy_balance    work, dissipation and stored energy of a step; forces released by fracture
 """

@@ -14,7 +14,7 @@ from mpi4py import MPI
 from ..mechanics.balance import Balance
 from ..solvers.newton import SolveResult
 from .energy_balance import StepEnergies, released_state
-from .protocols import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
+from .inelastic_update import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
 from .stable_time_step import EXPLICIT_STEP_POLICY, StableTimeStep, cell_frequencies
 from .state import State
 from .step_sizes import StepSizes

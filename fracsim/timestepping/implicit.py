@@ -11,7 +11,7 @@ from ..mechanics.balance import Balance
 from ..solvers.newton import SolveResult
 from ..solvers.nonlinear_solver import NonlinearSolver
 from .energy_balance import released_state
-from .protocols import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
+from .inelastic_update import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
 from .state import State
 from .step_sizes import StepSizes
 from .stepper import BalanceStepper

@@ -14,7 +14,7 @@ from mpi4py import MPI
 from ..solvers.newton import SolveResult
 from .energy_balance import StepEnergies, balanced_forces
 from .implicit import ImplicitStepper, sum_of_iterations
-from .protocols import PassResultProtocol
+from .inelastic_update import PassResultProtocol
 from .state import State
 from .stepper import StepReport
 

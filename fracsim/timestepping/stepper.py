@@ -22,8 +22,14 @@ from ..errors import StepAborted
 from ..mechanics.balance import Balance
 from ..solvers.newton import SolveResult
 from .energy_balance import NonFiniteState, StepEnergies, add_step_energies, balanced_forces, step_work
-from .inelastic_update import DamageListener, InelasticUpdate, StepTooLong
-from .protocols import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
+from .inelastic_update import (
+    DamageListener,
+    FractureProtocol,
+    InelasticUpdate,
+    PassResultProtocol,
+    PlasticFlowProtocol,
+    StepTooLong,
+)
 from .state import State
 from .step_sizes import StepSizes
 

@@ -181,7 +181,7 @@ class VirtualNodeBaseline:
         from ...mesh.domain import distribute
         from ...mesh.simplices import node_groups
         from ...scene import build_material, build_scene_on, make_stepper
-        from ...timestepping.protocols import NoFracture, NoPlasticFlow
+        from ...timestepping.inelastic_update import NoFracture, NoPlasticFlow
         from .virtual_nodes import duplicate_cut_cells
 
         began = time.perf_counter()
