@@ -5,17 +5,16 @@ A program that is not installed is left out, and the page says so.
 
 from __future__ import annotations
 
+import os
+import subprocess
 from importlib import import_module
 from typing import Any
 
 from ..report_section import Section
 from ..trial import Trial
 
-FAMILIES = (
-    "linear_step",
-    "phase_field",
-    "start_up",
-)  # by name: they are scripts as well, which are not to be imported before they run
+# by name: they are scripts as well, which must not be imported before they run
+FAMILIES = ("linear_step", "phase_field", "start_up")
 
 
 def _families() -> list[Any]:
@@ -31,3 +30,15 @@ def trials() -> list[Trial]:
 def sections(records: list[dict[str, Any]]) -> list[Section]:
     """Section for each program, even if it is not installed."""
     return [section for family in _families() for section in family.sections(records)]
+
+
+def working_python(variable: str, code: str) -> str | None:
+    """Python that an environment variable names, if it runs `code` without error; else None."""
+    given = os.environ.get(variable)
+    if not given:
+        return None
+    try:
+        done = subprocess.run([given, "-I", "-c", code], capture_output=True, timeout=120)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return given if done.returncode == 0 else None

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .interpreters import working_python
+from . import working_python
 
 VARIABLE = "AKANTU_PYTHON"
 ABSENT = f"Akantu is not installed here ({VARIABLE} names no Python that can import it)."

@@ -30,7 +30,7 @@ import numpy.typing as npt
 
 from ..report_section import ReportTable, Section, TableCell
 from ..trial import Trial
-from .interpreters import working_python
+from . import working_python
 
 VARIABLE = "PHASEFIELDX_PYTHON"
 ABSENT = f"PhaseFieldX is not installed here ({VARIABLE} names no Python that can import it)."
