@@ -203,6 +203,7 @@ def test_ties_beside_blocks_are_those_among_single_entries(dim: int) -> None:
     assert np.abs(found).max() > 1e-3
 
 
+@pytest.mark.fast_solver_only("blocks of a node, and a V cycle of our own")
 @pytest.mark.parametrize("dim", (2, 3))
 def test_ties_beside_blocks_are_in_products_and_in_the_cycle(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """As they are now, written out: also ties a hundred times as stiff as when multigrid was set up."""
@@ -348,9 +349,10 @@ def test_the_bound_on_their_frequency() -> None:
 
 
 @pytest.mark.parametrize("dim", [2, 3])
-def test_multigrid_knows_of_rotations_once_nodes_are_tied(dim: int) -> None:
+def test_multigrid_knows_of_rotations_once_nodes_are_tied(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Ties add entries to the matrix that multigrid is made of, by which PETSc forgets its near null space: all rigid
     motions are there once it is solved with."""
+    set_policy(monkeypatch, max_plain_direct_dofs=0)
     scene, state, _ = tied(dim, time={"scheme": "backward-euler", "step": 10.0, "end": 100.0}, solver={})
     state.advance()
     assert scene.solver is not None
