@@ -34,8 +34,8 @@ class Study(StudyTable):
     load: Deferred[LoadSettings] | None = key("Forces on the volume.", default=None)
     initial: Deferred[InitialSettings] | None = key("Velocity at the start.", default=None)
     solver: dict[str, OptionValue] = key(
-        "PETSc options by their names, without a dash. `plain = true`: PETSc and DOLFINx alone, without code that is "
-        "hand-written for speed.", factory=dict, example={"ksp_rtol": 1e-6}
+        "PETSc options by their names, without a dash. `plain = true`: DOLFINx alone assembles and PETSc alone solves, "
+        "without code that is hand-written for speed.", factory=dict, example={"ksp_rtol": 1e-6}
     )  # fmt: skip
     obstacle: list[Deferred[ObstacleSettings]] = key("Obstacles.", factory=list)
     body: list[Deferred[BodySettings]] = key("Rigid bodies.", factory=list)
