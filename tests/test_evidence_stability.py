@@ -250,9 +250,7 @@ def test_two_approaches_fail_and_chi_holds() -> None:
     assert rejected_approaches.judge(rejected_approaches.simulate("chi")) == "holds"
     projected = rejected_approaches.simulate("projected-stress")
     assert (
-        projected["loop"] > 0.1
-        and projected["peak"] > 10
-        and "energy from nowhere" in rejected_approaches.judge(projected)
+        projected["loop"] > 0.1 and projected["peak"] > 10 and "energy created" in rejected_approaches.judge(projected)
     )
     inverse = rejected_approaches.simulate("pseudo-inverse")
     assert inverse["rest_stress"] > 0.1 and inverse["lowest"] < -0.01 and inverse["jump"] > 1
@@ -312,7 +310,7 @@ def test_runs_that_nobody_vouches_for_may_end_unlike_and_are_named() -> None:
     warned = {"message": "fracsim: note: 3 cells are turned inside out"}
     lost = {"outcome": "not converged", "message": "fracsim: no solution at t = 1 s", "figures": {"finite": True}}
     (section,) = stability.sections([record("dt", "a", 1, **warned), record("dt", "a", 2, **lost)])
-    assert section.claims[3].holds and section.claims[3].measured.endswith("warn or give up: dt/a")
+    assert section.claims[3].holds and section.claims[3].measured.endswith("warn or do not converge: dt/a")
     assert section.tables[0].rows[0][3] is False
     (section,) = stability.sections([record("dt", "a", 1), record("dt", "a", 2, **lost)])
     assert section.claims[3].holds is False and "against it: dt/a" in section.claims[3].measured
@@ -332,7 +330,7 @@ def test_iterations_with_contact_stand_beside_those_without() -> None:
 def test_section_of_the_failed_approaches() -> None:
     figures = {"peak": 5.0, "rest_stress": 0.0, "loop": 1.0, "lowest": 0.0, "newton_failed_at": 0.1, "jump": 2.0}
     found = stability.sections([record("failed", "projected-stress", 1, figures=figures | {"reach": 1.0})])[1]
-    assert found.tables[0].rows[0][-1] == "fails: energy from nowhere, no solution, a cycle does work"
+    assert found.tables[0].rows[0][-1] == "fails: energy created, no solution, a cycle does work"
 
 
 def test_section_of_dependence() -> None:
@@ -417,7 +415,7 @@ def test_the_branches_of_a_crack() -> None:
     assert experiments.branch_angles(arms[0], 2e-3) is None
     stopped = np.concatenate([arms[0], arms[1][x < 0.03]])
     assert experiments.branch_angles(stopped, 2e-3) is None
-    first = experiments.branch_angles(stopped, 2e-3, experiments.FIRST)
+    first = experiments.branch_angles(stopped, 2e-3, experiments.FIRST_BRANCH_LENGTH)
     assert first is not None and first[0] == pytest.approx(0.02, abs=1e-3)
 
 

@@ -19,12 +19,12 @@ from .stability_measures import Figures, measure_run
 Values = npt.NDArray[np.float64]
 
 BARRIER_DISTANCE = (
-    1e-3  # m, of the barrier before obstacles: what a bar at 10 m/s falls in a hundred of the shortest steps
+    1e-3  # m, of the barrier before obstacles: the fall of a bar at 10 m/s in a hundred of the shortest steps
 )
 BAR_MASS = stability_studies.RUBBER["density"] * float(np.prod(stability_studies.BAR["size"]))  # kg, of the bar
 BALL_RADIUS = 0.25  # m, of the ball
-# m: contact is felt at points, and facets cut into a ball between them, where a crack may bring points to light; by
-# L^2 / (8 R) with L = sqrt(2) h, the longest edge of a face
+# m: contact acts at points, so that facets enter the ball between them by L^2 / (8 R), with L = sqrt(2) h the longest
+# edge of a face; a crack may create points there
 CHORD_HEIGHT = stability_studies.BAR["h"] ** 2 / (4 * BALL_RADIUS)
 SOFT_MODULUS = 1e7  # Pa
 
@@ -82,9 +82,9 @@ def pressed_shell(thickness: float, *, young: float = SOFT_MODULUS) -> stability
 def solid_stack() -> stability_studies.Data:
     """Study of the stack with a shell of 4 mm as one solid block."""
     _, study = shell_between_blocks(4e-3, 4e-3)
-    way = {"time": [0.0, 1.0], "value": [[0.0, 0.0, 0.0], [0.0, 0.0, -4e-3]]}
+    motion = {"time": [0.0, 1.0], "value": [[0.0, 0.0, 0.0], [0.0, 0.0, -4e-3]]}
     block = {"mesh": {"builder": "box", "size": [0.5, 0.5, 0.504], "h": 0.125}}
-    pressed = {"boundary": [{"on": "bottom", "fix": "xyz"}, {"on": "top", "displacement": way}]}
+    pressed = {"boundary": [{"on": "bottom", "fix": "xyz"}, {"on": "top", "displacement": motion}]}
     return without_contact(study) | block | pressed
 
 
@@ -144,13 +144,13 @@ def _box(size: tuple[float, ...], h: float, origin: tuple[float, ...] = ()) -> A
     return Box(size=size, h=h, origin=origin).build()
 
 
-def _join_meshes(*made: Any) -> Any:
+def _join_meshes(*meshes: Any) -> Any:
     """One mesh of bodies that share no node."""
     from ...meshes.data import MeshData
 
-    first = np.cumsum([0, *(len(item.points) for item in made)])
-    cells = [item.cells + number for item, number in zip(made, first, strict=False)]
-    return MeshData(np.concatenate([item.points for item in made]), np.concatenate(cells))
+    first = np.cumsum([0, *(len(item.points) for item in meshes)])
+    cells = [item.cells + number for item, number in zip(meshes, first, strict=False)]
+    return MeshData(np.concatenate([item.points for item in meshes]), np.concatenate(cells))
 
 
 MESH_STUDIES = {
@@ -162,7 +162,7 @@ MESH_STUDIES = {
 }
 
 
-# --- what is measured -----------------------------------------------------------------------------------------------
+# --- measures --------------------------------------------------------------------------------------------------------
 
 
 def measure_fall(run: Path) -> Figures:

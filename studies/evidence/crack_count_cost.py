@@ -37,7 +37,7 @@ WARM_UP_STEPS, TIMED_STEPS, BASELINE_STEPS = (
     5,
     3,
 )  # steps before timing, timed ones, and those of the baseline (10 times as dear)
-MAX_RATIO = 1.10  # what a step after 100 cuts may cost, over one before
+MAX_RATIO = 1.10  # of a step after 100 cuts over one before
 CYLINDER = {"builder": "cylinder", "radius": 0.05, "length": 0.3, "axis": "x"}
 WALL = {"builder": "box", "size": [2.0, 0.3, 1.5], "pattern": "unstructured"}
 SCENES: dict[str, dict[str, Any]] = {

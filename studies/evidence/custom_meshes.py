@@ -78,10 +78,10 @@ def _two_density_mesh() -> Any:
     """Mesh of a bar with the regions heavy and light."""
     from ...meshes.builders.box import Box
 
-    made = Box(size=(1.0, 0.25, 0.25), h=0.125).build()
-    heavy = np.flatnonzero(made.points[made.cells][:, :, 0].mean(axis=1) < 0.5)
-    light = np.setdiff1d(np.arange(len(made.cells)), heavy)
-    return replace(made, regions={"heavy": heavy, "light": light})
+    mesh = Box(size=(1.0, 0.25, 0.25), h=0.125).build()
+    heavy = np.flatnonzero(mesh.points[mesh.cells][:, :, 0].mean(axis=1) < 0.5)
+    light = np.setdiff1d(np.arange(len(mesh.cells)), heavy)
+    return replace(mesh, regions={"heavy": heavy, "light": light})
 
 
 def run_custom_mesh(make: Callable[[], tuple[Any, dict[str, Any]]]) -> None:

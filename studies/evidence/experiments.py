@@ -18,8 +18,8 @@ from .report_section import Claim, Picture, Plot, ReportTable, Section, Series, 
 from .trial import Trial
 
 GROUP = "experiments"
-FORK, MANY = 0.015, 4.0  # m over which branches are measured; edges by which they are apart
-FIRST = 0.003  # m over which the first two are seen, and within which those that are measured part
+BRANCH_LENGTH, BRANCH_DISTANCE = 0.015, 4.0  # m over which branches are measured; their least distance in edges
+FIRST_BRANCH_LENGTH = 0.003  # m over which the first branches are seen; the measured ones must start within it
 Record = dict[str, Any]
 Values = npt.NDArray[np.float64]
 Changes = dict[str, Any]
@@ -64,7 +64,7 @@ TENSION: Changes = {
         {"on": "bottom", "fix": "xy"},
         {"on": "top", "displacement": {"time": [0.0, 1.0], "value": [[0.0, 0.0], [0.0, 8e-6]]}},
     ],
-    "time": {"breaking_step": 0.001},  # one of 0.01 is 1.8 % of the peak, told by the last before it
+    "time": {"breaking_step": 0.001},  # a step of 0.01 is 1.8 % of the peak
 }
 PLATE_SIZES = ("h", (3e-5, 2e-5, 1.25e-5))
 BAR_SIZES = ("h_notch", (4e-4, 3e-4, 2.2e-4))
@@ -140,7 +140,7 @@ def _trial(experiment: Experiment, h: float) -> Trial:
     )  # fmt: skip
 
 
-# --- what is measured -----------------------------------------------------------------------------------------------
+# --- measures --------------------------------------------------------------------------------------------------------
 
 
 def measure_brazilian(run: Path) -> Record:
@@ -179,8 +179,8 @@ def measure_charpy_klst(run: Path) -> Record:
 def measure_notched_shear(run: Path) -> Record:
     """Load figures of the plate, along the axis with the larger motion of the grip."""
     rows = run_results.history(run)
-    way = {axis: float(np.abs(rows[f"motion_grip_{axis}"]).max()) for axis in "xy"}
-    return load_figures(rows, "grip", max(way, key=way.__getitem__))
+    displacement = {axis: float(np.abs(rows[f"motion_grip_{axis}"]).max()) for axis in "xy"}
+    return load_figures(rows, "grip", max(displacement, key=displacement.__getitem__))
 
 
 def measure_l_panel(run: Path) -> Record:
@@ -198,14 +198,14 @@ def measure_kalthoff(run: Path) -> Record:
 
 
 def measure_branching(run: Path) -> Record:
-    """Position and time of the final branching, angles of both branches (degrees) over FORK, and crack speed over c_R.
+    """Position and time of the final branching, angles of both branches (degrees), and crack speed over c_R.
 
-    `first` is the position of the first branching, of which one branch may have arrested.
+    Angles are those over BRANCH_LENGTH. `first` is the position of the first branching; its branches may have arrested.
     """
     size, centres = crack_faces(run)
     (x0, y0), rows = run_results.study(run)["crack"][0]["segment"][1], run_results.history(run)
-    places, apart = centres[:, :2] - [x0, y0], MANY * float(np.median(size))
-    outcome, first = branch_angles(places, apart), branch_angles(places, apart, FIRST)
+    places, apart = centres[:, :2] - [x0, y0], BRANCH_DISTANCE * float(np.median(size))
+    outcome, first = branch_angles(places, apart), branch_angles(places, apart, FIRST_BRANCH_LENGTH)
     if outcome is None or first is None:
         return {"fork": None, "pieces": float(rows["pieces"][-1])}
     x, upper, lower = outcome
@@ -217,7 +217,7 @@ def measure_branching(run: Path) -> Record:
     return figures | {"speed": x / float(there - begun) / rayleigh, "pieces": float(rows["pieces"][-1])}
 
 
-def branch_angles(places: Values, apart: float, over: float = FORK) -> tuple[float, float, float] | None:
+def branch_angles(places: Values, apart: float, over: float = BRANCH_LENGTH) -> tuple[float, float, float] | None:
     """Position and angles (degrees) of the final branching of crack faces (n, 2) from a notch at 0 along x.
 
     Args:
@@ -259,17 +259,17 @@ def load_figures(rows: dict[str, Values], pushed: str, axis: str) -> Record:
     `second`: load after the first peak, which is inertia under impact. `plateau`: median over the second half of the
     displacement. `at` and `travel`: displacement since contact at the peak and at the end, m.
     """
-    load, way, touched = load_path(rows, pushed, axis)
+    load, displacement, contact_start = load_path(rows, pushed, axis)
     return {
         "peak": float(load.max()),
-        "at": float(way[load.argmax()]) - touched,
+        "at": float(displacement[load.argmax()]) - contact_start,
         "second": second_peak(load),
-        "plateau": float(np.median(load[way >= (touched + way[-1]) / 2])),
+        "plateau": float(np.median(load[displacement >= (contact_start + displacement[-1]) / 2])),
         "last": float(load[-1]),
         "absorbed": float(rows[f"work_{pushed}" if f"work_{pushed}" in rows else "external_work"][-1]),
-        "travel": float(way[-1]) - touched,
+        "travel": float(displacement[-1]) - contact_start,
         "pieces": float(rows["pieces"][-1]),
-        "curve": [[float(value) for value in item] for item in downsample(way, load)],
+        "curve": [[float(value) for value in item] for item in downsample(displacement, load)],
     }
 
 
@@ -278,11 +278,11 @@ def load_path(rows: dict[str, Values], pushed: str, axis: str) -> tuple[Values, 
 
     For a grip that displacement is 0. For an obstacle, displacements count from its initial position.
     """
-    held, way = f"reaction_{pushed}_{axis}", np.abs(rows[f"motion_{pushed}_{axis}"])
+    held, displacement = f"reaction_{pushed}_{axis}", np.abs(rows[f"motion_{pushed}_{axis}"])
     if held in rows:
-        return np.abs(rows[held]), way, 0.0
-    load, way = np.abs(rows[f"contact_{pushed}_{axis}"]), way - way[0]
-    return load, way, float(way[np.flatnonzero(load)[0]]) if load.any() else 0.0
+        return np.abs(rows[held]), displacement, 0.0
+    load, displacement = np.abs(rows[f"contact_{pushed}_{axis}"]), displacement - displacement[0]
+    return load, displacement, float(displacement[np.flatnonzero(load)[0]]) if load.any() else 0.0
 
 
 def second_peak(load: Values) -> float:
@@ -291,41 +291,42 @@ def second_peak(load: Values) -> float:
     return float(after[int(np.argmax(after - np.minimum.accumulate(after)))])
 
 
-def downsample(way: Values, load: Values, most: int = 150) -> tuple[Values, Values]:
+def downsample(displacement: Values, load: Values, most: int = 150) -> tuple[Values, Values]:
     """About `most` points of a curve, with its peak and its end."""
     rows = np.unique([*np.arange(0, len(load), max(1, len(load) // most)), int(load.argmax()), len(load) - 1])
-    return way[rows], load[rows]
+    return displacement[rows], load[rows]
 
 
 # --- the page -------------------------------------------------------------------------------------------------------
 
 COLUMNS = (
     "experiment", "h, m", "outcome", "first peak, N", "second, N", "plateau, N", "last, N", "over reference",
-    "absorbed, J", "way of what pushes, m", "pieces",
+    "absorbed, J", "displacement of the load, m", "pieces",
 )  # fmt: skip
 RANGE_COLUMNS = ("experiment", "meshes", "peak, N", "spread", "reference, N", "off by", "source")
 TEXT = (
-    "Each on three meshes, all but one in 2D with the thickness of the specimen. The disk splits along its loaded"
-    " diameter at pi D t f_t / 2. Charpy and Izod bars in plane strain: A516 takes a fracture energy and snaps; "
-    "its first peak is the inertia of the bar that the striker sets in motion, so that it is the second, while "
-    "the crack begins, that compares with the static load. NVE 36 flows and bends at a load that stays: linear "
-    "triangles in plane strain lock in plastic flow, so that it lies above the limit load. KLST is of hardened "
-    "steel whose yield stress is a handbook's, not fitted. The load at which the notched plate in shear begins to"
-    " break is that of a kink at 70.5 degrees (Erdogan and Sih 1963), from the stiffness k(a) of plates with "
-    "longer and shorter cracks. The pane of glass is that of Borden et al. (2012), whose crack branches once; "
-    "branches are measured over the 15 mm after they part, along the outermost cracks, and have to be the first "
-    "two: where one of those stops they do not count. The panel of concrete (l-panel) has Winkler's modulus and "
-    "strength and G_c = 90 J/m^2 (Wu 2017); by the end the measured curve has taken 117 J/m^2 of its section, and"
-    " it begins at 0.64 of the stiffness of that modulus, which another program finds to be as here: it would be "
-    "that of 17.3 GPa (6.92 kN at 0.20 mm then). The cylinder of granite is in space: 0.2 m across, seven times "
-    "its process zone, and 50 mm long. At the peak a single crack covers three quarters of the section along its "
-    "loaded diameter within 20 microseconds. It stops some 2 h before either platen, where what a platen presses "
-    "on (a facet, at this h) is pressed together sideways, too; and while the halves part, others begin there by "
-    "strength, as in the disk, but they lie close together and crush the ends; nor does it help that a cell that "
-    "a crack cuts loses the pressure along it (1.1 to 1.3 sigma^2 h / 2 E that a sharp crack does not release). "
-    "With 12.5 mm, where 0.32 of all crack faces are along the loaded diameter in the end, it is 0.22 between "
-    "jaws of 1.5 times the radius, 0.34 where the sides of a crack press on each other (3 pieces, not 6) and 0.32"
-    " with steps of 1 microsecond. The other papers' own curves are pictures and could not be laid beside these."
+    "Each on three meshes, all but one in 2D with the thickness of the specimen. The disk splits along its loaded "
+    "diameter at pi D t f_t / 2. Charpy and Izod bars are in plane strain. A516 has a fracture energy and breaks in a "
+    "brittle way. Its first peak is the inertia of the bar at impact; the second, at the start of the crack, compares "
+    "with the static load. NVE 36 yields and bends at a nearly constant load. Linear triangles lock in plane plastic "
+    "flow, so that this load lies above the limit load. KLST is of hardened steel with a yield stress from a handbook, "
+    "not fitted. The notched plate in shear starts to break at the load of a kink at 70.5 degrees (Erdogan and Sih "
+    "1963), from the stiffness k(a) of plates with longer and shorter cracks. The glass plate is that of Borden et al. "
+    "(2012), whose crack branches once. Branches are measured over 15 mm along the outermost cracks; they must be the "
+    "first two, and do not count if one of those arrests. The concrete panel (l-panel) has Winkler's modulus and "
+    "strength and G_c = 90 J/m^2 (Wu 2017). The measured panel absorbed 117 J/m^2 of its section in the end. Its "
+    "initial stiffness is 0.64 of that with the given modulus, which another program confirms; it would fit 17.3 GPa "
+    "(then 6.92 kN at 0.20 mm). The granite cylinder is in 3D: 0.2 m in diameter, seven times its process zone, and "
+    "50 mm long. At the peak a single crack covers three quarters of the section along its loaded diameter within 20 "
+    "microseconds. It stops about 2 h before either platen, where the material under the platen (one facet at this h) "
+    "is compressed laterally, too. While the halves separate, other cracks start there by strength, as in the disk; "
+    "they are close together and crush the ends. Removing the pressure along the crack from cut cells does not help "
+    "(1.1 to 1.3 sigma^2 h / 2 E, which a sharp crack does not release). With 12.5 mm 0.32 of all crack faces "
+    "lie along "
+    "the loaded diameter at the end; 0.22 between jaws of 1.5 times the radius, 0.34 where crack faces carry pressure "
+    "(3 pieces, not 6), and 0.32 with steps of 1 microsecond. Curves of the other papers are available as "
+    "pictures only "
+    "and are not compared."
 )
 
 
@@ -391,7 +392,7 @@ def _panel_claim(records: list[Record]) -> Claim:
     outcome = [r["figures"] for r in records if r["case"] == panel.case and r["outcome"] == "done"]
     off = [item["peak"] / panel.peak - 1 for item in outcome]
     return Claim(
-        "A panel of concrete carries at most a tenth more or less than was measured, on three meshes",
+        "The peak of a concrete panel is within a tenth of the measured one on three meshes",
         _format_values(off, "{:+.1%}"),
         all(abs(item) <= (panel.within or 0.0) for item in off) if len(off) == 3 else None,
     )  # fmt: skip
@@ -404,16 +405,18 @@ def _notch_claims(records: list[Record]) -> tuple[Claim, ...]:
             for case in (plate.case, "kalthoff", "branching")}  # fmt: skip
     off = [outcome["peak"] / plate.peak - 1 for outcome in done[plate.case]]
     forks = [outcome for outcome in done["branching"] if outcome["fork"] is not None]
-    on = [abs(outcome["fork"] - outcome["first"]) < FIRST for outcome in forks]  # the first two, not later ones
+    on = [
+        abs(outcome["fork"] - outcome["first"]) < FIRST_BRANCH_LENGTH for outcome in forks
+    ]  # the first two branches, not later ones
     askew = [outcome["upper"] - outcome["lower"] if runs else np.inf for outcome, runs in zip(forks, on, strict=True)]
     angles = [outcome["angle"] for outcome in done["kalthoff"] if outcome["angle"] is not None]
     return (
         Claim("A notched plate in tension breaks within 3 % of Griffith's load on three meshes",
               _format_values(off, "{:+.1%}"),
               all(abs(item) <= (plate.within or 0.0) for item in off) if len(off) == 3 else None),
-        Claim("Kalthoff's crack goes at 65 to 75 degrees on three meshes", _format_values(angles, "{:.0f}"),
+        Claim("Kalthoff's crack grows at 65 to 75 degrees on three meshes", _format_values(angles, "{:.0f}"),
               all(65 <= angle <= 75 for angle in angles) if len(angles) == 3 else None),
-        Claim("A pane's crack branches on three meshes, symmetric within 10 degrees (inf: one branch stops)",
+        Claim("A pane's crack branches on three meshes, symmetric within 10 degrees (inf: one branch arrests)",
               _format_values(askew, "{:+.0f}"),
               all(abs(item) <= 10 for item in askew) and len(forks) == 3 if len(done["branching"]) == 3 else None),
     )  # fmt: skip
@@ -449,9 +452,9 @@ def _steel_claims(A516: list[Record], NVE36: list[Record]) -> tuple[Claim, ...]:
     stays = [record["figures"]["last"] / record["figures"]["plateau"] for record in NVE36]
     both = len(A516) == 6 and len(NVE36) == 6
     return (
-        Claim("A516 drops below 0.4 of what it has carried, Charpy and Izod", _format_values(left, "{:.2f}"),
+        Claim("The load of A516 falls below 0.4 of its peak, Charpy and Izod", _format_values(left, "{:.2f}"),
               all(item <= 0.4 for item in left) if both else None),
-        Claim("NVE 36 bends, and goes on carrying 0.8 of it and more", _format_values(stays, "{:.2f}"),
+        Claim("NVE 36 bends and still carries at least 0.8 of its plateau", _format_values(stays, "{:.2f}"),
               all(stay > 0.8 for stay in stays) if both else None),
     )  # fmt: skip
 
@@ -471,9 +474,9 @@ def _load_plot(records: list[Record], case: str) -> Plot:
     experiment, series, farthest = BY_CASE[case], [], 0.0
     for record in records:
         if _has_curve(record, case):
-            way, load = record["figures"]["curve"]
-            series.append(Series(record["name"], tuple(way), tuple(load), style="line"))
-            farthest = max(farthest, way[-1])
-    way, load = published_results.MEASURED.get(case, ((0.0, farthest), (experiment.peak, experiment.peak)))
-    line = Series(experiment.source, way, load, style="reference")
-    return Plot(f"{case}: load over the way of the {experiment.pushed}", "m", "N", (*series, line))
+            displacement, load = record["figures"]["curve"]
+            series.append(Series(record["name"], tuple(displacement), tuple(load), style="line"))
+            farthest = max(farthest, displacement[-1])
+    displacement, load = published_results.MEASURED.get(case, ((0.0, farthest), (experiment.peak, experiment.peak)))
+    line = Series(experiment.source, displacement, load, style="reference")
+    return Plot(f"{case}: load over displacement of the {experiment.pushed}", "m", "N", (*series, line))

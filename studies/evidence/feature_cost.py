@@ -29,12 +29,12 @@ from .report_section import Claim, Plot, ReportTable, Section, Series, TableCell
 from .trial import Trial
 
 WARM, STEPS = 3, 12
-# begun anew, up to so many steps, as long as the quartiles of the ratio are further apart than this share of it
-STEADY, MOST = 0.08, 36
+# blocks of steps are repeated, up to MAX_STEPS, while the quartiles of the ratio differ by more than this share of it
+MAX_QUARTILE_RANGE, MAX_STEPS = 0.08, 36
 SMALL_N, LARGE_N = 10, 20  # cells along a metre: 24k and 192k tetrahedra
-LIMIT = 1.05  # what the elastic bar may cost over the bare loop
-DAMAGE: dict[str, Any] = {"fracture": {"strength": 4e6}}  # the bar is never stressed enough to break by itself
-# a tangent and an exact solve for every iteration, as the bench has: where these are spared depends on the scene
+MAX_RATIO = 1.05  # of the elastic bar over the bare loop
+DAMAGE: dict[str, Any] = {"fracture": {"strength": 4e6}}  # above the stress of the bar
+# a tangent and an exact solve in every iteration, as in the bench; otherwise savings would depend on the scene
 EXACT: dict[str, Any] = {"solver": {"snes_type": "newtonls", "ksp_rtol": 1e-5}}
 YIELDING_EVERYWHERE: dict[str, Any] = {"solver": None, "plasticity": {"yield_stress": 2e3, "hardening": 1e5}}
 FRACTURE_MODULES = (
@@ -52,13 +52,13 @@ OPTIONAL = (
     *FRACTURE_MODULES, *CONTACT_MODULES, *PLASTIC_MODULES, AVERAGE, BRITTLE, "forms.damage", "forms.crack_closure",
     "report",
 )  # fmt: skip
-NEAR_NOTHING = 1.03  # what an obstacle that touches nothing may cost, at 192k tetrahedra
+MAX_OBSTACLE_RATIO = 1.03  # of an obstacle without contact, at 192k tetrahedra
 OTHER_CASES = {
     "faces": self_contact_cost,
     "solvers": solver_comparison,
     "steps": fracture_step_cost,
-}  # by their case: what touches flat, solvers, hard steps
-YIELDING = 1.30  # what flow everywhere may cost over the elastic bar
+}  # by their case
+MAX_YIELDING_RATIO = 1.30  # of plastic flow in all cells over the elastic bar
 
 
 @dataclass(frozen=True)
@@ -99,12 +99,11 @@ def feature_scenes(n: int) -> dict[str, FeatureScene]:
         "average": FeatureScene(near, average),
         "average-cut": FeatureScene(near, average, cut=True),
         "surface": FeatureScene(DAMAGE | {"output": {"surface": True}}, (*FRACTURE_MODULES, *SURFACE), cut=True),
-        # all with as many Newton iterations as they need; every cell yields after a few steps
+        # converged Newton iterations in all; every cell yields after a few steps
         "newton": FeatureScene({"solver": None}),
         "tangents": FeatureScene(EXACT),
         "plasticity": FeatureScene(YIELDING_EVERYWHERE | EXACT, PLASTIC_MODULES, baseline="tangents"),
-        # the forces of the elastic bar, which its residual is measured by, grow: it comes to keep its tangent, and to
-        # need one iteration only
+        # the elastic bar's forces, which scale its residual, grow: later it keeps its tangent and needs one iteration
         "plasticity-later": FeatureScene(YIELDING_EVERYWHERE, PLASTIC_MODULES, baseline="newton", first=30),
         "brittle": FeatureScene(
             DAMAGE | {"brittle": {"surfaces": 10}}, (*FRACTURE_MODULES, BRITTLE), needs="brittle"
@@ -200,7 +199,7 @@ def start_run(name: str, n: int, folder: Path) -> Any:
 
 def measure_alone(name: str, n: int, began: float) -> dict[str, Any]:
     """Start-up time, modules, fields and memory of a scene in this process."""
-    from ... import run, scene  # noqa: F401  what every run imports: memory is counted from here
+    from ... import run, scene  # noqa: F401  imports of every run: memory is counted from here
 
     before = _process_memory("VmRSS")
     with tempfile.TemporaryDirectory() as folder:
@@ -211,7 +210,7 @@ def measure_alone(name: str, n: int, began: float) -> dict[str, Any]:
             started_.step()
         frame = time_call(started_.comm, started_.write_frame)
         cells = started_.scene.domain.cell_count
-        own = ("fracsim.studies", "fracsim.report")  # those of this script
+        own = ("fracsim.studies", "fracsim.report")  # imported by this script
         modules = sorted(name for name in sys.modules if name.startswith("fracsim.") and not name.startswith(own))
         fields = _function_memory()
     memory = (_process_memory("VmHWM") - before) / cells
@@ -247,7 +246,7 @@ def time_in_turn(name: str, n: int) -> dict[str, Any]:
     """Seconds per step of a scene and of the scene it is compared with, one step of each in turn."""
     pairs: list[tuple[float, float]] = []
     ratio, spread = 1.0, float("inf")
-    while spread > STEADY / 2 * ratio and len(pairs) < MOST:
+    while spread > MAX_QUARTILE_RANGE / 2 * ratio and len(pairs) < MAX_STEPS:
         block, newton = _time_block(name, n)
         pairs += block
         ratios = [a / b for a, b in pairs]
@@ -321,25 +320,25 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     base = _modules_of_elastic(records)
     rows = tuple(_row(record, base) for record in records)
     text = (
-        f"Medians of the {STEPS} steps after the first {WARM}, run anew up to {MOST} of them as long as the quartiles "
-        f"of the ratio are more than {STEADY:.0%} apart; each timed in turn with a step of what it is compared with in "
-        "one process; ratio: the median of those of single steps; ± half the distance between the quartiles; Newton: "
-        "iterations of both in the last step. The elastic scene is compared with the same loop written bare in "
-        "DOLFINx, with fracsim's assembly of the tangent, without and with the energy that every run records; "
-        "'plasticity' (every cell yields) with 'tangents', "
-        "the elastic scene with as many Newton iterations as a step needs, and a tangent for each of them, which both "
-        "do there. As the program has it ('plasticity-later' over 'newton') the elastic bar, whose forces grow while "
-        "flow bounds the others, comes to keep its tangent, and to need one iteration less for the same relative "
-        "residual: that price of flow is the solver's. 'cut': a plane through "
-        "the middle is broken. 'frame': writing one frame, which no step contains. Start-up: from the first import to "
-        "the end of the first step, kernels compiled before."
+        f"Medians of the {STEPS} steps after the first {WARM}, repeated up to {MAX_STEPS} steps while the quartiles of "
+        f"the ratio differ by more than {MAX_QUARTILE_RANGE:.0%}. Each step is timed in turn with one of the "
+        f"scene it is "
+        "compared with. Ratio: median over single steps; ±: half the distance between the quartiles. Newton: "
+        "iterations "
+        "of both in the last step. The elastic scene is compared with the same loop in DOLFINx alone, with fracsim's "
+        "assembly of the tangent, without and with the energy that every run records. 'plasticity' (every cell yields) "
+        "is compared with 'tangents': the elastic scene with converged Newton iterations and a tangent in each, as in "
+        "'plasticity'. With default settings ('plasticity-later' over 'newton') the forces of the elastic bar grow, so "
+        "that it keeps its tangent and needs one iteration less for the same relative residual. 'cut': a plane through "
+        "the middle is broken. 'frame': time to write one frame, which is not part of a step. Start-up: from the first "
+        "import to the end of the first step, with compiled kernels."
     )
     plot = Plot(
         "Seconds per step over those of the scene compared with",
-        "scene, in the order of the table", "ratio", _bars(records), levels=(1.0, LIMIT),
+        "scene, in the order of the table", "ratio", _bars(records), levels=(1.0, MAX_RATIO),
     )  # fmt: skip
     table = ReportTable("ladder", "What each feature costs", columns, rows)
-    title = "Ladder: the cost of what is used, and of what is not"
+    title = "Cost of features, used and unused"
     first = Section(title, text, _claims(records), (table,), (plot,))
     return [first, *(OTHER_CASES[case].section(results) for case, results in by_itself.items() if results)]
 
@@ -384,27 +383,27 @@ def _claims(records: list[dict[str, Any]]) -> tuple[Claim, ...]:
         if "modules" in record["figures"]
     }
     extra = "; ".join(f"{name}: {', '.join(modules)}" for name, modules in results.items() if modules)
-    none = f"{len(results)} scenes, none imports the modules of another's feature"
+    none = f"{len(results)} scenes, none imports modules of an unused feature"
     return (
         _ratio_claim(
-            "Features that are off cost at most 5 % of a step (elastic scene over a bare loop that records its energy)",
+            "Unused features cost at most 5 % of a step (elastic scene over a bare loop that records its energy)",
             records,
             "elastic-recorded",
-            LIMIT,
+            MAX_RATIO,
         ),
         _ratio_claim(
-            "Yielding everywhere adds at most 30 % to a step of as many iterations and tangents",
+            "Plastic flow in all cells adds at most 30 % to a step with the same iterations and tangents",
             records,
             "plasticity",
-            YIELDING,
+            MAX_YIELDING_RATIO,
         ),
         _ratio_claim(
-            "An obstacle that touches nothing adds at most 3 % to a step at 192k tetrahedra",
+            "An obstacle without contact adds at most 3 % to a step at 192k tetrahedra",
             [record for record in records if record["settings"]["n"] == LARGE_N],
             "obstacle",
-            NEAR_NOTHING,
+            MAX_OBSTACLE_RATIO,
         ),
-        Claim("A feature that is off imports nothing", extra or none, not extra if results else None),
+        Claim("An unused feature imports nothing", extra or none, not extra if results else None),
     )
 
 

@@ -67,7 +67,7 @@ def _strength_trial(name: str, pattern: str, h: float, radius: float) -> Trial:
     )  # fmt: skip
 
 
-# --- what is measured -----------------------------------------------------------------------------------------------
+# --- measures --------------------------------------------------------------------------------------------------------
 
 
 def measure_bar(run: Path) -> Record:
@@ -154,12 +154,12 @@ def sections(records: list[Record]) -> list[Section]:
     rows = tuple(_row(record) for record in records)
     text = (
         "A bar pulled along its length and a plate pulled upwards, both with a slit, in plane strain and for a "
-        "thickness of 1 m, on five meshes. Cracks follow mesh edges: with radius 0 the peak load falls as the cells "
-        "at the tip get smaller, since an elastic stress there has no bound; a radius of two coarse cells gives the "
-        "stress a length of its own. With fracture.energy (plate-energy: the slit is a [[crack]], 350 J/m2) the crack"
-        " advances where it releases that energy. Stray is the mean distance of the new surface from the plane of the"
-        " slit. The broken area counts every crack, also those beside the one that parts the body. Spread is (max - "
-        "min) / mean over the meshes, as found."
+        "thickness of 1 m, on five meshes. Cracks follow mesh edges. With radius 0 the peak load falls with the cell "
+        "size at the tip, since the elastic stress there is singular. A radius of two coarse cells introduces a length "
+        "scale. With fracture.energy (plate-energy: the slit is a [[crack]], 350 J/m2) the crack advances where it "
+        "releases that energy. Stray is the mean distance of the new surface from the plane of the slit. The broken "
+        "area counts all cracks, including those that do not separate the body. Spread is (max - min) / mean over the "
+        "meshes."
     )
     tables = (
         ReportTable(

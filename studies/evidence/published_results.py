@@ -16,12 +16,12 @@ Record = dict[str, Any]
 
 CASE = "notched-tension"
 COLUMNS = ("single-edge notched tension, 1 mm, 2.7 kJ/m2", "h, m", "peak, N", "at, m", "stiffness, N/m")
-# figures that were collected for this project beforehand; the paper's curve itself was not laid beside
+# published figures; the curve of the paper is not compared
 PUBLISHED_ROWS: tuple[tuple[TableCell, ...], ...] = (
     ("phase field (Miehe et al. 2010)", None, 701.0, 5.55e-6, "1.37e8 to 1.42e8"),
     ("Griffith, sharp crack", None, 645.0, 4.56e-6, None),
 )
-# way of the load, mm, and the load, N
+# displacement, mm, and load, N
 PANEL_CURVE = (
     (0.0, 6.4), (0.0498, 2014.9), (0.0956, 4016.3), (0.1207, 5000.9), (0.1359, 5584.3), (0.1483, 5998.9),
     (0.1609, 6400.6), (0.1713, 6707.5), (0.1839, 6991.8), (0.1925, 7132.9), (0.2008, 7209.8), (0.2078, 7219.1),
@@ -30,7 +30,9 @@ PANEL_CURVE = (
     (0.4992, 2477.4), (0.5476, 2162.7), (0.5986, 1910.6), (0.6982, 1545.1), (0.7988, 1282.5), (0.8990, 1100.4),
     (1.0003, 1040.5),
 )  # fmt: skip
-MEASURED = {"l-panel": (tuple(way * 1e-3 for way, _ in PANEL_CURVE), tuple(load for _, load in PANEL_CURVE))}
+MEASURED = {
+    "l-panel": (tuple(displacement * 1e-3 for displacement, _ in PANEL_CURVE), tuple(load for _, load in PANEL_CURVE))
+}
 
 
 def table(records: list[Record]) -> tuple[ReportTable, ...]:
@@ -38,18 +40,18 @@ def table(records: list[Record]) -> tuple[ReportTable, ...]:
     done = [r for r in records if r["case"] == CASE and r["outcome"] == "done" and "curve" in r["figures"]]
     ours = [(f"{CASE}, {r['name']}", r["settings"]["h"], *curve_figures(*r["figures"]["curve"])) for r in done]
     return (
-        (ReportTable("published", "The notched plate beside others' results", COLUMNS, (*ours, *PUBLISHED_ROWS)),)
+        (ReportTable("published", "Notched plate: fracsim and published results", COLUMNS, (*ours, *PUBLISHED_ROWS)),)
         if ours
         else ()
     )
 
 
-def curve_figures(way: list[float], load: list[float]) -> tuple[float, float, float]:
+def curve_figures(displacement: list[float], load: list[float]) -> tuple[float, float, float]:
     """Peak (N), displacement at the peak (m) and stiffness (N/m) of a load curve.
 
     The stiffness is the slope of a line fitted up to half the peak. Displacements count from the zero of that line.
     """
-    moved, borne = np.array(way), np.array(load)
-    rise = np.flatnonzero((np.arange(len(borne)) < borne.argmax()) & (borne < borne.max() / 2))
-    slope, offset = np.polyfit(moved[rise], borne[rise], 1)
-    return float(borne.max()), float(moved[borne.argmax()] + offset / slope), float(slope)
+    u, force = np.array(displacement), np.array(load)
+    rise = np.flatnonzero((np.arange(len(force)) < force.argmax()) & (force < force.max() / 2))
+    slope, offset = np.polyfit(u[rise], force[rise], 1)
+    return float(force.max()), float(u[force.argmax()] + offset / slope), float(slope)

@@ -270,12 +270,13 @@ def section(records: list[dict[str, Any]]) -> Section:
     text = (
         "Section 6 of the supplement of Mandal et al. 2022, repeated: a pulled 2D bar of Saint Venant-Kirchhoff "
         "rubber, half of a cross-section broken, then all of it, without load from the first break on. From then on no "
-        "kinetic energy may exceed what was stored. The pseudo-inverse of edge lengths takes a cell with a broken edge "
-        "for deformed while it is at rest; the projected stress has no energy, so that a closed cycle does work and "
-        "the bar flies apart. Projecting Green's strain, which fracsim refuses beside nonlinear energies, holds in "
-        "this small bar. The degraded energy `chi` is what fracsim does."
+        "kinetic energy may exceed the stored energy. With the pseudo-inverse of edge lengths a cell with a "
+        "broken edge "
+        "is strained at rest. The projected stress has no energy, so that a closed cycle does work and the bar gains "
+        "energy. Projecting Green's strain, which fracsim refuses beside nonlinear energies, holds in "
+        "this small bar. fracsim uses the degraded energy `chi`."
     )
-    name = "Two failed approaches"
+    name = "Two rejected approaches"
     return Section(name, text, tables=(ReportTable("failed-approaches", "After the break", columns, tuple(rows)),))
 
 
@@ -285,7 +286,7 @@ def judge(figures: dict[str, Any]) -> str:
         return "not run to its end"
     reasons = []
     if figures["peak"] > 1.0 or figures["jump"] > 1.0:
-        reasons.append("energy from nowhere")
+        reasons.append("energy created")
     if figures["newton_failed_at"]:
         reasons.append("no solution")
     if figures["rest_stress"] > 1e-9:

@@ -26,8 +26,8 @@ from .report_section import Claim, ReportTable, Section, rerun_hint
 from .trial import Trial
 
 MAX_RATIO = 1.3  # of the best
-SHORT = 5.0  # s of the quickest way; what takes longer is run once
-ENOUGH, FEW, MANY = 2.0, 3, 15  # s of rounds of it, and how many there are at least and at most
+SHORT_RUN = 5.0  # s of the fastest solver; a longer run is timed once
+ROUND_SECONDS, MIN_ROUNDS, MAX_ROUNDS = 2.0, 3, 15  # s of the fastest solver in all rounds of a short run
 SOLVERS: dict[str, dict[str, Any]] = {"default": {}, "CG": {"ksp_type": "cg", "pc_type": "gamg"}, "factors": DIRECT}
 STEEL = {"energy": "linear", "young": 210e9, "poisson": 0.3, "density": 7850.0}
 RUBBER = {"energy": "neo-hookean", "young": 1e6, "poisson": 0.35, "density": 1000.0}
@@ -80,27 +80,27 @@ def measure(name: str) -> dict[str, Any]:
 
     The difference is the largest over all nodes, relative to the largest displacement.
     """
-    runs: dict[str, list[dict[str, Any]]] = {way: [_time_run(name, way)] for way in SOLVERS}
+    runs: dict[str, list[dict[str, Any]]] = {solver: [_time_run(name, solver)] for solver in SOLVERS}
     quickest = min(item[0]["seconds"] for item in runs.values())
-    if quickest < SHORT:
-        rounds = [{way: _time_run(name, way) for way in SOLVERS} for _ in range(_round_count(quickest))]
-        runs = {way: [round[way] for round in rounds] for way in SOLVERS}
+    if quickest < SHORT_RUN:
+        rounds = [{solver: _time_run(name, solver) for solver in SOLVERS} for _ in range(_round_count(quickest))]
+        runs = {solver: [round[solver] for round in rounds] for solver in SOLVERS}
     exact = runs["factors"][0]["u"]
     return {
         "dofs": len(exact),
-        **{way: {key: item[0][key] for key in ("newton", "krylov")} | {
+        **{solver: {key: item[0][key] for key in ("newton", "krylov")} | {
             "seconds": min(run["seconds"] for run in item),
             "apart": float(np.abs(item[0]["u"] - exact).max() / np.abs(exact).max()),
-        } for way, item in runs.items()},
+        } for solver, item in runs.items()},
     }  # fmt: skip
 
 
 def _round_count(seconds: float) -> int:
     """Number of rounds if the fastest solver takes `seconds`."""
-    return min(max(math.ceil(ENOUGH / seconds), FEW), MANY)
+    return min(max(math.ceil(ROUND_SECONDS / seconds), MIN_ROUNDS), MAX_ROUNDS)
 
 
-def _time_run(name: str, way: str) -> dict[str, Any]:
+def _time_run(name: str, solver: str) -> dict[str, Any]:
     """Run a study with one solver: processor seconds, iterations and displacement."""
     from mpi4py import MPI
 
@@ -110,7 +110,7 @@ def _time_run(name: str, way: str) -> dict[str, Any]:
     from .run_results import history
 
     with tempfile.TemporaryDirectory() as folder:
-        run = Run(build_scene(MPI.COMM_WORLD, validate(CASES[name] | {"solver": SOLVERS[way]}, name)), Path(folder))
+        run = Run(build_scene(MPI.COMM_WORLD, validate(CASES[name] | {"solver": SOLVERS[solver]}, name)), Path(folder))
         began = time.process_time()
         while not run.scene.ended(run.state):
             run.step()
@@ -137,28 +137,26 @@ def section(records: list[dict[str, Any]]) -> Section:
     done = [(record["settings"]["of"], record["figures"]) for record in records if record["figures"]]
     share = {name: figures["default"]["seconds"] / _best_seconds(figures) for name, figures in done}
     text = (
-        f"Quasi-static studies, processor seconds in the steps (each way in turn; the least of {FEW} to {MANY} rounds "
-        "where a run is short). CG: with multigrid, throughout. Factors: of MUMPS, throughout. The default begins with "
-        "CG and goes on with factors "
-        "where they cost less than the iterations did, as their operations tell once they have been made, "
-        "only where there are at most 100,000 dofs in the plane, 10,000 in space."
+        f"Quasi-static studies, processor seconds in the steps (each solver in turn; for short runs the minimum of "
+        f"{MIN_ROUNDS} to {MAX_ROUNDS} rounds). CG: with multigrid throughout. Factors: MUMPS throughout. The default "
+        "starts with CG and changes to factors where they cost less than the iterations did, by their operation count "
+        "once they are computed, with at most 100,000 dofs in 2D and 10,000 in 3D."
         f"{rerun_hint(records)}"
     )
     worst = max(share, key=share.__getitem__, default="")
-    told = f"{share[worst]:.2f} at most ({worst}), of {len(share)} studies" if share else "nothing"
-    claim = Claim(f"The default takes at most {MAX_RATIO:g} times the better of CG and factors", told,
+    measured = f"{share[worst]:.2f} at most ({worst}), of {len(share)} studies" if share else "nothing"
+    claim = Claim(f"The default takes at most {MAX_RATIO:g} times the better of CG and factors", measured,
                   all(item <= MAX_RATIO for item in share.values()) if share else None)  # fmt: skip
-    columns = ("study", "dofs", *(f"{way}, s" for way in SOLVERS), "default over best",
-               *(f"{way}: Newton / Krylov" for way in SOLVERS), "default apart from factors", "outcome")  # fmt: skip
+    columns = ("study", "dofs", *(f"{solver}, s" for solver in SOLVERS), "default over best",
+               *(f"{solver}: Newton / Krylov" for solver in SOLVERS), "default apart from factors",
+               "outcome")  # fmt: skip
     rows = tuple(_row(record, share.get(record["settings"]["of"])) for record in records)
-    return Section(
-        "The solver that nobody chose", text, (claim,), (ReportTable("ladder-solvers", "Solvers", columns, rows),)
-    )
+    return Section("Default linear solver", text, (claim,), (ReportTable("ladder-solvers", "Solvers", columns, rows),))
 
 
 def _best_seconds(figures: dict[str, Any]) -> float:
     """Seconds of the better of CG and the direct solver."""
-    return float(min(figures[way]["seconds"] for way in ("CG", "factors")))
+    return float(min(figures[solver]["seconds"] for solver in ("CG", "factors")))
 
 
 def _row(record: dict[str, Any], share: float | None) -> tuple[Any, ...]:
@@ -166,8 +164,8 @@ def _row(record: dict[str, Any], share: float | None) -> tuple[Any, ...]:
     name, figures = record["settings"]["of"], record["figures"]
     if not figures:
         return (name, *[None] * 9, f"{record['outcome']}: {record['message']}")
-    seconds = (figures[way]["seconds"] for way in SOLVERS)
-    counts = (f"{figures[way]['newton']} / {figures[way]['krylov']}" for way in SOLVERS)
+    seconds = (figures[solver]["seconds"] for solver in SOLVERS)
+    counts = (f"{figures[solver]['newton']} / {figures[solver]['krylov']}" for solver in SOLVERS)
     return (name, figures["dofs"], *seconds, share, *counts, figures["default"]["apart"], record["outcome"])
 
 

@@ -17,7 +17,7 @@ Record = dict[str, Any]
 TIME_STEPS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)  # s
 SINGLE_RUN = ((1, 0),)
 REPEATED_RUNS = tuple((ranks, time) for time in range(5) for ranks in (1, 2))
-MAX_ENERGY_GROWTH, MAX_ERROR = 0.05, 0.02  # more energy from nowhere, or a larger relative error, is no right answer
+MAX_ENERGY_GROWTH, MAX_ERROR = 0.05, 0.02  # relative; above either the result is wrong
 
 
 def trials() -> list[Trial]:
@@ -237,7 +237,7 @@ def _lengths() -> list[Trial]:
         results.append(
             _trial("lengths", name, scenes.stretched_block(1.3, mesh=mesh, strength=1.5e5), "measure_stretch")
         )
-        # the same bar in every length, its time scaled with it: the same breaks
+        # time scales with the length, so that the same edges break
         study = scenes.torn_body(mesh, speed=1.0, step=1e-2 * unit, steps=60, strength=1e5)
         results.append(_trial("lengths", f"{name}-torn", study))
     return results
@@ -274,7 +274,7 @@ def _contacts() -> list[Trial]:
         _trial("contact", f"dt-{step:.0e}-s", contact_studies.falling_bar(step), fell)
         for step in (*TIME_STEPS[:-1], 5e-2)
     ]
-    others = {"newmark": 50, "generalized-alpha": 100}  # steps: Newmark's gains energy at large strains, and takes more
+    others = {"newmark": 50, "generalized-alpha": 100}  # steps; Newmark gains energy at large strains and takes more
     results += [
         _trial("contact", f"dt-1e-02-s-{name}", contact_studies.falling_bar(1e-2, scheme=name, steps=steps), fell)
         for name, steps in others.items()
@@ -353,11 +353,11 @@ def sections(records: list[Record]) -> list[Section]:
     text = (
         "Energy growth is the largest rise of elastic + kinetic + dissipated - work as a share of the energy at play; "
         "the error is that of a force, a momentum or a weight known in closed form (homogeneous stretch, dead load on "
-        "a free body); the smallest J is that of the cells that still carry. `stable` means finite, and no energy "
-        "from nowhere, where no closed form is known; `warned` means that the run says that its "
-        "result is not to be trusted and why. In contact no point of a frame may lie in an obstacle or in another body "
-        "(in a ball not deeper than chords of facets may), or the row is wrong. Each row was run on 1 and on 2 ranks, "
-        "those on 1 two at a time."
+        "a free body); the smallest J is that of the cells that still carry. `stable` means finite and without "
+        "created energy, where no closed form is known; `warned` means that the run says that its "
+        "result is invalid, and why. In contact no point of a frame may lie inside an obstacle or another body "
+        "(inside a "
+        "ball no deeper than a facet's chord). Each row was run on 1 and on 2 ranks, two runs at a time on 1 rank."
     )
     results = [record for record in records if record["case"] == "failed"]
     first = Section("Stability", text, claims=_claims(table), tables=(_table(table),))
@@ -372,11 +372,11 @@ def _claims(records: list[Record]) -> tuple[Claim, ...]:
     differ = [runs for runs in _group_by_study(records) if not _agree(*runs)]
     apart = [_label(runs) for runs in differ if any(map(_is_trusted, runs))]
     doubtful = [_label(runs) for runs in differ if not any(map(_is_trusted, runs))]
-    aside = f"; unlike, but all of its runs warn or give up: {', '.join(doubtful)}" if doubtful else ""
+    aside = f"; different, but all runs warn or do not converge: {', '.join(doubtful)}" if doubtful else ""
     return (
-        _claim("No hang in the whole table, on 1 and 2 ranks", endless, records),
+        _claim("No run exceeds its time limit, on 1 and 2 ranks", endless, records),
         _claim("No NaN in history, fields or surface, on 1 and 2 ranks", infinite, records),
-        _claim("Each case ends in a right answer or in a clear word", wrong, records),
+        _claim("Each case ends with a correct result or a clear message", wrong, records),
         _claim("2 ranks break the same edges as 1", apart, records, aside),
     )
 
@@ -445,8 +445,9 @@ def _iterations(records: list[Record]) -> Section | None:
     both = ("Newton a step", "most", "CG a step", "most ", "CG a Newton iteration")
     columns = ("scene", *both, *(f"without contact: {name.strip()}" for name in both))
     text = (
-        "Iterations a step of 200 to 2,000 tetrahedra, on one rank. A barrier makes tangents stiff where bodies touch, "
-        "and their pattern changes with what does. Without contact: the same bar in flight, and the stack as one block."
+        "Iterations a step with 200 to 2,000 tetrahedra, on one rank. A barrier makes the tangent stiff at "
+        "contacts, and "
+        "its pattern changes with them. Without contact: the same free bar, and the stack as one block."
     )
     return Section(
         "Contact: iterations", text, tables=(ReportTable("contact-iterations", "Iterations", columns, tuple(rows)),)
@@ -472,7 +473,7 @@ FIGURES = ("error", "growth", "newton_mean", "newton_max", "krylov_mean", "small
 def _table(records: list[Record]) -> ReportTable:
     """Table of all runs."""
     rows = tuple(_row(one, others) for one, *others in _group_by_study(records))
-    return ReportTable("stability", "What survives, and what does not", COLUMNS, rows)
+    return ReportTable("stability", "Outcome of each case", COLUMNS, rows)
 
 
 def _row(one: Record, others: list[Record]) -> tuple[TableCell, ...]:

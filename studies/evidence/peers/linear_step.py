@@ -33,10 +33,10 @@ SCHEMES: dict[str, dict[str, Any]] = {
     "newmark": {"scheme": "newmark"},
     "the defaults": {},
 }
-SAME_EQUATIONS = next(iter(SCHEMES))  # the one with Akantu's equations
+SAME_EQUATIONS = next(iter(SCHEMES))  # the scheme with Akantu's equations
 
 
-def block_study(n: int, way: str) -> dict[str, Any]:
+def block_study(n: int, scheme: str) -> dict[str, Any]:
     """Study with n cells along a metre."""
     end = (WARM + STEPS) * TIME_STEP
     return {
@@ -47,7 +47,7 @@ def block_study(n: int, way: str) -> dict[str, Any]:
             {"on": "bottom", "fix": "xyz"},
             {"on": "top", "traction": {"time": [0.0, end], "value": [[0.0] * 3, [TRACTION, 0.0, 0.0]]}},
         ],
-        "time": {"step": TIME_STEP, "end": end} | SCHEMES[way],
+        "time": {"step": TIME_STEP, "end": end} | SCHEMES[scheme],
         "output": {"every": 1_000_000, "fields": [], "picture": False},
     }
 
@@ -68,26 +68,26 @@ def _trial(n: int) -> Trial:
 def compare(n: int) -> dict[str, Any]:
     """Seconds per step of Akantu and of fracsim's schemes, and relative difference of the displacements at the end."""
     with tempfile.TemporaryDirectory() as folder:
-        runs = {way: _start_run(n, way, Path(folder, str(place))) for place, way in enumerate(SCHEMES)}
+        runs = {scheme: _start_run(n, scheme, Path(folder, str(place))) for place, scheme in enumerate(SCHEMES)}
         theirs = AkantuProcess(problem_arrays(runs[SAME_EQUATIONS].scene, TIME_STEP), Path(folder))
-        times: dict[str, list[tuple[float, float]]] = {way: [] for way in SCHEMES}
+        times: dict[str, list[tuple[float, float]]] = {scheme: [] for scheme in SCHEMES}
         for number in range(WARM + STEPS):
             theirs.step((number + 1) / (WARM + STEPS))
-            for way, run in runs.items():
+            for scheme, run in runs.items():
                 wall, cpu = time.perf_counter(), time.process_time()
                 run.step()
-                times[way].append((time.perf_counter() - wall, time.process_time() - cpu))
+                times[scheme].append((time.perf_counter() - wall, time.process_time() - cpu))
         exact = theirs.end()
     ours = runs[SAME_EQUATIONS].state.u.reshape(exact.shape)
     return {
         "cells": runs[SAME_EQUATIONS].scene.domain.cell_count,
         "apart": float(np.abs(ours - exact).max() / np.abs(exact).max()),
         "akantu": {"wall": median(theirs.wall[WARM:]), "cpu": median(theirs.cpu[WARM:]), "first": theirs.cpu[0]},
-        "ours": {way: _median_times(pairs) for way, pairs in times.items()},
+        "ours": {scheme: _median_times(pairs) for scheme, pairs in times.items()},
     }
 
 
-def _start_run(n: int, way: str, folder: Path) -> Any:
+def _start_run(n: int, scheme: str, folder: Path) -> Any:
     """Run of a study before its first step."""
     from mpi4py import MPI
 
@@ -95,7 +95,7 @@ def _start_run(n: int, way: str, folder: Path) -> Any:
     from ....scene import build_scene
     from ....study.reader import validate
 
-    return Run(build_scene(MPI.COMM_WORLD, validate(block_study(n, way), way)), folder)
+    return Run(build_scene(MPI.COMM_WORLD, validate(block_study(n, scheme), scheme)), folder)
 
 
 def _median_times(pairs: list[tuple[float, float]]) -> dict[str, float]:
@@ -129,7 +129,7 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
         f"process and "
         f"thread each; medians. '{SAME_EQUATIONS}' solves Akantu's equations. Akantu keeps the factors of a "
         f"direct solver, we "
-        "keep multigrid and begin CG from earlier solutions. First: the first step, with what is made in it."
+        "keep multigrid and start CG from earlier solutions. First: the first step with its set-up."
         f"{rerun_hint(results)}"
     )
     columns = ("tetrahedra", "program", "wall s a step", "core-seconds a step", "over Akantu's", "first, core-seconds")
@@ -140,7 +140,7 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
 def _rows(figures: dict[str, Any]) -> list[tuple[Any, ...]]:
     """Rows of one size, one a program."""
     theirs = figures["akantu"]
-    programs = {"Akantu": theirs} | {f"fracsim, {way}": item for way, item in figures["ours"].items()}
+    programs = {"Akantu": theirs} | {f"fracsim, {scheme}": item for scheme, item in figures["ours"].items()}
     return [
         (figures["cells"], name, item["wall"], item["cpu"], item["cpu"] / theirs["cpu"], item["first"])
         for name, item in programs.items()

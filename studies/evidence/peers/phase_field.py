@@ -40,7 +40,7 @@ SIDE, YOUNG, POISSON, FRACTURE_ENERGY = 1e-3, 2.1e11, 0.3, 2700.0  # m, Pa, J/m^
 LENGTH_SCALE = 2.0  # length scale over h
 GRIFFITH_LOAD = 645.0  # N, of a sharp crack (experiments)
 MM_PER_M = 1e3
-DIRECTION_RADII = 0.08e-3, 0.25e-3  # m from the notch: where the direction of a crack is looked at
+DIRECTION_RADII = 0.08e-3, 0.25e-3  # m from the notch: where the crack direction is measured
 Values = npt.NDArray[np.float64]
 
 
@@ -50,18 +50,18 @@ class GripMotion:
 
     Attributes:
         axis: 0 tangential, 1 normal.
-        way: final displacement, m.
+        displacement: final displacement, m.
         steps: number of steps.
     """
 
     axis: int
-    way: float
+    displacement: float
     steps: int
 
     @property
     def course(self) -> Values:
         """Displacement of the grip at the end of each step (steps,), m."""
-        return self.way * np.arange(1.0, self.steps + 1) / self.steps
+        return self.displacement * np.arange(1.0, self.steps + 1) / self.steps
 
 
 GRIP_MOTIONS = {"tension": GripMotion(1, 6.5e-6, 65), "shear": GripMotion(0, 1.5e-5, 75)}
@@ -76,7 +76,7 @@ def phasefieldx_python() -> str | None:
 def plate_study(n: int, pull: GripMotion) -> dict[str, Any]:
     """Study for fracsim with n cells along a side."""
     moved = [0.0, 0.0]
-    moved[pull.axis] = pull.way
+    moved[pull.axis] = pull.displacement
     at = SIDE * (0.5 + 0.5 / n)
     return {
         "title": f"a notched plate of {2 * n * n} triangles",
@@ -105,8 +105,8 @@ def double_slit_nodes(points: Values, cells: npt.NDArray[np.int64]) -> tuple[Val
 
 def trials() -> list[Trial]:
     """Trials of both sizes in tension and the larger one in shear; empty if PhaseFieldX is not installed."""
-    asked = [*((n, "tension") for n in SIZES), (SIZES[-1], "shear")]
-    return [] if phasefieldx_python() is None else [_trial(n, pull) for n, pull in asked]
+    cases = [*((n, "tension") for n in SIZES), (SIZES[-1], "shear")]
+    return [] if phasefieldx_python() is None else [_trial(n, pull) for n, pull in cases]
 
 
 def _trial(n: int, pull: str) -> Trial:
@@ -175,10 +175,10 @@ def _run_phasefieldx(n: int, pull: str) -> dict[str, float]:
         done = subprocess.run([python, str(WORKER), str(problem), str(result)], capture_output=True, text=True)
         if done.returncode:
             raise RuntimeError(f"PhaseFieldX ended with code {done.returncode}: {done.stderr[-500:]}")
-        said = json.loads(done.stdout.splitlines()[-1])
+        totals = json.loads(done.stdout.splitlines()[-1])
         with np.load(result) as results:  # kN for a thickness of 1 mm
             crack = results["crack"] / MM_PER_M - SIDE / 2
-            return _figures(results["load"] * 1e3, given.course, crack, said["cpu"], said["solves"])
+            return _figures(results["load"] * 1e3, given.course, crack, totals["cpu"], totals["solves"])
 
 
 def crack_direction(crack: Values) -> float:
@@ -212,7 +212,7 @@ def main() -> None:
 
 # --- the section ----------------------------------------------------------------------------------------------------
 
-TITLE = "A notched plate beside a phase field's"
+TITLE = "Notched plate: fracsim and a phase field"
 TEXT = (
     "Single-edge notched plates on one lattice: PhaseFieldX 0.1.4 (AT2, history field, length scale of two cells, each "
     "step solved in turn to a change of 1e-4; in shear hybrid, by positive principal strains) and this program, as "

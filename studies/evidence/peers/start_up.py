@@ -34,9 +34,9 @@ JOBS: dict[str, dict[str, Any]] = {
 }
 
 
-def job_study(way: str) -> dict[str, Any]:
+def job_study(name: str) -> dict[str, Any]:
     """Study of ten steps of the block with 3,000 tetrahedra."""
-    results = block_study(5, "newmark, consistent mass") | JOBS[way]
+    results = block_study(5, "newmark, consistent mass") | JOBS[name]
     return results | {"time": results["time"] | {"end": STEPS * TIME_STEP}}
 
 
@@ -49,7 +49,7 @@ def trials() -> list[Trial]:
 def measure() -> dict[str, float]:
     """Median processor seconds of each job, and of Akantu if it is installed."""
     with tempfile.TemporaryDirectory() as folder:
-        commands = {way: _fracsim_command(way, Path(folder, f"way-{place}")) for place, way in enumerate(JOBS)}
+        commands = {name: _fracsim_command(name, Path(folder, f"name-{place}")) for place, name in enumerate(JOBS)}
         if akantu_python():
             commands["Akantu"] = _akantu_command(Path(folder))
         for command in commands.values():
@@ -61,12 +61,12 @@ def measure() -> dict[str, float]:
     return {name: median(results) for name, results in seconds.items()}
 
 
-def _fracsim_command(way: str, folder: Path) -> Callable[[], None]:
+def _fracsim_command(name: str, folder: Path) -> Callable[[], None]:
     """Function that runs a job of fracsim."""
     import tomli_w
 
     path = folder.with_suffix(".toml")
-    path.write_text(tomli_w.dumps(job_study(way)))
+    path.write_text(tomli_w.dumps(job_study(name)))
     command = ["fracsim", "run", str(path), "-o", str(folder), "--overwrite"]
     return lambda: _run(command)
 
@@ -89,8 +89,9 @@ def _akantu_command(folder: Path) -> Callable[[], None]:
 
 def _run(command: list[str], given: str = "") -> None:
     """Run a command with text on its stdin."""
-    kept = os.environ | {"PYTHONDONTWRITEBYTECODE": ""}  # modules are compiled once, whatever the machine says
-    subprocess.run(command, input=given, text=True, check=True, capture_output=True, timeout=120, env=kept)
+    # modules are compiled once, whatever the environment says
+    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": ""}
+    subprocess.run(command, input=given, text=True, check=True, capture_output=True, timeout=120, env=environment)
 
 
 def _processor_seconds(command: Callable[[], None]) -> float:
@@ -122,7 +123,7 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
         f"3,000 tetrahedra, {STEPS} steps, from the command to its end: processor seconds, medians of {RUNS} runs in "
         f"turn.{'' if 'Akantu' in figures else f' {ABSENT}'}{rerun_hint([results])}"
     )
-    worst = max(figures[way] for way in JOBS)
+    worst = max(figures[name] for name in JOBS)
     shown = ", ".join(f"{name} {seconds:.2f}" for name, seconds in figures.items())
     claim = Claim(f"A small job takes at most {MAX_SECONDS:g} s of processor time", shown, worst <= MAX_SECONDS)
     table = ReportTable("peers-start-up", "Start-up", ("job", "processor seconds"), tuple(figures.items()))

@@ -25,9 +25,9 @@ from ..trial import Setting
 Records = list[dict[str, Any]]
 Errors = Callable[[Records], dict[str, dict[str, float]]]
 
-ORDER_TOLERANCE = 0.2  # of an order of theory
-TIMING_NOISE = 1.25  # no setting is better for less: times of single runs differ by a good part of it
-TIMED_RUNS = 3  # runs of two settings of which the default came out dearer by more than that
+ORDER_TOLERANCE = 0.2  # of a theoretical order
+TIMING_NOISE = 1.25  # differences in time below this factor are noise
+TIMED_RUNS = 3  # runs of two settings if the default seems more expensive by more than that
 ERROR_LIMITS = (0.05, 0.01)
 
 
