@@ -1,12 +1,8 @@
 """Virtual work of a body: the integrands from which residual and tangent are derived.
 
-The quadrature is chosen here. With P1 displacement F is constant in a cell, so that one point integrates every energy
-exactly. With P2 F is linear: the rule of degree 2 (three points in a triangle, four in a tetrahedron) is exact for
-linear energies, leaves no mode of a cell without stiffness, and keeps the order of convergence for every energy.
-Inertia is not
-here: with a lumped or constant mass matrix it is linear algebra (solvers.newton).
+The quadrature is chosen here. Inertia is linear algebra with a lumped or constant mass matrix (mechanics.inertia).
 
-Equations: docs/theory.md#elastic-energies.
+Equations: docs/theory.md#elastic-energies, docs/theory.md#quadratic-displacement.
 """
 
 from __future__ import annotations
@@ -25,6 +21,9 @@ def stress_quadrature(field: Expr) -> dict[str, int]:
 
     The order is that of `field`, a displacement (a sum of fields) or its test function.
     """
+    # P1: F is constant in a cell, and one point integrates every energy exactly. P2: F is linear, and the rule of
+    # degree 2 (three points in a triangle, four in a tetrahedron) is exact for linear energies, leaves no zero-energy
+    # mode, and keeps the order of convergence of every energy.
     order = max(element.embedded_superdegree for element in extract_elements(field))
     return {"quadrature_degree": 2 * (order - 1)}
 
@@ -49,10 +48,7 @@ def viscous_work(
 ) -> Form:
     """Return the stiffness-proportional damping, int chi b (C : Edot) : sym(F_n^T grad w) dX, Edot = sym(F_n^T grad v).
 
-    At small strain this is Rayleigh's b K v. K of the deformed body would be neither positive nor independent of the
-    rotation of a stressed body, while this form always dissipates int b Edot : C : Edot. F_n is that of the start of
-        the step, which keeps the form linear in v. A rigid spin w then has a strain rate of about w^2 dt, which
-        vanishes with dt.
+    At small strain this is Rayleigh's b K v. It always dissipates, int b Edot : C : Edot.
 
     Args:
         energy: elastic energy.
@@ -63,6 +59,9 @@ def viscous_work(
         b: damping coefficient, s.
         chi: degradation.
     """
+    # K of the deformed body would be neither positive nor independent of the rotation of a stressed body. F of the
+    # start of the step keeps the form linear in v; a rigid spin w then has a strain rate of about w^2 dt, which
+    # vanishes with dt.
     F_n = ufl.Identity(u_n.ufl_shape[0]) if energy.linear else deformation_gradient(u_n)
     rate, virtual = (ufl.sym(F_n.T * ufl.grad(field)) for field in (v, w))
     return chi * b * ufl.inner(elastic_stress(energy, rate), virtual) * dx(metadata=stress_quadrature(w))

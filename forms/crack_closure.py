@@ -6,11 +6,6 @@ psi_d is the energy that damage leaves: chi psi_0 (share 1 - chi), or the edge-p
 Green's strain (stretch^2 - 1)/2 of the edge, or n . eps . n with the linear energy. The force of a spring is
 continuous: it is 0 while the crack is open, and a cycle of closing and opening dissipates nothing.
 
-With quadratic displacement F varies in a cell, and the midside node of a broken edge is free. The length of an edge is
-the distance of its ends: (x_j - x_i) = F_m (X_j - X_i) with F_m at its middle, since the slope of a parabola there is
-    that of its chord. F is linear in a cell, F_m = F + grad grad u . (X_m - X), so that the edge strains are known at
-    every point.
-
 Equations: docs/theory.md#crack-closure; alternatives: docs/theory.md#rejected-alternatives.
 """
 
@@ -39,12 +34,20 @@ def spring_modulus(energy: Any, dim: int, edges: int) -> Scalar:
 
 
 def midpoint_corrections(u: Expr, point: Expr, edges: Any) -> list[Expr]:
-    """Return grad grad u . (X_m - X) (d, d) for the middle m of each edge, for straight-sided cells.
+    """Return grad grad u . (X_m - X) (d, d) for the midpoint m of each edge, for straight-sided cells.
 
-    `point` is X (d,) in the reference cell, whose corners are 0 and the unit vectors.
+    The length of an edge with quadratic displacement is the distance of its ends, x_j - x_i = F_m (X_j - X_i) with F_m
+    at its midpoint; the midside node of a broken edge is free. F is linear in a cell, F_m = F + grad grad u . (X_m -
+    X), so that the edge strains are known at every point.
+
+    Args:
+        u: displacement, m.
+        point: X (d,) in the reference cell, whose corners are 0 and the unit vectors.
+        edges: (k, 2) local nodes.
     """
     J = ufl.Jacobian(ufl.domain.extract_unique_domain(u))
     corners = [ufl.as_vector([1.0 if i == k else 0.0 for i in range(len(point))]) for k in range(-1, len(point))]
+    # The slope of a parabola at the midpoint is that of its chord.
     second_gradient = ufl.grad(ufl.grad(u))
     return [ufl.dot(second_gradient, J * ((corners[i] + corners[j]) / 2 - point)) for i, j in edges]
 

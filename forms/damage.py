@@ -42,7 +42,8 @@ def edge_vectors(cell: Expr, edges: Any) -> list[Expr]:
     """Return d_ij = X_j - X_i, m, of the edges of the cells on which the coefficient `cell` is defined."""
     J = ufl.Jacobian(ufl.domain.extract_unique_domain(cell))
     d = J.ufl_shape[0]
-    corners = [ufl.as_vector([0] * d), *(ufl.as_vector([J[i, k] for i in range(d)]) for k in range(d))]  # X_i - X_0
+    # X_i - X_0
+    corners = [ufl.as_vector([0] * d), *(ufl.as_vector([J[i, k] for i in range(d)]) for k in range(d))]
     return [corners[j] - corners[i] for i, j in edges]
 
 

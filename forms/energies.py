@@ -146,9 +146,7 @@ class LinearElastic(_PlaneStrain):
 class Corotated(_PlaneStrain):
     """Hooke's law in a frame that rotates with the cell: eps = sym(R^T F) - I, R the polar rotation of F.
 
-    R is a field lagged by one iterate. At the polar rotation the first Piola-Kirchhoff stress R (2 mu eps + lambda
-    tr(eps) I) is exact, since the variation of R does no work on a stress that commutes with the stretch. The tangent
-    leaves that variation out, and is symmetric and positive.
+    R is a field lagged by one iterate.
     """
 
     needs_rotation: ClassVar[bool] = True
@@ -159,6 +157,9 @@ class Corotated(_PlaneStrain):
 
     def strain(self, F: Expr, rotation: Expr | None = None) -> Expr:
         """Return eps = sym(R^T F) - I."""
+        # At the polar rotation the first Piola-Kirchhoff stress R (2 mu eps + lambda tr(eps) I) is exact, since the
+        # variation of R does no work on a stress that commutes with the stretch. The tangent leaves that variation out,
+        # and is symmetric and positive.
         if rotation is None:
             raise ValueError("the corotated energy needs the polar rotation of F")
         return small_strain(rotation.T * F)
@@ -169,7 +170,7 @@ class SaintVenantKirchhoff(_PlaneStrain):
     """Saint Venant-Kirchhoff: psi = mu E:E + lambda/2 tr(E)^2, P = F (2 mu E + lambda tr(E) I).
 
     For large rotations and moderate strains: it softens in compression and does not resist inversion. Source: M22, eq.
-        26; M22s, eq. 29 prints P without the leading F.
+    26; M22s, eq. 29 prints P without the leading F.
     """
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
@@ -188,8 +189,7 @@ class NeoHookean(_PlaneStrain):
     """Stable neo-Hookean energy of Smith, de Goes and Kim (2018; M22, eq. 25), shifted so that psi(I) = 0.
 
     psi = m/2 (I_C - 3) + l/2 (J - alpha)^2 - m/2 log(I_C + 1) - psi_0, with m = 4/3 mu, l = lambda + 5/6 mu and
-    alpha = 1 + m/l - m/(4 l). It is finite and smooth for every F, inverted ones included. Without the shift a degraded
-    body at rest would seem to store energy.
+    alpha = 1 + m/l - m/(4 l). It is finite and smooth for every F, inverted ones included.
     """
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
@@ -197,7 +197,9 @@ class NeoHookean(_PlaneStrain):
         m = 4 / 3 * self.mu
         volumetric = self.lmbda + 5 / 6 * self.mu
         alpha = 1 + 3 / 4 * m / volumetric
-        trace_C = ufl.inner(F, F) + (3 - F.ufl_shape[0])  # 2D: plus F33^2 = 1
+        # In 2D F33^2 = 1 is added.
+        trace_C = ufl.inner(F, F) + (3 - F.ufl_shape[0])
+        # Without the shift a degraded body at rest would seem to store energy.
         at_rest = volumetric / 2 * (1 - alpha) ** 2 - m / 2 * math.log(4)
         distortion = m / 2 * (trace_C - 3) - m / 2 * ufl.ln(trace_C + 1)
         return distortion + volumetric / 2 * (ufl.det(F) - alpha) ** 2 - at_rest

@@ -116,15 +116,16 @@ class ImplicitFlow:
             int chi [(1 - beta) d P : grad w F_p^-1 + beta kappa tr d(v) tr d(w)
                      - 2 mu share softness Y_s/|s| (n : d(v)) (n : d(w))] dX,    n = s / |s|,  d(v) = grad v F^-1.
 
-        C = 2 mu dev + kappa I x I holds at small elastic strain; what is left out is smaller by that strain, so that
-        Newton's method converges slightly less than quadratically. The tangent is symmetric except for the Frobenius
-        norm, whose Y_s decreases with the pressure: dY_s = -3 p kappa tr d(v) / Y_s.
+        The tangent is symmetric except for the Frobenius norm, whose Y_s decreases with the pressure:
+        dY_s = -3 p kappa tr d(v) / Y_s.
         """
         trial, energy = TrialStress(self.energy, u, rotation), self.energy
         (beta, turning, pressure_factor), (of_v, of_w) = (
             self._flow_factors(trial),
             (self._elastic_variation(field) for field in (v, w)),
         )
+        # C = 2 mu dev + kappa I x I holds at small elastic strain. Newton's method converges slightly less than
+        # quadratically, since terms of the order of that strain are left out.
         elastic = ufl.derivative(ufl.inner(trial.P, of_w), u, v)
         kappa = energy.lmbda + 2 / 3 * energy.mu
         volumes, shapes = (ufl.inner(part, of_v) * ufl.inner(part, of_w) for part in (trial.inverse_transpose, trial.s))

@@ -156,9 +156,9 @@ def test_a_tip_that_is_ahead_waits_unless_there_is_enough_for_both() -> None:
         now = criterion.field_evaluator.evaluate_fields(*scene.fracture.evaluate_undamaged_stress())
         tangent = (found.point - found.behind) / np.linalg.norm(found.point - found.behind, axis=1)[:, None]
         ahead = int(np.argmax(found.point[:, 0]))
-        assert found.waits[ahead] and found.waits.sum() == 1
+        assert found.is_inactive[ahead] and found.is_inactive.sum() == 1
         released = release_rate(now.evaluate_forces(), found.ahead, tangent) * kink_gain(
-            now.phase_angles() * ~np.any(found.parts, axis=1)
+            now.phase_angles() * ~np.any(found.branch_direction, axis=1)
         )
         criterion.toughness = released[ahead] / share
         criterion(*scene.fracture.evaluate_undamaged_stress())
@@ -284,9 +284,9 @@ def test_what_is_kept_of_tips_that_branch_is_what_is_found_anew() -> None:
         parts = scene.balance.stress, graph, criterion.strength, criterion.toughness, criterion.cut_positions
         kept, found = criterion.find_tips(), RateDependentTipCriterion(*parts).find_tips()
         most = max(most, len(kept))
-        for name in ("cell", "mature", "waits", "alone"):
+        for name in ("cell", "mature", "is_inactive", "alone"):
             np.testing.assert_array_equal(getattr(kept, name), getattr(found, name))
-        for name in ("behind", "course", "ahead", "parts"):
+        for name in ("behind", "course", "ahead", "branch_direction"):
             np.testing.assert_allclose(getattr(kept, name), getattr(found, name), atol=1e-12)
         if most > 1:
             criterion.toughness = np.where(criterion.field_evaluator.centres[:, 1] > 0.52, np.inf, 0.02)

@@ -133,7 +133,7 @@ def burst(dim: int, crumbs: bool, forgetful: bool = False) -> Scene:
     state.settle()
     for _ in each_step(scene, state):
         if forgetful:
-            scene.fracture.criterion._tips.clear_bars()
+            scene.fracture.criterion._tips.clear_excluded_cells()
     return scene
 
 

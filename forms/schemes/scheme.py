@@ -72,9 +72,9 @@ class Scheme(Protocol):
 def prescribed_rates(dt: float, u: Array, start: Array, v: Array) -> tuple[Array, Array]:
     """Return the mean velocity of prescribed dofs over a step, and its change over dt.
 
-    It is for schemes in which a jump of a prescribed velocity would not be damped, but oscillate for ever. The
-    arguments are those of `Scheme.prescribed_dof_rates`.
+    The arguments are those of `Scheme.prescribed_dof_rates`.
     """
+    # In some schemes a jump of a prescribed velocity would oscillate for ever, without damping.
     rate = (u - start) / dt
     return rate, (rate - v) / dt
 

@@ -226,9 +226,9 @@ class CohesiveInitiation:
         """Allow or forbid new cracks."""
         self._is_allowed = allowed
 
-    def find_cells(self, stress: Values, barred: Flags) -> Ints:
+    def find_cells(self, stress: Values, excluded: Flags) -> Ints:
         """Find candidate cells by the stress of the softened body (cells, 3 or 6), Pa."""
-        return self._initiation.find_cells(stress, barred) if self._is_allowed else np.empty(0, np.int64)
+        return self._initiation.find_cells(stress, excluded) if self._is_allowed else np.empty(0, np.int64)
 
     def propose_cuts(self, cells: Ints, stress: Values) -> CutProposal:
         """Propose the most loaded of cells (n,) of all ranks; equal loads are ordered by a hash (collective)."""
@@ -285,7 +285,7 @@ class CohesiveTipCriterion(TipCriterion):
             is_front = np.linalg.norm(tips.ahead, axis=1) > TIP.min_front_advance * fields.disc_radius
             # A cell beside the crack, through which no front passes, stays uncut.
             loaded &= is_front | ~tips.mature
-        rows = np.flatnonzero(loaded & ~self._barred[tips.cell])
+        rows = np.flatnonzero(loaded & ~self._excluded_cells[tips.cell])
         cells, ahead, no = tips.cell[rows], tips.point[rows] - tips.behind[rows], np.zeros(len(rows), bool)
         exclusion = TIP.exclusion_radius[d] * self._h[cells]
         rank = rank_rows(TIP_ADVANCE, sigma[rows], input_numbers(self._domain, cells), tips.point[rows], exclusion)
@@ -296,8 +296,8 @@ class CohesiveTipCriterion(TipCriterion):
 class CohesiveFracturePass(FracturePass):
     """Fracture pass that cuts cells, softens cut cells, and breaks released edges.
 
-    Cut and broken edges are two patterns of the same edges: the broken ones separate fragments, and tips see their
-        crack in the cut ones.
+    Cut and broken edges are two patterns of the same edges: the broken ones separate fragments, the cut ones
+    are the crack of the tips.
 
     Attributes:
         cut_graph: graph in which the cut edges are broken.

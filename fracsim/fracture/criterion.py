@@ -59,7 +59,7 @@ class FractureCriterion(Protocol):
     def snapshot(self) -> object:
         """Return a copy of the history variables, never written to afterwards."""
 
-    def restore(self, memory: object) -> None:
+    def restore(self, saved: object) -> None:
         """Restore the history variables that `snapshot` returned."""
 
 
@@ -178,5 +178,5 @@ class OverloadedEdges:
         """Return None: the criterion has no history."""
         return None
 
-    def restore(self, memory: object) -> None:
+    def restore(self, saved: object) -> None:
         """Do nothing: the criterion has no history."""

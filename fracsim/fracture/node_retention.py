@@ -110,7 +110,7 @@ class CellRetention:
         """Return None: the criterion has no history."""
         return None
 
-    def restore(self, memory: object) -> None:
+    def restore(self, saved: object) -> None:
         """Do nothing: the criterion has no history."""
 
     def _spared_edges(self, fails: Flags, stress: Values) -> Flags:

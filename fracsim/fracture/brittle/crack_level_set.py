@@ -93,9 +93,9 @@ class CurvedLevelSet:
             new = self._extend_by_layer(new)
         return self.phi
 
-    def extrapolate_to(self, wanted: Flags) -> Values:
-        """Return phi (nodes,), on wanted nodes without a value that of the tangent plane at the nearest node."""
-        unknown = np.isnan(self.phi) & wanted
+    def extrapolate_to(self, required: Flags) -> Values:
+        """Return phi (nodes,), on required nodes without a value that of the tangent plane at the nearest node."""
+        unknown = np.isnan(self.phi) & required
         defined = np.flatnonzero(~np.isnan(self.phi))
         points, phi = self._mesh.points, self.phi.copy()
         # Beyond the surface phi continues as the tangent plane.

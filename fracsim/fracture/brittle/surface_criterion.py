@@ -103,10 +103,10 @@ class BrittleSurfaces:
         """Return the starts (n, d) and the cut positions (edges,)."""
         return self.starts, self.cut_positions.copy()
 
-    def restore(self, memory: object) -> None:
+    def restore(self, saved: object) -> None:
         """Restore the starts and cut positions that `snapshot` returned."""
-        assert isinstance(memory, tuple)
-        self.starts, self.cut_positions[:] = memory
+        assert isinstance(saved, tuple)
+        self.starts, self.cut_positions[:] = saved
 
     def _find_overloaded(self, cells: Cells, averaged: Values) -> OverloadedCells:
         """Find those of cells (n,) whose first principal stress reaches their strength."""

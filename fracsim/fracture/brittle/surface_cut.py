@@ -358,8 +358,8 @@ def _draw_cells_over(cells: Ints, sides: Flags, near: Flags, target: bool) -> Fl
     side = sides[cells]
     to_move = _count_flags(side != target)
     possible = (near[cells] | (side == target)).all(axis=1)[:, None]
-    wanting = (_flag_isolated(cells, sides, near) & (sides == target))[cells] & possible
-    row, corner = np.nonzero(wanting)
+    is_isolated = (_flag_isolated(cells, sides, near) & (sides == target))[cells] & possible
+    row, corner = np.nonzero(is_isolated)
     order = np.lexsort((row, to_move[row]))
     chosen = row[order[np.unique(cells[row, corner][order], return_index=True)[1]]]
     sides = sides.copy()

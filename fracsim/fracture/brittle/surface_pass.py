@@ -172,8 +172,8 @@ class SurfacePass:
             phi = curved(cell, origin, normal)
             defined = ~np.isnan(phi)
             # Whether a node of the surface has a cell on its own side depends on the nodes around it.
-            wanted = self._flag_neighbours(defined) if self.grains is None else np.ones_like(defined)
-            phi = curved.extrapolate_to(wanted)
+            required = self._flag_neighbours(defined) if self.grains is None else np.ones_like(defined)
+            phi = curved.extrapolate_to(required)
         return defined, phi * self._sign(phi, cell)
 
     def _flag_neighbours(self, nodes: Flags) -> Flags:

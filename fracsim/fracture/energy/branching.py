@@ -79,7 +79,7 @@ def branch_directions(
     rows = rows[np.lexsort([pairs.distance[rows], pairs.first[rows]])]
     tip, first = np.unique(pairs.first[rows], return_index=True)
     rows = rows[first]
-    result, waits = np.zeros((pairs.count, 2)), np.zeros(pairs.count, bool)
+    result, is_inactive = np.zeros((pairs.count, 2)), np.zeros(pairs.count, bool)
     result[tip] = rotate(mean[rows], np.sign(left[rows]) * TIP.branching_angle)
-    waits[tip] = lead[rows] > TIP.max_lead * disc[rows]
-    return result, waits
+    is_inactive[tip] = lead[rows] > TIP.max_lead * disc[rows]
+    return result, is_inactive

@@ -120,8 +120,8 @@ def cell_strength(strength: EdgeStrength, graph: EdgeGraph, cells: Ints) -> Valu
 class Initiation(Protocol):
     """Interface of the rule by which new cracks start."""
 
-    def find_cells(self, stress: Values, barred: Flags) -> Ints:
-        """Find candidate cells by the local stress (cells, 3 or 6), Pa; `barred`: (cells,) not to be cut."""
+    def find_cells(self, stress: Values, excluded: Flags) -> Ints:
+        """Find candidate cells by the local stress (cells, 3 or 6), Pa; `excluded`: (cells,) not to be cut."""
 
     def propose_cuts(self, cells: Ints, stress: Values) -> CutProposal:
         """Propose the candidates (n,) in which cracks start (collective)."""
@@ -137,12 +137,12 @@ class CrackInitiation:
         self._graph, self._strength, self._evaluator, self._disc = graph, strength, evaluator, disc
         self._dim = stress.domain.dim
 
-    def find_cells(self, stress: Values, barred: Flags) -> Ints:
+    def find_cells(self, stress: Values, excluded: Flags) -> Ints:
         """Find intact cells, farther than R from any crack, whose local stress (cells, 3 or 6) may be large enough."""
         graph, d, minimum = self._graph, self._dim, self._strength.minimum
         # Shear counts twice in the norm: a plain sum of squares excludes most cells in a third of the time.
         cells = np.flatnonzero(2 * np.einsum("ni,ni->n", stress, stress) >= minimum**2).astype(np.int64)
-        cells = cells[~(graph.damaged[cells] | barred[cells]) & (frobenius_norm(stress[cells], d) >= minimum)]
+        cells = cells[~(graph.damaged[cells] | excluded[cells]) & (frobenius_norm(stress[cells], d) >= minimum)]
         cells = cells[principal_stress_bound(symmetric_tensors(stress[cells], d)) >= minimum]
         cut_cells = self._evaluator.cut_cells
         # Near a crack the tip decides, not the stress of single cells.

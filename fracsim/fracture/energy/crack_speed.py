@@ -75,7 +75,7 @@ class RateDependentTipCriterion(TipCriterion):
         tip_states: (edges, 4) state of the tip that came in by each local edge (`TipState`).
     """
 
-    forks = True
+    may_branch = True
     tip_states: Values
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -88,10 +88,10 @@ class RateDependentTipCriterion(TipCriterion):
         """Return copies of the cut positions and of the states of tips."""
         return super().snapshot(), self.tip_states.copy()
 
-    def restore(self, memory: object) -> None:
+    def restore(self, saved: object) -> None:
         """Restore the cut positions and states that `snapshot` returned."""
-        assert isinstance(memory, tuple)
-        cut_positions, self.tip_states[:] = memory
+        assert isinstance(saved, tuple)
+        cut_positions, self.tip_states[:] = saved
         super().restore(cut_positions)
 
     @cached_property

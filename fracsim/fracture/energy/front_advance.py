@@ -50,11 +50,11 @@ class FrontTipCriterion(TipCriterion):
         """Return which tips (n,) reach G_c, or lack little in the ball of one that does; none branches (collective)."""
         critical = size >= toughness
         # Leaders are mature tips of all ranks that reach G_c.
-        leaders = tips.point[critical & tips.mature & ~self._barred[tips.cell]]
-        leaders = np.concatenate(allgather(self._domain.comm, leaders))
-        if not len(leaders):
+        leading_points = tips.point[critical & tips.mature & ~self._excluded_cells[tips.cell]]
+        leading_points = np.concatenate(allgather(self._domain.comm, leading_points))
+        if not len(leading_points):
             return critical, np.zeros(len(tips), bool)
-        near = cKDTree(leaders).query(tips.point)[0] < self.disc_radius_ratio * self._h[tips.cell]
+        near = cKDTree(leading_points).query(tips.point)[0] < self.disc_radius_ratio * self._h[tips.cell]
         return critical | (near & (size >= (1 - TIP.front_lag) * toughness)), np.zeros(len(tips), bool)
 
     def _propose_advances(self, fields: TipFields) -> CutProposal:
@@ -86,11 +86,11 @@ class FrontTipCriterion(TipCriterion):
         cell_planes = np.zeros((len(self._h), self.course_width))
         edge_planes = np.zeros((len(self.cut_positions), self.course_width))
         # Cells of leading tips keep their own plane.
-        leads_itself = np.zeros(len(self._h), bool)
-        leads_itself[cells], cell_planes[cells] = True, self._leading.ahead
+        has_own_plane = np.zeros(len(self._h), bool)
+        has_own_plane[cells], cell_planes[cells] = True, self._leading.ahead
         while True:
             edge_planes[edges] = courses
-            self._inherit_planes(cell_planes, edge_planes, leads_itself)
+            self._inherit_planes(cell_planes, edge_planes, has_own_plane)
             (following,), any_selected = select_proposals(self._domain, self._propose_following(cell_planes))
             if not any_selected:
                 break
@@ -99,24 +99,24 @@ class FrontTipCriterion(TipCriterion):
             all_edges.append(edges)
         return np.concatenate(all_edges)
 
-    def _inherit_planes(self, cell_planes: Values, edge_planes: Values, leads_itself: Flags) -> None:
+    def _inherit_planes(self, cell_planes: Values, edge_planes: Values, has_own_plane: Flags) -> None:
         """Give intact cells the plane of the edge by which they were entered, that with the largest sigma_1.
 
         Args:
             cell_planes: (cells, 7) planes, updated in place.
             edge_planes: (edges, 7) planes of cut edges.
-            leads_itself: (cells,) cells of tips with a plane of their own.
+            has_own_plane: (cells,) cells of tips with a plane of their own.
         """
         graph = self._graph
         entered = np.any(edge_planes[:, 3:6], axis=1)[graph.cell_edges].any(axis=1)
-        cells = np.flatnonzero(entered & ~(graph.damaged | leads_itself))
+        cells = np.flatnonzero(entered & ~(graph.damaged | has_own_plane))
         first = np.argmax(edge_planes[graph.cell_edges[cells], 6], axis=1)
         cell_planes[cells] = edge_planes[graph.cell_edges[cells, first]]
 
     def _propose_following(self, planes: Values) -> CutProposal:
         """Propose unsplit cells on planes (cells, 7), near enough to the tips that lead these."""
         has_plane = np.any(planes[:, 3:6], axis=1)
-        cells = np.flatnonzero(has_plane & ~(self._graph.split | self._barred)).astype(np.int64)
+        cells = np.flatnonzero(has_plane & ~(self._graph.split | self._excluded_cells)).astype(np.int64)
         cut = self._flag_cut_edges(cells)
         unsplit = ~is_split(3)[cut @ (1 << np.arange(6))]
         cells, cut = cells[unsplit], cut[unsplit]

@@ -62,11 +62,11 @@ class TipCriterion:
             the last column; None without them.
         extends_cuts: without inertia tips cut more than one cell in a pass.
         shares: tips of a front in 3D share their force (crack_front).
-        forks: tips may branch.
+        may_branch: tips may branch.
         course_width: numbers that describe the course of a crack beyond the cell that it cuts.
     """
 
-    extends_cuts, shares, forks, course_width = True, False, False, 2
+    extends_cuts, shares, may_branch, course_width = True, False, False, 2
     tip_states: Values | None = None
 
     def __init__(
@@ -93,7 +93,7 @@ class TipCriterion:
         self.disc_radius_ratio = TIP.disc_radius[domain.dim]
         disc = self.disc_radius_ratio * self._h
         radii = TipRadii(disc, TIP.average_radius * self._h, TIP.mature_length * self._h)
-        self.field_evaluator = TipFieldEvaluator(stress, graph, radii, forks=self.forks, shares=self.shares)
+        self.field_evaluator = TipFieldEvaluator(stress, graph, radii, may_branch=self.may_branch, shares=self.shares)
         self._initiation: Initiation = CrackInitiation(stress, graph, strength, self.field_evaluator, disc)
         mu, lmbda = np.asarray(stress.material.mu), np.asarray(stress.material.lmbda)
         # E' of plane strain; lambda is reduced in plane stress, where this is E' of plane stress.
@@ -101,7 +101,7 @@ class TipCriterion:
         self._modulus = np.broadcast_to(modulus, (domain.cell_count,))
         self._now, self._dt = 0.0, np.inf
         self.cells: Ints = np.empty(0, np.int64)
-        self._barred: Flags = np.zeros(domain.cell_count, bool)
+        self._excluded_cells: Flags = np.zeros(domain.cell_count, bool)
 
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """Find the local edges (n,) that cracks cut, with loads of 1 (collective).
@@ -110,7 +110,7 @@ class TipCriterion:
             stress: (cells, 3 or 6) Cauchy stress of the undamaged material, Pa.
             psi: (cells,) energy density of the undamaged material, J/m^3.
         """
-        tips, candidates = self.find_tips(), self._initiation.find_cells(stress, self._barred)
+        tips, candidates = self.find_tips(), self._initiation.find_cells(stress, self._excluded_cells)
         # The counts of all ranks decide, since the evaluations are collective.
         tip_count, candidate_count = sum_over_ranks(self._domain.comm, np.array([len(tips), len(candidates)]))
         none = empty_proposal(self._domain.dim, self.course_width)
@@ -141,10 +141,10 @@ class TipCriterion:
         """Return a copy of the cut positions (edges,)."""
         return self.cut_positions.copy()
 
-    def restore(self, memory: object) -> None:
+    def restore(self, saved: object) -> None:
         """Restore the cut positions that `snapshot` returned."""
-        assert isinstance(memory, np.ndarray)
-        self.cut_positions[:] = memory
+        assert isinstance(saved, np.ndarray)
+        self.cut_positions[:] = saved
 
     def release_rate(self) -> Values:
         """Return c_R / R (cells,), 1/s: the inverse of the time of a Rayleigh wave through the disc of a tip."""
@@ -160,13 +160,13 @@ class TipCriterion:
         largest = float(self._domain.comm.allreduce(fastest, op=MPI.MAX))
         return TIP.passes_per_size[self._domain.dim] * self.disc_radius_ratio * largest
 
-    def bar_cells(self, cells: Ints) -> None:
+    def exclude_cells(self, cells: Ints) -> None:
         """Exclude cells (n,) from cuts, in addition to those excluded before."""
-        self._barred[cells] = True
+        self._excluded_cells[cells] = True
 
-    def clear_bars(self) -> None:
+    def clear_excluded_cells(self) -> None:
         """Allow all cells to be cut."""
-        self._barred[:] = False
+        self._excluded_cells[:] = False
 
     def withdraw_cuts(self, edges: Edges) -> None:
         """Forget the cuts of edges (n,) that were found last and are not to break."""
@@ -189,17 +189,17 @@ class TipCriterion:
             size, kinked = kinked_release(fields.phase_angles(), tips, force)
             # A force backwards belongs to other tips in the disc.
             mature &= size > 0
-            turns, side_by_side = mature & np.any(kinked, axis=1), np.any(tips.parts, axis=1)
+            turns, side_by_side = mature & np.any(kinked, axis=1), np.any(tips.branch_direction, axis=1)
             ahead = np.where(turns[:, None], kinked, ahead)
             # Branches that are side by side advance in the same pass.
             exclusion = np.where(side_by_side, TIP.exclusion_radius[3] * h, exclusion)
-        enough, forked = self._find_critical_tips(size, toughness, tips)
-        if self.forks:
-            branches = turns & forked
+        enough, enough_for_branches = self._find_critical_tips(size, toughness, tips)
+        if self.may_branch:
+            branches = turns & enough_for_branches
             ahead = np.where(branches[:, None], tips.course, ahead)
-        # A branch waits for the other unless there is enough energy for both.
-        waits = (tips.waits & (size < TIP.branching_ratio * toughness)) | self._barred[tips.cell]
-        candidates = np.flatnonzero((~mature | enough) & ~waits)
+        # A branch is inactive behind the other unless there is enough energy for both.
+        is_inactive = (tips.is_inactive & (size < TIP.branching_ratio * toughness)) | self._excluded_cells[tips.cell]
+        candidates = np.flatnonzero((~mature | enough) & ~is_inactive)
         if not len(candidates):
             return empty_proposal(d, self.course_width)
         mean = fields.mean_stress(candidates)
@@ -299,7 +299,7 @@ class TipCriterion:
         course[edges] = courses
         entered = np.any(course[graph.cell_edges], axis=2)
         # Cells with one cut edge, on the far side of a cut, are next on the course of the crack.
-        is_next = (entered.sum(axis=1) == 1) & ~(graph.damaged | self._barred)
+        is_next = (entered.sum(axis=1) == 1) & ~(graph.damaged | self._excluded_cells)
         cells = np.flatnonzero(is_next).astype(np.int64)
         entry, turns = np.argmax(entered[cells], axis=1), np.ones(len(cells), bool)
         entry_edges = graph.cell_edges[cells, entry]
@@ -344,10 +344,10 @@ def kinked_release(psi: Values, tips: CrackTips, force: Values) -> tuple[Values,
     Without a crack behind the tip the size of the force is returned, and no direction.
     """
     # Branches side by side keep straight on, at the branching angle.
-    tangent, side_by_side = unit_or_zero(tips.point - tips.behind), np.any(tips.parts, axis=1)
+    tangent, side_by_side = unit_or_zero(tips.point - tips.behind), np.any(tips.branch_direction, axis=1)
     psi = np.where(side_by_side, 0.0, psi)
     along = release_rate(force, tips.ahead, tangent) * kink_gain(psi)
-    kinked = np.where(side_by_side[:, None], tips.parts, rotate(tangent, kink_angle(psi)))
+    kinked = np.where(side_by_side[:, None], tips.branch_direction, rotate(tangent, kink_angle(psi)))
     return np.where(np.any(tangent, axis=1), along, np.linalg.norm(force, axis=1)), kinked
 
 
@@ -362,9 +362,9 @@ class AttachedTipCriterion:
     """Tip criterion that leaves cells uncut if the cut would detach a node.
 
     A node without an unsplit cell stays attached by an edge (fracture.node_retention). Where a cut would break the last
-    edge that can attach it, the cell is not cut: it holds that node and nothing else, so that it has no energy to
-        release and separates no bodies. To spare a single edge of the cut instead would leave a tip inside the crack,
-        where the force is that of its neighbours.
+    edge that can attach it, the cell is not cut: it attaches that node and nothing else, has no energy to release and
+    separates no bodies. A single spared edge of the cut would leave a tip inside the crack, where the force is that of
+    its neighbours.
     """
 
     def __init__(self, tips: TipCriterion, graph: EdgeGraph, node_attachment: NodeAttachment) -> None:
@@ -383,18 +383,18 @@ class AttachedTipCriterion:
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """Find the local edges (n,) that cracks cut, none of which attaches a node, with loads of 1 (collective)."""
         graph = self._graph
-        # They are found again in every pass, so that a restart needs no memory of them.
-        self._tips.clear_bars()
+        # They are found again in every pass, so that a restart does not need them.
+        self._tips.clear_excluded_cells()
         while True:
             edges, load = self._tips(stress, psi)
             spared = np.zeros(len(graph.broken), bool)
             spared[edges[~self._node_attachment(edges, stress)]] = True
-            # A cell that would lose an edge which attaches a node is barred, and the pass is repeated without it.
+            # A cell that would lose an edge which attaches a node is excluded, and the pass is repeated without it.
             cells = self._tips.cells
             detaching = cells[spared[graph.cell_edges[cells]].any(axis=1)]
             if not sum_over_ranks(graph.domain.comm, len(detaching))[0]:
                 return edges, load
-            self._tips.bar_cells(detaching)
+            self._tips.exclude_cells(detaching)
             self._tips.withdraw_cuts(edges)
 
     def set_motion(self, v: Values, a: Values, now: float, dt: float) -> None:
@@ -405,6 +405,6 @@ class AttachedTipCriterion:
         """Return the history variables of the tips."""
         return self._tips.snapshot()
 
-    def restore(self, memory: object) -> None:
+    def restore(self, saved: object) -> None:
         """Restore the history variables of the tips."""
-        self._tips.restore(memory)
+        self._tips.restore(saved)

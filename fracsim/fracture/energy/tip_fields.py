@@ -94,7 +94,7 @@ class TipFieldEvaluator:
     """
 
     def __init__(
-        self, stress: Stress, graph: EdgeGraph, radii: TipRadii, *, forks: bool = False, shares: bool = False
+        self, stress: Stress, graph: EdgeGraph, radii: TipRadii, *, may_branch: bool = False, shares: bool = False
     ) -> None:
         """Find the near cells of other ranks (collective).
 
@@ -102,7 +102,7 @@ class TipFieldEvaluator:
             stress: stress of the body.
             graph: edges and their damage.
             radii: radii of neighbourhoods.
-            forks: cracks may branch (2D).
+            may_branch: cracks may branch (2D).
             shares: tips of a front share their force (3D).
         """
         self._stress, self._graph, self._radii = stress, graph, radii
@@ -114,7 +114,7 @@ class TipFieldEvaluator:
         self._nearby, self._geometry = NearbyCells(domain, largest_radius), CutGeometry(domain, graph)
         self.cut_cells = CutCells(graph, self._geometry, self.centres)
         self.neighbourhoods = TipNeighbourhoods(
-            self._nearby, self.cut_cells, graph, self._geometry, radii, forks=forks, shares=shares
+            self._nearby, self.cut_cells, graph, self._geometry, radii, may_branch=may_branch, shares=shares
         )
         # Gradients of barycentric coordinates, NaN until they are needed.
         self._barycentric_gradients = np.full((domain.cell_count, domain.dim + 1, domain.dim), np.nan)

@@ -55,8 +55,8 @@ class CrackTips:
         mature: (n,) whether the crack is longer than R.
         ahead: (n, d) advance that the force is divided by: in 3D the crack area it makes, m; in 2D see `branching`.
         course: (n, d) from the mean of the crack nearer than 2 R to the tip, m; 0 unless cracks may branch.
-        parts: (n, d) direction of a tip that advances side by side with another; 0 without one, and in 3D.
-        waits: (n,) whether the tip lets the other one advance first.
+        branch_direction: (n, d) direction of a tip that advances side by side with another; 0 without one, and in 3D.
+        is_inactive: (n,) whether the other one of two branches advances first.
         alone: (n,) whether no disc of another tip overlaps that of the tip.
         surface: (n, d) int q n dA over the surface of the body in the disc, m^(d-1).
     """
@@ -68,8 +68,8 @@ class CrackTips:
     mature: Flags
     ahead: Values
     course: Values
-    parts: Values
-    waits: Flags
+    branch_direction: Values
+    is_inactive: Flags
     alone: Flags
     surface: Values
 
@@ -103,7 +103,7 @@ class TipNeighbourhoods:
         geometry: CutGeometry,
         radii: TipRadii,
         *,
-        forks: bool,
+        may_branch: bool,
         shares: bool,
     ) -> None:
         """Start without tips.
@@ -114,15 +114,15 @@ class TipNeighbourhoods:
             graph: edges and their damage.
             geometry: positions of the cuts.
             radii: radii of neighbourhoods.
-            forks: cracks may branch (2D).
+            may_branch: cracks may branch (2D).
             shares: tips of a front share their force (3D).
         """
         self._nearby, self._cut_cells, self._graph, self._geometry = nearby, cut_cells, graph, geometry
-        self._radii, self._forks = radii, forks
+        self._radii, self._may_branch = radii, may_branch
         self.front_release_rate = FrontReleaseRate(graph.domain.comm, averaged=shares)
-        none, nowhere, no = np.empty(0, np.int64), np.empty((0, graph.domain.dim)), np.empty(0, bool)
+        none, no_points, no = np.empty(0, np.int64), np.empty((0, graph.domain.dim)), np.empty(0, bool)
         self.tips = CrackTips(
-            none, none.astype(np.uint8), nowhere, nowhere, no, nowhere, nowhere, nowhere, no, no, nowhere
+            none, none.astype(np.uint8), no_points, no_points, no, no_points, no_points, no_points, no, no, no_points
         )
         self._split = np.zeros(len(nearby.number), bool)
         # Pairs of a tip and a cell (among the near ones), and the weights of the cell in sums around the tip.
@@ -130,7 +130,7 @@ class TipNeighbourhoods:
         self._pair_cell: Ints = none
         self._weights: Values = np.empty((0, graph.domain.dim + len(_Weight)))
         # int q n dA over the surface of the body that the cell of a pair has.
-        self._surface_weights: Values = nowhere
+        self._surface_weights: Values = no_points
         self._matrices: dict[int, csr_matrix] = {}
         self._force_matrices: tuple[csc_matrix, csc_matrix] | None = None
 
@@ -271,18 +271,18 @@ class TipNeighbourhoods:
         """Find the tips, and the cells around new ones; return flags (n,) of the new ones."""
         graph, old = self._graph, self.tips
         cell = np.flatnonzero(graph.damaged & ~graph.split).astype(np.int64)
-        # A tip stays if its cell is cut as before.
+        # The neighbourhood of a tip is unchanged if its cell is cut as before.
         old_row = np.full(graph.domain.cell_count, -1)
         old_row[old.cell] = np.arange(len(old))
         row = old_row[cell]
-        stays = row >= 0
-        stays[stays] = old.pattern[row[stays]] == graph.pattern[cell[stays]]
-        new = np.flatnonzero(~stays)
+        unchanged = row >= 0
+        unchanged[unchanged] = old.pattern[row[unchanged]] == graph.pattern[cell[unchanged]]
+        new = np.flatnonzero(~unchanged)
         point = self._geometry.mean_cut_points(cell, cut)
         pair_tip, pair_cell, weights, surface_weights = self._find_surroundings(cell[new], point[new])
         # Merge the pairs of old and new tips, ordered by tips.
         new_row = np.full(len(old), -1)
-        new_row[row[stays]] = np.flatnonzero(stays)
+        new_row[row[unchanged]] = np.flatnonzero(unchanged)
         old_pairs = np.flatnonzero(new_row[self._pair_tip] >= 0)
         all_tips = np.concatenate([new_row[self._pair_tip[old_pairs]], new[pair_tip]])
         order = np.argsort(all_tips, kind="stable")
@@ -290,17 +290,27 @@ class TipNeighbourhoods:
         self._pair_cell = np.concatenate([self._pair_cell[old_pairs], pair_cell])[order]
         self._weights = np.concatenate([self._weights[old_pairs], weights])[order]
         self._surface_weights = np.concatenate([self._surface_weights[old_pairs], surface_weights])[order]
-        behind, ahead, course, parts, surfaces = np.zeros((5, *point.shape))
-        mature, waits, alone = np.zeros((3, len(cell)), bool)
+        behind, ahead, course, branch_direction, surfaces = np.zeros((5, *point.shape))
+        mature, is_inactive, alone = np.zeros((3, len(cell)), bool)
         size, slope = len(new), weights[:, : point.shape[1]]
         # The integral of grad q over the body is that of q n over its surface.
         surfaces[new] = np.column_stack([np.bincount(pair_tip, component, size) for component in slope.T])
         self.tips = CrackTips(
-            cell, graph.pattern[cell], point, behind, mature, ahead, course, parts, waits, alone, surfaces
+            cell,
+            graph.pattern[cell],
+            point,
+            behind,
+            mature,
+            ahead,
+            course,
+            branch_direction,
+            is_inactive,
+            alone,
+            surfaces,
         )
-        for name in ("behind", "mature", "ahead", "course", "parts", "waits", "alone", "surface"):
-            getattr(self.tips, name)[stays] = getattr(old, name)[row[stays]]
-        return ~stays
+        for name in ("behind", "mature", "ahead", "course", "branch_direction", "is_inactive", "alone", "surface"):
+            getattr(self.tips, name)[unchanged] = getattr(old, name)[row[unchanged]]
+        return ~unchanged
 
     def _find_surroundings(self, cell: Ints, point: Values) -> tuple[Ints, Ints, Values, Values]:
         """Find the pairs of tips and cells around them.
@@ -326,7 +336,7 @@ class TipNeighbourhoods:
         disc, beyond = self._radii.disc[self.tips.cell], self._radii.beyond[self.tips.cell]
         distance = cKDTree(changed).query(self.tips.point)[0]
         # In 2D a tip depends on other tips around it, and on what these depend on.
-        reach = disc * (1 + 1 / TIP.min_disc_radius) if changed.shape[1] == 3 else 2 * (1 + self._forks) * disc
+        reach = disc * (1 + 1 / TIP.min_disc_radius) if changed.shape[1] == 3 else 2 * (1 + self._may_branch) * disc
         return np.asarray(distance <= np.maximum(disc + beyond, reach))
 
     def _update_cracks_behind(self, rows: Ints) -> None:
@@ -357,16 +367,16 @@ class TipNeighbourhoods:
         """Update what tips `rows` (m,) in 2D have from tips whose discs overlap theirs."""
         tips, cut_cells = self.tips, self._cut_cells
         all_tips = np.flatnonzero(~cut_cells.split)
-        pairs = find_pairs(cKDTree(cut_cells.cut_point[all_tips]), tips.point[rows], (1 + self._forks) * disc)
+        pairs = find_pairs(cKDTree(cut_cells.cut_point[all_tips]), tips.point[rows], (1 + self._may_branch) * disc)
         other_points = cut_cells.cut_point[all_tips[pairs.second]]
         directions = self._direction_from_crack(other_points, disc[pairs.first])
         tips.ahead[rows] = branching.shared_advance(pairs, directions, disc)
-        if self._forks:
+        if self._may_branch:
             tips.alone[rows] = np.bincount(pairs.first, minlength=len(rows)) == 1
             tips.course[rows] = course = self._direction_from_crack(tips.point[rows], 2 * disc)
             other_course = self._direction_from_crack(other_points, 2 * disc[pairs.first])
-            parts, waits = branching.branch_directions(pairs, course[pairs.first], other_course, disc)
-            tips.parts[rows], tips.waits[rows] = parts, waits
+            branch_direction, is_inactive = branching.branch_directions(pairs, course[pairs.first], other_course, disc)
+            tips.branch_direction[rows], tips.is_inactive[rows] = branch_direction, is_inactive
 
     def _direction_from_crack(self, point: Values, radius: Values) -> Values:
         """Return vectors (n, d), m, from the mean of the crack nearer than radius (n,) to points (n, d)."""

@@ -32,7 +32,7 @@ class TipParameters:
         branching_angle: angle between a branch and the crack it comes from, rad. At 27 degrees short branches open
             without sliding.
         side_by_side: largest lead of a branch, in R, at which two branches advance side by side.
-        max_lead: lead in R from which on the branch ahead waits for the other.
+        max_lead: lead in R from which on the branch ahead is inactive.
         min_front_advance: least length of an advance, in R, that belongs to a crack front.
         min_surface_area: area of the body's surface in a ball, in R^2, from which on a front follows the surface.
         min_disc_radius: lower bound of R: cut polygons reach as far as a cell beyond their cell's centre.
