@@ -125,8 +125,8 @@ def test_what_hangs_is_solved_for_by_itself_in_long_steps(monkeypatch: pytest.Mo
     """Ten planes through a bar and steps in which inertia holds nothing: at most half the iterations that it
     takes by multigrid of another kind."""
     its = []
-    for held in (DEFAULT_POLICY.held_by_inertia, 0.0):
-        set_policy(monkeypatch, held_by_inertia=held)
+    for held in (DEFAULT_POLICY.max_deflated_inertia, 0.0):
+        set_policy(monkeypatch, max_deflated_inertia=held)
         its.append(sum(shattered(0.04, 10, {}, 6, step=0.1)[1][-3:]))
     assert its[0] < its[1] / 2, f"{its[0]} iterations, {its[1]} without"
 
@@ -140,7 +140,7 @@ def test_sweeps_do_for_what_is_in_pieces_in_short_steps(monkeypatch: pytest.Monk
     solver, u, v = scene.solver, scene.balance.u.x.array, asked.balance.u.x.array
     assert isinstance(solver, NonlinearSolver) and solver.snes.ksp.pc.getType() == "sor" and its[-1] > 5
     np.testing.assert_allclose(u, v, atol=1e-6 * np.abs(v).max())
-    solver.linear.preconditioner._policy = replace(DEFAULT_POLICY, sweeps_suffice=1.0)  # type: ignore[union-attr]
+    solver.linear.preconditioner._policy = replace(DEFAULT_POLICY, min_ssor_inertia=1.0)  # type: ignore[union-attr]
     solver.linear_response(np.ones(scene.balance.owned_dof_count))
     assert set(smoothers(scene)) == {("sor", 1)}
 

@@ -103,7 +103,7 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
     finest, also where it has stiffened by more than smoothers of before would bear; symmetric and positive. Of the
     largest eigenvalue Lanczos' method finds nine tenths at least. `slowly`: 0 where more is done with coarser
     levels."""
-    set_policy(monkeypatch, min_block_dofs=0, slow_cycle=slowly)
+    set_policy(monkeypatch, min_block_dofs=0, slow_cycle_ratio=slowly)
     small = {2: {"size": [0.6, 0.14], "h": 0.02}, 3: {"size": [0.6, 0.15, 0.15], "h": 0.05}}  # matrices are dense
     scene = bar(dim, {}, mesh=small[dim])
     Walk(scene).advance()
@@ -150,8 +150,12 @@ def test_more_is_done_with_coarser_levels_of_what_is_slender(monkeypatch: pytest
     set_policy(monkeypatch, min_block_dofs=0)
     set_policy(monkeypatch, slow_iterations=99)  # aggregates stay of one kind
     strip, block, its = [3.0, 0.04, 0.02], [0.2, 0.2, 0.2], []
-    for size, slowly in ((strip, DEFAULT_POLICY.slow_cycle), (strip, 1.0), (block, DEFAULT_POLICY.slow_cycle)):
-        set_policy(monkeypatch, slow_cycle=slowly)
+    for size, slowly in (
+        (strip, DEFAULT_POLICY.slow_cycle_ratio),
+        (strip, 1.0),
+        (block, DEFAULT_POLICY.slow_cycle_ratio),
+    ):
+        set_policy(monkeypatch, slow_cycle_ratio=slowly)
         scene = bar(
             3, {}, mesh={"size": size, "h": 0.02, "pattern": "unstructured"},
             boundary=[{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [0.0, 0.0, 0.01]}],

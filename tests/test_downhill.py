@@ -59,7 +59,7 @@ def test_what_was_misled_twice_goes_downhill_at_once_for_a_while(monkeypatch: py
     """A bar whose nodes are thrown about in each of three steps: to where it comes with exact tangents first."""
     found, u = [], []
     for astray in (2, 0):
-        set_policy(monkeypatch, positive_spell=astray)
+        set_policy(monkeypatch, positive_tangent_solves=astray)
         scene, calls = bar(3, {"snes_type": "newtonls", "snes_rtol": 1e-8}), [""]
         walk, rng = Walk(scene), np.random.default_rng(3)
         for thrown in (0, 1, 1, 1, 0, 0):

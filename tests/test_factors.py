@@ -106,7 +106,7 @@ def test_factors_that_could_not_be_made_are_not_kept() -> None:
     ksp.setType("cg")
     factors = DirectSolver(symmetric=True, dofs=2, dim=2)
     tangent: Any = SimpleNamespace(
-        update_entries=lambda: None, set_on=lambda ksp, pc: (ksp.setPC(pc), ksp.setOperators(K))
+        update_entries=lambda: None, attach_to=lambda ksp, pc: (ksp.setPC(pc), ksp.setOperators(K))
     )
     for _ in range(2):
         with factors.serving(ksp, ksp.getPC()):

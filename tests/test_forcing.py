@@ -25,15 +25,15 @@ def nothing() -> float:
 
 
 def test_digits_are_asked_for_as_the_residual_falls() -> None:
-    """0.9 (|r_k| / |r_k-1|)^2 between rtol and loosest_with_contact; no more of them than the solution needs."""
+    """0.9 (|r_k| / |r_k-1|)^2 between rtol and max_contact_rtol; no more of them than the solution needs."""
     forcing = EisenstatWalkerForcing(RTOL)
-    assert forcing.tolerance_for(10.0, 0.0) == DEFAULT_POLICY.loosest_with_contact  # nothing is known of the first
-    assert forcing.tolerance_for(5.0, 0.0) == DEFAULT_POLICY.loosest_with_contact
+    assert forcing.tolerance_for(10.0, 0.0) == DEFAULT_POLICY.max_contact_rtol  # nothing is known of the first
+    assert forcing.tolerance_for(5.0, 0.0) == DEFAULT_POLICY.max_contact_rtol
     assert forcing.tolerance_for(0.1, 0.0) == pytest.approx(0.9 * 0.02**2)
     assert forcing.tolerance_for(1e-6, 0.0) == RTOL
     assert forcing.tolerance_for(1e-8, 1e-10) == pytest.approx(1e-3)
     forcing.begin_attempt()
-    assert forcing.tolerance_for(1e-6, 0.0) == DEFAULT_POLICY.loosest_with_contact and forcing.tight_tolerance() == RTOL
+    assert forcing.tolerance_for(1e-6, 0.0) == DEFAULT_POLICY.max_contact_rtol and forcing.tight_tolerance() == RTOL
 
 
 def test_iterations_are_those_of_an_exact_solve() -> None:
@@ -75,9 +75,9 @@ def test_no_correction_is_rougher_than_may_be() -> None:
     sparing = ContractionForcing(RTOL)
     sparing.record_iterate(1.0, 1e-6, nothing)
     assert not sparing.record_iterate(0.9, 1e-6, nothing)  # a tangent that leaves nearly all of r
-    assert sparing.tolerance_for(1e-6, kept=False) == DEFAULT_POLICY.loosest_correction
+    assert sparing.tolerance_for(1e-6, kept=False) == DEFAULT_POLICY.max_correction_rtol
     sparing.record_iterate(1e-9, 1e-6, nothing)
-    assert sparing.tolerance_for(1e-6, kept=True) == DEFAULT_POLICY.loosest_last_correction  # far below what is little
+    assert sparing.tolerance_for(1e-6, kept=True) == DEFAULT_POLICY.max_last_correction_rtol  # far below what is little
     sparing.record_iterate(0.0, 0.0, nothing)
     assert sparing.tolerance_for(0.0, kept=True) >= RTOL  # nothing divides by a residual of 0
     assert sparing.equivalent_iterations(2) == 0  # too few to tell

@@ -108,8 +108,8 @@ def test_what_crawls_goes_on_down_the_potential(monkeypatch: pytest.MonkeyPatch)
     """A step of a block that is swung, by the norm of its residual and, from the first iteration on, down its
     potential: to the same place, which no norm has to be halved for."""
     found = []
-    for crawl in (DEFAULT_POLICY.crawl_iterations, 0):
-        set_policy(monkeypatch, crawl_iterations=crawl)
+    for crawl in (DEFAULT_POLICY.halving_iterations, 0):
+        set_policy(monkeypatch, halving_iterations=crawl)
         scene, state = make_scene(
             mesh={"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.34}, solver={"snes_rtol": 1e-10},
             material={"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 1.0},

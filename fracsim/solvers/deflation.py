@@ -180,7 +180,7 @@ def _rigid_motions(
     gram = np.zeros((count, B.shape[2], B.shape[2]))
     np.add.at(gram, fragment, np.einsum("ndi,ndj->nij", B, B))
     values, vectors = np.linalg.eigh(sum_over_ranks(comm, gram))
-    retained = values > policy.dependent_motion * np.maximum(values[:, -1:], 1.0)
+    retained = values > policy.dependent_motion_tolerance * np.maximum(values[:, -1:], 1.0)
     scaled = np.where(retained, 1 / np.sqrt(np.where(retained, values, 1.0)), 0.0)
     columns = np.where(retained, np.cumsum(retained).reshape(retained.shape) - 1, -1)
     return columns[fragment], np.einsum("ndi,nij,nj->ndj", B, vectors[fragment], scaled[fragment]), int(retained.sum())

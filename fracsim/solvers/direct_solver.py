@@ -80,7 +80,7 @@ class DirectSolver:
             self._pc = PETSc.PC().create(ksp.comm)
             self._pc.setType("cholesky" if self._symmetric else "lu")
             self._pc.setFactorSolverType("mumps")
-        operators.set_on(ksp, self._pc)
+        operators.attach_to(ksp, self._pc)
 
     def pattern_changed(self) -> None:
         """Forget the pattern: factors of the old one would be written past their arrays."""

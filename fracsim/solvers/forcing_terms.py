@@ -40,7 +40,7 @@ class EisenstatWalkerForcing:
         reduction = (norm / self._last_norm) ** 2 if self._last_norm else 1.0
         enough = 0.1 * solved_norm / norm if norm else 1.0
         self._last_norm = norm
-        self._used = min(self._policy.loosest_with_contact, max(self._rtol, 0.9 * reduction, enough))
+        self._used = min(self._policy.max_contact_rtol, max(self._rtol, 0.9 * reduction, enough))
         return self._used
 
     def equivalent_iterations(self, its: int) -> int:
@@ -87,7 +87,7 @@ class ContractionForcing:
             allowed = self._used * self._norms[0] or math.inf
             ratio = policy.cg_share / policy.cg_share_of_residual
             self._first_excess = max(1.0, ratio * left_by_cg() / allowed)
-        return len(self._norms) > 1 and 2 * self._contraction * norm <= policy.kept_tangent_share * solved_norm
+        return len(self._norms) > 1 and 2 * self._contraction * norm <= policy.reused_tangent_share * solved_norm
 
     def tolerance_for(self, solved_norm: float, *, kept: bool) -> float:
         """Return the tolerance of the solve from the last iterate; `kept`: with the tangent of the iterate before."""
@@ -97,8 +97,8 @@ class ContractionForcing:
             left = self._first_left / self._first_excess
         else:
             left = 2 * self._contraction if kept else self._contraction**2
-        share = min(policy.loosest_correction, policy.cg_share * left)
-        self._used = max(self.rtol, share, min(enough, policy.loosest_last_correction))
+        share = min(policy.max_correction_rtol, policy.cg_share * left)
+        self._used = max(self.rtol, share, min(enough, policy.max_last_correction_rtol))
         return self._used
 
     def tight_tolerance(self) -> float:

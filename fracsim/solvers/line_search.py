@@ -76,7 +76,7 @@ class MeritFunction:
             self._whole_step_rise = rise
         # Near the solution potentials differ by round-off alone, and a whole step is accepted. A step that was
         # shortened until it makes no difference is not: its direction rises.
-        is_near = self._whole_step_rise <= self._policy.near_solution * slack
+        is_near = self._whole_step_rise <= self._policy.near_solution_ratio * slack
         return -slack if abs(rise) <= slack and is_near else rise
 
     def _start_from(self, x: PETSc.Vec) -> None:

@@ -160,7 +160,7 @@ class LinearSolver:
         self.forcing = None if self._asked_rtol else _forcing(balance, chosen, policy)
         dofs = balance.work_vector.getSize()
         self.direct = DirectSolver(symmetric=balance.symmetric, dofs=dofs, dim=balance.domain.dim, policy=policy)
-        self.operators.tell_of_pattern(self.preconditioner, self.direct)
+        self.operators.add_pattern_listeners(self.preconditioner, self.direct)
 
     def _set_up_at_rest(self) -> None:
         """Assemble the tangent at rest and set up the KSP (collective)."""

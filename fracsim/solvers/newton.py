@@ -117,7 +117,7 @@ class ConvergenceTest:
         The residual of one cell that is nearly flat grows before it decreases. The incremental potential, where there
         is one that this attempt does not use, allows whole steps. Without inertia factors replace slow attempts.
         """
-        norms, balance, count = self._norms, self._balance, self._policy.crawl_iterations
+        norms, balance, count = self._norms, self._balance, self._policy.halving_iterations
         is_slow = len(norms) > count and norms[-1] > norms[-1 - count] / 2
         has_other_merit = self._modified is None and balance.conservative and balance.scheme.inertia
         return is_slow and has_other_merit and snes.ksp.getType() == "cg"
@@ -150,7 +150,7 @@ class ConvergenceTest:
         may_relax = self._modified is not None or self._eliminations < self._policy.max_eliminations
         if self._elimination is None or not its or not may_relax:
             return False
-        if snes.getFunctionNorm() < self._policy.fast_reduction * self._norms[-1]:
+        if snes.getFunctionNorm() < self._policy.fast_reduction_ratio * self._norms[-1]:
             return False
         if not self._elimination.relax_nodes(self.solved_norm):
             return False

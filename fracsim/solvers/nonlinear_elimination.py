@@ -373,11 +373,11 @@ def minimise_patches(region: PatchRegion, solved_norm: float, edge: float, polic
         decrease, slack = current.potential - trial.potential, policy.potential_round_off * current.size
         ratio = np.divide(decrease, predicted, out=np.zeros_like(decrease), where=predicted > 0)
         accepted = active & (
-            (ratio > policy.poor_decrease) | ((abs(decrease) <= slack) & (region.norms(trial.forces) < norms))
+            (ratio > policy.min_decrease_ratio) | ((abs(decrease) <= slack) & (region.norms(trial.forces) < norms))
         )
         length = region.norms(step)
         # The radius grows only if the step has used it up.
-        grows = accepted & (ratio > policy.good_decrease) & (length > 0.9 * radius)
+        grows = accepted & (ratio > policy.growth_decrease_ratio) & (length > 0.9 * radius)
         radius = np.where(grows, 2 * radius, np.where(accepted | ~active, radius, length / 4))
         w = np.where(accepted[region.patch_of_node, None], w + step, w)
         current = trial.where(accepted, current, region)

@@ -65,7 +65,8 @@ class NonlinearSolver:
             may_prefer=is_default and direct_is_cheap,
             has_inertia=balance.scheme.inertia,
         )
-        self._solvers = Solvers(balance, newton, self.selector, PositiveTangentSpell(policy.positive_spell), policy)
+        spell = PositiveTangentSpell(policy.positive_tangent_solves)
+        self._solvers = Solvers(balance, newton, self.selector, spell, policy)
 
     @property
     def snes(self) -> PETSc.SNES:

@@ -57,7 +57,7 @@ class PlainPreconditioner:
     def update(self, operators: TangentOperators) -> None:
         """Set up for the tangent of the next solve (collective)."""
         operators.update_entries()
-        operators.set_on(self._ksp, self.pc)
+        operators.attach_to(self._ksp, self.pc)
         if self.pc.getType() == "cholesky" and self.pc.getFactorSolverType() == "mumps":
             negative_pivots = self.pc.getFactorMatrix().getMumpsInfog(12)
             self.is_indefinite = negative_pivots > 0

@@ -23,11 +23,11 @@ class SolverPolicy:
     max_support_jump: float = 0.01
     # Share of |r| that an iteration leaves. Below it the method converges by itself and no nodes are relaxed
     # separately.
-    fast_reduction: float = 0.1
+    fast_reduction_ratio: float = 0.1
     # Eliminations in an attempt with the merit function |r|, which may rise in each of them: bounds a cycle.
     max_eliminations: int = 4
     # Iterations in which |r| has to be halved where it is the merit function; a slower attempt is given up.
-    crawl_iterations: int = 2
+    halving_iterations: int = 2
     # Linear solves of a step with a linear balance, before Newton's method takes over. One is the rule.
     max_linear_solves: int = 3
     # Solves of a step in which jammed obstacles advance, at most, and before advancing may be judged as too slow.
@@ -40,7 +40,7 @@ class SolverPolicy:
     # Share of the summed terms of the potential, below which two potentials are equal up to round-off.
     potential_round_off: float = 1e4 * float(np.finfo(float).eps)
     # Multiples of that round-off. Whole steps whose potential rises by no more are taken as steps near the solution.
-    near_solution: float = 1e3
+    near_solution_ratio: float = 1e3
     # Share of all nodes whose correction may be clipped. Clipping more would slow the motion of a whole fragment.
     max_clipped_nodes: float = 0.03
     # Iterations with exact tangents without a smaller |r|, after which an attempt is given up: it cycles.
@@ -52,18 +52,18 @@ class SolverPolicy:
 
     # --- inexact Newton (forcing_terms) ---
     # Largest relative tolerance of CG while contact acts. CG takes four times as many iterations with contact.
-    loosest_with_contact: float = 1e-2
+    max_contact_rtol: float = 1e-2
     # Shares of the residual left by the linearisation, which CG may leave: in the preconditioned norm, and in |r|.
     cg_share: float = 0.1
     cg_share_of_residual: float = 0.3
     # Share of the residual of a solution that CG may leave. Results on other numbers of ranks differ by it.
     cg_share_of_solution: float = 1e-2
     # Share of the residual of a solution that the tangent of an earlier iterate may leave.
-    kept_tangent_share: float = 0.3
+    reused_tangent_share: float = 0.3
     # Largest relative tolerance of a correction, and of a last one. A rougher correction of a slender body may not
     # be a direction of descent.
-    loosest_correction: float = 1e-2
-    loosest_last_correction: float = 0.1
+    max_correction_rtol: float = 1e-2
+    max_last_correction_rtol: float = 0.1
     # Iterations of CG from which on its rate of convergence is known.
     min_rate_iterations: int = 3
 
@@ -95,8 +95,8 @@ class SolverPolicy:
     # Largest cost of a factorisation in 3D, iterations for each dof: a compact body of n dofs takes n / 16.
     compact_direct_cost: float = 1 / 16
     # Solves that start with factors after iterations have failed: the first time, and at most.
-    first_direct_spell: int = 8
-    longest_direct_spell: int = 256
+    first_direct_solves: int = 8
+    max_direct_solves: int = 256
 
     # Dofs up to which `[solver] plain = true` preconditions by factors: 3.7 s for 14,000 dofs in space, GAMG above.
     max_plain_direct_dofs: int = 5_000
@@ -105,15 +105,15 @@ class SolverPolicy:
     # Restart length of GMRES. With PETSc's 30 it stalls on nearly incompressible bodies.
     gmres_restart: int = 200
     # Solves that begin with positive tangents after exact first tangents have failed in two solves in a row.
-    positive_spell: int = 8
+    positive_tangent_solves: int = 8
 
     # --- preconditioner ---
     # c_a rho h^2 / Y. Above it inertia resists the motion of parts that are attached by a node or an edge, and no
     # deflation is needed.
-    held_by_inertia: float = 1e-3
+    max_deflated_inertia: float = 1e-3
     # c_a rho h^2 / Y. Above it SSOR alone serves a body in fragments. Measured on a porcelain figure that shatters
     # (46,000 tetrahedra, a sixth): 2.5 times the iterations, half the time.
-    sweeps_suffice: float = 1e-2
+    min_ssor_inertia: float = 1e-2
     # Iterations of a whole body from which on aggregates of strong links are tried, and share of these that the new
     # aggregates may take. Measured: 38 iterations for 77 on a sheet of 234,000 tetrahedra, nu = 0.45.
     slow_iterations: int = 25
@@ -136,11 +136,11 @@ class SolverPolicy:
     thorough_cost_factor: float = 0.6
     # Solves whose slowest tells the iterations of a fresh set-up beside the V cycle. One step has tangents that differ
     # by three times the iterations; with two solves a jelly that tumbles was set up in each step.
-    fresh_solves: int = 5
+    solves_after_setup: int = 5
 
     # --- deflation ---
     # Share of the largest eigenvalue of a fragment's Gram matrix, below which rigid motions are linearly dependent.
-    dependent_motion: float = 1e-8
+    dependent_motion_tolerance: float = 1e-8
 
     # --- nonlinear elimination ---
     # Share of |r|^2 on the nodes that are relaxed: no more of them than it takes, and the least that is worth it.
@@ -159,8 +159,8 @@ class SolverPolicy:
     # Share of the largest eigenvalue of a node's block, to which smaller ones are raised for preconditioning.
     min_block_eigenvalue: float = 1e-8
     # Actual over predicted decrease: below the first a step is refused, above the second the radius may grow.
-    poor_decrease: float = 0.05
-    good_decrease: float = 0.7
+    min_decrease_ratio: float = 0.05
+    growth_decrease_ratio: float = 0.7
     # Relative tolerance and iterations of the conjugate gradients of a trust-region step.
     trust_cg_rtol: float = 1e-2
     max_trust_cg_iterations: int = 200
@@ -172,7 +172,7 @@ class SolverPolicy:
     # Cycles that tell whether coarse levels converge slowly, and share that the last of them leaves where they do.
     # Measured on a doormat after 110 steps: 31 iterations for 98, in 0.4 of the time.
     trial_cycles: int = 4
-    slow_cycle: float = 0.8
+    slow_cycle_ratio: float = 0.8
 
     # --- memory (weak_callbacks) ---
     # Scenes after which dropped ones are freed. A scene has some 13 communicators.

@@ -122,7 +122,7 @@ class AppliedPreconditioner:
         if rebuild:
             self.pc.reset()
         self.release_vcycle()
-        operators.set_on(self._ksp, self.pc)
+        operators.attach_to(self._ksp, self.pc)
         if self._is_default and operators.blocks is not None:
             from .multigrid.vcycle import create_vcycle
 
@@ -155,7 +155,7 @@ class AppliedPreconditioner:
             self.vcycle.update_operator()
         if new_fragments:
             self.release_deflation()
-            if mass_stiffness_ratio(self._balance) <= self._policy.held_by_inertia:
+            if mass_stiffness_ratio(self._balance) <= self._policy.max_deflated_inertia:
                 from .deflation import create_deflation
 
                 self._deflation = create_deflation(self._balance, base, self._policy)
@@ -293,7 +293,7 @@ class Preconditioner:
             self._due = max(self._due, Update.REFRESH)
         if self._due == Update.NONE:
             self._learn_from_solve(equivalent)
-            if self.applied.vcycle is not None and self._solves < policy.fresh_solves:
+            if self.applied.vcycle is not None and self._solves < policy.solves_after_setup:
                 self._fresh_iterations = max(self._fresh_iterations, equivalent)
         # Too many iterations. Also where a refresh is due: coarse spaces from before a crack carry the motion of one
         # side to the other.
@@ -325,7 +325,7 @@ class Preconditioner:
                 self._due = max(self._due, Update.REFRESH)
         # The step size calls for sweeps or for multigrid.
         if self._uses_ssor is not None and self._uses_ssor != (
-            mass_stiffness_ratio(self._balance) > policy.sweeps_suffice
+            mass_stiffness_ratio(self._balance) > policy.min_ssor_inertia
         ):
             self._uses_ssor, self._fresh_iterations = not self._uses_ssor, 0
             self._change_kind(SSOR_OPTIONS if self._uses_ssor else MULTIGRID_OPTIONS)
@@ -368,7 +368,7 @@ class Preconditioner:
 
     def _suit_fragments(self) -> None:
         """Aggregate without smoothing from now on, if inertia holds fragments that hang by a node (collective)."""
-        if mass_stiffness_ratio(self._balance) <= self._policy.held_by_inertia:
+        if mass_stiffness_ratio(self._balance) <= self._policy.max_deflated_inertia:
             return
         self._may_suit_fragments = self._uses_node_blocks = self._uses_ssor = False
         self._rebuild_ratio = self._policy.rebuild_ratio_fragments

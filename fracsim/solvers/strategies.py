@@ -76,7 +76,7 @@ class SolverSelector(CostLimit):
     def __init__(self, direct: DirectSolver, policy: SolverPolicy, *, may_prefer: bool, has_inertia: bool) -> None:
         """`may_prefer`: whether factors are used where they are cheaper, not only where iterations fail."""
         self._direct, self._policy, self._may_prefer, self._has_inertia = direct, policy, may_prefer, has_inertia
-        self.remaining, self._spell, self._preferred = 0, policy.first_direct_spell, False
+        self.remaining, self._spell, self._preferred = 0, policy.first_direct_solves, False
 
     def begins_with_factors(self) -> bool:
         """Whether the next solve begins with factors; counts that solve."""
@@ -95,11 +95,11 @@ class SolverSelector(CostLimit):
     def start_spell(self, *, preferred: bool) -> None:
         """Let the next solves begin with factors; `preferred`: iterations were expensive, but did not fail."""
         self._preferred = preferred
-        self.remaining, self._spell = self._spell, min(2 * self._spell, self._policy.longest_direct_spell)
+        self.remaining, self._spell = self._spell, min(2 * self._spell, self._policy.max_direct_solves)
 
     def iterations_served(self) -> None:
         """Free the factors and reset the number of solves with factors, after Krylov iterations have converged."""
-        self._spell = self._policy.first_direct_spell
+        self._spell = self._policy.first_direct_solves
         self._direct.release()
 
     def was_expensive(self, result: SolveResult, *, modified: bool) -> bool:

@@ -112,7 +112,7 @@ class TangentOperators:
         self._tangent.assemble(psd_tolerance=eigenvalue_floor, blocks_only=True)
         self._check_pattern()
 
-    def tell_of_pattern(self, *listeners: PatternListener) -> None:
+    def add_pattern_listeners(self, *listeners: PatternListener) -> None:
         """Tell these listeners of every change of the pattern."""
         self._listeners += listeners
 
@@ -148,7 +148,7 @@ class TangentOperators:
             fine_level = None
         self._block_operator.multiply_by(fine_level)
 
-    def set_on(self, ksp: PETSc.KSP, pc: PETSc.PC) -> None:
+    def attach_to(self, ksp: PETSc.KSP, pc: PETSc.PC) -> None:
         """Give the tangent to a KSP with this preconditioner, and set both up (collective)."""
         ksp.setPC(pc)
         pc.setReusePreconditioner(False)

@@ -120,7 +120,7 @@ class SinglePrecisionVCycle:
             self._apply_cycle(number)
             level.restart_from_residual()
             norms.append(level.rhs_norm())
-        return self._policy.slow_cycle * norms[-2] < norms[-1] < norms[-2]
+        return self._policy.slow_cycle_ratio * norms[-2] < norms[-1] < norms[-2]
 
     @property
     def _values(self) -> Values:
