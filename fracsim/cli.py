@@ -79,11 +79,11 @@ def run(
         print(
             f"{one_line(summary['title'])}: {summary['steps']} steps to t = {summary['time']:g} s in "
             f"{summary['wall']:.1f} s on {ranks} rank{'s'[: ranks > 1]}; {summary['broken_edges']} broken edges, "
-            f"{pieces} piece{'s'[: pieces != 1]}{_dust(summary)}. Results in {folder}"
+            f"{pieces} piece{'s'[: pieces != 1]}{_single_node_text(summary)}. Results in {folder}"
         )
 
 
-def _dust(summary: dict[str, Any]) -> str:
+def _single_node_text(summary: dict[str, Any]) -> str:
     """Return words on the number of single-node fragments; nothing if there are none."""
     dust = summary.get("dust")
     return f", {dust} of them dust (single nodes; [fracture] crumbs = false leaves none)" if dust else ""
@@ -161,7 +161,7 @@ def render(
     from .report.pictures.picture import render
     from .report.pictures.picture_options import PictureOptions, parse_limits, parse_size
 
-    _tell_of_runs(outs)
+    _note_active_runs(outs)
     how = PictureOptions(
         colour, explode, view, zoom, material=look, size=parse_size(size),
         limits=parse_limits(limits) if limits else None, magnify=magnify, floor=floor, title=title, bare=bare,
@@ -185,7 +185,7 @@ def export(
     import_outside("pyvista")
     from .report.export import export_surfaces
 
-    _tell_of_runs([out])
+    _note_active_runs([out])
     result = export_surfaces(out, kind, target, frame=frame, dust=dust, look=look)
     print(f"saved {result[0]}" + (f" and {len(result) - 1} more" if len(result) > 1 else ""))
 
@@ -206,7 +206,7 @@ def report(
     import_outside("matplotlib")
     from .report.html_report import make_report
 
-    _tell_of_runs(outs)
+    _note_active_runs(outs)
     print(f"saved {make_report(outs, html, references=reference, quantity=quantity, exact=exact)}")
 
 
@@ -252,7 +252,7 @@ def list_(
             print(f"  {name:18} {words}")
 
 
-def _tell_of_runs(folders: list[Path]) -> None:
+def _note_active_runs(folders: list[Path]) -> None:
     """Print a note on folders in which a run continues, whose results are incomplete."""
     from .output.lock import describe_lock_holder
 
@@ -322,13 +322,13 @@ def main(begin: Callable[[], None] | None = None) -> NoReturn:
         sys.stdout.flush()  # here what cannot be written is told
         return code
 
-    code = _guarded(work)
+    code = _exit_code(work)
     if not is_first_rank() and "mpi4py.MPI" not in sys.modules:
         sys.exit(Exit.DONE)  # mpirun kills all ranks at the first that fails, and rank 0 may still have to say why
     sys.exit(Exit.BAD_INPUT if bare else code)
 
 
-def _guarded(work: Callable[[], object]) -> int:
+def _exit_code(work: Callable[[], object]) -> int:
     """Return the exit code of `work`, and print the message of an error."""
     try:
         code = work()
@@ -336,15 +336,15 @@ def _guarded(work: Callable[[], object]) -> int:
             print("fracsim: interrupted before the first step; nothing was written", file=sys.stderr, flush=True)
         return code if isinstance(code, int) else Exit.DONE
     except (SystemExit, Exception) as error:
-        code, message = _verdict(error)
+        code, message = _error_code_and_message(error)
         # what ends a run by rule may come late from rank 0, which first writes a summary and draws the last frame
-        _end_others(message, code, late=isinstance(error, NotConverged | Stopped))
+        _end_other_ranks(message, code, late=isinstance(error, NotConverged | Stopped))
     if message and is_first_rank():
         print(message, file=sys.stderr, flush=True)
     return code
 
 
-def _verdict(error: BaseException) -> tuple[int, str]:
+def _error_code_and_message(error: BaseException) -> tuple[int, str]:
     """Return exit code and message: one sentence for an error of the user, a traceback for one of the program."""
     import click
 
@@ -360,17 +360,17 @@ def _verdict(error: BaseException) -> tuple[int, str]:
         where = f" {error.filename}" if error.filename else ""
         words = f"cannot write{where}: {error.strerror}; make room or give another --out"
         return int(Exit.CANNOT_WRITE), f"fracsim: {FracsimError(words)}"
-    if isinstance(error, OSError) and error.errno in _BAD_PATH and _is_of_user(error.filename):
+    if isinstance(error, OSError) and error.errno in _BAD_PATH and _is_user_file(error.filename):
         return int(Exit.BAD_INPUT), f"fracsim: {FracsimError(f'{error.filename}: {error.strerror}; give another path')}"
     return 1, "".join(traceback.format_exception(error)).rstrip()
 
 
-def _is_of_user(path: object) -> bool:
+def _is_user_file(path: object) -> bool:
     """Return whether a path is outside of the program itself."""
     return bool(path) and not str(path).startswith((sys.prefix, str(Path(__file__).parent)))
 
 
-def _end_others(message: str, code: int, *, late: bool) -> None:
+def _end_other_ranks(message: str, code: int, *, late: bool) -> None:
     """Return if every rank has failed; otherwise end the ranks that wait for this one."""
     if "mpi4py.MPI" not in sys.modules:
         return

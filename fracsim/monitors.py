@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from .output.result_checks import EnergyGainMonitor, InvertedCellMonitor, negligible_energy
 from .output.run_folder import software_versions
-from .output.summary import ResourceMeter, describe_trouble
+from .output.summary import ResourceMeter, irregular_event_text
 
 if TYPE_CHECKING:
     from .output.contact_checks import ObstacleContact, ObstacleContactMonitor, ObstacleOverlapMonitor
@@ -70,7 +70,7 @@ class RunMonitors:
 
     @property
     def load_dropped(self) -> bool:
-        """Whether the load has dropped so far that the run ends."""
+        """Return whether the load has dropped so far that the run ends."""
         return self.load_drop is not None and self.load_drop.has_dropped
 
     def record_step(self, state: State, report: StepReport, figures: dict[str, float], broken: int) -> None:
@@ -118,7 +118,7 @@ class RunMonitors:
     def notes(self, *, done: bool) -> list[str]:
         """Return notes on doubtful results (collective); `done`: the run came to its end."""
         energy, time = self._study.material.energy, self._study.time
-        trouble = describe_trouble(self.meter.read_totals()["trouble"])
+        trouble = irregular_event_text(self.meter.read_totals()["trouble"])
         notes = [note for note in (trouble, self.inverted.note(energy), self.energy_gain.note(time.scheme)) if note]
         if self.contact_monitor is not None:
             notes += self.contact_monitor.notes(done=done)

@@ -27,10 +27,10 @@ DOLFINX = "0.9"
 # Exit code after SIGINT, as typer and shells have it.
 INTERRUPTED = 130
 # Errors of a stream without a reader; EIO: its terminal was closed.
-_READER_GONE = (errno.EPIPE, errno.EIO)
+_CLOSED_READER_ERRORS = (errno.EPIPE, errno.EIO)
 # Control characters other than tabs and ends of lines, and those that change the direction of writing.
-_CONTROLS = {*range(0x20), *range(0x7F, 0xA0), 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)}
-_ESCAPES = {code: ascii(chr(code))[1:-1] for code in _CONTROLS - {*map(ord, "\t\n\r")}}
+_CONTROL_CODES = {*range(0x20), *range(0x7F, 0xA0), 0x200E, 0x200F, *range(0x202A, 0x202F), *range(0x2066, 0x206A)}
+_ESCAPES = {code: ascii(chr(code))[1:-1] for code in _CONTROL_CODES - {*map(ord, "\t\n\r")}}
 # Seconds that other ranks wait before they end, since the launcher ends all ranks with the first one.
 _FIRST_RANK_DELAY = 0.3
 
@@ -40,13 +40,13 @@ _FIRST_RANK_DELAY = 0.3
 
 def start_process() -> None:
     """Prepare streams, signals and the home folder of a command. Raises InputError."""
-    global _own
-    _own = True
+    global _is_own_process
+    _is_own_process = True
     runs = sys.argv[1:2] == ["run"]
-    _open_streams(None if runs else _READER_GONE)
+    _open_streams(None if runs else _CLOSED_READER_ERRORS)
     if runs:
         _handle_signals()
-    _check_surroundings()
+    _check_environment()
 
 
 def _handle_signals() -> None:
@@ -57,11 +57,11 @@ def _handle_signals() -> None:
             signal.signal(number, _end_before_run)
 
 
-_PARENT = os.getppid()
+_PARENT_PID = os.getppid()
 # Environment variables with the rank of a process.
-_RANK = ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK")
+_RANK_VARIABLES = ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK")
 # Whether this process was started as a command, and whether its run handles signals.
-_own = False
+_is_own_process = False
 _run_begun = False
 
 
@@ -126,7 +126,7 @@ class _Stream(io.TextIOWrapper):
         super().flush()
 
 
-def _check_surroundings() -> None:
+def _check_environment() -> None:
     """Raise InputError if the working folder was deleted, or if there is no home folder for compiled kernels."""
     try:
         os.getcwd()
@@ -161,18 +161,18 @@ def _end_before_run(number: int, frame: FrameType | None) -> None:
 
 def is_first_rank() -> bool:
     """Return whether this process is rank 0, without starting MPI."""
-    return all(os.environ.get(name, "0") == "0" for name in _RANK)
+    return all(os.environ.get(name, "0") == "0" for name in _RANK_VARIABLES)
 
 
 def _is_rank() -> bool:
     """Return whether a launcher started this process as a rank of a job."""
-    return any(name in os.environ for name in _RANK)
+    return any(name in os.environ for name in _RANK_VARIABLES)
 
 
 def start_run() -> None:
     """Leave signals to the run; from here on a crash ends the process at once, with the place in the program."""
     global _run_begun
-    if not _own:
+    if not _is_own_process:
         return
     import faulthandler
 
@@ -189,8 +189,8 @@ def start_run() -> None:
     from .mesh.parallel import launcher
     from .output.interrupt import end_with_launcher
 
-    if _is_rank() and (process := launcher(_PARENT)) is not None:
-        end_with_launcher(process, parent=_PARENT)
+    if _is_rank() and (process := launcher(_PARENT_PID)) is not None:
+        end_with_launcher(process, parent=_PARENT_PID)
     # what imports have made stays, and is not searched for garbage
     gc.freeze()
     gc.enable()
@@ -266,14 +266,14 @@ def import_dolfinx() -> None:
         return
     with outside_working_folder():
         # the handlers of PETSc would answer SIGHUP and SIGQUIT by MPI_Abort
-        if _own:
+        if _is_own_process:
             importlib.import_module("petsc4py").init([sys.argv[0], "-no_signal_handler"])
         dolfinx = importlib.import_module("dolfinx")
         _check_dolfinx(str(dolfinx.__version__))
         _read_settings("dolfinx", "jit")
         _read_settings("ffcx", "options")
     # UCX, of Open MPI, has taken SIGHUP
-    if _own:
+    if _is_own_process:
         _handle_signals()
 
 

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
     from .rigid.instances import Instances
 
-ALONE = MPI.COMM_SELF
+ROOT_COMM = MPI.COMM_SELF
 # Names in a checkpoint: of numbers, of monitors, and of arrays that only broken or dented bodies have.
 CLOCK_NAMES = ("t", "step", "work", "start")
 MONITOR_NAMES = {"blows", "loads", "frames"}
@@ -107,7 +107,7 @@ class RigidRun:
             check_text_files(folder)
         interrupt.has_output = True
         make_output_folder(folder, text, restart=restart)
-        self.history = History(ALONE, folder / "history.csv", names, step)
+        self.history = History(ROOT_COMM, folder / "history.csv", names, step)
         density = float(scene.study.material.density)
         self.frames = self._write(
             folder / "surface.pvd",
@@ -120,16 +120,16 @@ class RigidRun:
                 zip(self.history.obstacle_work, map(float, arrays["worked"]), strict=True)
             )
             print_notes(
-                ALONE,
+                ROOT_COMM,
                 [*self.history.notes, *missing_frame_notes(folder, self._frame_counts, self.frames.files.frame_counts)],
             )
         self._clock = FrameSchedule(scene.study.output.every, scene.study.frame_interval)
         self._clock.record_frame(self.state.t)
-        write_on_root(ALONE, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
+        write_on_root(ROOT_COMM, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
 
     def _write[T](self, path: Path, work: Callable[[], T]) -> T:
         """Return the result of work that writes a file. Raises CannotWrite."""
-        result = write_on_root(ALONE, path, work)
+        result = write_on_root(ROOT_COMM, path, work)
         assert result is not None
         return result
 
@@ -180,7 +180,7 @@ class RigidRun:
         damage, shapes = instances.damage(), instances.dented_shapes
         dented = {number: shape.points for number, shape in shapes.items()}
         path, placed = self.folder / "surface.pvd", self.scene.stepper.obstacles.placed_shapes(state.t, state.bodies)
-        write_on_root(ALONE, path, lambda: self.frames.write_frame(state.t, state.bodies, *damage, dented, placed))
+        write_on_root(ROOT_COMM, path, lambda: self.frames.write_frame(state.t, state.bodies, *damage, dented, placed))
         self._clock.record_frame(state.t)
 
     def checkpoint(self) -> Path:
@@ -191,7 +191,7 @@ class RigidRun:
         clock = {"t": state.t, "step": state.step, "work": state.work, "start": self._start}
         counts = {"blows": self.blows, "loads": self.loads, "frames": self.frames.files.frame_counts}
         notes = CheckpointNotes(self.text, counts)
-        write_on_root(ALONE, path, lambda: write_checkpoint_file(path, arrays, clock, self.scene.mesh, notes))
+        write_on_root(ROOT_COMM, path, lambda: write_checkpoint_file(path, arrays, clock, self.scene.mesh, notes))
         self._saved_at = state.t
         return path
 
@@ -203,7 +203,7 @@ class RigidRun:
             with self._progress:
                 return self._run()
         except CannotWrite as error:
-            raise CannotWrite(f"{error}. {self._rescued()}") from None
+            raise CannotWrite(f"{error}. {self._restart_advice()}") from None
         finally:
             self.history.close()
 
@@ -219,12 +219,12 @@ class RigidRun:
                 self._progress.end_line()
         except (NotConverged, Stopped) as error:
             failed = isinstance(error, NotConverged)
-            saved = self._saved(failed=failed)
+            saved = self._save_last_checkpoint(failed=failed)
             self._finish("not converged" if failed else "stopped")
             raise type(error)(f"{error}. {saved}") from None
         return self._finish("done")
 
-    def _saved(self, *, failed: bool) -> str:
+    def _save_last_checkpoint(self, *, failed: bool) -> str:
         """Write a last checkpoint and return a sentence that names it.
 
         After a step that `failed` none is written, since a blow in the step would be lost.
@@ -234,14 +234,14 @@ class RigidRun:
         last = describe_last_checkpoint(self.folder, self._saved_at)
         return f"No checkpoint was written: a blow in the step that failed would be lost. {last}"
 
-    def _rescued(self) -> str:
+    def _restart_advice(self) -> str:
         """Return a sentence on how to continue after output failed: from a new checkpoint or the last one."""
         with contextlib.suppress(CannotWrite):
             self._finish("could not write")
         try:
             # a step without its row would leave a gap
             if self.history.last_step == self.state.step:
-                return self._saved(failed=False)
+                return self._save_last_checkpoint(failed=False)
         except CannotWrite:
             pass
         return describe_last_checkpoint(self.folder, self._saved_at)
@@ -253,7 +253,7 @@ class RigidRun:
             try:
                 report = self.step()
             except StepAborted:
-                raise self._stopped("; the step that was under way begins anew") from None
+                raise self._stop_error("; the step that was under way begins anew") from None
             done = self.scene.ended(self.state)
             if done or self._clock.is_due(self.state.t, self.state.step):
                 self.write_frame()
@@ -262,7 +262,7 @@ class RigidRun:
                 self.checkpoint()
                 last = time.monotonic()
             if not done and self._interrupt.stop_reason():
-                raise self._stopped()
+                raise self._stop_error()
 
     def _report_progress(self, report: RigidReport) -> None:
         """Print the progress of the run."""
@@ -270,7 +270,7 @@ class RigidRun:
         details = f"analyses {report.blows + report.loads}  {report.seconds:.2g} s/step"
         self._progress.update(ProgressState(state.t, dt, state.step, self.broken, pieces, details))
 
-    def _stopped(self, more: str = "") -> Stopped:
+    def _stop_error(self, more: str = "") -> Stopped:
         """Return the error that ends the run at the present state."""
         reason, state = self._interrupt.stop_reason(), self.state
         return Stopped(f"stopped by {reason} at t = {state.t:g} s after {state.step} steps{more}")
@@ -290,7 +290,7 @@ class RigidRun:
             "wall": round(time.perf_counter() - self._began, 3), "cpu": round(time.process_time() - self._cpu, 4),
             "ranks": MPI.COMM_WORLD.size, "versions": software_versions(MPI.COMM_WORLD),
         }  # fmt: skip
-        write_summary(ALONE, self.folder, summary)
+        write_summary(ROOT_COMM, self.folder, summary)
         return summary
 
     def _count_single_nodes(self) -> dict[str, float]:
@@ -302,7 +302,7 @@ class RigidRun:
 
 def print_mesh_notes(scene: RigidScene) -> None:
     """Print the notes on the mesh, such as what was repaired while it was read."""
-    print_notes(ALONE, list(scene.mesh.notes))
+    print_notes(ROOT_COMM, list(scene.mesh.notes))
 
 
 def _check_stored(

@@ -176,7 +176,7 @@ class Run:
 
     @property
     def ended(self) -> bool:
-        """Whether the run is at the end of the study, or ended by `time.until`."""
+        """Return whether the run is at the end of the study, or ended by `time.until`."""
         return self.scene.ended(self.state) or self.monitors.load_dropped
 
     # --- one step, one frame, one checkpoint ---
@@ -248,7 +248,7 @@ class Run:
             with self.interrupt:
                 summary = self._run()
         except CannotWrite as error:
-            raise CannotWrite(f"{error}. {self._rescued()}") from None
+            raise CannotWrite(f"{error}. {self._restart_advice()}") from None
         finally:
             self.history.close()
         if self.comm.rank == 0 and self.scene.study.output.picture:
@@ -266,7 +266,7 @@ class Run:
                 self._progress.end_line()
         except (NotConverged, Stopped) as error:
             end_unless_all_failed(self.comm, f"fracsim: {error}", int(error.exit_code))  # what follows is collective
-            saved = self._saved()
+            saved = self._save_last_checkpoint()
             self._finish("not converged" if isinstance(error, NotConverged) else "stopped")
             raise type(error)(f"{error}. {saved}") from None
         return self._finish("done")
@@ -282,23 +282,23 @@ class Run:
             try:
                 report = self.step()
             except StepAborted:
-                raise self._stopped("; the step that was under way begins anew") from None
+                raise self._stop_error("; the step that was under way begins anew") from None
             done = self.ended
             if done or self._clock.is_due(self.state.t, self.state.step):
                 self.write_frame()
-            self._tell(report)
+            self._report_progress(report)
             if interval is not None and self.comm.bcast(time.monotonic() - last > interval):
                 self.checkpoint()
                 last = time.monotonic()
             if not done and self.interrupt.stop_reason():
-                raise self._stopped()
+                raise self._stop_error()
 
-    def _tell(self, report: StepReport) -> None:
+    def _report_progress(self, report: StepReport) -> None:
         broken, _, pieces = self.breaks.counts
         details = f"Newton {report.solve.newton_iterations}  {report.seconds:.2g} s/step"
         self._progress.update(ProgressState(self.state.t, report.dt, self.state.step, broken, pieces, details))
 
-    def _stopped(self, more: str = "") -> Stopped:
+    def _stop_error(self, more: str = "") -> Stopped:
         """Write a frame and return the error that ends the run at the present state (collective)."""
         if self._frame_of != self.state.step:
             self.write_frame()
@@ -328,20 +328,20 @@ class Run:
 
     # --- where to go on from ---
 
-    def _saved(self) -> str:
+    def _save_last_checkpoint(self) -> str:
         """Write a last checkpoint and return a sentence that names it; none if the state is not finite (collective)."""
         try:
             return f"Checkpoint: {self.checkpoint()}; go on with --restart"
         except NotConverged as error:
             return f"No checkpoint was written: {error}. {describe_last_checkpoint(self.folder, self._saved_at)}"
 
-    def _rescued(self) -> str:
+    def _restart_advice(self) -> str:
         """Return a sentence on how to continue after output failed: from a new checkpoint or the last one."""
         with contextlib.suppress(CannotWrite):
             write_summary(self.comm, self.folder, self._summary("could not write"))
         try:
             if self.history.last_step == self.state.step:  # a step without its row would leave a gap
-                return self._saved()
+                return self._save_last_checkpoint()
         except CannotWrite:
             pass
         return describe_last_checkpoint(self.folder, self._saved_at)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fracsim.output.result_checks import EnergyGainMonitor, negligible_energy
-from fracsim.output.summary import describe_trouble
+from fracsim.output.summary import irregular_event_text
 from support.scenes import deform, make_scene
 
 
@@ -70,8 +70,10 @@ def test_round_off_is_not_told() -> None:
 
 def test_what_a_run_went_on_in_spite_of_is_one_sentence() -> None:
     """Counts of what happened, none of what did not; a halved step that was taken in the end is no trouble."""
-    assert describe_trouble({"steps_failed": 7, "linear_failures": 0}) == ""
-    words = describe_trouble({"steps_failed": 7, "unbalanced_steps": 2, "linear_failures": 0, "cells_not_finite": 5})
+    assert irregular_event_text({"steps_failed": 7, "linear_failures": 0}) == ""
+    words = irregular_event_text(
+        {"steps_failed": 7, "unbalanced_steps": 2, "linear_failures": 0, "cells_not_finite": 5}
+    )
     assert words.startswith("the run went on in spite of 2 steps that ended out of balance")
     assert "; 5 cells crushed flat" in words and "linear" not in words
 

@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 
-from fracsim.cli import _dust
+from fracsim.cli import _single_node_text
 from fracsim.fracture.criterion import OverloadedEdges
 from fracsim.fracture.node_retention import RETENTION, CellRetention
 from fracsim.mesh.edge_graph import EdgeGraph
@@ -95,8 +95,8 @@ def test_dust_is_counted_with_its_mass(tmp_path: Any) -> None:
     wanted = domain.volumes[(graph.cell_nodes == corner).any(axis=1)].sum() / 3
     count, mass = run.breaks.count_single_nodes(domain.volumes)
     assert count == 1 and mass == pytest.approx(wanted, rel=1e-12)
-    assert "1 of them dust (single nodes; [fracture] crumbs = false leaves none)" in _dust({"dust": count})
-    assert not _dust({"dust": 0}) and not _dust({})
+    assert "1 of them dust (single nodes; [fracture] crumbs = false leaves none)" in _single_node_text({"dust": count})
+    assert not _single_node_text({"dust": 0}) and not _single_node_text({})
     run.write_frame()
     rows = [line.split(",") for line in (tmp_path / "pieces.csv").read_text().splitlines()]
     assert rows[0][-1] == "dust" and sorted((row[2], row[-1]) for row in rows[1:])[0] == ("1", "1")

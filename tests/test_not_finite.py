@@ -97,7 +97,7 @@ def test_a_checkpoint_is_of_a_finite_state(tmp_path: Path, what: str) -> None:
     with pytest.raises(NotConverged, match=r"is not finite \((chi|u|plastic|integrity|dissipated)\): it was not"):
         run.checkpoint()
     assert path.read_bytes() == before and os.listdir(path.parent) == ["state.h5"]
-    said = run._saved()
+    said = run._save_last_checkpoint()
     assert said.startswith("No checkpoint was written")
     assert said.endswith(f"The last good checkpoint: {path} at t = {t:g} s; go on with --restart")
 

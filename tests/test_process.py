@@ -88,7 +88,7 @@ def test_a_crash_ends_the_process(number: signal.Signals) -> None:
     done = process(f"""
 import os
 from fracsim import process
-process._own = True
+process._is_own_process = True
 process.start_run()
 os.kill(os.getpid(), {int(number)})
 """)

@@ -64,16 +64,16 @@ class ResourceMeter:
 
 
 # Events despite which a run continued. A step that was halved and then succeeded is not among them.
-_TROUBLE = {
+_EVENT_TEXTS = {
     "unbalanced_steps": "steps that ended out of balance, for the body weakened by a break had no solution",
     "linear_failures": "linear solves that failed and were taken as no correction",
     "cells_not_finite": "cells crushed flat, whose stress was no number and counted as none",
 }
 
 
-def describe_trouble(trouble: dict[str, int]) -> str:
+def irregular_event_text(trouble: dict[str, int]) -> str:
     """Sentence about the counters of trouble, by name; empty if all are 0."""
-    phrases = [f"{trouble[name]} {words}" for name, words in _TROUBLE.items() if trouble.get(name)]
+    phrases = [f"{trouble[name]} {words}" for name, words in _EVENT_TEXTS.items() if trouble.get(name)]
     return f"the run went on in spite of {'; '.join(phrases)} (counted in summary.json)" if phrases else ""
 
 

@@ -49,7 +49,7 @@ class RunData:
 
     @property
     def outcome(self) -> str:
-        """How the run ended; "unfinished" if it was killed."""
+        """Outcome of the run; "unfinished" if it was killed."""
         return str(self.summary.get("outcome", "unfinished"))
 
     @property

@@ -140,11 +140,12 @@ def _dead_loads(inputs: TermInputs) -> Term | None:
 def _force_tractions(inputs: TermInputs) -> list[OnFacets]:
     """Return forces as tractions on the area of their facets (collective)."""
     return [
-        (facets, _divide(force, surface_area(inputs.domain, facets))) for facets, force in inputs.on_facets("force")
+        (facets, _force_per_area(force, surface_area(inputs.domain, facets)))
+        for facets, force in inputs.on_facets("force")
     ]
 
 
-def _divide(force: TimeFunction, area: float) -> TimeFunction:
+def _force_per_area(force: TimeFunction, area: float) -> TimeFunction:
     return lambda t: np.asarray(force(t) / area)
 
 
@@ -158,7 +159,7 @@ def _obstacles(inputs: TermInputs) -> Term | None:
     return build_obstacle_term(inputs.study, inputs.domain, inputs.u, inputs.stress.material, inputs.scheme)
 
 
-def _solids(inputs: TermInputs) -> Term | None:
+def _mesh_obstacles(inputs: TermInputs) -> Term | None:
     if not any(obstacle.shape == "mesh" for obstacle in inputs.study.obstacle):
         return None
     from .contact_terms import build_mesh_obstacle_term
@@ -178,7 +179,7 @@ def _contact(inputs: TermInputs) -> Term | None:
     return build_self_contact_term(inputs.study, inputs.domain, inputs.u, inputs.stress.material)
 
 
-def _tethers(inputs: TermInputs) -> Term | None:
+def _node_ties(inputs: TermInputs) -> Term | None:
     fracture = inputs.study.fracture
     if fracture is None or fracture.crumbs or fracture.approach != "chi" or inputs.domain.order > 1:
         return None
@@ -193,7 +194,7 @@ def _inertia(inputs: TermInputs) -> Term | None:
     return Inertia(inputs.u, inputs.mass) if inputs.scheme.inertia else None
 
 
-def _drag(inputs: TermInputs) -> Term | None:
+def _mass_damping(inputs: TermInputs) -> Term | None:
     damping = inputs.study.damping
     if damping is None or not damping.mass:
         return None
@@ -208,11 +209,11 @@ TERMS: dict[str, Callable[[TermInputs], Term | None]] = {
     "pressure": _pressure,
     "dead loads": _dead_loads,
     "obstacles": _obstacles,
-    "solids": _solids,
+    "solids": _mesh_obstacles,
     "contact": _contact,
-    "tethers": _tethers,
+    "tethers": _node_ties,
     "inertia": _inertia,
-    "drag": _drag,
+    "drag": _mass_damping,
 }
 
 

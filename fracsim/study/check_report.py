@@ -26,7 +26,7 @@ from .unit_checks import unit_questions
 # nodes of a mesh with quadratic displacement over those with linear displacement: edges have nodes, too
 _NODE_RATIO = {2: "4 times", 3: "7 to 8 times"}
 # Measured with boxes of 25,000 and 207,000 tetrahedra without contact, with two obstacles and with the body alone.
-_AS_CRACKS_OPEN = "and of cracks that open"
+_WITH_CRACK_FACES = "and of cracks that open"
 _OBSTACLE_COST = "nothing is gathered; about 2 % of a step without contact"
 _MESH_OBSTACLE_COST = "gathered and detected on one rank, within two edge lengths"
 _CONTACT_COST = {
@@ -123,7 +123,7 @@ def _contact_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
         any_free = any(obstacle.is_free for obstacle in study.obstacle)
         if any(shape != "mesh" for shape in shapes):
             surface = summary.surface_text()
-            yield f"{_INDENT}acts on the points of {surface}, {_AS_CRACKS_OPEN}; {_OBSTACLE_COST}"
+            yield f"{_INDENT}acts on the points of {surface}, {_WITH_CRACK_FACES}; {_OBSTACLE_COST}"
         for i, obstacle in enumerate(study.obstacle):
             if obstacle.file is not None:
                 text = _mesh_obstacle(obstacle.file, obstacle.scale or 1.0, f"obstacle.{i}")
@@ -138,7 +138,7 @@ def _contact_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
         partners = "of fragments with each other" if between_fragments else "of the body with itself"
         cost = _CONTACT_COST[study.time.scheme_class.implicit]
         yield f"contact     {partners}, friction {study.contact.friction:g}; {cost}"
-        yield f"{_INDENT}its surface has {summary.surface_text()}, {_AS_CRACKS_OPEN}"
+        yield f"{_INDENT}its surface has {summary.surface_text()}, {_WITH_CRACK_FACES}"
 
 
 def _time_lines(study: Study, summary: MeshSummary) -> Iterator[str]:

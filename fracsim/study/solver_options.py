@@ -64,7 +64,7 @@ def check_options(options: Options) -> None:
 
 
 def uses_plain_solver(options: Options) -> bool:
-    """Whether PETSc and DOLFINx alone solve and assemble: `plain = true`.
+    """Return whether PETSc and DOLFINx alone solve and assemble: `plain = true`.
 
     Without the key the environment variable FRACSIM_PLAIN decides, which also reaches processes that a test starts.
     """
