@@ -4,7 +4,7 @@ The mesh is built again from the study, so a run may continue on another number 
 on which the next step depends: nodal and cell values, broken edges as pairs of input nodes, history variables of the
 terms, and the clock. On the same number of ranks a resumed run takes the steps of the uninterrupted run, to the last
 digit. Newton's method keeps tangents and preconditioners as well; a run discards them when it writes a checkpoint
-(`Stepper.forget`). Only finite states are written.
+(`Stepper.discard_unsaved_data`). Only finite states are written.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ if TYPE_CHECKING:
 
 _CLOCK = ("t", "step", "dt", "dissipated", "work")
 _NODAL = ("u", "v", "a", "forces")
-_OPTIONAL_NODAL = ("drag", "out_of_balance")
+# Arrays that a study may not have: name in the file, attribute of the state.
+_OPTIONAL_NODAL = {"drag": "damping", "out_of_balance": "out_of_balance"}
 _EDGES = ("weakened", "integrity", "broken", "breaks")
 # arrays that every rank needs as a whole
 _REPLICATED = (*_EDGES, "starts")
@@ -76,7 +77,8 @@ def write_checkpoint(
     """
     d, stress, comm = domain.dim, balance.stress, domain.comm
     terms = balance.histories.to_checkpoint()
-    nodal = {name: getattr(state, name) for name in (*_NODAL, *_OPTIONAL_NODAL)}
+    nodal = {name: getattr(state, name) for name in _NODAL}
+    nodal |= {name: getattr(state, attribute) for name, attribute in _OPTIONAL_NODAL.items()}
     clock: dict[str, Any] = {name: getattr(state, name) for name in _CLOCK}
     clock |= {"easy": state.easy_steps, "elastic": float(sum_over_ranks(comm, state.elastic)[0]), "dt_before": 0.0}
     if state.previous_increment is not None:
@@ -136,7 +138,7 @@ def read_checkpoint(
 ) -> State:
     """State of a checkpoint (collective). The degradation chi, plastic strain and `record` are set from it as well.
 
-    The history variables of the terms are returned as `memory["saved"]`; `Stepper.resume` passes them to the terms once
+    The history variables of the terms are returned as `history["saved"]`; `Stepper.from_checkpoint` passes them on once
     the displacement is set.
 
     Args:
@@ -156,7 +158,7 @@ def read_checkpoint(
     nodes = int(domain.space.dofmap.index_map.size_global)
     cell_count = int(domain.mesh.topology.index_map(domain.dim).size_global)
     shapes |= {name: (nodes, domain.dim) for name in _NODAL}
-    if state.drag is not None:
+    if state.damping is not None:
         shapes["drag"] = (nodes, domain.dim)
     if state.frequencies is not None:
         shapes["frequencies"] = (cell_count,)
@@ -185,6 +187,7 @@ def read_checkpoint(
         name: scattered(domain.input_numbering.gather_nodes, name).reshape(-1) for name in nodal_names if name in names
     }
     before = nodal.pop("u_before", None)
+    nodal = {_OPTIONAL_NODAL.get(name, name): values for name, values in nodal.items()}
     if record is not None and replicated["weakened"] is not None:
         _check_edges(comm, record, replicated["weakened"], checkpoint_path(folder))
         record.graph.restore_integrity(replicated["weakened"], replicated["integrity"])

@@ -56,7 +56,7 @@ def balanced_forces(balance: Balance, *, lumped: bool) -> tuple[Values, Values |
 
 
 def step_work(
-    balance: Balance, start: State, u: Values, v: Values, forces: Values, drag: Values | None, *, lumped: bool
+    balance: Balance, start: State, u: Values, v: Values, forces: Values, damping: Values | None, *, lumped: bool
 ) -> tuple[float, float]:
     """Return external work and viscous dissipation of a step on this rank, J.
 
@@ -69,7 +69,7 @@ def step_work(
         u: displacement at its end, m.
         v: velocity at its end, m/s.
         forces: loads and reactions of this step, N.
-        drag: its damping forces, N; None without damping.
+        damping: its damping forces, N; None without damping.
         lumped: the work that moves prescribed dofs is the gain of their kinetic energy, since their velocity may jump.
     """
     # Forces at the end of a step of generalized-alpha balance nothing: the pressure of a nearly incompressible body is
@@ -80,9 +80,9 @@ def step_work(
         kinetic_gain = 0.5 * float(balance.mass.lumped[owned] @ (v[owned] ** 2 - start.v[owned] ** 2))
     work = float(((0.5 + late) * forces + (0.5 - late) * start.forces) @ increment) + kinetic_gain
     viscous = 0.0
-    if drag is not None:
-        earlier = start.drag if start.drag is not None else 0.0
-        viscous = float(((0.5 + late) * drag + (0.5 - late) * earlier) @ increment)
+    if damping is not None:
+        earlier = start.damping if start.damping is not None else 0.0
+        viscous = float(((0.5 + late) * damping + (0.5 - late) * earlier) @ increment)
     return work, viscous
 
 

@@ -28,7 +28,7 @@ class EquilibriumPath:
     Attributes:
         u: displacement of the last equilibrium, (owned dofs,), m.
         forces: loads and reactions there, N.
-        drag: damping forces there, N; None without damping.
+        damping: damping forces there, N; None without damping.
         out_of_balance: residual on free dofs there, N; None in equilibrium.
         work: external work since the start of the step, J.
         lost: dissipated energy since the start of the step, J.
@@ -36,22 +36,22 @@ class EquilibriumPath:
 
     u: Values
     forces: Values
-    drag: Values | None
+    damping: Values | None
     out_of_balance: Values | None
     work: float = 0.0
     lost: float = 0.0
 
-    def continue_to(self, u: Values, forces: Values, drag: Values | None) -> None:
+    def continue_to(self, u: Values, forces: Values, damping: Values | None) -> None:
         """Continue the path to another equilibrium; forces are linear along the way."""
         change = u - self.u
         self.work += float((self.forces + forces) @ change) / 2
-        if drag is not None:
-            before = self.drag if self.drag is not None else 0.0
-            self.lost += float((before + drag) @ change) / 2
+        if damping is not None:
+            before = self.damping if self.damping is not None else 0.0
+            self.lost += float((before + damping) @ change) / 2
         if self.out_of_balance is not None:
             # The unbalanced forces decrease to 0 along the way.
             self.lost -= float(self.out_of_balance @ change) / 2
-        self.u, self.forces, self.drag, self.out_of_balance = u, forces, drag, None
+        self.u, self.forces, self.damping, self.out_of_balance = u, forces, damping, None
 
     def set_unbalanced(self, reactions: Values, owned: npt.NDArray[np.int32], out_of_balance: Values) -> None:
         """Set loads and reactions of the dofs `owned`, and the residual of free dofs, after a pass."""
@@ -87,7 +87,7 @@ class QuasiStaticStepper(ImplicitStepper):
 
     def _finish(self, state: State, dt: float, solve: SolveResult, began: float) -> tuple[State, StepReport]:
         """Break edges and solve in turn, until a pass changes nothing, or nothing that the solver would correct."""
-        path = EquilibriumPath(state.u, state.forces, state.drag, state.out_of_balance)
+        path = EquilibriumPath(state.u, state.forces, state.damping, state.out_of_balance)
         broken, released, limit = 0, 0.0, self.inelastic.max_passes
         for number in range(limit):
             self.balance.accept_step()
@@ -113,7 +113,7 @@ class QuasiStaticStepper(ImplicitStepper):
         """Return the state at the end of the path."""
         _, v, a = self.balance.scheme.complete_step(dt, path.u, state.u, state.v, state.a)
         return replace(
-            state, u=path.u, v=v, a=a, t=state.t + dt, step=state.step + 1, forces=path.forces, drag=path.drag,
+            state, u=path.u, v=v, a=a, t=state.t + dt, step=state.step + 1, forces=path.forces, damping=path.damping,
             previous_increment=(state.u, dt), out_of_balance=path.out_of_balance,
         )  # fmt: skip
 

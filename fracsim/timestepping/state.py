@@ -30,7 +30,7 @@ class State:
         easy_steps: successive steps without a reduction of the step size.
         elastic: stored energy, J, on this rank.
         forces: loads and reactions, N, at the level at which the last step balanced them.
-        drag: damping forces at that level, N; None without damping.
+        damping: damping forces at that level, N; None without damping.
         history: history variables by owner: "damage", "flow", "terms".
         out_of_balance: residual at the end of the last step, N; None if it is within the tolerance of the solver.
         previous_increment: displacement one step earlier, m, and the size of that step, s, for the extrapolation of a
@@ -49,7 +49,7 @@ class State:
     easy_steps: int = 0
     elastic: float = 0.0
     forces: Values = field(default_factory=lambda: np.empty(0))
-    drag: Values | None = None
+    damping: Values | None = None
     history: dict[str, object] = field(default_factory=dict)
     out_of_balance: Values | None = None
     previous_increment: tuple[Values, float] | None = None

@@ -174,14 +174,14 @@ class BalanceStepper:
         """Return the state with loads, reactions, damping forces and acceleration of its displacement and velocity."""
         balance, free = self.balance, self.balance.motion.free_dofs
         balance.evaluate_at(state.t, state.u, state.v)
-        applied, drag, a = balance.energies.applied_forces(), balance.energies.damping_forces(), state.a
+        applied, damping, a = balance.energies.applied_forces(), balance.energies.damping_forces(), state.a
         unbalanced = balance.stress.assemble_forces() - applied
-        if drag is not None:
-            unbalanced = unbalanced + drag
+        if damping is not None:
+            unbalanced = unbalanced + damping
         if balance.scheme.carries_acceleration:
             a = balance.mass.solve(-unbalanced, free)
         forces = applied + np.where(free, 0.0, unbalanced)
-        return replace(state, a=a, forces=forces, drag=drag, history=self.inelastic.snapshot())
+        return replace(state, a=a, forces=forces, damping=damping, history=self.inelastic.snapshot())
 
     def from_checkpoint(self, state: State) -> State:
         """Return the state of a checkpoint, whose damage and plastic strain the body has read."""
@@ -256,8 +256,8 @@ class BalanceStepper:
         solved, acting = balance.u.x.array[: balance.owned_dof_count].copy(), balanced_forces(balance, lumped=lumped)
         u, v, a = self._complete_step(state, dt)
         work, viscous = step_work(balance, state, u, v, *acting, lumped=lumped)
-        forces, drag = acting
-        end = replace(state, u=u, v=v, a=a, t=state.t + dt, step=state.step + 1, forces=forces, drag=drag)
+        forces, damping = acting
+        end = replace(state, u=u, v=v, a=a, t=state.t + dt, step=state.step + 1, forces=forces, damping=damping)
         flow_loss = self._flow()
         end, result = self._break_edges(end, solved, dt)
         lost = viscous + (result.released_energy + released + flow_loss)
