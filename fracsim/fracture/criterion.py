@@ -62,6 +62,9 @@ class FractureCriterion(Protocol):
     def restore(self, saved: object) -> None:
         """Restore the history variables that `snapshot` returned."""
 
+    def restore_cuts(self, cut_positions: Values, tip_states: Values | None) -> None:
+        """Restore the cut positions (edges,) and the states of tips (edges, n) that a checkpoint stored."""
+
 
 class CellAverage(Protocol):
     """Interface of a non-local average over cells (fracture.nonlocal_average)."""
@@ -180,3 +183,6 @@ class OverloadedEdges:
 
     def restore(self, saved: object) -> None:
         """Do nothing: the criterion has no history."""
+
+    def restore_cuts(self, cut_positions: Values, tip_states: Values | None) -> None:
+        """Do nothing: the criterion does not determine cuts."""

@@ -113,6 +113,9 @@ class CellRetention:
     def restore(self, saved: object) -> None:
         """Do nothing: the criterion has no history."""
 
+    def restore_cuts(self, cut_positions: Values, tip_states: Values | None) -> None:
+        """Do nothing: the criterion does not determine cuts."""
+
     def _spared_edges(self, fails: Flags, stress: Values) -> Flags:
         """Flag the edges (edges,) of the cells that retain a node, given the failing edges (collective)."""
         graph = self._graph

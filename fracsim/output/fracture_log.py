@@ -15,6 +15,7 @@ from ..mesh.parallel import sum_over_ranks
 
 if TYPE_CHECKING:
     from ..fracture.brittle.surface_criterion import BrittleSurfaces
+    from ..fracture.criterion import FractureCriterion
     from ..fracture.edge_history import EdgeHistory
     from ..fracture.fracture_pass import FracturePass
     from ..mesh.fragments import Fragments
@@ -45,8 +46,7 @@ class FractureLog:
         # (edges,) state of the broken edges that `fragments` belongs to
         self._broken: npt.NDArray[np.bool_] | None = None
         self.counts = (0, 0, _count_bodies(self._domain))
-        self._cut_by_criterion: npt.NDArray[np.float64] | None = None
-        self._carried: npt.NDArray[np.float64] | None = None
+        self._criterion: FractureCriterion | None = None
         if breaking is not None:
             from ..fracture.edge_history import EdgeHistory
 
@@ -54,8 +54,9 @@ class FractureLog:
             # not isinstance: that would import the brittle room, which other studies do not need
             if hasattr(breaking.criterion, "starts"):
                 self.surfaces = cast("BrittleSurfaces", breaking.criterion)
-            self._cut_by_criterion = breaking.criterion.cut_positions
-            self._carried = breaking.criterion.tip_states
+            # other criteria do not determine where an edge is cut
+            if breaking.criterion.cut_positions is not None:
+                self._criterion = breaking.criterion
             if breaking.initial_cuts is not None:
                 self.record.record_breaks(0.0, breaking.initial_cuts)
             self.update_counts()
@@ -64,25 +65,23 @@ class FractureLog:
         """Record the edges that broke since the last call, at time t in s, and find the fragments (collective)."""
         if self.record is None:
             return
-        if self._cut_by_criterion is not None:
+        if self._criterion is not None:
             # surfaces and cracks define the position of the cut themselves
-            self.record.record_breaks(t, self._cut_by_criterion)
+            self.record.record_breaks(t, self._criterion.cut_positions)
         else:
             self.record.record_breaks(t, self._cuts_by_forces() if self._by_forces else None)
         self.update_counts()
 
     def prepare_checkpoint(self) -> None:
         """Add to the record the cuts of edges that are not broken yet, and the state of crack tips (collective)."""
-        if self.record is not None and self._cut_by_criterion is not None:
-            self.record.record_weakened(self._cut_by_criterion, self._carried)
+        if self.record is not None and self._criterion is not None:
+            assert self._criterion.cut_positions is not None
+            self.record.record_weakened(self._criterion.cut_positions, self._criterion.tip_states)
 
     def apply_checkpoint(self) -> None:
         """Set cuts and crack tips of the criterion from the record, which was read from a checkpoint (collective)."""
-        if self.record is not None and self._cut_by_criterion is not None:
-            self._cut_by_criterion[:] = self.record.cut_positions
-            if self._carried is not None and self.record.tip_states is not None:
-                defined = ~np.isnan(self.record.tip_states[:, 0])
-                self._carried[defined] = self.record.tip_states[defined]
+        if self.record is not None and self._criterion is not None:
+            self._criterion.restore_cuts(self.record.cut_positions, self.record.tip_states)
         self.update_counts()
 
     def update_counts(self) -> None:

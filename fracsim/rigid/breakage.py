@@ -205,7 +205,7 @@ class BreakableBody:
             return
         self.graph.break_edges(self.graph.flags_of_keys(arrays["broken"]))
         local, row = self.graph.find_keys(arrays["broken"])
-        self._criterion.cut_positions[local] = arrays["cut"][row, 0]
+        self._criterion.set_cuts(local, arrays["cut"][row, 0])
         self._criterion.set_starts(arrays["starts"])
         self._find_fragments()
 
@@ -366,7 +366,7 @@ class BreakableBody:
         if np.any(new):
             for fragment in np.unique(self.fragments.node_fragment[self.graph.edge_nodes[local[new]]]):
                 self._discard_body(self._lowest_node(fragment))
-            criterion.cut_positions[local] = cut[order][row]
+            criterion.set_cuts(local, cut[order][row])
             flags = np.zeros(len(self.graph.broken), bool)
             flags[local] = True
             self.graph.break_edges(flags)

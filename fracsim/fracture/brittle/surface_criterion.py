@@ -108,6 +108,14 @@ class BrittleSurfaces:
         assert isinstance(saved, tuple)
         self.starts, self.cut_positions[:] = saved
 
+    def restore_cuts(self, cut_positions: Values, tip_states: Values | None) -> None:
+        """Restore the cut positions (edges,) that a checkpoint stored."""
+        self.cut_positions[:] = cut_positions
+
+    def set_cuts(self, edges: Edges, positions: Values) -> None:
+        """Set the cut positions (n,) of local edges (n,)."""
+        self.cut_positions[edges] = positions
+
     def _find_overloaded(self, cells: Cells, averaged: Values) -> OverloadedCells:
         """Find those of cells (n,) whose first principal stress reaches their strength."""
         dim = self._domain.dim
@@ -176,5 +184,5 @@ class BrittleSurfaces:
     def _store_cuts(self, opened: OpenedSurfaces) -> Edges:
         """Store the cut positions; return the local edges (n,) that are cut."""
         local, row = self._graph.find_keys(opened.keys)
-        self.cut_positions[local] = opened.cut_positions[row]
+        self.set_cuts(local, opened.cut_positions[row])
         return local

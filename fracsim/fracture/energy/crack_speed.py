@@ -94,6 +94,13 @@ class RateDependentTipCriterion(TipCriterion):
         cut_positions, self.tip_states[:] = saved
         super().restore(cut_positions)
 
+    def restore_cuts(self, cut_positions: Values, tip_states: Values | None) -> None:
+        """Restore the cut positions (edges,) and the states of tips (edges, 4) that a checkpoint stored."""
+        super().restore_cuts(cut_positions, tip_states)
+        if tip_states is not None:
+            defined = ~np.isnan(tip_states[:, 0])
+            self.tip_states[defined] = tip_states[defined]
+
     @cached_property
     def _rate(self) -> Values:
         """c_R / R (cells,), 1/s."""

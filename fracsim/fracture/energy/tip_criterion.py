@@ -146,6 +146,10 @@ class TipCriterion:
         assert isinstance(saved, np.ndarray)
         self.cut_positions[:] = saved
 
+    def restore_cuts(self, cut_positions: Values, tip_states: Values | None) -> None:
+        """Restore the cut positions (edges,) that a checkpoint stored."""
+        self.cut_positions[:] = cut_positions
+
     def release_rate(self) -> Values:
         """Return c_R / R (cells,), 1/s: the inverse of the time of a Rayleigh wave through the disc of a tip."""
         # Poisson's ratio from Lame's parameters.
@@ -408,3 +412,7 @@ class AttachedTipCriterion:
     def restore(self, saved: object) -> None:
         """Restore the history variables of the tips."""
         self._tips.restore(saved)
+
+    def restore_cuts(self, cut_positions: Values, tip_states: Values | None) -> None:
+        """Restore the cut positions (edges,) and the states of tips (edges, n) that a checkpoint stored."""
+        self._tips.restore_cuts(cut_positions, tip_states)
