@@ -68,7 +68,7 @@ def cuts(scene: Scene) -> tuple[Any, Any]:
     """(n, 2) sorted keys of the edges that surfaces cut, and where."""
     cut = scene.fracture.criterion.cut_positions
     own = np.flatnonzero(~np.isnan(cut))
-    keys = scene.fracture.graph.edge_keys(own)
+    keys = scene.fracture.graph.keys.of_edges(own)
     order = np.lexsort(keys.T[::-1])
     return keys[order], cut[own][order]
 

@@ -119,7 +119,7 @@ def test_keys_name_edges(graph: EdgeGraph) -> None:
     """Edges found again from their pairs of input nodes."""
     keys = graph.broken_keys()
     assert keys is not None
-    assert np.array_equal(graph.flags_of_keys(keys), graph.broken)
+    assert np.array_equal(graph.keys.edge_flags(keys), graph.broken)
     assert np.all(keys[:, 0] < keys[:, 1])
 
 

@@ -166,12 +166,12 @@ class OverloadedEdges:
 
     def _select_most_loaded(self, edges: Edges, load: Values, count: int) -> tuple[Edges, Values]:
         """Select the `count` most loaded edges of all ranks; ties are ordered by input nodes (collective)."""
-        keys = self._graph.edge_keys(edges.astype(np.int64))
+        keys = self._graph.keys.of_edges(edges.astype(np.int64))
         rows = np.concatenate(allgather(self._graph.domain.comm, np.column_stack([keys, -load])))
         order = np.lexsort((rows[:, 1], rows[:, 0], rows[:, 2]))  # the highest ratio first
         _, first = np.unique(rows[order, :2], axis=0, return_index=True)
         chosen = rows[order][np.sort(first)[:count], :2].astype(np.int64)
-        selected = self._graph.flags_of_keys(chosen) if len(chosen) else np.zeros(len(self._graph.broken), bool)
+        selected = self._graph.keys.edge_flags(chosen) if len(chosen) else np.zeros(len(self._graph.broken), bool)
         return edges[selected[edges]], load[selected[edges]]
 
     def set_motion(self, v: Values, a: Values, now: float, dt: float) -> None:

@@ -66,7 +66,7 @@ class EdgeHistory:
 
     def from_checkpoint(self, keys: Ints, values: Values) -> None:
         """Restore what `to_checkpoint` returned, on every rank: keys (n, 2) and values (n, 2 or more)."""
-        local, row = self.graph.find_keys(keys)
+        local, row = self.graph.keys.find_edges(keys)
         self.break_times[local], self.cut_positions[local] = values[row, :2].T
         if values.shape[1] > 2:
             self.tip_states = np.full((len(self.break_times), values.shape[1] - 2), np.nan)

@@ -217,11 +217,11 @@ class NodeAttachment:
         if self._cracks:
             load[fails[candidates]] = np.finfo(float).max
         load[attaching[candidates] | (self._is_prescribed_edge & ~fails)[candidates]] = ATTACHED
-        keys, ends = graph.edge_keys(candidates), graph.edge_nodes[candidates]
+        keys, ends = graph.keys.of_edges(candidates), graph.edge_nodes[candidates]
         swapped = graph.domain.input_numbering.nodes[ends[:, 0]] != keys[:, 0]
         ends[swapped] = ends[swapped, ::-1]
         parts = allgather(graph.domain.comm, (keys, load, without_cell[ends], self._prescribed[ends]))
-        return graph.flags_of_keys(_spanning_forest(*(np.concatenate(column) for column in zip(*parts, strict=True))))
+        return graph.keys.edge_flags(_spanning_forest(*(np.concatenate(column) for column in zip(*parts, strict=True))))
 
     def _edge_loads(self, edges: Ints, without_cell: Flags, stress: Values) -> Values:
         """Return the largest load over strength (n,) of edges in unsplit cells of this rank; -max without any."""

@@ -43,6 +43,67 @@ class Incidence:
         return np.unique(self._rows[positions])
 
 
+class EdgeKeys:
+    """Names of edges that do not depend on the partition: the numbers of their ends in the input mesh, the lower first.
+
+    `keys` (n, 2) below are such pairs.
+    """
+
+    def __init__(self, domain: Domain, edge_nodes: Ints, owned_count: int) -> None:
+        """`edge_nodes`: (edges, 2) local nodes of owned and ghost edges; `owned_count`: number of owned ones."""
+        self._comm, self._node_numbers = domain.comm, domain.input_numbering.nodes
+        self._edge_nodes, self._owned_count = edge_nodes, owned_count
+
+    def of_edges(self, edges: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """(n, 2) keys of local edges (n,)."""
+        return np.sort(self._node_numbers[self._edge_nodes[edges]], axis=1)
+
+    def find_edges(self, keys: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """Local edges whose keys are among `keys` (n, 2), ascending, and the row of each in `keys`."""
+        local_keys, order = self._by_key
+        wanted = _one_number(keys)
+        if not len(local_keys):
+            return np.empty(0, np.int64), np.empty(0, np.int64)
+        position = np.minimum(np.searchsorted(local_keys, wanted), len(local_keys) - 1)
+        rows = np.flatnonzero(local_keys[position] == wanted)
+        local = order[position[rows]]
+        ascending = np.argsort(local)
+        return local[ascending], rows[ascending]
+
+    @cached_property
+    def _by_key(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+        """(edges,) keys of owned and ghost edges as one number each, ascending, and the local edges in that order."""
+        keys = _one_number(self.of_edges(np.arange(len(self._edge_nodes))))
+        order = np.argsort(keys)
+        return keys[order], order
+
+    def edge_flags(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """(edges,) flags of the local edges whose keys are among `keys` (n, 2), in any order."""
+        flags = np.zeros(len(self._edge_nodes), bool)
+        flags[self.find_edges(keys[np.lexsort(keys.T[::-1])])[0]] = True
+        return flags
+
+    def gather(
+        self, flags: npt.NDArray[np.bool_], values: npt.NDArray[np.float64]
+    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
+        """(n, 2) sorted keys of all flagged edges, and the (n, m) rows of their `values` (edges, m), on rank 0.
+
+        None on the other ranks (collective).
+        """
+        owned = np.flatnonzero(flags[: self._owned_count])
+        parts = gather(self._comm, (self.of_edges(owned), values[owned]))
+        if parts is None:
+            return None
+        keys, rows = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        order = np.lexsort(keys.T[::-1])
+        return keys[order], rows[order]
+
+
+def _one_number(keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """(n,) keys (n, 2) as one 64-bit number each, which sort as the keys do."""
+    return np.asarray((keys[:, 0] << 32) + keys[:, 1], np.int64)
+
+
 class EdgeGraph:
     """Integrity of the edges of a distributed mesh, and the patterns of broken edges of its cells.
 
@@ -86,6 +147,11 @@ class EdgeGraph:
         result = np.full((len(self.broken), 2), -1, np.int32)
         result[self.cell_edges] = self.cell_nodes[:, local_edges(self.domain.dim)]
         return result
+
+    @cached_property
+    def keys(self) -> EdgeKeys:
+        """Names of the edges that do not depend on the partition."""
+        return EdgeKeys(self.domain, self.edge_nodes, self.edge_count)
 
     @cached_property
     def edge_cells(self) -> Incidence:
@@ -179,10 +245,6 @@ class EdgeGraph:
         """(n, k) integrity of each local edge of the cells."""
         return self.integrity[self.cell_edges[cells]]
 
-    def edge_keys(self, edges: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-        """(n, 2) input-mesh nodes of local edges, the lower first: a key that does not depend on the partition."""
-        return np.sort(self.domain.input_numbering.nodes[self.edge_nodes[edges]], axis=1)
-
     def gather_broken(
         self, values: npt.NDArray[np.float64] | None = None
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
@@ -190,7 +252,7 @@ class EdgeGraph:
 
         None on the other ranks (collective).
         """
-        return self._gather(self.broken, np.empty((len(self.broken), 0)) if values is None else values)
+        return self.keys.gather(self.broken, np.empty((len(self.broken), 0)) if values is None else values)
 
     def gather_weakened(
         self, values: npt.NDArray[np.float64] | None = None
@@ -199,7 +261,7 @@ class EdgeGraph:
 
         `values`: (edges, m), by default the integrity (edges, 1). None on the other ranks (collective).
         """
-        return self._gather(self.integrity < 1, self.integrity[:, None] if values is None else values)
+        return self.keys.gather(self.integrity < 1, self.integrity[:, None] if values is None else values)
 
     def restore_integrity(self, keys: npt.NDArray[np.int64], integrity: npt.NDArray[np.float64]) -> None:
         """Set the integrity (n, 1) of the edges with `keys` (n, 2), and 1 elsewhere: the inverse of `gather_weakened`.
@@ -207,52 +269,11 @@ class EdgeGraph:
         Both arrays are given on every rank.
         """
         values = np.ones(len(self.integrity))
-        local, rows = self.find_keys(keys)
+        local, rows = self.keys.find_edges(keys)
         values[local] = integrity[rows, 0]
         self.set_integrity(values)
-
-    def _gather(
-        self, flags: npt.NDArray[np.bool_], values: npt.NDArray[np.float64]
-    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
-        owned = np.flatnonzero(flags[: self.edge_count])
-        parts = gather(self.domain.comm, (self.edge_keys(owned), values[owned]))
-        if parts is None:
-            return None
-        keys, rows = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        order = np.lexsort(keys.T[::-1])
-        return keys[order], rows[order]
 
     def broken_keys(self) -> npt.NDArray[np.int64] | None:
         """(n, 2) sorted keys of all broken edges on rank 0, None elsewhere (collective)."""
         gathered = self.gather_broken()
         return None if gathered is None else gathered[0]
-
-    def find_keys(self, keys: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """Local edges whose keys are among `keys` (n, 2), sorted, and the row of each in `keys`."""
-        local_keys, order = self._by_key
-        wanted = _one_number(keys)
-        if not len(local_keys):
-            return np.empty(0, np.int64), np.empty(0, np.int64)
-        position = np.minimum(np.searchsorted(local_keys, wanted), len(local_keys) - 1)
-        rows = np.flatnonzero(local_keys[position] == wanted)
-        local = order[position[rows]]
-        ascending = np.argsort(local)
-        return local[ascending], rows[ascending]
-
-    @cached_property
-    def _by_key(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-        """(edges,) keys of owned and ghost edges as one number each, ascending, and the local edges in that order."""
-        keys = _one_number(self.edge_keys(np.arange(len(self.broken))))
-        order = np.argsort(keys)
-        return keys[order], order
-
-    def flags_of_keys(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-        """(edges,) flags of the local edges whose keys are among `keys` (n, 2), in any order."""
-        flags = np.zeros(len(self.broken), bool)
-        flags[self.find_keys(keys[np.lexsort(keys.T[::-1])])[0]] = True
-        return flags
-
-
-def _one_number(keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """(n,) keys (n, 2) as one 64-bit number each, which sort as the keys do."""
-    return np.asarray((keys[:, 0] << 32) + keys[:, 1], np.int64)

@@ -327,7 +327,7 @@ def _read_checked(folder: Path, domain: Domain, checks: _ContentChecks) -> Store
 def _check_edges(comm: MPI.Comm, record: EdgeHistory, keys: npt.NDArray[np.int64], path: Path) -> None:
     """Raise InputError if pairs of input nodes (n, 2), in rising order, are not edges of the mesh (collective)."""
     graph = record.graph
-    local, _ = graph.find_keys(keys)
+    local, _ = graph.keys.find_edges(keys)
     count = int(sum_over_ranks(comm, np.count_nonzero(local < graph.edge_count))[0])
     if count != len(keys):
         raise restart_error(path, f"{len(keys) - count} of its weakened edges are none of the mesh")

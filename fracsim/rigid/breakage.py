@@ -189,7 +189,7 @@ class BreakableBody:
         edges = np.arange(len(self.graph.broken))
         cut = np.full(len(edges), np.nan)
         if self._criterion is not None:
-            cut[MeshTopology(source).find_edges(self.graph.edge_keys(edges))] = self._criterion.cut_positions
+            cut[MeshTopology(source).find_edges(self.graph.keys.of_edges(edges))] = self._criterion.cut_positions
         return pattern, cut
 
     def to_checkpoint(self) -> dict[str, npt.NDArray[Any]]:
@@ -203,8 +203,8 @@ class BreakableBody:
         """Restore the damage that `to_checkpoint` stored."""
         if self._criterion is None:
             return
-        self.graph.break_edges(self.graph.flags_of_keys(arrays["broken"]))
-        local, row = self.graph.find_keys(arrays["broken"])
+        self.graph.break_edges(self.graph.keys.edge_flags(arrays["broken"]))
+        local, row = self.graph.keys.find_edges(arrays["broken"])
         self._criterion.set_cuts(local, arrays["cut"][row, 0])
         self._criterion.set_starts(arrays["starts"])
         self._find_fragments()
@@ -340,7 +340,7 @@ class BreakableBody:
         edges = np.flatnonzero(self.graph.broken & ~broken)
         effort = self.analyses - analyses, self.cg_iterations - iterations
         self.analyses, self.cg_iterations = analyses, iterations
-        return ImpactOutcome(name, self.graph.edge_keys(edges), criterion.cut_positions[edges], new_starts, *effort)
+        return ImpactOutcome(name, self.graph.keys.of_edges(edges), criterion.cut_positions[edges], new_starts, *effort)
 
     def _find_dent(self, name: int, loads: PointLoads, energy: float) -> ImpactOutcome:
         """Return the shape that loads leave. Raises NotConverged."""
@@ -361,7 +361,7 @@ class BreakableBody:
         keys = np.concatenate([outcome.edge_keys for outcome in outcomes])
         cut = np.concatenate([outcome.edge_cuts for outcome in outcomes])
         order = np.lexsort(keys.T[::-1])
-        local, row = self.graph.find_keys(keys[order])
+        local, row = self.graph.keys.find_edges(keys[order])
         new = ~self.graph.broken[local]
         if np.any(new):
             for fragment in np.unique(self.fragments.node_fragment[self.graph.edge_nodes[local[new]]]):

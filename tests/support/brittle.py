@@ -96,7 +96,7 @@ def scene_surface(scene: Scene) -> SplitSurface:
     assert scene.domain.input_mesh is not None
     skeleton, graph = EntityNumbering(scene.domain.input_mesh), scene.fracture.graph
     own = np.flatnonzero(graph.broken)
-    cut = skeleton.of_edges(graph.edge_keys(own), scene.fracture.criterion.cut_positions[own])
+    cut = skeleton.of_edges(graph.keys.of_edges(own), scene.fracture.criterion.cut_positions[own])
     pattern = scene.domain.input_numbering.gather_cells(graph.pattern)
     assert pattern is not None
     return build_split_surface(skeleton, pattern, cut)

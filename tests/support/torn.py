@@ -124,7 +124,7 @@ def edges(domain: Domain) -> Found:
     flags[graph.cell_edges[domain.input_numbering.cells % 7 == 0]] = True
     count = graph.break_edges(flags)
     ends = domain.nodes[graph.edge_nodes[: graph.edge_count]]
-    keys = graph.edge_keys(np.arange(graph.edge_count))
+    keys = graph.keys.of_edges(np.arange(graph.edge_count))
     every = domain.comm.gather((keys, hash_points(ends[:, 0] + ends[:, 1])))
     found = {
         "edges-broken": graph.broken_keys(),

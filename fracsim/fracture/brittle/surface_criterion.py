@@ -183,6 +183,6 @@ class BrittleSurfaces:
 
     def _store_cuts(self, opened: OpenedSurfaces) -> Edges:
         """Store the cut positions; return the local edges (n,) that are cut."""
-        local, row = self._graph.find_keys(opened.keys)
+        local, row = self._graph.keys.find_edges(opened.keys)
         self.set_cuts(local, opened.cut_positions[row])
         return local

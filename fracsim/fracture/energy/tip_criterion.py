@@ -280,7 +280,7 @@ class TipCriterion:
         # Of neighbours that cut the same edge the first in rank decides where.
         rows = rows[np.lexsort(rows[:, 5:2:-1].T)]
         keys, first = np.unique(rows[:, :2].astype(np.int64), axis=0, return_index=True)
-        local, key_row = self._graph.find_keys(keys)
+        local, key_row = self._graph.keys.find_edges(keys)
         new = ~self._graph.broken[local] & np.isnan(self.cut_positions[local])
         chosen = rows[first[key_row[new]]]
         self.cut_positions[local[new]] = chosen[:, 2]
