@@ -76,11 +76,11 @@ def bar_stresses() -> tuple[Values, Values, Values]:
     """
     body = falling_bar()
     loads = body.distribute_forces(0, np.array([[0.0, 0.1, 0.1]]), np.array([[END_FORCE, 0.0, 0.0]]))
-    domain, free = body.graph.domain, body._stiffness.whole_body()
+    domain, free = body.graph.domain, body.analyses.stiffness.whole_body()
     force = loads.nodal_forces(len(domain.nodes))
     share = np.ones(domain.cell_count)
-    relieved = body._stiffness.cell_stress(free(force), share)
-    held = body._stiffness.cell_stress(solve_pinned(free.matrix, domain.nodes, force), share)  # type: ignore[attr-defined]
+    relieved = body.analyses.stiffness.cell_stress(free(force), share)
+    held = body.analyses.stiffness.cell_stress(solve_pinned(free.matrix, domain.nodes, force), share)  # type: ignore[attr-defined]
     x = domain.nodes[domain.cell_nodes].mean(axis=1)[:, 0]
     return x, *(
         np.asarray(np.abs(np.linalg.eigvalsh(symmetric_tensors(item, 3))).max(axis=1)) for item in (relieved, held)

@@ -12,6 +12,7 @@ bodies                mass, position and motion; rotations in C (rotation_integr
 instance_placement    placement of the instances of a mesh
 instances             instances of one mesh, each with damage of its own
 breakage              fracture of a body and of its fragments
+fragment_analyses     cells and nodes of fragments, and their analyses
 denting               plastic flow: dents and bends
 free_body_analysis    quasi-static analysis of a free body, with inertia relief
 shell_analysis        the same for shells, by flat triangles

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -17,11 +17,10 @@ from ..fracture.brittle.surface_criterion import BrittleSurfaces
 from ..fracture.criterion import CellAverage
 from ..fracture.edge_stress import frobenius_norm
 from ..fracture.nonlocal_average import NeighbourAverage
-from ..mechanics.stress import Stress
 from ..mesh.edge_graph import EdgeGraph
-from ..mesh.fragments import Fragments, find_fragments
 from ..mesh.input_topology import MeshTopology
 from ..solvers.petsc_options import PetscOptions
+from .fragment_analyses import FragmentAnalyses, FragmentCells, StiffnessOperator
 from .surface_loads import PointLoads, distribute_on_circles, locate_forces
 
 if TYPE_CHECKING:
@@ -30,10 +29,6 @@ if TYPE_CHECKING:
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-
-# Fraction of its stiffness that a split cell keeps if all its parts belong to one fragment: a crack that ends in the
-# body is open, and the nodes between its faces stay in place.
-CRACKED_CELL_STIFFNESS = 1e-3
 
 
 class FragmentAverage:
@@ -47,6 +42,10 @@ class FragmentAverage:
         """Begin with all cells, `count` of them; `average`: None: values are taken as they are."""
         self._average = average
         self.in_fragment: Flags = np.ones(count, bool)
+
+    def restrict_to(self, cells: Flags) -> None:
+        """Average over flagged cells (cells,), those of another fragment."""
+        self.in_fragment = cells
 
     def __call__(self, values: Values, active: Flags | None = None) -> Values:
         """Return averages (cells, n) of values (cells, n) over active cells of the fragment; 0 outside of it."""
@@ -94,53 +93,13 @@ class ImpactOutcome:
     shape: DentedShape | None = None
 
 
-class BodyAnalysis(Protocol):
-    """Quasi-static analysis of one free body.
-
-    Attributes:
-        cell_fractions: (cells,) fraction of each cell that belongs to the body.
-    """
-
-    cell_fractions: Values
-
-    @property
-    def cg_iterations(self) -> int:
-        """Iterations of CG in the last solve."""
-
-    def __call__(self, force: Values) -> Values:
-        """Return displacements under forces (nodes of the mesh, d), N."""
-
-    def destroy(self) -> None:
-        """Free memory."""
-
-
-class StiffnessOperator(Protocol):
-    """Stiffness of bodies that are parts of one mesh; see free_body_analysis and shell_analysis."""
-
-    stress: Stress
-
-    @property
-    def beam_thickness(self) -> float:
-        """Thickness of the most slender part of a body, m."""
-
-    def whole_body(self, options: PetscOptions | None = None) -> BodyAnalysis:
-        """Return the analysis of all cells."""
-
-    def make_body(self, cell_fractions: Values, options: PetscOptions | None = None) -> BodyAnalysis:
-        """Return the analysis of cells with fractions (cells,)."""
-
-    def cell_stress(self, u: Values, cell_fractions: Values) -> Values:
-        """Return stresses (cells, 3 or 6), Pa, of displacements u."""
-
-
 class BreakableBody:
     """Fragments of one mesh (one rank).
 
     Attributes:
         graph: edges of the mesh.
         fragments: connected parts under intact edges.
-        analyses: number of analyses so far.
-        cg_iterations: iterations of CG in them.
+        analyses: of the fragments.
     """
 
     def __init__(
@@ -164,19 +123,9 @@ class BreakableBody:
             denting: plastic flow of a body that does not break; None: nothing yields.
             check_abort: called before an analysis; raises StepAborted if the run is to stop.
         """
-        self._check_abort = check_abort
-        self._stiffness, self._criterion, self._average, self._options = stiffness, criterion, average, options
-        self._denting = denting
-        self._domain, self.graph, self.analyses, self.cg_iterations = stiffness.stress.domain, graph, 0, 0
-        self._corners = np.ascontiguousarray(self._domain.cell_nodes.T)
-        # analyses by the lowest node of the fragment
-        self._bodies: dict[int, BodyAnalysis] = {}
-        self._node_of_input = np.argsort(self._domain.input_numbering.nodes)
-        self._find_fragments()
-
-    def _find_fragments(self) -> None:
-        self.fragments: Fragments = find_fragments(self.graph)
-        self._lengths: Values | None = None
+        self.graph, self.fragments = graph, FragmentCells(graph)
+        self.analyses = FragmentAnalyses(stiffness, self.fragments, options, check_abort)
+        self._domain, self._criterion, self._average, self._denting = graph.domain, criterion, average, denting
 
     # --- damage and checkpoints ---
 
@@ -207,13 +156,9 @@ class BreakableBody:
         local, row = self.graph.keys.find_edges(arrays["broken"])
         self._criterion.set_cuts(local, arrays["cut"][row, 0])
         self._criterion.set_starts(arrays["starts"])
-        self._find_fragments()
+        self.fragments.update()
 
     # --- loads ---
-
-    def fragment_of(self, name: int) -> int:
-        """Return the number of the fragment that a node of the input mesh belongs to."""
-        return int(self.fragments.node_fragment[self._node_of_input[name]])
 
     def may_break(self, fragment: int, force: float) -> bool:
         """Return whether forces, the sum of whose sizes is `force`, N, could break a fragment or make it yield.
@@ -223,11 +168,9 @@ class BreakableBody:
         """
         if not self.surfaces_left:
             return False
-        if self._lengths is None:
-            self._lengths = self._fragment_lengths()
-        h = self._stiffness.beam_thickness
-        weakest = self._weakest_stress()
-        return bool(2 * force * max(float(self._lengths[fragment]), h) / h**3 >= weakest)
+        h = self.analyses.stiffness.beam_thickness
+        length = max(float(self.fragments.diagonals[fragment]), h)
+        return bool(2 * force * length / h**3 >= self._weakest_stress())
 
     def _weakest_stress(self) -> float:
         """Return the least stress, Pa, at which a cell yields or a surface opens."""
@@ -235,14 +178,6 @@ class BreakableBody:
             return self._criterion.strength.minimum
         assert self._denting is not None
         return self._denting.min_yield_stress
-
-    def _fragment_lengths(self) -> Values:
-        """Return the diagonals (fragments,), m, of the bounding boxes of fragments."""
-        fragment, X = self.fragments.node_fragment, self._domain.nodes
-        order = np.argsort(fragment, kind="stable")
-        start = np.searchsorted(fragment[order], np.arange(int(fragment.max()) + 1))
-        sides = np.maximum.reduceat(X[order], start) - np.minimum.reduceat(X[order], start)
-        return np.asarray(np.linalg.norm(sides, axis=1))
 
     def distribute_forces(
         self, fragment: int, points: Values, force: Values, radius: Values | None = None
@@ -255,51 +190,8 @@ class BreakableBody:
             if self._denting is not None:
                 radius = np.maximum(radius, self._denting.min_contact_radii(force))
             points, force = distribute_on_circles(points, force, radius, self._domain.mean_edge_length)
-        cells = self._domain.cell_nodes[self.fragment_cell_fractions(fragment) > 0].astype(np.int64)
+        cells = self._domain.cell_nodes[self.fragments.cell_fractions(fragment) > 0].astype(np.int64)
         return locate_forces(self._domain.nodes, cells, points, force)
-
-    # --- analyses ---
-
-    def fragment_cell_fractions(self, fragment: int) -> Values:
-        """Return the fraction (cells,) of each cell that belongs to a fragment: the share of its nodes."""
-        fractions = self._count_corners(self.fragments.node_fragment == fragment) / len(self._corners)
-        fractions[self.graph.split & (fractions == 1)] = CRACKED_CELL_STIFFNESS
-        return fractions
-
-    def _count_corners(self, nodes: Flags) -> npt.NDArray[np.int8]:
-        """Return how many corners (cells,) of each cell have a flag (nodes,)."""
-        # a tenth of the time of a sum over an axis
-        flags = nodes.view(np.int8)
-        return np.asarray(sum(flags[corner] for corner in self._corners))
-
-    def analyse(self, fragment: int, loads: PointLoads) -> Values:
-        """Return the stresses (cells, 3 or 6), Pa, of a fragment under loads; 0 in all other cells.
-
-        Raises NotConverged, and StepAborted if the run is to stop.
-        """
-        if self._check_abort is not None:
-            self._check_abort()
-        body = self._body(fragment)
-        self.analyses += 1
-        u = body(loads.nodal_forces(len(self._domain.nodes)))
-        self.cg_iterations += body.cg_iterations
-        return self._stiffness.cell_stress(u, body.cell_fractions)
-
-    def _body(self, fragment: int) -> BodyAnalysis:
-        """Return the analysis of a fragment, which is kept until the fragment breaks.
-
-        The analysis of all cells serves all instances of the mesh.
-        """
-        key = self._lowest_node(fragment)
-        if key not in self._bodies:
-            fractions = self.fragment_cell_fractions(fragment)
-            if np.all(fractions == 1):
-                return self._stiffness.whole_body(self._options)
-            self._bodies[key] = self._stiffness.make_body(fractions, self._options)
-        return self._bodies[key]
-
-    def _lowest_node(self, fragment: int) -> int:
-        return int(np.flatnonzero(self.fragments.node_fragment == fragment)[0])
 
     # --- outcomes ---
 
@@ -329,29 +221,28 @@ class BreakableBody:
         if criterion is None:
             return self._find_dent(name, loads, energy)
         broken, starts = self.graph.broken.copy(), criterion.starts
-        analyses, iterations = self.analyses, self.cg_iterations
+        analyses, iterations = self.analyses.count, self.analyses.cg_iterations
         criterion.reserve(criterion.remaining - max_surfaces)
         try:
-            self.break_fragments(self.fragment_of(name), loads)
+            self.break_fragments(self.fragments.containing(name), loads)
         finally:
             new_starts = criterion.starts[len(starts) :]
             criterion.set_starts(starts)
             criterion.reserve(0)
         edges = np.flatnonzero(self.graph.broken & ~broken)
-        effort = self.analyses - analyses, self.cg_iterations - iterations
-        self.analyses, self.cg_iterations = analyses, iterations
+        effort = self.analyses.count - analyses, self.analyses.cg_iterations - iterations
         return ImpactOutcome(name, self.graph.keys.of_edges(edges), criterion.cut_positions[edges], new_starts, *effort)
 
     def _find_dent(self, name: int, loads: PointLoads, energy: float) -> ImpactOutcome:
         """Return the shape that loads leave. Raises NotConverged."""
         assert self._denting is not None
-        fragment, iterations, analyses = self.fragment_of(name), self.cg_iterations, self.analyses
-        body, stress = self._body(fragment), self.analyse(fragment, loads)
+        fragment = self.fragments.containing(name)
+        body, stress = self.analyses.body(fragment), self.analyses.analyse(fragment, loads)
+        iterations = body.cg_iterations
         shape = self._denting(body, stress, energy)  # type: ignore[arg-type]
-        self.cg_iterations += body.cg_iterations if shape is not None else 0
-        effort = self.analyses - analyses, self.cg_iterations - iterations
-        self.analyses, self.cg_iterations = analyses, iterations
-        return ImpactOutcome(name, np.empty((0, 2), np.int64), np.empty(0), np.empty((0, 3)), *effort, shape)
+        # plastic flow takes a second solve, by the same analysis
+        iterations += body.cg_iterations if shape is not None else 0
+        return ImpactOutcome(name, np.empty((0, 2), np.int64), np.empty(0), np.empty((0, 3)), 1, iterations, shape)
 
     def apply_outcomes(self, outcomes: list[ImpactOutcome]) -> None:
         """Break the edges that analyses on any rank found."""
@@ -365,22 +256,13 @@ class BreakableBody:
         new = ~self.graph.broken[local]
         if np.any(new):
             for fragment in np.unique(self.fragments.node_fragment[self.graph.edge_nodes[local[new]]]):
-                self._discard_body(self._lowest_node(fragment))
+                self.analyses.discard(self.fragments.lowest_node(fragment))
             criterion.set_cuts(local, cut[order][row])
             flags = np.zeros(len(self.graph.broken), bool)
             flags[local] = True
             self.graph.break_edges(flags)
-            self._find_fragments()
+            self.fragments.update()
         criterion.set_starts(np.concatenate([criterion.starts, *(outcome.surface_starts for outcome in outcomes)]))
-        self.analyses += sum(outcome.analyses for outcome in outcomes)
-        self.cg_iterations += sum(outcome.cg_iterations for outcome in outcomes)
-
-    def destroy(self, *, owns_operator: bool) -> None:
-        """Free the memory of the analyses; `owns_operator`: no other instance has this mesh."""
-        for node in [*self._bodies]:
-            self._discard_body(node)
-        if owns_operator:
-            self._stiffness.whole_body(self._options).destroy()
 
     # --- fracture ---
 
@@ -388,35 +270,27 @@ class BreakableBody:
         """Break a fragment, and the fragments that result, until nothing more breaks; return the number of edges."""
         if self._criterion is None:
             return 0
-        broken, waiting = 0, [self._lowest_node(fragment)]
-        while waiting:
-            node = waiting.pop()
+        broken, pending = 0, [self.fragments.lowest_node(fragment)]
+        while pending:
+            node = pending.pop()
             fragment = int(self.fragments.node_fragment[node])
             nodes = self.fragments.node_fragment == fragment
             own_loads = loads.select(nodes[loads.owner])
-            if not len(own_loads.force) or not self._has_unsplit_cell(nodes):
+            if not len(own_loads.force) or not self.fragments.has_unsplit_cell(nodes):
                 continue
             count = self._fracture_pass(fragment, nodes, own_loads)
             broken += count
             if count:
-                self._discard_body(node)
-                self._find_fragments()
-                waiting += self._lowest_nodes(nodes)
+                self.analyses.discard(node)
+                self.fragments.update()
+                pending += self.fragments.lowest_nodes(nodes)
         return broken
-
-    def _has_unsplit_cell(self, nodes: Flags) -> bool:
-        """Return whether a fragment with these nodes (nodes,) has an unsplit cell."""
-        return bool(np.any(self._inner_cells(nodes) & ~self.graph.split))
-
-    def _inner_cells(self, nodes: Flags) -> Flags:
-        """Return (cells,) flags of cells all of whose nodes have a flag (nodes,)."""
-        return np.asarray(self._count_corners(nodes) == len(self._corners))
 
     def _fracture_pass(self, fragment: int, nodes: Flags, loads: PointLoads) -> int:
         """Analyse a fragment once, break its edges, and return their number."""
         assert self._criterion is not None
-        stress = self.analyse(fragment, loads)
-        self._average.in_fragment = self._inner_cells(nodes)
+        stress = self.analyses.analyse(fragment, loads)
+        self._average.restrict_to(self.fragments.inner_cells(nodes))
         if self._is_surely_safe(stress):
             return 0
         edges, _ = self._criterion(stress)
@@ -437,14 +311,3 @@ class BreakableBody:
         size = frobenius_norm(stress[cells], self._domain.dim)
         below = float(size.max(initial=0.0)) < self._criterion.strength.minimum * (1 - 1e-9)
         return below and not self.graph.damaged[cells].any()
-
-    def _lowest_nodes(self, nodes: Flags) -> list[int]:
-        """Return the lowest node of each fragment that has some of these nodes (nodes,), the last fragment first."""
-        numbers = np.flatnonzero(nodes)
-        _, first = np.unique(self.fragments.node_fragment[numbers], return_index=True)
-        return [int(node) for node in numbers[first][::-1]]
-
-    def _discard_body(self, node: int) -> None:
-        """Free the analysis of the fragment with this lowest node."""
-        if (body := self._bodies.pop(node, None)) is not None:
-            body.destroy()

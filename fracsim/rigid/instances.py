@@ -109,7 +109,7 @@ class Instances:
         """Return whether forces, the sum of whose sizes is `force`, N, could break a body; see BreakableBody."""
         number, node = divmod(name, self.node_count)
         body = self.get(number)
-        return body.may_break(body.fragment_of(node), force)
+        return body.may_break(body.fragments.containing(node), force)
 
     def find_outcome(
         self, name: int, points: Values, force: Values, radius: Values, max_surfaces: int, energy: float = np.inf
@@ -131,7 +131,7 @@ class Instances:
         body, rotation = self.get(number), self.poses.rotation[number]
         # into the axes of the mesh
         mesh_points, mesh_force = (points - self.poses.position[number]) @ rotation, force @ rotation
-        loads = body.distribute_forces(body.fragment_of(node), mesh_points, mesh_force, radius)
+        loads = body.distribute_forces(body.fragments.containing(node), mesh_points, mesh_force, radius)
         return replace(body.find_outcome(node, loads, max_surfaces, energy), body_name=name)
 
     def apply_outcomes(self, outcomes: list[ImpactOutcome]) -> None:
@@ -149,7 +149,7 @@ class Instances:
     def _change_shape(self, number: int, shape: DentedShape) -> None:
         """Give an instance another shape."""
         if (body := self._bodies.pop(number, None)) is not None:
-            body.destroy(owns_operator=number in self.dented_shapes)
+            body.analyses.destroy(owns_operator=number in self.dented_shapes)
         self.dented_shapes[number] = shape
 
     # --- checkpoints ---

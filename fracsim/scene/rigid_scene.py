@@ -19,7 +19,8 @@ from ..mesh.domain import distribute
 from ..mesh.edge_graph import EdgeGraph
 from ..mesh.input_topology import MeshTopology
 from ..meshes.data import MeshData, format_point
-from ..rigid.breakage import BreakableBody, FragmentAverage, StiffnessOperator
+from ..rigid.breakage import BreakableBody, FragmentAverage
+from ..rigid.fragment_analyses import StiffnessOperator
 from ..rigid.fragment_geometry import FragmentGeometry
 from ..rigid.free_body_analysis import SolidStiffness
 from ..rigid.instance_placement import InstancePlacement, InstancePoses, instance_motion, place_mesh

@@ -20,7 +20,8 @@ from fracsim.mesh.split_surface.closed_surface import build_split_surface
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
 from fracsim.mesh.split_surface.polyhedron_moments import PolyhedronMoments, moments
 from fracsim.meshes.data import MeshData
-from fracsim.rigid.breakage import BreakableBody, FragmentAverage, StiffnessOperator
+from fracsim.rigid.breakage import BreakableBody, FragmentAverage
+from fracsim.rigid.fragment_analyses import StiffnessOperator
 from fracsim.rigid.free_body_analysis import SolidBody, SolidStiffness
 from fracsim.rigid.shell_analysis import ShellStiffness
 
