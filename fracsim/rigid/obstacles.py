@@ -23,6 +23,7 @@ from .convex_decomposition import Polyhedron, convex_parts, hull_corners
 
 if TYPE_CHECKING:
     from ..contact.obstacle import FreeObstacle
+    from .contact_points import ContactImpulses
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -191,6 +192,28 @@ class ObstacleSet:
         moved = [self.reference_point(number, t + dt) - self.reference_point(number, t) for number in numbers]
         return np.array(moved).reshape(-1, 3)
 
+    def forces_and_work(
+        self, impulses: ContactImpulses, fragment_count: int, t: float, dt: float
+    ) -> tuple[Values, Values]:
+        """Return mean forces (obstacles, 3), N, of fragments on obstacles, and the work (obstacles,), J, of obstacles.
+
+        Args:
+            impulses: of a step of all bodies.
+            fragment_count: number of fragments, which precede the obstacles.
+            t: start of the step, s.
+            dt: s.
+        """
+        of_fragments, of_obstacles = np.zeros((2, len(self.obstacles), 3))
+        sides = ((impulses.first, impulses.second, -1.0), (impulses.second, impulses.first, 1.0))
+        for receiver, partner, sign in sides:
+            is_fragment = partner < fragment_count
+            for chosen, total in ((is_fragment, of_fragments), (~is_fragment, of_obstacles)):
+                rows = (receiver >= fragment_count) & chosen
+                owner = self.obstacle_of[receiver[rows] - fragment_count]
+                np.add.at(total, owner, sign * impulses.impulse[rows] / dt)
+        work = -np.einsum("mi,mi->m", of_fragments + of_obstacles, self.displacements(t, dt))
+        return of_fragments, work
+
     def placed_shapes(self, t: float, bodies: Bodies) -> list[PosedShape]:
         """Return all obstacles at a time, s; the free ones are the last of `bodies`."""
         first = len(bodies) - len(self.free_numbers)
@@ -200,6 +223,11 @@ class ObstacleSet:
                 self.obstacles[number].shape, Pose(bodies.position[body], bodies.rotation[body])
             )
         return result
+
+    @property
+    def masses(self) -> Values:
+        """Masses (m,) of free obstacles and then of the parts of prescribed ones, kg; infinite for the latter."""
+        return np.concatenate([self.free_bodies().mass, np.full(len(self._prescribed), np.inf)])
 
     # --- columns of history.csv ---
 

@@ -22,7 +22,7 @@ from .instances import Instances, InstancesSnapshot
 from .mujoco_model import ContactParameters
 from .obstacles import ObstacleSet, Part
 from .parallel_analyses import ImpactLoads, ParallelAnalyses
-from .surface_loads import HertzContact, reduced_value
+from .surface_loads import HertzContact, ImpactSpheres
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -114,9 +114,6 @@ class RigidStepper:
     """
 
     shapes: FragmentShapes
-    # of all bodies and obstacles: masses, kg, and half their sizes, m
-    _mass: Values
-    _half_size: Values
 
     def __init__(
         self,
@@ -144,10 +141,11 @@ class RigidStepper:
         self.analyses = analyses or ParallelAnalyses(instances)
         self.instances, self._geometry, self._density = instances, geometry, density
         self.obstacles, self._parameters, self._hertz = ObstacleSet(obstacles), parameters, hertz
-        self._contact_time = contact_time
+        self._impact_spheres = ImpactSpheres(hertz, contact_time)
         self.impact_detector = ImpactDetector(
-            parameters.time_step, parameters.impact_threshold, self._impact_duration, self._radius_cubed_per_force
-        )
+            parameters.time_step, parameters.impact_threshold, self._impact_spheres.duration,
+            self._impact_spheres.radius_cubed_per_force,
+        )  # fmt: skip
         self.phases, self.initial_overlaps = PhaseTimes(), InitialOverlaps.empty()
         self._engine: Engine | None = None
         # state before a step that was abandoned
@@ -161,7 +159,11 @@ class RigidStepper:
         damage = {number: body.input_damage() for number, body in self.instances.damaged.items()}
         points = {number: shape.points for number, shape in self.instances.dented_shapes.items()}
         self.shapes, self._engine = self._geometry.update_shapes(damage, points), None
-        self._mass, self._half_size = self._masses_and_sizes()
+        volume = self.shapes.moments.volume
+        mass = np.concatenate([self._density * volume, self.obstacles.masses])
+        # half the side of a cube of equal volume
+        half_size = np.concatenate([np.cbrt(volume) / 2, self.obstacles.half_sizes])
+        self._impact_spheres.set_bodies(mass, half_size, self.fragment_count)
 
     def start(self) -> RigidState:
         """Return the state at t = 0: the bodies at their place, without motion."""
@@ -248,7 +250,9 @@ class RigidStepper:
         if dented := [number for number, shape in shapes.items() if shape is not shapes_before.get(number)]:
             moved = self._apply_dented_shapes(moved, dented)
         _check_finite(moved, state.t + self._parameters.time_step)
-        forces, obstacle_work = self._obstacle_forces_and_work(impulses, state.t)
+        forces, obstacle_work = self.obstacles.forces_and_work(
+            impulses, self.fragment_count, state.t, self._parameters.time_step
+        )
         gravity_work = moved.mass * ((moved.position - bodies.position) @ self._parameters.gravity)
         work = state.work + float(gravity_work.sum()) + float(obstacle_work.sum())
         lost = gravity_work + bodies.kinetic_energies - moved.kinetic_energies
@@ -299,19 +303,6 @@ class RigidStepper:
         """Return (body, body, depth in m) of all pairs that overlap by more than is admitted between fragments."""
         return (self._engine or self._make_engine(state.t, state.bodies)).find_penetrations(state.bodies)
 
-    def _obstacle_forces_and_work(self, impulses: ContactImpulses, t: float) -> tuple[Values, Values]:
-        """Return the mean forces (m, 3), N, of fragments on obstacles, and the work (m,), J, of driven obstacles."""
-        count, dt, obstacles = self.fragment_count, self._parameters.time_step, self.obstacles
-        of_fragments, of_obstacles = np.zeros((2, len(obstacles.obstacles), 3))
-        sides = ((impulses.first, impulses.second, -1.0), (impulses.second, impulses.first, 1.0))
-        for receiver, partner, sign in sides:
-            for chosen, total in ((partner < count, of_fragments), (partner >= count, of_obstacles)):
-                rows = (receiver >= count) & chosen
-                owner = obstacles.obstacle_of[receiver[rows] - count]
-                np.add.at(total, owner, sign * impulses.impulse[rows] / dt)
-        work = -np.einsum("mi,mi->m", of_fragments + of_obstacles, obstacles.displacements(t, dt))
-        return of_fragments, work
-
     # --- analyses and fracture ---
 
     def _select_loads(self, loads: list[BodyLoad], impulses: ContactImpulses) -> list[ImpactLoads]:
@@ -352,33 +343,6 @@ class RigidStepper:
         self.update_shapes()
         changed = np.isin(self.shapes.names // self.instances.node_count, instances)
         return bodies.with_shapes(self.shapes.moments, np.flatnonzero(changed))
-
-    # --- Hertz's contact ---
-
-    def _impact_duration(self, first: Ints, second: Ints, speed: Values) -> Values:
-        """Return the durations (k,), s, of impacts of bodies (k,) with others (k,) at speeds (k,), m/s."""
-        if self._contact_time is not None:
-            return np.full(len(first), self._contact_time)
-        mass = reduced_value(self._mass[first], self._mass[second])
-        radius = reduced_value(self._half_size[first], self._half_size[second])
-        return self._hertz.duration(mass, radius, speed, self._are_both_elastic(first, second))
-
-    def _radius_cubed_per_force(self, first: Ints, second: Ints) -> Values:
-        """Return a^3 / F (k,), m^3/N, of contacts of bodies (k,) with others (k,)."""
-        radius = reduced_value(self._half_size[first], self._half_size[second])
-        return self._hertz.radius_cubed_per_force(radius, self._are_both_elastic(first, second))
-
-    def _are_both_elastic(self, first: Ints, second: Ints) -> Flags:
-        """Return (k,) flags of pairs of fragments; obstacles are rigid."""
-        return np.asarray(np.maximum(first, second) < self.fragment_count)
-
-    def _masses_and_sizes(self) -> tuple[Values, Values]:
-        """Return masses, kg, of all bodies and obstacles, and half their sizes, m: that of a cube of equal volume."""
-        volume, obstacles = self.shapes.moments.volume, self.obstacles
-        free = obstacles.free_bodies().mass
-        prescribed = np.full(len(obstacles.half_sizes) - len(free), np.inf)
-        mass = np.concatenate([self._density * volume, free, prescribed])
-        return mass, np.concatenate([np.cbrt(volume) / 2, obstacles.half_sizes])
 
 
 def _check_finite(bodies: Bodies, t: float) -> None:

@@ -80,6 +80,40 @@ class HertzContact:
         return np.asarray(self.young / (1 - self.poisson**2) / np.where(both_elastic, 2, 1))
 
 
+class ImpactSpheres:
+    """Bodies and obstacles as spheres, for the durations and contact radii of their impacts by Hertz's law."""
+
+    def __init__(self, hertz: HertzContact, contact_time: float | None) -> None:
+        """`contact_time`: duration of all impacts, s; None: that of Hertz's law."""
+        self._hertz, self._contact_time = hertz, contact_time
+        self.set_bodies(np.empty(0), np.empty(0), 0)
+
+    def set_bodies(self, mass: Values, half_size: Values, elastic_count: int) -> None:
+        """Set the masses (n,), kg, and half the sizes (n,), m, of all bodies and obstacles.
+
+        `elastic_count`: number of the first ones that are elastic; all others are rigid.
+        """
+        self._mass, self._half_size, self._elastic_count = mass, half_size, elastic_count
+
+    def duration(self, first: Ints, second: Ints, speed: Values) -> Values:
+        """Return the durations (k,), s, of impacts of bodies (k,) with others (k,) at speeds (k,), m/s."""
+        if self._contact_time is not None:
+            return np.full(len(first), self._contact_time)
+        mass = reduced_value(self._mass[first], self._mass[second])
+        return self._hertz.duration(mass, self._radius(first, second), speed, self._are_both_elastic(first, second))
+
+    def radius_cubed_per_force(self, first: Ints, second: Ints) -> Values:
+        """Return a^3 / F (k,), m^3/N, of contacts of bodies (k,) with others (k,)."""
+        return self._hertz.radius_cubed_per_force(self._radius(first, second), self._are_both_elastic(first, second))
+
+    def _radius(self, first: Ints, second: Ints) -> Values:
+        """Return reduced radii (k,), m."""
+        return reduced_value(self._half_size[first], self._half_size[second])
+
+    def _are_both_elastic(self, first: Ints, second: Ints) -> Flags:
+        return np.asarray(np.maximum(first, second) < self._elastic_count)
+
+
 def reduced_value(first: Values, second: Values) -> Values:
     """Return reduced masses or radii 1 / (1 / a + 1 / b); a or b may be infinite."""
     return np.asarray(1.0 / (1.0 / first + 1.0 / second))
