@@ -12,9 +12,9 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.contact_points import Contacts
-from fracsim.rigid.contact_solver import ProjectedGradientSolver, project_on_cones
 from fracsim.rigid.engine import Engine
 from fracsim.rigid.mujoco_model import ContactParameters
+from fracsim.rigid.projected_gradient import ProjectedGradientSolver, project_on_cones
 from support.falling import CUBE, DOWN, MASS, cubes
 
 Values = npt.NDArray[np.float64]

@@ -24,11 +24,13 @@ Motion and contact:
 
 engine                a step of motion: events, and searches for contacts in rounds
 collision_detection   contacts that may close in a step
-mujoco_model          the scene as MuJoCo has it; contacts of hulls with planes
+mujoco_model          the scene as MuJoCo has it
+plane_contacts        contacts of convex hulls with planes
 obstacles             fixed, driven and free obstacles, and their shapes
 contact_points        contact points, and the impulses that they transmitted
 contact_law           unilateral constraints at contacts, impacts
-contact_solver        impulses: MuJoCo for few contacts, projected gradients in C for many
+contact_solver        impulses: MuJoCo for few contacts, projected gradients for many
+projected_gradient    Coulomb's law by accelerated projected gradients, in C
 impact_sequence       sequences of impact events within a step
 fragment_overlap      overlaps that exist from the moment of fracture
 core_contact          contact with the cores of fragments, in C

@@ -15,7 +15,8 @@ from .bodies import Bodies, fly, quaternions
 from .contact_points import Contacts
 from .core_contact import CoreContact
 from .fragment_overlap import AdmittedOverlaps
-from .mujoco_model import CheckedCorners, ContactParameters, MujocoModel
+from .mujoco_model import ContactParameters, MujocoModel
+from .plane_contacts import CheckedCorners
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]

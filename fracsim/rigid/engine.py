@@ -32,8 +32,9 @@ from .contact_solver import ContactSolver, has_many_contacts
 from .core_contact import CoreContact
 from .fragment_overlap import AdmittedOverlaps, InitialOverlaps
 from .impact_sequence import EventConditions, FamilyFunction, ImpactEvent, elapsed_approach, would_hit_next
-from .mujoco_model import CheckedCorners, ContactParameters, MujocoModel, build_model
+from .mujoco_model import ContactParameters, MujocoModel, build_model
 from .obstacles import Part, PrescribedObstacle
+from .plane_contacts import CheckedCorners
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
