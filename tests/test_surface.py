@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from fracsim.mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from fracsim.mesh.split_surface.entity_numbering import CRACK, EntityNumbering
-from fracsim.mesh.split_surface.smooth_cuts import MIN_SHARE, smooth_cuts
+from fracsim.mesh.split_surface.smooth_cuts import CUTS, smooth_cuts
 from fracsim.mesh.split_surface.surface_motion import NodalRotations
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.topology import boundary_facets, signed_measures
@@ -149,7 +149,9 @@ def test_smooth_cuts_make_a_crack_flat(dim: int) -> None:
     broken = separated(skeleton, (mesh.points[:, 0] > 0.5).astype(int))
     cut = smooth_cuts(skeleton, broken)
     assert (
-        np.array_equal(~np.isnan(cut), broken) and cut[broken].min() >= MIN_SHARE and cut[broken].max() <= 1 - MIN_SHARE
+        np.array_equal(~np.isnan(cut), broken)
+        and cut[broken].min() >= CUTS.min_distance
+        and cut[broken].max() <= 1 - CUTS.min_distance
     )
     rough, smooth = (torn(mesh, broken, each) for each in (None, cut))
     crack = [made.points[np.unique(made.elements[made.origin == CRACK])] for made in (rough, smooth)]

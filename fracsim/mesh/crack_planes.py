@@ -12,8 +12,6 @@ from ..errors import InputError
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-MAX_CORNER_OFFSET = 1e-6  # of the size of a polygon: distance of a corner from the plane of the polygon
-
 
 @dataclass(frozen=True)
 class CrackPlane:
@@ -71,7 +69,9 @@ def polygon(name: str, corners: Values) -> CrackPlane:
     """A crack over a planar polygon (k, 3), m. InputError if the corners do not lie in one plane."""
     centre = corners.mean(axis=0)
     _, sizes, axes = np.linalg.svd(corners - centre)
-    if sizes[1] <= MAX_CORNER_OFFSET * sizes[0] or sizes[2] > MAX_CORNER_OFFSET * sizes[0]:
+    # distance of a corner from the plane, and of all corners from a line
+    tolerance = 1e-6 * sizes[0]
+    if sizes[1] <= tolerance or sizes[2] > tolerance:
         raise InputError(f"{name}.polygon: its {len(corners)} corners do not span a plane; give a flat polygon (m)")
     return CrackPlane(name, centre, axes[2], corners)
 

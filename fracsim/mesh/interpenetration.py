@@ -13,10 +13,6 @@ from scipy.spatial import cKDTree
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-MIN_BARYCENTRIC = 0.05  # of a node that counts as inside a cell: touching bodies do not interpenetrate
-MAX_RADIUS_RATIO = 4.0  # of a cell to the median: larger cells are torn or crushed, and are left out
-MAX_BOX_PAIRS = 1 << 22  # compared at a time, which bounds memory
-
 
 def find_interpenetration(x: Values, cells: Ints, piece: Ints) -> tuple[int, int] | None:
     """The node that lies deepest inside a cell of another fragment, and that cell; None if there is none.
@@ -40,7 +36,8 @@ def find_interpenetration(x: Values, cells: Ints, piece: Ints) -> tuple[int, int
     foreign = piece[node] != of_cell[searched[cell]]
     node, cell = node[foreign], searched[cell[foreign]]
     depth = _depth(x, node, cells[cell])
-    if not len(depth) or depth.max() <= MIN_BARYCENTRIC:
+    # least barycentric coordinate of a node that counts as inside: bodies that only touch do not interpenetrate
+    if not len(depth) or depth.max() <= 0.05:
         return None
     deepest = np.argmax(depth)
     return int(node[deepest]), int(cell[deepest])
@@ -49,7 +46,8 @@ def find_interpenetration(x: Values, cells: Ints, piece: Ints) -> tuple[int, int
 def _meeting(lower: Values, upper: Values, count: Ints) -> tuple[Ints, Ints]:
     """(k,), (k,) pairs of fragments whose bounding boxes overlap, the one with fewer nodes first."""
     pairs = []
-    rows = max(1, MAX_BOX_PAIRS // len(lower))
+    # four million pairs of boxes are compared at a time, which bounds memory
+    rows = max(1, (1 << 22) // len(lower))
     for first in range(0, len(lower), rows):
         batch = slice(first, first + rows)
         meets = ((lower[batch, None] < upper) & (lower < upper[batch, None])).all(axis=2)
@@ -76,7 +74,8 @@ def _candidates(x: Values, nodes: Ints, cells: Ints) -> tuple[Ints, Ints]:
     corners = x[cells]
     centre = corners.mean(axis=1)
     radius = np.sqrt(((corners - centre[:, None]) ** 2).sum(axis=2).max(axis=1))
-    usual = np.flatnonzero(radius < MAX_RADIUS_RATIO * np.median(radius))
+    # larger cells are torn or crushed, and are left out
+    usual = np.flatnonzero(radius < 4 * np.median(radius))
     if not len(nodes) or not len(usual):
         return np.empty(0, np.int64), np.empty(0, np.int64)
     centres = cKDTree(centre[usual])

@@ -28,9 +28,7 @@ from mpi4py import MPI
 
 from ..errors import CannotWrite, InputError
 
-PATIENCE = 60.0  # s that a process waits for a library that another one compiles
 OTHERS = stat.S_IWGRP | stat.S_IWOTH
-NO_ROOM = 1 << 20  # bytes of free space below which a compiler's failure is taken for that of a full disk
 
 
 def library_folder() -> Path:
@@ -104,7 +102,8 @@ def not_for_others() -> Iterator[None]:
 def no_room(folder: Path) -> bool:
     """Whether a file system is full."""
     status = os.statvfs(folder)
-    return status.f_bavail * status.f_frsize < NO_ROOM
+    # bytes of free space below which a compiler's failure is taken for that of a full disk
+    return status.f_bavail * status.f_frsize < 1 << 20
 
 
 def note(text: str) -> None:
@@ -179,8 +178,8 @@ def _is_elf(content: bytes) -> bool:
 def alone(folder: Path, name: str) -> Iterator[None]:
     """One process at a time, of all ranks and jobs, has the library of a name to itself.
 
-    A file system without locks, and a process that holds one for longer than PATIENCE, stop nobody: two compilations
-    do no harm, they only take longer.
+    A file system without locks, and a process that holds one for more than a minute, stop nobody: two compilations do
+    no harm, they only take longer.
     """
     position = int(hashlib.sha256(name.encode()).hexdigest()[:12], 16)
     try:
@@ -190,7 +189,7 @@ def alone(folder: Path, name: str) -> Iterator[None]:
         yield
         return
     try:
-        deadline = time.monotonic() + PATIENCE
+        deadline = time.monotonic() + 60.0  # s
         while not _locked(lock, position) and time.monotonic() < deadline:
             time.sleep(0.02)
         yield

@@ -73,17 +73,15 @@ class CellMidsideNodes:
         values[self.nodes] = values[self.ends].mean(axis=1)
 
 
-# local edges in the order of the midside nodes of VTK and XDMF: (0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)
-FILE_EDGE_ORDER = {2: [2, 0, 1], 3: [5, 2, 4, 3, 1, 0]}
-
-
 def with_midside_nodes(data: MeshData, middles: MidsideNodes, *, written: bool) -> MeshData:
     """The mesh with midside nodes as points, and cells of 6 (2D) or 10 (3D) nodes.
 
     `written`: nodes of a cell are in the order of VTK and XDMF, otherwise in the order of local edges.
     """
     between = data.points[middles.ends].mean(axis=1) if data.middles is None else data.middles
-    ends = data.cells[:, local_edges(data.dim)[FILE_EDGE_ORDER[data.dim] if written else slice(None)]]
+    # edges of VTK and XDMF: (0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)
+    file_order = {2: [2, 0, 1], 3: [5, 2, 4, 3, 1, 0]}[data.dim]
+    ends = data.cells[:, local_edges(data.dim)[file_order if written else slice(None)]]
     cells = np.hstack([data.cells, middles.index_between(ends)])
     return replace(data, points=np.concatenate([data.points, between]), cells=cells)
 

@@ -18,8 +18,6 @@ FAILURE_WAIT = 5.0  # s, that a rank which failed waits for the failure messages
 LAUNCHERS = ("prte", "orte", "mpirun", "mpiexec", "hydra", "slurmstepd")
 Values = npt.NDArray[np.float64]
 
-_FAILED = 7919  # tag of the message that a rank has failed
-
 
 def on_root[T](comm: MPI.Comm, work: Callable[[], T]) -> T | None:
     """The result of `work` on rank 0, None elsewhere; an exception of `work` is raised on every rank."""
@@ -68,12 +66,13 @@ def who_failed(comm: MPI.Intracomm, patience: float) -> set[int]:
     messages between two ranks are used.
     """
     other_ranks = [rank for rank in range(comm.size) if rank != comm.rank]
-    sent = [comm.isend(None, rank, _FAILED) for rank in other_ranks]
+    tag = 7919  # of the message that a rank has failed; no other message has it
+    sent = [comm.isend(None, rank, tag) for rank in other_ranks]
     failed, deadline = {comm.rank}, time.monotonic() + patience
     while len(failed) < comm.size and time.monotonic() < deadline:
         for rank in other_ranks:
-            if rank not in failed and comm.iprobe(rank, _FAILED):
-                comm.recv(source=rank, tag=_FAILED)
+            if rank not in failed and comm.iprobe(rank, tag):
+                comm.recv(source=rank, tag=tag)
                 failed.add(rank)
         time.sleep(0.005)
     if len(failed) == comm.size:

@@ -12,13 +12,16 @@ import basix
 import numpy as np
 import numpy.typing as npt
 
-CELL = {1: basix.CellType.interval, 2: basix.CellType.triangle, 3: basix.CellType.tetrahedron}
+
+def cell_type(dim: int) -> basix.CellType:
+    """Basix's type of a simplex of dimension 1, 2 or 3."""
+    return {1: basix.CellType.interval, 2: basix.CellType.triangle, 3: basix.CellType.tetrahedron}[dim]
 
 
 @cache
 def local_edges(dim: int) -> npt.NDArray[np.int64]:
     """(edges per cell, 2) local nodes of each local edge, in DOLFINx's order."""
-    return np.array(basix.topology(CELL[dim])[1])
+    return np.array(basix.topology(cell_type(dim))[1])
 
 
 @cache

@@ -23,14 +23,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
+from ..forms.kinematics import SYMMETRIC_COMPONENTS
 from ..mesh.split_surface.polyhedron_moments import PolyhedronMoments, cones, moments
 from ..meshes.topology import components
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-# Components of a symmetric (3, 3) matrix.
-SYMMETRIC_PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 @dataclass(frozen=True)
@@ -303,7 +302,9 @@ def _triangle_moments(corners: Values, fragment: Ints, count: int) -> Values:
     middle = np.stack([np.bincount(fragment, x, count) for x in corners.mean(axis=1).T], axis=1) / sizes[:, None]
     x = corners - middle[fragment, None]
     s = x.sum(axis=1)
-    second = [area * ((x[:, :, i] * x[:, :, j]).sum(axis=1) + s[:, i] * s[:, j]) / 12 for i, j in SYMMETRIC_PAIRS]
+    second = [
+        area * ((x[:, :, i] * x[:, :, j]).sum(axis=1) + s[:, i] * s[:, j]) / 12 for i, j in SYMMETRIC_COMPONENTS[3]
+    ]
     return np.stack([area, *(area * s.T / 3), *second])
 
 
@@ -314,7 +315,7 @@ def _centres_and_spreads(sums: Values, group: Ints, count: int) -> tuple[Values,
     """
     area, *higher = (np.bincount(group, values, count) for values in sums)
     centre, second = np.stack(higher[:3], axis=1) / area[:, None], np.empty((count, 3, 3))
-    for (i, j), values in zip(SYMMETRIC_PAIRS, higher[3:], strict=True):
+    for (i, j), values in zip(SYMMETRIC_COMPONENTS[3], higher[3:], strict=True):
         second[:, i, j] = second[:, j, i] = values / area - centre[:, i] * centre[:, j]
     return centre, second
 

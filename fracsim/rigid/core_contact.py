@@ -56,8 +56,6 @@ class CoreSettings:
 
 
 SETTINGS = CoreSettings()
-# Number of a box beyond all others.
-UNBOUNDED = 1 << 40
 
 
 @dataclass(frozen=True)
@@ -139,8 +137,9 @@ class CoreContact:
 
         Their items (k,) are in the boxes from `begin` (k, 3) to `end` (k, 3).
         """
-        low = np.full((len(self._centre), 3), UNBOUNDED)
-        high = np.full((len(self._centre), 3), -UNBOUNDED)
+        beyond_all = 1 << 40  # no box has this number
+        low = np.full((len(self._centre), 3), beyond_all)
+        high = np.full((len(self._centre), 3), -beyond_all)
         np.minimum.at(low, fragment, begin)
         np.maximum.at(high, fragment, end)
         return low, np.maximum(high - low + 1, 0)

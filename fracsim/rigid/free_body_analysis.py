@@ -42,10 +42,7 @@ SOLVER_OPTIONS: PetscOptions = {
     # the coarsest matrix has the rigid modes too, and is singular
     "mg_coarse_pc_type": "svd",
 }
-# Small bodies are preconditioned by an incomplete factorisation: most fragments are analysed once or twice, and the
-# coarse spaces of multigrid would take most of the time of the first solve.
 INCOMPLETE_FACTORS: PetscOptions = {"pc_type": "icc"}
-MAX_FACTORED_NODES = 1500
 
 
 @dataclass(frozen=True)
@@ -156,7 +153,9 @@ class SolidBody:
         corner_mass = (cell_fractions * stiffness.density * domain.volumes)[cells] / corners.shape[1]
         mass = np.bincount(corners.ravel(), np.repeat(corner_mass, corners.shape[1]), minlength=len(domain.nodes))
         self.inertia_relief = InertiaRelief(mass[self.nodes].astype(float), modes)
-        small = len(self.nodes) < MAX_FACTORED_NODES
+        # Small bodies are preconditioned by an incomplete factorisation: most fragments are analysed once or twice, and
+        # the coarse spaces of multigrid would take most of the time of the first solve.
+        small = len(self.nodes) < 1500
         self._set_up_solver(SOLVER_OPTIONS | (INCOMPLETE_FACTORS if small else {}) | (options or {}))
 
     def _set_up_solver(self, options: PetscOptions) -> None:

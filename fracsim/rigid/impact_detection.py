@@ -39,18 +39,18 @@ class DetectionSettings:
         blow_factor: multiple of the impulse of the step before above which a contact passes a blow on.
         settling_steps: steps after a blow in which contacts are not analysed as loads.
         load_growth: multiple of the largest load so far above which a load is analysed again.
+        first_obstacle_name: above all names of bodies; prescribed obstacles are named by their numbers from here on.
+        max_steps: count of steps since the last blow of a body that had none.
     """
 
     blow_factor: float = 2.0
     settling_steps: int = 5
     load_growth: float = 1.1
+    first_obstacle_name: int = 2**30
+    max_steps: int = 2**30
 
 
 SETTINGS = DetectionSettings()
-# Above all names of bodies; prescribed obstacles are named by their numbers from here on.
-FIRST_OBSTACLE_NAME = 2**30
-# Steps since the last blow of a body that had none.
-NEVER = 2**30
 
 
 @dataclass(frozen=True)
@@ -156,7 +156,7 @@ class ImpactDetector:
         contacts = self._collect(impulses, bodies, names)
         speed, duration = self._find_blows(contacts, bodies, names)
         history, n = self._history, len(names)
-        history.steps_since_blow = np.where(speed > 0, 0, np.minimum(history.steps_since_blow + 1, NEVER))
+        history.steps_since_blow = np.where(speed > 0, 0, np.minimum(history.steps_since_blow + 1, SETTINGS.max_steps))
         received = contacts.received
         size = np.linalg.norm(received.impulses, axis=1) / self._dt
         load = np.bincount(received.body, size, n)
@@ -197,7 +197,7 @@ class ImpactDetector:
             return
         is_first_step = not len(history.names)
         _, new, old = np.intersect1d(names, history.names, assume_unique=True, return_indices=True)
-        steps, load = np.full(len(names), NEVER if is_first_step else 0), np.zeros(len(names))
+        steps, load = np.full(len(names), SETTINGS.max_steps if is_first_step else 0), np.zeros(len(names))
         steps[new], load[new] = history.steps_since_blow[old], history.largest_load[old]
         history.names, history.steps_since_blow, history.largest_load = names.copy(), steps, load
 
@@ -225,9 +225,10 @@ class ImpactDetector:
         """Return speeds (n,), m/s, and durations (n,), s, of the blows that bodies are under; 0 without a blow."""
         n, history = len(names), self._history
         code, approach_speed, impulse = contacts.pairs, contacts.approach_speed, contacts.pair_impulse
-        pair_names = np.stack([code // (2 * FIRST_OBSTACLE_NAME), code % (2 * FIRST_OBSTACLE_NAME)], axis=1)
-        is_body = pair_names < FIRST_OBSTACLE_NAME
-        pairs = np.where(is_body, np.searchsorted(names, pair_names), n + pair_names - FIRST_OBSTACLE_NAME)
+        first_obstacle = SETTINGS.first_obstacle_name
+        pair_names = np.stack(np.divmod(code, 2 * first_obstacle), axis=1)
+        is_body = pair_names < first_obstacle
+        pairs = np.where(is_body, np.searchsorted(names, pair_names), n + pair_names - first_obstacle)
         before: Values = np.zeros(len(code))
         if len(history.pairs):
             row = np.minimum(np.searchsorted(history.pairs, code), max(len(history.pairs) - 1, 0))
@@ -329,9 +330,9 @@ class _StepContacts:
 def _sum_by_pairs(impulses: ContactImpulses, names: Ints) -> tuple[Ints, Values, Values]:
     """Return codes (p,) of pairs, ascending, their fastest impacts (p,), m/s, and their impulses (p,), N s."""
     pairs = np.stack([impulses.first, impulses.second], axis=1)
-    obstacle_names = FIRST_OBSTACLE_NAME + np.arange(int(pairs.max(initial=0)) + 1)
+    obstacle_names = SETTINGS.first_obstacle_name + np.arange(int(pairs.max(initial=0)) + 1)
     pair_names = np.sort(np.concatenate([names, obstacle_names])[pairs], axis=1)
-    code, row = np.unique(pair_names @ np.array([2 * FIRST_OBSTACLE_NAME, 1]), return_inverse=True)
+    code, row = np.unique(pair_names @ np.array([2 * SETTINGS.first_obstacle_name, 1]), return_inverse=True)
     approach_speed: Values = np.zeros(len(code))
     np.maximum.at(approach_speed, row, impulses.approach_speed)
     total = np.bincount(row, np.linalg.norm(impulses.impulse, axis=1), len(code))

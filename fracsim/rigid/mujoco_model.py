@@ -42,8 +42,6 @@ class ModelSettings:
 
 
 SETTINGS = ModelSettings()
-# Bits of MuJoCo's masks of what collides: shapes with hulls, and everything with everything else.
-PLANE_BIT, GENERAL_BIT = 1, 2
 
 
 _warned: set[str] = set()
@@ -256,6 +254,8 @@ def _add_parts(
     A contact has the friction of the geom with the higher priority. A plane does not collide with hulls in MuJoCo;
     those contacts are found by PlaneContacts.
     """
+    # bits of MuJoCo's masks of what collides: planes with primitive shapes, and everything else with hulls too
+    plane_bit, general_bit = 1, 2
     for part in parts:
         geom = body.add_geom()
         geom.friction, geom.priority = [friction, 0.0, 0.0], priority
@@ -267,12 +267,12 @@ def _add_parts(
             geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.upper()}")
             geom.size = part.size
             geom.quat = Rotation.from_matrix(part.rotation).as_quat(scalar_first=True)
-            geom.contype = geom.conaffinity = PLANE_BIT if is_plane else PLANE_BIT | GENERAL_BIT
+            geom.contype = geom.conaffinity = plane_bit if is_plane else plane_bit | general_bit
         else:
             corners = part if not isinstance(part, PrimitiveShape) else part.corners
             assert meshes is not None and corners is not None
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, meshes.name(spec, corners)
-            geom.contype = geom.conaffinity = GENERAL_BIT
+            geom.contype = geom.conaffinity = general_bit
             if quat is not None:
                 geom.quat = quat
     return len(parts)

@@ -26,7 +26,6 @@ from .instances import Instances
 Values = npt.NDArray[np.float64]
 
 # Seconds between two looks for a message.
-POLLING_INTERVAL = 1e-3
 MESSAGE_TAG = 1
 
 
@@ -178,5 +177,5 @@ def send_to_workers(comm: MPI.Comm, message: Any) -> None:
 def wait_for_message(comm: MPI.Comm) -> Any:
     """Return the next message from rank 0."""
     while not comm.iprobe(source=0, tag=MESSAGE_TAG):
-        time.sleep(POLLING_INTERVAL)
+        time.sleep(1e-3)  # s, in which the core is free for others
     return comm.recv(source=0, tag=MESSAGE_TAG)

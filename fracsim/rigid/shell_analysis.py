@@ -32,11 +32,8 @@ from .free_body_analysis import InertiaRelief
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-# Stiffness of the rotation about the normal, in shear moduli.
-DRILLING_SHEAR_RATIO = 0.1
+# Corners of the sides of a triangle.
 SIDES = np.array([[0, 1], [1, 2], [2, 0]])
-# Barycentric coordinates of integration points that are exact for quadratic functions.
-MIDSIDE_POINTS = np.array([[0.5, 0.5, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5]])
 
 
 # --- triangles ---
@@ -83,9 +80,11 @@ class ShellTriangles:
         C, membrane, rotations = plane_stress(young, poisson), self.membrane_strain(), self.section_rotations()
         drilling = self.drilling_rotation()
         K = np.einsum("n,nai,ab,nbj->nij", self.area * thickness, membrane, C, membrane)
-        drilling_stiffness = DRILLING_SHEAR_RATIO * C[2, 2] * thickness / 3
+        # stiffness of the rotation about the normal: a tenth of the shear modulus
+        drilling_stiffness = 0.1 * C[2, 2] * thickness / 3
         K += drilling_stiffness * np.einsum("n,nki,nkj->nij", self.area, drilling, drilling)
-        for point in MIDSIDE_POINTS:
+        # the middles of the sides as integration points are exact for quadratic functions
+        for point in np.array([[0.5, 0.5, 0.0], [0.0, 0.5, 0.5], [0.5, 0.0, 0.5]]):
             curvature = self.curvature(rotations, point)
             K += np.einsum("n,nai,ab,nbj->nij", self.area * thickness**3 / 36, curvature, C, curvature)
         return self.to_space(K)

@@ -41,7 +41,6 @@ class PointLoadSettings:
 
 
 SETTINGS = PointLoadSettings()
-GOLDEN_ANGLE = np.pi * (3 - np.sqrt(5))
 
 
 # --- Hertz's contact ---
@@ -200,7 +199,9 @@ def distribute_on_circles(points: Values, force: Values, radius: Values, edge: f
     circle = np.repeat(np.arange(len(wide)), pairs)
     number = np.arange(len(circle)) - np.repeat(np.cumsum(pairs) - pairs, pairs)
     share = (number + 0.5) / pairs[circle]
-    r, angle = radius[wide][circle] * np.sqrt(1 - (1 - share) ** (2 / 3)), GOLDEN_ANGLE * number
+    # successive points are a golden angle apart, which spreads them evenly over the circle
+    angle = np.pi * (3 - np.sqrt(5)) * number
+    r = radius[wide][circle] * np.sqrt(1 - (1 - share) ** (2 / 3))
     first, second = _perpendicular_axes(force[wide])
     arm = (r * np.cos(angle))[:, None] * first[circle] + (r * np.sin(angle))[:, None] * second[circle]
     centre, point_force = points[wide][circle], (force[wide] / (2 * pairs[:, None]))[circle]

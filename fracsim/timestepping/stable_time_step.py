@@ -19,7 +19,7 @@ from ..mechanics.inertia import HRZ_FRACTIONS, corner_mass_fraction
 from ..mechanics.material_fields import PerCell
 from ..mechanics.stability_limit import SAFETY, frequency_bounds, stable_step
 from ..mechanics.stress import Stress
-from ..mesh.simplices import CELL, local_edges
+from ..mesh.simplices import cell_type, local_edges
 from ..mesh.small_matrices import barycentric_gradients
 from .state import State
 from .step_sizes import StepSizes
@@ -117,7 +117,7 @@ def quadratic_gain(dim: int) -> float:
     are the nodal displacements.
     """
     corners, edges = np.eye(dim + 1), local_edges(dim)
-    points, weights = map(np.asarray, basix.make_quadrature(CELL[dim], 2))
+    points, weights = map(np.asarray, basix.make_quadrature(cell_type(dim), 2))
     rows = []
     for point, w in zip(np.column_stack([1 - points.sum(axis=1), points]), weights / weights.sum(), strict=True):
         of_corners = (4 * point - 1)[:, None] * corners

@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from ...meshes.topology import facets_of
 from ..simplices import local_edges
-from .cut_patterns import CELL, EDGE, FACET, CutTable, PatternElements, cut_table, intact_cell_table
+from .cut_patterns import CutEntity, CutTable, PatternElements, cut_table, intact_cell_table
 from .entity_numbering import CRACK, EntityNumbering
 from .surface_motion import PointParents
 
@@ -29,7 +29,7 @@ class SurfacePoints:
         positions: (n, d) reference coordinates, m.
         parents: the nodes that each point follows.
         first: number of the first copy.
-        cell, kind, entity: (copies,) a cell that contains each copy; kind (EDGE, FACET, CELL) and local number of its
+        cell, kind, entity: (copies,) a cell that contains each copy; kind (a CutEntity) and local number of its
             entity.
         group: (copies, d + 1) flags of the nodes of the cell that each copy follows.
     """
@@ -70,16 +70,16 @@ class SurfacePoints:
         topology, copies, d = self._topology, self._copies, self._topology.dim
         kind, entity, lead = copies.kind[row], copies.entity[row], copies.lead[row]
         keys = np.empty(len(row), np.int64)
-        selected = np.flatnonzero(kind == EDGE)
+        selected = np.flatnonzero(kind == CutEntity.EDGE)
         edge = topology.cell_edges[cell[selected], entity[selected]]
         keys[selected] = 2 * edge + (topology.cells[cell[selected], lead[selected]] == topology.edges[edge, 1])
-        selected = np.flatnonzero(kind == FACET)
+        selected = np.flatnonzero(kind == CutEntity.FACET)
         facet = topology.cell_facets[cell[selected], entity[selected]]
         group = np.where(copies.group[row[selected]], topology.cells[cell[selected]], len(topology.points))
         rank = np.count_nonzero(topology.facets[facet] < group.min(axis=1)[:, None], axis=1)
         base = 2 * len(topology.edges)
         keys[selected] = base + d * facet + rank
-        selected = np.flatnonzero(kind == CELL)
+        selected = np.flatnonzero(kind == CutEntity.CELL)
         keys[selected] = base + d * len(topology.facets) + (d + 1) * owner[selected] + lead[selected]
         return keys
 
@@ -88,15 +88,15 @@ class SurfacePoints:
     def _places(self, row: Ints, cell: Ints) -> Values:
         topology, kind, entity = self._topology, self._copies.kind[row], self._copies.entity[row]
         result = np.empty((len(row), topology.dim))
-        selected = kind == EDGE
+        selected = kind == CutEntity.EDGE
         result[selected] = self._edge_points(topology.cell_edges[cell[selected], entity[selected]])
-        selected = kind == FACET
+        selected = kind == CutEntity.FACET
         if selected.any():
             nodes = topology.facets[topology.cell_facets[cell[selected], entity[selected]]]
             # ascending, so that all copies of a point have the same position to the last bit
             edges = np.sort(topology.cell_edges[cell[selected][:, None], _facet_edges()[entity[selected]]], axis=1)
             result[selected] = self._centres(nodes, edges)
-        selected = kind == CELL
+        selected = kind == CutEntity.CELL
         result[selected] = self._centres(topology.cells[cell[selected]], topology.cell_edges[cell[selected]])
         return result
 

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cache
 from itertools import permutations, product
 from typing import NamedTuple
@@ -32,7 +33,14 @@ import numpy.typing as npt
 from ..simplices import local_edges, node_groups
 
 Ints = npt.NDArray[np.int64]
-EDGE, FACET, CELL = 0, 1, 2
+
+
+class CutEntity(IntEnum):
+    """Entity of a cell whose point is copied for the sides of a crack."""
+
+    EDGE = 0
+    FACET = 1
+    CELL = 2
 
 
 class PatternPoint(NamedTuple):
@@ -154,15 +162,15 @@ class CutCell:
 
     def m(self, i: int, j: int) -> PatternPoint:
         """The copy of the point of edge ij that follows i."""
-        return PatternPoint(EDGE, self.edge[frozenset((i, j))], (i,))
+        return PatternPoint(CutEntity.EDGE, self.edge[frozenset((i, j))], (i,))
 
     def G(self, facet: int, i: int) -> PatternPoint:
         """The copy of the point of a facet that follows the group of i."""
-        return PatternPoint(FACET, facet, self.group(set(range(self.dim + 1)) - {facet}, i))
+        return PatternPoint(CutEntity.FACET, facet, self.group(set(range(self.dim + 1)) - {facet}, i))
 
     def T(self, i: int) -> PatternPoint:
         """The copy of the point of the cell that follows the group of i."""
-        return PatternPoint(CELL, 0, self.group(range(self.dim + 1), i))
+        return PatternPoint(CutEntity.CELL, 0, self.group(range(self.dim + 1), i))
 
     def _crack_faces(self) -> list[Element]:
         return [element for i, j, *remaining in _turned(self.dim) for element in self._crack_face(i, j, remaining)]

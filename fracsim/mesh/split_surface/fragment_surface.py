@@ -16,25 +16,25 @@ from scipy.sparse import csr_matrix, eye_array
 
 from ..simplices import is_split, local_edges
 from .closed_surface import SplitSurface, SurfacePoints, build_split_surface, build_surface_points
-from .cut_patterns import EDGE, FACET, middles, planar_cut_table
+from .cut_patterns import CutEntity, middles, planar_cut_table
 from .entity_numbering import EntityNumbering
+from .smooth_cuts import CUTS
 from .surface_map import SurfaceMap, whole
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Patterns = npt.NDArray[np.integer]
-MIN_CUT_DISTANCE = 0.15  # of an edge, from a cut to an end: thinner parts have no room for contact
 
 
 def build_fragment_surface(topology: EntityNumbering, pattern: Patterns, cut: Values | None = None) -> SplitSurface:
     """The split surface of damage patterns (C,) without crack faces within fragments and without loose nodes.
 
     A loose node has no undamaged cell. Edges between fragments, and to loose nodes, are open. `cut`: (E,) as in
-    build_split_surface, at least MIN_CUT_DISTANCE from the ends.
+    build_split_surface, at least `CUTS.min_distance` from the ends.
     """
     apart, loose, _ = open_edges(topology, pattern)
-    cut = None if cut is None else np.clip(cut, MIN_CUT_DISTANCE, 1 - MIN_CUT_DISTANCE)
+    cut = None if cut is None else np.clip(cut, CUTS.min_distance, 1 - CUTS.min_distance)
     surface = build_split_surface(topology, patterns_of(topology, apart), cut, planar_cut_table)
     # all corners of an element follow nodes of the same side
     selected = ~loose[surface.parents.first_parent[surface.elements[:, 0]]]
@@ -125,9 +125,9 @@ def _on_flat(
 def _within(points: SurfacePoints, dim: int) -> Flags:
     """(copies, d + 1) flags of the nodes of the edge, facet or cell that each point is the centre of."""
     result = np.ones(points.group.shape, bool)
-    selected = np.flatnonzero(points.kind == FACET)
+    selected = np.flatnonzero(points.kind == CutEntity.FACET)
     result[selected, points.entity[selected]] = False
-    selected = np.flatnonzero(points.kind == EDGE)
+    selected = np.flatnonzero(points.kind == CutEntity.EDGE)
     result[selected] = False
     result[selected[:, None], local_edges(dim)[points.entity[selected]]] = True
     return result

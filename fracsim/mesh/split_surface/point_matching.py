@@ -10,14 +10,13 @@ from .closed_surface import SplitSurface
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-GRID = 7.31e-9  # of the size of the body: step of rounded coordinates; irregular, so that no point lies between two
-
 
 def point_identity(surface: SplitSurface, which: Ints, number: Ints, size: float) -> Values:
     """(k, 2 d + 1) rows that identify the points `which` (k,): position, and numbers of parents, descending, then -1.
 
     `number`: (nodes,) numbers of nodes; with those of the input mesh, rows are equal on all ranks. A copy at the same
-    position whose group has lost nodes is another point. Positions are in steps of GRID times `size` (m).
+    position whose group has lost nodes is another point. Positions are rounded relative to the `size` (m)
+    of the body.
     """
     d, follow = surface.points.shape[1], surface.parents
     count = np.diff(follow.start)[which]
@@ -25,7 +24,9 @@ def point_identity(surface: SplitSurface, which: Ints, number: Ints, size: float
     within = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
     parents = np.full((len(which), d + 1), -1)
     parents[rows, within] = number[follow.parents[np.repeat(follow.start[:-1][which], count) + within]]
-    return np.concatenate([np.rint(surface.points[which] / (GRID * size)), -np.sort(-parents, axis=1)], axis=1)
+    # an irregular step, so that no point of a regular mesh lies half-way between two rounded positions
+    position = np.rint(surface.points[which] / (7.31e-9 * size))
+    return np.concatenate([position, -np.sort(-parents, axis=1)], axis=1)
 
 
 def match_points(old: Values, new: Values) -> Ints:

@@ -3,13 +3,15 @@
 The crack surface separates the ends of each broken edge. The cut c_e = x_i + s_e (x_j - x_i) of an edge moves towards
 the mean of the cuts that share a cell with it:
 
-    s_e <- (1 - w) s_e + w (mean c - x_i) . (x_j - x_i) / |x_j - x_i|^2,        s_e in [MIN_SHARE, 1 - MIN_SHARE].
+    s_e <- (1 - w) s_e + w (mean c - x_i) . (x_j - x_i) / |x_j - x_i|^2,        s_e in [0.15, 0.85].
 
 This is damped Laplacian smoothing along the edges: a nearly planar surface becomes planar on any mesh. The surface
 stays closed and its volume is unchanged, whatever the cuts.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -18,9 +20,24 @@ from scipy.sparse import coo_matrix
 from .entity_numbering import EntityNumbering
 
 Values = npt.NDArray[np.float64]
-MIN_SHARE = 0.15  # of an edge, between a cut and the nearer end
-DAMPING = 0.5  # w
-ITERATIONS = 30
+
+
+@dataclass(frozen=True)
+class CutSmoothing:
+    """Numbers of the positions of cuts on edges.
+
+    Attributes:
+        min_distance: of a cut from an end of its edge, in lengths of the edge; thinner parts have no room for contact.
+        damping: w.
+        iterations: of the smoothing.
+    """
+
+    min_distance: float = 0.15
+    damping: float = 0.5
+    iterations: int = 30
+
+
+CUTS = CutSmoothing()
 
 
 def smooth_cuts(topology: EntityNumbering, broken: npt.NDArray[np.bool_], cut: Values | None = None) -> Values:
@@ -37,10 +54,10 @@ def smooth_cuts(topology: EntityNumbering, broken: npt.NDArray[np.bool_], cut: V
         share[~free] = cut[broken_edges][~free]
     mean = _neighbours(topology, broken)
     per = 1.0 / np.einsum("ni,ni->n", along, along)
-    for _ in range(ITERATIONS if free.any() else 0):
+    for _ in range(CUTS.iterations if free.any() else 0):
         wanted = mean @ (start + share[:, None] * along)
-        pulled = (1 - DAMPING) * share + DAMPING * per * np.einsum("ni,ni->n", wanted - start, along)
-        share = np.where(free, np.clip(pulled, MIN_SHARE, 1 - MIN_SHARE), share)
+        pulled = (1 - CUTS.damping) * share + CUTS.damping * per * np.einsum("ni,ni->n", wanted - start, along)
+        share = np.where(free, np.clip(pulled, CUTS.min_distance, 1 - CUTS.min_distance), share)
     result[broken_edges] = share
     return result
 
