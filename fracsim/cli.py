@@ -377,9 +377,9 @@ def _end_other_ranks(message: str, code: int, *, late: bool) -> None:
     from mpi4py import MPI
 
     if MPI.COMM_WORLD.size > 1:
-        from .mesh.parallel import end_unless_all_failed
+        from .mesh.parallel import abort_unless_all_failed
 
-        end_unless_all_failed(MPI.COMM_WORLD, message, code, late=late)
+        abort_unless_all_failed(MPI.COMM_WORLD, message, code, late=late)
 
 
 __all__ = ["app", "main", "program"]

@@ -186,10 +186,10 @@ def start_run() -> None:
     # as Python has it, but PETSc has not
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     faulthandler.enable()
-    from .mesh.parallel import launcher
+    from .mesh.parallel import find_launcher
     from .output.interrupt import end_with_launcher
 
-    if _is_rank() and (process := launcher(_PARENT_PID)) is not None:
+    if _is_rank() and (process := find_launcher(_PARENT_PID)) is not None:
         end_with_launcher(process, parent=_PARENT_PID)
     # what imports have made stays, and is not searched for garbage
     gc.freeze()

@@ -14,7 +14,7 @@ import numpy as np
 from mpi4py import MPI
 
 from .errors import CannotWrite, NotConverged, StepAborted, Stopped, one_line
-from .mesh.parallel import end_unless_all_failed, from_root, on_root, sum_over_ranks
+from .mesh.parallel import abort_unless_all_failed, from_root, on_root, sum_over_ranks
 from .monitors import CHECKPOINT_MONITORS, RunMonitors, wants_surface
 from .output.atomic_write import write_on_root
 from .output.checkpoint import read_checkpoint, write_checkpoint
@@ -265,7 +265,7 @@ class Run:
             finally:
                 self._progress.end_line()
         except (NotConverged, Stopped) as error:
-            end_unless_all_failed(self.comm, f"fracsim: {error}", int(error.exit_code))  # what follows is collective
+            abort_unless_all_failed(self.comm, f"fracsim: {error}", int(error.exit_code))  # what follows is collective
             saved = self._save_last_checkpoint()
             self._finish("not converged" if isinstance(error, NotConverged) else "stopped")
             raise type(error)(f"{error}. {saved}") from None

@@ -96,7 +96,7 @@ def test_a_damaged_library_is_compiled_once_more(
             library.with_suffix(".sha256").unlink()
         assert c_library.load_library(twice).twice(21) == 42, kind
         assert f"{library} was damaged; it is compiled once more" in capfd.readouterr().err, kind
-        assert library_cache.is_whole(library)
+        assert library_cache.is_complete(library)
 
 
 @pytest.mark.parametrize("seal", [True, False])
@@ -123,7 +123,7 @@ def test_a_library_of_another_machine_is_compiled_once_more(
     content[0x12] = 0xB7  # e_machine: AArch64
     library.unlink()
     library.write_bytes(content)
-    library_cache.put_seal(library)
+    library_cache.write_digest(library)
     assert c_library.load_library(twice).twice(21) == 42
     assert f"{library} cannot be loaded; it is compiled once more" in capfd.readouterr().err
 
@@ -136,7 +136,7 @@ def test_what_others_may_write_is_refused(folder: Path, twice: Path, monkeypatch
         c_library.load_library(twice)
     library.chmod(0o755)
     folder.chmod(0o777)
-    library_cache._usable.cache_clear()
+    library_cache._checked_folder.cache_clear()
     with pytest.raises(InputError, match=f"{folder} may be written by others .mode 777"):
         c_library.load_library(twice)
     folder.chmod(0o755)
@@ -155,15 +155,15 @@ def test_a_cache_that_cannot_be_written_is_somewhere_else(
     (tmp_path / "file").touch()
     monkeypatch.setattr(library_cache, "get_options", lambda: {"cache_dir": tmp_path / "file" / "fenics"})
     monkeypatch.setattr(library_cache.tempfile, "gettempdir", lambda: str(tmp_path))
-    library_cache._usable.cache_clear()
+    library_cache._checked_folder.cache_clear()
     other = tmp_path / f"fracsim-{os.getuid()}"
     assert library_cache.library_folder() == other
     assert f"kept in {other}: {tmp_path / 'file' / 'fenics'} cannot be written" in capfd.readouterr().err
     other.chmod(0o777)
-    library_cache._usable.cache_clear()
+    library_cache._checked_folder.cache_clear()
     with pytest.raises(InputError, match=f"{other} may be written by others"):
         library_cache.library_folder()
-    library_cache._usable.cache_clear()
+    library_cache._checked_folder.cache_clear()
 
 
 def test_a_folder_that_becomes_unusable_is_a_message(

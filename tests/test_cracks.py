@@ -11,7 +11,7 @@ from mpi4py import MPI
 from scipy.spatial import ConvexHull
 
 from fracsim.errors import InputError
-from fracsim.mesh.crack_planes import plane, polygon, segment
+from fracsim.mesh.crack_planes import plane_crack, polygon_crack, segment_crack
 from fracsim.mesh.fragments import find_fragments
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
@@ -184,12 +184,12 @@ def test_check_tells_of_cracks() -> None:
 def test_shapes_in_space() -> None:
     """A polygon need not be convex; one that is bent has no plane."""
     corners = np.array([[0, 0, 1], [2, 0, 1], [2, 2, 1], [1, 0.5, 1], [0, 2, 1]], float)
-    crack = polygon("it", corners)
+    crack = polygon_crack("it", corners)
     points = np.array([[0.2, 0.5, 1], [1.0, 1.5, 1], [1.8, 0.5, 1], [2.1, 0.5, 1], [2.0, 1.0, 1]])
     np.testing.assert_array_equal(crack.contains(points, 1e-9), [True, False, True, False, True])
     assert crack.intersects_box(np.zeros(3), np.full(3, 1.5)) and not crack.intersects_box(np.zeros(3), np.full(3, 0.9))
     corners[3, 2] = 1.5
     with pytest.raises(InputError, match="do not span a plane"):
-        polygon("it", corners)
-    assert not plane("it", np.array([0.0, 3.0]), np.array([0.0, 1.0])).intersects_box(np.zeros(2), np.ones(2))
-    assert segment("it", np.array([[-1.0, 0.5], [2.0, 0.6]])).intersects_box(np.zeros(2), np.ones(2))
+        polygon_crack("it", corners)
+    assert not plane_crack("it", np.array([0.0, 3.0]), np.array([0.0, 1.0])).intersects_box(np.zeros(2), np.ones(2))
+    assert segment_crack("it", np.array([[-1.0, 0.5], [2.0, 0.6]])).intersects_box(np.zeros(2), np.ones(2))

@@ -21,7 +21,7 @@ from fracsim.mechanics.simd_kernels import (
     vectorise_kernel,
 )
 from fracsim.mesh import c_library as compiling
-from fracsim.mesh.dolfinx_compat import evaluate, source_of
+from fracsim.mesh.dolfinx_compat import evaluate, kernel_source
 from fracsim.scene import terms
 from support.scenes import Values, make_scene
 from test_dead_cells import damaged
@@ -111,7 +111,7 @@ def test_expressions_as_one_by_one(energy: str, dim: int) -> None:
     expression, balance = scene.fracture._undamaged._evaluate, scene.balance
     compiled_one = expression._compiled
     lanes = SimdExpression.for_expression(
-        compiled_one, expression.mesh, source_of(compiled_one, expression.mesh, jit_options())
+        compiled_one, expression.mesh, kernel_source(compiled_one, expression.mesh, jit_options())
     )
     assert lanes is not None and expression._kernel is None
     rng = np.random.default_rng(5)

@@ -204,7 +204,7 @@ class Balance:
 
     def assemble_residual(self, b: PETSc.Vec) -> PETSc.Vec:
         """Residual at the current u into b, N; rows of prescribed dofs hold their reactions (collective)."""
-        return self._add_nodal_parts(self._assembler.assemble_into(b, self._work))
+        return self._add_nodal_parts(self._assembler.assemble_local_vector(b, self._work))
 
     def _add_nodal_parts(self, b: PETSc.Vec) -> PETSc.Vec:
         """Add the parts of r that no form has: nodal forces, and M times the sum of accelerations."""
@@ -255,7 +255,7 @@ class Balance:
         """Update `reactions` on prescribed dofs alone: a residual over the cells at supports (collective)."""
         if not self._is_prescribed:
             return
-        b = self._add_nodal_parts(self._assembler.assemble_into(self._force_vector, self._work_at_supports))
+        b = self._add_nodal_parts(self._assembler.assemble_local_vector(self._force_vector, self._work_at_supports))
         self.reactions[self.motion.owned_dofs] = b.array_r[self.motion.owned_dofs]
 
     # --- Newton's method ---

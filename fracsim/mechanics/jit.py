@@ -23,16 +23,16 @@ from ufl.variable import Label
 
 from ..errors import CannotWrite, InputError
 from ..mesh.c_library import machine_flags
-from ..mesh.dolfinx_compat import bind_to_cells, evaluate, keep_kernels, only_cells, source_of
+from ..mesh.dolfinx_compat import bind_to_cells, cache_kernels, evaluate, kernel_source, single_integral_cells
 from ..mesh.domain import Domain
-from ..mesh.library_cache import library_folder, no_room, not_for_others
-from ..mesh.parallel import raise_together
+from ..mesh.library_cache import is_disk_full, library_folder, private_umask
+from ..mesh.parallel import raise_on_all_ranks
 
 if TYPE_CHECKING:
     from .kernel_selection import KernelSelection
     from .simd_kernels import SimdExpression
 
-keep_kernels()
+cache_kernels()
 
 _CENTRE = {2: np.array([[1 / 3, 1 / 3]]), 3: np.array([[0.25, 0.25, 0.25]])}
 
@@ -91,7 +91,7 @@ class CellForm(fem.Form):
     @cached_property
     def _cells(self) -> npt.NDArray[np.int64] | None:
         """Cells of the measure; None for a form with other integrals."""
-        return only_cells(self._all_cells)
+        return single_integral_cells(self._all_cells)
 
     def exclude_cells(self, dead: npt.NDArray[np.bool_]) -> None:
         """Integrate from now on over the cells of the measure that are not flagged (cells,) (not collective)."""
@@ -118,14 +118,14 @@ def compile_collectively[Kernel](comm: MPI.Comm, compile_kernel: Callable[[], Ke
     timed_out = comm.allreduce("JIT compilation timed out" in str(failure), op=MPI.LOR)
     if timed_out and comm.allreduce(_clear_abandoned(), op=MPI.LOR):
         kernel, failure = _attempt(compile_kernel)
-    raise_together(comm, failure)
+    raise_on_all_ranks(comm, failure)
     assert kernel is not None
     return kernel
 
 
 def _attempt[Kernel](compile_kernel: Callable[[], Kernel]) -> tuple[Kernel | None, Exception | None]:
     try:
-        with not_for_others():
+        with private_umask():
             return compile_kernel(), None
     except Exception as error:  # the compiler's, the linker's, the file system's
         return None, _explained(error)
@@ -136,7 +136,7 @@ def _explained(error: Exception) -> Exception:
     kind, folder = type(error).__module__.split(".")[0], library_folder()
     if kind not in ("cffi", "distutils", "setuptools") and "Compile" not in str(error) and "Link" not in str(error):
         return error
-    if no_room(folder):
+    if is_disk_full(folder):
         return CannotWrite(f"no room to compile kernels in {folder}; make room, or name another XDG_CACHE_HOME")
     return InputError(f"a kernel cannot be compiled in {folder}: {error}; install a C compiler, or name yours in CC")
 
@@ -209,7 +209,7 @@ class CellExpression:
         self._kernel: SimdExpression | None = None
         if kernels is not None and self.points_per_cell == 1:
             self._kernel = kernels.expression(
-                self._compiled, mesh, cells, lambda: source_of(self._compiled, mesh, jit_options())
+                self._compiled, mesh, cells, lambda: kernel_source(self._compiled, mesh, jit_options())
             )
         self._values: npt.NDArray[np.float64] | None = None
 

@@ -12,7 +12,7 @@ from dolfinx import fem
 from ufl.core.expr import Expr
 
 from ..forms.balance import pressure_work, traction_work
-from ..mesh.dolfinx_compat import exterior_facets
+from ..mesh.dolfinx_compat import exterior_facet_domain
 from ..mesh.domain import Domain, Ints
 from ..mesh.parallel import sum_over_ranks
 from .jit import compile_form
@@ -166,7 +166,7 @@ def surface_area(domain: Domain, facets: Ints) -> float:
         unit: Any = fem.Constant(domain.mesh, np.eye(domain.dim)[0])
         shares = fem.assemble_vector(compile_form(traction_work(unit, ufl.TestFunction(domain.space), ds)))
         return float(sum_over_ranks(domain.comm, np.sum(shares.array))[0])
-    cell, opposite = exterior_facets(domain.mesh, facets).reshape(-1, 2).T
+    cell, opposite = exterior_facet_domain(domain.mesh, facets).reshape(-1, 2).T
     nodes = domain.cell_nodes[cell]
     corners = nodes[np.arange(nodes.shape[1]) != opposite[:, None]].reshape(len(nodes), domain.dim)
     x = domain.nodes[corners]
@@ -179,6 +179,6 @@ def surface_area(domain: Domain, facets: Ints) -> float:
 
 def surface_measures(domain: Domain, parts: Sequence[Ints]) -> list[ufl.Measure]:
     """Surface measure of each set of local exterior facets; sets may overlap."""
-    entities = [(number, exterior_facets(domain.mesh, facets)) for number, facets in enumerate(parts)]
+    entities = [(number, exterior_facet_domain(domain.mesh, facets)) for number, facets in enumerate(parts)]
     ds = ufl.Measure("ds", domain=domain.mesh, subdomain_data=entities)
     return [ds(number) for number in range(len(parts))]

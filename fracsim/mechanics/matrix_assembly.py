@@ -20,7 +20,14 @@ import numpy.typing as npt
 from dolfinx import fem
 from petsc4py import PETSc
 
-from ..mesh.dolfinx_compat import assemble_into, block_csr, create_matrix, create_vector, expanded_csr, pattern_of
+from ..mesh.dolfinx_compat import (
+    assemble_local_vector,
+    create_matrix,
+    create_vector,
+    make_block_csr,
+    make_scalar_csr,
+    make_sparsity_pattern,
+)
 from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
 from .jit import CellForm
@@ -80,12 +87,12 @@ class TangentAssembler:
             block_code: library of products with blocks; None: single entries.
             with_dead_cells: whether cells that the form excludes are in the pattern.
         """
-        pattern = pattern_of(self.form.all_cells_form if with_dead_cells else self.form._cpp_object)
+        pattern = make_sparsity_pattern(self.form.all_cells_form if with_dead_cells else self.form._cpp_object)
         owned = self.form.function_spaces[0].dofmap.index_map.size_local
         pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
         pattern.finalize()
         self.matrix = create_matrix(self.form.mesh.comm, pattern)
-        self._sum = expanded_csr(pattern) if block_code is None else block_csr(pattern)
+        self._sum = make_scalar_csr(pattern) if block_code is None else make_block_csr(pattern)
         self._kernel_of = KernelCache(lambda form: self.kernels.bilinear_form(form, self._sum))
         rows, columns = (self._sum.index_map(axis) for axis in (0, 1))
         starts = self._sum.indptr[: rows.size_local + 1]
@@ -210,7 +217,7 @@ class VectorAssembler:
 
     def __call__(self, form: fem.Form) -> Values:
         """(owned dofs,) copy of an assembled form (collective)."""
-        return self.assemble_into(self._work, form).array_r.copy()
+        return self.assemble_local_vector(self._work, form).array_r.copy()
 
     def sum_contributions(self, add: Callable[[Values], None]) -> Values:
         """(owned dofs,) sums over ranks of what `add` adds to an array of their dofs, ghosts included (collective)."""
@@ -219,7 +226,7 @@ class VectorAssembler:
             add(local.array_w)
         return self.sum_over_ranks(self._work).array_r.copy()
 
-    def assemble_into(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
+    def assemble_local_vector(self, b: PETSc.Vec, form: fem.Form) -> PETSc.Vec:
         """b, overwritten with an assembled form (collective)."""
         return self.sum_over_ranks(self.assemble_local_part(b, form))
 
@@ -229,7 +236,7 @@ class VectorAssembler:
             local.set(0.0)
             done = self._add_by_kernel(local.array_w, form)
         if not done:
-            assemble_into(b, form)
+            assemble_local_vector(b, form)
         return b
 
     def _add_by_kernel(self, values: Values, form: fem.Form) -> bool:

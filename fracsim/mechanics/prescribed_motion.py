@@ -13,7 +13,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..errors import InputError
-from ..mesh.connected_bodies import free_motion, label_bodies, not_held
+from ..mesh.connected_bodies import describe_free_motion, label_bodies, unsupported_message
 from ..mesh.domain import Domain, Ints
 from ..mesh.parallel import on_root
 from ..meshes.data import MeshData, format_midpoint
@@ -103,8 +103,8 @@ def _check(mesh: MeshData | None, prescribed: npt.NDArray[np.bool_] | None) -> N
     bodies, body = label_bodies(mesh)
     for number in range(bodies):
         nodes = body == number
-        free = free_motion(mesh.points[nodes], prescribed[: len(body)][nodes])
+        free = describe_free_motion(mesh.points[nodes], prescribed[: len(body)][nodes])
         if free:
             where = f"the body around {format_midpoint(mesh.points, nodes)}"
             which = f"{where} (one of {bodies})" if bodies > 1 else "the body"
-            raise InputError(not_held(which, free))
+            raise InputError(unsupported_message(which, free))

@@ -23,13 +23,13 @@ from mpi4py import MPI
 from ..mesh.c_library import Float64, Int32, compile_on_all_ranks, struct_pointer
 from ..mesh.dolfinx_compat import (
     FormField,
-    cells_of,
-    constants_of,
     expression_fields,
+    form_cell_nodes,
     form_fields,
-    identity_rows,
-    integrals,
-    nodes_of_cells,
+    form_integral_types,
+    integrated_cells_of,
+    kernel_constants,
+    set_identity_rows,
 )
 
 Values = npt.NDArray[np.float64]
@@ -90,12 +90,12 @@ class SimdKernel:
     def __init__(self, form: fem.Form, code: CDLL) -> None:
         """`code`: library of `compile_simd_form`."""
         self._form, self._code = form, code
-        self._nodes = nodes_of_cells(form) if form.rank else form.mesh.geometry.dofmap
+        self._nodes = form_cell_nodes(form) if form.rank else form.mesh.geometry.dofmap
         self._fields = _KernelFields(form_fields(form))
 
     def _call(self, function: Any, *arguments: npt.NDArray[Any]) -> int:
         """Result of a C function of the form and further arrays."""
-        cells, geometry, c = cells_of(self._form), self._form.mesh.geometry, constants_of(self._form)
+        cells, geometry, c = integrated_cells_of(self._form), self._form.mesh.geometry, kernel_constants(self._form)
         arrays = cells, self._nodes, geometry.dofmap, geometry.x, c
         form = _SimdForm(len(cells), self._fields.width, len(c), *map(struct_pointer, arrays), self._fields.pointer)
         return int(function(byref(form), *arguments) or 0)
@@ -106,7 +106,7 @@ class SimdFunctional(SimdKernel):
 
     def integrate(self) -> float:
         """Sum over this rank's cells."""
-        values = np.empty(len(cells_of(self._form)))
+        values = np.empty(len(integrated_cells_of(self._form)))
         self._call(self._code.fill, values)
         return float(values.sum())
 
@@ -143,7 +143,7 @@ class SimdBilinearForm(SimdKernel):
             np.bitwise_or.at(self._prescribed, dofs // self._bs, (1 << dofs % self._bs).astype(np.uint8))
         if missing := self._call(self._code.add_blocks, self._positions, self._strides, self._prescribed, matrix.data):
             raise ValueError(f"the matrix has no place for cell {missing - 1} of its form")
-        identity_rows(matrix, self._form, bcs)
+        set_identity_rows(matrix, self._form, bcs)
 
 
 class SimdExpression:
@@ -166,7 +166,7 @@ class SimdExpression:
 
     def __call__(self, cells: npt.NDArray[np.int32], values: Values) -> None:
         """Evaluate the expression in cells (n,) into values (n, components)."""
-        c = constants_of(self._expression)
+        c = kernel_constants(self._expression)
         geometry = struct_pointer(self._geometry.dofmap), struct_pointer(self._geometry.x)
         form = _SimdForm(
             len(cells),
@@ -186,7 +186,7 @@ class SimdExpression:
 
 def compile_simd_form(form: fem.Form) -> CDLL | None:
     """Library of the vectorised kernel of a form; None if it cannot be vectorised (collective)."""
-    if integrals(form) != [fem.IntegralType.cell]:
+    if form_integral_types(form) != [fem.IntegralType.cell]:
         return None
     fields, corners = form_fields(form), form.mesh.geometry.cmap.dim
     bs, nodes = 1, 1

@@ -30,7 +30,15 @@ from dolfinx.jit import mpi_jit_decorator
 from mpi4py import MPI
 
 from ..errors import CannotWrite, FracsimError, InputError
-from .library_cache import alone, is_whole, library_folder, no_room, not_for_others, note, put_seal
+from .library_cache import (
+    exclusive_access,
+    is_complete,
+    is_disk_full,
+    library_folder,
+    print_note,
+    private_umask,
+    write_digest,
+)
 
 # square roots set no errno, and operations on the three components of a vector are vectorised; both within IEEE 754
 FAST_FLAGS = ["-fno-math-errno", "-fvect-cost-model=unlimited"]
@@ -76,11 +84,11 @@ def compile_library(name: str, text: str, more: list[str]) -> ctypes.CDLL:
     folder = library_folder()
     file = folder / f"fracsim_{name}_{tag}.so"
     try:
-        if not is_whole(file):
-            with alone(folder, file.name):
-                if not is_whole(file):  # another process may have compiled it meanwhile
+        if not is_complete(file):
+            with exclusive_access(folder, file.name):
+                if not is_complete(file):  # another process may have compiled it meanwhile
                     if file.exists():
-                        note(f"the library {file} was damaged; it is compiled once more")
+                        print_note(f"the library {file} was damaged; it is compiled once more")
                     _compile(command, name, text, file)
         return declare_signatures(_load(command, name, text, file), text)
     except OSError as error:
@@ -92,7 +100,7 @@ def compile_library(name: str, text: str, more: list[str]) -> ctypes.CDLL:
 
 def _compile(command: list[str], name: str, text: str, file: Path) -> None:
     """Compile a library; only the whole of it, and its digest, are left in the folder."""
-    with not_for_others(), tempfile.TemporaryDirectory(dir=file.parent) as scratch:
+    with private_umask(), tempfile.TemporaryDirectory(dir=file.parent) as scratch:
         source, output = Path(scratch) / f"{name}.c", Path(scratch) / file.name
         source.write_text(text, encoding="utf-8")
         try:
@@ -103,7 +111,7 @@ def _compile(command: list[str], name: str, text: str, file: Path) -> None:
                 raise
             _run([*portable, str(source), "-o", str(output), "-lm"])
         output.replace(file)
-        put_seal(file)
+        write_digest(file)
 
 
 def _load(command: list[str], name: str, text: str, file: Path) -> ctypes.CDLL:
@@ -111,7 +119,7 @@ def _load(command: list[str], name: str, text: str, file: Path) -> ctypes.CDLL:
     with suppress(OSError):
         return ctypes.CDLL(str(file))
     # undamaged by its digest, and yet of another machine or system
-    note(f"the library {file} cannot be loaded; it is compiled once more")
+    print_note(f"the library {file} cannot be loaded; it is compiled once more")
     _compile(command, name, text, file)
     try:
         return ctypes.CDLL(str(file))
@@ -286,7 +294,7 @@ def _run(command: list[str]) -> None:
     except OSError as error:
         message, failed = str(error), True
     folder = Path(command[-2]).parents[1]
-    if failed and ("No space left" in message or no_room(folder)):
+    if failed and ("No space left" in message or is_disk_full(folder)):
         raise CannotWrite(f"no room to compile in {folder}: {message}; make room, or name another XDG_CACHE_HOME")
     if failed:
         raise InputError(f"`{' '.join(command)}` failed: {message}; install a C compiler, or name yours in CC")

@@ -17,7 +17,7 @@ def label_bodies(mesh: MeshData) -> tuple[int, npt.NDArray[np.int64]]:
     return components(np.stack([first, mesh.cells[:, 1:].reshape(-1)], axis=1), len(mesh.points))
 
 
-def free_motion(points: Values, held: npt.NDArray[np.bool_]) -> str:
+def describe_free_motion(points: Values, held: npt.NDArray[np.bool_]) -> str:
     """A rigid motion, in words, that the prescribed components leave free; empty if there is none.
 
     The rows of A are the values of the rigid modes at the prescribed components, with lengths scaled by the size of the
@@ -44,7 +44,7 @@ def free_motion(points: Values, held: npt.NDArray[np.bool_]) -> str:
     return ""
 
 
-def not_held(which: str, motion: str) -> str:
+def unsupported_message(which: str, motion: str) -> str:
     """The message for a body that no support holds against a rigid motion."""
     return (
         f"boundary: nothing holds {which} against {motion}; a quasi-static study needs every body held: "

@@ -50,14 +50,14 @@ class CrackPlane:
         return _in_polygon(self.corners, self.normal, points, slack)
 
 
-def plane(name: str, point: Values, normal: Values) -> CrackPlane:
+def plane_crack(name: str, point: Values, normal: Values) -> CrackPlane:
     """A crack over the whole section of the body with a plane (2D: a line). InputError if the normal is zero."""
     if not (length := float(np.linalg.norm(normal))):
         raise InputError(f"{name}.plane: the normal must not be zero")
     return CrackPlane(name, point, np.asarray(normal / length))
 
 
-def segment(name: str, corners: Values) -> CrackPlane:
+def segment_crack(name: str, corners: Values) -> CrackPlane:
     """A crack along the segment between two points (2, 2), m, of a 2D body. InputError if the points coincide."""
     along = corners[1] - corners[0]
     if not (length := float(np.linalg.norm(along))):
@@ -65,7 +65,7 @@ def segment(name: str, corners: Values) -> CrackPlane:
     return CrackPlane(name, corners[0], np.array([-along[1], along[0]]) / length, corners)
 
 
-def polygon(name: str, corners: Values) -> CrackPlane:
+def polygon_crack(name: str, corners: Values) -> CrackPlane:
     """A crack over a planar polygon (k, 3), m. InputError if the corners do not lie in one plane."""
     centre = corners.mean(axis=0)
     _, sizes, axes = np.linalg.svd(corners - centre)

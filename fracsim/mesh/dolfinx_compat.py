@@ -1,25 +1,24 @@
-"""Calls of DOLFINx that changed after 0.9, or that no version promises to keep: all that a newer version touches.
+"""Calls of DOLFINx, FFCx and Basix that differ between versions, or that no version promises to keep.
 
-Run with 0.9 alone; the rest is from the sources, release notes and pull requests of 0.10 and 0.11.
+fracsim runs with DOLFINx 0.9 alone. What newer versions change is from the sources, release notes and pull requests of
+0.10 and 0.11:
 
-0.10        create_vector       la.create_petsc_vector is la.petsc.create_vector.
-            create_mesh         The element comes before the points (pull request 3826).
-            exterior_facets     fem.compute_integration_domains takes no dimension.
-            facets_of_nodes     graph.AdjacencyList has a class in Python; graph.adjacencylist, as here, makes it.
-            bind_to_cells       The class of a form takes a list of kernels, and entity maps as a list (mesh.EntityMap).
-                                Whether integrals still have `integral_ids` is to be tried.
-            assemble_matrix     `bcs` and the diagonal are given by place: their names are not the same in all versions.
-0.11        evaluate            Entities of facets are rows (cell, facet) (4140); cells, as here, are as before.
-after 0.11  create_mesh         takes `ghost_mode`; create_cell_partitioner is gone (4403).
+0.10        create_vector           la.create_petsc_vector is la.petsc.create_vector.
+            create_mesh             The element comes before the points (pull request 3826).
+            exterior_facet_domain   fem.compute_integration_domains takes no dimension.
+            find_facets             graph.AdjacencyList has a class in Python; graph.adjacencylist, as here, makes it.
+            bind_to_cells           The class of a form takes a list of kernels, and entity maps as a list
+                                    (mesh.EntityMap). It has not been tried whether integrals still have `integral_ids`.
+            assemble_matrix         `bcs` and the diagonal are positional: versions differ in their names.
+0.11        evaluate                Entities of facets are rows (cell, facet) (4140); cells, as here, are as before.
+after 0.11  create_mesh             takes `ghost_mode`; create_cell_partitioner is gone (4403).
 
-any         KeptCell            is a private class of Basix with one property kept; basix.ufl.element gives its equal.
-            keep_kernels        takes the place of two functions of FFCx; without it kernels are found alike, later, and
-                                damaged ones are not noticed.
+any         CachedCellElement       subclasses a private class of Basix; basix.ufl.element returns an equal element.
+            cache_kernels           replaces two functions of FFCx; without it kernels are found all the same, more
+                                    slowly, and damaged ones are not noticed.
 
-Nothing was found of the others: cells_of, integrals, nodes_of_cells, source_of, form_fields, constants_of,
-identity_rows, assemble_into, apply_lifting, pattern_of, expanded_csr, create_matrix. What FFCx writes is read by
-mechanics.simd_kernels. `tests/test_kernels.py` and `tests/test_dead_cells.py` fail first where bind_to_cells does not
-fit.
+No change was found for the other functions. mechanics.simd_kernels reads the C code that FFCx writes. Where
+bind_to_cells does not fit, `tests/test_kernels.py` and `tests/test_dead_cells.py` fail first.
 """
 
 from __future__ import annotations
@@ -48,43 +47,50 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from ufl.algorithms import extract_coefficients
 
-from .library_cache import kernel_file, load_whole, put_seal
+from .library_cache import kernel_file, load_kernel, write_digest
 
 Ints = npt.NDArray[np.int32]
 
 # --- mesh -----------------------------------------------------------------------------------------------------------
 
 
-class KeptCell(_BlockedElement):
-    """An element that is asked for its cell a hundred times a scene, and makes one, with all its faces, edges and
-    vertices, once: a third of the time that a scene in 3D takes to set up."""
+class CachedCellElement(_BlockedElement):
+    """An element that makes its UFL cell once."""
 
     @cached_property
     def cell(self) -> ufl.Cell:
         """Cell of the element."""
+        # UFL asks for it a hundred times a scene; to make its faces, edges and vertices each time took a third of the
+        # set-up of a scene in 3D
         return super().cell
 
 
-def coordinate_element(dim: int, degree: int = 1) -> KeptCell:
-    """Straight simplices; of degree 2 bent ones."""
+def coordinate_element(dim: int, degree: int = 1) -> CachedCellElement:
+    """Lagrange element of the geometry of simplices: straight for degree 1, curved for degree 2."""
     shape = "triangle" if dim == 2 else "tetrahedron"
-    return KeptCell(basix.ufl.element("Lagrange", shape, degree, dtype=np.float64), (dim,))
+    return CachedCellElement(basix.ufl.element("Lagrange", shape, degree, dtype=np.float64), (dim,))
 
 
 def create_mesh(
     comm: MPI.Comm, cells: npt.NDArray[np.int64], points: npt.NDArray[np.float64], element: _ElementBase
 ) -> dolfinx.mesh.Mesh:
-    """A mesh without ghost cells from (n, d + 1) nodes of cells and (m, d) points in m, each rank giving its share
-    (collective)."""
-    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")  # with threads each run would be parted otherwise
+    """A mesh without ghost cells, of which each rank gives some cells and points (collective).
+
+    `cells`: (n, d + 1) nodes.    `points`: (m, d), m.    `element`: of the geometry.
+    """
+    # with threads the partition would differ between runs
+    os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")
     partitioner = dolfinx.mesh.create_cell_partitioner(dolfinx.mesh.GhostMode.none)
     return dolfinx.mesh.create_mesh(comm, cells, points, element, partitioner)
 
 
-def facets_of_nodes(
+def find_facets(
     mesh: dolfinx.mesh.Mesh, nodes: npt.NDArray[np.int64], values: npt.NDArray[np.int32]
 ) -> tuple[Ints, Ints]:
-    """Local facets of (n, d) distinct sets of input nodes, each rank giving its share, and values (collective)."""
+    """Local facets of a mesh, and their values, of sets of input nodes that ranks give (collective).
+
+    `nodes`: (n, d) nodes of each facet, distinct over all ranks.    `values`: (n,).
+    """
     dim = mesh.topology.dim
     local, local_values = distribute_entity_data(mesh, dim - 1, nodes, values)
     mesh.topology.create_connectivity(dim - 1, 0)
@@ -92,8 +98,8 @@ def facets_of_nodes(
     return tags.indices, tags.values
 
 
-def exterior_facets(mesh: dolfinx.mesh.Mesh, facets: Ints) -> Ints:
-    """What a surface measure is given as subdomain data: pairs (cell, local facet) of local exterior facets."""
+def exterior_facet_domain(mesh: dolfinx.mesh.Mesh, facets: Ints) -> Ints:
+    """Subdomain data of a surface measure: pairs (cell, local facet) of local exterior facets."""
     topology = mesh.topology
     return fem.compute_integration_domains(fem.IntegralType.exterior_facet, topology, facets, topology.dim - 1)
 
@@ -101,9 +107,9 @@ def exterior_facets(mesh: dolfinx.mesh.Mesh, facets: Ints) -> Ints:
 # --- forms ----------------------------------------------------------------------------------------------------------
 
 
-def keep_kernels() -> None:
-    """Have FFCx look for a kernel once a process: it reads its folder for each, 1 ms where that holds 1,000 files. It
-    loads whole ones alone: others are compiled once more."""
+def cache_kernels() -> None:
+    """Make FFCx look for each kernel once a process, and compile damaged kernels again."""
+    # FFCx reads its folder at each look-up, 1 ms where the folder holds 1,000 files
     look_up, load = jit.get_cached_module, jit._load_objects
     cache: dict[tuple[str, tuple[str, ...], str], tuple[Any, Any]] = {}
 
@@ -111,21 +117,22 @@ def keep_kernels() -> None:
         key = name, tuple(objects), str(folder)
         if key in cache:
             return cache[key]
-        compiled = load_whole(lambda: look_up(name, objects, folder, timeout), Path(folder), name)
-        if compiled[0] is not None:  # None: it is compiled now
+        compiled = load_kernel(lambda: look_up(name, objects, folder, timeout), Path(folder), name)
+        # None: FFCx compiles the kernel now
+        if compiled[0] is not None:
             cache[key] = compiled
         return compiled
 
     def load_compiled(folder: Any, name: str, objects: Sequence[str]) -> tuple[Any, Any]:
         if (library := kernel_file(Path(folder), name)) is not None:
-            put_seal(library, Path(folder) / f"{name}.c")
+            write_digest(library, Path(folder) / f"{name}.c")
         return load(folder, name, objects)
 
     jit.get_cached_module, jit._load_objects = looked_up_once, load_compiled
 
 
 def bind_to_cells(form: fem.Form, whole: Any, constants: Sequence[Any], keep: Callable[[Ints], Ints]) -> Any:
-    """The C++ form of `whole`, with the kernels of `form`, over the cells that `keep` leaves of each of its integrals.
+    """C++ form with the kernels of `form`, over those cells of each integral of `whole` that `keep` returns.
 
     `whole`: C++ form as it was compiled; its integrals over facets stay. `constants`: C++ constants of the form.
     """
@@ -148,8 +155,8 @@ def evaluate(
     return expression.eval(mesh, cells, values)
 
 
-def source_of(expression: fem.Expression, mesh: dolfinx.mesh.Mesh, options: dict[str, Any]) -> Path:
-    """The C that FFCx has written for an expression, compiled with `options` before (collective)."""
+def kernel_source(expression: fem.Expression, mesh: dolfinx.mesh.Mesh, options: dict[str, Any]) -> Path:
+    """Path of the C code that FFCx wrote for an expression, compiled with `options` before (collective)."""
     kernel = expression.ufl_expression, expression.X()
     scalar = {"scalar_type": expression.dtype}
     _, module, _ = dolfinx.jit.ffcx_jit(mesh.comm, kernel, form_compiler_options=scalar, jit_options=options)
@@ -157,20 +164,26 @@ def source_of(expression: fem.Expression, mesh: dolfinx.mesh.Mesh, options: dict
     return source_file.with_name(source_file.name.split(".")[0] + ".c")
 
 
-def constants_of(kind: fem.Form | fem.Expression) -> npt.NDArray[np.float64]:
-    """The constants that the kernel of a form or an expression is given."""
-    return constants_in(kind._cpp_object)
+def kernel_constants(kind: fem.Form | fem.Expression) -> npt.NDArray[np.float64]:
+    """Constants that are passed to the kernel of a form or expression."""
+    return compiled_constants(kind._cpp_object)
 
 
-def constants_in(compiled: Any) -> npt.NDArray[np.float64]:
-    """The same of a C++ form."""
+def compiled_constants(compiled: Any) -> npt.NDArray[np.float64]:
+    """Constants that are passed to the kernels of a C++ form."""
     constants: npt.NDArray[np.float64] = dolfinx.cpp.fem.pack_constants(compiled)
     return constants
 
 
 @dataclass(frozen=True)
 class FormField:
-    """A function that the kernel of a form is given: `size` numbers at each of the dofs (cells, nodes) of a cell."""
+    """A function that is passed to the kernel of a form.
+
+    Attributes:
+        dofs: (cells, nodes) of each cell.
+        size: number of values at each dof.
+        values: (dofs * size,).
+    """
 
     dofs: Ints
     size: int
@@ -178,60 +191,60 @@ class FormField:
 
 
 def form_fields(form: fem.Form) -> list[FormField]:
-    """All of a form, in the order of its kernel."""
+    """Functions that are passed to the kernel of a form, in its order."""
     compiled: Any = form._cpp_object
     maps = ((function, function.function_space.dofmap) for function in compiled.coefficients)
     return [FormField(np.asarray(dofmap.map()), dofmap.bs, function.x.array) for function, dofmap in maps]
 
 
 def expression_fields(expression: fem.Expression) -> list[FormField]:
-    """The same of an expression."""
+    """Functions that are passed to the kernel of an expression, in its order."""
     fields, kernel = extract_coefficients(expression.ufl_expression), expression.ufcx_expression
     coefficients = [fields[kernel.original_coefficient_positions[i]] for i in range(kernel.num_coefficients)]
     maps = ((function, function.function_space.dofmap) for function in coefficients)
     return [FormField(dofmap.list, dofmap.bs, function.x.array) for function, dofmap in maps]
 
 
-def kernel_of(form: fem.Form) -> int:
-    """The address of the kernel of a form with one integral, over cells."""
+def kernel_address(form: fem.Form) -> int:
+    """Address of the kernel of a form with one integral, over cells."""
     module: Any = form.module
     return int(module.ffi.cast("uintptr_t", form.ufcx_form.form_integrals[0].tabulate_tensor_float64))
 
 
-def cells_of(form: fem.Form) -> Ints:
-    """The cells that a form with one integral, over cells, is integrated over now."""
+def integrated_cells_of(form: fem.Form) -> Ints:
+    """Present cells of a form with one integral, over cells."""
     compiled: Any = form._cpp_object
     (number,) = compiled.integral_ids(fem.IntegralType.cell)
     return np.asarray(compiled.domains(fem.IntegralType.cell, number))
 
 
-def only_cells(compiled: Any) -> npt.NDArray[np.int64] | None:
-    """The cells of a C++ form with one integral, over cells; None of any other."""
-    if integrals_in(compiled) != [fem.IntegralType.cell]:
+def single_integral_cells(compiled: Any) -> npt.NDArray[np.int64] | None:
+    """Cells of a C++ form with one integral, over cells; None for any other form."""
+    if compiled_integral_types(compiled) != [fem.IntegralType.cell]:
         return None
     (number,) = compiled.integral_ids(fem.IntegralType.cell)
     return np.array(compiled.domains(fem.IntegralType.cell, number), np.int64)
 
 
-def integrals(form: fem.Form) -> list[Any]:
-    """The kind of each integral of a form."""
-    return integrals_in(form._cpp_object)
+def form_integral_types(form: fem.Form) -> list[Any]:
+    """Type of each integral of a form."""
+    return compiled_integral_types(form._cpp_object)
 
 
-def integrals_in(compiled: Any) -> list[Any]:
-    """The same of a C++ form."""
+def compiled_integral_types(compiled: Any) -> list[Any]:
+    """Type of each integral of a C++ form."""
     return [kind for kind in compiled.integral_types for _ in compiled.integral_ids(kind)]
 
 
-def nodes_of_cells(form: fem.Form) -> Ints:
-    """(cells, nodes) local nodes of a form's functions."""
+def form_cell_nodes(form: fem.Form) -> Ints:
+    """(cells, nodes) local nodes of the test functions of a form."""
     space: Any = form.function_spaces[0]
     nodes: Ints = space.dofmap.map()
     return nodes
 
 
-def identity_rows(matrix: la.MatrixCSR, form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
-    """Put 1 on the diagonal of owned rows of prescribed dofs."""
+def set_identity_rows(matrix: la.MatrixCSR, form: fem.Form, bcs: list[fem.DirichletBC]) -> None:
+    """Set the diagonal of owned rows of prescribed dofs to 1."""
     space: Any = form.function_spaces[0]
     dolfinx.cpp.fem.insert_diagonal(matrix._cpp_object, space, [bc._cpp_object for bc in bcs], 1.0)
 
@@ -240,50 +253,50 @@ def identity_rows(matrix: la.MatrixCSR, form: fem.Form, bcs: list[fem.DirichletB
 
 
 def create_vector(space: fem.FunctionSpace) -> PETSc.Vec:
-    """A vector over the dofs of a space, ghosts included."""
+    """A vector of the dofs of a space, with ghosts."""
     return la.create_petsc_vector(space.dofmap.index_map, space.dofmap.index_map_bs)
 
 
-def assemble_into(b: PETSc.Vec, form: fem.Form) -> None:
-    """Add this rank's part of a linear form to b."""
+def assemble_local_vector(b: PETSc.Vec, form: fem.Form) -> None:
+    """Add the integrals of a linear form over the cells of this rank to b."""
     fem_petsc.assemble_vector(b, form)
 
 
 def apply_lifting(b: PETSc.Vec, form: fem.Form, bcs: list[fem.DirichletBC], u: fem.Function) -> None:
-    """b += A (g - u) of this rank, A the bilinear form's matrix, for prescribed values g that u does not have yet."""
+    """Add A (g - u) of this rank to b, with A the matrix of the bilinear form and g the prescribed values."""
     fem_petsc.apply_lifting(b, [form], [bcs], x0=[u.x.petsc_vec], alpha=-1.0)
 
 
 def assemble_matrix(form: fem.Form, bcs: list[fem.DirichletBC] | None = None, diagonal: float = 1.0) -> PETSc.Mat:
-    """A new matrix of a bilinear form; rows and columns of prescribed dofs are empty but for `diagonal`."""
+    """A new matrix of a bilinear form; rows and columns of prescribed dofs are 0, except `diagonal`."""
     matrix = fem_petsc.assemble_matrix(form, bcs or [], diagonal)
     matrix.assemble()
-    return _freed_with_its_name(matrix)
+    return _reference_counted(matrix)
 
 
-def pattern_of(form: Any) -> SparsityPattern:
-    """A new pattern of a bilinear form of C++, which may be added to."""
+def make_sparsity_pattern(form: Any) -> SparsityPattern:
+    """A new sparsity pattern of a C++ bilinear form, to which entries can be added."""
     return dolfinx.cpp.fem.create_sparsity_pattern(form)
 
 
-def expanded_csr(pattern: SparsityPattern) -> la.MatrixCSR:
-    """DOLFINx's own sparse matrix of a pattern, with an entry for every dof, not for every block of them."""
+def make_scalar_csr(pattern: SparsityPattern) -> la.MatrixCSR:
+    """DOLFINx's sparse matrix of a pattern, with scalar entries."""
     return la.matrix_csr(pattern, block_mode=la.BlockMode.expanded)  # type: ignore[attr-defined]
 
 
-def block_csr(pattern: SparsityPattern) -> la.MatrixCSR:
-    """The same with a block for every two nodes, the entries of a block one after another."""
+def make_block_csr(pattern: SparsityPattern) -> la.MatrixCSR:
+    """DOLFINx's sparse matrix of a pattern, with a contiguous block for each pair of nodes."""
     return la.matrix_csr(pattern)
 
 
 def create_matrix(comm: MPI.Comm, pattern: SparsityPattern) -> PETSc.Mat:
-    """PETSc's matrix of a pattern, empty (collective)."""
-    return _freed_with_its_name(create_petsc_matrix(comm, pattern))
+    """A PETSc matrix of a pattern, with zero entries (collective)."""
+    return _reference_counted(create_petsc_matrix(comm, pattern))
 
 
-def _freed_with_its_name(matrix: PETSc.Mat) -> PETSc.Mat:
-    """The same matrix, which is freed when the last name for it is gone: DOLFINx 0.9 never drops the object of Python
-    that it gives a matrix out as."""
-    same = copy(matrix)
+def _reference_counted(matrix: PETSc.Mat) -> PETSc.Mat:
+    """The same matrix, freed when Python has no reference to it any more."""
+    # DOLFINx 0.9 keeps a reference to the Python object that it returns; the copy refers to the same PETSc matrix
+    result = copy(matrix)
     matrix.destroy()
-    return same
+    return result

@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 from ..meshes.data import MeshData, format_point
 from ..meshes.topology import signed_measures
-from .dolfinx_compat import KeptCell, coordinate_element, create_mesh
+from .dolfinx_compat import CachedCellElement, coordinate_element, create_mesh
 from .facets import Facets, find_group_facets
 from .midside_nodes import CellMidsideNodes, MidsideNodes, find_midside_nodes, with_midside_nodes
 from .parallel import Gather, GatherSubset, bcast, sum_over_ranks
@@ -237,7 +237,7 @@ def distribute(comm: MPI.Comm, data: MeshData | None, order: int = 1) -> Domain:
 
 def _geometry(
     data: MeshData | None, midside_nodes: MidsideNodes | None, dim: int
-) -> tuple[npt.NDArray[np.int64], Values, KeptCell]:
+) -> tuple[npt.NDArray[np.int64], Values, CachedCellElement]:
     """Cells, points and the coordinate element, which is P2 only if cells are curved."""
     element, nodes = coordinate_element(dim), dim + 1
     if midside_nodes is not None and midside_nodes.curved:

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..meshes.topology import distinct_rows
-from .dolfinx_compat import facets_of_nodes
+from .dolfinx_compat import find_facets
 
 Ints = npt.NDArray[np.int32]
 
@@ -69,7 +69,7 @@ def find_group_facets(
     for first in range(0, len(names), groups_per_call):
         batch = slice(first, first + groups_per_call)
         rows, bits = _group_bits(mesh.topology.dim, None if nodes is None else nodes[batch])
-        facets, groups = facets_of_nodes(mesh, rows, bits)
+        facets, groups = find_facets(mesh, rows, bits)
         result |= {name: facets[groups >> bit & 1 == 1] for bit, name in enumerate(names[batch])}
     return result
 

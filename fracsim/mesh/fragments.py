@@ -11,7 +11,7 @@ from ..meshes.topology import components
 from .domain import Domain
 from .edge_graph import EdgeGraph
 from .ghost_exchange import owner_values
-from .parallel import allgather, offset
+from .parallel import allgather, rank_offset
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ def find_fragments(graph: EdgeGraph) -> Fragments:
     """
     domain = graph.domain
     local_count, local = components(_links(graph), len(domain.nodes))
-    first = offset(domain.comm, local_count)
+    first = rank_offset(domain.comm, local_count)
     label = local + first
     ghosts = slice(domain.node_count, None)
     owners_label = owner_values(domain.space.dofmap.index_map, label)

@@ -1,9 +1,9 @@
-"""The folder of compiled libraries, FFCx's and ours: which it is, who may write there, and which files are whole.
+"""The folder of compiled libraries, those of FFCx and of fracsim: its place, its access rights, and undamaged files.
 
-A library is code, and whoever may write it decides what a run does: one that others may write is refused. A machine
-that loses power, or a disk that is full, leaves libraries that are cut or empty, and to load a cut one may end the
-process by SIGBUS. So a library is looked at before it is loaded: its digest stands in a file beside it, and without one
-the table at the end of an ELF file is to be there. What is damaged is removed and compiled once more.
+A library is code, so that whoever may write it decides what a run does: libraries that others may write are refused. A
+loss of power or a full disk leaves incomplete libraries, and loading one may end the process by SIGBUS. Therefore a
+library is checked before it is loaded: against the digest in a file beside it or, without one, by the table at the end
+of an ELF file. Damaged files are removed and compiled again.
 """
 
 from __future__ import annotations
@@ -28,19 +28,19 @@ from mpi4py import MPI
 
 from ..errors import CannotWrite, InputError
 
-OTHERS = stat.S_IWGRP | stat.S_IWOTH
+WRITABLE_BY_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
 def library_folder() -> Path:
-    """Where libraries are kept: DOLFINx's folder, or a private one where that cannot be written, with a note.
+    """Folder of compiled libraries: DOLFINx's or, with a note, a private one if that cannot be written.
 
-    Raises InputError where others may write there.
+    Raises InputError if other users may write there.
     """
-    return _usable(Path(get_options()["cache_dir"]))
+    return _checked_folder(Path(get_options()["cache_dir"]))
 
 
 @cache
-def _usable(folder: Path) -> Path:
+def _checked_folder(folder: Path) -> Path:
     folder = folder.absolute()
     if _can_be_written(folder):
         _make_private(folder)
@@ -52,32 +52,34 @@ def _usable(folder: Path) -> Path:
             f"folder that can, such as XDG_CACHE_HOME=/scratch/me"
         )
     _make_private(temporary)
-    note(f"compiled kernels are kept in {temporary}: {folder} cannot be written; XDG_CACHE_HOME names another folder")
+    print_note(
+        f"compiled kernels are kept in {temporary}: {folder} cannot be written; XDG_CACHE_HOME names another folder"
+    )
     return temporary
 
 
 def _can_be_written(folder: Path) -> bool:
-    """Whether files can be made there, or the folder itself."""
+    """Whether files can be created in a folder, or the folder itself."""
     existing = next(path for path in (folder, *folder.parents) if os.path.lexists(path))
     return existing.is_dir() and os.access(existing, os.W_OK | os.X_OK)
 
 
 def _make_private(folder: Path) -> None:
-    """Make the folder; InputError where others may write in it."""
+    """Create the folder if it is missing; InputError if other users may write in it."""
     try:
-        with not_for_others():
+        with private_umask():
             folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise CannotWrite(f"the folder of compiled kernels {folder} cannot be made: {error.strerror}") from None
-    _refuse(folder)
+    _check_owner(folder)
 
 
-def _refuse(path: Path) -> None:
-    """InputError where someone else than this user (or root) owns a path, or may write it."""
+def _check_owner(path: Path) -> None:
+    """Raise InputError if a user other than this one and root owns a path, or may write it."""
     status = path.stat()
     if status.st_uid not in (os.getuid(), 0):
         who = f"belongs to user {status.st_uid}"
-    elif status.st_mode & OTHERS:
+    elif status.st_mode & WRITABLE_BY_OTHERS:
         who = f"may be written by others (mode {stat.S_IMODE(status.st_mode):o})"
     else:
         return
@@ -89,8 +91,8 @@ def _refuse(path: Path) -> None:
 
 
 @contextmanager
-def not_for_others() -> Iterator[None]:
-    """While it lasts, what is made cannot be written by others."""
+def private_umask() -> Iterator[None]:
+    """Context in which new files and folders cannot be written by other users."""
     before = os.umask(0o077)
     os.umask(before | 0o022)
     try:
@@ -99,15 +101,15 @@ def not_for_others() -> Iterator[None]:
         os.umask(before)
 
 
-def no_room(folder: Path) -> bool:
+def is_disk_full(folder: Path) -> bool:
     """Whether a file system is full."""
     status = os.statvfs(folder)
     # bytes of free space below which a compiler's failure is taken for that of a full disk
     return status.f_bavail * status.f_frsize < 1 << 20
 
 
-def note(text: str) -> None:
-    """Say it once a job."""
+def print_note(text: str) -> None:
+    """Print a note on rank 0."""
     if MPI.COMM_WORLD.rank == 0:
         print(f"fracsim: note: {text}", file=sys.stderr, flush=True)
 
@@ -115,39 +117,39 @@ def note(text: str) -> None:
 # --- whether files are whole ----------------------------------------------------------------------------------------
 
 
-def is_whole(library: Path, *sources: Path) -> bool:
-    """Whether a library, and sources that are read beside it, are as they were compiled; False where one is missing.
+def is_complete(library: Path, *sources: Path) -> bool:
+    """Whether a library, and sources that are read with it, are undamaged; False if one is missing.
 
-    Raises InputError where others may write one.
+    Raises InputError if other users may write one of them.
     """
     contents = []
     for path in (library, *sources):
         if not path.is_file():
             return False
-        _refuse(path)
+        _check_owner(path)
         contents.append(path.read_bytes())
-    seal = _seal(library)
+    seal = _digest_path(library)
     if seal.is_file():
         return seal.read_bytes() == _digest(contents)
     if not _is_elf(contents[0]) or not all(contents):
         return False
-    _write_seal(seal, contents)
+    _write_digests(seal, contents)
     return True
 
 
-def put_seal(library: Path, *sources: Path) -> None:
-    """Keep the digest of what has just been compiled."""
-    _write_seal(_seal(library), [path.read_bytes() for path in (library, *sources)])
+def write_digest(library: Path, *sources: Path) -> None:
+    """Write the digest of a library, and of sources that are read with it, beside the library."""
+    _write_digests(_digest_path(library), [path.read_bytes() for path in (library, *sources)])
 
 
-def _seal(library: Path) -> Path:
+def _digest_path(library: Path) -> Path:
     return library.with_name(library.name.split(".")[0] + ".sha256")
 
 
-def _write_seal(seal: Path, contents: Sequence[bytes]) -> None:
-    """Whole or not at all; a folder without room does without."""
+def _write_digests(seal: Path, contents: Sequence[bytes]) -> None:
+    """Write a digest in one step; a full disk goes without."""
     fresh = seal.with_suffix(f".{os.getpid()}")
-    with suppress(OSError), not_for_others():
+    with suppress(OSError), private_umask():
         fresh.write_bytes(_digest(contents))
         fresh.replace(seal)
     with suppress(OSError):
@@ -162,7 +164,7 @@ def _digest(contents: Sequence[bytes]) -> bytes:
 
 
 def _is_elf(content: bytes) -> bool:
-    """Whether a file of 64 bits reaches to the end of its section headers, which linkers write last."""
+    """Whether a 64-bit ELF file is complete, that is, contains its section headers, which linkers write last."""
     if len(content) < 64 or content[:5] != b"\x7fELF\x02":
         return False
     order = "<" if content[5] == 1 else ">"
@@ -175,15 +177,15 @@ def _is_elf(content: bytes) -> bool:
 
 
 @contextmanager
-def alone(folder: Path, name: str) -> Iterator[None]:
-    """One process at a time, of all ranks and jobs, has the library of a name to itself.
+def exclusive_access(folder: Path, name: str) -> Iterator[None]:
+    """Context that only one process at a time, of all ranks and jobs, enters for the library of a name.
 
-    A file system without locks, and a process that holds one for more than a minute, stop nobody: two compilations do
-    no harm, they only take longer.
+    It is entered without a lock on a file system that has none, and after a minute of waiting: two compilations of one
+    library do no harm.
     """
     position = int(hashlib.sha256(name.encode()).hexdigest()[:12], 16)
     try:
-        with not_for_others():
+        with private_umask():
             lock = os.open(folder / "fracsim.lock", os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
     except OSError:
         yield
@@ -198,7 +200,7 @@ def alone(folder: Path, name: str) -> Iterator[None]:
 
 
 def _locked(lock: int, place: int) -> bool:
-    """Whether the lock is ours now, or there are none on this file system."""
+    """Whether this process has the lock now, or the file system has no locks."""
     try:
         fcntl.lockf(lock, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
     except (BlockingIOError, PermissionError):
@@ -211,44 +213,45 @@ def _locked(lock: int, place: int) -> bool:
 # --- FFCx's libraries -----------------------------------------------------------------------------------------------
 
 
-def load_whole[Module](look_up: Callable[[], tuple[Any, Module]], folder: Path, name: str) -> tuple[Any, Module]:
-    """What FFCx's `look_up` of a kernel in a folder returns; a damaged one is removed before, so that FFCx compiles it
-    once more."""
-    if remove_damaged(folder, name):
-        note(f"the library {folder / name}.* was damaged; it is compiled once more")
+def load_kernel[Module](look_up: Callable[[], tuple[Any, Module]], folder: Path, name: str) -> tuple[Any, Module]:
+    """Result of FFCx's `look_up` of a kernel in a folder, where damaged kernels have been removed."""
+    if remove_damaged_kernel(folder, name):
+        print_note(f"the library {folder / name}.* was damaged; it is compiled once more")
     try:
         return look_up()
-    except (ImportError, AttributeError) as error:  # whole, and not to be loaded: of another machine or Python
-        with alone(folder, name):
+    except (ImportError, AttributeError) as error:
+        # undamaged, but of another machine or Python
+        with exclusive_access(folder, name):
             remove_kernel(folder, name)
-        note(f"the library {folder / name}.* cannot be loaded ({error}); it is compiled once more")
+        print_note(f"the library {folder / name}.* cannot be loaded ({error}); it is compiled once more")
         return look_up()
 
 
-def remove_damaged(folder: Path, name: str) -> bool:
-    """Remove a kernel of FFCx's that was compiled and is not whole; whether it did."""
+def remove_damaged_kernel(folder: Path, name: str) -> bool:
+    """Remove the files of a compiled kernel of FFCx if it is damaged; return whether they were removed."""
     ready = folder / f"{name}.c.cached"
-    if not ready.exists() or _kernel_is_whole(folder, name):
+    if not ready.exists() or _is_kernel_complete(folder, name):
         return False
-    with alone(folder, name):
-        if not ready.exists() or _kernel_is_whole(folder, name):
+    with exclusive_access(folder, name):
+        if not ready.exists() or _is_kernel_complete(folder, name):
             return False
         remove_kernel(folder, name)
     return True
 
 
-def _kernel_is_whole(folder: Path, name: str) -> bool:
+def _is_kernel_complete(folder: Path, name: str) -> bool:
     library = kernel_file(folder, name)
-    return library is not None and is_whole(library, folder / f"{name}.c")
+    return library is not None and is_complete(library, folder / f"{name}.c")
 
 
 def kernel_file(folder: Path, name: str) -> Path | None:
-    """The library of one of FFCx's kernels, None where there is none."""
+    """Library of a kernel of FFCx; None if there is none."""
     files = (folder / f"{name}{suffix}" for suffix in EXTENSION_SUFFIXES)
     return next((path for path in files if path.exists()), None)
 
 
 def remove_kernel(folder: Path, name: str) -> None:
-    """Remove all files of one of FFCx's kernels; the C file, by which others know that one is compiled, last."""
+    """Remove all files of a kernel of FFCx."""
+    # the C file last: by it other processes know that the kernel is compiled
     for path in sorted(folder.glob(f"{name}.*"), key=lambda path: path.suffix == ".c"):
         path.unlink(missing_ok=True)

@@ -9,7 +9,7 @@ from dolfinx import la
 from ..meshes.topology import components
 from .domain import Domain
 from .ghost_exchange import min_over_ranks, owner_values
-from .parallel import allgather, offset
+from .parallel import allgather, rank_offset
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -69,7 +69,7 @@ def _join_over_ranks(
     comm = domain.comm
     if comm.size == 1:
         return np.arange(count), size, lowest
-    first, index_map = offset(comm, count), domain.mesh.topology.index_map(domain.dim - 1)
+    first, index_map = rank_offset(comm, count), domain.mesh.topology.index_map(domain.dim - 1)
     label = np.full(index_map.size_local + index_map.num_ghosts, -1)
     label[domain.facets.cell_facets[cells]] = (first + component)[:, None]
     ghosts = slice(index_map.size_local, None)

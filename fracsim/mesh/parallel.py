@@ -27,7 +27,7 @@ def on_root[T](comm: MPI.Comm, work: Callable[[], T]) -> T | None:
             result = work()
         except (SystemExit, Exception) as error:
             failure = error
-    root_failure = comm.bcast(_sendable(failure))
+    root_failure = comm.bcast(_picklable(failure))
     if failure is not None:
         raise failure
     if root_failure is not None:
@@ -41,7 +41,7 @@ def from_root[T](comm: MPI.Comm, work: Callable[[], T]) -> T:
     return result
 
 
-def _sendable(failure: BaseException | None) -> BaseException | None:
+def _picklable(failure: BaseException | None) -> BaseException | None:
     """The exception, or a RuntimeError with the same message if the exception cannot be pickled."""
     try:
         pickle.loads(pickle.dumps(failure))
@@ -50,16 +50,16 @@ def _sendable(failure: BaseException | None) -> BaseException | None:
     return failure
 
 
-def raise_together(comm: MPI.Comm, failure: Exception | None) -> None:
+def raise_on_all_ranks(comm: MPI.Comm, failure: Exception | None) -> None:
     """Raise on every rank if any rank has failed: its own exception, or that of the lowest rank (collective)."""
-    failures = [error for error in comm.allgather(_sendable(failure)) if error is not None]
+    failures = [error for error in comm.allgather(_picklable(failure)) if error is not None]
     if failure is not None:
         raise failure
     if failures:
         raise failures[0]
 
 
-def who_failed(comm: MPI.Intracomm, patience: float) -> set[int]:
+def find_failed_ranks(comm: MPI.Intracomm, patience: float) -> set[int]:
     """The ranks that have failed within `patience` seconds, this rank included.
 
     Each rank that fails calls this function. Other ranks may be waiting in a collective operation. Therefore only
@@ -80,12 +80,12 @@ def who_failed(comm: MPI.Intracomm, patience: float) -> set[int]:
     return failed
 
 
-def end_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, late: bool = False) -> None:
+def abort_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, late: bool = False) -> None:
     """Return if every rank has failed; otherwise print the message once and end all ranks with the exit code.
 
     `late`: other ranks are given more time, since rank 0 may be drawing a picture before it fails.
     """
-    failed = who_failed(comm, 12 * FAILURE_WAIT if late else FAILURE_WAIT)
+    failed = find_failed_ranks(comm, 12 * FAILURE_WAIT if late else FAILURE_WAIT)
     if len(failed) == comm.size:
         return
     if comm.rank > min(failed):
@@ -94,12 +94,12 @@ def end_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, late:
     comm.Abort(code or 1)
 
 
-def starts_ranks(process: int) -> bool:
+def is_launcher(process: int) -> bool:
     """Whether a process starts the ranks of a job; False if the system gives no information on it."""
     return _name_and_parent(process)[0].startswith(LAUNCHERS)
 
 
-def launcher(process: int) -> int | None:
+def find_launcher(process: int) -> int | None:
     """The process that starts the ranks of a job, among a process and its ancestors; None if there is none."""
     while process > 1:
         name, parent = _name_and_parent(process)
@@ -140,7 +140,7 @@ def concatenate_over_ranks(comm: MPI.Intracomm, rows: npt.NDArray[Any]) -> npt.N
     return rows if comm.size == 1 else np.concatenate(allgather(comm, rows))
 
 
-def offset(comm: MPI.Intracomm, count: int) -> int:
+def rank_offset(comm: MPI.Intracomm, count: int) -> int:
     """Sum of `count` over the lower ranks."""
     before = comm.exscan(count)
     return int(before or 0)

@@ -15,7 +15,7 @@ import time
 from dataclasses import dataclass
 
 from ..errors import STOP_SIGNALS
-from ..mesh.parallel import starts_ranks
+from ..mesh.parallel import is_launcher
 
 PROGRESS_VARIABLE = "FRACSIM_PROGRESS"
 
@@ -198,7 +198,7 @@ def _terminal_columns() -> int:
     try:
         if sys.stderr.isatty():
             return os.get_terminal_size(sys.stderr.fileno()).columns or PROGRESS_TIMING.terminal_columns
-        if not starts_ranks(parent := os.getppid()):
+        if not is_launcher(parent := os.getppid()):
             return 0
         descriptor = os.open(f"/proc/{parent}/fd/2", os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
     except (OSError, ValueError):

@@ -11,7 +11,7 @@ from math import prod
 import numpy as np
 
 from ..errors import InputError
-from ..mesh.connected_bodies import not_held
+from ..mesh.connected_bodies import unsupported_message
 from ..mesh.selectors import Group, Selector, check_group, check_regions
 from ..meshes.data import AXES, MeshData
 from ..meshes.parameters import MAX_CELLS
@@ -104,7 +104,7 @@ def _check_translations(study: Study, dim: int) -> None:
     for condition in boundary_conditions(study, dim):
         prescribed |= condition.components
     if not prescribed.all():
-        raise InputError(not_held("the body", f"moving along {AXES[int(np.argmin(prescribed))]}"))
+        raise InputError(unsupported_message("the body", f"moving along {AXES[int(np.argmin(prescribed))]}"))
 
 
 def _check_groups(study: Study, summary: MeshSummary) -> None:

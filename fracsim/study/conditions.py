@@ -16,7 +16,7 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from ..mechanics.time_functions import TabulatedFunction, TimeFunction, Values, constant_function
-from ..mesh.crack_planes import CrackPlane, plane, polygon, segment
+from ..mesh.crack_planes import CrackPlane, plane_crack, polygon_crack, segment_crack
 from ..mesh.selectors import Group, PointsInBox, PointsOnPlane, Selector
 from ..meshes.data import AXES
 from . import (
@@ -312,15 +312,15 @@ def initial_cracks(study: Study, dim: int) -> list[CrackPlane]:
 def _crack(entry: CrackSettings, key: str, dim: int) -> CrackPlane:
     if entry.plane is not None:
         point = check_size(entry.plane.point, dim, f"{key}.plane.point")
-        return plane(key, point, check_size(entry.plane.normal, dim, f"{key}.plane.normal"))
+        return plane_crack(key, point, check_size(entry.plane.normal, dim, f"{key}.plane.normal"))
     if entry.segment is not None:
         if dim == 3:
             raise InputError(f"{key}.segment is for 2D meshes; this one has 3 dimensions: give a polygon or a plane")
-        return segment(key, np.array([check_size(end, dim, f"{key}.segment") for end in entry.segment]))
+        return segment_crack(key, np.array([check_size(end, dim, f"{key}.segment") for end in entry.segment]))
     assert entry.polygon is not None
     if dim == 2:
         raise InputError(f"{key}.polygon is for 3D meshes; this one has 2 dimensions: give a segment or a plane")
-    return polygon(key, np.array([check_size(corner, dim, f"{key}.polygon") for corner in entry.polygon]))
+    return polygon_crack(key, np.array([check_size(corner, dim, f"{key}.polygon") for corner in entry.polygon]))
 
 
 def fibre_direction(study: Study, dim: int) -> Values | None:

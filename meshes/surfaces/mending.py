@@ -193,7 +193,7 @@ def directed_edges(triangles: Indices) -> Indices:
     return np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
 
 
-def open_edges(triangles: Indices) -> Indices:
+def find_open_edges(triangles: Indices) -> Indices:
     """Places in `directed_edges` of the edges of one triangle only."""
     table = EdgeTable(triangles)
     return np.flatnonzero(table.counts[table.place] == 1)
@@ -213,7 +213,7 @@ def _divided(points: Points, triangles: Indices, reach: float) -> tuple[Indices,
     total = 0
     length = reach * float(np.ptp(points, axis=0).max())
     for _ in range(MAX_ROUNDS):
-        positions = open_edges(triangles)
+        positions = find_open_edges(triangles)
         if not 0 < len(positions) <= MAX_OPEN_EDGES:
             return triangles, total, len(positions) > 0
         splits = _nodes_on_edges(points, directed_edges(triangles)[positions], length)
@@ -232,7 +232,7 @@ def _divided(points: Points, triangles: Indices, reach: float) -> tuple[Indices,
         total += int(replaced.sum())
         triangles = np.concatenate([triangles[~replaced], np.array(new, np.int64)])
         triangles = triangles[_once(triangles)]
-    return triangles, total, len(open_edges(triangles)) > 0
+    return triangles, total, len(find_open_edges(triangles)) > 0
 
 
 def _nodes_on_edges(points: Points, edges: Indices, length: float) -> list[list[int]]:

@@ -28,7 +28,7 @@ from .closed import (
     read_surface,
 )
 from .enclosed import enclosed_volumes, winding_numbers
-from .mending import JOINED, EdgeTable, areas, directed_edges, mended, open_edges
+from .mending import JOINED, EdgeTable, areas, directed_edges, find_open_edges, mended
 from .self_intersection import crossing_triangles
 
 MAX_CHANGE = 0.1  # of the volume of a part, or of a side of its bounding box over the longest side
@@ -101,7 +101,7 @@ def repaired(points: Points, triangles: Indices, source: str) -> tuple[Points, I
     triangles, shell, _ = orient_consistently(triangles, EdgeTable(triangles), source)
     crossings = crossing_triangles(points, triangles, closed=True)
     owned = np.unique(crossings[shell[crossings[:, 0]] == shell[crossings[:, 1]]])
-    opened = np.unique(open_edges(triangles) // 3)
+    opened = np.unique(find_open_edges(triangles) // 3)
     area = np.bincount(shell, areas(points, triangles))
     cut, torn = (np.bincount(shell[which], minlength=len(area)) > 0 for which in (owned, opened))
     dust = torn & (area < DUST * area.sum())
@@ -139,7 +139,7 @@ def _mended(points: Points, triangles: Indices, source: str) -> tuple[Points, In
             parts = [mended(*_part(original[0], original[1][of_triangle == number])) for number in numbers]
             apart = _together([(own_points, owned) for own_points, owned, *_ in parts])
             # STL does not say which triangles are connected: each would be a part, and open
-            if not _crowded(apart[1]) and len(open_edges(apart[1])) <= len(open_edges(triangles)):
+            if not _crowded(apart[1]) and len(find_open_edges(apart[1])) <= len(find_open_edges(triangles)):
                 points, triangles = apart
                 notes = tuple(note for _, _, own_notes, *_ in parts for note in own_notes)
     check_areas(points, triangles, source)
@@ -187,7 +187,7 @@ class _Holes:
 
     @classmethod
     def of(cls, points: Points, triangles: Indices) -> _Holes:
-        edges = directed_edges(triangles)[open_edges(triangles)]
+        edges = directed_edges(triangles)[find_open_edges(triangles)]
         if len(edges) == 0:
             return cls(0, 0.0, "", np.zeros((0, 3, 3)))
         nodes, numbered = np.unique(edges, return_inverse=True)
@@ -216,7 +216,7 @@ def _fixed(points: Points, triangles: Indices, cut: int, source: str) -> tuple[P
         )
         + ([f"{cut} triangles that pass through others"] if cut else [])
     )
-    if len(new) == 0 or len(open_edges(new)):
+    if len(new) == 0 or len(find_open_edges(new)):
         raise MeshError(f"{source}: repair failed to mend {description}. {BY_HAND}")
     after, share = _volume(new_points, new), _new_share(points, triangles, new_points, new)
     size = float(np.ptp(points, axis=0).max())

@@ -117,16 +117,16 @@ class CutTable:
 @cache
 def cut_table(dim: int) -> CutTable:
     """The table of triangles (8 patterns) or tetrahedra (64 patterns), computed once."""
-    return tabled(CutCell, dim)
+    return tabulate(CutCell, dim)
 
 
 @cache
 def intact_cell_table(dim: int) -> CutTable:
     """The table of the pattern without broken edges alone, for an undamaged body."""
-    return tabled(CutCell, dim, 1)
+    return tabulate(CutCell, dim, 1)
 
 
-def tabled(kind: type[CutCell], dim: int, patterns: int | None = None) -> CutTable:
+def tabulate(kind: type[CutCell], dim: int, patterns: int | None = None) -> CutTable:
     """The table of a kind of cell, for all patterns or the first `patterns`."""
     cells = [kind(dim, pattern) for pattern in range(patterns or 1 << len(local_edges(dim)))]
     nodes = range(dim + 1)
@@ -249,7 +249,7 @@ def _starts(lists: list[list[Element]] | list[list[PatternPoint]]) -> Ints:
 @cache
 def planar_cut_table(dim: int) -> CutTable:
     """The table of planar cuts, computed once."""
-    return tabled(PlanarCutCell, dim)
+    return tabulate(PlanarCutCell, dim)
 
 
 class PlanarCutCell(CutCell):

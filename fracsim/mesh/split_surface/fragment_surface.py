@@ -33,9 +33,9 @@ def build_fragment_surface(topology: EntityNumbering, pattern: Patterns, cut: Va
     A loose node has no undamaged cell. Edges between fragments, and to loose nodes, are open. `cut`: (E,) as in
     build_split_surface, at least `CUTS.min_distance` from the ends.
     """
-    apart, loose, _ = open_edges(topology, pattern)
+    apart, loose, _ = find_open_edges(topology, pattern)
     cut = None if cut is None else np.clip(cut, CUTS.min_distance, 1 - CUTS.min_distance)
-    surface = build_split_surface(topology, patterns_of(topology, apart), cut, planar_cut_table)
+    surface = build_split_surface(topology, patterns_with_broken(topology, apart), cut, planar_cut_table)
     # all corners of an element follow nodes of the same side
     selected = ~loose[surface.parents.first_parent[surface.elements[:, 0]]]
     fields = {name: getattr(surface, name)[selected] for name in ("elements", "cell", "edge", "origin")}
@@ -47,8 +47,8 @@ def has_same_fragments(topology: EntityNumbering, pattern: Patterns, before: Pat
 
     Cracks within a fragment change neither.
     """
-    apart, loose, _ = open_edges(topology, pattern)
-    apart_before, loose_before, _ = open_edges(topology, before)
+    apart, loose, _ = find_open_edges(topology, pattern)
+    apart_before, loose_before, _ = find_open_edges(topology, before)
     if not (np.array_equal(apart, apart_before) and np.array_equal(loose, loose_before)):
         return False
     ends = np.zeros(len(topology.points), bool)
@@ -58,7 +58,7 @@ def has_same_fragments(topology: EntityNumbering, pattern: Patterns, before: Pat
     return np.array_equal(split_patterns[pattern[affected]], split_patterns[before[affected]])
 
 
-def open_edges(topology: EntityNumbering, pattern: Patterns) -> tuple[Flags, Flags, Ints]:
+def find_open_edges(topology: EntityNumbering, pattern: Patterns) -> tuple[Flags, Flags, Ints]:
     """(E,) flags of open edges, (N,) flags of loose nodes, and (N,) the fragment of each node.
 
     Fragments are connected by edges that are intact and do not lead to a loose node.
@@ -71,7 +71,7 @@ def open_edges(topology: EntityNumbering, pattern: Patterns) -> tuple[Flags, Fla
     return cut & (piece[ends[:, 0]] != piece[ends[:, 1]]), loose, piece
 
 
-def patterns_of(topology: EntityNumbering, broken: Flags) -> Patterns:
+def patterns_with_broken(topology: EntityNumbering, broken: Flags) -> Patterns:
     """(C,) patterns of the cells for `broken` edges (E,)."""
     bits = np.arange(topology.cell_edges.shape[1])
     return np.asarray((broken[topology.cell_edges] << bits).sum(axis=1), np.uint8)
@@ -104,8 +104,8 @@ def _on_flat(
 
     Also returns (k, m) the matrix of the means, and (k,) flags of points beside a crack within the fragment.
     """
-    apart, loose, piece = open_edges(topology, pattern)
-    flat = build_surface_points(topology, patterns_of(topology, apart), planar_cut_table)
+    apart, loose, piece = find_open_edges(topology, pattern)
+    flat = build_surface_points(topology, patterns_with_broken(topology, apart), planar_cut_table)
     node = topology.cells[drawn.cell]
     lead = node[np.arange(len(node)), drawn.group.argmax(axis=1)]
     same_fragment = np.where(loose[node], -1, piece[node]) == piece[lead][:, None]

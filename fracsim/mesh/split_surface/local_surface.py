@@ -22,7 +22,7 @@ from scipy.sparse import csr_matrix
 
 from ...meshes.data import MeshData
 from ..domain import Domain
-from ..parallel import offset
+from ..parallel import rank_offset
 from ..simplices import is_split
 from .closed_surface import SplitSurface, build_split_surface
 from .entity_numbering import CRACK, EntityNumbering
@@ -95,7 +95,7 @@ class LocalSurface:
         parents, arm = surface.parents.parents[entries], surface.parents.arm[entries]
         arms = self._wide(d * start, _by_axis(self._global(parents), d), (_shares(start)[:, None] * arm).reshape(-1), d)
         count = arms.shape[0]
-        left = _assembled(comm, (count, d * self._domain.node_count), arms, offset(comm, count) + np.arange(count))
+        left = _assembled(comm, (count, d * self._domain.node_count), arms, rank_offset(comm, count) + np.arange(count))
         right = self._gradients(pattern, parents[np.any(arm != 0, axis=1)])
         product = left.matMult(right)
         rows, nodes, values = product.getValuesCSR()
