@@ -327,7 +327,11 @@ def test_what_breaks_under_a_ball_gains_nothing() -> None:
     skin.cut_from_checkpoint(rows)
     np.testing.assert_array_equal(skin._excluded_facets, left_out)
     # what is drawn: all of it, beside the ball
-    at, (elements, _), u = skin.point_map, skin._surface.facets(), skin.interpolation.nodal(contact._end_displacement())
+    at, (elements, _), u = (
+        skin.point_map,
+        skin._surface.facets(),
+        skin.interpolation.nodal_values(contact._end_displacement()),
+    )
     whole = at.with_arm_share(np.ones(len(at.share)))
     shares = np.random.default_rng(1).dirichlet(np.full(3, 0.7), 200)
     least = [

@@ -63,11 +63,11 @@ def test_points_follow_affine_motions_and_hand_down_forces_and_moments(dim: int,
     follow, X = ParentMatrix(domain, surface), positions(scene)
     A, b = np.random.default_rng(dim).normal(size=(dim, dim)), np.arange(dim) + 1.0
     x = follow((X @ A.T + b).reshape(-1))
-    np.testing.assert_allclose(x, surface.at.rest @ A.T + b, atol=1e-13)
-    f = np.sin(100 * surface.at.rest) * surface.area[:, None]
+    np.testing.assert_allclose(x, surface.point_map.rest @ A.T + b, atol=1e-13)
+    f = np.sin(100 * surface.point_map.rest) * surface.area[:, None]
     nodal = follow.assemble_to_nodes(f).reshape(-1, dim)
     np.testing.assert_allclose(nodal.sum(axis=0), f.sum(axis=0), atol=1e-13)
-    np.testing.assert_allclose(X.T @ nodal, surface.at.rest.T @ f, atol=1e-13)
+    np.testing.assert_allclose(X.T @ nodal, surface.point_map.rest.T @ f, atol=1e-13)
 
 
 # --- impulse, rest, pressure ----------------------------------------------------------------------------------------

@@ -237,7 +237,7 @@ def test_cells_with_broken_edges_are_touched_by_their_corners() -> None:
         surface.update_damage(graph.pattern)
         area[order] = surface.area.sum()
         if order == 2:
-            touched = surface.columns[abs(surface.at.weights).max(axis=0).toarray().ravel() > 1e-12]
+            touched = surface.columns[abs(surface.point_map.weights).max(axis=0).toarray().ravel() > 1e-12]
             cells = np.flatnonzero(graph.pattern)
             of_whole = domain.cell_midside_nodes.of_edges[np.flatnonzero(graph.pattern == 0)]
             only_broken = np.setdiff1d(domain.cell_midside_nodes.of_edges[cells], of_whole)

@@ -44,13 +44,13 @@ def test_springs_at_points_are_no_faster_than_said() -> None:
     surface, graph = LocalSurface(scene.domain), EdgeGraph(scene.domain)
     graph.break_edges(np.random.default_rng(1).random(len(graph.broken)) < 0.4)
     surface.update_damage(graph.pattern)
-    carried = NodalMassShare(surface.at, ParentMatrix(scene.domain, surface), scene.balance.mass.lumped)
-    W, m = surface.at.weights.toarray(), masses(scene)[surface.columns, 0]
+    carried = NodalMassShare(surface.point_map, ParentMatrix(scene.domain, surface), scene.balance.mass.lumped)
+    W, m = surface.point_map.weights.toarray(), masses(scene)[surface.columns, 0]
 
     def fastest(k: Values) -> float:
         return float(np.linalg.eigvalsh((W.T * k) @ W / np.sqrt(m[:, None] * m)).max())
 
-    assert len(surface.at.copies) > 30
+    assert len(surface.point_map.copies) > 30
     own = carried.point_masses(surface.area)
     assert 0.3 < fastest(own) <= 1 + 1e-12
     for seed in range(5):

@@ -14,7 +14,7 @@ from fracsim.mesh.split_surface.fragment_surface import (
     has_same_fragments,
     project_onto_fragments,
 )
-from fracsim.mesh.split_surface.surface_map import whole
+from fracsim.mesh.split_surface.surface_map import make_surface_map
 from fracsim.meshes.topology import signed_measures
 from support.solids import assert_closed, cloud, components, enclosed, lattice, patterns, separated, torn
 
@@ -87,7 +87,9 @@ def test_a_surface_that_is_said_to_be_the_same_is(dim: int, seed: int, share: fl
     if has_same_fragments(skeleton, pattern, before):
         assert same
         u = rng.random(mesh.points.shape)
-        places = [whole(made, skeleton, at, made.points)(u) for made, at in ((one, before), (other, pattern))]
+        places = [
+            make_surface_map(made, skeleton, at, made.points)(u) for made, at in ((one, before), (other, pattern))
+        ]
         np.testing.assert_array_equal(*places)
     assert has_same_fragments(skeleton, before, before) and (same or not has_same_fragments(skeleton, pattern, before))
 
@@ -117,8 +119,10 @@ def test_walls_are_drawn_where_they_are_cut_flat(dim: int) -> None:
     for broken, share in ((around, 0.2), (around | crack, 0.0)):
         pattern, u = patterns(skeleton, broken), share * rng.random(x.shape)
         flat, drawn = build_fragment_surface(skeleton, pattern), build_split_surface(skeleton, pattern)
-        of_flat = whole(flat, skeleton, pattern, flat.points).with_arm_share(rng.uniform(0.5, 1.0, len(flat.points)))
-        before = whole(drawn, skeleton, pattern, drawn.points)
+        of_flat = make_surface_map(flat, skeleton, pattern, flat.points).with_arm_share(
+            rng.uniform(0.5, 1.0, len(flat.points))
+        )
+        before = make_surface_map(drawn, skeleton, pattern, drawn.points)
         after = project_onto_fragments(before, skeleton, pattern, of_flat)
         each = [
             enclosed(places(u), made.elements, inner[made.parents.first_parent[made.elements[:, 0]]], 2)[0][1]

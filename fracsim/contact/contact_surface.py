@@ -202,16 +202,16 @@ class ContactSurface:
     @property
     def point_map(self) -> SurfaceMap:
         """Map from nodal displacements to positions of points."""
-        return self._surface.at
+        return self._surface.point_map
 
     def identity(self, points: Ints) -> Values:
         """(k, 2 d + 1) rows that identify points (k,), whatever breaks."""
-        return self._surface.identity(points)
+        return self._surface.identify_points(points)
 
     @property
     def rest_positions(self) -> Values:
         """(n, d) reference positions of the points, m."""
-        return self._surface.at.rest
+        return self._surface.point_map.rest
 
     @property
     def node_numbers(self) -> Ints:
@@ -243,7 +243,7 @@ class ContactSurface:
     def point_stiffness(self, points: Ints, blocks: Values) -> csr_matrix:
         """W^T B W over `node_numbers`, N/m, of blocks B (k, d, d) at points (k,)."""
         k, d = blocks.shape[:2]
-        W = kron(self._surface.at.weights[points], np.eye(d), format="csr")
+        W = kron(self._surface.point_map.weights[points], np.eye(d), format="csr")
         B = bsr_matrix((blocks, np.arange(k), np.arange(k + 1)), shape=(k * d, k * d)).tocsr()
         return (W.T @ B @ W).tocsr()
 
@@ -255,7 +255,7 @@ class ContactSurface:
         rows, columns = np.repeat(dofs, dofs.shape[1], axis=1), np.tile(dofs, dofs.shape[1])
         size = d * len(points)
         B = csr_matrix((blocks.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(size, size))
-        W = kron(self._surface.at.weights[points], np.eye(d), format="csr")
+        W = kron(self._surface.point_map.weights[points], np.eye(d), format="csr")
         return (W.T @ B @ W).tocsr()
 
     # --- new crack faces ---
@@ -275,7 +275,7 @@ class ContactSurface:
             gaps: gap function of points.
             facet_gaps: gap function of facets, where obstacles act on them.
         """
-        old_map, old_identity = self._surface.at, self._surface.identity()
+        old_map, old_identity = self._surface.point_map, self._surface.identify_points()
         excluded = self._corner_identities(self._excluded_facets)
         gap = np.where(self.area > 0, gaps(self.positions(u)), np.nan)
         copies = old_map.copies
@@ -283,14 +283,14 @@ class ContactSurface:
         self._surface.update_damage(pattern)
         self.interpolation.destroy()
         self.interpolation, self._all, self._active = ParentMatrix(self._domain, self._surface), None, None
-        point_map, nodal = self._surface.at, self.interpolation.nodal(u)
-        share, gap = retracted.match(self._surface.identity(), self._width)
-        self._surface.at, without_room = retract_points(point_map, nodal, point_map.copies, share, gap, gaps)
+        point_map, nodal = self._surface.point_map, self.interpolation.nodal_values(u)
+        share, gap = retracted.match(self._surface.identify_points(), self._width)
+        self._surface.point_map, without_room = retract_points(point_map, nodal, point_map.copies, share, gap, gaps)
         self._exclude_points(without_room)
         if facet_gaps is not None:
             is_new = np.zeros(len(point_map.share), bool)
             is_new[point_map.copies] = True
-            rows = match_points(old_identity, self._surface.identity())
+            rows = match_points(old_identity, self._surface.identify_points())
             is_new[point_map.copies[rows[rows >= 0]]] = False
             self._excluded_facets = self._match_facets(excluded)
             self._retract_new_facets(is_new, nodal, gaps, facet_gaps)
@@ -298,7 +298,7 @@ class ContactSurface:
     def _retract_new_facets(self, is_new: Flags, u: Values, gaps: GapFunction, facet_gaps: FacetGapFunction) -> None:
         """Retract new points (n,) of facets that would be cut or in contact; exclude facets for which this fails."""
         for _ in range(RETRACTION.facet_rounds):
-            point_map, facets = self._surface.at, self.facets
+            point_map, facets = self._surface.point_map, self.facets
             has_new = is_new[facets.corners].any(axis=1)
             too_close = facet_gaps(facets, point_map(u)) < np.where(has_new, self._width, TINY)
             points = np.unique(facets.corners[too_close])
@@ -307,9 +307,9 @@ class ContactSurface:
                 break
             share = point_map.share.copy()
             share[points] *= RETRACTION.facet_factor
-            self._surface.at = point_map.with_arm_share(share)
+            self._surface.point_map = point_map.with_arm_share(share)
         closed = np.flatnonzero(is_new & (self.area > 0))
-        closed = closed[gaps(self._surface.at(u)[closed]) <= 0]
+        closed = closed[gaps(self._surface.point_map(u)[closed]) <= 0]
         if len(closed):
             self._exclude_points(np.union1d(closed, np.flatnonzero(self.area == 0)))
         self._exclude_facets(np.flatnonzero(self._facets_too_close(is_new, u, facet_gaps)))
@@ -318,7 +318,7 @@ class ContactSurface:
         """(m,) facets that are cut, or have a point that has `moved` (n,) and would be in contact."""
         facets = self._all_facets()
         min_gap = np.where(moved[facets.corners].any(axis=1), self._width, TINY)
-        return np.asarray(facet_gaps(facets, self._surface.at(u)) < min_gap)
+        return np.asarray(facet_gaps(facets, self._surface.point_map(u)) < min_gap)
 
     def _exclude_facets(self, facets: Ints) -> None:
         """Exclude these facets as well."""
@@ -327,20 +327,20 @@ class ContactSurface:
 
     def release_points(self, u: Values, gaps: GapFunction, facet_gaps: FacetGapFunction | None = None) -> None:
         """Extend retracted points, and include excluded points and facets, as far as there is room (collective)."""
-        nodal, old_map, excluded = self.interpolation.nodal(u), self._surface.at, self.area == 0
+        nodal, old_map, excluded = self.interpolation.nodal_values(u), self._surface.point_map, self.area == 0
         point_map = extend_points(old_map, nodal, self._width, gaps)
         if len(points := np.flatnonzero(excluded)):
             full, min_gap = np.ones(len(points)), np.full(len(points), self._width)
             point_map, points = retract_points(point_map, nodal, points, full, min_gap, gaps)
             self._exclude_points(points)
-        self._surface.at = point_map
+        self._surface.point_map = point_map
         changed = point_map is not old_map or len(points) or len(self._excluded_facets)
         if facet_gaps is not None and changed:
             self._restore_facets(old_map, excluded, nodal, facet_gaps)
 
     def _restore_facets(self, old_map: SurfaceMap, excluded: Flags, u: Values, facet_gaps: FacetGapFunction) -> None:
         """Undo extensions that bring a facet into contact; include facets that are not in contact."""
-        point_map = self._surface.at
+        point_map = self._surface.point_map
         moved = (point_map.share != old_map.share) | excluded
         too_close = self._facets_too_close(moved, u, facet_gaps)
         undone = np.unique(self._all_facets().corners[too_close])
@@ -348,9 +348,9 @@ class ContactSurface:
         if len(undone):
             share = point_map.share.copy()
             share[undone] = old_map.share[undone]
-            self._surface.at = point_map.with_arm_share(share)
+            self._surface.point_map = point_map.with_arm_share(share)
         if len(self._excluded_facets):
-            gap = facet_gaps(self._all_facets(), self._surface.at(u))[self._excluded_facets]
+            gap = facet_gaps(self._all_facets(), self._surface.point_map(u))[self._excluded_facets]
             if (gap >= self._width).any():
                 self._excluded_facets = self._excluded_facets[gap < self._width]
         self._exclude_facets(np.flatnonzero(self._facets_too_close(excluded, u, facet_gaps)))
@@ -359,14 +359,14 @@ class ContactSurface:
         """(k c, 2 d + 1) rows that identify the corners of facets (k,)."""
         if not len(facets):
             return np.empty((0, 2 * self._domain.dim + 1))
-        return self._surface.identity(self._all_facets().corners[facets].reshape(-1))
+        return self._surface.identify_points(self._all_facets().corners[facets].reshape(-1))
 
     def _match_facets(self, identity: Values) -> Ints:
         """Facets whose corners have the rows that `_corner_identities` returned."""
         if not len(identity):
             return np.empty(0, np.int64)
         corners = np.sort(self._all_facets().corners, axis=1)
-        all_identities = self._surface.identity(np.arange(len(self.area)))
+        all_identities = self._surface.identify_points(np.arange(len(self.area)))
         matched = match_points(identity, all_identities).reshape(-1, corners.shape[1])
         matched = np.sort(matched[(matched >= 0).all(axis=1)], axis=1)
         _, group = np.unique(np.concatenate([matched, corners]), axis=0, return_inverse=True)
@@ -380,7 +380,7 @@ class ContactSurface:
 
     def snapshot(self) -> object:
         """Factors of arms, areas, and excluded facets."""
-        return self._surface.at.share, self.area, self._excluded_facets
+        return self._surface.point_map.share, self.area, self._excluded_facets
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot of this surface (not collective).
@@ -388,19 +388,19 @@ class ContactSurface:
         Where edges have broken since, in an earlier pass of the step, the surface is another one and stays as it is.
         """
         share, area, excluded_facets = cast("tuple[Values, Values, Ints]", memory)
-        if len(share) != len(self._surface.at.share):
+        if len(share) != len(self._surface.point_map.share):
             return
         self._excluded_facets = excluded_facets
-        if share is not self._surface.at.share:
-            self._surface.at = self._surface.at.with_arm_share(share)
+        if share is not self._surface.point_map.share:
+            self._surface.point_map = self._surface.point_map.with_arm_share(share)
         self.area = area
 
     def to_checkpoint(self) -> Values:
         """Rows of points that are retracted or excluded: identity, factor, whether excluded; on rank 0 (collective)."""
-        point_map = self._surface.at
+        point_map = self._surface.point_map
         excluded = self.area[point_map.copies] == 0
         selected = np.flatnonzero((point_map.share[point_map.copies] < 1) | excluded)
-        identity = self._surface.identity()[selected]
+        identity = self._surface.identify_points()[selected]
         points = point_map.copies[selected]
         rows = np.column_stack([identity, point_map.share[points], self.area[points] == 0])
         gathered = gather(self.comm, rows)
@@ -408,11 +408,11 @@ class ContactSurface:
 
     def from_checkpoint(self, rows: Values) -> None:
         """Set the state from the rows of a checkpoint."""
-        point_map = self._surface.at
-        matched = match_points(rows[:, :-2], self._surface.identity())
+        point_map = self._surface.point_map
+        matched = match_points(rows[:, :-2], self._surface.identify_points())
         points, share = point_map.copies[matched[matched >= 0]], np.ones(len(point_map.share))
         share[points] = rows[matched >= 0, -2]
-        self._surface.at = point_map.with_arm_share(share)
+        self._surface.point_map = point_map.with_arm_share(share)
         self._exclude_points(points[rows[matched >= 0, -1] > 0])
 
     def cut_to_checkpoint(self) -> Values:

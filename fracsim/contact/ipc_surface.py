@@ -25,7 +25,7 @@ from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surfac
 from ..mesh.split_surface.entity_numbering import CRACK, EntityNumbering
 from ..mesh.split_surface.fragment_surface import build_fragment_surface, has_same_fragments, project_onto_fragments
 from ..mesh.split_surface.point_matching import match_points, point_identity
-from ..mesh.split_surface.surface_map import SurfaceMap, whole
+from ..mesh.split_surface.surface_map import SurfaceMap, make_surface_map
 from ..meshes.data import format_point
 from .ipc_pairs import IpcPairs, max_length
 from .sample_points import SlipFriction
@@ -177,7 +177,7 @@ class SelfContactSurface:
         else:
             self.split = build_split_surface(skeleton, pattern)
         self._rest_positions = offset_crack_faces(self.split, self.face_gap * law.distance)
-        self.point_map = whole(self.split, skeleton, pattern, self._rest_positions)
+        self.point_map = make_surface_map(self.split, skeleton, pattern, self._rest_positions)
         self._parameters = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
         is_copy = np.zeros(len(self._rest_positions), bool)
         is_copy[self.point_map.copies] = True

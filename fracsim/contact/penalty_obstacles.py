@@ -76,14 +76,14 @@ class NodalMassShare:
         """`mass`: (owned dofs,) lumped, kg (collective)."""
         self._interpolation, self._weights = interpolation, abs(point_map.weights)
         self._sum = np.asarray(self._weights.sum(axis=1)).ravel()
-        self._mass = interpolation.nodal(mass)[:, 0].copy()
+        self._mass = interpolation.nodal_values(mass)[:, 0].copy()
 
     def node_rates(self, stiffness: Values) -> Values:
         """(columns,) 1/m_a sum_p |w_pa| k_p S_p at nodes, 1/s^2, of k (n,), N/m (collective)."""
         load = self._weights.T @ (stiffness * self._sum)
         vector = np.zeros((len(load), self._interpolation.dim))
         vector[:, 0] = load
-        summed = self._interpolation.nodal(self._interpolation.summed(vector))[:, 0]
+        summed = self._interpolation.nodal_values(self._interpolation.sum_at_nodes(vector))[:, 0]
         return np.asarray(summed / np.maximum(self._mass, np.finfo(float).tiny))
 
     def max_rate(self, stiffness: Values) -> float:

@@ -74,7 +74,7 @@ class SelfContact(Term):
 
         def build() -> SelfContactSurface:
             assert pattern is not None and u is not None and self._skeleton is not None
-            cut = None if cuts is None else self._skeleton.of_edges(cuts[0], cuts[1][:, 0])
+            cut = None if cuts is None else self._skeleton.edge_values(cuts[0], cuts[1][:, 0])
             return self._build_surface(pattern, u, cut)
 
         self._surface = on_root(self.comm, build)
@@ -345,6 +345,6 @@ def node_gather(domain: Domain, law: SelfContactLaw) -> Gather:
 
 def _refined(domain: Domain) -> MeshData | None:
     """Input mesh with quadratic cells subdivided into linear ones."""
-    from ..mesh.split_surface.quadratic_surface import refined_input
+    from ..mesh.split_surface.quadratic_surface import subdivided_input_mesh
 
-    return refined_input(domain)
+    return subdivided_input_mesh(domain)

@@ -61,7 +61,7 @@ class EdgeKeys:
     def find_edges(self, keys: npt.NDArray[np.int64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """Local edges whose keys are among `keys` (n, 2), ascending, and the row of each in `keys`."""
         local_keys, order = self._by_key
-        wanted = _one_number(keys)
+        wanted = _encode(keys)
         if not len(local_keys):
             return np.empty(0, np.int64), np.empty(0, np.int64)
         position = np.minimum(np.searchsorted(local_keys, wanted), len(local_keys) - 1)
@@ -73,7 +73,7 @@ class EdgeKeys:
     @cached_property
     def _by_key(self) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
         """(edges,) keys of owned and ghost edges as one number each, ascending, and the local edges in that order."""
-        keys = _one_number(self.of_edges(np.arange(len(self._edge_nodes))))
+        keys = _encode(self.of_edges(np.arange(len(self._edge_nodes))))
         order = np.argsort(keys)
         return keys[order], order
 
@@ -99,7 +99,7 @@ class EdgeKeys:
         return keys[order], rows[order]
 
 
-def _one_number(keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+def _encode(keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """(n,) keys (n, 2) as one 64-bit number each, which sort as the keys do."""
     return np.asarray((keys[:, 0] << 32) + keys[:, 1], np.int64)
 
@@ -176,7 +176,7 @@ class EdgeGraph:
         count = int(sum_over_ranks(self.domain.comm, np.count_nonzero(new[: self.edge_count]))[0])
         if count:
             self.integrity[new] = 0.0
-            self._note_broken(new)
+            self._mark_broken(new)
         return count
 
     def weaken(self, integrity: npt.NDArray[np.float64]) -> tuple[int, int]:
@@ -187,7 +187,7 @@ class EdgeGraph:
         reduced = np.minimum(self.integrity, min_over_ranks(self.index_map, integrity))
         less, new = reduced < self.integrity, (reduced == 0) & ~self.broken
         self.integrity[:] = reduced
-        self._note_broken(new)
+        self._mark_broken(new)
         self.damaged |= less[self.cell_edges].any(axis=1)
         counts = [np.count_nonzero(flags[: self.edge_count]) for flags in (new, less)]
         broken, weakened = sum_over_ranks(self.domain.comm, np.array(counts))
@@ -198,10 +198,10 @@ class EdgeGraph:
         self.integrity[:] = integrity
         self.broken[:], self.pattern[:] = False, 0
         self.split = self._searched_split = np.zeros(len(self.pattern), bool)
-        self._note_broken(self.integrity == 0)
+        self._mark_broken(self.integrity == 0)
         self.damaged[:] = (self.integrity[self.cell_edges] < 1).any(axis=1)
 
-    def _note_broken(self, new: npt.NDArray[np.bool_]) -> None:
+    def _mark_broken(self, new: npt.NDArray[np.bool_]) -> None:
         """Mark the flagged edges (edges,) as broken and update the patterns of their cells."""
         self.broken |= new
         touched = self.edge_cells(np.flatnonzero(new))

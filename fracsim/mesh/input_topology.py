@@ -11,7 +11,7 @@ from ..meshes.data import Indices, MeshData
 from ..meshes.topology import distinct_rows
 from .simplices import local_edges
 
-_NUMBERED: WeakKeyDictionary[MeshData, tuple[Indices, Indices]] = WeakKeyDictionary()
+_EDGE_NUMBERS: WeakKeyDictionary[MeshData, tuple[Indices, Indices]] = WeakKeyDictionary()
 
 
 class MeshTopology:
@@ -27,9 +27,9 @@ class MeshTopology:
 
     def __init__(self, mesh: MeshData) -> None:
         self.dim, self.points, self.cells = mesh.dim, mesh.points, mesh.cells
-        if mesh not in _NUMBERED:
-            _NUMBERED[mesh] = _numbered(mesh)
-        self.edges, self.cell_edges = _NUMBERED[mesh]
+        if mesh not in _EDGE_NUMBERS:
+            _EDGE_NUMBERS[mesh] = _number_edges(mesh)
+        self.edges, self.cell_edges = _EDGE_NUMBERS[mesh]
 
     def find_edges(self, keys: Indices) -> Indices:
         """(n,) numbers of the edges between pairs of nodes `keys` (n, 2), in either order; all edges exist."""
@@ -43,7 +43,7 @@ class MeshTopology:
         return flags
 
 
-def _numbered(mesh: MeshData) -> tuple[Indices, Indices]:
+def _number_edges(mesh: MeshData) -> tuple[Indices, Indices]:
     """(E, 2) distinct edges, and (C, k) the edges of each cell."""
     pairs = np.sort(mesh.cells[:, local_edges(mesh.dim)], axis=2).reshape(-1, 2)
     edges, _, inverse = distinct_rows(pairs)

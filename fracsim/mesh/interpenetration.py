@@ -14,28 +14,28 @@ Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
 
-def find_interpenetration(x: Values, cells: Ints, piece: Ints) -> tuple[int, int] | None:
+def find_interpenetration(x: Values, cells: Ints, fragment: Ints) -> tuple[int, int] | None:
     """The node that lies deepest inside a cell of another fragment, and that cell; None if there is none.
 
-    `x`: (N, d) current positions, m.    `cells`: (C, d + 1) the intact cells.    `piece`: (N,) fragment of each node.
+    `x`: (N, d) current positions, m.    `cells`: (C, d + 1) intact cells.    `fragment`: (N,) fragment of each node.
     """
-    of_cell = piece[cells[:, 0]]
-    nodes = np.argsort(piece, kind="stable")
-    names, start, count = np.unique(piece[nodes], return_index=True, return_counts=True)
+    cell_fragment = fragment[cells[:, 0]]
+    nodes = np.argsort(fragment, kind="stable")
+    names, start, count = np.unique(fragment[nodes], return_index=True, return_counts=True)
     if len(names) < 2:
         return None
     lower, upper = np.minimum.reduceat(x[nodes], start), np.maximum.reduceat(x[nodes], start)
-    small, large = _meeting(lower, upper, count)
+    small, large = _overlapping_boxes(lower, upper, count)
     if not len(small):
         return None
-    near = _inside_boxes(x[nodes], start, count, small, lower[large], upper[large])
-    holds = np.zeros(piece.max() + 1, bool)
+    near = _points_in_boxes(x[nodes], start, count, small, lower[large], upper[large])
+    holds = np.zeros(fragment.max() + 1, bool)
     holds[names[large]] = True
-    searched = np.flatnonzero(holds[of_cell])
+    searched = np.flatnonzero(holds[cell_fragment])
     node, cell = _candidates(x, nodes[near], cells[searched])
-    foreign = piece[node] != of_cell[searched[cell]]
+    foreign = fragment[node] != cell_fragment[searched[cell]]
     node, cell = node[foreign], searched[cell[foreign]]
-    depth = _depth(x, node, cells[cell])
+    depth = _min_barycentric(x, node, cells[cell])
     # least barycentric coordinate of a node that counts as inside: bodies that only touch do not interpenetrate
     if not len(depth) or depth.max() <= 0.05:
         return None
@@ -43,22 +43,22 @@ def find_interpenetration(x: Values, cells: Ints, piece: Ints) -> tuple[int, int
     return int(node[deepest]), int(cell[deepest])
 
 
-def _meeting(lower: Values, upper: Values, count: Ints) -> tuple[Ints, Ints]:
+def _overlapping_boxes(lower: Values, upper: Values, count: Ints) -> tuple[Ints, Ints]:
     """(k,), (k,) pairs of fragments whose bounding boxes overlap, the one with fewer nodes first."""
     pairs = []
     # four million pairs of boxes are compared at a time, which bounds memory
     rows = max(1, (1 << 22) // len(lower))
     for first in range(0, len(lower), rows):
         batch = slice(first, first + rows)
-        meets = ((lower[batch, None] < upper) & (lower < upper[batch, None])).all(axis=2)
-        i, j = np.nonzero(meets)
+        overlap = ((lower[batch, None] < upper) & (lower < upper[batch, None])).all(axis=2)
+        i, j = np.nonzero(overlap)
         pairs.append(np.stack([i + first, j])[:, i + first < j])
     i, j = np.concatenate(pairs, axis=1)
     fewer = count[i] <= count[j]
     return np.where(fewer, i, j), np.where(fewer, j, i)
 
 
-def _inside_boxes(x: Values, start: Ints, count: Ints, small: Ints, lower: Values, upper: Values) -> Ints:
+def _points_in_boxes(x: Values, start: Ints, count: Ints, small: Ints, lower: Values, upper: Values) -> Ints:
     """Points of the fragments `small` (k,) that lie in the boxes `lower`, `upper` (k, d) of their pairs."""
     counts = count[small]
     pair = np.repeat(np.arange(len(small)), counts)
@@ -85,7 +85,7 @@ def _candidates(x: Values, nodes: Ints, cells: Ints) -> tuple[Ints, Ints]:
     return nodes[pairs["i"][close]], cell[close]
 
 
-def _depth(x: Values, node: Ints, cells: Ints) -> Values:
+def _min_barycentric(x: Values, node: Ints, cells: Ints) -> Values:
     """(n,) minimum barycentric coordinate of each node in its cell; -1 in a cell without volume."""
     corners = x[cells]
     edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)

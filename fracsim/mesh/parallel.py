@@ -275,9 +275,9 @@ class Gather:
         """`input_index`: (n,) index in the input mesh of each entity that this rank owns."""
         self.comm = comm
         self.count = len(input_index)
-        pieces = gather(comm, np.ascontiguousarray(input_index))
-        self._counts = [len(piece) for piece in pieces] if pieces is not None else None
-        self._order = np.concatenate(pieces) if pieces is not None else None
+        parts = gather(comm, np.ascontiguousarray(input_index))
+        self._counts = [len(part) for part in parts] if parts is not None else None
+        self._order = np.concatenate(parts) if parts is not None else None
 
     def __call__(self, values: npt.NDArray[Any]) -> npt.NDArray[Any] | None:
         """(N, ...) rows of all ranks in input order on rank 0, None elsewhere; `values` (n, ...) of owned entities."""

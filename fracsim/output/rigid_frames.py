@@ -157,7 +157,7 @@ class InstanceSurface(BodySurface):
         for number in changed:
             self._dented[number] = points[number]
             self._instances[number] = build_split_surface(
-                self.skeleton.moved(points[number]), self._built_patterns[number]
+                self.skeleton.with_points(points[number]), self._built_patterns[number]
             )
         if changed:
             self._join()
@@ -179,7 +179,7 @@ class InstanceSurface(BodySurface):
         """See `BodySurface.replay_fragment_names`."""
         for t in times:
             broken = (broken_at <= t * (1 + 1e-12)).reshape(len(self._poses), -1)
-            components = [self.skeleton.pieces(edges) for edges in broken]
+            components = [self.skeleton.find_fragments(edges) for edges in broken]
             first = np.cumsum([0, *(count for count, _ in components)])
             fragment = np.concatenate([of_node + start for (_, of_node), start in zip(components, first, strict=False)])
             self._names.update(int(first[-1]), fragment, self.mass)

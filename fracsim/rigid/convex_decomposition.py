@@ -24,7 +24,7 @@ import numpy.typing as npt
 from scipy.spatial import ConvexHull, QhullError
 
 from ..forms.kinematics import SYMMETRIC_COMPONENTS
-from ..mesh.split_surface.polyhedron_moments import PolyhedronMoments, cones, moments
+from ..mesh.split_surface.polyhedron_moments import PolyhedronMoments, cone_volumes, moments
 from ..meshes.topology import components
 
 Ints = npt.NDArray[np.int64]
@@ -107,7 +107,7 @@ class Polyhedron:
         if count == 1:
             return self
         surface = part[self.triangles[:, 0]]
-        volume = np.bincount(surface, cones((self.points - self.points[0])[self.triangles]), count)
+        volume = np.bincount(surface, cone_volumes((self.points - self.points[0])[self.triangles]), count)
         # the surface of a cavity encloses a negative volume
         return Polyhedron.from_triangles(self.points, self.triangles[volume[surface] > 0])
 
@@ -123,7 +123,7 @@ class Polyhedron:
             hull = ConvexHull(self.points)
         except (QhullError, ValueError):
             return ConvexHullPart(self.points, 0.0, 0.0)
-        volume = float(cones((self.points - self.points[0])[self.triangles]).sum())
+        volume = float(cone_volumes((self.points - self.points[0])[self.triangles]).sum())
         return ConvexHullPart(self.points[hull.vertices], float(hull.area), max(float(hull.volume) - volume, 0.0))
 
     def cut_by_plane(self, point: Values, normal: Values) -> tuple[Polyhedron, Polyhedron]:

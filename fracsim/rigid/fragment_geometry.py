@@ -131,7 +131,7 @@ class FragmentGeometry:
 
     def _make_shapes(self, pattern: Patterns, cut: Values | None, number: int, points: Values) -> _InstanceShapes:
         """Return the shapes of an instance with patterns (C,) and nodes at `points` (N, 3)."""
-        surface = build_split_surface(self.numbering.moved(points), pattern, cut)
+        surface = build_split_surface(self.numbering.with_points(points), pattern, cut)
         fragment = surface.point_fragment[surface.elements[:, 0]]
         fragment_moments = moments(surface.points, surface.elements, fragment, surface.fragment_count)
         names = np.unique(surface.node_fragment, return_index=True)[1]

@@ -73,7 +73,7 @@ def open_at(
 def after(mesh: MeshData, opened: OpenedSurfaces) -> Broken:
     """The body with what a pass opened."""
     skeleton = EntityNumbering(mesh)
-    cut = skeleton.of_edges(opened.keys, opened.cut_positions)
+    cut = skeleton.edge_values(opened.keys, opened.cut_positions)
     broken = ~np.isnan(cut)
     bits = 1 << np.arange(skeleton.cell_edges.shape[1])
     made = build_split_surface(skeleton, broken[skeleton.cell_edges] @ bits, cut)
@@ -96,7 +96,7 @@ def scene_surface(scene: Scene) -> SplitSurface:
     assert scene.domain.input_mesh is not None
     skeleton, graph = EntityNumbering(scene.domain.input_mesh), scene.fracture.graph
     own = np.flatnonzero(graph.broken)
-    cut = skeleton.of_edges(graph.keys.of_edges(own), scene.fracture.criterion.cut_positions[own])
+    cut = skeleton.edge_values(graph.keys.of_edges(own), scene.fracture.criterion.cut_positions[own])
     pattern = scene.domain.input_numbering.gather_cells(graph.pattern)
     assert pattern is not None
     return build_split_surface(skeleton, pattern, cut)

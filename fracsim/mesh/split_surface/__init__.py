@@ -1,14 +1,17 @@
 """The split surface of a damaged body, for output and contact; the system of equations does not contain it.
 
-cut_patterns      what every damage pattern does to one cell, derived once; cells cut flat between pieces; solid: the
-                  surface of pieces alone; laid: all walls, those of pieces there
-entity_numbering  numbers of the edges, facets and boundary of the input mesh
-closed_surface    the points of a state of damage, numbered; damage -> points, elements and the parents of every point
-smooth_cuts       where edges are cut so that what is drawn is smooth
-local_surface     the surface of one rank's cells, whose points follow nodes linearly
-surface_map       the same points drawn in towards their nodes by any share; identity: which are the same after a
-                  break
-surface_motion    children follow parents: x = mean over p of x_p + R_p (X - X_p)
+entity_numbering    numbers of the edges, facets and boundary facets of a mesh
+cut_patterns        points and elements of one cell for each pattern of broken edges, also with planar cuts
+closed_surface      points, elements and parents of the split surface of a damaged mesh
+fragment_surface    the split surface with crack faces between fragments alone, for contact
+smooth_cuts         positions of cuts that give a smooth surface
+surface_motion      motion of points with their parents: x = mean over p of x_p + R_p (X - X_p)
+surface_map         linear map from nodal displacements to points, with shortened arms
+local_surface       the split surface of the cells of one rank, linear in the nodes
+quadratic_surface   the split surface of quadratic cells
+point_matching      points that are the same before and after edges break
+polyhedron_moments  volume, centre and second moments within closed surfaces
 
-Works on the arrays of a mesh on one rank, so that the surface is the same at any number of ranks.
+Except for local_surface the modules work on a whole mesh on one rank, so that the surface does not depend on the number
+of ranks.
 """

@@ -45,15 +45,15 @@ class SurfacePoints:
         self._of_node[nodes] = np.arange(len(nodes))
         row, owner = self._copies.expand(pattern)
         self._first = np.searchsorted(owner, np.arange(len(damaged)))  # first copy of each damaged cell
-        number, first_position = _numbered(self._keys(row, damaged[owner], owner))
+        number, first_position = _number_keys(self._keys(row, damaged[owner], owner))
         self._of_copy = np.append(number + len(nodes), -1)  # something to index where there is no copy
         row, cell = row[first_position], damaged[owner[first_position]]
         self.cell, self.kind, self.entity = cell, self._copies.kind[row], self._copies.entity[row]
         self.first, self.group = len(nodes), (group := self._copies.group[row])
         parents = np.concatenate([nodes, topology.cells[cell][group]])
         count = np.concatenate([np.ones(len(nodes), np.int64), group.sum(axis=1)])
-        self.positions: Values = np.concatenate([topology.points[nodes], self._places(row, cell)])
-        self.parents = PointParents.of(parents, count, self.positions, topology.points)
+        self.positions: Values = np.concatenate([topology.points[nodes], self._reference_positions(row, cell)])
+        self.parents = PointParents.from_positions(parents, count, self.positions, topology.points)
 
     def of_nodes(self, nodes: Ints) -> Ints:
         """Points of boundary nodes (2D: of any nodes); -1 for other nodes."""
@@ -85,7 +85,7 @@ class SurfacePoints:
 
     # --- reference positions ---
 
-    def _places(self, row: Ints, cell: Ints) -> Values:
+    def _reference_positions(self, row: Ints, cell: Ints) -> Values:
         topology, kind, entity = self._topology, self._copies.kind[row], self._copies.entity[row]
         result = np.empty((len(row), topology.dim))
         selected = kind == CutEntity.EDGE
@@ -110,9 +110,9 @@ class SurfacePoints:
         """Centroids, or the mean of the given cuts if there are two or more, so that a planar crack stays planar."""
         centre: Values = self._topology.points[nodes].mean(axis=1)
         if self._cut is not None:
-            placed = ~np.isnan(self._cut[edges])
-            selected = np.flatnonzero(placed.sum(axis=1) >= 2)
-            weight = placed[selected] / placed[selected].sum(axis=1, keepdims=True)
+            has_cut = ~np.isnan(self._cut[edges])
+            selected = np.flatnonzero(has_cut.sum(axis=1) >= 2)
+            weight = has_cut[selected] / has_cut[selected].sum(axis=1, keepdims=True)
             cuts = self._edge_points(edges[selected].ravel()).reshape(*edges[selected].shape, self._topology.dim)
             centre[selected] = np.einsum("ne,nei->ni", weight, cuts)
         return centre
@@ -124,7 +124,7 @@ def _facet_edges() -> Ints:
     return np.array([np.flatnonzero(np.all(local_edges(3) != facet, axis=1)) for facet in range(4)])
 
 
-def _numbered(keys: Ints) -> tuple[Ints, Ints]:
+def _number_keys(keys: Ints) -> tuple[Ints, Ints]:
     """The number of each key among the distinct keys, ascending, and the first position of each distinct key.
 
     By counting, since the keys are dense.
@@ -145,10 +145,14 @@ class SplitSurface:
         points: (n, d) reference coordinates, m: nodes of the mesh first (3D: of its boundary), then the copies.
         parents: the nodes that each point follows.
         elements: (m, d) triangles with normals outwards (3D) or segments with the body to their left (2D): closed.
-        cell: (m,) of the mesh. edge: (m,) whose breaking opened it, -1 on the boundary. origin: (m,) see Skeleton.
-        fill: (k, 3) triangles that cover the body in 2D, none in 3D; fill_cell: (k,).
-        broken: (E,) edges.
-        pieces, piece_of_node: how many, and (N,), numbered by their lowest node.
+        cell: (m,) cell of each element.
+        edge: (m,) edge whose breaking opened each element, -1 on the boundary.
+        origin: (m,) index into EntityNumbering.origins.
+        fill: (k, 3) triangles that cover the body in 2D; none in 3D.
+        fill_cell: (k,) cell of each of these triangles.
+        broken: (E,) flags of broken edges.
+        fragment_count: number of fragments.
+        node_fragment: (N,) fragment of each node; fragments are numbered by their lowest node.
     """
 
     points: Values
@@ -181,7 +185,7 @@ def build_split_surface(
     `table`: the table of patterns for a dimension.
     """
     rows = table if pattern.any() else intact_cell_table
-    return _Builder(topology, pattern, cut, rows(topology.dim))()
+    return _SurfaceBuilder(topology, pattern, cut, rows(topology.dim))()
 
 
 def build_surface_points(
@@ -192,7 +196,7 @@ def build_surface_points(
     return SurfacePoints(topology, damaged, pattern[damaged].astype(np.int64), None, table(topology.dim))
 
 
-class _Builder:
+class _SurfaceBuilder:
     """Builds the split surface; boundary facets of undamaged cells are elements as they are."""
 
     def __init__(
@@ -207,15 +211,24 @@ class _Builder:
         self.points = SurfacePoints(topology, self.damaged, self.pattern, cut, table)
 
     def __call__(self) -> SplitSurface:
-        parts = self._whole_facets(), self._torn_facets(), self._walls()
+        parts = self._undamaged_cell_facets(), self._damaged_cell_facets(), self._crack_faces()
         elements, cell, edge, origin = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        count, piece = self.topology.pieces(self.broken)
+        count, node_fragment = self.topology.find_fragments(self.broken)
         points = self.points
         return SplitSurface(
-            points.positions, points.parents, elements, cell, edge, origin, *self._fill(), self.broken, count, piece
+            points.positions,
+            points.parents,
+            elements,
+            cell,
+            edge,
+            origin,
+            *self._fill(),
+            self.broken,
+            count,
+            node_fragment,
         )
 
-    def _whole_facets(self) -> tuple[Ints, ...]:
+    def _undamaged_cell_facets(self) -> tuple[Ints, ...]:
         """(corners, cell, edge, origin) of boundary facets of undamaged cells."""
         boundary = self.topology.boundary
         selected = np.flatnonzero(self.place[boundary[:, 0]] < 0)
@@ -223,7 +236,7 @@ class _Builder:
         corners = self.points.of_nodes(boundary_corners(self.topology, selected))
         return corners, cell, np.full(len(selected), -1), self.topology.origin[selected]
 
-    def _torn_facets(self) -> tuple[Ints, ...]:
+    def _damaged_cell_facets(self) -> tuple[Ints, ...]:
         """(corners, cell, edge, origin) of boundary facets of damaged cells."""
         cell, facet = self.topology.boundary.T
         selected = np.flatnonzero(self.place[cell] >= 0)
@@ -232,7 +245,7 @@ class _Builder:
         corners, owner, edge = self._expand(self.table.facets, key, damaged_index)
         return corners, cell[selected[owner]], edge, self.topology.origin[selected[owner]]
 
-    def _walls(self) -> tuple[Ints, ...]:
+    def _crack_faces(self) -> tuple[Ints, ...]:
         """(corners, cell, edge, origin) of crack faces, both sides."""
         corners, owner, edge = self._expand(self.table.crack_faces, self.pattern, np.arange(len(self.damaged)))
         cell = self.damaged[owner]

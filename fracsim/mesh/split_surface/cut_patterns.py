@@ -131,10 +131,10 @@ def tabulate(kind: type[CutCell], dim: int, patterns: int | None = None) -> CutT
     cells = [kind(dim, pattern) for pattern in range(patterns or 1 << len(local_edges(dim)))]
     nodes = range(dim + 1)
     return CutTable(
-        _copies(cells, dim),
-        _elements([(cell, cell.crack_faces) for cell in cells], dim),
-        _elements([(cell, cell.boundary(facet)) for cell in cells for facet in nodes], dim),
-        _elements([(cell, cell.fan(cell.T, (0, 1, 2)) if dim == 2 else []) for cell in cells], 3),
+        _copy_rows(cells, dim),
+        _element_rows([(cell, cell.crack_faces) for cell in cells], dim),
+        _element_rows([(cell, cell.boundary(facet)) for cell in cells for facet in nodes], dim),
+        _element_rows([(cell, cell.fan(cell.cell_copy, (0, 1, 2)) if dim == 2 else []) for cell in cells], 3),
     )
 
 
@@ -160,41 +160,41 @@ class CutCell:
             connected |= new
         return tuple(sorted(connected))
 
-    def m(self, i: int, j: int) -> PatternPoint:
+    def edge_copy(self, i: int, j: int) -> PatternPoint:
         """The copy of the point of edge ij that follows i."""
         return PatternPoint(CutEntity.EDGE, self.edge[frozenset((i, j))], (i,))
 
-    def G(self, facet: int, i: int) -> PatternPoint:
+    def facet_copy(self, facet: int, i: int) -> PatternPoint:
         """The copy of the point of a facet that follows the group of i."""
         return PatternPoint(CutEntity.FACET, facet, self.group(set(range(self.dim + 1)) - {facet}, i))
 
-    def T(self, i: int) -> PatternPoint:
+    def cell_copy(self, i: int) -> PatternPoint:
         """The copy of the point of the cell that follows the group of i."""
         return PatternPoint(CutEntity.CELL, 0, self.group(range(self.dim + 1), i))
 
     def _crack_faces(self) -> list[Element]:
-        return [element for i, j, *remaining in _turned(self.dim) for element in self._crack_face(i, j, remaining)]
+        return [element for i, j, *remaining in _node_orders(self.dim) for element in self._crack_face(i, j, remaining)]
 
     def _crack_face(self, i: int, j: int, remaining: list[int]) -> list[Element]:
         """The crack face towards j on the side of i, with its normal out of the part of i."""
         if not self.broken(i, j):
             return []
-        m, T, edge = self.m(i, j), self.T(i), self.edge[frozenset((i, j))]
+        m, T, edge = self.edge_copy(i, j), self.cell_copy(i), self.edge[frozenset((i, j))]
         if self.dim == 2:  # the part of i lies to the left
-            return [((m, T) if sign((i, j, *remaining)) > 0 else (T, m), edge)]
+            return [((m, T) if permutation_sign((i, j, *remaining)) > 0 else (T, m), edge)]
         k, last = remaining
-        return [((m, self.G(last, i), T), edge), ((m, T, self.G(k, i)), edge)]
+        return [((m, self.facet_copy(last, i), T), edge), ((m, T, self.facet_copy(k, i)), edge)]
 
     def boundary(self, facet: int) -> list[Element]:
         """The elements of a boundary facet: the facet itself if it has no broken edge, so that no T-junction arises."""
         loop = [node for node in range(self.dim + 1) if node != facet]
         loop = loop if facet % 2 == 0 else [loop[1], loop[0], *loop[2:]]
         if self.dim == 3:
-            return self.fan(lambda i: self.G(facet, i), tuple(loop))
+            return self.fan(lambda i: self.facet_copy(facet, i), tuple(loop))
         a, b = loop
         if not self.broken(a, b):
             return [((a, b), -1)]
-        return [((a, self.m(a, b)), -1), ((self.m(b, a), b), -1)]
+        return [((a, self.edge_copy(a, b)), -1), ((self.edge_copy(b, a), b), -1)]
 
     def fan(self, centre: Callable[[int], PatternPoint], loop: tuple[int, ...]) -> list[Element]:
         """The elements of a triangle: itself if its edges are intact, else a fan around the copies of its centre."""
@@ -204,45 +204,45 @@ class CutCell:
         triangles: list[tuple[Corner, ...]] = []
         for i, j in sides:
             if self.broken(i, j):
-                triangles += [(centre(i), i, self.m(i, j)), (centre(j), self.m(j, i), j)]
+                triangles += [(centre(i), i, self.edge_copy(i, j)), (centre(j), self.edge_copy(j, i), j)]
             else:
                 triangles += [(centre(i), i, j)]
         return [(triangle, -1) for triangle in triangles]
 
 
 @cache
-def _turned(dim: int) -> list[tuple[int, ...]]:
+def _node_orders(dim: int) -> list[tuple[int, ...]]:
     """Permutations (i, j, ...) of the nodes, one for each ordered pair: in 3D the even permutations."""
-    return [order for order in permutations(range(dim + 1)) if dim == 2 or sign(order) > 0]
+    return [order for order in permutations(range(dim + 1)) if dim == 2 or permutation_sign(order) > 0]
 
 
-def sign(order: tuple[int, ...]) -> int:
+def permutation_sign(order: tuple[int, ...]) -> int:
     """Sign of a permutation, 1 or -1."""
     swaps = sum(order[a] > order[b] for a in range(len(order)) for b in range(a + 1, len(order)))
     return -1 if swaps % 2 else 1
 
 
-def _copies(cells: list[CutCell], dim: int) -> PatternPoints:
+def _copy_rows(cells: list[CutCell], dim: int) -> PatternPoints:
     rows = [copy for cell in cells for copy in cell.copies]
     group = np.zeros((len(rows), dim + 1), bool)
     for row, copy in zip(group, rows, strict=True):
         row[list(copy.group)] = True
     kind, entity = (np.array([copy[field] for copy in rows], np.int64) for field in (0, 1))
-    return PatternPoints(_starts([cell.copies for cell in cells]), kind, entity, group.argmax(axis=1), group)
+    return PatternPoints(_row_starts([cell.copies for cell in cells]), kind, entity, group.argmax(axis=1), group)
 
 
-def _elements(lists: list[tuple[CutCell, list[Element]]], width: int) -> PatternElements:
+def _element_rows(lists: list[tuple[CutCell, list[Element]]], width: int) -> PatternElements:
     corners, edges = [], []
     for cell, elements in lists:
         index = {copy: number for number, copy in enumerate(cell.copies)}
         for element, edge in elements:
             corners.append([index[corner] if isinstance(corner, PatternPoint) else -1 - corner for corner in element])
             edges.append(edge)
-    start = _starts([elements for _, elements in lists])
+    start = _row_starts([elements for _, elements in lists])
     return PatternElements(start, np.array(corners, np.int64).reshape(-1, width), np.array(edges, np.int64))
 
 
-def _starts(lists: list[list[Element]] | list[list[PatternPoint]]) -> Ints:
+def _row_starts(lists: list[list[Element]] | list[list[PatternPoint]]) -> Ints:
     return np.concatenate([[0], np.cumsum([len(rows) for rows in lists])]).astype(np.int64)
 
 
@@ -263,19 +263,19 @@ class PlanarCutCell(CutCell):
     def _crack_faces(self) -> list[Element]:
         nodes = range(self.dim + 1)
         parts = sorted({self.group(nodes, i) for i in nodes})
-        faces = [corners for part in parts if len(part) < len(nodes) for corners in self._around(part)]
+        faces = [corners for part in parts if len(part) < len(nodes) for corners in self._faces_around(part)]
         return [(corners, min(corner.entity for corner in corners)) for corners in faces]
 
-    def _around(self, part: tuple[int, ...]) -> list[tuple[PatternPoint, ...]]:
+    def _faces_around(self, part: tuple[int, ...]) -> list[tuple[PatternPoint, ...]]:
         """The elements between `part` and the other nodes, with normals out of `part`."""
-        part, complement = _ordered(part, tuple(node for node in range(self.dim + 1) if node not in part))
+        part, complement = _in_even_order(part, tuple(node for node in range(self.dim + 1) if node not in part))
         if len(part) == 1:
-            return [tuple(self.m(part[0], node) for node in complement)]
+            return [tuple(self.edge_copy(part[0], node) for node in complement)]
         if len(complement) == 1:
-            return [tuple(self.m(node, complement[0]) for node in (part if self.dim == 3 else part[::-1]))]
+            return [tuple(self.edge_copy(node, complement[0]) for node in (part if self.dim == 3 else part[::-1]))]
         (i, j), (k, last) = part, complement
-        a, b, c, d = self.m(i, k), self.m(i, last), self.m(j, last), self.m(j, k)
-        return [(a, b, c), (a, c, d)]  # the same diagonal from both sides: see middles
+        a, b, c, d = self.edge_copy(i, k), self.edge_copy(i, last), self.edge_copy(j, last), self.edge_copy(j, k)
+        return [(a, b, c), (a, c, d)]  # the same diagonal from both sides: see face_centre_weights
 
     def fan(self, centre: Callable[[int], PatternPoint], loop: tuple[int, ...]) -> list[Element]:
         """The elements of a triangle, without a point at its centre."""
@@ -283,14 +283,14 @@ class PlanarCutCell(CutCell):
         turns = [loop, (*loop[1:], loop[0]), (*loop[2:], *loop[:2])]
         for a, b, c in turns:
             if self.broken(a, b) and self.broken(a, c):
-                corners.append((a, self.m(a, b), self.m(a, c)))
+                corners.append((a, self.edge_copy(a, b), self.edge_copy(a, c)))
                 if not self.broken(b, c):
-                    corners += [(self.m(b, a), b, c), (self.m(b, a), c, self.m(c, a))]
+                    corners += [(self.edge_copy(b, a), b, c), (self.edge_copy(b, a), c, self.edge_copy(c, a))]
         return [(element, -1) for element in corners or [loop]]
 
 
 @cache
-def middles(dim: int) -> npt.NDArray[np.float64]:
+def face_centre_weights(dim: int) -> npt.NDArray[np.float64]:
     """(2^(d+1), 2^(d+1), d + 1, d + 1) weights of the edge points ij in the centre of the face between two groups.
 
     The first two indices are the groups of nodes of a cell or facet, as bits; i is in the first, j in the second group.
@@ -304,18 +304,18 @@ def middles(dim: int) -> npt.NDArray[np.float64]:
         pairs = list(product(first, second))
         # a quadrilateral is two triangles: the centre is the middle of their common side
         if len(first) == len(second) == 2:
-            pairs = list(zip(*_ordered(first, second), strict=True))
+            pairs = list(zip(*_in_even_order(first, second), strict=True))
         for i, j in pairs:
             result[first_bits, second_bits, i, j] = 1 / len(pairs)
     return result
 
 
-def _ordered(part: tuple[int, ...], complement: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+def _in_even_order(part: tuple[int, ...], complement: tuple[int, ...]) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """The two groups, with two nodes exchanged if part + complement is an odd permutation."""
-    if sign(part + complement) > 0:
+    if permutation_sign(part + complement) > 0:
         return part, complement
-    return (part, _swapped(complement)) if len(complement) > 1 else (_swapped(part), complement)
+    return (part, _swap_first_two(complement)) if len(complement) > 1 else (_swap_first_two(part), complement)
 
 
-def _swapped(nodes: tuple[int, ...]) -> tuple[int, ...]:
+def _swap_first_two(nodes: tuple[int, ...]) -> tuple[int, ...]:
     return nodes[1], nodes[0], *nodes[2:]

@@ -37,7 +37,7 @@ class EntityNumbering(MeshTopology):
         self.boundary = np.argwhere(counts[self.cell_facets] == 1)
         self.origins, self.origin = _origins(mesh, self.facets[self.cell_facets[tuple(self.boundary.T)]])
 
-    def moved(self, points: Values) -> EntityNumbering:
+    def with_points(self, points: Values) -> EntityNumbering:
         """The same topology with nodes at `points` (N, d), m."""
         if points is self.points:
             return self
@@ -52,7 +52,7 @@ class EntityNumbering(MeshTopology):
         on_boundary[self.facets[self.cell_facets[tuple(self.boundary.T)]]] = True
         return np.flatnonzero(on_boundary)
 
-    def of_edges(self, keys: Ints, values: Values) -> Values:
+    def edge_values(self, keys: Ints, values: Values) -> Values:
         """(E,) values of the edges between pairs of nodes `keys` (n, 2), NaN for all other edges."""
         result = np.full(len(self.edges), np.nan)
         result[self.find_edges(keys)] = values
@@ -66,7 +66,7 @@ class EntityNumbering(MeshTopology):
         broken[self.cell_edges[damaged][(pattern[damaged, None] >> bits) & 1 == 1]] = True
         return broken
 
-    def pieces(self, broken: npt.NDArray[np.bool_]) -> tuple[int, Ints]:
+    def find_fragments(self, broken: npt.NDArray[np.bool_]) -> tuple[int, Ints]:
         """The number of fragments, and (N,) the fragment of each node; `broken` (E,). Numbered by their lowest node."""
         return components(self.edges[~broken], len(self.points))
 

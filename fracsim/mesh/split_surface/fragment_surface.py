@@ -16,10 +16,10 @@ from scipy.sparse import csr_matrix, eye_array
 
 from ..simplices import is_split, local_edges
 from .closed_surface import SplitSurface, SurfacePoints, build_split_surface, build_surface_points
-from .cut_patterns import CutEntity, middles, planar_cut_table
+from .cut_patterns import CutEntity, face_centre_weights, planar_cut_table
 from .entity_numbering import EntityNumbering
 from .smooth_cuts import CUTS
-from .surface_map import SurfaceMap, whole
+from .surface_map import SurfaceMap, make_surface_map
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -67,8 +67,8 @@ def find_open_edges(topology: EntityNumbering, pattern: Patterns) -> tuple[Flags
     loose[topology.cells[pattern == 0]] = False
     ends = topology.edges
     cut = topology.broken_edges(pattern) | loose[ends].any(axis=1)
-    _, piece = topology.pieces(cut)
-    return cut & (piece[ends[:, 0]] != piece[ends[:, 1]]), loose, piece
+    _, node_fragment = topology.find_fragments(cut)
+    return cut & (node_fragment[ends[:, 0]] != node_fragment[ends[:, 1]]), loose, node_fragment
 
 
 def patterns_with_broken(topology: EntityNumbering, broken: Flags) -> Patterns:
@@ -86,43 +86,43 @@ def project_onto_fragments(
     Points of loose nodes are not projected.
     """
     drawn = build_surface_points(topology, pattern)
-    points, mean, cracked = _on_flat(topology, pattern, drawn)
-    surface_map = surface_map.projected_onto(points[~cracked], mean[~cracked], flat)
+    points, mean, cracked = _planar_means(topology, pattern, drawn)
+    surface_map = surface_map.project_onto(points[~cracked], mean[~cracked], flat)
     if not cracked.any():
         return surface_map
     positions, beside = drawn.positions.copy(), points[cracked]
     positions[beside] = mean[cracked] @ flat.rest
-    return surface_map.projected_onto(
-        beside, eye_array(len(positions), format="csr")[beside], whole(drawn, topology, pattern, positions)
+    return surface_map.project_onto(
+        beside, eye_array(len(positions), format="csr")[beside], make_surface_map(drawn, topology, pattern, positions)
     )
 
 
-def _on_flat(
+def _planar_means(
     topology: EntityNumbering, pattern: npt.NDArray[np.integer], drawn: SurfacePoints
 ) -> tuple[Ints, csr_matrix, Flags]:
     """Points (k,) of `drawn` on crack faces between fragments, and their means of points of the planar surface.
 
     Also returns (k, m) the matrix of the means, and (k,) flags of points beside a crack within the fragment.
     """
-    apart, loose, piece = find_open_edges(topology, pattern)
+    apart, loose, node_fragment = find_open_edges(topology, pattern)
     flat = build_surface_points(topology, patterns_with_broken(topology, apart), planar_cut_table)
     node = topology.cells[drawn.cell]
     lead = node[np.arange(len(node)), drawn.group.argmax(axis=1)]
-    same_fragment = np.where(loose[node], -1, piece[node]) == piece[lead][:, None]
-    within = _within(drawn, topology.dim)
+    same_fragment = np.where(loose[node], -1, node_fragment[node]) == node_fragment[lead][:, None]
+    within = _entity_nodes(drawn, topology.dim)
     same_side, opposite = within & same_fragment, within & ~same_fragment
     between = np.flatnonzero(opposite.any(axis=1) & ~loose[lead])
     bits = 1 << np.arange(topology.dim + 1)
-    share = middles(topology.dim)[same_side[between] @ bits, opposite[between] @ bits]
+    share = face_centre_weights(topology.dim)[same_side[between] @ bits, opposite[between] @ bits]
     row, i, j = np.nonzero(share)
     ends = np.stack([node[between[row], i], node[between[row], j]], axis=1)
-    column = flat.first + np.searchsorted(_keys(topology, flat), _key(topology, ends))
+    column = flat.first + np.searchsorted(_planar_point_keys(topology, flat), _edge_end_keys(topology, ends))
     shape = len(between), len(flat.positions)
     cracked = (drawn.group != same_side)[between].any(axis=1)
     return drawn.first + between, csr_matrix((share[row, i, j], (row, column)), shape=shape), cracked
 
 
-def _within(points: SurfacePoints, dim: int) -> Flags:
+def _entity_nodes(points: SurfacePoints, dim: int) -> Flags:
     """(copies, d + 1) flags of the nodes of the edge, facet or cell that each point is the centre of."""
     result = np.ones(points.group.shape, bool)
     selected = np.flatnonzero(points.kind == CutEntity.FACET)
@@ -133,14 +133,14 @@ def _within(points: SurfacePoints, dim: int) -> Flags:
     return result
 
 
-def _keys(topology: EntityNumbering, flat: SurfacePoints) -> Ints:
+def _planar_point_keys(topology: EntityNumbering, flat: SurfacePoints) -> Ints:
     """(copies,) keys of the points, which all lie on edges, ascending."""
     edge = topology.cell_edges[flat.cell, flat.entity]
     end = topology.cells[flat.cell, flat.group.argmax(axis=1)]
     return np.asarray(2 * edge + (end == topology.edges[edge, 1]))
 
 
-def _key(topology: EntityNumbering, ends: Ints) -> Ints:
+def _edge_end_keys(topology: EntityNumbering, ends: Ints) -> Ints:
     """(k,) keys of the points of the edges between nodes `ends` (k, 2) that follow the first end."""
     edge = topology.find_edges(ends)
     return np.asarray(2 * edge + (ends[:, 0] == topology.edges[edge, 1]))

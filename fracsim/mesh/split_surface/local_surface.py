@@ -27,7 +27,7 @@ from ..simplices import is_split
 from .closed_surface import SplitSurface, build_split_surface
 from .entity_numbering import CRACK, EntityNumbering
 from .point_matching import point_identity
-from .surface_map import SurfaceMap, gradient_entries, middles
+from .surface_map import SurfaceMap, gradient_entries, mean_parent_positions
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -38,14 +38,14 @@ class LocalSurface:
     """Points of the split surface of the cells of this rank.
 
     Attributes:
-        at: map from nodal displacements to the n points.
+        point_map: map from nodal displacements to the n points.
         area: (n,) area of each point, m^2 (2D: length, m).
-        columns: global numbers of the nodes in the columns of the weights of `at`.
+        columns: global numbers of the nodes in the columns of the weights of `point_map`.
     """
 
     def __init__(self, domain: Domain) -> None:
         self._domain = domain
-        mesh = _mesh_of(domain)
+        mesh = _local_mesh(domain)
         self._topology = EntityNumbering(mesh)
         self.update_damage(np.zeros(len(mesh.cells), np.uint8))
 
@@ -59,20 +59,20 @@ class LocalSurface:
         area = _areas(surface, self._topology)
         self._contact_points = np.flatnonzero(area > 0)
         self.area, self._split_surface = area[self._contact_points], surface
-        means = self._means(surface)
+        means = self._mean_matrix(surface)
         turning = self._domain.comm.allreduce(len(surface.parents.rotating_nodes)) > 0
-        arms = self._arms(surface, pattern) if turning else csr_matrix(means.shape)
-        self.columns, (means, arms) = _on_columns([means, arms])
-        middle = middles(surface.points, surface.parents)[self._contact_points]
+        arms = self._arm_matrix(surface, pattern) if turning else csr_matrix(means.shape)
+        self.columns, (means, arms) = _restrict_to_used_columns([means, arms])
+        middle = mean_parent_positions(surface.points, surface.parents)[self._contact_points]
         out = surface.points[self._contact_points] - middle
-        self.at = SurfaceMap(means, middle, arms, out)
+        self.point_map = SurfaceMap(means, middle, arms, out)
 
-    def identity(self, points: Ints | None = None) -> Values:
-        """(k, 2 d + 1) rows that identify `points` (k,), by default `at.copies`, as edges break.
+    def identify_points(self, points: Ints | None = None) -> Values:
+        """(k, 2 d + 1) rows that identify `points` (k,), by default `point_map.copies`, as edges break.
 
         See point_matching.point_identity.
         """
-        domain, which = self._domain, self.at.copies if points is None else points
+        domain, which = self._domain, self.point_map.copies if points is None else points
         return point_identity(
             self._split_surface, self._contact_points[which], domain.input_numbering.nodes, domain.bounds.diagonal
         )
@@ -83,44 +83,48 @@ class LocalSurface:
         real = measure > 0
         return np.searchsorted(self._contact_points, elements[real]), measure[real]
 
-    def _means(self, surface: SplitSurface) -> csr_matrix:
+    def _mean_matrix(self, surface: SplitSurface) -> csr_matrix:
         """(points, global nodes) matrix of the means over the parents of each point."""
         start, entries = _parents_of(surface, self._contact_points)
-        return self._wide(start, self._global(surface.parents.parents[entries]), _shares(start))
+        return self._global_matrix(start, self._global_numbers(surface.parents.parents[entries]), _shares(start))
 
-    def _arms(self, surface: SplitSurface, pattern: npt.NDArray[np.uint8]) -> csr_matrix:
+    def _arm_matrix(self, surface: SplitSurface, pattern: npt.NDArray[np.uint8]) -> csr_matrix:
         """(points, global nodes) matrix of the means over parents of arm times averaged gradient (collective)."""
         comm, d = self._domain.comm, self._domain.dim
         start, entries = _parents_of(surface, self._contact_points)
         parents, arm = surface.parents.parents[entries], surface.parents.arm[entries]
-        arms = self._wide(d * start, _by_axis(self._global(parents), d), (_shares(start)[:, None] * arm).reshape(-1), d)
+        arms = self._global_matrix(
+            d * start, _by_axis(self._global_numbers(parents), d), (_shares(start)[:, None] * arm).reshape(-1), d
+        )
         count = arms.shape[0]
-        left = _assembled(comm, (count, d * self._domain.node_count), arms, rank_offset(comm, count) + np.arange(count))
-        right = self._gradients(pattern, parents[np.any(arm != 0, axis=1)])
+        left = _assemble_petsc(
+            comm, (count, d * self._domain.node_count), arms, rank_offset(comm, count) + np.arange(count)
+        )
+        right = self._gradient_matrix(pattern, parents[np.any(arm != 0, axis=1)])
         product = left.matMult(right)
         rows, nodes, values = product.getValuesCSR()
         for matrix in (left, right, product):
             matrix.destroy()
-        return self._wide(rows, nodes, values)
+        return self._global_matrix(rows, nodes, values)
 
-    def _gradients(self, pattern: npt.NDArray[np.uint8], parents: Ints) -> PETSc.Mat:
+    def _gradient_matrix(self, pattern: npt.NDArray[np.uint8], parents: Ints) -> PETSc.Mat:
         """(d nodes, nodes) matrix of d/dX_j of a nodal field, averaged over intact cells (collective).
 
         Rows are right for nodes that are among the `parents` of any rank.
         """
         domain, d = self._domain, self._domain.dim
-        wanted = self._summed(parents, 1.0) > 0
+        wanted = self._sum_over_ranks(parents, 1.0) > 0
         cells = np.flatnonzero(~is_split(d)[pattern] & wanted[domain.cell_nodes].any(axis=1))
         corners, volume = domain.cell_nodes[cells].astype(np.int64), domain.volumes[cells][:, None]
         # sums at other nodes lack cells: their rows are not used
-        around = np.maximum(self._summed(corners, volume), np.finfo(float).tiny)
+        around = np.maximum(self._sum_over_ranks(corners, volume), np.finfo(float).tiny)
         rows, columns, values = gradient_entries(domain.nodes[corners], volume / around[corners], corners)
-        nodes = self._global(np.arange(len(domain.nodes)))
+        nodes = self._global_numbers(np.arange(len(domain.nodes)))
         shape = d * len(nodes), self._domain.space.dofmap.index_map.size_global
         entries = csr_matrix((values, (rows, nodes[columns])), shape=shape)
-        return _assembled(domain.comm, (d * domain.node_count, domain.node_count), entries, _by_axis(nodes, d))
+        return _assemble_petsc(domain.comm, (d * domain.node_count, domain.node_count), entries, _by_axis(nodes, d))
 
-    def _summed(self, nodes: Ints, values: Values | float) -> Values:
+    def _sum_over_ranks(self, nodes: Ints, values: Values | float) -> Values:
         """(nodes,) sums over all ranks of `values` at `nodes` (collective)."""
         result = la.vector(self._domain.space.dofmap.index_map, 1, np.float64)
         weights = np.broadcast_to(values, nodes.shape).reshape(-1)
@@ -129,16 +133,16 @@ class LocalSurface:
         result.scatter_forward()
         return np.asarray(result.array)
 
-    def _global(self, nodes: Ints) -> Ints:
+    def _global_numbers(self, nodes: Ints) -> Ints:
         return self._domain.space.dofmap.index_map.local_to_global(nodes.astype(np.int32)).astype(np.int64)
 
-    def _wide(self, start: Ints, columns: Ints, values: Values, width: int = 1) -> csr_matrix:
+    def _global_matrix(self, start: Ints, columns: Ints, values: Values, width: int = 1) -> csr_matrix:
         """Sparse matrix with `width` columns for each global node."""
         shape = len(start) - 1, width * self._domain.space.dofmap.index_map.size_global
         return csr_matrix((values, columns, start), shape=shape)
 
 
-def _assembled(comm: MPI.Comm, owned: tuple[int, int], rows: csr_matrix, number: Ints) -> PETSc.Mat:
+def _assemble_petsc(comm: MPI.Comm, owned: tuple[int, int], rows: csr_matrix, number: Ints) -> PETSc.Mat:
     """PETSc matrix with `owned` rows and columns on this rank: the sum of the `rows` of all ranks (collective).
 
     `number`: global number of each row.
@@ -155,7 +159,7 @@ def _assembled(comm: MPI.Comm, owned: tuple[int, int], rows: csr_matrix, number:
     return matrix
 
 
-def _mesh_of(domain: Domain) -> MeshData:
+def _local_mesh(domain: Domain) -> MeshData:
     """The cells of this rank as a mesh, with the boundary facets of the body as group OUTSIDE."""
     exterior = domain.facets.boundary
     geometry = dolfinx.mesh.entities_to_geometry(domain.mesh, domain.dim - 1, exterior)
@@ -201,7 +205,7 @@ def _by_axis(numbers: Ints, d: int) -> Ints:
     return (d * numbers[:, None] + np.arange(d)).reshape(-1)
 
 
-def _on_columns(matrices: list[csr_matrix]) -> tuple[Ints, list[csr_matrix]]:
+def _restrict_to_used_columns(matrices: list[csr_matrix]) -> tuple[Ints, list[csr_matrix]]:
     """The columns that have entries, and the matrices restricted to them."""
     used = np.zeros(matrices[0].shape[1], bool)
     for matrix in matrices:
@@ -233,9 +237,9 @@ class ParentMatrix:
 
     def __call__(self, owned: Values) -> Values:
         """(n, d) values at the points of a field with `owned` dofs (collective)."""
-        return np.asarray(self._surface.at.weights @ self.nodal(owned))
+        return np.asarray(self._surface.point_map.weights @ self.nodal_values(owned))
 
-    def nodal(self, owned: Values) -> Values:
+    def nodal_values(self, owned: Values) -> Values:
         """(columns, d) values of a field at the nodes in the columns (collective)."""
         self._nodes.array_w[:] = owned
         self._scatter.scatter(self._nodes, self._local, PETSc.InsertMode.INSERT, PETSc.ScatterMode.FORWARD)
@@ -243,9 +247,9 @@ class ParentMatrix:
 
     def assemble_to_nodes(self, forces: Values) -> Values:
         """(owned dofs,) nodal forces equivalent to `forces` (n, d) at the points, N (collective)."""
-        return self.summed(self._surface.at.weights.T @ forces)
+        return self.sum_at_nodes(self._surface.point_map.weights.T @ forces)
 
-    def summed(self, parts: Values) -> Values:
+    def sum_at_nodes(self, parts: Values) -> Values:
         """(owned dofs,) sums over ranks of `parts` (columns, d) at the nodes in the columns (collective)."""
         self._local.array_w[:] = parts.reshape(-1)
         self._nodes.set(0.0)

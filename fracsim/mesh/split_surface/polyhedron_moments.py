@@ -43,7 +43,7 @@ class PolyhedronMoments:
         return trace if self.second.shape[1] == 2 else trace * np.eye(3) - self.second
 
 
-def cones(x: Values) -> Values:
+def cone_volumes(x: Values) -> Values:
     """(m,) signed volumes of the cones from the origin over elements with corners (m, d, d)."""
     if x.shape[2] == 2:
         return np.asarray(x[:, 0, 0] * x[:, 1, 1] - x[:, 0, 1] * x[:, 1, 0]) / 2

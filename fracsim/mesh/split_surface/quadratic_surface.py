@@ -48,7 +48,7 @@ def with_midside_points(surface: SplitSurface, domain: Domain, pattern: npt.NDAr
     parent = surface.parents.first_parent
     between = _midside_nodes(domain, cell, parent[facets[:, i]], parent[facets[:, j]])
     nodes, number = np.unique(between, return_inverse=True)
-    smaller = _divided(_between(facets, len(surface.points) + number.reshape(between.shape)))
+    smaller = _subdivide(_node_table(facets, len(surface.points) + number.reshape(between.shape)))
     unchanged, parts = ~on_boundary, len(SUBDIVISION[domain.dim - 1])
     count = np.concatenate([np.diff(surface.parents.start), np.ones(len(nodes), np.int64)])
     points = np.concatenate([surface.points, domain.nodes[nodes]])
@@ -56,7 +56,7 @@ def with_midside_points(surface: SplitSurface, domain: Domain, pattern: npt.NDAr
     return replace(
         surface,
         points=points,
-        parents=PointParents.of(parents, count, points, domain.nodes),
+        parents=PointParents.from_positions(parents, count, points, domain.nodes),
         elements=np.concatenate([surface.elements[unchanged], smaller]),
         cell=np.concatenate([surface.cell[unchanged], np.repeat(cell, parts)]),
         edge=np.concatenate([surface.edge[unchanged], np.full(len(smaller), -1)]),
@@ -74,7 +74,7 @@ def _midside_nodes(domain: Domain, cell: Ints, low: Ints, high: Ints) -> Ints:
     )
 
 
-def refined_input(domain: Domain) -> MeshData | None:
+def subdivided_input_mesh(domain: Domain) -> MeshData | None:
     """The input mesh on rank 0, None elsewhere; for quadratic displacement its cells are divided, without groups.
 
     Its points are numbered by `Domain.input_numbering.nodes`.
@@ -82,11 +82,11 @@ def refined_input(domain: Domain) -> MeshData | None:
     if domain.midside_nodes is None or domain.input_mesh is None:
         return domain.input_mesh
     whole = with_midside_nodes(domain.input_mesh, domain.midside_nodes, written=False)
-    cells = _divided(_between(*np.split(whole.cells, [domain.dim + 1], axis=1)))
+    cells = _subdivide(_node_table(*np.split(whole.cells, [domain.dim + 1], axis=1)))
     return MeshData(whole.points, orient_cells(whole.points, cells)[0])
 
 
-def _between(corners: npt.NDArray[np.integer], middles: npt.NDArray[np.integer]) -> Ints:
+def _node_table(corners: npt.NDArray[np.integer], middles: npt.NDArray[np.integer]) -> Ints:
     """(cells, d + 1, d + 1) corner i of each cell at (i, i), the midside node of edge ij at (i, j)."""
     count = corners.shape[1]
     result = np.empty((len(corners), count, count), np.int64)
@@ -96,7 +96,7 @@ def _between(corners: npt.NDArray[np.integer], middles: npt.NDArray[np.integer])
     return result
 
 
-def _divided(between: Ints) -> Ints:
+def _subdivide(between: Ints) -> Ints:
     """(cells 2^d, d + 1) nodes of the parts of all simplices, in the order of the simplices."""
     parts = np.array(SUBDIVISION[between.shape[1] - 1])  # (2^d, d + 1, 2)
     return between[:, parts[..., 0], parts[..., 1]].reshape(-1, between.shape[1])

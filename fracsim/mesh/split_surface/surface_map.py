@@ -59,7 +59,7 @@ class SurfaceMap:
         """The map with shares `share` (n,) of the arms."""
         return SurfaceMap(self._mean, self._middle, self._arms, self._out, share)
 
-    def projected_onto(self, points: Ints, mean: csr_matrix, other: SurfaceMap) -> SurfaceMap:
+    def project_onto(self, points: Ints, mean: csr_matrix, other: SurfaceMap) -> SurfaceMap:
         """The map with `points` (k,) at means, rows (k, m), of the points of `other` with s = 1."""
         n = len(self.share)
         to = csr_matrix((np.ones(len(points)), (points, np.arange(len(points)))), shape=(n, len(points)))
@@ -78,14 +78,14 @@ class SurfaceMap:
         return np.asarray(middle + share[:, None] * (self._out[points] + self._arms[points] @ u))
 
 
-def middles(points: Values, follow: PointParents) -> Values:
+def mean_parent_positions(points: Values, follow: PointParents) -> Values:
     """(n, d) mean reference positions of the parents of `points` (n, d), m."""
     start = follow.start
     result: Values = points - np.add.reduceat(follow.arm, start[:-1], axis=0) / np.diff(start)[:, None]
     return result
 
 
-def whole(
+def make_surface_map(
     surface: SplitSurface | SurfacePoints, topology: EntityNumbering, pattern: npt.NDArray[np.integer], places: Values
 ) -> SurfaceMap:
     """The map of points at reference positions `places` (n, d), m, on a rank that holds the whole mesh."""

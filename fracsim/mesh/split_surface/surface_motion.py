@@ -44,7 +44,7 @@ class PointParents:
     nodes: int
 
     @classmethod
-    def of(cls, parents: Ints, count: Ints, points: Values, node_points: Values) -> PointParents:
+    def from_positions(cls, parents: Ints, count: Ints, points: Values, node_points: Values) -> PointParents:
         """Parents with their arms, from reference positions.
 
         `count`: (n,) number of parents of each point.    `points`: (n, d), m.    `node_points`: (nodes, d), m.
@@ -104,7 +104,7 @@ class NodalRotations:
 
     def __init__(self, topology: EntityNumbering, pattern: npt.NDArray[np.integer], nodes: Ints) -> None:
         d = topology.dim
-        nodes, self._of = np.unique(_turning_with(topology, pattern)[nodes], return_inverse=True)
+        nodes, self._of = np.unique(_rotation_source(topology, pattern)[nodes], return_inverse=True)
         row = np.full(len(topology.points), -1)
         row[nodes] = np.arange(len(nodes))
         around = np.any(row[topology.cells] >= 0, axis=1) & ~is_split(d)[pattern]
@@ -137,23 +137,23 @@ class NodalRotations:
         return polar_rotation(F)[self._of]
 
 
-def _turning_with(topology: EntityNumbering, pattern: npt.NDArray[np.integer]) -> Ints:
+def _rotation_source(topology: EntityNumbering, pattern: npt.NDArray[np.integer]) -> Ints:
     """(N,) the node whose rotation each node has.
 
     That is the node itself if it has an unsplit cell or if no connected node has one. Otherwise it is the nearest such
     node along intact edges, the lowest one of several.
     """
     result = np.arange(len(topology.points))
-    whole = np.zeros(len(result), bool)
-    whole[topology.cells[~is_split(topology.dim)[pattern]]] = True
-    if whole.all():
+    has_unsplit_cell = np.zeros(len(result), bool)
+    has_unsplit_cell[topology.cells[~is_split(topology.dim)[pattern]]] = True
+    if has_unsplit_cell.all():
         return result
     pairs = local_edges(topology.dim)
-    cells = np.flatnonzero(~whole[topology.cells].all(axis=1))
+    cells = np.flatnonzero(~has_unsplit_cell[topology.cells].all(axis=1))
     intact = (np.asarray(pattern)[cells, None] >> np.arange(len(pairs))) & 1 == 0
     ends = topology.cells[cells][:, pairs][intact]
     ends = np.concatenate([ends, ends[:, ::-1]])
-    has_rotation = whole.copy()
+    has_rotation = has_unsplit_cell.copy()
     while len(new := np.flatnonzero(~has_rotation[ends[:, 0]] & has_rotation[ends[:, 1]])):
         nearest = np.full(len(result), len(result))
         np.minimum.at(nearest, ends[new, 0], result[ends[new, 1]])

@@ -114,7 +114,7 @@ class BodySurface:
             times: times of the earlier frames, s.
         """
         for t in times:
-            count, fragment_of_node = self.skeleton.pieces(broken_at <= t * (1 + 1e-12))
+            count, fragment_of_node = self.skeleton.find_fragments(broken_at <= t * (1 + 1e-12))
             self._names.update(count, fragment_of_node, self.mass)
 
     def _build(self, cut: Values | None) -> None:
@@ -200,9 +200,9 @@ class BodySurface:
         if not corrections:
             return built.parents.displacement(u, self._rotations(u))
         if self._uncorrected is None:
-            from ...mesh.split_surface.surface_map import whole
+            from ...mesh.split_surface.surface_map import make_surface_map
 
-            self._uncorrected = whole(built, self.skeleton, self._pattern, built.points)
+            self._uncorrected = make_surface_map(built, self.skeleton, self._pattern, built.points)
         point_map = self._uncorrected
         for correct in corrections:
             point_map = correct(point_map, built.elements, u, t)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...mesh.split_surface.polyhedron_moments import cones
+from ...mesh.split_surface.polyhedron_moments import cone_volumes
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -100,7 +100,7 @@ def enclosed_volumes(points: Values, elements: Ints, fragment: Ints, count: int)
     """
     # near the origin there is less cancellation
     x = (points - points.mean(axis=0))[elements]
-    return group_sums(fragment, cones(x), count)
+    return group_sums(fragment, cone_volumes(x), count)
 
 
 def group_sums(group: Ints, values: Values, count: int) -> Values:

@@ -74,7 +74,7 @@ class SurfaceOutput:
             surface = BodySurface(domain.input_mesh, cell_density, smooth=smooth)
             if broken is not None and resume_at is not None:
                 edges, history = broken
-                surface.replay_fragment_names(surface.skeleton.of_edges(edges, history[:, 0]), files.times)
+                surface.replay_fragment_names(surface.skeleton.edge_values(edges, history[:, 0]), files.times)
             return surface, files
 
         self._path = folder / "surface.pvd"
@@ -106,7 +106,7 @@ class SurfaceOutput:
             broken_at = cut = None
             if broken is not None and pattern is not None:
                 edges, history = broken
-                broken_at, cut = (surface.skeleton.of_edges(edges, column) for column in history.T)
+                broken_at, cut = (surface.skeleton.edge_values(edges, column) for column in history.T)
                 surface.update(pattern, cut)
             drawn = {
                 name: data for term in self._obstacle_terms for name, data in term.output_surfaces(state.t).items()
