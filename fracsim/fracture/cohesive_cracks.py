@@ -290,7 +290,7 @@ class CohesiveTipCriterion(TipCriterion):
         exclusion = TIP.exclusion_radius[d] * self._h[cells]
         rank = rank_rows(TIP_ADVANCE, sigma[rows], input_numbers(self._domain, cells), tips.point[rows], exclusion)
         across = remove_normal_stress(mean[rows], ahead)
-        return CutProposal(rank, cells, across, self._entry_edges(cells), ahead, no, no)
+        return CutProposal(rank, cells, across, self._graph.first_broken_edge(cells), ahead, no, no)
 
 
 class CohesiveFracturePass(FracturePass):

@@ -241,6 +241,10 @@ class EdgeGraph:
         """(n, k) whether each local edge of the cells is intact."""
         return np.asarray(intact_edges(self.domain.dim)[self.pattern[cells]])
 
+    def first_broken_edge(self, cells: npt.NDArray[np.integer]) -> npt.NDArray[np.int64]:
+        """(n,) lowest broken local edge of each cell, by which a crack entered a cell that holds a crack tip."""
+        return np.argmax(~self.intact(cells), axis=1)
+
     def cell_integrity(self, cells: npt.NDArray[np.integer]) -> npt.NDArray[np.float64]:
         """(n, k) integrity of each local edge of the cells."""
         return self.integrity[self.cell_edges[cells]]

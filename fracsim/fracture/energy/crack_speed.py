@@ -108,7 +108,7 @@ class RateDependentTipCriterion(TipCriterion):
 
     def _find_critical_tips(self, size: Values, toughness: Values, tips: CrackTips) -> tuple[Flags, Flags]:
         """Return which tips (n,) have arrived at the end of their cell (in long steps: reach G_c), and which branch."""
-        entry, rate = self._graph.cell_edges[tips.cell, self._entry_edges(tips.cell)], self._rate[tips.cell]
+        entry, rate = self._graph.cell_edges[tips.cell, self._graph.first_broken_edge(tips.cell)], self._rate[tips.cell]
         slowness, remaining, flow, updated = self.tip_states[entry].T
         # A tip without a state has just appeared.
         time = np.where(np.isnan(updated), 0.0, self._now - updated)
@@ -137,7 +137,7 @@ class RateDependentTipCriterion(TipCriterion):
         cell = fields.tips.cell[self._arrived]
         # A tip that arrived and is not allowed to cut the next cell stops.
         cell = cell[~np.isin(cell, advances.cells)]
-        stopped = self._graph.cell_edges[cell, self._entry_edges(cell)]
+        stopped = self._graph.cell_edges[cell, self._graph.first_broken_edge(cell)]
         self.tip_states[stopped, TipState.SLOWNESS], self.tip_states[stopped, TipState.REMAINING] = AT_REST[:2]
         return advances
 

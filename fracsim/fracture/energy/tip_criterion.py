@@ -220,12 +220,8 @@ class TipCriterion:
         rank = rank_rows(
             TIP_ADVANCE, sigma[active], input_numbers(self._domain, cells), tips.point[rows], exclusion[rows]
         )
-        entry = self._entry_edges(cells)
+        entry = self._graph.first_broken_edge(cells)
         return CutProposal(rank, cells, mean[active], entry, ahead[rows], turns[rows], branches[rows])
-
-    def _entry_edges(self, cells: Ints) -> Ints:
-        """Return the local edges (n,) by which cracks came into cells (n,)."""
-        return np.argmax(~self._graph.intact(cells), axis=1)
 
     def _find_critical_tips(self, size: Values, toughness: Values, tips: CrackTips) -> tuple[Flags, Flags]:
         """Return which tips (n,) with release rates `size` (n,) reach G_c, and which branch (collective)."""
