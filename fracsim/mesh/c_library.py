@@ -86,7 +86,8 @@ def compile_library(name: str, text: str, more: list[str]) -> ctypes.CDLL:
     try:
         if not is_complete(file):
             with exclusive_access(folder, file.name):
-                if not is_complete(file):  # another process may have compiled it meanwhile
+                # another process may have compiled it meanwhile
+                if not is_complete(file):
                     if file.exists():
                         print_note(f"the library {file} was damaged; it is compiled once more")
                     _compile(command, name, text, file)
@@ -130,7 +131,8 @@ def _load(command: list[str], name: str, text: str, file: Path) -> ctypes.CDLL:
         ) from None
 
 
-_unavailable: list[str] = []  # names of libraries that could not be compiled in this process
+# names of libraries that could not be compiled in this process
+_unavailable: list[str] = []
 
 
 def compile_on_all_ranks(comm: MPI.Comm, name: str, text: str, more: list[str]) -> ctypes.CDLL | None:
@@ -222,7 +224,8 @@ class ArrayArgument:
 def declare_signatures(code: ctypes.CDLL, text: str) -> ctypes.CDLL:
     """The library itself, with types of arguments and results as its C text declares them."""
     for result, name, arguments in _FUNCTION.findall(text):
-        if hasattr(code, name):  # the preprocessor may have dropped it
+        # a function that the preprocessor removed is not in the library
+        if hasattr(code, name):
             function = getattr(code, name)
             function.argtypes = [_type_of(argument, name) for argument in arguments.split(",")]
             function.restype = None if result.strip() == "void" else _type_of(result)
@@ -263,7 +266,8 @@ def array_pointer(values: npt.NDArray[Any]) -> Any:
     """
     try:
         return ctypes.byref(_NUMBER_OF_DTYPE[values.dtype].from_buffer(values))
-    except (TypeError, ValueError, KeyError):  # read-only, empty, not contiguous, or of another type
+    except (TypeError, ValueError, KeyError):
+        # read-only, empty, not contiguous, or of another type
         return struct_pointer(values)
 
 
@@ -282,7 +286,8 @@ def struct_pointer(values: npt.NDArray[Any]) -> Any:
     if values.size and values.flags.writeable:
         return ctypes.pointer(number.from_buffer(values))
     pointer: Any = ctypes.cast(values.ctypes.data, POINTER(number))
-    pointer.array = values  # which has to live as long as the pointer
+    # keeps the array alive as long as the pointer
+    pointer.array = values
     return pointer
 
 

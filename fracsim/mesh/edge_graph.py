@@ -138,7 +138,8 @@ class EdgeGraph:
         self.pattern = np.zeros(domain.cell_count, np.uint8)
         self.damaged = np.zeros(domain.cell_count, bool)
         self.split = np.zeros(domain.cell_count, bool)
-        self._searched_split = self.split  # state of `split` at the last call of break_unloaded_edges
+        # state of `split` at the last call of break_unloaded_edges
+        self._searched_split = self.split
         self._shared = la.vector(self.index_map, 1, np.int32)
 
     @cached_property
@@ -219,9 +220,10 @@ class EdgeGraph:
     def break_unloaded_edges(self) -> int:
         """Break the edges all of whose cells, on all ranks, are split, except retained ones (collective).
 
-        Returns the number of edges. Such an edge carries no force, so that no criterion would break it, yet it would
-        connect its ends in the graph. The mechanics do not change: chi of its cells is 0 and no average contains them.
+        Returns the number of edges.
         """
+        # Such an edge carries no force, so that no criterion would break it, yet it would connect its ends in the
+        # graph. The mechanics do not change: chi of its cells is 0 and no average contains them.
         searched = self._searched_split if self.retained is None else np.zeros(len(self.split), bool)
         self._searched_split = self.split
         in_split_cell = np.zeros(len(self.broken), bool)

@@ -30,18 +30,18 @@ class Fragments:
 
 
 def find_fragments(graph: EdgeGraph) -> Fragments:
-    """The fragments of a graph (collective).
-
-    Components are found within each rank, then joined over the nodes that ranks share, in one exchange.
-    """
+    """The fragments of a graph (collective)."""
     domain = graph.domain
+    # components within this rank
     local_count, local = components(_links(graph), len(domain.nodes))
+    # links between components of different ranks: a shared node has the labels of its owner and of this rank
     first = rank_offset(domain.comm, local_count)
     label = local + first
     ghosts = slice(domain.node_count, None)
     owners_label = owner_values(domain.space.dofmap.index_map, label)
     links = np.stack([label[ghosts], owners_label[ghosts]], axis=1)
     all_links = np.concatenate(allgather(domain.comm, np.unique(links, axis=0)))
+    # fragments in the order of their lowest nodes, so that their numbers do not depend on the partition
     lowest = np.full(local_count, np.iinfo(np.int64).max)
     np.minimum.at(lowest, local, domain.input_numbering.nodes)
     lowest = np.concatenate(allgather(domain.comm, lowest))
@@ -55,11 +55,8 @@ def find_fragments(graph: EdgeGraph) -> Fragments:
 
 
 def midside_parents(domain: Domain) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-    """(m,) midside nodes and (m,) the end of the edge of each whose fragment it belongs to.
-
-    That is the end which comes first in the input mesh. The edge may be broken, so that the midside node alone does not
-    tell the fragment.
-    """
+    """(m,) midside nodes, and (m,) the end of the edge of each of them whose fragment the node belongs to."""
+    # the end that comes first in the input mesh: a broken edge does not tell the fragment of its midside node
     midside = domain.cell_midside_nodes
     ends = midside.ends
     return midside.nodes, ends[np.arange(len(ends)), np.argmin(domain.input_numbering.nodes[ends], axis=1)]

@@ -191,7 +191,8 @@ def exclusive_access(folder: Path, name: str) -> Iterator[None]:
         yield
         return
     try:
-        deadline = time.monotonic() + 60.0  # s
+        # waits for 60 s at most
+        deadline = time.monotonic() + 60.0
         while not _locked(lock, position) and time.monotonic() < deadline:
             time.sleep(0.02)
         yield

@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-FAILURE_WAIT = 5.0  # s, that a rank which failed waits for the failure messages of other ranks
+# s that a rank which failed waits for the failure messages of other ranks
+FAILURE_WAIT = 5.0
 # first letters of the names of processes that start ranks
 LAUNCHERS = ("prte", "orte", "mpirun", "mpiexec", "hydra", "slurmstepd")
 Values = npt.NDArray[np.float64]
@@ -60,13 +61,11 @@ def raise_on_all_ranks(comm: MPI.Comm, failure: Exception | None) -> None:
 
 
 def find_failed_ranks(comm: MPI.Intracomm, patience: float) -> set[int]:
-    """The ranks that have failed within `patience` seconds, this rank included.
-
-    Each rank that fails calls this function. Other ranks may be waiting in a collective operation. Therefore only
-    messages between two ranks are used.
-    """
+    """The ranks that have failed within `patience` seconds, this rank included; each rank that fails calls this."""
+    # other ranks may be waiting in a collective operation: only messages between two ranks are safe
     other_ranks = [rank for rank in range(comm.size) if rank != comm.rank]
-    tag = 7919  # of the message that a rank has failed; no other message has it
+    # no other message has this tag
+    tag = 7919
     sent = [comm.isend(None, rank, tag) for rank in other_ranks]
     failed, deadline = {comm.rank}, time.monotonic() + patience
     while len(failed) < comm.size and time.monotonic() < deadline:
@@ -89,7 +88,8 @@ def abort_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, lat
     if len(failed) == comm.size:
         return
     if comm.rank > min(failed):
-        time.sleep(FAILURE_WAIT)  # a lower rank prints its message and ends all ranks
+        # meanwhile a lower rank prints its message and ends all ranks
+        time.sleep(FAILURE_WAIT)
     print(message or f"fracsim: rank {comm.rank} ended alone", file=sys.stderr, flush=True)
     comm.Abort(code or 1)
 
@@ -151,7 +151,8 @@ def rank_offset(comm: MPI.Intracomm, count: int) -> int:
 # MPI before version 4 has 32-bit counts and displacements, and mpi4py counts pickled objects in bytes. The functions
 # below count rows of an array, or blocks of a pickled object, by an MPI datatype of the size of a row or block.
 
-BLOCK = 256  # bytes; the limit is 550 GB of pickled objects on all ranks together
+# Bytes of a block: with 32-bit counts of blocks the limit is 550 GB of pickled objects on all ranks together.
+BLOCK = 256
 
 
 @cache

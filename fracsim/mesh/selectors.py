@@ -12,7 +12,8 @@ from ..errors import InputError
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-RELATIVE_TOLERANCE = 1e-9  # of the size of the body: round-off of coordinates
+# Round-off of coordinates, relative to the size of the body.
+RELATIVE_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,8 @@ class PointsOnPlane:
     within: float | None = None
 
     def __post_init__(self) -> None:
-        if not np.linalg.norm(self.normal) > 0:  # components below 1e-154 underflow in the norm
+        # components below 1e-154 underflow in the norm
+        if not np.linalg.norm(self.normal) > 0:
             raise InputError(f"normal = {list(self.normal)}: a normal must not be zero")
 
     def __str__(self) -> str:

@@ -36,7 +36,8 @@ def node_groups(dim: int) -> npt.NDArray[np.int8]:
     """(patterns, d + 1) the lowest local node that intact edges connect each local node to, for each pattern."""
     edges, intact = local_edges(dim), intact_edges(dim)
     label = np.tile(np.arange(dim + 1, dtype=np.int8), (len(intact), 1))
-    for _ in range(dim):  # a path through d + 1 nodes has at most d edges
+    # a path through d + 1 nodes has at most d edges
+    for _ in range(dim):
         for edge in range(len(edges)):
             i, j = int(edges[edge, 0]), int(edges[edge, 1])
             lower = np.minimum(label[:, i], label[:, j])

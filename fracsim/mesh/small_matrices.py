@@ -18,7 +18,8 @@ def cofactors(A: Matrices) -> Matrices:
         result[:, 0, 0], result[:, 0, 1] = A[:, 1, 1], -A[:, 1, 0]
         result[:, 1, 0], result[:, 1, 1] = -A[:, 0, 1], A[:, 0, 0]
         return result
-    for i in range(3):  # a row is the cross product of the other two
+    # a row is the cross product of the other two
+    for i in range(3):
         p, q = A[:, (i + 1) % 3], A[:, (i + 2) % 3]
         for j in range(3):
             k, m = (j + 1) % 3, (j + 2) % 3
@@ -46,7 +47,8 @@ def polar_rotation(F: Matrices, iterations: int = 20) -> Matrices:
     Convergence is quadratic. For inverted or nearly flat cells the iteration would converge to a reflection or stall;
     an SVD is used there. Source: Higham (1986), Computing the polar decomposition.
     """
-    with np.errstate(invalid="ignore", over="ignore"):  # cells of a diverging iterate are not finite
+    # cells of a diverging iterate are not finite
+    with np.errstate(invalid="ignore", over="ignore"):
         regular = np.linalg.det(F) > 1e-6 * np.einsum("nij,nij->n", F, F) ** (F.shape[1] / 2)
     if not regular.all():
         result = np.empty_like(F)
@@ -57,7 +59,8 @@ def polar_rotation(F: Matrices, iterations: int = 20) -> Matrices:
     for _ in range(iterations):
         change = inverse_transpose(R) - R
         R += change / 2
-        if np.max(np.abs(change), initial=0.0) < 1e-8:  # quadratic convergence: the next change is at round-off
+        # quadratic convergence: the next change is at round-off
+        if np.max(np.abs(change), initial=0.0) < 1e-8:
             break
     return R
 

@@ -34,7 +34,8 @@ from .projected_gradient import ProjectedGradientSolver
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-Motions = tuple[Values, Values]  # velocities and spins (n, 3)
+# Velocities and spins (n, 3).
+Motions = tuple[Values, Values]
 
 # Fields of MuJoCo's contacts that are the same in all of them.
 CONTACT_FIELDS = ("dim", "solref", "solreffriction", "solimp", "includemargin", "efc_address", "mu", "H", "flex",

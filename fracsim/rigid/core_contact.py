@@ -137,7 +137,8 @@ class CoreContact:
 
         Their items (k,) are in the boxes from `begin` (k, 3) to `end` (k, 3).
         """
-        beyond_all = 1 << 40  # no box has this number
+        # no box has this number
+        beyond_all = 1 << 40
         low = np.full((len(self._centre), 3), beyond_all)
         high = np.full((len(self._centre), 3), -beyond_all)
         np.minimum.at(low, fragment, begin)

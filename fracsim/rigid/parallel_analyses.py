@@ -177,5 +177,6 @@ def send_to_workers(comm: MPI.Comm, message: Any) -> None:
 def wait_for_message(comm: MPI.Comm) -> Any:
     """Return the next message from rank 0."""
     while not comm.iprobe(source=0, tag=MESSAGE_TAG):
-        time.sleep(1e-3)  # s, in which the core is free for others
+        # a worker that sleeps leaves its core to others
+        time.sleep(1e-3)
     return comm.recv(source=0, tag=MESSAGE_TAG)

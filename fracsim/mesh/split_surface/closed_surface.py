@@ -44,9 +44,11 @@ class SurfacePoints:
         self._of_node = np.full(len(topology.points), -1)
         self._of_node[nodes] = np.arange(len(nodes))
         row, owner = self._copies.expand(pattern)
-        self._first = np.searchsorted(owner, np.arange(len(damaged)))  # first copy of each damaged cell
+        # first copy of each damaged cell
+        self._first = np.searchsorted(owner, np.arange(len(damaged)))
         number, first_position = _number_keys(self._keys(row, damaged[owner], owner))
-        self._of_copy = np.append(number + len(nodes), -1)  # something to index where there is no copy
+        # the last entry is read where there is no copy
+        self._of_copy = np.append(number + len(nodes), -1)
         row, cell = row[first_position], damaged[owner[first_position]]
         self.cell, self.kind, self.entity = cell, self._copies.kind[row], self._copies.entity[row]
         self.first, self.group = len(nodes), (group := self._copies.group[row])
@@ -205,7 +207,8 @@ class _SurfaceBuilder:
         self.topology, self.table = topology, table
         self.damaged = np.flatnonzero(pattern)
         self.pattern = pattern[self.damaged].astype(np.int64)
-        self.place = np.full(len(pattern), -1)  # of a cell among the damaged ones
+        # index of each cell among the damaged ones
+        self.place = np.full(len(pattern), -1)
         self.place[self.damaged] = np.arange(len(self.damaged))
         self.broken = topology.broken_edges(pattern)
         self.points = SurfacePoints(topology, self.damaged, self.pattern, cut, table)

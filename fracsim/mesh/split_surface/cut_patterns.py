@@ -180,7 +180,8 @@ class CutCell:
         if not self.broken(i, j):
             return []
         m, T, edge = self.edge_copy(i, j), self.cell_copy(i), self.edge[frozenset((i, j))]
-        if self.dim == 2:  # the part of i lies to the left
+        if self.dim == 2:
+            # the part of i lies to the left
             return [((m, T) if permutation_sign((i, j, *remaining)) > 0 else (T, m), edge)]
         k, last = remaining
         return [((m, self.facet_copy(last, i), T), edge), ((m, T, self.facet_copy(k, i)), edge)]
@@ -275,7 +276,8 @@ class PlanarCutCell(CutCell):
             return [tuple(self.edge_copy(node, complement[0]) for node in (part if self.dim == 3 else part[::-1]))]
         (i, j), (k, last) = part, complement
         a, b, c, d = self.edge_copy(i, k), self.edge_copy(i, last), self.edge_copy(j, last), self.edge_copy(j, k)
-        return [(a, b, c), (a, c, d)]  # the same diagonal from both sides: see face_centre_weights
+        # the same diagonal from both sides: see face_centre_weights
+        return [(a, b, c), (a, c, d)]
 
     def fan(self, centre: Callable[[int], PatternPoint], loop: tuple[int, ...]) -> list[Element]:
         """The elements of a triangle, without a point at its centre."""

@@ -14,7 +14,8 @@ from ..input_topology import MeshTopology
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
-CRACK, BODY = 0, 1  # origins of elements that do not lie on a boundary facet
+# Origins of elements that do not lie on a boundary facet
+CRACK, BODY = 0, 1
 
 
 class EntityNumbering(MeshTopology):

@@ -150,7 +150,8 @@ def _assemble_petsc(comm: MPI.Comm, owned: tuple[int, int], rows: csr_matrix, nu
     matrix = PETSc.Mat().create(comm)
     matrix.setSizes(((owned[0], PETSc.DETERMINE), (owned[1], PETSc.DETERMINE)))
     matrix.setType(PETSc.Mat.Type.AIJ)
-    matrix.setUp()  # without preallocation, since other ranks add entries
+    # without preallocation, since other ranks add entries
+    matrix.setUp()
     used = np.flatnonzero(np.diff(rows.indptr))
     start = np.append(rows.indptr[used], rows.nnz)
     indices = [numbers.astype(PETSc.IntType) for numbers in (start, rows.indices, number[used])]

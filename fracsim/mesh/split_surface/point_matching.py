@@ -33,7 +33,8 @@ def match_points(old: Values, new: Values) -> Ints:
     """(k,) the index in `new` (n, w) of each row of `old` (k, w); -1 if there is none."""
     if not len(old):
         return np.empty(0, np.int64)
-    lead = new.shape[1] // 2  # column of the first parent
+    # column of the first parent
+    lead = new.shape[1] // 2
     near = np.flatnonzero(np.isin(new[:, lead], old[:, lead]))
     rows = np.concatenate([new[near], old])
     _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)

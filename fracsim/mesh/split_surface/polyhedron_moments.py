@@ -58,7 +58,8 @@ def moments(points: Values, elements: Ints, body: Ints, count: int) -> Polyhedro
     d = points.shape[1]
     arrays = [np.ascontiguousarray(points), *(np.ascontiguousarray(numbers, np.int64) for numbers in (elements, body))]
     element_count, sizes = np.zeros(count, np.int64), (d, 1, d, d * d)
-    reference_point, volume, first, second = (np.zeros((count, size)) for size in sizes)  # about one point of each body
+    # relative to one point of each body, since sums about a distant origin would cancel
+    reference_point, volume, first, second = (np.zeros((count, size)) for size in sizes)
     sums = load_library(SOURCE).sums
     sums(*map(c_int64, (len(elements), d, count)), *(*arrays, element_count, reference_point, volume, first, second))
     arm = np.divide(first, (d + 1) * volume, out=np.zeros_like(first), where=volume > 0)

@@ -66,7 +66,8 @@ def with_midside_points(surface: SplitSurface, domain: Domain, pattern: npt.NDAr
 
 def _midside_nodes(domain: Domain, cell: Ints, low: Ints, high: Ints) -> Ints:
     """(m, n) midside nodes between the nodes `low` and `high` (m, n) of the cells (m,)."""
-    ends = domain.cell_nodes[cell][:, local_edges(domain.dim)]  # (m, edges, 2)
+    # ends: (m, edges, 2)
+    ends = domain.cell_nodes[cell][:, local_edges(domain.dim)]
     pair = np.sort(np.stack([low, high], axis=-1), axis=-1)
     same = (pair[:, :, None] == np.sort(ends, axis=-1)[:, None]).all(axis=-1)
     return np.asarray(
@@ -98,5 +99,6 @@ def _node_table(corners: npt.NDArray[np.integer], middles: npt.NDArray[np.intege
 
 def _subdivide(between: Ints) -> Ints:
     """(cells 2^d, d + 1) nodes of the parts of all simplices, in the order of the simplices."""
-    parts = np.array(SUBDIVISION[between.shape[1] - 1])  # (2^d, d + 1, 2)
+    # parts: (2^d, d + 1, 2)
+    parts = np.array(SUBDIVISION[between.shape[1] - 1])
     return between[:, parts[..., 0], parts[..., 1]].reshape(-1, between.shape[1])

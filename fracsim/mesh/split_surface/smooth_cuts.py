@@ -70,5 +70,6 @@ def _neighbours(topology: EntityNumbering, broken: npt.NDArray[np.bool_]) -> coo
     edge = number[topology.cell_edges[cells[row], column]]
     member = coo_matrix((np.ones(len(row)), (row, edge)), shape=(len(cells), int(broken.sum()))).tocsr()
     shared = member.T @ member
-    shared.data[:] = 1.0  # independent of the number of shared cells
+    # independent of the number of shared cells
+    shared.data[:] = 1.0
     return shared.multiply(1.0 / shared.sum(axis=1)).tocsr()

@@ -116,9 +116,12 @@ def gradient_entries(X: Values, share: Values, number: Ints) -> tuple[Ints, Ints
     average around each of its nodes.
     """
     d = X.shape[2]
-    inverse = np.linalg.inv(X[:, 1:] - X[:, :1])  # of rows X_k - X_0: column k is the gradient of corner k + 1
-    slope = np.concatenate([-inverse.sum(axis=2)[:, :, None], inverse], axis=2)  # cell, axis, corner
-    entries = share[:, :, None, None] * slope[:, None]  # cell, corner, axis, corner
+    # column k of the inverse of the rows X_k - X_0 is the gradient of corner k + 1
+    inverse = np.linalg.inv(X[:, 1:] - X[:, :1])
+    # axes: cell, component, corner
+    slope = np.concatenate([-inverse.sum(axis=2)[:, :, None], inverse], axis=2)
+    # axes: cell, node of the average, component, corner
+    entries = share[:, :, None, None] * slope[:, None]
     rows = np.broadcast_to((d * number[:, :, None] + np.arange(d))[..., None], entries.shape)
     columns = np.broadcast_to(number[:, None, None, :], entries.shape)
     return rows.reshape(-1), columns.reshape(-1), entries.reshape(-1)

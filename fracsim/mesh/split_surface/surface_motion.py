@@ -110,8 +110,10 @@ class NodalRotations:
         around = np.any(row[topology.cells] >= 0, axis=1) & ~is_split(d)[pattern]
         self._cells = topology.cells[around]
         span = topology.points[self._cells]
-        span = span[:, 1:] - span[:, :1]  # rows X_k - X_0
-        self._inverse = np.linalg.inv(span) * np.abs(np.linalg.det(span))[:, None, None]  # d! V (X_k - X_0)^-1
+        # rows X_k - X_0
+        span = span[:, 1:] - span[:, :1]
+        # d! V (X_k - X_0)^-1
+        self._inverse = np.linalg.inv(span) * np.abs(np.linalg.det(span))[:, None, None]
         target = row[self._cells]
         cell, corner = np.nonzero(target >= 0)
         ones = np.ones(len(cell))
@@ -122,7 +124,8 @@ class NodalRotations:
 
             self._sum = csr_matrix((ones, (target[cell, corner], cell)), shape=(len(nodes), len(self._cells)))
             volume = self._sum @ np.abs(np.linalg.det(span))
-            self._per_volume = 1.0 / np.where(volume > 0, volume, 1.0)  # without cells the mean is 0 and F the identity
+            # without cells the mean is 0 and F the identity
+            self._per_volume = 1.0 / np.where(volume > 0, volume, 1.0)
 
     def __call__(self, u: Values) -> Values:
         """(nodes, d, d) rotations R for displacements u (N, d), m, with F = 1 + mean of grad u."""
