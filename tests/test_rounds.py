@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
 from fracsim.rigid.bodies import Bodies
-from fracsim.rigid.engine import Engine
+from fracsim.rigid.engine import SETTINGS, Engine
 from fracsim.rigid.fragment_overlap import InitialOverlaps
 from fracsim.rigid.mujoco_model import ContactParameters
 from support.falling import CUBE, DOWN, cubes
@@ -22,8 +22,8 @@ STEP, SPEED = 0.02, 5.0
 
 def struck(monkeypatch: pytest.MonkeyPatch, farther: float) -> tuple[Bodies, InitialOverlaps]:
     """Two pieces that lie in one another by 0.3 m from birth and fly on together; a third block strikes the one ahead
-    half-way through the step. `farther`: times what was thought, see rigid.collision_detection."""
-    monkeypatch.setattr("fracsim.rigid.collision_detection.EXCESS_REACH_RATIO", farther)
+    half-way through the step. `farther`: times what was thought, see rigid.engine."""
+    monkeypatch.setattr("fracsim.rigid.engine.SETTINGS", replace(SETTINGS, excess_reach_ratio=farther))
     bodies = cubes([[0.0, 0.0, 0.0], [0.7, 0.05, 0.0], [1.8, 0.0, 0.05]])
     velocity: Values = np.array([[SPEED, 0, 0], [SPEED, 0, 0], [-SPEED, 0, 0]])
     engine = Engine(

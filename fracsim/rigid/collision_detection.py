@@ -22,9 +22,6 @@ Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-# A body that moves farther than this multiple of its bound is searched for contacts again.
-EXCESS_REACH_RATIO = 1.5
-
 
 # --- bounds of motion ---
 
@@ -47,10 +44,10 @@ class MotionBounds:
         """Return how far obstacles move in dt, s: (m,) relative to the common velocity, and relative to space, m."""
         return [dt * np.linalg.norm(self.obstacle_velocity - frame, axis=1) for frame in (self.common_velocity, 0.0)]
 
-    def exceeded_by(self, present: MotionBounds) -> Flags:
-        """Return (n,) flags of bodies whose `present` bounds are much larger than these."""
+    def exceeded_by(self, present: MotionBounds, ratio: float) -> Flags:
+        """Return (n,) flags of bodies whose `present` bounds are larger than `ratio` times these."""
         pairs = zip(present.reach, self.reach, strict=True)
-        return np.any([current > EXCESS_REACH_RATIO * before for current, before in pairs], axis=0)
+        return np.any([current > ratio * before for current, before in pairs], axis=0)
 
     def widen(self, exceeded: Flags, present: MotionBounds) -> MotionBounds:
         """Return bounds that also cover the `present` motion of the bodies flagged in `exceeded` (n,)."""

@@ -38,9 +38,6 @@ if TYPE_CHECKING:
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-# Mean contact pressure under a ball on a yielding body, in yield stresses (D. Tabor; K. L. Johnson 1985, section 6.3).
-PRESSURE_YIELD_RATIO = 2.8
-
 
 @dataclass(frozen=True)
 class DentedShape:
@@ -80,7 +77,9 @@ class PlasticDenting:
     def min_contact_radii(self, force: Values) -> Values:
         """Return the least radii (k,), m, of the circles that forces (k, 3), N, press on a yielding body."""
         size = np.linalg.norm(force, axis=1)
-        return np.asarray(np.sqrt(size / (np.pi * PRESSURE_YIELD_RATIO * self.min_yield_stress)))
+        # the mean pressure under a ball on a yielding body is 2.8 yield stresses (D. Tabor; K. L. Johnson 1985,
+        # section 6.3)
+        return np.asarray(np.sqrt(size / (np.pi * 2.8 * self.min_yield_stress)))
 
     def __call__(self, body: SolidBody, stress: Values, energy: float = np.inf) -> DentedShape | None:
         """Return the shape after a blow; None if no cell yields.

@@ -46,12 +46,14 @@ class EngineSettings:
     """Limits of the repetitions in a step.
 
     Attributes:
+        excess_reach_ratio: multiple of its bound of motion above which a body is searched for contacts again.
         search_rounds: largest number of searches for contacts of bodies that move farther than expected.
         missed_depth: c_0 dt; corners that were not checked may penetrate a plane by at most this much.
         max_events: events in a sequence with few contacts.
         max_crowded_events: events in a sequence with many contacts.
     """
 
+    excess_reach_ratio: float = 1.5
     search_rounds: int = 3
     missed_depth: float = 0.25
     max_events: int = 6
@@ -134,7 +136,7 @@ class Engine:
             moved, impulses, last, accurate = self._solve_events(bodies, event, step, rough=True)
             # bodies that were impacted in an earlier event have been searched again already
             present = bound_motion(model, parameters, moved, rates, last.bounds.common_velocity)
-            exceeded = last.is_last & last.bounds.exceeded_by(present)
+            exceeded = last.is_last & last.bounds.exceeded_by(present, SETTINGS.excess_reach_ratio)
             depth = SETTINGS.missed_depth * parameters.impact_threshold * parameters.time_step
             exceeded |= model.planes.find_missed(moved, end_points, depth, checked)
             if not np.any(exceeded):
@@ -259,7 +261,7 @@ class ImpactStep:
         """Return the event after one that left the bodies with new velocities; None if there is no further impact."""
         model, parameters, rates = self._model, self._parameters, event.bounds.obstacle_velocity
         present = bound_motion(model, parameters, bodies, rates, event.bounds.common_velocity)
-        exceeded = event.bounds.exceeded_by(present)
+        exceeded = event.bounds.exceeded_by(present, SETTINGS.excess_reach_ratio)
         bounds = bound_motion(model, parameters, bodies, rates)
         contacts, retained = self._update_contacts(bodies, bounds, event.contacts, exceeded)
         conditions = event.conditions.following(event.elapsed, event.overlaps)
