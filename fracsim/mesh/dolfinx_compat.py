@@ -295,7 +295,7 @@ def create_matrix(comm: MPI.Comm, pattern: SparsityPattern) -> PETSc.Mat:
 
 
 def _reference_counted(matrix: PETSc.Mat) -> PETSc.Mat:
-    """The same matrix, freed when Python has no reference to it any more."""
+    """Reference to a matrix that is freed when Python has no reference to it any more."""
     # DOLFINx 0.9 keeps a reference to the Python object that it returns; the copy refers to the same PETSc matrix
     result = copy(matrix)
     matrix.destroy()

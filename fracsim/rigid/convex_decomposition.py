@@ -102,7 +102,7 @@ class Polyhedron:
 
     @property
     def without_cavities(self) -> Polyhedron:
-        """The solid with its enclosed cavities filled, since nothing can touch their walls."""
+        """The solid with its enclosed cavities filled, since nothing can touch their inner surfaces."""
         count, part = components(self.triangles[:, [0, 1, 1, 2]].reshape(-1, 2), len(self.points))
         if count == 1:
             return self

@@ -297,14 +297,14 @@ class ImpactStep:
         rates = bounds.obstacle_velocity
         constraints, overlaps = self._constrain(initial, start, rates, conditions, conditions.elapsed, impacted)
         elapsed = self._flight_fractions(constraints, initial, conditions)
-        flies = elapsed > conditions.elapsed_or_zero
+        in_flight = elapsed > conditions.elapsed_or_zero
         time = self._parameters.time_step * (elapsed - conditions.elapsed_or_zero)
         velocity_gain = time[:, None] * conditions.gravity
-        bodies = self._fly(start, time, velocity_gain) if np.any(flies) else start
-        contacts, retained = self._find_near(bodies, initial, bounds, elapsed, flies, earlier)
-        if np.any(flies):
+        bodies = self._fly(start, time, velocity_gain) if np.any(in_flight) else start
+        contacts, retained = self._find_near(bodies, initial, bounds, elapsed, in_flight, earlier)
+        if np.any(in_flight):
             # bodies at rest sank into what supports them while they flew
-            lift = sinking_corrections(initial, contacts, flies & conditions.is_first)
+            lift = sinking_corrections(initial, contacts, in_flight & conditions.is_first)
             bodies = replace(bodies, position=bodies.position + lift)
             falling = replace(bodies, velocity=bodies.velocity + velocity_gain)
             gaps = corrected_gaps(contacts, lift)
@@ -331,14 +331,14 @@ class ImpactStep:
         return replace(fly(self._model, flying, time), velocity=start.velocity)
 
     def _find_near(
-        self, bodies: Bodies, initial: Contacts, bounds: MotionBounds, elapsed: Values, flies: Flags,
+        self, bodies: Bodies, initial: Contacts, bounds: MotionBounds, elapsed: Values, in_flight: Flags,
         earlier: PreviousRound | None,
     ) -> tuple[Contacts, Ints]:  # fmt: skip
         """Return the contacts near bodies at their impacts, and the numbers of earlier contacts that stay."""
         if earlier is None:
-            return self._update_contacts(bodies, bounds, initial, flies)
+            return self._update_contacts(bodies, bounds, initial, in_flight)
         event = earlier.event
-        if event.contacts is event.initial_contacts and not np.any(flies):
+        if event.contacts is event.initial_contacts and not np.any(in_flight):
             return initial, earlier.retained
         return self._update_contacts(bodies, bounds, event.contacts, earlier.exceeded | (elapsed != event.elapsed))
 

@@ -159,7 +159,7 @@ class AdmittedOverlaps:
 
     @property
     def without_contact(self) -> AdmittedOverlaps:
-        """The same bodies without admitted overlaps."""
+        """These bodies without admitted overlaps."""
         return replace(self, new_pairs=self.new_pairs[:0], geom_pairs=self.geom_pairs[:0], depth=self.depth[:0])
 
     def to_initial_overlaps(self) -> InitialOverlaps:

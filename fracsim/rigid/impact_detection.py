@@ -87,7 +87,7 @@ class BodyLoad:
 
 @dataclass
 class _History:
-    """What is known of earlier steps.
+    """Contacts and loads of earlier steps.
 
     Attributes:
         names: (n,) of the bodies, ascending.

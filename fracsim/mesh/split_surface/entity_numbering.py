@@ -39,7 +39,7 @@ class EntityNumbering(MeshTopology):
         self.origins, self.origin = _origins(mesh, self.facets[self.cell_facets[tuple(self.boundary.T)]])
 
     def with_points(self, points: Values) -> EntityNumbering:
-        """The same topology with nodes at `points` (N, d), m."""
+        """This topology with nodes at `points` (N, d), m."""
         if points is self.points:
             return self
         result = copy(self)
