@@ -208,6 +208,14 @@ def test_faces_lie_on_each_other_or_cross_in_edges() -> None:
         assert (upper < upper.min() + 1e-9).sum() == nearest
 
 
+def test_cost_of_self_contact_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("ipctk")
+    monkeypatch.setattr(self_contact_cost, "STEPS", 1)
+    monkeypatch.setattr(self_contact_cost, "REPEATS", 1)
+    figures = self_contact_cost.measure("flat", 1)
+    assert figures["touching"] > 0 and all(figures[name] > 0 for name in self_contact_cost.PAIR_OPERATIONS)
+
+
 def test_flat_on_flat_is_held_against_edge_on_edge() -> None:
     def record(kind: str, step: float) -> dict[str, Any]:
         figures = {"triangles": 1, "touching": 1, "newton": 2.0, "step": step} | dict.fromkeys(

@@ -113,7 +113,7 @@ def time_pair_operations(surface: Any, x: Any) -> dict[str, Any]:
         "gradient": lambda k: pairs.gradient(away if k % 2 else x),
         "hessian": lambda k: pairs.hessian(away if k % 2 else x),
     }
-    touching = sum(len(results) for _, results in pairs._search.active_pairs(pairs._mesh.vertices(x)))
+    touching = sum(len(active.pairs) for active in pairs._search.active_pairs(pairs._mesh.vertices(x)))
     return {"touching": touching} | {
         name: median(map(_timer(work), range(REPEATS))) for name, work in operations.items()
     }
