@@ -23,6 +23,8 @@ from fracsim.studies.evidence.crack_count_cost import random_planes
 from support.scenes import Walk
 from support.solver_policy import set_policy
 
+pytestmark = pytest.mark.fast_solver_only("multigrid of another kind for a body in pieces, deflation, blocks")
+
 SOLVER: dict[str, Any] = {"snes_type": "ksponly", "ksp_rtol": 1e-6}
 
 

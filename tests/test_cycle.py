@@ -21,6 +21,8 @@ from support.solver_policy import set_policy
 
 Values = npt.NDArray[np.float64]
 
+pytestmark = pytest.mark.fast_solver_only("a V cycle of our own, in single precision")
+
 
 def bar(dim: int, given: dict[str, Any], **tables: Any) -> Scene:
     """A bar of soft neo-Hookean stuff that is pulled, of some hundred nodes; `tables`: others of the study."""
