@@ -107,11 +107,9 @@ class IntactEdgeStress:
         return carried, ~graph.split
 
     def find_averages_above(self, carried: Values, active: Flags | None, bound: float) -> tuple[Ints, Values]:
-        """Find the cells whose averaged stress may reach `bound` (Pa) in some direction, and that stress (collective).
-
-        The largest normal stress of an average is at most the average of the largest normal stresses. So a scalar
-        average excludes most cells.
-        """
+        """Find cells whose averaged stress may reach `bound` (Pa) in some direction, and that stress (collective)."""
+        # The largest normal stress of an average is at most the average of the largest normal stresses: a scalar
+        # average excludes most cells.
         norms, bound = normal_stress_bound(carried, self._edge_stress.dim), bound * (1 - BOUND_ROUND_OFF)
         if self._average is not None:
             return self._average.find_averages_above(carried, norms, bound, active)

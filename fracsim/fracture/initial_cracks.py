@@ -24,9 +24,7 @@ MIN_CUT_SHARE = 0.02
 def cut_edges(graph: EdgeGraph, crack: CrackPlane) -> Values:
     """Return the cut positions (edges,) of local edges, NaN where the crack does not cut (collective).
 
-    A position is 0 at the end that comes first in the input mesh and 1 at the other. In 2D the crack cuts the edges
-    that it crosses, so that it ends where it enters its last cell. In 3D it cuts whole cells: a cell with some of its
-    crossed edges cut would not be split, and the crack would be about 0.4 h short along its front.
+    A position is 0 at the end that comes first in the input mesh and 1 at the other.
     """
     domain, tolerance = graph.domain, 1e-9 * graph.domain.bounds.diagonal
     ends = domain.nodes[edge_ends_in_input_order(graph)]
@@ -37,8 +35,11 @@ def cut_edges(graph: EdgeGraph, crack: CrackPlane) -> Values:
     share = np.divide(height[:, 0], height[:, 0] - height[:, 1], out=np.zeros(len(height)), where=crossed)
     points = ends[:, 0] + share[:, None] * (ends[:, 1] - ends[:, 0])
     if domain.dim == 2:
+        # The crack ends where it enters its last cell.
         crossed[crossed] = crack.contains(points[crossed], tolerance)
     else:
+        # A cell with some of its crossed edges cut would not be split: the crack would be about 0.4 h short along its
+        # front.
         crossed = graph.any_over_ranks(_edges_of_cut_cells(graph.cell_edges, crossed, points, crack, tolerance))
     return np.where(crossed, np.clip(share, MIN_CUT_SHARE, 1 - MIN_CUT_SHARE), np.nan)
 

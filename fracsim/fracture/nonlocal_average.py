@@ -106,8 +106,6 @@ class NonlocalAverage:
     ) -> tuple[Ints, Values]:
         """Find the cells (m,) whose average may reach `bound` in norm, and their averages (m, n) (collective).
 
-        The norm of an average is at most the average of the norms, which needs one column instead of six.
-
         Args:
             values: (cells, n), 0 on inactive cells.
             norms: (cells,) norms of `values`, in any norm.
@@ -115,7 +113,8 @@ class NonlocalAverage:
             active: (cells,) cells that enter averages; None: all.
         """
         n = values.shape[1]
-        # No average exceeds the largest norm of all ranks.
+        # The norm of an average is at most the average of the norms, one column instead of six, and no average exceeds
+        # the largest norm of all ranks.
         if max_over_ranks(self._comm, float(np.max(norms, initial=0.0))) < bound:
             return np.empty(0, np.int64), np.empty((0, n))
         near, near_norms = self._exchange(values), self._exchange(norms[:, None])[:, 0]
@@ -236,12 +235,13 @@ class _WeightMatrix:
     def flag_centres_near(self, near_flags: Flags) -> Flags:
         """Flag the centres (centres,) with rows that may have a flagged near cell (near,) within the radius.
 
-        Own cells among the flagged ones must have rows: nearness is symmetric, so that their rows tell the centres.
+        Own cells among the flagged ones must have rows.
         """
         count, marks = len(self._centres), np.zeros(len(near_flags), bool)
         # Of two cells exactly R apart only one may count as near, which matters if the kernel is not 0 at R.
         if KERNELS[self._kernel](np.ones(1))[0]:
             return ~marks[:count]
+        # Nearness is symmetric: the rows of flagged cells have their centres.
         for block in self.blocks:
             block.mark_neighbours(near_flags, marks)
         return marks[:count] | self._near_other_rank if near_flags[count:].any() else marks[:count]
@@ -263,10 +263,7 @@ class _WeightMatrix:
         self._add_rows(np.flatnonzero(self._missing))
 
     def active_sums(self, active: Values | None) -> list[Values]:
-        """Return, for each block, the sums of the weights of near cells with 1 in `active` (near, 1); None: of all.
-
-        Only rows near cells that became active or inactive since the last call are summed again.
-        """
+        """Return, for each block, the sums of the weights of near cells with 1 in `active` (near, 1); None: of all."""
         if active is None:
             return [block.row_sums for block in self.blocks]
         changed, self._active = (active != self._active)[:, 0], active
@@ -274,6 +271,7 @@ class _WeightMatrix:
             # A changed cell without a row of its own may be near rows that exist: sum all again.
             self._active_sums = []
         elif changed.any():
+            # Only rows near cells that became active or inactive are summed again.
             near = self.flag_centres_near(changed)
             for block, sums in zip(self.blocks, self._active_sums, strict=False):
                 rows = np.flatnonzero(near[block.cells])

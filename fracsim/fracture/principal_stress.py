@@ -38,8 +38,12 @@ def first_principal_stress(stress: Values) -> Values:
 def first_principal_directions(stress: Values, points: Values, seed: int) -> Values:
     """Return unit directions (n, d) of the largest principal stress; their sign is arbitrary.
 
-    If several principal stresses are equal to the largest one, a direction of their eigenspace is drawn from the seed
-    and the bits of the points (n, d). So it is the same on any number of ranks.
+    If several principal stresses are equal to the largest one, a direction of their eigenspace is drawn.
+
+    Args:
+        stress: (n, d, d), Pa.
+        points: (n, d) from whose bits directions are drawn, m.
+        seed: seed of the draws.
     """
     values, vectors = np.linalg.eigh(stress)
     size = np.abs(values).max(axis=1, keepdims=True)
@@ -47,6 +51,7 @@ def first_principal_directions(stress: Values, points: Values, seed: int) -> Val
     result = vectors[:, :, -1].copy()
     multiple = np.flatnonzero(is_largest.sum(axis=1) > 1)
     if len(multiple):
+        # Hashed from the points, so that the directions are the same on any number of ranks.
         d = stress.shape[1]
         draw = np.column_stack([hash_points(points[multiple], d * seed + axis) for axis in range(d)])
         shares = np.einsum("nij,ni->nj", vectors[multiple], draw) * is_largest[multiple]

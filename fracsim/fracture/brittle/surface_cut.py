@@ -246,18 +246,16 @@ class CrossedCells:
         return np.unique(self.edges[self.open])
 
     def connected_open_edges(self, dim: int, seeds: Ints) -> Ints:
-        """Return the open edges that are linked to seed edges by triangles with two open edges.
-
-        A level set crosses two edges of a triangle or none, and so did every older crack. Of three edges the two sheets
-        share one, so that no chain of such triangles leads through an older crack: each ends on it or on the boundary.
-        """
+        """Return the open edges that are linked to seed edges by triangles with two open edges."""
         edges, inverse = np.unique(self.edges[self.open], return_inverse=True)
         number = np.zeros(self.edges.shape, np.int64)
         number[self.open] = inverse
         triangles = cell_triangles(dim)
         is_open = self.open[:, triangles]
+        # A level set crosses two edges of a triangle or none, and so did every older crack. Of three edges the two
+        # sheets share one, so that no chain of triangles leads through an older crack: each ends on it or on the
+        # boundary.
         linking = np.count_nonzero(is_open, axis=2) == 2
-        # Each such triangle links its two open edges.
         links = number[:, triangles][linking][is_open[linking]].reshape(-1, 2)
         label = components(links, len(edges))[1]
         return edges[np.isin(label, label[np.isin(edges, seeds)])]

@@ -183,10 +183,8 @@ class SurfacePass:
         return result
 
     def _sign(self, phi: Values, cell: int) -> float:
-        """Return 1 or -1, so that the lowest node of the cell that is not on the surface is on the positive side.
-
-        Nodes on the surface belong to the positive side, and a principal direction has no sign of its own.
-        """
+        """Return 1 or -1, so that the lowest node of the cell that is not on the surface is on the positive side."""
+        # A principal direction has no sign. Nodes on the surface belong to the positive side.
         nodes = np.sort(self.mesh.cells[cell])
         off_surface = np.flatnonzero(np.abs(phi[nodes]) > self.mesh.tolerance)
         return 1.0 if not len(off_surface) or phi[nodes[off_surface[0]]] > 0 else -1.0

@@ -14,10 +14,8 @@ Values = npt.NDArray[np.float64]
 
 
 def transposed_product(H: Values, vectors: Values) -> Values:
-    """Return H^T v (n, d) of matrices (n, d, d) and vectors (n, d).
-
-    It works component by component, which is fast where each component is contiguous in memory.
-    """
+    """Return H^T v (n, d) of matrices (n, d, d) and vectors (n, d)."""
+    # By components, which are contiguous in memory for fields from other ranks.
     result = np.empty_like(vectors)
     for k in range(vectors.shape[1]):
         result[:, k] = H[:, 0, k] * vectors[:, 0]

@@ -55,13 +55,13 @@ def advance_vectors(polygons: Values, pairs: tuple[Ints, Ints], points: Values, 
 def project_on_surface(advance: Values, surface: Values, radius: Values) -> Values:
     """Return advances (n, 3), m, along the body's surface for fronts that end in it.
 
-    An advance across the surface would move the surface itself. A front that has the surface ahead advances towards it.
-
     Args:
         advance: (n, 3) advances of tips, m.
         surface: (n, 3) int q n dA over the surface of the body in the ball, m^2.
         radius: (n,) R, m.
     """
+    # An advance across the surface would move the surface itself. A front that has the surface ahead advances towards
+    # it.
     size = np.linalg.norm(surface, axis=1)[:, None]
     is_near = size > TIP.min_surface_area * radius[:, None] ** 2
     normal = np.divide(surface, size, out=np.zeros_like(surface), where=is_near)
@@ -111,8 +111,7 @@ class FrontReleaseRate:
     def __call__(self, force: Values) -> Values:
         """Return G along the advance of each tip (n, 3), J/m^2, of the forces g (n, 3) on tips (collective).
 
-        It is 0 for tips of no front, and for those whose advance would take energy: the force in their ball is that of
-        tips on the crack's other side.
+        It is 0 for tips of no front, and for those whose advance would take energy.
         """
         # g . a of tips, 0 where there is no front.
         released = np.where(self._is_front, np.einsum("nk,nk->n", force, self._advance), 0.0)
@@ -120,4 +119,5 @@ class FrontReleaseRate:
         if self._averaged:
             released = self._weights @ np.concatenate(allgather(self._comm, released))[self._order]
             square = self._averaged_square
+        # A negative force belongs to tips on the other side of the crack in the same ball.
         return np.asarray(np.maximum(weighted_mean(released, square), 0.0)[:, None] * self._direction)

@@ -285,10 +285,6 @@ class TipCriterion:
     def _extend_cuts(self, edges: Edges, courses: Values) -> Edges:
         """Return the cut edges (n,), in 2D with those of intact cells beyond, cut straight on (collective).
 
-        A tip that kinked by K_I and K_II has a direction for more than a cell; the force over a disc of 5 h changes by
-        some per cent from one cell to the next. Evaluated there before a solve it would be that of a body out of
-        balance.
-
         Args:
             edges: (n,) edges that were cut just now.
             courses: (n, 2) directions of the cracks; 0 for those that are not extended.
@@ -298,7 +294,9 @@ class TipCriterion:
         graph, course = self._graph, np.zeros((len(self._graph.broken), self.course_width))
         course[edges] = courses
         entered = np.any(course[graph.cell_edges], axis=2)
-        # Cells with one cut edge, on the far side of a cut, are next on the course of the crack.
+        # Cells with one cut edge, on the far side of a cut, are next on the course of the crack. They are cut in the
+        # same pass: the force over a disc of 5 h changes by some per cent from one cell to the next, and before a solve
+        # it would be that of a body out of balance.
         is_next = (entered.sum(axis=1) == 1) & ~(graph.damaged | self._excluded_cells)
         cells = np.flatnonzero(is_next).astype(np.int64)
         entry, turns = np.argmax(entered[cells], axis=1), np.ones(len(cells), bool)
@@ -340,12 +338,12 @@ def input_numbers(domain: Domain, cells: Ints) -> Values:
 def kinked_release(psi: Values, tips: CrackTips, force: Values) -> tuple[Values, Values]:
     """Return G (n,), J/m^2, of tips in 2D that kink by their phase angles psi (n,), and their directions (n, 2).
 
-    Only the force along the crack counts: the stress along the crack faces, and the waves in it, act across it besides.
     Without a crack behind the tip the size of the force is returned, and no direction.
     """
     # Branches side by side keep straight on, at the branching angle.
     tangent, side_by_side = unit_or_zero(tips.point - tips.behind), np.any(tips.branch_direction, axis=1)
     psi = np.where(side_by_side, 0.0, psi)
+    # Across the crack acts also the stress along the crack faces, with the waves in it.
     along = release_rate(force, tips.ahead, tangent) * kink_gain(psi)
     kinked = np.where(side_by_side[:, None], tips.branch_direction, rotate(tangent, kink_angle(psi)))
     return np.where(np.any(tangent, axis=1), along, np.linalg.norm(force, axis=1)), kinked

@@ -221,12 +221,10 @@ class TipFieldEvaluator:
         return eshelby_stress(chi * psi, H, P)
 
     def _closure_stress(self, cells: Ints, share: Values) -> Values:
-        """Return Eshelby's stress (n, d, d), Pa, of the springs of broken edges, of which cells have `share` (n,).
-
-        It depends on the displacement of the corners alone.
-        """
+        """Return Eshelby's stress (n, d, d), Pa, of the springs of broken edges, of which cells have `share` (n,)."""
         graph, material, corners = self._graph, self._stress.material, self._domain.cell_nodes[cells]
         nodes, moved = self._domain.nodes[corners], self._stress.u.x.array.reshape(-1, self._domain.dim)[corners]
+        # The length of an edge depends on its corners alone, also with quadratic displacement.
         H = np.einsum("nki,nkj->nij", moved, self._gradients_of_coordinates(cells))
         first, second = local_edges(self._domain.dim).T
         stiff = np.broadcast_to(spring_modulus(material, self._domain.dim, len(first)), (len(self.centres),))[cells]

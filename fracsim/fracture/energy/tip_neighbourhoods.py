@@ -175,10 +175,8 @@ class TipNeighbourhoods:
 
     @property
     def _force_operators(self) -> tuple[csc_matrix, csc_matrix]:
-        """V grad q less int q n dA (tips, d requested), one axis after the other, and V q (tips, requested).
-
-        They are stored by columns, which takes two thirds of the time: in rows each sum waits for the one before.
-        """
+        """V grad q less int q n dA (tips, d requested), one axis after the other, and V q (tips, requested)."""
+        # By columns products take two thirds of the time: by rows each sum depends on the one before.
         if self._force_matrices is None:
             slopes = self._weights[:, : self.tips.point.shape[1]] - self._surface_weights_ahead()
             axes = [self._sparse_matrix(component) for component in slopes.T]
