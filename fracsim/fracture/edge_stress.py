@@ -51,7 +51,7 @@ def normal_stress_bound(components: Values, dim: int) -> Values:
     average is at most the average of the bounds.
     """
     result = np.empty(len(components))
-    _code().pull(c_int64(dim), c_int64(len(components)), np.ascontiguousarray(components), result)
+    _code().normal_stress_bound(c_int64(dim), c_int64(len(components)), np.ascontiguousarray(components), result)
     return result
 
 
@@ -121,13 +121,15 @@ class EdgeStressOperator:
         """Return n . s . n (n, k) along the edges of cells (n,) under stress (n, 3 or 6), n the unit edge vector."""
         result = np.empty(components.shape)
         arguments = np.ascontiguousarray(cells), self._cells, np.ascontiguousarray(components), result
-        _code().normal(c_int64(self.dim), c_int64(len(cells)), *arguments)
+        _code().normal_stress(c_int64(self.dim), c_int64(len(cells)), *arguments)
         return result
 
     def intact_edge_stress(self, components: Values, damage: EdgeDamage) -> Values:
         """Return the part of the stress (cells, 3 or 6) that intact edges carry; 0 in split and in flat cells."""
         result = np.empty(components.shape)
-        _code().carried(c_int64(self.dim), self._cells, _damage_arrays(damage), *_row_layout(components), result)
+        _code().intact_edge_stress(
+            c_int64(self.dim), self._cells, _damage_arrays(damage), *_row_layout(components), result
+        )
         return result
 
     def lower_chi(self, chi: Values, components: Values, damage: EdgeDamage) -> tuple[Ints, Values]:
@@ -141,7 +143,7 @@ class EdgeStressOperator:
         """
         cells, drop = np.empty(self._count, np.int64), np.empty(self._count)
         arguments = *_row_layout(components), chi, cells, drop
-        count = _code().lower(c_int64(self.dim), self._cells, _damage_arrays(damage), *arguments)
+        count = _code().lower_chi(c_int64(self.dim), self._cells, _damage_arrays(damage), *arguments)
         return cells[:count], drop[:count]
 
 

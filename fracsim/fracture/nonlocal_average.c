@@ -1,78 +1,79 @@
-/* Rows of a sparse matrix times columns, term after term as they are stored. */
+/* Products of rows of a sparse matrix with columns, summed in the order of storage (fracture.nonlocal_average). */
 
 #include <stdint.h>
 
-enum { AHEAD = 4 }; /* rows */
+enum { PREFETCH_ROWS = 4 };
 
 typedef struct {
-    const int32_t *start, *place; /* (rows + 1,), (weights,) */
+    const int32_t *start, *column; /* (rows + 1,), (weights,) */
     const double *weight;
 } Rows;
 
-/* Mark all places in the rows of those of the cells (count,) that are `chosen`. */
-void mark(const Rows *rows, int64_t count, const int64_t *cells, const uint8_t *chosen, uint8_t *marks)
+/* Mark all columns of the rows of those of the cells (count,) that are `chosen`. */
+void mark_columns(const Rows *rows, int64_t count, const int64_t *cells, const uint8_t *chosen, uint8_t *marks)
 {
     for (int64_t n = 0; n < count; n++)
         if (chosen[cells[n]])
-            for (int32_t j = rows->start[n]; j < rows->start[n + 1]; j++) marks[rows->place[j]] = 1;
+            for (int32_t j = rows->start[n]; j < rows->start[n + 1]; j++) marks[rows->column[j]] = 1;
 }
 
-/* found (width,): a row times x (places, width). */
-static inline __attribute__((always_inline)) void columns(
-    const Rows *rows, int64_t row, int width, const double *x, double *found)
+/* result (width,) = a row times x (columns, width). */
+static inline __attribute__((always_inline)) void row_product(
+    const Rows *rows, int64_t row, int width, const double *x, double *result)
 {
-    double sums[6] = {0}; /* not in memory: each would wait for the one before to be there */
+    double sums[6] = {0}; /* in registers: in memory each sum would wait for the one before */
     for (int32_t j = rows->start[row]; j < rows->start[row + 1]; j++)
-        for (int k = 0; k < width; k++) sums[k] += rows->weight[j] * x[(int64_t)width * rows->place[j] + k];
-    for (int k = 0; k < width; k++) found[k] = sums[k];
+        for (int k = 0; k < width; k++) sums[k] += rows->weight[j] * x[(int64_t)width * rows->column[j] + k];
+    for (int k = 0; k < width; k++) result[k] = sums[k];
 }
 
-static inline void row_times(const Rows *rows, int64_t row, int64_t width, const double *x, double *found)
+static inline void multiply_row(const Rows *rows, int64_t row, int64_t width, const double *x, double *result)
 {
-    switch (width) { /* a norm, stress in the plane and in space */
-    case 1: columns(rows, row, 1, x, found); return;
-    case 3: columns(rows, row, 3, x, found); return;
-    case 6: columns(rows, row, 6, x, found); return;
+    switch (width) { /* a norm, stress in 2D and in 3D */
+    case 1: row_product(rows, row, 1, x, result); return;
+    case 3: row_product(rows, row, 3, x, result); return;
+    case 6: row_product(rows, row, 6, x, result); return;
     }
-    for (int64_t k = 0; k < width; k++) found[k] = 0;
+    for (int64_t k = 0; k < width; k++) result[k] = 0;
     for (int32_t j = rows->start[row]; j < rows->start[row + 1]; j++)
-        for (int64_t k = 0; k < width; k++) found[k] += rows->weight[j] * x[width * rows->place[j] + k];
+        for (int64_t k = 0; k < width; k++) result[k] += rows->weight[j] * x[width * rows->column[j] + k];
 }
 
-/* The chosen ones of the rows, found: (count, width). */
-void times(
+/* result (count, width) = the chosen rows times x. */
+void multiply_rows(
     const Rows *rows, int64_t count, const int64_t *chosen, int64_t width, const double *restrict x,
-    double *restrict found)
+    double *restrict result)
 {
-    for (int64_t n = 0; n < count; n++) row_times(rows, chosen[n], width, x, found + width * n);
+    for (int64_t n = 0; n < count; n++) multiply_row(rows, chosen[n], width, x, result + width * n);
 }
 
-/* Tell the processor which row will be read. */
-static inline void fetch(const Rows *rows, int64_t row)
+/* Load a row into the cache. */
+static inline void prefetch_row(const Rows *rows, int64_t row)
 {
     for (int32_t j = rows->start[row]; j < rows->start[row + 1]; j += 8) {
         __builtin_prefetch(rows->weight + j);
-        if (j % 16 < 8) __builtin_prefetch(rows->place + j);
+        if (j % 16 < 8) __builtin_prefetch(rows->column + j);
     }
 }
 
-/* Cells of rows (count,), of those that `may` (cells,), whose row times x reaches `bound` times `whole` (rows,), where
-   that is not 0: the first ones of `found`. Of these `averages` (found, width) are the row times values (places, width)
-   over `whole`. Returns how many. */
-int64_t reaching(
-    const Rows *rows, int64_t count, const int64_t *cells, const uint8_t *may, const double *x, const double *whole,
-    double bound, int64_t width, const double *values, int64_t *found, double *averages)
+/* Averages that reach a bound: of cells (count,) that are a `candidate` (cells,), those whose row times x is at least
+   `bound` times the sum of the row. `result` has their numbers, `averages` (result, width) the row times values
+   (columns, width) over the sum of the row. Returns their number. */
+int64_t averages_above(
+    const Rows *rows, int64_t count, const int64_t *cells, const uint8_t *candidate, const double *x,
+    const double *row_sums, double bound, int64_t width, const double *values, int64_t *result, double *averages)
 {
-    int64_t many = 0;
+    int64_t selected = 0;
     for (int64_t row = 0; row < count; row++) {
         double sum;
-        if (row + AHEAD < count && may[cells[row + AHEAD]]) fetch(rows, row + AHEAD);
-        if (!may[cells[row]] || !(whole[row] > 0)) continue;
-        row_times(rows, row, 1, x, &sum);
-        if (!(sum >= bound * whole[row])) continue;
-        row_times(rows, row, width, values, averages + width * many);
-        for (int64_t k = 0; k < width; k++) averages[width * many + k] /= whole[row];
-        found[many++] = cells[row];
+        const int64_t ahead = row + PREFETCH_ROWS;
+        if (ahead < count && candidate[cells[ahead]]) prefetch_row(rows, ahead);
+        if (!candidate[cells[row]] || !(row_sums[row] > 0)) continue;
+        multiply_row(rows, row, 1, x, &sum);
+        if (!(sum >= bound * row_sums[row])) continue;
+        multiply_row(rows, row, width, values, averages + width * selected);
+        for (int64_t k = 0; k < width; k++) averages[width * selected + k] /= row_sums[row];
+        result[selected++] = cells[row];
     }
-    return many;
+    return selected;
 }

@@ -177,20 +177,20 @@ class _WeightBlock:
         cells, averages = np.empty(count, np.int64), np.empty((count, width))
         inputs = self.cells, candidates, np.ascontiguousarray(norms), sums, c_double(bound)
         outputs = c_int64(width), np.ascontiguousarray(values), cells, averages
-        count = _code().reaching(byref(self._matrix), c_int64(count), *inputs, *outputs)
+        count = _code().averages_above(byref(self._matrix), c_int64(count), *inputs, *outputs)
         return cells[:count], averages[:count]
 
     def mark_neighbours(self, near_flags: Flags, marks: Flags) -> None:
         """Set `marks` (near,) of the cells that are near the flagged own cells (near,) of this block."""
         sizes = c_int64(len(self.cells)), self.cells
-        _code().mark(byref(self._matrix), *sizes, near_flags, marks)
+        _code().mark_columns(byref(self._matrix), *sizes, near_flags, marks)
 
     def multiply(self, values: Values, rows: Ints | None = None) -> Values:
         """Return the weighted sums (n, k) of near values (near, k), of all rows or of `rows`."""
         rows = self._all_rows if rows is None else rows
         result, values = np.empty((len(rows), values.shape[1])), np.ascontiguousarray(values)
         sizes = c_int64(len(rows)), rows, c_int64(values.shape[1])
-        _code().times(byref(self._matrix), *sizes, values, result)
+        _code().multiply_rows(byref(self._matrix), *sizes, values, result)
         return result
 
 

@@ -48,7 +48,7 @@ def advance_vectors(polygons: Values, pairs: tuple[Ints, Ints], points: Values, 
     """
     inputs = [np.ascontiguousarray(array) for array in (polygons, pairs[1], pairs[0], points, radius)]
     result: Values = np.zeros(points.shape)
-    load_library(SOURCE).advance(c_int64(len(pairs[0])), *inputs, result)
+    load_library(SOURCE).advance_vectors(c_int64(len(pairs[0])), *inputs, result)
     return result
 
 
