@@ -21,7 +21,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-STEPS, WARM = 8, 2
+TIMED_STEPS, WARM_UP_STEPS = 8, 2
 EVENTS = {
     "residual": "SNESFunctionEval",
     "tangent": "SNESJacobianEval",
@@ -66,11 +66,11 @@ def run_case(n: int, bare: bool) -> dict[str, Any]:
         loop = BareLoop(n, run.scene.domain) if bare else None
         stage = PETSc.Log.Stage("fracsim")
         times: dict[str, list[float]] = {name: [] for name in ("step", "bare", "fracture", *EVENTS)}
-        for _ in range(WARM + STEPS):
+        for _ in range(WARM_UP_STEPS + TIMED_STEPS):
             _timed_step(run, stage, times)
             if loop is not None:
                 times["bare"].append(time_call(comm, loop.step))
-        figures = {name: float(np.median(values[WARM:])) for name, values in times.items() if values}
+        figures = {name: float(np.median(values[WARM_UP_STEPS:])) for name, values in times.items() if values}
         figures["output"] = time_call(comm, run.write_frame)
         figures["after_fracture"] = _after_fracture(run, stage)
     memory = comm.allreduce(_peak_memory())
@@ -111,9 +111,9 @@ def _after_fracture(run: Any, stage: Any) -> float:
 
     break_edges(run, np.ones(len(run.scene.fracture.graph.broken), bool))
     times: dict[str, list[float]] = {name: [] for name in ("step", "fracture", *EVENTS)}
-    for _ in range(WARM + STEPS):
+    for _ in range(WARM_UP_STEPS + TIMED_STEPS):
         _timed_step(run, stage, times)
-    return float(np.median(times["step"][WARM:]))
+    return float(np.median(times["step"][WARM_UP_STEPS:]))
 
 
 def time_call(comm: Any, work: Any) -> float:
@@ -291,7 +291,7 @@ def main() -> None:
             print(format_table([row]), flush=True)
     given.out.parent.mkdir(parents=True, exist_ok=True)
     given.out.write_text(json.dumps(cases, indent=2) + "\n")
-    print(f"\nseconds per step, medians of {STEPS} steps (table in {given.out})\n{format_table(cases)}")
+    print(f"\nseconds per step, medians of {TIMED_STEPS} steps (table in {given.out})\n{format_table(cases)}")
 
 
 if __name__ == "__main__":

@@ -19,8 +19,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-LARGEST = 300_000  # bytes of a picture
-MOST_SINGLE = 0.05  # share of pieces: a study whose pieces are single nodes shows its mesh, not a fracture
+MAX_PICTURE_BYTES = 300_000  # bytes of a picture
+MAX_SINGLE_NODE_SHARE = 0.05  # share of pieces: a study whose pieces are single nodes shows its mesh, not a fracture
 PAGE = Path("docs/gallery.md")
 RUNS = Path("out/gallery")
 HEAD = """# Gallery
@@ -189,8 +189,8 @@ def main() -> None:
     )
     for folder in runs:
         count, single = count_fragments(RUNS / folder)
-        if single > MOST_SINGLE * count:
-            sys.exit(f"{folder}: {single} of {count} pieces are single nodes, more than {MOST_SINGLE:.0%}")
+        if single > MAX_SINGLE_NODE_SHARE * count:
+            sys.exit(f"{folder}: {single} of {count} pieces are single nodes, more than {MAX_SINGLE_NODE_SHARE:.0%}")
 
 
 def run_study(folder: str, arguments: str, *, again: bool) -> None:
@@ -221,10 +221,10 @@ def has_ended(folder: Path) -> bool:
 
 
 def reduce_colours(path: Path) -> None:
-    """Reduce a picture larger than LARGEST to 256 colours."""
+    """Reduce a picture larger than MAX_PICTURE_BYTES to 256 colours."""
     from PIL import Image
 
-    if path.stat().st_size > LARGEST:
+    if path.stat().st_size > MAX_PICTURE_BYTES:
         with Image.open(path) as image:
             small = image.convert("RGB").quantize(256, dither=Image.Dither.NONE)
         small.save(path, optimize=True)

@@ -210,7 +210,7 @@ def test_faces_lie_on_each_other_or_cross_in_edges() -> None:
 
 def test_cost_of_self_contact_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("ipctk")
-    monkeypatch.setattr(self_contact_cost, "STEPS", 1)
+    monkeypatch.setattr(self_contact_cost, "CONTACT_STEPS", 1)
     monkeypatch.setattr(self_contact_cost, "REPEATS", 1)
     figures = self_contact_cost.measure("flat", 1)
     assert figures["touching"] > 0 and all(figures[name] > 0 for name in self_contact_cost.PAIR_OPERATIONS)

@@ -28,7 +28,7 @@ from . import fracture_step_cost, self_contact_cost, solver_comparison
 from .report_section import Claim, Plot, ReportTable, Section, Series, TableCell
 from .trial import Trial
 
-WARM, STEPS = 3, 12
+WARM_UP_STEPS, TIMED_STEPS = 3, 12
 # blocks of steps are repeated, up to MAX_STEPS, while the quartiles of the ratio differ by more than this share of it
 MAX_QUARTILE_RANGE, MAX_STEPS = 0.08, 36
 SMALL_N, LARGE_N = 10, 20  # cells along a metre: 24k and 192k tetrahedra
@@ -82,7 +82,7 @@ class FeatureScene:
     plane: bool = False
     baseline: str = "elastic"
     needs: str = ""
-    first: int = WARM
+    first: int = WARM_UP_STEPS
 
 
 def feature_scenes(n: int) -> dict[str, FeatureScene]:
@@ -206,7 +206,7 @@ def measure_alone(name: str, n: int, began: float) -> dict[str, Any]:
         started_ = start_run(name, n, Path(folder))
         started_.step()
         start_up = time.perf_counter() - began
-        for _ in range(WARM):
+        for _ in range(WARM_UP_STEPS):
             started_.step()
         frame = time_call(started_.comm, started_.write_frame)
         cells = started_.scene.domain.cell_count
@@ -272,7 +272,7 @@ def _time_block(name: str, n: int) -> tuple[list[tuple[float, float]], str]:
             from ..bench import BareLoop
 
             steps.append(BareLoop(n, runs[0].scene.domain, records=bool(scene.baseline), in_lanes=True).step)
-        pairs = [_time_pair(runs[0].comm, steps, number) for number in range(scene.first + STEPS)]
+        pairs = [_time_pair(runs[0].comm, steps, number) for number in range(scene.first + TIMED_STEPS)]
         newton = " / ".join(str(run.scene.stepper.solver.snes.its) for run in runs)
     return pairs[scene.first :], newton
 
@@ -320,7 +320,8 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     base = _modules_of_elastic(records)
     rows = tuple(_row(record, base) for record in records)
     text = (
-        f"Medians of the {STEPS} steps after the first {WARM}, repeated up to {MAX_STEPS} steps while the quartiles of "
+        f"Medians of the {TIMED_STEPS} steps after the first {WARM_UP_STEPS}, repeated up to {MAX_STEPS} steps "
+        f"while the quartiles of "
         f"the ratio differ by more than {MAX_QUARTILE_RANGE:.0%}. Each step is timed in turn with one of the "
         f"scene it is "
         "compared with. Ratio: median over single steps; ±: half the distance between the quartiles. Newton: "

@@ -23,7 +23,7 @@ from .trial import Trial
 
 Data = dict[str, Any]
 MAX_STEP_SECONDS = 5.0  # s: whole runs on random meshes took this long when one step of a lattice took 129 s
-TURNS, BLOCK, WARM = 10, 100, 4  # explicit steps: blocks, steps a block, and steps before them
+BLOCK_COUNT, BLOCK_STEPS, WARM_UP_STEPS = 10, 100, 4  # explicit steps: blocks, steps a block, and steps before them
 PULLED = {"on": "right", "displacement": {"time": [0.0, 1.0], "value": [[0.0, 0.0], [6e-4, 0.0]]}}
 SHEARED = {"on": "top", "displacement": {"time": [0.0, 1.0], "value": [[0.0, 0.0], [1e-3, 0.0]]}}
 BENT = {"on": "right", "displacement": {"time": [0.0, 1.0], "value": [[0.0, 0.0], [0.0, 2e-3]]}}
@@ -75,7 +75,7 @@ COLUMN_STUDY: Data = {
 }
 CRACK_CORNERS = ((-1.0, -1.0), (0.513, -1.0), (0.513, 2.0), (-1.0, 2.0))
 COLUMN_CRACK: Data = {"crack": [{"polygon": [[x, y, 2.013] for x, y in CRACK_CORNERS]}]}
-FRONT, STEPS = "front", 60
+FRONT, FRONT_STEPS = "front", 60
 MAX_FRONT_SHARE = 0.05  # of a step
 
 
@@ -106,12 +106,12 @@ def measure_collapse(name: str) -> Data:
 
 def measure_explicit() -> Data:
     """Processor seconds of equal numbers of steps of the pane without and with fracture."""
-    return _time_in_turn(PANE_STUDY, PANE_FRACTURE, TURNS, BLOCK)
+    return _time_in_turn(PANE_STUDY, PANE_FRACTURE, BLOCK_COUNT, BLOCK_STEPS)
 
 
 def measure_front() -> Data:
     """Processor seconds of equal numbers of steps of the column without and with a crack front."""
-    return _time_in_turn(COLUMN_STUDY, COLUMN_CRACK, STEPS, 1)
+    return _time_in_turn(COLUMN_STUDY, COLUMN_CRACK, FRONT_STEPS, 1)
 
 
 def _time_in_turn(study: Data, more: Data, turns: int, block: int) -> Data:
@@ -124,7 +124,7 @@ def _time_in_turn(study: Data, more: Data, turns: int, block: int) -> Data:
         seconds: list[list[float]] = [[], []]
         reports = []
         for run in runs:
-            _time_steps(run, WARM)
+            _time_steps(run, WARM_UP_STEPS)
         for _ in range(turns):
             for run, spent in zip(runs, seconds, strict=True):
                 took, reports_of = _time_steps(run, block)

@@ -25,7 +25,7 @@ from .report_section import Claim, ReportTable, Section
 from .trial import Trial
 
 CONTACT_KINDS = ("flat", "edge")
-REPEATS, STEPS = 7, 48  # the first dozen, at impact, cost most with faces and least with edges
+REPEATS, CONTACT_STEPS = 7, 48  # the first dozen, at impact, cost most with faces and least with edges
 MAX_RATIO = 1.25  # of processor times; allows for noise and caches
 PAIR_OPERATIONS = ("detection, short way", "detection, long way", "energy", "gradient", "hessian")
 COS_45 = np.sqrt(0.5)
@@ -90,9 +90,9 @@ def measure(kind: str, n: int) -> dict[str, Any]:
 
 
 def _time_contact_steps(run: Any, contact: Any) -> list[tuple[float, int]]:
-    """Processor time (s) and Newton iterations of the first STEPS steps that end in contact."""
+    """Processor time (s) and Newton iterations of the first CONTACT_STEPS steps that end in contact."""
     results: list[tuple[float, int]] = []
-    while len(results) < STEPS:
+    while len(results) < CONTACT_STEPS:
         began = time.process_time()
         run.step()
         if contact.stored_energy() > 0:

@@ -25,7 +25,7 @@ from ..trial import Trial
 from .akantu import ABSENT, AkantuProcess, akantu_python, problem_arrays
 
 SIZES = (10, 20)  # 24k and 192k tetrahedra
-WARM, STEPS = 2, 28
+WARM_UP_STEPS, TIMED_STEPS = 2, 28
 TIME_STEP, TRACTION = 5e-3, 1e3  # s, Pa
 MAX_TIME_RATIO, MAX_DIFFERENCE = 0.8, 1e-4  # of Akantu's step; of the displacement
 SCHEMES: dict[str, dict[str, Any]] = {
@@ -38,7 +38,7 @@ SAME_EQUATIONS = next(iter(SCHEMES))  # the scheme with Akantu's equations
 
 def block_study(n: int, scheme: str) -> dict[str, Any]:
     """Study with n cells along a metre."""
-    end = (WARM + STEPS) * TIME_STEP
+    end = (WARM_UP_STEPS + TIMED_STEPS) * TIME_STEP
     return {
         "title": f"a linear block of {24 * n**3} tetrahedra",
         "mesh": {"builder": "box", "size": [1.0, 1.0, 4.0], "h": 1 / n},
@@ -71,8 +71,8 @@ def compare(n: int) -> dict[str, Any]:
         runs = {scheme: _start_run(n, scheme, Path(folder, str(place))) for place, scheme in enumerate(SCHEMES)}
         theirs = AkantuProcess(problem_arrays(runs[SAME_EQUATIONS].scene, TIME_STEP), Path(folder))
         times: dict[str, list[tuple[float, float]]] = {scheme: [] for scheme in SCHEMES}
-        for number in range(WARM + STEPS):
-            theirs.step((number + 1) / (WARM + STEPS))
+        for number in range(WARM_UP_STEPS + TIMED_STEPS):
+            theirs.step((number + 1) / (WARM_UP_STEPS + TIMED_STEPS))
             for scheme, run in runs.items():
                 wall, cpu = time.perf_counter(), time.process_time()
                 run.step()
@@ -82,7 +82,11 @@ def compare(n: int) -> dict[str, Any]:
     return {
         "cells": runs[SAME_EQUATIONS].scene.domain.cell_count,
         "apart": float(np.abs(ours - exact).max() / np.abs(exact).max()),
-        "akantu": {"wall": median(theirs.wall[WARM:]), "cpu": median(theirs.cpu[WARM:]), "first": theirs.cpu[0]},
+        "akantu": {
+            "wall": median(theirs.wall[WARM_UP_STEPS:]),
+            "cpu": median(theirs.cpu[WARM_UP_STEPS:]),
+            "first": theirs.cpu[0],
+        },
         "ours": {scheme: _median_times(pairs) for scheme, pairs in times.items()},
     }
 
@@ -100,7 +104,7 @@ def _start_run(n: int, scheme: str, folder: Path) -> Any:
 
 def _median_times(pairs: list[tuple[float, float]]) -> dict[str, float]:
     """Median wall and processor times after the first steps, and processor time of the first."""
-    wall, cpu = zip(*pairs[WARM:], strict=True)
+    wall, cpu = zip(*pairs[WARM_UP_STEPS:], strict=True)
     return {"wall": median(wall), "cpu": median(cpu), "first": pairs[0][1]}
 
 
@@ -125,7 +129,8 @@ def sections(records: list[dict[str, Any]]) -> list[Section]:
     if not done:
         return [Section(TITLE, results[0]["message"] if results else ABSENT)]
     text = (
-        f"Block of 24 n^3 tetrahedra, {STEPS} steps of {TIME_STEP:g} s after the first {WARM}, in turn, one "
+        f"Block of 24 n^3 tetrahedra, {TIMED_STEPS} steps of {TIME_STEP:g} s after the first {WARM_UP_STEPS}, in "
+        f"turn, one "
         f"process and "
         f"thread each; medians. '{SAME_EQUATIONS}' solves Akantu's equations. Akantu keeps the factors of a "
         f"direct solver, we "

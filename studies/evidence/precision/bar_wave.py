@@ -20,7 +20,7 @@ from .precision_trials import MINIMAL_OUTPUT, TIGHT_TOLERANCES, Study, study_tri
 DURATION, END, PULL = 0.6, 0.9, 1e-3  # s, s, Pa
 KNOTS = 400
 CELLS = (32, 64, 128, 256)
-FIRST_CELLS, STEPS = 128, (64, 512, 1024, 2048)  # of backward Euler; steps in a second
+EULER_CELLS, EULER_STEPS = 128, (64, 512, 1024, 2048)  # of backward Euler; steps in a second
 SECOND_ORDER = ("newmark", "generalized-alpha", "explicit")
 
 
@@ -46,7 +46,7 @@ def trials() -> list[Trial]:
     for load in ("pulse", "step"):
         for scheme in SECOND_ORDER:
             results += [_trial(load, cells, scheme, 0.5 / cells) for cells in CELLS if load == "pulse" or cells > 32]
-    results += [_trial("pulse", FIRST_CELLS, "backward-euler", 1 / count) for count in STEPS]
+    results += [_trial("pulse", EULER_CELLS, "backward-euler", 1 / count) for count in EULER_STEPS]
     results += [_trial("step", cells, "backward-euler", 0.5 / cells) for cells in CELLS if cells > 32]
     results.append(_trial("pulse", 256, "explicit", 0.5 / 256, ranks=2))
     return results
@@ -100,8 +100,8 @@ def _trial_names(scheme: str, pairs: tuple[tuple[int, int], ...]) -> tuple[str, 
     return tuple(f"{scheme}-{cells}-{count}" for cells, count in pairs)
 
 
-FINE = ((64, 128), (128, 256), (256, 512))
-FIRST = tuple((FIRST_CELLS, count) for count in STEPS[1:])
+SECOND_ORDER_RUNS = ((64, 128), (128, 256), (256, 512))
+EULER_RUNS = tuple((EULER_CELLS, count) for count in EULER_STEPS[1:])
 CASES = [
     AccuracyCase(
         "wave-pulse", "Bar wave: smooth pulse", _text, ("scheme", "h", "dt"),
@@ -111,10 +111,10 @@ CASES = [
             ExpectedOrder(error, variable, order, _trial_names(scheme, names), scheme)
             for error in ("velocity", "displacement")
             for scheme, variable, order, names in (
-                ("newmark", "h", 2.0, FINE),
-                ("generalized-alpha", "h", 2.0, FINE),
-                ("explicit", "h", 2.0, FINE),
-                ("backward-euler", "dt", 1.0, FIRST),
+                ("newmark", "h", 2.0, SECOND_ORDER_RUNS),
+                ("generalized-alpha", "h", 2.0, SECOND_ORDER_RUNS),
+                ("explicit", "h", 2.0, SECOND_ORDER_RUNS),
+                ("backward-euler", "dt", 1.0, EULER_RUNS),
             )
         ),
         split="scheme", excluded=("explicit",),
@@ -124,7 +124,7 @@ CASES = [
         measured_errors("velocity", "displacement"),
         ("displacement", "velocity"),
         tuple(
-            ExpectedOrder(error, "h", order, _trial_names(scheme, FINE), scheme)
+            ExpectedOrder(error, "h", order, _trial_names(scheme, SECOND_ORDER_RUNS), scheme)
             for scheme, p in (("newmark", 2), ("generalized-alpha", 2), ("explicit", 2), ("backward-euler", 1))
             for error, order in (("velocity", p / (2 * (p + 1))), ("displacement", 3 * p / (2 * (p + 1))))
         ),
