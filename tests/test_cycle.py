@@ -13,7 +13,8 @@ from petsc4py import PETSc
 from cases import BAR, study
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers.linear_solver import LinearSolver
-from fracsim.solvers.multigrid import bcsr, smoother, vcycle
+from fracsim.solvers.multigrid import bcsr, vcycle
+from fracsim.solvers.multigrid.levels import SmoothedLevel
 from fracsim.solvers.policy import DEFAULT_POLICY
 from fracsim.solvers.preconditioner import Update, mass_stiffness_ratio
 from support.scenes import Walk
@@ -62,7 +63,7 @@ def inverse_blocks(A: Values, size: int) -> Values:
     return B
 
 
-def by_hand(A: list[Values], P: list[Values], levels: list[smoother.SmoothedLevel]) -> Values:
+def by_hand(A: list[Values], P: list[Values], levels: list[SmoothedLevel]) -> Values:
     """M of the finest level in double precision, p by Chebyshev's polynomial of the eigenvalues of L^T A L, L L^T = B:
     r after n steps is T_n((m - l) / h) / T_n(m / h) of r before; C is as many cycles as there shall be, each of what
     the one before has left; the coarsest matrix is inverted."""
@@ -89,7 +90,7 @@ def largest_eigenvalue(B: Values, A: Values) -> float:
     return float(np.linalg.eigvalsh(L.T @ A @ L)[-1])
 
 
-def largest_of(level: smoother.SmoothedLevel) -> float:
+def largest_of(level: SmoothedLevel) -> float:
     """The eigenvalue that it smooths for."""
     return 2 / (level._weights[0][1] * (1.1 + level.smoothing.lower_bound))
 
@@ -112,7 +113,7 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
     linear, preconditioner = linear_of(scene), linear_of(scene).preconditioner
     preconditioner._due = Update.REFRESH
     assert linear.solve()
-    made, pc = preconditioner._vcycle, preconditioner.pc
+    made, pc = preconditioner.applied.vcycle, preconditioner.pc
     assert isinstance(made, vcycle.SinglePrecisionVCycle) and preconditioner.serving.handle == made.pc.handle
     A = [dense(pc.getMGSmoother(level).getOperators()[1]) for level in range(pc.getMGLevels())]
     P = [dense(pc.getMGInterpolation(level)) for level in range(1, len(A))]
@@ -164,7 +165,7 @@ def test_more_is_done_with_coarser_levels_of_what_is_slender(monkeypatch: pytest
             time={"end": 9.0, "scheme": "backward-euler", "step": 3.0},
         )  # fmt: skip
         its.append(Walk(scene).advance().solve.krylov_iterations)
-        made = linear_of(scene).preconditioner._vcycle
+        made = linear_of(scene).preconditioner.applied.vcycle
         assert made is not None
         assert (made._levels[-2].smoothing == vcycle.THOROUGH_SMOOTHING[0]) == (size is strip and slowly < 1)
     assert its[0] < 0.8 * its[1] and its[2] < its[0]
@@ -180,7 +181,7 @@ def test_it_takes_no_more_iterations_than_in_double_precision(monkeypatch: pytes
         walk = Walk(scene)
         its.append([walk.advance().solve.krylov_iterations for _ in range(4)])
         u.append(walk.u)
-        assert (linear_of(scene).preconditioner._vcycle is None) == bool(given)
+        assert (linear_of(scene).preconditioner.applied.vcycle is None) == bool(given)
     assert all(0.8 * double <= single <= double for single, double in zip(*its, strict=True)) and min(its[0]) > 5
     np.testing.assert_allclose(*u, rtol=0, atol=1e-6 * np.abs(u[1]).max())
 
@@ -248,9 +249,9 @@ def test_coarse_spaces_are_kept_where_no_edge_has_broken(monkeypatch: pytest.Mon
     ):  # fmt: skip
         preconditioner._extra_iterations = extra
         preconditioner.edges_broke(broke)
-        made, spaces = preconditioner._vcycle, preconditioner.pc.getMGInterpolation(1)
+        made, spaces = preconditioner.applied.vcycle, preconditioner.pc.getMGInterpolation(1)
         assert linear.solve()
-        assert (preconditioner._vcycle is made) == cycle_kept, (extra, broke)
+        assert (preconditioner.applied.vcycle is made) == cycle_kept, (extra, broke)
         assert (preconditioner.pc.getMGInterpolation(1).handle == spaces.handle) == spaces_kept, (extra, broke)
 
 
@@ -260,4 +261,4 @@ def test_without_a_compiler_petscs_own_stays(monkeypatch: pytest.MonkeyPatch) ->
     scene = bar(3, {})
     assert Walk(scene).advance().solve.converged
     preconditioner = linear_of(scene).preconditioner
-    assert preconditioner._vcycle is None and preconditioner.serving.getType() == "gamg"
+    assert preconditioner.applied.vcycle is None and preconditioner.serving.getType() == "gamg"

@@ -21,7 +21,7 @@ from .policy import SolverPolicy
 from .preconditioner import Update
 
 if TYPE_CHECKING:
-    from .multigrid.fine_level import FineLevel
+    from .multigrid.levels import FineLevel
     from .tangent_operators import TangentOperators
 
 

@@ -26,7 +26,7 @@ from .policy import SolverPolicy
 
 if TYPE_CHECKING:
     from .deflation import DeflatedPreconditioner
-    from .multigrid.fine_level import FineLevel
+    from .multigrid.levels import FineLevel
     from .multigrid.vcycle import SinglePrecisionVCycle
     from .tangent_operators import TangentOperators
 

@@ -14,7 +14,7 @@ from .preconditioner import mass_stiffness_ratio, rigid_body_nullspace
 
 if TYPE_CHECKING:
     from ..mechanics.block_matrix import BlockMatrix
-    from .multigrid.fine_level import FineLevel
+    from .multigrid.levels import FineLevel
 
 
 class PatternListener(Protocol):

@@ -14,7 +14,7 @@ from petsc4py import PETSc
 
 if TYPE_CHECKING:
     from ...mechanics.block_matrix import BlockMatrix
-    from .fine_level import FineLevel
+    from .levels import FineLevel
 
 
 class BlockOperator:

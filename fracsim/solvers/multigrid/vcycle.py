@@ -6,7 +6,7 @@ precision. From x = 0 the cycle is
 
     M = 2 p - p A' p + (1 - p A') C (1 - A' p),    C = P' A'_coarse^-1 P'^T,    A' = S A S,  P' = S_fine^-1 P S_coarse
 
-with Chebyshev's smoother p = q(B A') B (smoother). It is symmetric, and positive definite if the eigenvalues of p A'
+with Chebyshev's smoother p = q(B A') B (levels). It is symmetric, and positive definite if the eigenvalues of p A'
 are within (0, 2), whatever the rounding errors of an almost singular A'.
 
 Where cycles from the second finest level down converge slowly, as in thin and torn bodies, coarse levels have more
@@ -31,9 +31,8 @@ from ..policy import DEFAULT_POLICY, SolverPolicy
 from ..weak_callbacks import ApplyContext
 from . import bcsr
 from .bcsr import GhostedVector, Prolongation
-from .fine_level import FineLevel
 from .hierarchy import BlockCSRData, copy_levels
-from .smoother import SmoothedLevel, SmoothingParameters
+from .levels import FineLevel, SmoothedLevel, SmoothingParameters
 
 if TYPE_CHECKING:
     from ...mechanics.block_matrix import BlockMatrix
