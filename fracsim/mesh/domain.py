@@ -221,6 +221,7 @@ def distribute(comm: MPI.Comm, data: MeshData | None, order: int = 1) -> Domain:
     """
     head = None
     if data is not None:
+        # what all ranks need of the input mesh, in one message
         bounds = BoundingBox(data.points.min(axis=0), data.points.max(axis=0))
         head = (data.dim, list(data.facet_groups), _region_index(data), list(data.regions), bounds)
     dim, groups, region, region_names, bounds = bcast(comm, head)

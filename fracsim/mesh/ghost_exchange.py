@@ -29,6 +29,7 @@ def min_over_ranks(index_map: IndexMap, values: npt.NDArray[Any]) -> npt.NDArray
     if comm.size == 1:
         return values
     first, owned_count = index_map.local_range[0], index_map.size_local
+    # every rank has the ghosts of all ranks, and takes those that it owns
     ghosts, ghost_values = (np.concatenate(allgather(comm, rows)) for rows in (index_map.ghosts, values[owned_count:]))
     owned = (ghosts >= first) & (ghosts < first + owned_count)
     result = values.copy()

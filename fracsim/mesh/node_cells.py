@@ -35,9 +35,8 @@ class NodeCellCount:
 def node_components(domain: Domain, flags: Flags) -> tuple[int, Ints]:
     """The number of facet-connected components of the flagged cells, and (owned nodes,) that of each node (collective).
 
-    Cells that share only a node or an edge are not connected: they rotate freely about it. A node of several components
-    has the largest, a node of none has -1. Components are numbered from the largest, equally large ones by their lowest
-    cell in the input mesh. `flags`: (owned cells,).
+    Components are numbered from the largest one. A node of several components has the largest, a node of none has -1.
+    `flags`: (owned cells,).
     """
     cells = np.flatnonzero(flags)
     count, component = _local_components(domain, cells)
@@ -45,6 +44,7 @@ def node_components(domain: Domain, flags: Flags) -> tuple[int, Ints]:
     size: Ints = np.bincount(component, minlength=count)
     np.minimum.at(lowest, component, domain.input_numbering.cells[cells])
     joined, size, lowest = _join_over_ranks(domain, cells, component, count, size, lowest)
+    # equally large components by their lowest cell in the input mesh, at any partition
     number = np.empty(len(size), np.int64)
     number[np.lexsort((lowest, -size))] = np.arange(len(size))
     return len(size), _lowest_number(domain, cells, number[joined[component]])
@@ -54,6 +54,7 @@ def _local_components(domain: Domain, cells: Ints) -> tuple[int, Ints]:
     """The number of components on this rank, and (n,) that of each of the cells (n,)."""
     index = np.full(domain.cell_count, -1)
     index[cells] = np.arange(len(cells))
+    # cells that share only a node or an edge are not connected: they rotate freely about it
     links = index[domain.facets.neighbours]
     return components(links[(links >= 0).all(axis=1)], len(cells))
 

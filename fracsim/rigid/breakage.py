@@ -161,13 +161,10 @@ class BreakableBody:
     # --- loads ---
 
     def may_break(self, fragment: int, force: float) -> bool:
-        """Return whether forces, the sum of whose sizes is `force`, N, could break a fragment or make it yield.
-
-        The bound is the stress of a beam of the length of the fragment and the least thickness. There must be
-        surfaces left.
-        """
+        """Return whether forces, the sum of whose sizes is `force`, N, could break a fragment or make it yield."""
         if not self.surfaces_left:
             return False
+        # upper bound: bending stress of a beam of the length of the fragment and the least thickness
         h = self.analyses.stiffness.beam_thickness
         length = max(float(self.fragments.diagonals[fragment]), h)
         return bool(2 * force * length / h**3 >= self._weakest_stress())
@@ -226,6 +223,7 @@ class BreakableBody:
         try:
             self.break_fragments(self.fragments.containing(name), loads)
         finally:
+            # surfaces count only once the outcome is applied
             new_starts = criterion.starts[len(starts) :]
             criterion.set_starts(starts)
             criterion.reserve(0)
@@ -302,12 +300,10 @@ class BreakableBody:
         return count + self.graph.break_unloaded_edges() if count else 0
 
     def _is_surely_safe(self, stress: Values) -> bool:
-        """Return whether no average can reach the strength, since no cell of the fragment does.
-
-        With damaged cells this is not known: a cell in which a crack ends may have an average above its own stress.
-        """
+        """Return whether no average can reach the strength, since no cell of the fragment does."""
         assert self._criterion is not None
         cells = np.flatnonzero(self._average.in_fragment & ~self.graph.split)
         size = frobenius_norm(stress[cells], self._domain.dim)
         below = float(size.max(initial=0.0)) < self._criterion.strength.minimum * (1 - 1e-9)
+        # a cell in which a crack ends may have an average above its own stress
         return below and not self.graph.damaged[cells].any()

@@ -77,6 +77,7 @@ def make_constraints(
         threshold: c_0, m/s.
         restitution: coefficient of restitution e, 0 to 1.
     """
+    # faster than resting contacts, and closed within the step
     impacts = (approach_speed > threshold) & (gap < approach_speed * dt)
     resting = _approach_without_impact(gap, gap, dt, threshold)
     allowed = np.where(impacts, -restitution * approach_speed * dt, resting)
@@ -92,8 +93,6 @@ def make_event_constraints(
 ) -> ContactConstraints:  # fmt: skip
     """Return the constraints of one event in a sequence.
 
-    In the last event contacts that would be postponed close just as the step ends.
-
     Args:
         gap: (k,) m.
         approach_speed: (k,) m/s.
@@ -105,6 +104,7 @@ def make_event_constraints(
         impact_candidates: (k,) contacts in which an impact counts.
     """
     impacts = impact_candidates & (gap + approach < approach_speed * dt)
+    # in the last event of a sequence these close just as the step ends
     postponed = impacts & impacts_later(gap, approach_speed, dt, threshold)
     resting = _approach_without_impact(gap, gap / remaining, dt, threshold)
     allowed = np.where(impacts & ~postponed, -restitution * approach_speed * dt, resting)

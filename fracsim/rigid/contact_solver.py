@@ -158,9 +158,6 @@ class MujocoNewtonSolver:
     def solve(self, allowed_approach: Values, active: Flags) -> tuple[Values, Values, Flags]:
         """Return forces and moments of bodies, forces of contacts, and which contacts transmit a force.
 
-        Newton's method changes the set of closed contacts in every iteration, and may need many iterations for it. Then
-        softer contacts are solved first, of which each solution starts the next one.
-
         Args:
             allowed_approach: (k,) distance that the bodies may approach, m.
             active: (k,) contacts that are solved for.
@@ -173,6 +170,8 @@ class MujocoNewtonSolver:
         data.contact.dist[:], data.contact.exclude[:] = allowed_approach, ~active
         self._run_solver(1.0, SETTINGS.direct_iterations)
         if not self._has_converged():
+            # Newton's method changes the set of closed contacts in every iteration, and may need many iterations for
+            # it. Then softer contacts are solved first, of which each solution starts the next one.
             for factor in SETTINGS.compliance_factors:
                 self._run_solver(factor, SETTINGS.newton_iterations)
         closed = active & (data.efc_force[data.contact.efc_address] > 0)
@@ -295,17 +294,14 @@ class ContactSolver:
         )  # fmt: skip
 
     def _solve_by_newton(self, event: ImpactEvent, obstacle_points: Values) -> Values:
-        """Return forces and moments (n, 6) by MuJoCo's solver.
-
-        MuJoCo's convex problem separates contacts that slip with speed s at mu s. Therefore they may approach by mu s
-        dt more, with the slip speed of the solution, which is updated a few times. With a slip speed that is too
-        large the body would sink in by the difference in every step.
-        """
+        """Return forces and moments (n, 6) by MuJoCo's solver."""
         dt, contacts, active, model = self._parameters.time_step, event.contacts, event.active, self._model
         rates, newton = event.bounds.obstacle_velocity, self._newton or MujocoNewtonSolver(model, self._parameters)
         self._newton = newton
         points = obstacle_points[model.driven]
         newton.set_up(event.bodies, points, rates[model.driven], contacts, event.conditions.gravity)
+        # MuJoCo's convex problem separates contacts that slip with speed s at mu s. Therefore they may approach by
+        # mu s dt more, with the slip speed of the solution, which is updated a few times.
         factor = dt * contacts.friction
         slip_approach = factor * contacts.slip_speeds(*velocities_of_all(event.bodies, rates), active)
         for _ in range(SETTINGS.slip_rounds):
@@ -313,6 +309,7 @@ class ContactSolver:
             motion = velocities_of_all(self.apply_forces(event, force), rates)
             missed = self._find_missed(event, active, motion)
             active, before = active | missed, slip_approach
+            # with a slip speed that is too large the body would sink in by the difference in every step
             slip_approach = np.minimum(slip_approach, factor * contacts.slip_speeds(*motion, active))
             change = (before - slip_approach)[closed]
             if not np.any(missed) and np.all(change < SETTINGS.slip_tolerance * self._parameters.impact_threshold * dt):

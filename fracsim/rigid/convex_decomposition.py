@@ -102,7 +102,8 @@ class Polyhedron:
 
     @property
     def without_cavities(self) -> Polyhedron:
-        """The solid with its enclosed cavities filled, since nothing can touch their inner surfaces."""
+        """The solid with its enclosed cavities filled."""
+        # nothing can touch the inner surface of a cavity
         count, part = components(self.triangles[:, [0, 1, 1, 2]].reshape(-1, 2), len(self.points))
         if count == 1:
             return self
@@ -127,11 +128,9 @@ class Polyhedron:
         return ConvexHullPart(self.points[hull.vertices], float(hull.area), max(float(hull.volume) - volume, 0.0))
 
     def cut_by_plane(self, point: Values, normal: Values) -> tuple[Polyhedron, Polyhedron]:
-        """Return the parts above and below the plane through a point (3,) with a normal (3,).
-
-        Each part is closed by a cone over the section from its centre. Where the section is not convex, triangles of
-        the cone overlap with opposite signs, so that volumes are exact.
-        """
+        """Return the parts above and below the plane through a point (3,) with a normal (3,)."""
+        # Each part is closed by a cone over the section from its centre. Where the section is not convex, triangles of
+        # the cone overlap with opposite signs, so that volumes are exact.
         above = (self.points - point) @ normal >= 0
         count = above[self.triangles].sum(axis=1)
         is_cut = (count == 1) | (count == 2)

@@ -405,10 +405,10 @@ def _carry_over(flags: Flags, retained: Ints, count: int) -> Flags:
 def sinking_corrections(before: Contacts, after: Contacts, flew: Flags) -> Values:
     """Return the translations (n, 3), m, that set bodies which flew (n,) back onto their support.
 
-    A body flies freely up to its impact, also into what it approaches more slowly than c_0, by up to c_0 dt. It is
-    moved along the normal of the obstacle by what its deepest contact is deeper than any was before. Velocities stay,
-    so that only the work of its weight, which was too large, is corrected.
+    They are moved along the normal of the obstacle by what their deepest contact is deeper than any was before.
     """
+    # A body flies freely up to its impact, also into what it approaches more slowly than c_0, by up to c_0 dt. Its
+    # velocity stays, so that only the work of its weight, which was too large, is corrected.
     count = len(flew)
     depth: Values = np.zeros(count)
     rows, body, _ = _obstacle_contacts(before, flew)

@@ -217,11 +217,9 @@ def _movable_shape(shape: PrimitiveShape, side: float) -> tuple[PrimitiveShape, 
 
 
 def _add_placed_body(spec: Any) -> Any:
-    """Add a body whose position is set directly.
-
-    With free joints MuJoCo would compute the inverse of the mass matrix, at a cost that grows with the square of the
-    number of bodies. Pairs of bodies without any joint are not searched for contacts.
-    """
+    """Add a body whose position is set directly."""
+    # With free joints MuJoCo would compute the inverse of the mass matrix, at a cost that grows with the square of the
+    # number of bodies. Pairs of bodies without any joint are not searched for contacts.
     body = spec.worldbody.add_body()
     body.add_joint(type=mujoco.mjtJoint.mjJNT_SLIDE)
     body.explicitinertial, body.mass, body.inertia = True, 1.0, np.ones(3)
@@ -251,10 +249,10 @@ def _add_parts(
 ) -> int:  # fmt: skip
     """Add geoms to a body, hulls rotated by `quat`; return their number.
 
-    A contact has the friction of the geom with the higher priority. A plane does not collide with hulls in MuJoCo;
-    those contacts are found by PlaneContacts.
+    A contact has the friction of the geom with the higher priority.
     """
-    # bits of MuJoCo's masks of what collides: planes with primitive shapes, and everything else with hulls too
+    # bits of MuJoCo's masks of what collides: planes with primitive shapes alone, since PlaneContacts finds their
+    # contacts with hulls, and everything else with hulls too
     plane_bit, general_bit = 1, 2
     for part in parts:
         geom = body.add_geom()

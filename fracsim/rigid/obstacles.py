@@ -204,6 +204,7 @@ class ObstacleSet:
             dt: s.
         """
         of_fragments, of_obstacles = np.zeros((2, len(self.obstacles), 3))
+        # the second body of a contact receives the impulse, the first one its reaction
         sides = ((impulses.first, impulses.second, -1.0), (impulses.second, impulses.first, 1.0))
         for receiver, partner, sign in sides:
             is_fragment = partner < fragment_count

@@ -57,8 +57,6 @@ def _is_among_first(group: Ints, value: Values, count: int) -> Flags:
 def _supporting_corners(body: Ints, arm: Values, axes: Values, later_gap: Values) -> Flags:
     """Return (k,) flags of corners that may support their body: the lowest and the outermost in each sector.
 
-    A body with few corners is supported by all of them.
-
     Args:
         body: (k,) of the corners.
         arm: (k, 3) from the centre of the body, m.
@@ -68,6 +66,7 @@ def _supporting_corners(body: Ints, arm: Values, axes: Values, later_gap: Values
     x, y = arm @ axes[:, 0], arm @ axes[:, 1]
     sector = np.floor((np.arctan2(x, y) / (2 * np.pi) + 0.5) * SETTINGS.sectors).astype(np.int64)
     group = SETTINGS.sectors * body + np.minimum(sector, SETTINGS.sectors - 1)
+    # a body with few corners may be supported by all of them
     has_few = np.bincount(body) <= SETTINGS.sectors * (SETTINGS.lowest_corners + SETTINGS.outermost_corners)
     lowest = _is_among_first(group, later_gap, SETTINGS.lowest_corners)
     outermost = _is_among_first(group, -np.hypot(x, y), SETTINGS.outermost_corners)
@@ -124,8 +123,6 @@ class PlaneContacts:
     def find_missed(self, bodies: Bodies, obstacle_points: Values, depth: float, checked: CheckedCorners) -> Flags:
         """Return (n,) flags of bodies with unchecked corners that penetrate a plane by more than `depth`, m.
 
-        Those that may support the body are required from now on.
-
         Args:
             bodies: after the step.
             obstacle_points: (m, 3) reference points of obstacles after the step, m.
@@ -138,6 +135,7 @@ class PlaneContacts:
             rows = np.flatnonzero((gap < -depth) & ~checked.checked[number, near])
             if len(rows):
                 body = self.corner_body[near[rows]]
+                # corners that may support the body are contacts in all later searches of the step
                 supporting = _supporting_corners(body, self._arms(bodies, near[rows]), self.frames[number], gap[rows])
                 checked.required[number, near[rows[supporting]]] = missed[body] = True
         return missed

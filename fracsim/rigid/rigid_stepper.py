@@ -212,8 +212,6 @@ class RigidStepper:
     def advance(self, state: RigidState) -> tuple[RigidState, RigidReport]:
         """Return the state one step later, and the figures of the step.
 
-        If bodies break, the step is repeated with the fragments, which take no more of a blow than they can.
-
         Raises:
             NotConverged: an analysis failed, or the motion is not finite.
             StepAborted: the run is to stop; `to_checkpoint` returns the state before the step.
@@ -241,6 +239,7 @@ class RigidStepper:
         clock = self.phases.add("analysis", clock)
         broken = sum(broken_by_name.values())
         if broken:
+            # the step is repeated with the fragments, which take no more of a blow than they can
             bodies = self._replace_by_fragments(bodies, {name for name, count in broken_by_name.items() if count})
             clock = self.phases.add("pieces", clock)
             moved, impulses = self._move(state, bodies)
@@ -256,6 +255,7 @@ class RigidStepper:
         gravity_work = moved.mass * ((moved.position - bodies.position) @ self._parameters.gravity)
         work = state.work + float(gravity_work.sum()) + float(obstacle_work.sum())
         lost = gravity_work + bodies.kinetic_energies - moved.kinetic_energies
+        # the work of a free obstacle is the energy that it lost
         obstacle_work[self.obstacles.free_numbers] = lost[self.fragment_count :]
         after = RigidState(state.t + self._parameters.time_step, state.step + 1, moved, work)
         blows = sum(load.speed > 0 for load in result)

@@ -82,7 +82,6 @@ def project_onto_fragments(
 ) -> SurfaceMap:
     """The `surface_map` with points on crack faces between fragments projected onto the planar cuts `flat`.
 
-    Points beside a crack within the fragment lie there in the reference configuration, and move with their own nodes.
     Points of loose nodes are not projected.
     """
     drawn = build_surface_points(topology, pattern)
@@ -90,6 +89,8 @@ def project_onto_fragments(
     surface_map = surface_map.project_onto(points[~cracked], mean[~cracked], flat)
     if not cracked.any():
         return surface_map
+    # beside a crack within the fragment a point lies on the plane in the reference configuration, and moves with its
+    # own nodes
     positions, beside = drawn.positions.copy(), points[cracked]
     positions[beside] = mean[cracked] @ flat.rest
     return surface_map.project_onto(
