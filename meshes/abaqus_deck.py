@@ -1,10 +1,7 @@
-"""Keyword blocks of an Abaqus input file: keyword, parameters and data lines, whatever the file includes.
+"""Keyword blocks of an Abaqus input file and the files it includes: keyword, parameters and data lines.
 
 Syntax: Abaqus Analysis User's Guide, "Input syntax rules". Keyword lines begin with a star, comments with two. Letter
 case and blanks count only within quotes. A keyword line that ends with a comma continues on the next line.
-
-Numbers of a block are read at once by NumPy where every field holds one number, else field by field, so that a message
-can name the line.
 """
 
 from __future__ import annotations
@@ -21,10 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from .data import Indices, MeshError
+from .file_text import SourceText, decode_text, with_line_feeds
 from .plain_files import unreadable_reason_beside
-from .text_rows import SourceText, decode_text
 
-MAX_INCLUDES = 1000  # files that a deck includes, however deep
 _BLANKS = b" \t"
 _SEPARATORS_TO_BLANKS = bytes.maketrans(b",\n\t", b"   ")
 _FIELD = re.compile(r'(?:"[^"]*"?|[^",])*')  # up to a comma outside quotes
@@ -38,8 +34,9 @@ class KeywordBlock:
     Attributes:
         keyword: upper case, without blanks: "ENDPART".
         parameters: names in upper case without blanks -> values as written, without quotes.
-        source, offset: where the keyword stands.
-        pieces: data lines (source, begin, end); comments stand between them.
+        source: text with the keyword.
+        offset: of the keyword.
+        pieces: data lines (source, begin, end) between comments.
     """
 
     keyword: str
@@ -72,23 +69,32 @@ class KeywordBlock:
             yield fields[:-1] if len(fields) > 1 and not fields[-1] else fields
 
     def is_open(self) -> bool:
-        """Whether the last data line is the last of a file and has no line end."""
-        return any(end == len(source.text) and not source.text.endswith(b"\n") for source, _, end in self.pieces)
+        """Whether a file ends within the data lines, without a line end: it may have been cut off."""
+        return self._open_piece() is not None
 
-    def check_ended(self) -> None:
-        """MeshError where the last data line is the last of a file and has no line end: it may be cut short."""
+    def _open_piece(self) -> tuple[SourceText, int] | None:
+        """The text and offset at which a file ends within the data lines, without a line end."""
         for source, _, end in self.pieces:
             if end == len(source.text) and not source.text.endswith(b"\n"):
-                source.refuse(
-                    end, "the file ends within this line, without a line break. Is the file whole? Export it again; "
-                    "where it is whole, add a line break."
-                )  # fmt: skip
+                return source, end
+        return None
+
+    def check_ended(self) -> None:
+        """Raise MeshError if a file ends within the data lines, without a line end."""
+        if piece := self._open_piece():
+            source, end = piece
+            source.refuse(
+                end,
+                "the file ends within this line, without a line break. Is the file whole? Export it again; where it "
+                "is whole, add a line break.",
+            )
 
     def numbers(self, kind: type[np.int64] | type[np.float64]) -> tuple[npt.NDArray[Any], Indices]:
-        """All numbers of the data lines, and how many of them there are up to the end of each line.
+        """All numbers of the data lines, and for each line the index behind its last number.
 
         Empty fields among coordinates are 0, as in Abaqus.
         """
+        # by NumPy at once if every field holds one number; else field by field, so that a message can name the line
         fast = _numbers_at_once(b"".join(source.text[begin:end] for source, begin, end in self.pieces), kind)
         return fast if fast is not None else self._numbers_by_field(kind)
 
@@ -99,8 +105,8 @@ class KeywordBlock:
             for text in fields:
                 value = number(text, kind)
                 if value is None:
-                    description = "a whole number" if kind is np.int64 else "a number"
-                    self.refuse(f"'{text[:40]}' is not {description}, as the data of *{self.keyword} need.", i)
+                    expected = "a whole number" if kind is np.int64 else "a number"
+                    self.refuse(f"'{text[:40]}' is not {expected}, as the data of *{self.keyword} need.", i)
                 values.append(value)
             ends.append(len(values))
         return np.array(values, kind), np.array(ends, np.int64)
@@ -118,7 +124,7 @@ def number(text: str, kind: type[np.int64] | type[np.float64]) -> float | None:
 
 
 def _numbers_at_once(text: bytes, kind: type[Any]) -> tuple[npt.NDArray[Any], Indices] | None:
-    """As KeywordBlock.numbers; None unless every field holds exactly one number."""
+    """The result of KeywordBlock.numbers; None unless every field holds exactly one number."""
     compact = text.translate(None, _BLANKS).strip(b"\n")
     while b"\n\n" in compact:
         compact = compact.replace(b"\n\n", b"\n")
@@ -142,19 +148,20 @@ def _numbers_at_once(text: bytes, kind: type[Any]) -> tuple[npt.NDArray[Any], In
 
 
 def split_fields(line: str) -> list[str]:
-    """What stands between commas; a comma in quotes separates nothing."""
+    """The fields between commas; a comma in quotes separates nothing."""
     if '"' not in line:
         return line.split(",")
-    fields, position = [], 0
-    while position <= len(line):
-        match = _FIELD.match(line, position)
-        assert match  # nothing matches as well
+    fields, begin = [], 0
+    while begin <= len(line):
+        match = _FIELD.match(line, begin)
+        assert match  # the pattern matches an empty field
         fields.append(match[0])
-        position = match.end() + 1
+        begin = match.end() + 1
     return fields
 
 
 def unquoted(text: str) -> str:
+    """The text without blanks and quotes around it."""
     text = text.strip()
     return text[1:-1].strip() if len(text) > 1 and text[0] == text[-1] == '"' else text
 
@@ -163,11 +170,11 @@ def unquoted(text: str) -> str:
 
 
 def keyword_blocks(path: Path) -> list[KeywordBlock]:
-    """Keyword blocks of a deck in their order, those of included files in the place of *INCLUDE.
+    """Keyword blocks of a deck in their order, those of included files in place of *INCLUDE.
 
     Raises:
-        MeshError: no text; data lines before the first keyword; a file to be included that is not a plain file beside
-            the deck, includes itself, or is one of more than MAX_INCLUDES.
+        MeshError: the file is not text, or has data lines before the first keyword; a file to be included is no plain
+            file beside the deck, includes itself, or is one of too many.
     """
     reader = _DeckReader(path)
     reader.read(_source(path))
@@ -182,39 +189,40 @@ def _source(path: Path) -> SourceText:
     if text.startswith((b"\xff\xfe", b"\xfe\xff")):
         text = text.decode("utf-16", errors="replace").encode()
     text = text.removeprefix(b"\xef\xbb\xbf")
-    if (position := text.find(b"\0")) >= 0:
+    if (null := text.find(b"\0")) >= 0:
         SourceText(path, text).refuse(
-            position, "a byte 0 stands here; the file is not text. Export the mesh as an Abaqus input file (.inp)."
+            null, "a byte 0 stands here; the file is not text. Export the mesh as an Abaqus input file (.inp)."
         )
-    if b"\r" in text:
-        text = text.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
-    return SourceText(path, text)
+    return SourceText(path, with_line_feeds(text))
 
 
 class _DeckReader:
+    """The keyword blocks of a deck, and the files that are open while it is read."""
+
     def __init__(self, deck: Path) -> None:
-        self.deck = deck
         self.blocks: list[KeywordBlock] = []
         self._open = [deck.resolve()]
         self._included = 0
 
     def read(self, source: SourceText) -> None:
-        text, data, position = source.text, 0, 0
-        while (star := text.find(b"*", position)) >= 0:
+        """Append the keyword blocks of a text."""
+        text, data, at = source.text, 0, 0  # offsets of the data lines that are not added yet, and of what is not read
+        while (star := text.find(b"*", at)) >= 0:
             begin = text.rfind(b"\n", 0, star) + 1
             if text[begin:star].strip():
-                position = _line_end(text, star)  # within a line
+                at = _line_end(text, star)  # the star stands within a line
                 continue
             self._add_data(source, data, begin)
             if text[star : star + 2] == b"**":
-                data = position = _line_end(text, star)
+                data = at = _line_end(text, star)
                 continue
             words, data = _keyword_words(source, star)
-            position = data
+            at = data
             self._add_keyword(_block(words, source, star))
         self._add_data(source, data, len(text))
 
     def _add_data(self, source: SourceText, begin: int, end: int) -> None:
+        """Add data lines to the last keyword."""
         if begin >= end:
             return
         if self.blocks:
@@ -226,25 +234,26 @@ class _DeckReader:
             ))  # fmt: skip
 
     def _add_keyword(self, block: KeywordBlock) -> None:
+        """Add a keyword block, or the blocks of the file that it includes; a keyword may have its data in a file."""
+        name = block.parameters.get("INPUT", "")
         if block.keyword == "INCLUDE":
-            self._include(block, block.parameters.get("INPUT", ""))
+            if not name:
+                block.refuse("*INCLUDE names no file; write *INCLUDE, INPUT=mesh.inc with a file beside the deck.")
+            self._include(block, name)
             return
         self.blocks.append(block)
         if block.keyword in ("NODE", "ELEMENT", "NSET", "ELSET", "SURFACE") and "INPUT" in block.parameters:
-            source = self._beside(block, block.parameters["INPUT"])
-            self._open.append(source.path.resolve())
-            self.read(source)
-            self._open.pop()
+            self._include(block, name)
 
     def _include(self, block: KeywordBlock, name: str) -> None:
-        if not name:
-            block.refuse("*INCLUDE names no file; write *INCLUDE, INPUT=mesh.inc with a file beside the deck.")
+        """Read a file that a keyword names."""
         source = self._beside(block, name)
         self._open.append(source.path.resolve())
         self.read(source)
         self._open.pop()
 
     def _beside(self, block: KeywordBlock, name: str) -> SourceText:
+        """The text of a file that a keyword names: a plain file in the folder of its file, or below."""
         path = block.source.path.parent / name
         wrong = unreadable_reason_beside(block.source.path, name)
         if not wrong and path.is_symlink():
@@ -254,14 +263,14 @@ class _DeckReader:
         if wrong:
             block.refuse(f"*{block.keyword} names the file '{name}', which {wrong}.")
         self._included += 1
-        if self._included > MAX_INCLUDES:
-            block.refuse(f"more than {MAX_INCLUDES} files are included; put the mesh into one file.")
+        if self._included > (most := 1000):
+            block.refuse(f"more than {most} files are included; put the mesh into one file.")
         return _source(path)
 
 
-def _line_end(text: bytes, position: int) -> int:
-    """Offset of the line after."""
-    end = text.find(b"\n", position)
+def _line_end(text: bytes, at: int) -> int:
+    """Offset of the line after the one with an offset."""
+    end = text.find(b"\n", at)
     return len(text) if end < 0 else end + 1
 
 
@@ -289,6 +298,7 @@ def _keyword_words(source: SourceText, star: int) -> tuple[str, int]:
 
 
 def _block(words: str, source: SourceText, offset: int) -> KeywordBlock:
+    """The keyword and parameters of a keyword line."""
     first, *parameters = split_fields(words)
     values = {}
     for parameter in parameters:
@@ -299,4 +309,5 @@ def _block(words: str, source: SourceText, offset: int) -> KeywordBlock:
 
 
 def _joined(words: str) -> str:
+    """Words in upper case without blanks."""
     return "".join(words.split()).upper()

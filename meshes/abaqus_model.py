@@ -1,11 +1,11 @@
-"""What an Abaqus input file defines: parts, instances and the assembly, with their nodes, elements, sets and surfaces.
+"""Parts, instances and the assembly that an Abaqus input file defines, with nodes, elements, sets and surfaces.
 
-Sets and surfaces are kept as they are written; `abaqus` resolves them when every node and element has its number.
+Sets and surfaces are kept as they are written; `abaqus_sets` resolves them.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -13,40 +13,60 @@ import numpy as np
 
 from .abaqus_deck import KeywordBlock, keyword_blocks, number
 from .abaqus_elements import SUPPORTED, kind_of
-from .data import Indices, Points
-from .text_rows import SourceText
+from .data import Indices, Points, list_some
+from .file_text import SourceText
 
-SHOWN = 5  # names in a message
-# Keywords that make nodes or elements in ways that are not supported: without these a body would be smaller.
+# Keywords that generate or move nodes and elements, which is not supported: without them the body would be incomplete.
 GENERATORS = {"NGEN", "NFILL", "NCOPY", "NMAP", "ELGEN", "ELCOPY", "SYMMETRICMODELGENERATION", "SYSTEM", "PARAMETER"}
 GENERATORS |= {"IMPORT"}
 KEYWORDS = ("NODE", "ELEMENT", "NSET", "ELSET", "SURFACE", "PART", "INSTANCE", "ASSEMBLY", "INCLUDE")
-NO_INDICES = np.zeros(0, np.int64)
+NO_INDICES: Indices = np.zeros(0, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
 class SetEntry:
-    """Members of a set: `numbers`, or the range first, last, step, or a set or number by its name, of an instance."""
+    """Members of a set or surface, given in one of three ways.
+
+    Attributes:
+        block: of the keyword that has the entry.
+        numbers: of nodes or elements.
+        span: first, last and step of a range of numbers.
+        name: of another set, or "instance.set" or "instance.number".
+        instance: whose numbers or sets are meant; "": the one that has the entry.
+        of_elements: whether nodes of the elements of the set `name` are meant.
+        face: of the elements of a surface, such as "S2"; "": their free faces.
+    """
 
     block: KeywordBlock
     numbers: Indices | None = None
     span: tuple[int, int, int] | None = None
     name: str = ""
     instance: str = ""
-    of_elements: bool = False  # nodes of the elements of the set `name`
-    face: str = ""  # of a surface: identifier, "" for free faces
+    of_elements: bool = False
+    face: str = ""
 
 
 @dataclass(eq=False)
 class NamedSet:
+    """A set of nodes or elements, or a surface, as written.
+
+    Attributes:
+        name: as written.
+        internal: whether Abaqus/CAE made it for its own use.
+        entries: its members.
+        surface_kind: "ELEMENT", "NODE" or "UNION" of a surface, "" of one that is not used.
+    """
+
     name: str
     internal: bool
     entries: list[SetEntry] = field(default_factory=list)
-    surface_kind: str = ""  # "ELEMENT", "NODE", "UNION"
+    surface_kind: str = ""
 
 
 @dataclass(frozen=True, eq=False)
 class ElementBlock:
+    """Elements of one *ELEMENT: element numbers (m,) and node numbers (m, k)."""
+
     block: KeywordBlock
     kind: str
     ids: Indices
@@ -55,7 +75,7 @@ class ElementBlock:
 
 @dataclass(eq=False)
 class Component:
-    """A part, an instance or, with the name "", the assembly: what numbers nodes and elements on its own."""
+    """A part, an instance or, with the name "", the assembly; each has numbers of its own."""
 
     name: str
     opened: KeywordBlock | None = None
@@ -70,12 +90,20 @@ class Component:
 
 
 def label_key(name: str) -> str:
-    """What two spellings of a name have in common: letter case and the width of blanks do not count."""
+    """The key of a name: letter case and the number of blanks do not count in Abaqus."""
     return " ".join(name.split()).upper()
 
 
 class Deck:
-    """Parts, instances and the assembly, as the keyword blocks of a file define them."""
+    """Parts, instances and the assembly of an input file.
+
+    Attributes:
+        assembly: nodes, elements and sets outside parts and instances.
+        parts: by key.
+        instances: by key: the instance, the key of its part, and its keyword block.
+        notes: messages to the user.
+        last: the last keyword block of the file.
+    """
 
     def __init__(self, path: Path) -> None:
         self.assembly = Component("")
@@ -120,9 +148,11 @@ class Deck:
 
     @property
     def _scope(self) -> Component:
+        """The part, instance or assembly that is being defined."""
         return self._open[-1][1] if self._open else self.assembly
 
     def _begin(self, block: KeywordBlock) -> None:
+        """*PART, *INSTANCE or *ASSEMBLY."""
         kind, name = block.keyword, block.parameters.get("NAME", "")
         outer = self._open[-1][0].keyword if self._open else ""
         if outer != ("ASSEMBLY" if kind == "INSTANCE" else ""):
@@ -134,8 +164,7 @@ class Deck:
             return
         if not name:
             block.refuse(f"*{kind} has no name; write *{kind}, NAME=...")
-        allowed = self.parts if kind == "PART" else self.instances
-        if label_key(name) in allowed:
+        if label_key(name) in (self.parts if kind == "PART" else self.instances):
             block.refuse(f"there is a {kind.lower()} '{name}' already; names must differ.")
         component = Component(name, block)
         if kind == "PART":
@@ -145,8 +174,8 @@ class Deck:
             if label_key(part) not in self.parts:
                 block.refuse(
                     f"instance '{name}' is of the part '{part}', which the file does not define before it (parts: "
-                    f"{list_names(p.name for p in self.parts.values())}). An instance from an earlier analysis cannot "
-                    "be read; export the whole model."
+                    f"{list_some(each.name for each in self.parts.values())}). An instance from an earlier analysis "
+                    "cannot be read; export the whole model."
                 )
             self.instances[label_key(name)] = component, label_key(part), block
         self._open.append((block, component))
@@ -183,9 +212,10 @@ class Deck:
                 "a node needs a whole number from 1 and finite coordinates: 1, 0.0, 0.5, 2.0.", int(bad.argmax())
             )
         self._scope.nodes.append((block, ids, points))
-        self._member(block, "NSET", self._scope.node_sets, ids)
+        self._add_to_set(block, "NSET", self._scope.node_sets, ids)
 
-    def _member(self, block: KeywordBlock, key: str, sets: dict[str, NamedSet], ids: Indices) -> None:
+    def _add_to_set(self, block: KeywordBlock, key: str, sets: dict[str, NamedSet], ids: Indices) -> None:
+        """Add nodes or elements to the set that their keyword names."""
         if name := block.parameters.get(key):
             _named(sets, name).entries.append(SetEntry(block, numbers=ids))
 
@@ -203,12 +233,13 @@ class Deck:
             block.check_ended()
             rows = _element_rows(block, element_type, shape[1])
             ids = rows[:, 0]
-            if shape[0] == "line3":  # Abaqus has the middle between the ends
+            if shape[0] == "line3":  # Abaqus lists the midside node between the ends
                 rows = rows[:, [0, 1, 3, 2]]
             self._scope.elements.append(ElementBlock(block, shape[0], ids, rows[:, 1:]))
-        self._member(block, "ELSET", self._scope.element_sets, ids)
+        self._add_to_set(block, "ELSET", self._scope.element_sets, ids)
 
     def _unused_elements(self, block: KeywordBlock, element_type: str) -> Indices:
+        """Count elements that are left out; their numbers and nodes are known, so that none counts as lost."""
         ids: list[int] = []
         nodes: list[int] = []
         continued = False
@@ -217,7 +248,7 @@ class Deck:
             if not continued:
                 ids += values[:1]
             nodes += values[0 if continued else 1 :]
-            continued = len(fields) > 15
+            continued = len(fields) > 15  # a full line goes on with the next one
         self._scope.unused[element_type] = self._scope.unused.get(element_type, 0) + len(ids)
         self._scope.unused_ids.append(np.array(ids, np.int64))
         self._scope.unused_nodes.append(np.array(nodes, np.int64))
@@ -307,9 +338,3 @@ def _element_rows(block: KeywordBlock, element_type: str, nodes: int) -> Indices
             int(position[bad.argmax()]),
         )
     return rows
-
-
-def list_names(names: Iterable[str]) -> str:
-    """The first few names, and dots where there are more."""
-    listed = list(names)
-    return ", ".join(listed[:SHOWN]) + (", ..." if len(listed) > SHOWN else "") if listed else "none"

@@ -145,3 +145,25 @@ def _flattened(parent: Indices) -> Indices:
     while not np.array_equal(above := parent[parent], parent):
         parent = above
     return parent
+
+
+def positions_of(ids: Indices, wanted: Indices) -> Indices:
+    """Index of each wanted number in `ids`, which are distinct; -1 where `ids` lacks it. Shape of `wanted`."""
+    if not len(ids):
+        return np.full(wanted.shape, -1, np.int64)
+    if (np.diff(ids) <= 0).any():
+        order = np.argsort(ids, kind="stable")
+        sorted_positions = positions_of(ids[order], wanted)
+        return np.where(sorted_positions >= 0, order[sorted_positions], -1)
+    first, last = int(ids[0]), int(ids[-1])
+    if last - first == len(ids) - 1:  # consecutive numbers need no search
+        return np.where((wanted >= first) & (wanted <= last), wanted - first, -1)
+    index = np.minimum(np.searchsorted(ids, wanted), len(ids) - 1)
+    return np.where(ids[index] == wanted, index, -1)
+
+
+def first_repeated(ids: Indices) -> int | None:
+    """The least number that occurs more than once; None where all differ."""
+    ordered = np.sort(ids)
+    repeated = ordered[1:][np.diff(ordered) == 0]
+    return int(repeated[0]) if len(repeated) else None

@@ -25,10 +25,10 @@ from attack.meshes import _read as attacked
 from attack.meshes import mutated
 from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
-from fracsim.meshes.msh2 import KINDS
+from fracsim.meshes.msh import KINDS
 from fracsim.meshes.read import read_contents, read_mesh
 from fracsim.meshes.surfaces.closed import read_surface
-from fracsim.meshes.time_limit import read_with_time_limit
+from fracsim.meshes.time_limit import ReaderLimits, read_with_time_limit
 
 FILES = Path(__file__).parent / "meshes"
 BAR = 0.1 * 0.02 * 0.02
@@ -368,7 +368,7 @@ def test_elements_of_gmsh_that_do_not_fit(tmp_path: Path) -> None:
     for line, message in (
         (" 99 2 21 1 1 2 3 4", "of the type 99, which is not supported"),
         (" 4 2 21 1 1 2 3", "has 9 numbers, not 8"),
-        (" 4 2 21 1 1 2 3 5000", "has the node 5000, which is not in the file"),
+        (" 4 2 21 1 1 2 3 5000", "has the node 5000, which is not among the"),
         (" 4 2 21 1 1 2 3 4.5", "is not whole"),
     ):
         wrong = [*lines[:1], lines[1].split()[0] + line, *lines[2:]]
@@ -560,7 +560,7 @@ def test_tetrahedra_of_first_and_second_order_beside_each_other(tmp_path: Path) 
         ("ENDDATA", "", "ends without ENDDATA behind BEGIN BULK: it was cut off"),
         ("GRID,2,,1.", "GRID,2,5,1.", "line 13: GRID 2 is in the coordinate system 5; export the nodes in basic"),
         ("GRID,2,,1.", "GRID,2,,l.", "line 13: `l.` is no coordinate"),
-        ("CTETRA  2       8       2", "CTETRA  2       8       22", "element 2 has the node 22, which is no GRID"),
+        ("CTETRA  2       8       2", "CTETRA  2       8       22", "element 2 has the node 22, which is not among"),
         ("       3       4       15", "       3       4", "is not the number of a node of CTETRA 2"),
         ("CTETRA  2", "CTETRA  1", "line 19: element 1 is given a second time"),
         ("CTETRA  2", "CTRIAX  2", "line 19: CTRIAX is axisymmetric, which is not supported"),
@@ -634,7 +634,7 @@ def test_a_reader_that_does_not_end_is_ended(tmp_path: Path) -> None:
     """Here one that waits for a pipe, which `read_mesh` would refuse before."""
     os.mkfifo(tmp_path / "part.xyz")
     with pytest.raises(MeshError, match=r"part.xyz' could not be read: it did not end within 1 s; the file is damaged"):
-        read_with_time_limit(tmp_path / "part.xyz", Path.read_bytes, "it", 1)
+        read_with_time_limit(tmp_path / "part.xyz", Path.read_bytes, "it", limits=ReaderLimits(seconds=1.0))
     with pytest.raises(MeshError, match="is a named pipe, not a file"):
         read_mesh(tmp_path / "part.xyz")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -80,8 +81,8 @@ def test_damaged_files_are_named(tmp_path: Path, data: bytes, message: str) -> N
 @pytest.mark.parametrize("end", ["\n", "\r\n"])
 def test_text_as_most_write_it_is_read_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: str) -> None:
     """Without the reader of other texts, which is slow; of 300 facets in two solids, each number at its place."""
-    monkeypatch.setattr(stl, "PART", 1000)
-    monkeypatch.setattr(stl, "_of_text", None)
+    monkeypatch.setattr(stl, "_corners_of_regular_text", partial(stl._corners_of_regular_text, part=1000))
+    monkeypatch.setattr(stl, "_corners_of_text", None)
     faces = np.random.default_rng(1).random((300, 3, 3)).round(6)
     (tmp_path / "a.stl").write_text(text(faces[:170], end=end) + text(faces[170:], end=end), newline="")
     np.testing.assert_allclose(read_contents(tmp_path / "a.stl").points.reshape(-1, 3, 3), faces, atol=1e-6)
@@ -90,7 +91,7 @@ def test_text_as_most_write_it_is_read_in_parts(tmp_path: Path, monkeypatch: pyt
 @pytest.mark.parametrize("place", range(0, 300, 23))
 def test_text_in_parts_loses_no_facet(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, place: int) -> None:
     """A facet with a vertex of four numbers, beside one of two, and one that is cut short, wherever they stand."""
-    monkeypatch.setattr(stl, "PART", 1000)
+    monkeypatch.setattr(stl, "_corners_of_regular_text", partial(stl._corners_of_regular_text, part=1000))
     lines = text(np.random.default_rng(1).random((300, 3, 3))).split("\n")
     first = 1 + 7 * place + 2
     for instead in (

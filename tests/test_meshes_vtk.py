@@ -16,7 +16,7 @@ from scipy.io import netcdf_file
 
 from fracsim.meshes import BUILDERS, MeshError
 from fracsim.meshes.check import check_mesh
-from fracsim.meshes.netcdf_size import missing_bytes
+from fracsim.meshes.exodus import missing_bytes
 from fracsim.meshes.read import read_contents, read_mesh
 
 HERE = Path(__file__).parent / "meshes"

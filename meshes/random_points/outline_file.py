@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ..data import Indices, MeshData, MeshError, Points
+from ..file_text import decode_text
 from ..parameters import check_extent, positive, require_affordable
 from ..plain_files import unreadable_reason
-from ..text_rows import decode_text
 from ..topology import Floats, boundary_facets, signed_measures
 from .outline import Outline
 from .points import scatter

@@ -1,8 +1,11 @@
-"""Sets of cells from an array on the cells: integer tags, or names."""
+"""Named sets of cells, and sets from integer tags or strings on the cells.
+
+A set has, for each block of cells, the numbers of the cells of that block that belong to it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sized
 from typing import Any
 
 import numpy as np
@@ -13,7 +16,7 @@ from .mesh_conversion import Block
 
 Array = npt.NDArray[Any]
 
-# Arrays by which formats mark groups of cells; the first that the file has is used. 0 means "no group" in all of them.
+# Cell arrays in which formats store groups, in order of preference; the value 0 means "no group" in all of them.
 TAG_ARRAYS = (
     "gmsh:physical",
     "group",
@@ -24,26 +27,33 @@ TAG_ARRAYS = (
     "su2:tag",
     "tetgen:ref",
 )
-REGION_ARRAYS = ("region", "material")  # as people call them, in any case; 0 is a region like any other
+REGION_ARRAYS = ("region", "material")  # usual names, upper or lower case; here the value 0 is a region too
 NOT_TAGS = ("gmsh:geometrical", "vtkGhostType", "ObjectId")
-MAX_TAGS = 1000  # an integer array with more values than this numbers cells; it does not group them
+MAX_TAGS = 1000  # distinct values; an integer array with more of them is a numbering of the cells
+
+
+def add_to_set(sets: dict[str, list[Indices]], blocks: Sized, name: str, block: int, members: Indices) -> None:
+    """Add cells of one block to the set of a name, which is created if it does not exist."""
+    parts = sets.setdefault(name, [np.zeros(0, np.int64) for _ in range(len(blocks))])
+    parts[block] = np.union1d(parts[block], members).astype(np.int64) if len(parts[block]) else members
 
 
 def tag_sets(
     cell_data: dict[str, list[Any]], blocks: list[Block], names_of: Callable[[int, int], list[str]]
 ) -> tuple[dict[str, list[Indices]], tuple[str, ...], tuple[str, ...]]:
-    """Sets of cells by one array of tags, the names of all arrays that could be such, and notes.
+    """Sets of cells from one array of tags, the names of all arrays of tags, and notes.
 
-    Arguments:
-        cell_data: name -> for each block an array with one value a cell; integers are tags, strings are names.
-        names_of: names of the sets of a tag and a dimension.
+    Args:
+        cell_data: name -> for each block an array with one value a cell; integers are tags, strings are set names.
+        blocks: the cells.
+        names_of: set names of a tag and a dimension.
     """
     arrays = {key: parts for key, values in cell_data.items() if (parts := _tags(key, values)) is not None}
-    chosen = _chosen(arrays)
+    chosen = _preferred(arrays)
     if chosen is None:
         return {}, (), ()
-    remaining = [key for key in arrays if key != chosen]
-    notes = (f"Groups come from the cell array '{chosen}'; not used: {', '.join(remaining)}.",) if remaining else ()
+    others = [key for key in arrays if key != chosen]
+    notes = (f"Groups come from the cell array '{chosen}'; not used: {', '.join(others)}.",) if others else ()
     top = max((block.dim for block in blocks if len(block.nodes)), default=0)
     sets: dict[str, list[Indices]] = {}
     for i, (block, tags) in enumerate(zip(blocks, arrays[chosen], strict=True)):
@@ -52,11 +62,12 @@ def tag_sets(
                 continue
             for name in [str(tag)] if tags.dtype.kind == "U" else names_of(int(tag), block.dim):
                 if name:
-                    sets.setdefault(name, [np.zeros(0, np.int64) for _ in blocks])[i] = np.flatnonzero(tags == tag)
+                    add_to_set(sets, blocks, name, i, np.flatnonzero(tags == tag))
     return sets, tuple(arrays), notes
 
 
-def _chosen(arrays: dict[str, list[Array]]) -> str | None:
+def _preferred(arrays: dict[str, list[Array]]) -> str | None:
+    """Name of the array that becomes the sets: by TAG_ARRAYS, then by REGION_ARRAYS, else the first."""
     by_name = {key.casefold(): key for key in reversed(arrays)}
     for key in TAG_ARRAYS:
         if key in arrays:
@@ -65,9 +76,10 @@ def _chosen(arrays: dict[str, list[Array]]) -> str | None:
 
 
 def _tags(key: str, values: list[Any]) -> list[Array] | None:
-    """The parts of an array that holds tags: integers or strings, one a cell, of few values; None of any other.
+    """The array of each block if they hold tags, else None.
 
-    Whole numbers in an array of floats are tags where the array has the name of one.
+    Tags are integers or strings, one a cell, with at most MAX_TAGS distinct values. Integers stored as floats are
+    tags if the array has a name of REGION_ARRAYS.
     """
     parts = [np.asarray(part) for part in values]
     if key in NOT_TAGS or any(part.ndim != 1 for part in parts):
@@ -82,7 +94,7 @@ def _tags(key: str, values: list[Any]) -> list[Array] | None:
 
 
 def members_by_tag(values: Indices) -> Iterator[tuple[int, Indices]]:
-    """Numbers other than 0, and the places of each."""
+    """Each distinct value other than 0 and the indices at which it stands."""
     order = np.argsort(values, kind="stable").astype(np.int64)
     distinct, first = np.unique(values[order], return_index=True)
     for tag, members in zip(map(int, distinct), np.split(order, first[1:]), strict=False):
@@ -93,12 +105,12 @@ def members_by_tag(values: Indices) -> Iterator[tuple[int, Indices]]:
 def sets_by_tag(
     tags: list[Indices], name_of: Callable[[int, int], str], what: str
 ) -> tuple[dict[str, list[Indices]], tuple[str, ...]]:
-    """Sets of cells by one whole number a cell, 0 for none; and notes.
+    """Sets of cells from one integer tag a cell, 0 for none; and notes.
 
-    Arguments:
-        tags: for each block one number a cell.
-        name_of: the name of a number in a block, "" where it has none: it is called "tag-7" then.
-        what: the numbers in words, for a note where those without a name are too many to mean groups.
+    Args:
+        tags: for each block one tag a cell.
+        name_of: name of a tag in a block; where it is "" the set is called "tag-<n>".
+        what: plural of the tags' meaning, for the note that more than MAX_TAGS tags without a name are not used.
     """
     sets: dict[str, list[Indices]] = {}
     unnamed: set[int] = set()
@@ -108,10 +120,8 @@ def sets_by_tag(
             if not name:
                 unnamed.add(tag)
                 name = f"tag-{tag}"
-            parts = sets.setdefault(name, [np.zeros(0, np.int64) for _ in tags])
-            parts[i] = np.union1d(parts[i], members).astype(np.int64) if len(parts[i]) else members
+            add_to_set(sets, tags, name, i, members)
     if len(unnamed) <= MAX_TAGS:
         return sets, ()
-    numbers = {f"tag-{tag}" for tag in unnamed}
-    retained = {name: parts for name, parts in sets.items() if name not in numbers}
-    return retained, (f"Not used: {len(unnamed)} {what} without a name, too many to mean groups of cells.",)
+    named = {name: parts for name, parts in sets.items() if name not in {f"tag-{tag}" for tag in unnamed}}
+    return named, (f"Not used: {len(unnamed)} {what} without a name, too many to mean groups of cells.",)
