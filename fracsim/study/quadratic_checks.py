@@ -52,7 +52,7 @@ def _unsupported_keys(study: Study) -> list[tuple[str, bool, str]]:
 def has_curved_cells(study: Study, builder: Any) -> bool:
     """Returns whether boundary cells of the study are curved; `builder` is that of its mesh, None for a file."""
     straight = study.mesh.order == 1 or study.fracture is not None or study.plasticity is not None
-    return not straight and bool(getattr(builder, "rounds", ()))
+    return not straight and bool(getattr(builder, "curved_boundaries", ()))
 
 
 def with_curved_boundary(study: Study, mesh: MeshData, builder: Any) -> MeshData:
@@ -65,4 +65,4 @@ def with_curved_boundary(study: Study, mesh: MeshData, builder: Any) -> MeshData
         return mesh
     from ..meshes.curved_boundaries import curved_midside_points
 
-    return replace(mesh, middles=curved_midside_points(mesh, builder.rounds))
+    return replace(mesh, middles=curved_midside_points(mesh, builder.curved_boundaries))

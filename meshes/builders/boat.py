@@ -16,11 +16,15 @@ from ..shell import extrude_shell
 class Boat:
     """A hull along x, open above, its gunwale at z = 0 and its keel below; round at both ends.
 
-    Half the beam at a share s of the length from the middle, -1 to 1, and a share t from the keel (0) up to the gunwale
-    (1): beam / 2 sqrt(1 - s^2) sqrt(t), at a depth of depth (1 - 0.3 s^2) (1 - t).
+    With s = 2 x / length from -1 to 1, and t from 0 at the keel to 1 at the gunwale, the half beam is
+    beam / 2 sqrt(1 - s^2) sqrt(t) at z = -depth (1 - 0.3 s^2) (1 - t).
 
     Attributes:
-        length, beam, depth: [m].    thickness: of the planks [m].    h: size of the triangles [m].
+        length: [m].
+        beam: greatest width [m].
+        depth: of the keel amidships [m].
+        thickness: of the planks [m].
+        h: size of the triangles [m].
 
     Groups: inner, outer, rim.
 
@@ -45,23 +49,26 @@ class Boat:
         require_affordable("boat", self.h, self.cells_estimate())
 
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Lower and upper corner of the bounding box [m]."""
         points = self.build().points
         return tuple(points.min(axis=0).tolist()), tuple(points.max(axis=0).tolist())
 
     def _steps(self) -> tuple[int, int]:
-        """Along the length, and from gunwale to gunwale."""
+        """Number of cells along the length, and from gunwale to gunwale."""
         across = 2 * round(np.hypot(self.beam / 2, self.depth) / self.h)
         return max(round(self.length / self.h), 4), max(across, 4)
 
     def cells_estimate(self) -> int:
+        """Approximate number of cells."""
         along, across = self._steps()
         return 3 * (2 * (along - 2) * across + 2 * across)
 
     def build(self) -> MeshData:
+        """The mesh."""
         return extrude_shell(*self._surface(), self.thickness, "boat")
 
     def _surface(self) -> tuple[Points, Indices]:
-        """The middle surface; its ends are one node each."""
+        """Points and triangles of the middle surface; bow and stern are one node each."""
         along, across = self._steps()
         s = np.linspace(-1, 1, along + 1)[1:-1, None]
         w = np.linspace(-1, 1, across + 1)[None]  # from one gunwale over the keel to the other
@@ -78,4 +85,4 @@ class Boat:
             np.stack([np.full(across, stern), rows[0, 1:], rows[0, :-1]], axis=1),
             np.stack([np.full(across, bow), rows[-1, :-1], rows[-1, 1:]], axis=1),
         ]
-        return np.concatenate([points, ends]), np.concatenate([*(item.reshape(-1, 3) for item in quads), *fans])
+        return np.concatenate([points, ends]), np.concatenate([*(halves.reshape(-1, 3) for halves in quads), *fans])

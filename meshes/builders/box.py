@@ -23,9 +23,8 @@ class Box:
         size: side lengths [m] along x, y(, z).
         origin: the corner with the least coordinates [m]; zeros where left out.
         h: cell size [m]. Structured: each side has round(size / h) equal steps, at least one.
-        pattern: "structured": a lattice, each square cut into 2 triangles or each cube into 6 tetrahedra, all alike
-            (Kuhn's subdivision: conforming, and quick for any size); "unstructured": random points, no preferred
-            directions.
+        pattern: "structured": a lattice, each square cut into 2 triangles or each cube into 6 tetrahedra by Kuhn's
+            subdivision; "unstructured": random points, without preferred directions.
         seed: of the random points, where there are any: 1, 2, ... are different meshes.
 
     Groups: left, right (least and greatest x), bottom, top (y in 2D, z in 3D), and in 3D front, back (least and
@@ -60,18 +59,22 @@ class Box:
 
     @property
     def groups(self) -> tuple[str, ...]:
+        """Names of the facet groups."""
         return tuple(self._planes())
 
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Lower and upper corner of the bounding box [m]."""
         origin = self.origin or (0.0,) * len(self.size)
         return tuple(origin), tuple(o + s for o, s in zip(origin, self.size, strict=True))
 
     def cells_estimate(self) -> int:
+        """Approximate number of cells."""
         if self.pattern == "unstructured":
             return estimate_cells_in_box(SizeField(self.h), (0.0,) * len(self.size), self.size)
         return int(np.prod(self._steps(), dtype=float)) * (2 if len(self.size) == 2 else 6)
 
     def build(self) -> MeshData:
+        """The mesh."""
         if self.pattern == "structured":
             points, cells = lattice(self._steps())
             points = self._placed(points)
@@ -83,20 +86,20 @@ class Box:
         return tuple(max(1, round(length / self.h)) for length in self.size)
 
     def _placed(self, unit: Points) -> Points:
-        """Points of the unit box moved to the body's place, its far faces exactly at the upper bounds."""
+        """Points of the unit box mapped to the bounds, faces exactly on them."""
         low, high = (np.array(corner, dtype=np.float64) for corner in self.bounds())
         return np.where(unit == 1.0, high, low + unit * (high - low))
 
     def _planes(self) -> dict[str, tuple[int, float]]:
+        """Facet group -> axis and coordinate [m] of its plane."""
         low, high = self.bounds()
         sides = [("left", "right"), ("front", "back"), ("bottom", "top")]
         if len(self.size) == 2:
             del sides[1]
-        pairs = enumerate(sides)
         return {
-            name: (axis, position[axis])
-            for axis, pair in pairs
-            for name, position in zip(pair, (low, high), strict=True)
+            name: (axis, corner[axis])
+            for axis, names in enumerate(sides)
+            for name, corner in zip(names, (low, high), strict=True)
         }
 
     def _draw(self, gmsh: Any) -> None:
@@ -108,7 +111,7 @@ class Box:
 
 
 def lattice(steps: tuple[int, ...]) -> tuple[Points, Indices]:
-    """A lattice of the unit square or cube, cut by Kuhn's subdivision: points (n, d) and positive cells (m, d + 1).
+    """Points (n, d) and positive cells (m, d + 1) of the unit square or cube in a lattice, cut by Kuhn's subdivision.
 
     Each permutation of the axes is a path of unit steps from the least corner of a cube to the greatest; the nodes
     on the path are one simplex. Neighbouring cubes cut their common face along the same diagonal.

@@ -1,4 +1,4 @@
-"""A round bar, and a disk in 2D."""
+"""A circular cylinder, and a disk in 2D."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from .profile import Profile
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A solid circular cylinder that starts at the origin and runs along an axis.
+    """A solid circular cylinder along an axis, one end around the origin.
 
     Attributes:
         radius: [m].
         length: [m].
-        h: cell size [m]. The round side is a polygon with its nodes on the circle: the volume is less by about
+        h: cell size [m]. The side is a polygon with its nodes on the circle, so that the volume is too small by about
             (h / radius)^2 / 6 of itself.
         axis: "x", "y" or "z".
 
@@ -49,23 +49,26 @@ class Cylinder:
         require_affordable("cylinder", self.h, self.cells_estimate())
 
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Lower and upper corner of the bounding box [m]."""
         along = "xyz".index(self.axis)
         low, high = [-self.radius] * 3, [self.radius] * 3
         low[along], high[along] = 0.0, self.length
         return tuple(low), tuple(high)
 
     def cells_estimate(self) -> int:
+        """Approximate number of cells."""
         return estimate_cells_in_box(SizeField(self.h), *self.bounds(), filled=pi / 4)
 
     @property
-    def rounds(self) -> tuple[CurvedBoundary, ...]:
-        """The round side."""
+    def curved_boundaries(self) -> tuple[CurvedBoundary, ...]:
+        """The side."""
         return (CurvedBoundary(("side",), self.radius, "xyz".index(self.axis)),)
 
     def build(self) -> MeshData:
+        """The mesh."""
         points, cells = mesh_with_gmsh(self._draw, 3, SizeField(self.h))
         along = "xyz".index(self.axis)
-        # Drawn along z; turning the axes in a circle keeps every cell's orientation.
+        # drawn along z; a cyclic permutation of the axes keeps the orientation of cells
         points = np.roll(points, along - 2, axis=1)
         boundary = boundary_facets(cells)
         ends = facet_groups_on_planes(points, boundary, {"bottom": (along, 0.0), "top": (along, self.length)})
@@ -105,26 +108,30 @@ class Disk:
 
     @property
     def groups(self) -> tuple[str, ...]:
+        """Names of the facet groups."""
         return ("top", "bottom", "rim") if self.arc else ("rim",)
 
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Lower and upper corner of the bounding box [m]."""
         return (-self.radius,) * 2, (self.radius,) * 2
 
     def cells_estimate(self) -> int:
+        """Approximate number of cells."""
         return estimate_cells_in_box(SizeField(self.h), *self.bounds(), filled=pi / 4)
 
     @property
-    def rounds(self) -> tuple[CurvedBoundary, ...]:
+    def curved_boundaries(self) -> tuple[CurvedBoundary, ...]:
         """The rim."""
         return (CurvedBoundary(self.groups, self.radius),)
 
     def build(self) -> MeshData:
+        """The mesh."""
         draw = self._sectors().draw if self.arc else self._draw
         points, cells = mesh_with_gmsh(lambda gmsh: draw(gmsh, 0.0), 2, SizeField(self.h))
         boundary = boundary_facets(cells)
         if not self.arc:
             return MeshData(points, cells, {"rim": boundary})
-        # the end of an arc is a node: facets lie inside or outside, told by their mid-points
+        # the ends of arcs are nodes: the midpoint of a facet tells whether it lies on an arc
         middle = points[boundary].mean(axis=1)
         near = np.abs(middle[:, 0]) < np.abs(middle[:, 1]) * np.tan(radians(self.arc / 2))
         parts = {"top": near & (middle[:, 1] > 0), "bottom": near & (middle[:, 1] < 0), "rim": ~near}
@@ -134,7 +141,7 @@ class Disk:
         gmsh.model.occ.addDisk(0.0, 0.0, 0.0, self.radius, self.radius)
 
     def _sectors(self) -> Profile:
-        """The rim cut at both ends of each arc and at its middle, and on the x axis."""
+        """The rim with nodes at the ends and the middle of each arc, and on the x axis."""
         half = self.arc / 2
         angles = [0.0, 90 - half, 90.0, 90 + half, 180.0, 270 - half, 270.0, 270 + half]
         corners = [(self.radius * cos(radians(angle)), self.radius * sin(radians(angle))) for angle in angles]

@@ -12,7 +12,7 @@ from .profile import CutRectangle, Profile
 
 @dataclass(frozen=True)
 class LPanel(CutRectangle):
-    """A square without its lower right quarter: a leg on the left, an arm on the right; Winkler's panel as it stands.
+    """A square without its lower right quarter: a leg on the left, an arm on the right; by default Winkler's panel.
 
     2D: x is the length, y the height. 3D: x the length, y the thickness, z the height. One corner is at the origin; the
     leg stands on "bottom", and the inner corner is in the middle.
@@ -22,7 +22,7 @@ class LPanel(CutRectangle):
         thickness: [m]; 0 makes a 2D mesh.
         seat: distance from the end of the arm of a place on its lower side that is a node (2D), or a line of nodes,
             to be pushed at [m].
-        h: cell size [m] away from the crack's way.
+        h: cell size [m] away from the expected crack.
         h_corner: cell size [m] from the inner corner to the left side; h / 4 where left out.
 
     Groups: left, right (least and greatest x), bottom, top (least and greatest height), corner (the two sides that meet
@@ -52,12 +52,8 @@ class LPanel(CutRectangle):
         require_affordable("l-panel", min(self.h, self._fine), self.cells_estimate())
 
     @property
-    def length(self) -> float:  # type: ignore[override]
-        return self.size
-
-    @property
-    def height(self) -> float:  # type: ignore[override]
-        return self.size
+    def _extent(self) -> tuple[float, float, float]:
+        return self.size, self.size, self.thickness
 
     @property
     def _middle(self) -> float:
@@ -69,12 +65,12 @@ class LPanel(CutRectangle):
 
     @property
     def _sizing(self) -> SizeField:
-        """Fine where a crack goes that rises by a third of its way."""
+        """Fine where the crack is expected, which rises by up to a third of its length."""
         middle = self._middle
         return SizeField(self.h, min(self._fine, self.h), (0.0, middle), (middle, middle * 4 / 3))
 
     def cells_estimate(self) -> int:
-        """Those of the square less those that would fill its lower right quarter."""
+        """Approximate number of cells: of the square less those of its lower right quarter."""
         middle, depth = self._middle, (self.thickness,) if self.thickness else ()
         quarter = estimate_cells_in_box(self._sizing, (middle, 0.0, *(0.0 for _ in depth)), (self.size, middle, *depth))
         return max(1, round(super().cells_estimate() - quarter))

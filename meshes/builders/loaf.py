@@ -19,8 +19,8 @@ from ..topology import boundary_facets, exclude_facets, facet_groups_on_planes, 
 class Loaf:
     """A loaf along x, its middle over the origin, its flat bottom at z = 0.
 
-    A box with rounded edges is meshed; then all heights are multiplied by
-    1 + dome (1 - (2 x / length)^4) (1 - (2 y / width)^2), and the widths by 1 + flare z / height, as out of a tin.
+    A box with rounded edges is meshed; then heights are multiplied by
+    1 + dome (1 - (2 x / length)^4) (1 - (2 y / width)^2), and widths by 1 + flare z / height.
 
     Attributes:
         size: length, width and height of the whole loaf [m].
@@ -71,23 +71,26 @@ class Loaf:
         require_affordable("loaf", self.h, self.cells_estimate())
 
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Lower and upper corner of the bounding box [m]."""
         length, width, height = self.size
         return (-length / 2, -width / 2, 0.0), (length / 2, width / 2, height)
 
     def cells_estimate(self) -> int:
+        """Approximate number of cells."""
         length, width, height = self._block
         lost = (4 - pi) * self.rounding**2 * (height + length + width) / (length * width * height)
-        baked = (1 + self.flare / 2) * (1 + self.dome * 4 / 5 * 2 / 3)  # means of the factors on width and height
-        return estimate_cells_in_box(SizeField(self.h), (0.0,) * 3, self._block, filled=max(0.5, 1 - lost) * baked)
+        growth = (1 + self.flare / 2) * (1 + self.dome * 4 / 5 * 2 / 3)  # means of the factors on width and height
+        return estimate_cells_in_box(SizeField(self.h), (0.0,) * 3, self._block, filled=max(0.5, 1 - lost) * growth)
 
     def build(self) -> MeshData:
-        points, cells = mesh_with_gmsh(self._draw, 3, SizeField(self.h), self._baked)
+        """The mesh."""
+        points, cells = mesh_with_gmsh(self._draw, 3, SizeField(self.h), self._domed)
         boundary = boundary_facets(cells)
         bottom = facet_groups_on_planes(points, boundary, {"bottom": (2, 0.0)})
-        reach = self.size[0] / 2 - self.grip * (1 - 1e-9)
+        inner_end = self.size[0] / 2 - self.grip * (1 - 1e-9)  # nodes at the end count in spite of round-off
         ends = {
-            "left": facets_on_nodes(boundary, points[:, 0] <= -reach),
-            "right": facets_on_nodes(boundary, points[:, 0] >= reach),
+            "left": facets_on_nodes(boundary, points[:, 0] <= -inner_end),
+            "right": facets_on_nodes(boundary, points[:, 0] >= inner_end),
         }
         for name, facets in ends.items():
             require(len(facets) > 0, f"loaf: no facet lies within grip = {self.grip!r} of the {name} end; enlarge it.")
@@ -100,6 +103,7 @@ class Loaf:
         return length, width / (1 + self.flare), height / (1 + self.dome)
 
     def _draw(self, gmsh: Any) -> None:
+        """The block with rounded edges."""
         length, width, height = self._block
         occ = gmsh.model.occ
         block = occ.addBox(-length / 2, -width / 2, 0.0, length, width, height)
@@ -107,8 +111,8 @@ class Loaf:
         lower = [occ.getCenterOfMass(1, edge)[2] < 1e-6 * height for edge in edges]
         occ.fillet([block], edges, [self.bottom_rounding if low else self.rounding for low in lower])
 
-    def _baked(self, points: Points) -> Points:
-        """The block's surface points raised and widened, then scaled so that they fill the bounds exactly."""
+    def _domed(self, points: Points) -> Points:
+        """Surface points of the block with dome and flare, scaled so that they fill the bounds exactly."""
         length, width, height = self._block
         x, y, z = points.T
         rise = self.dome * (1 - (2 * x / length) ** 4) * (1 - (2 * y / width) ** 2)

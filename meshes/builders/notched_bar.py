@@ -18,12 +18,13 @@ from .profile import CutRectangle, Point, Profile
 
 @dataclass(frozen=True)
 class NotchedBar(CutRectangle):
-    """A straight bar along x with a notch in the middle of its lower side; as it stands, the Charpy V specimen.
+    """A straight bar along x with a notch in the middle of its lower side; by default the Charpy V specimen.
 
     2D: x is the length, y the height. 3D: x the length, y the thickness, z the height. One corner is at the origin.
 
     Attributes:
-        length, height: [m].
+        length: [m].
+        height: [m].
         thickness: [m]; 0 makes a 2D mesh.
         notch: "V": flanks at `notch_angle` with a root rounded to `notch_radius` (0: sharp);
             "U": parallel flanks 2 `notch_radius` apart with a half-circle at the root;
@@ -73,14 +74,19 @@ class NotchedBar(CutRectangle):
         require_affordable("notched-bar", min(self.h, self._fine), self.cells_estimate())
 
     @property
+    def _extent(self) -> tuple[float, float, float]:
+        return self.length, self.height, self.thickness
+
+    @property
     def groups(self) -> tuple[str, ...]:
+        """Names of the facet groups."""
         return (*super().groups, *(("support-left", "support-right", "load") if self.span else ()))
 
     def mouth(self) -> float:
         """Width of the notch where it meets the lower side [m]."""
         return 2 * (self._flank[0][0] - self.length / 2)
 
-    # --- what the parameters mean ---------------------------------------------------------------------------------
+    # --- derived quantities ---------------------------------------------------------------------------------------
 
     @property
     def _fine(self) -> float:

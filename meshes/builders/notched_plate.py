@@ -12,13 +12,14 @@ from .profile import CutRectangle, Profile
 
 @dataclass(frozen=True)
 class NotchedPlate(CutRectangle):
-    """A plate with a straight slit from its left edge towards +x; as it stands, the crack branching plate.
+    """A plate with a straight slit from its left edge towards +x; by default the crack branching plate.
 
     2D: x is the length, y the height. 3D: x the length, y the thickness, z the height. One corner is at the origin.
     Single-edge notched tension: length = height = 0.001, notch_length = 0.0005, notch_width = 5e-6.
 
     Attributes:
-        length, height: [m].
+        length: [m].
+        height: [m].
         thickness: [m]; 0 makes a 2D mesh.
         notch_length: from the left edge to the tip of the slit [m].
         notch_width: distance of the slit's parallel flanks [m]; they end in a right-angled point at the tip.
@@ -66,6 +67,10 @@ class NotchedPlate(CutRectangle):
             f"not lie within height = {self.height!r}.",
         )
         require_affordable("notched-plate", min(self.h, self._fine), self.cells_estimate())
+
+    @property
+    def _extent(self) -> tuple[float, float, float]:
+        return self.length, self.height, self.thickness
 
     @property
     def _fine(self) -> float:

@@ -1,4 +1,4 @@
-"""A glass ball with a short neck, as hangs on a tree: a shell."""
+"""A hollow glass ball with a short neck, a Christmas ornament."""
 
 from __future__ import annotations
 
@@ -15,14 +15,16 @@ from ..shell import extrude_shell
 
 @dataclass(frozen=True)
 class Ornament:
-    """A ball around the origin with an open neck upwards along z, of some thickness.
+    """A spherical shell around the origin with an open neck along z.
 
-    Rings of random phase, their triangles by Delaunay's rule on the ball.
+    Points lie on rings around z; triangles by Delaunay's rule on the sphere.
 
     Attributes:
-        radius: of the middle of its wall [m].    neck: radius of the opening [m]; 0: a whole ball.
-        height: of the neck above its opening [m].
-        thickness: of the wall [m].    h: size of the triangles [m].
+        radius: of the middle surface [m].
+        neck: radius of the opening [m]; 0: a whole sphere.
+        height: of the neck above the opening [m].
+        thickness: of the wall [m].
+        h: size of the triangles [m].
 
     Groups: inner, outer, and rim where there is a neck.
 
@@ -50,31 +52,35 @@ class Ornament:
 
     @property
     def groups(self) -> tuple[str, ...]:
+        """Names of the facet groups."""
         return ("inner", "outer", "rim") if self.neck else ("inner", "outer")
 
     @property
     def _opening(self) -> float:
-        """Angle of the opening from the z axis."""
+        """Polar angle of the rim of the opening [rad]."""
         return asin(self.neck / self.radius)
 
     def area(self) -> float:
-        """Of the middle surface [m^2]."""
+        """Area of the middle surface [m^2]."""
         return 2 * pi * self.radius**2 * (1 + cos(self._opening)) + (2 * pi * self.neck * self.height)
 
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Lower and upper corner of the bounding box [m]."""
         outer = self.radius + self.thickness / 2
         top = self.radius * cos(self._opening) + self.height if self.neck else outer
         return (-outer, -outer, -outer), (outer, outer, max(top, outer) if top > outer else top)
 
     def cells_estimate(self) -> int:
+        """Approximate number of cells."""
         return int(3 * self.area() / (0.433 * self.h**2))
 
     def build(self) -> MeshData:
+        """The mesh."""
         points, triangles = self._surface()
         return extrude_shell(points, triangles, self.thickness, "ornament")
 
     def _surface(self) -> tuple[Points, Indices]:
-        """The middle surface: a ball whose top is drawn out to the neck."""
+        """Points and triangles of the middle surface: the sphere below the opening, and the neck."""
         from scipy.spatial import ConvexHull
 
         points = _rings(self.h / self.radius, self._opening if self.neck else 0.0)
@@ -92,15 +98,18 @@ class Ornament:
 
 
 def _rings(step: float, opening: float) -> Points:
-    """(n, 3) points of the unit ball, rings about z that are a step apart, from the opening down to the pole."""
-    count = max(round((pi - opening) / (step * 0.87)), 3)
+    """(n, 3) points of the unit sphere on rings around z, from the opening [rad] down to the pole.
+
+    `step`: distance of neighbours on a ring, over the radius.
+    """
+    count = max(round((pi - opening) / (step * 0.87)), 3)  # rings are a height of equilateral triangles apart
     angles = opening + (pi - opening) * np.arange(count + 1) / count
     rings = []
     for number, angle in enumerate(angles):
         segments = max(round(2 * pi * np.sin(angle) / step), 1)
         if number == 0 and opening:
             segments = max(segments, 8)
-        turn = 2 * pi * (np.arange(segments) + 0.618 * number) / segments
+        turn = 2 * pi * (np.arange(segments) + 0.618 * number) / segments  # golden ratio: no two rings in phase
         ring = np.stack(
             [np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.full(segments, np.cos(angle))], 1
         )
@@ -109,7 +118,7 @@ def _rings(step: float, opening: float) -> Points:
 
 
 def _with_neck(points: Points, triangles: Indices, ring: Indices, height: float, h: float) -> tuple[Points, Indices]:
-    """A tube upwards from a ring of points about the z axis."""
+    """Points and triangles with a tube [m] of triangles of size h added upwards from a ring of points about z."""
     ring = ring[np.argsort(np.arctan2(points[ring, 1], points[ring, 0]))]
     layers, count, first = max(round(height / h), 1), len(ring), len(points)
     above = [points[ring] + [0.0, 0.0, height * (k + 1) / layers] for k in range(layers)]

@@ -16,11 +16,12 @@ from .profile import CutRectangle, Profile
 class PlateHole(CutRectangle):
     """The quarter x > 0, height > 0 of a plate of twice this length and height with a hole around the origin.
 
-    2D: x is the length, y the height. 3D: x the length, y the thickness, z the height. Holding x on "left" and the
-    height on "bottom" makes it stand for the whole plate.
+    2D: x is the length, y the height. 3D: x the length, y the thickness, z the height. With symmetry conditions on
+    "left" and "bottom" it stands for the whole plate.
 
     Attributes:
-        length, height: of the quarter [m].
+        length: of the quarter [m].
+        height: of the quarter [m].
         thickness: [m]; 0 makes a 2D mesh.
         radius: of the hole [m].
         h: cell size [m] away from the hole.
@@ -54,12 +55,16 @@ class PlateHole(CutRectangle):
         )
         require_affordable("plate-hole", min(self.h, self._fine), self.cells_estimate())
 
+    @property
+    def _extent(self) -> tuple[float, float, float]:
+        return self.length, self.height, self.thickness
+
     def cells_estimate(self) -> int:
-        """The hole is taken for filled with the cells beside it, less its own share of them."""
+        """Approximate number of cells: of the rectangle less those of the hole."""
         return max(1, round(super().cells_estimate() - pi / 4 * self._cells_within(self.radius, self.radius)))
 
     @property
-    def rounds(self) -> tuple[CurvedBoundary, ...]:
+    def curved_boundaries(self) -> tuple[CurvedBoundary, ...]:
         """The hole."""
         return (CurvedBoundary(("hole",), self.radius, 1 if self.thickness else None),)
 

@@ -45,7 +45,7 @@ class Profile:
 
 
 def mesh_profile(profile: Profile, thickness: float, sizing: SizeField) -> tuple[Points, Indices]:
-    """Points and positive cells of the profile in x-y (thickness 0), or of the solid with its thickness along y."""
+    """Points and positive cells of the profile in the x-y plane (thickness 0), or of a solid with thickness along y."""
     dim = 3 if thickness > 0 else 2
     points, cells = mesh_with_gmsh(lambda gmsh: profile.draw(gmsh, thickness), dim, sizing)
     if dim == 3:
@@ -55,51 +55,61 @@ def mesh_profile(profile: Profile, thickness: float, sizing: SizeField) -> tuple
 
 
 class CutRectangle(ABC):
-    """A rectangle (2D) or box with one corner at the origin, out of which something is cut: what its builders share.
+    """A rectangle or box with one corner at the origin and a cut: notch, hole or corner.
 
     2D: x is the length, y the height. 3D: x the length, y the thickness, z the height.
     """
 
-    cut: ClassVar[str]  # the group of what is no side
-    length: float
-    height: float
-    thickness: float  # 0: 2D
+    cut: ClassVar[str]  # facet group of the boundary that the cut makes
+
+    @property
+    @abstractmethod
+    def _extent(self) -> tuple[float, float, float]:
+        """Length, height and thickness [m]; thickness 0: 2D."""
 
     @property
     @abstractmethod
     def _sizing(self) -> SizeField:
-        """The size of cells from place to place."""
+        """Cell size as a function of place."""
 
     @abstractmethod
     def _profile(self) -> Profile:
-        """What is left of the rectangle of length and height."""
+        """The rectangle of length and height without the cut."""
 
     @property
     def groups(self) -> tuple[str, ...]:
-        return ("left", "right", "bottom", "top", *(("front", "back") if self.thickness else ()), self.cut)
+        """Names of the facet groups."""
+        return ("left", "right", "bottom", "top", *(("front", "back") if self._extent[2] else ()), self.cut)
 
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        high = (self.length, self.thickness, self.height) if self.thickness else (self.length, self.height)
+        """Lower and upper corner of the bounding box [m]."""
+        length, height, thickness = self._extent
+        high = (length, thickness, height) if thickness else (length, height)
         return (0.0,) * len(high), high
 
     def cells_estimate(self) -> int:
-        return self._cells_within(self.length, self.height)
+        """Approximate number of cells."""
+        length, height, _ = self._extent
+        return self._cells_within(length, height)
 
     def _cells_within(self, x: float, y: float) -> int:
-        """About how many cells fill the rectangle from the origin to (x, y), over all the thickness."""
-        high = (x, y, self.thickness) if self.thickness else (x, y)
+        """Approximate number of cells in the rectangle from the origin to (x, y) [m], through the thickness."""
+        thickness = self._extent[2]
+        high = (x, y, thickness) if thickness else (x, y)
         return estimate_cells_in_box(self._sizing, (0.0,) * len(high), high)
 
     def build(self) -> MeshData:
-        points, cells = mesh_profile(self._profile(), self.thickness, self._sizing)
+        """The mesh."""
+        points, cells = mesh_profile(self._profile(), self._extent[2], self._sizing)
         return MeshData(points, cells, self._groups(points, cells))
 
     def _groups(self, points: Points, cells: Indices) -> dict[str, Indices]:
         """Left, right (x), bottom, top (the last axis), in 3D front, back (y), and the rest of the boundary."""
         up = points.shape[1] - 1
-        planes = {"left": (0, 0.0), "right": (0, self.length), "bottom": (up, 0.0), "top": (up, self.height)}
+        length, height, thickness = self._extent
+        planes = {"left": (0, 0.0), "right": (0, length), "bottom": (up, 0.0), "top": (up, height)}
         if up == 2:
-            planes |= {"front": (1, 0.0), "back": (1, self.thickness)}
+            planes |= {"front": (1, 0.0), "back": (1, thickness)}
         boundary = boundary_facets(cells)
         groups = facet_groups_on_planes(points, boundary, planes)
         return groups | {self.cut: exclude_facets(boundary, *groups.values())}

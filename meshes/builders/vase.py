@@ -15,16 +15,14 @@ from ..parameters import positive, require, require_affordable, require_not_nega
 from ..sizing import SizeField, estimate_cells_in_body
 from ..topology import boundary_facets, exclude_facets, facet_groups_on_planes, facets_on_nodes
 
-# Heights of the control polygon of the profile are equal, so that r is a polynomial in z: a foot, a belly, a neck and a
-# lip. The unit is the radius of the belly.
+# Radii of the control polygon of the profile from foot to lip, in units of the radius of the belly. Their heights are
+# equally spaced, so that r is a polynomial in z.
 CONTROL = (0.50, 1.05, 1.50, 0.90, 0.05, 0.35, 0.55)
-
-FLAT = 2e-3  # volume over longest edge cubed of the cells that gmsh leaves between two faces of the side, now and then
 
 
 @dataclass(frozen=True)
 class Vase:
-    """A vase that stands on z = 0 around the z axis, open at its rim, or solid.
+    """A vase around the z axis with its base at z = 0, open at its rim, or solid.
 
     The profile is a Bezier curve, r(z) a polynomial of degree 6 with its greatest value at the belly.
 
@@ -60,6 +58,7 @@ class Vase:
 
     @property
     def groups(self) -> tuple[str, ...]:
+        """Names of the facet groups."""
         return ("base", "rim", "side", "inside") if self.wall else ("base", "rim", "side")
 
     def outline(self) -> Polynomial:
@@ -68,10 +67,10 @@ class Vase:
         unit = Polynomial([0.0, 1.0])
         terms = [c * comb(degree, i) * unit**i * (1 - unit) ** (degree - i) for i, c in enumerate(CONTROL)]
         share = sum(terms, Polynomial([0.0]))
-        return self.radius / _greatest(share) * share(Polynomial([0.0, 1 / self.height]))
+        return self.radius / _maximum(share) * share(Polynomial([0.0, 1 / self.height]))
 
     def volume(self) -> float:
-        """pi (integral of r^2 over the height, less that of (r - wall)^2 above the floor) [m^3]."""
+        """Volume [m^3]: pi (integral of r^2 over the height, less that of (r - wall)^2 above the floor)."""
         outer = (self.outline() ** 2).integ()
         whole = outer(self.height) - outer(0.0)
         if not self.wall:
@@ -80,16 +79,20 @@ class Vase:
         return float(pi * (whole - inner(self.height) + inner(self.wall)))
 
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Lower and upper corner of the bounding box [m]."""
         return (-self.radius, -self.radius, 0.0), (self.radius, self.radius, self.height)
 
     def cells_estimate(self) -> int:
+        """Approximate number of cells."""
         return estimate_cells_in_body(self.volume(), self.wall, self.h)
 
     def build(self) -> MeshData:
+        """The mesh."""
         from ..surfaces.fill import remove_boundary_slivers
 
         points, cells = mesh_with_gmsh(self._draw, 3, SizeField(self.h))
-        cells = remove_boundary_slivers(points, cells, FLAT)
+        # gmsh sometimes leaves flat cells between two faces of the side: volume over longest edge cubed up to 2e-3
+        cells = remove_boundary_slivers(points, cells, 2e-3)
         boundary = boundary_facets(cells)
         groups = facet_groups_on_planes(points, boundary, {"base": (2, 0.0), "rim": (2, self.height)})
         if self.wall:
@@ -99,7 +102,7 @@ class Vase:
         return MeshData(points, cells, groups | {"side": exclude_facets(boundary, *groups.values())})
 
     def _draw(self, gmsh: Any) -> None:
-        """The half section, turned once around the axis."""
+        """The half section, revolved around the axis."""
         occ = gmsh.model.occ
         top = float(self.outline()(self.height))
         outer = _bezier(self.outline(), 0.0, self.height)
@@ -139,8 +142,8 @@ def _bezier(radius: Polynomial, start: float, end: float) -> list[tuple[float, f
     return [(float(r), start + i / n * (end - start)) for i, r in enumerate(radii)]
 
 
-def _greatest(share: Polynomial) -> float:
-    """The greatest value over [0, 1]: at an end, or where the slope is zero."""
+def _maximum(share: Polynomial) -> float:
+    """The maximum over [0, 1]: at an end, or where the slope is zero."""
     flat = share.deriv().roots()
     inner = flat.real[(np.abs(flat.imag) < 1e-12) & (flat.real > 0) & (flat.real < 1)]
     return float(share(np.concatenate([[0.0, 1.0], inner])).max())
