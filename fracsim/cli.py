@@ -112,7 +112,7 @@ def mesh(
     """Build and save the mesh of a study, print its quality."""
     if not is_first_rank():
         return
-    from .meshes.directions import preferred
+    from .meshes.directions import preferred_directions
     from .meshes.quality import mesh_quality
     from .study.mesh_source import build_mesh, save_mesh
     from .study.reader import load_study
@@ -120,7 +120,7 @@ def mesh(
     data = build_mesh(load_study(study, set_).mesh)
     for note in data.notes:
         print(f"note: {one_line(note)}")
-    for name, value in (mesh_quality(data) | preferred(data)).items():
+    for name, value in (mesh_quality(data) | preferred_directions(data)).items():
         print(f"{name:24} {value:.6g}" if isinstance(value, float) else f"{name:24} {one_line(str(value))}")
     save_mesh(data, out)
     print(f"saved in {out}")

@@ -1,13 +1,13 @@
-"""Meshes as plain arrays with named groups: builders, files, closed surfaces to fill, and checks.
+"""Meshes as plain arrays with named groups: builders, readers, closed surfaces, and checks.
 
-    BUILDERS["box"](size=(1.0, 1.0, 4.0), h=0.1).build()    a body by its name
+    BUILDERS["box"](size=(1.0, 1.0, 4.0), h=0.1).build()    a body by the name of its builder
     read.read_mesh("part.msh")                              a mesh from file
     shell.read_shell("hull.stl", 0.002)                     a surface, open or closed, with a thickness
-    fill.fill_surface("part.stl", h=0.01)                   tetrahedra inside a closed surface
-    check.check_mesh(mesh)                                  named or mended, before anything is solved
-    quality.mesh_quality(mesh)                              numbers that tell a good mesh from a bad one
+    surfaces.fill.fill_surface("part.stl", h=0.01)          tetrahedra inside a closed surface
+    check.check_mesh(mesh)                                  faults mended or refused
+    quality.mesh_quality(mesh)                              quality measures
 
-Importing this needs NumPy only: gmsh, meshio and SciPy are imported when they are called, on the process that calls.
+The package needs NumPy only; gmsh, meshio and SciPy are imported by the functions that use them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from .parameters import Builder
 
 
 class _Builders(Mapping[str, type[Builder]]):
-    """Builders by the name that studies call them by, each imported when it is asked for."""
+    """Builder classes by their names in studies, each imported on access."""
 
     classes: ClassVar[dict[str, str]] = {
         "boat": "boat.Boat",
@@ -41,8 +41,8 @@ class _Builders(Mapping[str, type[Builder]]):
 
     def __getitem__(self, name: str) -> type[Builder]:
         module, kind = self.classes[name].split(".")
-        result: type[Builder] = getattr(import_module(f".builders.{module}", __name__), kind)
-        return result
+        builder: type[Builder] = getattr(import_module(f".builders.{module}", __name__), kind)
+        return builder
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.classes)

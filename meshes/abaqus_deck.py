@@ -103,7 +103,7 @@ class KeywordBlock:
         ends = []
         for i, fields in enumerate(self.lines()):
             for text in fields:
-                value = number(text, kind)
+                value = parse_number(text, kind)
                 if value is None:
                     expected = "a whole number" if kind is np.int64 else "a number"
                     self.refuse(f"'{text[:40]}' is not {expected}, as the data of *{self.keyword} need.", i)
@@ -112,7 +112,7 @@ class KeywordBlock:
         return np.array(values, kind), np.array(ends, np.int64)
 
 
-def number(text: str, kind: type[np.int64] | type[np.float64]) -> float | None:
+def parse_number(text: str, kind: type[np.int64] | type[np.float64]) -> float | None:
     """The number that a field holds, or None."""
     try:
         if kind is np.int64:
@@ -303,11 +303,11 @@ def _block(words: str, source: SourceText, offset: int) -> KeywordBlock:
     values = {}
     for parameter in parameters:
         key, _, value = parameter.partition("=")
-        if key := _joined(key):
+        if key := _normalised(key):
             values[key] = unquoted(value)
-    return KeywordBlock(_joined(first), values, source, offset)
+    return KeywordBlock(_normalised(first), values, source, offset)
 
 
-def _joined(words: str) -> str:
+def _normalised(words: str) -> str:
     """Words in upper case without blanks."""
     return "".join(words.split()).upper()

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .abaqus_deck import KeywordBlock, keyword_blocks, number
+from .abaqus_deck import KeywordBlock, keyword_blocks, parse_number
 from .abaqus_elements import SUPPORTED, kind_of
 from .data import Indices, Points, list_some
 from .file_text import SourceText
@@ -244,7 +244,7 @@ class Deck:
         nodes: list[int] = []
         continued = False
         for fields in block.lines():
-            values = [int(v) for v in (number(text, np.int64) for text in fields) if v is not None]
+            values = [int(v) for v in (parse_number(text, np.int64) for text in fields) if v is not None]
             if not continued:
                 ids += values[:1]
             nodes += values[0 if continued else 1 :]
@@ -277,7 +277,7 @@ class Deck:
         numbers: list[int] = []
         for fields in block.lines():
             for text in fields:
-                value = number(text, np.int64)
+                value = parse_number(text, np.int64)
                 if value is not None:
                     numbers.append(int(value))
                 elif text:
@@ -306,7 +306,7 @@ class Deck:
             if not fields[0] or len(fields) > 2:
                 block.refuse("a line of *SURFACE needs a set or a number and a face: top_elements, S2.", i)
             face = fields[1].upper() if len(fields) == 2 and kind == "ELEMENT" else ""
-            value = number(fields[0], np.int64)
+            value = parse_number(fields[0], np.int64)
             numbers = None if value is None else np.array([value], np.int64)
             surface.entries.append(SetEntry(block, numbers, name="" if numbers is not None else fields[0], face=face))
 

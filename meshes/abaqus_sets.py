@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 
 from .abaqus_assembly import Assembly, Instance
-from .abaqus_deck import number
+from .abaqus_deck import parse_number
 from .abaqus_model import NO_INDICES, NamedSet, SetEntry, label_key
 from .data import Indices, list_some
 from .topology import distinct_rows
@@ -91,7 +91,7 @@ class SetResolver:
             if target is None:
                 continue
             local_name = entry.name[dot + 1 :].strip().strip('"').strip()
-            value = number(local_name, np.int64)
+            value = parse_number(local_name, np.int64)
             numbers = None if value is None else np.array([value], np.int64)
             name = local_name if numbers is None else ""
             return target, SetEntry(entry.block, numbers, name=name, of_elements=entry.of_elements, face=entry.face)

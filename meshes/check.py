@@ -1,38 +1,37 @@
-"""What is wrong with a mesh is found before anything is solved: mended and noted, or named and refused."""
+"""Checks of a mesh before anything is solved: faults are mended with a note, or refused with a message."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from .data import Indices, MeshData, MeshError, Points, format_midpoint, format_point
-from .joining import coincident_nodes, join_bodies, label_bodies
+from .data import Indices, MeshData, MeshError, Points, format_midpoint, format_point, list_some
 from .parameters import LONGEST, SHORTEST
-from .topology import Floats, Mask, components, distinct_rows, facets_of, orient_cells, signed_measures
+from .topology import Floats, Mask, components, distinct_rows, edges_of, facets_of, orient_cells, signed_measures
 
-SHOWN = 5  # examples in a message
+SAME_PLACE = 1e-6  # distance over the size of the mesh within which nodes coincide
 
 
 def check_mesh(mesh: MeshData, *, join: bool = False) -> MeshData:
-    """The mesh, fit to be solved on, with a note for everything that was mended or that the user should know.
+    """The mesh without the faults that can be mended, with notes for the user.
 
-    Mended: nodes that no cell uses are removed (groups and regions follow); inverted cells are turned.
-    Joined, with `join`: coincident nodes of different bodies (see joining).
-    Noted: nodes at the same place that are not joined, separate bodies, parts that hang together by an edge or node
+    Mended: nodes without cells are removed (groups and regions follow); inverted cells are turned.
+    Joined, with `join`: coincident nodes of different bodies.
+    Noted: nodes at the same place that are not joined, separate bodies, parts that are connected by an edge or node
     only, group facets inside the body, cells in several regions.
 
     Raises:
-        MeshError: no cells, wrong array shapes, cells or groups that name nodes that do not exist, coordinates that
-            are no numbers, flat cells, a cell given twice, a facet of more than two cells, cells that lie over
-            one another, a group facet that is no facet of a cell.
+        MeshError: no cells, wrong array shapes, cells or groups with nodes that do not exist, coordinates that are no
+            numbers, flat cells, a cell given twice, a facet of more than two cells, overlapping cells at a facet, a
+            group facet that is no facet of a cell.
     """
     _check_arrays(mesh)
     _check_coordinates(mesh)
     mesh = _without_orphans(mesh)
     mesh = join_bodies(mesh) if join else mesh
-    mesh = _groups_once(_turned(mesh))
+    mesh = _without_repeated_facets(_oriented(mesh))
     _check_flat(mesh)
     _check_cells_once(mesh)
     table = _FacetTable(mesh.cells)
@@ -40,28 +39,28 @@ def check_mesh(mesh: MeshData, *, join: bool = False) -> MeshData:
     count, body = label_bodies(mesh)
     notes = [
         *_check_groups(mesh, table),
-        *_open_places(mesh, body),
-        *_bodies(mesh, table, count, body),
-        *_regions(mesh),
+        *_unmerged_nodes(mesh, body),
+        *_body_notes(mesh, table, count, body),
+        *_region_notes(mesh),
     ]
     return replace(mesh, notes=mesh.notes + tuple(notes))
 
 
 class _FacetTable:
-    """The facets of all cells, sorted once for every check that needs them.
+    """The facets of all cells.
 
     Attributes:
         facets: (m (d + 1), d), cell by cell, normals outwards.
-        counts: number of cells at each distinct facet.
-        place: the distinct facet of each of `facets`.
+        counts: (k,) number of cells at each distinct facet.
+        index: (m (d + 1),) distinct facet of each of `facets`.
     """
 
     def __init__(self, cells: Indices) -> None:
         self.facets = facets_of(cells).reshape(-1, cells.shape[1] - 1)
-        self._distinct, self.counts, self.place = distinct_rows(np.sort(self.facets, axis=1))
+        self._distinct, self.counts, self.index = distinct_rows(np.sort(self.facets, axis=1))
 
     def cells_at(self, groups: list[Indices]) -> list[Indices]:
-        """Number of cells at each facet of each group; 0 where it is no facet of the mesh."""
+        """For each group the number of cells at each facet; 0 of a facet that is not of the mesh."""
         sizes = np.cumsum([len(self._distinct), *map(len, groups)])
         _, _, inverse = distinct_rows(np.sort(np.concatenate([self._distinct, *groups]), axis=1))
         counts = np.zeros(inverse.max() + 1, np.int64)
@@ -69,9 +68,9 @@ class _FacetTable:
         return np.split(counts[inverse[sizes[0] :]], sizes[1:-1] - sizes[0]) if groups else []
 
     def pairs(self, nodes: int) -> Indices:
-        """Cells that share a facet: (k, 2)."""
-        order = np.argsort(self.place, kind="stable")
-        shared = np.flatnonzero(np.diff(self.place[order]) == 0)
+        """(k, 2) cells that share a facet; `nodes`: of a cell."""
+        order = np.argsort(self.index, kind="stable")
+        shared = np.flatnonzero(np.diff(self.index[order]) == 0)
         return np.stack([order[shared], order[shared + 1]], axis=1) // nodes
 
 
@@ -96,6 +95,7 @@ def _check_arrays(mesh: MeshData) -> None:
 
 
 def _check_numbers(rows: Indices, nodes: int, what: str) -> None:
+    """Raise MeshError if a row has a node out of range."""
     wrong = np.flatnonzero(((rows < 0) | (rows >= nodes)).any(axis=1))
     if len(wrong):
         raise MeshError(
@@ -105,12 +105,13 @@ def _check_numbers(rows: Indices, nodes: int, what: str) -> None:
 
 
 def _check_coordinates(mesh: MeshData) -> None:
+    """Raise MeshError if coordinates of used nodes are no numbers, or the size of the body is out of range."""
     used = np.zeros(len(mesh.points), bool)
     used[mesh.cells] = True
     wrong = np.flatnonzero(used & ~(np.abs(mesh.points) <= LONGEST).all(axis=1))
     if len(wrong):
         raise MeshError(
-            f"{len(wrong)} nodes have coordinates that are not finite numbers: node {_some(wrong)}, "
+            f"{len(wrong)} nodes have coordinates that are not finite numbers: node {list_some(wrong)}, "
             f"the first at {mesh.points[wrong[0]].tolist()} (at most {LONGEST:g} m is allowed); export the mesh again."
         )
     if used.any() and (size := float(np.ptp(mesh.points[used], axis=0).max())) < SHORTEST:
@@ -122,17 +123,15 @@ def _check_flat(mesh: MeshData) -> None:
     if len(flat):
         measure = "volume" if mesh.dim == 3 else "area"
         raise MeshError(
-            f"{len(flat)} cells have no {measure}: cell {_some(flat)}, the first near "
+            f"{len(flat)} cells have no {measure}: cell {list_some(flat)}, the first near "
             f"{format_midpoint(mesh.points, mesh.cells[flat[0]])}; remesh there, or merge its nodes."
         )
 
 
 def flat_cells(points: Points, cells: Indices, share: float = 0.0) -> Mask:
-    """Whether each cell's measure cannot be told from zero, or is below a share of its longest edge^d: (m,).
-
-    Coordinates x are stored to eps |x|, which moves a node by that much and the measure by up to about
-    (d + 1) / (d - 1)! * eps |x| * L^(d - 1), L the longest edge; twice that is taken.
-    """
+    """(m,) whether each cell's measure is zero to round-off, or below a share of its longest edge^d."""
+    # Coordinates x are stored to eps |x|, which changes the measure by up to about
+    # (d + 1) / (d - 1)! * eps |x| * L^(d - 1) with the longest edge L; the bound is twice that.
     dim = points.shape[1]
     corners = points[cells]
     longest = _longest_edges(points, cells)
@@ -141,7 +140,7 @@ def flat_cells(points: Points, cells: Indices, share: float = 0.0) -> Mask:
 
 
 def _precision(points: Points) -> float:
-    """Relative rounding of the coordinates: that of single precision where all of them fit into it."""
+    """Relative round-off of the coordinates, that of single precision if all of them fit into it."""
     single = bool(np.array_equal(points, points.astype(np.float32)))
     return float(np.finfo(np.float32 if single else np.float64).eps)
 
@@ -151,21 +150,21 @@ def _check_cells_once(mesh: MeshData) -> None:
     twice = np.flatnonzero(counts[inverse] > 1)
     if len(twice):
         raise MeshError(
-            f"{len(twice)} cells have the same nodes as another cell: cell {_some(twice)}, the first near "
+            f"{len(twice)} cells have the same nodes as another cell: cell {list_some(twice)}, the first near "
             f"{format_midpoint(mesh.points, mesh.cells[twice[0]])}; remove the copies."
         )
 
 
 def _check_facets(mesh: MeshData, table: _FacetTable) -> None:
-    """Each facet belongs to one cell or to two on its opposite sides."""
-    _refuse_facets(mesh, table.facets[table.counts[table.place] > 2], "belong to more than two cells")
-    # Outward normals of the two cells are opposite; a facet met twice with one normal has both cells on one side.
-    _, same, inverse = distinct_rows(_canonical(table.facets))
+    """Raise MeshError unless each facet belongs to one cell, or to two on opposite sides."""
+    _refuse_facets(mesh, table.facets[table.counts[table.index] > 2], "belong to more than two cells")
+    # outward normals of the two cells are opposite: a facet with the same normal twice has both cells on one side
+    _, same, inverse = distinct_rows(_rotated_to_least(table.facets))
     _refuse_facets(mesh, table.facets[same[inverse] > 1], "have two cells on the same side, so that the cells overlap")
 
 
-def _canonical(facets: Indices) -> Indices:
-    """Each triangle turned in a circle so that its least node comes first; its normal is kept. Edges stay."""
+def _rotated_to_least(facets: Indices) -> Indices:
+    """Triangles (k, 3) with their nodes rotated so that the least comes first; edges (k, 2) as they are."""
     if facets.shape[1] == 2:
         return facets
     columns = (facets.argmin(axis=1)[:, None] + np.arange(3)) % 3
@@ -182,7 +181,7 @@ def _refuse_facets(mesh: MeshData, facets: Indices, what: str) -> None:
 
 
 def _check_groups(mesh: MeshData, table: _FacetTable) -> Iterator[str]:
-    """Each group facet is a facet of a cell; a note where it lies inside the body."""
+    """Raise MeshError if a group facet is no facet of a cell; notes of group facets inside the body."""
     cells_there = table.cells_at(list(mesh.facet_groups.values()))
     for (name, facets), count in zip(mesh.facet_groups.items(), cells_there, strict=True):
         _refuse_lost(mesh, name, facets, np.flatnonzero(count == 0))
@@ -192,6 +191,7 @@ def _check_groups(mesh: MeshData, table: _FacetTable) -> Iterator[str]:
 
 
 def _refuse_lost(mesh: MeshData, name: str, facets: Indices, lost: Indices) -> None:
+    """Raise MeshError if facets of a group, by their numbers `lost`, are no facets of cells."""
     if len(lost):
         raise MeshError(
             f"{len(lost)} of the {len(facets)} facets of group '{name}' are not facets of any cell, the first with "
@@ -204,6 +204,7 @@ def _refuse_lost(mesh: MeshData, name: str, facets: Indices, lost: Indices) -> N
 
 
 def _without_orphans(mesh: MeshData) -> MeshData:
+    """The mesh without nodes that belong to no cell."""
     used = np.zeros(len(mesh.points), bool)
     used[mesh.cells] = True
     orphans = int((~used).sum())
@@ -218,7 +219,8 @@ def _without_orphans(mesh: MeshData) -> MeshData:
     return MeshData(mesh.points[used], number[mesh.cells], groups, mesh.regions, (*mesh.notes, note))
 
 
-def _turned(mesh: MeshData) -> MeshData:
+def _oriented(mesh: MeshData) -> MeshData:
+    """The mesh with inverted cells turned."""
     cells, count = orient_cells(mesh.points, mesh.cells)
     if count == 0:
         return mesh
@@ -226,8 +228,8 @@ def _turned(mesh: MeshData) -> MeshData:
     return replace(mesh, cells=cells, notes=(*mesh.notes, note))
 
 
-def _groups_once(mesh: MeshData) -> MeshData:
-    """Group facets that are listed several times are kept once; nobody needs to be told."""
+def _without_repeated_facets(mesh: MeshData) -> MeshData:
+    """The mesh with each facet once in its group."""
     groups = {}
     for name, facets in mesh.facet_groups.items():
         _, _, inverse = distinct_rows(np.sort(facets, axis=1))
@@ -235,11 +237,71 @@ def _groups_once(mesh: MeshData) -> MeshData:
     return replace(mesh, facet_groups=groups)
 
 
+# --- joined ---------------------------------------------------------------------------------------------------------
+
+
+def label_bodies(mesh: MeshData) -> tuple[int, Indices]:
+    """Number of bodies, which share no node, and the body of each node (n,)."""
+    return components(edges_of(mesh.cells), len(mesh.points))
+
+
+def coincident_nodes(mesh: MeshData, body: Indices) -> Indices:
+    """(k, 2) pairs of nodes of different bodies that coincide; `body`: (n,) as of `label_bodies`."""
+    from scipy.spatial import cKDTree  # slow to import; most meshes have one body
+
+    reach = SAME_PLACE * float(np.ptp(mesh.points, axis=0).max())
+    pairs: Indices = cKDTree(mesh.points).query_pairs(reach, output_type="ndarray").astype(np.int64)
+    return pairs[body[pairs[:, 0]] != body[pairs[:, 1]]]
+
+
+def join_bodies(mesh: MeshData) -> MeshData:
+    """The mesh with one node in place of the coincident nodes of different bodies, and a note.
+
+    Nodes of one body at the same place stay apart, as along a crack.
+
+    Raises:
+        MeshError: several bodies without coincident nodes, or nodes that coincide with two nodes of one other body.
+    """
+    count, body = label_bodies(mesh)
+    if count == 1:
+        return replace(mesh, notes=(*mesh.notes, "[mesh] join = true: the mesh is one body already."))
+    pairs = coincident_nodes(mesh, body)
+    if len(pairs) == 0:
+        raise MeshError(
+            f"[mesh] join = true, and no nodes of the {count} bodies are at the same place (within {SAME_PLACE:g} of "
+            "the mesh's size). Mesh the parts so that common faces have common nodes, or leave join out."
+        )
+    clusters, cluster = components(pairs, len(mesh.points))
+    _refuse_cracks(mesh, body, cluster)
+    retained = np.unique(cluster, return_index=True)[1]
+    groups = {name: cluster[facets] for name, facets in mesh.facet_groups.items()}
+    joined = replace(mesh, points=mesh.points[retained], cells=cluster[mesh.cells], facet_groups=groups)
+    bodies_left = label_bodies(joined)[0]
+    note = (
+        f"{len(mesh.points) - clusters} nodes were joined with coincident nodes of another body: {count} bodies are "
+        f"{bodies_left} now."
+    )
+    return replace(joined, notes=(*mesh.notes, note))
+
+
+def _refuse_cracks(mesh: MeshData, body: Indices, cluster: Indices) -> None:
+    """Raise MeshError if two nodes of one body coincide with the same node of another body."""
+    order = np.lexsort((body, cluster))
+    same = (np.diff(cluster[order]) == 0) & (np.diff(body[order]) == 0)
+    if same.any():
+        where = format_point(mesh.points[order[np.flatnonzero(same)[0]]])
+        raise MeshError(
+            f"[mesh] join = true: {int(same.sum())} nodes coincide with two nodes of one other body, the first at "
+            f"{where} m: that body is open there, as along a crack, and which side is joined is not known. Join these "
+            "nodes in the file, or move them apart."
+        )
+
+
 # --- noted ----------------------------------------------------------------------------------------------------------
 
 
-def _open_places(mesh: MeshData, body: Indices) -> Iterator[str]:
-    """Nodes of one body at the same place."""
+def _unmerged_nodes(mesh: MeshData, body: Indices) -> Iterator[str]:
+    """A note of nodes of one body at the same place."""
     order = np.lexsort((body, *mesh.points.T))
     same = (np.diff(mesh.points[order], axis=0) == 0).all(axis=1) & (np.diff(body[order]) == 0)
     if same.any():
@@ -250,7 +312,11 @@ def _open_places(mesh: MeshData, body: Indices) -> Iterator[str]:
         )
 
 
-def _bodies(mesh: MeshData, table: _FacetTable, by_nodes: int, body: Indices) -> Iterator[str]:
+def _body_notes(mesh: MeshData, table: _FacetTable, by_nodes: int, body: Indices) -> Iterator[str]:
+    """Notes of separate bodies, and of parts that are connected by an edge or node only.
+
+    `by_nodes`: number of bodies that share no node.
+    """
     by_facets = components(table.pairs(mesh.dim + 1), len(mesh.cells))[0]
     if by_nodes > 1:
         yield f"The mesh has {by_nodes} bodies that share no node; each needs its own supports."
@@ -268,7 +334,8 @@ def _bodies(mesh: MeshData, table: _FacetTable, by_nodes: int, body: Indices) ->
         )
 
 
-def _regions(mesh: MeshData) -> Iterator[str]:
+def _region_notes(mesh: MeshData) -> Iterator[str]:
+    """A note of cells in several regions."""
     times = np.zeros(len(mesh.cells), np.int64)
     for cells in mesh.regions.values():
         times[np.unique(cells)] += 1
@@ -276,15 +343,7 @@ def _regions(mesh: MeshData) -> Iterator[str]:
         yield f"{int((times > 1).sum())} cells are in more than one region."
 
 
-# --- words ----------------------------------------------------------------------------------------------------------
-
-
-def _some(numbers: Iterable[int]) -> str:
-    """The first few numbers, and dots where there are more."""
-    listed = list(numbers)
-    return ", ".join(str(int(n)) for n in listed[:SHOWN]) + (", ..." if len(listed) > SHOWN else "")
-
-
 def _longest_edges(points: Points, cells: Indices) -> Floats:
+    """(m,) longest edge of each cell [m]."""
     first, second = np.triu_indices(cells.shape[1], k=1)
     return np.linalg.norm(points[cells[:, first]] - points[cells[:, second]], axis=2).max(axis=1)

@@ -14,16 +14,17 @@ AXES = "xyz"
 
 
 class MeshError(ValueError):
-    """A mesh that cannot be built or used; the message says what is wrong, where, and what to do."""
+    """A mesh that cannot be built or used; the message tells what is wrong, where, and what to do."""
 
 
 @dataclass(frozen=True, eq=False)
 class Shell:
-    """What a mesh is the thickness of: n nodes below, n above, three cells to a triangle (meshes.shell).
+    """Middle surface of a mesh of n nodes below and n above it, three cells for each triangle (meshes.shell).
 
     Attributes:
-        middle: (2 n, 3) place in the middle surface of each node of the mesh, m.
-        triangles: (m, 3) between the first n nodes.    thickness: m.
+        middle: (2 n, 3) point of the middle surface for each node of the mesh [m].
+        triangles: (m, 3) between the first n nodes.
+        thickness: [m].
     """
 
     middle: Points
@@ -31,7 +32,7 @@ class Shell:
     thickness: float
 
 
-@dataclass(frozen=True, eq=False)  # two are equal where they are the same: what is made of one is kept beside it
+@dataclass(frozen=True, eq=False)  # compared by identity, so that a mesh can be a key of what is computed from it
 class MeshData:
     """A simplex mesh in arrays, with named groups.
 
@@ -41,9 +42,9 @@ class MeshData:
         facet_groups: name -> (k, d) node indices of boundary edges (d = 2) or triangles (d = 3).
             A facet may be in more than one group.
         regions: name -> (k,) cell indices. Empty: the body is of one material.
-        notes: what was mended while reading, one sentence each, to be told to the user.
-        shell: of what it is the thickness; None: a solid.
-        middles: (k, d) where the middles of topology.edges_of the cells belong, in metres; None: half-way.
+        notes: messages to the user about what was mended, one sentence each.
+        shell: the middle surface; None of a solid.
+        middles: (k, d) midside points of the edges (topology.edges_of) [m]; None: the midpoints.
     """
 
     points: Points
@@ -56,6 +57,7 @@ class MeshData:
 
     @property
     def dim(self) -> int:
+        """Dimension of space, 2 or 3."""
         return int(self.points.shape[1])
 
 

@@ -180,12 +180,12 @@ def missing_bytes(path: Path) -> int | None:
     """How many bytes a netCDF classic file is shorter than its header says, at most 0 if whole; None: no header."""
     with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
         try:
-            return _needed(_Header(data)) - len(data)
+            return _required_bytes(_Header(data)) - len(data)
         except (struct.error, KeyError, IndexError, OverflowError):
             return None
 
 
-def _needed(header: _Header) -> int:
+def _required_bytes(header: _Header) -> int:
     """Offset behind the last value; struct.error, KeyError or IndexError of a damaged header."""
     records = header.count()
     streaming = records == (2**64 - 1 if header.version == 5 else 2**32 - 1)

@@ -80,6 +80,14 @@ class SourceText:
         filled = ends > begins  # lines that are not blank
         return Rows(values, *(array[filled].astype(np.int64) for array in (begins, ends, offsets)))
 
+    def integers(self, values: npt.NDArray[np.float64], offsets: Indices, expected: str) -> Indices:
+        """The numbers (n, ...) of n lines as integers; MeshError names the first line with another number."""
+        wrong = is_not_integer(values).reshape(len(values), -1).any(axis=1) if values.size else np.zeros(0, bool)
+        if wrong.any():
+            self.damaged(int(offsets[wrong.argmax()]), f"a number of this line is not whole; {expected}.")
+        integers: Indices = values.astype(np.int64)
+        return integers
+
     def _refuse_row(self, begin: int, end: int, expected: str) -> NoReturn:
         """Raises MeshError at the first line that holds anything else than numbers."""
         while begin < end:

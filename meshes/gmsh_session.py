@@ -1,26 +1,31 @@
-"""gmsh, used quietly: started for one mesh, ended whatever happens, the same mesh each time."""
+"""Meshes by gmsh: a session for each, without output, with the same result each time."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from enum import IntEnum
 from typing import Any
 
 import numpy as np
 
 from .data import Indices, MeshError, Points
 from .quality import POOR, radius_ratios
-from .random_points.faces import scatter_faces, scatter_plane
+from .random_points.faces import GmshElement, scatter_faces, scatter_plane
 from .sizing import INNER_SIZE_FACTOR, SizeField
 from .topology import orient_cells
 
-TRIANGLE, TETRAHEDRON = 2, 4  # gmsh's numbers for cell types
-DELAUNAY, HXT = 1, 10  # and for algorithms
+
+class Algorithm(IntEnum):
+    """gmsh's numbers for algorithms that fill volumes (Mesh.Algorithm3D)."""
+
+    DELAUNAY = 1
+    HXT = 10
 
 
 @contextmanager
 def session() -> Iterator[Any]:
-    """gmsh with an empty model of its own; a failure inside gmsh is raised as MeshError with gmsh's reason."""
+    """The module gmsh with an empty model; a failure inside gmsh becomes a MeshError with gmsh's reason."""
     import gmsh
 
     local = not gmsh.isInitialized()
@@ -33,7 +38,7 @@ def session() -> Iterator[Any]:
     try:
         yield gmsh
     except Exception as error:
-        if not _is_of_gmsh(error):
+        if not _is_from_gmsh(error):
             raise
         raise MeshError(f"gmsh could not make the mesh: {str(error).strip() or 'it gave no reason'}.") from error
     finally:
@@ -43,8 +48,9 @@ def session() -> Iterator[Any]:
             gmsh.model.remove()
 
 
-def _is_of_gmsh(error: Exception) -> bool:
-    """Whether gmsh raised the error: gmsh raises plain Exception. Others may come of a signal, which ends the run."""
+def _is_from_gmsh(error: Exception) -> bool:
+    """Whether gmsh raised the error."""
+    # gmsh raises plain Exception; a subclass may come from the handler of a signal, which ends the run
     return type(error) is Exception
 
 
@@ -55,10 +61,16 @@ def mesh_with_gmsh(
     move: Callable[[Points], Points] | None = None,
     seed: int = 1,
 ) -> tuple[Points, Indices]:
-    """Points (n, d) and positive cells (m, d + 1) of what `draw` puts into gmsh's OpenCASCADE model.
+    """Points (n, d) and positive cells (m, d + 1) of a body.
 
-    A flat body, and the flat and cylindrical faces of a solid, have random points (`scattered`). `move` maps the nodes
-    of the surface mesh (k, 3) to other places before the volume is filled. `seed`: of the random points.
+    A plane body, and the flat and cylindrical faces of a solid, have random points (see random_points).
+
+    Args:
+        draw: adds the body to gmsh's OpenCASCADE model.
+        dim: of the body.
+        sizing: cell size.
+        move: maps the nodes (k, 3) of the surface mesh before the volume is filled.
+        seed: of the random points.
 
     Raises:
         MeshError: gmsh failed; the message has its reason.
@@ -75,7 +87,7 @@ def mesh_with_gmsh(
         if move:
             _move_nodes(gmsh, move)
         fill_volumes(gmsh, sizing)
-        return _mended(gmsh)
+        return _relocated(gmsh)
 
 
 def _move_nodes(gmsh: Any, move: Callable[[Points], Points]) -> None:
@@ -85,25 +97,22 @@ def _move_nodes(gmsh: Any, move: Callable[[Points], Points]) -> None:
 
 
 def fill_volumes(gmsh: Any, sizing: SizeField) -> None:
-    """Tetrahedra in the volumes of a model whose surfaces are meshed.
-
-    By HXT (several times as fast as gmsh's Delaunay), by Delaunay where that fails; then cells of a radius ratio
-    below 0.3 are mended, of which HXT leaves a few.
-    """
+    """Fill the volumes of a model whose surfaces are meshed with tetrahedra."""
     sizing.apply(gmsh, INNER_SIZE_FACTOR)
-    for algorithm in (HXT, DELAUNAY):
+    # HXT is several times as fast as gmsh's Delaunay algorithm, but may fail
+    for algorithm in (Algorithm.HXT, Algorithm.DELAUNAY):
         gmsh.option.setNumber("Mesh.Algorithm3D", algorithm)
         try:
             gmsh.model.mesh.generate(3)
             break
         except Exception as error:
-            if algorithm == DELAUNAY or not _is_of_gmsh(error):
+            if algorithm == Algorithm.DELAUNAY or not _is_from_gmsh(error):
                 raise
-    gmsh.model.mesh.optimize("", True)
+    gmsh.model.mesh.optimize("", True)  # HXT leaves a few cells with a radius ratio below 0.3
 
 
-def _mended(gmsh: Any) -> tuple[Points, Indices]:
-    """Points and tetrahedra; inner nodes are moved first where cells are poor, as a few at random points are."""
+def _relocated(gmsh: Any) -> tuple[Points, Indices]:
+    """Points and tetrahedra; if a few cells are poor, as between random points, inner nodes are moved first."""
     points, cells = cells_of_model(gmsh, 3)
     if radius_ratios(points, cells).min() >= POOR:
         return points, cells
@@ -113,14 +122,14 @@ def _mended(gmsh: Any) -> tuple[Points, Indices]:
 
 
 def cells_of_model(gmsh: Any, dim: int) -> tuple[Points, Indices]:
-    """Points (n, d) and positive cells (m, d + 1) of the current gmsh model, only the nodes that cells use."""
+    """Points (n, d) and positive cells (m, d + 1) of the current model of gmsh, without nodes outside cells."""
     tags, coordinates, _ = gmsh.model.mesh.getNodes()
-    _, connectivity = gmsh.model.mesh.getElementsByType(TETRAHEDRON if dim == 3 else TRIANGLE)
+    _, connectivity = gmsh.model.mesh.getElementsByType(GmshElement.TETRAHEDRON if dim == 3 else GmshElement.TRIANGLE)
     if len(connectivity) == 0:
         raise MeshError("gmsh made no cells; is the body larger than zero and h small enough?")
-    position = np.zeros(int(tags.max()) + 1, np.int64)
-    position[tags] = np.arange(len(tags))
-    used, cells = np.unique(position[connectivity], return_inverse=True)
+    index = np.zeros(int(tags.max()) + 1, np.int64)
+    index[tags] = np.arange(len(tags))
+    used, cells = np.unique(index[connectivity], return_inverse=True)
     points = np.ascontiguousarray(coordinates.reshape(-1, 3)[used, :dim])
     cells, _ = orient_cells(points, cells.reshape(-1, dim + 1).astype(np.int64))
     return points, cells

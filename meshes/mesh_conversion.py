@@ -169,14 +169,14 @@ class MeshFileContents:
             raise MeshError(f"{source} holds no triangles or tetrahedra ({self._census(range(4))}).")
         self._refuse_other_shapes(source, dim)
         self._refuse_lost_nodes(source)
-        points, notes = self._flattened(source) if dim == 2 else (self.points, ())
+        points, notes = self._in_plane(source) if dim == 2 else (self.points, ())
         cut, cut_notes = self._cut(points, dim, source)
         top = [i for i, block in enumerate(cut.blocks) if block.dim == dim and len(block.nodes)]
         below = [i for i, block in enumerate(cut.blocks) if block.shape == ("line" if dim == 2 else "triangle")]
         cells = np.concatenate([cut.blocks[i].corners for i in top])
         regions = cut._cell_sets(top)
         if self.copies:
-            cells, regions = _each_once(cells, regions)
+            cells, regions = _without_copies(cells, regions)
         groups = cut._node_groups(cells, len(points)) | cut._facet_sets(below)
         notes = self.notes + notes + self._order_note(dim) + self._stray_note(dim) + cut_notes
         notes += self._unused_note({*groups, *regions}, dim)
@@ -244,7 +244,7 @@ class MeshFileContents:
                 notes.append(f"{_counted([self.blocks[i] for i in cut])}{where} were cut into {parts} {simplices}.")
         return replace(self, blocks=blocks, sets=sets), tuple(notes)
 
-    def _flattened(self, source: str) -> tuple[Points, tuple[str, ...]]:
+    def _in_plane(self, source: str) -> tuple[Points, tuple[str, ...]]:
         """The points of a plane mesh without z, and a note where z is not 0."""
         if self.points.shape[1] == 2:
             return self.points, ()
@@ -364,7 +364,7 @@ def _without_nodes(mesh: MeshData, nodes: Mask) -> MeshData:
     return replace(mesh, points=mesh.points[~nodes], cells=number[mesh.cells], facet_groups=groups)
 
 
-def _each_once(cells: Indices, regions: dict[str, Indices]) -> tuple[Indices, dict[str, Indices]]:
+def _without_copies(cells: Indices, regions: dict[str, Indices]) -> tuple[Indices, dict[str, Indices]]:
     """Cells without copies in the order of the file, and regions with the new cell numbers."""
     _, _, inverse = distinct_rows(np.sort(cells, axis=1))
     _, first, number = np.unique(inverse, return_index=True, return_inverse=True)

@@ -272,7 +272,7 @@ def _check_hdf5(path: Path, h5: Path) -> None:
 
 
 def _xdmf_reader(path: Path) -> Any:
-    """meshio's reader of XDMF, which checks each file that a data item names before it opens it."""
+    """A reader of XDMF by meshio, which checks each file that a data item names before it opens it."""
     from meshio.xdmf.main import XdmfReader
 
     checked: set[str] = set()

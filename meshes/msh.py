@@ -16,7 +16,7 @@ import numpy as np
 
 from .cell_sets import add_to_set, sets_by_tag
 from .data import Indices, Points
-from .file_text import SourceText, decode_text, excerpt, is_not_integer, refuse_file
+from .file_text import SourceText, decode_text, excerpt, refuse_file
 from .mesh_conversion import Block, MeshFileContents, node_indices
 from .topology import first_repeated
 
@@ -185,7 +185,7 @@ class _Msh2:
             if len(lines) != count:
                 self.source.damaged(begin - 1, f"{count} nodes are declared, and {len(lines)} are there.")
             values = lines.columns(slice(None), 4)
-            self.ids = self._integers(values[:, 0], lines.offsets, NODE)
+            self.ids = self.source.integers(values[:, 0], lines.offsets, NODE)
             self.points = np.ascontiguousarray(values[:, 1:])
         if (repeated := first_repeated(self.ids)) is not None:
             self.source.damaged(begin, f"node {repeated} is listed twice.")
@@ -196,15 +196,6 @@ class _Msh2:
         if begin + np.dtype(dtype).itemsize * count > len(self.source.text):
             self.source.damaged(begin, f"{what} are declared, and the file ends before the last of them.")
         return np.frombuffer(self.source.text, dtype, count, begin)
-
-    def _integers(self, values: Any, offsets: Indices, expected: str) -> Indices:
-        """One number of each line, as integers; MeshError names the line of one that is none."""
-        wrong = is_not_integer(values)
-        if wrong.any():
-            row = int(wrong.argmax())
-            self.source.damaged(int(offsets[row]), f"{values[row]:g} is no whole number; {expected}.")
-        integers: Indices = values.astype(np.int64)
-        return integers
 
     # --- elements ---
 
@@ -238,7 +229,7 @@ class _Msh2:
             return
         if (short := lines.counts < 4).any():
             self.source.damaged(int(lines.offsets[short.argmax()]), f"this element is cut short; {ELEMENT}.")
-        types, tags = (self._integers(lines.values[lines.begins + i], lines.offsets, ELEMENT) for i in (1, 2))
+        types, tags = (self.source.integers(lines.values[lines.begins + i], lines.offsets, ELEMENT) for i in (1, 2))
         keys = np.stack([types, tags, lines.counts], axis=1)
         distinct, first, key_of_line = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         key_of_line = key_of_line.ravel()
@@ -252,15 +243,8 @@ class _Msh2:
                     f"not {width}.",
                 )  # fmt: skip
             rows = np.flatnonzero(key_of_line == number)
-            values = self._integer_rows(lines.columns(rows, width), lines.offsets[rows])
+            values = self.source.integers(lines.columns(rows, width), lines.offsets[rows], ELEMENT)
             yield type_, (values[:, 0], self._physical(values, 3, tag_count), values[:, 3 + tag_count :])
-
-    def _integer_rows(self, values: Any, offsets: Indices) -> Indices:
-        """Lines of elements as integers; MeshError names the line that holds another number."""
-        if (wrong := is_not_integer(values).any(axis=1)).any():
-            self.source.damaged(int(offsets[wrong.argmax()]), f"a number of this element is not whole; {ELEMENT}.")
-        integers: Indices = values.astype(np.int64)
-        return integers
 
     @staticmethod
     def _physical(values: Indices, column: int, tag_count: int) -> Indices:

@@ -1,24 +1,26 @@
-"""Checks of builder parameters that every builder shares; each failure is one sentence."""
+"""The interface of builders, checks of their parameters, and their curved boundaries."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from .data import MeshData, MeshError
+from .data import MeshData, MeshError, Points
+from .topology import edges_of
 
-# A tetrahedral mesh of this size needs some 50 GB before anything is solved: surely a slip of units.
-MAX_CELLS = 200_000_000
-SHORTEST, LONGEST = 1e-30, 1e30  # m
+MAX_CELLS = 200_000_000  # tetrahedra need some 50 GB before anything is solved: more is a wrong unit of length
+SHORTEST, LONGEST = 1e-30, 1e30  # [m]: squares and cubes of lengths in between neither under- nor overflow
 
 
 class Builder(Protocol):
-    """What every builder in BUILDERS offers; `name` is how studies call it."""
+    """A body with parameters that can be meshed; every class of BUILDERS is one."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """Name of the builder in studies."""
 
     @property
     def groups(self) -> tuple[str, ...]:
@@ -32,13 +34,13 @@ class Builder(Protocol):
         """Lower and upper corner of the body's bounding box [m], known without building."""
 
     def cells_estimate(self) -> int:
-        """About how many cells build() will make (a factor of 1.5 either way)."""
+        """Approximate number of cells that build() makes, within a factor of 1.5."""
 
     def build(self) -> MeshData:
         """The mesh. Called on one process only."""
 
 
-def positive(builder: str, **values: float) -> None:
+def require_positive(builder: str, **values: float) -> None:
     """Raise MeshError unless every value is a positive finite number."""
     for name, value in values.items():
         if not (is_length(value) and value > 0):
@@ -55,7 +57,7 @@ def require_not_negative(builder: str, **values: float) -> None:
 
 
 def require_one_of(builder: str, name: str, value: str, allowed: tuple[str, ...]) -> None:
-    """Raise MeshError unless the value is one of the allowed words."""
+    """Raise MeshError unless the value is one of the allowed strings."""
     if value not in allowed:
         raise MeshError(f"{builder}: {name} = {value!r} is not one of {', '.join(allowed)}.")
 
@@ -67,7 +69,7 @@ def require(condition: bool, message: str) -> None:
 
 
 def require_affordable(builder: str, h: float, cells: float, hint: str = "Lengths are in metres.") -> None:
-    """Raise MeshError where the mesh would be too large to hold; `hint` ends the message."""
+    """Raise MeshError if the mesh would have more than MAX_CELLS cells; `hint` ends the message."""
     if cells > MAX_CELLS:
         raise MeshError(
             f"{builder}: h = {h!r} m would make about {cells:.1e} cells, more than {MAX_CELLS:.0e}; take a larger h. "
@@ -75,18 +77,58 @@ def require_affordable(builder: str, h: float, cells: float, hint: str = "Length
         )
 
 
-def check_extent(points: npt.NDArray[np.float64], what: str) -> None:
-    """Raise MeshError where coordinates (n, d) are no numbers, or a body is out of reach of squares and cubes."""
-    wrong = np.flatnonzero(~(np.abs(points) <= LONGEST).all(axis=1))
-    if len(wrong):
+def check_extent(points: npt.NDArray[np.float64], source: str, used: npt.NDArray[np.bool_] | None = None) -> None:
+    """Raise MeshError if coordinates are no numbers or too large, or the size of a body is too small.
+
+    Args:
+        points: (n, d) [m].
+        source: begins the message.
+        used: (n,) points that belong to the body; None: all.
+    """
+    own = points if used is None or used.all() else points[used]
+    if not np.abs(own).max(initial=0.0) <= LONGEST:
+        wrong = ~(np.abs(points) <= LONGEST).all(axis=1)
+        numbers = np.flatnonzero(wrong if used is None else used & wrong)
         raise MeshError(
-            f"{what} has {len(wrong)} points whose coordinates are not finite numbers of at most {LONGEST:g} m, the "
-            f"first is point {wrong[0]} at {points[wrong[0]].tolist()}; export it again, or mend its scale."
+            f"{source} has {len(numbers)} points that are not finite numbers of at most {LONGEST:g} m, the first is "
+            f"point {numbers[0]} at {points[numbers[0]].tolist()}; export it again, or mend its scale."
         )
-    if len(points) and (size := float(np.ptp(points, axis=0).max())) < SHORTEST:
-        raise MeshError(f"{what} is {size:g} m large, and {SHORTEST:g} m or more is needed; mend its scale.")
+    if len(own) and (size := float(np.ptp(own, axis=0).max())) < SHORTEST:
+        raise MeshError(f"{source} is {size:g} m large, and {SHORTEST:g} m or more is needed; mend its scale.")
 
 
 def is_length(value: object) -> bool:
-    """Whether it is one that lengths may have: finite, and far from where squares and cubes overflow."""
+    """Whether a value is a number that a length may have: finite, and far from overflow of its square and cube."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LONGEST
+
+
+# --- curved boundaries ----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class CurvedBoundary:
+    """Facets on a circle around the origin, or on a cylinder around an axis through it.
+
+    Attributes:
+        groups: names of the facet groups that lie on it.
+        radius: [m].
+        along: axis of the cylinder, 0 to 2; None: a circle in the plane.
+    """
+
+    groups: tuple[str, ...]
+    radius: float
+    along: int | None = None
+
+
+def curved_midside_points(mesh: MeshData, boundaries: tuple[CurvedBoundary, ...]) -> Points:
+    """(k, d) midside points [m] of the k edges of the mesh (see `edges_of`), those of curved facets at their radius."""
+    edges = edges_of(mesh.cells)
+    middles = mesh.points[edges].mean(axis=1)
+    keys, count = edges[:, 0] * len(mesh.points) + edges[:, 1], len(mesh.points)
+    for boundary in boundaries:
+        of_facets = edges_of(np.concatenate([mesh.facet_groups[name] for name in boundary.groups]))
+        chosen = np.searchsorted(keys, of_facets[:, 0] * count + of_facets[:, 1])
+        across = np.arange(mesh.dim) != (mesh.dim if boundary.along is None else boundary.along)
+        radial = middles[chosen] * across
+        middles[chosen] += radial * (boundary.radius / np.linalg.norm(radial, axis=1, keepdims=True) - 1)
+    return middles

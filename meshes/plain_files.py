@@ -1,8 +1,8 @@
-"""Files that a user names, and files that those name: which of them may be opened, and how files are written.
+"""Checks of files before they are opened, and replacement of files that are written.
 
-A named pipe would be waited for without end, and a device or a link within a file leads to data that is not the
-user's. So a file is read where it is a plain one; what it names where it is a plain one in the same folder; HDF5 where
-all of it is in the file itself. What is written is a new file: a link at its place is replaced, not followed.
+A file is read if it is a plain one: reading a named pipe would never end. A file that another file names is read if it
+is a plain one in the same folder or below, HDF5 if all its data are in the file itself: devices and links lead to other
+data. A written file is a new one: a link at its place is replaced, not followed.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _KINDS = (
     (stat.S_ISBLK, "a device"),
 )
 MISSING = "does not exist"
-NEW = ".new"  # ends the name of a file that is not whole yet
+NEW = ".new"  # ending of a file that is being written
 HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
 def unreadable_reason(path: str | PathLike[str]) -> str:
-    """Why a file cannot be read, without opening it: "is a named pipe, not a file"; "" of a plain file."""
+    """Why a file cannot be read, found without opening it: "is a named pipe, not a file"; "" of a plain file."""
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
@@ -43,10 +43,12 @@ def unreadable_reason(path: str | PathLike[str]) -> str:
 
 
 class NotAPlainFileError(OSError):
-    """What has the name of a file is something else."""
+    """A folder, pipe or device has the name of a file.
+
+    `wrong`: the result of `unreadable_reason`.
+    """
 
     def __init__(self, path: Path, wrong: str) -> None:
-        """`wrong`: as of `unreadable_reason`."""
         super().__init__(errno.EPERM, wrong, str(path))
 
     def __str__(self) -> str:
@@ -57,13 +59,13 @@ class NotAPlainFileError(OSError):
 
 
 def check_readable(path: Path) -> None:
-    """Raise NotAPlainFileError where a folder, a pipe or a device has the name of a file to be read."""
+    """Raise NotAPlainFileError if a file to be read is a folder, pipe or device."""
     if (wrong := unreadable_reason(path)) not in ("", MISSING):
         raise NotAPlainFileError(path, wrong)
 
 
 def unreadable_reason_beside(path: Path, name: str) -> str:
-    """Why a file that the file `path` names cannot be read: it lies in another folder, or as of `unreadable_reason`."""
+    """Why a file `name` that the file `path` names cannot be read: outside its folder, or see `unreadable_reason`."""
     folder = os.path.abspath(path.parent)
     inside = os.path.normpath(os.path.join(folder, name))
     if os.path.commonpath([folder, inside]) != folder:
@@ -78,9 +80,9 @@ def is_hdf5(path: Path) -> bool:
 
 
 def find_external_data(file: Any) -> str:
-    """The first name in an open h5py.File whose data lie in another file; "" where there is none.
+    """The first name in an open h5py.File whose data lie in another file; "" if there is none.
 
-    External links, data sets in external files, and virtual data sets. No other file is opened.
+    That is an external link, a data set in an external file, or a virtual data set. No other file is opened.
     """
     import h5py
 
@@ -93,7 +95,7 @@ def find_external_data(file: Any) -> str:
             if isinstance(link, h5py.ExternalLink):
                 return where
             if not isinstance(link, h5py.HardLink):
-                continue  # a soft link: what it leads to has a link of its own
+                continue  # the target of a soft link has a hard link of its own
             entry = group[name]
             if isinstance(entry, h5py.Dataset) and (entry.is_virtual or entry.external):
                 return where
@@ -107,13 +109,13 @@ def find_external_data(file: Any) -> str:
 
 
 def check_replaceable(path: Path) -> None:
-    """Raise NotAPlainFileError where a folder, a pipe or a device has the name of a file to be written."""
+    """Raise NotAPlainFileError if a folder, pipe or device is at the place of a file to be written."""
     if not path.is_symlink():
         check_readable(path)
 
 
 def create(path: Path) -> BinaryIO:
-    """A new file, to be written, in place of the file, link or pipe that has its name. Raises OSError."""
+    """A new file for writing, in place of a file, link or pipe of that name; raises OSError."""
     if path.is_dir() and not path.is_symlink():
         raise NotAPlainFileError(path, "is a folder, not a file")
     path.unlink(missing_ok=True)
@@ -122,8 +124,10 @@ def create(path: Path) -> BinaryIO:
 
 @contextlib.contextmanager
 def atomic_replacement(path: Path) -> Iterator[Path]:
-    """A new file beside `path` that takes its place once it is whole; where that fails the old file stays. For one
-    process at a time. Raises OSError."""
+    """The path of a new file beside `path`, which replaces it when the context ends; after an error the old file stays.
+
+    For one process at a time. Raises OSError.
+    """
     check_replaceable(path)
     new = path.with_name(path.name + NEW)
     create(new).close()
@@ -138,12 +142,15 @@ def atomic_replacement(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def atomic_replacement_of_all(path: Path) -> Iterator[Path]:
-    """The same name in a new folder beside `path`: all files that are made there come to lie beside `path`, once they
-    are whole. For programs that go by the ending of a name, or make several files of it. Raises OSError."""
+    """The same name in a new folder beside `path`; all files written there move to the folder of `path` at the end.
+
+    For programs that choose the format by the ending of a name, or write several files. Raises OSError.
+    """
     check_replaceable(path)
     with TemporaryDirectory(prefix=f".{path.name[:50]}-", dir=path.parent) as folder:
         yield Path(folder) / path.name
-        for result in sorted(Path(folder).iterdir()):
-            check_replaceable(path.parent / result.name)
-        for result in sorted(Path(folder).iterdir()):
-            os.replace(result, path.parent / result.name)
+        written = sorted(Path(folder).iterdir())
+        for file in written:
+            check_replaceable(path.parent / file.name)
+        for file in written:
+            os.replace(file, path.parent / file.name)

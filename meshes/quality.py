@@ -1,4 +1,4 @@
-"""How good the cells of a mesh are."""
+"""Quality measures of the cells of a mesh."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ POOR = 0.2  # radius ratio below which a cell is counted as poor
 
 
 def mesh_quality(mesh: MeshData) -> dict[str, float | int]:
-    """Numbers that tell a good mesh from a bad one; the same code for triangles and tetrahedra.
+    """Sizes, radius ratios, angles and aspect ratios of a mesh of triangles or tetrahedra.
 
     Returns:
         nodes, cells: counts.
@@ -47,7 +47,7 @@ def mesh_quality(mesh: MeshData) -> dict[str, float | int]:
 
 
 def radius_ratios(points: Points, cells: Indices) -> Floats:
-    """d r / R of each cell, in [0, 1]: (m,).
+    """(m,) radius ratio d r / R of each cell, in [0, 1].
 
     r = 1 / sum_i |g_i| with g_i the gradients of the barycentric coordinates; the circumcentre c (seen from the first
     node) solves 2 (x_i - x_0) . c = |x_i - x_0|^2, and R = |c|.
@@ -61,19 +61,19 @@ def radius_ratios(points: Points, cells: Indices) -> Floats:
 
 
 def _height_vectors(points: Points, cells: Indices) -> Floats:
-    """Gradients of the barycentric coordinates: along the heights, of one over their length [1/m]: (m, d + 1, d)."""
+    """(m, d + 1, d) gradients of the barycentric coordinates [1/m]: along the heights, one over their length."""
     spans = points[cells[:, 1:]] - points[cells[:, :1]]
-    remaining = np.linalg.inv(spans).transpose(0, 2, 1)
-    return np.concatenate([-remaining.sum(axis=1, keepdims=True), remaining], axis=1)
+    gradients = np.linalg.inv(spans).transpose(0, 2, 1)
+    return np.concatenate([-gradients.sum(axis=1, keepdims=True), gradients], axis=1)
 
 
 def _angles(gradients: Floats) -> Floats:
-    """Angle between each two facets of each cell [rad]: (m, pairs); their inner normals enclose pi minus it."""
+    """(m, pairs) angle between each two facets of each cell [rad]: pi less the angle between their inner normals."""
     unit = gradients / np.linalg.norm(gradients, axis=2, keepdims=True)
     first, second = np.triu_indices(gradients.shape[1], k=1)
     return np.arccos(np.clip(-np.einsum("mpi,mpi->mp", unit[:, first], unit[:, second]), -1.0, 1.0))
 
 
 def _lengths(points: Points, pairs: Indices) -> Floats:
-    """Lengths of node pairs (..., 2) [m]: (...)."""
+    """(...) lengths of node pairs (..., 2) [m]."""
     return np.linalg.norm(points[pairs[..., 0]] - points[pairs[..., 1]], axis=-1)

@@ -1,10 +1,9 @@
-"""Shells: triangles in space with a thickness, as one layer of prisms of three tetrahedra each.
+"""Shells: triangles in space with a thickness t, as one layer of prisms of three tetrahedra each.
 
-    x = X - h/2 n, X + h/2 n
-
-of a node at X, n the mean of its triangles' normals weighted by their angles there, longer where they differ so that
-the thickness stays. Nodes i (below) and i + N (above), cells 3 t, 3 t + 1 and 3 t + 2 of triangle t; the side of a
-prism between nodes i < j is cut from i below to j above, so that neighbours agree.
+Node i of N at X in the middle surface becomes node i at X - t/2 n and node i + N at X + t/2 n. The vector n is the mean
+of the normals of its triangles weighted by their angles; at folds it is longer, so that the thickness stays. Triangle k
+becomes cells 3 k, 3 k + 1 and 3 k + 2; the side of a prism between nodes i < j is cut from i below to j above, so that
+neighbours agree.
 """
 
 from __future__ import annotations
@@ -16,26 +15,30 @@ import numpy as np
 from .data import Indices, MeshData, MeshError, Points, Shell, format_midpoint
 from .topology import Floats, boundary_facets, signed_measures
 
-LONGEST = 2.0  # times the thickness that a normal at a fold may be long
-
 
 def extrude_shell(
     points: Points, triangles: Indices, thickness: float, source: str = "shell", notes: tuple[str, ...] = ()
 ) -> MeshData:
-    """The shell of triangles (m, 3), turned alike, between points (n, 3), m. Groups: inner, outer, and rim where it is
-    open; outer is where the normals of the triangles point.
+    """The mesh of a shell. Facet groups: inner, outer (where the normals point), and rim if the surface is open.
+
+    Args:
+        points: (n, 3) of the middle surface [m].
+        triangles: (m, 3) with consistent orientation.
+        thickness: [m].
+        source: begins the message of an error.
+        notes: of the mesh.
 
     Raises:
-        MeshError: folds leave no room for the thickness; the message begins with `source`.
+        MeshError: the surface is folded too sharply for the thickness.
     """
-    normal = _normals(points, triangles)
+    normal = _offset_normals(points, triangles)
     combined = np.concatenate([points - thickness / 2 * normal, points + thickness / 2 * normal])
     order = np.argsort(triangles, axis=1)
     odd = np.linalg.det(np.eye(3)[order]) < 0
     a, b, c = np.take_along_axis(triangles, order, axis=1).T
-    A, B, C = (item + len(points) for item in (a, b, c))
+    A, B, C = (nodes + len(points) for nodes in (a, b, c))
     prism = [[a, b, c, C], [a, b, C, B], [a, A, B, C]]
-    cells = np.stack([np.stack(item, axis=1) for item in prism], axis=1)
+    cells = np.stack([np.stack(tetrahedron, axis=1) for tetrahedron in prism], axis=1)
     cells[odd] = cells[odd][:, :, [0, 1, 3, 2]]
     cells = cells.reshape(-1, 4)
     inside_out = np.flatnonzero(signed_measures(combined, cells) <= 0)
@@ -51,8 +54,8 @@ def extrude_shell(
     return MeshData(combined, cells, groups, notes=notes, shell=shell)
 
 
-def _normals(points: Points, triangles: Indices) -> Floats:
-    """(n, 3) along the mean normal, as long as the thickness needs."""
+def _offset_normals(points: Points, triangles: Indices) -> Floats:
+    """(n, 3) mean normal of each node, longer than 1 at folds so that the thickness stays."""
     sides = points[np.roll(triangles, -1, axis=1)] - points[triangles]
     of_triangle = np.cross(sides[:, 0], sides[:, 1])
     of_triangle /= np.linalg.norm(of_triangle, axis=1)[:, None]
@@ -63,17 +66,22 @@ def _normals(points: Points, triangles: Indices) -> Floats:
     np.add.at(mean, triangles, angle[:, :, None] * of_triangle[:, None])
     whole = np.bincount(triangles.ravel(), angle.ravel(), len(points))[:, None]
     length = np.linalg.norm(mean, axis=1)[:, None]
-    return np.asarray(mean / length * np.minimum(whole / length, LONGEST))
+    return np.asarray(mean / length * np.minimum(whole / length, 2.0))  # sharper folds become thinner
 
 
 def read_shell(path: str | Path, thickness: float, scale: float = 1.0) -> MeshData:
-    """A shell from a file of triangles or quads, closed or open; `scale`: metres per unit of it.
+    """The mesh of a shell from a file of triangles or quads, closed or open.
+
+    Args:
+        path: the file.
+        thickness: [m].
+        scale: metres per unit of length of the file.
 
     Raises:
-        MeshError: the file cannot be read or holds no surface; an edge of more than two triangles, or triangles that
-            cannot be turned alike; a thickness that its folds leave no room for.
+        MeshError: the file cannot be read or holds no surface; an edge belongs to more than two triangles; triangles
+            cannot be oriented consistently; the surface is folded too sharply for the thickness.
     """
-    from .surfaces.closed import read_triangles  # shells of builders need no reader
+    from .surfaces.closed import read_triangles  # shells of builders need no readers
 
     path = Path(path)
     source = f"Shell file '{path}'"

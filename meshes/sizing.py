@@ -1,4 +1,4 @@
-"""How large cells should be from place to place, and how many of them that makes."""
+"""Cell size as a function of place, and estimates of numbers of cells."""
 
 from __future__ import annotations
 
@@ -10,26 +10,27 @@ import numpy as np
 from .data import Points
 from .topology import Floats
 
-# Measured on boxes of 3 000 to 340 000 cells: cells = measure / (share * h^d). An equilateral triangle has 0.433 h^2
-# and a regular tetrahedron 0.118 h^3, but regular tetrahedra do not fill space, nor do triangles between random points.
+# Mean measure of a cell over h^d, on boxes of 3 000 to 340 000 cells. An equilateral triangle has 0.433 h^2 and a
+# regular tetrahedron 0.118 h^3, but regular tetrahedra do not fill space, and random points make other triangles.
 SHARE = {2: 0.404, 3: 0.092}
 
-# Asked for h, gmsh makes surface edges of length h but inner edges of 1.3 h (its criterion is on the circumsphere).
-# Asked for this share of h inside, the median edge is h within 2 % (the same boxes, algorithm HXT).
+# For a size h gmsh makes surface edges of length h, but inner edges of 1.3 h: its criterion is on the circumsphere.
+# With this factor inside, the median edge is h within 2 % (the same boxes, algorithm HXT).
 INNER_SIZE_FACTOR = 0.7
 
 
 @dataclass(frozen=True)
 class SizeField:
-    """Cell size: `h`, or finer near a fine place, an axis-parallel rectangle (a line or a point where it is thin).
+    """Cell size: `h`, or finer near an axis-parallel rectangle, which may be a line or a point.
 
-    size(x) = min(h, fine + growth * distance(x, place)); the distance is taken in the x-y plane of gmsh's model.
+    size(x) = min(h, fine + growth * distance(x, rectangle)), the distance in the x-y plane of gmsh's model.
 
     Attributes:
-        h: size [m] away from the place.
-        fine: size [m] at the place; None: `h` everywhere.
-        low, high: corners of the place [m].
-        growth: change of size per distance, dimensionless.
+        h: size [m] away from the rectangle.
+        fine: size [m] in the rectangle; None: `h` everywhere.
+        low: lower corner of the rectangle [m].
+        high: upper corner of the rectangle [m].
+        growth: change of size over distance.
     """
 
     h: float
@@ -39,14 +40,14 @@ class SizeField:
     growth: float = 0.3
 
     def at(self, points: Points) -> Floats:
-        """Cell size [m] at points (n, 2 or 3): (n,)."""
+        """(n,) cell size [m] at points (n, 2 or 3)."""
         if self.fine is None:
             return np.full(len(points), self.h)
         outside = np.maximum(np.maximum(np.subtract(self.low, points[:, :2]), points[:, :2] - self.high), 0.0)
         return np.minimum(self.h, self.fine + self.growth * np.linalg.norm(outside, axis=1))
 
     def apply(self, gmsh: Any, factor: float = 1.0) -> None:
-        """Hand the sizes, times the factor, to gmsh as its background field, and nothing else."""
+        """Make the size, times a factor, gmsh's only background field."""
         for source in ("FromPoints", "FromCurvature", "ExtendFromBoundary"):
             gmsh.option.setNumber(f"Mesh.MeshSize{source}", 0)
         gmsh.option.setNumber("Mesh.MeshSizeMax", factor * self.h)
@@ -56,9 +57,10 @@ class SizeField:
         field.setAsBackgroundMesh(tag)
 
     def _expression(self) -> str:
+        """The size as a formula of x and y for gmsh."""
         if self.fine is None:
             return f"{self.h!r}"
-        # |x - a| + |x - b| - |b - a| is twice the distance of x to the interval [a, b]; gmsh's parser knows abs.
+        # |x - a| + |x - b| - |b - a| is twice the distance of x from the interval [a, b]; gmsh's parser knows abs
         squares = "+".join(
             f"((abs({axis}-({a!r}))+abs({axis}-({b!r}))-{b - a!r})/2)^2"
             for axis, a, b in zip("xy", self.low, self.high, strict=True)
@@ -69,9 +71,15 @@ class SizeField:
 def estimate_cells_in_box(
     sizing: SizeField, low: tuple[float, ...], high: tuple[float, ...], filled: float = 1.0
 ) -> int:
-    """About how many cells gmsh makes of these sizes in a box of which the given share is filled.
+    """Approximate number of cells in a box of which a share is filled.
 
-    The integral of dx / (share * size^d), by the midpoint rule; `low` and `high` in metres.
+    The integral of 1 / (SHARE * size^d), by the midpoint rule.
+
+    Args:
+        sizing: cell size.
+        low: lower corner of the box [m].
+        high: upper corner of the box [m].
+        filled: share of the box.
     """
     dim = len(low)
     sides = np.subtract(high, low)
@@ -82,11 +90,9 @@ def estimate_cells_in_box(
 
 
 def estimate_cells_in_body(volume: float, wall: float, h: float) -> int:
-    """About how many cells gmsh makes of size h in a body of this volume [m^3], solid (wall 0) or a shell.
-
-    A wall no thicker than h has cells from one side to the other: three tetrahedra to a prism over a triangle of
-    0.433 h^2, whatever its thickness.
-    """
+    """Approximate number of cells of size h [m] in a body of a volume [m^3], solid (wall 0) or with a wall [m]."""
+    # A wall thinner than h has cells from one side to the other: three tetrahedra for each prism over an equilateral
+    # triangle of 0.433 h^2, whatever its thickness.
     solid = volume / (SHARE[3] * h**3)
     through = 3 * volume / wall / (0.433 * h**2) if wall else 0.0
     return max(1, round(max(solid, through)))

@@ -44,7 +44,7 @@ class ProcessDiedError(MeshError):
         self.how = how
 
 
-def within[T](seconds: float, work: Callable[..., T], *arguments: Any, memory: int | None = None) -> T:
+def call_with_time_limit[T](seconds: float, work: Callable[..., T], *arguments: Any, memory: int | None = None) -> T:
     """The result of work(*arguments) in another Python process; its exceptions are raised here.
 
     Args:
@@ -68,7 +68,7 @@ def within[T](seconds: float, work: Callable[..., T], *arguments: Any, memory: i
             output = done.stderr.decode(errors="replace").strip()[-300:]
             how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
             raise ProcessDiedError(how, output)
-        result, failure = _unpacked(answer)
+        result, failure = _unpack(answer)
     if failure is not None:
         raise failure
     return result
@@ -91,7 +91,7 @@ def read_with_time_limit[T](
     size = path.stat().st_size
     seconds = limits.seconds + seconds_per_megabyte * size / 1e6
     try:
-        return within(seconds, reader, path, memory=limits.memory + limits.memory_per_byte * size)
+        return call_with_time_limit(seconds, reader, path, memory=limits.memory + limits.memory_per_byte * size)
     except ProcessDiedError as died:
         reason = f"{program} died ({died.how}); the file is damaged, or there is not enough memory"
     except TimeoutError:
@@ -113,7 +113,7 @@ def _pack(answer: Any, file: BinaryIO) -> None:
     file.write((file.tell() - begin - len(stream)).to_bytes(8))
 
 
-def _unpacked(file: BinaryIO) -> tuple[Any, Any]:
+def _unpack(file: BinaryIO) -> tuple[Any, Any]:
     """The object that `_pack` wrote; its arrays are the pages of the file, not copied, and writable."""
     pages = memoryview(mmap.mmap(file.fileno(), 0, mmap.MAP_PRIVATE, mmap.PROT_READ | mmap.PROT_WRITE))
     end = len(pages) - 8

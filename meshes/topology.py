@@ -14,7 +14,7 @@ Mask = npt.NDArray[np.bool_]
 
 
 def signed_measures(points: Points, cells: npt.NDArray[np.integer]) -> Floats:
-    """Signed area [m^2] or volume [m^3] of each cell, positive where its nodes are positively ordered: (m,).
+    """(m,) signed area [m^2] or volume [m^3] of each cell, positive if its nodes are positively ordered.
 
     det(x_1 - x_0, ..., x_d - x_0) / d!
     """
@@ -24,7 +24,7 @@ def signed_measures(points: Points, cells: npt.NDArray[np.integer]) -> Floats:
 
 
 def orient_cells(points: Points, cells: Indices) -> tuple[Indices, int]:
-    """The cells with positive measure, the last two nodes swapped where it was negative; and how many were."""
+    """Cells with positive measure, those of negative measure with their last two nodes swapped; number of these."""
     inverted = signed_measures(points, cells) < 0
     cells = cells.copy()
     cells[inverted, -2:] = cells[inverted, :-3:-1]
@@ -32,10 +32,7 @@ def orient_cells(points: Points, cells: Indices) -> tuple[Indices, int]:
 
 
 def facets_of(cells: Indices) -> Indices:
-    """The facets of each cell, ordered so that their normals point out of positive cells: (m, d + 1, d).
-
-    Facet i lies opposite node i.
-    """
+    """(m, d + 1, d) facets of each cell, facet i opposite node i; their normals point out of positive cells."""
     nodes = cells.shape[1]
     rows = []
     for opposite in range(nodes):
@@ -48,7 +45,7 @@ def facets_of(cells: Indices) -> Indices:
 
 
 def edges_of(cells: Indices) -> Indices:
-    """Every edge of the mesh once, lower node first: (k, 2)."""
+    """(k, 2) every edge of the mesh once, lower node first, in rising order."""
     first, second = np.triu_indices(cells.shape[1], k=1)
     pairs = np.sort(np.stack([cells[:, first].ravel(), cells[:, second].ravel()], axis=1), axis=1)
     return distinct_rows(pairs)[0]
@@ -57,7 +54,7 @@ def edges_of(cells: Indices) -> Indices:
 def distinct_rows(rows: Indices) -> tuple[Indices, Indices, Indices]:
     """Distinct rows (k, w) in rising order, their numbers of occurrences (k,), and the distinct row of each row (n,).
 
-    Rows are compared as they stand: sort each row first where the order of its nodes does not matter.
+    To compare rows regardless of the order of their nodes, sort each row first.
     """
     if len(rows) == 0:
         return rows, np.zeros(0, np.int64), np.zeros(0, np.int64)
@@ -75,10 +72,10 @@ def distinct_rows(rows: Indices) -> tuple[Indices, Indices, Indices]:
 
 
 def _row_keys(rows: Indices) -> list[Indices]:
-    """Integers (n,) that compare as the rows (n, w) do, the most significant first: one sort takes several columns."""
+    """Integers (n,) that compare like the rows (n, w), the most significant first; each holds several columns."""
     lowest = int(rows.min())
     bits = (int(rows.max()) - lowest).bit_length()
-    # a signed integer of 64 bits holds so many columns
+    # columns that fit into a signed integer of 64 bits
     per_key = max(1, 63 // max(bits, 1))
     keys = []
     for begin in range(0, rows.shape[1], per_key):
@@ -91,40 +88,47 @@ def _row_keys(rows: Indices) -> list[Indices]:
 
 
 def boundary_facets(cells: Indices) -> Indices:
-    """The facets that belong to one cell only, their normals pointing outwards: (k, d)."""
+    """(k, d) facets that belong to one cell only, their normals pointing outwards."""
     facets = facets_of(cells).reshape(-1, cells.shape[1] - 1)
     _, counts, inverse = distinct_rows(np.sort(facets, axis=1))
     return facets[counts[inverse] == 1]
 
 
 def facets_on_nodes(facets: Indices, nodes: Mask) -> Indices:
-    """The facets all of whose nodes are marked."""
+    """(k, d) facets all of whose nodes are marked; `nodes`: (n,) the marks."""
     return facets[nodes[facets].all(axis=1)]
 
 
 def exclude_facets(facets: Indices, *others: Indices) -> Indices:
-    """The facets that are in none of the others, whatever the order of their nodes."""
+    """(k, d) facets that are in none of the others, regardless of the order of their nodes."""
     rows = np.sort(np.concatenate([facets, *others]), axis=1)
     _, _, inverse = distinct_rows(rows)
     return facets[~np.isin(inverse[: len(facets)], inverse[len(facets) :])]
 
 
 def facet_groups_on_planes(points: Points, facets: Indices, names: dict[str, tuple[int, float]]) -> dict[str, Indices]:
-    """Facet groups on planes: name -> (axis, coordinate [m]). Nodes count as on it within 1e-9 of the body's size."""
+    """Facet groups on planes normal to the axes.
+
+    Args:
+        points: (n, d) [m].
+        facets: (k, d) that are sorted into groups.
+        names: group -> axis and coordinate [m] of its plane; nodes within 1e-9 of the body's size count as on it.
+    """
     tolerance = 1e-9 * float(np.ptp(points, axis=0).max())
     return {
-        name: facets_on_nodes(facets, np.abs(points[:, axis] - position) <= tolerance)
-        for name, (axis, position) in names.items()
+        name: facets_on_nodes(facets, np.abs(points[:, axis] - coordinate) <= tolerance)
+        for name, (axis, coordinate) in names.items()
     }
 
 
 def components(links: npt.NDArray[np.integer], count: int) -> tuple[int, Indices]:
-    """How many parts `count` nodes fall into that are joined by `links` (n, 2), and the part of each node.
+    """Number of connected components of `count` nodes with links (n, 2), and the component of each node (count,).
 
-    Parts are numbered by their lowest node. Each round hooks the roots of trees that a link joins on the lowest root
-    beside them, and makes the trees flat (Shiloach and Vishkin 1982): at most log2 rounds. SciPy has it too, but takes
-    longer to be imported than most meshes to be looked at, and as long as this for large ones.
+    Components are numbered by their lowest nodes. Source: Y. Shiloach and U. Vishkin (1982), An O(log n) parallel
+    connectivity algorithm.
     """
+    # Each round hooks the roots of trees that a link joins onto the lower root, and flattens the trees: at most
+    # log2(count) rounds. SciPy's function is no faster on large graphs, and slow to import.
     root: Indices = np.arange(count)
     first, second = links[:, 0], links[:, 1]
     while True:
@@ -141,7 +145,7 @@ def components(links: npt.NDArray[np.integer], count: int) -> tuple[int, Indices
 
 
 def _flattened(parent: Indices) -> Indices:
-    """(n,) the root of each node of trees given by parents, which are their own at roots."""
+    """(n,) root of each node of trees given by parents; a root is its own parent."""
     while not np.array_equal(above := parent[parent], parent):
         parent = above
     return parent

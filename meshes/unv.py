@@ -121,16 +121,8 @@ class _UniversalFile:
             return
         heads = lines.columns(slice(0, None, step), widths[0])
         points = heads[:, 4:] if one_line else lines.columns(slice(1, None, 2), 3)
-        self.ids.append(self._integers(heads[:, 0], lines.offsets[::step], NODE_LINE))
+        self.ids.append(self.source.integers(heads[:, 0], lines.offsets[::step], NODE_LINE))
         self.points.append(np.ascontiguousarray(points))
-
-    def _integers(self, values: Points, offsets: Indices, expected: str) -> Indices:
-        """Numbers of lines as integers; MeshError names the line that holds another number."""
-        rows = is_not_integer(values).reshape(len(values), -1).any(axis=1) if values.size else np.zeros(0, bool)
-        if rows.any():
-            self.source.damaged(int(offsets[rows.argmax()]), f"a number of this line is not whole; {expected}.")
-        integers: Indices = values.astype(np.int64)
-        return integers
 
     def _elements(self, lines: Rows) -> None:
         """Read elements, a run of elements of one type and number of nodes at once."""
@@ -160,7 +152,7 @@ class _UniversalFile:
                 )  # fmt: skip
             first = lines.begins[line : line + run * period : period]
             values = lines.values[first[:, None] + np.arange(sum(wanted))]
-            rows = self._integers(
+            rows = self.source.integers(
                 values[:, [0, *range(6 + 3 * beam, sum(wanted))]], lines.offsets[line::period][:run], ELEMENT_LINE
             )
             self._add(type_, size, rows, int(lines.offsets[line]))
@@ -215,7 +207,7 @@ class _UniversalFile:
             values = self.source.rows(name_end, stop, GROUP_LINE).values
             if len(values) != width * count:
                 self.source.damaged(begin, f"a group of {count} members has more numbers on its last line.")
-            members = self._integers(values, np.full(len(values), name_end), GROUP_LINE).reshape(-1, width)
+            members = self.source.integers(values, np.full(len(values), name_end), GROUP_LINE).reshape(-1, width)
             name = decode_text(text[head_end:name_end]).strip() or f"group-{int(head.values[0])}"
             nodes, elements = (members[members[:, 0] == entity, 1] for entity in (7, 8))  # entity type codes
             self.groups.append((name, nodes, elements))

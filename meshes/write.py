@@ -1,4 +1,4 @@
-"""Saving a mesh with its groups, in any format of meshio."""
+"""Mesh files with groups, in any format of meshio."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from .plain_files import NotAPlainFileError, atomic_replacement_of_all
 
 
 def write_mesh(mesh: MeshData, path: Path) -> None:
-    """Save cells, boundary facets and groups. Groups become cell data `group` (0: none), named in `field_data`.
+    """Save cells, facets and groups; groups become cell data `group` (0: none), with names in `field_data`.
 
-    A facet that is in several groups is saved with the last of them. MeshError where the format is not known.
+    A facet that is in several groups is saved with the last of them.
+
+    Raises:
+        MeshError: the format is unknown, or the file cannot be written.
     """
     import meshio
 

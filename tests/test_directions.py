@@ -10,10 +10,10 @@ import pytest
 
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.data import MeshData, MeshError
-from fracsim.meshes.directions import preferred
+from fracsim.meshes.directions import preferred_directions
 from fracsim.meshes.quality import mesh_quality
 from fracsim.meshes.random_points.outline import Outline
-from fracsim.meshes.random_points.points import APART, scatter
+from fracsim.meshes.random_points.points import SAMPLING, scatter
 from fracsim.meshes.sizing import SizeField
 from fracsim.meshes.topology import boundary_facets, edges_of, signed_measures
 from fracsim.study.mesh_source import build_mesh
@@ -40,7 +40,7 @@ def test_a_lattice_has_three_directions() -> None:
     """All edges lie in three directions, where 6 x 3.5 of 180 degrees would by chance: 180 / 21."""
     for size in ((1.0, 1.0), (2.0, 0.5)):
         mesh = BUILDERS["box"](size=size, h=0.1).build()
-        assert preferred(mesh)["directions"] == pytest.approx(180 / 21, rel=1e-12)
+        assert preferred_directions(mesh)["directions"] == pytest.approx(180 / 21, rel=1e-12)
 
 
 def test_the_measure_does_not_depend_on_how_the_body_lies() -> None:
@@ -48,14 +48,14 @@ def test_the_measure_does_not_depend_on_how_the_body_lies() -> None:
     flat = BUILDERS["box"](size=(1.0, 1.0), h=0.1).build()
     c, s = np.cos(np.pi / 8), np.sin(np.pi / 8)
     turned = MeshData(flat.points @ np.array([[c, s], [-s, c]]), flat.cells)
-    assert preferred(turned)["directions"] == pytest.approx(180 / 21, rel=1e-12)
+    assert preferred_directions(turned)["directions"] == pytest.approx(180 / 21, rel=1e-12)
     solid = BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.1).build()
     edges, outer = edges_of(solid.cells), set(map(tuple, edges_of(boundary_facets(solid.cells)).tolist()))
     inner = np.array([tuple(edge) not in outer for edge in edges.tolist()])
     spans = np.diff(solid.points[edges], axis=1)[:, 0]
     along = (np.abs(spans[inner]) > 1e-9).astype(int) @ [1, 2, 4]  # Kuhn: seven directions
     share = np.bincount(along).max() / inner.sum()
-    assert preferred(solid)["directions"] == pytest.approx(share / (1 - np.cos(np.radians(6))), rel=1e-12)
+    assert preferred_directions(solid)["directions"] == pytest.approx(share / (1 - np.cos(np.radians(6))), rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -69,13 +69,13 @@ def test_the_measure_does_not_depend_on_how_the_body_lies() -> None:
     ],
 )
 def test_unstructured_bodies_have_none(name: str, parameters: dict[str, object]) -> None:
-    assert preferred(BUILDERS[name](**parameters).build())["directions"] < 1.3
+    assert preferred_directions(BUILDERS[name](**parameters).build())["directions"] < 1.3
 
 
 def test_flat_and_round_faces_have_none() -> None:
     """Lattices of gmsh have 4.5 (flat) and 5.4 (round); so few edges as here 1.4 by chance."""
-    box = preferred(BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.08, pattern="unstructured").build())
-    cylinder = preferred(BUILDERS["cylinder"](h=0.012).build())
+    box = preferred_directions(BUILDERS["box"](size=(1.0, 1.0, 1.0), h=0.08, pattern="unstructured").build())
+    cylinder = preferred_directions(BUILDERS["cylinder"](h=0.012).build())
     assert max(box["directions_faces"], cylinder["directions_faces"]) < 1.6
     assert max(box["directions"], cylinder["directions"]) < 1.6
 
@@ -85,8 +85,8 @@ def test_points_are_apart_and_leave_no_gap() -> None:
     h = 0.05
     points, cells = scatter(ring(*SQUARE, h=h), SizeField(h).at)
     quality = mesh_quality(MeshData(points, cells))
-    assert quality["edge_min"] >= APART * h * (1 - 1e-12)
-    assert quality["edge_max"] <= 2 * APART * h * 1.001
+    assert quality["edge_min"] >= SAMPLING.distance * h * (1 - 1e-12)
+    assert quality["edge_max"] <= 2 * SAMPLING.distance * h * 1.001
     assert quality["angle_min"] >= 29.9
     assert signed_measures(points, cells).sum() == pytest.approx(1.0, rel=1e-12)
 
@@ -137,7 +137,7 @@ def test_the_page_has_what_packaged_studies_have() -> None:
     plane, space, walls, faces = (tuple(map(float, found.group(k, k + 1))) for k in (1, 3, 5, 7))
     inside = {"bar-2d": plane, "charpy": plane, "notched-bar": plane, "granite-cylinder": space, "dropped-vase": walls}
     for name, (low, high) in inside.items():
-        values = preferred(build_mesh(load_study(name).mesh))
+        values = preferred_directions(build_mesh(load_study(name).mesh))
         assert low <= values["directions"] <= high, name
         assert faces[0] <= values.get("directions_faces", faces[0]) <= faces[1], name
     assert float(found.group(9)) == pytest.approx(180 / 21, abs=0.05)

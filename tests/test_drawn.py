@@ -10,7 +10,7 @@ import pytest
 from cases import STRIP, changed
 from fracsim.errors import InputError
 from fracsim.meshes.data import MeshError
-from fracsim.meshes.directions import preferred
+from fracsim.meshes.directions import preferred_directions
 from fracsim.meshes.random_points.outline_file import fill_outline, read_outline
 from fracsim.meshes.topology import signed_measures
 from fracsim.study.check import check_study
@@ -58,7 +58,7 @@ def test_what_is_drawn_is_filled(path: Path) -> None:
 
 def test_it_has_no_preferred_directions(path: Path) -> None:
     mesh = fill_outline(read_outline(path), 0.05)
-    assert preferred(mesh)["directions"] < 1.35
+    assert preferred_directions(mesh)["directions"] < 1.35
     sides = mesh.points[mesh.cells] - mesh.points[np.roll(mesh.cells, 1, axis=1)]
     lengths = np.linalg.norm(sides, axis=2)
     assert 0.5 * 0.05 < np.median(lengths) < 1.1 * 0.05 and lengths.max() < 1.6 * 0.05

@@ -19,7 +19,7 @@ from fracsim.meshes.quality import mesh_quality
 from fracsim.meshes.read import read_contents
 from fracsim.meshes.surfaces.closed import closed_surface, read_surface
 from fracsim.meshes.surfaces.fill import expected_cells, fill_closed, fill_surface
-from fracsim.meshes.time_limit import within
+from fracsim.meshes.time_limit import call_with_time_limit
 from fracsim.meshes.topology import boundary_facets, signed_measures
 
 Shell = tuple[Points, Indices]
@@ -35,7 +35,9 @@ def own_process() -> None:
 def _filled_here(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
     """gmsh works in this process, but where a test asks for `own_process`: starting one takes longer than the cells."""
     if "own_process" not in request.fixturenames:
-        monkeypatch.setattr("fracsim.meshes.surfaces.fill.within", lambda seconds, work, *given: work(*given))
+        monkeypatch.setattr(
+            "fracsim.meshes.surfaces.fill.call_with_time_limit", lambda seconds, work, *given: work(*given)
+        )
 
 
 def skin(name: str, **parameters: object) -> Shell:
@@ -329,13 +331,13 @@ def test_cells_are_expected_within_a_factor(tmp_path: Path, made: Made, h: float
 
 def test_work_in_a_process_of_its_own() -> None:
     """Results and exceptions come back; what takes too long or dies is told."""
-    assert within(20, divmod, 7, 2) == (3, 1)
+    assert call_with_time_limit(20, divmod, 7, 2) == (3, 1)
     with pytest.raises(ZeroDivisionError):
-        within(20, divmod, 7, 0)
+        call_with_time_limit(20, divmod, 7, 0)
     with pytest.raises(TimeoutError):
-        within(0.2, time.sleep, 60)
+        call_with_time_limit(0.2, time.sleep, 60)
     with pytest.raises(MeshError, match="signal 6"):
-        within(20, os.abort)
+        call_with_time_limit(20, os.abort)
 
 
 def test_size_must_be_sensible(tmp_path: Path) -> None:
@@ -359,8 +361,8 @@ def test_arrays_of_another_process_are_not_copied() -> None:
 
     tracemalloc.start()
     try:
-        values, none = within(60, np.meshgrid, np.arange(2000.0), np.arange(0))
-        ones = within(60, np.ones, (1000, 2000))
+        values, none = call_with_time_limit(60, np.meshgrid, np.arange(2000.0), np.arange(0))
+        ones = call_with_time_limit(60, np.ones, (1000, 2000))
         assert tracemalloc.get_traced_memory()[1] < 0.3 * ones.nbytes
     finally:
         tracemalloc.stop()

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import struct
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from fracsim.meshes.surfaces import repair as repairing
 from fracsim.meshes.surfaces import self_intersection
 from fracsim.meshes.surfaces.closed import ClosedSurface, RepairableSurfaceError
 from fracsim.meshes.surfaces.fill import fill_surface
-from fracsim.meshes.surfaces.repair import read_body, repaired
+from fracsim.meshes.surfaces.repair import read_body, repair_triangles
 from fracsim.meshes.surfaces.self_intersection import crossing_triangles
 from fracsim.meshes.topology import signed_measures
 from fracsim.study import MeshSettings
@@ -40,7 +41,9 @@ def _here(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> No
     """Repair and gmsh work in this process, but where a test asks for `own_process`: starting one takes longer."""
     if "own_process" not in request.fixturenames:
         for module in ("repair", "fill"):
-            monkeypatch.setattr(f"fracsim.meshes.surfaces.{module}.within", lambda seconds, work, *given: work(*given))
+            monkeypatch.setattr(
+                f"fracsim.meshes.surfaces.{module}.call_with_time_limit", lambda seconds, work, *given: work(*given)
+            )
 
 
 def of(mesh: object) -> Surface:
@@ -305,7 +308,7 @@ def test_a_spike_far_out_is_not_cut_off_in_silence(tmp_path: Path) -> None:
 
 def test_what_cuts_itself_after_the_repair_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A repair that leaves its surface as it was."""
-    monkeypatch.setattr(repairing, "repaired", lambda points, triangles, source: (points, triangles, ()))
+    monkeypatch.setattr(repairing, "repair_triangles", lambda points, triangles, source: (points, triangles, ()))
     for damaged, wrong in ((pushed_through(2.08), "cuts itself"), (without(sphere(), (0, 0, 1)), "is open")):
         with pytest.raises(MeshError, match=rf"part.ply', repaired, {wrong}"):
             read_body(saved(tmp_path, damaged), repair=True)
@@ -331,9 +334,9 @@ def test_without_the_wheels(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         monkeypatch.setitem(sys.modules, name, None)
     assert read_body(saved(tmp_path, sphere())).notes == ()
     with pytest.raises(MeshError, match=r"needs pymeshfix, .*pip install fracsim\[repair\]"):
-        repaired(*without(sphere(), (0, 0, 1)), "S")
+        repair_triangles(*without(sphere(), (0, 0, 1)), "S")
     with pytest.raises(MeshError, match="needs manifold3d"):
-        repaired(*joined(box((2, 1, 1)), box((1, 1, 1), (1, 0.3, 0.2))), "S")
+        repair_triangles(*joined(box((2, 1, 1)), box((1, 1, 1), (1, 0.3, 0.2))), "S")
 
 
 @pytest.mark.parametrize(
@@ -350,7 +353,7 @@ def test_a_repair_that_hangs_or_crashes(
         assert seconds == 7
         raise failure
 
-    monkeypatch.setattr(repairing, "within", fails)
+    monkeypatch.setattr(repairing, "call_with_time_limit", fails)
     with pytest.raises(MeshError, match=message):
         read_body(saved(tmp_path, sphere()), repair=True, time_limit=7)
 
@@ -377,8 +380,8 @@ def test_neighbours_and_parts_that_touch_do_not_cross() -> None:
 def test_a_search_that_is_not_ended_is_no_sound_surface(monkeypatch: pytest.MonkeyPatch) -> None:
     """Before, what had been found by then was taken for all of it."""
     points = np.random.default_rng(0).random((600, 3))
-    monkeypatch.setattr(self_intersection, "MAX_PAIRS", 1000)
-    monkeypatch.setattr(self_intersection, "MAX_PAIRS_EACH", 1)
+    limits = replace(self_intersection.CROSSING, max_pairs=1000, max_pairs_per_triangle=1)
+    monkeypatch.setattr(self_intersection, "CROSSING", limits)
     with pytest.raises(MeshError, match="200 triangles was not searched to the end"):
         crossing_triangles(points, np.arange(600).reshape(-1, 3))
 

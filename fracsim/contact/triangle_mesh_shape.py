@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
-from ..meshes.surfaces.enclosed import AT_ONCE, enclosed_volumes, parts, winding_numbers
+from ..meshes.surfaces.triangle_geometry import BATCH_SIZE, batches, enclosed_volumes, winding_numbers
 from ..meshes.topology import distinct_rows
 from .shape_base import Tessellation
 
@@ -30,7 +30,7 @@ class TriangleMeshPolicy:
     """
 
     max_triangles: int = 100_000
-    max_products: int = 30 * AT_ONCE
+    max_products: int = 30 * BATCH_SIZE
     min_winding: float = 0.5
 
 
@@ -215,4 +215,4 @@ def surface_distances(x: Values, corners: Values) -> Values:
         height = abs(np.einsum("nki,ki->nk", from_corner[:, :, 0], normal))
         return np.asarray(np.where(is_above, height, distance).min(axis=1))
 
-    return np.concatenate([min_distances(part) for part in parts(x, len(corners))])
+    return np.concatenate([min_distances(part) for part in batches(x, len(corners))])

@@ -220,12 +220,12 @@ def _direction_notes(study: Study, summary: MeshSummary) -> Iterator[str]:
     """Notes on preferred directions of the edges of a mesh that was read or built: cracks run along edges."""
     if study.fracture is None or study.brittle is not None or summary.mesh is None:
         return
-    from ..meshes.directions import preferred
+    from ..meshes.directions import preferred_directions
 
     mesh = summary.mesh
     if len(mesh.points) < LIMITS.min_direction_nodes[summary.dim]:
         return
-    ratio, limit = max(preferred(mesh, LIMITS.max_sampled_cells).values()), LIMITS.max_edge_direction_ratio
+    ratio, limit = max(preferred_directions(mesh, LIMITS.max_sampled_cells).values()), LIMITS.max_edge_direction_ratio
     if ratio > limit and study.fracture.energy is None:
         yield f"note: the mesh has {ratio:.2g} times as many edges along its commonest directions as one without any,"
         yield "and cracks run along edges: take random points (builders, surface, outline), or fracture.energy"

@@ -23,7 +23,7 @@ from .body import SOURCE_KEYS
 from .error_messages import unknown_key_message, validation_message
 
 if TYPE_CHECKING:
-    from ..meshes.random_points.outline_file import Drawn
+    from ..meshes.random_points.outline_file import PolygonOutline
     from ..meshes.surfaces.closed import ClosedSurface
 
 
@@ -119,7 +119,7 @@ def open_surface(mesh: MeshSettings) -> ClosedSurface | None:
             raise MeshError(str(error) if repair else f"{error} {REPAIR_HINT}") from None
 
 
-def open_outline(mesh: MeshSettings) -> Drawn | None:
+def open_outline(mesh: MeshSettings) -> PolygonOutline | None:
     """Returns the outline of a [mesh] table in metres, not filled; None if it has none.
 
     Raises:

@@ -63,6 +63,6 @@ def with_curved_boundary(study: Study, mesh: MeshData, builder: Any) -> MeshData
     """
     if not has_curved_cells(study, builder):
         return mesh
-    from ..meshes.curved_boundaries import curved_midside_points
+    from ..meshes.parameters import curved_midside_points
 
     return replace(mesh, middles=curved_midside_points(mesh, builder.curved_boundaries))

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..data import Indices, MeshData, Points
-from ..parameters import positive, require, require_affordable
+from ..parameters import require, require_affordable, require_positive
 from ..shell import extrude_shell
 
 
@@ -43,7 +43,9 @@ class Boat:
     h: float = 0.2
 
     def __post_init__(self) -> None:
-        positive("boat", length=self.length, beam=self.beam, depth=self.depth, thickness=self.thickness, h=self.h)
+        require_positive(
+            "boat", length=self.length, beam=self.beam, depth=self.depth, thickness=self.thickness, h=self.h
+        )
         require(self.h <= self.beam / 2, f"boat: h = {self.h!r} must be at most half of beam = {self.beam!r}.")
         require(self.thickness < self.h, f"boat: thickness = {self.thickness!r} must be below h = {self.h!r}.")
         require_affordable("boat", self.h, self.cells_estimate())

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..data import Indices, MeshData, MeshError, Points
 from ..gmsh_session import mesh_with_gmsh
-from ..parameters import is_length, positive, require, require_affordable, require_one_of
+from ..parameters import is_length, require, require_affordable, require_one_of, require_positive
 from ..sizing import SizeField, estimate_cells_in_box
 from ..topology import boundary_facets, facet_groups_on_planes
 
@@ -46,7 +46,7 @@ class Box:
     def __post_init__(self) -> None:
         if len(self.size) not in (2, 3):
             raise MeshError(f"box: size = {list(self.size)} must have two entries (triangles) or three (tetrahedra).")
-        positive("box", h=self.h, **{f"size[{i}]": length for i, length in enumerate(self.size)})
+        require_positive("box", h=self.h, **{f"size[{i}]": length for i, length in enumerate(self.size)})
         require(
             len(self.origin) in (0, len(self.size)) and all(is_length(x) for x in self.origin),
             f"box: origin = {list(self.origin)} must have as many numbers as size = {list(self.size)}.",

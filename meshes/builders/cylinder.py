@@ -8,10 +8,9 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from ..curved_boundaries import CurvedBoundary
 from ..data import MeshData
 from ..gmsh_session import mesh_with_gmsh
-from ..parameters import positive, require, require_affordable, require_one_of
+from ..parameters import CurvedBoundary, require, require_affordable, require_one_of, require_positive
 from ..sizing import SizeField, estimate_cells_in_box
 from ..topology import boundary_facets, exclude_facets, facet_groups_on_planes
 from .profile import Profile
@@ -44,7 +43,7 @@ class Cylinder:
     axis: Literal["x", "y", "z"] = "z"
 
     def __post_init__(self) -> None:
-        positive("cylinder", radius=self.radius, length=self.length, h=self.h)
+        require_positive("cylinder", radius=self.radius, length=self.length, h=self.h)
         require_one_of("cylinder", "axis", self.axis, ("x", "y", "z"))
         require_affordable("cylinder", self.h, self.cells_estimate())
 
@@ -102,7 +101,7 @@ class Disk:
     arc: float = 0.0
 
     def __post_init__(self) -> None:
-        positive("disk", radius=self.radius, h=self.h)
+        require_positive("disk", radius=self.radius, h=self.h)
         require(0 <= self.arc < 180, f"disk: arc = {self.arc!r} must be at least 0 and less than 180 degrees.")
         require_affordable("disk", self.h, self.cells_estimate())
 

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..data import Indices, MeshData, Points
-from ..parameters import positive, require, require_affordable, require_not_negative
+from ..parameters import require, require_affordable, require_not_negative, require_positive
 from ..sizing import estimate_cells_in_body
 from ..topology import Floats, boundary_facets, exclude_facets, facets_on_nodes
 
@@ -105,7 +105,7 @@ class Figure:
     h: float = 0.01
 
     def __post_init__(self) -> None:
-        positive("figure", height=self.height, h=self.h)
+        require_positive("figure", height=self.height, h=self.h)
         require_not_negative("figure", wall=self.wall)
         thinnest = self.height * min(part.end_radius for part in PARTS.values())
         require(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ..parameters import positive, require, require_affordable, require_not_negative
+from ..parameters import require, require_affordable, require_not_negative, require_positive
 from ..sizing import SizeField, estimate_cells_in_box
 from .profile import CutRectangle, Profile
 
@@ -43,7 +43,7 @@ class LPanel(CutRectangle):
     h_corner: float | None = None
 
     def __post_init__(self) -> None:
-        positive("l-panel", size=self.size, seat=self.seat, h=self.h, h_corner=self._fine)
+        require_positive("l-panel", size=self.size, seat=self.seat, h=self.h, h_corner=self._fine)
         require_not_negative("l-panel", thickness=self.thickness)
         require(
             self.seat < self._middle,

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..data import MeshData, Points
 from ..gmsh_session import mesh_with_gmsh
-from ..parameters import is_length, positive, require, require_affordable
+from ..parameters import is_length, require, require_affordable, require_positive
 from ..sizing import SizeField, estimate_cells_in_box
 from ..topology import boundary_facets, exclude_facets, facet_groups_on_planes, facets_on_nodes
 
@@ -52,8 +52,8 @@ class Loaf:
 
     def __post_init__(self) -> None:
         require(len(self.size) == 3, f"loaf: size = {list(self.size)} must be length, width and height.")
-        positive("loaf", h=self.h, rounding=self.rounding, bottom_rounding=self.bottom_rounding, grip=self.grip)
-        positive("loaf", **{f"size[{i}]": length for i, length in enumerate(self.size)})
+        require_positive("loaf", h=self.h, rounding=self.rounding, bottom_rounding=self.bottom_rounding, grip=self.grip)
+        require_positive("loaf", **{f"size[{i}]": length for i, length in enumerate(self.size)})
         for name, share in (("dome", self.dome), ("flare", self.flare)):
             require(is_length(share) and 0 <= share <= 1, f"loaf: {name} = {share!r} must lie between 0 and 1.")
         length, width, height = self._block

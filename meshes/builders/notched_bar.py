@@ -10,7 +10,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from ..data import Indices, Points
-from ..parameters import is_length, positive, require, require_affordable, require_not_negative, require_one_of
+from ..parameters import is_length, require, require_affordable, require_not_negative, require_one_of, require_positive
 from ..sizing import SizeField
 from ..topology import facets_on_nodes
 from .profile import CutRectangle, Point, Profile
@@ -66,8 +66,8 @@ class NotchedBar(CutRectangle):
 
     def __post_init__(self) -> None:
         require_one_of("notched-bar", "notch", self.notch, ("V", "U", "slit"))
-        positive("notched-bar", length=self.length, height=self.height, notch_depth=self.notch_depth, h=self.h)
-        positive("notched-bar", h_notch=self._fine, **({"patch": self.patch} if self.span else {}))
+        require_positive("notched-bar", length=self.length, height=self.height, notch_depth=self.notch_depth, h=self.h)
+        require_positive("notched-bar", h_notch=self._fine, **({"patch": self.patch} if self.span else {}))
         require_not_negative("notched-bar", thickness=self.thickness, refined=self.refined, span=self.span)
         self._check_notch()
         self._check_supports()
@@ -108,9 +108,9 @@ class NotchedBar(CutRectangle):
 
     def _check_notch(self) -> None:
         if self.notch == "slit":
-            positive("notched-bar", notch_width=self.notch_width)
+            require_positive("notched-bar", notch_width=self.notch_width)
         elif self.notch == "U":
-            positive("notched-bar", notch_radius=self.notch_radius)
+            require_positive("notched-bar", notch_radius=self.notch_radius)
         else:
             require_not_negative("notched-bar", notch_radius=self.notch_radius)
             require(

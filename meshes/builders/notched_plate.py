@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ..parameters import positive, require, require_affordable, require_not_negative
+from ..parameters import require, require_affordable, require_not_negative, require_positive
 from ..sizing import SizeField
 from .profile import CutRectangle, Profile
 
@@ -50,8 +50,8 @@ class NotchedPlate(CutRectangle):
     refined: float = 0.0
 
     def __post_init__(self) -> None:
-        positive("notched-plate", length=self.length, height=self.height, h=self.h, h_tip=self._fine)
-        positive("notched-plate", notch_length=self.notch_length, notch_width=self.notch_width)
+        require_positive("notched-plate", length=self.length, height=self.height, h=self.h, h_tip=self._fine)
+        require_positive("notched-plate", notch_length=self.notch_length, notch_width=self.notch_width)
         require_not_negative(
             "notched-plate", thickness=self.thickness, refined=self.refined, notch_position=self._position
         )

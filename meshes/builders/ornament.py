@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from ..data import Indices, MeshData, Points
-from ..parameters import positive, require, require_affordable
+from ..parameters import require, require_affordable, require_positive
 from ..shell import extrude_shell
 
 
@@ -42,7 +42,7 @@ class Ornament:
     h: float = 0.006
 
     def __post_init__(self) -> None:
-        positive("ornament", radius=self.radius, thickness=self.thickness, h=self.h, height=self.height)
+        require_positive("ornament", radius=self.radius, thickness=self.thickness, h=self.h, height=self.height)
         require(0 <= self.neck < 0.9 * self.radius, f"ornament: neck = {self.neck!r} must be from 0 to 0.9 radius.")
         require(
             self.thickness < 0.5 * self.radius, f"ornament: thickness = {self.thickness!r} must be below radius / 2."

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from math import pi
 from typing import ClassVar
 
-from ..curved_boundaries import CurvedBoundary
-from ..parameters import positive, require, require_affordable, require_not_negative
+from ..parameters import CurvedBoundary, require, require_affordable, require_not_negative, require_positive
 from ..sizing import SizeField
 from .profile import CutRectangle, Profile
 
@@ -46,7 +45,9 @@ class PlateHole(CutRectangle):
     h_hole: float | None = None
 
     def __post_init__(self) -> None:
-        positive("plate-hole", length=self.length, height=self.height, radius=self.radius, h=self.h, h_hole=self._fine)
+        require_positive(
+            "plate-hole", length=self.length, height=self.height, radius=self.radius, h=self.h, h_hole=self._fine
+        )
         require_not_negative("plate-hole", thickness=self.thickness)
         require(
             self.radius < min(self.length, self.height),

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ..data import Indices, MeshData, Points
-from ..parameters import positive, require, require_not_negative
+from ..parameters import require, require_not_negative, require_positive
 from ..topology import boundary_facets, orient_cells
 
 MAX_STONES = 100_000  # also of a layer along each axis
@@ -45,7 +45,7 @@ class Stones:
     seed: int = 1
 
     def __post_init__(self) -> None:
-        positive("stones", radius=self.radius)
+        require_positive("stones", radius=self.radius)
         require_not_negative("stones", spread=self.spread)
         require(1 <= self.count <= MAX_STONES, f"stones: count = {self.count!r} must be from 1 to {MAX_STONES:,}.")
         within = min(self.aside) >= 1 and max(self.aside) <= MAX_STONES

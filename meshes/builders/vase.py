@@ -11,7 +11,7 @@ from numpy.polynomial import Polynomial
 
 from ..data import MeshData
 from ..gmsh_session import mesh_with_gmsh
-from ..parameters import positive, require, require_affordable, require_not_negative
+from ..parameters import require, require_affordable, require_not_negative, require_positive
 from ..sizing import SizeField, estimate_cells_in_body
 from ..topology import boundary_facets, exclude_facets, facet_groups_on_planes, facets_on_nodes
 
@@ -47,7 +47,7 @@ class Vase:
     h: float = 0.006
 
     def __post_init__(self) -> None:
-        positive("vase", height=self.height, radius=self.radius, h=self.h)
+        require_positive("vase", height=self.height, radius=self.radius, h=self.h)
         require_not_negative("vase", wall=self.wall)
         neck = float(self.outline()(np.linspace(0, self.height, 400)).min())
         require(

@@ -1,11 +1,13 @@
-"""Random points on the faces of gmsh's models: in the plane of a 2D body, and on flat and round faces in space.
+"""Random points on faces of gmsh's models: in the plane of a 2D body, on flat and cylindrical faces of a solid.
 
-gmsh draws the outline and places nodes on it; its own triangles are pieces of lattices turned along the outline.
+gmsh places nodes on the curves alone: its triangles are pieces of lattices aligned with the outline.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
+from math import tau
 from typing import Any
 
 import numpy as np
@@ -16,25 +18,27 @@ from ..topology import Floats
 from .outline import Outline
 from .points import scatter
 
-LINE, TRIANGLE = 1, 2  # gmsh's numbers for cell types
-TURN = 2 * np.pi
-FACES = 1_000_000  # seeds from one of a mesh to the next: each of its faces has its own
+
+class GmshElement(IntEnum):
+    """gmsh's numbers for element types."""
+
+    LINE = 1
+    TRIANGLE = 2
+    TETRAHEDRON = 4
 
 
 def scatter_plane(gmsh: Any, sizing: SizeField, seed: int = 1) -> tuple[Points, Indices]:
-    """Points (n, 2) and positive triangles (m, 3) of a flat body whose curves are meshed; MeshError as of `scatter`."""
+    """Points (n, 2) and positive triangles (m, 3) of a plane body whose curves are meshed; MeshError: see `scatter`."""
     nodes = _Curves.of(gmsh, [tag for _, tag in gmsh.model.getEntities(1)])
     return scatter(Outline(nodes.points[:, :2], nodes.pieces), sizing.at, seed)
 
 
 def scatter_faces(gmsh: Any, sizing: SizeField, seed: int = 1) -> None:
-    """Mesh the flat and cylindrical faces of a meshed surface anew; others stay as gmsh made them.
-
-    Sizes are those at the first two coordinates of gmsh's model, as everywhere.
-    """
+    """Remesh the flat and cylindrical faces of a meshed surface; other faces stay as gmsh made them."""
     for _, face in gmsh.model.getEntities(2):
         if gmsh.model.getType(2, face) in ("Plane", "Cylinder"):
-            _mesh_anew(gmsh, face, sizing, face + FACES * (seed - 1))
+            # each face has seeds of its own, a million for the faces of one mesh
+            _remesh(gmsh, face, sizing, face + 1_000_000 * (seed - 1))
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,7 @@ class _Curves:
     Attributes:
         tags: (n,) gmsh's number of each node.
         points: (n, 3) [m].
-        pieces: (k, 2) places in `tags` of the ends of each straight piece.
+        pieces: (k, 2) indices in `tags` of the ends of each straight piece.
     """
 
     tags: Indices
@@ -53,14 +57,15 @@ class _Curves:
 
     @classmethod
     def of(cls, gmsh: Any, curves: list[int]) -> _Curves:
-        ends = [gmsh.model.mesh.getElementsByType(LINE, curve)[1] for curve in curves]
+        """The nodes of curves by their tags."""
+        ends = [gmsh.model.mesh.getElementsByType(GmshElement.LINE, curve)[1] for curve in curves]
         tags, pieces = np.unique(np.concatenate(ends).astype(np.int64), return_inverse=True)
         points = np.array([gmsh.model.mesh.getNode(tag)[0] for tag in tags])
         return cls(tags, points, pieces.reshape(-1, 2))
 
 
-def _mesh_anew(gmsh: Any, face: int, sizing: SizeField, seed: int) -> None:
-    """Lay the face out in a plane, scatter points there, and put them and their triangles in the place of gmsh's."""
+def _remesh(gmsh: Any, face: int, sizing: SizeField, seed: int) -> None:
+    """Replace gmsh's triangles of a face by those between random points in its developed plane."""
     sides = [tag for _, tag in gmsh.model.getBoundary([(2, face)], combined=False, oriented=False)]
     seams = {side for side in sides if sides.count(side) == 2}
     nodes = _Curves.of(gmsh, sorted(set(sides)))
@@ -70,7 +75,7 @@ def _mesh_anew(gmsh: Any, face: int, sizing: SizeField, seed: int) -> None:
         seam = np.isin(tags, _Curves.of(gmsh, sorted(seams)).tags)
         tags, flat, pieces = _cut_open(tags, flat, pieces, seam)
     scale = _scale(gmsh, face)
-    outward = _turning(gmsh, face)
+    same_orientation = _is_oriented_as_parameters(gmsh, face)
 
     def place(points: Points) -> Points:
         return np.array(gmsh.model.getValue(2, face, (points / scale).ravel())).reshape(-1, 3)
@@ -82,21 +87,24 @@ def _mesh_anew(gmsh: Any, face: int, sizing: SizeField, seed: int) -> None:
     new = last + 1 + np.arange(len(inner))
     gmsh.model.mesh.addNodes(2, face, new, place(inner).ravel(), (inner / scale).ravel())
     corners = np.concatenate([tags, new])[cells]
-    gmsh.model.mesh.addElementsByType(face, TRIANGLE, [], (corners if outward else corners[:, ::-1]).ravel())
+    gmsh.model.mesh.addElementsByType(
+        face, GmshElement.TRIANGLE, [], (corners if same_orientation else corners[:, ::-1]).ravel()
+    )
 
 
 def _parameters(gmsh: Any, face: int, points: Points) -> Floats:
+    """(n, 2) parameters of points on a face."""
     return np.array(gmsh.model.getParametrization(2, face, points.ravel())).reshape(-1, 2)
 
 
 def _scale(gmsh: Any, face: int) -> Floats:
-    """Metres for each unit of the face's two parameters, the same all over a plane or a cylinder: (2,)."""
+    """(2,) metres for each unit of the parameters of a face, constant on a plane or a cylinder."""
     return np.linalg.norm(np.array(gmsh.model.getDerivative(2, face, [0.0, 0.0])).reshape(2, 3), axis=1)
 
 
-def _turning(gmsh: Any, face: int) -> bool:
-    """Whether gmsh's triangles turn as the parameters do."""
-    triangle = gmsh.model.mesh.getElementsByType(TRIANGLE, face)[1][:3]
+def _is_oriented_as_parameters(gmsh: Any, face: int) -> bool:
+    """Whether gmsh's triangles have the orientation of the face's parameters."""
+    triangle = gmsh.model.mesh.getElementsByType(GmshElement.TRIANGLE, face)[1][:3]
     corners = np.array([gmsh.model.mesh.getNode(tag)[0] for tag in triangle])
     middle = _parameters(gmsh, face, corners.mean(axis=0))
     along = np.array(gmsh.model.getDerivative(2, face, middle.ravel())).reshape(2, 3)
@@ -104,15 +112,22 @@ def _turning(gmsh: Any, face: int) -> bool:
 
 
 def _cut_open(tags: Indices, flat: Floats, pieces: Indices, seam: Any) -> tuple[Indices, Floats, Indices]:
-    """A face that closes on itself, cut along its seam: nodes on it at 0 and, a second time, after a whole turn."""
+    """A closed cylindrical face cut along its seam: nodes on it at angle 0 and, a second time, at 2 pi.
+
+    Args:
+        tags: (n,) gmsh's number of each node of its curves.
+        flat: (n, 2) parameters, the first an angle.
+        pieces: (k, 2) pieces of the curves.
+        seam: (n,) whether each node lies on the seam.
+    """
     flat[seam, 0] = 0.0
     copy = np.full(len(tags), -1)
     copy[seam] = len(tags) + np.arange(seam.sum())
     along = seam[pieces].all(axis=1)
-    far = seam[pieces] & (flat[pieces[:, ::-1], 0] > TURN / 2)  # the other end lies before the end of the turn
+    far = seam[pieces] & (flat[pieces[:, ::-1], 0] > tau / 2)  # the other end lies near the angle 2 pi
     closed = np.where(far, copy[pieces], pieces)
     return (
         np.concatenate([tags, tags[seam]]),
-        np.concatenate([flat, flat[seam] + [TURN, 0.0]]),
+        np.concatenate([flat, flat[seam] + [tau, 0.0]]),
         np.concatenate([closed, copy[pieces[along]]]),
     )

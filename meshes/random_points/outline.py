@@ -1,4 +1,4 @@
-"""A plane outline in straight pieces, and the triangles that lie inside it."""
+"""Plane outlines of straight pieces, and the triangles inside them."""
 
 from __future__ import annotations
 
@@ -10,31 +10,28 @@ import numpy as np
 from ..data import Indices, MeshError, Points
 from ..topology import Mask, components, distinct_rows, facets_of, signed_measures
 
-ROUNDS = 40  # most times that pieces are halved before the outline is given up
-FLAT = 1e-9  # area over squared longest edge of the triangles between points of one straight line: they are no cells
-
 
 @dataclass(frozen=True)
 class Outline:
-    """Closed polygons, in any order; what lies inside an odd number of them is the body.
+    """Closed polygons in any order; the body is inside an odd number of them.
 
     Attributes:
         points: (n, 2) [m].
-        pieces: (k, 2) numbers of the two ends of each straight piece.
+        pieces: (k, 2) indices of the ends of each straight piece.
     """
 
     points: Points
     pieces: Indices
 
-    def conforming(self) -> Outline:
+    def conforming(self, max_halvings: int = 40) -> Outline:
         """The outline with pieces halved until each of them is an edge of the Delaunay triangles of its points.
 
         Raises:
             MeshError: pieces cross one another.
         """
         outline = self
-        for _ in range(ROUNDS):
-            lost = outline._lost(delaunay(outline.points).simplices)
+        for _ in range(max_halvings):
+            lost = outline._missing(delaunay(outline.points).simplices)
             if not lost.any():
                 return outline
             where = outline.points[outline.pieces[lost][0]].mean(axis=0)
@@ -44,8 +41,8 @@ class Outline:
             "cut by others, however short they are made; mend it there."
         )
 
-    def _lost(self, simplices: Indices) -> Mask:
-        """Which pieces are no edges of the triangles: (k,)."""
+    def _missing(self, simplices: Indices) -> Mask:
+        """(k,) whether each piece is no edge of the triangles."""
         edges = np.sort(facets_of(simplices).reshape(-1, 2), axis=1)
         _, _, inverse = distinct_rows(np.concatenate([np.sort(self.pieces, axis=1), edges]))
         return ~np.isin(inverse[: len(self.pieces)], inverse[len(self.pieces) :])
@@ -59,32 +56,31 @@ class Outline:
         return Outline(points, np.concatenate([self.pieces[~chosen], *halves]))
 
     def inside(self, points: Points, simplices: Indices) -> Mask:
-        """Which triangles of a Delaunay triangulation that holds every piece are part of the body: (m,).
-
-        Triangles that are joined across edges that are no pieces lie on the same side.
-        """
+        """(m,) whether each triangle of a Delaunay triangulation that contains every piece is part of the body."""
         edges = np.sort(facets_of(simplices).reshape(-1, 2), axis=1)
-        rows, _, position = distinct_rows(np.concatenate([np.sort(self.pieces, axis=1), edges]))
-        wall = np.zeros(len(rows), bool)
-        wall[position[: len(self.pieces)]] = True
-        position = position[len(self.pieces) :]
-        order = np.argsort(position, kind="stable")
-        same = np.flatnonzero((np.diff(position[order]) == 0) & ~wall[position[order][:-1]])
+        rows, _, edge_of = distinct_rows(np.concatenate([np.sort(self.pieces, axis=1), edges]))
+        is_piece = np.zeros(len(rows), bool)
+        is_piece[edge_of[: len(self.pieces)]] = True
+        edge_of = edge_of[len(self.pieces) :]
+        # triangles that are connected across edges that are no pieces lie on the same side: one of each part is tested
+        order = np.argsort(edge_of, kind="stable")
+        same = np.flatnonzero((np.diff(edge_of[order]) == 0) & ~is_piece[edge_of[order][:-1]])
         _, part = components(np.stack([order[same], order[same + 1]], axis=1) // 3, len(simplices))
         area = np.abs(signed_measures(points, simplices))
         ranked = np.lexsort((-area, part))
         largest = ranked[np.unique(part[ranked], return_index=True)[1]]
         spans = np.ptp(points[simplices], axis=1).max(axis=1)
-        return self._around(points[simplices[largest]].mean(axis=1))[part] & (area > FLAT * spans**2)
+        # triangles between points of one straight line are no cells
+        return self._contains(points[simplices[largest]].mean(axis=1))[part] & (area > 1e-9 * spans**2)
 
-    def _around(self, points: Points) -> Mask:
-        """Whether points lie inside: a ray towards +x crosses an odd number of pieces. Few points, one a part: (m,)."""
+    def _contains(self, points: Points) -> Mask:
+        """(n,) whether points (n, 2) lie inside: a ray towards +x crosses an odd number of pieces."""
         start, end = self.points[self.pieces[:, 0]], self.points[self.pieces[:, 1]]
         x, y = points[:, :1], points[:, 1:]
         spans = (start[:, 1] > y) != (end[:, 1] > y)
         rise = np.where(end[:, 1] == start[:, 1], 1.0, end[:, 1] - start[:, 1])
-        position = start[:, 0] + (y - start[:, 1]) / rise * (end[:, 0] - start[:, 0])
-        return np.asarray((spans & (position > x)).sum(axis=1) % 2 == 1)
+        crossing_x = start[:, 0] + (y - start[:, 1]) / rise * (end[:, 0] - start[:, 0])
+        return np.asarray((spans & (crossing_x > x)).sum(axis=1) % 2 == 1)
 
 
 def delaunay(points: Points) -> Any:

@@ -1,4 +1,4 @@
-"""Outlines in text files, filled with triangles between random points: plane bodies without preferred directions."""
+"""Outlines in text files, filled with triangles between random points."""
 
 from __future__ import annotations
 
@@ -9,23 +9,21 @@ import numpy as np
 
 from ..data import Indices, MeshData, MeshError, Points
 from ..file_text import decode_text
-from ..parameters import check_extent, positive, require_affordable
+from ..parameters import check_extent, require_affordable, require_positive
 from ..plain_files import unreadable_reason
 from ..topology import Floats, boundary_facets, signed_measures
 from .outline import Outline
 from .points import scatter
 
-MAX_CHECKED_SIDES = 3000  # of which each is held against each
-CELLS = 2.6  # triangles over area / h^2 that random points make
-
 
 @dataclass(frozen=True)
-class Drawn:
-    """Closed polygons of straight sides; what lies inside an odd number of them is the body.
+class PolygonOutline:
+    """Closed polygons with facet groups; the body is inside an odd number of them.
 
     Attributes:
-        start, end: (k, 2) of the sides [m].
-        groups: (k,) name of the facet group of each side; "" for none but `outline`, which is all of them.
+        start: (k, 2) first end of each side [m].
+        end: (k, 2) second end of each side [m].
+        groups: (k,) facet group of each side; "" for none but `outline`, which has all sides.
     """
 
     start: Points
@@ -34,33 +32,37 @@ class Drawn:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Facet groups."""
+        """Names of the facet groups."""
         return ("outline", *(name for name in dict.fromkeys(self.groups) if name))
 
     @property
     def area(self) -> float:
-        """What the polygons enclose [m^2]; holes count as such where they lie inside one polygon."""
+        """Area of the largest polygon less that of all others [m^2], which are holes in it as a rule."""
         sides = np.cumsum([0, *self._lengths()])
         twice = self.start[:, 0] * self.end[:, 1] - self.start[:, 1] * self.end[:, 0]
         loops = np.abs(np.add.reduceat(twice, sides[:-1])) / 2
         return float(2 * loops.max() - loops.sum())
 
     def _lengths(self) -> list[int]:
-        """How many sides each polygon has: one ends where the next side does not go on from there."""
+        """Number of sides of each polygon; one ends where the next side does not start."""
         last = np.flatnonzero(np.any(self.end[:-1] != self.start[1:], axis=1)) + 1
         return [int(count) for count in np.diff([0, *last, len(self.start)])]
 
     def cells_estimate(self, h: float) -> int:
-        """About how many triangles of size h [m] fill it: one at each part of a side at least."""
+        """Approximate number of triangles of size h [m]; at least one at each part of a side."""
         parts = np.linalg.norm(self.end - self.start, axis=1).sum() / h
-        return max(1, round(CELLS * abs(self.area) / h**2), round(parts))
+        # random points make 2.6 triangles for an area of h^2
+        return max(1, round(2.6 * abs(self.area) / h**2), round(parts))
 
 
-def read_outline(path: str | Path, scale: float = 1.0) -> Drawn:
-    """Polygons of a text file: a line `x, y` a corner, or `x, y, group` where the side that begins there is in a facet
-    group; a blank line ends a polygon; `#` begins a remark. Commas or blanks part numbers.
+def read_outline(path: str | Path, scale: float = 1.0) -> PolygonOutline:
+    """Polygons of a text file.
+
+    A line is a corner: `x, y`, or `x, y, group` with the facet group of the side that begins there. A blank line ends a
+    polygon; `#` begins a comment. Numbers are separated by commas or blanks.
 
     Args:
+        path: the file.
         scale: metres for each unit of length of the file.
 
     Raises:
@@ -81,16 +83,17 @@ def read_outline(path: str | Path, scale: float = 1.0) -> Drawn:
             loops[-1].append(_corner(words, f"outline file '{path}', line {number}"))
         elif "#" not in line and loops[-1]:
             loops.append([])
-    loops = [_open(loop) for loop in loops if loop]
+    loops = [_without_repeated_corners(loop) for loop in loops if loop]
     if not loops or min(map(len, loops)) < 3:
         raise MeshError(f"outline file '{path}': a polygon needs three corners or more, a line `x, y` each.")
     corners = [scale * np.array([corner[:2] for corner in loop]) for loop in loops]
     check_extent(np.concatenate(corners), f"outline file '{path}'")
-    start, end = np.concatenate(corners), np.concatenate([np.roll(item, -1, axis=0) for item in corners])
-    return Drawn(start, end, tuple(corner[2] for loop in loops for corner in loop))
+    start, end = np.concatenate(corners), np.concatenate([np.roll(loop, -1, axis=0) for loop in corners])
+    return PolygonOutline(start, end, tuple(corner[2] for loop in loops for corner in loop))
 
 
 def _corner(words: list[str], where: str) -> tuple[float, float, str]:
+    """Coordinates and group of a line; `where`: begins the message of a MeshError."""
     try:
         x, y = (float(word) for word in words[:2])
         if len(words) > 3 or not np.isfinite([x, y]).all():
@@ -102,24 +105,24 @@ def _corner(words: list[str], where: str) -> tuple[float, float, str]:
     return x, y, words[2] if len(words) == 3 else ""
 
 
-def _open(loop: list[tuple[float, float, str]]) -> list[tuple[float, float, str]]:
-    """Without corners that repeat the one before, as the last does where a polygon is closed by hand."""
+def _without_repeated_corners(loop: list[tuple[float, float, str]]) -> list[tuple[float, float, str]]:
+    """A polygon without repeated corners, such as the last one of a polygon that is closed in the file."""
     return [corner for corner, after in zip(loop, [*loop[1:], loop[0]], strict=True) if corner[:2] != after[:2]]
 
 
-def fill_outline(drawn: Drawn, h: float, seed: int = 1) -> MeshData:
-    """Triangles of size h [m] between random points inside an outline; its sides are cut into equal parts of h at most.
+def fill_outline(drawn: PolygonOutline, h: float, seed: int = 1) -> MeshData:
+    """The mesh of triangles of size h [m] between random points inside an outline.
 
     Raises:
-        MeshError: h is out of range, or the outline meets itself.
+        MeshError: h is out of range, or the outline intersects itself.
     """
-    positive("outline", h=h)
-    _check_apart(drawn)
+    require_positive("outline", h=h)
+    _check_crossings(drawn)
     require_affordable("outline", h, drawn.cells_estimate(h))
-    outline = _in_parts(drawn, h)
+    outline = _split_sides(drawn, h)
     points, cells = scatter(outline, lambda at: np.full(len(at), h), seed)
     facets = boundary_facets(cells)
-    side = _side_of(points[facets].mean(axis=1), drawn)
+    side = _nearest_side(points[facets].mean(axis=1), drawn)
     names = np.array(drawn.groups)[side]
     groups = {"outline": facets} | {name: facets[names == name] for name in drawn.names[1:]}
     if not signed_measures(points, cells).sum() > 0:
@@ -127,14 +130,15 @@ def fill_outline(drawn: Drawn, h: float, seed: int = 1) -> MeshData:
     return MeshData(points, cells, groups)
 
 
-def _check_apart(drawn: Drawn) -> None:
-    """MeshError where two sides cross: each has the ends of the other on both hands. Points would find it late."""
-    if len(drawn.start) > MAX_CHECKED_SIDES:
+def _check_crossings(drawn: PolygonOutline) -> None:
+    """Raise MeshError if two sides cross: each has the ends of the other on its two sides."""
+    # each side is compared with each: of longer outlines `scatter` finds it, later
+    if len(drawn.start) > 3000:
         return
     a, b = drawn.start, drawn.end
 
     def left(of: Points) -> Floats:
-        """(k, k) on which hand of side i the point j lies."""
+        """(k, k) 1 if point j lies to the left of side i, -1 to the right."""
         (ax, ay), (bx, by), (x, y) = a.T[..., None], b.T[..., None], of.T[:, None]
         return np.asarray(np.sign((bx - ax) * (y - ay) - (by - ay) * (x - ax)))
 
@@ -147,15 +151,15 @@ def _check_apart(drawn: Drawn) -> None:
         )
 
 
-def _in_parts(drawn: Drawn, h: float) -> Outline:
-    """Sides cut into equal parts of length h at most."""
+def _split_sides(drawn: PolygonOutline, h: float) -> Outline:
+    """The outline with sides cut into equal parts of at most h [m]."""
     length = np.linalg.norm(drawn.end - drawn.start, axis=1)
     parts = np.maximum(1, np.ceil(length / h * (1 - 1e-9))).astype(np.int64)
     side = np.repeat(np.arange(len(parts)), parts)
     first = np.cumsum(parts) - parts
     share = (np.arange(len(side)) - first[side]) / parts[side]
     points = drawn.start[side] + share[:, None] * (drawn.end - drawn.start)[side]
-    # each part leads to the next point, the last of a polygon to its first
+    # each part ends at the next point, the last of a polygon at its first
     after = np.arange(1, len(points) + 1)
     ends = np.cumsum(drawn._lengths())
     last = np.append(first, len(points))[ends] - 1
@@ -163,8 +167,8 @@ def _in_parts(drawn: Drawn, h: float) -> Outline:
     return Outline(points, np.stack([np.arange(len(points)), after], axis=1))
 
 
-def _side_of(at: Points, drawn: Drawn) -> Indices:
-    """(n,) the side that each point (n, 2) lies on."""
+def _nearest_side(at: Points, drawn: PolygonOutline) -> Indices:
+    """(n,) the side nearest to each point (n, 2)."""
     along = drawn.end - drawn.start
     from_start = at[:, None] - drawn.start
     share = np.clip(np.einsum("nki,ki->nk", from_start, along) / np.einsum("ki,ki->k", along, along), 0, 1)

@@ -1,4 +1,4 @@
-"""Closed surfaces of triangles: read, joined, turned outwards, sorted into bodies and cavities."""
+"""Closed surfaces of triangles: read from file, merged, oriented outwards, sorted into bodies and cavities."""
 
 from __future__ import annotations
 
@@ -9,13 +9,19 @@ import numpy as np
 
 from ..data import Indices, MeshError, Points, format_midpoint
 from ..mesh_conversion import Block
-from ..parameters import LONGEST, SHORTEST
+from ..parameters import check_extent
 from ..topology import Floats, Mask, components
-from .enclosed import enclosed_volumes, winding_numbers
-from .mending import EdgeTable, areas, has_no_area, mend_open_surface, mended
-from .polygons import triangles_of_faces
-
-PROBES = 300  # points of a part that are looked up in another part
+from .mending import EdgeTable, mend_closed_surface, mend_open_surface
+from .triangle_geometry import (
+    Triangulation,
+    areas,
+    concatenate,
+    enclosed_volumes,
+    has_no_area,
+    probes_inside,
+    triangles_of_faces,
+    without_unused_points,
+)
 
 
 class RepairableSurfaceError(MeshError):
@@ -52,22 +58,25 @@ class ClosedSurface:
 
     @property
     def sides(self) -> tuple[float, ...]:
-        """Sides of the bounding box [m]: (3,)."""
+        """(3,) sides of the bounding box [m]."""
         return tuple(np.ptp(self.points, axis=0).tolist())
 
     @property
     def extent(self) -> str:
-        """The sides in words."""
+        """The sides as text."""
         return " x ".join(f"{side:.4g}" for side in self.sides) + " m"
 
-    def part(self, shell: int) -> tuple[Points, Indices]:
+    def part(self, shell: int) -> Triangulation:
         """Points and triangles of one shell."""
-        used, triangles = np.unique(self.triangles[self.shell == shell], return_inverse=True)
-        return self.points[used], triangles.reshape(-1, 3)
+        return without_unused_points(self.points, self.triangles[self.shell == shell])
 
 
 def read_surface(path: str | Path, scale: float = 1.0) -> ClosedSurface:
-    """A closed surface from STL, OBJ, PLY or another format with triangles or quads; `scale`: metres per unit of it.
+    """A closed surface from STL, OBJ, PLY or another format with triangles or quads.
+
+    Args:
+        path: the file.
+        scale: metres per unit of length of the file.
 
     Raises:
         MeshError: the file cannot be read, holds no surface, or the surface is not closed, not orientable, has
@@ -78,8 +87,16 @@ def read_surface(path: str | Path, scale: float = 1.0) -> ClosedSurface:
 
 
 def read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indices, tuple[str, ...]]:
-    """Points [m] and triangles of a surface, closed or open, mended (see mending) and turned alike; notes of that.
-    MeshError as of read_surface, beginning with `source`; an edge of more than two triangles."""
+    """Points [m] and triangles of a surface, closed or open, mended (see mending) and oriented alike; and notes.
+
+    Args:
+        path: the file.
+        scale: metres per unit of length of the file.
+        source: begins the message of an error.
+
+    Raises:
+        MeshError: see read_surface; an edge of more than two triangles.
+    """
     points, triangles = read_raw_triangles(path, scale, source)
     check_points(points, triangles, source)
     points, triangles, notes, _, may_be_flat = mend_open_surface(points, triangles)
@@ -94,8 +111,8 @@ def read_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indic
 
 
 def read_raw_triangles(path: Path, scale: float, source: str) -> tuple[Points, Indices]:
-    """Points [m] and triangles as they are in a file; `scale`: metres per unit of it. MeshError as of read_surface."""
-    from ..read import read_contents  # the readers of all formats: a body of a builder needs none
+    """Points [m] and triangles as they are in a file; arguments and errors as of `read_triangles`."""
+    from ..read import read_contents  # the bodies of builders need no readers
 
     contents = read_contents(path)
     triangles = np.concatenate(
@@ -106,15 +123,13 @@ def read_raw_triangles(path: Path, scale: float, source: str) -> tuple[Points, I
     return scale * contents.points, triangles
 
 
-def combine_shells(shells: list[tuple[Points, Indices]], source: str) -> ClosedSurface:
+def combine_shells(shells: list[Triangulation], source: str) -> ClosedSurface:
     """Closed shells, one inside another or apart, as one surface."""
-    starts = np.cumsum([0] + [len(points) for points, _ in shells])
-    triangles = [shell + start for (_, shell), start in zip(shells, starts, strict=False)]
-    return closed_surface(np.concatenate([points for points, _ in shells]), np.concatenate(triangles), source)
+    return closed_surface(*concatenate(shells), source)
 
 
 def _triangles(points: Points, block: Block) -> Indices:
-    """The triangles of a block, quads and polygons cut into them."""
+    """The triangles of a block; quads and polygons are cut, other cells left out."""
     if block.shape == "triangle":
         return block.corners
     faces = block.corners if block.shape == "quad" else block.nodes
@@ -125,25 +140,25 @@ def _triangles(points: Points, block: Block) -> Indices:
             f"The surface has {len(faces)} faces of kind {block.kind} with fewer than three corners, or with corners "
             "that do not exist; export it again, as triangles."
         )
-    with np.errstate(all="ignore"):  # coordinates out of reach are told by closed_surface
+    with np.errstate(all="ignore"):  # check_points refuses coordinates that overflow
         return triangles_of_faces(points, faces)
 
 
 def closed_surface(points: Points, triangles: Indices, source: str) -> ClosedSurface:
-    """Triangles joined at coincident points, mended (see mending), checked, turned outwards and sorted into bodies.
+    """A surface of triangles, mended (see mending), checked, oriented outwards and sorted into bodies.
 
     Raises:
         MeshError: see read_surface; `source` begins the message.
     """
     check_points(points, triangles, source)
-    points, triangles, mends, _, may_be_flat = mended(points, triangles)
+    points, triangles, mended_notes, _, may_be_flat = mend_closed_surface(points, triangles)
     if may_be_flat:
         check_areas(points, triangles, source)
     table = EdgeTable(triangles)
     check_edges(points, table, source, (1, 2))
     triangles, shell, turned = orient_consistently(triangles, table, source)
-    triangles, bodies, inside_out = _outwards(points, triangles, shell, source)
-    notes = list(mends)
+    triangles, bodies, inside_out = _orient_outwards(points, triangles, shell, source)
+    notes = list(mended_notes)
     if turned:
         notes.append(f"{turned} of {len(triangles)} surface triangles faced the other way than the rest; turned.")
     if inside_out:
@@ -157,22 +172,16 @@ def closed_surface(points: Points, triangles: Indices, source: str) -> ClosedSur
 
 
 def check_points(points: Points, triangles: Indices, source: str) -> None:
+    """Raise MeshError if a corner does not exist, or a coordinate or the size is out of range."""
     if triangles.min() < 0 or triangles.max() >= len(points):
         raise MeshError(f"{source} names points that do not exist (there are {len(points)}); it is damaged.")
     is_used = np.zeros(len(points), bool)
     is_used[triangles] = True
-    named = points if is_used.all() else points[is_used]
-    if not np.abs(named).max() <= LONGEST:
-        wrong = np.flatnonzero(is_used & ~(np.abs(points) <= LONGEST).all(axis=1))
-        raise MeshError(
-            f"{source} has {len(wrong)} points that are not finite numbers of at most {LONGEST:g} m, the first is "
-            f"point {wrong[0]}."
-        )
-    if (size := float(np.ptp(named, axis=0).max())) < SHORTEST:
-        raise MeshError(f"{source} is {size:g} m large, and {SHORTEST:g} m or more is needed.")
+    check_extent(points, source, is_used)
 
 
 def check_areas(points: Points, triangles: Indices, source: str) -> None:
+    """Raise MeshError if a triangle has no area."""
     if len(triangles) == 0:
         raise MeshError(f"{source} has no triangle that is larger than a point.")
     flat = np.flatnonzero(has_no_area(points, triangles))
@@ -184,13 +193,13 @@ def check_areas(points: Points, triangles: Indices, source: str) -> None:
 
 
 def check_edges(points: Points, table: EdgeTable, source: str, which: tuple[int, ...]) -> None:
-    """MeshError where edges belong to one triangle only (1) or to more than two (2)."""
-    result = {
+    """Raise MeshError if edges belong to one triangle only (`which` has 1) or to more than two (2)."""
+    faults = {
         1: (table.edges[table.counts == 1], "is open: {} edges belong to one triangle only"),
         2: (table.edges[table.counts > 2], "is not the surface of a body: {} edges belong to more than two triangles"),
     }
     for kind in which:
-        wrong, description = result[kind]
+        wrong, description = faults[kind]
         if len(wrong):
             refused = RepairableSurfaceError if 1 in which else MeshError
             raise refused(
@@ -201,15 +210,17 @@ def check_edges(points: Points, table: EdgeTable, source: str, which: tuple[int,
 
 
 def orient_consistently(triangles: Indices, table: EdgeTable, source: str) -> tuple[Indices, Indices, int]:
-    """Triangles turned so that neighbours face the same side; the connected part of each; how many were turned.
+    """Triangles oriented like their neighbours; the connected part of each; how many were turned.
 
-    Each triangle t has two states, as given (t) and turned (t + k). States of neighbours that agree are linked; the
-    links fall into two mirrored halves for each part, or into one where the part has one side only (Moebius).
+    Raises:
+        MeshError: a part has one side only.
     """
+    # Each triangle t has two states, as given (t) and turned (t + k). States of neighbours that agree are linked; a
+    # part has two mirrored sets of linked states, or one if it has one side only (Moebius).
     count = len(triangles)
-    directed, counts, edge = table.directed, table.counts, table.place
+    directed, counts, edge = table.directed, table.counts, table.edge_of
     order = np.argsort(edge, kind="stable")
-    order = order[counts[edge[order]] == 2]  # an open one has edges of one triangle
+    order = order[counts[edge[order]] == 2]  # an open surface has edges of one triangle
     first, second = order[0::2], order[1::2]
     disagree = directed[first, 0] == directed[second, 0]
     a, b = first // 3, second // 3
@@ -222,41 +233,43 @@ def orient_consistently(triangles: Indices, table: EdgeTable, source: str) -> tu
         raise MeshError(f"{source} has one side only, like a Moebius strip; it encloses no body.")
     _, shell = np.unique(np.minimum(as_given, turned), return_inverse=True)
     flip = turned < as_given
-    # Of the two ways to make a part consistent take the one that turns fewer triangles.
+    # of the two consistent orientations of a part the one that turns fewer triangles
     size, flips = np.bincount(shell), np.bincount(shell, weights=flip)
     flip ^= (2 * flips > size)[shell]
     return _flipped(triangles, flip), shell, int(flip.sum())
 
 
 def _flipped(triangles: Indices, which: Mask) -> Indices:
+    """Triangles (k, 3), the marked ones with reversed orientation."""
     return np.where(which[:, None], triangles[:, ::-1], triangles)
 
 
-def _outwards(points: Points, triangles: Indices, shell: Indices, source: str) -> tuple[Indices, list[list[int]], int]:
-    """Triangles with normals out of the material; for each body its outer shell and its cavities; shells turned."""
+def _orient_outwards(
+    points: Points, triangles: Indices, shell: Indices, source: str
+) -> tuple[Indices, list[list[int]], int]:
+    """Triangles with normals out of the material; shells of each body, the outer first; number of turned shells."""
     volumes = np.bincount(shell, weights=enclosed_volumes(points, triangles))
-    holders = _holders(points, triangles, shell, source)
-    depth = holders.sum(axis=1)
+    inside = _nesting(points, triangles, shell, source)
+    depth = inside.sum(axis=1)
     wrong = (volumes > 0) != (depth % 2 == 0)
-    bodies = [[int(outer), *_cavities(outer, holders, depth)] for outer in np.flatnonzero(depth % 2 == 0)]
+    bodies = [[int(outer), *_cavities(outer, inside, depth)] for outer in np.flatnonzero(depth % 2 == 0)]
     return _flipped(triangles, wrong[shell]), bodies, int(wrong.sum())
 
 
-def _cavities(outer: np.int64, holders: Mask, depth: Indices) -> list[int]:
-    inside = holders[:, outer] & (depth == depth[outer] + 1)
-    return [int(shell) for shell in np.flatnonzero(inside)]
+def _cavities(outer: np.int64, inside: Mask, depth: Indices) -> list[int]:
+    """Shells directly within an outer shell; `inside` as of `_nesting`, `depth`: number of shells around each."""
+    return [int(shell) for shell in np.flatnonzero(inside[:, outer] & (depth == depth[outer] + 1))]
 
 
-def _holders(points: Points, triangles: Indices, shell: Indices, source: str) -> Mask:
-    """Whether shell i lies inside shell j: (s, s). Where only some of its points do, the two cut each other."""
+def _nesting(points: Points, triangles: Indices, shell: Indices, source: str) -> Mask:
+    """(s, s) whether shell i lies inside shell j; MeshError if only some of its points do."""
     count = int(shell.max()) + 1
     inside = np.zeros((count, count), bool)
     if count == 1:
         return inside
     corners = [points[triangles[shell == j]] for j in range(count)]
-    for i, j in _near(corners):
-        probes = np.unique(corners[i].reshape(-1, 3), axis=0)
-        within = abs(winding_numbers(probes[:: 1 + len(probes) // PROBES], corners[j])) > 0.5
+    for i, j in _overlapping_boxes(corners):
+        within = probes_inside(np.unique(corners[i].reshape(-1, 3), axis=0), corners[j])
         if within.any() and not within.all():
             raise RepairableSurfaceError(
                 f"{source} has parts that cut each other, near "
@@ -267,7 +280,7 @@ def _holders(points: Points, triangles: Indices, shell: Indices, source: str) ->
     return inside
 
 
-def _near(corners: list[Floats]) -> list[tuple[int, int]]:
+def _overlapping_boxes(corners: list[Floats]) -> list[tuple[int, int]]:
     """Pairs of different shells whose bounding boxes overlap."""
     low = np.array([c.min(axis=(0, 1)) for c in corners])
     high = np.array([c.max(axis=(0, 1)) for c in corners])

@@ -1,4 +1,4 @@
-"""Triangles of even size on the zero level of a function, for bodies that are given by how deep a point lies in them.
+"""Triangles of even size on the zero level of a depth function.
 
 The body-centred lattice and the snapping of its nodes are those of Labelle and Shewchuk, Isosurface stuffing (SIGGRAPH
 2007); of its tetrahedra only the cut surface is taken, which gmsh then fills.
@@ -7,6 +7,7 @@ The body-centred lattice and the snapping of its nodes are those of Labelle and 
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -16,39 +17,51 @@ from ..topology import Floats, Mask, distinct_rows, edges_of
 # (n, 3) points -> depth (n,) [m], positive inside, and its gradient (n, 3)
 Depth = Callable[[Points], tuple[Floats, Floats]]
 
-SNAP = 0.35  # a node whose edge is cut nearer to it than this share of the edge is moved onto the surface
-SPACING = 1.25  # lattice constant over the median edge of the triangles (measured on spheres)
-ROUNDS = 4  # of evening out
+
+@dataclass(frozen=True)
+class LatticeSettings:
+    """Settings of the surface from a lattice."""
+
+    spacing: float = 1.25  # lattice constant over the median edge of the triangles (measured on spheres)
+    snap: float = 0.35  # share of an edge: a node whose edge is cut nearer to it is moved onto the surface
+    smoothing_steps: int = 4
+    newton_steps: int = 4  # of a projection onto the surface
+
+
+LATTICE = LatticeSettings()
 
 
 def level_surface(depth: Depth, low: Floats, high: Floats, h: float) -> tuple[Points, Indices]:
-    """Points on the surface depth = 0 within the box and triangles between them, closed, with edges of about h [m]."""
-    nodes, tets = _lattice(low, high, SPACING * h)
+    """Points and triangles of the closed surface depth = 0 in the box from `low` to `high`, with edges near h [m]."""
+    nodes, tets = _lattice(low, high, LATTICE.spacing * h)
     value = depth(nodes)[0]
-    near = _too_near(value, edges_of(tets[_meets(value, tets)]))
+    near = _nodes_to_snap(value, edges_of(tets[_is_cut(value, tets)]))
     nodes[near] = _projected(depth, nodes[near])
     value[near] = 0.0
-    corners = _cut(np.sign(value).astype(np.int64), tets[_meets(value, tets)])
+    corners = _cut(np.sign(value).astype(np.int64), tets[_is_cut(value, tets)])
     pairs, _, triangles = distinct_rows(corners.reshape(-1, 2))
     first, second = pairs.T
     share = np.where(first == second, 0.0, value[first] / np.where(first == second, 1.0, value[first] - value[second]))
     points = _projected(depth, nodes[first] + share[:, None] * (nodes[second] - nodes[first]))
-    return _evened(depth, points, _single(triangles.reshape(-1, 3)))
+    return _smoothed(depth, points, _without_sheets(triangles.reshape(-1, 3)))
 
 
-def _meets(value: Floats, tets: Indices) -> Mask:
-    """Tetrahedra that the surface cuts or touches."""
+def _is_cut(value: Floats, tets: Indices) -> Mask:
+    """Whether the surface cuts or touches each tetrahedron."""
     return np.asarray((value[tets].max(axis=1) >= 0) & (value[tets].min(axis=1) <= 0))
 
 
 def _lattice(low: Floats, high: Floats, step: float) -> tuple[Points, Indices]:
-    """Corners and centres of cubes around the box, and tetrahedra of two neighbouring centres and an edge between."""
+    """Nodes and tetrahedra of the body-centred lattice around the box.
+
+    Nodes are corners and centres of cubes; a tetrahedron has two neighbouring centres and an edge between them.
+    """
     count = np.ceil((high - low) / step).astype(int) + 4
     origin = (low + high) / 2 - step * count / 2
     corner = np.arange(np.prod(count + 1)).reshape(count + 1)
     centre = np.arange(np.prod(count)).reshape(count) + corner.size
-    positions = [np.indices(shape).reshape(3, -1).T for shape in (tuple(count + 1), tuple(count))]
-    nodes = origin + step * np.concatenate([positions[0], positions[1] + 0.5])
+    corners, centres = (np.indices(shape).reshape(3, -1).T for shape in (tuple(count + 1), tuple(count)))
+    nodes = origin + step * np.concatenate([corners, centres + 0.5])
     tets = []
     for axis in range(3):
         cells, faces = np.moveaxis(centre, axis, 0), np.moveaxis(corner, axis, 0)[1:-1]
@@ -58,21 +71,22 @@ def _lattice(low: Floats, high: Floats, step: float) -> tuple[Points, Indices]:
     return nodes, np.concatenate(tets)
 
 
-def _too_near(value: Floats, edges: Indices) -> Indices:
-    """Nodes beside which an edge is cut."""
+def _nodes_to_snap(value: Floats, edges: Indices) -> Indices:
+    """Nodes on the surface, or with an edge that is cut near to them."""
     a, b = value[edges].T
     cut = a * b < 0
     edges, a, b = edges[cut], a[cut], b[cut]
     share = a / (a - b)
-    return np.unique(np.concatenate([edges[share < SNAP, 0], edges[share > 1 - SNAP, 1], np.flatnonzero(value == 0)]))
+    near = [edges[share < LATTICE.snap, 0], edges[share > 1 - LATTICE.snap, 1]]
+    return np.unique(np.concatenate([*near, np.flatnonzero(value == 0)]))
 
 
 def _cut(sign: Indices, tets: Indices) -> Indices:
-    """Triangles (k, 3, 2) where the tetrahedra are cut; a corner is the pair of nodes between which it lies.
+    """(k, 3, 2) triangles at which tetrahedra are cut; a corner is the pair of nodes between which it lies.
 
-    A node on the surface is the pair of itself. Faces that lie on the surface count for the cell inside, once.
+    A node on the surface is paired with itself. A face on the surface counts for the tetrahedron inside.
     """
-    result = []
+    cuts = []
     patterns, which = np.unique(sign[tets], axis=0, return_inverse=True)
     for number, pattern in enumerate(patterns):
         inside, on, outside = ([int(i) for i in np.flatnonzero(pattern == s)] for s in (1, 0, -1))
@@ -82,29 +96,29 @@ def _cut(sign: Indices, tets: Indices) -> Indices:
         if len(inside) == len(outside) == 2:
             ring[2], ring[3] = ring[3], ring[2]
         fan = [(ring[0], ring[k], ring[k + 1]) for k in range(1, len(ring) - 1)]
-        result.append(tets[which.ravel() == number][:, np.array(fan)].reshape(-1, 3, 2))
-    return np.sort(np.concatenate(result), axis=2)
+        cuts.append(tets[which.ravel() == number][:, np.array(fan)].reshape(-1, 3, 2))
+    return np.sort(np.concatenate(cuts), axis=2)
 
 
-def _single(triangles: Indices) -> Indices:
-    """Without those that occur twice, from both sides: the body has no thickness there."""
+def _without_sheets(triangles: Indices) -> Indices:
+    """Triangles without those that occur twice, from both sides, where the body has no thickness."""
     _, counts, inverse = distinct_rows(np.sort(triangles, axis=1))
     return triangles[counts[inverse] == 1]
 
 
 def _projected(depth: Depth, points: Points) -> Points:
-    """Points moved onto the surface along the gradient (Newton)."""
-    for _ in range(4):
+    """Points moved onto the surface along the gradient, by Newton's method."""
+    for _ in range(LATTICE.newton_steps):
         value, gradient = depth(points)
         points = points - (value / np.einsum("ni,ni->n", gradient, gradient))[:, None] * gradient
     return points
 
 
-def _evened(depth: Depth, points: Points, triangles: Indices) -> tuple[Points, Indices]:
-    """Each point moved half-way to the mean of its neighbours and back to the surface, a few times."""
+def _smoothed(depth: Depth, points: Points, triangles: Indices) -> tuple[Points, Indices]:
+    """The surface with points moved half-way to the mean of their neighbours and back to the surface, a few times."""
     edges = np.concatenate([pairs := edges_of(triangles), pairs[:, ::-1]])
     degree = np.bincount(edges[:, 0], minlength=len(points))[:, None]
-    for _ in range(ROUNDS):
+    for _ in range(LATTICE.smoothing_steps):
         sums = np.stack([np.bincount(edges[:, 0], column, len(points)) for column in points[edges[:, 1]].T], axis=1)
         points = _projected(depth, (points + sums / degree) / 2)
     return points, triangles

@@ -1,4 +1,4 @@
-"""Pairs of triangles of a surface that pass through one another.
+"""Pairs of triangles of a surface that intersect.
 
 A tree of bounding boxes finds the pairs that are near. Triangles with a common edge cannot pass through one another,
 nor can those with one common node whose triangles lie around it like a graph over a plane: only the other pairs, a few
@@ -8,19 +8,30 @@ of a smooth surface, are tested exactly.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..data import Indices, MeshError, Points
 from ..topology import Floats, Mask
 
-TOUCHING = 1e-6  # share of the surface's size; an edge that reaches less far beyond a triangle touches it only
-MARGIN = 1e-9  # of the coordinates within a triangle: what passes nearer to its boundary
-AT_ONCE = 500_000  # pairs of boxes or triangles
-# pairs of boxes and triangles that are compared, at least and for each triangle: a sphere of 1.3 million takes 35 each
-MAX_PAIRS, MAX_PAIRS_EACH = 100_000_000, 1000
-MAX_STEP = 2**20 - 4  # steps of coordinates along the longest side, so that three of them fit into one integer
-GUARDS = 1 << 20 | 1 << 41 | 1 << 62  # bits above the steps of three axes
+
+@dataclass(frozen=True)
+class CrossingLimits:
+    """Tolerances of the test whether triangles intersect, and bounds of the search."""
+
+    touching: float = 1e-6  # over the size of the surface: an edge that reaches less far beyond a triangle touches it
+    margin: float = 1e-9  # of barycentric coordinates: an edge that passes nearer to the boundary counts if `closed`
+    min_cosine: float = 0.1  # between the normals of a node and of its triangles, which are a graph over a plane then
+    batch: int = 500_000  # pairs of boxes that are compared at once
+    max_pairs: int = 100_000_000  # compared pairs of boxes and triangles: this many, or
+    max_pairs_per_triangle: int = 1000  # so many for each triangle (a sphere of 1.3 million triangles takes 35)
+
+
+CROSSING = CrossingLimits()
+MAX_STEP = 2**20 - 4  # integer coordinate at the end of the longest side: three of 21 bits fit into one integer
+GUARDS = 1 << 20 | 1 << 41 | 1 << 62  # the highest of the 21 bits of each axis, which is free
+# shift and mask of each step that inserts two zeros between the bits of a number
 _SPREADING = (
     (32, 0x1F00000000FFFF),
     (16, 0x1F0000FF0000FF),
@@ -28,34 +39,37 @@ _SPREADING = (
     (4, 0x10C30C30C30C30C3),
     (2, 0x1249249249249249),
 )
-MIN_COSINE = 0.1  # of the angle between the normals of a node and of its triangles, that these form a graph
-MAX_CODE = 2**40  # of random numbers of nodes, so that sums of some thousand of them are exact
 
 
 def crossing_triangles(points: Points, triangles: Indices, *, closed: bool = False) -> Indices:
-    """Pairs of triangles, the lower number first, of which an edge of one passes through the other: (k, 2).
+    """(k, 2) pairs of triangles, the lower number first, such that an edge of one passes through the other.
 
-    An edge through the boundary of a triangle counts where `closed`. Triangles in one plane are not found.
+    Intersections within one plane are not found.
+
+    Args:
+        points: (n, 3) [m].
+        triangles: (k, 3).
+        closed: whether an edge through the boundary of a triangle counts.
 
     Raises:
         MeshError: so many triangles are near one another that the search would take too long.
     """
     if len(triangles) < 2:
         return np.zeros((0, 2), np.int64)
-    order = _along_curve(sum(points[column] for column in triangles.T) / 3)
-    triangles = triangles[order]  # those that are near in space are near in memory
+    order = _order_along_curve(sum(points[column] for column in triangles.T) / 3)
+    triangles = triangles[order]  # neighbours in space are neighbours in memory
     corners = points[triangles]
     low = np.minimum(np.minimum(corners[:, 0], corners[:, 1]), corners[:, 2])
     high = np.maximum(np.maximum(corners[:, 0], corners[:, 1]), corners[:, 2])
-    tolerance = TOUCHING * float((high.max(axis=0) - low.min(axis=0)).max())
+    tolerance = CROSSING.touching * float((high.max(axis=0) - low.min(axis=0)).max())
     graph = _graph_nodes(corners, triangles, len(points))
     columns = np.ascontiguousarray(triangles.T)
-    result: list[Indices] = [np.zeros((0, 2), np.int64)]
+    crossings: list[Indices] = [np.zeros((0, 2), np.int64)]
     for first, second in _near_pairs(low, high):
         pairs = np.stack(_without_neighbours(columns, first, second, graph), axis=1)
-        crossed = _crossed(points, triangles, pairs, tolerance, -MARGIN if closed else MARGIN)
-        result.append(np.sort(order[pairs[crossed]], axis=1))
-    pairs = np.concatenate(result)
+        crossed = _crossed(points, triangles, pairs, tolerance, -CROSSING.margin if closed else CROSSING.margin)
+        crossings.append(np.sort(order[pairs[crossed]], axis=1))
+    pairs = np.concatenate(crossings)
     return pairs[np.lexsort(pairs.T[::-1])]
 
 
@@ -63,9 +77,14 @@ def crossing_triangles(points: Points, triangles: Indices, *, closed: bool = Fal
 
 
 def _near_pairs(low: Points, high: Points) -> Iterator[tuple[Indices, Indices]]:
-    """Pairs of triangles whose bounding boxes (n, 3) overlap, each pair once, some at a time. MeshError: see above.
+    """Pairs of triangles whose bounding boxes overlap, each pair once, in batches.
 
-    Triangles that are near in space have to be near in the list.
+    Args:
+        low: (n, 3) lower corners of the boxes; boxes that are near in space should be near in the list.
+        high: (n, 3) upper corners.
+
+    Raises:
+        MeshError: too many boxes overlap.
     """
     levels = _box_tree(low, high)
     # pairs of boxes at a level whose children are to be compared; None: each box with itself
@@ -74,14 +93,14 @@ def _near_pairs(low: Points, high: Points) -> Iterator[tuple[Indices, Indices]]:
     ]
     compared = 0
     while stack:
-        if compared >= max(MAX_PAIRS, MAX_PAIRS_EACH * len(low)):
+        if compared >= max(CROSSING.max_pairs, CROSSING.max_pairs_per_triangle * len(low)):
             raise MeshError(
                 f"The surface of {len(low)} triangles was not searched to the end for triangles that pass "
                 "through one another: too many are near each other. Remove doubled parts, or make the surface "
                 "coarser, for example in MeshLab: Filters > Remeshing > Quadric Edge Collapse Decimation."
             )
         depth, first, partner = stack.pop()
-        if len(first) > AT_ONCE:
+        if len(first) > CROSSING.batch:
             half = len(first) // 2
             stack += [(depth, first[:half], None if partner is None else partner[:half])]
             stack += [(depth, first[half:], None if partner is None else partner[half:])]
@@ -92,7 +111,7 @@ def _near_pairs(low: Points, high: Points) -> Iterator[tuple[Indices, Indices]]:
         children: list[tuple[Indices, Indices]] = []
         for i, j in ((0, 1),) if partner is None else ((0, 0), (0, 1), (1, 0), (1, 1)):
             compared += len(first)
-            # a guard bit is left where the upper bound is no less than the lower one
+            # a guard bit stays if the upper bound is not below the lower one
             above = (high_second[:, j] - low_first[:, i]) & (high_first[:, i] - low_second[:, j])
             near = above & GUARDS == GUARDS
             children.append((2 * first[near] + i, 2 * second[near] + j))
@@ -103,13 +122,12 @@ def _near_pairs(low: Points, high: Points) -> Iterator[tuple[Indices, Indices]]:
             stack.append((depth + 1, first, second))
 
 
-def _along_curve(middles: Points) -> Indices:
-    """The order of points (n, 3) along a Z curve through their bounding box (G. M. Morton 1966)."""
+def _order_along_curve(middles: Points) -> Indices:
+    """(n,) order of points (n, 3) along a Z curve through their bounding box (G. M. Morton 1966)."""
     low = middles.min(axis=0)
     steps = _steps(middles, low, float((middles.max(axis=0) - low).max()))
     code = np.zeros(len(middles), np.int64)
     for axis in range(3):
-        # two bits of zero are put between each two bits
         spread: Indices = steps[:, axis]
         for shift, mask in _SPREADING:
             spread = (spread | spread << shift) & mask
@@ -118,15 +136,15 @@ def _along_curve(middles: Points) -> Indices:
 
 
 def _steps(points: Points, low: Floats, size: float) -> Indices:
-    """Coordinates of points (n, 3) from `low` on as whole numbers, MAX_STEP for `size`."""
+    """(n, 3) coordinates from `low` on as integers, MAX_STEP for a length of `size` [m]."""
     return ((points - low) * (MAX_STEP / max(size, np.finfo(float).tiny))).astype(np.int64)
 
 
 def _box_tree(low: Points, high: Points) -> list[tuple[Indices, Indices]]:
-    """Lower and upper bounds (boxes,) of each level from the root: boxes 2 i and 2 i + 1 are in box i.
+    """Lower and upper bounds (boxes,) of each level of a tree from the root on; box i holds boxes 2 i and 2 i + 1.
 
-    The last level has the boxes given (n, 3), and empty ones that make it a power of two. The bounds of the three axes,
-    rounded outwards to steps, stand in one integer, guard bits in the upper one.
+    The last level consists of the given boxes (n, 3) and of empty ones up to a power of two. The bounds of three axes,
+    rounded outwards to integers, are packed into one integer, with guard bits in the upper one.
     """
     origin = low.min(axis=0)
     size = float((high.max(axis=0) - origin).max())
@@ -144,7 +162,7 @@ def _box_tree(low: Points, high: Points) -> list[tuple[Indices, Indices]]:
 
 
 def _packed(steps: Indices) -> Indices:
-    """(n,) the numbers of three axes (3, n), each in 21 bits, of which the highest is free."""
+    """(n,) integers of three axes (3, n), packed into 21 bits each, the highest of which is free."""
     return np.asarray(steps[0] | steps[1] << 21 | steps[2] << 42)
 
 
@@ -152,11 +170,15 @@ def _packed(steps: Indices) -> Indices:
 
 
 def _without_neighbours(corners: Indices, first: Indices, second: Indices, graph: Mask) -> tuple[Indices, Indices]:
-    """Pairs of triangles but for those with a common edge, or with one common node that is a `graph` node.
+    """Pairs of triangles without those that have a common edge, or one common node of `graph`.
 
-    Two triangles with a common edge meet there and, if they lie in one plane, in an area: no edge of one passes
-    through the other. `corners`: (3, n) nodes of the triangles.
+    Args:
+        corners: (3, n) nodes of the triangles.
+        first: of each pair.
+        second: of each pair.
+        graph: (nodes,) result of `_graph_nodes`.
     """
+    # triangles with a common edge meet there and, if they lie in one plane, in an area: no edge passes through
     of_first, of_second = ([column[number] for column in corners] for number in (first, second))
     common = [(node == of_second[0]) | (node == of_second[1]) | (node == of_second[2]) for node in of_first]
     count = np.sum(common, axis=0, dtype=np.int8)
@@ -166,25 +188,31 @@ def _without_neighbours(corners: Indices, first: Indices, second: Indices, graph
 
 
 def _graph_nodes(corners: Floats, triangles: Indices, count: int) -> Mask:
-    """(count,) the nodes around which the triangles (n, 3), with corners (n, 3, 3), lie like a graph over a plane.
+    """(count,) whether the triangles around each node are a graph over a plane.
 
-    The triangles of a node go once around it, and all their normals point to one side of the plane: the projection on
-    the plane is one to one, so that the triangles meet in common edges and in the node only.
+    They go once around the node, and all their normals point to one side of the plane. The projection on the plane is
+    one to one, so that the triangles meet in common edges and in the node only.
+
+    Args:
+        corners: (n, 3, 3) coordinates.
+        triangles: (n, 3) nodes.
+        count: number of nodes.
     """
     normals = _unit_normals(corners)
     normal = np.stack([sum(np.bincount(column, part, count) for column in triangles.T) for part in normals.T], axis=1)
     length = np.linalg.norm(normal, axis=1)
-    # a direction in the plane: across the normal
+    # a direction in the plane, normal to the mean normal
     x, y, z = normal.T
     zero = np.zeros(count)
     across = np.where(np.abs(x) > 0.9 * length, [z, zero, -x], [zero, z, -y]).T
-    code = np.random.default_rng(1).integers(MAX_CODE, size=count).astype(np.float64)[triangles]
+    # random numbers of the nodes, so small that sums of some thousand of them are exact
+    code = np.random.default_rng(1).integers(2**40, size=count).astype(np.float64)[triangles]
     turns, open_ends, turned = np.zeros(count), np.zeros(count), np.zeros(count)
     for corner in range(3):
         node, after, before = (triangles[:, corner], (corner + 1) % 3, (corner + 2) % 3)
-        aligned = np.einsum("ki,ki->k", normals, normal[node]) > MIN_COSINE * length[node]
+        aligned = np.einsum("ki,ki->k", normals, normal[node]) > CROSSING.min_cosine * length[node]
         turned += np.bincount(node, ~aligned, count)
-        # once around: the direction is passed upwards once; of an open fan the first and last node do not cancel out
+        # once around: the direction is passed upwards once; the first and last node of an open fan do not cancel
         direction = across[node]
         height = np.einsum("kci,ki->kc", corners[:, [after, before]] - corners[:, [corner]], direction)
         turns += np.bincount(node, (height[:, 0] < 0) & (height[:, 1] >= 0), count)
@@ -199,7 +227,7 @@ def _crossed(points: Points, triangles: Indices, pairs: Indices, tolerance: floa
     """(k,) whether an edge of one triangle of each pair passes through the other."""
     crossed = np.zeros(len(pairs), bool)
     reaching = np.zeros(len(pairs), bool)
-    for first, second in ((0, 1), (1, 0)):  # to both sides of the other's plane: few neighbours do
+    for first, second in ((0, 1), (1, 0)):  # few neighbours have nodes on both sides of the other's plane
         heights = _heights(points[triangles[pairs[:, first]]], points[triangles[pairs[:, second]]])
         reaching |= (heights.min(axis=1) < -tolerance) & (heights.max(axis=1) > tolerance)
     straddling = np.flatnonzero(reaching)
@@ -213,12 +241,12 @@ def _crossed(points: Points, triangles: Indices, pairs: Indices, tolerance: floa
 
 
 def _heights(x: Floats, faces: Floats) -> Floats:
-    """(k, e) of points (k, e, 3) over the planes of triangles (k, 3, 3)."""
+    """(k, e) heights of points (k, e, 3) above the planes of triangles (k, 3, 3)."""
     return np.asarray(np.einsum("kei,ki->ke", x - faces[:, :1], _unit_normals(faces)))
 
 
 def _unit_normals(faces: Floats) -> Floats:
-    """(k, 3) of triangles (k, 3, 3); zero where they have no area."""
+    """(k, 3) unit normals of triangles (k, 3, 3); zero of those without area."""
     a, b, c = faces.transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     return np.asarray(normal / np.maximum(np.linalg.norm(normal, axis=1), np.finfo(float).tiny)[:, None])
