@@ -34,7 +34,9 @@ def read_abaqus(path: Path) -> MeshFileContents:
     notes = [*deck.notes, *assembly.notes]
     cells = _cell_sets(assembly, resolver, notes)
     point_sets = {
-        name: np.unique(np.concatenate([resolver.members(instance, "node_sets", own) for instance, own in holders]))
+        name: np.unique(
+            np.concatenate([resolver.members(instance, "node_sets", set_name) for instance, set_name in holders])
+        )
         for name, holders in resolver.published("node_sets", notes)
     }
     notes += _unused_elements(assembly, cells)
@@ -55,7 +57,7 @@ def _cell_sets(assembly: Assembly, resolver: SetResolver, notes: list[str]) -> d
     cells = {}
     for name, holders in resolver.published("element_sets", notes):
         members = np.unique(
-            np.concatenate([resolver.members(instance, "element_sets", own) for instance, own in holders])
+            np.concatenate([resolver.members(instance, "element_sets", set_name) for instance, set_name in holders])
         )
         cells[name] = members[attached[members]]
     bodies = [instance for instance in assembly.instances if instance.name and instance.mesh.cells]
@@ -73,8 +75,8 @@ def _surfaces(
     empty = []
     for name, holders in resolver.published("surfaces", notes):
         is_used = False
-        for instance, own in holders:
-            rows, nodes = resolver.facets(instance, own)
+        for instance, set_name in holders:
+            rows, nodes = resolver.facets(instance, set_name)
             rows = [row for row in rows if len(row) and (row.shape[1] == 2) == (assembly.dim == 2)]
             facets.setdefault(name, []).extend(rows)
             if len(nodes):

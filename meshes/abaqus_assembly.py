@@ -68,10 +68,9 @@ class Instance:
 
     def members(self, entry: SetEntry, nodes: bool) -> tuple[Indices, int]:
         """Nodes, or cells, of an entry of numbers or of a range, and how many of its members are not in the file."""
-        if nodes:
-            ids, indices = self.mesh.node_ids, self.first_node + np.arange(len(self.mesh.node_ids))
-        else:
-            ids, indices = self.elements
+        ids, indices = (
+            (self.mesh.node_ids, self.first_node + np.arange(len(self.mesh.node_ids))) if nodes else self.elements
+        )
         unused = NO_INDICES if nodes else self.unused_ids
         if entry.span is not None:
             first, last, step = entry.span
@@ -81,9 +80,9 @@ class Instance:
             in_range = (unused >= first) & (unused <= last) & ((unused - first) % step == 0)
             return indices[begin:end][inside], max(0, count - int(in_range.sum()))
         assert entry.numbers is not None
-        at = positions_of(ids, entry.numbers)
-        lost = entry.numbers[at < 0]
-        return indices[at[at >= 0]], len(lost) - int(np.isin(lost, unused).sum())
+        index = positions_of(ids, entry.numbers)
+        lost = entry.numbers[index < 0]
+        return indices[index[index >= 0]], len(lost) - int(np.isin(lost, unused).sum())
 
 
 class Assembly:
@@ -116,7 +115,7 @@ class Assembly:
                     self.cell_count += len(instance.mesh.cells[kind][0])
         self.blocks = {
             kind: np.concatenate(
-                [each.first_node + each.mesh.cells[kind][1] for each in self.instances if kind in each.mesh.cells]
+                [part.first_node + part.mesh.cells[kind][1] for part in self.instances if kind in part.mesh.cells]
             )
             for kind in self.kinds
         }

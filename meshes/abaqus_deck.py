@@ -99,6 +99,7 @@ class KeywordBlock:
         return fast if fast is not None else self._numbers_by_field(kind)
 
     def _numbers_by_field(self, kind: type[np.int64] | type[np.float64]) -> tuple[npt.NDArray[Any], Indices]:
+        """The result of `numbers`; MeshError names the line of a field that holds no number."""
         values: list[float] = []
         ends = []
         for i, fields in enumerate(self.lines()):
@@ -114,6 +115,7 @@ class KeywordBlock:
 
 def parse_number(text: str, kind: type[np.int64] | type[np.float64]) -> float | None:
     """The number that a field holds, or None."""
+    # Python takes other digits and underscores for numbers, which Abaqus does not
     try:
         if kind is np.int64:
             value = int(text) if text.isascii() and "_" not in text else None
@@ -130,6 +132,7 @@ def _numbers_at_once(text: bytes, kind: type[Any]) -> tuple[npt.NDArray[Any], In
         compact = compact.replace(b"\n\n", b"\n")
     if not compact:
         return np.zeros(0, kind), np.zeros(0, np.int64)
+    # NumPy would pass over an empty field
     if b",," in compact or b"\n," in compact or compact.startswith(b","):
         return None
     try:
@@ -138,6 +141,7 @@ def _numbers_at_once(text: bytes, kind: type[Any]) -> tuple[npt.NDArray[Any], In
             values = np.fromstring(text.translate(_SEPARATORS_TO_BLANKS), sep=" ", dtype=kind)
     except (ValueError, OverflowError, DeprecationWarning):  # a field holds something else
         return None
+    # fields up to the end of each line: its commas and those before, one more for each line without a comma at its end
     symbols = np.frombuffer(compact + b"\n", np.uint8)
     line_ends = np.flatnonzero(symbols == ord("\n"))
     separators = symbols == ord(",")
@@ -182,10 +186,12 @@ def keyword_blocks(path: Path) -> list[KeywordBlock]:
 
 
 def _source(path: Path) -> SourceText:
+    """The text of a file, in UTF-8 and with line feeds; MeshError if it is not text."""
     try:
         text = path.read_bytes()
     except OSError as error:
         raise MeshError(f"Mesh file '{path}' cannot be read: {error.strerror}.") from None
+    # some Windows programs write UTF-16 or a byte order mark
     if text.startswith((b"\xff\xfe", b"\xfe\xff")):
         text = text.decode("utf-16", errors="replace").encode()
     text = text.removeprefix(b"\xef\xbb\xbf")
@@ -206,18 +212,18 @@ class _DeckReader:
 
     def read(self, source: SourceText) -> None:
         """Append the keyword blocks of a text."""
-        text, data, at = source.text, 0, 0  # offsets of the data lines that are not added yet, and of what is not read
-        while (star := text.find(b"*", at)) >= 0:
+        text, data, unread = source.text, 0, 0  # offsets of data lines that are not added yet, and of text not read yet
+        while (star := text.find(b"*", unread)) >= 0:
             begin = text.rfind(b"\n", 0, star) + 1
             if text[begin:star].strip():
-                at = _line_end(text, star)  # the star stands within a line
+                unread = _line_end(text, star)  # the star stands within a line
                 continue
             self._add_data(source, data, begin)
             if text[star : star + 2] == b"**":
-                data = at = _line_end(text, star)
+                data = unread = _line_end(text, star)
                 continue
             words, data = _keyword_words(source, star)
-            at = data
+            unread = data
             self._add_keyword(_block(words, source, star))
         self._add_data(source, data, len(text))
 
@@ -263,8 +269,8 @@ class _DeckReader:
         if wrong:
             block.refuse(f"*{block.keyword} names the file '{name}', which {wrong}.")
         self._included += 1
-        if self._included > (most := 1000):
-            block.refuse(f"more than {most} files are included; put the mesh into one file.")
+        if self._included > (limit := 1000):
+            block.refuse(f"more than {limit} files are included; put the mesh into one file.")
         return _source(path)
 
 

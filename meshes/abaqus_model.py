@@ -174,25 +174,28 @@ class Deck:
             if label_key(part) not in self.parts:
                 block.refuse(
                     f"instance '{name}' is of the part '{part}', which the file does not define before it (parts: "
-                    f"{list_some(each.name for each in self.parts.values())}). An instance from an earlier analysis "
+                    f"{list_some(part.name for part in self.parts.values())}). An instance from an earlier analysis "
                     "cannot be read; export the whole model."
                 )
             self.instances[label_key(name)] = component, label_key(part), block
         self._open.append((block, component))
 
     def _end(self, block: KeywordBlock) -> None:
+        """*END PART, *END INSTANCE or *END ASSEMBLY."""
         kind = block.keyword.removeprefix("END")
         if not self._open or self._open[-1][0].keyword != kind:
             block.refuse(f"*END {kind} stands without *{kind}; the file is damaged. Export it again.")
         self._open.pop()
 
     def _nodes(self, block: KeywordBlock) -> None:
+        """*NODE."""
         if block.parameters.get("SYSTEM", "R").upper() != "R":
             block.refuse("*NODE, SYSTEM= with cylindrical or spherical coordinates; write x, y, z.")
         block.check_ended()
         values, ends = block.numbers(np.float64)
         counts = np.diff(ends, prepend=0)
         width = int(counts[0]) if len(counts) else 4
+        # a number and two or three coordinates, which up to three direction cosines of a normal may follow
         wrong = (counts != width) & ~((counts > 3) & (counts < 8) & (width > 3)) | (counts < 3) | (counts > 7)
         if wrong.any():
             line = int(np.flatnonzero(wrong)[0])
@@ -220,6 +223,7 @@ class Deck:
             _named(sets, name).entries.append(SetEntry(block, numbers=ids))
 
     def _elements(self, block: KeywordBlock) -> None:
+        """*ELEMENT."""
         element_type = "".join(block.parameters.get("TYPE", "").upper().split())
         if not element_type:
             block.refuse(f"*ELEMENT has no type; write *ELEMENT, TYPE=C3D4. Supported are {SUPPORTED}.")
@@ -255,6 +259,7 @@ class Deck:
         return self._scope.unused_ids[-1]
 
     def _set(self, block: KeywordBlock) -> None:
+        """*NSET or *ELSET."""
         parameters = block.parameters
         name = parameters.get(block.keyword, "")
         if not name:
@@ -286,6 +291,7 @@ class Deck:
             entries.append(SetEntry(block, numbers=np.array(numbers, np.int64), instance=instance))
 
     def _surface(self, block: KeywordBlock) -> None:
+        """*SURFACE."""
         name, kind = block.parameters.get("NAME", ""), block.parameters.get("TYPE", "ELEMENT").upper()
         if not name:
             block.refuse("*SURFACE has no name; write *SURFACE, TYPE=ELEMENT, NAME=top.")
@@ -312,6 +318,7 @@ class Deck:
 
 
 def _named(sets: dict[str, NamedSet], name: str, internal: bool = False) -> NamedSet:
+    """The set of a name, which is created if it does not exist."""
     return sets.setdefault(label_key(name), NamedSet(" ".join(name.split()), internal))
 
 
@@ -319,9 +326,10 @@ def _element_rows(block: KeywordBlock, element_type: str, nodes: int) -> Indices
     """Element numbers and their nodes, (m, nodes + 1); an element may run over several lines."""
     values, ends = block.numbers(np.int64)
     width = nodes + 1
-    wanted = np.arange(width, (len(values) // width) * width + 1, width)
-    position = np.searchsorted(ends, wanted)
-    aligned = ends[np.minimum(position, len(ends) - 1)] == wanted if len(ends) else np.zeros(0, bool)
+    # an element may continue on other lines, but has to end where a line ends
+    element_ends = np.arange(width, (len(values) // width) * width + 1, width)
+    last_line = np.searchsorted(ends, element_ends)
+    aligned = ends[np.minimum(last_line, len(ends) - 1)] == element_ends if len(ends) else np.zeros(0, bool)
     if len(values) % width or not aligned.all():
         first = int(np.flatnonzero(~aligned)[0]) if not aligned.all() else len(aligned)
         line = int(np.searchsorted(ends, first * width, side="right"))
@@ -335,6 +343,6 @@ def _element_rows(block: KeywordBlock, element_type: str, nodes: int) -> Indices
     if (bad := rows.min(axis=1, initial=1) < 1).any():
         block.refuse(
             f"element {rows[bad.argmax(), 0]} has a number below 1; numbers of elements and nodes begin with 1.",
-            int(position[bad.argmax()]),
+            int(last_line[bad.argmax()]),
         )
     return rows

@@ -80,7 +80,7 @@ class SetResolver:
         if entry.instance:
             target = self.assembly.instance(entry.instance)
             if instance.name or target is None:
-                names = (each.name for each in self.assembly.instances if each.name)
+                names = (candidate.name for candidate in self.assembly.instances if candidate.name)
                 entry.block.refuse(_unknown("instance", entry.instance, names))
             return target, entry
         if not entry.name or label_key(entry.name) in self.sets_of(instance, table) or instance.name:
@@ -149,7 +149,7 @@ class SetResolver:
         holders: dict[str, list[tuple[Instance, str]]] = {}
         for instance in self.assembly.instances:
             for key, named in self.sets_of(instance, table).items():
-                if not all(each.internal for each in named):
+                if not all(definition.internal for definition in named):
                     holders.setdefault(key, []).append((instance, named[0].name))
         ambiguous = []
         for entries in holders.values():

@@ -52,8 +52,8 @@ def tag_sets(
     chosen = _preferred(arrays)
     if chosen is None:
         return {}, (), ()
-    others = [key for key in arrays if key != chosen]
-    notes = (f"Groups come from the cell array '{chosen}'; not used: {', '.join(others)}.",) if others else ()
+    unused = [key for key in arrays if key != chosen]
+    notes = (f"Groups come from the cell array '{chosen}'; not used: {', '.join(unused)}.",) if unused else ()
     top = max((block.dim for block in blocks if len(block.nodes)), default=0)
     sets: dict[str, list[Indices]] = {}
     for i, (block, tags) in enumerate(zip(blocks, arrays[chosen], strict=True)):

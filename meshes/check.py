@@ -119,6 +119,7 @@ def _check_coordinates(mesh: MeshData) -> None:
 
 
 def _check_flat(mesh: MeshData) -> None:
+    """Raise MeshError if a cell has no measure."""
     flat = np.flatnonzero(flat_cells(mesh.points, mesh.cells))
     if len(flat):
         measure = "volume" if mesh.dim == 3 else "area"
@@ -146,6 +147,7 @@ def _precision(points: Points) -> float:
 
 
 def _check_cells_once(mesh: MeshData) -> None:
+    """Raise MeshError if two cells have the same nodes."""
     _, counts, inverse = distinct_rows(np.sort(mesh.cells, axis=1))
     twice = np.flatnonzero(counts[inverse] > 1)
     if len(twice):
@@ -172,6 +174,7 @@ def _rotated_to_least(facets: Indices) -> Indices:
 
 
 def _refuse_facets(mesh: MeshData, facets: Indices, what: str) -> None:
+    """Raise MeshError if there are such facets; `what`: their fault."""
     if len(facets):
         distinct = distinct_rows(np.sort(facets, axis=1))[0]
         raise MeshError(

@@ -69,8 +69,8 @@ def format_point(point: Iterable[float]) -> str:
 def list_some(items: Iterable[object], most: int = 5) -> str:
     """The first items, separated by commas, and how many more there are: "a, b and 3 more"; "none" of no items."""
     texts = [str(item) for item in items]
-    more = f" and {len(texts) - most} more" if len(texts) > most else ""
-    return ", ".join(texts[:most]) + more if texts else "none"
+    count = f" and {len(texts) - most} more" if len(texts) > most else ""
+    return ", ".join(texts[:most]) + count if texts else "none"
 
 
 def format_midpoint(points: Points, nodes: Indices) -> str:

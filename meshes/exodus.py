@@ -49,11 +49,11 @@ def read_exodus(path: Path, head: bytes) -> MeshFileContents:
     blocks: list[Block] = []
     names: list[str] = []  # of each block of cells
     point_sets: dict[str, Indices] = {}
-    # place of each kind of object in the output (vtkExodusIIReader), and the name of objects without one
-    for place, kind, word in zip((0, 4, 7), kinds, ("block", "side", "nodes"), strict=True):
+    # index of each kind of object in the output (vtkExodusIIReader), and the name of objects without one
+    for index, kind, word in zip((0, 4, 7), kinds, ("block", "side", "nodes"), strict=True):
         for i in range(reader.GetNumberOfObjects(kind)):
             name = _name(reader, kind, i, word)
-            grid = _object(reader.GetOutput(), place, i)
+            grid = _object(reader.GetOutput(), index, i)
             declared = reader.GetNumberOfEntriesInObject(kind, i)
             read = 0 if grid is None else grid.GetNumberOfCells()
             if kind == vtkExodusIIReader.ELEM_BLOCK and read != declared:
@@ -87,9 +87,9 @@ def _name(reader: Any, kind: int, i: int, word: str) -> str:
     return name if name and not re.match(r"Unnamed (block|set) ID: ", name) else f"{word}-{reader.GetObjectId(kind, i)}"
 
 
-def _object(output: Any, place: int, i: int) -> Any:
-    """The grid of object i of the kind at a place of the reader's output; None if it is not there."""
-    group = output.GetBlock(place) if place < output.GetNumberOfBlocks() else None
+def _object(output: Any, index: int, i: int) -> Any:
+    """The grid of object i of the kind at an index of the reader's output; None if it is not there."""
+    group = output.GetBlock(index) if index < output.GetNumberOfBlocks() else None
     return group.GetBlock(i) if group is not None and i < group.GetNumberOfBlocks() else None
 
 

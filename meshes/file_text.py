@@ -72,6 +72,7 @@ class SourceText:
         starts = _token_starts(text)
         if values is None or len(values) != len(starts):
             self._refuse_row(begin, end, expected)
+        # tokens and numbers are as many: each token is a number, and its line is known by its offset
         symbols = np.frombuffer(text, np.uint8)
         line_ends = np.append(np.flatnonzero(symbols == ord("\n")), len(symbols))
         ends = np.searchsorted(starts, line_ends)

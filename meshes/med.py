@@ -64,6 +64,7 @@ def _refuse(path: Path, reason: str) -> NoReturn:
 
 
 def _contents(path: Path, file: Any, where: list[str]) -> MeshFileContents:
+    """The arrays of an open file; `where[0]` is set to what is being read."""
     meshes = list(file["ENS_MAA"]) if "ENS_MAA" in file else []
     if len(meshes) != 1:
         count = f"{len(meshes)} meshes ({', '.join(meshes[:5])}); export one of them alone"
@@ -100,6 +101,7 @@ def _contents(path: Path, file: Any, where: list[str]) -> MeshFileContents:
 
 
 def _points(path: Path, nodes: Any, dim: int) -> Points:
+    """(n, dim) coordinates of a group of nodes."""
     values = np.asarray(nodes["COO"][()], np.float64)
     declared = int(nodes["COO"].attrs.get("NBR", len(values) // max(dim, 1)))
     if dim not in (2, 3) or values.shape != (dim * declared,):

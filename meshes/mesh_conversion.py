@@ -192,6 +192,7 @@ class MeshFileContents:
         return ", ".join(f"{count} {kind}" for kind, count in counts.items()) or "no cells at all"
 
     def _refuse_other_shapes(self, source: str, dim: int) -> None:
+        """Raise MeshError if cells of the body, such as polyhedra, cannot be cut into simplices."""
         if any(block.dim == dim and block.shape not in CORNERS and len(block.nodes) for block in self.blocks):
             allowed = "triangles and quadrilaterals" if dim == 2 else "tetrahedra, hexahedra, wedges and pyramids"
             raise MeshError(
@@ -263,6 +264,7 @@ class MeshFileContents:
         return np.ascontiguousarray(self.points[:, :2]), (note,) if note else ()
 
     def _order_note(self, dim: int) -> tuple[str, ...]:
+        """A note if cells of the body are of higher order."""
         curved = sum(len(block.nodes) for block in self.blocks if block.dim == dim and block.kind != block.shape)
         if not curved:
             return ()
@@ -283,6 +285,7 @@ class MeshFileContents:
         of_lower, of_body = self._nodes_of(rows_of_lower), self._nodes_of(rows_of_body)
         curved = any(block.kind != block.shape for block in body)
         stray: dict[str, int] = {}
+        # facets of the body's cells are compared with the cells of dimension d - 1 by their sorted corners
         for width in {CORNERS[block.shape] for block in lower}:
             facets: list[Indices] = [np.zeros((0, width), np.int64)]
             for block in body:
@@ -317,6 +320,7 @@ class MeshFileContents:
         )
 
     def _facet_sets(self, blocks: list[int]) -> dict[str, Indices]:
+        """Facet groups of the sets of cells in blocks of facets."""
         groups = {}
         for name, members in self.sets.items():
             facets = [self.blocks[i].corners[members[i]] for i in blocks if len(members[i])]
@@ -325,6 +329,7 @@ class MeshFileContents:
         return groups
 
     def _cell_sets(self, blocks: list[int]) -> dict[str, Indices]:
+        """Regions of the sets of cells in blocks, cells numbered over all of these blocks."""
         starts = np.cumsum([0] + [len(self.blocks[i].nodes) for i in blocks])
         regions = {}
         for name, members in self.sets.items():

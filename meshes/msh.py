@@ -94,10 +94,12 @@ class _Msh2:
         self._read_sections()
 
     def _read_sections(self) -> None:
+        """Read every section."""
         text, position = self.source.text, 0
         read: set[str] = set()
         while head := re.compile(rb"\s*\$(\w+)[ \t]*\r?\n").match(text, position):
             name, begin = head[1].decode(), head.end()
+            # binary sections may hold the bytes of `$End`: their lengths tell where they end
             if name in ("Nodes", "ParametricNodes"):
                 end = self._nodes(begin, name == "ParametricNodes")
             elif name == "Elements":
@@ -130,6 +132,7 @@ class _Msh2:
             refuse_file(self.path, f"it has no section ${min(lost)}; it is cut off or damaged", f"{SAVE}.")
 
     def _format(self, begin: int, end: int) -> None:
+        """Read the section of the format: text, or the byte order of a binary file."""
         text = self.source.text[begin:end]
         head = re.match(rb"\s*([\d.]+)\s+([01])\s+(\d+)[ \t]*\r?\n", text)
         if not head or head[3] != b"8":
@@ -155,6 +158,7 @@ class _Msh2:
         return int(line[1]), line.end()
 
     def _section_end(self, begin: int, name: str) -> int:
+        """Offset of the `$` that ends a section of text."""
         end = self.source.text.find(b"$", begin)
         if end < 0:
             self.source.damaged(len(self.source.text) - 1, f"the file ends within the section ${name}: it was cut off.")
@@ -214,6 +218,7 @@ class _Msh2:
         return self._binary_end if self.byte_order else end
 
     def _kind(self, type_: int, offset: int) -> tuple[str, int]:
+        """Cell type and number of nodes of an element type; MeshError at an offset if it is not supported."""
         if type_ not in KINDS:
             self.source.refuse(
                 offset,
@@ -230,6 +235,7 @@ class _Msh2:
         if (short := lines.counts < 4).any():
             self.source.damaged(int(lines.offsets[short.argmax()]), f"this element is cut short; {ELEMENT}.")
         types, tags = (self.source.integers(lines.values[lines.begins + i], lines.offsets, ELEMENT) for i in (1, 2))
+        # lines of one type, number of tags and length are taken together, in the order in which such lines begin
         keys = np.stack([types, tags, lines.counts], axis=1)
         distinct, first, key_of_line = np.unique(keys, axis=0, return_index=True, return_inverse=True)
         key_of_line = key_of_line.ravel()
@@ -318,6 +324,7 @@ def read_with_gmsh(path: Path) -> MeshFileContents:
 
 
 def _contents_of_model(gmsh: Any) -> MeshFileContents:
+    """The mesh of gmsh's current model, physical groups as sets."""
     tags, coordinates, _ = gmsh.model.mesh.getNodes()
     index = np.full(int(tags.max(initial=0)) + 1, -1, np.int64)
     index[tags] = np.arange(len(tags))

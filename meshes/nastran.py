@@ -163,6 +163,7 @@ class _BulkData:
             self._refuse(f"`{text[:20]}` is no coordinate: GRID, 5, , 0.0, 0.5, 1.5-3. {EXPORT_AGAIN}")
 
     def _grid(self, fields: list[str]) -> None:
+        """Read a GRID, which is a node."""
         number = self._integer(fields[1], "number of a GRID")
         if (fields[2] or "0") != "0":
             self._refuse(
@@ -173,14 +174,15 @@ class _BulkData:
             self._refuse(f"GRID {number} is given a second time, at another place. {EXPORT_AGAIN}")
 
     def _element(self, name: str, fields: list[str]) -> None:
+        """Read an element: number, property, corner nodes, midside nodes."""
         shape, sizes = SHAPES[name]
         number = self._integer(fields[1], f"number of a {name}")
         property_id = self._integer(fields[2], "number of a property") if fields[2] else number
         texts = fields[3 : 3 + sizes[-1]]
         texts += [""] * (sizes[0] - len(texts))
-        what = f"number of a node of {name} {number}"
-        nodes = [self._integer(text, what) for text in texts[: sizes[0]]]
-        midside = [self._integer(text, what) for text in texts[sizes[0] :] if text]
+        description = f"number of a node of {name} {number}"
+        nodes = [self._integer(text, description) for text in texts[: sizes[0]]]
+        midside = [self._integer(text, description) for text in texts[sizes[0] :] if text]
         if number in self.element_ids:
             self._refuse(f"element {number} is given a second time. {EXPORT_AGAIN}")
         self.element_ids.add(number)

@@ -85,15 +85,15 @@ def check_extent(points: npt.NDArray[np.float64], source: str, used: npt.NDArray
         source: begins the message.
         used: (n,) points that belong to the body; None: all.
     """
-    own = points if used is None or used.all() else points[used]
-    if not np.abs(own).max(initial=0.0) <= LONGEST:
+    body = points if used is None or used.all() else points[used]
+    if not np.abs(body).max(initial=0.0) <= LONGEST:
         wrong = ~(np.abs(points) <= LONGEST).all(axis=1)
         numbers = np.flatnonzero(wrong if used is None else used & wrong)
         raise MeshError(
             f"{source} has {len(numbers)} points that are not finite numbers of at most {LONGEST:g} m, the first is "
             f"point {numbers[0]} at {points[numbers[0]].tolist()}; export it again, or mend its scale."
         )
-    if len(own) and (size := float(np.ptp(own, axis=0).max())) < SHORTEST:
+    if len(body) and (size := float(np.ptp(body, axis=0).max())) < SHORTEST:
         raise MeshError(f"{source} is {size:g} m large, and {SHORTEST:g} m or more is needed; mend its scale.")
 
 

@@ -57,13 +57,13 @@ class PlyElement:
             begins: (n,) index of the first number of each line.
             ends: (n,) index behind the last number of each line.
         """
-        at = begins.copy()
+        end = begins.copy()
         for words in self.properties:
             if words[0] == "list":
-                counts = np.where(at < ends, values[np.minimum(at, len(values) - 1)], 0)
-                at += np.clip(np.nan_to_num(counts), 0, len(values)).astype(np.int64)
-            at += 1
-        widths: Indices = at - begins
+                counts = np.where(end < ends, values[np.minimum(end, len(values) - 1)], 0)
+                end += np.clip(np.nan_to_num(counts), 0, len(values)).astype(np.int64)
+            end += 1
+        widths: Indices = end - begins
         return widths
 
 

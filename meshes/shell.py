@@ -33,6 +33,7 @@ def extrude_shell(
     """
     normal = _offset_normals(points, triangles)
     combined = np.concatenate([points - thickness / 2 * normal, points + thickness / 2 * normal])
+    # prisms are cut by their sorted nodes; an odd permutation reverses the orientation
     order = np.argsort(triangles, axis=1)
     odd = np.linalg.det(np.eye(3)[order]) < 0
     a, b, c = np.take_along_axis(triangles, order, axis=1).T

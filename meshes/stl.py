@@ -79,6 +79,7 @@ def _corners_of_text(path: Path, data: bytes) -> npt.NDArray[np.float64]:
     words = [joined[word] for word in parts[1::2]]
     ends = sum(word == b"endfacet" for word in words)
     texts = [text.split() for word, text in zip(words, parts[2::2], strict=True) if word == b"vertex"]
+    # the keywords of one facet after another
     expected = [b"vertex"] * 3 + [b"endloop", b"endfacet"]
     wrong = next((i for i, word in enumerate(words) if word != expected[i % 5]), len(words))
     if wrong < len(words) or len(words) % 5 or not ends:

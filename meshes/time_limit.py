@@ -59,6 +59,7 @@ def call_with_time_limit[T](seconds: float, work: Callable[..., T], *arguments: 
     """
     command = [sys.executable, "-P", "-m", __name__]  # -P: no module of the same name in the working folder
     task = pickle.dumps((max(1, ceil(seconds)), memory, os.getpid(), work, arguments))
+    # the answer goes through memory that both processes map: arrays are not copied
     with open(os.memfd_create("answer"), "rb") as answer:
         command.append(str(answer.fileno()))
         done = subprocess.run(command, input=task, capture_output=True, check=False, pass_fds=[answer.fileno()])

@@ -155,7 +155,7 @@ def positions_of(ids: Indices, wanted: Indices) -> Indices:
     """Index of each wanted number in `ids`, which are distinct; -1 where `ids` lacks it. Shape of `wanted`."""
     if not len(ids):
         return np.full(wanted.shape, -1, np.int64)
-    if (np.diff(ids) <= 0).any():
+    if (np.diff(ids) <= 0).any():  # files list nodes in any order
         order = np.argsort(ids, kind="stable")
         sorted_positions = positions_of(ids[order], wanted)
         return np.where(sorted_positions >= 0, order[sorted_positions], -1)

@@ -95,6 +95,7 @@ class _UniversalFile:
             self.source.damaged(marks[-1], "lines stand behind the last dataset.")
 
     def _dataset(self, number: int, begin: int, end: int) -> None:
+        """Read the dataset of a number, whose lines stand between two offsets."""
         content = DATASETS.get(number, "")
         if content.startswith("nodes"):
             self._nodes(self.source.rows(begin, end, NODE_LINE), one_line=content == "nodes on one line")
@@ -106,6 +107,7 @@ class _UniversalFile:
             self.unused.append(str(number))
 
     def _nodes(self, lines: Rows, one_line: bool) -> None:
+        """Read nodes: number, coordinate systems and colour, then coordinates, on one line or two."""
         counts = lines.counts
         step, widths = (1, [7]) if one_line else (2, [4, 3])
         if len(lines) % step:
@@ -134,26 +136,27 @@ class _UniversalFile:
             head = self._head(lines, line)
             type_, size = int(head[1]), int(head[5])
             beam = type_ in BEAMS
-            wanted = [6, *([3] if beam else []), *([8] * (size // 8) + ([size % 8] if size % 8 else []))]
-            period = len(wanted)
+            # numbers on each line of an element: its head, the line of a beam, eight nodes on a line
+            widths = [6, *([3] if beam else []), *([8] * (size // 8) + ([size % 8] if size % 8 else []))]
+            period = len(widths)
             compared = min((len(lines) - line) // period, window)
             if not compared:
                 self.source.damaged(int(lines.offsets[line]), f"element {int(head[0])} is cut short; {ELEMENT_LINE}.")
             table = counts[line : line + compared * period].reshape(compared, period)
             starts = lines.begins[line : line + compared * period : period]
-            same = (table == wanted).all(axis=1)
+            same = (table == widths).all(axis=1)
             same[same] &= (lines.values[starts[same] + 1] == type_) & (lines.values[starts[same] + 5] == size)
             run = compared if same.all() else int(same.argmin())
             if not run:
-                bad = line + int((table[0] != wanted).argmax())
+                bad = line + int((table[0] != widths).argmax())
                 self.source.damaged(
                     int(lines.offsets[bad]), f"this line of element {int(head[0])} (type {type_}, {size} nodes) has "
-                    f"{counts[bad]} numbers instead of {wanted[bad - line]}; {ELEMENT_LINE}.",
+                    f"{counts[bad]} numbers instead of {widths[bad - line]}; {ELEMENT_LINE}.",
                 )  # fmt: skip
             first = lines.begins[line : line + run * period : period]
-            values = lines.values[first[:, None] + np.arange(sum(wanted))]
+            values = lines.values[first[:, None] + np.arange(sum(widths))]
             rows = self.source.integers(
-                values[:, [0, *range(6 + 3 * beam, sum(wanted))]], lines.offsets[line::period][:run], ELEMENT_LINE
+                values[:, [0, *range(6 + 3 * beam, sum(widths))]], lines.offsets[line::period][:run], ELEMENT_LINE
             )
             self._add(type_, size, rows, int(lines.offsets[line]))
             line += run * period
@@ -211,8 +214,8 @@ class _UniversalFile:
             name = decode_text(text[head_end:name_end]).strip() or f"group-{int(head.values[0])}"
             nodes, elements = (members[members[:, 0] == entity, 1] for entity in (7, 8))  # entity type codes
             self.groups.append((name, nodes, elements))
-            if others := len(members) - len(nodes) - len(elements):
-                self.left_out["members of groups that are neither nodes nor elements"] = others
+            if other_members := len(members) - len(nodes) - len(elements):
+                self.left_out["members of groups that are neither nodes nor elements"] = other_members
             begin = stop
 
     # --- contents ---
@@ -252,8 +255,8 @@ class _UniversalFile:
             if len(nodes):
                 indices = positions_of(ids, nodes)
                 lost += int((indices < 0).sum())
-                known = point_sets.get(name, indices[:0])
-                point_sets[name] = np.union1d(known, indices[indices >= 0]).astype(np.int64)
+                before = point_sets.get(name, indices[:0])
+                point_sets[name] = np.union1d(before, indices[indices >= 0]).astype(np.int64)
             if not len(elements):
                 continue
             indices = positions_of(numbers, elements)

@@ -60,6 +60,7 @@ def _read(path: Path) -> MeshFileContents:
     with path.open("rb") as file:
         head = file.read(len(HDF5_SIGNATURE))
     kind = ENDINGS[path.suffix.lower()]
+    # files of VTKHDF may have the ending .vtk
     try:
         if kind == EXODUS:
             contents = read_exodus(path, head)
@@ -195,12 +196,12 @@ def _contents(path: Path, grids: list[Grid]) -> MeshFileContents:
     sets, used, tag_notes = tag_sets(cell_data, blocks, lambda tag, _: [f"tag-{tag}"])
     point_sets = {name: np.flatnonzero(values) for name, values in grid.point_data.items() if _is_mask(values)}
     hidden = ("vtkGhostType", "GlobalPointIds", "GlobalCellIds", "GlobalNodeId", "GlobalElementId")
-    for place, names in (
+    for kind, names in (
         ("cell", [name for name in grid.cell_data if name not in (*used, *hidden)]),
         ("point", [name for name in grid.point_data if name not in (*point_sets, *hidden)]),
     ):
         if names:
-            notes.append(f"Not used: the {place} arrays {', '.join(names)}.")
+            notes.append(f"Not used: the {kind} arrays {', '.join(names)}.")
     return MeshFileContents(grid.points, blocks, sets, point_sets, notes=(*tag_notes, *notes))
 
 

@@ -28,8 +28,10 @@ def write_mesh(mesh: MeshData, path: Path) -> None:
         region[cells] = names.index(name) + 1
     tags = [np.full(len(nodes), number) for number, nodes in enumerate(facets, start=1)]
     blocks = [(cell, mesh.cells), *((facet, nodes) for nodes in facets)]
+    # formats of meshio have three coordinates
     points = np.pad(mesh.points, ((0, 0), (0, 3 - mesh.dim)))
     values = [region, *tags]
+    # gmsh reads physical groups; in other formats one array has all groups
     data = {"gmsh:physical": values, "gmsh:geometrical": values} if path.suffix == ".msh" else {"group": values}
     field_data = {
         name: np.array([number, mesh.dim if name in mesh.regions else mesh.dim - 1])

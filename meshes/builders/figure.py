@@ -133,6 +133,7 @@ class Figure:
         of_parts = [part.scaled(self.height).depth(points) for part in PARTS.values()]
         depths, gradients = np.array([d for d, _ in of_parts]), np.array([g for _, g in of_parts])
         blend, deepest = BLEND * self.height, depths.max(axis=0)
+        # log(sum exp) relative to the deepest part, so that nothing overflows
         weights = np.exp((depths - deepest) / blend)
         sums = weights.sum(axis=0)
         return deepest + blend * np.log(sums), np.einsum("pn,pni->ni", weights / sums, gradients)

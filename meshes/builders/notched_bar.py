@@ -107,6 +107,7 @@ class NotchedBar(CutRectangle):
         return 0.0 if self.notch == "slit" else self.notch_radius
 
     def _check_notch(self) -> None:
+        """Raise MeshError if the parameters of the notch are out of range."""
         if self.notch == "slit":
             require_positive("notched-bar", notch_width=self.notch_width)
         elif self.notch == "U":
@@ -126,6 +127,7 @@ class NotchedBar(CutRectangle):
         )
 
     def _check_supports(self) -> None:
+        """Raise MeshError if the notch or the supports do not fit."""
         mouth = self.mouth()
         require(mouth < self.length, f"notched-bar: the notch is {mouth:.3g} m wide, length = {self.length!r} m only.")
         require(
@@ -160,6 +162,7 @@ class NotchedBar(CutRectangle):
         corners += [(middle, self.notch_depth), shoulder, foot, *((self.length - x, 0.0) for x in reversed(below))]
         corners += [(self.length, 0.0), (self.length, self.height), *((x, self.height) for x in above)]
         corners += [(0.0, self.height)]
+        # a sharp notch ends in one point; corners that coincide are left out
         if not self._root_radius:
             return Profile([c for i, c in enumerate(corners) if i == 0 or c != corners[i - 1]], {})
         centre = (middle, self.notch_depth - self._root_radius)

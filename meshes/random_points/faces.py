@@ -71,7 +71,7 @@ def _remesh(gmsh: Any, face: int, sizing: SizeField, seed: int) -> None:
     nodes = _Curves.of(gmsh, sorted(set(sides)))
     flat = _parameters(gmsh, face, nodes.points)
     tags, pieces = nodes.tags, nodes.pieces
-    if seams:
+    if seams:  # a curve that bounds the face twice
         seam = np.isin(tags, _Curves.of(gmsh, sorted(seams)).tags)
         tags, flat, pieces = _cut_open(tags, flat, pieces, seam)
     scale = _scale(gmsh, face)
@@ -81,6 +81,7 @@ def _remesh(gmsh: Any, face: int, sizing: SizeField, seed: int) -> None:
         return np.array(gmsh.model.getValue(2, face, (points / scale).ravel())).reshape(-1, 3)
 
     points, cells = scatter(Outline(flat * scale, pieces), lambda points: sizing.at(place(points)), seed)
+    # nodes of the curves stay; copies of the nodes of a seam are the same nodes
     gmsh.model.mesh.clear([(2, face)])
     last = gmsh.model.mesh.getMaxNodeTag()
     inner = points[len(tags) :]

@@ -142,6 +142,7 @@ def _check_crossings(drawn: PolygonOutline) -> None:
         (ax, ay), (bx, by), (x, y) = a.T[..., None], b.T[..., None], of.T[:, None]
         return np.asarray(np.sign((bx - ax) * (y - ay) - (by - ay) * (x - ax)))
 
+    # the ends of side j lie on two sides of side i, and the reverse
     apart = left(a) * left(b) < 0
     crossed = np.argwhere(apart & apart.T)
     if len(crossed):

@@ -224,8 +224,9 @@ def orient_consistently(triangles: Indices, table: EdgeTable, source: str) -> tu
     first, second = order[0::2], order[1::2]
     disagree = directed[first, 0] == directed[second, 0]
     a, b = first // 3, second // 3
-    if not disagree.any():
+    if not disagree.any():  # as in most files
         return triangles, components(np.stack([a, b], axis=1), count)[1], 0
+    # two triangles that pass their common edge in the same direction disagree
     links = np.concatenate([np.stack([a, b + count * disagree], 1), np.stack([a + count, b + count * ~disagree], 1)])
     _, state = components(links, 2 * count)
     as_given, turned = state[:count], state[count:]
@@ -251,6 +252,7 @@ def _orient_outwards(
     volumes = np.bincount(shell, weights=enclosed_volumes(points, triangles))
     inside = _nesting(points, triangles, shell, source)
     depth = inside.sum(axis=1)
+    # shells inside an even number of others are outer ones, all others are cavities
     wrong = (volumes > 0) != (depth % 2 == 0)
     bodies = [[int(outer), *_cavities(outer, inside, depth)] for outer in np.flatnonzero(depth % 2 == 0)]
     return _flipped(triangles, wrong[shell]), bodies, int(wrong.sum())

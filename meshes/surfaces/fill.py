@@ -245,7 +245,7 @@ def remove_boundary_slivers(points: Points, cells: Indices, thin: float = FILL.s
     Such a cell has its four nodes on one face of the body, almost in a plane; without it the face is cut along the
     other diagonal.
     """
-    while True:
+    while True:  # cells behind a removed one are on the boundary then
         facets = np.sort(facets_of(cells), axis=2)
         _, counts, inverse = distinct_rows(facets.reshape(-1, 3))
         outside = (counts[inverse].reshape(-1, 4) == 1).any(axis=1)

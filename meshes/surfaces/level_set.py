@@ -41,6 +41,7 @@ def level_surface(depth: Depth, low: Floats, high: Floats, h: float) -> tuple[Po
     corners = _cut(np.sign(value).astype(np.int64), tets[_is_cut(value, tets)])
     pairs, _, triangles = distinct_rows(corners.reshape(-1, 2))
     first, second = pairs.T
+    # linear interpolation along the edge, then Newton's method
     share = np.where(first == second, 0.0, value[first] / np.where(first == second, 1.0, value[first] - value[second]))
     points = _projected(depth, nodes[first] + share[:, None] * (nodes[second] - nodes[first]))
     return _smoothed(depth, points, _without_sheets(triangles.reshape(-1, 3)))
@@ -63,6 +64,7 @@ def _lattice(low: Floats, high: Floats, step: float) -> tuple[Points, Indices]:
     corners, centres = (np.indices(shape).reshape(3, -1).T for shape in (tuple(count + 1), tuple(count)))
     nodes = origin + step * np.concatenate([corners, centres + 0.5])
     tets = []
+    # two cubes that share a face: their centres and each edge of the face are a tetrahedron
     for axis in range(3):
         cells, faces = np.moveaxis(centre, axis, 0), np.moveaxis(corner, axis, 0)[1:-1]
         around = (faces[:, :-1, :-1], faces[:, 1:, :-1], faces[:, 1:, 1:], faces[:, :-1, 1:])
@@ -90,8 +92,10 @@ def _cut(sign: Indices, tets: Indices) -> Indices:
     patterns, which = np.unique(sign[tets], axis=0, return_inverse=True)
     for number, pattern in enumerate(patterns):
         inside, on, outside = ([int(i) for i in np.flatnonzero(pattern == s)] for s in (1, 0, -1))
+        # no cut; or it touches a node or an edge only
         if not inside or len(on) + len(outside) == 0 or (not outside and len(on) < 3):
             continue
+        # corners in order around the cut: a triangle, or a quadrilateral between two nodes inside and two outside
         ring = [(i, i) for i in on] + [(i, o) for i in inside for o in outside]
         if len(inside) == len(outside) == 2:
             ring[2], ring[3] = ring[3], ring[2]

@@ -188,7 +188,7 @@ class EdgeTable:
         )
 
 
-def open_edges(triangles: Indices) -> Indices:
+def find_open_edges(triangles: Indices) -> Indices:
     """Indices in `directed_edges` of the edges that belong to one triangle only."""
     table = EdgeTable(triangles)
     return np.flatnonzero(table.counts[table.edge_of] == 1)
@@ -210,7 +210,7 @@ def _divide_t_junctions(points: Points, triangles: Indices, distance: float) -> 
     total = 0
     length = distance * float(np.ptp(points, axis=0).max())
     for _ in range(MENDING.max_rounds):
-        open_ = open_edges(triangles)
+        open_ = find_open_edges(triangles)
         if not 0 < len(open_) <= MENDING.max_open_edges:
             return triangles, total, len(open_) > 0
         splits = _nodes_on_edges(points, directed_edges(triangles)[open_], length)
@@ -219,6 +219,7 @@ def _divide_t_junctions(points: Points, triangles: Indices, distance: float) -> 
             number, side = divmod(int(edge), 3)
             if not nodes or replaced[number]:
                 continue
+            # a fan from the opposite corner to the pieces of the edge
             a, b, c = (int(node) for node in np.roll(triangles[number], -side))
             chain = [a, *nodes, b]
             if c not in nodes:
@@ -229,7 +230,7 @@ def _divide_t_junctions(points: Points, triangles: Indices, distance: float) -> 
         total += int(replaced.sum())
         triangles = np.concatenate([triangles[~replaced], np.array(new, np.int64)])
         triangles = triangles[_is_first_copy(triangles)]
-    return triangles, total, len(open_edges(triangles)) > 0
+    return triangles, total, len(find_open_edges(triangles)) > 0
 
 
 def _nodes_on_edges(points: Points, edges: Indices, length: float) -> list[list[int]]:

@@ -27,7 +27,7 @@ from .closed import (
     read_raw_triangles,
     read_surface,
 )
-from .mending import MENDING, EdgeTable, mend_closed_surface, open_edges
+from .mending import MENDING, EdgeTable, find_open_edges, mend_closed_surface
 from .self_intersection import crossing_triangles
 from .triangle_geometry import (
     Triangulation,
@@ -119,7 +119,7 @@ def repair_triangles(points: Points, triangles: Indices, source: str) -> tuple[P
     triangles, shell, _ = orient_consistently(triangles, EdgeTable(triangles), source)
     crossings = crossing_triangles(points, triangles, closed=True)
     crossing = np.unique(crossings[shell[crossings[:, 0]] == shell[crossings[:, 1]]])  # within one part
-    at_holes = np.unique(open_edges(triangles) // 3)
+    at_holes = np.unique(find_open_edges(triangles) // 3)
     area = np.bincount(shell, areas(points, triangles))
     is_crossing, is_open = (np.bincount(shell[which], minlength=len(area)) > 0 for which in (crossing, at_holes))
     dust = is_open & (area < REPAIR.dust * area.sum())
@@ -158,7 +158,7 @@ def _mend(points: Points, triangles: Indices, source: str) -> tuple[Points, Indi
             ]
             apart = concatenate([(part.points, part.triangles) for part in parts])
             # STL does not tell which triangles are connected: each would be an open part
-            if not _is_non_manifold(apart[1]) and len(open_edges(apart[1])) <= len(open_edges(triangles)):
+            if not _is_non_manifold(apart[1]) and len(find_open_edges(apart[1])) <= len(find_open_edges(triangles)):
                 points, triangles = apart
                 notes = tuple(note for part in parts for note in part.notes)
     check_areas(points, triangles, source)
@@ -193,7 +193,7 @@ class _Holes:
     @classmethod
     def of(cls, points: Points, triangles: Indices) -> _Holes:
         """The holes of a part."""
-        edges = directed_edges(triangles)[open_edges(triangles)]
+        edges = directed_edges(triangles)[find_open_edges(triangles)]
         if len(edges) == 0:
             return cls(0, 0.0, "", np.zeros((0, 3, 3)))
         nodes, local_edges = np.unique(edges, return_inverse=True)
@@ -215,6 +215,7 @@ def _repair_part(points: Points, triangles: Indices, crossing: int, source: str)
     Raises:
         MeshError: the repair failed, or changes the shape grossly.
     """
+    # the volume before is that of the part with each hole closed by a fan from its centroid
     holes = _Holes.of(points, triangles)
     corners = np.concatenate([points[triangles], holes.lids])
     before = _volume(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3))
@@ -224,7 +225,7 @@ def _repair_part(points: Points, triangles: Indices, crossing: int, source: str)
     faults = [f"{holes.count} holes (longest edge {holes.longest:.3g} m, the first near {holes.where})"]
     faults = (faults if holes.count else []) + [f"{crossing} triangles that pass through others"] * (crossing > 0)
     description = " and ".join(faults)
-    if len(new) == 0 or len(open_edges(new)):
+    if len(new) == 0 or len(find_open_edges(new)):
         raise MeshError(f"{source}: repair failed to mend {description}. {BY_HAND}")
     after, share = _volume(new_points, new), _new_area(points, triangles, new_points, new)
     size = float(np.ptp(points, axis=0).max())
@@ -360,8 +361,8 @@ def _union(parts: list[Triangulation], source: str) -> tuple[Triangulation, str]
 def _refuse_cavities(parts: list[Triangulation], source: str) -> None:
     """Raise MeshError if a part lies within another: it may be a cavity, which the union would fill."""
     for i, (points, _) in enumerate(parts):
-        for j, (others, triangles) in enumerate(parts):
-            if i != j and probes_inside(points, others[triangles]).all():
+        for j, (outer_points, triangles) in enumerate(parts):
+            if i != j and probes_inside(points, outer_points[triangles]).all():
                 raise MeshError(
                     f"{source}: parts that cross have another part within them, near "
                     f"{format_midpoint(points, np.arange(len(points)))}; whether it is a cavity is not known. Unite "

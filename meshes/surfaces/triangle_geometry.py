@@ -115,6 +115,6 @@ def _is_ear(corners: Floats, normal: Floats, left: list[int], i: int) -> bool:
     a, b, c = corners[ear]
     if np.cross(b - a, c - b) @ normal <= 0:
         return False
-    others = corners[[node for node in left if node not in ear]]
-    sides = [np.cross(end - start, others - start) @ normal for start, end in ((a, b), (b, c), (c, a))]
+    other_corners = corners[[node for node in left if node not in ear]]
+    sides = [np.cross(end - start, other_corners - start) @ normal for start, end in ((a, b), (b, c), (c, a))]
     return not (np.array(sides) >= 0).all(axis=0).any()
