@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from fracsim.mechanics.inertia import MassBlocks
 from fracsim.mechanics.matrix_assembly import TangentAssembler
+from support.ranks import run_on_ranks
 from test_dead_cells import damaged
 
 
@@ -35,3 +38,12 @@ def test_without_a_compiler_single_entries_stay(monkeypatch: pytest.MonkeyPatch)
     assert assembly.switch_to_blocks() is assembly.blocks is None
     assembly([])
     assert assembly.matrix is matrix and matrix.norm() > 0
+
+
+@pytest.mark.parametrize("ranks", [1, *(pytest.param(count, marks=pytest.mark.ranks) for count in (2, 3))])
+def test_contact_beside_blocks_is_that_of_single_entries(ranks: int, tmp_path: Path) -> None:
+    """A block between a driven ball with friction and a free one: products, rows and diagonals, and the same motion."""
+    found = run_on_ranks("support.coupled", ranks, tmp_path)
+    assert found["coupled"] >= 3
+    assert max(found["product"], found["rows"], found["diagonal"]) < 1e-12
+    assert found["displacement"] < 1e-6

@@ -202,7 +202,7 @@ def test_rows_of_the_tangent_are_those_of_its_products(first: bool, monkeypatch:
         free = random.uniform(size=(3, d)) > 0.3
         products = scene.balance.tangent._assembler.blocks
         assert products is not None
-        products.ties = [TieMatrix(scene.domain.comm, ties + ties.T, np.arange(3), tied, free.astype(float))]
+        products.couplings = [TieMatrix(scene.domain.comm, ties + ties.T, np.arange(3), tied, free.astype(float))]
     x, y = scene.balance.work_vector.duplicate(), scene.balance.work_vector.duplicate()
     rows = scene.balance.tangent.owned_rows(nodes).toarray()
     for row, dof in zip(rows, (d * nodes[:, None] + np.arange(d)).reshape(-1), strict=True):

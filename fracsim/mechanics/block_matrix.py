@@ -1,15 +1,15 @@
-"""Tangent in blocks of the d dofs of a node: products with it, and with ties beside it.
+"""Tangent in blocks of the d dofs of a node: products with it, and with couplings beside it.
 
 PETSc's own matrix of blocks multiplies as fast, but to give it the values takes as long as fifteen products. Products
-are therefore made where DOLFINx has summed the blocks (block_matrix.c). Ties couple a few nodes anywhere, outside the
-pattern of the blocks, and stay beside them.
+are therefore made where DOLFINx has summed the blocks (block_matrix.c). Ties and contact couple nodes anywhere, outside
+the pattern of the blocks, and stay beside them.
 """
 
 from __future__ import annotations
 
 from ctypes import CDLL
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -19,7 +19,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..mesh.c_library import FAST_FLAGS, compile_on_all_ranks
-from ..mesh.parallel import sum_over_ranks
+from ..mesh.parallel import allgather, sum_over_ranks
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -31,18 +31,38 @@ Reals = npt.NDArray[np.floating[Any]]
 SOURCE = Path(__file__).with_suffix(".c")
 
 
+class NodeCoupling(Protocol):
+    """Stiffness between nodes anywhere, which is added to a matrix in blocks.
+
+    Attributes:
+        nodes: (m,) local numbers of the coupled nodes that this rank owns.
+    """
+
+    nodes: Ints
+
+    @property
+    def diagonal_blocks(self) -> Values:
+        """(m, d, d) blocks on the diagonal at the nodes of this rank, N/m."""
+
+    def multiply(self, x: Reals) -> Values:
+        """(m, d) product at the nodes of this rank with their x (m, d) (collective)."""
+
+    def owned_rows(self, nodes: Ints, node_map: IndexMap) -> csr_matrix:
+        """(d n, dofs of all ranks) rows of owned nodes (n,); `node_map`: nodes of the body (collective)."""
+
+
 class BlockMatrix:
     """Square matrix in blocks, whose owned rows are complete.
 
     Attributes:
         matrix: DOLFINx's matrix with the blocks.
-        ties: operators that are added to it.
+        couplings: stiffness between nodes anywhere that is added to it.
     """
 
     def __init__(self, matrix: la.MatrixCSR, code: CDLL) -> None:
         """`code`: library of `compile_block_product` for the size of the blocks."""
         self.matrix, self._code = matrix, code
-        self.ties: list[TieMatrix] = []
+        self.couplings: list[NodeCoupling] = []
         columns = matrix.index_map(1)
         self._rows = matrix.index_map(0).size_local
         self._ghosted = la.create_petsc_vector(columns, matrix.block_size[1]) if columns.comm.size > 1 else None
@@ -50,10 +70,10 @@ class BlockMatrix:
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Product y = K x (collective)."""
         self._multiply_blocks(x, y)
-        if self.ties:
+        if self.couplings:
             y_nodes, x_nodes = (vector.reshape(-1, self.matrix.block_size[0]) for vector in (y.array_w, x.array_r))
-            for tie in self.ties:
-                y_nodes[tie.nodes] += tie.multiply(x_nodes[tie.nodes])
+            for coupling in self.couplings:
+                y_nodes[coupling.nodes] += coupling.multiply(x_nodes[coupling.nodes])
 
     def _multiply_blocks(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         if (ghosted := self._ghosted) is None:
@@ -69,7 +89,7 @@ class BlockMatrix:
         self._code.multiply(self._rows, matrix.indptr, matrix.indices, matrix.data, x.array_r, y.array_w)
 
     def owned_rows(self, nodes: Ints) -> csr_matrix:
-        """(d n, dofs of all ranks) rows of owned nodes (n,), with their ties (collective)."""
+        """(d n, dofs of all ranks) rows of owned nodes (n,), with their couplings (collective)."""
         from scipy.sparse import csr_matrix
 
         K, d, columns = self.matrix, self.matrix.block_size[0], self.matrix.index_map(1)
@@ -82,8 +102,8 @@ class BlockMatrix:
         values = K.data.reshape(-1, d, d)[block]
         entries = tuple(np.broadcast_to(index, values.shape).reshape(-1) for index in (row, column))
         result = csr_matrix((values.reshape(-1), entries), shape=(d * len(nodes), d * columns.size_global))
-        for tie in self.ties:
-            result = result + tie.owned_rows(nodes, columns)
+        for coupling in self.couplings:
+            result = result + coupling.owned_rows(nodes, columns)
         return result
 
     def destroy(self) -> None:
@@ -111,9 +131,10 @@ class TieMatrix:
         self.K, self.nodes, self.indices, self._comm, self._free = K, nodes, indices, comm, free
 
     @property
-    def diagonal(self) -> Values:
-        """(m, d) diagonal of K at the nodes of this rank, N/m."""
-        return np.asarray(self.K.diagonal()[self.indices][:, None] * self._free)
+    def diagonal_blocks(self) -> Values:
+        """(m, d, d) blocks of K on the diagonal at the nodes of this rank, N/m."""
+        diagonal = self.K.diagonal()[self.indices][:, None] * self._free
+        return np.asarray(diagonal[:, :, None] * np.eye(diagonal.shape[1]))
 
     def multiply(self, x: Reals) -> Values:
         """(m, d) K x at the nodes of this rank, of their x (m, d) (collective)."""
@@ -141,3 +162,64 @@ class TieMatrix:
         values = K.data[inside][:, None] * table[K.row[inside], 1:] * table[K.col[inside], 1:]
         entries = tuple((d * index[:, None] + axes).reshape(-1) for index in (row, column))
         return csr_matrix((values.reshape(-1), entries), shape=(d * len(nodes), d * node_map.size_global))
+
+
+class CouplingMatrix:
+    """Stiffness between nodes anywhere, of a matrix over the dofs, as contact has it.
+
+    Attributes:
+        nodes: (m,) local numbers of the coupled nodes that this rank owns.
+    """
+
+    def __init__(self, matrix: PETSc.Mat) -> None:
+        """Take the entries of a matrix over the dofs of all ranks, N/m (collective)."""
+        from scipy.sparse import csr_matrix
+
+        d, self._comm = matrix.getBlockSize(), matrix.comm.tompi4py()
+        starts, columns, values = matrix.getValuesCSR()
+        local = csr_matrix((values, columns, starts), shape=(len(starts) - 1, matrix.getSize()[1]))
+        self.nodes: Ints = np.unique(np.flatnonzero(np.diff(starts)) // d)
+        self._first = matrix.getOwnershipRange()[0] // d
+        coupled = np.union1d(self.nodes + self._first, columns // d)
+        # global numbers of all coupled nodes, and the indices of this rank's among them
+        self._numbers: Ints = np.unique(np.concatenate(allgather(self._comm, coupled)))
+        self._indices = np.searchsorted(self._numbers, self.nodes + self._first)
+        rows, columns = (_dofs_of(nodes, d) for nodes in (self.nodes, self._numbers))
+        self._K = csr_matrix(local[rows][:, columns])
+        self._shape = len(self.nodes), d
+
+    @property
+    def diagonal_blocks(self) -> Values:
+        """(m, d, d) blocks on the diagonal at the nodes of this rank, N/m."""
+        (m, d), K = self._shape, self._K.tocoo()
+        blocks = np.zeros((m, d, d))
+        inside = K.col // d == self._indices[K.row // d]
+        row, column = K.row[inside], K.col[inside]
+        blocks[row // d, row % d, column % d] = K.data[inside]
+        return blocks
+
+    def multiply(self, x: Reals) -> Values:
+        """(m, d) product at the nodes of this rank with their x (m, d) (collective)."""
+        if self._comm.size > 1:
+            x_all = np.zeros((len(self._numbers), self._shape[1]))
+            x_all[self._indices] = x
+            x = sum_over_ranks(self._comm, x_all)
+        return np.asarray(self._K @ x.reshape(-1)).reshape(self._shape)
+
+    def owned_rows(self, nodes: Ints, node_map: IndexMap) -> csr_matrix:
+        """(d n, dofs of all ranks) rows of owned nodes (n,); `node_map`: nodes of the body."""
+        from scipy.sparse import csr_matrix
+
+        d, K = self._shape[1], self._K.tocoo()
+        position = np.full(node_map.size_local, -1)
+        position[nodes] = np.arange(len(nodes))
+        row = position[self.nodes][K.row // d]
+        inside = row >= 0
+        row, column = row[inside], self._numbers[K.col[inside] // d]
+        entries = d * row + K.row[inside] % d, d * column + K.col[inside] % d
+        return csr_matrix((K.data[inside], entries), shape=(d * len(nodes), d * node_map.size_global))
+
+
+def _dofs_of(nodes: Ints, d: int) -> Ints:
+    """(d n,) dofs of nodes (n,)."""
+    return np.asarray(d * nodes[:, None] + np.arange(d)).reshape(-1)

@@ -1,7 +1,8 @@
 """Tangent K(u) = d r / d u of a balance of forces.
 
 Forms of the terms are assembled cell by cell (mechanics.matrix_assembly). Couplings between nodes of different cells
-are added to that matrix. Those that would fill it stay beside it: as low-rank updates, or as StiffCoupling.
+are added to a matrix of single entries, and stay beside a matrix in blocks. Those that would fill the matrix stay
+beside it in both cases: as low-rank updates, or as StiffCoupling.
 
 Equations: docs/theory.md#linear-systems.
 """
@@ -91,6 +92,7 @@ class Tangent:
         self.may_be_incomplete = any(term.leaves_tangent_incomplete for term in terms)
         self._linear = all(term.linear for term in terms)
         self._has_couplings = False  # whether a coupling has ever been added
+        self._couplings: list[PETSc.Mat] = []  # of the last tangent, beside its blocks, but for ties
         self._has_varying_couplings = False  # whether one that is no constant has
         self._with_contact = True
         self._psd: PsdProjection | None = None
@@ -112,9 +114,9 @@ class Tangent:
     def switch_to_blocks(self) -> BlockMatrix | None:
         """Assemble into blocks of a node's dofs from now on; returns the matrix in blocks (collective).
 
-        None if terms add single entries, or without a compiler.
+        None if terms add entries to the matrix themselves, or without a compiler.
         """
-        if any(map(adds_single_entries, self._terms)):
+        if overriding(self._terms, "add_stiffness"):
             return None
         return self._assembler.switch_to_blocks(with_dead_cells=not self._mass.is_diagonal)
 
@@ -123,9 +125,9 @@ class Tangent:
         if self._has_couplings and self._assembler.entries_outdated:
             self.matrix.zeroEntries()  # entries beyond the blocks
         if self._assembler.update_entries() and self._with_contact:
-            for coupling in [term.coupling_matrix() for term in self._stiff]:
-                if coupling is not None:
-                    self._couple(coupling, constant=True)
+            ties = [term.coupling_matrix() for term in self._tied_terms]
+            for coupling in [*filter(None, ties), *self._couplings]:
+                self._add_coupling(coupling)
 
     def owned_rows(self, nodes: Ints) -> csr_matrix:
         """(d n, dofs of all ranks) rows of owned nodes (n,), with ties (collective)."""
@@ -194,16 +196,9 @@ class Tangent:
             self._assemble_body(psd_tolerance)
         self.stiff_couplings, self.has_contact_coupling = [], False
         if (blocks := self._assembler.blocks) is not None:
-            ties = [term.tie_matrix(self._motion.free_dofs) for term in self._tied_terms] if self._with_contact else []
-            blocks.ties = [tie for tie in ties if tie is not None]
-            return
-        for term in self._stiff:
-            term.add_stiffness(self.matrix)
-            if not self._with_contact or (coupling := term.coupling_matrix()) is None:
-                continue
-            # a constant one is still in a tangent that is reused
-            if not (reused and term.linear):
-                self._couple(coupling, constant=term.linear)
+            self._couple_blocks(blocks)
+        else:
+            self._couple_entries(reused=reused)
         eliminating = self._eliminating if self._with_contact else []
         self.low_rank_updates = [update for term in eliminating for update in term.low_rank_updates()]
         for U, _ in self.low_rank_updates:
@@ -273,24 +268,57 @@ class Tangent:
 
     # --- couplings between nodes of different cells ---
 
-    def _couple(self, coupling: PETSc.Mat | StiffCoupling, *, constant: bool) -> None:
-        """Add a matrix of another pattern to K, without prescribed dofs; a StiffCoupling stays beside it (collective).
+    def _couple_entries(self, *, reused: bool) -> None:
+        """Add stiffness and couplings of the terms to the entries; `reused`: those of the body are reused (collective).
 
-        A constant coupling stays in K while the body's part is reused.
+        Constant couplings are still in entries that are reused.
         """
-        self.has_contact_coupling |= not constant
+        for term in self._stiff:
+            term.add_stiffness(self.matrix)
+            if not self._with_contact or (coupling := self._coupling_of(term)) is None:
+                continue
+            if not (reused and term.linear):
+                self._add_coupling(coupling)
+
+    def _couple_blocks(self, blocks: BlockMatrix) -> None:
+        """Keep ties and couplings of the terms beside the blocks (collective)."""
+        from .block_matrix import CouplingMatrix
+
+        blocks.couplings, self._couplings = [], []
+        if not self._with_contact:
+            return
+        ties = [term.tie_matrix(self._motion.free_dofs) for term in self._tied_terms]
+        blocks.couplings += [tie for tie in ties if tie is not None]
+        for term in self._stiff:
+            if term in self._tied_terms or (coupling := self._coupling_of(term)) is None:
+                continue
+            coupling.zeroRowsColumns(self._prescribed_rows, diag=0.0)
+            self._couplings.append(coupling)
+            blocks.couplings.append(CouplingMatrix(coupling))
+
+    def _coupling_of(self, term: Term) -> PETSc.Mat | None:
+        """Coupling of a term that is to be added to K, if any; a StiffCoupling is kept beside it (collective)."""
+        coupling = term.coupling_matrix()
+        if coupling is None:
+            return None
+        self.has_contact_coupling |= not term.linear
         if isinstance(coupling, StiffCoupling):
             coupling.matrix.zeroRowsColumns(self._prescribed_rows, diag=0.0)
             coupling.directions[self._motion.owned_dofs] = 0.0
             self.stiff_couplings.append(coupling)
-            return
+            return None
+        self._has_varying_couplings |= not term.linear
+        return coupling
+
+    def _add_coupling(self, coupling: PETSc.Mat) -> None:
+        """Add a matrix of another pattern to the entries of K, without prescribed dofs (collective)."""
         K = self.matrix
         before = K.getInfo()["nz_used"]
         part = coupling.copy()
         part.zeroRowsColumns(self._prescribed_rows, diag=0.0)
         K.axpy(1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
         part.destroy()
-        self._has_couplings, self._has_varying_couplings = True, self._has_varying_couplings or not constant
+        self._has_couplings = True
         self.pattern_version += bool(sum_over_ranks(self.domain.comm, int(K.getInfo()["nz_used"] != before))[0])
 
     @cached_property
@@ -307,10 +335,3 @@ class Tangent:
 def _exclude_dead_cells(stress: Stress, form: CellForm) -> None:
     if (dead := stress.dead_cells) is not None:
         form.exclude_cells(dead)
-
-
-def adds_single_entries(term: Term) -> bool:
-    """Whether a term adds single entries to the tangent, which blocks cannot take: neither a form nor ties."""
-    kind = type(term)
-    couples = kind.coupling_matrix is not Term.coupling_matrix and not isinstance(term, TieTerm)
-    return couples or isinstance(term, LowRankTerm) or kind.add_stiffness is not Term.add_stiffness

@@ -28,8 +28,7 @@ from scipy.sparse.csgraph import connected_components
 
 from ..mechanics.balance import Balance
 from ..mechanics.cell_energy import CellEnergy
-from ..mechanics.tangent import adds_single_entries
-from ..mechanics.term import Term
+from ..mechanics.term import overriding
 from ..mechanics.term_protocols import TieTerm
 from ..mesh.parallel import allgather, sum_over_ranks
 from .policy import DEFAULT_POLICY, SolverPolicy
@@ -95,9 +94,8 @@ def create_elimination(balance: Balance, policy: SolverPolicy = DEFAULT_POLICY) 
     All its parts but the stress of each cell have to be constant forces, inertia and ties.
     """
     remaining_terms = [term for term in balance.terms if term is not balance.stress]
-    are_constant = not any(
-        type(term).tangent_form is not Term.tangent_form or adds_single_entries(term) for term in remaining_terms
-    )
+    has_ties_alone = all(isinstance(term, TieTerm) for term in overriding(remaining_terms, "coupling_matrix"))
+    are_constant = has_ties_alone and not overriding(remaining_terms, "tangent_form", "add_stiffness")
     has_cell_energy = balance.domain.order == 1 and balance.stress.rotation is None
     has_lumped_inertia = balance.mass.is_diagonal and balance.scheme.inertia
     has_potential = balance.conservative and not balance.contact.limits_newton_steps

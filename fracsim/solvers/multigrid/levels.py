@@ -25,7 +25,7 @@ from .hierarchy import BlockCSRData, LevelData
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ...mechanics.block_matrix import TieMatrix
+    from ...mechanics.block_matrix import NodeCoupling
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -60,7 +60,7 @@ class SmoothedLevel:
         x: scaled solution.
         residual: b - A' x.
         scale: (dofs with ghosts,) S.
-        ties: ties, which are added to the blocks of A.
+        couplings: stiffness between nodes anywhere that is added to the blocks of A.
         smoothing: amount of smoothing.
     """
 
@@ -79,7 +79,7 @@ class SmoothedLevel:
         diagonal = np.abs(data.diagonal)
         self.scale: Values = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         self._comm, self._owned, self._size, self._policy = nodes.comm, nodes.size_local * size, size, policy
-        self.ties: Sequence[TieMatrix] = ()
+        self.couplings: Sequence[NodeCoupling] = ()
         self._matrix = BlockCSR(code, size, pattern.starts, pattern.columns)
         self._inverse = BlockDiagonal(code, size, nodes.size_local)
         self.b, self.x, self.residual, self._direction, self._next_x = (GhostedVector(nodes, size) for _ in range(5))
@@ -88,9 +88,9 @@ class SmoothedLevel:
         self._row = np.repeat(np.arange(nodes.size_local), np.diff(pattern.starts))
         self._on_diagonal = np.flatnonzero(pattern.columns == self._row)
 
-    def assign_values(self, values: Values, ties: Sequence[TieMatrix] = ()) -> None:
-        """Assign the blocks (blocks, size^2) of A and its ties, and set up the smoother (collective)."""
-        self.ties = ties
+    def assign_values(self, values: Values, couplings: Sequence[NodeCoupling] = ()) -> None:
+        """Assign the blocks (blocks, size^2) of A and its couplings, and set up the smoother (collective)."""
+        self.couplings = couplings
         self._matrix.assign_scaled(values, self.scale, self.scale)
         self._inverse.assign_inverse(self._diagonal_blocks())
         self._largest_eigenvalue = self._estimate_largest_eigenvalue()
@@ -103,12 +103,12 @@ class SmoothedLevel:
         self._weights = chebyshev(self._largest_eigenvalue, smoothing.steps, smoothing.lower_bound, upper)
 
     def _diagonal_blocks(self) -> Single:
-        """Return the diagonal blocks of A' with the ties, (owned nodes, size, size)."""
+        """Return the diagonal blocks of A' with the couplings, (owned nodes, size, size)."""
         D = np.zeros_like(self._inverse.blocks)
         D[self._row[self._on_diagonal]] = self._matrix.blocks[self._on_diagonal].reshape(-1, *D.shape[1:])
-        for tie in self.ties:
-            axes = np.arange(self._size)
-            D[tie.nodes[:, None], axes, axes] += tie.diagonal * self._scale_at(tie.nodes) ** 2
+        for coupling in self.couplings:
+            scale = self._scale_at(coupling.nodes)
+            D[coupling.nodes] += coupling.diagonal_blocks * (scale[:, :, None] * scale[:, None, :])
         return D
 
     def _estimate_largest_eigenvalue(self) -> float:
@@ -152,21 +152,21 @@ class SmoothedLevel:
         self.x.update_ghosts()
         self.residual.array[: self._owned] = 0.0
         self._matrix.add_product(self.x, self.residual)
-        for nodes, product in self._tie_products():
+        for nodes, product in self._coupling_products():
             self._by_nodes(self.residual)[nodes] += product
 
     def _compute_residual(self) -> None:
         """Compute residual = b - A' x (collective)."""
         self.x.update_ghosts()
         self._matrix.compute_residual(self.b, self.x, self.residual)
-        for nodes, product in self._tie_products():
+        for nodes, product in self._coupling_products():
             self._by_nodes(self.residual)[nodes] -= product
 
-    def _tie_products(self) -> Iterator[tuple[Ints, Values]]:
-        """Yield the nodes of each tie matrix, and its product with x."""
-        for tie in self.ties:
-            scale = self._scale_at(tie.nodes)
-            yield tie.nodes, scale * tie.multiply(scale * self._by_nodes(self.x)[tie.nodes])
+    def _coupling_products(self) -> Iterator[tuple[Ints, Values]]:
+        """Yield the nodes of each coupling, and its product with x."""
+        for coupling in self.couplings:
+            scale = self._scale_at(coupling.nodes)
+            yield coupling.nodes, scale * coupling.multiply(scale * self._by_nodes(self.x)[coupling.nodes])
 
     def _scale_at(self, nodes: Ints) -> Values:
         """Return S at nodes, (n, size)."""
@@ -203,7 +203,7 @@ class SmoothedLevel:
         for keep, take in weights:
             self.x.update_ghosts()
             self._matrix.smoothing_step(self._inverse, keep, take, self.b, self.x, self._direction, self._next_x)
-            for nodes, product in self._tie_products():
+            for nodes, product in self._coupling_products():
                 step = take * np.einsum("nij,nj->ni", self._inverse.blocks[nodes], product)
                 for vector in (self._direction, self._next_x):
                     self._by_nodes(vector)[nodes] -= step
@@ -233,9 +233,9 @@ class FineLevel(SmoothedLevel):
         self._unscaled_x = GhostedVector(nodes, size, np.float64)
         self._lost = np.zeros((nodes.size_local, size, size), np.float32)
 
-    def assign_values(self, values: Values, ties: Sequence[TieMatrix] = ()) -> None:
-        """Assign the blocks of A and its ties, and compute the rounding loss of the blocks (collective)."""
-        super().assign_values(values, ties)
+    def assign_values(self, values: Values, couplings: Sequence[NodeCoupling] = ()) -> None:
+        """Assign the blocks of A and its couplings, and compute the rounding loss of the blocks (collective)."""
+        super().assign_values(values, couplings)
         self._matrix.compute_rounding_loss(values, self._unscale, self._unscale, self._lost)
 
     def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
@@ -245,8 +245,8 @@ class FineLevel(SmoothedLevel):
         self._unscaled_x.update_ghosts()
         self._matrix.multiply(self._lost, self._unscale, self._unscaled_x, values, product)
         product_by_nodes, x_by_nodes = (array.reshape(-1, self._size) for array in (product, values))
-        for tie in self.ties:
-            product_by_nodes[tie.nodes] += tie.multiply(x_by_nodes[tie.nodes])
+        for coupling in self.couplings:
+            product_by_nodes[coupling.nodes] += coupling.multiply(x_by_nodes[coupling.nodes])
 
 
 def chebyshev(largest: float, steps: int, lower: float, upper: float) -> list[tuple[float, float]]:

@@ -128,7 +128,7 @@ class SinglePrecisionVCycle:
 
     def update_operator(self) -> None:
         """Assign the present tangent to the finest level (collective)."""
-        self.fine_level.assign_values(self._values, self._blocks.ties)
+        self.fine_level.assign_values(self._values, self._blocks.couplings)
 
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Evaluate y = M x (collective)."""
