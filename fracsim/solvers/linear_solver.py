@@ -151,7 +151,6 @@ class LinearSolver:
         else:
             self.preconditioner = Preconditioner(
                 ksp, options, balance, policy, is_default=_is_default_preconditioner(given), keeps=self.is_iterative,
-                has_block_products=self.operators.products is not None,
             )  # fmt: skip
         self._asked_rtol = float(given.get("ksp_rtol", 0.0))
         self.steps_are_linear = steps_are_linear(balance, given, ksp.getType())
@@ -231,7 +230,6 @@ class LinearSolver:
     def _prepare(self, eigenvalue_floor: float | None) -> None:
         """Assemble the tangent, and update preconditioner or factors to it (collective)."""
         self.operators.assemble(eigenvalue_floor)
-        self.operators.update_products()
         self._tell_of_last_solve()
         tangent = self.tangent
         if (tangent.low_rank_updates or tangent.stiff_couplings) and self.ksp.getType() == "preonly":

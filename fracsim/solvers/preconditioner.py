@@ -48,10 +48,6 @@ FRAGMENT_OPTIONS: PetscOptions = {
 }
 SSOR_OPTIONS: PetscOptions = {"pc_type": "sor"}
 MULTIGRID_OPTIONS: PetscOptions = {"pc_type": "gamg"}
-# The finest level: one step with the inverses of the nodes' blocks, within bounds of their own spectrum.
-NODE_BLOCK_OPTIONS: PetscOptions = {
-    "pc_type": "pbjacobi", "ksp_max_it": 1, "ksp_chebyshev_esteig": "0,0.05,0,1.1"
-}  # fmt: skip
 STRONG_LINKS: PetscOptions = {"pc_gamg_threshold": 0.05, "pc_gamg_aggressive_square_graph": False}
 # On several ranks PETSc (3.22) coarsens the square of a graph of strong links: without, MISk does not end.
 STRONG_LINKS_ON_RANKS: PetscOptions = STRONG_LINKS | {"pc_gamg_aggressive_square_graph": True}
@@ -111,13 +107,12 @@ class AppliedPreconditioner:
         self.pc.reset()
         self.pc.setFromOptions()
 
-    def set_up(self, operators: TangentOperators, *, rebuild: bool, by_node_blocks: bool) -> None:
+    def set_up(self, operators: TangentOperators, *, rebuild: bool) -> None:
         """Set up for the tangent of the next solve (collective).
 
         Args:
             operators: tangent.
             rebuild: whether coarse spaces are made anew.
-            by_node_blocks: whether the finest level of PETSc's multigrid is smoothed by blocks of a node's dofs.
         """
         if rebuild:
             self.pc.reset()
@@ -127,18 +122,6 @@ class AppliedPreconditioner:
             from .multigrid.vcycle import create_vcycle
 
             self.vcycle = create_vcycle(self.pc, operators.blocks, self._policy)
-        if self.vcycle is None and by_node_blocks and self.pc.getType() == "gamg":
-            self._smooth_by_node_blocks()
-
-    def _smooth_by_node_blocks(self) -> None:
-        # most products of a large body are with the finest level
-        finest = self.pc.getMGSmoother(self.pc.getMGLevels() - 1)
-        options = PETSc.Options(finest.getOptionsPrefix())
-        for key, value in NODE_BLOCK_OPTIONS.items():
-            options[key] = value
-        finest.setFromOptions()
-        for key in NODE_BLOCK_OPTIONS:
-            options.delValue(key)
 
     @property
     def may_deflate(self) -> bool:
@@ -198,7 +181,6 @@ class Preconditioner:
         *,
         is_default: bool,
         keeps: bool,
-        has_block_products: bool,
     ) -> None:
         """Create the preconditioner (collective).
 
@@ -209,12 +191,10 @@ class Preconditioner:
             policy: tuned numbers.
             is_default: whether the study chooses no preconditioner.
             keeps: whether it is reused for later tangents, unlike factors.
-            has_block_products: whether products with the finest level are most of the work.
         """
         self._comm, self._balance, self._policy = ksp.comm, balance, policy
         self.applied = AppliedPreconditioner(ksp, options, balance, policy, is_default=is_default)
         self._node_count = balance.domain.space.dofmap.index_map.size_global
-        self._has_block_products = has_block_products
         # --- facts ---
         self._iterations = self._equivalent = 0  # of the last solve, and of one to full accuracy
         self._edges_since_update = 0
@@ -233,7 +213,6 @@ class Preconditioner:
         self._may_suit_fragments = is_default and balance.scheme.inertia
         # iterations with aggregates of all links, while strong ones are on trial; 0: unknown; None: settled
         self._all_links_iterations: int | None = 0 if self._may_suit_fragments else None
-        self._uses_node_blocks = False
         self._uses_ssor: bool | None = None  # of a body in fragments; None: it is in one piece
         self._rebuild_ratio = policy.rebuild_ratio
 
@@ -360,7 +339,6 @@ class Preconditioner:
         is_worse = equivalent > (policy.strong_link_gain * all_links if all_links else policy.slow_iterations)
         self._all_links_iterations = equivalent if is_worse and not all_links else (None if all_links else 0)
         if is_worse:
-            self._uses_node_blocks = self._has_block_products
             strong = STRONG_LINKS if self._comm.size == 1 else STRONG_LINKS_ON_RANKS
             self._change_kind(ALL_LINKS if all_links else strong)
             self._fresh_iterations = 0
@@ -370,7 +348,7 @@ class Preconditioner:
         """Aggregate without smoothing from now on, if inertia holds fragments that hang by a node (collective)."""
         if mass_stiffness_ratio(self._balance) <= self._policy.max_deflated_inertia:
             return
-        self._may_suit_fragments = self._uses_node_blocks = self._uses_ssor = False
+        self._may_suit_fragments = self._uses_ssor = False
         self._rebuild_ratio = self._policy.rebuild_ratio_fragments
         self._change_kind(FRAGMENT_OPTIONS)
 
@@ -395,7 +373,7 @@ class Preconditioner:
         if rebuild:
             self._fresh_iterations = self._solves = 0
             self._edges_since_rebuild = False
-        self.applied.set_up(operators, rebuild=rebuild, by_node_blocks=self._uses_node_blocks)
+        self.applied.set_up(operators, rebuild=rebuild)
         if rebuild or self.applied.vcycle is None:
             self._extra_iterations = 0.0
         self._extra_at_refresh = self._extra_iterations

@@ -74,8 +74,8 @@ class TangentOperators:
         self._release_operators()
         tangent = self._tangent
         self.products: PETSc.Mat | None = None
-        if self._may_use_blocks and blocks_pay_off(tangent.matrix, self._policy.min_block_dofs):
-            blocks = tangent.switch_to_blocks()
+        pay_off = self._may_use_blocks and blocks_pay_off(tangent.matrix, self._policy.min_block_dofs)
+        if pay_off and (blocks := tangent.switch_to_blocks()) is not None:
             self._block_operator = BlockOperator(tangent.matrix, blocks)
             self.products = self._block_operator.to_petsc()
         self.operator = self.products or tangent.matrix
@@ -111,6 +111,7 @@ class TangentOperators:
         self.eigenvalue_floor = eigenvalue_floor
         self._tangent.assemble(psd_tolerance=eigenvalue_floor, blocks_only=True)
         self._check_pattern()
+        self._attach_nullspace()
 
     def add_pattern_listeners(self, *listeners: PatternListener) -> None:
         """Tell these listeners of every change of the pattern."""
@@ -121,16 +122,8 @@ class TangentOperators:
         if self._known_pattern == self._tangent.pattern_version:
             return
         self._known_pattern = self._tangent.pattern_version
-        if self._block_operator is not None:
-            self._block_operator.pattern_changed()
         for listener in self._listeners:
             listener.pattern_changed()
-
-    def update_products(self) -> None:
-        """Update products and rigid body modes to the last tangent (collective)."""
-        if self._block_operator is not None:
-            self._block_operator.update_copy()
-        self._attach_nullspace()
 
     def update_entries(self) -> None:
         """Update the entries of `matrix` to the blocks (collective)."""
@@ -160,9 +153,7 @@ class TangentOperators:
 
     def _release_operators(self) -> None:
         """Free the matrices for products."""
-        if self._block_operator is not None:
-            self._block_operator.release_copy()
-            self._block_operator = None
+        self._block_operator = None
         if self._low_rank_operator is not None:
             self._low_rank_operator.destroy()
             self._low_rank_operator = None
