@@ -30,7 +30,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Data]:
     return from_files(tmp_path_factory.mktemp("files"))
 
 
-PARTS = 4
+PARTS = 8
 FILES = ("file", "soft file", "surface", "outline", "shell")
 
 
