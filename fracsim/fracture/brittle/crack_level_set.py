@@ -7,7 +7,7 @@ facet which the surface crosses gets
     phi_j = mean over i of phi_i + (N_i + N_j) / 2 . (X_j - X_i)     (trapezoidal rule),
 
 with the principal direction D_j around the node and its reliability w_j: 1 where the stress reaches the strength and
-one principal stress stands out, 0 without tension, so that the surface goes straight on there.
+one principal stress stands out, 0 without tension, where the surface continues straight.
 
 Equations: docs/theory.md#brittle-surfaces.
 """

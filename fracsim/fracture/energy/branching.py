@@ -1,13 +1,13 @@
-"""Crack tips that share a disc, as those of a crack that has branched do (2D; `crack_speed` decides when it branches).
+"""Crack tips that share a disc, such as those of a branched crack (2D; `crack_speed` has the criterion of branching).
 
     g = G a,   a = sum_k q(x_k) t_k      of tips x_k in the disc that advance along t_k and release G each
 
-The force of a disc with several tips is that of all of them, so it is divided by the advance of all. Each of two short
-branches releases 0.52 of what the single crack releases straight on.
+The force of a disc with several tips is that of all of them, so that it is divided by the advance of all. Each of two
+short branches releases 0.52 of the energy of the single crack straight ahead.
 
-That force does not tell the direction of one tip. Until branches have left each other's discs they advance side by side
-and straight on, at the angle at which short branches open without sliding. But a branch does not wait for the other if
-there is enough energy for both: the other has stopped, and would never catch up.
+The force does not give the direction of one tip. Until branches have left each other's discs they advance side by side
+and straight, at the angle at which short branches open without sliding. If there is enough energy for both, a branch
+advances without the other, which has stopped and would never catch up.
 
 Equations: docs/theory.md#crack-speed-and-branching.
 """

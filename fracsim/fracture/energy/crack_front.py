@@ -10,8 +10,8 @@ Neighbouring tips of a front without inertia share their force,
 
     G_i = sum_j w_ij g_j . a_j / sum_j w_ij |a_j|^2,    w_ij = 1 - |x_j - x_i| / R_i.
 
-Along a straight front this reduces the standard deviation of G from 2.5 % to 1.1 %. Fronts with inertia go by each tip
-alone: what lags behind is fed more, and with the mean they ran at 0.61 c_R instead of 0.70 c_R.
+Along a straight front this reduces the standard deviation of G from 2.5 % to 1.1 %. With inertia each tip has
+its own rate: a tip that lags behind gets more energy, and with the mean fronts ran at 0.61 c_R instead of 0.70 c_R.
 
 Equations: docs/theory.md#configurational-force.
 """

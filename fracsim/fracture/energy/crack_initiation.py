@@ -39,8 +39,8 @@ class CutProposal:
         stress: (n, d, d) averaged stress, Pa.
         entry: (n,) local edges by which cracks came in; None for new cracks, as the following.
         ahead: (n, d) directions of the cracks.
-        turns: (n,) the crack goes exactly along `ahead`, not across the first principal stress.
-        branches: (n,) the crack becomes two.
+        turns: (n,) the crack follows `ahead` exactly, not the plane across the first principal stress.
+        branches: (n,) the crack branches.
     """
 
     rank: Values
@@ -77,7 +77,7 @@ def rank_rows(kind: int, sigma: Values, key: Values, points: Values, exclusion: 
 
     Args:
         kind: TIP_ADVANCE or NEW_CRACK.
-        sigma: (n,) first principal stress, Pa: the largest goes first.
+        sigma: (n,) first principal stress, Pa; cells are selected from the largest on.
         key: (n, ...) numbers that the hash is of, the same on any number of ranks.
         points: (n, d) m.
         exclusion: (n,) distance within which no other cell may be cut, m.

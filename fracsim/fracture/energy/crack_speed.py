@@ -1,18 +1,17 @@
-"""Crack tips with a speed, which branch where the speed does not take up the energy that flows to them (2D, inertia).
+"""Speed of crack tips in 2D with inertia, and the criterion by which cracks branch.
 
     v = c_R (1 - G_c / G*),   G* = G / (1 - v / c_R)     up to c_R / 2, with a relaxation time of R / c_R
     mean of G over R / c_R >= 2 G_c                      the crack branches
 
-G* is the energy that would flow to the tip at rest (Freund 1972), and R / c_R the time of a Rayleigh wave through its
-disc. Where G = G_c, G* grows with the speed, and at c_R / 2 it is that of two cracks: from there on the crack could
-become two that start from rest (Eshelby 1970). In glass and PMMA it sheds short side branches instead of running faster
-(Sharon and Fineberg 1999). So the speed is limited here, and G grows beyond G_c. At 2 G_c two cracks at c_R / 2 take
-the energy
-up: the crack becomes these, and they keep its speed.
+G* is the energy release rate of a tip at rest (Freund 1972), and R / c_R the time of a Rayleigh wave through its disc.
+Where G = G_c, G* grows with the speed, and at c_R / 2 it is that of two cracks: from there on the crack could become
+two that start from rest (Eshelby 1970). In glass and PMMA it sheds short side branches instead of a higher speed
+(Sharon and Fineberg 1999). The speed is therefore limited, and G grows beyond G_c. At 2 G_c two cracks at c_R / 2 take
+up the energy: the crack branches, and both keep its speed.
 
-A tip cuts a cell when it has travelled through it. Cutting by G >= G_c alone would let it run at c_R and stop in turn,
-since the energy of a cut cell is released over R / c_R. The speed is used where no other tip's disc overlaps, and in
-steps in which a wave stays in the disc. In longer steps a tip goes by G >= G_c, as one.
+A tip cuts a cell when it has travelled through it. With G >= G_c alone it would alternate between c_R and rest, since
+the energy of a cut cell is released over R / c_R. The speed is used where no disc of another tip overlaps, and in steps
+in which a wave does not leave the disc. In other cases the criterion of a tip is G >= G_c.
 
 Equations: docs/theory.md#crack-speed-and-branching.
 """

@@ -107,8 +107,8 @@ def branching_cuts(
 ) -> EdgeCuts:
     """Return the edges by which cracks leave their triangles, two of them for those that branch (n,).
 
-    Branches are at the branching angle to `ahead`. In a triangle that both would leave by one edge the crack goes on as
-    one, and branches in the next. The other arguments are those of `exit_cuts`.
+    Branches are at the branching angle to `ahead`. In a triangle that both would leave by one edge the crack stays
+    single, and branches in the next. The other arguments are those of `exit_cuts`.
     """
     single_cuts = exit_cuts(corners, entry, point, normal, ahead, split_beyond)
     rows = np.flatnonzero(branches)

@@ -1,10 +1,10 @@
 """Advance of fronts in 3D without inertia: a whole stretch of a front advances before the body is solved for again.
 
-A ball of 4 h cannot distinguish the release rates of neighbouring tips to better than some per cent (crack_front). So
-when a tip reaches G_c, tips in its ball that lack at most 3 % advance with it. Each of them leads a plane: cells that
-its cut enters are cut by the plane up to 0.65 h away, one by one, no nearer than h / 2 to one another, in rounds
-without a solve, since cells cut at once would not match. A tip that was evaluated and has less stays. Young tips go by
-stress, which one cell changes, and lead no plane.
+A ball of 4 h cannot distinguish the release rates of neighbouring tips to better than some per cent (crack_front). When
+a tip reaches G_c, tips in its ball that lack at most 3 % therefore advance with it. Each of them leads a plane. Cells
+that its cut enters are cut by the plane up to 0.65 h away, one by one, no nearer than h / 2 to one another: cells cut
+at once would not match. Tips with less do not advance. The criterion of young tips is the stress, which one cell
+changes; they lead no plane.
 
 Equations: docs/theory.md#tip-criterion.
 """

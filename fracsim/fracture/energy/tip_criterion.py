@@ -1,8 +1,9 @@
 """Criterion of a body with a fracture energy G_c: which crack tips advance, and where cracks start.
 
 A tip advances by a cell if the configurational force over a disc of 5 h (3D: a ball of 4 h) reaches G_c, once the crack
-behind it is longer than the disc (a mature tip). Young tips and undamaged material go by stress: its average reaches
-the strength f_t; or at a young tip the mean square over 3 h reaches that of a crack with G = G_c.
+behind it is longer than the disc (a mature tip). The criterion of young tips and of undamaged material is the average
+stress, which has to reach the strength f_t; or, at a young tip, the mean square over 3 h, which has to reach that of a
+crack with G = G_c.
 
 Equations: docs/theory.md#tip-criterion.
 """
@@ -252,8 +253,8 @@ class TipCriterion:
     def _cut_rows(self, proposal: CutProposal, cuts: EdgeCuts) -> Values:
         """Return rows (n, 6 + course_width) that describe the cut edges to all ranks.
 
-        They are the key of the edge, its cut position, the rank of the cell (3), and the course of a crack that goes
-        straight on, 0 for the others.
+        They are the key of the edge, its cut position, the rank of the cell (3), and the course of a crack that
+        continues straight, 0 for the others.
         """
         cells = proposal.cells[cuts.row]
         # Edges are described by input nodes, which all ranks know.

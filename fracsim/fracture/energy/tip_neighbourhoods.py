@@ -1,7 +1,7 @@
 """Neighbourhoods of crack tips: the cells around each tip and their weights, updated only where cracks have changed.
 
 A tip is a cell that is cut and not split, at the mean of the points at which its edges are cut. The cells around a tip
-and their weights are kept as long as the tip stays, and the crack behind it as long as no part of that changes.
+and their weights are stored until the cell is split, the crack behind it until a part of it changes.
 """
 
 from __future__ import annotations
