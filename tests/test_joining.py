@@ -311,7 +311,7 @@ def test_ties_are_in_the_tangent_once(monkeypatch: pytest.MonkeyPatch) -> None:
     K = balance.tangent.matrix
     balance.tangent.assemble()
     once = K.convert("dense").getDenseArray().copy() if K.comm.size == 1 else None
-    assert once is not None and not balance.tangent.has_contact_coupling
+    assert once is not None and not balance.tangent.couplings.has_contact
     added = tethers.coupling_matrix()
     assert added is not None
     # a node and a corner of its cell that share no cell: nothing but the tie is there

@@ -35,6 +35,7 @@ from .term_protocols import LowRankTerm, StepLimiter, TieTerm
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
+    from ..mesh.domain import Domain
     from .block_matrix import BlockMatrix
     from .psd_projection import PsdProjection
 
@@ -58,6 +59,96 @@ class ReusePolicy:
 REUSE = ReusePolicy()
 
 
+class Couplings:
+    """Couplings between nodes of different cells, which the terms of a balance add to its tangent.
+
+    Attributes:
+        stiff: couplings of the last tangent that the assembled matrix lacks.
+        has_contact: whether terms coupled nodes in the last tangent, except by constants.
+        in_entries: whether the matrix of single entries has ever had one.
+        varying: whether a coupling that is no constant has ever been added to K.
+    """
+
+    def __init__(self, terms: Sequence[Term], motion: PrescribedMotion, domain: Domain) -> None:
+        self._motion, self._domain = motion, domain
+        self._tied = [term for term in terms if isinstance(term, TieTerm)]
+        self._coupled = overriding(terms, "add_stiffness", "coupling_matrix")
+        self.stiff: list[StiffCoupling] = []
+        self._beside_blocks: list[PETSc.Mat] = []  # of the last tangent, but for ties
+        self.has_contact = self.in_entries = self.varying = False
+
+    def add_to_entries(self, K: PETSc.Mat, *, with_contact: bool, only_varying: bool) -> bool:
+        """Add stiffness and couplings of the terms to the entries (collective).
+
+        Args:
+            K: tangent in single entries.
+            with_contact: whether couplings are added.
+            only_varying: whether K has the constant couplings already.
+
+        Returns:
+            Whether the nonzero pattern has changed.
+        """
+        self.stiff, self.has_contact, changed = [], False, False
+        for term in self._coupled:
+            term.add_stiffness(K)
+            if not with_contact or (coupling := self._coupling_of(term)) is None:
+                continue
+            if not (only_varying and term.linear):
+                changed |= self._add(K, coupling)
+        return changed
+
+    def put_beside(self, blocks: BlockMatrix, *, with_contact: bool) -> None:
+        """Put ties and couplings of the terms beside the blocks (collective)."""
+        from .block_matrix import CouplingMatrix
+
+        self.stiff, self.has_contact, blocks.couplings, self._beside_blocks = [], False, [], []
+        if not with_contact:
+            return
+        ties = [term.tie_matrix(self._motion.free_dofs) for term in self._tied]
+        blocks.couplings += [tie for tie in ties if tie is not None]
+        for term in self._coupled:
+            if term in self._tied or (coupling := self._coupling_of(term)) is None:
+                continue
+            coupling.zeroRowsColumns(self._prescribed_rows, diag=0.0)
+            self._beside_blocks.append(coupling)
+            blocks.couplings.append(CouplingMatrix(coupling))
+
+    def copy_to_entries(self, K: PETSc.Mat) -> bool:
+        """Add ties and the couplings beside the blocks to entries; returns whether the pattern changed (collective)."""
+        ties = [tie for term in self._tied if (tie := term.coupling_matrix()) is not None]
+        return any([self._add(K, coupling) for coupling in (*ties, *self._beside_blocks)])
+
+    def _coupling_of(self, term: Term) -> PETSc.Mat | None:
+        """Coupling of a term that is to be added to K, if any; a StiffCoupling is kept beside it (collective)."""
+        coupling = term.coupling_matrix()
+        if coupling is None:
+            return None
+        self.has_contact |= not term.linear
+        if isinstance(coupling, StiffCoupling):
+            coupling.matrix.zeroRowsColumns(self._prescribed_rows, diag=0.0)
+            coupling.directions[self._motion.owned_dofs] = 0.0
+            self.stiff.append(coupling)
+            return None
+        self.varying |= not term.linear
+        return coupling
+
+    def _add(self, K: PETSc.Mat, coupling: PETSc.Mat) -> bool:
+        """Add a matrix of another pattern without prescribed dofs; returns whether the pattern changed (collective)."""
+        before = K.getInfo()["nz_used"]
+        part = coupling.copy()
+        part.zeroRowsColumns(self._prescribed_rows, diag=0.0)
+        K.axpy(1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
+        part.destroy()
+        self.in_entries = True
+        return bool(sum_over_ranks(self._domain.comm, int(K.getInfo()["nz_used"] != before))[0])
+
+    @cached_property
+    def _prescribed_rows(self) -> npt.NDArray[np.int32]:
+        """Global numbers of the prescribed dofs of this rank."""
+        first, d = self._domain.space.dofmap.index_map.local_range[0], self._domain.dim
+        return np.asarray(self._motion.owned_dofs + first * d, PETSc.IntType)
+
+
 class Tangent:
     """Tangent of a balance, with rows and columns of prescribed dofs replaced by those of the identity.
 
@@ -68,9 +159,8 @@ class Tangent:
         pattern_version: number of changes of the matrix or of its nonzero pattern. PETSc does not notice new entries:
             the owner of anything made for an earlier pattern has to make it again.
         low_rank_updates: U (owned dofs, k) and C (k, k): the assembled matrix lacks - U C U^T.
-        stiff_couplings: couplings that the assembled matrix lacks.
-        may_be_incomplete: whether K may lack `low_rank_updates` or `stiff_couplings`.
-        has_contact_coupling: whether terms coupled dofs of different cells in the last tangent, except by constants.
+        couplings: couplings between nodes of different cells.
+        may_be_incomplete: whether the assembled matrix may lack low-rank updates or stiff couplings.
     """
 
     def __init__(
@@ -80,20 +170,12 @@ class Tangent:
         self.domain, self.c_v = stress.domain, 0.0
         self._u, self._terms, self._stress, self._motion, self._mass = u, terms, stress, motion, mass
         self._owned = u.x.index_map.size_local * u.x.block_size
-        self.pattern_version, self.has_contact_coupling = 0, False
+        self.pattern_version, self.couplings = 0, Couplings(terms, motion, self.domain)
         self.low_rank_updates: list[tuple[Values, Values]] = []
-        self.stiff_couplings: list[StiffCoupling] = []
-        self._tied_terms, self._eliminating = (
-            [term for term in terms if isinstance(term, TieTerm)],
-            [term for term in terms if isinstance(term, LowRankTerm)],
-        )
+        self._eliminating = [term for term in terms if isinstance(term, LowRankTerm)]
         self._inertial = overriding(terms, "mass_factor")
-        self._stiff = overriding(terms, "add_stiffness", "coupling_matrix")
         self.may_be_incomplete = any(term.leaves_tangent_incomplete for term in terms)
         self._linear = all(term.linear for term in terms)
-        self._has_couplings = False  # whether a coupling has ever been added
-        self._couplings: list[PETSc.Mat] = []  # of the last tangent, beside its blocks, but for ties
-        self._has_varying_couplings = False  # whether one that is no constant has
         self._with_contact = True
         self._psd: PsdProjection | None = None
         # tolerance of the moduli and displacement of the last tangent in this attempt
@@ -122,12 +204,10 @@ class Tangent:
 
     def update_entries(self) -> None:
         """Update `matrix` from its blocks, with the couplings beside them (collective)."""
-        if self._has_couplings and self._assembler.entries_outdated:
+        if self.couplings.in_entries and self._assembler.entries_outdated:
             self.matrix.zeroEntries()  # entries beyond the blocks
         if self._assembler.update_entries() and self._with_contact:
-            ties = [term.coupling_matrix() for term in self._tied_terms]
-            for coupling in [*filter(None, ties), *self._couplings]:
-                self._add_coupling(coupling)
+            self.pattern_version += self.couplings.copy_to_entries(self.matrix)
 
     def owned_rows(self, nodes: Ints) -> csr_matrix:
         """(d n, dofs of all ranks) rows of owned nodes (n,), with ties (collective)."""
@@ -194,12 +274,13 @@ class Tangent:
         reused = self._is_reusable(psd_tolerance)
         if not reused:
             self._assemble_body(psd_tolerance)
-        self.stiff_couplings, self.has_contact_coupling = [], False
+        with_contact = self._with_contact
         if (blocks := self._assembler.blocks) is not None:
-            self._couple_blocks(blocks)
+            self.couplings.put_beside(blocks, with_contact=with_contact)
         else:
-            self._couple_entries(reused=reused)
-        eliminating = self._eliminating if self._with_contact else []
+            changed = self.couplings.add_to_entries(self.matrix, with_contact=with_contact, only_varying=reused)
+            self.pattern_version += changed
+        eliminating = self._eliminating if with_contact else []
         self.low_rank_updates = [update for term in eliminating for update in term.low_rank_updates()]
         for U, _ in self.low_rank_updates:
             U[self._motion.owned_dofs] = 0.0
@@ -208,7 +289,7 @@ class Tangent:
 
     def _assemble_body(self, psd_tolerance: float | None) -> None:
         """Assemble forms and inertia, without couplings."""
-        if self._has_couplings:
+        if self.couplings.in_entries:
             self.matrix.zeroEntries()  # entries beyond the pattern of the cells
         psd_form = None if psd_tolerance is None else self._psd_form(psd_tolerance)
         factor = sum(term.mass_factor for term in self._inertial)
@@ -218,7 +299,7 @@ class Tangent:
         else:
             self._assembler(self._motion.bcs, psd_form)
             if factor:
-                self._mass.add_to(self.matrix, factor, more_entries=self._has_couplings)
+                self._mass.add_to(self.matrix, factor, more_entries=self.couplings.in_entries)
         u = self._u.x.array[: self._owned]
         self._assembled_at = (psd_tolerance, u.copy()) if self._depends_on_u_alone else None
 
@@ -228,7 +309,7 @@ class Tangent:
         In contact most Newton steps are small against a mean edge, and only the barrier is nonlinear. While fragments
         come into contact one after another, the same step is found again and again.
         """
-        if self._assembled_at is None or self._has_varying_couplings or not self.has_contact_coupling:
+        if self._assembled_at is None or self.couplings.varying or not self.couplings.has_contact:
             return False
         tolerance, u = self._assembled_at
         if tolerance != psd_tolerance:
@@ -265,67 +346,6 @@ class Tangent:
         if not same:
             self._last = rates, [field.copy() for field in fields]
         return bool(self.domain.comm.allreduce(same, op=MPI.LAND))
-
-    # --- couplings between nodes of different cells ---
-
-    def _couple_entries(self, *, reused: bool) -> None:
-        """Add stiffness and couplings of the terms to the entries; `reused`: those of the body are reused (collective).
-
-        Constant couplings are still in entries that are reused.
-        """
-        for term in self._stiff:
-            term.add_stiffness(self.matrix)
-            if not self._with_contact or (coupling := self._coupling_of(term)) is None:
-                continue
-            if not (reused and term.linear):
-                self._add_coupling(coupling)
-
-    def _couple_blocks(self, blocks: BlockMatrix) -> None:
-        """Keep ties and couplings of the terms beside the blocks (collective)."""
-        from .block_matrix import CouplingMatrix
-
-        blocks.couplings, self._couplings = [], []
-        if not self._with_contact:
-            return
-        ties = [term.tie_matrix(self._motion.free_dofs) for term in self._tied_terms]
-        blocks.couplings += [tie for tie in ties if tie is not None]
-        for term in self._stiff:
-            if term in self._tied_terms or (coupling := self._coupling_of(term)) is None:
-                continue
-            coupling.zeroRowsColumns(self._prescribed_rows, diag=0.0)
-            self._couplings.append(coupling)
-            blocks.couplings.append(CouplingMatrix(coupling))
-
-    def _coupling_of(self, term: Term) -> PETSc.Mat | None:
-        """Coupling of a term that is to be added to K, if any; a StiffCoupling is kept beside it (collective)."""
-        coupling = term.coupling_matrix()
-        if coupling is None:
-            return None
-        self.has_contact_coupling |= not term.linear
-        if isinstance(coupling, StiffCoupling):
-            coupling.matrix.zeroRowsColumns(self._prescribed_rows, diag=0.0)
-            coupling.directions[self._motion.owned_dofs] = 0.0
-            self.stiff_couplings.append(coupling)
-            return None
-        self._has_varying_couplings |= not term.linear
-        return coupling
-
-    def _add_coupling(self, coupling: PETSc.Mat) -> None:
-        """Add a matrix of another pattern to the entries of K, without prescribed dofs (collective)."""
-        K = self.matrix
-        before = K.getInfo()["nz_used"]
-        part = coupling.copy()
-        part.zeroRowsColumns(self._prescribed_rows, diag=0.0)
-        K.axpy(1.0, part, PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN)
-        part.destroy()
-        self._has_couplings = True
-        self.pattern_version += bool(sum_over_ranks(self.domain.comm, int(K.getInfo()["nz_used"] != before))[0])
-
-    @cached_property
-    def _prescribed_rows(self) -> npt.NDArray[np.int32]:
-        """Global numbers of the prescribed dofs of this rank."""
-        first, d = self.domain.space.dofmap.index_map.local_range[0], self.domain.dim
-        return np.asarray(self._motion.owned_dofs + first * d, PETSc.IntType)
 
     def destroy(self) -> None:
         """Free PETSc's objects."""

@@ -211,7 +211,7 @@ class LinearSolver:
         self._equivalent = forcing.equivalent_iterations(self.ksp.its)
         if isinstance(forcing, EisenstatWalkerForcing):
             self._prepare(eigenvalue_floor)
-            in_contact = self.tangent.has_contact_coupling
+            in_contact = self.tangent.couplings.has_contact
             rtol = forcing.tolerance_for(norm, solved_norm) if in_contact else forcing.tight_tolerance()
         else:
             keeps_tangent = forcing.record_iterate(norm, solved_norm, self._residual_left_by_cg)
@@ -232,7 +232,7 @@ class LinearSolver:
         self.operators.assemble(eigenvalue_floor)
         self._tell_of_last_solve()
         tangent = self.tangent
-        if (tangent.low_rank_updates or tangent.stiff_couplings) and self.ksp.getType() == "preonly":
+        if (tangent.low_rank_updates or tangent.couplings.stiff) and self.ksp.getType() == "preonly":
             # Factors leave out the low-rank updates.
             self.ksp.setType("gmres")
         if self.direct.serves:
@@ -243,7 +243,7 @@ class LinearSolver:
 
     def _add_stiff_couplings(self, base: PETSc.PC) -> None:
         """Add the stiff couplings of the balance to the preconditioner (collective)."""
-        couplings = [coupling for coupling in self.tangent.stiff_couplings if len(coupling.stiffness)]
+        couplings = [coupling for coupling in self.tangent.couplings.stiff if len(coupling.stiffness)]
         if not couplings:
             self.ksp.setPC(base)
             return

@@ -34,7 +34,7 @@ class LowRankOperator:
         self._matrix.mult(x, y)
         for U, C in self._tangent.low_rank_updates:
             y.array_w[:] -= U @ (C @ sum_over_ranks(self._matrix.comm.tompi4py(), U.T @ x.array_r))
-        for coupling in self._tangent.stiff_couplings:
+        for coupling in self._tangent.couplings.stiff:
             coupling.matrix.multAdd(x, y, y)
 
     def to_petsc(self) -> PETSc.Mat:
