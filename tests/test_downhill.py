@@ -57,6 +57,7 @@ LETTERS = {"exact tangents": "e", "positive tangents": "d"}  # of strategies; ot
 
 def test_what_was_misled_twice_goes_downhill_at_once_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
     """A bar whose nodes are thrown about in each of three steps: to where it comes with exact tangents first."""
+    set_policy(monkeypatch, max_plain_direct_dofs=0)
     found, u = [], []
     for astray in (2, 0):
         set_policy(monkeypatch, positive_tangent_solves=astray)

@@ -21,6 +21,7 @@ from fracsim.scene import build_scene
 
 from . import quadratic, shattered, tearing, torn
 from .scenes import make_study
+from .solver_policy import other_policy
 
 Numbers = dict[str, npt.NDArray[Any]]
 SOFT = {"young": 1.0, "poisson": 0.3, "density": 1.0}
@@ -197,7 +198,9 @@ ON_RANKS = ("explicit-obstacles", "explicit-contact", "explicit-joined", "ductil
 
 def main(path: str) -> None:
     """Some cases on all ranks; rank 0 saves what differs."""
-    found = [each for name in ON_RANKS for each in differences(MPI.COMM_WORLD, name, Path(path).parent / name)]
+    # Factors of MUMPS on several ranks, and what is solved with them, differ in the last digit from run to run.
+    with other_policy(max_plain_direct_dofs=0):
+        found = [each for name in ON_RANKS for each in differences(MPI.COMM_WORLD, name, Path(path).parent / name)]
     if MPI.COMM_WORLD.rank == 0:
         np.savez(path, differences=np.array(found))
 
