@@ -42,8 +42,8 @@ class CheckLimits:
         stable_share_random, stable_share_lattice: stable step over the time of a wave through the finest cells of size
             h, for meshes that are not built: 0.36 to 0.39 and 0.12 to 0.14 for random points, 0.63 and 0.48 for
             lattices.
-        quadratic_frequency_factor: replaces d + 1 with quadratic displacement (`timestepping.stable_time_step.gain`,
-            whose import is slow).
+        quadratic_frequency_factor: replaces d + 1 with quadratic displacement
+            (`timestepping.stable_time_step.quadratic_gain`, whose import is slow).
         overlap_round_off: overlap of body and obstacle over the size of the body that counts as contact.
         min_inside_coordinate: least barycentric coordinate of a point inside a cell; bodies may touch.
         max_rigid_overlap: overlap of a rigid body and an obstacle over the mean edge, as convex parts may have in a
