@@ -166,6 +166,7 @@ def test_any_solver_options_are_forgotten() -> None:
     assert dict(PETSc.Options().getAll()) == before
 
 
+@pytest.mark.fast_solver_only("the number of its calls")
 def test_a_step_is_read_in_few_files() -> None:
     """One implicit step without contact crosses files fewer than 150 times (a goal of the structure)."""
     from fracsim.studies.cross_file_calls import STUDY, count_calls
