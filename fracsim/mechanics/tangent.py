@@ -277,6 +277,8 @@ class Tangent:
         with_contact = self._with_contact
         if (blocks := self._assembler.blocks) is not None:
             self.couplings.put_beside(blocks, with_contact=with_contact)
+            # entries have the couplings of the last tangent, also where its blocks are reused
+            self._assembler.entries_outdated = True
         else:
             changed = self.couplings.add_to_entries(self.matrix, with_contact=with_contact, only_varying=reused)
             self.pattern_version += changed
@@ -309,7 +311,9 @@ class Tangent:
         In contact most Newton steps are small against a mean edge, and only the barrier is nonlinear. While fragments
         come into contact one after another, the same step is found again and again.
         """
-        if self._assembled_at is None or self.couplings.varying or not self.couplings.has_contact:
+        # blocks have no couplings, but single entries are sums of both
+        has_old_couplings = self.couplings.varying and self._assembler.blocks is None
+        if self._assembled_at is None or has_old_couplings or not self.couplings.has_contact:
             return False
         tolerance, u = self._assembled_at
         if tolerance != psd_tolerance:
