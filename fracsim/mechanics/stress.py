@@ -151,7 +151,7 @@ class Stress(Term):
             self.chi = _undamaged_field(self.domain, "chi", 1)
             if not model.cracks_close:
                 return self.material.energy
-        edges: list[list[int]] = np.asarray(local_edges(self.domain.dim)).tolist()  # type: ignore[assignment]
+        edges = [[int(node) for node in pair] for pair in local_edges(self.domain.dim)]
         self.integrity = _undamaged_field(self.domain, "integrity", len(edges))
         if model.approach == "edge":
             from ..forms.damage import EdgeProjectedEnergy, StrainEnergy

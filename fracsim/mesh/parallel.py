@@ -252,14 +252,16 @@ def bcast(comm: MPI.Comm, value: Any) -> Any:
     """The object of rank 0 on every rank (collective)."""
     if comm.size == 1:
         return value
+    if comm.rank == 0:
+        blocks = _packed(value)
+        comm.Bcast(np.array([len(blocks)], np.int64))
+        comm.Bcast(_sent(blocks))
+        return value
     count = np.zeros(1, np.int64)
-    blocks = _packed(value) if comm.rank == 0 else np.empty((0, BLOCK), np.uint8)
-    count[0] = len(blocks)
     comm.Bcast(count)
-    if comm.rank:
-        blocks = np.empty((int(count[0]), BLOCK), np.uint8)  # type: ignore[assignment,unused-ignore]
-    comm.Bcast(_sent(blocks))
-    return value if comm.rank == 0 else _unpacked(blocks, count)[0]
+    received = np.empty((int(count[0]), BLOCK), np.uint8)
+    comm.Bcast(_sent(received))
+    return _unpacked(received, count)[0]
 
 
 # --- in the order of the input mesh ---------------------------------------------------------------------------------

@@ -143,8 +143,7 @@ class CutCell:
 
     def __init__(self, dim: int, pattern: int) -> None:
         self.dim, self.pattern = dim, pattern
-        pairs: list[list[int]] = local_edges(dim).tolist()  # type: ignore[assignment]
-        self.edge = {frozenset(pair): k for k, pair in enumerate(pairs)}
+        self.edge = {frozenset((int(a), int(b))): k for k, (a, b) in enumerate(zip(*local_edges(dim).T, strict=True))}
         self.crack_faces = self._crack_faces()
         used = {corner for corners, _ in self.crack_faces for corner in corners if isinstance(corner, PatternPoint)}
         self.copies = sorted(used)
