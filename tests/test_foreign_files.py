@@ -214,7 +214,7 @@ def test_hdf5_has_its_data_in_itself(here: Path, how: str, ending: str) -> None:
             layout = h5py.VirtualLayout((4,), float)
             layout[:] = h5py.VirtualSource("whole.h5", "a", (4,))
             file.create_virtual_dataset("more", layout)
-    with pytest.raises(MeshError, match=r"the data of '/.*' in part\..* lie in another file; save all in one"):
+    with pytest.raises(MeshError, match=r"the data of '/.*' in part\..* lie in another file. Save all in one"):
         read_mesh(path)
 
 
