@@ -126,8 +126,8 @@ class Term:
     def coupling_matrix(self) -> PETSc.Mat | StiffCoupling | None:
         """Remaining part of that derivative: a matrix of any pattern over the dofs, None if there is none (collective).
 
-        The tangent takes its entries, and its pattern changes where they are at new places. A StiffCoupling stays
-        beside the tangent.
+        It is added to the entries of the tangent, whose nonzero pattern may change, and stays beside a tangent in
+        blocks. A StiffCoupling stays beside both.
         """
         return None
 
