@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from typing import Any
 
 import numpy as np
@@ -87,3 +88,7 @@ def main(path: str) -> None:
     }
     if comm.rank == 0:
         np.savez(path, **found)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
