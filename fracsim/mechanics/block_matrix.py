@@ -179,11 +179,11 @@ class CouplingMatrix:
         starts, columns, values = matrix.getValuesCSR()
         local = csr_matrix((values, columns, starts), shape=(len(starts) - 1, matrix.getSize()[1]))
         self.nodes: Ints = np.unique(np.flatnonzero(np.diff(starts)) // d)
-        self._first = matrix.getOwnershipRange()[0] // d
-        coupled = np.union1d(self.nodes + self._first, columns // d)
+        own = self.nodes + matrix.getOwnershipRange()[0] // d  # global numbers
+        coupled = np.union1d(own, columns // d)
         # global numbers of all coupled nodes, and the indices of this rank's among them
         self._numbers: Ints = np.unique(np.concatenate(allgather(self._comm, coupled)))
-        self._indices = np.searchsorted(self._numbers, self.nodes + self._first)
+        self._indices = np.searchsorted(self._numbers, own)
         rows, columns = (_dofs_of(nodes, d) for nodes in (self.nodes, self._numbers))
         self._K = csr_matrix(local[rows][:, columns])
         self._shape = len(self.nodes), d

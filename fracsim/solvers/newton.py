@@ -69,13 +69,14 @@ class ConvergenceTest:
         solved_norm: largest |r| of a solution, N.
         stopped_for_cost: whether the last attempt was ended because of its cost.
         aborted: whether the last solve was ended by a request to stop.
+        stop_requested: function (collective) called between iterations; a solve ends where it is true.
     """
 
     def __init__(self, balance: Balance, rtol: float, policy: SolverPolicy) -> None:
         """`rtol`: relative tolerance of the residual."""
         self._balance, self._policy, self._asked_rtol = balance, policy, rtol
         self._rtol, self._first_norm = rtol, 0.0
-        self._stop_requested: Callable[[], bool] = lambda: False
+        self.stop_requested: Callable[[], bool] = lambda: False
         self._elimination: NonlinearElimination | None = None  # of a body with broken edges
         self._norms: list[float] = []  # |r| of the iterates of the attempt
         self._eliminations = 0
@@ -86,7 +87,7 @@ class ConvergenceTest:
 
     def set_stop_request(self, stop_requested: Callable[[], bool]) -> None:
         """Set a function (collective) called between iterations; a solve ends where it is true."""
-        self._stop_requested = stop_requested
+        self.stop_requested = stop_requested
 
     def allow_elimination(self) -> None:
         """Relax nodes that hold most of the residual separately from now on (collective)."""
@@ -129,7 +130,7 @@ class ConvergenceTest:
             return int(reason.DIVERGED_FNORM_NAN)
         if self.is_solved(norms[2], its) or self._is_solved_by_elimination(snes, its):
             return int(reason.CONVERGED_FNORM_RELATIVE)
-        if self._stop_requested():  # SNES ends its solve, and can be used again
+        if self.stop_requested():  # SNES ends its solve, and can be used again
             self.aborted = True
             return int(reason.DIVERGED_INNER)
         krylov = snes.getLinearSolveIterations()
@@ -218,11 +219,9 @@ class NewtonSolver:
         self._is_single_solve = chosen["snes_type"] == "ksponly"
         self._has_line_search = chosen["snes_type"] == "newtonls"
         self._modified = self._first_modified  # of the last attempt
-        self._stop_requested: Callable[[], bool] = lambda: False
 
     def set_stop_request(self, stop_requested: Callable[[], bool]) -> None:
         """Set a function (collective) called between iterations; where it is true an attempt raises StepAborted."""
-        self._stop_requested = stop_requested
         self._convergence.set_stop_request(stop_requested)
 
     def edges_broke(self, count: int | None) -> None:
@@ -379,7 +378,7 @@ class NewtonSolver:
                 solved = self._convergence.is_solved(norm, solve)
             if solved:
                 return SolveResult(True, solve, krylov, "")
-            if self._stop_requested():
+            if self._convergence.stop_requested():
                 raise StepAborted
             if solve == self._policy.max_linear_solves:
                 break
