@@ -179,11 +179,11 @@ class CouplingMatrix:
         starts, columns, values = matrix.getValuesCSR()
         local = csr_matrix((values, columns, starts), shape=(len(starts) - 1, matrix.getSize()[1]))
         self.nodes: Ints = np.unique(np.flatnonzero(np.diff(starts)) // d)
-        own = self.nodes + matrix.getOwnershipRange()[0] // d  # global numbers
-        coupled = np.union1d(own, columns // d)
+        owned = self.nodes + matrix.getOwnershipRange()[0] // d  # global numbers
+        coupled = np.union1d(owned, columns // d)
         # global numbers of all coupled nodes, and the indices of this rank's among them
         self._numbers: Ints = np.unique(np.concatenate(allgather(self._comm, coupled)))
-        self._indices = np.searchsorted(self._numbers, own)
+        self._indices = np.searchsorted(self._numbers, owned)
         rows, columns = (_dofs_of(nodes, d) for nodes in (self.nodes, self._numbers))
         self._K = csr_matrix(local[rows][:, columns])
         self._shape = len(self.nodes), d
