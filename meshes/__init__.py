@@ -26,6 +26,7 @@ class _Builders(Mapping[str, type[Builder]]):
     classes: ClassVar[dict[str, str]] = {
         "boat": "boat.Boat",
         "box": "box.Box",
+        "capsule": "sphere.SolidCapsule",
         "cylinder": "cylinder.Cylinder",
         "disk": "cylinder.Disk",
         "figure": "figure.Figure",
@@ -35,6 +36,7 @@ class _Builders(Mapping[str, type[Builder]]):
         "notched-plate": "notched_plate.NotchedPlate",
         "ornament": "ornament.Ornament",
         "plate-hole": "plate_hole.PlateHole",
+        "sphere": "sphere.SolidSphere",
         "stones": "stones.Stones",
         "vase": "vase.Vase",
     }

@@ -1,9 +1,9 @@
-"""The interface of builders, checks of their parameters, and their curved boundaries."""
+"""The interface of builders, checks of their parameters, their curved boundaries and their round solids."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -100,6 +100,28 @@ def check_extent(points: npt.NDArray[np.float64], source: str, used: npt.NDArray
 def is_length(value: object) -> bool:
     """Whether a value is a number that a length may have: finite, and far from overflow of its square and cube."""
     return isinstance(value, (int, float)) and not isinstance(value, bool) and abs(value) <= LONGEST
+
+
+# --- round solids ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class RoundSolid:
+    """Sphere, capsule or cylinder that the mesh of a builder approximates, with its boundary nodes on it.
+
+    Attributes:
+        kind: of the solid.
+        centre: of the solid [m].
+        radius: [m].
+        length: of a cylinder, or between the centres of the ends of a capsule [m].
+        along: axis of a capsule or cylinder, 0 to 2.
+    """
+
+    kind: Literal["sphere", "capsule", "cylinder"]
+    centre: tuple[float, float, float]
+    radius: float
+    length: float = 0.0
+    along: int = 2
 
 
 # --- curved boundaries ----------------------------------------------------------------------------------------------

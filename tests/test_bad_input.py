@@ -113,7 +113,7 @@ REFUSED: list[tuple[Data, str]] = [
     (probing(on="left", name="a b"), 'probe.0.name = "a b": must be letters, digits and -'),
     # words that are not on the list
     (changed(BAR, mesh={"builder": "boxx"}), 'mesh.builder = "boxx" is not a builder; did you mean box?'),
-    (changed(BAR, mesh={"builder": "quiche"}), "is not a builder; there are: boat, box, cylinder, disk, figure"),
+    (changed(BAR, mesh={"builder": "quiche"}), "is not a builder; there are: boat, box, capsule, cylinder, disk"),
     (changed(BAR, material={"energy": "neohookean"}), "did you mean neo-hookean?"),
     (changed(BAR, material={"energy": "rubber"}), "must be 'linear', 'corotated', 'stvk' or 'neo-hookean'"),
     (changed(BAR, time={"scheme": "newmarks"}), "did you mean newmark?"),

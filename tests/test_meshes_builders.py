@@ -29,6 +29,10 @@ CASES: list[tuple[str, dict[str, Any]]] = [
     ("box", {"size": (1.0, 0.5, 0.5), "h": 0.2, "origin": (0.1, -1.0, 3.0)}),
     ("box", {"size": (1.0, 2.0), "h": 0.2, "pattern": "unstructured"}),
     ("box", {"size": (1.0, 0.5, 0.5), "h": 0.2, "origin": (1.0, 2.0, 3.0), "pattern": "unstructured"}),
+    ("sphere", {}),
+    ("sphere", {"radius": 0.3, "h": 0.15}),
+    ("capsule", {"h": 0.015}),
+    ("capsule", {"h": 0.015, "length": 0.1, "axis": "y"}),
     ("cylinder", {"h": 0.015}),
     ("cylinder", {"h": 0.015, "axis": "x"}),
     ("disk", {}),
@@ -139,7 +143,8 @@ def test_bounds_are_known_before_building(built: tuple[Any, MeshData]) -> None:
     size = np.subtract(high, low)
     # A polygon in a circle misses the circle's extremes by up to r (1 - cos(h / 2r)) ~ h^2 / 8r.
     # The blended figure reaches beyond its parts: at a tip of two deep parts, by up to blend * log(2).
-    slack = builder.h**2 / (8 * builder.radius) if builder.name in ("cylinder", "disk", "ornament", "vase") else 0.0
+    is_round = builder.name in ("capsule", "cylinder", "disk", "ornament", "sphere", "vase")
+    slack = builder.h**2 / (8 * builder.radius) if is_round else 0.0
     if builder.name == "figure":
         slack = builder.h**2 / (8 * builder.height * 0.03) + builder.height * BLEND * log(2)
     np.testing.assert_allclose(mesh.points.min(axis=0), low, atol=slack + 1e-12 * size.max())

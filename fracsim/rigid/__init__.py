@@ -27,6 +27,7 @@ collision_detection   contacts that may close in a step
 mujoco_model          the scene as MuJoCo has it
 plane_contacts        contacts of convex hulls with planes
 obstacles             fixed, driven and free obstacles, and their shapes
+round_shape           spheres, capsules and cylinders of builders
 contact_points        contact points, and the impulses that they transmitted
 contact_law           unilateral constraints at contacts, impacts
 contact_solver        impulses: MuJoCo for few contacts, projected gradients for many

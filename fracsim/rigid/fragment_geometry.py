@@ -15,12 +15,14 @@ from ..meshes.data import MeshData
 from .convex_decomposition import Polyhedron, convex_parts, hull_corners, shell_convex_parts
 from .core_contact import CoreContact, CoreGeometry
 from .instance_placement import InstancePoses
+from .obstacles import Part
+from .round_shape import RoundShape
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Patterns = npt.NDArray[np.uint8]
-# Key of the surface, corners of the convex parts, outermost points.
-_CollisionShape = tuple[int, list[Values], Values]
+# Key of the surface, convex parts, outermost points.
+_CollisionShape = tuple[int, list[Part], Values]
 
 
 @dataclass(frozen=True)
@@ -29,10 +31,11 @@ class FragmentShapes:
 
     Attributes:
         names: (n,) lowest nodes.
-        moments: of the solid within each split surface.
+        moments: volume, centre of mass and second moments of each.
+        mesh_moments: of the solid within each split surface; those of round shapes differ.
         node_fragment: (N,).
-        convex_parts: corners (m, 3) of the convex parts of each, relative to its centre, in the axes of the mesh, m.
-            Unbroken instances share theirs.
+        convex_parts: of each, corners (m, 3) or a shape, relative to its centre, in the axes of the mesh, m. Unbroken
+            instances share theirs.
         rotation: (n, 3, 3) from these axes to those of the body at rest.
         hull_points: outermost points (k, 3) of each, likewise.
         core_contact: None if nothing has broken.
@@ -40,8 +43,9 @@ class FragmentShapes:
 
     names: Ints
     moments: PolyhedronMoments
+    mesh_moments: PolyhedronMoments
     node_fragment: Ints
-    convex_parts: list[list[Values]]
+    convex_parts: list[list[Part]]
     rotation: Values
     hull_points: list[Values]
     core_contact: CoreContact | None = None
@@ -58,8 +62,9 @@ class _InstanceShapes:
     pattern: Patterns
     names: Ints
     moments: PolyhedronMoments
+    mesh_moments: PolyhedronMoments
     node_fragment: Ints
-    convex_parts: list[list[Values]]
+    convex_parts: list[list[Part]]
     hull_points: list[Values]
     core: CoreGeometry
 
@@ -71,8 +76,17 @@ class FragmentGeometry:
         mean_edge: of the mesh, m.
     """
 
-    def __init__(self, mesh: MeshData, poses: InstancePoses | None = None) -> None:
-        """Compute the shape of the unbroken mesh; `poses`: of the instances at rest; None: one, as the mesh is."""
+    def __init__(
+        self, mesh: MeshData, poses: InstancePoses | None = None, round_shape: RoundShape | None = None
+    ) -> None:
+        """Compute the shape of the unbroken mesh.
+
+        Args:
+            mesh: of one instance.
+            poses: of the instances at rest; None: one, as the mesh is.
+            round_shape: that the unbroken mesh stands for; None: it collides as a union of convex parts.
+        """
+        self._round_shape = round_shape
         self.numbering, self.poses = EntityNumbering(mesh), poses or InstancePoses.identity(1)
         self._shell = mesh.shell
         edges = mesh.points[self.numbering.edges]
@@ -80,6 +94,7 @@ class FragmentGeometry:
         # Collision shapes of each instance by lowest node. They are kept only if all digits of the surface are the
         # same: cells that fragments share change as neighbours break, and a restart must find the same shapes.
         self._collision_shapes: dict[int, dict[int, _CollisionShape]] = {}
+        self._points_at_rest = mesh.points
         self._unbroken = self._make_shapes(np.zeros(len(mesh.cells), np.uint8), None, 0, mesh.points)
         self._placed = [self._place(number, self._unbroken) for number in range(len(self.poses))]
         self._changed: dict[int, _InstanceShapes] = {}
@@ -110,15 +125,16 @@ class FragmentGeometry:
         """Return the shapes of all instances one after another."""
         placed = self._placed
         first = np.cumsum([0, *(len(shapes.names) for shapes in placed)])
-        total = PolyhedronMoments(*(np.concatenate([getattr(shapes.moments, name) for shapes in placed])
-                          for name in ("volume", "centre", "second")))  # fmt: skip
+        total, of_meshes = (
+            _join_moments([getattr(shapes, name) for shapes in placed]) for name in ("moments", "mesh_moments")
+        )
         fragment = np.concatenate([shapes.node_fragment + start for shapes, start in zip(placed, first, strict=False)])
         parts = [part for shapes in placed for part in shapes.convex_parts]
         hull_points = [points for shapes in placed for points in shapes.hull_points]
         names = np.concatenate([shapes.names for shapes in placed])
         rotation = np.concatenate([shapes.rotation for shapes in placed])
         cores = self._make_core_contact(rotation)
-        return FragmentShapes(names, total, fragment, parts, rotation, hull_points, cores)
+        return FragmentShapes(names, total, of_meshes, fragment, parts, rotation, hull_points, cores)
 
     def _make_core_contact(self, rotation: Values) -> CoreContact | None:
         """Return the core contact of all fragments with rotations (n, 3, 3); None if there are no cores."""
@@ -133,15 +149,19 @@ class FragmentGeometry:
         """Return the shapes of an instance with patterns (C,) and nodes at `points` (N, 3)."""
         surface = build_split_surface(self.numbering.with_points(points), pattern, cut)
         fragment = surface.point_fragment[surface.elements[:, 0]]
-        fragment_moments = moments(surface.points, surface.elements, fragment, surface.fragment_count)
+        mesh_moments = body_moments = moments(surface.points, surface.elements, fragment, surface.fragment_count)
         names = np.unique(surface.node_fragment, return_index=True)[1]
         solids = _fragment_solids(surface, fragment)
         before = self._collision_shapes.get(number, {})
         shapes = [before.get(name) for name in map(int, names)]
         new = [k for k, shape in enumerate(shapes) if shape is None or shape[0] != solids[k].content_key]
+        round_shape = self._round_shape_of(surface, points)
+        if round_shape is not None:
+            shapes, new = [(solids[0].content_key, round_shape.collision_parts, round_shape.plane_corners)], []
+            body_moments = round_shape.moments(mesh_moments.volume)
         parts_of_new = self._convex_parts(surface, fragment, solids, np.array(new, np.int64))
         for k, parts in zip(new, parts_of_new, strict=True):
-            centre = fragment_moments.centre[k]
+            centre = mesh_moments.centre[k]
             extreme = hull_corners(solids[k].points if self._uses_clusters(surface) else np.concatenate(parts))
             shapes[k] = solids[k].content_key, [corners - centre for corners in parts], extreme - centre
         result = [shape for shape in shapes if shape is not None]
@@ -150,8 +170,13 @@ class FragmentGeometry:
         core = CoreGeometry.from_split_surface(surface, self.numbering) if has_cores else CoreGeometry.empty()
         parts_of_all, hull_points = [shape[1] for shape in result], [shape[2] for shape in result]
         return _InstanceShapes(
-            points, pattern, names, fragment_moments, surface.node_fragment, parts_of_all, hull_points, core
+            points, pattern, names, body_moments, mesh_moments, surface.node_fragment, parts_of_all, hull_points, core
         )
+
+    def _round_shape_of(self, surface: SplitSurface, points: Values) -> RoundShape | None:
+        """Return the round shape of an instance with nodes at `points` (N, 3), m; None if it is broken or dented."""
+        is_intact = surface.fragment_count == 1 and points is self._points_at_rest
+        return self._round_shape if is_intact else None
 
     def _convex_parts(
         self, surface: SplitSurface, fragment: Ints, solids: list[Polyhedron], chosen: Ints
@@ -178,15 +203,23 @@ class FragmentGeometry:
     def _place(self, number: int, shapes: _InstanceShapes) -> FragmentShapes:
         """Return the shapes of an instance at its pose at rest."""
         rotation, position = self.poses.rotation[number], self.poses.position[number]
-        local = shapes.moments
-        placed = PolyhedronMoments(
-            local.volume, local.centre @ rotation.T + position, rotation @ local.second @ rotation.T
-        )
+        placed, of_mesh = (_place_moments(local, rotation, position) for local in (shapes.moments, shapes.mesh_moments))
         names = shapes.names + number * len(shapes.node_fragment)
         rotations = np.tile(rotation, (len(shapes.names), 1, 1))
         return FragmentShapes(
-            names, placed, shapes.node_fragment, shapes.convex_parts, rotations, shapes.hull_points
+            names, placed, of_mesh, shapes.node_fragment, shapes.convex_parts, rotations, shapes.hull_points
         )  # fmt: skip
+
+
+def _place_moments(local: PolyhedronMoments, rotation: Values, position: Values) -> PolyhedronMoments:
+    """Return the moments of bodies that are rotated (3, 3) and then displaced (3,), m."""
+    return PolyhedronMoments(local.volume, local.centre @ rotation.T + position, rotation @ local.second @ rotation.T)
+
+
+def _join_moments(moments_of_all: list[PolyhedronMoments]) -> PolyhedronMoments:
+    """Return the moments of several sets of bodies one after another."""
+    columns = zip(*(vars(of_set).values() for of_set in moments_of_all), strict=True)
+    return PolyhedronMoments(*(np.concatenate(values) for values in columns))
 
 
 def _fragment_solids(surface: SplitSurface, fragment: Ints) -> list[Polyhedron]:

@@ -44,6 +44,10 @@ class ModelSettings:
 SETTINGS = ModelSettings()
 
 
+# Bits of MuJoCo's masks of what collides: planes with primitive shapes alone, since PlaneContacts finds their contacts
+# with hulls; cylinders with cylinders, and prisms in them (obstacles) with prisms; all with everything else.
+PLANE_BIT, GENERAL_BIT, CYLINDER_BIT, PRISM_BIT = 1, 2, 4, 8
+
 _warned: set[str] = set()
 
 
@@ -94,6 +98,7 @@ class MujocoModel:
         inverse_inertia: (n, 3, 3).
         extent: (n,) distance that each body reaches from its centre, m.
         planes: contacts of hulls with planes, which MuJoCo does not search for.
+        cylinder_axis: (n, 3) unit vectors in the axes of the bodies; 0 for bodies that are no cylinders.
     """
 
     compiled: Any
@@ -105,6 +110,7 @@ class MujocoModel:
     inverse_inertia: Values
     extent: Values
     planes: PlaneContacts
+    cylinder_axis: Values
 
 
 def build_model(
@@ -127,11 +133,11 @@ def build_model(
     """
     mass, inertia = np.maximum(bodies.mass, SETTINGS.min_mass), bodies.inertia + SETTINGS.min_mass * np.eye(3)
     rotation = np.tile(np.eye(3), (len(bodies), 1, 1)) if rotation is None else rotation
-    quat = quaternions(rotation)
     spec, moving, meshes, count = mujoco.MjSpec(), [], _Meshes(), len(bodies)
     for number, body_parts in enumerate(parts):
         body = _add_placed_body(spec)
-        moving += [number] * _add_parts(spec, body, body_parts, parameters.friction, meshes=meshes, quat=quat[number])
+        turn = rotation[number]
+        moving += [number] * _add_parts(spec, body, body_parts, parameters.friction, meshes=meshes, rotation=turn)
     driven = [number for number, obstacle in enumerate(obstacles) if obstacle.driven]
     fixed = [number for number, obstacle in enumerate(obstacles) if not obstacle.driven]
     for number in driven:
@@ -158,7 +164,19 @@ def build_model(
     spec.memory = max(SETTINGS.min_bytes, SETTINGS.bytes_per_part * len(body_of_geom))
     inverse: Values = np.asarray(np.linalg.inv(inertia)) if count else inertia
     driven_numbers = np.array(driven, np.int64)
-    return MujocoModel(spec.compile(), body_of_geom, first_geom, driven_numbers, mass, inertia, inverse, extent, planes)
+    axis = _cylinder_axes(parts, rotation)
+    return MujocoModel(
+        spec.compile(), body_of_geom, first_geom, driven_numbers, mass, inertia, inverse, extent, planes, axis
+    )  # fmt: skip
+
+
+def _cylinder_axes(parts: Sequence[Sequence[Part]], rotation: Values) -> Values:
+    """Return the axes (n, 3) of bodies that are cylinders, 0 for others; `rotation`: (n, 3, 3) of the parts."""
+    result: Values = np.zeros((len(parts), 3))
+    for number, (part, *_) in enumerate(parts):
+        if isinstance(part, PrimitiveShape) and part.kind == "cylinder":
+            result[number] = rotation[number] @ part.rotation[:, 2]
+    return result
 
 
 def _make_plane_contacts(
@@ -188,10 +206,11 @@ def _make_plane_contacts(
 
 def _scene_size(bodies: Bodies, parts: Sequence[Sequence[Part]]) -> float:
     """Return the distance over which bodies are spread, with their own size, m."""
-    hulls = [
-        np.abs(part).max() for body_parts in parts for part in body_parts if not isinstance(part, PrimitiveShape)
+    sizes = [
+        np.abs(part.extreme_points if isinstance(part, PrimitiveShape) else part).max()
+        for body_parts in parts for part in body_parts
     ]  # fmt: skip
-    return float(np.ptp(bodies.position, axis=0).max() + 2 * max(hulls, default=1.0))
+    return float(np.ptp(bodies.position, axis=0).max() + 2 * max(sizes, default=1.0))
 
 
 def _extents(parts: Sequence[Sequence[Part]]) -> Values:
@@ -245,15 +264,15 @@ class _Meshes:
 
 def _add_parts(
     spec: Any, body: Any, parts: Sequence[Part], friction: float, priority: int = 0, offset: Values | None = None,
-    *, is_plane: bool = False, meshes: _Meshes | None = None, quat: Values | None = None,
+    *, is_plane: bool = False, meshes: _Meshes | None = None, rotation: Values | None = None,
 ) -> int:  # fmt: skip
-    """Add geoms to a body, hulls rotated by `quat`; return their number.
+    """Add geoms to a body, rotated by `rotation` (3, 3) about its centre; return their number.
 
     A contact has the friction of the geom with the higher priority.
     """
-    # bits of MuJoCo's masks of what collides: planes with primitive shapes alone, since PlaneContacts finds their
-    # contacts with hulls, and everything else with hulls too
-    plane_bit, general_bit = 1, 2
+    has_prism = len(parts) > 1 and isinstance(parts[0], PrimitiveShape) and parts[0].kind == "cylinder"
+    rotation = np.eye(3) if rotation is None else rotation
+    quat = quaternions(rotation[None])[0]
     for part in parts:
         geom = body.add_geom()
         geom.friction, geom.priority = [friction, 0.0, 0.0], priority
@@ -264,13 +283,12 @@ def _add_parts(
         if isinstance(part, PrimitiveShape) and part.corners is None:
             geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.upper()}")
             geom.size = part.size
-            geom.quat = Rotation.from_matrix(part.rotation).as_quat(scalar_first=True)
-            geom.contype = geom.conaffinity = plane_bit if is_plane else plane_bit | general_bit
+            geom.quat = Rotation.from_matrix(rotation @ part.rotation).as_quat(scalar_first=True)
+            bits = PLANE_BIT if is_plane else PLANE_BIT | (CYLINDER_BIT if has_prism else GENERAL_BIT)
         else:
             corners = part if not isinstance(part, PrimitiveShape) else part.corners
             assert meshes is not None and corners is not None
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, meshes.name(spec, corners)
-            geom.contype = geom.conaffinity = general_bit
-            if quat is not None:
-                geom.quat = quat
+            geom.quat, bits = quat, PRISM_BIT if has_prism else GENERAL_BIT
+        geom.contype, geom.conaffinity = bits, bits | (0 if is_plane else GENERAL_BIT)
     return len(parts)

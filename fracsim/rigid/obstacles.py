@@ -61,6 +61,24 @@ class PrimitiveShape:
         return np.array([[x + y, 0.0, 0.0] if self.kind == "capsule" else [x, y, z]])
 
 
+# Sides of the prism in a cylinder: its faces are 3.4 % of the radius below the cylinder.
+PRISM_SIDES = 12
+
+
+def cylinder_parts(cylinder: PrimitiveShape) -> list[PrimitiveShape]:
+    """Return a cylinder and a prism inscribed in it, as the parts of a body that moves.
+
+    MuJoCo finds the line on which a cylinder rolls, and at most four contacts of its rim. The corners of the prism are
+    contacts where the cylinder tilts or spins.
+    """
+    angle = 2 * np.pi * np.arange(PRISM_SIDES) / PRISM_SIDES
+    radius, half, _ = cylinder.size
+    rim = radius * np.stack([np.cos(angle), np.sin(angle)])
+    ends = [np.concatenate([rim, np.full((1, PRISM_SIDES), z)]) for z in (half, -half)]
+    corners = np.ascontiguousarray((cylinder.rotation @ np.concatenate(ends, axis=1)).T)
+    return [cylinder, replace(cylinder, kind="hull", corners=corners)]
+
+
 # Convex part of a body: corners (n, 3) of a hull relative to the centre, in the axes at rest, m, or a shape.
 Part = Values | PrimitiveShape
 
@@ -141,6 +159,9 @@ class ObstacleSet:
         self.obstacles = obstacles
         self.free_numbers = [number for number, obstacle in enumerate(obstacles) if obstacle.free]
         shapes = [obstacle_parts(obstacle.shape, f"obstacle {obstacle.name}") for obstacle in obstacles]
+        for number in self.free_numbers:
+            if shapes[number][0].kind == "cylinder":
+                shapes[number] = cylinder_parts(shapes[number][0])
         self.convex_parts: list[list[Part]] = [
             [replace(part, friction=obstacles[number].friction) for part in shapes[number]]
             for number in self.free_numbers
@@ -250,6 +271,6 @@ class ObstacleSet:
 
 
 def _hull_points(parts: Sequence[PrimitiveShape]) -> Values:
-    """Return the corners (k, 3), m, that a plane may touch; none of round shapes, which MuJoCo has itself."""
+    """Return the corners (k, 3), m, that a plane may touch; none of spheres and capsules, which MuJoCo has itself."""
     hulls = [part.corners for part in parts if part.corners is not None]
     return hull_corners(np.concatenate(hulls)) if hulls else np.empty((0, 3))

@@ -327,6 +327,10 @@ class RigidStepper:
         self.update_shapes()
         after = self.shapes
         parent = np.searchsorted(before.names, before.names[before.node_fragment[after.names]])
+        # centre and inertia of a round body become those of its mesh, and of its fragments, with the same momenta
+        parted = np.bincount(parent, minlength=len(bodies)) > 1
+        is_round = np.any(before.moments.second != before.mesh_moments.second, axis=(1, 2))
+        bodies = bodies.with_shapes(before.mesh_moments, np.flatnonzero(parted & is_round))
         fragments = bodies.split_into(self._densities(), after.moments, parent)
         self.impact_detector.forget_bodies(np.array([*names], np.int64))
         self._broken_instances = {name // self.instances.node_count for name in names}

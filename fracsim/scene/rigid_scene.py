@@ -26,10 +26,12 @@ from ..rigid.free_body_analysis import SolidStiffness
 from ..rigid.instance_placement import InstancePlacement, InstancePoses, instance_motion, place_mesh
 from ..rigid.instances import Instances
 from ..rigid.parallel_analyses import ParallelAnalyses, serve_analyses
+from ..rigid.round_shape import RoundShape
 from ..rigid.surface_loads import HertzContact
 from ..study import ContactSettings, Study
 from ..study.check import build_checked_mesh
 from ..study.conditions import volume_loads
+from ..study.mesh_source import find_builder
 from ..study.overlap_checks import body_placements
 from .contact_terms import build_rigid_obstacles
 from .inelastic_updates import build_average, build_strength, build_surface_parameters
@@ -101,7 +103,8 @@ def build_rigid_scene(
     parameters = ContactParameters(study.time.max_step, gravity, contact.friction, contact.restitution or 0.0)
     hertz = HertzContact(study.material.young, study.material.poisson)
     analyses = ParallelAnalyses(instances, comm, (study, mesh, placements))
-    geometry = FragmentGeometry(mesh, poses)
+    round_shape = RoundShape.of_mesh(mesh, getattr(find_builder(study.mesh), "round_solid", None))
+    geometry = FragmentGeometry(mesh, poses, round_shape)
     stepper = RigidStepper(
         instances, geometry, density, obstacles, parameters, hertz, contact.contact_time, analyses
     )  # fmt: skip

@@ -34,6 +34,8 @@ _CONTACT_COST = {
     for implicit, share in ((True, "tenth of a step"), (False, "two fifths of an explicit step (12,000 cells)"))
 }
 _INDENT = " " * 12
+# builders of bodies that collide as their meshes: with flat faces, or shells
+_NOT_ROUND = ("boat", "box", "l-panel", "notched-bar", "notched-plate", "ornament", "stones")
 
 
 def report_lines(study: Study, summary: MeshSummary, near: list[str]) -> Iterator[str]:
@@ -162,6 +164,7 @@ def _rigid_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
         yield f"{_INDENT}{line}"
     copies = sum(int(np.prod(body.copies)) for body in study.body) or 1
     yield f"bodies      {copies} times the mesh; they move on one rank, no fields.xdmf"
+    yield from (f"{_INDENT}{line}" for line in _collision_lines(study))
     if study.brittle is not None and study.fracture is not None:
         yield f"fracture    strength {study.fracture.strength:g} Pa, {_average(study.fracture)}"
         yield f"brittle     {'of each body, ' if copies > 1 else ''}{_brittle(study.brittle)}"
@@ -178,6 +181,18 @@ def _rigid_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
     yield f"contact     friction {contact.friction:g}, restitution {restitution:g}, an impact lasts {duration}"
     yield f"time        rigid, {study.time.end / study.time.max_step:.0f} steps of {study.time.max_step:g} s"
     yield from _frame_lines(study)
+
+
+def _collision_lines(study: Study) -> Iterator[str]:
+    """What unbroken rigid bodies collide as; nothing for shells and bodies of builders with flat faces."""
+    if study.mesh.shell is not None or study.mesh.builder in _NOT_ROUND:
+        return
+    solid = getattr(find_builder(study.mesh), "round_solid", None)
+    if solid is not None:
+        yield f"unbroken bodies collide as a {solid.kind}, fragments as convex polyhedra"
+        return
+    yield "note: bodies collide as convex polyhedra, so that round ones roll more slowly than smooth ones; the builders"
+    yield "sphere, capsule and cylinder roll as such"
 
 
 def _frame_lines(study: Study) -> Iterator[str]:

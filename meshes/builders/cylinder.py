@@ -10,7 +10,7 @@ import numpy as np
 
 from ..data import MeshData
 from ..gmsh_session import mesh_with_gmsh
-from ..parameters import CurvedBoundary, require, require_affordable, require_one_of, require_positive
+from ..parameters import CurvedBoundary, RoundSolid, require, require_affordable, require_one_of, require_positive
 from ..sizing import SizeField, estimate_cells_in_box
 from ..topology import boundary_facets, exclude_facets, facet_groups_on_planes
 from .profile import Profile
@@ -62,6 +62,13 @@ class Cylinder:
     def curved_boundaries(self) -> tuple[CurvedBoundary, ...]:
         """The side."""
         return (CurvedBoundary(("side",), self.radius, "xyz".index(self.axis)),)
+
+    @property
+    def round_solid(self) -> RoundSolid:
+        """The cylinder."""
+        along = "xyz".index(self.axis)
+        x, y, z = (self.length / 2 if axis == along else 0.0 for axis in range(3))
+        return RoundSolid("cylinder", (x, y, z), self.radius, self.length, along)
 
     def build(self) -> MeshData:
         """The mesh."""
