@@ -12,10 +12,9 @@ import pytest
 from mpi4py import MPI
 
 from fracsim.contact.mesh_obstacles import AllMeshPairs, MeshObstacle
-from fracsim.contact.mesh_rigid_body import FreeMesh
 from fracsim.contact.mesh_rigid_term import FreeMeshTerm
-from fracsim.contact.pose import Pose
-from fracsim.contact.pose_derivatives import point_set_derivatives
+from fracsim.contact.pose import Pose, PosedShape
+from fracsim.contact.rigid_pose import FreePose
 from fracsim.contact.shapes import RoundedBox
 from fracsim.contact.triangle_mesh_shape import (
     TriangleMeshShape,
@@ -260,7 +259,7 @@ def test_moments_are_those_of_a_box() -> None:
     np.testing.assert_allclose(solid.inertia(7.0), own + away, atol=1e-13)
 
 
-def free_solid(scene: Scene) -> tuple[FreeMeshTerm, FreeMesh]:
+def free_solid(scene: Scene) -> tuple[FreeMeshTerm, FreePose]:
     (term,) = [each for each in scene.balance.terms if isinstance(each, FreeMeshTerm)]
     return term, term.free[0]
 
@@ -286,16 +285,14 @@ def test_what_is_pushed_by_a_body_is_the_derivative_by_its_pose(tmp_path: Path) 
     scene.balance.begin_step(state.t + 0.01, 0.01, state.u, state.v, state.a)
     scene.balance.set_displacement(state.u)
     term, solid = free_solid(scene)
-    before = term._surroundings(0, term._end_positions())
     z, h = 1e-3 * np.array([1.0, -2.0, 1.0, 3.0, 1.0, -2.0]), 1e-6
-    solid.move_to(z)
-    here, pose = solid.pose_derivatives(before, z), solid.pose
-    assert here.energy > 0 and before.friction is not None and np.abs(here.gradient).min() > 0
-    ends = []
+    term._unknowns.move_to([z])
+    here, pose, ends = term.pose_derivatives()[0], solid.posed.pose, []
+    assert here.energy > 0 and term._friction is not None and np.abs(here.gradient).min() > 0
     for q in np.concatenate([h * np.eye(6), -h * np.eye(6)]):
-        solid.pose = pose.incremented(q)
-        energy, g, *_, arm = solid._point_derivatives(before)  # type: ignore[misc]
-        ends.append((energy, point_set_derivatives(energy, g, *_, arm).gradient))
+        solid.posed = PosedShape(solid.posed.shape, pose.incremented(q))
+        term.poses_moved()
+        ends.append(((found := term.pose_derivatives()[0]).energy, found.gradient))
     slope = np.array([(ends[k][0] - ends[k + 6][0]) / (2 * h) for k in range(6)])
     np.testing.assert_allclose(here.gradient, slope, atol=1e-5 * np.abs(slope).max())
     bent = np.array([(ends[k][1] - ends[k + 6][1]) / (2 * h) for k in range(6)])
@@ -373,7 +370,7 @@ def test_a_free_solid_rests_on_a_floor_and_hangs_on_a_hinge(tmp_path: Path) -> N
     assert turned > 0.9
 
 
-def _lowest(solid: FreeMesh) -> float:
+def _lowest(solid: FreePose) -> float:
     return float(solid.motion.pose.points_to_space(solid.body.shape.tessellate()[0])[:, 2].min())
 
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.contact.laws import Barrier
-from fracsim.contact.obstacle import RigidObstacle, overlap_depth
+from fracsim.contact.obstacle import FreeObstacle, RigidObstacle, overlap_depth
 from fracsim.contact.obstacle_pairs import ObstaclePairs
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.rigid_obstacle_term import FreeObstacleTerm
@@ -29,6 +29,15 @@ BESIDE: list[tuple[Shape, Shape]] = [
 ]
 
 
+def thing(shape: Shape) -> FreeObstacle:
+    """A free obstacle of that shape, of 1 kg."""
+    d, turns = shape.dim, 1 if shape.dim == 2 else 3
+    return FreeObstacle(
+        "it", shape, np.zeros(d), mass=1.0, inertia=shape.inertia(1.0), motion_basis=np.eye(d + turns),
+        mass_centre=np.zeros(d), gravity=np.zeros(d), start_rate=np.zeros(d + turns),
+    )  # fmt: skip
+
+
 @pytest.mark.parametrize("along", (False, True))
 @pytest.mark.parametrize("both", BESIDE, ids=lambda both: "-".join(type(each).__name__ for each in both))
 def test_derivatives_by_the_pose(both: tuple[Shape, Shape], along: bool) -> None:
@@ -43,20 +52,21 @@ def test_derivatives_by_the_pose(both: tuple[Shape, Shape], along: bool) -> None
     gap = -overlap_depth(PosedShape(shape, start), there)
     down = -there.normal(start.centre[None])[0] if d == 3 else np.array([0.0, -1.0])
     here = start.incremented(np.concatenate([(gap - 0.02) * down, np.zeros(turns)]))
-    stops = ObstaclePairs(
-        RigidObstacle("it", shape, np.zeros(d)), {1: RigidObstacle("other", other, np.zeros(d))}, Barrier(50.0, 0.2)
-    )
-    stops.begin_step(
-        here.incremented(np.concatenate([-0.05 * down, 0.05 * np.ones(turns)])), [there, there], along=along
-    )
-    placed = [there, there]
-    found, h = stops.pose_derivatives(here, placed), 1e-6
+    body = thing(shape)
+    stops = ObstaclePairs({0: body, 1: RigidObstacle("other", other, np.zeros(d))}, Barrier(50.0, 0.2))
+
+    def placed(pose: Pose) -> list[PosedShape]:
+        return [PosedShape(shape, pose), there]
+
+    further = here.incremented(np.concatenate([-0.05 * down, 0.05 * np.ones(turns)]))
+    stops.begin_step(placed(further), time_averaged=along)
+    found, h = stops.derivatives(placed(here))[0][0], 1e-6
     steps = h * np.eye(d + turns)
 
     def potential(q: Values) -> float:
-        return stops.energies(here.incremented(q), placed)[1]
+        return stops.energies(placed(here.incremented(q)))[1]
 
-    assert stops.are_open(here, placed) and found.energy > 1e-3
+    assert stops.are_open(placed(here)) and found.energy > 1e-3
     slope = np.array([potential(e) - potential(-e) for e in steps]) / (2 * h)
     np.testing.assert_allclose(found.gradient, slope, atol=1e-6 * np.abs(slope).max())
     h, zero = 1e-4, np.zeros(d + turns)

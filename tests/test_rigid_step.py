@@ -14,7 +14,7 @@ from fracsim.contact.node_contact import evaluate_points, lag_contact
 from fracsim.contact.obstacle import FreeObstacle
 from fracsim.contact.pose import PosedShape, left_jacobian, left_jacobian_derivative
 from fracsim.contact.pose_derivatives import PoseDerivatives, pose_derivatives
-from fracsim.contact.rigid_body import RigidStep
+from fracsim.contact.rigid_body import RigidStep, RigidSystem, SystemDerivatives
 from fracsim.contact.shapes import Sphere, TranslatedShape
 from fracsim.forms.schemes import BackwardEuler, GeneralizedAlpha, Newmark, Scheme
 from fracsim.mechanics.contact_time_weights import ContactTimeWeights
@@ -111,7 +111,8 @@ def test_a_body_that_tumbles_keeps_its_angular_momentum(scheme: Scheme) -> None:
     for _ in range(200):
         step = RigidStep(body, flight, scheme, dt, scheme.rate_coefficients(dt)[0], 1 - scheme.alpha_f, 1.0)
         none = PoseDerivatives(0.0, np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6)))
-        z, _ = step.minimise(np.zeros(6), lambda _, none=none: none, lambda *_: 1.0)
+        contact = SystemDerivatives([none])
+        (z,), _ = RigidSystem([step]).minimise([np.zeros(6)], lambda _, contact=contact: contact, lambda *_: 1.0)
         flight = step.end_motion(z, np.zeros(6))
         energies.append(body.history_values(flight)[-1])
     np.testing.assert_allclose(flight.momentum, first.momentum, atol=1e-10)

@@ -39,7 +39,7 @@ Free obstacles:
 
     rigid_body            incremental potential of poses
     pose_derivatives      derivatives of contact by a pose
-    rigid_pose, mesh_rigid_body  condensation of the pose of analytic and triangle-mesh obstacles
+    rigid_pose            poses as unknowns of Newton's method
     obstacle_pairs        contact of free obstacles with others
 
 Modules without DOLFINx and MPI: laws, closest_point, facet_contact, node_contact, obstacle, pose, shape_base, shapes,

@@ -14,7 +14,7 @@ from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from .contact_surface import ContactSurface, FacetGapFunction
 from .facet_contact import ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
-from .laws import CoulombFriction, ObstacleLaw
+from .laws import CoulombFriction, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
 from .obstacle import RigidObstacle
 from .pose import PosedShape, min_distance
@@ -45,6 +45,7 @@ class ContactState:
         self._domain, self._u, self._owned = domain, u, domain.node_count * domain.dim
         self.comm = domain.comm
         self._contact_forces: list[ContactForces] | None = None
+        self._sticking_slips: list[float] | None = None  # m, of each obstacle in the step; None: not known yet
         self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
         self._attempts = 0  # of Newton's method in the step
         self._tangent_positions: Values | None = None  # of the points at the last tangent of this attempt
@@ -116,7 +117,8 @@ class ContactState:
 
     def begin_step(self, level: TimeLevel) -> None:
         """Move obstacles to the end of the step, and store the contact at its start for friction."""
-        self._level, self._contact_forces, self._attempts = level, None, 0
+        self._level, self._attempts = level, 0
+        self.discard_forces()
         end = level.t + (1 - level.fraction) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
             return  # evaluation of a step's result: lagged contact and motions are still those of the step
@@ -157,7 +159,13 @@ class ContactState:
     def _discard_start(self) -> None:
         """Discard the contact at the start of the step, as the points are no longer the same."""
         none = [None] * len(self.obstacles)
-        self._lagged, self._step_starts, self._contact_forces, self._tangent_positions = [*none], [*none], None, None
+        self._lagged, self._step_starts, self._tangent_positions = [*none], [*none], None
+        self._sticking_slips = None
+        self.discard_forces()
+
+    def discard_forces(self) -> None:
+        """Discard forces, as u or poses have changed."""
+        self._contact_forces = None
 
     def _end_displacement(self) -> Values:
         """(owned dofs,) displacement at the end of the step that belongs to the current u, m."""
@@ -166,6 +174,8 @@ class ContactState:
     def obstacle_forces(self) -> list[ContactForces]:
         """Forces of each obstacle at the current u (collective)."""
         if self._contact_forces is None:
+            if self._sticking_slips is None:
+                self._sticking_slips = self._compute_sticking_slips()
             self.positions = self.surface.positions(self._end_displacement())
             self._contact_forces = [
                 self._evaluate_obstacle(number, posed) for number, posed in enumerate(self._kinematics.posed)
@@ -177,8 +187,9 @@ class ContactState:
         if self._is_out_of_range(number, posed):
             return no_contact(self._domain.dim)
         obstacle, lagged = self.obstacles[number], self._lagged[number]
-        sticking_slip = self.law.sticking_speed * self._dt
-        friction = CoulombFriction(obstacle.friction, sticking_slip) if lagged is not None else None
+        friction = None
+        if lagged is not None and self._sticking_slips is not None:
+            friction = CoulombFriction(obstacle.friction, self._sticking_slips[number])
         obstacle_motion, start = self._contact_point_motion(number, posed), self._step_starts[number]
         start_posed = self._kinematics.start_posed[number]
         if start is not None:
@@ -202,6 +213,22 @@ class ContactState:
         if start is None or number not in self._facet_obstacles:
             return True
         return self._kinematics.start_posed[number].distance_bound(self._start_positions) >= width
+
+    def _compute_sticking_slips(self) -> list[float]:
+        """Slip in the step that counts as sticking, m, at each obstacle (collective)."""
+        speeds = np.zeros(len(self.obstacles))
+        if self.law.sticking_ratio and any(obstacle.friction for obstacle in self.obstacles):
+            velocity = self.surface.interpolation(self._start_velocity)
+            for number, lagged in enumerate(self._lagged):
+                if lagged is not None and len(lagged.points):
+                    relative = velocity[lagged.points] - self._obstacle_velocity(number, lagged.position)
+                    speeds[number] = np.linalg.norm(tangential(lagged.normal, relative), axis=1).max()
+            self.comm.Allreduce(MPI.IN_PLACE, speeds, MPI.MAX)
+        return [self._dt * max(self.law.sticking_speed, self.law.sticking_ratio * speed) for speed in speeds]
+
+    def _obstacle_velocity(self, number: int, x: Values) -> Values:
+        """(d,) velocity of an obstacle at the start of the step, or (n, d) of its points at x (n, d), m/s."""
+        return np.asarray(self._kinematics.increments[number][: self._domain.dim] / self._dt)
 
     def _contact_point_motion(self, number: int, posed: PosedShape) -> Values:
         """(d,) motion of an obstacle in the step, or (k, d) of its points in lagged contact, m."""

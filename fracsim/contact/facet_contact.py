@@ -58,6 +58,7 @@ class _SearchState:
         distance: of facets that were asked for, m.
         margin: by which facets farther away were found as well, m.
         facets: (k,) those found.
+        radius: of the shape about its reference point, m.
     """
 
     x: Values
@@ -65,6 +66,7 @@ class _SearchState:
     distance: float
     margin: float
     facets: Ints
+    radius: float
 
     def is_valid(self, posed: PosedShape, x: Values, distance: float) -> bool:
         """Whether no facet within that distance, m, can be missing.
@@ -75,9 +77,7 @@ class _SearchState:
         point_motion = float(np.sqrt(np.einsum("nd,nd->n", motion, motion).max(initial=0.0)))
         pose, old_pose = posed.pose, self.posed.pose
         rotation = float(np.linalg.norm(pose.rotation - old_pose.rotation))
-        obstacle_motion = float(np.linalg.norm(pose.centre - old_pose.centre)) + (
-            rotation and rotation * _outer_radius(posed)
-        )
+        obstacle_motion = float(np.linalg.norm(pose.centre - old_pose.centre)) + (rotation * self.radius)
         return distance - self.distance + point_motion + obstacle_motion <= self.margin
 
 
@@ -106,7 +106,7 @@ class FacetCandidates:
         radius = np.sqrt(np.einsum("kcd,kcd->kc", arms, arms).max(axis=1, initial=0.0))
         margin = max(float(radius.mean()) if len(radius) else 0.0, distance)
         near = np.flatnonzero(posed.distance(centroid) - radius < distance + margin)
-        return _SearchState(x, posed, distance, margin, near)
+        return _SearchState(x, posed, distance, margin, near, _outer_radius(posed))
 
 
 def _outer_radius(posed: PosedShape) -> float:

@@ -69,10 +69,12 @@ class ObstacleLaw:
     Attributes:
         barrier: potential of the gap.
         sticking_speed: slip velocity below which friction counts as sticking, m/s.
+        sticking_ratio: the same, in the largest slip velocity at the start of the step.
     """
 
     barrier: GapPotential
     sticking_speed: float
+    sticking_ratio: float = 0.0
 
 
 @dataclass(frozen=True)

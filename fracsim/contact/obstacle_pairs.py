@@ -11,7 +11,7 @@ exactly in 2D, and in 3D except for two edges that cross, of which points are sa
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import cast
 
@@ -20,9 +20,15 @@ import numpy.typing as npt
 
 from .laws import GapPotential
 from .node_contact import ContactForces, StepStart, evaluate_points
-from .obstacle import RigidObstacle
+from .obstacle import RigidObstacle, free_pairs
 from .pose import Pose, PosedShape, rotate_vectors
-from .pose_derivatives import PoseDerivatives, carried_point_derivatives, pose_derivatives
+from .pose_derivatives import (
+    MixedHessian,
+    PoseDerivatives,
+    carried_point_derivatives,
+    mixed_pose_hessian,
+    pose_derivatives,
+)
 from .shape_base import ConvexBody, Shape, frame_about, unit_vector
 from .shapes import Capsule, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
 from .step_limit import PoseMotion, safe_fractions
@@ -281,64 +287,92 @@ class _PairMotion:
 
 
 type PosedObstacles = Mapping[int, PosedShape] | Sequence[PosedShape]  # by the numbers of obstacles
+type Numbers = tuple[int, int]  # of a free obstacle and another one
 
 
 class ObstaclePairs:
-    """All pairs of one free obstacle; `posed` are all obstacles at their poses, by their numbers."""
+    """All pairs of free obstacles with others; `posed` are all obstacles at their poses, by their numbers.
 
-    def __init__(self, body: RigidObstacle, prescribed: dict[int, RigidObstacle], barrier: GapPotential) -> None:
-        """`prescribed`: held or driven obstacles, by their numbers."""
-        self._pairs = {number: ObstaclePair.between(body, obstacle) for number, obstacle in prescribed.items()}
-        self._barrier, self._pose_size = barrier, len(body.pose_increment(0.0, 0.0))
-        self._start: dict[int, list[Values]] = {}
+    A pair of two triangle meshes has no distance function, and is left out.
+    """
 
-    def begin_step(self, pose: Pose, posed: PosedObstacles, *, along: bool) -> None:
-        """Begin a step; `along`: barriers are averaged over it."""
-        pairs = self._pairs.items() if along else []
-        self._start = {number: pair.gaps(pose, posed[number].pose) for number, pair in pairs}
+    def __init__(self, obstacles: Mapping[int, RigidObstacle], barrier: GapPotential) -> None:
+        """`obstacles` by their numbers, free ones and others."""
+        numbers = list(obstacles)
+        pairs = free_pairs([obstacles[number] for number in numbers])
+        named = [(numbers[i], numbers[j]) for i, j in pairs]
+        self._pairs = {
+            (i, j): ObstaclePair.between(obstacles[i], obstacles[j])
+            for i, j in named
+            if not all(isinstance(obstacles[number].shape, TriangleMeshShape) for number in (i, j))
+        }
+        self._free = {number for number, obstacle in obstacles.items() if obstacle.free}
+        self._barrier = barrier
+        self._start: dict[Numbers, list[Values]] = {}
 
-    def are_open(self, pose: Pose, posed: PosedObstacles) -> bool:
-        """Whether all gaps are open at a pose."""
-        gaps = [pair.gaps(pose, posed[number].pose) for number, pair in self._pairs.items()]
+    def begin_step(self, posed: PosedObstacles, *, time_averaged: bool) -> None:
+        """Begin a step; `time_averaged`: barriers are averaged over it."""
+        pairs = self._pairs.items() if time_averaged else []
+        self._start = {(i, j): pair.gaps(posed[i].pose, posed[j].pose) for (i, j), pair in pairs}
+
+    def are_open(self, posed: PosedObstacles) -> bool:
+        """Whether all gaps are open."""
+        gaps = [pair.gaps(posed[i].pose, posed[j].pose) for (i, j), pair in self._pairs.items()]
         return all(gap.min(initial=np.inf) > 0 for sides in gaps for gap in sides)
 
-    def safe_fraction(self, pose: Pose, q: Values, motions: dict[int, PoseMotion]) -> float:
-        """Fraction of the increment q (p,) that leaves a tenth of each gap, with motions of the others."""
+    def safe_fraction(self, motions: Mapping[int, PoseMotion]) -> float:
+        """Fraction of the motions of obstacles that leaves a tenth of each gap between them."""
         fractions = [
-            pair.safe_fraction(pose, q, motions[number][0].pose, motions[number][1])
-            for number, pair in self._pairs.items()
+            pair.safe_fraction(motions[i][0].pose, motions[i][1], motions[j][0].pose, motions[j][1])
+            for (i, j), pair in self._pairs.items()
+            if i in motions and j in motions
         ]
         return min(fractions, default=1.0)
 
-    def pose_derivatives(self, pose: Pose, posed: PosedObstacles) -> PoseDerivatives:
-        """Energy of contact with the others, and its derivatives by the pose."""
-        p = self._pose_size
-        total = PoseDerivatives(0.0, np.zeros(p), np.zeros((p, p)), np.zeros((p, p)))
-        for number in self._pairs:
-            (of_body, x), (of_other, y) = self._contact_forces(number, pose, posed)
-            total = (
-                total + carried_point_derivatives(of_body, x, pose) + pose_derivatives(of_other, y, pose, None, pose)
-            )
-        return total
+    def derivatives(self, posed: PosedObstacles) -> tuple[dict[int, PoseDerivatives], dict[Numbers, MixedHessian]]:
+        """Energies and derivatives of contact by the poses of free obstacles.
 
-    def wrench(self, pose: Pose, posed: PosedObstacles) -> Values:
-        """(p,) force and moment of the others on the obstacle, N and N m."""
-        return -self.pose_derivatives(pose, posed).gradient
+        Returns:
+            Derivatives by the pose of each free obstacle in contact; the energy of a pair counts with its first one.
+            And mixed second derivatives of pairs of free ones.
+        """
+        bodies: dict[int, PoseDerivatives] = {}
+        mixed: dict[Numbers, MixedHessian] = {}
+        for (i, j), ((of_i, x), (of_j, y)) in self._contact_forces(posed).items():
+            first, second = posed[i].pose, posed[j].pose
+            by_first = carried_point_derivatives(of_i, x, first) + pose_derivatives(of_j, y, first, None, first)
+            bodies[i] = bodies[i] + by_first if i in bodies else by_first
+            if j not in self._free:
+                continue
+            by_second = pose_derivatives(of_i, x, second, None, second) + carried_point_derivatives(of_j, y, second)
+            by_second = replace(by_second, energy=0.0)
+            bodies[j] = bodies[j] + by_second if j in bodies else by_second
+            sides = mixed_pose_hessian(of_i, x, first, second), mixed_pose_hessian(of_j, y, second, first)
+            mixed[i, j] = sides[0][0] + sides[1][0].T, sides[0][1] + sides[1][1].T
+        return bodies, mixed
 
-    def energies(self, pose: Pose, posed: PosedObstacles) -> tuple[float, float]:
+    def wrenches(self, posed: PosedObstacles) -> dict[int, Values]:
+        """(p,) force and moment of the others on each free obstacle in contact, N and N m."""
+        return {number: -body.gradient for number, body in self.derivatives(posed)[0].items()}
+
+    def energies(self, posed: PosedObstacles) -> tuple[float, float]:
         """Energy of the barriers, and potential of their forces in the step, J."""
-        contacts = [contact for number in self._pairs for contact, _ in self._contact_forces(number, pose, posed)]
+        contacts = [contact for sides in self._contact_forces(posed).values() for contact, _ in sides]
         return sum(contact.energy for contact in contacts), sum(contact.potential for contact in contacts)
 
-    def work(self, pose: Pose, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> float:
-        """Work of the others on the obstacle by their own increments (p,) in the step, J."""
+    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> float:
+        """Work of prescribed obstacles on free ones by their own increments (p,) in the step, J."""
         total = 0.0
-        for number in self._pairs:
-            (of_body, _), (of_other, _) = self._contact_forces(number, pose, posed)
-            force = of_body.normal.sum(axis=0) - of_other.normal.sum(axis=0)
-            total += float(force @ increments[number][: pose.dim])
+        for (i, j), ((of_i, _), (of_j, _)) in self._contact_forces(posed).items():
+            if j not in self._free:
+                force = of_i.normal.sum(axis=0) - of_j.normal.sum(axis=0)
+                total += float(force @ increments[j][: posed[i].pose.dim])
         return total
 
-    def _contact_forces(self, number: int, pose: Pose, posed: PosedObstacles) -> list[tuple[ContactForces, Values]]:
-        pair, start = self._pairs[number], self._start.get(number)
-        return pair.contact_forces(pose, posed[number].pose, self._barrier, start)
+    def _contact_forces(self, posed: PosedObstacles) -> dict[Numbers, list[tuple[ContactForces, Values]]]:
+        """Forces on the points of both obstacles of each pair in contact."""
+        contacts = {
+            (i, j): pair.contact_forces(posed[i].pose, posed[j].pose, self._barrier, self._start.get((i, j)))
+            for (i, j), pair in self._pairs.items()
+        }
+        return {numbers: sides for numbers, sides in contacts.items() if any(len(side.points) for side, _ in sides)}

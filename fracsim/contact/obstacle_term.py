@@ -71,11 +71,16 @@ class ObstacleTerm(ContactState, Term):
         # of the last step: work of each obstacle, J, dissipation by friction, J, and forces on each, N
         self._obstacle_work, self._friction_loss = [0.0] * len(self.obstacles), 0.0
         self._force_readings: list[Values] | None = None  # None: no step yet
-        self._tangent_is_exact = False
+        self._is_exact: bool | None = None  # whether the tangent at the current u and poses is; None: not known yet
 
     def update_displacement(self) -> None:
         """Discard contact forces, as u has changed."""
-        self._contact_forces = None
+        self.discard_forces()
+
+    def discard_forces(self) -> None:
+        """Discard forces, and whether the tangent is exact, as u or poses have changed."""
+        super().discard_forces()
+        self._is_exact = None
 
     def rest_gaps(self) -> Values:
         """(obstacles,) least gaps of the body at rest to each obstacle at t = 0, m (collective).
@@ -102,21 +107,27 @@ class ObstacleTerm(ContactState, Term):
 
     def coupling_matrix(self) -> PETSc.Mat | None:
         """Minus the derivative of the forces; None where nothing is in contact (collective)."""
-        contacts = self.obstacle_forces()
+        contacts, exact = self.obstacle_forces(), self.uses_exact_tangent()
+        self._tangent_positions = self.positions
         points = np.concatenate([contact.points for contact in contacts])
-        motion, self._tangent_positions = self._max_motion(points), self.positions
-        count_and_motion = np.array([len(points), motion])
-        self.comm.Allreduce(MPI.IN_PLACE, count_and_motion, op=MPI.MAX)
-        count, max_motion = count_and_motion
-        if not count:
+        if not self.comm.allreduce(len(points)):
             return None
-        exact = self._tangent_is_exact = self._exact_tangent_allowed(max_motion)
         blocks = np.concatenate([contact.tangent(exact=exact) for contact in contacts])
         matrix = self.surface.point_stiffness(points, blocks)
         for facets in (contact.facets for contact in contacts if contact.facets is not None):
             inner = facets.hessian if exact else facets.stiffness
             matrix = matrix + self.surface.facet_stiffness(facets.corners, inner)
         return self._coupling((self._level.contact_weights.factor * matrix).tocsr(), self.surface.node_numbers)
+
+    def uses_exact_tangent(self) -> bool:
+        """Whether the tangent has negative eigenvalues of contact: near the solution (collective)."""
+        if self._is_exact is None:
+            points = np.concatenate([contact.points for contact in self.obstacle_forces()])
+            motion = self.comm.allreduce(self._max_motion(points), op=MPI.MAX)
+            first = self._attempts <= 1
+            limit = EXACT_TANGENT.first_attempt if first else EXACT_TANGENT.later_attempts
+            self._is_exact = bool(motion < limit * self.barrier_width) and self._may_be_exact()
+        return self._is_exact
 
     def _max_motion(self, points: Ints) -> float:
         """Largest motion of points (k,) since the last tangent, m; infinite without one."""
@@ -125,15 +136,13 @@ class ObstacleTerm(ContactState, Term):
         motion = (self.positions - self._tangent_positions)[points]
         return float(np.linalg.norm(motion, axis=1).max(initial=0.0))
 
-    def _exact_tangent_allowed(self, motion: float) -> bool:
-        """Whether Newton's method is near the solution; `motion`: largest motion of points, m (collective)."""
-        first = self._attempts <= 1
-        limit = EXACT_TANGENT.first_attempt if first else EXACT_TANGENT.later_attempts
-        return motion < limit * self.barrier_width
+    def _may_be_exact(self) -> bool:
+        """Whether the tangent may be exact near the solution (collective)."""
+        return True
 
     def begin_solve(self) -> None:
         """Count an attempt of Newton's method; after a failure tangents become exact later."""
-        self._tangent_positions, self._tangent_is_exact, self._attempts = None, False, self._attempts + 1
+        self._tangent_positions, self._is_exact, self._attempts = None, None, self._attempts + 1
 
     def stored_energy(self) -> float:
         """Energy of the barriers at the current u, this rank's share, J (collective)."""
@@ -173,7 +182,7 @@ class ObstacleTerm(ContactState, Term):
         """Fraction of a change of u (owned dofs,), m, that leaves a tenth of every gap (collective)."""
         self.obstacle_forces()
         motion = self.surface.interpolation(np.divide(change, self._level.fraction))
-        moving = enumerate(zip(self._kinematics.posed, self._obstacle_increments(motion), strict=True))
+        moving = enumerate(zip(self._kinematics.posed, self._obstacle_increments(), strict=True))
         by_obstacle = [
             safe_motion_fractions(posed, self.positions, motion, q, self._facets_for(number))
             for number, (posed, q) in moving
@@ -181,8 +190,8 @@ class ObstacleTerm(ContactState, Term):
         fractions = [values[self.surface.area > 0] for values in by_obstacle]
         return float(min(values.min(initial=1.0) for values in fractions))
 
-    def _obstacle_increments(self, motion: Values) -> list[Values]:
-        """(p,) increments of the poses of obstacles for a motion (n, d) of the points, m (collective)."""
+    def _obstacle_increments(self) -> list[Values]:
+        """(p,) increments of the poses of obstacles in a correction of Newton's method."""
         return [np.zeros_like(increment) for increment in self._kinematics.increments]
 
     def feasible_guess(self, u: Values) -> Values:
@@ -221,7 +230,7 @@ class ObstacleTerm(ContactState, Term):
     def _advance_obstacles(self, x: Values) -> None:
         motions = self._kinematics.prescribed_motions(self._facets_for)
         self._kinematics.advance(x, motions, self.surface.min_fraction)
-        self._contact_forces = None
+        self.discard_forces()
 
     # --- fracture, and surfaces for output ---
 
@@ -271,7 +280,7 @@ class ObstacleTerm(ContactState, Term):
     def clear_search(self) -> None:
         """Discard results of searches, which a checkpoint does not hold (not collective)."""
         self.surface.clear_caches()
-        self._contact_forces = None
+        self.discard_forces()
 
     def destroy(self) -> None:
         """Destroy the objects of PETSc."""

@@ -9,16 +9,22 @@ Equations: docs/theory.md#rigid-obstacles.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
+from ..mesh.parallel import sum_over_ranks
 from .node_contact import ContactForces, FacetCoupling, LaggedContact
 from .pose import Pose, rotation_derivative, rotation_second_derivative
 
 Values = npt.NDArray[np.float64]
+
+
+type MixedHessian = tuple[Values, Values]  # (p, p) by two poses: exact, and of the positive part
 
 
 @dataclass(frozen=True)
@@ -79,6 +85,20 @@ def pose_derivatives(
     return PoseDerivatives(contact.potential, pose_gradient, hessian, stiffness)
 
 
+def sum_of_derivatives(local: Sequence[PoseDerivatives], comm: MPI.Intracomm) -> list[PoseDerivatives]:
+    """Sums over all ranks of derivatives of several obstacles (collective)."""
+    rows = [
+        np.concatenate([[part.energy], part.gradient, part.hessian.reshape(-1), part.stiffness.reshape(-1)])
+        for part in local
+    ]
+    result = []
+    for row in sum_over_ranks(comm, np.array(rows)):
+        p = len(local[0].gradient)
+        energy, gradient, *matrices = np.split(row, [1, 1 + p, 1 + p + p * p])
+        result.append(PoseDerivatives(float(energy[0]), gradient, *(matrix.reshape(p, p) for matrix in matrices)))
+    return result
+
+
 def carried_point_derivatives(contact: ContactForces, x: Values, pose: Pose) -> PoseDerivatives:
     """Derivatives of contact of points x (n, d), m, that the obstacle itself carries, by its pose."""
     arm = x[contact.points] - pose.centre
@@ -90,7 +110,7 @@ def carried_point_derivatives(contact: ContactForces, x: Values, pose: Pose) -> 
     return PoseDerivatives(contact.potential, -np.einsum("ndp,nd->p", J, gradient), hessian, stiffness)
 
 
-def mixed_pose_hessian(contact: ContactForces, x: Values, carrier: Pose, second: Pose) -> tuple[Values, Values]:
+def mixed_pose_hessian(contact: ContactForces, x: Values, carrier: Pose, second: Pose) -> MixedHessian:
     """(p, p) second derivatives of the energy by the poses of a carrier of points and of another obstacle.
 
     Args:

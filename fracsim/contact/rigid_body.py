@@ -21,13 +21,11 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
 from ..forms.schemes import Scheme
 from ..mechanics.contact_time_weights import acceleration_change
-from ..mesh.parallel import sum_over_ranks
 from .obstacle import FreeObstacle, RigidMotion
-from .pose import Pose, left_jacobian, left_jacobian_derivative
+from .pose import Pose, left_jacobian, left_jacobian_derivative, rotation_derivative
 from .pose_derivatives import PoseDerivatives
 
 Values = npt.NDArray[np.float64]
@@ -40,47 +38,24 @@ class RigidSolverPolicy:
     Attributes:
         max_iterations: of Newton's method.
         decrement_tolerance: Newton's decrement, in the energies involved, at which it ends.
+        solved_decrement: decrement, in the energies involved, of a solution together with the body. Its square root
+            is the error of the motion in a step.
         round_off: error of Phi, in the energies involved, that the line search tolerates.
+        reduction_range: smallest and largest factor by which the line search shortens a step.
         min_fraction: of a step of Newton's method in the line search.
         sufficient_decrease: part of the predicted decrease that a step must achieve (Armijo).
     """
 
     max_iterations: int = 100
     decrement_tolerance: float = 1e-18
+    solved_decrement: float = 1e-15
     round_off: float = 1e-13
+    reduction_range: tuple[float, float] = (0.1, 0.5)
     min_fraction: float = 1e-12
     sufficient_decrease: float = 1e-4
 
 
 SOLVER = RigidSolverPolicy()
-
-
-@dataclass(frozen=True)
-class PosePredictor:
-    """Linear path of a step of Newton's method that moves points and an obstacle together.
-
-    Attributes:
-        positions: (n, d) points at its start, m.
-        motion: (n, d) of the points, m.
-        z: (k,) increment of the obstacle at its start.
-        dz: (k,) its change.
-    """
-
-    positions: Values
-    motion: Values
-    z: Values
-    dz: Values
-
-    def fraction_at(self, x: Values, comm: MPI.Intracomm = MPI.COMM_SELF) -> float:
-        """Fraction of the path nearest to the points of all ranks at x (n, d), m (collective)."""
-        along, length = sum_over_ranks(
-            comm, [float(np.vdot(x - self.positions, self.motion)), float(np.vdot(self.motion, self.motion))]
-        )
-        return float(np.clip(along / length, 0.0, 1.0)) if length > 0 else 0.0
-
-    def way_at(self, fraction: float) -> Values:
-        """(k,) z at a fraction of the path."""
-        return self.z + fraction * self.dz
 
 
 @dataclass(frozen=True)
@@ -107,11 +82,14 @@ class RigidSystem:
 
     Phi(z) = sum over obstacles of Phi_i(z_i) + s^2 k sum over pairs of E_ij(z_i, z_j), z: (k,) of each. Steps are of
     one scheme and size.
+
+    Attributes:
+        level: s, level of the step at which forces balance.
     """
 
     def __init__(self, steps: Sequence[RigidStep]) -> None:
         self._steps, first = steps, steps[0]
-        self._level, self._factor = first.share, first.factor
+        self.level, self._factor = first.share, first.factor
         self._ends = np.cumsum([len(step.M) for step in steps])
 
     def split(self, values: Values) -> list[Values]:
@@ -146,14 +124,13 @@ class RigidSystem:
             contact: z -> derivatives of contact, of all ranks.
             free: z, dz -> fraction of dz on which no gap closes.
         """
-        derivatives, weight = contact(z), self._factor * self._level**2
+        derivatives, weight = contact(z), self._factor * self.level**2
         phi = self._free_potential(z) + weight * derivatives.energy
         for _ in range(SOLVER.max_iterations):
             gradient, hessian, stiffness = self.system(z, derivatives)
-            step: Values = np.asarray(-_solve(hessian, stiffness, gradient) / self._level)
-            decrement, dz = -self._level * float(gradient @ step), self.split(step)
-            scale = sum(body.energy_scale(z_i) for body, z_i in zip(self._steps, z, strict=True))
-            scale = scale + weight * derivatives.energy
+            step: Values = np.asarray(-_solve(hessian, stiffness, gradient) / self.level)
+            decrement, dz = -self.level * float(gradient @ step), self.split(step)
+            scale = self.energy_scale(z, derivatives)
             if not decrement > SOLVER.decrement_tolerance * scale:
                 break
             fraction, tolerance = free(z, dz), SOLVER.round_off * (scale + abs(phi))
@@ -163,14 +140,27 @@ class RigidSystem:
                 trial_phi = self._free_potential(trial) + weight * trial_derivatives.energy
                 if trial_phi <= phi - SOLVER.sufficient_decrease * fraction * decrement + tolerance:
                     break
-                fraction /= 2
+                fraction *= _minimum_of_parabola(trial_phi - phi, fraction * decrement)
             else:
                 break
             z, derivatives, phi = trial, trial_derivatives, trial_phi
         return z, derivatives
 
+    def energy_scale(self, z: Sequence[Values], contact: SystemDerivatives) -> float:
+        """Size of the energies of which Phi is the difference, J."""
+        inertia = sum(step.energy_scale(z_i) for step, z_i in zip(self._steps, z, strict=True))
+        return inertia + self._factor * self.level**2 * contact.energy
+
     def _free_potential(self, z: Sequence[Values]) -> float:
         return sum(step.free_potential(z_i) for step, z_i in zip(self._steps, z, strict=True))
+
+
+def _minimum_of_parabola(rise: float, decrement: float) -> float:
+    """Fraction of a step at the minimum of the parabola with slope -decrement at its start and `rise` at its end, J."""
+    low, high = SOLVER.reduction_range
+    if not np.isfinite(rise):
+        return high
+    return float(np.clip(decrement / (2 * (rise + decrement)), low, high))
 
 
 def _solve(hessian: Values, stiffness: Values, gradient: Values) -> Values:
@@ -245,6 +235,11 @@ class RigidStep:
 
     # --- kinematics ---
 
+    def start_velocity(self, x: Values) -> Values:
+        """(n, d) velocities at the start of points x (n, d), m, that the obstacle carries, m/s."""
+        d, rate = self.start.pose.dim, self.increment(self._rates[0])
+        return np.asarray(rate[:d] - rotation_derivative(x - self.start.pose.centre) @ rate[d:])
+
     def increment(self, z: Values) -> Values:
         """(p,) increment q of the pose in the step."""
         return np.asarray(self.body.motion_basis @ z)
@@ -296,18 +291,6 @@ class RigidStep:
         """Size of the energies of which Phi is the difference, J."""
         s_z = self.share * z
         return self.c_a / 2 * float(s_z @ self.M @ s_z + self.z_a @ self.M @ self.z_a)
-
-    def minimise(
-        self,
-        z: Values,
-        contact: Callable[[Values], PoseDerivatives],
-        free: Callable[[Values, Values], float],
-    ) -> tuple[Values, PoseDerivatives]:
-        """(k,) minimiser of Phi from z, and the derivatives of contact there; as of RigidSystem (collective)."""
-        result, derivatives = RigidSystem([self]).minimise(
-            [z], lambda z: SystemDerivatives([contact(z[0])]), lambda z, dz: free(z[0], dz[0])
-        )
-        return result[0], derivatives.bodies[0]
 
     def end_motion(self, z: Values, force: Values) -> RigidMotion:
         """State of motion at the end, with force and moment (p,) of the body on the obstacle there, N and N m."""

@@ -1,13 +1,7 @@
 """Terms of the balance for contact with analytic obstacles of which some are free rigid bodies.
 
-For a body at x the poses z minimise the incremental potential Phi (rigid_pose), by a small Newton method within the
-term. The body is in contact with a function of x alone:
-
-    E(x) = min over z of Phi(x, z),    dE/dx = dPhi/dx at that z,    d2E/dx2 = Phi_xx - Phi_xz Phi_zz^-1 Phi_zx
-
-So the system of equations keeps its size, with the solution of the full system. The last part couples all points in
-contact with one another. Its rank is that of the poses, and it is applied, not stored. Every rank finds the same poses
-from sums over all ranks.
+In implicit steps the poses of free obstacles are unknowns of Newton's method beside u (rigid_pose). All ranks have the
+same poses, from sums over all ranks.
 
 Equations: docs/theory.md#rigid-obstacles.
 """
@@ -15,13 +9,11 @@ Equations: docs/theory.md#rigid-obstacles.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from mpi4py import MPI
 
 from ..forms.schemes import Scheme
 from ..mesh.domain import Domain
@@ -32,13 +24,19 @@ from .obstacle import FreeMotions, FreeObstacle, PlaceableObstacle, RigidMotion,
 from .obstacle_pairs import ObstaclePairs
 from .obstacle_term import ObstacleTerm
 from .pose import PosedShape
-from .rigid_body import RigidStep, is_positive_definite
-from .rigid_pose import BodySurroundings, CondensedPose, FreeObstacleSystem
+from .pose_derivatives import (
+    PoseDerivatives,
+    contact_wrench,
+    point_pose_hessian,
+    pose_derivatives,
+    resultant,
+    sum_of_derivatives,
+)
+from .rigid_body import RigidStep
+from .rigid_pose import FreePose, PoseUnknowns
+from .step_limit import safe_motion_fractions
 
 Values = npt.NDArray[np.float64]
-
-# evaluations in which free obstacles are held back, before they are released whatever they press on
-MAX_HOLDS = 4
 
 
 class FreeObstacleBase(ObstacleTerm):
@@ -102,125 +100,106 @@ class FreeObstacleTerm(FreeObstacleBase):
 
     Attributes:
         free: the free ones by their numbers.
+        pairs: contact of these with other obstacles.
     """
 
     leaves_tangent_incomplete = True
-    free: dict[int, CondensedPose]
+    free: dict[int, FreePose]
 
     def __init__(
         self, domain: Domain, u: fem.Function, obstacles: Sequence[RigidObstacle], law: ObstacleLaw, scheme: Scheme
     ) -> None:
         """Raise InputError where the body at rest overlaps an obstacle (collective)."""
-        prescribed = {number: obstacle for number, obstacle in enumerate(obstacles) if not obstacle.free}
-        self.free = {
-            number: CondensedPose(obstacle, ObstaclePairs(obstacle, prescribed, law.barrier))
-            for number, obstacle in enumerate(obstacles)
-            if isinstance(obstacle, FreeObstacle)
-        }
-        self._scheme = scheme
-        self._free_system = FreeObstacleSystem(self.free, law.barrier) if len(self.free) > 1 else None
-        self._equilibrium_positions: Values | None = None  # (n, d) of points for which the poses are in equilibrium
-        self._is_first_evaluation = False  # of a solve: the body has not been moved by the obstacles yet
-        self._held_fraction = 0.0  # fraction of their way to equilibrium from which free obstacles are held back
-        self._hold_count = 0  # evaluations in which they were held back
+        numbered = dict(enumerate(obstacles))
+        self.free = {n: FreePose(obstacle) for n, obstacle in numbered.items() if isinstance(obstacle, FreeObstacle)}
+        self._scheme, self.pairs = scheme, ObstaclePairs(numbered, law.barrier)
+        self._unknowns = PoseUnknowns(domain.comm, self.free, self.pairs, self)
         super().__init__(domain, u, obstacles, law)
 
     # --- steps ---
 
     def _begin_new_step(self) -> None:
         super()._begin_new_step()
-        level, self._equilibrium_positions = self._level, None
-        weights = level.contact_weights
-        for number, obstacle in self.free.items():
-            step = RigidStep(
-                obstacle.body, obstacle.motion, self._scheme, level.dt, level.c_a, level.fraction, weights.factor
+        level, weights = self._level, self._level.contact_weights
+        for number, pose in self.free.items():
+            pose.begin_step(
+                RigidStep(pose.body, pose.motion, self._scheme, level.dt, level.c_a, level.fraction, weights.factor)
             )
-            self._kinematics.increments[number] = obstacle.begin_step(step, self._lagged[number])
-            obstacle.obstacle_pairs.begin_step(
-                obstacle.motion.pose, self._kinematics.start_posed, along=weights.time_averaged
-            )
-        if self._free_system is not None:
-            self._free_system.begin_step(along=weights.time_averaged)
+            self._kinematics.increments[number] = pose.step.increment(pose.step.free_flight)
+        self.pairs.begin_step(self._kinematics.start_posed, time_averaged=weights.time_averaged)
+        self.poses_moved()
 
     def accept_step(self) -> None:
         """Record contact in the step, and give free obstacles their momentum (collective)."""
         super().accept_step()
-        contacts, wrenches = self.obstacle_forces(), {} if self._free_system is None else self._free_system.wrenches()
-        for number, obstacle in self.free.items():
-            obstacle.end_step(contacts[number], self._surroundings(number), wrenches.get(number, 0.0))
+        contacts, of_pairs = self.obstacle_forces(), self.pairs.wrenches(self.posed())
+        for number, pose in self.free.items():
+            of_body = contact_wrench(contacts[number], self.positions, pose.posed.pose)
+            wrench = sum_over_ranks(self.comm, of_body) + of_pairs.get(number, 0.0)
+            pose.motion = pose.end_motion(wrench)
 
-    # --- equilibrium of free obstacles ---
+    # --- contact of the body with free obstacles (rigid_pose.BodyContact) ---
 
-    def obstacle_forces(self) -> list[ContactForces]:
-        """Forces of each obstacle at the current u, free ones in equilibrium (collective)."""
-        if self._contact_forces is None and self._in_step():
-            self.positions = self.surface.positions(self._end_displacement())
-            if not self.comm.allreduce(_is_same(self.positions, self._equilibrium_positions), op=MPI.LAND):
-                self._equilibrium_positions = self.positions
-                if self._is_first_evaluation:
-                    self._approach_equilibrium()
-                elif not self._held_fraction:
-                    self._equilibrate()
-                self._update_kinematics()
-        return super().obstacle_forces()
+    def posed(self) -> list[PosedShape]:
+        """All obstacles at their current poses."""
+        return self._kinematics.posed
 
-    def _reset_equilibrium(self) -> None:
-        """Begin a solve: poses are not in equilibrium."""
-        self._equilibrium_positions, self._is_first_evaluation = None, True
-        self._held_fraction, self._hold_count = 0.0, 0
+    def poses_moved(self) -> None:
+        """Take over the poses of free obstacles, and discard forces."""
+        for number, pose in self.free.items():
+            self._kinematics.posed[number] = pose.posed
+        self.discard_forces()
 
-    def _approach_equilibrium(self) -> None:
-        """Move free obstacles towards equilibrium as far as is safe (collective).
+    def discard_forces(self) -> None:
+        """Discard forces and the equations of the poses, as u or poses have changed."""
+        super().discard_forces()
+        self._unknowns.discard()
 
-        Before a body that has not given way yet, a heavy obstacle would come to rest at a tiny distance, with a force
-        that is of no use.
-        """
-        self._is_first_evaluation = False
-        start = {number: obstacle.z for number, obstacle in self.free.items()}
-        self._equilibrate()
-        changes = {number: obstacle.z - start[number] for number, obstacle in self.free.items()}
-        surroundings = self._all_surroundings()
-        if self._free_system is not None:
-            fraction = self._free_system.free_fraction(surroundings, start, changes)
-        else:
-            fraction = min(
-                obstacle.free_fraction(surroundings[number], start[number], changes[number])
-                for number, obstacle in self.free.items()
+    def pose_derivatives(self) -> dict[int, PoseDerivatives]:
+        """Energy and derivatives by the pose of each free obstacle, of all ranks (collective)."""
+        contacts = self.obstacle_forces()
+        local = [
+            pose_derivatives(
+                contacts[number], self.positions, pose.posed.pose, self._lagged[number], pose.step.start.pose
             )
-        self._hold_count += 1
-        if self._hold_count == MAX_HOLDS:
-            fraction = 1.0
-        self._held_fraction = 1 - fraction
-        for number, obstacle in self.free.items():
-            obstacle.move_to(start[number] + fraction * changes[number])
-            if fraction < 1:
-                obstacle.discard_derivatives()
+            for number, pose in self.free.items()
+        ]
+        return dict(zip(self.free, sum_of_derivatives(local, self.comm), strict=True))
 
-    def _equilibrate(self) -> None:
-        """Move all free obstacles to equilibrium with the points at their current positions (collective)."""
-        if self._free_system is not None:
-            return self._free_system.equilibrate(self._all_surroundings())
-        for number, obstacle in self.free.items():
-            obstacle.equilibrate(self._surroundings(number))
+    def mixed_hessians(self) -> dict[int, Values]:
+        """(owned dofs, p) derivatives of minus the nodal forces by the pose, of obstacles in contact (collective)."""
+        contacts, exact = self.obstacle_forces(), self.uses_exact_tangent()
+        counts = sum_over_ranks(self.comm, np.array([len(contacts[number].points) for number in self.free]))
+        touching = [number for number, count in zip(self.free, counts, strict=True) if count]
+        return {number: self._mixed_hessian(number, contacts[number], exact=exact) for number in touching}
 
-    def _all_surroundings(self) -> dict[int, BodySurroundings]:
-        return {number: self._surroundings(number) for number in self.free}
+    def _mixed_hessian(self, number: int, contact: ContactForces, *, exact: bool) -> Values:
+        pose = self.free[number]
+        by_pose = point_pose_hessian(
+            contact, self.positions, pose.posed.pose, self._lagged[number], pose.step.start.pose, exact=exact
+        )
+        forces = np.zeros((len(self.positions), *by_pose.shape[1:]))
+        forces[contact.points] = by_pose
+        to_nodes = self.surface.interpolation.assemble_to_nodes
+        return np.stack([to_nodes(column) for column in np.moveaxis(forces, 2, 0)], axis=1)
+
+    def free_fraction(self, increments: Mapping[int, Values]) -> float:
+        """Fraction of increments (p,) of free poses on which no gap to the body at rest closes (collective)."""
+        self.obstacle_forces()
+        at_rest = 0 * self.positions
+        fractions: list[Values] = [np.ones(len(self.positions))]
+        for number, q in increments.items():
+            posed = self._kinematics.posed[number]
+            fractions.append(safe_motion_fractions(posed, self.positions, at_rest, q, self._facets_for(number)))
+        return self.surface.min_fraction(np.min(fractions, axis=0))
+
+    def _may_be_exact(self) -> bool:
+        """Whether the exact second derivative by the poses is positive definite (collective)."""
+        return not self._in_step() or self._unknowns.equations().exact_is_positive
 
     def _in_step(self) -> bool:
         """Whether a step has begun and is not accepted yet."""
-        return bool(self._level.dt) and all(obstacle.in_step for obstacle in self.free.values())
-
-    def _surroundings(self, number: int) -> BodySurroundings:
-        return self._surroundings_at(number, self.positions)
-
-    def _surroundings_at(self, number: int, x: Values) -> BodySurroundings:
-        evaluate, facets = partial(self._evaluate_obstacle, number), self._facets_for(number)
-        return BodySurroundings(self.surface, x, evaluate, facets, self._kinematics.posed)
-
-    def _update_kinematics(self) -> None:
-        """Set the poses of free obstacles in the kinematics of all."""
-        for number, obstacle in self.free.items():
-            self._kinematics.posed[number] = obstacle.posed
+        return bool(self._level.dt) and self._unknowns.in_step
 
     def _contact_point_motion(self, number: int, posed: PosedShape) -> Values:
         lagged = self._lagged[number]
@@ -228,183 +207,124 @@ class FreeObstacleTerm(FreeObstacleBase):
             return super()._contact_point_motion(number, posed)
         return self.free[number].contact_point_motion(lagged, posed)
 
-    # --- forces, tangent and energy ---
+    def _obstacle_velocity(self, number: int, x: Values) -> Values:
+        return (
+            self.free[number].step.start_velocity(x) if number in self.free else super()._obstacle_velocity(number, x)
+        )
+
+    # --- unknowns of Newton's method (EliminatingTerm) ---
+
+    def low_rank_updates(self) -> list[tuple[Values, Values]]:
+        """B (owned dofs, k) and D^-1 (k, k) of obstacles in contact with the body (collective)."""
+        return self._unknowns.low_rank_updates() if self._in_step() else []
+
+    def condensed_residual(self) -> Values | None:
+        """(owned dofs,) B D^-1 r_y, N; None where no obstacle touches the body (collective)."""
+        return self._unknowns.condensed_residual() if self._in_step() else None
+
+    def begin_correction(self, change: Values) -> None:
+        """Compute the change of the poses that belongs to a change of u (owned dofs,), m (collective)."""
+        self._unknowns.begin_correction(change)
+
+    def move_along(self, fraction: float) -> None:
+        """Move free obstacles to a fraction of the correction."""
+        self._unknowns.move_along(fraction)
+
+    def unknowns_are_solved(self) -> bool:
+        """Whether the poses are a solution (collective)."""
+        return not self._in_step() or self._unknowns.are_solved()
+
+    def solve_unknowns(self) -> None:
+        """Solve for the poses with the body held (collective)."""
+        self._unknowns.solve()
+
+    # --- energies ---
 
     def potential(self) -> float:
         """Potential of contact, with inertia and weight of free obstacles on rank 0, J (collective)."""
         energy, level = super().potential(), self._level
         if self.comm.rank == 0 and level.dt:
-            for obstacle in self.free.values():
-                _, of_pairs = obstacle.obstacle_pairs.energies(obstacle.posed.pose, self._kinematics.posed)
-                energy += obstacle.step.free_potential(obstacle.z) + level.contact_weight * level.fraction * of_pairs
-            if self._free_system is not None:
-                energy += level.contact_weight * level.fraction * self._free_system.energies()[1]
+            of_pairs = self.pairs.energies(self.posed())[1]
+            energy += self._unknowns.free_potential() + level.contact_weight * level.fraction * of_pairs
         return energy
 
     def stored_energy(self) -> float:
         """Energy of all barriers, those between obstacles on rank 0, J (collective)."""
         energy = super().stored_energy()
-        if self.comm.rank == 0:
-            posed = self._kinematics.posed
-            energy += sum(body.obstacle_pairs.energies(body.posed.pose, posed)[0] for body in self.free.values())
-            energy += 0.0 if self._free_system is None else self._free_system.energies()[0]
-        return energy
-
-    def low_rank_updates(self) -> list[tuple[Values, Values]]:
-        """Phi_xz (owned dofs, k) and Phi_zz^-1 (k, k) of obstacles in contact (collective)."""
-        if not self._in_step() or not (contacts := self.obstacle_forces()) or self._held_fraction:
-            return []
-        counts = sum_over_ranks(self.comm, np.array([len(contacts[number].points) for number in self.free]))
-        touched = [number for number, count in zip(self.free, counts, strict=True) if count]
-        if self._free_system is not None and touched:
-            U = np.concatenate([self._mixed_block(number, contacts[number]) for number in self.free], axis=1)
-            return [(U, self._free_system.compliance(self._all_surroundings(), exact=self._tangent_is_exact))]
-        return [(self._mixed_block(number, contacts[number]), self._compliance(number)) for number in touched]
-
-    def _mixed_block(self, number: int, contact: ContactForces) -> Values:
-        """(owned dofs, k) Phi_xz (collective)."""
-        by_z = self.free[number].mixed_block(contact, self.positions, exact=self._tangent_is_exact)
-        forces = np.zeros((len(self.positions), *by_z.shape[1:]))
-        forces[contact.points] = by_z
-        to_nodes = self.surface.interpolation.assemble_to_nodes
-        return np.stack([to_nodes(column) for column in np.moveaxis(forces, 2, 0)], axis=1)
-
-    def _compliance(self, number: int) -> Values:
-        """(k, k) Phi_zz^-1 (collective)."""
-        hessian = self.free[number].hessian(self._surroundings(number), exact=self._tangent_is_exact)
-        return np.asarray(np.linalg.inv(hessian), np.float64)
-
-    def _exact_tangent_allowed(self, motion: float) -> bool:
-        """Whether Newton's method is near the solution, and Phi_zz is positive definite (collective)."""
-        if not super()._exact_tangent_allowed(motion):
-            return False
-        if self._free_system is not None:
-            return is_positive_definite(self._free_system.hessian(self._all_surroundings(), exact=True))
-        return all(
-            is_positive_definite(obstacle.hessian(self._surroundings(number), exact=True))
-            for number, obstacle in self.free.items()
-        )
+        return energy if self.comm.rank else energy + self.pairs.energies(self.posed())[0]
 
     def _normal_work(self, number: int) -> float:
         if number not in self.free:
             return super()._normal_work(number)
-        return self.free[number].normal_work(self.obstacle_forces()[number], self.positions)
+        pose, contact = self.free[number], self.obstacle_forces()[number]
+        force = resultant(contact.normal, self.positions[contact.points] - pose.posed.pose.centre)
+        return float(force @ pose.step.increment(pose.z))
 
     def step_work(self) -> tuple[float, float]:
         """Work of obstacles' own motion, of gravity and other obstacles on free ones; dissipation (collective)."""
         work, dissipation = super().step_work()
         if self.comm.rank == 0:
-            for number, obstacle in self.free.items():
-                start, end = self._kinematics.start_posed[number].pose, obstacle.posed.pose
-                work += obstacle.body.gravity_potential(start)[0] - obstacle.body.gravity_potential(end)[0]
-                work += obstacle.obstacle_pairs.work(end, self._kinematics.posed, self._kinematics.increments)
+            work += self._unknowns.gravity_work() + self.pairs.work(self.posed(), self._kinematics.increments)
         return work, dissipation
 
     # --- step limits ---
 
-    def _obstacle_increments(self, motion: Values) -> list[Values]:
-        """(p,) increments of the poses with which Newton's method moves obstacles and points (collective)."""
-        increments, contacts = super()._obstacle_increments(motion), self.obstacle_forces()
-        if self._held_fraction:
-            return increments
-        exact = self._tangent_is_exact
-        if self._free_system is not None:
-            predicted = self._free_system.predict_increments(
-                dict(enumerate(contacts)), self._all_surroundings(), motion, exact=exact
-            )
-            for number, q in predicted.items():
-                increments[number] = q
-            return increments
-        for number, obstacle in self.free.items():
-            increments[number] = obstacle.predict_increment(
-                contacts[number], self._surroundings(number), motion, exact=exact
-            )
+    def max_step_fraction(self, change: Values) -> float:
+        """Fraction of a correction of u (owned dofs,), m, and poses that leaves a tenth of every gap (collective)."""
+        between = self._unknowns.fraction_between_obstacles(self._unknowns.increments())
+        return min(super().max_step_fraction(change), between)
+
+    def _obstacle_increments(self) -> list[Values]:
+        """(p,) increments of the poses in a correction."""
+        increments = super()._obstacle_increments()
+        for number, q in self._unknowns.increments().items():
+            increments[number] = q
         return increments
 
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) first guess without a collision: obstacles stop before they meet, or the body (collective)."""
         u, level = super().feasible_guess(u), self._level
-        self._reset_equilibrium()
-        for obstacle in self.free.values():
-            obstacle.discard_predictor()
         if not level.dt:
             return u
         x = self.surface.positions(level.u_n)
         motion = self.surface.positions(level.displacement_at_end(u)) - x
-        fraction, guesses = 1.0, {}
-        for number, obstacle in self.free.items():
-            guesses[number], safe = self._first_guess(obstacle, self._surroundings_at(number, x), motion)
-            fraction = min(fraction, safe)
-        if self._free_system is not None:
-            fraction = min(fraction, self._free_system.safe_guess(guesses))
-        for number, z in guesses.items():
-            self.free[number].move_to(fraction * z)
-        self._update_kinematics()
+        guesses = {number: self._first_guess(number, x, motion) for number in self.free}
+        motions = {n: (self.free[n].start_posed, self.free[n].step.increment(z)) for n, (z, _) in guesses.items()}
+        fraction = min(self.pairs.safe_fraction(motions), *(safe for _, safe in guesses.values()))
+        self._unknowns.move_to([fraction * z for z, _ in guesses.values()])
         return u if fraction == 1 else np.asarray(level.u_n + fraction * (u - level.u_n))
 
-    def _first_guess(
-        self, obstacle: CondensedPose, surroundings: BodySurroundings, motion: Values
-    ) -> tuple[Values, float]:
+    def _first_guess(self, number: int, x: Values, motion: Values) -> tuple[Values, float]:
         """First guess (k,) of an increment, and its fraction that closes no gap (collective).
 
-        The first of these without a collision: free flight, rest, motion with a driven obstacle.
-
         Args:
-            obstacle: free obstacle.
-            surroundings: body at the start of the step.
-            motion: (n, d) of the points, m.
+        number: of the free obstacle.
+        x: (n, d) points of the body at the start of the step, m.
+        motion: (n, d) of the points, m.
         """
-        motions = self._kinematics.full_motions()
-        carried = [obstacle.carried_by(increment) for _, increment in motions.values() if increment.any()]
-        guesses = [obstacle.step.free_flight, 0 * obstacle.step.free_flight, *carried]
-        fraction = 0.0
-        for z in guesses:
-            safe = obstacle.safe_fraction(surroundings, motion, z, motions)
-            if safe == 1:
-                return z, 1.0
-            fraction = min(fraction, safe) if fraction else safe
-        return guesses[0], fraction
+        pose, prescribed = self.free[number], self._kinematics.full_motions()
+
+        def safe_fraction(z: Values) -> float:
+            start, q = pose.start_posed, pose.step.increment(z)
+            of_points = safe_motion_fractions(start, x, motion, q, self._facets_for(number))
+            of_pairs = self.pairs.safe_fraction(prescribed | {number: (start, q)})
+            return min(of_pairs, self.surface.min_fraction(of_points))
+
+        return pose.first_guess([increment for _, increment in prescribed.values()], safe_fraction)
 
     def is_feasible(self, u: Values) -> bool:
         """Whether every gap is open with the body at u, also between obstacles (collective)."""
-        posed = self._kinematics.posed
-        apart = all(body.obstacle_pairs.are_open(body.posed.pose, posed) for body in self.free.values())
-        return super().is_feasible(u) and apart and (self._free_system is None or self._free_system.are_open())
-
-    def remaining_motion(self) -> float:
-        """Remaining fraction of the motion of prescribed obstacles, or of free ones to equilibrium (collective)."""
-        if self._is_first_evaluation:
-            self.obstacle_forces()
-        return max(super().remaining_motion(), self._held_fraction)
-
-    def continue_motion(self) -> None:
-        """Advance held obstacles, and free ones towards equilibrium (collective)."""
-        super().continue_motion()
-        if self._held_fraction:
-            self.obstacle_forces()
-            self._approach_equilibrium()
-            self._update_kinematics()
-            self._contact_forces = None
+        return super().is_feasible(u) and self.pairs.are_open(self.posed())
 
     def _advance_obstacles(self, x: Values) -> None:
         """Advance prescribed obstacles as far as the body and free obstacles allow."""
-        remaining, no_motion = self._kinematics.remaining_motions(), np.zeros_like(self._kinematics.increments[0])
-        fractions = [
-            obstacle.obstacle_pairs.safe_fraction(obstacle.posed.pose, no_motion, remaining)
-            for obstacle in self.free.values()
-        ]
+        remaining, at_rest = self._kinematics.remaining_motions(), np.zeros_like(self._kinematics.increments[0])
+        fraction = self.pairs.safe_fraction(remaining | {n: (pose.posed, at_rest) for n, pose in self.free.items()})
         motions = self._kinematics.prescribed_motions(self._facets_for)
-        self._kinematics.advance(x, motions, self.surface.min_fraction, min(fractions))
-        self._contact_forces = self._equilibrium_positions = None
+        self._kinematics.advance(x, motions, self.surface.min_fraction, fraction)
+        self.discard_forces()
 
     def restrict_motion(self) -> None:
         """Hold all obstacles at the start of the step (collective)."""
-        for obstacle in self.free.values():
-            obstacle.return_to_start()
-        self._update_kinematics()
-        self._reset_equilibrium()
+        self._unknowns.move_to([0 * pose.z for pose in self.free.values()])
         super().restrict_motion()
-
-
-def _is_same(x: Values, previous: Values | None) -> bool:
-    return previous is not None and np.array_equal(x, previous)

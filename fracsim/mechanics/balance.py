@@ -25,6 +25,7 @@ from ..mesh.dolfinx_compat import apply_lifting
 from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
 from .contact_time_weights import ContactTimeWeights, acceleration_change
+from .eliminated_unknowns import EliminatedUnknowns
 from .inertia import MassMatrix
 from .jit import CellForm, cell_measure
 from .matrix_assembly import VectorAssembler
@@ -58,6 +59,7 @@ class Balance:
         level: time level of the last step or evaluation.
         contact_weights: weights of contact forces in a step of that scheme.
         contact: contact among the terms.
+        eliminated: unknowns of terms beside u; None: there are none.
         histories: history variables of the terms.
         energies: sums of energies and forces over the terms.
         tangent: derivative of r, of implicit schemes alone.
@@ -97,6 +99,8 @@ class Balance:
         self.motion, self.mass, self.scheme = motion, mass, scheme
         self.contact_weights = ContactTimeWeights.for_scheme(scheme)
         self.contact, self.histories = ContactTerms(domain.comm, terms), TermHistories(terms)
+        eliminated = EliminatedUnknowns(domain.comm, terms)
+        self.eliminated = eliminated if eliminated.exist else None
         self.terms_with = {name: overriding(terms, name) for name in _STEP_METHODS}
         self.linear = all(term.linear for term in terms)
         self.symmetric = all(term.symmetric for term in terms)
@@ -177,6 +181,8 @@ class Balance:
         self.u.x.scatter_forward()
         for term in self.terms_with["update_displacement"]:
             term.update_displacement()
+        if self.eliminated is not None:
+            self.eliminated.follow(u)
 
     def set_iterate(self, x: PETSc.Vec, *, prescribed: bool = True) -> None:
         """Put an iterate into u; `prescribed`: with prescribed dofs at their values (collective)."""
@@ -232,6 +238,8 @@ class Balance:
         # as the Krylov solve
         self.set_iterate(x)
         np.copyto(self.reactions, self.assemble_residual(b).array_r)
+        if self.eliminated is not None and (condensed := self.eliminated.condensed_residual()) is not None:
+            b.array_w[:] -= condensed
         b.array_w[self.motion.owned_dofs] = 0.0
 
     def assemble_extension_residual(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
@@ -264,10 +272,16 @@ class Balance:
         """Begin an attempt of Newton's method at the step."""
         self.tangent.begin_solve()
         self.contact.begin_solve()
+        if self.eliminated is not None:
+            self.eliminated.begin_solve()
 
     def max_step_fraction(self, change: Values) -> float:
         """Largest fraction in (0, 1] of a change of u (owned dofs,), m, that all terms allow (collective)."""
+        if self.eliminated is not None:
+            self.eliminated.begin_correction(self.u.x.array[: self.owned_dof_count], change)
         fraction = self.contact.max_step_fraction(change)
+        if self.eliminated is not None:
+            self.eliminated.allow(fraction)
         self.tangent.record_step_fraction(fraction)
         return fraction
 

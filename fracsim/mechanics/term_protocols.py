@@ -114,11 +114,26 @@ class RigidMotionTerm(Protocol):
 
 
 @runtime_checkable
-class LowRankTerm(Protocol):
-    """Term with unknowns of its own, which it has eliminated from the equations."""
+class EliminatingTerm(Protocol):
+    """Term with unknowns y of its own, which are eliminated from each linear system (eliminated_unknowns)."""
 
     def low_rank_updates(self) -> list[tuple[Values, Values]]:
         """Matrices U (owned dofs, k) and C (k, k), C summed over ranks: the tangent lacks - U C U^T (collective)."""
+
+    def condensed_residual(self) -> Values | None:
+        """(owned dofs,) B D^-1 r_y at the current unknowns, N; None where it is zero (collective)."""
+
+    def begin_correction(self, change: Values) -> None:
+        """Compute the change dy that belongs to a change of u (owned dofs,), m (collective)."""
+
+    def move_along(self, fraction: float) -> None:
+        """Set y to that of the start of the correction plus a fraction of dy."""
+
+    def unknowns_are_solved(self) -> bool:
+        """Whether r_y = 0 to the tolerance (collective)."""
+
+    def solve_unknowns(self) -> None:
+        """Solve r_y = 0 with u held (collective)."""
 
 
 @runtime_checkable

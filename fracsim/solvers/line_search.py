@@ -36,10 +36,16 @@ class MeritFunction:
     def begin_solve(self) -> None:
         """Forget the values of earlier solves."""
         self._whole_step_rise: float | None = None  # J, of the first trial of an iteration
-        # The last potential and residual are valid for one version of the displacement each.
+        # The last potential and residual are valid for one version of the unknowns each.
         self._last_potential, self._potential_version, self._residual_version = (0.0, 0.0), -1, -1
         self._start_potential, self._start_norm = 0.0, 0.0
         self._at_start, self._by_norm, self._eliminated = True, False, False
+
+    @property
+    def _version(self) -> int:
+        """Number of changes of all unknowns."""
+        eliminated = self._balance.eliminated
+        return self._balance.displacement_version + (0 if eliminated is None else eliminated.version)
 
     def begin_line_search(self) -> None:
         """Note that PETSc evaluates the start of an iteration next."""
@@ -55,7 +61,7 @@ class MeritFunction:
     def evaluate_residual(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
         """Evaluate r at x into b (collective)."""
         self._balance.set_iterate(x)
-        if self._residual_version == self._balance.displacement_version:
+        if self._residual_version == self._version:
             self._residual.copy(b)
         else:
             self._balance.assemble_free_residual(x, b)
@@ -92,15 +98,15 @@ class MeritFunction:
     def _potential(self) -> tuple[float, float]:
         """Return the potential and the sum of the absolute values of its summands, J (collective)."""
         # Newton's method asks for it mostly where the line search has evaluated it already.
-        if self._potential_version != self._balance.displacement_version:
+        if self._potential_version != self._version:
             self._last_potential = self._balance.energies.incremental_potential()
-            self._potential_version = self._balance.displacement_version
+            self._potential_version = self._version
         return self._last_potential
 
     def _norm_at(self, x: PETSc.Vec) -> float:
         """Return |r| at x, N (collective)."""
         self._balance.assemble_free_residual(x, self._residual)
-        self._residual_version = self._balance.displacement_version
+        self._residual_version = self._version
         return float(self._residual.norm())
 
     def _evaluate_start(self, x: PETSc.Vec) -> None:

@@ -128,7 +128,7 @@ class ConvergenceTest:
         reason = PETSc.SNES.ConvergedReason
         if not np.isfinite(norms[2]):
             return int(reason.DIVERGED_FNORM_NAN)
-        if self.is_solved(norms[2], its) or self._is_solved_by_elimination(snes, its):
+        if self._all_solved(snes, norms[2], its) or self._is_solved_by_elimination(snes, its):
             return int(reason.CONVERGED_FNORM_RELATIVE)
         if self.stop_requested():  # SNES ends its solve, and can be used again
             self.aborted = True
@@ -142,6 +142,26 @@ class ConvergenceTest:
             return int(reason.DIVERGED_MAX_IT)  # half the step is solved in a few iterations
         self._norms.append(snes.getFunctionNorm())
         return int(reason.DIVERGED_LINE_SEARCH if self.crawls(snes) else reason.ITERATING)
+
+    def _all_solved(self, snes: PETSc.SNES, norm: float, its: int) -> bool:
+        """Whether r = 0 for u and for the unknowns that are eliminated from the linear systems (collective).
+
+        Where r = 0 for u alone, or the last step was short, the others are solved for with u held, and r is evaluated
+        again.
+        """
+        eliminated, solved = self._balance.eliminated, self.is_solved(norm, its)
+        if eliminated is None or not eliminated.need_solution(solved=solved):
+            return solved
+        eliminated.solve()
+        return self._is_solved_at_new_residual(snes, its)
+
+    def _is_solved_at_new_residual(self, snes: PETSc.SNES, its: int) -> bool:
+        """Evaluate r again, which has changed at the present iterate; whether u is a solution (collective)."""
+        x, r = snes.getSolution(), snes.getFunction()[0]
+        x.array_w[:] = self._balance.u.x.array[: self._balance.owned_dof_count]
+        snes.computeFunction(x, r)
+        snes.setFunctionNorm(r.norm())
+        return self.is_solved(snes.getFunctionNorm(), its)
 
     def _is_solved_by_elimination(self, snes: PETSc.SNES, its: int) -> bool:
         """Relax the few nodes that hold most of the residual; whether the balance is solved then (collective).
@@ -158,11 +178,7 @@ class ConvergenceTest:
         self._eliminations += 1
         if self._modified is not None:
             self._modified.merit.note_elimination()
-        x, r = snes.getSolution(), snes.getFunction()[0]
-        x.array_w[:] = self._balance.u.x.array[: self._balance.owned_dof_count]
-        snes.computeFunction(x, r)
-        snes.setFunctionNorm(r.norm())
-        return self.is_solved(snes.getFunctionNorm(), its)
+        return self._is_solved_at_new_residual(snes, its)
 
     def is_solved(self, norm: float, its: int) -> bool:
         """Whether |r| = `norm`, N, after `its` iterations is that of a solution (collective)."""
