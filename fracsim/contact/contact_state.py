@@ -146,11 +146,12 @@ class ContactState:
                 for gap, contact in zip(gaps, lagged, strict=True)
             ]
         self._start_forces = [contact.force @ contact.normal for contact in lagged]
+        sum_at_points = None if self.comm.size == 1 else self.surface.sum_at_points
         for number in self._facet_obstacles:
             of_facets, _ = evaluate_facets(self.surface.facets, posed[number], x, barrier)
             self._start_forces[number] = self._start_forces[number] + of_facets.forces.sum(axis=(0, 1))
             if self.obstacles[number].friction:
-                lagged[number] = add_facet_friction(lagged[number], of_facets, x)
+                lagged[number] = add_facet_friction(lagged[number], of_facets, x, sum_at_points)
         self._lagged = [
             contact if obstacle.friction else None for contact, obstacle in zip(lagged, self.obstacles, strict=True)
         ]

@@ -20,7 +20,7 @@ from mpi4py import MPI
 from scipy.sparse import bsr_matrix, csr_matrix, kron
 
 from ..mesh.domain import Domain
-from ..mesh.parallel import gather
+from ..mesh.parallel import allgather, gather
 from ..mesh.split_surface.local_surface import LocalSurface, ParentMatrix
 from ..mesh.split_surface.point_matching import match_points
 from ..mesh.split_surface.surface_map import SurfaceMap
@@ -207,6 +207,15 @@ class ContactSurface:
     def identity(self, points: Ints) -> Values:
         """(k, 2 d + 1) rows that identify points (k,), whatever breaks."""
         return self._surface.identify_points(points)
+
+    def sum_at_points(self, points: Ints, values: Values) -> Values:
+        """(k, m) sums over all ranks of values (k, m) at points (k,) that ranks share (collective)."""
+        parts = allgather(self.comm, (self.identity(points), values))
+        _, row = np.unique(np.concatenate([identity for identity, _ in parts]), axis=0, return_inverse=True)
+        sums = np.zeros((len(row), values.shape[1]))
+        np.add.at(sums, row.reshape(-1), np.concatenate([part for _, part in parts]))
+        first = sum(len(identity) for identity, _ in parts[: self.comm.rank])
+        return np.asarray(sums[row.reshape(-1)[first : first + len(points)]])
 
     @property
     def rest_positions(self) -> Values:

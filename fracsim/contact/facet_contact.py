@@ -12,7 +12,7 @@ Equations: docs/theory.md#facets.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -358,7 +358,9 @@ def _block_diagonal(blocks: Values) -> Values:
     return full.reshape(k, c * d, c * d)
 
 
-def add_facet_friction(lagged: LaggedContact, inner: FacetForces, x: Values) -> LaggedContact:
+def add_facet_friction(
+    lagged: LaggedContact, inner: FacetForces, x: Values, sum_at_points: Callable[[Ints, Values], Values] | None = None
+) -> LaggedContact:
     """Lagged contact of points, with the normal forces on facets added to their corners.
 
     Friction acts at points alone. A point within a facet would stick where its corners slip, and Newton's method
@@ -369,11 +371,12 @@ def add_facet_friction(lagged: LaggedContact, inner: FacetForces, x: Values) -> 
         lagged: contact of points at the start of the step.
         inner: forces on facets then.
         x: (n, d) points then, m.
+        sum_at_points: points (k,), values (k, m) of this rank -> their sums over the ranks that share a point
+            (collective); None: no point is shared. Direction and point of the obstacle are those of the sums, and each
+            rank has a share of the force.
     """
     corners, d = inner.corners.reshape(-1), x.shape[1]
     points = np.union1d(lagged.points, corners)
-    if len(points) == 0:
-        return lagged
     point_rows, corner_rows = np.searchsorted(points, lagged.points), np.searchsorted(points, corners)
     force, weight, moment = np.zeros((len(points), d)), np.zeros(len(points)), np.zeros((len(points), d))
     force[point_rows], weight[point_rows] = lagged.force[:, None] * lagged.normal, lagged.force
@@ -383,11 +386,16 @@ def add_facet_friction(lagged: LaggedContact, inner: FacetForces, x: Values) -> 
     np.add.at(weight, corner_rows, corner_force.reshape(-1))
     corner_moment = corner_force[:, :, None] * inner.closest.position[:, None, :]
     np.add.at(moment, corner_rows, corner_moment.reshape(-1, d))
+    share = np.ones(len(points))
+    if sum_at_points is not None:
+        total = sum_at_points(points, np.column_stack([force, weight, moment]))
+        share = np.divide(weight, total[:, d], out=np.zeros(len(points)), where=total[:, d] > 0)
+        force, weight, moment = total[:, :d], total[:, d], total[:, d + 1 :]
     size = np.linalg.norm(force, axis=1)
-    loaded = np.flatnonzero(size > 0)
+    loaded = np.flatnonzero(size * share > 0)
     points, size, position = points[loaded], size[loaded], x[points[loaded]]
     normal, obstacle_point = force[loaded] / size[:, None], moment[loaded] / weight[loaded, None]
-    return LaggedContact(points, size, normal, position, obstacle_point)
+    return LaggedContact(points, share[loaded] * size, normal, position, obstacle_point)
 
 
 def merge_forces(of_points: ContactForces, inner: FacetForces, stored: float) -> ContactForces:
