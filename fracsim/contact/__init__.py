@@ -20,6 +20,7 @@ Laws and geometry:
     obstacle_tessellation  tessellation of obstacles for output
     shape_base, shapes    signed distances, moments and tessellations of half space, sphere, capsule, box, cylinder
     triangle_mesh_shape   closed surfaces of triangles
+    proximity             points and facets that may be near an obstacle
     supporting_obstacles  obstacles that a body is set down on
 
 Points and facets before analytic obstacles:

@@ -102,6 +102,10 @@ class FacetClosestPoints:
     smoothing: float
     barycentric: Values
 
+    def select(self, rows: Ints) -> FacetClosestPoints:
+        """Closest points of some of the facets."""
+        return FacetClosestPoints(self.posed, self.x[rows], self.smoothing, self.barycentric[rows])
+
     @cached_property
     def position(self) -> Values:
         """(k, d) y, m."""

@@ -18,9 +18,11 @@ from .laws import CoulombFriction, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
 from .obstacle import RigidObstacle
 from .pose import PosedShape, min_distance
+from .proximity import ProximityCandidates
 from .step_limit import ObstacleKinematics, check_obstacles_apart, refuse_overlap
 
 Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 
 class ContactState:
@@ -36,6 +38,7 @@ class ContactState:
     positions: Values
     _lagged: list[LaggedContact | None]  # contact at the start of the step, one per obstacle with friction
     _step_starts: list[StepStart | None]  # points at the start of the step, where barriers are averaged over it
+    _started_near: list[Ints]  # points on which each obstacle acted then
 
     def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[RigidObstacle], law: ObstacleLaw) -> None:
         """Raise InputError where the body at rest, or a free obstacle, overlaps an obstacle (collective)."""
@@ -55,6 +58,7 @@ class ContactState:
 
             check_free_obstacles(self.obstacles)
         self._facet_obstacles = self._find_facet_obstacles()
+        self._point_candidates = ProximityCandidates(self.surface.mean_edge_length)
         if self._facet_obstacles:
             self._check_facets()
 
@@ -141,6 +145,8 @@ class ContactState:
             lag_contact(x, gap, self.surface.area, shape, barrier) for gap, shape in zip(gaps, posed, strict=True)
         ]
         if self._level.contact_weights.time_averaged:
+            width, area = barrier.width, self.surface.area
+            self._started_near = [np.flatnonzero((gap < width) & (area > 0)) for gap in gaps]
             self._step_starts = [
                 StepStart(gap, contact.points, contact.normal, contact.position)
                 for gap, contact in zip(gaps, lagged, strict=True)
@@ -192,11 +198,19 @@ class ContactState:
         if lagged is not None and self._sticking_slips is not None:
             friction = CoulombFriction(obstacle.friction, self._sticking_slips[number])
         obstacle_motion, start = self._contact_point_motion(number, posed), self._step_starts[number]
-        start_posed = self._kinematics.start_posed[number]
+        start_posed, candidates = self._kinematics.start_posed[number], self._candidates(number, posed)
         if start is not None:
             start = start.carried_with(start_posed.pose, posed.pose)
         of_points = evaluate_points(
-            self.positions, self.surface.area, posed, self.law.barrier, lagged, friction, obstacle_motion, start
+            self.positions,
+            self.surface.area,
+            posed,
+            self.law.barrier,
+            lagged,
+            friction,
+            obstacle_motion,
+            start,
+            candidates,
         )
         if number not in self._facet_obstacles:
             return of_points
@@ -205,15 +219,21 @@ class ContactState:
         return merge_forces(of_points, inner, stored)
 
     def _is_out_of_range(self, number: int, posed: PosedShape) -> bool:
-        """Whether an obstacle is too far from all points to act, now and at the start of the step."""
-        lagged, start, width = self._lagged[number], self._step_starts[number], self.law.barrier.width
-        if (lagged is not None and len(lagged.points)) or (start is not None and len(start.active)):
+        """Whether an obstacle is too far from all points and facets to act, now and at the start of the step."""
+        lagged, width = self._lagged[number], self.law.barrier.width
+        if (lagged is not None and len(lagged.points)) or len(self._candidates(number, posed)):
             return False
-        if posed.distance_bound(self.positions) < width:
-            return False
-        if start is None or number not in self._facet_obstacles:
+        if number not in self._facet_obstacles:
             return True
-        return self._kinematics.start_posed[number].distance_bound(self._start_positions) >= width
+        ends = [(posed, self.positions)]
+        if self._step_starts[number] is not None:
+            ends.append((self._kinematics.start_posed[number], self._start_positions))
+        return not any(len(self.surface.facets.candidates(*end, width)) for end in ends)
+
+    def _candidates(self, number: int, posed: PosedShape) -> Ints:
+        """(k,) points on which an obstacle may act, or acted at the start of the step."""
+        near, start = self._point_candidates(posed, self.positions, self.law.barrier.width), self._step_starts[number]
+        return near if start is None else np.union1d(near, self._started_near[number])
 
     def _compute_sticking_slips(self) -> list[float]:
         """Slip in the step that counts as sticking, m, at each obstacle (collective)."""

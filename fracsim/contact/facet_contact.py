@@ -13,7 +13,7 @@ Equations: docs/theory.md#facets.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -23,6 +23,7 @@ from .closest_point import FacetClosestPoints, SoftMinGap, find_closest_points, 
 from .laws import BARRIER, GapPotential, TimeAveragedPotential
 from .node_contact import ContactForces, LaggedContact, positive_part
 from .pose import PosedShape
+from .proximity import ProximityCandidates
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -37,82 +38,13 @@ class FacetPolicy:
         smoothing: mu of closest points, in barrier widths.
         max_bow: facets whose middle comes nearer to an obstacle than their nodes by less, in barrier widths, are
             left to their nodes.
-        outline_excess: factor of the radius of a tessellation, which lies within its shape.
     """
 
     smoothing: float = 0.1
     max_bow: float = 0.1
-    outline_excess: float = 1.1
 
 
 FACETS = FacetPolicy()
-
-
-@dataclass(frozen=True)
-class _SearchState:
-    """Result of a search, and where it was made.
-
-    Attributes:
-        x: (n, d) points then, m.
-        posed: obstacle then.
-        distance: of facets that were asked for, m.
-        margin: by which facets farther away were found as well, m.
-        facets: (k,) those found.
-        radius: of the shape about its reference point, m.
-    """
-
-    x: Values
-    posed: PosedShape
-    distance: float
-    margin: float
-    facets: Ints
-    radius: float
-
-    def is_valid(self, posed: PosedShape, x: Values, distance: float) -> bool:
-        """Whether no facet within that distance, m, can be missing.
-
-        A distance changes by no more than the point moves, |t| of the obstacle, and ||R - R_0|| times its radius.
-        """
-        motion = x - self.x
-        point_motion = float(np.sqrt(np.einsum("nd,nd->n", motion, motion).max(initial=0.0)))
-        pose, old_pose = posed.pose, self.posed.pose
-        rotation = float(np.linalg.norm(pose.rotation - old_pose.rotation))
-        obstacle_motion = float(np.linalg.norm(pose.centre - old_pose.centre)) + (rotation * self.radius)
-        return distance - self.distance + point_motion + obstacle_motion <= self.margin
-
-
-@dataclass(frozen=True, eq=False)
-class FacetCandidates:
-    """Facets that may be near an obstacle; all facets are searched again only when something has moved far.
-
-    Attributes:
-        corners: (m, c) of all facets.
-    """
-
-    corners: Ints
-    _states: dict[int, _SearchState] = field(default_factory=dict)
-
-    def __call__(self, posed: PosedShape, x: Values, distance: float) -> Ints:
-        """(k,) facets with a point nearer than `distance`, m, to an obstacle, points at x (n, d), m; others too."""
-        last = self._states.get(id(posed.shape))
-        if last is None or last.posed.shape is not posed.shape or not last.is_valid(posed, x, distance):
-            last = self._states[id(posed.shape)] = self._search(posed, x, distance)
-        return last.facets
-
-    def _search(self, posed: PosedShape, x: Values, distance: float) -> _SearchState:
-        corners = x[self.corners]
-        centroid = corners.mean(axis=1)
-        arms = corners - centroid[:, None]
-        radius = np.sqrt(np.einsum("kcd,kcd->kc", arms, arms).max(axis=1, initial=0.0))
-        margin = max(float(radius.mean()) if len(radius) else 0.0, distance)
-        near = np.flatnonzero(posed.distance(centroid) - radius < distance + margin)
-        return _SearchState(x, posed, distance, margin, near, _outer_radius(posed))
-
-
-def _outer_radius(posed: PosedShape) -> float:
-    """Radius of a shape about its reference point, m."""
-    points, _ = posed.shape.tessellate()
-    return FACETS.outline_excess * float(np.linalg.norm(points, axis=1).max())
 
 
 def facets_matter(radius: float, edge: float, width: float) -> bool:
@@ -143,8 +75,12 @@ class ContactFacets:
         return np.full(self.corners.shape, np.nan)
 
     @cached_property
-    def _candidates(self) -> FacetCandidates:
-        return FacetCandidates(self.corners)
+    def _candidates(self) -> ProximityCandidates:
+        return ProximityCandidates(0.0, self.corners)
+
+    def candidates(self, posed: PosedShape, x: Values, reach: float) -> Ints:
+        """(k,) facets that may have a gap below `reach`, m, to an obstacle, with points at x (n, d), m; others too."""
+        return self._candidates(posed, x, reach + self.max_gap_error)
 
     @property
     def max_gap_error(self) -> float:
@@ -194,9 +130,9 @@ class ContactFacets:
             centroids; (k, c) distances of corners on the tangent plane minus `max_gap_error`; (k, d) normals.
         """
         (_, c), d = self.corners.shape, x.shape[1]
-        if posed.distance_bound(x) >= reach.max(initial=0.0) + self.max_gap_error:
-            return np.empty(0, np.int64), np.empty(0), np.empty((0, c)), np.empty((0, d))
-        near = self._candidates(posed, x, float(reach.max(initial=0.0)) + self.max_gap_error)
+        near = self.candidates(posed, x, float(reach.max(initial=0.0)))
+        if not len(near):
+            return near, np.empty(0), np.empty((0, c)), np.empty((0, d))
         facet_reach = np.broadcast_to(reach, len(x))[self.corners[near]].max(axis=1, initial=0.0) + self.max_gap_error
         corners = x[self.corners[near]]
         centroid = corners.mean(axis=1)
@@ -338,15 +274,21 @@ def evaluate_facets(
     near = facets.within_reach(posed, x, law.width)
     if start is not None:
         near = np.union1d(near, facets.within_reach(*start, law.width))
-    corners, area = facets.corners[near], facets.area[near]
     closest = facets.closest_points(posed, x, near)
+    start_gap, acting = None, closest.gap < law.width  # elsewhere gap' >= gap, and F = 0 with its derivatives
+    if start is not None:
+        start_gap = find_closest_points(
+            start[0], start[1][facets.corners[near]], facets.smoothing, closest.barycentric
+        ).gap
+        acting |= start_gap < law.width
+    rows = np.flatnonzero(acting)
+    corners, area, closest = facets.corners[near[rows]], facets.area[near[rows]], closest.select(rows)
     stored = FacetForces(corners, area, closest, law, law, law)
-    if start is None:
+    if start is None or start_gap is None:
         return stored, float(stored.energy.sum())
-    start_gap = find_closest_points(start[0], start[1][corners], facets.smoothing, closest.barycentric).gap
     corner_gaps = start[0].distance(start[1][corners].reshape(-1, x.shape[1]))
     plane_gap = SoftMinGap(corner_gaps.reshape(corners.shape), facets.smoothing).gap
-    laws = (TimeAveragedPotential(law, gap) for gap in (start_gap, plane_gap, corner_gaps))
+    laws = (TimeAveragedPotential(law, gap) for gap in (start_gap[rows], plane_gap, corner_gaps))
     return FacetForces(corners, area, closest, *laws), float(stored.energy.sum())
 
 
@@ -378,7 +320,9 @@ def add_facet_friction(
     corners, d = inner.corners.reshape(-1), x.shape[1]
     points = np.union1d(lagged.points, corners)
     point_rows, corner_rows = np.searchsorted(points, lagged.points), np.searchsorted(points, corners)
-    force, weight, moment = np.zeros((len(points), d)), np.zeros(len(points)), np.zeros((len(points), d))
+    force: Values = np.zeros((len(points), d))
+    weight: Values = np.zeros(len(points))
+    moment: Values = np.zeros((len(points), d))
     force[point_rows], weight[point_rows] = lagged.force[:, None] * lagged.normal, lagged.force
     moment[point_rows] = lagged.force[:, None] * lagged.position
     np.add.at(force, corner_rows, inner.forces.reshape(-1, d))

@@ -203,6 +203,7 @@ def evaluate_points(
     friction: CoulombFriction | None,
     obstacle_motion: Values,
     start: StepStart | None = None,
+    candidates: Ints | None = None,
 ) -> ContactForces:
     """Forces of an obstacle on points; the energy is the integral of b(gap) over the surface.
 
@@ -215,13 +216,16 @@ def evaluate_points(
         friction: law of friction.
         obstacle_motion: (d,) motion of the obstacle in the step, or (k, d) of its points in lagged contact, m.
         start: points at the start of the step, where the barrier is averaged over the step.
+        candidates: (m,) points, ascending, that may be in contact now or were at the start; None: all.
     """
-    gap = posed.distance(x)
-    near = ((gap if start is None else np.minimum(gap, start.gap)) < barrier.width) & (area > 0)
-    if friction is not None and lagged is not None:
-        near[lagged.points] = True
-    points = np.flatnonzero(near)
-    gap, point_area, positions = gap[points], area[points], x[points]
+    points = np.arange(len(x)) if candidates is None else candidates
+    gap = posed.distance(x[points])
+    near = ((gap if start is None else np.minimum(gap, start.gap[points])) < barrier.width) & (area[points] > 0)
+    points, gap = points[near], gap[near]
+    if friction is not None and lagged is not None and len(lagged.points):
+        points = np.union1d(points, lagged.points)
+        gap = posed.distance(x[points])
+    point_area, positions = area[points], x[points]
     normal = posed.normal(positions)
     potential = barrier if start is None else TimeAveragedPotential(barrier, start.gap[points])
     curved = None if start is None else start.curved_gap(points, gap, normal, positions)

@@ -12,13 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
-from .laws import GapPotential
+from .laws import BARRIER, GapPotential
 from .node_contact import ContactForces, StepStart, evaluate_points
 from .obstacle import RigidObstacle, free_pairs
 from .pose import Pose, PosedShape, rotate_vectors
@@ -191,6 +192,15 @@ class ObstaclePair:
         yield body.points_to_space(self.points[0].points), PosedShape(self.targets[0], obstacle)
         yield obstacle.points_to_space(self.points[1].points), PosedShape(self.targets[1], body)
 
+    def gap_bound(self, body: Pose, obstacle: Pose) -> float:
+        """Lower bound of all gaps, m: that of the centre of the first minus its radius; distances are Lipschitz."""
+        return float(PosedShape(self.targets[0], obstacle).distance(body.centre[None]).item()) - self._radius
+
+    @cached_property
+    def _radius(self) -> float:
+        """Largest distance of the points of the first from its centre, m."""
+        return float(np.linalg.norm(self.points[0].points, axis=1).max())
+
     def gaps(self, body: Pose, obstacle: Pose) -> list[Values]:
         """(n,) gaps of the points of each, m."""
         return [posed.distance(x) for x, posed in self.sides(body, obstacle)]
@@ -217,6 +227,12 @@ class ObstaclePair:
 
     def safe_fraction(self, body: Pose, q: Values, obstacle: Pose, other_q: Values) -> float:
         """Fraction of the increments q and `other_q` (p,) of both poses that leaves a tenth of each gap."""
+        d, between = body.dim, float(np.linalg.norm(body.centre - obstacle.centre))
+        straight = float(np.linalg.norm(q[:d] - other_q[:d]))
+        angle, other_angle = float(np.linalg.norm(q[d:])), float(np.linalg.norm(other_q[d:]))
+        reach = straight + angle * self._radius + other_angle * (between + straight + self._radius)
+        if self.gap_bound(body, obstacle) * (1 - BARRIER.min_gap_ratio) > reach:
+            return 1.0
         (x, target), (y, other_target) = self.sides(body, obstacle)
         motions = [
             _PairMotion(target, x - body.centre, body.centre, q, target.effective_increment(other_q)),
@@ -309,11 +325,15 @@ class ObstaclePairs:
         self._free = {number for number, obstacle in obstacles.items() if obstacle.free}
         self._barrier = barrier
         self._start: dict[Numbers, list[Values]] = {}
+        self._started_near: set[Numbers] = set()  # pairs in contact at the start of the step
 
     def begin_step(self, posed: PosedObstacles, *, time_averaged: bool) -> None:
         """Begin a step; `time_averaged`: barriers are averaged over it."""
         pairs = self._pairs.items() if time_averaged else []
         self._start = {(i, j): pair.gaps(posed[i].pose, posed[j].pose) for (i, j), pair in pairs}
+        self._started_near = {
+            numbers for numbers, gaps in self._start.items() if np.concatenate(gaps).min() < self._barrier.width
+        }
 
     def are_open(self, posed: PosedObstacles) -> bool:
         """Whether all gaps are open."""
@@ -374,5 +394,6 @@ class ObstaclePairs:
         contacts = {
             (i, j): pair.contact_forces(posed[i].pose, posed[j].pose, self._barrier, self._start.get((i, j)))
             for (i, j), pair in self._pairs.items()
+            if (i, j) in self._started_near or pair.gap_bound(posed[i].pose, posed[j].pose) < self._barrier.width
         }
         return {numbers: sides for numbers, sides in contacts.items() if any(len(side.points) for side, _ in sides)}

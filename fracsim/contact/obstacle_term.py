@@ -184,7 +184,7 @@ class ObstacleTerm(ContactState, Term):
         motion = self.surface.interpolation(np.divide(change, self._level.fraction))
         moving = enumerate(zip(self._kinematics.posed, self._obstacle_increments(), strict=True))
         by_obstacle = [
-            safe_motion_fractions(posed, self.positions, motion, q, self._facets_for(number))
+            safe_motion_fractions(posed, self.positions, motion, q, self._facets_for(number), self._point_candidates)
             for number, (posed, q) in moving
         ]
         fractions = [values[self.surface.area > 0] for values in by_obstacle]

@@ -178,10 +178,7 @@ class FreeObstacleTerm(FreeObstacleBase):
         by_pose = point_pose_hessian(
             contact, self.positions, pose.posed.pose, self._lagged[number], pose.step.start.pose, exact=exact
         )
-        forces = np.zeros((len(self.positions), *by_pose.shape[1:]))
-        forces[contact.points] = by_pose
-        to_nodes = self.surface.interpolation.assemble_to_nodes
-        return np.stack([to_nodes(column) for column in np.moveaxis(forces, 2, 0)], axis=1)
+        return self.surface.interpolation.assemble_points_to_nodes(contact.points, by_pose)
 
     def free_fraction(self, increments: Mapping[int, Values]) -> float:
         """Fraction of increments (p,) of free poses on which no gap to the body at rest closes (collective)."""
@@ -190,7 +187,8 @@ class FreeObstacleTerm(FreeObstacleBase):
         fractions: list[Values] = [np.ones(len(self.positions))]
         for number, q in increments.items():
             posed = self._kinematics.posed[number]
-            fractions.append(safe_motion_fractions(posed, self.positions, at_rest, q, self._facets_for(number)))
+            facets = self._facets_for(number)
+            fractions.append(safe_motion_fractions(posed, self.positions, at_rest, q, facets, self._point_candidates))
         return self.surface.min_fraction(np.min(fractions, axis=0))
 
     def _may_be_exact(self) -> bool:
@@ -306,7 +304,7 @@ class FreeObstacleTerm(FreeObstacleBase):
 
         def safe_fraction(z: Values) -> float:
             start, q = pose.start_posed, pose.step.increment(z)
-            of_points = safe_motion_fractions(start, x, motion, q, self._facets_for(number))
+            of_points = safe_motion_fractions(start, x, motion, q, self._facets_for(number), self._point_candidates)
             of_pairs = self.pairs.safe_fraction(prescribed | {number: (start, q)})
             return min(of_pairs, self.surface.min_fraction(of_points))
 

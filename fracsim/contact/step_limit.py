@@ -24,6 +24,7 @@ from .facet_contact import ContactFacets
 from .laws import BARRIER
 from .obstacle import RigidObstacle
 from .pose import PosedShape, rotate_vectors
+from .proximity import ProximityCandidates
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -174,8 +175,7 @@ class FacetMotion:
     def select(self, facets: Ints) -> FacetMotion:
         """Motion of some of the facets, at the start."""
         closest = self._closest
-        selected = FacetClosestPoints(closest.posed, closest.x[facets], closest.smoothing, closest.barycentric[facets])
-        return FacetMotion(selected, self._relative[facets], self._rotation)
+        return FacetMotion(closest.select(facets), self._relative[facets], self._rotation)
 
     def _closest_at(self, fraction: Values) -> FacetClosestPoints:
         if not np.array_equal(fraction, self._fraction):
@@ -221,7 +221,12 @@ type ObstacleMotion = tuple[PosedShape, Values, ContactFacets | None]
 
 
 def safe_motion_fractions(
-    posed: PosedShape, x: Values, motion: Values, q: Values, facets: ContactFacets | None = None
+    posed: PosedShape,
+    x: Values,
+    motion: Values,
+    q: Values,
+    facets: ContactFacets | None = None,
+    candidates: ProximityCandidates | None = None,
 ) -> Values:
     """(n,) fractions in [0, 1] of motions that leave a tenth of each gap to an obstacle; 0 where a gap is closed.
 
@@ -231,6 +236,7 @@ def safe_motion_fractions(
         motion: (n, d) of the points, m.
         q: (p,) increment of the obstacle's pose.
         facets: facets on which the obstacle acts; corners get the fractions of their facets as well.
+        candidates: search for points near the obstacle; None: all are tested.
     """
     rotation = (q := posed.effective_increment(q))[posed.pose.dim :]
     relative = motion - q[: posed.pose.dim]
@@ -238,11 +244,16 @@ def safe_motion_fractions(
     if rotation.any():
         rotation_motion = np.linalg.norm(rotation) * (np.linalg.norm(x - posed.pose.centre, axis=1) + reach)
         reach = reach + rotation_motion
-    if posed.distance_bound(x) > LIMITS.reach * reach.max(initial=0.0):
-        return np.ones(len(x))
-    gap = posed.distance(x)
-    fraction = np.where(gap > 0, 1.0, 0.0)
-    near = np.flatnonzero((gap > 0) & (gap < LIMITS.reach * reach))
+    max_reach, fraction = LIMITS.reach * float(reach.max(initial=0.0)), np.ones(len(x))
+    if candidates is not None:
+        tested = candidates(posed, x, max_reach)
+    elif posed.distance_bound(x) > max_reach:
+        return fraction
+    else:
+        tested = np.arange(len(x))
+    gap = posed.distance(x[tested])
+    fraction[tested[gap <= 0]] = 0.0
+    near = tested[(gap > 0) & (gap < LIMITS.reach * reach[tested])]
     if len(near):
         points = PointMotion(posed, x[near], motion[near], q)
         fraction[near] = safe_fractions(points.gap, points.speed, len(near))

@@ -250,6 +250,12 @@ class ParentMatrix:
         """(owned dofs,) nodal forces equivalent to `forces` (n, d) at the points, N (collective)."""
         return self.sum_at_nodes(self._surface.point_map.weights.T @ forces)
 
+    def assemble_points_to_nodes(self, points: Ints, forces: Values) -> Values:
+        """(owned dofs, m) nodal forces equivalent to m sets of forces (k, d, m) at points (k,) (collective)."""
+        k, d, m = forces.shape
+        at_nodes = self._surface.point_map.weights[points].T @ forces.reshape(k, d * m)
+        return np.stack([self.sum_at_nodes(part) for part in np.moveaxis(at_nodes.reshape(-1, d, m), 2, 0)], axis=1)
+
     def sum_at_nodes(self, parts: Values) -> Values:
         """(owned dofs,) sums over ranks of `parts` (columns, d) at the nodes in the columns (collective)."""
         self._local.array_w[:] = parts.reshape(-1)

@@ -1,0 +1,102 @@
+"""Points and facets of a surface that may be near an obstacle, searched again only after large motions.
+
+Source: L. Verlet (1967), Computer "experiments" on classical fluids I, Physical Review 159, 98: lists of neighbours.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from .pose import PosedShape
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+# factor of the radius of a tessellation, which lies within its shape
+OUTLINE_EXCESS = 1.1
+
+
+def outline_radius(posed: PosedShape) -> float:
+    """Radius of a shape about its reference point, m; infinite for a half space."""
+    points, _ = posed.shape.tessellate()
+    return OUTLINE_EXCESS * float(np.linalg.norm(points, axis=1).max())
+
+
+@dataclass(frozen=True)
+class ProximitySearch:
+    """Result of a search, and where it was made.
+
+    Attributes:
+        x: (n, d) points then, m.
+        posed: obstacle then.
+        distance: of what was asked for, m.
+        margin: by which what is farther away was found as well, m.
+        near: (k,) points or facets found.
+        radius: of the shape about its reference point, m.
+    """
+
+    x: Values
+    posed: PosedShape
+    distance: float
+    margin: float
+    near: Ints
+    radius: float
+
+    def is_valid(self, posed: PosedShape, motion: float, distance: float) -> bool:
+        """Whether nothing within that distance, m, can be missing; `motion`: largest of the points since then, m.
+
+        A distance changes by no more than the point moves, |t| of the obstacle, and ||R - R_0|| times its radius.
+        """
+        pose, old_pose = posed.pose, self.posed.pose
+        rotation = float(np.linalg.norm(pose.rotation - old_pose.rotation))
+        obstacle_motion = float(np.linalg.norm(pose.centre - old_pose.centre)) + (rotation and rotation * self.radius)
+        return distance - self.distance + motion + obstacle_motion <= self.margin
+
+
+class ProximityCandidates:
+    """Points, or facets, of a surface that may be near obstacles."""
+
+    def __init__(self, margin: float, corners: Ints | None = None) -> None:
+        """Candidates of a surface.
+
+        Args:
+            margin: motion, m, after which all are searched again.
+            corners: (m, c) points of facets; None: points are searched for.
+        """
+        self._least_margin, self._corners = margin, corners
+        self._searches: dict[int, ProximitySearch] = {}
+        self._motion: tuple[Values, ProximitySearch, float] | None = None  # the last that was computed
+
+    def __call__(self, posed: PosedShape, x: Values, distance: float) -> Ints:
+        """(k,) those nearer than `distance`, m, to an obstacle, with points at x (n, d), m; others too, ascending."""
+        last = self._searches.get(id(posed.shape))
+        is_known = last is not None and last.posed.shape is posed.shape and last.x.shape == x.shape
+        if last is None or not is_known or not last.is_valid(posed, self._max_motion(last, x), distance):
+            last = self._searches[id(posed.shape)] = self._search(posed, x, distance)
+        return last.near
+
+    def _max_motion(self, last: ProximitySearch, x: Values) -> float:
+        """Largest motion of points since a search, m."""
+        if self._motion is None or self._motion[0] is not x or self._motion[1] is not last:
+            motion = x - last.x
+            self._motion = x, last, float(np.sqrt(np.einsum("nd,nd->n", motion, motion).max(initial=0.0)))
+        return self._motion[2]
+
+    def _search(self, posed: PosedShape, x: Values, distance: float) -> ProximitySearch:
+        margin, bound = max(self._least_margin, distance), posed.distance_bound(x)
+        if bound > distance + margin:  # all are far
+            return ProximitySearch(x, posed, distance, bound - distance, np.empty(0, np.int64), outline_radius(posed))
+        if self._corners is None:
+            gap = posed.distance(x)
+        else:
+            corners = x[self._corners]
+            centroid = corners.mean(axis=1)
+            arms = corners - centroid[:, None]
+            radius = np.sqrt(np.einsum("kcd,kcd->kc", arms, arms).max(axis=1, initial=0.0))
+            margin = max(float(radius.mean()) if len(radius) else 0.0, margin)
+            gap = posed.distance(centroid) - radius
+        near = np.flatnonzero(gap < distance + margin)
+        return ProximitySearch(x, posed, distance, margin, near, outline_radius(posed))
