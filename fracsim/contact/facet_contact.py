@@ -330,7 +330,7 @@ def add_facet_friction(
     np.add.at(weight, corner_rows, corner_force.reshape(-1))
     corner_moment = corner_force[:, :, None] * inner.closest.position[:, None, :]
     np.add.at(moment, corner_rows, corner_moment.reshape(-1, d))
-    share = np.ones(len(points))
+    share: Values = np.ones(len(points))
     if sum_at_points is not None:
         total = sum_at_points(points, np.column_stack([force, weight, moment]))
         share = np.divide(weight, total[:, d], out=np.zeros(len(points)), where=total[:, d] > 0)
