@@ -50,6 +50,11 @@ ROOT_COMM = MPI.COMM_SELF
 CLOCK_NAMES = ("t", "step", "work", "start")
 MONITOR_NAMES = {"blows", "loads", "frames"}
 OPTIONAL_ARRAYS = ("broken", "cut", "starts", "starts_of", "shape_of", "shape_points", "shape_yields")
+ARRAYS_OF_ONE_LENGTH = (
+    ("broken", "cut"), ("starts", "starts_of"), ("shape_of", "shape_points", "shape_yields"),
+    ("overlap.names", "overlap.parts", "overlap.depth"), ("known.names", "known.quiet", "known.borne"),
+    ("known.pairs", "known.pushed"), ("known.on", "known.where", "known.gave", "known.spread"),
+)  # fmt: skip
 
 
 class RigidRun:
@@ -329,6 +334,8 @@ def _check_stored(
         right = (*first.get(name, values.shape[:1]), *expected.get(name, values).shape[1:])
         if values.shape != right:
             raise restart_error(path, f"{name} has the shape {values.shape}, of this study it is {right}")
+        if expected.get(name, values).dtype.kind == "i" and values.dtype.kind != "i":
+            raise restart_error(path, f"{name} is not all whole numbers")
         # infinite: an overlap that was not measured; an edge that is not broken
         if name in ("overlap.depth", "broken_at"):
             values = np.where(values == np.inf, 0.0, values)
@@ -337,7 +344,7 @@ def _check_stored(
             values = np.nan_to_num(values)
         if not float(np.max(np.abs(values), initial=0.0)) < CHECKPOINT_LIMITS.magnitude:
             raise restart_error(path, f"{name} is not finite")
-    for group in (("broken", "cut"), ("starts", "starts_of"), ("shape_of", "shape_points", "shape_yields")):
+    for group in ARRAYS_OF_ONE_LENGTH:
         if len({len(arrays.get(name, ())) for name in group}) > 1:
             raise restart_error(path, f"{' and '.join(group)} do not belong together")
     limits = {"broken": len(instances) * instances.node_count, "starts_of": len(instances), "shape_of": len(instances)}

@@ -154,6 +154,9 @@ RIGID: dict[str, damaged.Edit] = {
     "broken short": damaged.array("broken", lambda keys: keys[1:]), "starts_of far out": damaged.at("starts_of", 7),
     "broken_at short": damaged.array("broken_at", lambda at: at[:-1]),
     "worked long": damaged.array("worked", lambda worked: np.append(worked, 0.0)),
+    **{f"{name} long": damaged.array(name, lambda values: np.concatenate([values, values[:1]]))
+       for name in ("known.quiet", "known.borne")},
+    "known.names of fractions": damaged.array("known.names", lambda names: names + 0.5),
     "start nan": damaged.number("start", np.nan), "step -5": damaged.number("step", -5),
     "t nan": damaged.number("t", np.nan), "an array more": lambda file: file.__setitem__("more", [1.0]),
 }  # fmt: skip
