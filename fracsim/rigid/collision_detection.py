@@ -15,8 +15,10 @@ from .bodies import Bodies, fly, quaternions
 from .contact_points import Contacts
 from .core_contact import CoreContact
 from .fragment_overlap import AdmittedOverlaps
+from .mujoco_model import SETTINGS as MODEL_SETTINGS
 from .mujoco_model import ContactParameters, MujocoModel
 from .plane_contacts import CheckedCorners
+from .shell_contact import ShellContacts
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -86,14 +88,19 @@ def _reach(model: MujocoModel, parameters: ContactParameters, bodies: Bodies, fr
 
 
 class _MujocoSearch:
-    """MuJoCo's collision detection in a compiled model."""
+    """MuJoCo's collision detection of a model."""
 
     def __init__(self, model: MujocoModel) -> None:
-        compiled, n = model.compiled, len(model.mass)
-        self._compiled, self._data = compiled, mujoco.MjData(compiled)
-        self._body_of_geom, self._driven = model.body_of_geom, n + model.driven
+        self._spec, self._body_of_geom = model.spec, model.body_of_geom
+        self._count, self._driven = len(model.mass), len(model.mass) + model.driven
+        self._compile()
+
+    def _compile(self) -> None:
+        """Compile the model, with the memory of its description."""
+        compiled = self._compiled = self._spec.compile()
+        self._data = mujoco.MjData(compiled)
         # MuJoCo's bodies: the world, bodies, driven obstacles; the last flag is that of all fixed obstacles
-        body = np.concatenate([[-1], np.arange(n), self._driven])
+        body = np.concatenate([[-1], np.arange(self._count), self._driven])
         masks = [(compiled.geom_contype, self._body_of_geom), (compiled.body_contype, body)]
         self._masks = [(mask, mask.copy(), numbers) for mask, numbers in masks]
 
@@ -106,6 +113,18 @@ class _MujocoSearch:
             margin: (n + m + 1,) distances, m; pairs within the sum of their margins are found.
             searching: (n + m + 1,) flags. The last margin and flag are those of all fixed obstacles.
         """
+        while not self._find(centres, quat, margin, searching):
+            self._enlarge_memory()
+        contact = self._data.contact
+        return [contact.geom.reshape(-1, 2).copy(), contact.pos.reshape(-1, 3).copy(),
+                contact.frame.reshape(-1, 3, 3).copy(), contact.dist.copy(),
+                contact.friction.reshape(-1, 5)[:, 0].copy()]  # fmt: skip
+
+    def _find(self, centres: Values, quat: Values, margin: Values, searching: Flags) -> bool:
+        """Place the bodies and find the contacts; return whether there was memory for them.
+
+        The arguments are those of the search.
+        """
         compiled, data, n = self._compiled, self._data, len(quat)
         compiled.body_pos[1 : n + 1], compiled.body_pos[n + 1 :] = centres[:n], centres[self._driven]
         compiled.body_quat[1 : n + 1] = quat
@@ -114,24 +133,39 @@ class _MujocoSearch:
         for mask, initial, numbers in self._masks:
             mask[:] = np.where(searching[numbers], initial, 0)
         mujoco.mj_kinematics(compiled, data)
-        mujoco.mj_collision(compiled, data)
-        if data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL].number:
+        try:
+            mujoco.mj_collision(compiled, data)
+        except mujoco.FatalError as error:
+            # contacts and working arrays share the memory
+            if "out of memory" not in str(error):
+                raise
+            return False
+        return not data.warning[mujoco.mjtWarning.mjWARN_CONTACTFULL].number
+
+    def _enlarge_memory(self) -> None:
+        """Compile the model with more memory for contacts. Raises NotConverged at the limit."""
+        size = MODEL_SETTINGS.growth * self._spec.memory
+        if size > MODEL_SETTINGS.max_bytes:
             raise NotConverged(
-                f"{data.ncon} contacts are more than the rigid engine has room for; a smaller time.step or a larger "
-                "mesh.h has fewer"
+                f"{self._data.ncon} contacts are more than the rigid engine has room for; a smaller time.step or a "
+                "larger mesh.h has fewer"
             )
-        contact = data.contact
-        return [contact.geom.reshape(-1, 2).copy(), contact.pos.reshape(-1, 3).copy(),
-                contact.frame.reshape(-1, 3, 3).copy(), contact.dist.copy(),
-                contact.friction.reshape(-1, 5)[:, 0].copy()]  # fmt: skip
+        self._spec.memory = size
+        self._compile()
 
 
 class CollisionDetector:
     """Search for contacts between the bodies of a model, and of bodies with obstacles."""
 
-    def __init__(self, model: MujocoModel, cores: CoreContact | None = None, friction: float = 0.0) -> None:
-        """Keep the model; `cores`: those of the first bodies, with the coefficient of `friction` there."""
-        self._model, self._cores, self._friction = model, cores, friction
+    def __init__(
+        self, model: MujocoModel, cores: CoreContact | None = None, friction: float = 0.0,
+        shells: ShellContacts | None = None,
+    ) -> None:  # fmt: skip
+        """Keep the model; `cores`: those of the first bodies, with the coefficient of `friction` there.
+
+        `shells`: selection of the contacts of unbroken shells; None: there are none.
+        """
+        self._model, self._cores, self._friction, self._shells = model, cores, friction, shells
         self._search = _MujocoSearch(model)
 
     def __call__(
@@ -158,6 +192,8 @@ class CollisionDetector:
         geoms, point, axes, gap, friction = self._search(centres, quaternions(bodies.rotation), margin, searching)
         geoms = geoms.astype(np.int64)
         contacts = Contacts.with_arms(geoms, model.body_of_geom[geoms], point, axes, gap, friction, centres)
+        if self._shells is not None:
+            contacts = self._shells.select(contacts, bodies)
         for of_plane in self._find_plane_contacts(
             bodies, obstacle_points, reach[1], obstacle_reach[1], dt, checked, chosen
         ):

@@ -35,6 +35,7 @@ from .impact_sequence import EventConditions, FamilyFunction, ImpactEvent, elaps
 from .mujoco_model import ContactParameters, MujocoModel, build_model
 from .obstacles import Part, PrescribedObstacle
 from .plane_contacts import CheckedCorners
+from .shell_contact import ShellContacts, ShellSurface
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -77,6 +78,7 @@ class Engine:
         hull_points: Sequence[Values] | None = None,
         rotation: Values | None = None,
         cores: CoreContact | None = None,
+        shells: Sequence[ShellSurface | None] | None = None,
     ) -> None:
         """Make the model of a set of bodies.
 
@@ -90,10 +92,15 @@ class Engine:
             hull_points: outermost points of each body; None: all corners.
             rotation: (n, 3, 3) from the axes of parts and points to those of the bodies at rest; None: identity.
             cores: of the first bodies; fragments that overlap keep out of them.
+            shells: surfaces of the first bodies, None for those that are no unbroken shells; None: there are none.
         """
         self._parameters, self._count = parameters, len(bodies)
         self._model = build_model(bodies, parts, obstacles, parameters, hull_points, rotation)
-        self._detector = CollisionDetector(self._model, cores, parameters.friction)
+        shell_contacts = None
+        if shells is not None and any(shell is not None for shell in shells):
+            turn = np.tile(np.eye(3), (len(bodies), 1, 1)) if rotation is None else rotation
+            shell_contacts = ShellContacts(shells, turn, self._model.first_geom)
+        self._detector = CollisionDetector(self._model, cores, parameters.friction, shell_contacts)
         self._solver = ContactSolver(self._model, parameters)
         # reference points of obstacles at the end of the last step, m
         self._obstacle_points: Values = np.array([obstacle.position for obstacle in obstacles]).reshape(-1, 3)

@@ -17,10 +17,13 @@ from .core_contact import CoreContact, CoreGeometry
 from .instance_placement import InstancePoses
 from .obstacles import Part
 from .round_shape import RoundShape
+from .shell_contact import ShellSurface
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Patterns = npt.NDArray[np.uint8]
+# Mean distance of the hull from a closed shell, in thicknesses, up to which the shell is convex.
+MAX_SHELL_DEVIATION = 0.01
 # Key of the surface, convex parts, outermost points.
 _CollisionShape = tuple[int, list[Part], Values]
 
@@ -38,6 +41,7 @@ class FragmentShapes:
             instances share theirs.
         rotation: (n, 3, 3) from these axes to those of the body at rest.
         hull_points: outermost points (k, 3) of each, likewise.
+        shells: surfaces of those whose convex parts are the prisms of an unbroken shell, likewise; None for others.
         core_contact: None if nothing has broken.
     """
 
@@ -48,6 +52,7 @@ class FragmentShapes:
     convex_parts: list[list[Part]]
     rotation: Values
     hull_points: list[Values]
+    shells: list[ShellSurface | None]
     core_contact: CoreContact | None = None
 
 
@@ -66,6 +71,7 @@ class _InstanceShapes:
     node_fragment: Ints
     convex_parts: list[list[Part]]
     hull_points: list[Values]
+    shell: ShellSurface | None
     core: CoreGeometry
 
 
@@ -77,15 +83,18 @@ class FragmentGeometry:
     """
 
     def __init__(
-        self, mesh: MeshData, poses: InstancePoses | None = None, round_shape: RoundShape | None = None
-    ) -> None:
+        self, mesh: MeshData, poses: InstancePoses | None = None, round_shape: RoundShape | None = None,
+        max_prisms: float = np.inf,
+    ) -> None:  # fmt: skip
         """Compute the shape of the unbroken mesh.
 
         Args:
             mesh: of one instance.
             poses: of the instances at rest; None: one, as the mesh is.
             round_shape: that the unbroken mesh stands for; None: it collides as a union of convex parts.
+            max_prisms: triangles of all shells up to which they touch as such; with more they are convex parts.
         """
+        self._max_prisms = max_prisms
         self._round_shape = round_shape
         self.numbering, self.poses = EntityNumbering(mesh), poses or InstancePoses.identity(1)
         self._shell = mesh.shell
@@ -131,10 +140,11 @@ class FragmentGeometry:
         fragment = np.concatenate([shapes.node_fragment + start for shapes, start in zip(placed, first, strict=False)])
         parts = [part for shapes in placed for part in shapes.convex_parts]
         hull_points = [points for shapes in placed for points in shapes.hull_points]
+        shells = [shell for shapes in placed for shell in shapes.shells]
         names = np.concatenate([shapes.names for shapes in placed])
         rotation = np.concatenate([shapes.rotation for shapes in placed])
         cores = self._make_core_contact(rotation)
-        return FragmentShapes(names, total, of_meshes, fragment, parts, rotation, hull_points, cores)
+        return FragmentShapes(names, total, of_meshes, fragment, parts, rotation, hull_points, shells, cores)
 
     def _make_core_contact(self, rotation: Values) -> CoreContact | None:
         """Return the core contact of all fragments with rotations (n, 3, 3); None if there are no cores."""
@@ -159,6 +169,10 @@ class FragmentGeometry:
         if round_shape is not None:
             shapes, new = [(solids[0].content_key, round_shape.collision_parts, round_shape.plane_corners)], []
             body_moments = round_shape.moments(mesh_moments.volume)
+        shell = self._shell_surface(surface, solids, mesh_moments.centre[0])
+        if shell is not None:
+            outer = hull_corners(np.concatenate(shell.prisms))
+            shapes, new = [(solids[0].content_key, [*shell.prisms], outer)], []
         parts_of_new = self._convex_parts(surface, fragment, solids, np.array(new, np.int64))
         for k, parts in zip(new, parts_of_new, strict=True):
             centre = mesh_moments.centre[k]
@@ -170,13 +184,32 @@ class FragmentGeometry:
         core = CoreGeometry.from_split_surface(surface, self.numbering) if has_cores else CoreGeometry.empty()
         parts_of_all, hull_points = [shape[1] for shape in result], [shape[2] for shape in result]
         return _InstanceShapes(
-            points, pattern, names, body_moments, mesh_moments, surface.node_fragment, parts_of_all, hull_points, core
-        )
+            points, pattern, names, body_moments, mesh_moments, surface.node_fragment, parts_of_all, hull_points,
+            shell, core,
+        )  # fmt: skip
 
     def _round_shape_of(self, surface: SplitSurface, points: Values) -> RoundShape | None:
         """Return the round shape of an instance with nodes at `points` (N, 3), m; None if it is broken or dented."""
         is_intact = surface.fragment_count == 1 and points is self._points_at_rest
         return self._round_shape if is_intact else None
+
+    def _shell_surface(
+        self, surface: SplitSurface, solids: list[Polyhedron], centre: Values
+    ) -> ShellSurface | None:  # fmt: skip
+        """Return the surface of an unbroken shell relative to its centre (3,), m; None of others and of convex ones.
+
+        The hull of a closed shell that is convex has the triangles of its outer side.
+        """
+        if self._shell is None or surface.fragment_count > 1:
+            return None
+        if len(self.poses) * len(self._shell.triangles) > self._max_prisms:
+            return None
+        shell, hull = self._shell, solids[0].without_cavities.convex_hull
+        if hull.excess_volume <= MAX_SHELL_DEVIATION * shell.thickness * hull.area:
+            return None
+        lower, upper = (self._points_at_rest - centre).reshape(2, -1, 3)
+        prisms = [np.concatenate([lower[nodes], upper[nodes]]) for nodes in shell.triangles]
+        return ShellSurface((lower + upper) / 2, shell.triangles, shell.thickness, prisms)
 
     def _convex_parts(
         self, surface: SplitSurface, fragment: Ints, solids: list[Polyhedron], chosen: Ints
@@ -207,7 +240,8 @@ class FragmentGeometry:
         names = shapes.names + number * len(shapes.node_fragment)
         rotations = np.tile(rotation, (len(shapes.names), 1, 1))
         return FragmentShapes(
-            names, placed, of_mesh, shapes.node_fragment, shapes.convex_parts, rotations, shapes.hull_points
+            names, placed, of_mesh, shapes.node_fragment, shapes.convex_parts, rotations, shapes.hull_points,
+            [shapes.shell] * len(names),
         )  # fmt: skip
 
 

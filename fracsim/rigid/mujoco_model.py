@@ -29,7 +29,10 @@ class ModelSettings:
         min_mass: kg, and kg m^2 of the inertia; MuJoCo refuses smaller values.
         slab_size: half the side of the box that stands for a driven plane, in sizes of the scene. MuJoCo's planes are
             fixed.
-        bytes_per_part: memory for pairs of parts that may touch.
+        bytes_per_part: memory for pairs of parts that may touch, as a search begins.
+        max_counted_parts: parts of a body that count for this memory; of a shell with many parts few touch.
+        max_bytes: largest memory; it grows up to there where contacts need it.
+        growth: factor of the memory where it is too small.
         min_bytes: least memory for them.
         min_impact_speed: m/s; slower contacts are no impacts, whatever the step is.
     """
@@ -37,6 +40,9 @@ class ModelSettings:
     min_mass: float = 1e-14
     slab_size: float = 20.0
     bytes_per_part: int = 2**18
+    max_counted_parts: int = 32
+    max_bytes: int = 2**33
+    growth: int = 4
     min_bytes: int = 2**26
     min_impact_speed: float = 1e-3
 
@@ -54,7 +60,8 @@ _warned: set[str] = set()
 def _print_warning(text: str) -> None:
     """Print a warning of MuJoCo once, which by itself would write a file into the working folder."""
     message = text.partition(" at DOF")[0]
-    if message not in _warned:
+    # the search for contacts (collision_detection) repeats itself with more memory
+    if message not in _warned and not message.startswith("Too many contacts"):
         _warned.add(message)
         print(f"fracsim: note: MuJoCo: {message}", file=sys.stderr)
 
@@ -89,7 +96,7 @@ class MujocoModel:
     """Model for MuJoCo's collision detection, and mass properties of its bodies.
 
     Attributes:
-        compiled: MuJoCo's model, of bodies that are placed and have no dynamics.
+        spec: MuJoCo's description of the model, of bodies that are placed and have no dynamics.
         body_of_geom: (geoms,) numbers of bodies, then of prescribed obstacles.
         first_geom: (n,) first geom of each body.
         driven: numbers of driven obstacles.
@@ -101,7 +108,7 @@ class MujocoModel:
         cylinder_axis: (n, 3) unit vectors in the axes of the bodies; 0 for bodies that are no cylinders.
     """
 
-    compiled: Any
+    spec: Any
     body_of_geom: Ints
     first_geom: Ints
     driven: Ints
@@ -161,12 +168,13 @@ def build_model(
         points = [[*body_parts, outer] for body_parts, outer in zip(parts, hull_points, strict=True)]
     extent = _extents(points)
     planes = _make_plane_contacts(parts, obstacles, body_of_geom, first_geom, hull_points, rotation, extent)
-    spec.memory = max(SETTINGS.min_bytes, SETTINGS.bytes_per_part * len(body_of_geom))
+    counted = sum(min(len(body_parts), SETTINGS.max_counted_parts) for body_parts in parts) + len(obstacles)
+    spec.memory = max(SETTINGS.min_bytes, SETTINGS.bytes_per_part * counted)
     inverse: Values = np.asarray(np.linalg.inv(inertia)) if count else inertia
     driven_numbers = np.array(driven, np.int64)
     axis = _cylinder_axes(parts, rotation)
     return MujocoModel(
-        spec.compile(), body_of_geom, first_geom, driven_numbers, mass, inertia, inverse, extent, planes, axis
+        spec, body_of_geom, first_geom, driven_numbers, mass, inertia, inverse, extent, planes, axis
     )  # fmt: skip
 
 

@@ -295,7 +295,7 @@ class RigidStepper:
             rotation = np.concatenate([rotation, np.tile(np.eye(3), (len(obstacles.free_numbers), 1, 1))])
         self._engine = Engine(
             bodies, parts, obstacles.prescribed_obstacles(t), self._parameters, self.initial_overlaps,
-            self.body_names, hull_points, rotation, shapes.core_contact,
+            self.body_names, hull_points, rotation, shapes.core_contact, shapes.shells,
         )  # fmt: skip
         return self._engine
 

@@ -30,6 +30,7 @@ from ..rigid.round_shape import RoundShape
 from ..rigid.surface_loads import HertzContact
 from ..study import ContactSettings, Study
 from ..study.check import build_checked_mesh
+from ..study.check_limits import LIMITS
 from ..study.conditions import volume_loads
 from ..study.mesh_source import find_builder
 from ..study.overlap_checks import body_placements
@@ -104,7 +105,7 @@ def build_rigid_scene(
     hertz = HertzContact(study.material.young, study.material.poisson)
     analyses = ParallelAnalyses(instances, comm, (study, mesh, placements))
     round_shape = RoundShape.of_mesh(mesh, getattr(find_builder(study.mesh), "round_solid", None))
-    geometry = FragmentGeometry(mesh, poses, round_shape)
+    geometry = FragmentGeometry(mesh, poses, round_shape, LIMITS.max_shell_triangles)
     stepper = RigidStepper(
         instances, geometry, density, obstacles, parameters, hertz, contact.contact_time, analyses
     )  # fmt: skip

@@ -48,6 +48,8 @@ class CheckLimits:
         min_inside_coordinate: least barycentric coordinate of a point inside a cell; bodies may touch.
         max_rigid_overlap: overlap of a rigid body and an obstacle over the mean edge, as convex parts may have in a
             run.
+        max_shell_triangles: triangles of all rigid shells that touch as such; the search for their contacts takes some
+            10 s to set up, as a study begins and where a shell breaks.
         max_overlap_pairs: pairs of cells and points that are compared at once.
     """
 
@@ -86,6 +88,7 @@ class CheckLimits:
     overlap_round_off: float = 1e-9
     min_inside_coordinate: float = 1e-6
     max_rigid_overlap: float = 0.05
+    max_shell_triangles: int = 200_000
     max_overlap_pairs: int = 1 << 21
 
 

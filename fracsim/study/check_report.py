@@ -34,8 +34,9 @@ _CONTACT_COST = {
     for implicit, share in ((True, "tenth of a step"), (False, "two fifths of an explicit step (12,000 cells)"))
 }
 _INDENT = " " * 12
-# builders of bodies that collide as their meshes: with flat faces, or shells
-_NOT_ROUND = ("boat", "box", "l-panel", "notched-bar", "notched-plate", "ornament", "stones")
+# builders of shells, and of solid bodies with flat faces
+_SHELLS = ("boat", "ornament")
+_FLAT = ("box", "l-panel", "notched-bar", "notched-plate", "stones")
 
 
 def report_lines(study: Study, summary: MeshSummary, near: list[str]) -> Iterator[str]:
@@ -164,7 +165,7 @@ def _rigid_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
         yield f"{_INDENT}{line}"
     copies = sum(int(np.prod(body.copies)) for body in study.body) or 1
     yield f"bodies      {copies} times the mesh; they move on one rank, no fields.xdmf"
-    yield from (f"{_INDENT}{line}" for line in _collision_lines(study))
+    yield from (f"{_INDENT}{line}" for line in _collision_lines(study, summary, copies))
     if study.brittle is not None and study.fracture is not None:
         yield f"fracture    strength {study.fracture.strength:g} Pa, {_average(study.fracture)}"
         yield f"brittle     {'of each body, ' if copies > 1 else ''}{_brittle(study.brittle)}"
@@ -183,9 +184,17 @@ def _rigid_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
     yield from _frame_lines(study)
 
 
-def _collision_lines(study: Study) -> Iterator[str]:
-    """What unbroken rigid bodies collide as; nothing for shells and bodies of builders with flat faces."""
-    if study.mesh.shell is not None or study.mesh.builder in _NOT_ROUND:
+def _collision_lines(study: Study, summary: MeshSummary, copies: int) -> Iterator[str]:
+    """What unbroken rigid bodies collide as; nothing for builders of solid bodies with flat faces."""
+    if study.mesh.shell is not None or study.mesh.builder in _SHELLS:
+        # a triangle is three cells
+        if copies * summary.cell_count > 3 * LIMITS.max_shell_triangles:
+            yield f"note: shells of more than {LIMITS.max_shell_triangles:,} triangles in all collide as unions of"
+            yield "convex parts, which may lie some thicknesses off them; a larger mesh.h has fewer triangles"
+        else:
+            yield "unbroken shells touch with their triangles, fragments as convex polyhedra"
+        return
+    if study.mesh.builder in _FLAT:
         return
     solid = getattr(find_builder(study.mesh), "round_solid", None)
     if solid is not None:
