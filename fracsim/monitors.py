@@ -141,15 +141,15 @@ def _obstacle_monitors(scene: Scene) -> tuple[ObstacleContactMonitor | None, Obs
     obstacles = scene.study.obstacle
     if not obstacles:
         return None, None
-    from .contact.obstacle_term import ObstacleTerm
+    from .contact.rigid_obstacles import VerletRigidObstacles
     from .output.contact_checks import ObstacleContactMonitor, ObstacleOverlapMonitor
 
     terms = [term for term in scene.balance.terms if term.name in ("obstacles", "solids")]
     contact_monitor = ObstacleContactMonitor(cast("list[ObstacleContact]", terms))
-    obstacle_terms = [term for term in terms if isinstance(term, ObstacleTerm)]
-    if not obstacle_terms or len(obstacles) == 1 or not any(item.is_free for item in obstacles):
+    motions = [term for term in scene.balance.terms if isinstance(term, VerletRigidObstacles)]
+    if not motions or len(obstacles) == 1:
         return contact_monitor, None
-    return contact_monitor, ObstacleOverlapMonitor(obstacle_terms[0])
+    return contact_monitor, ObstacleOverlapMonitor(motions[0])
 
 
 def _interpenetration_monitor(study: Study) -> InterpenetrationMonitor | None:

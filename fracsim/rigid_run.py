@@ -145,7 +145,10 @@ class RigidRun:
         arrays, clock, earlier = stored.arrays, stored.clock, stored.notes.monitors
         _check_stored(stored, stepper.to_checkpoint(self.state), len(self.scene.obstacles), stepper.instances)
         self._start = float(clock["start"])
-        self.state = stepper.from_checkpoint(arrays, float(clock["t"]), int(clock["step"]), float(clock["work"]))
+        try:
+            self.state = stepper.from_checkpoint(arrays, float(clock["t"]), int(clock["step"]), float(clock["work"]))
+        except (ValueError, IndexError, TypeError) as error:
+            raise restart_error(stored.path, f"its arrays do not fit this study ({error})") from error
         if len(self.state.bodies) != len(stepper.body_names) or len(arrays["broken_at"]) != len(
             stepper.instances.damage()[1]
         ):

@@ -125,7 +125,10 @@ class Run:
             raise restart_error(checkpoint_path(self.folder), f"notes/monitors has no {missing[0]}")
         state = read_checkpoint(self.folder, scene.domain, self.state, scene.balance, breaks.record, breaks.surfaces)
         breaks.apply_checkpoint()
-        self.state = scene.stepper.from_checkpoint(state)
+        try:
+            self.state = scene.stepper.from_checkpoint(state)
+        except (ValueError, IndexError, TypeError) as error:  # histories of terms, whose arrays have any number of rows
+            raise restart_error(checkpoint_path(self.folder), f"its arrays do not fit this study ({error})") from error
         asked = scene.study.model_dump(mode="json")["time"]["step"]
         if notes.study_tables()["time"]["step"] != asked:  # else the size of the last step goes on
             self.state = replace(self.state, dt=scene.study.time.max_step)

@@ -98,6 +98,24 @@ def test_on_two_ranks_there_is_one_message(stopped: Path, tmp_path: Path) -> Non
         assert done.stderr.count("fracsim: --restart: cannot read") == 1 and "Traceback" not in done.stderr
 
 
+@pytest.mark.parametrize("name", ["term.contact.pause", "term.contact.share", "term.contact.stiffness"])
+def test_histories_of_contact_that_do_not_fit_are_refused(name: str, tmp_path: Path) -> None:
+    """Arrays without their rows: how many there are is known to the surface alone."""
+    pytest.importorskip("ipctk", reason="an environment made without a network")
+    study = {
+        "title": "touches itself", "mesh": {"builder": "box", "size": [0.4, 0.2, 0.2], "h": 0.1}, "contact": {},
+        "material": {"energy": "neo-hookean", "young": 1e6, "poisson": 0.3, "density": 1000.0},
+        "fracture": {"strength": 1e4},
+        "boundary": [{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [2.0, 0.0, 0.0]}],
+        "time": {"scheme": "backward-euler", "step": 2e-3, "end": 8e-3},
+        "output": {"every": 10, "picture": False, "checkpoint": 1e-9},
+    }  # fmt: skip
+    run_study(MPI.COMM_SELF, validate(study, "torn.toml"), tmp_path / "out")
+    write_study(tmp_path / "torn.toml", study, time={"end": 0.012})
+    edit = damaged.array(name, lambda values: values[:0])
+    assert "do not fit" in refused(tmp_path, tmp_path / "again", lambda path: damaged.resealed(path, edit))
+
+
 @pytest.mark.parametrize("kind", ["fifo", "folder"])
 def test_what_is_no_file_is_not_opened(stopped: Path, tmp_path: Path, kind: str) -> None:
     """A FIFO would hang."""

@@ -318,7 +318,7 @@ def test_what_breaks_under_a_ball_gains_nothing() -> None:
     scene.fracture.mark_changed()
     scene.balance.edges_broke(graph.pattern)
     assert contact.stored_energy() <= before * (1 + 1e-6)
-    skin, placed = contact.surface, contact._kinematics.posed[0]
+    skin, placed = contact.surface, contact.posed[0]
     x = skin.positions(contact._end_displacement())
     assert (skin.facets.gaps(placed, x, 1.0) > 0).all()
     left_out = skin._excluded_facets

@@ -13,7 +13,7 @@ from fracsim.contact.obstacle import RigidObstacle
 from fracsim.contact.obstacle_pairs import ObstaclePair
 from fracsim.contact.pose import Pose
 from fracsim.contact.pose_derivatives import mixed_pose_hessian
-from fracsim.contact.rigid_obstacle_term import FreeObstacleTerm
+from fracsim.contact.rigid_obstacles import FreeRigidObstacles
 from fracsim.contact.shapes import Capsule, RoundedBox, RoundedCylinder, Shape, Sphere
 from support.scenes import Scene, Walk, each_step, make_scene, march
 
@@ -57,7 +57,7 @@ def test_mixed_derivatives_by_both_poses(both: tuple[Shape, Shape]) -> None:
     np.testing.assert_allclose(found, assembled, atol=2e-5 * np.abs(assembled).max())
 
 
-def scene_of(*obstacles: dict[str, Any], dim: int = 2, **more: Any) -> tuple[Scene, Walk, FreeObstacleTerm]:
+def scene_of(*obstacles: dict[str, Any], dim: int = 2, **more: Any) -> tuple[Scene, Walk, FreeRigidObstacles]:
     """A block from 0 to 1 in x, up to 0.3, that is held below, and obstacles."""
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0, 0.3] if dim == 2 else [1.0, 1.0, 0.3], "h": 0.3},
@@ -65,19 +65,19 @@ def scene_of(*obstacles: dict[str, Any], dim: int = 2, **more: Any) -> tuple[Sce
         boundary=[{"on": "bottom", "fix": "xyz"[:dim]}], solver={"snes_rtol": 1e-9, "ksp_rtol": 1e-9},
         obstacle=list(obstacles), **more,
     )  # fmt: skip
-    (term,) = [term for term in scene.balance.terms if isinstance(term, FreeObstacleTerm)]
+    (term,) = [term for term in scene.balance.terms if isinstance(term, FreeRigidObstacles)]
     return scene, state, term
 
 
-def gap(term: FreeObstacleTerm) -> float:
+def gap(term: FreeRigidObstacles) -> float:
     """The least between free obstacles, m."""
     at = [each.motion.pose for each in term.free.values()]
     return min(float(g.min(initial=9.0)) for (i, j), pair in term.pairs._pairs.items() for g in pair.gaps(at[i], at[j]))
 
 
-def linear(term: FreeObstacleTerm) -> Values:
+def linear(term: FreeRigidObstacles) -> Values:
     """(d,) momentum of the free obstacles, kg m/s."""
-    return np.asarray(sum(each.motion.momentum[: term._domain.dim] for each in term.free.values()))
+    return np.asarray(sum(each.motion.momentum[: term.dim] for each in term.free.values()))
 
 
 def disk(name: str, x: float, y: float, **more: Any) -> dict[str, Any]:
@@ -128,6 +128,6 @@ def test_a_pile_on_a_body_weighs_what_it_weighs() -> None:
     march(scene, state)
     told = dict(zip(scene.probes.columns, scene.probes(), strict=True))
     assert told["contact_box_y"] == pytest.approx(13.0 * G, rel=1e-3) and told["contact_it_y"] == 0.0
-    wrenches = term.pairs.wrenches(term.posed())
+    wrenches = term.pairs.wrenches(term.posed)
     assert [wrenches[number][1] for number in (0, 1)] == pytest.approx([-5.0 * G, 5.0 * G], rel=1e-3)
     assert max(abs(told[f"velocity_{name}_y"]) for name in ("box", "it")) < 1e-3

@@ -11,7 +11,8 @@ import pytest
 from mpi4py import MPI
 from pydantic import ValidationError
 
-from fracsim.contact.rigid_obstacle_term import FreeObstacleTerm
+from fracsim.contact.obstacle_term import ObstacleTerm
+from fracsim.contact.rigid_obstacles import FreeRigidObstacles
 from fracsim.errors import InputError
 from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
@@ -32,8 +33,8 @@ def ball(**more: Any) -> dict[str, Any]:
     return {"name": "it", "shape": "sphere", "radius": 0.1, "at": [0.5, 0.42], "mass": 5.0} | more
 
 
-def contact_of(scene: Scene) -> FreeObstacleTerm:
-    (found,) = [term for term in scene.balance.terms if isinstance(term, FreeObstacleTerm)]
+def contact_of(scene: Scene) -> FreeRigidObstacles:
+    (found,) = [term for term in scene.balance.terms if isinstance(term, FreeRigidObstacles)]
     return found
 
 
@@ -280,7 +281,7 @@ def test_a_free_ball_smaller_than_a_facet_is_felt_between_its_corners(dim: int, 
         assert np.linalg.norm(x - centre, axis=2).min() > 0.1  # no corner is near
         np.testing.assert_allclose(momenta(scene, state)[0], before, atol=1e-9 * 2)
         assert report.kinetic + report.elastic < energy * (1 + 1e-6)
-    assert 0 < least < contact_of(scene).barrier_width
+    assert 0 < least < next(term for term in scene.balance.terms if isinstance(term, ObstacleTerm)).barrier_width
     moved = contact_of(scene).free[0].motion.momentum[dim - 1] / 0.5
     assert 0.1 < moved < 4.0
 

@@ -11,8 +11,8 @@ import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 
+from fracsim.contact.mesh_obstacle_term import MeshObstacleTerm
 from fracsim.contact.mesh_obstacles import AllMeshPairs, MeshObstacle
-from fracsim.contact.mesh_rigid_term import FreeMeshTerm
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.rigid_pose import FreePose
 from fracsim.contact.shapes import RoundedBox
@@ -259,9 +259,9 @@ def test_moments_are_those_of_a_box() -> None:
     np.testing.assert_allclose(solid.inertia(7.0), own + away, atol=1e-13)
 
 
-def free_solid(scene: Scene) -> tuple[FreeMeshTerm, FreePose]:
-    (term,) = [each for each in scene.balance.terms if isinstance(each, FreeMeshTerm)]
-    return term, term.free[0]
+def free_solid(scene: Scene) -> tuple[MeshObstacleTerm, FreePose]:
+    (term,) = [each for each in scene.balance.terms if isinstance(each, MeshObstacleTerm)]
+    return term, term.bodies.free[0]
 
 
 def momenta(scene: Scene, state: Walk) -> tuple[Values, Values]:
@@ -286,13 +286,13 @@ def test_what_is_pushed_by_a_body_is_the_derivative_by_its_pose(tmp_path: Path) 
     scene.balance.set_displacement(state.u)
     term, solid = free_solid(scene)
     z, h = 1e-3 * np.array([1.0, -2.0, 1.0, 3.0, 1.0, -2.0]), 1e-6
-    term._unknowns.move_to([z])
-    here, pose, ends = term.pose_derivatives()[0], solid.posed.pose, []
+    term.bodies._unknowns.move_to([z])
+    here, pose, ends = term.pose_derivatives([0])[0], solid.posed.pose, []
     assert here.energy > 0 and term._friction is not None and np.abs(here.gradient).min() > 0
     for q in np.concatenate([h * np.eye(6), -h * np.eye(6)]):
-        solid.posed = PosedShape(solid.posed.shape, pose.incremented(q))
+        term.bodies.posed[0] = PosedShape(solid.posed.shape, pose.incremented(q))
         term.poses_moved()
-        ends.append(((found := term.pose_derivatives()[0]).energy, found.gradient))
+        ends.append(((found := term.pose_derivatives([0])[0]).energy, found.gradient))
     slope = np.array([(ends[k][0] - ends[k + 6][0]) / (2 * h) for k in range(6)])
     np.testing.assert_allclose(here.gradient, slope, atol=1e-5 * np.abs(slope).max())
     bent = np.array([(ends[k][1] - ends[k + 6][1]) / (2 * h) for k in range(6)])
@@ -305,7 +305,7 @@ def test_an_isolated_pair_keeps_its_momenta(tmp_path: Path) -> None:
     tables = thrown(tmp_path, velocity=[0.2, 0.0, -2.0], spin=[1.0, 0.5, 0.2])
     scene, state = make_scene(**tables, time={"scheme": "backward-euler", "step": 0.01, "end": 0.08})
     (linear, angular), (term, _) = momenta(scene, state), free_solid(scene)
-    held = term.kinetic_energy()
+    held = term.bodies.kinetic_energy()
     for report in each_step(scene, state):
         now = momenta(scene, state)
         np.testing.assert_allclose(now[0], linear, atol=1e-9 * 40)
@@ -423,7 +423,7 @@ def test_a_driven_one_turns_and_drags(tmp_path: Path) -> None:
         assert report.kinetic + report.elastic + state.dissipated <= state.work * (1 + 1e-6) + 1e-9
     pressed = np.array(forces)
     assert pressed[:, 1].max() > 500 and abs(pressed[:, 0]).max() > 0.2 * pressed[:, 1].max()
-    pose = term.posed_obstacles(state.t)[0].pose
+    pose = term.bodies.posed_at(state.t)[0].pose
     np.testing.assert_allclose(pose.rotation_vector(), [0.0, 1.6, 0.0], atol=1e-12)
     assert last(scene)["gap_block"] > 0.1  # it is through
 
@@ -485,3 +485,37 @@ def test_scenes_that_have_none(tables: dict[str, Any], message: str, tmp_path: P
     obstacle = block(tmp_path) | {"at": [0.5, 0.5, -0.6][: len(tables.get("mesh", CUBE)["size"])]}
     with pytest.raises((InputError, ValueError), match=message):
         make_scene(**{"mesh": CUBE, "material": SOFT, "obstacle": [obstacle]} | tables)
+
+
+def test_a_free_ball_bounces_on_a_held_solid(tmp_path: Path) -> None:
+    """Dropped on the middle of a flat block from a file, beside the body: it never enters the block, and comes back."""
+    held = block(tmp_path, (1.0, 1.0, 0.2)) | {"at": [3.0, 0.5, 0.0], "name": "table"}
+    ball = {"name": "ball", "shape": "sphere", "radius": 0.1, "at": [3.0, 0.5, 0.25], "mass": 5.0,
+            "velocity": [0.0, 0.0, -2.0]}  # fmt: skip
+    scene, state = make_scene(
+        mesh=CUBE, material=SOFT, solver=FINE, obstacle=[held, ball], contact={"itself": False, "distance": 0.02},
+        time={"scheme": "newmark", "step": 2e-3, "end": 0.06},
+    )  # fmt: skip
+    heights, speeds = [], []
+    for _ in each_step(scene, state):
+        heights.append(last(scene)["position_ball_z"])
+        speeds.append(last(scene)["velocity_ball_z"])
+    assert min(heights) > 0.2 and max(speeds) > 0.9 and max(np.abs(speeds)) < 2 * (1 + 1e-6)
+
+
+def test_a_free_solid_hits_a_free_ball(tmp_path: Path) -> None:
+    """Centre to centre, beside the body: momentum of both stays, the energy does not grow, and they part."""
+    thrown_block = block(tmp_path, (0.3, 0.3, 0.3)) | {"at": [3.0, 0.5, 0.5], "mass": 2.0, "velocity": [1.0, 0.0, 0.0]}
+    ball = {"name": "ball", "shape": "sphere", "radius": 0.1, "at": [3.28, 0.5, 0.5], "mass": 5.0}
+    scene, state = make_scene(
+        mesh=CUBE, material=SOFT, solver=FINE, obstacle=[thrown_block, ball],
+        contact={"itself": False, "distance": 0.02}, time={"scheme": "newmark", "step": 4e-3, "end": 0.12},
+    )  # fmt: skip
+    free = free_solid(scene)[0].bodies.free
+    for report in each_step(scene, state):
+        total = sum(pose.motion.momentum[:3] for pose in free.values())
+        np.testing.assert_allclose(total, [2.0, 0.0, 0.0], atol=1e-9)
+        assert report.kinetic + report.elastic <= 1.0 * (1 + 1e-6)
+        x = free[0].posed.pose.points_to_space(free[0].body.shape.points)
+        assert x[:, 0].max() < free[1].motion.pose.centre[0] - 0.1
+    assert last(scene)["velocity_ball_x"] > last(scene)["velocity_block_x"] + 0.3

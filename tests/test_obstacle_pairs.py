@@ -13,7 +13,7 @@ from fracsim.contact.laws import Barrier
 from fracsim.contact.obstacle import FreeObstacle, RigidObstacle, overlap_depth
 from fracsim.contact.obstacle_pairs import ObstaclePairs
 from fracsim.contact.pose import Pose, PosedShape
-from fracsim.contact.rigid_obstacle_term import FreeObstacleTerm
+from fracsim.contact.rigid_obstacles import FreeRigidObstacles
 from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylinder, Shape, Sphere
 from support.scenes import each_step, make_scene
 
@@ -93,9 +93,9 @@ def thrown(
         contact={"distance": 0.03, "stiffness": 3e3, "itself": False}, solver={"snes_rtol": 1e-9, "ksp_rtol": 1e-9},
         time={"scheme": scheme, "step": step, "end": end},
     )  # fmt: skip
-    (contact,) = [term for term in scene.balance.terms if isinstance(term, FreeObstacleTerm)]
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, FreeRigidObstacles)]
     for report in each_step(scene, state):
-        placed = contact.posed_obstacles(state.t)
+        placed = contact.posed_at(state.t)
         assert overlap_depth(placed[-1], placed[0]) < 0
         row = dict(zip(scene.probes.columns, scene.probes(), strict=True))
         yield row | {"energy": report.kinetic + report.elastic + state.dissipated - state.work}

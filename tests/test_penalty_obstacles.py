@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 from pydantic import ValidationError
 
-from fracsim.contact.penalty_obstacles import NodalMassShare, PenaltyFreeObstacleTerm, PenaltyObstacleTerm
+from fracsim.contact.penalty_obstacles import NodalMassShare, PenaltyObstacleTerm
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.split_surface.local_surface import LocalSurface, ParentMatrix
 from fracsim.scene import Scene
@@ -138,11 +138,11 @@ def test_a_ball_that_strikes_a_block(mass: float) -> None:
                    "velocity": [1.0, 0.0, -5.0], "spin": [3.0, 2.0, 1.0], "friction": 0.3}],
         time={"scheme": "explicit", "step": 0.02, "end": 0.1},
     )  # fmt: skip
-    (contact,) = [term for term in scene.balance.terms if isinstance(term, PenaltyFreeObstacleTerm)]
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, PenaltyObstacleTerm)]
     X, m = positions(scene), masses(scene)
 
     def momentum() -> Values:
-        flight, p = contact.free[0].motion, m * state.v.reshape(-1, 3)
+        flight, p = contact.bodies.free[0].motion, m * state.v.reshape(-1, 3)
         spun = np.cross(flight.pose.centre, flight.momentum[:3]) + flight.momentum[3:]
         turning = np.cross(X + state.u.reshape(-1, 3), p).sum(axis=0) + spun
         return np.concatenate([p.sum(axis=0) + flight.momentum[:3], turning])

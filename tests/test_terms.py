@@ -65,11 +65,11 @@ def test_a_term_couples_what_no_cell_does(monkeypatch: pytest.MonkeyPatch, solve
     steps that the term holds down to half of what Newton's method wants. The corner under load has a prescribed y."""
     made: list[Tie] = []
 
-    def tie(parts: Any) -> Tie:
+    def tie(parts: Any) -> list[Tie]:
         X = parts.domain.nodes[: parts.domain.node_count]
         near, far = (int(np.argmin(np.linalg.norm(X - corner, axis=1))) for corner in ([1.0, 0.0], [0.0, 1.0]))
         made.append(Tie(parts.u, parts.assembler.create_vector(), 2 * near, 2 * far + 1, 0.7))
-        return made[-1]
+        return [made[-1]]
 
     monkeypatch.setitem(scene_module.TERMS, "tie", tie)
     place = {"box": [[1 - 1e-9, -1e-9], [1 + 1e-9, 1e-9]]}

@@ -5,12 +5,11 @@ with itself, is computed by ipctk.
 
 Terms of the balance:
 
-    obstacle_term         analytic obstacles, held or driven; contact_state: points and obstacles in a step
-    rigid_obstacle_term   the same with free obstacles
-    mesh_obstacle_term    triangle-mesh obstacles, held or driven
-    mesh_rigid_term       the same with free obstacles
+    rigid_obstacles       motion of all obstacles: prescribed, and inertia, weight and poses of free ones
+    obstacle_term         the body before analytic obstacles; contact_state: points and obstacles in a step
+    mesh_obstacle_term    the body before triangle-mesh obstacles
     self_contact          a body with itself, and its fragments with one another
-    penalty_obstacles     analytic obstacles in explicit steps, free ones too
+    penalty_obstacles     the body before analytic obstacles in explicit steps
     penalty_self_contact  a body with itself in explicit steps
 
 Laws and geometry:

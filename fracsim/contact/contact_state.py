@@ -19,7 +19,8 @@ from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_poin
 from .obstacle import RigidObstacle
 from .pose import PosedShape, min_distance
 from .proximity import ProximityCandidates
-from .step_limit import ObstacleKinematics, check_obstacles_apart, refuse_overlap
+from .rigid_obstacles import RigidObstacles
+from .step_limit import check_obstacles_apart, refuse_overlap
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -29,7 +30,9 @@ class ContactState:
     """Obstacles, and the points of a body that they act on at the end of a step.
 
     Attributes:
-        obstacles: held, driven or free.
+        obstacles: analytic obstacles.
+        numbers: their numbers in the study.
+        bodies: motion of all obstacles.
         law: contact law.
         surface: points of the body that may touch.
         positions: (n, d) positions of these points at the end of the step that belongs to u, m.
@@ -40,11 +43,13 @@ class ContactState:
     _step_starts: list[StepStart | None]  # points at the start of the step, where barriers are averaged over it
     _started_near: list[Ints]  # points on which each obstacle acted then
 
-    def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[RigidObstacle], law: ObstacleLaw) -> None:
+    def __init__(
+        self, domain: Domain, u: fem.Function, bodies: RigidObstacles, numbers: Sequence[int], law: ObstacleLaw
+    ) -> None:
         """Raise InputError where the body at rest, or a free obstacle, overlaps an obstacle (collective)."""
-        self.obstacles, self.law = tuple(obstacles), law
+        self.bodies, self.numbers, self.law = bodies, tuple(numbers), law
+        self.obstacles = tuple(bodies.obstacles[number] for number in numbers)
         self.surface = ContactSurface(domain, law.barrier.width)
-        self._kinematics = ObstacleKinematics(self.obstacles, self._prescribed_numbers())
         self._domain, self._u, self._owned = domain, u, domain.node_count * domain.dim
         self.comm = domain.comm
         self._contact_forces: list[ContactForces] | None = None
@@ -52,11 +57,8 @@ class ContactState:
         self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
         self._attempts = 0  # of Newton's method in the step
         self._tangent_positions: Values | None = None  # of the points at the last tangent of this attempt
-        check_obstacles_apart(self.comm, self.surface.rest_positions, self.obstacles)
-        if any(obstacle.free for obstacle in self.obstacles):
-            from .obstacle import check_free_obstacles
-
-            check_free_obstacles(self.obstacles)
+        items = dict(zip(self.numbers, self.obstacles, strict=True))
+        check_obstacles_apart(self.comm, self.surface.rest_positions, items)
         self._facet_obstacles = self._find_facet_obstacles()
         self._point_candidates = ProximityCandidates(self.surface.mean_edge_length)
         if self._facet_obstacles:
@@ -93,7 +95,7 @@ class ContactState:
         x, posed = self.surface.rest_positions, [obstacle.posed_at(0.0) for obstacle in self.obstacles]
         for number in self._facet_obstacles:
             distances = self.surface.facets.distances(posed[number], x, 0.0)
-            refuse_overlap(self.comm, distances, number, self.obstacles[number])
+            refuse_overlap(self.comm, distances, self.numbers[number], self.obstacles[number])
         facet_gaps = self._facet_gap_function(posed)
         assert facet_gaps is not None
         self.surface.exclude_cut_facets(x, facet_gaps)
@@ -111,33 +113,40 @@ class ContactState:
 
     def _facets_are_open(self, x: Values) -> bool:
         """Whether no facet is cut with points at x (n, d), m (collective)."""
-        if (facet_gaps := self._facet_gap_function(self._kinematics.posed)) is None:
+        if (facet_gaps := self._facet_gap_function(self.posed)) is None:
             return True
         return bool(self.comm.allreduce(bool((facet_gaps(self.surface.facets, x) > 0).all()), op=MPI.LAND))
 
-    def _prescribed_numbers(self) -> list[int]:
-        """Numbers of obstacles with a prescribed motion: held or driven."""
-        return list(range(len(self.obstacles)))
+    @property
+    def posed(self) -> list[PosedShape]:
+        """Obstacles at their current poses."""
+        return [self.bodies.posed[number] for number in self.numbers]
+
+    @property
+    def start_posed(self) -> list[PosedShape]:
+        """Obstacles at the start of the step."""
+        return [self.bodies.start_posed[number] for number in self.numbers]
+
+    @property
+    def increments(self) -> list[Values]:
+        """(p,) increment of each pose in the step."""
+        return [self.bodies.increments[number] for number in self.numbers]
 
     def begin_step(self, level: TimeLevel) -> None:
         """Move obstacles to the end of the step, and store the contact at its start for friction."""
+        self.bodies.begin_step(level)
         self._level, self._attempts = level, 0
         self.discard_forces()
         end = level.t + (1 - level.fraction) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
             return  # evaluation of a step's result: lagged contact and motions are still those of the step
         self._end, self._dt, self._start_velocity = end, level.dt, level.v_n
-        self._place_obstacles(end - level.dt, end)
         self._discard_start()
         if level.dt:
             self._begin_new_step()
 
-    def _place_obstacles(self, start: float, end: float) -> None:
-        """Place obstacles at the times of the start and the end of a step, s."""
-        self._kinematics.begin_step(start, end)
-
     def _begin_new_step(self) -> None:
-        posed, barrier = self._kinematics.start_posed, self.law.barrier
+        posed, barrier = self.start_posed, self.law.barrier
         self.surface.release_points(self._level.u_n, partial(min_distance, posed), self._facet_gap_function(posed))
         x = self.surface.positions(self._level.u_n)
         gaps = [shape.distance(x) for shape in posed]
@@ -184,9 +193,7 @@ class ContactState:
             if self._sticking_slips is None:
                 self._sticking_slips = self._compute_sticking_slips()
             self.positions = self.surface.positions(self._end_displacement())
-            self._contact_forces = [
-                self._evaluate_obstacle(number, posed) for number, posed in enumerate(self._kinematics.posed)
-            ]
+            self._contact_forces = [self._evaluate_obstacle(number, posed) for number, posed in enumerate(self.posed)]
         return self._contact_forces
 
     def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
@@ -197,8 +204,8 @@ class ContactState:
         friction = None
         if lagged is not None and self._sticking_slips is not None:
             friction = CoulombFriction(obstacle.friction, self._sticking_slips[number])
-        obstacle_motion, start = self._contact_point_motion(number, posed), self._step_starts[number]
-        start_posed, candidates = self._kinematics.start_posed[number], self._candidates(number, posed)
+        obstacle_motion, start = self._contact_point_motion(number), self._step_starts[number]
+        start_posed, candidates = self.start_posed[number], self._candidates(number, posed)
         if start is not None:
             start = start.carried_with(start_posed.pose, posed.pose)
         of_points = evaluate_points(
@@ -227,7 +234,7 @@ class ContactState:
             return True
         ends = [(posed, self.positions)]
         if self._step_starts[number] is not None:
-            ends.append((self._kinematics.start_posed[number], self._start_positions))
+            ends.append((self.start_posed[number], self._start_positions))
         return not any(len(self.surface.facets.candidates(*end, width)) for end in ends)
 
     def _candidates(self, number: int, posed: PosedShape) -> Ints:
@@ -242,18 +249,16 @@ class ContactState:
             velocity = self.surface.interpolation(self._start_velocity)
             for number, lagged in enumerate(self._lagged):
                 if lagged is not None and len(lagged.points):
-                    relative = velocity[lagged.points] - self._obstacle_velocity(number, lagged.position)
+                    relative = velocity[lagged.points] - self.bodies.velocity(self.numbers[number], lagged.position)
                     speeds[number] = np.linalg.norm(tangential(lagged.normal, relative), axis=1).max()
             self.comm.Allreduce(MPI.IN_PLACE, speeds, MPI.MAX)
         return [self._dt * max(self.law.sticking_speed, self.law.sticking_ratio * speed) for speed in speeds]
 
-    def _obstacle_velocity(self, number: int, x: Values) -> Values:
-        """(d,) velocity of an obstacle at the start of the step, or (n, d) of its points at x (n, d), m/s."""
-        return np.asarray(self._kinematics.increments[number][: self._domain.dim] / self._dt)
-
-    def _contact_point_motion(self, number: int, posed: PosedShape) -> Values:
+    def _contact_point_motion(self, number: int) -> Values:
         """(d,) motion of an obstacle in the step, or (k, d) of its points in lagged contact, m."""
-        return np.asarray(self._kinematics.increments[number][: self._domain.dim])
+        lagged = self._lagged[number]
+        no_motion = np.zeros(self._domain.dim)
+        return no_motion if lagged is None else self.bodies.contact_point_motion(self.numbers[number], lagged)
 
     def nodal_forces(self) -> Values:
         """(owned dofs,) forces of the obstacles on the nodes at the end of the step, N (collective)."""
@@ -271,6 +276,6 @@ class ContactState:
         if lagged is None or not len(lagged.points):
             return 0.0, 0.0
         force = contact.friction[np.searchsorted(contact.points, lagged.points)]
-        obstacle_motion = self._contact_point_motion(number, self._kinematics.posed[number])
+        obstacle_motion = self._contact_point_motion(number)
         motion = self.positions[lagged.points] - lagged.position
         return float(np.vdot(force, motion)), float((force * obstacle_motion).sum())

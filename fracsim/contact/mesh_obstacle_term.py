@@ -9,7 +9,7 @@ Equations: docs/theory.md#contact.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import cast
@@ -22,7 +22,6 @@ from scipy.sparse import csr_matrix
 
 from ..mechanics.extra_couplings import StiffCoupling
 from ..mechanics.term import TimeLevel
-from ..mechanics.term_protocols import SurfaceData
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
 from ..mesh.parallel import from_root, on_root
@@ -40,8 +39,9 @@ from .mesh_obstacles import (
     ProximityTest,
 )
 from .obstacle import RigidObstacle
-from .obstacle_tessellation import ObstacleTessellations
-from .pose import Pose, PosedShape
+from .pose import Pose
+from .pose_derivatives import PoseDerivatives, point_jacobian, point_set_derivatives
+from .rigid_obstacles import RigidObstacles
 from .self_contact import SelfContact
 from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
 
@@ -129,10 +129,12 @@ def motion_corrections(pairs: MeshObstaclePairs, start_pose: Pose, x: Values, en
 
 
 class MeshObstacleTerm(SelfContact):
-    """Triangle-mesh obstacles that the body cannot penetrate.
+    """Triangle-mesh obstacles that the body cannot penetrate (rigid_obstacles.ObstacleContactTerm).
 
     Attributes:
-        obstacles: held or driven, their shapes triangle meshes.
+        bodies: motion of all obstacles.
+        numbers: numbers of the triangle meshes.
+        obstacles: these.
         law: contact law, except for the coefficient of friction, which is that of each obstacle.
     """
 
@@ -141,27 +143,35 @@ class MeshObstacleTerm(SelfContact):
     _friction: MeshFriction | None
 
     def __init__(
-        self, domain: Domain, u: fem.Function, obstacles: dict[int, RigidObstacle], law: SelfContactLaw
+        self, domain: Domain, u: fem.Function, bodies: RigidObstacles, numbers: Sequence[int], law: SelfContactLaw
     ) -> None:
-        """Build the term; `obstacles` by their numbers in the study (collective).
+        """Build the term (collective).
+
+        Args:
+            domain: mesh.
+            u: displacement.
+            bodies: motion of all obstacles.
+            numbers: numbers of the triangle meshes.
+            law: contact law.
 
         Raises:
             InputError: if an obstacle overlaps the body at rest.
         """
-        self.obstacles, edge = tuple(obstacles.values()), domain.mean_edge_length
-        self._drawings = ObstacleTessellations(self.obstacles, domain.bounds.lower, domain.bounds.upper)
+        self.bodies, self.numbers, edge = bodies, tuple(numbers), domain.mean_edge_length
+        self.obstacles = tuple(bodies.obstacles[number] for number in numbers)
+        # the tangent by points and poses has a positive semi-definite form alone
+        self.allows_exact_tangent = not any(obstacle.free for obstacle in self.obstacles)
         # on rank 0 alone
-        self._meshes = on_root(domain.comm, lambda: [_build_mesh(*item, edge) for item in obstacles.items()]) or []
-        self._start_poses = [obstacle.posed_at(0.0).pose for obstacle in self.obstacles]
-        self._increments: list[Values] = [np.zeros(6) for _ in self.obstacles]  # (6,) of each in the step
-        self._place_meshes(1.0)
+        items = zip(self.numbers, self.obstacles, strict=True)
+        self._meshes = on_root(domain.comm, lambda: [_build_mesh(*item, edge) for item in items]) or []
         self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
         self._proximity = ProximityTest(domain, self.obstacles, law.distance)
         self._started_near = True
         self._far: bool | None = None  # at the current u; None: not known yet
         # of the last step: work of each obstacle, J, dissipation by friction, J, and forces on each, N
-        self._obstacle_work, self._friction_loss = [0.0] * len(obstacles), 0.0
+        self._obstacle_work, self._friction_loss = [0.0] * len(numbers), 0.0
         self._force_readings: list[Values] | None = None  # None: no step yet
+        self._place_meshes(self._poses)
         super().__init__(domain, u, law)
 
     @property
@@ -196,30 +206,29 @@ class MeshObstacleTerm(SelfContact):
         assert self._surface is not None
         return at.with_arm_share(np.minimum(self._surface.point_map.share, at.share))
 
-    def posed_obstacles(self, t: float) -> list[PosedShape]:
-        """Each obstacle at time t, s (not collective)."""
-        return [obstacle.posed_at(t) for obstacle in self.obstacles]
+    @property
+    def _poses(self) -> list[Pose]:
+        """Current poses of the obstacles."""
+        return [self.bodies.posed[number].pose for number in self.numbers]
 
-    def output_surfaces(self, t: float) -> dict[str, SurfaceData]:
-        """Tessellation of each obstacle at time t, s, by its name."""
-        return self._drawings(self.posed_obstacles(t))
+    @property
+    def _start_poses(self) -> list[Pose]:
+        """Poses of the obstacles at the start of the step."""
+        return [self.bodies.start_posed[number].pose for number in self.numbers]
 
-    def _place_meshes(self, travelled: float) -> None:
-        """Move obstacles to a fraction of their motion in the step."""
-        self._travelled, self._is_stale = travelled, True
-        self._poses = [self._pose_after(number, travelled) for number in range(len(self.obstacles))]
-        # meshes are on rank 0 alone
-        for mesh, pose in zip(self._meshes, self._poses, strict=False):
+    def _place_meshes(self, poses: Sequence[Pose]) -> None:
+        """Move the meshes to poses; they are on rank 0 alone."""
+        for mesh, pose in zip(self._meshes, poses, strict=False):
             mesh.move_to(pose)
 
-    def _pose_after(self, number: int, travelled: float) -> Pose:
-        """Pose of an obstacle after a fraction of its motion."""
-        return self._start_poses[number].incremented(travelled * self._increments[number])
-
     def _step_poses(self) -> list[tuple[Pose, Pose]]:
-        """Poses of each obstacle at the start and the end of the step."""
-        ends = [self._pose_after(number, 1.0) for number in range(len(self.obstacles))]
-        return list(zip(self._start_poses, ends, strict=True))
+        """Poses of each obstacle at the start of the step, and now."""
+        return list(zip(self._start_poses, self._poses, strict=True))
+
+    def poses_moved(self) -> None:
+        """Move the meshes to the poses of the obstacles, and discard forces."""
+        self._place_meshes(self._poses)
+        self._far = self._contact_force = self._stored = None
 
     def _is_far(self) -> bool:
         """Whether nothing can be in contact at the current u, nor could at the start of the step (collective)."""
@@ -259,13 +268,13 @@ class MeshObstacleTerm(SelfContact):
 
     def begin_step(self, level: TimeLevel) -> None:
         """Move obstacles to the end of the step, and lag friction with the contact at its start."""
+        self.bodies.begin_step(level)
         self._level, self._is_stale, self._far, self._attempts = level, True, None, 0
         end = level.t + (1 - level.fraction) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
             return  # evaluation of a step's result: friction and motions are still those of the step
         self._end, self._dt, self._start_velocity = end, level.dt, level.v_n
         self._friction = self._tangent_positions = None
-        self._place_obstacles(end - level.dt, end)
         self._started_near = not self._proximity.is_far([level.u_n], self._step_poses())
         self._start_positions = None
         zero: Values = np.zeros((1, 3))
@@ -273,14 +282,9 @@ class MeshObstacleTerm(SelfContact):
         if level.dt and self._started_near:
             nodal, sticking_speed = self._gathered(level.u_n), self._sticking_speed(level.v_n)
             if self._surface is not None and nodal is not None:
-                self._place_meshes(0.0)
+                self._place_meshes(self._start_poses)
                 self._begin_on_root(self._surface, nodal, sticking_speed * level.dt)
-        self._place_meshes(1.0)
-
-    def _place_obstacles(self, start: float, end: float) -> None:
-        """Store the motions of obstacles between the times of a step, s."""
-        self._start_poses = [obstacle.posed_at(start).pose for obstacle in self.obstacles]
-        self._increments = [obstacle.pose_increment(start, end) for obstacle in self.obstacles]
+        self._place_meshes(self._poses)
 
     def _begin_on_root(self, surface: MeshContactSurface, nodal: Values, slip: float) -> None:
         """Begin a step on rank 0 at displacements (nodes, 3), m; `slip`: that counts as sticking, m."""
@@ -315,8 +319,9 @@ class MeshObstacleTerm(SelfContact):
             self._obstacle_work[number] = float(np.vdot(mean_gradient, motion)) + friction_work
 
     def step_work(self) -> tuple[float, float]:
-        """Work of the obstacles' own motion in the step, and dissipation by friction, on rank 0, J."""
-        return sum(self._obstacle_work), self._friction_loss
+        """Work of prescribed obstacles in the step, and dissipation by friction, on rank 0, J."""
+        prescribed = [number for number, obstacle in enumerate(self.obstacles) if not obstacle.free]
+        return sum(self._obstacle_work[number] for number in prescribed), self._friction_loss
 
     def damping_forces(self) -> None:
         """Return None: dissipation is summed step by step (`step_work`)."""
@@ -324,10 +329,34 @@ class MeshObstacleTerm(SelfContact):
     # --- step limits ---
 
     def max_step_fraction(self, change: Values) -> float:
-        """Fraction of a change of u (owned dofs,), m, without a collision (collective)."""
-        u, level = self._u.x.array[: self._owned], self._level
-        ends = [level.displacement_at_end(u), level.displacement_at_end(u + change)]
-        return 1.0 if self._proximity.is_far(ends, self._step_poses()) else super().max_step_fraction(change)
+        """Fraction of a correction of u (owned dofs,), m, and free poses without a collision (collective)."""
+        u, increments = self._u.x.array[: self._owned], self.bodies.correction_increments()
+        motion = np.asarray(change / self._level.fraction, np.float64)
+        return self._fraction_along(self._level.displacement_at_end(u), increments, motion)
+
+    def _fraction_along(self, u: Values, increments: Mapping[int, Values], change: Values | None) -> float:
+        """Fraction of increments (p,) from current poses and a motion of the body without a collision (collective).
+
+        `u`, `change`: (owned dofs,) displacement at the start, and its change, m; None: the body is at rest.
+        """
+        poses = [(pose, pose) for pose in self._poses]
+        for index, number in enumerate(self.numbers):
+            if number in increments:
+                poses[index] = poses[index][0], poses[index][0].incremented(increments[number])
+        if self._proximity.is_far([u] if change is None else [u, u + change], poses):
+            return 1.0
+        x, motion = self._positions_at(u), None if change is None else self._gathered(change)
+
+        def fraction_on_root() -> float:
+            assert self._surface is not None and x is not None
+            end = x if motion is None else x + self._surface.point_map.weights @ motion
+            starts, ends = zip(*poses, strict=True)
+            self._place_meshes(ends)
+            fraction = self._surface.pairs.moving_free_fraction(x, end, starts)
+            self._place_meshes(starts)
+            return fraction
+
+        return from_root(self.comm, fraction_on_root)
 
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) first guess of u, m, that crosses no obstacle on its way from the start (collective)."""
@@ -353,7 +382,9 @@ class MeshObstacleTerm(SelfContact):
 
     def _first_guess(self, surface: MeshContactSurface, start: Values, end: Values) -> Values:
         """(nodes, 3) displacements that the body reaches on its way from `start` to `end`, m, on rank 0."""
-        return stop_before_meshes(surface, surface.pairs, start, end, self._start_poses)
+        prescribed = [index for index, obstacle in enumerate(self.obstacles) if not obstacle.free]
+        start_poses = [self._start_poses[index] for index in prescribed]
+        return stop_before_meshes(surface, surface.pairs.select(prescribed), start, end, start_poses)
 
     def is_feasible(self, u: Values) -> bool:
         """Whether nothing is crossed on the straight way from the start to u (collective)."""
@@ -369,32 +400,96 @@ class MeshObstacleTerm(SelfContact):
 
         return from_root(self.comm, is_free)
 
-    def restrict_motion(self) -> None:
-        """Hold obstacles where they would meet the body at the step's start (collective)."""
-        self._place_meshes(0.0)
-        self._advance(self._level.u_n)
+    # --- contact of the body, as the obstacles see it (rigid_obstacles.ObstacleContactTerm) ---
 
-    def remaining_motion(self) -> float:
-        """Fraction of the obstacles' motion that remains in the step."""
-        return 1.0 - self._travelled
+    def rest_fraction(self, increments: Mapping[int, Values], u: Values | None) -> float:
+        """Fraction of increments (p,) from current poses on which no gap to the body closes (collective).
 
-    def continue_motion(self) -> None:
-        """Advance held obstacles as far as the body at the current u allows (collective)."""
-        if self.remaining_motion():
-            self._advance(self._level.displacement_at_end(self._u.x.array[: self._owned]))
+        `u`: (owned dofs,) displacement of the body at rest, m; None: the current one at the end of the step.
+        """
+        if not increments:
+            return 1.0
+        if u is None:
+            u = self._level.displacement_at_end(self._u.x.array[: self._owned])
+        return self._fraction_along(u, increments, None)
 
-    def _advance(self, u: Values) -> None:
-        """Advance obstacles as far as the body at owned displacements u allows (collective)."""
-        nodal, travelled = self._gathered(u), self._travelled
+    def start_fraction(self, number: int, q: Values, u: Values) -> float:
+        """Fraction of an increment (p,) of an obstacle and the motion of the body that closes no gap (collective).
 
-        def free_fraction() -> float:
-            assert self._surface is not None and nodal is not None
-            x, start_poses = self._surface.point_map(nodal), [mesh.pose for mesh in self._meshes]
-            self._place_meshes(1.0)
-            return self._surface.pairs.moving_free_fraction(x, x, start_poses)
+        Both from the start of the step; `u`: (owned dofs,) displacement of the level after the motion, m.
+        """
+        level, index = self._level, self.numbers.index(number)
+        start, u_end = self._start_poses[index], level.displacement_at_end(u)
+        poses = [(pose, pose) for pose in self._poses]
+        poses[index] = start, start.incremented(q)
+        if self._proximity.is_far([level.u_n, u_end], poses):
+            return 1.0
+        x, end = self._positions_at(level.u_n), self._positions_at(u_end)
 
-        fraction = from_root(self.comm, free_fraction)
-        self._place_meshes(1.0 if fraction == 1 else travelled + fraction * (1.0 - travelled))
+        def fraction_on_root() -> float:
+            assert self._surface is not None and x is not None and end is not None
+            pairs = self._surface.pairs.pairs[index]
+            pairs.mesh.move_to(poses[index][1])
+            fraction = pairs.moving_free_fraction(x, end, start)
+            pairs.mesh.move_to(self._poses[index])
+            return fraction
+
+        return from_root(self.comm, fraction_on_root)
+
+    def wrenches(self, numbers: Sequence[int]) -> dict[int, Values]:
+        """(p,) force and moment of the body on obstacles, N and N m (collective)."""
+        return {number: -derivatives.gradient for number, derivatives in self.pose_derivatives(numbers).items()}
+
+    def pose_derivatives(self, numbers: Sequence[int]) -> dict[int, PoseDerivatives]:
+        """Energy and derivatives by the poses of obstacles (collective)."""
+        none = PoseDerivatives(0.0, np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6)))
+        if not numbers or self._is_far():
+            return dict.fromkeys(numbers, none)
+        x = self._end_positions()
+        by_number = from_root(self.comm, lambda: {number: self._derivatives_on_root(number, x) for number in numbers})
+        return {number: none if derivatives is None else derivatives for number, derivatives in by_number.items()}
+
+    def _derivatives_on_root(self, number: int, x: Values | None) -> PoseDerivatives | None:
+        """Derivatives by the pose of an obstacle with the body at x (n, 3), m; None: the body is far."""
+        assert self._surface is not None and x is not None
+        pairs, n = self._surface.pairs.pairs[self.numbers.index(number)], len(x)
+        if pairs.is_far(x):
+            return None
+        points, mesh = pairs.with_mesh(x), slice(3 * n, None)
+        energy, gradient = pairs.energy(points), pairs.gradient(points)
+        exact, positive = pairs.hessian(points, exact=True), pairs.hessian(points)
+        if self._friction is not None and (friction := self._friction.friction_with(pairs)) is not None:
+            energy, gradient = energy + friction.energy(points), gradient + friction.gradient(points)
+            exact, positive = exact + friction.hessian(points, exact=True), positive + friction.hessian(points)
+        arms = pairs.mesh.positions - pairs.mesh.pose.centre
+        return point_set_derivatives(energy, gradient[n:], exact[mesh, mesh], positive[mesh, mesh], arms)
+
+    def mixed_hessians(self, numbers: Sequence[int]) -> dict[int, Values]:
+        """(owned dofs, p) second derivatives by nodes and the poses of obstacles in contact (collective)."""
+        if not numbers or self._is_far():
+            return {}
+        x = self._end_positions()
+        mixed = on_root(self.comm, lambda: {number: self._mixed_on_root(number, x) for number in numbers}) or {}
+        touching = self.comm.bcast([number for number, blocks in mixed.items() if blocks is not None])
+        return {number: self._gather.scatter(mixed.get(number)).reshape(self._owned, -1) for number in touching}
+
+    def _mixed_on_root(self, number: int, x: Values | None) -> Values | None:
+        """(nodes, 3 p) second derivatives by nodes and pose with the body at x (n, 3), m; None: no contact."""
+        assert self._surface is not None and x is not None
+        pairs, body = self._surface.pairs.pairs[self.numbers.index(number)], slice(0, x.size)
+        if pairs.is_far(x):
+            return None
+        points = pairs.with_mesh(x)
+        H = pairs.hessian(points)
+        if self._friction is not None and (friction := self._friction.friction_with(pairs)) is not None:
+            H = H + friction.hessian(points)
+        J = point_jacobian(pairs.mesh.positions - pairs.mesh.pose.centre).reshape(-1, 6)
+        mixed = H[body, x.size :] @ J
+        return self._surface.nodal_forces(mixed.reshape(len(x), -1)) if mixed.any() else None
+
+    def uses_exact_tangent(self) -> bool:
+        """Whether the tangent at the current u may have negative eigenvalues: not with free obstacles."""
+        return self.allows_exact_tangent
 
     # --- columns of history.csv, and figures for the end of a run ---
 

@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import InputError
 from ..mechanics.time_functions import TimeFunction
 from ..meshes.data import AXES
-from .pose import Pose, PosedShape, Values, rotation_derivative, rotation_second_derivative
+from .pose import Pose, PosedShape, Values, rotation_derivative, rotation_second_derivative, solve_matrix
 from .shape_base import Shape
 
 
@@ -195,13 +195,6 @@ class MovingObstacle(Protocol):
     motion: RigidMotion
 
 
-class PlaceableObstacle(MovingObstacle, Protocol):
-    """Free obstacle with a pose in a step."""
-
-    def reset_pose(self) -> PosedShape:
-        """Return to the pose of the state of motion."""
-
-
 @dataclass(frozen=True)
 class FreeMotions:
     """States of motion of free obstacles: history of a term, and columns of history.csv.
@@ -276,6 +269,69 @@ class _MotionReader:
         return self._values[index : index + 1]
 
 
+# --- free obstacles in explicit steps ---
+
+
+class VerletObstacle:
+    """Free obstacle in explicit steps: velocity Verlet of its momentum.
+
+        p_{n+1/2} = p_n + dt/2 f_n,    z = dt M^-1 p_{n+1/2},    p_{n+1} = p_{n+1/2} + dt/2 f_{n+1}
+
+    p is the momentum of z, M the mass matrix at the middle of the step. Forces and moments are those on the points
+    themselves: body and obstacle exchange momentum to round-off, in steps of any size.
+
+    Attributes:
+        body: the obstacle.
+        motion: its state of motion at the start of a step, until that is accepted.
+        gravity_work: work of gravity in the last step, J.
+    """
+
+    gravity_work: float = 0.0
+
+    def __init__(self, body: FreeObstacle) -> None:
+        self.body, self.motion = body, body.start_motion()
+
+    def begin_step(self, dt: float) -> PosedShape:
+        """Begin a step of dt, s; returns the obstacle at the pose of its end."""
+        start, basis = self.motion.pose, self.body.motion_basis
+        self._dt, self._half_momentum = dt, self.motion.momentum + dt / 2 * self.motion.force
+        half = dt / 2 * solve_matrix(self.body.mass_matrix(start.rotation), self._half_momentum)
+        mass = self.body.mass_matrix(start.incremented(basis @ half).rotation)
+        self._increment: Values = np.asarray(basis @ (dt * solve_matrix(mass, self._half_momentum)))
+        return PosedShape(self.body.shape, start.incremented(self._increment))
+
+    def end_step(self, posed: PosedShape, wrench: Values) -> float:
+        """Accept the step; returns the work of contact on the obstacle, J.
+
+        Args:
+            posed: obstacle at the end.
+            wrench: (p,) force and moment of the body on it there, N and N m.
+        """
+        start, body, pose = self.motion, self.body, posed.pose
+        force = body.motion_basis.T @ (wrench - body.gravity_potential(pose)[1])
+        rotation = pose.rotation_vector() if pose.dim == 3 else start.rotation + self._increment[2:]
+        self.motion = RigidMotion(pose, self._half_momentum + self._dt / 2 * force, force, rotation)
+        self.gravity_work = body.gravity_potential(start.pose)[0] - body.gravity_potential(pose)[0]
+        change = float(body.history_values(self.motion)[-1] - body.history_values(start)[-1])
+        return change - self.gravity_work
+
+    def contact_point_motion(self, x: Values, posed: PosedShape) -> Values:
+        """(n, d) motion in the step of the obstacle's points that were at x (n, d) at its start, m."""
+        return posed.pose.points_to_space(self.motion.pose.to_body(x)) - x
+
+    def spring_stiffness(self, x: Values, k: Values, posed: PosedShape) -> Values:
+        """(k, k) stiffness by z of springs k (n,), N/m, in any direction at positions x (n, d), m."""
+        arm = x - posed.pose.centre
+        translation = np.broadcast_to(-np.eye(arm.shape[1]), (len(arm), arm.shape[1], arm.shape[1]))
+        J = np.concatenate([translation, rotation_derivative(arm)], axis=2) @ self.body.motion_basis
+        return np.asarray(np.einsum("n,nip,niq->pq", k, J, J))
+
+    def max_frequency(self, stiffness: Values, posed: PosedShape) -> float:
+        """Square of the highest frequency on springs of a stiffness (k, k), with the body at rest, 1/s^2."""
+        mass = self.body.mass_matrix(posed.pose.rotation)
+        return float(np.linalg.eigvals(solve_matrix(mass, stiffness)).real.max(initial=0.0))
+
+
 # --- overlaps ---
 
 
@@ -310,11 +366,13 @@ def overlap_depth(body: PosedShape, second: PosedShape) -> float:
     return -float(minimum.min())
 
 
-def check_free_obstacles(obstacles: Sequence[RigidObstacle]) -> None:
-    """Raise InputError where a free obstacle overlaps or touches another one at the start."""
-    posed = [obstacle.posed_at(0.0) for obstacle in obstacles]
-    for a, b, depth in find_overlaps(posed, free_pairs(obstacles), -OVERLAP.min_overlap):
+def check_free_obstacles(obstacles: Mapping[int, RigidObstacle]) -> None:
+    """Raise InputError where a free obstacle overlaps or touches another one at the start; analytic, by numbers."""
+    numbers, posed = list(obstacles), [obstacle.posed_at(0.0) for obstacle in obstacles.values()]
+    pairs = free_pairs(list(obstacles.values()))
+    for a, b, depth in find_overlaps(posed, pairs, -OVERLAP.min_overlap):
+        name, second = (obstacles[numbers[index]].name for index in (a, b))
         raise InputError(
-            f"obstacle.{a}: {obstacles[a].name} moves freely and overlaps {obstacles[b].name} at the start, by "
+            f"obstacle.{numbers[a]}: {name} moves freely and overlaps {second} at the start, by "
             f"{max(0.0, depth):.4g} m; move it away or make it smaller"
         )

@@ -315,8 +315,9 @@ class ObstaclePairs:
     def __init__(self, obstacles: Mapping[int, RigidObstacle], barrier: GapPotential) -> None:
         """`obstacles` by their numbers, free ones and others."""
         numbers = list(obstacles)
-        pairs = free_pairs([obstacles[number] for number in numbers])
-        named = [(numbers[i], numbers[j]) for i, j in pairs]
+        named = [(numbers[i], numbers[j]) for i, j in free_pairs([obstacles[number] for number in numbers])]
+        # a triangle mesh comes first, since it is in contact at its own points
+        named = [(j, i) if isinstance(obstacles[j].shape, TriangleMeshShape) else (i, j) for i, j in named]
         self._pairs = {
             (i, j): ObstaclePair.between(obstacles[i], obstacles[j])
             for i, j in named
@@ -353,22 +354,24 @@ class ObstaclePairs:
         """Energies and derivatives of contact by the poses of free obstacles.
 
         Returns:
-            Derivatives by the pose of each free obstacle in contact; the energy of a pair counts with its first one.
-            And mixed second derivatives of pairs of free ones.
+            Derivatives by the pose of each free obstacle in contact, where the energy of a pair counts once. And mixed
+            second derivatives of pairs of free ones.
         """
         bodies: dict[int, PoseDerivatives] = {}
         mixed: dict[Numbers, MixedHessian] = {}
         for (i, j), ((of_i, x), (of_j, y)) in self._contact_forces(posed).items():
             first, second = posed[i].pose, posed[j].pose
-            by_first = carried_point_derivatives(of_i, x, first) + pose_derivatives(of_j, y, first, None, first)
-            bodies[i] = bodies[i] + by_first if i in bodies else by_first
-            if j not in self._free:
-                continue
-            by_second = pose_derivatives(of_i, x, second, None, second) + carried_point_derivatives(of_j, y, second)
-            by_second = replace(by_second, energy=0.0)
-            bodies[j] = bodies[j] + by_second if j in bodies else by_second
-            sides = mixed_pose_hessian(of_i, x, first, second), mixed_pose_hessian(of_j, y, second, first)
-            mixed[i, j] = sides[0][0] + sides[1][0].T, sides[0][1] + sides[1][1].T
+            by_pose = {
+                i: carried_point_derivatives(of_i, x, first) + pose_derivatives(of_j, y, first, None, first),
+                j: pose_derivatives(of_i, x, second, None, second) + carried_point_derivatives(of_j, y, second),
+            }
+            free = [number for number in (i, j) if number in self._free]
+            if len(free) == 2:  # the energy counts once
+                by_pose[j] = replace(by_pose[j], energy=0.0)
+                sides = mixed_pose_hessian(of_i, x, first, second), mixed_pose_hessian(of_j, y, second, first)
+                mixed[i, j] = sides[0][0] + sides[1][0].T, sides[0][1] + sides[1][1].T
+            for number in free:
+                bodies[number] = bodies[number] + by_pose[number] if number in bodies else by_pose[number]
         return bodies, mixed
 
     def wrenches(self, posed: PosedObstacles) -> dict[int, Values]:
@@ -384,9 +387,10 @@ class ObstaclePairs:
         """Work of prescribed obstacles on free ones by their own increments (p,) in the step, J."""
         total = 0.0
         for (i, j), ((of_i, _), (of_j, _)) in self._contact_forces(posed).items():
-            if j not in self._free:
-                force = of_i.normal.sum(axis=0) - of_j.normal.sum(axis=0)
-                total += float(force @ increments[j][: posed[i].pose.dim])
+            on_first, d = of_i.normal.sum(axis=0) - of_j.normal.sum(axis=0), posed[i].pose.dim
+            for number, force in ((j, on_first), (i, -on_first)):
+                if number not in self._free:
+                    total += float(force @ increments[number][:d])
         return total
 
     def _contact_forces(self, posed: PosedObstacles) -> dict[Numbers, list[tuple[ContactForces, Values]]]:

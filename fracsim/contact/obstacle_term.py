@@ -10,7 +10,7 @@ Equations: docs/theory.md#contact.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -22,17 +22,24 @@ from petsc4py import PETSc
 
 from ..mechanics.extra_couplings import CouplingBuilder
 from ..mechanics.term import Term
-from ..mechanics.term_protocols import SurfaceData
 from ..mesh.domain import Domain
+from ..mesh.parallel import sum_over_ranks
 from ..mesh.split_surface.surface_map import SurfaceMap
 from ..meshes.data import AXES
 from .contact_state import ContactState
 from .contact_surface import retract_cut_elements, retract_from_obstacles
 from .laws import ObstacleLaw
 from .node_contact import ContactForces
-from .obstacle import RigidObstacle
-from .obstacle_tessellation import ObstacleTessellations
-from .pose import PosedShape, min_distance
+from .pose import min_distance
+from .pose_derivatives import (
+    PoseDerivatives,
+    contact_wrench,
+    point_pose_hessian,
+    pose_derivatives,
+    resultant,
+    sum_of_derivatives,
+)
+from .rigid_obstacles import RigidObstacles
 from .step_limit import safe_motion_fractions, stop_before_obstacles
 
 Values = npt.NDArray[np.float64]
@@ -59,15 +66,28 @@ EXACT_TANGENT = ExactTangentPolicy()
 
 
 class ObstacleTerm(ContactState, Term):
-    """Analytic obstacles, held or driven, that the body cannot penetrate."""
+    """Analytic obstacles that the body cannot penetrate (rigid_obstacles.ObstacleContactTerm)."""
 
     name = "obstacles"
+    allows_exact_tangent = True
 
-    def __init__(self, domain: Domain, u: fem.Function, obstacles: Sequence[RigidObstacle], law: ObstacleLaw) -> None:
-        """Raise InputError where the body at rest overlaps an obstacle (collective)."""
-        super().__init__(domain, u, obstacles, law)
+    def __init__(
+        self, domain: Domain, u: fem.Function, bodies: RigidObstacles, numbers: Sequence[int], law: ObstacleLaw
+    ) -> None:
+        """Build the term (collective).
+
+        Args:
+            domain: mesh.
+            u: displacement.
+            bodies: motion of all obstacles.
+            numbers: numbers of the analytic ones.
+            law: contact law.
+
+        Raises:
+            InputError: if the body at rest overlaps an obstacle.
+        """
+        super().__init__(domain, u, bodies, numbers, law)
         self._coupling = CouplingBuilder(domain)
-        self._drawings = ObstacleTessellations(obstacles, domain.bounds.lower, domain.bounds.upper)
         # of the last step: work of each obstacle, J, dissipation by friction, J, and forces on each, N
         self._obstacle_work, self._friction_loss = [0.0] * len(self.obstacles), 0.0
         self._force_readings: list[Values] | None = None  # None: no step yet
@@ -126,7 +146,7 @@ class ObstacleTerm(ContactState, Term):
             motion = self.comm.allreduce(self._max_motion(points), op=MPI.MAX)
             first = self._attempts <= 1
             limit = EXACT_TANGENT.first_attempt if first else EXACT_TANGENT.later_attempts
-            self._is_exact = bool(motion < limit * self.barrier_width) and self._may_be_exact()
+            self._is_exact = bool(motion < limit * self.barrier_width) and self.bodies.may_use_exact_tangent()
         return self._is_exact
 
     def _max_motion(self, points: Ints) -> float:
@@ -135,10 +155,6 @@ class ObstacleTerm(ContactState, Term):
             return np.inf
         motion = (self.positions - self._tangent_positions)[points]
         return float(np.linalg.norm(motion, axis=1).max(initial=0.0))
-
-    def _may_be_exact(self) -> bool:
-        """Whether the tangent may be exact near the solution (collective)."""
-        return True
 
     def begin_solve(self) -> None:
         """Count an attempt of Newton's method; after a failure tangents become exact later."""
@@ -164,17 +180,15 @@ class ObstacleTerm(ContactState, Term):
 
     def _normal_work(self, number: int) -> float:
         """Work of normal forces on the body by the motion of an obstacle in the step, this rank's share, J."""
-        end_weight, shift = (
-            self._level.contact_weights.end_work_share,
-            self._kinematics.increments[number][: self._domain.dim],
-        )
-        end_force = self.obstacle_forces()[number].normal.sum(axis=0)
-        force = end_weight * end_force + (1 - end_weight) * self._start_forces[number]
-        return float(force @ shift)
+        end_weight, q = self._level.contact_weights.end_work_share, self.increments[number]
+        contact, centre = self.obstacle_forces()[number], self.posed[number].pose.centre
+        end = float(resultant(contact.normal, self.positions[contact.points] - centre) @ q)
+        return end_weight * end + (1 - end_weight) * float(self._start_forces[number] @ q[: self._domain.dim])
 
     def step_work(self) -> tuple[float, float]:
-        """Work of the obstacles' own motion in the step, and dissipation by friction, this rank's share, J."""
-        return sum(self._obstacle_work[number] for number in self._kinematics.prescribed), self._friction_loss
+        """Work of prescribed obstacles in the step, and dissipation by friction, this rank's share, J."""
+        prescribed = [number for number, obstacle in enumerate(self.obstacles) if not obstacle.free]
+        return sum(self._obstacle_work[number] for number in prescribed), self._friction_loss
 
     # --- step limits ---
 
@@ -182,78 +196,121 @@ class ObstacleTerm(ContactState, Term):
         """Fraction of a change of u (owned dofs,), m, that leaves a tenth of every gap (collective)."""
         self.obstacle_forces()
         motion = self.surface.interpolation(np.divide(change, self._level.fraction))
-        moving = enumerate(zip(self._kinematics.posed, self._obstacle_increments(), strict=True))
-        by_obstacle = [
-            safe_motion_fractions(posed, self.positions, motion, q, self._facets_for(number), self._point_candidates)
-            for number, (posed, q) in moving
-        ]
+        increments = self.bodies.correction_increments()
+        by_obstacle = [self._fractions(number, motion, increments.get(n)) for number, n in enumerate(self.numbers)]
         fractions = [values[self.surface.area > 0] for values in by_obstacle]
         return float(min(values.min(initial=1.0) for values in fractions))
 
-    def _obstacle_increments(self) -> list[Values]:
-        """(p,) increments of the poses of obstacles in a correction of Newton's method."""
-        return [np.zeros_like(increment) for increment in self._kinematics.increments]
+    def _fractions(self, number: int, motion: Values, q: Values | None) -> Values:
+        """(n,) fractions of the motion (n, d) of points, m, and an increment (p,), None: none, that close no gap."""
+        if q is None:
+            q = np.zeros_like(self.increments[number])
+        facets = self._facets_for(number)
+        return safe_motion_fractions(self.posed[number], self.positions, motion, q, facets, self._point_candidates)
 
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) first guess of u, m, that crosses no obstacle on its way from the start (collective)."""
         level = self._level
         if not level.dt:
             return u
-        motions = self._kinematics.prescribed_motions(self._facets_for)
+        prescribed = self.bodies.prescribed_motions()
+        motions = [(*prescribed[n], self._facets_for(i)) for i, n in enumerate(self.numbers) if n in prescribed]
         end = stop_before_obstacles(self.surface, motions, level.u_n, level.displacement_at_end(u))
         return np.asarray(level.u_n + level.fraction * (end - level.u_n))
 
     def is_feasible(self, u: Values) -> bool:
         """Whether every gap is open with the body at u (collective)."""
         x = self.surface.positions(self._level.displacement_at_end(u))
-        return self.surface.gaps_are_open(min_distance(self._kinematics.posed, x)) and self._facets_are_open(x)
+        return self.surface.gaps_are_open(min_distance(self.posed, x)) and self._facets_are_open(x)
 
-    def restrict_motion(self) -> None:
-        """Hold obstacles where they would meet the body at the step's start (collective).
+    # --- contact of the body, as the obstacles see it (rigid_obstacles.ObstacleContactTerm) ---
 
-        A part that is jammed between an obstacle and something else cannot be moved along by a first guess.
-        """
-        self._kinematics.return_to_start()
-        self._advance_obstacles(self.surface.positions(self._level.u_n))
-
-    def remaining_motion(self) -> float:
-        """Fraction of the obstacles' motion that remains in the step."""
-        return self._kinematics.remaining_fraction
-
-    def continue_motion(self) -> None:
-        """Advance held obstacles as far as the body at the current u allows (collective)."""
-        self._tangent_positions = None
-        if self._kinematics.remaining_fraction:
-            self.obstacle_forces()
-            self._advance_obstacles(self.positions)
-
-    def _advance_obstacles(self, x: Values) -> None:
-        motions = self._kinematics.prescribed_motions(self._facets_for)
-        self._kinematics.advance(x, motions, self.surface.min_fraction)
+    def poses_moved(self) -> None:
+        """Discard forces, as obstacles have moved."""
         self.discard_forces()
+
+    def rest_fraction(self, increments: Mapping[int, Values], u: Values | None) -> float:
+        """Fraction of increments (p,) from current poses on which no gap to the body closes (collective).
+
+        `u`: (owned dofs,) displacement of the body at rest, m; None: the current one at the end of the step.
+        """
+        if u is None:
+            self.obstacle_forces()
+        x = self.positions if u is None else self.surface.positions(u)
+        fractions: list[Values] = [np.ones(len(x))]
+        for number, n in enumerate(self.numbers):
+            if n in increments:
+                facets = self._facets_for(number)
+                motion = np.zeros_like(x), increments[n], facets, self._point_candidates
+                fractions.append(safe_motion_fractions(self.posed[number], x, *motion))
+        return self.surface.min_fraction(np.min(fractions, axis=0))
+
+    def start_fraction(self, number: int, q: Values, u: Values) -> float:
+        """Fraction of an increment (p,) of an obstacle and the motion of the body that closes no gap (collective).
+
+        Both from the start of the step; `u`: (owned dofs,) displacement of the level after the motion, m.
+        """
+        level, index = self._level, self.numbers.index(number)
+        x = self.surface.positions(level.u_n)
+        motion = self.surface.positions(level.displacement_at_end(u)) - x
+        facets = self._facets_for(index)
+        return self.surface.min_fraction(
+            safe_motion_fractions(self.start_posed[index], x, motion, q, facets, self._point_candidates)
+        )
+
+    def wrenches(self, numbers: Sequence[int]) -> dict[int, Values]:
+        """(p,) force and moment of the body on obstacles, N and N m, of all ranks (collective)."""
+        if not numbers:
+            return {}
+        contacts = self.obstacle_forces()
+        local = [
+            contact_wrench(contacts[index], self.positions, self.posed[index].pose)
+            for index in map(self.numbers.index, numbers)
+        ]
+        return dict(zip(numbers, sum_over_ranks(self.comm, np.array(local)), strict=True))
+
+    def pose_derivatives(self, numbers: Sequence[int]) -> dict[int, PoseDerivatives]:
+        """Energy and derivatives by the poses of obstacles, of all ranks (collective)."""
+        if not numbers:
+            return {}
+        contacts, local = self.obstacle_forces(), []
+        for index in map(self.numbers.index, numbers):
+            pose, start = self.posed[index].pose, self.start_posed[index].pose
+            local.append(pose_derivatives(contacts[index], self.positions, pose, self._lagged[index], start))
+        return dict(zip(numbers, sum_of_derivatives(local, self.comm), strict=True))
+
+    def mixed_hessians(self, numbers: Sequence[int]) -> dict[int, Values]:
+        """(owned dofs, p) derivatives of minus the nodal forces by poses, of obstacles in contact (collective)."""
+        if not numbers:
+            return {}
+        contacts, exact, indices = self.obstacle_forces(), self.uses_exact_tangent(), map(self.numbers.index, numbers)
+        touching = sum_over_ranks(self.comm, np.array([len(contacts[index].points) for index in indices])) > 0
+        return {
+            number: self._mixed_hessian(self.numbers.index(number), exact=exact)
+            for number, touches in zip(numbers, touching, strict=True)
+            if touches
+        }
+
+    def _mixed_hessian(self, index: int, *, exact: bool) -> Values:
+        contact, pose, start = self.obstacle_forces()[index], self.posed[index].pose, self.start_posed[index].pose
+        by_pose = point_pose_hessian(contact, self.positions, pose, self._lagged[index], start, exact=exact)
+        return self.surface.interpolation.assemble_points_to_nodes(contact.points, by_pose)
 
     # --- fracture, and surfaces for output ---
 
-    def posed_obstacles(self, t: float) -> list[PosedShape]:
-        """Each obstacle at the time t of the state, s (not collective)."""
-        return [obstacle.posed_at(t) for obstacle in self.obstacles]
-
     def separate_surface(self, position: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
         """Retract points of a surface for output that would lie in an obstacle, as those of contact are."""
-        posed = self.posed_obstacles(t)
+        all_posed = self.bodies.posed_at(t)
+        posed = [all_posed[number] for number in self.numbers]
         position = retract_from_obstacles(position, u, partial(min_distance, posed))
         if not self._facet_obstacles:
             return position
         facets, curved = self.surface.facets_from(elements), [posed[number] for number in self._facet_obstacles]
         return retract_cut_elements(position, u, elements, lambda x: ~facets.are_open(curved, x))
 
-    def output_surfaces(self, t: float) -> dict[str, SurfaceData]:
-        """Tessellation of each obstacle at time t, s, by its name."""
-        return self._drawings(self.posed_obstacles(t))
-
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Add new crack faces to the surface, retracted where they would lie in an obstacle (collective)."""
-        posed = self._kinematics.posed
+        posed = self.posed
         gaps, facet_gaps = partial(min_distance, posed), self._facet_gap_function(posed)
         self.surface.edges_broke(pattern, self._end_displacement(), gaps, facet_gaps)
         self._discard_start()
@@ -310,7 +367,7 @@ class ObstacleTerm(ContactState, Term):
 
     def _gap(self, number: int) -> float:
         self.obstacle_forces()
-        posed = self._kinematics.posed[number]
+        posed = self.posed[number]
         point_gap = self.surface.min_distance(posed.distance(self.positions))
         if (facets := self._facets_for(number)) is None:
             return point_gap
@@ -329,10 +386,8 @@ class ObstacleTerm(ContactState, Term):
 
         It is that of the velocities at the start, without any contact; of this rank's points.
         """
-        motion, kinematics, result = self._dt * self.surface.interpolation(self._start_velocity), self._kinematics, []
-        for increment, posed, contact in zip(
-            kinematics.increments, kinematics.posed, self.obstacle_forces(), strict=True
-        ):
+        motion, result = self._dt * self.surface.interpolation(self._start_velocity), list[float]()
+        for increment, posed, contact in zip(self.increments, self.posed, self.obstacle_forces(), strict=True):
             # points with a normal force, not with friction alone
             pushed = contact.points[contact.normal.any(axis=1)]
             relative = increment[: self._domain.dim] - motion[pushed]

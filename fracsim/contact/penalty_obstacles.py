@@ -17,7 +17,7 @@ Equations: docs/theory.md#explicit-contact.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import cast
@@ -34,12 +34,10 @@ from ..mesh.split_surface.point_matching import match_points
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .laws import ObstacleLaw, tangential
 from .node_contact import ContactForces
-from .obstacle import FreeObstacle, RigidMotion, RigidObstacle
+from .obstacle import VerletObstacle
 from .obstacle_term import ObstacleTerm
-from .pose import PosedShape, min_distance, rotation_derivative
-from .pose_derivatives import contact_wrench
-from .rigid_body import solve_matrix
-from .rigid_obstacle_term import FreeObstacleBase
+from .pose import PosedShape, min_distance
+from .rigid_obstacles import RigidObstacles, VerletRigidObstacles
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -184,7 +182,8 @@ class PenaltyObstacleTerm(ObstacleTerm):
         self,
         domain: Domain,
         u: fem.Function,
-        obstacles: Sequence[RigidObstacle],
+        bodies: RigidObstacles,
+        numbers: Sequence[int],
         law: ObstacleLaw,
         mass: Values,
         max_added: float,
@@ -194,7 +193,8 @@ class PenaltyObstacleTerm(ObstacleTerm):
         Args:
             domain: mesh.
             u: displacement.
-            obstacles: obstacles.
+            bodies: motion of all obstacles.
+            numbers: numbers of the analytic ones.
             law: contact law with a penalty.
             mass: (owned dofs,) lumped, kg.
             max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
@@ -203,11 +203,11 @@ class PenaltyObstacleTerm(ObstacleTerm):
             InputError: if the body at rest overlaps an obstacle.
         """
         self._mass, self._max_added = mass, max_added
-        dim, count = domain.dim, len(obstacles)
+        dim, count = domain.dim, len(numbers)
         self._step_end = StepEnd([FrictionSprings.none(dim)] * count, [np.zeros(dim)] * count)
         self._start_points: Values | None = None  # (n, d) at the start of a step that is not accepted yet, m
         self._springs = self._step_end.springs
-        super().__init__(domain, u, obstacles, law)
+        super().__init__(domain, u, bodies, numbers, law)
         self._update_stiffness()
 
     def _find_facet_obstacles(self) -> list[int]:
@@ -225,13 +225,24 @@ class PenaltyObstacleTerm(ObstacleTerm):
         self._added_frequency, self._stiffness_of = mass_share.max_rate(self.stiffness), (point_map, area)
 
     def frequency_bound(self) -> float:
-        """Increase of the square of the highest frequency if all points were in contact, 1/s^2."""
-        return self._added_frequency
+        """Increase of the square of the highest frequency if all points were in contact, 1/s^2 (collective).
+
+        With that of the lightest free obstacle: the squares of a body and an obstacle on one spring add up.
+        """
+        free = cast("dict[int, VerletObstacle]", self.bodies.free)
+        return self._added_frequency + max(map(self._obstacle_frequency, free, free.values()), default=0.0)
+
+    def _obstacle_frequency(self, number: int, obstacle: VerletObstacle) -> float:
+        self.obstacle_forces()
+        posed = self.bodies.posed[number]
+        near = np.flatnonzero(posed.distance(self.positions) < PENALTY.near_gap * self.law.barrier.width)
+        stiffness = obstacle.spring_stiffness(self.positions[near], self.stiffness[near], posed)
+        return obstacle.max_frequency(sum_over_ranks(self.comm, stiffness.reshape(-1)).reshape(stiffness.shape), posed)
 
     # --- steps ---
 
     def _begin_new_step(self) -> None:
-        self.surface.release_points(self._level.u_n, partial(min_distance, self._kinematics.start_posed))
+        self.surface.release_points(self._level.u_n, partial(min_distance, self.start_posed))
         point_map, area = self._stiffness_of
         if self.comm.allreduce(point_map is not self.surface.point_map or area is not self.surface.area):
             self._update_stiffness()
@@ -244,20 +255,17 @@ class PenaltyObstacleTerm(ObstacleTerm):
         pressure = k * (law.width - gap)
         energy, friction = 0.5 * float(pressure @ (law.width - gap)), np.zeros_like(normal)
         if coefficient := self.obstacles[number].friction:
-            motion = self._relative_motion(number, posed)[points]
+            motion = self._relative_motion(number)[points]
             springs = self._step_end.springs[number].stretched(points, motion, normal, k, coefficient * pressure)
             self._springs[number], friction, energy = springs, springs.force, energy + springs.energy
         return ContactForces(points, energy, pressure[:, None] * normal, friction, 0.0, _no_tangent)
 
-    def _relative_motion(self, number: int, posed: PosedShape) -> Values:
+    def _relative_motion(self, number: int) -> Values:
         """(n, d) motion of the points relative to an obstacle in the step, m; zero once the step is accepted."""
         if self._start_points is None:
             return np.zeros_like(self.positions)
-        return np.asarray(self.positions - self._start_points - self._obstacle_point_motion(number, posed))
-
-    def _obstacle_point_motion(self, number: int, posed: PosedShape) -> Values:
-        """(d,) or (n, d) motion of an obstacle under the points in the step, m."""
-        return np.asarray(self._kinematics.increments[number][: self._domain.dim])
+        motion = self.bodies.point_motion(self.numbers[number], self._start_points)
+        return np.asarray(self.positions - self._start_points - motion)
 
     def obstacle_forces(self) -> list[ContactForces]:
         """Forces of each obstacle at the current u (collective)."""
@@ -270,14 +278,26 @@ class PenaltyObstacleTerm(ObstacleTerm):
         contacts, previous = self.obstacle_forces(), self._step_end
         forces = [(contact.normal + contact.friction).sum(axis=0) for contact in contacts]
         self._friction_loss, self._force_readings = 0.0, [-force for force in forces]
-        for number, (obstacle, posed) in enumerate(zip(self.obstacles, self._kinematics.posed, strict=True)):
+        for number, obstacle in enumerate(self.obstacles):
             if obstacle.friction:
-                motion = self._relative_motion(number, posed)
+                motion = self._relative_motion(number)
                 self._friction_loss += self._springs[number].dissipated(previous.springs[number], motion)
-        for number in self._kinematics.prescribed:
-            shift = self._kinematics.increments[number][: self._domain.dim]
+        for number in (number for number, obstacle in enumerate(self.obstacles) if not obstacle.free):
+            shift = self.increments[number][: self._domain.dim]
             self._obstacle_work[number] = float((forces[number] + previous.forces[number]) @ shift) / 2
         self._step_end, self._start_points = StepEnd(self._springs, forces), None
+
+    def work_columns(self) -> dict[str, Callable[[], float]]:
+        """work_NAME: work of each obstacle on the body in the last step, J; of a free one that of its momentum."""
+        columns, bodies = super().work_columns(), self.bodies
+        if isinstance(bodies, VerletRigidObstacles):
+            of_free = {f"work_{bodies.obstacles[n].name}": partial(self._work_of_free, n) for n in bodies.free}
+            columns |= of_free
+        return columns
+
+    def _work_of_free(self, number: int) -> float:
+        assert isinstance(self.bodies, VerletRigidObstacles)
+        return 0.0 if self.comm.rank else -self.bodies.contact_work(number)
 
     # --- state ---
 
@@ -355,143 +375,3 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
 def _no_tangent() -> tuple[Values, Values]:
     raise NotImplementedError("explicit steps ask for no tangent")
-
-
-# --- free obstacles ---
-
-
-class VerletObstacle:
-    """Free obstacle in explicit steps: velocity Verlet of its momentum.
-
-        p_{n+1/2} = p_n + dt/2 f_n,    z = dt M^-1 p_{n+1/2},    p_{n+1} = p_{n+1/2} + dt/2 f_{n+1}
-
-    p is the momentum of z, M the mass matrix at the middle of the step. Forces and moments are those on the points
-    themselves: body and obstacle exchange momentum to round-off, in steps of any size.
-
-    Attributes:
-        body: the obstacle.
-        motion: its state of motion at the start of a step, until that is accepted.
-        gravity_work: work of gravity in the last step, J.
-    """
-
-    gravity_work: float = 0.0
-
-    def __init__(self, body: FreeObstacle) -> None:
-        self.body, self.motion = body, body.start_motion()
-
-    def reset_pose(self) -> PosedShape:
-        """Pose of the state of motion."""
-        return PosedShape(self.body.shape, self.motion.pose)
-
-    def begin_step(self, dt: float) -> PosedShape:
-        """Begin a step of dt, s; returns the obstacle at the pose of its end."""
-        start, basis = self.motion.pose, self.body.motion_basis
-        self._dt, self._half_momentum = dt, self.motion.momentum + dt / 2 * self.motion.force
-        half = dt / 2 * solve_matrix(self.body.mass_matrix(start.rotation), self._half_momentum)
-        mass = self.body.mass_matrix(start.incremented(basis @ half).rotation)
-        self._increment: Values = np.asarray(basis @ (dt * solve_matrix(mass, self._half_momentum)))
-        return PosedShape(self.body.shape, start.incremented(self._increment))
-
-    def end_step(self, posed: PosedShape, wrench: Values) -> float:
-        """Accept the step; returns the work of contact on the obstacle, J.
-
-        Args:
-            posed: obstacle at the end.
-            wrench: (p,) force and moment of the body on it there, N and N m.
-        """
-        start, body, pose = self.motion, self.body, posed.pose
-        force = body.motion_basis.T @ (wrench - body.gravity_potential(pose)[1])
-        rotation = pose.rotation_vector() if pose.dim == 3 else start.rotation + self._increment[2:]
-        self.motion = RigidMotion(pose, self._half_momentum + self._dt / 2 * force, force, rotation)
-        self.gravity_work = body.gravity_potential(start.pose)[0] - body.gravity_potential(pose)[0]
-        change = float(body.history_values(self.motion)[-1] - body.history_values(start)[-1])
-        return change - self.gravity_work
-
-    def contact_point_motion(self, x: Values, posed: PosedShape) -> Values:
-        """(n, d) motion in the step of the obstacle's points that were at x (n, d) at its start, m."""
-        return posed.pose.points_to_space(self.motion.pose.to_body(x)) - x
-
-    def spring_stiffness(self, x: Values, k: Values, posed: PosedShape) -> Values:
-        """(k, k) stiffness by z of springs k (n,), N/m, in any direction at positions x (n, d), m."""
-        arm = x - posed.pose.centre
-        translation = np.broadcast_to(-np.eye(arm.shape[1]), (len(arm), arm.shape[1], arm.shape[1]))
-        J = np.concatenate([translation, rotation_derivative(arm)], axis=2) @ self.body.motion_basis
-        return np.asarray(np.einsum("n,nip,niq->pq", k, J, J))
-
-    def max_frequency(self, stiffness: Values, posed: PosedShape) -> float:
-        """Square of the highest frequency on springs of a stiffness (k, k), with the body at rest, 1/s^2."""
-        mass = self.body.mass_matrix(posed.pose.rotation)
-        return float(np.linalg.eigvals(solve_matrix(mass, stiffness)).real.max(initial=0.0))
-
-
-class PenaltyFreeObstacleTerm(FreeObstacleBase, PenaltyObstacleTerm):
-    """Obstacles, at least one of them free, in explicit steps; they are not in contact with one another."""
-
-    free: dict[int, VerletObstacle]
-
-    def __init__(
-        self,
-        domain: Domain,
-        u: fem.Function,
-        obstacles: Sequence[RigidObstacle],
-        law: ObstacleLaw,
-        mass: Values,
-        max_added: float,
-    ) -> None:
-        """As of PenaltyObstacleTerm (collective)."""
-        self.free = {
-            number: VerletObstacle(obstacle)
-            for number, obstacle in enumerate(obstacles)
-            if isinstance(obstacle, FreeObstacle)
-        }
-        super().__init__(domain, u, obstacles, law, mass, max_added)
-
-    def frequency_bound(self) -> float:
-        """Increase of the square of the highest frequency, with that of the lightest obstacle, 1/s^2 (collective).
-
-        The squares of a body and an obstacle on one spring add up.
-        """
-        self.obstacle_forces()
-        return super().frequency_bound() + max(self._obstacle_frequency(*item) for item in self.free.items())
-
-    def _obstacle_frequency(self, number: int, obstacle: VerletObstacle) -> float:
-        posed = self._kinematics.posed[number]
-        near = np.flatnonzero(posed.distance(self.positions) < PENALTY.near_gap * self.law.barrier.width)
-        stiffness = obstacle.spring_stiffness(self.positions[near], self.stiffness[near], posed)
-        return obstacle.max_frequency(sum_over_ranks(self.comm, stiffness.reshape(-1)).reshape(stiffness.shape), posed)
-
-    # --- steps ---
-
-    def _begin_new_step(self) -> None:
-        super()._begin_new_step()
-        for number, obstacle in self.free.items():
-            self._kinematics.posed[number] = obstacle.begin_step(self._level.dt)
-
-    def _obstacle_point_motion(self, number: int, posed: PosedShape) -> Values:
-        if number in self.free and self._start_points is not None:
-            return self.free[number].contact_point_motion(self._start_points, posed)
-        return super()._obstacle_point_motion(number, posed)
-
-    def accept_step(self) -> None:
-        """Sum the work of the step, and give free obstacles their momentum (collective)."""
-        super().accept_step()
-        for number, obstacle in self.free.items():
-            posed, contact = self._kinematics.posed[number], self.obstacle_forces()[number]
-            wrench = contact_wrench(contact, self.positions, posed.pose)
-            work = obstacle.end_step(posed, sum_over_ranks(self.comm, wrench))
-            self._obstacle_work[number] = 0.0 if self.comm.rank else -work
-
-    def step_work(self) -> tuple[float, float]:
-        """Work of the obstacles' own motion, and of gravity on free ones (on rank 0); dissipation by friction, J."""
-        work, dissipation = super().step_work()
-        by_gravity = 0.0 if self.comm.rank else sum(obstacle.gravity_work for obstacle in self.free.values())
-        return work + by_gravity, dissipation
-
-    # --- state ---
-
-    def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set the state from the arrays of a checkpoint."""
-        super().from_checkpoint(saved)
-        for number, obstacle in self.free.items():
-            self._kinematics.hold_at_start(number, obstacle.reset_pose())
-        self.update_displacement()

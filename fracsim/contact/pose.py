@@ -214,3 +214,8 @@ def _series(coefficients: list[float], w: Values) -> float:
 
 def _cross(w: Values) -> Values:
     return np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
+
+
+def solve_matrix(matrix: Values, values: Values) -> Values:
+    """A^-1 b of a matrix (k, k) and values (k,) or (k, m)."""
+    return np.asarray(np.linalg.solve(matrix, values), np.float64)

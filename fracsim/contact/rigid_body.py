@@ -25,7 +25,7 @@ import numpy.typing as npt
 from ..forms.schemes import Scheme
 from ..mechanics.contact_time_weights import acceleration_change
 from .obstacle import FreeObstacle, RigidMotion
-from .pose import Pose, left_jacobian, left_jacobian_derivative, rotation_derivative
+from .pose import Pose, left_jacobian, left_jacobian_derivative, rotation_derivative, solve_matrix
 from .pose_derivatives import PoseDerivatives
 
 Values = npt.NDArray[np.float64]
@@ -308,8 +308,3 @@ class RigidStep:
         if pose.dim == 2:
             return self.start.rotation + self.increment(z)[2:]
         return pose.rotation_vector()
-
-
-def solve_matrix(matrix: Values, values: Values) -> Values:
-    """A^-1 b of a matrix (k, k) and values (k,) or (k, m)."""
-    return np.asarray(np.linalg.solve(matrix, values), np.float64)

@@ -23,9 +23,9 @@ from ..mesh.parallel import sum_over_ranks
 from .node_contact import LaggedContact
 from .obstacle import FreeObstacle, RigidMotion
 from .obstacle_pairs import ObstaclePairs
-from .pose import PosedShape
+from .pose import PosedShape, solve_matrix
 from .pose_derivatives import PoseDerivatives
-from .rigid_body import SOLVER, RigidStep, RigidSystem, SystemDerivatives, is_positive_definite, solve_matrix
+from .rigid_body import SOLVER, RigidStep, RigidSystem, SystemDerivatives, is_positive_definite
 
 Values = npt.NDArray[np.float64]
 
@@ -52,11 +52,6 @@ class FreePose:
 
     # --- steps ---
 
-    def reset_pose(self) -> PosedShape:
-        """Return to the pose of the state of motion."""
-        self.posed = PosedShape(self.body.shape, self.motion.pose)
-        return self.posed
-
     def begin_step(self, step: RigidStep) -> None:
         """Begin a step, or begin it again, at its start."""
         if self._step_motion is not self.motion:
@@ -78,15 +73,10 @@ class FreePose:
         self._solution = self.z
         return self.step.end_motion(self.z, wrench)
 
-    @property
-    def start_posed(self) -> PosedShape:
-        """The obstacle at the start of the step."""
-        return PosedShape(self.body.shape, self.step.start.pose)
-
-    def contact_point_motion(self, lagged: LaggedContact, posed: PosedShape) -> Values:
-        """(k, d) motion in the step of the obstacle's points in lagged contact, m, with the obstacle at `posed`."""
+    def contact_point_motion(self, lagged: LaggedContact) -> Values:
+        """(k, d) motion in the step of the obstacle's points in lagged contact, m."""
         start = self.step.start.pose
-        return posed.pose.points_to_space(start.to_body(lagged.obstacle_point)) - lagged.obstacle_point
+        return self.posed.pose.points_to_space(start.to_body(lagged.obstacle_point)) - lagged.obstacle_point
 
     def first_guess(
         self, increments: Sequence[Values], safe_fraction: Callable[[Values], float]
@@ -122,10 +112,13 @@ class FreePose:
 
 
 class BodyContact(Protocol):
-    """Contact of the body with free obstacles, at the current u and poses."""
+    """Contact of the body with free obstacles, at the current u and poses.
 
-    def posed(self) -> Mapping[int, PosedShape] | Sequence[PosedShape]:
-        """All obstacles at their poses, by their numbers."""
+    Attributes:
+        posed: all obstacles at their poses, by their numbers.
+    """
+
+    posed: list[PosedShape]
 
     def pose_derivatives(self) -> Mapping[int, PoseDerivatives]:
         """Energy and derivatives by the poses of free obstacles, sums over all ranks (collective)."""
@@ -137,7 +130,7 @@ class BodyContact(Protocol):
         """Whether the tangent has negative eigenvalues of contact (collective)."""
 
     def free_fraction(self, increments: Mapping[int, Values]) -> float:
-        """Fraction of increments (p,) of free poses on which no gap to the body at rest closes (collective)."""
+        """Fraction of increments (p,) of free poses on which no gap closes, the body at rest (collective)."""
 
     def poses_moved(self) -> None:
         """Take over the poses of free obstacles, and discard forces (not collective)."""
@@ -234,7 +227,7 @@ class PoseUnknowns:
 
     def _contact(self) -> SystemDerivatives:
         """Derivatives of all contact at the current poses (collective)."""
-        of_body, (of_pairs, mixed) = self._body.pose_derivatives(), self.pairs.derivatives(self._body.posed())
+        of_body, (of_pairs, mixed) = self._body.pose_derivatives(), self.pairs.derivatives(self._body.posed)
         index = {number: row for row, number in enumerate(self.free)}
         return SystemDerivatives(
             [of_body[number] + of_pairs[number] if number in of_pairs else of_body[number] for number in self.free],
@@ -319,14 +312,7 @@ class PoseUnknowns:
         self.move_to(z)
         items = zip(self.free.items(), z, dz, strict=True)
         increments = {number: pose.step.pose_change(z_i, dz_i) for (number, pose), z_i, dz_i in items}
-        return min(self._body.free_fraction(increments), self.fraction_between_obstacles(increments))
-
-    def fraction_between_obstacles(self, increments: Mapping[int, Values]) -> float:
-        """Fraction of increments (p,) of free poses on which no gap between obstacles closes, the others at rest."""
-        posed = self._body.posed()
-        numbers = posed.keys() if isinstance(posed, Mapping) else range(len(posed))
-        at_rest = np.zeros_like(next(iter(increments.values())))
-        return self.pairs.safe_fraction({n: (posed[n], increments.get(n, at_rest)) for n in numbers})
+        return self._body.free_fraction(increments)
 
     # --- energies ---
 
@@ -337,6 +323,6 @@ class PoseUnknowns:
     def gravity_work(self) -> float:
         """Work of gravity in the step, J."""
         return sum(
-            pose.body.gravity_potential(pose.start_posed.pose)[0] - pose.body.gravity_potential(pose.posed.pose)[0]
+            pose.body.gravity_potential(pose.step.start.pose)[0] - pose.body.gravity_potential(pose.posed.pose)[0]
             for pose in self.free.values()
         )

@@ -9,7 +9,7 @@ Equations: docs/theory.md#contact.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -40,12 +40,12 @@ class SelfContact(Term):
 
     Attributes:
         law: contact law.
-        exact_near_solution: whether tangents are exact near the solution.
+        allows_exact_tangent: whether tangents are exact near the solution.
     """
 
     name = "contact"
     leaves_tangent_incomplete = True
-    exact_near_solution: ClassVar[bool] = True
+    allows_exact_tangent: bool = True
     _attempts = 0  # of Newton's method in the step
     _cuts: CutPositions | None = None
 
@@ -147,6 +147,8 @@ class SelfContact(Term):
         """Set the state from the arrays of a checkpoint."""
         self._set_stiffness(float(saved["stiffness"][0]))
         if self._surface is not None:
+            if len(saved["share"]) != len(self._surface.point_map.share):
+                raise ValueError(f"{len(saved['share'])} points of the contact surface instead of those of its damage")
             pause, remaining = (int(number) for number in saved.get("pause", (1, 1)))
             self._surface.restore((saved["share"], saved["left_out"].astype(np.int64), (pause, remaining)))
 
@@ -232,7 +234,7 @@ class SelfContact(Term):
             assert self._surface is not None and x is not None
             is_near = self._surface.is_near_tangent(x, self._tangent_positions, again=self._attempts > 1)
             self._tangent_positions = x
-            exact = is_near and self.exact_near_solution
+            exact = is_near and self.allows_exact_tangent
             H = self._surface.pairs.hessian(x, exact=exact)
             if self._friction is not None:
                 H = (H + self._friction.hessian(x, exact=exact)).tocsr()

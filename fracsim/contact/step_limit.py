@@ -9,7 +9,7 @@ Equations: docs/theory.md#step-limits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -312,9 +312,9 @@ def _corrections(area: Values, motions: Sequence[ObstacleMotion], x: Values, mot
     return correction, stopped
 
 
-def check_obstacles_apart(comm: MPI.Intracomm, x: Values, obstacles: tuple[RigidObstacle, ...]) -> None:
+def check_obstacles_apart(comm: MPI.Intracomm, x: Values, obstacles: Mapping[int, RigidObstacle]) -> None:
     """Raise InputError where a point x (n, d) of the body lies in an obstacle before the first step (collective)."""
-    for number, obstacle in enumerate(obstacles):
+    for number, obstacle in obstacles.items():
         refuse_overlap(comm, obstacle.posed_at(0.0).distance(x), number, obstacle)
 
 
@@ -329,82 +329,3 @@ def refuse_overlap(comm: MPI.Intracomm, gaps: Values, number: int, obstacle: Rig
 
 
 type PoseMotion = tuple[PosedShape, Values]  # an obstacle at its start, and the increment (p,) of its pose
-
-
-class ObstacleKinematics:
-    """Poses and motions of obstacles in a step.
-
-    Attributes:
-        posed: obstacles at their current poses.
-        start_posed: obstacles at the start of the step.
-        increments: (p,) increment of each pose in the step.
-        prescribed: numbers of obstacles with a prescribed motion.
-    """
-
-    posed: list[PosedShape]
-    start_posed: list[PosedShape]
-    increments: list[Values]
-
-    def __init__(self, obstacles: Sequence[RigidObstacle], prescribed: list[int]) -> None:
-        self._obstacles, self.prescribed = obstacles, prescribed
-        self._travelled = 1.0  # fraction of their motion
-
-    def begin_step(self, start: float, end: float) -> None:
-        """Begin a step between these times, s, or an evaluation of a state at `end`."""
-        self.posed = [obstacle.posed_at(end) for obstacle in self._obstacles]
-        self.start_posed = [obstacle.posed_at(start) for obstacle in self._obstacles]
-        self.increments = [obstacle.pose_increment(start, end) for obstacle in self._obstacles]
-        self._travelled = 1.0
-
-    def hold_at_start(self, number: int, posed: PosedShape) -> None:
-        """Place an obstacle whose motion is not known yet where it began."""
-        self.posed[number] = self.start_posed[number] = posed
-
-    def prescribed_motions(self, facets: Callable[[int], ContactFacets | None]) -> list[ObstacleMotion]:
-        """Full motions of the prescribed obstacles; `facets`: number -> facets on which an obstacle acts."""
-        return [(self.start_posed[number], self.increments[number], facets(number)) for number in self.prescribed]
-
-    def return_to_start(self) -> None:
-        """Move the prescribed obstacles back to the start."""
-        self._travelled = 0.0
-
-    @property
-    def remaining_fraction(self) -> float:
-        """Fraction of the motion of prescribed obstacles that remains."""
-        return 1 - self._travelled
-
-    def full_motions(self) -> dict[int, PoseMotion]:
-        """Full motion of each prescribed obstacle, by its number."""
-        return {number: (self.start_posed[number], self.increments[number]) for number in self.prescribed}
-
-    def remaining_motions(self) -> dict[int, PoseMotion]:
-        """Remaining motion of each prescribed obstacle, by its number."""
-        return {
-            number: (self._posed_after(*motion), (1 - self._travelled) * motion[1])
-            for number, motion in self.full_motions().items()
-        }
-
-    def advance(
-        self, x: Values, motions: list[ObstacleMotion], minimum: Callable[[Values], float], limit: float = 1.0
-    ) -> None:
-        """Advance the prescribed obstacles as far as is safe (collective).
-
-        Args:
-            x: (n, d) points, which rest, m.
-            motions: full motions (`prescribed_motions`).
-            minimum: minimum of fractions (n,) over all ranks.
-            limit: largest fraction of the remaining motion.
-        """
-        remaining, no_motion = 1 - self._travelled, np.zeros_like(x)
-        fractions = [
-            safe_motion_fractions(self._posed_after(posed, q), x, no_motion, remaining * q, facets)
-            for posed, q, facets in motions
-        ]
-        fraction = min(minimum(np.min(fractions, axis=0)) if fractions else 1.0, limit)
-        self._travelled = 1.0 if fraction == 1 else self._travelled + fraction * remaining
-        for number, (posed, q, _) in zip(self.prescribed, motions, strict=True):
-            self.posed[number] = self._posed_after(posed, q)
-
-    def _posed_after(self, posed: PosedShape, increment: Values) -> PosedShape:
-        """Current pose of an obstacle that was at `posed` at the start."""
-        return PosedShape(posed.shape, posed.pose.incremented(self._travelled * increment))

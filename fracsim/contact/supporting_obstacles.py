@@ -84,27 +84,50 @@ def build_inactive_at_rest[Term: ObstacleTerm](
     return term
 
 
-def offset_from_meshes(
-    analytic: dict[int, RigidObstacle], free: Sequence[RigidObstacle], width: float, edge: float
-) -> dict[int, RigidObstacle]:
-    """Obstacles moved back so that barriers do not act between them and free triangle meshes at rest.
+def pair_obstacles(obstacles: Sequence[RigidObstacle], width: float, edge: float) -> dict[int, RigidObstacle]:
+    """Obstacles as they are in contact with one another, by their numbers.
+
+    Triangle meshes have triangles as small as those of the body. Prescribed analytic obstacles are moved back so that
+    barriers do not act between them and free triangle meshes at rest.
 
     Args:
-        others: obstacles by their numbers.
-        free: free triangle meshes.
+        obstacles: by their numbers.
         width: of the barrier, m.
         edge: length to which triangles are refined, m.
     """
-    x, moved = [], {}
-    for obstacle in free:
-        assert isinstance(obstacle.shape, TriangleMeshShape)
-        points, _ = refine_triangles(obstacle.shape.points, obstacle.shape.triangles, edge)
-        x.append(obstacle.posed_at(0.0).pose.points_to_space(points))
-    for number, obstacle in analytic.items():
-        gap = min(float(obstacle.posed_at(0.0).distance(points).min()) for points in x)
-        offset = min(max(SET_DOWN.clearance * width - gap, 0.0), _max_offset(obstacle.shape))
-        moved[number] = offset_obstacle(obstacle, offset if gap >= 0 else 0.0)
-    return moved
+    result = {number: _with_small_triangles(obstacle, edge) for number, obstacle in enumerate(obstacles)}
+    free_meshes = [
+        obstacle for obstacle in result.values() if obstacle.free and isinstance(obstacle.shape, TriangleMeshShape)
+    ]
+    x = [obstacle.posed_at(0.0).pose.points_to_space(_points(obstacle.shape)) for obstacle in free_meshes]
+    for number, obstacle in result.items():
+        if x and not obstacle.free and not isinstance(obstacle.shape, TriangleMeshShape):
+            gap = min(float(obstacle.posed_at(0.0).distance(points).min()) for points in x)
+            offset = min(max(SET_DOWN.clearance * width - gap, 0.0), _max_offset(obstacle.shape))
+            if gap >= 0 and offset:
+                result[number] = replace(obstacle, shape=_offset_shape(obstacle.shape, offset))
+    return result
+
+
+def _offset_shape(shape: Shape, offset: float) -> Shape:
+    """Shape with its surface moved back by `offset`, m, about the same reference point."""
+    if isinstance(shape, HalfSpace):
+        return TranslatedShape(shape, -offset * shape.normal(np.zeros((1, shape.dim)))[0])
+    if isinstance(shape, TranslatedShape):
+        return TranslatedShape(_inset(shape.shape, offset), shape.offset)
+    return _inset(shape, offset)
+
+
+def _with_small_triangles(obstacle: RigidObstacle, edge: float) -> RigidObstacle:
+    """Obstacle whose triangles, if it is a triangle mesh, have edges of at most `edge`, m."""
+    if not isinstance(shape := obstacle.shape, TriangleMeshShape):
+        return obstacle
+    return replace(obstacle, shape=TriangleMeshShape(*refine_triangles(shape.points, shape.triangles, edge)))
+
+
+def _points(shape: Shape) -> Values:
+    assert isinstance(shape, TriangleMeshShape)
+    return shape.points
 
 
 def offset_obstacle(obstacle: RigidObstacle, offset: float) -> RigidObstacle:
@@ -115,9 +138,7 @@ def offset_obstacle(obstacle: RigidObstacle, offset: float) -> RigidObstacle:
     if isinstance(shape, HalfSpace):
         normal = shape.normal(obstacle.start_point[None])[0]
         return replace(obstacle, start_point=obstacle.start_point - offset * normal)
-    if isinstance(shape, TranslatedShape):
-        return replace(obstacle, shape=TranslatedShape(_inset(shape.shape, offset), shape.offset))
-    return replace(obstacle, shape=_inset(shape, offset))
+    return replace(obstacle, shape=_offset_shape(shape, offset))
 
 
 def _inset(shape: Shape, offset: float) -> Shape:

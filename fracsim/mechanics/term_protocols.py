@@ -66,19 +66,29 @@ class ContactTerm(StepLimiter, Protocol):
     def begin_solve(self) -> None:
         """Begin an attempt of Newton's method at the step."""
 
-    def feasible_guess(self, u: Values) -> Values:
-        """(owned dofs,) an initial guess u, m, moved to where no gap is closed, as far as possible (collective)."""
-
     def clear_search(self) -> None:
         """Clear caches of the contact search and initial guesses: what a checkpoint does not have (collective)."""
 
 
 @runtime_checkable
-class PrescribedContact(Protocol):
-    """Contact with bodies in prescribed motion, which can be restricted to a part of it during a solve."""
+class InitialGuess(Protocol):
+    """Term that moves an initial guess to where no gap is closed."""
+
+    def feasible_guess(self, u: Values) -> Values:
+        """(owned dofs,) an initial guess u, m, moved to where no gap is closed, as far as possible (collective)."""
+
+
+@runtime_checkable
+class FeasibilityTest(Protocol):
+    """Term with gaps to bodies in prescribed motion."""
 
     def is_feasible(self, u: Values) -> bool:
         """Whether all gaps are open at u (owned dofs,), m, so that Newton's method may start there (collective)."""
+
+
+@runtime_checkable
+class RestrictedMotion(Protocol):
+    """Bodies in prescribed motion, which can be restricted to a part of it during a solve."""
 
     def restrict_motion(self) -> None:
         """Restrict the prescribed motion to what the body at the start of the step allows (collective)."""
@@ -217,7 +227,9 @@ class ContactTerms:
         self._comm = comm
         self._limiters = [term for term in terms if isinstance(term, StepLimiter)]
         self._contacts = [term for term in terms if isinstance(term, ContactTerm)]
-        self._prescribed = [term for term in terms if isinstance(term, PrescribedContact)]
+        self._guessing = [term for term in terms if isinstance(term, InitialGuess)]
+        self._tests = [term for term in terms if isinstance(term, FeasibilityTest)]
+        self._prescribed = [term for term in terms if isinstance(term, RestrictedMotion)]
         self._crack_faces = [term for term in terms if isinstance(term, CrackFaceContact)]
         self.limits_newton_steps = bool(self._limiters)
 
@@ -251,10 +263,10 @@ class ContactTerms:
             u: (owned dofs,) initial guess with prescribed dofs at their values, m.
             u_n: (owned dofs,) displacement at the start of the step, m.
         """
-        for term in self._contacts:
+        for term in self._guessing:
             u = term.feasible_guess(u)
         # all are asked, since the question is collective
-        if all([term.is_feasible(u) for term in self._prescribed]):
+        if all([term.is_feasible(u) for term in self._tests]):
             return u
         for contact in self._prescribed:
             contact.restrict_motion()

@@ -13,7 +13,7 @@ from ..contact.obstacle_tessellation import min_extent
 from ..timestepping.state import State
 
 if TYPE_CHECKING:
-    from ..contact.obstacle_term import ObstacleTerm
+    from ..contact.rigid_obstacles import RigidObstacles
 
 
 class ObstacleContact(Protocol):
@@ -143,18 +143,18 @@ class ObstacleOverlapMonitor:
         deepest_overlap: time in s, depth in m, and names of the two obstacles; empty if there was no overlap.
     """
 
-    def __init__(self, contact: ObstacleTerm) -> None:
-        """Start without any frame; `contact` is the contact term of the obstacles."""
-        self._contact, self._pairs = contact, free_pairs(contact.obstacles)
+    def __init__(self, motion: RigidObstacles) -> None:
+        """Start without any frame; `motion` of the obstacles."""
+        self._motion, self._pairs = motion, free_pairs(motion.obstacles)
         self.deepest_overlap: dict[str, Any] = {}
 
     def record_frame(self, t: float) -> None:
         """Record the poses of the obstacles at time t in s (not collective)."""
         if not self._pairs:
             return
-        for first, second, depth in find_overlaps(self._contact.posed_obstacles(t), self._pairs):
+        for first, second, depth in find_overlaps(self._motion.posed_at(t), self._pairs):
             if depth > self.deepest_overlap.get("depth", 0.0):
-                names = [self._contact.obstacles[number].name for number in (first, second)]
+                names = [self._motion.obstacles[number].name for number in (first, second)]
                 self.deepest_overlap = {"time": t, "depth": depth, "both": names}
 
     def to_checkpoint(self) -> dict[str, Any]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,6 +16,7 @@ from mpi4py import MPI
 from ..contact.laws import Barrier, ObstacleLaw
 from ..contact.obstacle import RigidObstacle
 from ..contact.obstacle_term import ObstacleTerm
+from ..contact.rigid_obstacles import RigidObstacles
 from ..contact.shapes import Shape
 from ..contact.supporting_obstacles import build_inactive_at_rest
 from ..errors import InputError
@@ -32,7 +33,6 @@ from ..study.overlap_checks import build_shape
 
 if TYPE_CHECKING:
     from ..contact.laws import Penalty
-    from ..contact.penalty_obstacles import PenaltyObstacleTerm
     from ..contact.triangle_mesh_shape import TriangleMeshShape
 
 Values = npt.NDArray[np.float64]
@@ -69,43 +69,73 @@ class ContactDefaults:
 DEFAULTS = ContactDefaults()
 
 
-# --- obstacles that are described by their distance ---
+# --- obstacles ---
 
 
-def build_obstacle_term(
-    study: Study, domain: Domain, u: fem.Function, material: MaterialFields, scheme: Scheme
-) -> ObstacleTerm:
-    """Return the term of all obstacles but those from files (collective).
+def build_obstacle_terms(
+    study: Study, domain: Domain, u: fem.Function, stress: Stress, mass: Values, scheme: Scheme
+) -> list[Term]:
+    """Return terms of contact with all obstacles, and that of their motion (collective).
 
-    Raises InputError if one overlaps the body at the start.
+    `mass`: (owned dofs,) lumped, kg. Raises InputError if an obstacle overlaps the body, or a free one another.
     """
-    obstacles, law = build_shape_obstacles(study, domain.dim), _obstacle_law(_contact(study), domain, material)
+    placements, contact = obstacle_placements(study, domain.dim), _contact(study)
+    obstacles = [
+        _read_obstacle(domain.comm, entry, number) if entry.shape == "mesh" else _build_obstacle(entry, number)
+        for number, entry in enumerate(placements)
+    ]
+    meshes = [number for number, entry in enumerate(placements) if entry.shape == "mesh"]
+    analytic = [number for number in range(len(obstacles)) if number not in meshes]
+    barrier: type[Barrier | Penalty] = Barrier
+    make_term: Callable[..., ObstacleTerm] = ObstacleTerm
+    if not scheme.implicit:
+        from ..contact.laws import Penalty
+        from ..contact.penalty_obstacles import PenaltyObstacleTerm
+
+        limit = _max_added_frequency(contact, domain, stress)
+        barrier, make_term = Penalty, partial(PenaltyObstacleTerm, mass=mass, max_added=limit)
+    law = _obstacle_law(contact, domain, stress.material, barrier)
+
+    def make(moved: Sequence[RigidObstacle], law: ObstacleLaw) -> ObstacleTerm:
+        placed = list(obstacles)
+        for number, obstacle in zip(analytic, moved, strict=True):
+            placed[number] = obstacle
+        return make_term(domain, u, _build_motion(domain, placed, scheme, law), analytic, law)
+
+    terms: list[Any] = []
+    if analytic:
+        shapes = [obstacles[number] for number in analytic]
+        mutual = scheme.implicit and any(obstacle.free for obstacle in shapes)
+        terms = [build_inactive_at_rest(domain, shapes, law, make, mutual=mutual)]
+    motion = terms[0].bodies if terms else _build_motion(domain, obstacles, scheme, law)
+    if meshes:
+        terms.append(_build_mesh_obstacle_term(study, domain, u, motion, meshes, law, stress.material))
+    for term in terms:
+        motion.add_contact(term)
+    return [*terms, motion]
+
+
+def _build_motion(
+    domain: Domain, obstacles: Sequence[RigidObstacle], scheme: Scheme, law: ObstacleLaw
+) -> RigidObstacles:
+    """Return the motion of obstacles. Raises InputError if a free one overlaps another at the start."""
     if not any(obstacle.free for obstacle in obstacles):
-        return build_inactive_at_rest(domain, obstacles, law, partial(ObstacleTerm, domain, u), mutual=False)
-    from ..contact.rigid_obstacle_term import FreeObstacleTerm
+        return RigidObstacles(domain, obstacles)
+    from ..contact.obstacle import check_free_obstacles
+    from ..contact.triangle_mesh_shape import TriangleMeshShape
 
-    make = partial(FreeObstacleTerm, domain, u, scheme=scheme)
-    return build_inactive_at_rest(domain, obstacles, law, make, mutual=True)
+    numbered = dict(enumerate(obstacles))
+    is_mesh = {number: isinstance(obstacle.shape, TriangleMeshShape) for number, obstacle in numbered.items()}
+    check_free_obstacles({number: obstacle for number, obstacle in numbered.items() if not is_mesh[number]})
+    if not scheme.implicit:
+        from ..contact.rigid_obstacles import VerletRigidObstacles
 
+        return VerletRigidObstacles(domain, obstacles)
+    from ..contact.rigid_obstacles import FreeRigidObstacles
+    from ..contact.supporting_obstacles import pair_obstacles
 
-def build_explicit_obstacle_term(
-    study: Study, domain: Domain, u: fem.Function, stress: Stress, mass: Values
-) -> PenaltyObstacleTerm:
-    """Return the term of the same obstacles for explicit steps (collective); `mass`: (owned dofs,) lumped, kg."""
-    from ..contact.laws import Penalty
-    from ..contact.penalty_obstacles import PenaltyObstacleTerm
-
-    obstacles = build_shape_obstacles(study, domain.dim)
-    contact = _contact(study)
-    law = _obstacle_law(contact, domain, stress.material, Penalty)
-    limit = _max_added_frequency(contact, domain, stress)
-    term_type = PenaltyObstacleTerm
-    if any(obstacle.free for obstacle in obstacles):
-        from ..contact.penalty_obstacles import PenaltyFreeObstacleTerm
-
-        term_type = PenaltyFreeObstacleTerm
-    make = partial(term_type, domain, u, mass=mass, max_added=limit)
-    return build_inactive_at_rest(domain, obstacles, law, make, mutual=False)
+    pairs = pair_obstacles(obstacles, law.barrier.width, domain.mean_edge_length)
+    return FreeRigidObstacles(domain, obstacles, scheme, law.barrier, pairs)
 
 
 def _max_added_frequency(contact: ContactSettings, domain: Domain, stress: Stress) -> float:
@@ -116,15 +146,6 @@ def _max_added_frequency(contact: ContactSettings, domain: Domain, stress: Stres
         return float("inf")
     highest = float(np.max(cell_frequencies(stress), initial=0.0))
     return float(DEFAULTS.added_frequency * domain.comm.allreduce(highest, op=MPI.MAX))
-
-
-def build_shape_obstacles(study: Study, dim: int) -> list[RigidObstacle]:
-    """Return all obstacles but those from files.
-
-    Raises InputError if a shape is impossible or does not fit the dimension.
-    """
-    entries = enumerate(obstacle_placements(study, dim))
-    return [_build_obstacle(entry, number) for number, entry in entries if entry.shape != "mesh"]
 
 
 def build_rigid_obstacles(study: Study) -> list[RigidObstacle]:
@@ -162,10 +183,16 @@ def _build_free_obstacle(entry: ObstaclePlacement, motion: FreeObstacleMotion, s
 # --- obstacles from files ---
 
 
-def build_mesh_obstacle_term(
-    study: Study, domain: Domain, u: fem.Function, material: MaterialFields, scheme: Scheme
+def _build_mesh_obstacle_term(
+    study: Study,
+    domain: Domain,
+    u: fem.Function,
+    motion: RigidObstacles,
+    numbers: list[int],
+    obstacle_law: ObstacleLaw,
+    material: MaterialFields,
 ) -> Term:
-    """Return the term of the obstacles from files (collective).
+    """Return the term of contact with obstacles from files (collective).
 
     Raises InputError if one overlaps the body at the start, or without ipctk.
     """
@@ -176,36 +203,14 @@ def build_mesh_obstacle_term(
         raise InputError(
             'an obstacle of shape = "mesh" needs ipctk, which this environment lacks: pip install fracsim[contact]'
         ) from None
-    placements = obstacle_placements(study, domain.dim)
-    obstacles = {
-        number: _read_obstacle(domain.comm, entry, number)
-        for number, entry in enumerate(placements)
-        if entry.shape == "mesh"
-    }
     contact = _contact(study)
-    obstacle_law = _obstacle_law(contact, domain, material)
     stiffness = contact.stiffness or DEFAULTS.self_stiffness * _max_young(domain, material)
-    creep_ratio = 0.0 if contact.creep else DEFAULTS.creep_ratio
     law = ipc_surface.SelfContactLaw(
-        obstacle_law.barrier.width, stiffness, 0.0, obstacle_law.sticking_speed, creep_ratio,
-        corners_only=_uses_corners_only(study),
+        _obstacle_law(contact, domain, material).barrier.width, stiffness, 0.0, obstacle_law.sticking_speed,
+        obstacle_law.sticking_ratio, corners_only=_uses_corners_only(study),
     )  # fmt: skip
-    between = "an obstacle from a file and the body"
-    if not any(obstacle.free for obstacle in obstacles.values()):
-        return _fit_distance(partial(MeshObstacleTerm, domain, u, obstacles), law, contact, between)
-    from ..contact.mesh_rigid_term import FreeMeshTerm
-    from ..contact.supporting_obstacles import offset_from_meshes
-
-    free = [obstacle for obstacle in obstacles.values() if obstacle.free]
-    prescribed = {
-        number: _build_obstacle(entry, number)
-        for number, entry in enumerate(placements)
-        if entry.shape != "mesh" and entry.free_motion is None
-    }
-    barrier = cast("Barrier", obstacle_law.barrier)
-    offset = offset_from_meshes(prescribed, free, barrier.width, domain.mean_edge_length)
-    make = partial(FreeMeshTerm, domain, u, obstacles, scheme=scheme, analytic=offset, barrier=barrier)
-    return _fit_distance(make, law, contact, between)
+    make = partial(MeshObstacleTerm, domain, u, motion, numbers)
+    return _fit_distance(make, law, contact, "an obstacle from a file and the body")
 
 
 def _read_obstacle(comm: MPI.Intracomm, entry: ObstaclePlacement, number: int) -> RigidObstacle:

@@ -110,31 +110,31 @@ class TermInputs:
         return [(numbers, condition.function) for numbers, condition in zip(facets, conditions, strict=True)]
 
 
-def _viscosity(inputs: TermInputs) -> Term | None:
+def _viscosity(inputs: TermInputs) -> list[Term]:
     damping = inputs.study.damping
     if damping is None or not damping.stiffness:
-        return None
+        return []
     from ..mechanics.damping import Viscosity
 
-    return Viscosity(inputs.assembler, inputs.u, inputs.stress, damping.stiffness)
+    return [Viscosity(inputs.assembler, inputs.u, inputs.stress, damping.stiffness)]
 
 
-def _pressure(inputs: TermInputs) -> Term | None:
+def _pressure(inputs: TermInputs) -> list[Term]:
     pressures = inputs.on_facets("pressure")
     linear = inputs.stress.material.energy.linear
-    return Pressure(inputs.assembler, inputs.u, pressures, linear=linear) if pressures else None
+    return [Pressure(inputs.assembler, inputs.u, pressures, linear=linear)] if pressures else []
 
 
-def _dead_loads(inputs: TermInputs) -> Term | None:
+def _dead_loads(inputs: TermInputs) -> list[Term]:
     tractions, on_volume = (
         [*inputs.on_facets("traction"), *_force_tractions(inputs)],
         volume_loads(inputs.study, inputs.domain.dim),
     )
     if not tractions and not on_volume:
-        return None
+        return []
     gravity = (inputs.density, on_volume["gravity"]) if "gravity" in on_volume else None
     body_force = on_volume.get("body_force")
-    return DeadLoads(inputs.assembler, inputs.u, tractions=tractions, gravity=gravity, body_force=body_force)
+    return [DeadLoads(inputs.assembler, inputs.u, tractions=tractions, gravity=gravity, body_force=body_force)]
 
 
 def _force_tractions(inputs: TermInputs) -> list[OnFacets]:
@@ -149,67 +149,55 @@ def _force_per_area(force: TimeFunction, area: float) -> TimeFunction:
     return lambda t: np.asarray(force(t) / area)
 
 
-def _obstacles(inputs: TermInputs) -> Term | None:
-    if all(obstacle.shape == "mesh" for obstacle in inputs.study.obstacle):
-        return None
-    from .contact_terms import build_explicit_obstacle_term, build_obstacle_term
+def _obstacles(inputs: TermInputs) -> list[Term]:
+    if not inputs.study.obstacle:
+        return []
+    from .contact_terms import build_obstacle_terms
 
-    if not inputs.scheme.implicit:
-        return build_explicit_obstacle_term(inputs.study, inputs.domain, inputs.u, inputs.stress, inputs.mass.lumped)
-    return build_obstacle_term(inputs.study, inputs.domain, inputs.u, inputs.stress.material, inputs.scheme)
+    return build_obstacle_terms(inputs.study, inputs.domain, inputs.u, inputs.stress, inputs.mass.lumped, inputs.scheme)
 
 
-def _mesh_obstacles(inputs: TermInputs) -> Term | None:
-    if not any(obstacle.shape == "mesh" for obstacle in inputs.study.obstacle):
-        return None
-    from .contact_terms import build_mesh_obstacle_term
-
-    return build_mesh_obstacle_term(inputs.study, inputs.domain, inputs.u, inputs.stress.material, inputs.scheme)
-
-
-def _contact(inputs: TermInputs) -> Term | None:
+def _contact(inputs: TermInputs) -> list[Term]:
     if inputs.study.contact is None or not inputs.study.contact.itself:
-        return None
+        return []
     from .contact_terms import build_explicit_self_contact_term, build_self_contact_term
 
     if not inputs.scheme.implicit:
-        return build_explicit_self_contact_term(
-            inputs.study, inputs.domain, inputs.u, inputs.stress, inputs.mass.lumped
-        )
-    return build_self_contact_term(inputs.study, inputs.domain, inputs.u, inputs.stress.material)
+        mass = inputs.mass.lumped
+        return [build_explicit_self_contact_term(inputs.study, inputs.domain, inputs.u, inputs.stress, mass)]
+    return [build_self_contact_term(inputs.study, inputs.domain, inputs.u, inputs.stress.material)]
 
 
-def _node_ties(inputs: TermInputs) -> Term | None:
+def _node_ties(inputs: TermInputs) -> list[Term]:
     fracture = inputs.study.fracture
     if fracture is None or fracture.crumbs or fracture.approach != "chi" or inputs.domain.order > 1:
-        return None
+        return []
     from ..mechanics.node_ties import NodeTies
 
     domain = inputs.domain
     young = domain.comm.allreduce(float(np.max(inputs.stress.material.young, initial=0.0)), op=MPI.MAX)
-    return NodeTies(domain, inputs.u, young, inputs.mass.lumped, inputs.motion.prescribed_nodes)
+    return [NodeTies(domain, inputs.u, young, inputs.mass.lumped, inputs.motion.prescribed_nodes)]
 
 
-def _inertia(inputs: TermInputs) -> Term | None:
-    return Inertia(inputs.u, inputs.mass) if inputs.scheme.inertia else None
+def _inertia(inputs: TermInputs) -> list[Term]:
+    return [Inertia(inputs.u, inputs.mass)] if inputs.scheme.inertia else []
 
 
-def _mass_damping(inputs: TermInputs) -> Term | None:
+def _mass_damping(inputs: TermInputs) -> list[Term]:
     damping = inputs.study.damping
     if damping is None or not damping.mass:
-        return None
+        return []
     from ..mechanics.damping import Drag
 
-    return Drag(inputs.u, inputs.mass, damping.mass)
+    return [Drag(inputs.u, inputs.mass, damping.mass)]
 
 
 # Terms of the balance beside the stress, in their order. A new term gets a line here.
-TERMS: dict[str, Callable[[TermInputs], Term | None]] = {
+TERMS: dict[str, Callable[[TermInputs], list[Term]]] = {
     "viscosity": _viscosity,
     "pressure": _pressure,
     "dead loads": _dead_loads,
     "obstacles": _obstacles,
-    "solids": _mesh_obstacles,
     "contact": _contact,
     "tethers": _node_ties,
     "inertia": _inertia,
@@ -236,5 +224,5 @@ def build_balance(study: Study, domain: Domain, scheme: Scheme, material: Materi
     degradation = None if fracture is None else DegradationModel(fracture.approach, fracture.unilateral)
     stress = Stress(assembler, u, material, degradation, floor=floor)
     inputs = TermInputs(study, scheme, assembler, u, density, stress, mass, motion, entries)
-    terms = [term for make in TERMS.values() if (term := make(inputs)) is not None]
+    terms = [term for make in TERMS.values() for term in make(inputs)]
     return Balance(assembler, u, [stress, *terms], motion, mass, scheme, study.time.max_step)

@@ -20,9 +20,9 @@ class Spring(Term):
         self._u, self._owned, self._k = u, owned, k
 
     @classmethod
-    def of(cls, inputs: TermInputs) -> Spring:
+    def of(cls, inputs: TermInputs) -> list[Term]:
         """As TERMS makes it."""
-        return cls(inputs.u, inputs.assembler.owned_dof_count, 2.0)
+        return [cls(inputs.u, inputs.assembler.owned_dof_count, 2.0)]
 
     @property
     def _at(self) -> Values:

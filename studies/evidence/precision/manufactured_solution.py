@@ -69,7 +69,7 @@ def plane_rotation(F: Expr) -> Expr:
 @contextmanager
 def with_manufactured_load() -> Iterator[None]:
     """Context in which scenes are built with the manufactured load."""
-    TERMS["load"] = ManufacturedLoad
+    TERMS["load"] = lambda inputs: [ManufacturedLoad(inputs)]
     try:
         yield
     finally:
