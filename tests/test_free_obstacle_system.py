@@ -72,7 +72,11 @@ def scene_of(*obstacles: dict[str, Any], dim: int = 2, **more: Any) -> tuple[Sce
 def gap(term: FreeRigidObstacles) -> float:
     """The least between free obstacles, m."""
     at = [each.motion.pose for each in term.free.values()]
-    return min(float(g.min(initial=9.0)) for (i, j), pair in term.pairs._pairs.items() for g in pair.gaps(at[i], at[j]))
+    return min(
+        float(g.min(initial=9.0))
+        for (i, j), pair in term.pairs.kinds[0]._pairs.items()
+        for g in pair.gaps(at[i], at[j])
+    )
 
 
 def linear(term: FreeRigidObstacles) -> Values:

@@ -519,3 +519,47 @@ def test_a_free_solid_hits_a_free_ball(tmp_path: Path) -> None:
         x = free[0].posed.pose.points_to_space(free[0].body.shape.points)
         assert x[:, 0].max() < free[1].motion.pose.centre[0] - 0.1
     assert last(scene)["velocity_ball_x"] > last(scene)["velocity_block_x"] + 0.3
+
+
+def two_solids(folder: Path, second: dict[str, Any], scheme: str = "newmark") -> tuple[Scene, Walk]:
+    """A block from a file thrown at another one, beside the body."""
+    first = block(folder, (0.3, 0.3, 0.3)) | {"at": [3.0, 0.5, 0.5], "mass": 2.0, "velocity": [1.0, 0.0, 0.0]}
+    return make_scene(
+        mesh=CUBE, material=SOFT, solver=FINE, obstacle=[first, first | {"name": "second", "velocity": None} | second],
+        contact={"itself": False, "distance": 0.02}, time={"scheme": scheme, "step": 4e-3, "end": 0.12},
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("turned", (False, True))
+def test_free_solids_hit_one_another(turned: bool, tmp_path: Path) -> None:
+    """Beside the body: momentum of both stays, their surfaces never cut each other, and they part."""
+    pytest.importorskip("ipctk")
+    spin = {"spin": [0.0, 0.5, 1.5]} if turned else {}
+    scene, state = two_solids(tmp_path, {"at": [3.35, 0.55, 0.52], "mass": 5.0} | spin)
+    bodies = free_solid(scene)[0].bodies
+    free = bodies.free.values()
+
+    def angular() -> Values:
+        motions = [pose.motion for pose in free]
+        return np.sum([np.cross(each.pose.centre, each.momentum[:3]) + each.momentum[3:] for each in motions], axis=0)
+
+    before = angular()
+    for _ in each_step(scene, state):
+        np.testing.assert_allclose(sum(pose.motion.momentum[:3] for pose in free), [2.0, 0.0, 0.0], atol=1e-9)
+        sides = [(pose.posed.pose.points_to_space(pose.body.shape.points), pose.body.shape.triangles) for pose in free]
+        assert bodies.pairs.are_open(bodies.posed) and penetration_depth(*sides, cut=False) is None
+    np.testing.assert_allclose(angular(), before, atol=0.02 * np.abs(before).max())
+    assert last(scene)["velocity_second_x"] > last(scene)["velocity_block_x"] + 0.1
+
+
+def test_a_free_solid_comes_off_a_held_and_a_driven_one(tmp_path: Path) -> None:
+    """A held one sends it back; a wall that is driven into it takes it along, by work that is told."""
+    pytest.importorskip("ipctk")
+    scene, state = two_solids(tmp_path, {"at": [3.35, 0.5, 0.5], "mass": None})
+    for report in each_step(scene, state):
+        assert report.kinetic + report.elastic <= 1.0 * (1 + 1e-6)
+    assert last(scene)["velocity_block_x"] < -0.3
+    scene, state = two_solids(tmp_path, {"at": [2.65, 0.5, 0.5], "mass": None, "velocity": [3.0, 0.0, 0.0]})
+    for report in each_step(scene, state):
+        assert report.kinetic + report.elastic <= 1.0 + state.work + 1e-6
+    assert last(scene)["velocity_block_x"] > 2.5 and state.work > 1.0

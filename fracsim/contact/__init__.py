@@ -40,7 +40,7 @@ Free obstacles:
     rigid_body            incremental potential of poses
     pose_derivatives      derivatives of contact by a pose
     rigid_pose            poses as unknowns of Newton's method
-    obstacle_pairs        contact of free obstacles with others
+    obstacle_pairs, mesh_pairs  contact between obstacles: analytic ones, triangle meshes
 
 Modules without DOLFINx and MPI: laws, closest_point, facet_contact, node_contact, obstacle, pose, shape_base, shapes,
 triangle_mesh_shape. Every rank evaluates its own points.

@@ -319,6 +319,10 @@ class IpcPairs:
         self._friction, self._distance = friction, distance
         self._area = vertex_areas(rest_positions, elements)
 
+    def restrict_to_patches(self, patch: npt.NDArray[np.int32]) -> None:
+        """Let elements touch those of other patches alone; `patch`: (n,) number of the patch of each point."""
+        self._mesh.can_collide = ipctk.make_vertex_patches_filter(patch[np.unique(self._elements)])
+
     # --- barrier ---
 
     def energy(self, x: Values) -> float:

@@ -167,9 +167,7 @@ class MeshObstaclePairs(IpcPairs):
         points = np.concatenate([rest_positions, mesh.points])
         triangles = np.concatenate([elements, mesh.triangles + len(rest_positions)])
         super().__init__(points, triangles, distance=distance, stiffness=stiffness, friction=mesh.friction)
-        side = np.repeat(np.array([0, 1], np.int32), [len(rest_positions), len(mesh.points)])
-        included = np.unique(triangles)
-        self._mesh.can_collide = ipctk.make_vertex_patches_filter(side[included])
+        self.restrict_to_patches(np.repeat(np.array([0, 1], np.int32), [len(rest_positions), len(mesh.points)]))
         self._body_points = np.unique(elements)
 
     @property

@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import cast
+from typing import Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -374,10 +374,6 @@ class ObstaclePairs:
                 bodies[number] = bodies[number] + by_pose[number] if number in bodies else by_pose[number]
         return bodies, mixed
 
-    def wrenches(self, posed: PosedObstacles) -> dict[int, Values]:
-        """(p,) force and moment of the others on each free obstacle in contact, N and N m."""
-        return {number: -body.gradient for number, body in self.derivatives(posed)[0].items()}
-
     def energies(self, posed: PosedObstacles) -> tuple[float, float]:
         """Energy of the barriers, and potential of their forces in the step, J."""
         contacts = [contact for sides in self._contact_forces(posed).values() for contact, _ in sides]
@@ -401,3 +397,69 @@ class ObstaclePairs:
             if (i, j) in self._started_near or pair.gap_bound(posed[i].pose, posed[j].pose) < self._barrier.width
         }
         return {numbers: sides for numbers, sides in contacts.items() if any(len(side.points) for side, _ in sides)}
+
+
+class PairContact(Protocol):
+    """Contact between obstacles of one kind."""
+
+    def begin_step(self, posed: PosedObstacles, *, time_averaged: bool) -> None:
+        """Begin a step; `time_averaged`: barriers are averaged over it."""
+
+    def are_open(self, posed: PosedObstacles) -> bool:
+        """Whether all gaps are open."""
+
+    def safe_fraction(self, motions: Mapping[int, PoseMotion]) -> float:
+        """Fraction of the motions of obstacles that leaves a tenth of each gap between them."""
+
+    def derivatives(self, posed: PosedObstacles) -> tuple[dict[int, PoseDerivatives], dict[Numbers, MixedHessian]]:
+        """Energies and derivatives by the poses of free obstacles in contact."""
+
+    def energies(self, posed: PosedObstacles) -> tuple[float, float]:
+        """Energy of the barriers, and potential of their forces in the step, J."""
+
+    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> float:
+        """Work of prescribed obstacles on free ones by their own increments (p,) in the step, J."""
+
+
+class AllPairs:
+    """Contact between obstacles of all kinds; `posed` are all obstacles at their poses, by their numbers."""
+
+    def __init__(self, kinds: Sequence[PairContact]) -> None:
+        self.kinds = tuple(kinds)
+
+    def begin_step(self, posed: PosedObstacles, *, time_averaged: bool) -> None:
+        """Begin a step; `time_averaged`: barriers are averaged over it."""
+        for pairs in self.kinds:
+            pairs.begin_step(posed, time_averaged=time_averaged)
+
+    def are_open(self, posed: PosedObstacles) -> bool:
+        """Whether all gaps are open."""
+        return all(pairs.are_open(posed) for pairs in self.kinds)
+
+    def safe_fraction(self, motions: Mapping[int, PoseMotion]) -> float:
+        """Fraction of the motions of obstacles that leaves a tenth of each gap between them."""
+        return min((pairs.safe_fraction(motions) for pairs in self.kinds), default=1.0)
+
+    def derivatives(self, posed: PosedObstacles) -> tuple[dict[int, PoseDerivatives], dict[Numbers, MixedHessian]]:
+        """Energies and derivatives by the poses of free obstacles in contact."""
+        bodies: dict[int, PoseDerivatives] = {}
+        mixed: dict[Numbers, MixedHessian] = {}
+        for pairs in self.kinds:
+            of_bodies, of_pairs = pairs.derivatives(posed)
+            mixed |= of_pairs
+            for number, body in of_bodies.items():
+                bodies[number] = bodies[number] + body if number in bodies else body
+        return bodies, mixed
+
+    def wrenches(self, posed: PosedObstacles) -> dict[int, Values]:
+        """(p,) force and moment of the others on each free obstacle in contact, N and N m."""
+        return {number: -body.gradient for number, body in self.derivatives(posed)[0].items()}
+
+    def energies(self, posed: PosedObstacles) -> tuple[float, float]:
+        """Energy of the barriers, and potential of their forces in the step, J."""
+        energies = [pairs.energies(posed) for pairs in self.kinds]
+        return sum(stored for stored, _ in energies), sum(potential for _, potential in energies)
+
+    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> float:
+        """Work of prescribed obstacles on free ones by their own increments (p,) in the step, J."""
+        return sum(pairs.work(posed, increments) for pairs in self.kinds)

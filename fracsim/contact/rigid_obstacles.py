@@ -22,10 +22,9 @@ from ..forms.schemes import Scheme
 from ..mechanics.term import Term, TimeLevel
 from ..mechanics.term_protocols import SurfaceData
 from ..mesh.domain import Domain
-from .laws import GapPotential
 from .node_contact import LaggedContact
 from .obstacle import FreeMotions, FreeObstacle, MovingObstacle, RigidMotion, RigidObstacle, VerletObstacle
-from .obstacle_pairs import ObstaclePairs
+from .obstacle_pairs import AllPairs
 from .obstacle_tessellation import ObstacleTessellations
 from .pose import PosedShape
 from .pose_derivatives import PoseDerivatives
@@ -290,8 +289,7 @@ class FreeRigidObstacles(RigidObstacles):
         domain: Domain,
         obstacles: Sequence[RigidObstacle],
         scheme: Scheme,
-        barrier: GapPotential,
-        pair_obstacles: Mapping[int, RigidObstacle],
+        pairs: AllPairs,
     ) -> None:
         """Build the term.
 
@@ -299,14 +297,13 @@ class FreeRigidObstacles(RigidObstacles):
             domain: mesh of the body.
             obstacles: by their numbers in the study.
             scheme: of time integration.
-            barrier: of contact between obstacles.
-            pair_obstacles: obstacles as they are in contact with one another, by their numbers.
+            pairs: contact between obstacles.
 
         Raises:
             InputError: if a free obstacle overlaps another one.
         """
         free = {n: FreePose(obstacle) for n, obstacle in enumerate(obstacles) if isinstance(obstacle, FreeObstacle)}
-        self.pairs, self._scheme = ObstaclePairs(pair_obstacles, barrier), scheme
+        self.pairs, self._scheme = pairs, scheme
         self._unknowns = PoseUnknowns(domain.comm, free, self.pairs, self)
         super().__init__(domain, obstacles, free)
         if not self.pairs.are_open(self.posed):
@@ -467,7 +464,8 @@ class FreeRigidObstacles(RigidObstacles):
         if level is None or not level.dt:
             return u
         guesses = {number: self._first_guess(number, u) for number in self.free}
-        motions = {n: (self.start_posed[n], self.free[n].step.increment(z)) for n, (z, _) in guesses.items()}
+        motions = self.prescribed_motions()
+        motions |= {n: (self.start_posed[n], self.free[n].step.increment(z)) for n, (z, _) in guesses.items()}
         fraction = min(self.pairs.safe_fraction(motions), *(safe for _, safe in guesses.values()))
         self._unknowns.move_to([fraction * z for z, _ in guesses.values()])
         return u if fraction == 1 else np.asarray(level.u_n + fraction * (u - level.u_n))

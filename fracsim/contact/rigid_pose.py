@@ -22,7 +22,7 @@ from mpi4py import MPI
 from ..mesh.parallel import sum_over_ranks
 from .node_contact import LaggedContact
 from .obstacle import FreeObstacle, RigidMotion
-from .obstacle_pairs import ObstaclePairs
+from .obstacle_pairs import AllPairs
 from .pose import PosedShape, solve_matrix
 from .pose_derivatives import PoseDerivatives
 from .rigid_body import SOLVER, RigidStep, RigidSystem, SystemDerivatives, is_positive_definite
@@ -188,9 +188,7 @@ class PoseUnknowns:
         pairs: contact of these with other obstacles.
     """
 
-    def __init__(
-        self, comm: MPI.Intracomm, free: Mapping[int, FreePose], pairs: ObstaclePairs, body: BodyContact
-    ) -> None:
+    def __init__(self, comm: MPI.Intracomm, free: Mapping[int, FreePose], pairs: AllPairs, body: BodyContact) -> None:
         """`body`: contact of the body with them."""
         self.free, self.pairs, self._comm, self._body = free, pairs, comm, body
         # at the current u and poses

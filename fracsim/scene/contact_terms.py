@@ -95,19 +95,20 @@ def build_obstacle_terms(
         limit = _max_added_frequency(contact, domain, stress)
         barrier, make_term = Penalty, partial(PenaltyObstacleTerm, mass=mass, max_added=limit)
     law = _obstacle_law(contact, domain, stress.material, barrier)
+    mesh_stiffness = contact.stiffness or DEFAULTS.self_stiffness * _max_young(domain, stress.material)
 
     def make(moved: Sequence[RigidObstacle], law: ObstacleLaw) -> ObstacleTerm:
         placed = list(obstacles)
         for number, obstacle in zip(analytic, moved, strict=True):
             placed[number] = obstacle
-        return make_term(domain, u, _build_motion(domain, placed, scheme, law), analytic, law)
+        return make_term(domain, u, _build_motion(domain, placed, scheme, law, mesh_stiffness), analytic, law)
 
     terms: list[Any] = []
     if analytic:
         shapes = [obstacles[number] for number in analytic]
         mutual = scheme.implicit and any(obstacle.free for obstacle in shapes)
         terms = [build_inactive_at_rest(domain, shapes, law, make, mutual=mutual)]
-    motion = terms[0].bodies if terms else _build_motion(domain, obstacles, scheme, law)
+    motion = terms[0].bodies if terms else _build_motion(domain, obstacles, scheme, law, mesh_stiffness)
     if meshes:
         terms.append(_build_mesh_obstacle_term(study, domain, u, motion, meshes, law, stress.material))
     for term in terms:
@@ -116,26 +117,33 @@ def build_obstacle_terms(
 
 
 def _build_motion(
-    domain: Domain, obstacles: Sequence[RigidObstacle], scheme: Scheme, law: ObstacleLaw
+    domain: Domain, obstacles: Sequence[RigidObstacle], scheme: Scheme, law: ObstacleLaw, mesh_stiffness: float
 ) -> RigidObstacles:
-    """Return the motion of obstacles. Raises InputError if a free one overlaps another at the start."""
+    """Return the motion of obstacles. Raises InputError if a free one overlaps another at the start.
+
+    `mesh_stiffness`: of the barrier between triangle meshes, Pa.
+    """
     if not any(obstacle.free for obstacle in obstacles):
         return RigidObstacles(domain, obstacles)
     from ..contact.obstacle import check_free_obstacles
+    from ..contact.obstacle_pairs import AllPairs, ObstaclePairs, PairContact
+    from ..contact.rigid_obstacles import FreeRigidObstacles, VerletRigidObstacles
+    from ..contact.supporting_obstacles import pair_obstacles
     from ..contact.triangle_mesh_shape import TriangleMeshShape
 
     numbered = dict(enumerate(obstacles))
     is_mesh = {number: isinstance(obstacle.shape, TriangleMeshShape) for number, obstacle in numbered.items()}
     check_free_obstacles({number: obstacle for number, obstacle in numbered.items() if not is_mesh[number]})
     if not scheme.implicit:
-        from ..contact.rigid_obstacles import VerletRigidObstacles
-
         return VerletRigidObstacles(domain, obstacles)
-    from ..contact.rigid_obstacles import FreeRigidObstacles
-    from ..contact.supporting_obstacles import pair_obstacles
+    in_pairs = pair_obstacles(obstacles, law.barrier.width, domain.mean_edge_length)
+    kinds: list[PairContact] = [ObstaclePairs(in_pairs, law.barrier)]
+    meshes = {number: obstacle for number, obstacle in in_pairs.items() if is_mesh[number]}
+    if len(meshes) > 1 and any(obstacle.free for obstacle in meshes.values()):
+        from ..contact.mesh_pairs import MeshPairs
 
-    pairs = pair_obstacles(obstacles, law.barrier.width, domain.mean_edge_length)
-    return FreeRigidObstacles(domain, obstacles, scheme, law.barrier, pairs)
+        kinds.append(MeshPairs(meshes, distance=law.barrier.width, stiffness=mesh_stiffness))
+    return FreeRigidObstacles(domain, obstacles, scheme, AllPairs(kinds))
 
 
 def _max_added_frequency(contact: ContactSettings, domain: Domain, stress: Stress) -> float:
