@@ -15,7 +15,7 @@ class Hill:
 
     def __init__(self) -> None:
         self.work_vector, self.displacement_version, self._x = PETSc.Vec().createSeq(1), 0, 0.0
-        self.contact = self.energies = self
+        self.contact, self.energies, self.eliminated = self, self, None
 
     def set_iterate(self, x: PETSc.Vec) -> None:
         if x.array_r[0] != self._x:
