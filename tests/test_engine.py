@@ -355,3 +355,16 @@ def test_a_crumb_does_not_whirl() -> None:
         assert np.linalg.norm(bodies.spin[0]) <= 1.0 / 2e-2 * (1 + 1e-9) and low > -2e-3
     assert bodies.kinetic_energy < falling.kinetic_energy
     assert bodies.spin[1] == pytest.approx([0.0, 0.0, 300.0])
+
+
+def test_without_active_contacts_there_are_no_forces() -> None:
+    """All impacts of an event may be left to later ones."""
+    bodies, rules = cubes([[0.0, 0.0, 0.5]]), ContactParameters(1e-3, DOWN)
+    model = build_model(bodies, [[CUBE]], [floor()], rules)
+    place = np.zeros((1, 3))
+    bounds = MotionBounds(place, np.zeros(3), 2 * [np.full(1, 0.1)])
+    contacts = CollisionDetector(model)(bodies, place, bounds, 1e-3, model.planes.begin_step())
+    newton, none = contact_solver.MujocoNewtonSolver(model, rules), np.empty((0, 3))
+    newton.set_up(bodies, none, none, contacts, DOWN)
+    force, contact_force, closed = newton.solve(contacts.gap, np.zeros(len(contacts), bool))
+    assert len(contacts) >= 4 and not force.any() and not contact_force.any() and not closed.any()

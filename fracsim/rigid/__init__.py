@@ -25,6 +25,7 @@ Motion and contact:
 engine                a step of motion: events, and searches for contacts in rounds
 collision_detection   contacts that may close in a step
 mujoco_model          the scene as MuJoCo has it
+cylinder_contact      contacts of cylinders that roll, tilt and spin
 shell_contact         contacts of the triangles of unbroken shells
 plane_contacts        contacts of convex hulls with planes
 obstacles             fixed, driven and free obstacles, and their shapes

@@ -192,13 +192,14 @@ class CollisionDetector:
         geoms, point, axes, gap, friction = self._search(centres, quaternions(bodies.rotation), margin, searching)
         geoms = geoms.astype(np.int64)
         contacts = Contacts.with_arms(geoms, model.body_of_geom[geoms], point, axes, gap, friction, centres)
+        contacts = model.cylinders.select(contacts, bodies)
         if self._shells is not None:
             contacts = self._shells.select(contacts, bodies)
         for of_plane in self._find_plane_contacts(
             bodies, obstacle_points, reach[1], obstacle_reach[1], dt, checked, chosen
         ):
             contacts = contacts.concatenate(of_plane)
-        contacts = without_axial_approach(contacts, model.cylinder_axis, bodies, dt)
+        contacts = model.cylinders.without_axial_approach(contacts, bodies, dt)
         if self._cores is None or overlaps is None:
             return contacts
         pairs = overlaps.body_pairs
@@ -234,26 +235,3 @@ class CollisionDetector:
             pairs = model.body_of_geom[geoms]
             result.append(Contacts.with_arms(geoms, pairs, points, axes, gaps, friction, centres))
         return result
-
-
-def without_axial_approach(contacts: Contacts, axis: Values, bodies: Bodies, dt: float) -> Contacts:
-    """Return the contacts with the gaps of cylinders larger by what corners approach as cylinders spin on their axes.
-
-    A cylinder that spins on its axis keeps its shape in space, while corners of the prism in it (obstacles) move: a
-    rolling cylinder would run onto its corners. Of the points of the cylinder itself none approaches in this way.
-
-    Args:
-        contacts: k of them.
-        axis: (n, 3) of cylinders, in the axes of the bodies; 0 for other bodies.
-        bodies: n of them.
-        dt: s.
-    """
-    spinning = np.flatnonzero(np.any(axis, axis=1))
-    if not len(spinning):
-        return contacts
-    in_space: Values = np.zeros((int(contacts.pairs.max(initial=len(bodies))) + 1, 3))
-    in_space[spinning] = np.einsum("nij,nj->ni", bodies.rotation[spinning], axis[spinning])
-    spin: Values = np.zeros_like(in_space)
-    spin[spinning] = np.einsum("ni,ni->n", in_space[spinning], bodies.spin[spinning])[:, None] * in_space[spinning]
-    approach = contacts.approach_speeds(0 * spin, spin)
-    return replace(contacts, gap=contacts.gap + dt * np.maximum(approach, 0.0))

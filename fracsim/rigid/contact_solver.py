@@ -167,6 +167,9 @@ class MujocoNewtonSolver:
             contacts, N; flags (k,) of contacts under pressure.
         """
         data = self._data
+        if not np.any(active):
+            # all impacts are left to later events
+            return np.zeros((self._count, 6)), np.zeros((len(active), 3)), active
         data.contact.dist[:], data.contact.exclude[:] = allowed_approach, ~active
         self._run_solver(1.0, SETTINGS.direct_iterations)
         if not self._has_converged():

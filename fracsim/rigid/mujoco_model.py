@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import mujoco
 import numpy as np
@@ -14,6 +14,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from .bodies import Bodies, quaternions
+from .cylinder_contact import CylinderContacts
 from .obstacles import Part, PrescribedObstacle, PrimitiveShape
 from .plane_contacts import PlaneContacts
 
@@ -105,7 +106,7 @@ class MujocoModel:
         inverse_inertia: (n, 3, 3).
         extent: (n,) distance that each body reaches from its centre, m.
         planes: contacts of hulls with planes, which MuJoCo does not search for.
-        cylinder_axis: (n, 3) unit vectors in the axes of the bodies; 0 for bodies that are no cylinders.
+        cylinders: among the bodies.
     """
 
     spec: Any
@@ -117,7 +118,7 @@ class MujocoModel:
     inverse_inertia: Values
     extent: Values
     planes: PlaneContacts
-    cylinder_axis: Values
+    cylinders: CylinderContacts
 
 
 def build_model(
@@ -172,19 +173,38 @@ def build_model(
     spec.memory = max(SETTINGS.min_bytes, SETTINGS.bytes_per_part * counted)
     inverse: Values = np.asarray(np.linalg.inv(inertia)) if count else inertia
     driven_numbers = np.array(driven, np.int64)
-    axis = _cylinder_axes(parts, rotation)
+    cylinders = _find_cylinders(parts, rotation, first_geom, count + planes.obstacle)
     return MujocoModel(
-        spec, body_of_geom, first_geom, driven_numbers, mass, inertia, inverse, extent, planes, axis
+        spec, body_of_geom, first_geom, driven_numbers, mass, inertia, inverse, extent, planes, cylinders
     )  # fmt: skip
 
 
-def _cylinder_axes(parts: Sequence[Sequence[Part]], rotation: Values) -> Values:
-    """Return the axes (n, 3) of bodies that are cylinders, 0 for others; `rotation`: (n, 3, 3) of the parts."""
-    result: Values = np.zeros((len(parts), 3))
-    for number, (part, *_) in enumerate(parts):
-        if isinstance(part, PrimitiveShape) and part.kind == "cylinder":
-            result[number] = rotation[number] @ part.rotation[:, 2]
-    return result
+def _has_prism(body_parts: Sequence[Part]) -> bool:
+    """Return whether a body is a cylinder with the prism in it."""
+    first = body_parts[0]
+    return len(body_parts) > 1 and isinstance(first, PrimitiveShape) and first.kind == "cylinder"
+
+
+def _find_cylinders(
+    parts: Sequence[Sequence[Part]], rotation: Values, first_geom: Ints, planes: Ints
+) -> CylinderContacts:  # fmt: skip
+    """Return the cylinders among bodies.
+
+    Args:
+        parts: of n bodies.
+        rotation: (n, 3, 3) of the parts.
+        first_geom: (n,).
+        planes: (p,) numbers of planes.
+    """
+    axis: Values = np.zeros((len(parts), 3))
+    radius: Values = np.zeros(len(parts))
+    prism_geom = np.full(len(parts), -1)
+    for number, body_parts in enumerate(parts):
+        if _has_prism(body_parts):
+            cylinder = cast("PrimitiveShape", body_parts[0])
+            axis[number], radius[number] = rotation[number] @ cylinder.rotation[:, 2], cylinder.size[0]
+            prism_geom[number] = first_geom[number] + 1
+    return CylinderContacts(axis, prism_geom, radius, planes)
 
 
 def _make_plane_contacts(
@@ -202,14 +222,19 @@ def _make_plane_contacts(
         for k, part in enumerate(body_parts) if not isinstance(part, PrimitiveShape)
     ]  # fmt: skip
     if hull_points is not None:
-        hulls = [(body, first_geom[body], points) for body, points in enumerate(hull_points)]
+        hulls = [
+            (body, first_geom[body] + _has_prism(parts[body]), points) for body, points in enumerate(hull_points)
+        ]  # fmt: skip
     corners = np.concatenate([np.empty((0, 3)), *(points for *_, points in hulls)])
     sizes = [len(points) for *_, points in hulls]
     body, geom = (np.repeat(np.array([hull[k] for hull in hulls], np.int64), sizes) for k in (0, 1))
     corners = np.einsum("kij,kj->ki", rotation[body], corners)
     plane_geom = [np.flatnonzero(body_of_geom == len(parts) + number)[0] for number in numbers]
     friction = np.array([obstacles[number].friction for number in numbers])
-    return PlaneContacts(numbers, np.array(plane_geom, np.int64), normal, friction, corners, body, geom, extent)
+    is_optional = np.array([_has_prism(body_parts) for body_parts in parts], bool)
+    return PlaneContacts(
+        numbers, np.array(plane_geom, np.int64), normal, friction, corners, body, geom, extent, is_optional
+    )  # fmt: skip
 
 
 def _scene_size(bodies: Bodies, parts: Sequence[Sequence[Part]]) -> float:
@@ -278,7 +303,7 @@ def _add_parts(
 
     A contact has the friction of the geom with the higher priority.
     """
-    has_prism = len(parts) > 1 and isinstance(parts[0], PrimitiveShape) and parts[0].kind == "cylinder"
+    has_prism = _has_prism(parts)
     rotation = np.eye(3) if rotation is None else rotation
     quat = quaternions(rotation[None])[0]
     for part in parts:

@@ -99,6 +99,7 @@ class PlaneContacts:
         corner_body: (N,) bodies.
         corner_geom: (N,) geoms.
         extent: (n,) distance that each body reaches from its centre, m.
+        is_optional: (n,) bodies whose corners are contacts only where a step without them goes through a plane.
     """
 
     obstacle: Ints
@@ -109,6 +110,7 @@ class PlaneContacts:
     corner_body: Ints
     corner_geom: Ints
     extent: Values
+    is_optional: Flags
 
     @cached_property
     def frames(self) -> list[Values]:
@@ -185,7 +187,8 @@ class PlaneContacts:
             near, gap = self._corners_near(bodies, obstacle_points[obstacle], normal, reach + plane_reach, chosen)
             is_checked, required = checked.checked[number], checked.required[number]
             is_checked[slice(None) if chosen is None else chosen[self.corner_body]] = False
-            rows = np.flatnonzero((gap < reach[self.corner_body[near]] + plane_reach) | required[near])
+            may_touch = (gap < reach[self.corner_body[near]] + plane_reach) & ~self.is_optional[self.corner_body[near]]
+            rows = np.flatnonzero(may_touch | required[near])
             if not len(rows):
                 continue
             near, body, gap = near[rows], self.corner_body[near[rows]], gap[rows]
