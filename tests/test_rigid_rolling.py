@@ -146,6 +146,26 @@ def test_a_round_body_that_lands_without_friction_keeps_its_spin(kind: str, rest
     assert max(speeds) == pytest.approx(restitution * np.sqrt(9.0 + 2 * G * 0.2), abs=0.02)
 
 
+@pytest.mark.parametrize("shift", [0.0, 0.05])
+def test_a_log_rests_on_two_logs(shift: float) -> None:
+    """Between walls, for a second: it lies at r + sqrt(3) r, level, with both other ones on the floor."""
+    walls = [
+        FLOOR | {"name": name, "at": [side * (2 * RADIUS + 1e-4), 0.0, 0.0], "normal": [-side, 0.0, 0.0]}
+        for name, side in (("left", -1.0), ("right", 1.0))
+    ]
+    top = RADIUS * (1 + np.sqrt(3))
+    bodies = [{"position": [x, 0.0, RADIUS]} for x in (-RADIUS, RADIUS)] + [{"position": [0.0, shift, top + 1e-3]}]
+    time = {"scheme": "rigid", "step": 5e-3, "end": 1.0}
+    built = scene(MESHES["cylinder"] | {"h": 0.05}, [FLOOR, *walls], body=bodies, time=time)
+    state = built.initial_state
+    while not built.ended(state):
+        state, _ = built.stepper.advance(state)
+    assert np.allclose(state.bodies.position[:, 2], [RADIUS, RADIUS, top], atol=1e-4)
+    assert np.allclose(state.bodies.position[:, 1] - LENGTH / 2, [0.0, 0.0, shift], atol=1e-4)
+    axis = state.bodies.rotation[2, :, 1]
+    assert np.allclose(axis, [0.0, 1.0, 0.0], atol=1e-3)
+
+
 def test_depths_of_cylinders_are_no_more_than_they_can_be() -> None:
     """Of a disk that stands in another one by 5.7 mm MuJoCo finds 152 mm, along its axis."""
     disk = obstacle_primitive(RoundedCylinder(0.1, 0.03, 1e-4, (0.0, 0.0, 1.0)), "disk")

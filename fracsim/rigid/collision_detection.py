@@ -192,7 +192,7 @@ class CollisionDetector:
         geoms, point, axes, gap, friction = self._search(centres, quaternions(bodies.rotation), margin, searching)
         geoms = geoms.astype(np.int64)
         contacts = Contacts.with_arms(geoms, model.body_of_geom[geoms], point, axes, gap, friction, centres)
-        contacts = model.cylinders.select(contacts, bodies)
+        contacts = model.cylinders.select(contacts, bodies, centres)
         if self._shells is not None:
             contacts = self._shells.select(contacts, bodies)
         for of_plane in self._find_plane_contacts(

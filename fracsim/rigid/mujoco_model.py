@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -106,7 +106,7 @@ class MujocoModel:
         inverse_inertia: (n, 3, 3).
         extent: (n,) distance that each body reaches from its centre, m.
         planes: contacts of hulls with planes, which MuJoCo does not search for.
-        cylinders: among the bodies.
+        cylinders: and capsules among bodies and obstacles.
     """
 
     spec: Any
@@ -173,7 +173,7 @@ def build_model(
     spec.memory = max(SETTINGS.min_bytes, SETTINGS.bytes_per_part * counted)
     inverse: Values = np.asarray(np.linalg.inv(inertia)) if count else inertia
     driven_numbers = np.array(driven, np.int64)
-    cylinders = _find_cylinders(parts, rotation, first_geom, count + planes.obstacle)
+    cylinders = _find_cylinders(parts, obstacles, rotation, first_geom)
     return MujocoModel(
         spec, body_of_geom, first_geom, driven_numbers, mass, inertia, inverse, extent, planes, cylinders
     )  # fmt: skip
@@ -186,25 +186,31 @@ def _has_prism(body_parts: Sequence[Part]) -> bool:
 
 
 def _find_cylinders(
-    parts: Sequence[Sequence[Part]], rotation: Values, first_geom: Ints, planes: Ints
+    parts: Sequence[Sequence[Part]], obstacles: Sequence[PrescribedObstacle], rotation: Values, first_geom: Ints
 ) -> CylinderContacts:  # fmt: skip
-    """Return the cylinders among bodies.
+    """Return the cylinders and capsules among bodies and obstacles.
 
     Args:
         parts: of n bodies.
+        obstacles: prescribed ones.
         rotation: (n, 3, 3) of the parts.
         first_geom: (n,).
-        planes: (p,) numbers of planes.
     """
-    axis: Values = np.zeros((len(parts), 3))
-    radius: Values = np.zeros(len(parts))
-    prism_geom = np.full(len(parts), -1)
+    n, shapes = len(parts), [obstacle.shape for obstacle in obstacles]
+    turns = np.concatenate([rotation, np.tile(np.eye(3), (len(shapes), 1, 1))])
+    total = n + len(shapes)
+    axis: Values = np.zeros((total, 3))
+    radius, half_length, is_capsule = np.zeros(total), np.zeros(total), np.zeros(total, bool)
+    prism_geom = np.full(total, -1)
+    for number, part in enumerate([*(body_parts[0] for body_parts in parts), *shapes]):
+        if isinstance(part, PrimitiveShape) and part.kind in ("cylinder", "capsule"):
+            axis[number], is_capsule[number] = turns[number] @ part.rotation[:, 2], part.kind == "capsule"
+            radius[number], half_length[number], _ = part.size
     for number, body_parts in enumerate(parts):
         if _has_prism(body_parts):
-            cylinder = cast("PrimitiveShape", body_parts[0])
-            axis[number], radius[number] = rotation[number] @ cylinder.rotation[:, 2], cylinder.size[0]
             prism_geom[number] = first_geom[number] + 1
-    return CylinderContacts(axis, prism_geom, radius, planes)
+    planes = n + np.flatnonzero([shape.kind == "plane" for shape in shapes])
+    return CylinderContacts(n, axis, radius, half_length, is_capsule, prism_geom, planes)
 
 
 def _make_plane_contacts(
