@@ -28,11 +28,13 @@ BESIDE: list[tuple[Shape, Shape]] = [
 ]
 
 
+@pytest.mark.parametrize("friction", (0.0, 0.4))
 @pytest.mark.parametrize("both", BESIDE, ids=lambda both: "-".join(type(each).__name__ for each in both))
-def test_mixed_derivatives_by_both_poses(both: tuple[Shape, Shape]) -> None:
-    """Second derivative of the energy by an increment of one pose and of the other, by differences."""
+def test_mixed_derivatives_by_both_poses(both: tuple[Shape, Shape], friction: float) -> None:
+    """Second derivative of the energy by an increment of one pose and of the other, by differences; with friction after
+    a step in which one slid over the other."""
     d, turns = both[0].dim, 1 if both[0].dim == 2 else 3
-    one, other = (RigidObstacle(name, shape, np.zeros(d)) for name, shape in zip("ab", both, strict=True))
+    one, other = (RigidObstacle(*item, np.zeros(d), friction=friction) for item in zip("ab", both, strict=True))
     stop, barrier = ObstaclePair.between(one, other), Barrier(50.0, 0.2)
     here = Pose.at_point(np.array([0.05, 0.03, 1.0][3 - d :])).incremented(
         np.concatenate([np.zeros(d), 0.1 * np.ones(turns)])
@@ -40,15 +42,19 @@ def test_mixed_derivatives_by_both_poses(both: tuple[Shape, Shape]) -> None:
     there = Pose.at_point(np.zeros(d)).incremented(np.concatenate([np.zeros(d), np.linspace(-0.1, 0.1, turns)]))
     apart = min(gap.min() for gap in stop.gaps(here, there))
     here = here.incremented(np.eye(d + turns)[d - 1] * (0.05 - apart))
+    slid = here.incremented(0.03 * np.eye(d + turns)[0])
+    rub = stop.begin_step(here, there, barrier, lambda points, normals: 0.1).friction
+    assert (rub is not None and len(rub.force) > 0) == (friction > 0)
 
     def energy(q: Values, p: Values) -> float:
-        return sum(
-            touch.potential
-            for touch, _ in stop.contact_forces(here.incremented(q), there.incremented(p), barrier, None)
-        )
+        poses = slid.incremented(q), there.incremented(p)
+        sides = stop.contact_forces(*poses, barrier, None)
+        return sum(contact.potential for contact, _ in sides) + (0.0 if rub is None else rub.energy(poses))
 
-    (own, x), (its, y) = stop.contact_forces(here, there, barrier, None)
-    found = mixed_pose_hessian(own, x, here, there)[0] + mixed_pose_hessian(its, y, there, here)[0].T
+    (own, x), (its, y) = stop.contact_forces(slid, there, barrier, None)
+    found = mixed_pose_hessian(own, x, slid, there)[0] + mixed_pose_hessian(its, y, there, slid)[0].T
+    if rub is not None:
+        found = found + rub.derivatives((slid, there))[2]
     steps, assembled = 1e-4 * np.eye(d + turns), np.zeros_like(found)
     for i, q in enumerate(steps):
         for j, p in enumerate(steps):

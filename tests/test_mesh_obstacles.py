@@ -563,3 +563,25 @@ def test_a_free_solid_comes_off_a_held_and_a_driven_one(tmp_path: Path) -> None:
     for report in each_step(scene, state):
         assert report.kinetic + report.elastic <= 1.0 + state.work + 1e-6
     assert last(scene)["velocity_block_x"] > 2.5 and state.work > 1.0
+
+
+@pytest.mark.parametrize("ratio", (1.1, 0.5))
+def test_a_free_solid_rubs_on_a_held_one(ratio: float, tmp_path: Path) -> None:
+    """Coulomb, with gravity aslant: it stays where mu is above the tangent, and slides with g (sin - mu cos) below."""
+    pytest.importorskip("ipctk")
+    slope = 0.3
+    mu = ratio * np.tan(slope)
+    floor = block(tmp_path, (2.0, 2.0, 0.4)) | {"at": [3.5, 0.5, 0.0], "name": "floor", "friction": mu}
+    (tmp_path / "small").mkdir()
+    small = block(tmp_path / "small", (0.4, 0.4, 0.2)) | {"at": [3.3, 0.5, 0.329], "mass": 5.0, "guide": "xz"}
+    scene, state = make_scene(
+        mesh=CUBE, material=SOFT, solver=FINE, obstacle=[floor, small], boundary=[{"on": "bottom", "fix": "xyz"}],
+        contact={"itself": False, "distance": 0.03}, load={"gravity": [G * np.sin(slope), 0.0, -G * np.cos(slope)]},
+        time={"scheme": "backward-euler", "step": 1e-2, "end": 0.5},
+    )  # fmt: skip
+    rows = []
+    for _ in each_step(scene, state):
+        rows.append((state.t, last(scene)["velocity_block_x"]))
+    late = np.array([row for row in rows if row[0] > 0.3])
+    rate = np.polyfit(*late.T, 1)[0]
+    assert rate == pytest.approx(max(0.0, G * (np.sin(slope) - mu * np.cos(slope))), rel=0.03, abs=0.02)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fracsim.contact.laws import Barrier
+from fracsim.contact.laws import Barrier, ObstacleLaw
 from fracsim.contact.obstacle import FreeObstacle, RigidObstacle, overlap_depth
 from fracsim.contact.obstacle_pairs import ObstaclePairs
 from fracsim.contact.pose import Pose, PosedShape
@@ -29,6 +29,16 @@ BESIDE: list[tuple[Shape, Shape]] = [
 ]
 
 
+class AtRest:
+    """Obstacles that begin a step without velocities."""
+
+    def __init__(self, posed: list[PosedShape]) -> None:
+        self.start_posed = posed
+
+    def velocity(self, number: int, x: Values) -> Values:
+        return 0 * x
+
+
 def thing(shape: Shape) -> FreeObstacle:
     """A free obstacle of that shape, of 1 kg."""
     d, turns = shape.dim, 1 if shape.dim == 2 else 3
@@ -38,9 +48,10 @@ def thing(shape: Shape) -> FreeObstacle:
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("friction", (0.0, 0.3))
 @pytest.mark.parametrize("along", (False, True))
 @pytest.mark.parametrize("both", BESIDE, ids=lambda both: "-".join(type(each).__name__ for each in both))
-def test_derivatives_by_the_pose(both: tuple[Shape, Shape], along: bool) -> None:
+def test_derivatives_by_the_pose(both: tuple[Shape, Shape], along: bool, friction: float) -> None:
     """Of the energy of a body that nearly touches, by differences of the increment; `along`: of a step that began a
     little further away."""
     shape, other = both
@@ -53,13 +64,16 @@ def test_derivatives_by_the_pose(both: tuple[Shape, Shape], along: bool) -> None
     down = -there.normal(start.centre[None])[0] if d == 3 else np.array([0.0, -1.0])
     here = start.incremented(np.concatenate([(gap - 0.02) * down, np.zeros(turns)]))
     body = thing(shape)
-    stops = ObstaclePairs({0: body, 1: RigidObstacle("other", other, np.zeros(d))}, Barrier(50.0, 0.2))
+    stops = ObstaclePairs(
+        {0: body, 1: RigidObstacle("other", other, np.zeros(d), friction=friction)},
+        ObstacleLaw(Barrier(50.0, 0.2), sticking_speed=1.0),
+    )
 
     def placed(pose: Pose) -> list[PosedShape]:
         return [PosedShape(shape, pose), there]
 
     further = here.incremented(np.concatenate([-0.05 * down, 0.05 * np.ones(turns)]))
-    stops.begin_step(placed(further), time_averaged=along)
+    stops.begin_step(AtRest(placed(further)), 0.1, time_averaged=along)
     found, h = stops.derivatives(placed(here))[0][0], 1e-6
     steps = h * np.eye(d + turns)
 
@@ -82,14 +96,19 @@ def test_derivatives_by_the_pose(both: tuple[Shape, Shape], along: bool) -> None
 
 
 def thrown(
-    obstacles: list[dict[str, Any]], scheme: str, step: float, end: float, dim: int = 2
+    obstacles: list[dict[str, Any]],
+    scheme: str,
+    step: float,
+    end: float,
+    dim: int = 2,
+    gravity: Sequence[float] = (0.0, -10.0, 0.0),
 ) -> Iterator[dict[str, float]]:
     """Columns of history.csv after each step, with the energy of all less what was put in and lost, J. Nothing lies in
     another one, beside a body that is out of the way."""
     scene, state = make_scene(
         mesh={"builder": "box", "size": [1.0] * dim, "h": 1.0}, boundary=[{"on": "bottom", "fix": "xyz"[:dim]}],
         material={"energy": "linear", "young": 1e5, "poisson": 0.0, "density": 1.0},
-        load={"gravity": [0.0, -10.0, 0.0][:dim]}, obstacle=obstacles,
+        load={"gravity": list(gravity[:dim])}, obstacle=obstacles,
         contact={"distance": 0.03, "stiffness": 3e3, "itself": False}, solver={"snes_rtol": 1e-9, "ksp_rtol": 1e-9},
         time={"scheme": scheme, "step": step, "end": end},
     )  # fmt: skip
@@ -98,7 +117,7 @@ def thrown(
         placed = contact.posed_at(state.t)
         assert overlap_depth(placed[-1], placed[0]) < 0
         row = dict(zip(scene.probes.columns, scene.probes(), strict=True))
-        yield row | {"energy": report.kinetic + report.elastic + state.dissipated - state.work}
+        yield row | {"time": state.t, "energy": report.kinetic + report.elastic + state.dissipated - state.work}
 
 
 FLOOR = {"name": "floor", "shape": "plane", "at": [0.0, -1.0], "normal": [0.0, 1.0]}
@@ -140,3 +159,40 @@ def test_a_box_falls_on_the_edge_of_another_in_3d() -> None:
     energy = [row["energy"] for row in rows]
     assert max(energy) < energy[0] + 1e-3 and energy[-1] < energy[0] - 1
     assert max(row["velocity_it_y"] for row in rows) > 0.5
+
+
+SLOPE, G = 0.3, 10.0  # rad, m/s^2
+
+
+@pytest.mark.parametrize("ratio", (1.05, 0.95, 0.3))
+def test_a_weight_rubs_on_a_held_floor(ratio: float) -> None:
+    """Coulomb, with gravity aslant and mu a little above or below the tangent: it comes to rest, or slides with
+    g (sin - mu cos)."""
+    mu = ratio * np.tan(SLOPE)
+    floor = FLOOR | {"at": [0.0, -1.0], "friction": mu}
+    box = {"name": "it", "shape": "box", "size": [0.6, 0.2], "at": [3.0, -0.873], "mass": 5.0, "guide": "xy"}
+    gravity = [G * np.sin(SLOPE), -G * np.cos(SLOPE)]
+    rows = list(thrown([floor, box], "backward-euler", 5e-3, 0.6, gravity=gravity))
+    late = [row for row in rows if row["time"] > 0.4]  # the weight has settled on its barrier
+    rate = np.polyfit([row["time"] for row in late], [row["velocity_it_x"] for row in late], 1)[0]
+    assert rate == pytest.approx(max(0.0, G * (np.sin(SLOPE) - mu * np.cos(SLOPE))), rel=0.02, abs=0.01)
+    if ratio > 1:
+        assert abs(rows[-1]["velocity_it_x"]) < 2e-3
+    energy = [row["energy"] for row in late]
+    assert np.ptp(energy) < 0.02 * 5.0 * G * (late[-1]["position_it_x"] - late[0]["position_it_x"]) + 1e-3
+
+
+def test_a_spinning_disk_drives_a_plate() -> None:
+    """A spinning disk lies on a plate that moves along x: friction gives the plate what it takes of the spin, and the
+    momentum along x stays; energy is lost to friction alone, which is told."""
+    disk = BALL | {"spin": [30.0], "friction": 0.5, "at": [3.0, 0.178]}
+    plate = {"name": "plate", "shape": "box", "size": [2.0, 0.1], "at": [3.0, 0.0], "mass": 20.0, "guide": "x"}
+    rows = list(thrown([plate, disk], "backward-euler", 2e-3, 0.2, gravity=[0.0, -10.0]))
+    along = [5.0 * row["velocity_it_x"] + 20.0 * row["velocity_plate_x"] for row in rows]
+    np.testing.assert_allclose(along, 0.0, atol=1e-9)
+    last, inertia = rows[-1], 5.0 * 0.1**2 / 2
+    assert abs(last["velocity_it_x"]) > 0.3
+    # the moment of the friction force about the centre is its arm times the momentum that it gives along x
+    assert inertia * (30.0 - last["spin_it_z"]) == pytest.approx(0.1 * 5.0 * abs(last["velocity_it_x"]), rel=0.1)
+    energy = [row["energy"] for row in rows]
+    assert max(energy) <= energy[0] * (1 + 1e-9) and energy[-1] > 0.9 * energy[0]

@@ -1,26 +1,26 @@
-"""Contact between triangle-mesh obstacles of which one at least is free: barrier of ipctk, without friction.
+"""Contact between two triangle-mesh obstacles of which one at least is free: barrier and lagged friction of ipctk.
 
-The points of an obstacle are x = c + R X, so that derivatives by poses follow from those by points. Prescribed
-obstacles do not touch one another.
+The points of an obstacle are x = c + R X, so that derivatives by poses follow from those by points.
 
-Equations: docs/theory.md#barrier, docs/theory.md#rigid-obstacles.
+Equations: docs/theory.md#barrier, docs/theory.md#friction, docs/theory.md#rigid-obstacles.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_matrix
 
 from .ipc_pairs import IpcPairs
-from .laws import BARRIER
+from .laws import BARRIER, ObstacleLaw
 from .mesh_obstacles import MESH
 from .obstacle import RigidObstacle
-from .obstacle_pairs import Numbers, PosedObstacles
+from .obstacle_pairs import Numbers, PosedObstacles, StepMotion
 from .pose import Pose
 from .pose_derivatives import MixedHessian, PoseDerivatives, point_jacobian, point_set_derivatives
+from .sample_points import IpcFriction
 from .step_limit import PoseMotion
 
 Values = npt.NDArray[np.float64]
@@ -29,108 +29,125 @@ Values = npt.NDArray[np.float64]
 GAP_SHARE = 0.5
 
 
-class MeshPairs:
-    """All pairs of triangle-mesh obstacles; `posed` are all obstacles at their poses, by their numbers."""
+class MeshPair:
+    """A pair of triangle-mesh obstacles; `posed` are all obstacles at their poses, by their numbers."""
 
-    def __init__(self, obstacles: Mapping[int, RigidObstacle], *, distance: float, stiffness: float) -> None:
-        """`obstacles`: triangle meshes by their numbers; `distance`, m, and `stiffness`, Pa, of the barrier."""
-        self._points = {number: obstacle.shape.tessellate()[0] for number, obstacle in obstacles.items()}
+    def __init__(self, obstacles: Mapping[int, RigidObstacle], law: ObstacleLaw, stiffness: float) -> None:
+        """`obstacles`: the two by their numbers; `law`: distance and friction; `stiffness`: of the barrier, Pa."""
+        self._numbers, self._law = list(obstacles), law
         self._free = [number for number, obstacle in obstacles.items() if obstacle.free]
-        sizes = [len(points) for points in self._points.values()]
-        ends = np.cumsum(sizes)
-        self._rows = {n: slice(end - size, end) for n, size, end in zip(obstacles, sizes, ends, strict=True)}
-        elements = [obstacle.shape.tessellate()[1] + self._rows[number].start for number, obstacle in obstacles.items()]
-        patch = {number: 1 + self._free.index(number) if number in self._free else 0 for number in obstacles}
-        self._patches = np.repeat(np.array([patch[number] for number in obstacles], np.int32), sizes)
-        self._rest, self._elements, self._stiffness = (
-            np.concatenate([*self._points.values()]),
-            np.concatenate(elements),
-            stiffness,
-        )
-        self._distance = distance
-        self._pairs = self._build()
-        start = self._positions({number: obstacle.posed_at(0.0).pose for number, obstacle in obstacles.items()})
-        if (gap := self._pairs.min_gap(start)) < distance:
+        tessellations = [obstacle.shape.tessellate() for obstacle in obstacles.values()]
+        self._points, first = [points for points, _ in tessellations], len(tessellations[0][0])
+        self._rows = slice(0, first), slice(first, None)
+        self._friction_coefficient = max(obstacle.friction for obstacle in obstacles.values())
+        rest = np.concatenate(self._points)
+        elements = np.concatenate([tessellations[0][1], tessellations[1][1] + first])
+        patches = np.repeat(np.array([0, 1], np.int32), [first, len(rest) - first])
+
+        def build(distance: float) -> IpcPairs:
+            coefficient = self._friction_coefficient
+            pairs = IpcPairs(rest, elements, distance=distance, stiffness=stiffness, friction=coefficient)
+            pairs.restrict_to_patches(patches)
+            return pairs
+
+        self._distance, self._pairs = law.barrier.width, build(law.barrier.width)
+        start = self._positions([obstacle.posed_at(0.0).pose for obstacle in obstacles.values()])
+        if (gap := self._pairs.min_gap(start)) < self._distance:
             self._distance = GAP_SHARE * gap
-            self._pairs = self._build()
+            self._pairs = build(self._distance)
+        self._friction: IpcFriction | None = None
+        self._start: Values = start  # (n, 3) points of both at the start of the step, m
 
-    def _build(self) -> IpcPairs:
-        pairs = IpcPairs(self._rest, self._elements, distance=self._distance, stiffness=self._stiffness)
-        pairs.restrict_to_patches(self._patches)
-        return pairs
-
-    def _positions(self, poses: Mapping[int, Pose]) -> Values:
-        """(n, 3) points of all obstacles at poses, m."""
-        return np.concatenate([poses[number].points_to_space(points) for number, points in self._points.items()])
+    def _positions(self, poses: Sequence[Pose]) -> Values:
+        """(n, 3) points of both obstacles at poses, m."""
+        return np.concatenate([pose.points_to_space(X) for pose, X in zip(poses, self._points, strict=True)])
 
     def _at(self, posed: PosedObstacles) -> Values | None:
-        """(n, 3) points of all obstacles, m; None: no two of them are near."""
-        x = self._positions({number: posed[number].pose for number in self._points})
-        boxes = {number: (x[rows].min(axis=0), x[rows].max(axis=0)) for number, rows in self._rows.items()}
-        for i, j in combinations(boxes, 2):
-            gap = np.maximum(boxes[i][0] - boxes[j][1], boxes[j][0] - boxes[i][1]).max()
-            if gap < self._distance and (i in self._free or j in self._free):
-                return x
-        return None
+        """(n, 3) points of both obstacles, m; None: they are far, and were so at the start of the step."""
+        x = self._positions([posed[number].pose for number in self._numbers])
+        first, second = (x[rows] for rows in self._rows)
+        gap = np.maximum(first.min(axis=0) - second.max(axis=0), second.min(axis=0) - first.max(axis=0)).max()
+        return x if gap < self._distance or self._friction is not None else None
 
-    def begin_step(self, posed: PosedObstacles, *, time_averaged: bool) -> None:
-        """Begin a step: forces are those of its end, whatever the scheme."""
+    def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
+        """Begin a step of dt, s: friction is lagged; forces are those of the end of the step, whatever the scheme."""
+        self._friction = None
+        if self._friction_coefficient and (x := self._at(motion.start_posed)) is not None:
+            ends = [motion.velocity(n, x[rows]) for n, rows in zip(self._numbers, self._rows, strict=True)]
+            velocity = np.concatenate([np.broadcast_to(v, X.shape) for v, X in zip(ends, self._points, strict=True)])
+            pressed = self._pairs.gradient(x).any(axis=1)
+            if pressed.any():
+                speed = float(np.linalg.norm(np.ptp(velocity[pressed], axis=0)))
+                slip = dt * max(self._law.sticking_speed, self._law.sticking_ratio * speed)
+                self._start, self._friction = x, self._pairs.lag_friction(x, x, slip)
 
     def are_open(self, posed: PosedObstacles) -> bool:
-        """Whether no two obstacles intersect."""
+        """Whether the obstacles do not intersect."""
         return (x := self._at(posed)) is None or not len(self._pairs.intersections(x))
 
     def energies(self, posed: PosedObstacles) -> tuple[float, float]:
-        """Energy of the barriers, and potential of their forces in the step, J."""
-        energy = 0.0 if (x := self._at(posed)) is None else self._pairs.energy(x)
-        return energy, energy
+        """Energy of the barrier, and potential of all forces in the step, J."""
+        if (x := self._at(posed)) is None:
+            return 0.0, 0.0
+        energy = self._pairs.energy(x)
+        return energy, energy + (0.0 if self._friction is None else self._friction.energy(x))
+
+    def _gradient(self, x: Values) -> Values:
+        """(n, 3) minus the forces on the points, N."""
+        gradient = self._pairs.gradient(x)
+        return gradient if self._friction is None else gradient + self._friction.gradient(x)
+
+    def _hessian(self, x: Values, *, exact: bool) -> csr_matrix:
+        """(3 n, 3 n) second derivatives by the points, N/m."""
+        H = self._pairs.hessian(x, exact=exact)
+        return H if self._friction is None else csr_matrix(H + self._friction.hessian(x, exact=exact))
 
     def derivatives(self, posed: PosedObstacles) -> tuple[dict[int, PoseDerivatives], dict[Numbers, MixedHessian]]:
         """Energies and derivatives by the poses of free obstacles, as of ObstaclePairs."""
-        if (x := self._at(posed)) is None:
+        if (x := self._at(posed)) is None or not (gradient := self._gradient(x)).any():
             return {}, {}
-        energy, gradient = self._pairs.energy(x), self._pairs.gradient(x)
-        if not gradient.any():
-            return {}, {}
-        hessians = self._pairs.hessian(x, exact=True), self._pairs.hessian(x)
-        dofs = {number: slice(3 * rows.start, 3 * rows.stop) for number, rows in self._rows.items()}
-        arms = {number: x[self._rows[number]] - posed[number].pose.centre for number in self._free}
-        bodies = {}
-        for number in self._free:
-            exact, positive = (H[dofs[number], dofs[number]] for H in hessians)
-            bodies[number] = point_set_derivatives(energy, gradient[self._rows[number]], exact, positive, arms[number])
-            energy = 0.0  # it counts once
-        J = {number: point_jacobian(arm).reshape(arm.size, -1) for number, arm in arms.items()}
-        mixed: dict[Numbers, MixedHessian] = {}
-        for i, j in combinations(self._free, 2):
-            exact, positive = (np.asarray(J[i].T @ (H[dofs[i], dofs[j]] @ J[j])) for H in hessians)
-            mixed[i, j] = exact, positive
-        return bodies, mixed
+        energy, hessians = self.energies(posed)[1], [self._hessian(x, exact=exact) for exact in (True, False)]
+        first = 3 * len(self._points[0])
+        dofs, bodies, J = (slice(0, first), slice(first, None)), dict[int, PoseDerivatives](), list[Values]()
+        for number, rows, columns in zip(self._numbers, self._rows, dofs, strict=True):
+            arm = x[rows] - posed[number].pose.centre
+            J.append(point_jacobian(arm).reshape(arm.size, -1))
+            if number in self._free:
+                exact, positive = (H[columns, columns] for H in hessians)
+                bodies[number] = point_set_derivatives(energy, gradient[rows], exact, positive, arm)
+                energy = 0.0  # it counts once
+        if len(self._free) < 2:
+            return bodies, {}
+        exact, positive = (np.asarray(J[0].T @ (H[dofs[0], dofs[1]] @ J[1])) for H in hessians)
+        return bodies, {(self._numbers[0], self._numbers[1]): (exact, positive)}
 
-    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> float:
-        """Work of prescribed obstacles on free ones by their own increments (6,) in the step, J."""
+    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> tuple[float, float]:
+        """Work of a prescribed obstacle on the free one by its own increment (6,) in the step; dissipation, J."""
         if (x := self._at(posed)) is None:
-            return 0.0
-        gradient, total = self._pairs.gradient(x), 0.0
-        for number, rows in self._rows.items():
+            return 0.0, 0.0
+        gradient, total = self._gradient(x), 0.0
+        for number, rows in zip(self._numbers, self._rows, strict=True):
             if number not in self._free:
                 J = point_jacobian(x[rows] - posed[number].pose.centre)
                 total += float(np.einsum("nd,ndp,p->", gradient[rows], J, increments[number]))
-        return total
+        if self._friction is None:
+            return total, 0.0
+        return total, float(np.vdot(self._friction.gradient(x), x - self._start))
 
     def safe_fraction(self, motions: Mapping[int, PoseMotion]) -> float:
-        """Fraction of the motions of obstacles that leaves a tenth of each gap; the others are at rest elsewhere.
+        """Fraction of the motions of both that leaves a tenth of each gap; 1 where the motion of one is not given.
 
         Points of an obstacle that rotates move on arcs, which are divided into chords that end on them.
         """
-        moving = {number: motions[number] for number in self._points if number in motions}
-        if len(moving) < len(self._points) or not any(q.any() for _, q in moving.values()):
+        if not all(number in motions for number in self._numbers):
             return 1.0
-        turn = max(float(np.linalg.norm(q[3:])) for _, q in moving.values())
-        pieces = 1 + int(turn / MESH.max_rotation)
+        moving = [motions[number] for number in self._numbers]
+        if not any(q.any() for _, q in moving):
+            return 1.0
+        pieces = 1 + int(max(float(np.linalg.norm(q[3:])) for _, q in moving) / MESH.max_rotation)
 
         def positions(fraction: float) -> Values:
-            return self._positions({n: posed.pose.incremented(fraction * q) for n, (posed, q) in moving.items()})
+            return self._positions([posed.pose.incremented(fraction * q) for posed, q in moving])
 
         for piece in range(pieces):
             first, fraction, chord = piece / pieces, 1.0, 0.0

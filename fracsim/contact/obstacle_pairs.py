@@ -1,4 +1,4 @@
-"""Contact of a free obstacle with held or driven ones, by barriers at inset points; without friction.
+"""Contact of free obstacles with others, by barriers at inset points, with lagged friction.
 
     E = sum over points of both of  A b(gap),    gap: distance to the other shape minus the radius of the points
 
@@ -10,24 +10,25 @@ exactly in 2D, and in 3D except for two edges that cross, of which points are sa
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import product
 from typing import Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from .laws import BARRIER, GapPotential
-from .node_contact import ContactForces, StepStart, evaluate_points
+from .laws import BARRIER, CoulombFriction, GapPotential, ObstacleLaw, tangential
+from .node_contact import ContactForces, StepStart, evaluate_points, lag_contact
 from .obstacle import RigidObstacle, free_pairs
-from .pose import Pose, PosedShape, rotate_vectors
+from .pose import Pose, PosedShape, rotate_vectors, rotation_second_derivative
 from .pose_derivatives import (
     MixedHessian,
     PoseDerivatives,
     carried_point_derivatives,
     mixed_pose_hessian,
+    point_jacobian,
     pose_derivatives,
 )
 from .shape_base import ConvexBody, Shape, frame_about, unit_vector
@@ -160,6 +161,73 @@ class OffsetShape:
 
 
 @dataclass(frozen=True, eq=False)
+class PairFriction:
+    """Lagged friction of a pair of obstacles in a step, at the points at which they touched at its start.
+
+    The slip of a point is the motion of the first obstacle's material there minus that of the other's.
+
+    Attributes:
+        law: Coulomb's.
+        force: (k,) normal forces, N.
+        normal: (k, d) unit normals.
+        point: (k, d) points at the start of the step, m.
+        start: poses of both then.
+    """
+
+    law: CoulombFriction
+    force: Values
+    normal: Values
+    point: Values
+    start: tuple[Pose, Pose]
+
+    def _carried(self, poses: tuple[Pose, Pose]) -> tuple[Values, Values]:
+        """(k, d) points of both obstacles now, m."""
+        first, second = (
+            pose.points_to_space(start.to_body(self.point)) for pose, start in zip(poses, self.start, strict=True)
+        )
+        return first, second
+
+    def slip(self, poses: tuple[Pose, Pose]) -> Values:
+        """(k, d) motion of the first obstacle over the other in the step, m."""
+        first, second = self._carried(poses)
+        return np.asarray(first - second)
+
+    def energy(self, poses: tuple[Pose, Pose]) -> float:
+        """Potential of friction, J."""
+        return float(self.law.energy(self.force, self.normal, self.slip(poses)).sum())
+
+    def on_first(self, poses: tuple[Pose, Pose]) -> Values:
+        """(k, d) forces on the first obstacle, N."""
+        return -self.law.gradient(self.force, self.normal, self.slip(poses))
+
+    def derivatives(self, poses: tuple[Pose, Pose]) -> tuple[PoseDerivatives, PoseDerivatives, Values]:
+        """Derivatives by the pose of each, with the energy in the first; (p, p) second derivatives by both."""
+        gradient, slip, d = -self.on_first(poses), self.slip(poses), poses[0].dim
+        H, energies, result, J = self.law.hessian(self.force, self.normal, slip), (self.energy(poses), 0.0), [], []
+        for pose, x, energy, sign in zip(poses, self._carried(poses), energies, (1.0, -1.0), strict=True):
+            arm = x - pose.centre
+            J.append(sign * point_jacobian(arm))
+            stiffness = np.einsum("kip,kij,kjq->pq", J[-1], H, J[-1])
+            hessian = stiffness.copy()
+            hessian[d:, d:] += rotation_second_derivative(sign * gradient, arm).sum(axis=0)
+            result.append(PoseDerivatives(energy, np.einsum("kdp,kd->p", J[-1], gradient), hessian, stiffness))
+        return result[0], result[1], np.asarray(np.einsum("kip,kij,kjq->pq", J[0], H, J[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class PairStart:
+    """Pair of obstacles at the start of a step.
+
+    Attributes:
+        gaps: (n,) of the points of each, m.
+        friction: in the step; None: without contact, or friction.
+    """
+
+    gaps: list[Values]
+    friction: PairFriction | None
+
+
+@dataclass(frozen=True, eq=False)
 class ObstaclePair:
     """A free obstacle, the first, and another one.
 
@@ -167,25 +235,28 @@ class ObstaclePair:
         points: their inset points.
         areas: (n,) shares of these, m^2.
         targets: shapes that the points of each are in contact with: the other one, grown by their radius.
+        friction: coefficient of friction, the larger one of both.
     """
 
     points: tuple[InsetPoints, InsetPoints]
     areas: tuple[Values, Values]
     targets: tuple[Shape, Shape]
+    friction: float
 
     @classmethod
     def between(cls, body: RigidObstacle, obstacle: RigidObstacle) -> ObstaclePair:
         """Pair of two obstacles."""
         first, second = inset_points(body.shape), inset_points(obstacle.shape)
+        friction = max(body.friction, obstacle.friction)
         # a triangle mesh has no distance function: it is in contact with others at its own points alone
         if isinstance(body.shape, TriangleMeshShape):
             none = InsetPoints(np.empty((0, 3)), 0.0)
             areas = np.full(len(first.points), first.area), np.empty(0)
-            return cls((first, none), areas, (obstacle.shape,) * 2)
+            return cls((first, none), areas, (obstacle.shape,) * 2, friction)
         areas = np.full(len(first.points), first.area), np.full(len(second.points), second.area)
         targets = OffsetShape(obstacle.shape, first.radius), OffsetShape(body.shape, second.radius)
         # an OffsetShape has all of a Shape that `evaluate_points` needs
-        return cls((first, second), areas, cast("tuple[Shape, Shape]", targets))
+        return cls((first, second), areas, cast("tuple[Shape, Shape]", targets), friction)
 
     def sides(self, body: Pose, obstacle: Pose) -> Iterator[tuple[Values, PosedShape]]:
         """(n, d) points of each obstacle in space, m, and the shape that they are in contact with."""
@@ -205,13 +276,37 @@ class ObstaclePair:
         """(n,) gaps of the points of each, m."""
         return [posed.distance(x) for x, posed in self.sides(body, obstacle)]
 
+    def begin_step(
+        self, body: Pose, obstacle: Pose, barrier: GapPotential, slip: Callable[[Values, Values], float]
+    ) -> PairStart:
+        """State of the pair at the start of a step, at the poses of both there.
+
+        Args:
+            body: pose of the first obstacle.
+            obstacle: pose of the other one.
+            barrier: b.
+            slip: points and normals of contact (k, d) -> slip that counts as sticking, m.
+        """
+        gaps = self.gaps(body, obstacle)
+        if not self.friction:
+            return PairStart(gaps, None)
+        sides = zip(self.sides(body, obstacle), gaps, self.areas, self.points, strict=True)
+        lagged = [(lag_contact(x, gap, area, posed, barrier), inset) for (x, posed), gap, area, inset in sides]
+        force = np.concatenate([contact.force for contact, _ in lagged])
+        if not len(force):
+            return PairStart(gaps, None)
+        normal = np.concatenate([contact.normal for contact, _ in lagged])
+        point = np.concatenate([contact.position - inset.radius * contact.normal for contact, inset in lagged])
+        law = CoulombFriction(self.friction, slip(point, normal))
+        return PairStart(gaps, PairFriction(law, force, normal, point, (body, obstacle)))
+
     def contact_forces(
         self, body: Pose, obstacle: Pose, barrier: GapPotential, start: list[Values] | None
     ) -> list[tuple[ContactForces, Values]]:
-        """Forces on the points of each, and their positions (n, d), m.
+        """Normal forces on the points of each, and their positions (n, d), m.
 
         Args:
-            body: pose of the free obstacle.
+            body: pose of the first obstacle.
             obstacle: pose of the other one.
             barrier: b.
             start: gaps at the start of the step, where the barrier is averaged over it.
@@ -306,13 +401,26 @@ type PosedObstacles = Mapping[int, PosedShape] | Sequence[PosedShape]  # by the 
 type Numbers = tuple[int, int]  # of a free obstacle and another one
 
 
+class StepMotion(Protocol):
+    """Motion of obstacles in a step, as pairs need it at its start.
+
+    Attributes:
+        start_posed: obstacles at the start of the step, by their numbers.
+    """
+
+    start_posed: list[PosedShape]
+
+    def velocity(self, number: int, x: Values) -> Values:
+        """(d,) velocity of an obstacle at the start of the step, or (n, d) of its points at x (n, d), m/s."""
+
+
 class ObstaclePairs:
     """All pairs of free obstacles with others; `posed` are all obstacles at their poses, by their numbers.
 
     A pair of two triangle meshes has no distance function, and is left out.
     """
 
-    def __init__(self, obstacles: Mapping[int, RigidObstacle], barrier: GapPotential) -> None:
+    def __init__(self, obstacles: Mapping[int, RigidObstacle], law: ObstacleLaw) -> None:
         """`obstacles` by their numbers, free ones and others."""
         numbers = list(obstacles)
         named = [(numbers[i], numbers[j]) for i, j in free_pairs([obstacles[number] for number in numbers])]
@@ -324,17 +432,27 @@ class ObstaclePairs:
             if not all(isinstance(obstacles[number].shape, TriangleMeshShape) for number in (i, j))
         }
         self._free = {number for number, obstacle in obstacles.items() if obstacle.free}
-        self._barrier = barrier
-        self._start: dict[Numbers, list[Values]] = {}
+        self._law, self._barrier, self._time_averaged = law, law.barrier, False
+        self._start: dict[Numbers, PairStart] = {}
         self._started_near: set[Numbers] = set()  # pairs in contact at the start of the step
 
-    def begin_step(self, posed: PosedObstacles, *, time_averaged: bool) -> None:
-        """Begin a step; `time_averaged`: barriers are averaged over it."""
-        pairs = self._pairs.items() if time_averaged else []
-        self._start = {(i, j): pair.gaps(posed[i].pose, posed[j].pose) for (i, j), pair in pairs}
-        self._started_near = {
-            numbers for numbers, gaps in self._start.items() if np.concatenate(gaps).min() < self._barrier.width
-        }
+    def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
+        """Begin a step of dt, s; `time_averaged`: barriers are averaged over it."""
+        self._start, self._started_near, self._time_averaged = {}, set(), time_averaged
+        for (i, j), pair in self._pairs.items():
+            first, second = (motion.start_posed[number].pose for number in (i, j))
+            is_near = pair.gap_bound(first, second) < self._barrier.width
+            if time_averaged or (is_near and pair.friction):
+                slip = partial(self._sticking_slip, motion, dt, (i, j))
+                self._start[i, j] = pair.begin_step(first, second, self._barrier, slip)
+            if is_near:
+                self._started_near.add((i, j))
+
+    def _sticking_slip(self, motion: StepMotion, dt: float, numbers: Numbers, points: Values, normals: Values) -> float:
+        """Slip in the step that counts as sticking, m."""
+        first, second = (np.broadcast_to(motion.velocity(n, points), points.shape) for n in numbers)
+        speed = float(np.linalg.norm(tangential(normals, first - second), axis=1).max())
+        return dt * max(self._law.sticking_speed, self._law.sticking_ratio * speed)
 
     def are_open(self, posed: PosedObstacles) -> bool:
         """Whether all gaps are open."""
@@ -365,45 +483,71 @@ class ObstaclePairs:
                 i: carried_point_derivatives(of_i, x, first) + pose_derivatives(of_j, y, first, None, first),
                 j: pose_derivatives(of_i, x, second, None, second) + carried_point_derivatives(of_j, y, second),
             }
+            sides = mixed_pose_hessian(of_i, x, first, second), mixed_pose_hessian(of_j, y, second, first)
+            blocks = sides[0][0] + sides[1][0].T, sides[0][1] + sides[1][1].T
             free = [number for number in (i, j) if number in self._free]
             if len(free) == 2:  # the energy counts once
                 by_pose[j] = replace(by_pose[j], energy=0.0)
-                sides = mixed_pose_hessian(of_i, x, first, second), mixed_pose_hessian(of_j, y, second, first)
-                mixed[i, j] = sides[0][0] + sides[1][0].T, sides[0][1] + sides[1][1].T
+            if (friction := self._friction((i, j))) is not None:
+                by_i, by_j, by_both = friction.derivatives((first, second))
+                if i not in self._free:
+                    by_j = replace(by_j, energy=by_i.energy)
+                by_pose = {i: by_pose[i] + by_i, j: by_pose[j] + by_j}
+                blocks = blocks[0] + by_both, blocks[1] + by_both
+            if len(free) == 2:
+                mixed[i, j] = blocks
             for number in free:
                 bodies[number] = bodies[number] + by_pose[number] if number in bodies else by_pose[number]
         return bodies, mixed
 
-    def energies(self, posed: PosedObstacles) -> tuple[float, float]:
-        """Energy of the barriers, and potential of their forces in the step, J."""
-        contacts = [contact for sides in self._contact_forces(posed).values() for contact, _ in sides]
-        return sum(contact.energy for contact in contacts), sum(contact.potential for contact in contacts)
+    def _friction(self, numbers: Numbers) -> PairFriction | None:
+        start = self._start.get(numbers)
+        return None if start is None else start.friction
 
-    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> float:
-        """Work of prescribed obstacles on free ones by their own increments (p,) in the step, J."""
-        total = 0.0
+    def energies(self, posed: PosedObstacles) -> tuple[float, float]:
+        """Energy of the barriers, and potential of all forces in the step, J."""
+        stored, potential = 0.0, 0.0
+        for (i, j), sides in self._contact_forces(posed).items():
+            stored += sum(contact.energy for contact, _ in sides)
+            potential += sum(contact.potential for contact, _ in sides)
+            if (friction := self._friction((i, j))) is not None:
+                potential += friction.energy((posed[i].pose, posed[j].pose))
+        return stored, potential
+
+    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> tuple[float, float]:
+        """Work of prescribed obstacles on free ones by their own increments (p,) in the step; dissipation, J."""
+        total, dissipated = 0.0, 0.0
         for (i, j), ((of_i, _), (of_j, _)) in self._contact_forces(posed).items():
             on_first, d = of_i.normal.sum(axis=0) - of_j.normal.sum(axis=0), posed[i].pose.dim
+            if (friction := self._friction((i, j))) is not None:
+                poses = posed[i].pose, posed[j].pose
+                by_friction = friction.on_first(poses)
+                on_first = on_first + by_friction.sum(axis=0)
+                dissipated -= float(np.vdot(by_friction, friction.slip(poses)))
             for number, force in ((j, on_first), (i, -on_first)):
                 if number not in self._free:
                     total += float(force @ increments[number][:d])
-        return total
+        return total, dissipated
 
     def _contact_forces(self, posed: PosedObstacles) -> dict[Numbers, list[tuple[ContactForces, Values]]]:
-        """Forces on the points of both obstacles of each pair in contact."""
-        contacts = {
-            (i, j): pair.contact_forces(posed[i].pose, posed[j].pose, self._barrier, self._start.get((i, j)))
-            for (i, j), pair in self._pairs.items()
-            if (i, j) in self._started_near or pair.gap_bound(posed[i].pose, posed[j].pose) < self._barrier.width
+        """Normal forces on the points of both obstacles of each pair in contact, now or at the start of the step."""
+        contacts = {}
+        for (i, j), pair in self._pairs.items():
+            if (i, j) in self._started_near or pair.gap_bound(posed[i].pose, posed[j].pose) < self._barrier.width:
+                start = self._start[i, j].gaps if self._time_averaged else None
+                contacts[i, j] = pair.contact_forces(posed[i].pose, posed[j].pose, self._barrier, start)
+        return {
+            numbers: sides
+            for numbers, sides in contacts.items()
+            if self._friction(numbers) is not None or any(len(contact.points) for contact, _ in sides)
         }
-        return {numbers: sides for numbers, sides in contacts.items() if any(len(side.points) for side, _ in sides)}
 
 
 class PairContact(Protocol):
     """Contact between obstacles of one kind."""
 
-    def begin_step(self, posed: PosedObstacles, *, time_averaged: bool) -> None:
-        """Begin a step; `time_averaged`: barriers are averaged over it."""
+    def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
+        """Begin a step of dt, s; `time_averaged`: barriers are averaged over it."""
 
     def are_open(self, posed: PosedObstacles) -> bool:
         """Whether all gaps are open."""
@@ -417,8 +561,8 @@ class PairContact(Protocol):
     def energies(self, posed: PosedObstacles) -> tuple[float, float]:
         """Energy of the barriers, and potential of their forces in the step, J."""
 
-    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> float:
-        """Work of prescribed obstacles on free ones by their own increments (p,) in the step, J."""
+    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> tuple[float, float]:
+        """Work of prescribed obstacles on free ones by their own increments (p,) in the step; dissipation, J."""
 
 
 class AllPairs:
@@ -427,10 +571,10 @@ class AllPairs:
     def __init__(self, kinds: Sequence[PairContact]) -> None:
         self.kinds = tuple(kinds)
 
-    def begin_step(self, posed: PosedObstacles, *, time_averaged: bool) -> None:
-        """Begin a step; `time_averaged`: barriers are averaged over it."""
+    def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
+        """Begin a step of dt, s; `time_averaged`: barriers are averaged over it."""
         for pairs in self.kinds:
-            pairs.begin_step(posed, time_averaged=time_averaged)
+            pairs.begin_step(motion, dt, time_averaged=time_averaged)
 
     def are_open(self, posed: PosedObstacles) -> bool:
         """Whether all gaps are open."""
@@ -460,6 +604,7 @@ class AllPairs:
         energies = [pairs.energies(posed) for pairs in self.kinds]
         return sum(stored for stored, _ in energies), sum(potential for _, potential in energies)
 
-    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> float:
-        """Work of prescribed obstacles on free ones by their own increments (p,) in the step, J."""
-        return sum(pairs.work(posed, increments) for pairs in self.kinds)
+    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> tuple[float, float]:
+        """Work of prescribed obstacles on free ones by their own increments (p,) in the step; dissipation, J."""
+        works = [pairs.work(posed, increments) for pairs in self.kinds]
+        return sum(work for work, _ in works), sum(dissipated for _, dissipated in works)

@@ -326,7 +326,7 @@ class FreeRigidObstacles(RigidObstacles):
                 RigidStep(pose.body, pose.motion, self._scheme, level.dt, level.c_a, level.fraction, weights.factor)
             )
             self.increments[number] = pose.step.increment(pose.step.free_flight)
-        self.pairs.begin_step(self.start_posed, time_averaged=weights.time_averaged)
+        self.pairs.begin_step(self, level.dt, time_averaged=weights.time_averaged)
         self._unknowns.discard()
 
     def update_displacement(self) -> None:
@@ -442,10 +442,11 @@ class FreeRigidObstacles(RigidObstacles):
         return 0.0 if self.comm.rank else self.pairs.energies(self.posed)[0]
 
     def step_work(self) -> tuple[float, float]:
-        """Work of gravity and prescribed obstacles on free ones, on rank 0, J; nothing is dissipated."""
+        """Work of gravity and prescribed obstacles on free ones, and dissipation between obstacles, on rank 0, J."""
         if self.comm.rank:
             return 0.0, 0.0
-        return self._unknowns.gravity_work() + self.pairs.work(self.posed, self.increments), 0.0
+        work, dissipated = self.pairs.work(self.posed, self.increments)
+        return self._unknowns.gravity_work() + work, dissipated
 
     # --- step limits ---
 

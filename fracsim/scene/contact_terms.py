@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
+from itertools import combinations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -137,12 +138,12 @@ def _build_motion(
     if not scheme.implicit:
         return VerletRigidObstacles(domain, obstacles)
     in_pairs = pair_obstacles(obstacles, law.barrier.width, domain.mean_edge_length)
-    kinds: list[PairContact] = [ObstaclePairs(in_pairs, law.barrier)]
-    meshes = {number: obstacle for number, obstacle in in_pairs.items() if is_mesh[number]}
-    if len(meshes) > 1 and any(obstacle.free for obstacle in meshes.values()):
-        from ..contact.mesh_pairs import MeshPairs
+    kinds: list[PairContact] = [ObstaclePairs(in_pairs, law)]
+    for pair in combinations([number for number in numbered if is_mesh[number]], 2):
+        if any(numbered[number].free for number in pair):
+            from ..contact.mesh_pairs import MeshPair
 
-        kinds.append(MeshPairs(meshes, distance=law.barrier.width, stiffness=mesh_stiffness))
+            kinds.append(MeshPair({number: in_pairs[number] for number in pair}, law, mesh_stiffness))
     return FreeRigidObstacles(domain, obstacles, scheme, AllPairs(kinds))
 
 
