@@ -40,13 +40,13 @@ class MeshPair:
         self._points, first = [points for points, _ in tessellations], len(tessellations[0][0])
         self._rows = slice(0, first), slice(first, None)
         self._friction_coefficient = max(obstacle.friction for obstacle in obstacles.values())
-        rest = np.concatenate(self._points)
+        reference = np.concatenate(self._points)
         elements = np.concatenate([tessellations[0][1], tessellations[1][1] + first])
-        patches = np.repeat(np.array([0, 1], np.int32), [first, len(rest) - first])
+        patches = np.repeat(np.array([0, 1], np.int32), [first, len(reference) - first])
 
         def build(distance: float) -> IpcPairs:
             coefficient = self._friction_coefficient
-            pairs = IpcPairs(rest, elements, distance=distance, stiffness=stiffness, friction=coefficient)
+            pairs = IpcPairs(reference, elements, distance=distance, stiffness=stiffness, friction=coefficient)
             pairs.restrict_to_patches(patches)
             return pairs
 
