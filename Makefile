@@ -61,7 +61,9 @@ paraview:
 bench:
 	./env python3 -m fracsim.studies.bench -o out/bench.json
 
-# Seconds per step of the nine scenes of Mandal et al. (2022), table 2; hours. `make table small=1`: a third of the cells.
+# Seconds per step of the scenes of Mandal et al. (2022), table 2, on one rank; an hour. `make table small=1`: a third of the
+# cells.
+table: ranks := 1
 table:
 	./env python3 -m fracsim.studies.paper_table -o out/table --ranks $(ranks) $(if $(small),--small --limit 60)
 
