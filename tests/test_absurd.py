@@ -125,6 +125,15 @@ def test_a_spin_of_an_obstacle_is_bounded_as_well() -> None:
         validate(mutated(BASES["bar"], ("obstacle", 1, "spin", 0), 1e30), "test.toml")
 
 
+@pytest.mark.parametrize(("at", "value"), [
+    (("obstacle", 3, "velocity", 0), 1e30), (("obstacle", 2, "displacement", "value", 1, 0), 1e30),
+])  # fmt: skip
+def test_the_motion_of_a_driven_obstacle_is_bounded_as_well(at: tuple[str | int, ...], value: float) -> None:
+    """The path of the body past it was bounded for minutes, before the wall limit was looked at."""
+    with pytest.raises(InputError, match=r"moves it by 1e\+27 m in a step of 0\.001 s; at most 1e\+06 m are followed"):
+        validate(mutated(BASES["bar"], at, value), "test.toml")
+
+
 def test_the_initial_spin_of_a_body_is_bounded_as_well() -> None:
     """Its path past obstacles was bounded for minutes, before the wall limit was looked at."""
     with pytest.raises(InputError, match=r"initial\.spin turns it by 1e\+27 rad in a step of 0\.001 s; at most"):

@@ -41,6 +41,7 @@ class MeshObstaclePolicy:
         max_arm: distance of points of crack faces from the nodes that they follow, in longest edges.
         max_rotation: rotation of an obstacle in one piece of a motion, rad.
         min_fraction: of a piece, below which nothing moves.
+        gap_share: distance of the barrier between obstacles in their gap at the start, where that is the smaller one.
         unlimited: part of the search distance from which on a safe distance counts as unlimited.
     """
 
@@ -48,6 +49,7 @@ class MeshObstaclePolicy:
     max_arm: float = 2.0
     max_rotation: float = 0.3
     min_fraction: float = 1e-4
+    gap_share: float = 0.5
     unlimited: float = 0.999
 
 

@@ -25,9 +25,6 @@ from .step_limit import PoseMotion
 
 Values = npt.NDArray[np.float64]
 
-# distance of the barrier in the least gap at the start, where the gap is smaller than the distance
-GAP_SHARE = 0.5
-
 
 class MeshPair:
     """A pair of triangle-mesh obstacles; `posed` are all obstacles at their poses, by their numbers."""
@@ -53,7 +50,7 @@ class MeshPair:
         self._distance, self._pairs = law.barrier.width, build(law.barrier.width)
         start = self._positions([obstacle.posed_at(0.0).pose for obstacle in obstacles.values()])
         if (gap := self._pairs.min_gap(start)) < self._distance:
-            self._distance = GAP_SHARE * gap
+            self._distance = MESH.gap_share * gap
             self._pairs = build(self._distance)
         self._friction: IpcFriction | None = None
         self._start: Values = start  # (n, 3) points of both at the start of the step, m

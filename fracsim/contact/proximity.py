@@ -15,14 +15,14 @@ from .pose import PosedShape
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-# factor of the radius of a tessellation, which lies within its shape
-OUTLINE_EXCESS = 1.1
-
 
 def outline_radius(posed: PosedShape) -> float:
-    """Radius of a shape about its reference point, m; infinite for a half space."""
+    """Bound of the radius of a shape about its reference point, m; of a half space that of its patch: it never turns.
+
+    The tessellation lies within its shape, by less than a tenth of the radius.
+    """
     points, _ = posed.shape.tessellate()
-    return OUTLINE_EXCESS * float(np.linalg.norm(points, axis=1).max())
+    return 1.1 * float(np.linalg.norm(points, axis=1).max())
 
 
 @dataclass(frozen=True)

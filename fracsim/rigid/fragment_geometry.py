@@ -15,15 +15,13 @@ from ..meshes.data import MeshData
 from .convex_decomposition import Polyhedron, convex_parts, hull_corners, shell_convex_parts
 from .core_contact import CoreContact, CoreGeometry
 from .instance_placement import InstancePoses
-from .obstacles import Part
+from .obstacles import COLLISION_SHAPES, Part
 from .round_shape import RoundShape
 from .shell_contact import ShellSurface
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Patterns = npt.NDArray[np.uint8]
-# Mean distance of the hull from a closed shell, in thicknesses, up to which the shell is convex.
-MAX_SHELL_DEVIATION = 0.01
 # Key of the surface, convex parts, outermost points.
 _CollisionShape = tuple[int, list[Part], Values]
 
@@ -205,7 +203,7 @@ class FragmentGeometry:
         if len(self.poses) * len(self._shell.triangles) > self._max_prisms:
             return None
         shell, hull = self._shell, solids[0].without_cavities.convex_hull
-        if hull.excess_volume <= MAX_SHELL_DEVIATION * shell.thickness * hull.area:
+        if hull.excess_volume <= COLLISION_SHAPES.max_shell_deviation * shell.thickness * hull.area:
             return None
         lower, upper = (self._points_at_rest - centre).reshape(2, -1, 3)
         prisms = [np.concatenate([lower[nodes], upper[nodes]]) for nodes in shell.triangles]

@@ -61,8 +61,23 @@ class PrimitiveShape:
         return np.array([[x + y, 0.0, 0.0] if self.kind == "capsule" else [x, y, z]])
 
 
-# Sides of the prism in a cylinder: its faces are 3.4 % of the radius below the cylinder.
-PRISM_SIDES = 12
+@dataclass(frozen=True)
+class CollisionShapePolicy:
+    """Tuned numbers of the shapes that collide.
+
+    Attributes:
+        prism_sides: sides of the prism in a cylinder. Its faces are 3.4 % of the radius below the cylinder.
+        max_round_deviation: largest distance of boundary nodes from the surface of a round solid, in radii: round-off,
+            also of single precision.
+        max_shell_deviation: mean distance of the hull from a closed shell, in thicknesses, up to which it is convex.
+    """
+
+    prism_sides: int = 12
+    max_round_deviation: float = 1e-6
+    max_shell_deviation: float = 0.01
+
+
+COLLISION_SHAPES = CollisionShapePolicy()
 
 
 def cylinder_parts(cylinder: PrimitiveShape) -> list[PrimitiveShape]:
@@ -71,10 +86,11 @@ def cylinder_parts(cylinder: PrimitiveShape) -> list[PrimitiveShape]:
     MuJoCo finds the line on which a cylinder rolls, and at most four contacts of its rim. The corners of the prism are
     contacts where the cylinder tilts or spins.
     """
-    angle = 2 * np.pi * np.arange(PRISM_SIDES) / PRISM_SIDES
+    sides = COLLISION_SHAPES.prism_sides
+    angle = 2 * np.pi * np.arange(sides) / sides
     radius, half, _ = cylinder.size
     rim = radius * np.stack([np.cos(angle), np.sin(angle)])
-    ends = [np.concatenate([rim, np.full((1, PRISM_SIDES), z)]) for z in (half, -half)]
+    ends = [np.concatenate([rim, np.full((1, sides), z)]) for z in (half, -half)]
     corners = np.ascontiguousarray((cylinder.rotation @ np.concatenate(ends, axis=1)).T)
     return [cylinder, replace(cylinder, kind="hull", corners=corners)]
 

@@ -25,12 +25,9 @@ from ..mesh.split_surface.polyhedron_moments import PolyhedronMoments
 from ..meshes.data import MeshData
 from ..meshes.parameters import RoundSolid
 from ..meshes.topology import boundary_facets
-from .obstacles import Part, PrimitiveShape, cylinder_parts
+from .obstacles import COLLISION_SHAPES, Part, PrimitiveShape, cylinder_parts
 
 Values = npt.NDArray[np.float64]
-
-# Largest distance of boundary nodes from the surface of a round solid, in radii: round-off, also of single precision.
-MAX_DEVIATION = 1e-6
 
 
 @dataclass(frozen=True)
@@ -50,7 +47,7 @@ class RoundShape:
             return None
         shape, boundary = cls(solid), np.unique(boundary_facets(mesh.cells))
         deviation = float(np.abs(shape.distance(mesh.points[boundary])).max()) / solid.radius
-        if deviation <= MAX_DEVIATION:
+        if deviation <= COLLISION_SHAPES.max_round_deviation:
             return shape
         print(
             f"fracsim: note: boundary nodes are up to {deviation:.2g} radii off the {solid.kind} of the builder; "

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 from .body import RegionSettings
 from .fracture import FractureSettings
@@ -198,6 +199,43 @@ def _check_spins(study: Study) -> None:
             )
 
 
+def _check_obstacle_motions(study: Study) -> None:
+    step = study.time.max_step
+    # longer motions in a step lose the digits of gaps
+    max_motion = 1e6  # m
+    for number, obstacle in enumerate(study.obstacle):
+        motions = {
+            "velocity": step * _largest(_values_over_time(obstacle.velocity)[1]),
+            "displacement": _largest_motion(*_values_over_time(obstacle.displacement), step),
+        }
+        for name, motion in motions.items():
+            if motion > max_motion:
+                raise ValueError(
+                    f"obstacle.{number}.{name} moves it by {motion:.3g} m in a step of {step:g} s; at most "
+                    f"{max_motion:g} m are followed: give a slower motion or a shorter time.step"
+                )
+
+
+def _values_over_time(value: Any) -> tuple[list[float], list[list[float]]]:
+    """Return times, s, and vectors of a value that may be constant or tabulated; None: no vectors."""
+    if value is None:
+        return [], []
+    return ([0.0], [value]) if isinstance(value, list) else (value.time, value.value)
+
+
+def _largest(vectors: list[list[float]]) -> float:
+    return max((abs(number) for vector in vectors for number in vector), default=0.0)
+
+
+def _largest_motion(times: list[float], vectors: list[list[float]], step: float) -> float:
+    """Return the largest motion along an axis in a step, m, of displacements that are linear between times."""
+    spans = zip(pairwise(times), pairwise(vectors), strict=True)
+    return max(
+        (min(1.0, step / (t1 - t0)) * abs(b - a) for (t0, t1), (v0, v1) in spans for a, b in zip(v0, v1, strict=True)),
+        default=0.0,
+    )
+
+
 def _check_stop_criterion(study: Study) -> None:
     if study.time.until is None:
         return
@@ -228,6 +266,7 @@ CHECKS: tuple[Callable[[Study], None], ...] = (
     _check_contact,
     _check_free_obstacles,
     _check_spins,
+    _check_obstacle_motions,
     check_displacement_order,
     check_rigid,
     _check_stop_criterion,
