@@ -51,9 +51,9 @@ REPEATS = (
     "test_studies.py::test_full_sizes_are_those_of_the_paper",
     "test_study_file.py::test_studies_of_the_package_survive_being_written[jelly-figure]",
     # rows of the paper's table on a figure: six others
-    "test_table.py::test_rows_have_the_papers_cells_and_steps[jelly-figure]",
-    "test_table.py::test_rows_have_the_papers_cells_and_steps[jade-figure]",
-    "test_table.py::test_rows_have_the_papers_cells_and_steps[porcelain-figure]",
+    "test_table.py::test_rows_have_the_papers_cells[jelly-figure]",
+    "test_table.py::test_rows_have_the_papers_cells[jade-figure]",
+    "test_table.py::test_rows_have_the_papers_cells[porcelain-figure]",
     # a figure by its defaults: it is built by them, and checked, in test_meshes_builders
     "test_required_keys.py::test_builders_require_nothing[figure]",
     # pictures by other fields: a number (age), a component (stress:xy), exploded
