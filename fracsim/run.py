@@ -405,9 +405,13 @@ def run_study(
             print_notes(comm, list(scene.domain.input_mesh.notes))
         try:
             options: dict[str, Any] = {"interrupt": interrupt, "progress": progress, "began": began}
-            return Run(scene, folder, restart=restart, overwrite=overwrite, **options)()
-        finally:
-            scene.destroy()
+            summary = Run(scene, folder, restart=restart, overwrite=overwrite, **options)()
+        except BaseException:
+            if comm.size == 1:  # a rank that failed alone would wait for the others here
+                scene.destroy()
+            raise
+        scene.destroy()
+        return summary
 
 
 def _run_rigid(

@@ -40,6 +40,7 @@ def test_without_a_compiler_single_entries_stay(monkeypatch: pytest.MonkeyPatch)
     assert assembly.matrix is matrix and matrix.norm() > 0
 
 
+@pytest.mark.fast_solver_only("plain matrices have single entries")
 @pytest.mark.parametrize("ranks", [1, *(pytest.param(count, marks=pytest.mark.ranks) for count in (2, 3))])
 def test_contact_beside_blocks_is_that_of_single_entries(ranks: int, tmp_path: Path) -> None:
     """A block between a driven ball with friction and a free one: products, rows and diagonals, and the same motion."""
