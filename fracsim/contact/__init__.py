@@ -33,7 +33,8 @@ Surfaces with ipctk:
 
     ipc_surface, ipc_pairs, sample_points  split surface, pairs of elements, sample points and friction at them
     mesh_obstacles        pairs of a body and a triangle-mesh obstacle
-    penalty_point_facet   penalty between points and facets
+    penalty_pairs         penalty between points and facets, and between edges, with friction
+    penalty_contacts, penalty_point_facet, penalty_edges  energy of contacts; points before facets; edges
 
 Free obstacles:
 

@@ -268,6 +268,17 @@ class SelfContactSurface:
         load[:nodes] = pressure[:nodes]
         return share, load
 
+    def new_numbers(self, previous: SelfContactSurface, count: int) -> Ints:
+        """(n,) numbers on this surface of n = `count` points of the points of the previous surface; -1: none."""
+        old, new, total = previous.point_map.copies, self.point_map.copies, len(previous.split.points)
+        # nodes have kept their numbers, and come before copies
+        nodes = min(old.min(initial=total), new.min(initial=count))
+        number = np.full(total, -1)
+        number[:nodes] = np.arange(nodes)
+        rows = match_points(previous._identity(), self._identity())
+        number[old[rows >= 0]] = new[rows[rows >= 0]]
+        return number
+
     def _crowded_faces(self, u: Values, max_pressure: Values) -> Ints:
         """Crack faces with a pressure above `max_pressure` (n,), Pa, at a corner, or else those that intersect."""
         pressed = self._pressed_faces(u, max_pressure)

@@ -1,15 +1,11 @@
-"""Penalty between points and facets of one surface, for contact of a body with itself in explicit steps; on one rank.
+"""Points before facets of a surface, for a penalty in explicit steps; on one rank.
 
-    E(x) = sum over points p of  k_p (D - g_p)^2 / 2    where g_p < D
-
-g_p is the distance, m, to the nearest facet of those that p is in front of, D the gap below which the penalty acts. A
-point that was in contact at the end of the last step may lie behind its facet, or one beside it: g_p < 0. All other
-points behind a facet are on the far side of its body. Facets of which a point is a corner do not act on it, nor do
-edges act on one another.
+g_p is the distance, m, of a point p to the nearest facet of those that p is in front of. A point that was in contact at
+the end of the last step may lie behind its facet, or one beside it: g_p < 0. All other points behind a facet are on the
+far side of its body. Facets of which a point is a corner do not act on it.
 
 k_p is the stiffness that the point, or a corner of its facet, may have as contact begins, and is constant during
-contact. With l the barycentric coordinates on the facet and n its normal, dE/dx_p = -k (D - g) n and
-dE/dx_c = k l_c (D - g) n: forces and their moments sum to zero.
+contact. The weights of a contact are 1 of the point and minus the barycentric coordinates on the facet.
 
 Equations: docs/theory.md#explicit-contact.
 """
@@ -24,8 +20,9 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
 from .closest_point import minimise_on_simplex
-from .ipc_pairs import IpcPairs, PairKind, PairSearch, centred
+from .ipc_pairs import PairKind, PairSearch, centred
 from .ipc_surface import unit_normals
+from .penalty_contacts import ContactStiffness, PenaltyContacts
 from .sample_points import Vertices
 
 Values = npt.NDArray[np.float64]
@@ -168,122 +165,77 @@ def _closest_points(x: Values, points: Ints, corners: Ints) -> tuple[Values, Val
 
 
 @dataclass(frozen=True)
-class PenaltyContacts:
-    """Pairs in contact.
+class PointHistory:
+    """Contacts of points at the end of the last step.
 
     Attributes:
-        pairs: points before facets.
-        stiffness: (k,) k_p, N/m.
-    """
-
-    pairs: PointFacetPairs
-    stiffness: Values
-
-
-class PointFacetPenalty(IpcPairs):
-    """Penalty between the points and facets of a surface.
-
-    Attributes:
-        contact_facets: (n, d) corners of the facets in contact with points at the end of the last step, or NO_FACET.
-        contact_stiffness: (n,) k_p of these, N/m; 0 of points without contact.
+        facets: (n, d) corners of the facets in contact with points, or NO_FACET.
+        stiffness: (n,) k_p of these, N/m; 0 of points without contact.
         slip: (n, d) stretch of their springs of friction, m.
-        width: D, m.
     """
 
-    def __init__(self, rest_positions: Values, elements: Ints, stiffness: Values, *, distance: float) -> None:
-        """`stiffness`: (n,) k_p, N/m; the others as for IpcPairs."""
-        super().__init__(rest_positions, elements, distance=distance, stiffness=1.0)
-        self.contact_facets: Ints = np.full((len(rest_positions), rest_positions.shape[1]), NO_FACET, np.int64)
-        self.contact_stiffness: Values = np.zeros(len(rest_positions))
-        self.slip: Values = np.zeros_like(rest_positions)
-        self._point_stiffness, self.width, self._elements = stiffness, distance, elements
+    facets: Ints
+    stiffness: Values
+    slip: Values
+
+    @classmethod
+    def none(cls, count: int, dim: int) -> PointHistory:
+        """No contact of n = `count` points."""
+        return cls(np.full((count, dim), NO_FACET, np.int64), np.zeros(count), np.zeros((count, dim)))
+
+    def renumbered(self, number: Ints, max_stiffness: Values) -> PointHistory:
+        """Contacts with new numbers (n,) of points, -1: none, no stiffer than `max_stiffness` (new n,), N/m."""
+        result = PointHistory.none(len(max_stiffness), self.facets.shape[1])
+        points = np.flatnonzero((number >= 0) & (self.stiffness > 0))
+        rows, corners = number[points], self.facets[points]
+        result.facets[rows] = np.where(corners >= 0, number[corners], NO_FACET)
+        result.stiffness[rows] = np.minimum(self.stiffness[points], max_stiffness[rows])
+        result.slip[rows] = self.slip[points]
+        return result
+
+
+class PointFacetContacts:
+    """Points of a surface before its facets, and their history.
+
+    Attributes:
+        history: contacts at the end of the last step.
+    """
+
+    def __init__(
+        self,
+        mesh: ipctk.CollisionMesh,
+        elements: Ints,
+        stiffness: ContactStiffness,
+        *,
+        distance: float,
+        edge: float,
+    ) -> None:
+        """Points and facets of a surface.
+
+        Args:
+            mesh: of ipctk.
+            elements: (k, d) facets.
+            stiffness: of points.
+            distance: D, m.
+            edge: mean length of edges, m.
+        """
+        count, dim = len(stiffness.point), elements.shape[1]
+        self.history = PointHistory.none(count, dim)
+        self._mesh, self._stiffness, self._width, self._elements, self._edge = mesh, stiffness, distance, elements, edge
         self._used = np.unique(elements)  # the points of ipctk's mesh
-        kind = PairKind(distance, 1.0, "ee_candidates", Vertices(self._mesh))
+        kind = PairKind(distance, 1.0, "ee_candidates", Vertices(mesh))
         reach, margin = POINT_FACET.max_gap * distance, POINT_FACET.search_margin * distance
-        self._search = PairSearch(self._mesh, [kind], reach, margin)
+        self._search = PairSearch(mesh, [kind], reach, margin)
         self._candidates: ipctk.Candidates | None = None  # those of which closest points are cached
         self._cache: ClosestPointCache
         self._is_close: Flags  # (k,) cached pairs that were close at the positions of their last check
         self._check_positions: Values
         self._last: tuple[Values, PointFacetPairs] | None = None
-        self._last_contacts: tuple[PointFacetPairs, PenaltyContacts] | None = None
 
-    def energy(self, x: Values) -> float:
-        """Energy E(x), J."""
-        contacts = self.contacts(x)
-        return 0.5 * float(contacts.stiffness @ (self.width - contacts.pairs.gap) ** 2)
-
-    def gradient(self, x: Values) -> Values:
-        """(n, d) dE/dx, N: minus the forces on the points."""
-        contacts, gradient = self.contacts(x), np.zeros_like(x)
-        pairs = contacts.pairs
-        force = (contacts.stiffness * (self.width - pairs.gap))[:, None] * pairs.normal
-        np.add.at(gradient, pairs.points, -force)
-        np.add.at(gradient, pairs.corners, pairs.barycentric[:, :, None] * force[:, None])
-        return gradient
-
-    def min_gap(self, x: Values) -> float:
-        """Least gap below D, m; infinite where there is none."""
-        return float(self.contacts(x).pairs.gap.min(initial=np.inf))
-
-    def end_step(self, x: Values, slips: Values | None = None) -> None:
-        """Store contacts at the end of a step, with points at x (n, d), and slips (k, d) of their springs, m."""
-        contacts = self.contacts(x)
-        if not len(contacts.stiffness) and not self.contact_stiffness.any():
-            return
-        facets, stiffness, slip = np.full_like(self.contact_facets, NO_FACET), np.zeros(len(x)), np.zeros_like(x)
-        points = contacts.pairs.points
-        facets[points], stiffness[points] = contacts.pairs.corners, contacts.stiffness
-        if slips is not None:
-            slip[points] = slips
-        self.set_contacts(facets, stiffness, slip)
-
-    def set_contacts(self, facets: Ints, stiffness: Values, slip: Values) -> None:
-        """Set facets (n, d), stiffness (n,) and slip (n, d) of the points in contact."""
-        self.contact_facets, self.contact_stiffness, self.slip = facets, stiffness, slip
-        self._last_contacts = None
-
-    def max_added_frequency(self, x: Values, weights: csr_matrix, mass: Values) -> float:
-        """Bound of the increase of the square of a frequency (penalty_obstacles.NodalMassShare), 1/s^2.
-
-        Args:
-            x: (n, d) points, m.
-            weights: (n, nodes) with which points follow nodes.
-            mass: (nodes,) kg.
-        """
-        near = self._contacts_within(x, POINT_FACET.ahead_gap * self.width)
-        k, d = near.pairs.corners.shape
-        if not k:
-            return 0.0
-        rows = np.repeat(np.arange(k), d)
-        entries = near.pairs.barycentric.reshape(-1), (rows, near.pairs.corners.reshape(-1))
-        facet_map = csr_matrix(entries, shape=(k, len(x)))
-        size = abs(weights[near.pairs.points] - facet_map @ weights)
-        load = size.T @ (near.stiffness * np.asarray(size.sum(axis=1)).ravel())
-        return float((load / mass).max(initial=0.0))
-
-    def clearance(self, x: Values) -> float:
-        """Distance by which any two points at x (n, d) may approach before anything is near, m; 0 if anything is."""
-        if self.contact_stiffness.any() or len(self._close_rows(x)):
-            return 0.0
-        vertices, candidates = centred(self._mesh.vertices(x)), ipctk.Candidates()
-        reach = POINT_FACET.clearance_gap * self.width
-        candidates.build(self._mesh, vertices, vertices, reach / 2, ipctk.LBVH())
-        points, facets = self._points_and_facets(candidates).T
-        distance = closest_distance(x, points, self._elements[facets], reach)
-        return max(0.0, distance - POINT_FACET.ahead_gap * self.width)
-
-    def contacts(self, x: Values) -> PenaltyContacts:
-        """Pairs in contact with points at x (n, d), m; those of the last x are kept."""
+    def contacts_within(self, x: Values, reach: float) -> PenaltyContacts:
+        """Nearest facet of each point that has one within `reach`, m, with points at x (n, d), m."""
         pairs = self._all_pairs(x)
-        if self._last_contacts is None or self._last_contacts[0] is not pairs:
-            self._last_contacts = pairs, self._contacts_within(x, self.width)
-        return self._last_contacts[1]
-
-    def _contacts_within(self, x: Values, reach: float) -> PenaltyContacts:
-        """Nearest facet of each point that has one within `reach`, m."""
-        pairs = self._all_pairs(x)
-        previous = self.contact_facets[pairs.points]
+        previous = self.history.facets[pairs.points]
         # facets of the last step, or beside them, may be in front of a point that lies behind
         stays = (previous[:, :, None] == pairs.corners[:, None]).any(axis=(1, 2))
         pairs = pairs.select((pairs.gap > 0) | stays)
@@ -291,22 +243,62 @@ class PointFacetPenalty(IpcPairs):
         is_nearest = np.zeros(len(order), bool)
         is_nearest[order[np.unique(pairs.points[order], return_index=True)[1]]] = True
         pairs = pairs.select(is_nearest & (pairs.gap < reach))
-        return PenaltyContacts(pairs, self._stiffness_of(pairs))
+        return PenaltyContacts(
+            points=np.column_stack([pairs.points, pairs.corners]),
+            weights=np.column_stack([np.ones(len(pairs.points)), -pairs.barycentric]),
+            gap=pairs.gap,
+            normal=pairs.normal,
+            stiffness=self._stiffness_of(pairs),
+            share=np.ones(len(pairs.points)),
+            share_gradient=None,
+            slip=self.history.slip[pairs.points],
+            start_stiffness=self.history.stiffness[pairs.points],
+        )
+
+    def end_step(self, contacts: PenaltyContacts, slip: Values | None) -> None:
+        """Store contacts at the end of a step, and slips (k, d) of their springs, m."""
+        if not len(contacts.gap) and not self.history.stiffness.any():
+            return
+        history, points = PointHistory.none(*self.history.slip.shape), contacts.points[:, 0]
+        history.facets[points], history.stiffness[points] = contacts.points[:, 1:], contacts.stiffness
+        if slip is not None:
+            history.slip[points] = slip
+        self.history = history
+
+    def anything_is_near(self, x: Values) -> bool:
+        """Whether any point has contact, or may be near a facet, at x (n, d), m."""
+        return bool(self.history.stiffness.any()) or len(self._close_rows(x)) > 0
+
+    def clearance(self, x: Values, reach: float) -> float:
+        """Least distance between points and facets at x (n, d), m, at most `reach`."""
+        vertices, candidates = centred(self._mesh.vertices(x)), ipctk.Candidates()
+        candidates.build(self._mesh, vertices, vertices, reach / 2, ipctk.LBVH())
+        points, facets = self._points_and_facets(candidates).T
+        return closest_distance(x, points, self._elements[facets], reach)
+
+    def search_along(self, x: Values, end: Values) -> None:
+        """Search candidates for the motion from x to `end` (n, d), m."""
+        self._search.search_along(self._mesh.vertices(x), self._mesh.vertices(end))
+
+    def clear_caches(self) -> None:
+        """Discard the candidates."""
+        self._search.clear_caches()
 
     def _all_pairs(self, x: Values) -> PointFacetPairs:
         """Pairs of points in front of facets or behind; those of the last x are kept."""
         if self._last is None or not np.array_equal(x, self._last[0]):
             positions, rows = x.copy(), self._close_rows(x)
-            reach, tolerance = POINT_FACET.max_gap * self.width, POINT_FACET.same_distance * self._edge
+            reach, tolerance = POINT_FACET.max_gap * self._width, POINT_FACET.same_distance * self._edge
             self._last = positions, point_facet_pairs(positions, self._cache, rows, reach, tolerance)
         return self._last[1]
 
     def _stiffness_of(self, pairs: PointFacetPairs) -> Values:
         """(k,) k_p, N/m: at most what a corner of the facet may have; constant during contact."""
-        weight = np.maximum(pairs.barycentric, POINT_FACET.min_barycentric)
-        limit = (self._point_stiffness[pairs.corners] / weight).min(axis=1, initial=np.inf)
-        previous = self.contact_stiffness[pairs.points]
-        return np.where(previous > 0, previous, np.minimum(self._point_stiffness[pairs.points], limit))
+        allowed, weight = self._stiffness, np.maximum(pairs.barycentric, POINT_FACET.min_barycentric)
+        limit = (allowed.limit[pairs.corners] / weight).min(axis=1, initial=np.inf)
+        largest = allowed.point[pairs.points] * allowed.reduction[pairs.corners].min(axis=1, initial=np.inf)
+        previous = self.history.stiffness[pairs.points]
+        return np.where(previous > 0, previous, np.minimum(largest, limit))
 
     def _close_rows(self, x: Values) -> Ints:
         """(k,) cached pairs that may be as near, or as deep, as counts, with points at x (n, d), m.
@@ -316,13 +308,13 @@ class PointFacetPenalty(IpcPairs):
         vertices = self._mesh.vertices(x)
         (candidates,) = self._search.candidates(vertices)
         margin = POINT_FACET.search_margin
-        positions, reach = centred(vertices), (POINT_FACET.max_gap + 3 * margin) * self.width
+        positions, reach = centred(vertices), (POINT_FACET.max_gap + 3 * margin) * self._width
         if candidates is not self._candidates:
             points, facets = self._points_and_facets(candidates).T
             self._candidates, self._cache = candidates, ClosestPointCache(points, self._elements[facets])
             self._check_positions = positions
             self._is_close = self._cache.are_within(x.copy(), np.arange(len(points)), reach)
-        elif (far := np.sum((positions - self._check_positions) ** 2, axis=1) > (margin * self.width) ** 2).any():
+        elif (far := np.sum((positions - self._check_positions) ** 2, axis=1) > (margin * self._width) ** 2).any():
             moved = np.zeros(len(x), bool)
             moved[self._used[far]] = True
             rows = np.flatnonzero(self._cache.involves(moved))
@@ -332,7 +324,7 @@ class PointFacetPenalty(IpcPairs):
 
     def _points_and_facets(self, candidates: ipctk.Candidates) -> Ints:
         """(k, 2) points and facets of ipctk's candidates."""
-        if self.contact_facets.shape[1] == 3:
+        if self._elements.shape[1] == 3:
             numbers = [(pair.vertex_id, pair.face_id) for pair in candidates.fv_candidates]
         else:
             numbers = [(pair.vertex_id, pair.edge_id) for pair in candidates.ev_candidates]
@@ -351,7 +343,7 @@ def penalty_stiffness(weights: csr_matrix, area: Values, mass: Values, pressure:
         area: (n,) m^2.
         mass: (nodes,) kg.
         pressure: penalty's stiffness, Pa/m.
-        most: 1/s^2.
+        max_added: 1/s^2.
     """
     size = abs(weights)
     row_sum = np.asarray(size.sum(axis=1)).ravel()

@@ -1,108 +1,40 @@
 """Term of the balance for contact of a body with itself, and of its fragments, in explicit steps: a penalty.
 
 k_p = kappa A_p / (2 D), but at most what leaves the stable step as it is (penalty_point_facet.penalty_stiffness). What
-points near each other add to the square of the highest frequency limits the step.
-
-Coulomb friction: each point in contact has a spring that slips (Cundall and Strack 1979),
-
-    f_p = -k_p s,    s += (1 - n n^T) (dx_p - sum_c l_c dx_c) in a step, shortened to k_p |s| <= mu k_p (D - g)
-
-with k_p, the gap g, its normal n and the barycentric coordinates l on the facet as of the penalty; the corners of the
-facet take -l_c f_p. Forces sum to zero; their moment is that of f_p over the gap.
+points near each other add to the square of the highest frequency limits the step. Pairs and friction: penalty_pairs.
 
 Equations: docs/theory.md#explicit-contact.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import ClassVar, cast
 
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
-from scipy.sparse import csr_matrix
 
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import from_root, on_root
 from ..mesh.split_surface.entity_numbering import EntityNumbering
-from ..mesh.split_surface.point_matching import match_points
 from .ipc_pairs import vertex_areas
 from .ipc_surface import SelfContactLaw, SelfContactSurface
-from .laws import tangential
-from .penalty_point_facet import NO_FACET, PointFacetPenalty, penalty_stiffness
+from .penalty_contacts import ContactStiffness
+from .penalty_pairs import PairSprings, PenaltyHistory, PenaltyPairs, history_from_checkpoint
+from .penalty_point_facet import PointHistory, penalty_stiffness
 from .self_contact import SelfContact, node_gather
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class SelfFrictionSprings:
-    """Springs of friction between points and facets in contact.
-
-    Attributes:
-        pairs: penalty.
-        coefficient: of friction.
-        start: (n, d) points at the start of the step, m; None: the step is accepted.
-    """
-
-    pairs: PointFacetPenalty
-    coefficient: float
-    start: Values | None
-
-    def gradient(self, x: Values) -> Values:
-        """(n, d) minus the forces on the points, N."""
-        contacts, gradient = self.pairs.contacts(x), np.zeros_like(x)
-        pairs = contacts.pairs
-        force = contacts.stiffness[:, None] * self.slips(x)
-        np.add.at(gradient, pairs.points, force)
-        np.add.at(gradient, pairs.corners, -pairs.barycentric[:, :, None] * force[:, None])
-        return gradient
-
-    def energy(self, x: Values) -> float:
-        """Energy of the springs, J."""
-        return 0.5 * float(self.pairs.contacts(x).stiffness @ np.sum(self.slips(x) ** 2, axis=1))
-
-    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
-        """Raise NotImplementedError: explicit steps need no tangent."""
-        raise NotImplementedError("explicit steps ask for no tangent")
-
-    def slips(self, x: Values) -> Values:
-        """(k, d) stretch of the springs of the contacts at x, m; zero for new contacts."""
-        contacts, start = self.pairs.contacts(x), self._start_slips(x)
-        slip = tangential(contacts.pairs.normal, start + self._relative_motion(x))
-        max_length = self.coefficient * (self.pairs.width - contacts.pairs.gap)
-        length = np.maximum(np.linalg.norm(slip, axis=1), np.finfo(float).tiny)
-        return np.asarray(np.minimum(1.0, max_length / length)[:, None] * slip)
-
-    def dissipated(self, x: Values) -> float:
-        """Energy dissipated in the step, J: minus the work by the trapezoidal rule, minus the change of energy."""
-        k = self.pairs.contacts(x).stiffness[:, None]
-        work = -0.5 * float(np.vdot(k * (self._start_slips(x) + self.slips(x)), self._relative_motion(x)))
-        start_energy = 0.5 * float(self.pairs.contact_stiffness @ np.sum(self.pairs.slip**2, axis=1))
-        return start_energy - self.energy(x) - work
-
-    def _start_slips(self, x: Values) -> Values:
-        """(k, d) stretch of the springs at the start of the step, m."""
-        return np.asarray(self.pairs.slip[self.pairs.contacts(x).pairs.points])
-
-    def _relative_motion(self, x: Values) -> Values:
-        """(k, d) motion over their facets of points in contact since the start of the step, m."""
-        pairs = self.pairs.contacts(x).pairs
-        if self.start is None:
-            return np.zeros((len(pairs.points), x.shape[1]))
-        motion = x - self.start
-        relative = motion[pairs.points] - np.einsum("kcd,kc->kd", motion[pairs.corners], pairs.barycentric)
-        return np.where((self.pairs.contact_stiffness[pairs.points] > 0)[:, None], relative, 0.0)
-
-
 class PenaltyContactSurface(SelfContactSurface):
     """Surface of a body with penalty contact, on rank 0."""
 
-    pairs: PointFacetPenalty
+    pairs: PenaltyPairs
     closed_pressure: ClassVar[float] = 0.0  # a face that is pressed at all has no room
     search_all_faces: ClassVar[bool] = True  # to read candidates takes longer than to have more of them
 
@@ -124,7 +56,7 @@ class PenaltyContactSurface(SelfContactSurface):
         super().__init__(skeleton, pattern, law, u, previous, cut)
         self._previous = None
 
-    def _build_pairs(self, elements: Ints) -> PointFacetPenalty:
+    def _build_pairs(self, elements: Ints) -> PenaltyPairs:
         # by all elements and full arms: constant while a surface lasts
         if self._stiffness is None:
             pressure, area = (
@@ -132,34 +64,14 @@ class PenaltyContactSurface(SelfContactSurface):
                 vertex_areas(self._rest_positions, self.split.elements),
             )
             self._stiffness = penalty_stiffness(self.point_map.weights, area, self.mass, pressure, self._max_added)
-        pairs = PointFacetPenalty(self._rest_positions, elements, self._stiffness, distance=self._law.distance)
+        stiffness = ContactStiffness.of_one_body(self._stiffness)
+        pairs = PenaltyPairs(self._rest_positions, elements, stiffness, distance=self._law.distance)
         if (last := getattr(self, "pairs", None)) is not None:
-            pairs.set_contacts(last.contact_facets, last.contact_stiffness, last.slip)
+            pairs.set_history(last.history)
         elif self._previous is not None:
-            pairs.set_contacts(*self._previous_contacts(self._previous, self._stiffness))
+            number = self.new_numbers(self._previous, len(self._stiffness))
+            pairs.set_history(self._previous.pairs.history.renumbered(number, self._stiffness))
         return pairs
-
-    def _previous_contacts(self, previous: PenaltyContactSurface, max_stiffness: Values) -> tuple[Ints, Values, Values]:
-        """Facets (n, d), stiffness (n,) and slip (n, d) of contacts of the previous surface, for the current points.
-
-        What was in contact stays so, with no larger stiffness.
-        """
-        old, new, pairs = previous.point_map.copies, self.point_map.copies, previous.pairs
-        # nodes have kept their numbers
-        nodes = min(old.min(initial=len(pairs.contact_facets)), new.min(initial=len(max_stiffness)))
-        new_number = np.full(len(pairs.contact_facets), NO_FACET)
-        new_number[:nodes] = np.arange(nodes)
-        rows = match_points(previous._identity(), self._identity())
-        new_number[old[rows >= 0]] = new[rows[rows >= 0]]
-        stiffness = np.zeros(len(max_stiffness))
-        facets = np.full((len(max_stiffness), pairs.contact_facets.shape[1]), NO_FACET)
-        slip = np.zeros(facets.shape)
-        points = np.flatnonzero((new_number >= 0) & (pairs.contact_stiffness > 0))
-        corners = pairs.contact_facets[points]
-        facets[new_number[points]] = np.where(corners >= 0, new_number[corners], NO_FACET)
-        stiffness[new_number[points]] = pairs.contact_stiffness[points]
-        slip[new_number[points]] = pairs.slip[points]
-        return facets, np.minimum(stiffness, max_stiffness), slip
 
 
 # displacements where nothing was near, clearance, and number of surfaces so far
@@ -173,7 +85,7 @@ class PenaltySelfContact(SelfContact):
     """
 
     _surface: PenaltyContactSurface | None
-    _friction: SelfFrictionSprings | None
+    _friction: PairSprings | None
     _idle_displacement: Values | None = None  # (owned dofs,) where nothing was near, m; None: something was
     _idle_clearance = 0.0  # approach of any two points from there on before anything is near, m
     _surface_count = 0  # surfaces so far
@@ -219,7 +131,7 @@ class PenaltySelfContact(SelfContact):
             super().begin_step(level)
         if self._coefficient and self._surface is not None:
             start = self._start_positions if level.dt and not idle else None
-            self._friction = SelfFrictionSprings(self._surface.pairs, self._coefficient, start)
+            self._friction = PairSprings(self._surface.pairs, self._coefficient, start)
 
     def update_displacement(self) -> None:
         """Discard positions and forces, as u has changed."""
@@ -314,20 +226,16 @@ class PenaltySelfContact(SelfContact):
 
     def snapshot(self) -> object:
         """State of the surface, contacts, and idle state."""
-        contacts = None
-        if self._surface is not None:
-            pairs = self._surface.pairs
-            contacts = pairs.contact_facets, pairs.contact_stiffness, pairs.slip
+        contacts = None if self._surface is None else self._surface.pairs.history
         idle = self._idle_displacement, self._idle_clearance, self._surface_count
         return super().snapshot(), contacts, idle
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective)."""
-        surface, contacts, idle = cast("tuple[object, tuple[Ints, Values, Values] | None, _IdleState]", memory)
+        surface, contacts, idle = cast("tuple[object, PenaltyHistory | None, _IdleState]", memory)
         super().restore(surface)
-        pairs = None if self._surface is None else self._surface.pairs
-        if pairs is not None and contacts is not None and contacts[1] is not pairs.contact_stiffness:
-            pairs.set_contacts(*contacts)
+        if self._surface is not None and contacts is not None:
+            self._surface.pairs.set_history(contacts)
         self._idle_displacement, self._idle_clearance, surface_count = idle
         # edges have broken since: it is another surface
         if surface_count != self._surface_count:
@@ -337,15 +245,13 @@ class PenaltySelfContact(SelfContact):
     def to_checkpoint(self) -> dict[str, Values]:
         """Arrays for a checkpoint, with facets in contact, their stiffness and the springs of friction."""
         if self._surface is None:
-            return super().to_checkpoint() | {"by": np.empty((0, 0)), "held": np.empty(0), "slip": np.empty((0, 0))}
-        pairs = self._surface.pairs
-        contacts = {"by": pairs.contact_facets.astype(float), "held": pairs.contact_stiffness, "slip": pairs.slip}
-        return super().to_checkpoint() | contacts
+            empty = PenaltyHistory(PointHistory.none(0, 0), None)
+            return super().to_checkpoint() | empty.to_checkpoint()
+        return super().to_checkpoint() | self._surface.pairs.history.to_checkpoint()
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint."""
         self._idle_displacement = self._idle = None
         super().from_checkpoint(saved)
         if self._surface is not None and "by" in saved:
-            slip = saved.get("slip", np.zeros(saved["by"].shape))
-            self._surface.pairs.set_contacts(saved["by"].astype(np.int64), saved["held"], slip)
+            self._surface.pairs.set_history(history_from_checkpoint(saved))

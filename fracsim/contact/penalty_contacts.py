@@ -1,0 +1,143 @@
+"""Contacts of a penalty between elements of surfaces in 2D and 3D: energy, forces and added stiffness.
+
+A contact has m = d + 1 points x_i with weights w_i that sum to zero: a point and the corners of a facet, or the ends of
+two edges. Its gap is g = n . sum_i w_i x_i with the unit normal n, and its energy
+
+    E = k h (D - g)^2 / 2    for g < D
+
+with the stiffness k and a share h in [0, 1], which is 1 for points before facets and depends on x for edges. As dg/dx_i
+= w_i n, forces sum to zero; so do their moments, as E is invariant under rotations.
+
+Equations: docs/theory.md#explicit-contact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class ContactStiffness:
+    """Stiffness that points of surfaces may have in a penalty.
+
+    Attributes:
+        point: (n,) k_p of points before facets, N/m.
+        limit: (n,) what a point carries as a corner of a facet or an end of an edge, N/m; infinite where it is rigid.
+        reduction: (n,) factor of k_p of points before facets with this corner: what the mass of the corner leaves.
+    """
+
+    point: Values
+    limit: Values
+    reduction: Values
+
+    @classmethod
+    def of_one_body(cls, stiffness: Values) -> ContactStiffness:
+        """Stiffness of a surface in contact with itself, of k_p (n,), N/m."""
+        return cls(stiffness, stiffness, np.ones(len(stiffness)))
+
+
+@dataclass(frozen=True)
+class PenaltyContacts:
+    """Contacts within some gap.
+
+    Attributes:
+        points: (k, m) numbers of points.
+        weights: (k, m) w.
+        gap: (k,) m; negative: penetration.
+        normal: (k, d) n.
+        stiffness: (k,) k, N/m.
+        share: (k,) h.
+        share_gradient: (k, m, d) dh/dx, 1/m; None: zero.
+        slip: (k, d) stretch of the springs of friction at the start of the step, m.
+        start_stiffness: (k,) k h at the start of the step, N/m; 0 of new contacts.
+    """
+
+    points: Ints
+    weights: Values
+    gap: Values
+    normal: Values
+    stiffness: Values
+    share: Values
+    share_gradient: Values | None
+    slip: Values
+    start_stiffness: Values
+
+    def select(self, rows: Flags | Ints) -> PenaltyContacts:
+        """Some of the contacts."""
+        gradient = None if self.share_gradient is None else self.share_gradient[rows]
+        return PenaltyContacts(
+            self.points[rows], self.weights[rows], self.gap[rows], self.normal[rows], self.stiffness[rows],
+            self.share[rows], gradient, self.slip[rows], self.start_stiffness[rows],
+        )  # fmt: skip
+
+    @property
+    def spring_stiffness(self) -> Values:
+        """(k,) k h, N/m."""
+        return np.asarray(self.stiffness * self.share)
+
+    def energy(self, width: float) -> float:
+        """Energy with D = `width`, m, J."""
+        return 0.5 * float(self.spring_stiffness @ (width - self.gap) ** 2)
+
+    def gradient(self, width: float, count: int) -> Values:
+        """(n, d) derivatives of the energy with D = `width`, m, by all points n = `count`, N."""
+        closure = width - self.gap
+        result = self.sum_at_points(-(self.spring_stiffness * closure)[:, None] * self.normal, count)
+        if self.share_gradient is not None:
+            factor = 0.5 * self.stiffness * closure**2
+            np.add.at(result, self.points, factor[:, None, None] * self.share_gradient)
+        return result
+
+    def sum_at_points(self, vectors: Values, count: int) -> Values:
+        """(n, d) sums of w_i times vectors (k, d) at the points n = `count`."""
+        result = np.zeros((count, vectors.shape[1]))
+        np.add.at(result, self.points, self.weights[:, :, None] * vectors[:, None])
+        return result
+
+    def relative(self, x: Values) -> Values:
+        """(k, d) sums of w_i x_i of positions or motions x (n, d), m."""
+        return np.asarray(np.einsum("km,kmd->kd", self.weights, x[self.points]))
+
+    def positions(self, x: Values, side: Flags) -> Values:
+        """(k, d) position of each contact among the points of one side, flags (n,), at x (n, d), m."""
+        weights = abs(self.weights) * side[self.points]
+        weights = weights / np.maximum(weights.sum(axis=1), np.finfo(float).tiny)[:, None]
+        return np.asarray(np.einsum("km,kmd->kd", weights, x[self.points]))
+
+    def max_added_frequency(self, nodes: csr_matrix, mass: Values) -> float:
+        """Bound of the increase of the square of a frequency if all contacts are closed, 1/s^2.
+
+        Args:
+            nodes: (n, nodes) weights with which points follow nodes; zero for points of what does not move.
+            mass: (nodes,) kg.
+        """
+        k, m = self.points.shape
+        if not k:
+            return 0.0
+        entries = self.weights.reshape(-1), (np.repeat(np.arange(k), m), self.points.reshape(-1))
+        size = abs(csr_matrix(entries, shape=(k, nodes.shape[0])) @ nodes)
+        load = size.T @ (self.stiffness * np.asarray(size.sum(axis=1)).ravel())
+        return float((load / mass).max(initial=0.0))
+
+
+def concatenate_contacts(parts: list[PenaltyContacts]) -> PenaltyContacts:
+    """Contacts of several kinds, in their order."""
+    if len(parts) == 1:
+        return parts[0]
+    gradients = [
+        np.zeros((*part.points.shape, part.normal.shape[1])) if part.share_gradient is None else part.share_gradient
+        for part in parts
+    ]
+    names = [entry.name for entry in fields(PenaltyContacts)]
+    arrays = {
+        name: np.concatenate([getattr(part, name) for part in parts]) for name in names if name != "share_gradient"
+    }
+    return PenaltyContacts(**arrays, share_gradient=np.concatenate(gradients))

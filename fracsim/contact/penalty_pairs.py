@@ -1,0 +1,244 @@
+"""Penalty between points and facets, and between edges, of surfaces in explicit steps, with friction; on one rank.
+
+    E(x) = sum over points p of k_p (D - g_p)^2 / 2 + sum over edges of k h (D - g)^2 / 2    where g < D
+
+(penalty_contacts). Points before facets: penalty_point_facet; edges against edges, in 3D: penalty_edges.
+
+Coulomb friction: each contact has a spring that slips (Cundall and Strack 1979),
+
+    f = -k h s,    s += (1 - n n^T) sum_i w_i dx_i in a step, shortened to |s| <= mu (D - g)
+
+Equations: docs/theory.md#explicit-contact.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.sparse import csr_matrix
+
+from .ipc_pairs import IpcPairs
+from .laws import tangential
+from .penalty_contacts import ContactStiffness, PenaltyContacts, concatenate_contacts
+from .penalty_edges import EdgeContacts, EdgePairHistory
+from .penalty_point_facet import POINT_FACET, PointFacetContacts, PointHistory
+
+Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+NO_ROWS: Ints = np.empty(0, np.int64)
+
+
+@dataclass(frozen=True)
+class PenaltyHistory:
+    """Contacts at the end of the last step.
+
+    Attributes:
+        points: of points before facets.
+        edges: of edges against edges; None in 2D.
+    """
+
+    points: PointHistory
+    edges: EdgePairHistory | None
+
+    def to_checkpoint(self) -> dict[str, Values]:
+        """Arrays for a checkpoint."""
+        arrays = {"by": self.points.facets.astype(float), "held": self.points.stiffness, "slip": self.points.slip}
+        return arrays if self.edges is None else arrays | {"edges": self.edges.to_array()}
+
+    def renumbered(self, number: Ints, max_stiffness: Values) -> PenaltyHistory:
+        """Contacts with new numbers (n,) of points, -1: none, no stiffer than `max_stiffness` (new n,), N/m."""
+        edges = None if self.edges is None else self.edges.renumbered(number)
+        return PenaltyHistory(self.points.renumbered(number, max_stiffness), edges)
+
+
+def history_from_checkpoint(saved: dict[str, Values]) -> PenaltyHistory:
+    """Contacts at the end of the last step, from the arrays of a checkpoint."""
+    facets, stiffness = saved["by"].astype(np.int64), saved["held"]
+    points = PointHistory(facets, stiffness, saved.get("slip", np.zeros(facets.shape)))
+    if facets.shape[1] == 2:
+        return PenaltyHistory(points, None)
+    return PenaltyHistory(
+        points, EdgePairHistory.from_array(saved["edges"]) if "edges" in saved else EdgePairHistory.none()
+    )
+
+
+class PenaltyPairs(IpcPairs):
+    """Penalty between the elements of a surface; x is always (n, d), m.
+
+    Attributes:
+        width: D, m.
+    """
+
+    def __init__(
+        self,
+        rest_positions: Values,
+        elements: Ints,
+        stiffness: ContactStiffness,
+        *,
+        distance: float,
+        patch: npt.NDArray[np.int32] | None = None,
+    ) -> None:
+        """Pairs of a surface.
+
+        Args:
+            rest_positions: (n, d) reference positions, m.
+            elements: (m, d) points of segments or triangles.
+            stiffness: of points.
+            distance: D, m.
+            patch: (n,) numbers of parts of the surface that touch others alone; None: all touch.
+        """
+        super().__init__(rest_positions, elements, distance=distance, stiffness=1.0)
+        self.width, is_3d = distance, rest_positions.shape[1] == 3
+        if patch is not None:
+            self.restrict_to_patches(patch)
+        edge = float(self._edge)
+        self._points = PointFacetContacts(self._mesh, elements, stiffness, distance=distance, edge=edge)
+        self._edges = (
+            EdgeContacts(rest_positions, elements, stiffness.limit, distance=distance, patch=patch) if is_3d else None
+        )
+        self._near: tuple[Values, PenaltyContacts, PenaltyContacts] | None = None  # of the last x
+        self._touching: PenaltyContacts | None = None  # those of them in contact
+
+    @property
+    def history(self) -> PenaltyHistory:
+        """Contacts at the end of the last step."""
+        return PenaltyHistory(self._points.history, None if self._edges is None else self._edges.history)
+
+    def set_history(self, history: PenaltyHistory) -> None:
+        """Set the contacts at the end of the last step."""
+        self._points.history = history.points
+        if self._edges is not None and history.edges is not None:
+            self._edges.set_history(history.edges)
+        self._near = None
+
+    def energy(self, x: Values) -> float:
+        """Energy E(x), J."""
+        return self.contacts(x).energy(self.width)
+
+    def gradient(self, x: Values) -> Values:
+        """(n, d) dE/dx, N: minus the forces on the points."""
+        return self.contacts(x).gradient(self.width, len(x))
+
+    def min_gap(self, x: Values) -> float:
+        """Least gap below D, m; infinite where there is none."""
+        return float(self.contacts(x).gap.min(initial=np.inf))
+
+    def contacts(self, x: Values) -> PenaltyContacts:
+        """Contacts with points at x; those of the last x are kept."""
+        near = self.near_contacts(x)
+        if self._touching is None:
+            self._touching = near.select(near.gap < self.width)
+        return self._touching
+
+    def near_contacts(self, x: Values) -> PenaltyContacts:
+        """Contacts that may be closed a step later, with points at x; those of the last x are kept."""
+        return concatenate_contacts(self._near_parts(x))
+
+    def _near_parts(self, x: Values) -> list[PenaltyContacts]:
+        if self._near is None or not np.array_equal(x, self._near[0]):
+            reach = POINT_FACET.ahead_gap * self.width
+            points = self._points.contacts_within(x, reach)
+            edges = points.select(NO_ROWS) if self._edges is None else self._edges.contacts_within(x, reach)
+            self._near, self._touching = (x.copy(), points, edges), None
+        _, points, edges = self._near
+        return [points, edges] if len(edges.gap) else [points]
+
+    def end_step(self, x: Values, slips: Values | None = None) -> None:
+        """Store contacts at the end of a step, and slips (k, d) of the springs of `contacts`, m."""
+        points, *edges = self._near_parts(x)
+        touches = points.gap < self.width
+        count = int(touches.sum())
+        self._points.end_step(points.select(touches), None if slips is None else slips[:count])
+        if self._edges is not None:
+            near, slip = edges[0] if edges else points.select(NO_ROWS), None
+            if slips is not None:
+                slip = np.zeros_like(near.normal)
+                slip[near.gap < self.width] = slips[count:]
+            self._edges.end_step(x, near, slip)
+        self._near = self._touching = None
+
+    def max_added_frequency(self, x: Values, nodes: csr_matrix, mass: Values) -> float:
+        """Bound of the increase of the square of a frequency (PenaltyContacts.max_added_frequency), 1/s^2."""
+        return self.near_contacts(x).max_added_frequency(nodes, mass)
+
+    def clearance(self, x: Values) -> float:
+        """Distance by which any two points at x may approach before anything is near, m; 0 if anything is."""
+        if self._points.anything_is_near(x):
+            return 0.0
+        reach = POINT_FACET.clearance_gap * self.width
+        distance = self._points.clearance(x, reach)
+        if self._edges is not None:
+            distance = self._edges.clearance(x, distance)
+        return max(0.0, distance - POINT_FACET.ahead_gap * self.width)
+
+    def search_along(self, x: Values, end: Values) -> None:
+        """Search candidates for the whole motion from x to `end`."""
+        self._points.search_along(x, end)
+        if self._edges is not None:
+            self._edges.search_along(x, end)
+
+    def clear_caches(self) -> None:
+        """Discard the candidates of collision detection."""
+        self._points.clear_caches()
+        if self._edges is not None:
+            self._edges.clear_caches()
+        self._near = self._touching = None
+
+
+@dataclass(frozen=True)
+class PairSprings:
+    """Springs of friction at the contacts of a penalty.
+
+    Attributes:
+        pairs: penalty.
+        coefficient: of friction.
+        start: (n, d) points at the start of the step, m; None: the step is accepted.
+    """
+
+    pairs: PenaltyPairs
+    coefficient: float
+    start: Values | None
+
+    def gradient(self, x: Values) -> Values:
+        """(n, d) minus the forces on the points, N."""
+        contacts = self.pairs.contacts(x)
+        return contacts.sum_at_points(contacts.spring_stiffness[:, None] * self.slips(x), len(x))
+
+    def energy(self, x: Values) -> float:
+        """Energy of the springs, J."""
+        return 0.5 * float(self.pairs.contacts(x).spring_stiffness @ np.sum(self.slips(x) ** 2, axis=1))
+
+    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
+        """Raise NotImplementedError: explicit steps need no tangent."""
+        raise NotImplementedError("explicit steps ask for no tangent")
+
+    def slips(self, x: Values) -> Values:
+        """(k, d) stretch of the springs of the contacts at x, m; zero for new contacts."""
+        contacts = self.pairs.contacts(x)
+        slip = tangential(contacts.normal, contacts.slip + self._relative_motion(x))
+        max_length = self.coefficient * (self.pairs.width - contacts.gap)
+        length = np.maximum(np.linalg.norm(slip, axis=1), np.finfo(float).tiny)
+        return np.asarray(np.minimum(1.0, max_length / length)[:, None] * slip)
+
+    def dissipated(self, x: Values) -> float:
+        """Energy dissipated in the step, J: minus the work by the trapezoidal rule, minus the change of energy."""
+        contacts, history = self.pairs.contacts(x), self.pairs.history
+        start, end = (
+            contacts.start_stiffness[:, None] * contacts.slip,
+            contacts.spring_stiffness[:, None] * self.slips(x),
+        )
+        work = -0.5 * float(np.vdot(start + end, self._relative_motion(x)))
+        start_energy = 0.5 * float(history.points.stiffness @ np.sum(history.points.slip**2, axis=1))
+        if (edges := history.edges) is not None:
+            start_energy += 0.5 * float((edges.stiffness * edges.share) @ np.sum(edges.slip**2, axis=1))
+        return start_energy - self.energy(x) - work
+
+    def _relative_motion(self, x: Values) -> Values:
+        """(k, d) motion at contacts that stay in contact since the start of the step, m."""
+        contacts = self.pairs.contacts(x)
+        if self.start is None:
+            return np.zeros_like(contacts.normal)
+        return np.where((contacts.start_stiffness > 0)[:, None], contacts.relative(x - self.start), 0.0)
