@@ -319,6 +319,16 @@ class IpcPairs:
         self._friction, self._distance = friction, distance
         self._area = vertex_areas(rest_positions, elements)
 
+    @property
+    def collision_mesh(self) -> ipctk.CollisionMesh:
+        """Surface of ipctk: the points of elements alone."""
+        return self._mesh
+
+    @property
+    def mean_edge_length(self) -> float:
+        """Mean length of edges at rest, m."""
+        return float(self._edge)
+
     def restrict_to_patches(self, patch: npt.NDArray[np.int32]) -> None:
         """Let elements touch those of other patches alone; `patch`: (n,) number of the patch of each point."""
         self._mesh.can_collide = ipctk.make_vertex_patches_filter(patch[np.unique(self._elements)])

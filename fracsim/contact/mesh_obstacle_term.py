@@ -27,7 +27,7 @@ from ..mesh.ghost_exchange import with_straight_edges
 from ..mesh.parallel import from_root, on_root
 from ..mesh.split_surface.surface_map import SurfaceMap
 from ..meshes.data import AXES
-from .ipc_pairs import max_length
+from .ipc_pairs import IpcPairs, max_length
 from .ipc_surface import SelfContactLaw
 from .laws import BARRIER
 from .mesh_obstacles import (
@@ -72,7 +72,7 @@ GUESS = MeshGuessPolicy()
 
 
 def stop_before_meshes(
-    surface: MeshContactSurface, pairs: AllMeshPairs, start: Values, end: Values, start_poses: Sequence[Pose]
+    surface: MeshContactSurface, pairs: AllMeshPairs[IpcPairs], start: Values, end: Values, start_poses: Sequence[Pose]
 ) -> Values:
     """First guess with points stopped where they would cross an obstacle; the same array where none would.
 
@@ -104,7 +104,7 @@ def _node_means(weights: csr_matrix, correction: Values) -> Values:
     return np.where(counts[:, None], (weights @ correction) / np.where(counts, weight, 1.0)[:, None], 0.0)
 
 
-def motion_corrections(pairs: MeshObstaclePairs, start_pose: Pose, x: Values, end: Values) -> Values:
+def motion_corrections(pairs: MeshObstaclePairs[IpcPairs], start_pose: Pose, x: Values, end: Values) -> Values:
     """(n, 3) differences of safe motions of points and their motions from x to `end`, m.
 
     In the frame of the obstacle a point stops where it comes as near to it as a tenth of its distance; piece by piece,
@@ -112,7 +112,7 @@ def motion_corrections(pairs: MeshObstaclePairs, start_pose: Pose, x: Values, en
     """
     # motion relative to the obstacle
     motion = end - pairs.mesh.pose.points_to_space(start_pose.to_body(x))
-    edge = pairs.mean_edge_length
+    edge = pairs.contact.mean_edge_length
     count = min(max(1, int(np.ceil(max_length(motion) / edge))), GUESS.max_pieces)
     # safe and unlimited positions, before the obstacle at its end
     safe_x, free_x = end - motion, end - motion
@@ -194,12 +194,17 @@ class MeshObstacleTerm(SelfContact):
         pattern, u = self._gathered_pattern(), self._gathered(self._u.x.array[: self._owned])
 
         def build() -> MeshContactSurface:
-            assert self._skeleton is not None and pattern is not None and u is not None
-            return MeshContactSurface(self._skeleton, pattern, self._meshes, self.law, u, self._surface)
+            assert pattern is not None and u is not None
+            return self._build_mesh_surface(pattern, u)
 
         self._surface = on_root(self.comm, build)
         self._positions = self._start_positions = self._tangent_positions = self._friction = None
         self._is_stale = True
+
+    def _build_mesh_surface(self, pattern: npt.NDArray[np.uint8], u: Values) -> MeshContactSurface:
+        """Surface of a pattern of damage at displacements u (nodes, 3), m, on rank 0."""
+        assert self._skeleton is not None
+        return MeshContactSurface(self._skeleton, pattern, self._meshes, self.law, u, self._surface)
 
     def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
         """Retract points of a surface for output as those of contact are."""
@@ -456,8 +461,8 @@ class MeshObstacleTerm(SelfContact):
         if pairs.is_far(x):
             return None
         points, mesh = pairs.with_mesh(x), slice(3 * n, None)
-        energy, gradient = pairs.energy(points), pairs.gradient(points)
-        exact, positive = pairs.hessian(points, exact=True), pairs.hessian(points)
+        energy, gradient = pairs.contact.energy(points), pairs.contact.gradient(points)
+        exact, positive = pairs.contact.hessian(points, exact=True), pairs.contact.hessian(points)
         if self._friction is not None and (friction := self._friction.friction_with(pairs)) is not None:
             energy, gradient = energy + friction.energy(points), gradient + friction.gradient(points)
             exact, positive = exact + friction.hessian(points, exact=True), positive + friction.hessian(points)
@@ -480,7 +485,7 @@ class MeshObstacleTerm(SelfContact):
         if pairs.is_far(x):
             return None
         points = pairs.with_mesh(x)
-        H = pairs.hessian(points)
+        H = pairs.contact.hessian(points)
         if self._friction is not None and (friction := self._friction.friction_with(pairs)) is not None:
             H = H + friction.hessian(points)
         J = point_jacobian(pairs.mesh.positions - pairs.mesh.pose.centre).reshape(-1, 6)

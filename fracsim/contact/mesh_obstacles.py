@@ -6,8 +6,7 @@ of its forces on them. Each obstacle has pairs of its own with the body: its fri
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from copy import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import ipctk
@@ -30,6 +29,7 @@ from .triangle_mesh_shape import penetration_depth
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Patches = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -145,7 +145,7 @@ class MeshObstacle:
         return float(self._tree.query(x[candidates])[0].min(initial=distance))
 
 
-class MeshObstaclePairs(IpcPairs):
+class MeshObstaclePairs[Contact: IpcPairs]:
     """Pairs of a body's surface and one obstacle.
 
     Points are (n + m, 3): those of the body, then those of the obstacle.
@@ -156,9 +156,23 @@ class MeshObstaclePairs(IpcPairs):
     """
 
     def __init__(
-        self, rest_positions: Values, elements: Ints, mesh: MeshObstacle, *, distance: float, stiffness: float
+        self,
+        rest_positions: Values,
+        elements: Ints,
+        mesh: MeshObstacle,
+        distance: float,
+        make_contact: Callable[[Values, Ints, Patches], Contact],
     ) -> None:
-        """`rest_positions` (n, 3), m, and `elements` (k, 3) of the body; the others as for IpcPairs."""
+        """Pairs of both surfaces.
+
+        Args:
+            rest_positions: (n, 3) of the body, m.
+            elements: (k, 3) of the body.
+            mesh: the obstacle.
+            distance: at which contact begins, m.
+            make_contact: returns the contact of points (n + m, 3), triangles (k, 3) of both, and patches (n + m,), of
+                which different ones may touch.
+        """
         self.mesh, self.body_count, self._element_count, self._reach = (
             mesh,
             len(rest_positions),
@@ -168,14 +182,13 @@ class MeshObstaclePairs(IpcPairs):
         # the obstacle in its own frame, so that the measures of its elements are constant
         points = np.concatenate([rest_positions, mesh.points])
         triangles = np.concatenate([elements, mesh.triangles + len(rest_positions)])
-        super().__init__(points, triangles, distance=distance, stiffness=stiffness, friction=mesh.friction)
-        self.restrict_to_patches(np.repeat(np.array([0, 1], np.int32), [len(rest_positions), len(mesh.points)]))
-        self._body_points = np.unique(elements)
+        patches = np.repeat(np.array([0, 1], np.int32), [len(rest_positions), len(mesh.points)])
+        self._contact, self._body_points = make_contact(points, triangles, patches), np.unique(elements)
 
     @property
-    def mean_edge_length(self) -> float:
-        """Mean edge length of both surfaces, m."""
-        return float(self._edge)
+    def contact(self) -> Contact:
+        """Barrier or penalty between the elements of both."""
+        return self._contact
 
     def with_mesh(self, x: Values) -> Values:
         """(n + m, 3) points of the body at x (n, 3), and of the obstacle at its current pose, m."""
@@ -192,7 +205,7 @@ class MeshObstaclePairs(IpcPairs):
     def full_gradient(self, x: Values) -> Values:
         """(n + m, 3) dE/dx by the points of the body and of the obstacle, N."""
         points = self.with_mesh(x)
-        return np.zeros_like(points) if self.is_far(x) else self.gradient(points)
+        return np.zeros_like(points) if self.is_far(x) else self.contact.gradient(points)
 
     def moving_free_fraction(self, x: Values, end: Values, start_pose: Pose) -> float:
         """Fraction of the motions of body and obstacle without a collision.
@@ -206,7 +219,7 @@ class MeshObstaclePairs(IpcPairs):
         """
         end_pose, q = self.mesh.pose, start_pose.increment_to(self.mesh.pose)
         if not q[3:].any():
-            return self.free_fraction(self._points_at(x, start_pose), self._points_at(end, end_pose))
+            return self.contact.free_fraction(self._points_at(x, start_pose), self._points_at(end, end_pose))
         pieces, motion = 1 + int(np.linalg.norm(q[3:]) / MESH.max_rotation), end - x
         for piece in range(pieces):
             first, fraction, chord = piece / pieces, 1.0, 0.0
@@ -214,7 +227,7 @@ class MeshObstaclePairs(IpcPairs):
             while chord < 1 and fraction > MESH.min_fraction:
                 last = first + fraction / pieces
                 stop = self._points_at(x + last * motion, start_pose.incremented(last * q))
-                chord = self.free_fraction(start, stop)
+                chord = self.contact.free_fraction(start, stop)
                 fraction *= 1.0 if chord == 1 else (1 - BARRIER.min_gap_ratio) * chord
             if chord < 1:
                 return first
@@ -229,7 +242,7 @@ class MeshObstaclePairs(IpcPairs):
         """(k,) elements of the body at x (n, 3) that the obstacle intersects."""
         if self.is_far(x):
             return np.empty(0, np.int64)
-        pairs = np.sort(self.intersections(self.with_mesh(x)), axis=1)
+        pairs = np.sort(self.contact.intersections(self.with_mesh(x)), axis=1)
         of_both = (pairs[:, 0] < self._element_count) & (pairs[:, 1] >= self._element_count)
         return np.unique(pairs[of_both, 0])
 
@@ -237,54 +250,42 @@ class MeshObstaclePairs(IpcPairs):
         """Least distance with the body at x (n, 3), m; beyond the barrier that of vertices."""
         if not len(self._body_points):
             return float("inf")
-        gap = float("inf") if self.is_far(x) else self.min_gap(self.with_mesh(x))
+        gap = float("inf") if self.is_far(x) else self.contact.min_gap(self.with_mesh(x))
         return gap if gap < float("inf") else max(self.mesh.vertex_distance(x[self._body_points]), self._reach)
 
     def safe_distances(self, x: Values, limit: float) -> Values:
         """(n,) distances that each point of the body at x (n, 3) may move by itself, m; infinite from `limit` on."""
-        vertices, candidates = self._mesh.vertices(self.with_mesh(x)), ipctk.Candidates()
-        candidates.build(self._mesh, vertices, limit, ipctk.LBVH())
-        safe = candidates.compute_per_vertex_safe_distances(self._mesh, vertices, limit)
-        distances = np.asarray(self._mesh.to_full_dof(np.repeat(safe, 3))).reshape(-1, 3)[: self.body_count, 0]
+        collision_mesh = self.contact.collision_mesh
+        vertices, candidates = collision_mesh.vertices(self.with_mesh(x)), ipctk.Candidates()
+        candidates.build(collision_mesh, vertices, limit, ipctk.LBVH())
+        safe = candidates.compute_per_vertex_safe_distances(collision_mesh, vertices, limit)
+        distances = np.asarray(collision_mesh.to_full_dof(np.repeat(safe, 3))).reshape(-1, 3)[: self.body_count, 0]
         unlimited = np.ones(self.body_count, bool)
         unlimited[self._body_points] = distances[self._body_points] >= MESH.unlimited * limit
         return np.where(unlimited, np.inf, distances)
 
 
-class AllMeshPairs:
-    """Pairs of a body's surface and several obstacles; x (n, 3) of the body, m.
+class AllMeshPairs[Contact: IpcPairs]:
+    """Pairs of a body's surface and several obstacles; x (n, 3) of the body, m."""
 
-    Attributes:
-        pairs: of each obstacle.
-    """
+    def __init__(self, pairs: Sequence[MeshObstaclePairs[Contact]]) -> None:
+        self._pairs = pairs
 
-    def __init__(
-        self,
-        rest_positions: Values,
-        elements: Ints,
-        obstacles: Sequence[MeshObstacle],
-        *,
-        distance: float,
-        stiffness: float,
-    ) -> None:
-        """As for MeshObstaclePairs."""
-        self.pairs = [
-            MeshObstaclePairs(rest_positions, elements, mesh, distance=distance, stiffness=stiffness)
-            for mesh in obstacles
-        ]
+    @property
+    def pairs(self) -> Sequence[MeshObstaclePairs[Contact]]:
+        """Pairs of each obstacle."""
+        return self._pairs
 
-    def select(self, numbers: Sequence[int]) -> AllMeshPairs:
+    def select(self, numbers: Sequence[int]) -> AllMeshPairs[Contact]:
         """Pairs of some of the obstacles."""
-        selected = copy(self)
-        selected.pairs = [self.pairs[number] for number in numbers]
-        return selected
+        return AllMeshPairs([self.pairs[number] for number in numbers])
 
-    def _near(self, x: Values) -> list[MeshObstaclePairs]:
+    def _near(self, x: Values) -> list[MeshObstaclePairs[Contact]]:
         return [pairs for pairs in self.pairs if not pairs.is_far(x)]
 
     def energy(self, x: Values) -> float:
         """Energy E, J."""
-        return sum(pairs.energy(pairs.with_mesh(x)) for pairs in self._near(x))
+        return sum(pairs.contact.energy(pairs.with_mesh(x)) for pairs in self._near(x))
 
     def gradient(self, x: Values) -> Values:
         """(n, 3) dE/dx, N."""
@@ -294,22 +295,22 @@ class AllMeshPairs:
         """(3 n, 3 n) d2E/dx2, N/m; as for IpcPairs."""
         H, size = csr_matrix((x.size, x.size)), x.size
         for pairs in self._near(x):
-            H = H + pairs.hessian(pairs.with_mesh(x), exact=exact)[:size, :size]
+            H = H + pairs.contact.hessian(pairs.with_mesh(x), exact=exact)[:size, :size]
         return csr_matrix(H)
 
     def set_stiffness(self, stiffness: float) -> None:
         """Set the stiffness of the barriers, Pa."""
         for pairs in self.pairs:
-            pairs.set_stiffness(stiffness)
+            pairs.contact.set_stiffness(stiffness)
 
     def clear_caches(self) -> None:
         """Discard the candidates of collision detection."""
         for pairs in self.pairs:
-            pairs.clear_caches()
+            pairs.contact.clear_caches()
 
     def min_gap(self, x: Values) -> float:
         """Least distance within the barrier, m; infinite where there is none."""
-        return min((pairs.min_gap(pairs.with_mesh(x)) for pairs in self._near(x)), default=np.inf)
+        return min((pairs.contact.min_gap(pairs.with_mesh(x)) for pairs in self._near(x)), default=np.inf)
 
     def free_fraction(self, x: Values, end: Values) -> float:
         """Fraction in (0, 1] of the straight motion of the body from x to `end` with obstacles at rest."""
@@ -323,11 +324,11 @@ class AllMeshPairs:
     def search_along(self, x: Values, end: Values) -> None:
         """Search candidates for the whole motion of the body from x to `end`."""
         for pairs in self._near(x):
-            pairs.search_along(pairs.with_mesh(x), pairs.with_mesh(end))
+            pairs.contact.search_along(pairs.with_mesh(x), pairs.with_mesh(end))
 
     def pressure(self, x: Values) -> Values:
         """(n,) sum of the pressures of all barriers on each point, Pa."""
-        pressures = [pairs.pressure(pairs.with_mesh(x))[: len(x)] for pairs in self._near(x)]
+        pressures = [pairs.contact.pressure(pairs.with_mesh(x))[: len(x)] for pairs in self._near(x)]
         return np.sum(pressures, axis=0) if pressures else np.zeros(len(x))
 
     def intersections(self, x: Values) -> Ints:
@@ -338,7 +339,7 @@ class AllMeshPairs:
     def lag_friction(self, x: Values, start: Values, slip: float) -> MeshFriction:
         """Friction with pressures and tangents at x and obstacles at their current poses; as of IpcPairs."""
         rubbing = [pairs for pairs in self._near(x) if pairs.mesh.friction]
-        friction = [pairs.lag_friction(pairs.with_mesh(x), pairs.with_mesh(start), slip) for pairs in rubbing]
+        friction = [pairs.contact.lag_friction(pairs.with_mesh(x), pairs.with_mesh(start), slip) for pairs in rubbing]
         return MeshFriction(rubbing, friction)
 
 
@@ -351,7 +352,7 @@ class MeshFriction:
         friction: of each.
     """
 
-    pairs: list[MeshObstaclePairs]
+    pairs: Sequence[MeshObstaclePairs[IpcPairs]]
     friction: list[IpcFriction]
 
     def energy(self, x: Values) -> float:
@@ -360,12 +361,12 @@ class MeshFriction:
             friction.energy(pairs.with_mesh(x)) for pairs, friction in zip(self.pairs, self.friction, strict=True)
         )
 
-    def full_gradient(self, pairs: MeshObstaclePairs, x: Values) -> Values:
+    def full_gradient(self, pairs: MeshObstaclePairs[IpcPairs], x: Values) -> Values:
         """(n + m, 3) derivatives of the friction with one obstacle by the points of both, N."""
         points, friction = pairs.with_mesh(x), self.friction_with(pairs)
         return np.zeros_like(points) if friction is None else friction.gradient(points)
 
-    def friction_with(self, pairs: MeshObstaclePairs) -> IpcFriction | None:
+    def friction_with(self, pairs: MeshObstaclePairs[IpcPairs]) -> IpcFriction | None:
         """Friction with one obstacle; None: without friction."""
         items = zip(self.pairs, self.friction, strict=True)
         return next((friction for item_pairs, friction in items if item_pairs is pairs), None)
@@ -390,7 +391,7 @@ class MeshContactSurface(SelfContactSurface):
     """
 
     face_gap = 0.0
-    pairs: AllMeshPairs
+    pairs: AllMeshPairs[IpcPairs]
 
     def __init__(
         self,
@@ -416,7 +417,28 @@ class MeshContactSurface(SelfContactSurface):
                 by = "" if depth is None else f", by {depth:.4g} m"
                 raise InputError(f"{mesh.name} {verb} the body at the start{by}; move it away or make it smaller")
 
-    def _build_pairs(self, elements: Ints) -> AllMeshPairs:
+    def _build_pairs(self, elements: Ints) -> AllMeshPairs[IpcPairs]:
         # the coefficient of friction is that of each obstacle
         parameters = {name: self._parameters[name] for name in ("distance", "stiffness")}
-        return AllMeshPairs(self._rest_positions, elements, self._obstacles, **parameters)
+        return all_mesh_pairs(self._rest_positions, elements, self._obstacles, **parameters)
+
+
+def all_mesh_pairs(
+    rest_positions: Values,
+    elements: Ints,
+    obstacles: Sequence[MeshObstacle],
+    *,
+    distance: float,
+    stiffness: float,
+) -> AllMeshPairs[IpcPairs]:
+    """Pairs of a body, `rest_positions` (n, 3), m, and `elements` (k, 3), and obstacles; the others as for IpcPairs."""
+
+    def build(mesh: MeshObstacle) -> MeshObstaclePairs[IpcPairs]:
+        def make_contact(points: Values, triangles: Ints, patches: Patches) -> IpcPairs:
+            contact = IpcPairs(points, triangles, distance=distance, stiffness=stiffness, friction=mesh.friction)
+            contact.restrict_to_patches(patches)
+            return contact
+
+        return MeshObstaclePairs(rest_positions, elements, mesh, distance, make_contact)
+
+    return AllMeshPairs([build(mesh) for mesh in obstacles])

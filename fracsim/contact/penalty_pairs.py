@@ -94,8 +94,8 @@ class PenaltyPairs(IpcPairs):
         self.width, is_3d = distance, rest_positions.shape[1] == 3
         if patch is not None:
             self.restrict_to_patches(patch)
-        edge = float(self._edge)
-        self._points = PointFacetContacts(self._mesh, elements, stiffness, distance=distance, edge=edge)
+        edge = self.mean_edge_length
+        self._points = PointFacetContacts(self.collision_mesh, elements, stiffness, distance=distance, edge=edge)
         self._edges = (
             EdgeContacts(rest_positions, elements, stiffness.limit, distance=distance, patch=patch) if is_3d else None
         )
