@@ -19,8 +19,6 @@ def refusal(kind: str, motion: str, scheme: str, dim: int) -> str:
     """What a study of a cell is told; empty if it runs."""
     if motion in ("free", "hinge") and scheme == "quasi-static":
         return "inertia"
-    if kind == "mesh" and scheme == "explicit":
-        return "needs an implicit scheme"
     if kind == "mesh" and dim == 2:
         return "a 2D mesh has none"
     return ""

@@ -478,7 +478,6 @@ def test_what_cannot_be_is_refused(
     ("tables", "message"),
     [
         ({"mesh": CUBE | {"size": [1.0, 1.0]}}, 'shape = "mesh": a 2D mesh has none; choose "box"'),
-        ({"time": {"scheme": "explicit", "step": 1e-3, "end": 1.0}}, "which needs an implicit scheme"),
     ],
 )
 def test_scenes_that_have_none(tables: dict[str, Any], message: str, tmp_path: Path) -> None:

@@ -9,7 +9,9 @@ import pytest
 from fracsim.contact.obstacle import overlap_depth
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.shapes import HalfSpace, RoundedBox, Shape, Sphere
+from fracsim.contact.triangle_mesh_shape import TriangleMeshShape
 from support.shapes import ALL, BODIES
+from test_mesh_obstacles import CORNERS, SIDES
 
 Values = npt.NDArray[np.float64]
 
@@ -45,3 +47,14 @@ def test_no_point_of_a_body_lies_deeper(name: str) -> None:
         there = at(other, [0.0] * body.dim)
         strewn = -there.distance(here.pose.points_to_space(X)).min()
         assert strewn - 1e-5 < overlap_depth(here, there) < strewn + 0.04
+
+
+def test_overlaps_of_triangle_meshes() -> None:
+    """A cube of triangles over a plane, and into another cube: by the depth of its lowest corners; none where apart."""
+    cube = TriangleMeshShape(CORNERS, SIDES)
+    floor = at(HalfSpace((0.0, 0.0, 1.0)), [0.0, 0.0, 0.0])
+    for pair in ((at(cube, [0.2, 0.1, 0.4]), floor), (floor, at(cube, [0.2, 0.1, 0.4]))):
+        assert overlap_depth(*pair) == pytest.approx(0.1)
+    assert overlap_depth(at(cube, [0.0, 0.0, 0.6]), floor) == pytest.approx(-0.1)
+    assert overlap_depth(at(cube, [0.3, 0.2, 0.9]), at(cube, [0.0, 0.0, 0.0])) == pytest.approx(0.1)
+    assert overlap_depth(at(cube, [0.3, 0.2, 1.1]), at(cube, [0.0, 0.0, 0.0])) < 0

@@ -106,14 +106,18 @@ def test_ridges_rub() -> None:
         np.testing.assert_allclose(force.sum(axis=0), 0.0, atol=1e-12)
 
 
-def two_bars(folder: Path, angle: float) -> str:
-    """Two bars of square section on edge, one across over the other, 0.05 m apart."""
+def tilted_bar() -> tuple[Values, Ints]:
+    """(n, 3) points and (k, 4) cells of a bar of square section on edge, along y, its middle at the origin."""
     bar = lattice(1, 6, 1, size=0.25)
     tilt = np.sqrt(0.5) * np.array([[1.0, 0, 1], [0, np.sqrt(2), 0], [-1, 0, 1]])
-    c, s = np.cos(angle), np.sin(angle)
-    X = (bar.points - bar.points.mean(axis=0)) @ tilt.T
+    return (bar.points - bar.points.mean(axis=0)) @ tilt.T, bar.cells
+
+
+def two_bars(folder: Path, angle: float) -> str:
+    """Two bars of square section on edge, one across over the other, 0.05 m apart."""
+    (X, bar_cells), c, s = tilted_bar(), np.cos(angle), np.sin(angle)
     over = X @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]).T + [0.03, 0.07, 0.25 * np.sqrt(2) + 0.05]
-    cells = np.concatenate([bar.cells, bar.cells + len(X)])
+    cells = np.concatenate([bar_cells, bar_cells + len(X)])
     meshio.Mesh(np.concatenate([X, over]), [("tetra", cells)]).write(folder / "bars.vtu")
     return str(folder / "bars.vtu")
 

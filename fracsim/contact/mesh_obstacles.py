@@ -280,7 +280,7 @@ class AllMeshPairs[Contact: IpcPairs]:
         """Pairs of some of the obstacles."""
         return AllMeshPairs([self.pairs[number] for number in numbers])
 
-    def _near(self, x: Values) -> list[MeshObstaclePairs[Contact]]:
+    def _near(self, x: Values) -> Sequence[MeshObstaclePairs[Contact]]:
         return [pairs for pairs in self.pairs if not pairs.is_far(x)]
 
     def energy(self, x: Values) -> float:

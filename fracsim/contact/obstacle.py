@@ -15,6 +15,7 @@ from ..mechanics.time_functions import TimeFunction
 from ..meshes.data import AXES
 from .pose import Pose, PosedShape, Values, rotation_derivative, rotation_second_derivative, solve_matrix
 from .shape_base import Shape
+from .triangle_mesh_shape import TriangleMeshShape, penetration_depth, surfaces_intersect
 
 
 @dataclass(frozen=True)
@@ -355,8 +356,11 @@ def find_overlaps(
 def overlap_depth(body: PosedShape, second: PosedShape) -> float:
     """Depth of an overlap, m: minus the minimum of the distance to `second` over a convex body; negative if apart.
 
-    Steepest descent from the points of its tessellation by ever shorter steps, each projected back onto the body.
+    Steepest descent from the points of its tessellation by ever shorter steps, each projected back onto the body. Of
+    triangle meshes it is the depth of the deepest point; minus infinity where no point is inside.
     """
+    if any(isinstance(posed.shape, TriangleMeshShape) for posed in (body, second)):
+        return _mesh_overlap_depth(body, second)
     x = body.pose.points_to_space(body.shape.tessellate()[0])
     step, minimum = float(np.linalg.norm(np.ptp(x, axis=0))), second.distance(x)
     for _ in range(OVERLAP.iterations):
@@ -364,6 +368,17 @@ def overlap_depth(body: PosedShape, second: PosedShape) -> float:
         x = x - np.maximum(body.distance(x), 0.0)[:, None] * body.normal(x)
         minimum, step = np.minimum(minimum, second.distance(x)), OVERLAP.step_ratio * step
     return -float(minimum.min())
+
+
+def _mesh_overlap_depth(first: PosedShape, second: PosedShape) -> float:
+    """Depth of the deepest point of either shape in the other, m, one at least a triangle mesh; -inf if none is."""
+    tessellations = [(posed.pose.points_to_space(posed.shape.tessellate()[0]), posed) for posed in (first, second)]
+    analytic = [posed for posed in (first, second) if not isinstance(posed.shape, TriangleMeshShape)]
+    if analytic:
+        return -min(float(analytic[0].distance(x).min()) for x, posed in tessellations if posed is not analytic[0])
+    surfaces = [(x, posed.shape.tessellate()[1].astype(np.int64)) for x, posed in tessellations]
+    depth = penetration_depth(surfaces[0], surfaces[1], cut=surfaces_intersect(surfaces[0], surfaces[1]))
+    return -np.inf if depth is None else depth
 
 
 def check_free_obstacles(obstacles: Mapping[int, RigidObstacle]) -> None:

@@ -229,8 +229,9 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
         With that of the lightest free obstacle: the squares of a body and an obstacle on one spring add up.
         """
-        free = cast("dict[int, VerletObstacle]", self.bodies.free)
-        return self._added_frequency + max(map(self._obstacle_frequency, free, free.values()), default=0.0)
+        free = {number: obstacle for number, obstacle in self.bodies.free.items() if number in self.numbers}
+        of_free = cast("dict[int, VerletObstacle]", free)
+        return self._added_frequency + max(map(self._obstacle_frequency, of_free, of_free.values()), default=0.0)
 
     def _obstacle_frequency(self, number: int, obstacle: VerletObstacle) -> float:
         self.obstacle_forces()
@@ -291,13 +292,9 @@ class PenaltyObstacleTerm(ObstacleTerm):
         """work_NAME: work of each obstacle on the body in the last step, J; of a free one that of its momentum."""
         columns, bodies = super().work_columns(), self.bodies
         if isinstance(bodies, VerletRigidObstacles):
-            of_free = {f"work_{bodies.obstacles[n].name}": partial(self._work_of_free, n) for n in bodies.free}
-            columns |= of_free
+            of_free = [number for number in bodies.free if number in self.numbers]
+            columns |= {f"work_{bodies.obstacles[n].name}": partial(bodies.work_on_body, n) for n in of_free}
         return columns
-
-    def _work_of_free(self, number: int) -> float:
-        assert isinstance(self.bodies, VerletRigidObstacles)
-        return 0.0 if self.comm.rank else -self.bodies.contact_work(number)
 
     # --- state ---
 

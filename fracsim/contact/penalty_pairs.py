@@ -149,9 +149,8 @@ class PenaltyPairs(IpcPairs):
     def end_step(self, x: Values, slips: Values | None = None) -> None:
         """Store contacts at the end of a step, and slips (k, d) of the springs of `contacts`, m."""
         points, *edges = self._near_parts(x)
-        touches = points.gap < self.width
-        count = int(touches.sum())
-        self._points.end_step(points.select(touches), None if slips is None else slips[:count])
+        count = int((points.gap < self.width).sum())
+        self._points.end_step(points, None if slips is None else slips[:count])
         if self._edges is not None:
             near, slip = edges[0] if edges else points.select(NO_ROWS), None
             if slips is not None:

@@ -1,8 +1,8 @@
 """Points before facets of a surface, for a penalty in explicit steps; on one rank.
 
-g_p is the distance, m, of a point p to the nearest facet of those that p is in front of. A point that was in contact at
-the end of the last step may lie behind its facet, or one beside it: g_p < 0. All other points behind a facet are on the
-far side of its body. Facets of which a point is a corner do not act on it.
+g_p is the distance, m, of a point p to the nearest facet of those that p is in front of. A point that was near a facet
+at the end of the last step may lie behind it, or one beside it: g_p < 0. All other points behind a facet are on the far
+side of its body. Facets of which a point is a corner do not act on it.
 
 k_p is the stiffness that the point, or a corner of its facet, may have as contact begins, and is constant during
 contact. The weights of a contact are 1 of the point and minus the barycentric coordinates on the facet.
@@ -166,11 +166,11 @@ def _closest_points(x: Values, points: Ints, corners: Ints) -> tuple[Values, Val
 
 @dataclass(frozen=True)
 class PointHistory:
-    """Contacts of points at the end of the last step.
+    """Points near facets at the end of the last step.
 
     Attributes:
-        facets: (n, d) corners of the facets in contact with points, or NO_FACET.
-        stiffness: (n,) k_p of these, N/m; 0 of points without contact.
+        facets: (n, d) corners of the facets that points were before, or NO_FACET.
+        stiffness: (n,) k_p of points in contact, N/m; 0 of others.
         slip: (n, d) stretch of their springs of friction, m.
     """
 
@@ -184,9 +184,9 @@ class PointHistory:
         return cls(np.full((count, dim), NO_FACET, np.int64), np.zeros(count), np.zeros((count, dim)))
 
     def renumbered(self, number: Ints, max_stiffness: Values) -> PointHistory:
-        """Contacts with new numbers (n,) of points, -1: none, no stiffer than `max_stiffness` (new n,), N/m."""
+        """The same with new numbers (n,) of points, -1: none, no stiffer than `max_stiffness` (new n,), N/m."""
         result = PointHistory.none(len(max_stiffness), self.facets.shape[1])
-        points = np.flatnonzero((number >= 0) & (self.stiffness > 0))
+        points = np.flatnonzero((number >= 0) & (self.facets != NO_FACET).any(axis=1))
         rows, corners = number[points], self.facets[points]
         result.facets[rows] = np.where(corners >= 0, number[corners], NO_FACET)
         result.stiffness[rows] = np.minimum(self.stiffness[points], max_stiffness[rows])
@@ -255,12 +255,13 @@ class PointFacetContacts:
             start_stiffness=self.history.stiffness[pairs.points],
         )
 
-    def end_step(self, contacts: PenaltyContacts, slip: Values | None) -> None:
-        """Store contacts at the end of a step, and slips (k, d) of their springs, m."""
-        if not len(contacts.gap) and not self.history.stiffness.any():
+    def end_step(self, near: PenaltyContacts, slip: Values | None) -> None:
+        """Store contacts `near` at the end of a step, and slips (k, d) of the springs of those that touch, m."""
+        if not len(near.gap) and not (self.history.facets != NO_FACET).any():
             return
-        history, points = PointHistory.none(*self.history.slip.shape), contacts.points[:, 0]
-        history.facets[points], history.stiffness[points] = contacts.points[:, 1:], contacts.stiffness
+        history, touches = PointHistory.none(*self.history.slip.shape), near.gap < self._width
+        history.facets[near.points[:, 0]], points = near.points[:, 1:], near.points[touches, 0]
+        history.stiffness[points] = near.stiffness[touches]
         if slip is not None:
             history.slip[points] = slip
         self.history = history

@@ -520,9 +520,9 @@ class VerletRigidObstacles(RigidObstacles):
         for number, wrench in self._wrenches().items():
             self._contact_work[number] = self.free[number].end_step(self.posed[number], wrench)
 
-    def contact_work(self, number: int) -> float:
-        """Work of the body on a free obstacle in the last step, J."""
-        return self._contact_work[number]
+    def work_on_body(self, number: int) -> float:
+        """Work of a free obstacle on the body in the last step, on rank 0, J."""
+        return 0.0 if self.comm.rank else -self._contact_work[number]
 
     def point_motion(self, number: int, x: Values) -> Values:
         """(d,) motion of an obstacle in the step, or (n, d) of its points that were at x (n, d), m."""

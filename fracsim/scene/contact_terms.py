@@ -111,7 +111,7 @@ def build_obstacle_terms(
         terms = [build_inactive_at_rest(domain, shapes, law, make, mutual=mutual)]
     motion = terms[0].bodies if terms else _build_motion(domain, obstacles, scheme, law, mesh_stiffness)
     if meshes:
-        terms.append(_build_mesh_obstacle_term(study, domain, u, motion, meshes, law, stress.material))
+        terms.append(_build_mesh_obstacle_term(study, domain, u, motion, meshes, law, stress, mass, scheme))
     for term in terms:
         motion.add_contact(term)
     return [*terms, motion]
@@ -199,7 +199,9 @@ def _build_mesh_obstacle_term(
     motion: RigidObstacles,
     numbers: list[int],
     obstacle_law: ObstacleLaw,
-    material: MaterialFields,
+    stress: Stress,
+    mass: Values,
+    scheme: Scheme,
 ) -> Term:
     """Return the term of contact with obstacles from files (collective).
 
@@ -212,13 +214,18 @@ def _build_mesh_obstacle_term(
         raise InputError(
             'an obstacle of shape = "mesh" needs ipctk, which this environment lacks: pip install fracsim[contact]'
         ) from None
-    contact = _contact(study)
+    contact, material = _contact(study), stress.material
     stiffness = contact.stiffness or DEFAULTS.self_stiffness * _max_young(domain, material)
     law = ipc_surface.SelfContactLaw(
         _obstacle_law(contact, domain, material).barrier.width, stiffness, 0.0, obstacle_law.sticking_speed,
         obstacle_law.sticking_ratio, corners_only=_uses_corners_only(study),
     )  # fmt: skip
-    make = partial(MeshObstacleTerm, domain, u, motion, numbers)
+    make: Callable[..., MeshObstacleTerm] = partial(MeshObstacleTerm, domain, u, motion, numbers)
+    if not scheme.implicit:
+        from ..contact.penalty_mesh_obstacles import PenaltyMeshObstacleTerm
+
+        limit = _max_added_frequency(contact, domain, stress)
+        make = partial(PenaltyMeshObstacleTerm, domain, u, motion, numbers, mass=mass, max_added=limit)
     return _fit_distance(make, law, contact, "an obstacle from a file and the body")
 
 

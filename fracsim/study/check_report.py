@@ -133,9 +133,6 @@ def _contact_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
                 yield f"{_INDENT}{obstacle.name}: {text}"
         if len(study.obstacle) > 1 and any_free and not study.time.scheme_class.implicit:
             yield f"{_INDENT}note: in explicit steps obstacles pass through each other"
-        if any_free and "mesh" in shapes:
-            yield f"{_INDENT}note: free obstacles have no contact with those from files; free ones from files have it"
-            yield f"{_INDENT}with fixed and driven shapes, at their points"
     if study.contact is not None and study.contact.itself:
         between_fragments = study.contact.itself == "pieces"
         partners = "of fragments with each other" if between_fragments else "of the body with itself"

@@ -165,12 +165,6 @@ def _check_contact(study: Study) -> None:
     scheme = f'time.scheme = "{study.time.scheme}"'
     if study.contact is not None and not study.time.scheme_class.implicit and study.contact.creep is not None:
         raise ValueError(f"contact.creep is for implicit schemes: with {scheme} friction sticks; remove it")
-    from_files = [number for number, obstacle in enumerate(study.obstacle) if obstacle.shape == "mesh"]
-    if from_files and not study.time.scheme_class.implicit:
-        raise ValueError(
-            f"obstacle.{from_files[0]} is read from a file, which needs an implicit scheme, not {scheme}; choose "
-            '"backward-euler", or another shape'
-        )
     if study.contact is not None and not study.contact.itself and not study.obstacle:
         raise ValueError("[contact] has itself = false and there is no [[obstacle]]: nothing can touch; remove it")
 

@@ -125,6 +125,7 @@ CELLS = (
     ("analytic", "fixed", "newmark", 2), ("analytic", "prescribed", "quasi-static", 3),
     ("analytic", "free", "newmark", 3), ("analytic", "free", "explicit", 2), ("analytic", "hinge", "backward-euler", 2),
     ("mesh", "free", "backward-euler", 3), ("mesh", "prescribed", "generalized-alpha", 3),
+    ("mesh", "free", "explicit", 3), ("mesh", "prescribed", "explicit", 3),
     ("bodies", "", "backward-euler", 2), ("bodies", "", "explicit", 3),
 )  # fmt: skip
 
