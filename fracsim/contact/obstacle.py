@@ -285,9 +285,11 @@ class VerletObstacle:
         body: the obstacle.
         motion: its state of motion at the start of a step, until that is accepted.
         gravity_work: work of gravity in the last step, J.
+        increment: (p,) increment of the pose in the step.
     """
 
     gravity_work: float = 0.0
+    increment: Values
 
     def __init__(self, body: FreeObstacle) -> None:
         self.body, self.motion = body, body.start_motion()
@@ -298,8 +300,8 @@ class VerletObstacle:
         self._dt, self._half_momentum = dt, self.motion.momentum + dt / 2 * self.motion.force
         half = dt / 2 * solve_matrix(self.body.mass_matrix(start.rotation), self._half_momentum)
         mass = self.body.mass_matrix(start.incremented(basis @ half).rotation)
-        self._increment: Values = np.asarray(basis @ (dt * solve_matrix(mass, self._half_momentum)))
-        return PosedShape(self.body.shape, start.incremented(self._increment))
+        self.increment = np.asarray(basis @ (dt * solve_matrix(mass, self._half_momentum)))
+        return PosedShape(self.body.shape, start.incremented(self.increment))
 
     def end_step(self, posed: PosedShape, wrench: Values) -> float:
         """Accept the step; returns the work of contact on the obstacle, J.
@@ -310,7 +312,7 @@ class VerletObstacle:
         """
         start, body, pose = self.motion, self.body, posed.pose
         force = body.motion_basis.T @ (wrench - body.gravity_potential(pose)[1])
-        rotation = pose.rotation_vector() if pose.dim == 3 else start.rotation + self._increment[2:]
+        rotation = pose.rotation_vector() if pose.dim == 3 else start.rotation + self.increment[2:]
         self.motion = RigidMotion(pose, self._half_momentum + self._dt / 2 * force, force, rotation)
         self.gravity_work = body.gravity_potential(start.pose)[0] - body.gravity_potential(pose)[0]
         change = float(body.history_values(self.motion)[-1] - body.history_values(start)[-1])

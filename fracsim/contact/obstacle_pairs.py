@@ -46,10 +46,12 @@ class InsetPolicy:
     Attributes:
         edge_points: points on an edge or a segment, and circles on a cylinder.
         circle_points: points on a circle.
+        touching_share: share of a surface that touches at once in a penalty, as one face of a box.
     """
 
     edge_points: int = 9
     circle_points: int = 24
+    touching_share: float = 0.25
 
 
 SAMPLES = InsetPolicy()
@@ -432,19 +434,45 @@ class ObstaclePairs:
             if not all(isinstance(obstacles[number].shape, TriangleMeshShape) for number in (i, j))
         }
         self._free = {number for number, obstacle in obstacles.items() if obstacle.free}
-        self._law, self._barrier, self._time_averaged = law, law.barrier, False
+        self._law, self._width, self._time_averaged = law, law.barrier.width, False
+        self._barriers: dict[Numbers, GapPotential] = dict.fromkeys(self._pairs, law.barrier)
         self._start: dict[Numbers, PairStart] = {}
         self._started_near: set[Numbers] = set()  # pairs in contact at the start of the step
+
+    def set_penalties(self, penalty: Callable[[Numbers, float], GapPotential]) -> None:
+        """Set the potential of each pair by its numbers and the area that may touch at once, m^2, of the smaller."""
+        for numbers, pair in self._pairs.items():
+            touching = [max(SAMPLES.touching_share * area.sum(), area.max()) for area in pair.areas if len(area)]
+            self._barriers[numbers] = penalty(numbers, float(min(touching, default=0.0)))
+
+    def are_far(self, posed: PosedObstacles) -> bool:
+        """Whether no obstacles can be in contact."""
+        bounds = (pair.gap_bound(posed[i].pose, posed[j].pose) for (i, j), pair in self._pairs.items())
+        return all(bound >= self._width for bound in bounds)
+
+    def near_springs(self, posed: PosedObstacles, max_gap: float) -> Iterator[tuple[Numbers, Values, Values]]:
+        """Pairs with points at gaps below `max_gap`, m: these (n, d), m, and their stiffness (n,) in contact, N/m."""
+        for (i, j), pair in self._pairs.items():
+            first, second = posed[i].pose, posed[j].pose
+            if pair.gap_bound(first, second) >= max_gap:
+                continue
+            points, stiffness = [], []
+            for (x, target), area in zip(pair.sides(first, second), pair.areas, strict=True):
+                near = target.distance(x) < max_gap
+                points.append(x[near])
+                stiffness.append(area[near] * self._barriers[i, j].curvature(np.zeros(int(near.sum()))))
+            if any(len(x) for x in points):
+                yield (i, j), np.concatenate(points), np.concatenate(stiffness)
 
     def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
         """Begin a step of dt, s; `time_averaged`: barriers are averaged over it."""
         self._start, self._started_near, self._time_averaged = {}, set(), time_averaged
         for (i, j), pair in self._pairs.items():
             first, second = (motion.start_posed[number].pose for number in (i, j))
-            is_near = pair.gap_bound(first, second) < self._barrier.width
+            is_near = pair.gap_bound(first, second) < self._width
             if time_averaged or (is_near and pair.friction):
                 slip = partial(self._sticking_slip, motion, dt, (i, j))
-                self._start[i, j] = pair.begin_step(first, second, self._barrier, slip)
+                self._start[i, j] = pair.begin_step(first, second, self._barriers[i, j], slip)
             if is_near:
                 self._started_near.add((i, j))
 
@@ -504,6 +532,10 @@ class ObstaclePairs:
         start = self._start.get(numbers)
         return None if start is None else start.friction
 
+    def wrenches(self, posed: PosedObstacles) -> dict[int, Values]:
+        """(p,) force and moment of the others on each free obstacle in contact, N and N m."""
+        return {number: -body.gradient for number, body in self.derivatives(posed)[0].items()}
+
     def energies(self, posed: PosedObstacles) -> tuple[float, float]:
         """Energy of the barriers, and potential of all forces in the step, J."""
         stored, potential = 0.0, 0.0
@@ -533,9 +565,10 @@ class ObstaclePairs:
         """Normal forces on the points of both obstacles of each pair in contact, now or at the start of the step."""
         contacts = {}
         for (i, j), pair in self._pairs.items():
-            if (i, j) in self._started_near or pair.gap_bound(posed[i].pose, posed[j].pose) < self._barrier.width:
+            if (i, j) in self._started_near or pair.gap_bound(posed[i].pose, posed[j].pose) < self._width:
                 start = self._start[i, j].gaps if self._time_averaged else None
-                contacts[i, j] = pair.contact_forces(posed[i].pose, posed[j].pose, self._barrier, start)
+                barrier = self._barriers[i, j]
+                contacts[i, j] = pair.contact_forces(posed[i].pose, posed[j].pose, barrier, start)
         return {
             numbers: sides
             for numbers, sides in contacts.items()

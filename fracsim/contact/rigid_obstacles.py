@@ -12,6 +12,7 @@ Equations: docs/theory.md#rigid-obstacles.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Protocol, cast
 
 import numpy as np
@@ -22,9 +23,10 @@ from ..forms.schemes import Scheme
 from ..mechanics.term import Term, TimeLevel
 from ..mechanics.term_protocols import SurfaceData
 from ..mesh.domain import Domain
+from .laws import Penalty
 from .node_contact import LaggedContact
 from .obstacle import FreeMotions, FreeObstacle, MovingObstacle, RigidMotion, RigidObstacle, VerletObstacle
-from .obstacle_pairs import AllPairs
+from .obstacle_pairs import AllPairs, Numbers, ObstaclePairs
 from .obstacle_tessellation import ObstacleTessellations
 from .pose import PosedShape
 from .pose_derivatives import PoseDerivatives
@@ -33,6 +35,9 @@ from .rigid_pose import FreePose, PoseUnknowns
 from .step_limit import PoseMotion
 
 Values = npt.NDArray[np.float64]
+
+PAIR_SHARE = 0.2  # of what contact may add to the square of a frequency, for one obstacle on another
+PAIR_NEAR_GAP = 3.0  # gap, in widths of the penalty, of points that may be in contact a step later
 
 type Increments = Mapping[int, Values]  # (p,) of poses, by the numbers of obstacles
 
@@ -494,19 +499,48 @@ class FreeRigidObstacles(RigidObstacles):
 
 
 class VerletRigidObstacles(RigidObstacles):
-    """Obstacles of which some are free, in explicit steps; they are not in contact with one another.
+    """Obstacles of which some are free, in explicit steps: a penalty acts between free ones and others.
 
     Attributes:
         free: free obstacles by their numbers.
+        pairs: contact of these with other obstacles, without friction.
     """
 
     free: dict[int, VerletObstacle]
 
-    def __init__(self, domain: Domain, obstacles: Sequence[RigidObstacle]) -> None:
-        """`obstacles`: by their numbers in the study."""
+    def __init__(
+        self,
+        domain: Domain,
+        obstacles: Sequence[RigidObstacle],
+        pairs: ObstaclePairs,
+        penalty: Penalty,
+        max_added: float,
+    ) -> None:
+        """Build the term.
+
+        Args:
+            domain: mesh of the body.
+            obstacles: by their numbers in the study.
+            pairs: contact between obstacles.
+            penalty: of points in contact; less stiff where it would add more than a share of `max_added`.
+            max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
+        """
         numbered = enumerate(obstacles)
         free = {n: VerletObstacle(obstacle) for n, obstacle in numbered if isinstance(obstacle, FreeObstacle)}
         self._contact_work = dict.fromkeys(free, 0.0)  # of the body on each in the last step, J
+        self._prescribed_work = 0.0  # of prescribed obstacles on free ones in the last step, J
+        self._pairs, self._width = pairs, penalty.width
+
+        tiny = np.finfo(float).tiny
+
+        def limited(numbers: Numbers, area: float) -> Penalty:
+            mass = min(free[number].body.mass for number in numbers if number in free)
+            return replace(
+                penalty,
+                stiffness=min(penalty.stiffness, PAIR_SHARE * max_added * mass * penalty.width / max(area, tiny)),
+            )
+
+        pairs.set_penalties(limited)
         super().__init__(domain, obstacles, free)
 
     def _place(self, start: float, end: float) -> None:
@@ -517,8 +551,38 @@ class VerletRigidObstacles(RigidObstacles):
 
     def accept_step(self) -> None:
         """Give free obstacles their momentum (collective)."""
-        for number, wrench in self._wrenches().items():
-            self._contact_work[number] = self.free[number].end_step(self.posed[number], wrench)
+        start, end = dict[int, Values](), dict[int, Values]()
+        self._prescribed_work = 0.0
+        if not (self._pairs.are_far(self.start_posed) and self._pairs.are_far(self.posed)):
+            start, end = (self._pairs.wrenches(posed) for posed in (self.start_posed, self.posed))
+            works = [self._pairs.work(posed, self.increments)[0] for posed in (self.start_posed, self.posed)]
+            self._prescribed_work = 0.5 * sum(works)
+        for number, of_body in self._wrenches().items():
+            obstacle, zero = self.free[number], np.zeros_like(of_body)
+            of_pairs = start.get(number, zero), end.get(number, zero)
+            work = obstacle.end_step(self.posed[number], of_body + of_pairs[1])
+            self._contact_work[number] = work - 0.5 * float((of_pairs[0] + of_pairs[1]) @ obstacle.increment)
+
+    def stored_energy(self) -> float:
+        """Energy of the penalty between obstacles, on rank 0, J."""
+        return 0.0 if self.comm.rank else self._pairs.energies(self.posed)[0]
+
+    def frequency_bound(self) -> float:
+        """Increase of the square of the highest frequency if all near points were in contact, 1/s^2.
+
+        With the largest eigenvalues l_i, l_j of M^-1 K of both obstacles of a pair it is at most the largest sum of
+        l_i + sqrt(l_i l_j) over the pairs of an obstacle (Gershgorin's bound for blocks).
+        """
+        sums = dict.fromkeys(self.free, 0.0)
+        for numbers, x, k in self._pairs.near_springs(self.posed, PAIR_NEAR_GAP * self._width):
+            squares = {
+                number: obstacle.max_frequency(obstacle.spring_stiffness(x, k, posed), posed)
+                for number, (obstacle, posed) in ((n, (self.free[n], self.posed[n])) for n in numbers if n in self.free)
+            }
+            coupling = float(np.sqrt(np.prod(list(squares.values())))) if len(squares) == 2 else 0.0
+            for number, square in squares.items():
+                sums[number] += square + coupling
+        return max(sums.values())
 
     def work_on_body(self, number: int) -> float:
         """Work of a free obstacle on the body in the last step, on rank 0, J."""
@@ -531,5 +595,7 @@ class VerletRigidObstacles(RigidObstacles):
         return self.free[number].contact_point_motion(x, self.posed[number])
 
     def step_work(self) -> tuple[float, float]:
-        """Work of gravity on free obstacles, on rank 0, J; nothing is dissipated."""
-        return (0.0 if self.comm.rank else sum(obstacle.gravity_work for obstacle in self.free.values())), 0.0
+        """Work of gravity and prescribed obstacles on free ones, on rank 0, J; nothing is dissipated."""
+        if self.comm.rank:
+            return 0.0, 0.0
+        return sum(obstacle.gravity_work for obstacle in self.free.values()) + self._prescribed_work, 0.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -95,6 +95,8 @@ def build_obstacle_terms(
 
         limit = _max_added_frequency(contact, domain, stress)
         barrier, make_term = Penalty, partial(PenaltyObstacleTerm, mass=mass, max_added=limit)
+    else:
+        limit = np.inf
     law = _obstacle_law(contact, domain, stress.material, barrier)
     mesh_stiffness = contact.stiffness or DEFAULTS.self_stiffness * _max_young(domain, stress.material)
 
@@ -102,14 +104,14 @@ def build_obstacle_terms(
         placed = list(obstacles)
         for number, obstacle in zip(analytic, moved, strict=True):
             placed[number] = obstacle
-        return make_term(domain, u, _build_motion(domain, placed, scheme, law, mesh_stiffness), analytic, law)
+        return make_term(domain, u, _build_motion(domain, placed, scheme, law, mesh_stiffness, limit), analytic, law)
 
     terms: list[Any] = []
     if analytic:
         shapes = [obstacles[number] for number in analytic]
-        mutual = scheme.implicit and any(obstacle.free for obstacle in shapes)
+        mutual = any(obstacle.free for obstacle in shapes)
         terms = [build_inactive_at_rest(domain, shapes, law, make, mutual=mutual)]
-    motion = terms[0].bodies if terms else _build_motion(domain, obstacles, scheme, law, mesh_stiffness)
+    motion = terms[0].bodies if terms else _build_motion(domain, obstacles, scheme, law, mesh_stiffness, limit)
     if meshes:
         terms.append(_build_mesh_obstacle_term(study, domain, u, motion, meshes, law, stress, mass, scheme))
     for term in terms:
@@ -118,11 +120,17 @@ def build_obstacle_terms(
 
 
 def _build_motion(
-    domain: Domain, obstacles: Sequence[RigidObstacle], scheme: Scheme, law: ObstacleLaw, mesh_stiffness: float
+    domain: Domain,
+    obstacles: Sequence[RigidObstacle],
+    scheme: Scheme,
+    law: ObstacleLaw,
+    mesh_stiffness: float,
+    max_added: float,
 ) -> RigidObstacles:
     """Return the motion of obstacles. Raises InputError if a free one overlaps another at the start.
 
-    `mesh_stiffness`: of the barrier between triangle meshes, Pa.
+    `mesh_stiffness`: of the barrier between triangle meshes, Pa; `max_added`: what a penalty may add to the square of
+    the highest frequency, 1/s^2.
     """
     if not any(obstacle.free for obstacle in obstacles):
         return RigidObstacles(domain, obstacles)
@@ -135,9 +143,11 @@ def _build_motion(
     numbered = dict(enumerate(obstacles))
     is_mesh = {number: isinstance(obstacle.shape, TriangleMeshShape) for number, obstacle in numbered.items()}
     check_free_obstacles({number: obstacle for number, obstacle in numbered.items() if not is_mesh[number]})
-    if not scheme.implicit:
-        return VerletRigidObstacles(domain, obstacles)
     in_pairs = pair_obstacles(obstacles, law.barrier.width, domain.mean_edge_length)
+    if not scheme.implicit:
+        without_friction = {number: replace(obstacle, friction=0.0) for number, obstacle in in_pairs.items()}
+        pairs, penalty = ObstaclePairs(without_friction, law), cast("Penalty", law.barrier)
+        return VerletRigidObstacles(domain, obstacles, pairs, penalty, max_added)
     kinds: list[PairContact] = [ObstaclePairs(in_pairs, law)]
     for pair in combinations([number for number in numbered if is_mesh[number]], 2):
         if any(numbered[number].free for number in pair):
