@@ -78,10 +78,10 @@ def test_a_point_over_a_facet_and_a_facet_over_a_point(tmp_path: Path) -> None:
     np.testing.assert_allclose(only.sum(axis=0), 0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("speed", (0.5, 1.0))
+@pytest.mark.parametrize("speed", (pytest.param(0.5, marks=pytest.mark.slow), 1.0, 2.0))
 def test_a_body_bounces_off_a_held_block(speed: float, tmp_path: Path) -> None:
     """Energy to 2 %; the impulse is what changes the momentum; depths by trimesh below half an edge times v / c."""
-    scene, state = falling(block(tmp_path) | {"at": [0.45, 0.55, -0.55]}, [0.0, 0.0, -speed], 0.3 / speed)
+    scene, state = falling(block(tmp_path) | {"at": [0.45, 0.55, -0.55]}, [0.0, 0.0, -speed], 0.27 + 0.03 / speed)
     term, m = term_of(scene), scene.balance.mass.lumped.sum() / 3
     impulse, force, began, depth = 0.0, 0.0, 0.5 * m * speed**2, 0.0
     for report in each_step(scene, state):
@@ -90,7 +90,7 @@ def test_a_body_bounces_off_a_held_block(speed: float, tmp_path: Path) -> None:
         assert report.kinetic + report.elastic == pytest.approx(began, rel=0.02)
         assert m * (mean_velocity(scene, state)[2] + speed) == pytest.approx(impulse, abs=1e-9 * m)
         depth = max(depth, deepest(term))
-    assert mean_velocity(scene, state)[2] > 0.7 * speed
+    assert mean_velocity(scene, state)[2] > 0.6 * speed
     assert depth < 0.25 * speed / 10.0
 
 
@@ -137,7 +137,7 @@ def test_an_isolated_pair_keeps_its_momenta_and_energy(mass: float, friction: fl
     assert abs(mean_velocity(scene, state)[2]) > 1e-3 and (state.dissipated > 0) == (friction > 0)
 
 
-@pytest.mark.parametrize(("share", "sticks"), [(1.2, True), (0.8, False)])
+@pytest.mark.parametrize(("share", "sticks"), [pytest.param(1.2, True, marks=pytest.mark.slow), (0.8, False)])
 def test_on_a_slope_it_sticks_or_slides(share: float, sticks: bool, tmp_path: Path) -> None:
     """tan(theta) = 0.5 and mu = `share` of it, on a plate from a file: it stays, or slides with g (sin - mu cos)."""
     slope = 0.5
@@ -174,6 +174,7 @@ def test_the_work_of_a_turning_driven_obstacle_is_in_the_books(tmp_path: Path) -
     assert state.work == pytest.approx(work)
 
 
+@pytest.mark.slow
 def test_a_small_ball_from_a_file_does_not_pass_between_points(tmp_path: Path) -> None:
     """A ball is thrown at the middle of a facet: its own points press the facet, so that it comes off again."""
     trimesh.creation.icosphere(subdivisions=3, radius=0.2).export(tmp_path / "ball.stl")

@@ -11,6 +11,7 @@ import pytest
 
 from fracsim.contact.rigid_obstacles import VerletRigidObstacles
 from fracsim.scene import Scene
+from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import Walk, each_step, make_scene
 from test_mesh_obstacles import SOFT, block, last
 
@@ -31,15 +32,15 @@ def bodies_of(scene: Scene) -> VerletRigidObstacles:
     return found
 
 
-@pytest.mark.parametrize("kind", ("balls", "boxes", "ball and file", "file and box"))
+@pytest.mark.parametrize("kind", ("balls", "boxes", "ball and file", "file and box", "files"))
 def test_two_free_ones_collide(kind: str, tmp_path: Path) -> None:
     """Off their centres: linear and angular momentum to round-off, energy to 2 %, and depths of a few of their steps'
     motion; they part at the speed at which they met."""
     ball, box = {"shape": "sphere", "radius": 0.2}, {"shape": "box", "size": [0.3, 0.3, 0.3]}
     cube = block(tmp_path, (0.3, 0.3, 0.3)) if "file" in kind else {}
     first, second = {"balls": (ball, ball), "boxes": (box, box), "ball and file": (ball, cube),
-                     "file and box": (cube, box)}[kind]  # fmt: skip
-    off = [0.05, 0.08] if "box" in kind else [0.03, 0.05]
+                     "file and box": (cube, box), "files": (cube, cube)}[kind]  # fmt: skip
+    off = [0.05, 0.08] if "box" in kind or kind == "files" else [0.03, 0.05]
     scene, state = beside(
         3, first | {"name": "a", "at": [-0.25, 0.0, 0.0], "mass": 3.0, "velocity": [1.0, 0.0, 0.0]},
         second | {"name": "b", "at": [0.25, *off], "mass": 5.0, "velocity": [-0.5, 0.0, 0.0]}, end=0.4,
@@ -94,3 +95,18 @@ def test_a_light_one_takes_shorter_steps() -> None:
         )  # fmt: skip
         steps.append(state.advance().dt)
     assert steps[1] < 0.2 * steps[0] and steps[1] < 0.5 * steps[2] <= 0.5 * steps[0]
+
+
+def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
+    """Two free blocks from files, stopped in contact and resumed: the same but for round-off."""
+    cube = block(tmp_path, (0.3, 0.3, 0.3))
+    tables = {
+        "mesh": {"builder": "box", "size": [1.0] * 3, "h": 0.5, "origin": [-20.0] * 3}, "material": SOFT,
+        "contact": {"itself": False, "distance": 0.02}, "output": {"picture": False, "interval": 9.0},
+        "obstacle": [cube | {"name": "a", "at": [-0.16, 0.0, 0.0], "mass": 3.0, "velocity": [1.0, 0.0, 0.0]},
+                     cube | {"name": "b", "at": [0.16, 0.05, 0.08], "mass": 5.0}],
+        "time": {"scheme": "explicit", "step": 5e-3, "end": 9.0},
+    }  # fmt: skip
+    going, _, again = going_stopped_resumed(tables, tmp_path, 5, 20)
+    assert_alike(again, going, 1e-12)
+    assert last(going.scene)["velocity_b_x"] > 0.3

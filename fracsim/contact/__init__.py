@@ -35,6 +35,7 @@ Surfaces with ipctk:
     ipc_surface, ipc_pairs, sample_points  split surface, pairs of elements, sample points and friction at them
     mesh_obstacles        pairs of a body and a triangle-mesh obstacle
     penalty_pairs         penalty between points and facets, and between edges, with friction
+    penalty_mesh_pairs    penalty between triangle-mesh obstacles
     penalty_contacts, penalty_point_facet, penalty_edges  energy of contacts; points before facets; edges
 
 Free obstacles:

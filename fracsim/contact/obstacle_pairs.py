@@ -19,7 +19,7 @@ from typing import Protocol, cast
 import numpy as np
 import numpy.typing as npt
 
-from .laws import BARRIER, CoulombFriction, GapPotential, ObstacleLaw, tangential
+from .laws import BARRIER, CoulombFriction, GapPotential, ObstacleLaw, Penalty, tangential
 from .node_contact import ContactForces, StepStart, evaluate_points, lag_contact
 from .obstacle import RigidObstacle, free_pairs
 from .pose import Pose, PosedShape, rotate_vectors, rotation_second_derivative
@@ -439,7 +439,7 @@ class ObstaclePairs:
         self._start: dict[Numbers, PairStart] = {}
         self._started_near: set[Numbers] = set()  # pairs in contact at the start of the step
 
-    def set_penalties(self, penalty: Callable[[Numbers, float], GapPotential]) -> None:
+    def set_penalties(self, penalty: Callable[[Numbers, float], Penalty]) -> None:
         """Set the potential of each pair by its numbers and the area that may touch at once, m^2, of the smaller."""
         for numbers, pair in self._pairs.items():
             touching = [max(SAMPLES.touching_share * area.sum(), area.max()) for area in pair.areas if len(area)]
@@ -449,6 +449,9 @@ class ObstaclePairs:
         """Whether no obstacles can be in contact."""
         bounds = (pair.gap_bound(posed[i].pose, posed[j].pose) for (i, j), pair in self._pairs.items())
         return all(bound >= self._width for bound in bounds)
+
+    def accept_step(self, posed: PosedObstacles) -> None:
+        """Do nothing: forces depend on the poses alone."""
 
     def near_springs(self, posed: PosedObstacles, max_gap: float) -> Iterator[tuple[Numbers, Values, Values]]:
         """Pairs with points at gaps below `max_gap`, m: these (n, d), m, and their stiffness (n,) in contact, N/m."""

@@ -29,7 +29,7 @@ from .mesh_obstacle_term import MeshObstacleTerm
 from .mesh_obstacles import AllMeshPairs, MeshContactSurface, MeshObstacle, MeshObstaclePairs, Patches
 from .obstacle import VerletObstacle
 from .penalty_contacts import ContactStiffness
-from .penalty_pairs import PairSprings, PenaltyHistory, PenaltyPairs, history_from_checkpoint
+from .penalty_pairs import PairSprings, PenaltyHistory, PenaltyPairs
 from .penalty_point_facet import PointHistory, penalty_stiffness
 from .pose import Pose
 from .pose_derivatives import resultant
@@ -391,6 +391,4 @@ class PenaltyMeshObstacleTerm(MeshObstacleTerm):
         self._end_wrenches = list(saved["wrenches"])
         if self._surface is not None:
             for index, pairs in enumerate(self._surface.pairs.pairs):
-                names = ("by", "held", "slip", "edges")
-                history = history_from_checkpoint({name: saved[f"{name}_{index}"] for name in names})
-                pairs.contact.set_history(history)
+                pairs.contact.set_history(PenaltyHistory.from_checkpoint(saved, f"_{index}"))

@@ -48,21 +48,20 @@ class PenaltyHistory:
         arrays = {"by": self.points.facets.astype(float), "held": self.points.stiffness, "slip": self.points.slip}
         return arrays if self.edges is None else arrays | {"edges": self.edges.to_array()}
 
+    @classmethod
+    def from_checkpoint(cls, saved: dict[str, Values], suffix: str = "") -> PenaltyHistory:
+        """Contacts from the arrays of a checkpoint, of names with a suffix."""
+        facets, stiffness = saved[f"by{suffix}"].astype(np.int64), saved[f"held{suffix}"]
+        points = PointHistory(facets, stiffness, saved.get(f"slip{suffix}", np.zeros(facets.shape)))
+        if facets.shape[1] == 2:
+            return cls(points, None)
+        edges = saved.get(f"edges{suffix}")
+        return cls(points, EdgePairHistory.none() if edges is None else EdgePairHistory.from_array(edges))
+
     def renumbered(self, number: Ints, max_stiffness: Values) -> PenaltyHistory:
         """Contacts with new numbers (n,) of points, -1: none, no stiffer than `max_stiffness` (new n,), N/m."""
         edges = None if self.edges is None else self.edges.renumbered(number)
         return PenaltyHistory(self.points.renumbered(number, max_stiffness), edges)
-
-
-def history_from_checkpoint(saved: dict[str, Values]) -> PenaltyHistory:
-    """Contacts at the end of the last step, from the arrays of a checkpoint."""
-    facets, stiffness = saved["by"].astype(np.int64), saved["held"]
-    points = PointHistory(facets, stiffness, saved.get("slip", np.zeros(facets.shape)))
-    if facets.shape[1] == 2:
-        return PenaltyHistory(points, None)
-    return PenaltyHistory(
-        points, EdgePairHistory.from_array(saved["edges"]) if "edges" in saved else EdgePairHistory.none()
-    )
 
 
 class PenaltyPairs(IpcPairs):

@@ -23,7 +23,7 @@ from ..mesh.split_surface.entity_numbering import EntityNumbering
 from .ipc_pairs import vertex_areas
 from .ipc_surface import SelfContactLaw, SelfContactSurface
 from .penalty_contacts import ContactStiffness
-from .penalty_pairs import PairSprings, PenaltyHistory, PenaltyPairs, history_from_checkpoint
+from .penalty_pairs import PairSprings, PenaltyHistory, PenaltyPairs
 from .penalty_point_facet import PointHistory, penalty_stiffness
 from .self_contact import SelfContact, node_gather
 
@@ -254,4 +254,4 @@ class PenaltySelfContact(SelfContact):
         self._idle_displacement = self._idle = None
         super().from_checkpoint(saved)
         if self._surface is not None and "by" in saved:
-            self._surface.pairs.set_history(history_from_checkpoint(saved))
+            self._surface.pairs.set_history(PenaltyHistory.from_checkpoint(saved))

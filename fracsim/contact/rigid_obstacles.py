@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Protocol, cast
+from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +33,10 @@ from .pose_derivatives import PoseDerivatives
 from .rigid_body import RigidStep
 from .rigid_pose import FreePose, PoseUnknowns
 from .step_limit import PoseMotion
+
+if TYPE_CHECKING:
+    from .penalty_mesh_pairs import PenaltyMeshPair  # with ipctk
+    from .penalty_pairs import PenaltyHistory
 
 Values = npt.NDArray[np.float64]
 
@@ -499,11 +503,12 @@ class FreeRigidObstacles(RigidObstacles):
 
 
 class VerletRigidObstacles(RigidObstacles):
-    """Obstacles of which some are free, in explicit steps: a penalty acts between free ones and others.
+    """Obstacles of which some are free, in explicit steps.
+
+    Between free ones and others a penalty acts, without friction.
 
     Attributes:
         free: free obstacles by their numbers.
-        pairs: contact of these with other obstacles, without friction.
     """
 
     free: dict[int, VerletObstacle]
@@ -512,7 +517,8 @@ class VerletRigidObstacles(RigidObstacles):
         self,
         domain: Domain,
         obstacles: Sequence[RigidObstacle],
-        pairs: ObstaclePairs,
+        analytic_pairs: ObstaclePairs,
+        mesh_pairs: Sequence[PenaltyMeshPair],
         penalty: Penalty,
         max_added: float,
     ) -> None:
@@ -521,7 +527,8 @@ class VerletRigidObstacles(RigidObstacles):
         Args:
             domain: mesh of the body.
             obstacles: by their numbers in the study.
-            pairs: contact between obstacles.
+            analytic_pairs: pairs of obstacles of which one at least is analytic.
+            mesh_pairs: pairs of triangle meshes.
             penalty: of points in contact; less stiff where it would add more than a share of `max_added`.
             max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
         """
@@ -529,7 +536,8 @@ class VerletRigidObstacles(RigidObstacles):
         free = {n: VerletObstacle(obstacle) for n, obstacle in numbered if isinstance(obstacle, FreeObstacle)}
         self._contact_work = dict.fromkeys(free, 0.0)  # of the body on each in the last step, J
         self._prescribed_work = 0.0  # of prescribed obstacles on free ones in the last step, J
-        self._pairs, self._width = pairs, penalty.width
+        self._pairs: list[ObstaclePairs | PenaltyMeshPair] = [analytic_pairs, *mesh_pairs]
+        self._mesh_pairs, self._width = mesh_pairs, penalty.width
 
         tiny = np.finfo(float).tiny
 
@@ -540,7 +548,8 @@ class VerletRigidObstacles(RigidObstacles):
                 stiffness=min(penalty.stiffness, PAIR_SHARE * max_added * mass * penalty.width / max(area, tiny)),
             )
 
-        pairs.set_penalties(limited)
+        for pairs in self._pairs:
+            pairs.set_penalties(limited)
         super().__init__(domain, obstacles, free)
 
     def _place(self, start: float, end: float) -> None:
@@ -551,21 +560,51 @@ class VerletRigidObstacles(RigidObstacles):
 
     def accept_step(self) -> None:
         """Give free obstacles their momentum (collective)."""
-        start, end = dict[int, Values](), dict[int, Values]()
-        self._prescribed_work = 0.0
-        if not (self._pairs.are_far(self.start_posed) and self._pairs.are_far(self.posed)):
-            start, end = (self._pairs.wrenches(posed) for posed in (self.start_posed, self.posed))
-            works = [self._pairs.work(posed, self.increments)[0] for posed in (self.start_posed, self.posed)]
-            self._prescribed_work = 0.5 * sum(works)
+        self._prescribed_work, ends = 0.0, (self.start_posed, self.posed)
+        of_pairs = [{number: np.zeros_like(self.increments[number]) for number in self.free} for _ in ends]
+        for pairs in self._pairs:
+            if all(pairs.are_far(posed) for posed in ends):
+                continue
+            for posed, total in zip(ends, of_pairs, strict=True):
+                for number, wrench in pairs.wrenches(posed).items():
+                    if number in total:
+                        total[number] += wrench
+                self._prescribed_work += 0.5 * pairs.work(posed, self.increments)[0]
+            pairs.accept_step(self.posed)
         for number, of_body in self._wrenches().items():
-            obstacle, zero = self.free[number], np.zeros_like(of_body)
-            of_pairs = start.get(number, zero), end.get(number, zero)
-            work = obstacle.end_step(self.posed[number], of_body + of_pairs[1])
-            self._contact_work[number] = work - 0.5 * float((of_pairs[0] + of_pairs[1]) @ obstacle.increment)
+            obstacle, (start, end) = self.free[number], (total[number] for total in of_pairs)
+            work = obstacle.end_step(self.posed[number], of_body + end)
+            self._contact_work[number] = work - 0.5 * float((start + end) @ obstacle.increment)
 
     def stored_energy(self) -> float:
         """Energy of the penalty between obstacles, on rank 0, J."""
-        return 0.0 if self.comm.rank else self._pairs.energies(self.posed)[0]
+        return 0.0 if self.comm.rank else sum(pairs.energies(self.posed)[0] for pairs in self._pairs)
+
+    # --- state: of motion, and contacts of triangle meshes ---
+
+    def snapshot(self) -> object:
+        """States of motion, and contacts at the end of the last step."""
+        return super().snapshot(), [pair.history for pair in self._mesh_pairs]
+
+    def restore(self, memory: object) -> None:
+        """Restore a snapshot (not collective)."""
+        motions, contacts = cast("tuple[object, list[PenaltyHistory]]", memory)
+        super().restore(motions)
+        for pair, history in zip(self._mesh_pairs, contacts, strict=True):
+            pair.set_history(history)
+
+    def to_checkpoint(self) -> dict[str, Values]:
+        """Rows of states of motion, and contacts at the end of the last step."""
+        arrays = super().to_checkpoint()
+        for index, pair in enumerate(self._mesh_pairs):
+            arrays |= {f"{name}_{index}": values for name, values in pair.history.to_checkpoint().items()}
+        return arrays
+
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
+        """Set states of motion and contacts from the arrays of a checkpoint."""
+        super().from_checkpoint(saved)
+        for index, pair in enumerate(self._mesh_pairs):
+            pair.set_history(type(pair.history).from_checkpoint(saved, f"_{index}"))
 
     def frequency_bound(self) -> float:
         """Increase of the square of the highest frequency if all near points were in contact, 1/s^2.
@@ -574,7 +613,9 @@ class VerletRigidObstacles(RigidObstacles):
         l_i + sqrt(l_i l_j) over the pairs of an obstacle (Gershgorin's bound for blocks).
         """
         sums = dict.fromkeys(self.free, 0.0)
-        for numbers, x, k in self._pairs.near_springs(self.posed, PAIR_NEAR_GAP * self._width):
+        max_gap = PAIR_NEAR_GAP * self._width
+        springs = (spring for pairs in self._pairs for spring in pairs.near_springs(self.posed, max_gap))
+        for numbers, x, k in springs:
             squares = {
                 number: obstacle.max_frequency(obstacle.spring_stiffness(x, k, posed), posed)
                 for number, (obstacle, posed) in ((n, (self.free[n], self.posed[n])) for n in numbers if n in self.free)

@@ -123,7 +123,6 @@ def _contact_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
     if study.obstacle:
         yield f"obstacles   {_obstacle_list(study)}"
         shapes = [obstacle.shape for obstacle in study.obstacle]
-        any_free = any(obstacle.is_free for obstacle in study.obstacle)
         if any(shape != "mesh" for shape in shapes):
             surface = summary.surface_text()
             yield f"{_INDENT}acts on the points of {surface}, {_WITH_CRACK_FACES}; {_OBSTACLE_COST}"
@@ -131,8 +130,6 @@ def _contact_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
             if obstacle.file is not None:
                 text = _mesh_obstacle(obstacle.file, obstacle.scale or 1.0, f"obstacle.{i}")
                 yield f"{_INDENT}{obstacle.name}: {text}"
-        if shapes.count("mesh") > 1 and any_free and not study.time.scheme_class.implicit:
-            yield f"{_INDENT}note: in explicit steps obstacles from files pass through each other"
     if study.contact is not None and study.contact.itself:
         between_fragments = study.contact.itself == "pieces"
         partners = "of fragments with each other" if between_fragments else "of the body with itself"
