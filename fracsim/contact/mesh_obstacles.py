@@ -111,7 +111,6 @@ class MeshObstacle:
         triangles: (k, 3).
         friction: coefficient of friction.
         pose: current pose.
-        positions: (m, 3) its points at that pose, m.
     """
 
     def __init__(self, name: str, points: Values, triangles: Ints, friction: float) -> None:
@@ -120,9 +119,17 @@ class MeshObstacle:
         self.move_to(Pose.at_point(np.zeros(3)))
 
     def move_to(self, pose: Pose) -> None:
-        """Move to a pose."""
-        self.pose, self.positions = pose, self.positions_at(pose)
-        self._bounds = self.positions.min(axis=0), self.positions.max(axis=0)
+        """Move to a pose; points are computed when they are asked for, as most obstacles are far in most steps."""
+        self.pose = pose
+        self._positions: Values | None = None
+        self._bounds: tuple[Values, Values] | None = None
+
+    @property
+    def positions(self) -> Values:
+        """(m, 3) its points at the current pose, m."""
+        if self._positions is None:
+            self._positions = self.positions_at(self.pose)
+        return self._positions
 
     def positions_at(self, pose: Pose) -> Values:
         """(m, 3) its points at a pose, m."""
@@ -130,6 +137,8 @@ class MeshObstacle:
 
     def is_far(self, x: Values, distance: float) -> bool:
         """Whether its bounding box is farther than `distance` from that of points x (n, 3), m."""
+        if self._bounds is None:
+            self._bounds = self.positions.min(axis=0), self.positions.max(axis=0)
         low, high = self._bounds
         return bool(np.any(x.min(axis=0) - high > distance) or np.any(low - x.max(axis=0) > distance))
 
