@@ -19,6 +19,7 @@ from ufl.core.expr import Expr
 from .kinematics import embed, green_strain, identity, small_strain
 
 Scalar = Any  # a float, or a UFL coefficient for a field
+MIN_STRETCH = 0.1  # sum of two principal stretches, below which a cell counts as inverted (Corotated.turning_moduli)
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
@@ -158,11 +159,35 @@ class Corotated(_PlaneStrain):
     def strain(self, F: Expr, rotation: Expr | None = None) -> Expr:
         """Return eps = sym(R^T F) - I."""
         # At the polar rotation the first Piola-Kirchhoff stress R (2 mu eps + lambda tr(eps) I) is exact, since the
-        # variation of R does no work on a stress that commutes with the stretch. The tangent leaves that variation out,
-        # and is symmetric and positive.
+        # variation of R does no work on a stress that commutes with the stretch. The moduli need that variation: see
+        # `turning_moduli`.
         if rotation is None:
             raise ValueError("the corotated energy needs the polar rotation of F")
         return small_strain(rotation.T * F)
+
+    def turning_moduli(self, F: Expr, rotation: Expr, of_v: Expr, of_w: Expr) -> Expr:
+        """Return what the variation of R adds to the second variation of psi, J/m^3.
+
+            2 a_w . M a_v,  M = (tr(T) I - T) (tr(S) I - S)^-1,  in 2D tr(T) / tr(S),    F = R S,  T = R^T P
+
+        a is the axial vector of skew(R^T dF). The eigenvalues of M are (T_i + T_j) / (s_i + s_j): a cell in tension
+        resists rotation, one in compression gives way. 0 in inverted cells, where denominators may vanish.
+
+        Args:
+            F: deformation gradient (d x d).
+            rotation: R.
+            of_v: variation dF (d x d).
+            of_w: another one.
+        """
+        strain = self.strain(F, rotation)
+        T, S = elastic_stress(self, strain), strain + identity(strain)
+        a_v, a_w = (_axial_vector(rotation.T * variation) for variation in (of_v, of_w))
+        if F.ufl_shape[0] == 2:
+            product = 2 * a_w * ufl.tr(T) / ufl.tr(S) * a_v
+            return ufl.conditional(ufl.gt(ufl.tr(S), MIN_STRETCH), product, 0.0)
+        G_T, G_S = (ufl.tr(tensor) * identity(tensor) - tensor for tensor in (T, S))
+        product = 2 * ufl.inner(a_w, ufl.dot(ufl.sym(ufl.dot(G_T, ufl.inv(G_S))), a_v))
+        return ufl.conditional(ufl.gt(ufl.det(G_S), MIN_STRETCH**3), product, 0.0)
 
 
 @dataclass(frozen=True)
@@ -217,6 +242,14 @@ def first_piola_kirchhoff(energy: Energy, F: Expr, rotation: Expr | None = None)
     """Return P = d psi / d F, Pa (d x d)."""
     variable = ufl.variable(F)
     return ufl.diff(energy.psi(variable, rotation), variable)
+
+
+def _axial_vector(tensor: Expr) -> Expr:
+    """Return the axial vector of the skew part of a tensor; in 2D its component across the plane."""
+    if tensor.ufl_shape[0] == 2:
+        return (tensor[1, 0] - tensor[0, 1]) / 2
+    pairs = ((2, 1), (0, 2), (1, 0))
+    return ufl.as_vector([(tensor[i, j] - tensor[j, i]) / 2 for i, j in pairs])
 
 
 def cauchy_stress(energy: Energy, F: Expr, rotation: Expr | None = None) -> Expr:

@@ -49,6 +49,11 @@ class ElastoplasticEnergy(WrappedEnergy):
         """Return the energy density, J/m^3."""
         return self.base.psi(self.elastic_part(F), embed(rotation, 1.0) if rotation is not None else None)
 
+    def turning_moduli(self, F: Expr, rotation: Expr, of_v: Expr, of_w: Expr) -> Expr:
+        """Return what the variation of the rotation of F_e adds to the second variation of psi, J/m^3."""
+        variations = (embed(variation, 0.0) * self.plastic_inverse for variation in (of_v, of_w))
+        return self.base.turning_moduli(self.elastic_part(F), embed(rotation, 1.0), *variations)  # type: ignore[attr-defined]
+
 
 class TrialStress:
     """Stress of the elastic part of a deformation, before any plastic flow.
@@ -127,6 +132,8 @@ class ImplicitFlow:
         # C = 2 mu dev + kappa I x I holds at small elastic strain. Newton's method converges slightly less than
         # quadratically, since terms of the order of that strain are left out.
         elastic = ufl.derivative(ufl.inner(trial.P, of_w), u, v)
+        if rotation is not None:
+            elastic += energy.turning_moduli(deformation_gradient(u), rotation, ufl.grad(v), ufl.grad(w))
         kappa = energy.lmbda + 2 / 3 * energy.mu
         volumes, shapes = (ufl.inner(part, of_v) * ufl.inner(part, of_w) for part in (trial.inverse_transpose, trial.s))
         total = (1 - beta) * elastic + beta * kappa * volumes - 2 * energy.mu * turning * shapes

@@ -38,7 +38,7 @@ def test_matrices_are_made_positive(correct: Callable[..., None], size: int, sma
     assert (found[-1] == 7.0).all()
 
 
-@pytest.mark.parametrize("energy", ["neo-hookean", "stvk"])
+@pytest.mark.parametrize("energy", ["neo-hookean", "stvk", "corotated"])
 @pytest.mark.parametrize("dim", [2, 3])
 def test_a_crumpled_body_is_made_positive(energy: str, dim: int) -> None:
     """K+ has no negative eigenvalue where K has, nor has K+ - K; and what is positive stays as it is, to round-off."""

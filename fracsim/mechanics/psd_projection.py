@@ -46,7 +46,11 @@ class PsdProjection:
         domain, d = stress.domain, stress.domain.dim
         F = ufl.variable(deformation_gradient(stress.u))
         P = stress.energy_factor * ufl.diff(stress.energy.psi(F, stress.rotation_field), F)
-        self._moduli = point_expression(domain, ufl.diff(P, F), kernels=stress.kernels)
+        moduli = ufl.diff(P, F)
+        if stress.rotation_varies:  # F stands for any variation, in which the form is quadratic
+            turning = stress.turning_moduli(F, F) / 2
+            moduli += stress.degradation_factor * ufl.diff(ufl.diff(turning, F), F)
+        self._moduli = point_expression(domain, moduli, kernels=stress.kernels)
         self._field = point_field(domain, (d * d, d * d), "correction of moduli")
         self._size, self._cells = d * d, domain.cell_count
         self._correct = stress.kernels.psd_correction() or plain_psd_correction

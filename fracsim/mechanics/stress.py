@@ -21,7 +21,7 @@ import ufl
 from dolfinx import fem
 from ufl.core.expr import Expr
 
-from ..forms.balance import elastic_energy, internal_work
+from ..forms.balance import elastic_energy, internal_work, stress_quadrature
 from ..forms.energies import Energy
 from ..forms.kinematics import deformation_gradient
 from ..mesh.domain import Domain
@@ -221,10 +221,30 @@ class Stress(Term):
         """Derivative of the virtual work in the direction v."""
         flow = self._flow_form
         if flow is None:
-            return ufl.derivative(self.virtual_work(w, dx), self.u, v)
+            return ufl.derivative(self.virtual_work(w, dx), self.u, v) + self._turning_tangent(v, w, dx)
         tangent = flow.tangent(self.u, v, w, dx, chi=self.degradation_factor, rotation=self.rotation_field)
         springs = self._springs(w, dx)
         return tangent + (ufl.derivative(springs, self.u, v) if springs else 0)
+
+    def _turning_tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> Form:
+        """Part of the tangent by the variation of the rotation; 0 for energies without one."""
+        if not self.rotation_varies:
+            return 0
+        moduli = self.turning_moduli(ufl.grad(v), ufl.grad(w))
+        return self.degradation_factor * moduli * dx(metadata=stress_quadrature(w))
+
+    @property
+    def rotation_varies(self) -> bool:
+        """Whether the tangent has the variation of the rotation: with `rotation_field`, except for projected strain.
+
+        The stress of a strain projected on edges does not commute with the stretch.
+        """
+        return self.rotation_field is not None and (self.integrity is None or self.chi is not None)
+
+    def turning_moduli(self, of_v: Expr, of_w: Expr) -> Expr:
+        """What the variation of the rotation adds to the moduli of the undamaged body, for variations of F, J/m^3."""
+        energy, F = self.material.energy, deformation_gradient(self.u)
+        return energy.turning_moduli(F, self.rotation_field, of_v, of_w)  # type: ignore[attr-defined]
 
     def _springs(self, w: Expr, dx: ufl.Measure) -> Form:
         """Virtual work of closing cracks in a body with plastic flow."""
