@@ -52,7 +52,7 @@ class ReusePolicy:
         max_fraction: fraction of a Newton step that contact allowed; the next step, its remainder, uses the same part.
     """
 
-    max_move: float = 0.01
+    max_move: float = 1e-3
     max_fraction: float = 0.5
 
 
