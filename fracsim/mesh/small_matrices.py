@@ -49,18 +49,20 @@ def polar_rotation(F: Matrices, iterations: int = 20) -> Matrices:
     """
     # cells of a diverging iterate are not finite
     with np.errstate(invalid="ignore", over="ignore"):
-        regular = np.linalg.det(F) > 1e-6 * np.einsum("nij,nij->n", F, F) ** (F.shape[1] / 2)
+        determinant = np.einsum("nj,nj->n", F[:, 0], cofactors(F)[:, 0])
+        regular = determinant > 1e-6 * np.einsum("nij,nij->n", F, F) ** (F.shape[1] / 2)
     if not regular.all():
         result = np.empty_like(F)
         result[regular] = polar_rotation(F[regular], iterations)
         result[~regular] = _rotation_by_svd(F[~regular])
         return result
-    R = F.copy()
+    R, moving = F.copy(), np.arange(len(F))  # most cells converge before the most stretched one
     for _ in range(iterations):
-        change = inverse_transpose(R) - R
-        R += change / 2
+        change = inverse_transpose(R[moving]) - R[moving]
+        R[moving] += change / 2
         # quadratic convergence: the next change is at round-off
-        if np.max(np.abs(change), initial=0.0) < 1e-8:
+        moving = moving[np.abs(change).max(axis=(1, 2), initial=0.0) >= 1e-8]
+        if not len(moving):
             break
     return R
 
