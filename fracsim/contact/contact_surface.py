@@ -177,11 +177,11 @@ class ContactSurface:
         """Facets of which neither a corner nor the facet itself is excluded (not collective)."""
         cached = self._active
         if cached is None or cached[0] is not self.area or cached[1] is not self._excluded_facets:
-            facets = self._all_facets()
-            active = np.ones(len(facets.area), bool)
-            active[self._excluded_facets] = False
-            active &= (self.area[facets.corners] > 0).all(axis=1)
-            selected = ContactFacets(facets.corners[active], facets.area[active], facets.smoothing)
+            selected = facets = self._all_facets()
+            if len(self._excluded_facets) or (self.area == 0).any():
+                active = np.asarray((self.area > 0)[facets.corners].all(axis=1))
+                active[self._excluded_facets] = False
+                selected = ContactFacets(facets.corners[active], facets.area[active], facets.smoothing)
             cached = self._active = self.area, self._excluded_facets, selected
         return cached[2]
 

@@ -69,6 +69,7 @@ class ProximityCandidates:
         self._least_margin, self._corners = margin, corners
         self._searches: dict[int, ProximitySearch] = {}
         self._motion: tuple[Values, ProximitySearch, float] | None = None  # the last that was computed
+        self._balls: tuple[Values, Values, Values] | None = None  # points, and centroids and radii of facets
 
     def __call__(self, posed: PosedShape, x: Values, distance: float) -> Ints:
         """(k,) those nearer than `distance`, m, to an obstacle, with points at x (n, d), m; others too, ascending."""
@@ -92,11 +93,18 @@ class ProximityCandidates:
         if self._corners is None:
             gap = posed.distance(x)
         else:
-            corners = x[self._corners]
-            centroid = corners.mean(axis=1)
-            arms = corners - centroid[:, None]
-            radius = np.sqrt(np.einsum("kcd,kcd->kc", arms, arms).max(axis=1, initial=0.0))
+            centroid, radius = self._bounding_balls(x)
             margin = max(float(radius.mean()) if len(radius) else 0.0, margin)
             gap = posed.distance(centroid) - radius
         near = np.flatnonzero(gap < distance + margin)
         return ProximitySearch(x, posed, distance, margin, near, outline_radius(posed))
+
+    def _bounding_balls(self, x: Values) -> tuple[Values, Values]:
+        """(m, d) centroids of the facets, and (m,) greatest distances of their corners from them, m."""
+        if self._balls is None or self._balls[0] is not x:
+            assert self._corners is not None
+            corners = [x[points] for points in self._corners.T]
+            centroid = sum(corners[1:], corners[0]) / len(corners)
+            squares = [np.einsum("kd,kd->k", arm, arm) for arm in (corner - centroid for corner in corners)]
+            self._balls = x, centroid, np.sqrt(np.maximum.reduce(squares))
+        return self._balls[1:]

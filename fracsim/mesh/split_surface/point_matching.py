@@ -31,14 +31,28 @@ def point_identity(surface: SplitSurface, which: Ints, number: Ints, size: float
 
 def match_points(old: Values, new: Values) -> Ints:
     """(k,) the index in `new` (n, w) of each row of `old` (k, w); -1 if there is none."""
-    if not len(old):
-        return np.empty(0, np.int64)
-    # column of the first parent
-    lead = new.shape[1] // 2
-    near = np.flatnonzero(np.isin(new[:, lead], old[:, lead]))
-    rows = np.concatenate([new[near], old])
+    if not len(old) or not len(new):
+        return np.full(len(old), -1)
+    old_keys, new_keys = _row_keys(old), _row_keys(new)
+    order = np.argsort(new_keys, kind="stable")
+    place = np.minimum(np.searchsorted(new_keys[order], old_keys), len(new) - 1)
+    match = order[place]
+    same_key = new_keys[match] == old_keys
+    is_equal = same_key & (new[match] == old).all(axis=1)
+    if not np.array_equal(is_equal, same_key):  # two rows with one key
+        return _match_sorted(old, new)
+    return np.where(is_equal, match, -1)
+
+
+def _row_keys(rows: Values) -> Ints:
+    """(n,) integers that are equal for equal rows (n, w) of whole numbers, and hardly ever for others."""
+    factors = np.random.default_rng(1).integers(-(2**62), 2**62, rows.shape[1]) | 1
+    return np.asarray(rows.astype(np.int64) @ factors)  # modulo 2^64
+
+
+def _match_sorted(old: Values, new: Values) -> Ints:
+    """`match_points` by sorting whole rows."""
+    rows = np.concatenate([new, old])
     _, first, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    match = first[inverse.reshape(-1)[len(near) :]]
-    result = np.full(len(old), -1)
-    result[match < len(near)] = near[match[match < len(near)]]
-    return result
+    match = first[inverse.reshape(-1)[len(new) :]]
+    return np.where(match < len(new), match, -1)
