@@ -56,6 +56,30 @@ class MeshObstaclePolicy:
 MESH = MeshObstaclePolicy()
 
 
+def free_fraction_on_arcs(
+    free_fraction: Callable[[Values, Values], float], positions: Callable[[float], Values], rotation: float
+) -> float:
+    """Fraction of a motion with a rotation without a collision; arcs are divided into chords that end on them.
+
+    Args:
+        free_fraction: fraction of the straight motion between two positions (n, 3) without a collision.
+        positions: (n, 3) points, m, after a fraction of the motion.
+        rotation: angle of the whole motion, rad.
+    """
+    pieces = 1 + int(rotation / MESH.max_rotation)
+    for piece in range(pieces):
+        first, fraction, chord = piece / pieces, 1.0, 0.0
+        start = positions(first)
+        while chord < 1 and fraction > MESH.min_fraction:
+            chord = free_fraction(start, positions(first + fraction / pieces))
+            fraction *= 1.0 if chord == 1 else (1 - BARRIER.min_gap_ratio) * chord
+        if chord < 1:
+            return first
+        if fraction < 1:
+            return first + fraction / pieces
+    return 1.0
+
+
 class ProximityTest:
     """Test by bounding boxes whether a body can be near an obstacle; nothing is gathered."""
 
@@ -219,30 +243,19 @@ class MeshObstaclePairs[Contact: IpcPairs]:
     def moving_free_fraction(self, x: Values, end: Values, start_pose: Pose) -> float:
         """Fraction of the motions of body and obstacle without a collision.
 
-        The points of an obstacle that rotates move on arcs, which are divided into chords that end on them.
-
         Args:
             x: (n, 3) points of the body at the start, m.
             end: (n, 3) points of the body at the end of their straight motion, m.
             start_pose: pose of the obstacle at the start; it is at the end now.
         """
-        end_pose, q = self.mesh.pose, start_pose.increment_to(self.mesh.pose)
+        end_pose, q, motion = self.mesh.pose, start_pose.increment_to(self.mesh.pose), end - x
         if not q[3:].any():
             return self.contact.free_fraction(self._points_at(x, start_pose), self._points_at(end, end_pose))
-        pieces, motion = 1 + int(np.linalg.norm(q[3:]) / MESH.max_rotation), end - x
-        for piece in range(pieces):
-            first, fraction, chord = piece / pieces, 1.0, 0.0
-            start = self._points_at(x + first * motion, start_pose.incremented(first * q))
-            while chord < 1 and fraction > MESH.min_fraction:
-                last = first + fraction / pieces
-                stop = self._points_at(x + last * motion, start_pose.incremented(last * q))
-                chord = self.contact.free_fraction(start, stop)
-                fraction *= 1.0 if chord == 1 else (1 - BARRIER.min_gap_ratio) * chord
-            if chord < 1:
-                return first
-            if fraction < 1:
-                return first + fraction / pieces
-        return 1.0
+
+        def positions(fraction: float) -> Values:
+            return self._points_at(x + fraction * motion, start_pose.incremented(fraction * q))
+
+        return free_fraction_on_arcs(self.contact.free_fraction, positions, float(np.linalg.norm(q[3:])))
 
     def _points_at(self, x: Values, pose: Pose) -> Values:
         return np.concatenate([x, self.mesh.positions_at(pose)])

@@ -14,8 +14,8 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
 from .ipc_pairs import IpcPairs
-from .laws import BARRIER, ObstacleLaw
-from .mesh_obstacles import MESH
+from .laws import ObstacleLaw
+from .mesh_obstacles import MESH, free_fraction_on_arcs
 from .obstacle import RigidObstacle
 from .obstacle_pairs import Numbers, PosedObstacles, StepMotion
 from .pose import Pose
@@ -132,28 +132,15 @@ class MeshPair:
         return total, float(np.vdot(self._friction.gradient(x), x - self._start))
 
     def safe_fraction(self, motions: Mapping[int, PoseMotion]) -> float:
-        """Fraction of the motions of both that leaves a tenth of each gap; 1 where the motion of one is not given.
-
-        Points of an obstacle that rotates move on arcs, which are divided into chords that end on them.
-        """
+        """Fraction of the motions of both that leaves a tenth of each gap; 1 where the motion of one is not given."""
         if not all(number in motions for number in self._numbers):
             return 1.0
         moving = [motions[number] for number in self._numbers]
         if not any(q.any() for _, q in moving):
             return 1.0
-        pieces = 1 + int(max(float(np.linalg.norm(q[3:])) for _, q in moving) / MESH.max_rotation)
 
         def positions(fraction: float) -> Values:
             return self._positions([posed.pose.incremented(fraction * q) for posed, q in moving])
 
-        for piece in range(pieces):
-            first, fraction, chord = piece / pieces, 1.0, 0.0
-            start = positions(first)
-            while chord < 1 and fraction > MESH.min_fraction:
-                chord = self._pairs.free_fraction(start, positions(first + fraction / pieces))
-                fraction *= 1.0 if chord == 1 else (1 - BARRIER.min_gap_ratio) * chord
-            if chord < 1:
-                return first
-            if fraction < 1:
-                return first + fraction / pieces
-        return 1.0
+        rotation = max(float(np.linalg.norm(q[3:])) for _, q in moving)
+        return free_fraction_on_arcs(self._pairs.free_fraction, positions, rotation)

@@ -21,10 +21,9 @@ from .penalty_contacts import ContactStiffness
 from .penalty_pairs import PenaltyHistory, PenaltyPairs
 from .pose import Pose
 from .pose_derivatives import resultant
+from .rigid_obstacles import PAIR_PENALTY
 
 Values = npt.NDArray[np.float64]
-
-MESH_NEAR_GAP = 3.0  # distance of bounding boxes, in widths of the penalty, up to which contacts are stored
 
 type PenaltyLimit = Callable[[Numbers, float], Penalty]  # numbers of a pair, area that may touch at once, m^2
 
@@ -110,7 +109,7 @@ class PenaltyMeshPair:
 
     def accept_step(self, posed: PosedObstacles) -> None:
         """Store contacts at the end of a step."""
-        if (x := self._near_positions(posed, MESH_NEAR_GAP * self._pairs.width)) is not None:
+        if (x := self._near_positions(posed, PAIR_PENALTY.near_gap * self._pairs.width)) is not None:
             self._pairs.end_step(x)
 
     # --- state ---

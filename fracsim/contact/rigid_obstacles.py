@@ -12,7 +12,7 @@ Equations: docs/theory.md#rigid-obstacles.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
@@ -40,10 +40,23 @@ if TYPE_CHECKING:
 
 Values = npt.NDArray[np.float64]
 
-PAIR_SHARE = 0.2  # of what contact may add to the square of a frequency, for one obstacle on another
-PAIR_NEAR_GAP = 3.0  # gap, in widths of the penalty, of points that may be in contact a step later
-
 type Increments = Mapping[int, Values]  # (p,) of poses, by the numbers of obstacles
+
+
+@dataclass(frozen=True)
+class PairPenaltyPolicy:
+    """Tuned numbers of the penalty between two obstacles.
+
+    Attributes:
+        share: of what contact may add to the square of a frequency.
+        near_gap: gap, in widths of the penalty, up to which contacts are followed, since they may act a step later.
+    """
+
+    share: float = 0.2
+    near_gap: float = 3.0
+
+
+PAIR_PENALTY = PairPenaltyPolicy()
 
 
 class ObstacleContactTerm(Protocol):
@@ -545,7 +558,9 @@ class VerletRigidObstacles(RigidObstacles):
             mass = min(free[number].body.mass for number in numbers if number in free)
             return replace(
                 penalty,
-                stiffness=min(penalty.stiffness, PAIR_SHARE * max_added * mass * penalty.width / max(area, tiny)),
+                stiffness=min(
+                    penalty.stiffness, PAIR_PENALTY.share * max_added * mass * penalty.width / max(area, tiny)
+                ),
             )
 
         for pairs in self._pairs:
@@ -613,7 +628,7 @@ class VerletRigidObstacles(RigidObstacles):
         l_i + sqrt(l_i l_j) over the pairs of an obstacle (Gershgorin's bound for blocks).
         """
         sums = dict.fromkeys(self.free, 0.0)
-        max_gap = PAIR_NEAR_GAP * self._width
+        max_gap = PAIR_PENALTY.near_gap * self._width
         springs = (spring for pairs in self._pairs for spring in pairs.near_springs(self.posed, max_gap))
         for numbers, x, k in springs:
             squares = {

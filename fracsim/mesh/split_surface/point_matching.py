@@ -35,8 +35,8 @@ def match_points(old: Values, new: Values) -> Ints:
         return np.full(len(old), -1)
     old_keys, new_keys = _row_keys(old), _row_keys(new)
     order = np.argsort(new_keys, kind="stable")
-    place = np.minimum(np.searchsorted(new_keys[order], old_keys), len(new) - 1)
-    match = order[place]
+    insertion = np.minimum(np.searchsorted(new_keys[order], old_keys), len(new) - 1)
+    match = order[insertion]
     same_key = new_keys[match] == old_keys
     is_equal = same_key & (new[match] == old).all(axis=1)
     if not np.array_equal(is_equal, same_key):  # two rows with one key
