@@ -19,7 +19,6 @@ from ufl.core.expr import Expr
 from .kinematics import embed, green_strain, identity, small_strain
 
 Scalar = Any  # a float, or a UFL coefficient for a field
-MIN_STRETCH = 0.1  # sum of two principal stretches, below which a cell counts as inverted (Corotated.turning_moduli)
 
 
 def lame(young: float, poisson: float) -> tuple[float, float]:
@@ -151,6 +150,7 @@ class Corotated(_PlaneStrain):
     """
 
     needs_rotation: ClassVar[bool] = True
+    min_stretch: ClassVar[float] = 0.1  # sum of two principal stretches, below which a cell counts as inverted
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
         """Return the energy density, J/m^3; `rotation` is R (d x d)."""
@@ -184,10 +184,10 @@ class Corotated(_PlaneStrain):
         a_v, a_w = (_axial_vector(rotation.T * variation) for variation in (of_v, of_w))
         if F.ufl_shape[0] == 2:
             product = 2 * a_w * ufl.tr(T) / ufl.tr(S) * a_v
-            return ufl.conditional(ufl.gt(ufl.tr(S), MIN_STRETCH), product, 0.0)
+            return ufl.conditional(ufl.gt(ufl.tr(S), self.min_stretch), product, 0.0)
         G_T, G_S = (ufl.tr(tensor) * identity(tensor) - tensor for tensor in (T, S))
         product = 2 * ufl.inner(a_w, ufl.dot(ufl.sym(ufl.dot(G_T, ufl.inv(G_S))), a_v))
-        return ufl.conditional(ufl.gt(ufl.det(G_S), MIN_STRETCH**3), product, 0.0)
+        return ufl.conditional(ufl.gt(ufl.det(G_S), self.min_stretch**3), product, 0.0)
 
 
 @dataclass(frozen=True)

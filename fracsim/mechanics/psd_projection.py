@@ -24,7 +24,7 @@ from ..forms.balance import stress_quadrature
 from ..forms.kinematics import deformation_gradient
 from ..mesh.c_library import FAST_FLAGS, compile_library
 from .jit import CellForm, cell_measure, point_expression, point_field
-from .stress import Stress
+from .stress import Stress, turning_moduli
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.uint8]
@@ -47,9 +47,8 @@ class PsdProjection:
         F = ufl.variable(deformation_gradient(stress.u))
         P = stress.energy_factor * ufl.diff(stress.energy.psi(F, stress.rotation_field), F)
         moduli = ufl.diff(P, F)
-        if stress.rotation_varies:  # F stands for any variation, in which the form is quadratic
-            turning = stress.turning_moduli(F, F) / 2
-            moduli += stress.degradation_factor * ufl.diff(ufl.diff(turning, F), F)
+        if (turning := turning_moduli(stress, F, F)) is not None:  # quadratic in a variation, for which F stands
+            moduli += ufl.diff(ufl.diff(turning / 2, F), F)
         self._moduli = point_expression(domain, moduli, kernels=stress.kernels)
         self._field = point_field(domain, (d * d, d * d), "correction of moduli")
         self._size, self._cells = d * d, domain.cell_count

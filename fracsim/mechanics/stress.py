@@ -221,30 +221,13 @@ class Stress(Term):
         """Derivative of the virtual work in the direction v."""
         flow = self._flow_form
         if flow is None:
-            return ufl.derivative(self.virtual_work(w, dx), self.u, v) + self._turning_tangent(v, w, dx)
+            tangent = ufl.derivative(self.virtual_work(w, dx), self.u, v)
+            if (moduli := turning_moduli(self, ufl.grad(v), ufl.grad(w))) is not None:
+                tangent += moduli * dx(metadata=stress_quadrature(w))
+            return tangent
         tangent = flow.tangent(self.u, v, w, dx, chi=self.degradation_factor, rotation=self.rotation_field)
         springs = self._springs(w, dx)
         return tangent + (ufl.derivative(springs, self.u, v) if springs else 0)
-
-    def _turning_tangent(self, v: Expr, w: Expr, dx: ufl.Measure) -> Form:
-        """Part of the tangent by the variation of the rotation; 0 for energies without one."""
-        if not self.rotation_varies:
-            return 0
-        moduli = self.turning_moduli(ufl.grad(v), ufl.grad(w))
-        return self.degradation_factor * moduli * dx(metadata=stress_quadrature(w))
-
-    @property
-    def rotation_varies(self) -> bool:
-        """Whether the tangent has the variation of the rotation: with `rotation_field`, except for projected strain.
-
-        The stress of a strain projected on edges does not commute with the stretch.
-        """
-        return self.rotation_field is not None and (self.integrity is None or self.chi is not None)
-
-    def turning_moduli(self, of_v: Expr, of_w: Expr) -> Expr:
-        """What the variation of the rotation adds to the moduli of the undamaged body, for variations of F, J/m^3."""
-        energy, F = self.material.energy, deformation_gradient(self.u)
-        return energy.turning_moduli(F, self.rotation_field, of_v, of_w)  # type: ignore[attr-defined]
 
     def _springs(self, w: Expr, dx: ufl.Measure) -> Form:
         """Virtual work of closing cracks in a body with plastic flow."""
@@ -340,6 +323,20 @@ def _floored(chi: Expr | None, floor: float) -> Expr | float:
     if chi is None:
         return 1.0
     return floor + (1 - floor) * chi if floor else chi
+
+
+def turning_moduli(stress: Stress, of_v: Expr, of_w: Expr) -> Expr | None:
+    """What the variation of the rotation adds to the moduli, for two variations of F, J/m^3; None: it is left out.
+
+    Energies without a rotation have none. The stress of a strain that is projected on edges does not commute with the
+    stretch: its tangent is that of a fixed rotation.
+    """
+    is_projected = stress.integrity is not None and stress.chi is None
+    if stress.rotation_field is None or is_projected:
+        return None
+    energy, F = stress.material.energy, deformation_gradient(stress.u)
+    moduli = energy.turning_moduli(F, stress.rotation_field, of_v, of_w)  # type: ignore[attr-defined]
+    return stress.degradation_factor * moduli
 
 
 def _elastic_part(u: fem.Function, material: MaterialFields, dim: int) -> Expr:
