@@ -17,8 +17,9 @@ from fracsim.mechanics.term_protocols import SurfaceData
 from fracsim.output.fields_file import Field
 from fracsim.output.surface.body_surface import BodySurface
 from fracsim.output.surface.vtk_files import SurfaceFiles
+from fracsim.report.pictures import renderer
 from fracsim.report.pictures.annotations import annotate, format_length, format_time, round_length
-from fracsim.report.pictures.picture import SHEET_GAP, render, tile_pictures
+from fracsim.report.pictures.picture import SHEET_GAP, render, tile_pictures, virtual_display
 from fracsim.report.pictures.picture_options import (
     DEFAULT_SIZE,
     MATERIAL_LOOKS,
@@ -26,7 +27,9 @@ from fracsim.report.pictures.picture_options import (
     parse_limits,
     parse_size,
 )
-from fracsim.report.pictures.renderer import OBSTACLE_COLOUR, crack_opening
+from fracsim.report.pictures.renderer import crack_opening
+from fracsim.report.pictures.shadows import SHADOW_STYLE, DepthWindow, lamp_camera, lamp_directions, shadow_shares
+from fracsim.report.pictures.surroundings import PLANE_COLOUR
 from fracsim.study.time_and_output import LOOKS
 from support.solids import lattice, patterns, separated
 
@@ -307,11 +310,83 @@ def test_a_floor_is_where_the_obstacle_plane_is(tmp_path: Path) -> None:
     slab, floor = (
         shown(render(folder, options=each)) for each in (look, PictureOptions(**{**vars(look), "floor": True}))
     )
-    solid = [int(OBSTACLE_COLOUR[i : i + 2], 16) for i in (1, 3, 5)]
-    assert (np.abs(slab - solid).max(axis=2) < 60).mean() > (np.abs(floor - solid).max(axis=2) < 60).mean() + 0.02
+    warm = [(pixels[..., 0] > pixels[..., 2] + 10).mean() for pixels in (slab, floor)]
+    assert rgb_of(PLANE_COLOUR)[0] > rgb_of(PLANE_COLOUR)[2] + 15 and floor[0, 0, 0] < floor[0, 0, 2]
+    assert warm[0] > warm[1] + 0.02
     shadow = (floor.max(axis=2) < 0.93 * floor[0, 0].max()) & ~of_hue(floor, 0)
     body = of_hue(floor, 0)
     assert np.nonzero(shadow)[0].mean() > np.nonzero(body)[0].mean() + 20
+
+
+# --- obstacles and shadows ---
+
+
+def with_obstacle(folder: Path, lower: tuple[float, ...], upper: tuple[float, ...]) -> Path:
+    """The bar without a crack and an obstacle, a box between two corners in m."""
+    import pyvista
+
+    box = pyvista.Box([side for pair in zip(lower, upper, strict=True) for side in pair]).triangulate()
+    box = box.compute_normals(auto_orient_normals=True)
+    surface = BodySurface(lattice(6, 1, 1), 1.0)
+    none = np.zeros_like(surface.skeleton.points)
+    drawn = SurfaceData(np.asarray(box.points, float), box.regular_faces, np.empty((0, 2), int))
+    SurfaceFiles(folder, 3).write_frame(surface.make_frame(0.0, none, none), {"block": drawn})
+    return folder
+
+
+def test_an_obstacle_in_front_is_opaque_and_hides_its_part_of_the_body(tmp_path: Path) -> None:
+    """A box in front of a third of the bar: no red of the bar there, all of it beside the box."""
+    folder = with_obstacle(tmp_path, (2.0, -2.0, -0.2), (4.0, -1.0, 1.2))
+    red = of_hue(shown(render(folder, options=FRONT)), 0)
+    columns = np.flatnonzero(red.any(axis=0))
+    middle = columns.min() + np.ptp(columns) // 2
+    assert not red[:, middle - 20 : middle + 20].any()
+    assert red[:, columns.min() + 5 : columns.min() + 60].any(axis=0).all()
+
+
+def test_an_obstacle_that_hides_most_of_the_body_is_translucent(tmp_path: Path) -> None:
+    """A plate in front of the whole bar: the bar is seen through it, redder than the plate beside it."""
+    pixels = shown(render(with_obstacle(tmp_path, (-1.0, -2.0, -2.0), (7.0, -1.9, 3.0)), options=FRONT))
+    height, width = SMALL[1], SMALL[0]
+    redness = pixels[..., 0] - pixels[..., 1:].max(axis=2)
+    assert redness[height // 2, width // 2] > redness[height // 2 - 70, width // 2] + 30
+
+
+def test_an_obstacle_casts_its_shadow_on_the_body(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A box above the bar darkens its top, by what the main light gives; one below it on the far side does not."""
+    look = replace(FRONT, view="0,-1.2,1.0")
+    above = with_obstacle(tmp_path / "above", (2.0, 0.3, 1.6), (3.0, 1.2, 1.8))
+    below = with_obstacle(tmp_path / "below", (2.0, 0.3, -0.8), (3.0, 1.2, -0.6))
+    shadowed = [shown(render(folder, options=look)) for folder in (above, below)]
+    monkeypatch.setattr(renderer, "SCENE_STYLE", replace(renderer.SCENE_STYLE, shadow_light=1.0))
+    lit = [shown(render(folder, options=look)) for folder in (above, below)]
+    darker = [(full - dim)[of_hue(full, 0), 0] for full, dim in zip(lit, shadowed, strict=True)]
+    assert min(map(np.min, darker)) >= 0
+    assert np.count_nonzero(darker[0] > 40) > 300 and np.count_nonzero(darker[1] > 40) < 30
+
+
+def test_the_shadow_of_a_sphere_on_a_plane_has_its_radius() -> None:
+    """Light from straight above: hidden within the radius of the sphere, lit beyond, over a half-shadow as wide as the
+    lamp is seen from there; its area is that of the sphere's disc."""
+    import pyvista
+
+    direction, height, radius = np.array([0.0, 0.0, 1.0]), 1.0, 0.5
+    sphere = pyvista.Sphere(radius=radius, center=(0.0, 0.0, height), theta_resolution=90, phi_resolution=90)
+    plane = pyvista.Plane(i_size=4.0, j_size=4.0, i_resolution=1, j_resolution=1)
+    with virtual_display(), DepthWindow(200, 200) as window, DepthWindow(512, 512) as maps:
+        window.set_surfaces([plane])
+        seen = window.depth_from(lamp_camera(direction, np.zeros(3), 2.0))
+        maps.set_surfaces([sphere])
+        cameras = [lamp_camera(ray, np.zeros(3), 2.0) for ray in lamp_directions(direction)]
+        share = shadow_shares(seen, maps, cameras, np.ones(seen.depth.shape, bool))
+        rows, columns = np.indices(share.shape).reshape(2, -1)
+        points = seen.points_at(rows, columns)
+    np.testing.assert_allclose(points[2], 0.0, atol=1e-5)
+    distance = np.hypot(*points[:2]).reshape(share.shape)
+    half = SHADOW_STYLE.lamp_radius * height + 0.02
+    assert (share[distance < radius - half] == 1).all() and (share[distance > radius + half] == 0).all()
+    assert 0 < share[np.abs(distance - radius) < 0.01].mean() < 1
+    assert share.sum() * (4.0 / 200) ** 2 == pytest.approx(np.pi * radius**2, rel=0.03)
 
 
 # --- what is written, and what cannot be ---

@@ -6,5 +6,7 @@ colour_maps       arrays that colour a picture, their range and colour map
 frames            files of the frames of a run, and their geometry
 picture           writes pictures, sheets and films
 picture_options   options of a picture, and looks of materials
-renderer          lights, body, obstacles and floor, drawn to pixels
+renderer          lights and body, drawn to pixels
+shadows           shadows of the main light, from depth images
+surroundings      obstacles and floor
 """

@@ -125,7 +125,7 @@ def aim_camera(plotter: Any, view: ViewBounds, options: PictureOptions) -> None:
         view: bounds to show.
         options: direction, zoom and size of the picture.
     """
-    axes, half_sides = _camera_axes(options, view.is_flat), _half_sides(options, view.is_flat)
+    axes, half_sides = camera_axes(options, view.is_flat), _half_sides(options, view.is_flat)
     distance = float((view.extents.reshape(2, 2).sum(axis=1) / half_sides.reshape(2, 2).sum(axis=1)).max())
     slack = half_sides * distance - view.extents
     centre = (slack[1::2] - slack[::2]) / 2
@@ -143,12 +143,12 @@ def aim_camera(plotter: Any, view: ViewBounds, options: PictureOptions) -> None:
 
 def _extents(points: Values, options: PictureOptions, flat: bool) -> Values:
     """Maxima (4,) of x + t z, -x + t z, y + t z, -y + t z over points (n, 3), m; see `aim_camera`."""
-    x, y, z = _camera_axes(options, flat) @ points.T
+    x, y, z = camera_axes(options, flat) @ points.T
     half_sides = np.zeros(4) if flat else _half_sides(options, flat)
     return np.array([(side + t * z).max() for side, t in zip((x, -x, y, -y), half_sides, strict=True)])
 
 
-def _camera_axes(options: PictureOptions, flat: bool) -> Values:
+def camera_axes(options: PictureOptions, flat: bool) -> Values:
     """Unit vectors (3, 3) to the right, upwards and towards the camera."""
     back = np.array([0.0, 0, 1]) if flat else np.asarray(options.view_direction(), float)
     back /= np.linalg.norm(back)

@@ -1,24 +1,20 @@
-"""Renderer: lights, camera, body, obstacles and floor of a frame, drawn to an array of pixels.
+"""Renderer: lights, camera, body and surroundings of a frame, drawn to an array of pixels.
 
 A crack that opens by less than a pixel is drawn as a line where it meets the boundary.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
 from .annotations import ColourLegend, annotate, format_time
-from .camera import ViewBounds, aim_camera, pixel_width, prepare_grid
-from .colour_maps import colour_range, field_title, map_colours, rgb, select_array
+from .camera import ViewBounds, aim_camera, camera_axes, pixel_width, prepare_grid
+from .colour_maps import colour_range, field_title, map_colours, select_array
 from .frames import (
-    VTK_LINE,
-    VTK_TRIANGLE,
     FrameParts,
     FrameSource,
     frame_parts,
@@ -28,12 +24,22 @@ from .frames import (
     with_normals,
 )
 from .picture_options import MATERIAL_LOOKS, PictureOptions, material_look
+from .shadows import SHADOW_STYLE, DepthWindow, lamp_camera, lamp_directions, shadow_shares
+from .surroundings import (
+    Floor,
+    add_flat_obstacle,
+    add_floor,
+    add_obstacle,
+    darken_floor,
+    find_floor,
+    hiding_obstacles,
+    make_translucent,
+    obstacle_surface,
+)
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Pixels = npt.NDArray[np.uint8]
-
-OBSTACLE_COLOUR, _OBSTACLE_EDGE_COLOUR = "#c2b393", "#6e6350"
 
 
 @dataclass(frozen=True)
@@ -47,11 +53,8 @@ class SceneStyle:
         supersampling: samples per pixel along each side.
         min_opening: a crack that opens by less is drawn as a line of this width, pixels.
         point_tolerance: copies of a point are closer to each other, as a share of the largest side of the body.
-        obstacle_opacity: opacity of obstacles in 3D.
-        min_floor_level: least vertical component of the unit normal of a plane that serves as floor.
-        floor_radius: radius of the floor.
-        shadow_brightness: brightness of a shadow, as a share of that of the floor.
-        shadow_height: height of the shadow above the floor, so that it is visible.
+        shadow_light: share of the main light that shadows have, as reflected by the surroundings.
+        min_light_level: least component of the direction of the main light along the normal of a floor.
     """
 
     lamps: tuple[tuple[tuple[float, float, float], float], ...] = (
@@ -62,11 +65,8 @@ class SceneStyle:
     supersampling: int = 2
     min_opening: float = 1.5
     point_tolerance: float = 1e-7
-    obstacle_opacity: float = 0.5
-    min_floor_level: float = 0.5
-    floor_radius: float = 40.0
-    shadow_brightness: float = 0.86
-    shadow_height: float = 5e-4
+    shadow_light: float = 0.4
+    min_light_level: float = 0.3
 
 
 SCENE_STYLE = SceneStyle()
@@ -159,7 +159,7 @@ class Renderer:
         self._line_scale = SCENE_STYLE.supersampling if options.fine else 1
         self._plotter = pyvista.Plotter(off_screen=True, window_size=options.size, lighting="none")
         self._plotter.set_background(MATERIAL_LOOKS["plain"].backdrop if self._flat else self.material.backdrop)
-        self._add_lights()
+        self._main_light = self._add_lights()
 
     def __enter__(self) -> Self:
         return self
@@ -176,16 +176,24 @@ class Renderer:
         # first: the width of narrow cracks is in pixels
         aim_camera(plotter, self._view, options)
         grid = prepare_grid(frame, options)
-        self._add_body(frame_parts(grid))
-        if not self._flat:
+        parts = frame_parts(grid)
+        self._add_body(parts)
+        if self._flat:
+            for file in frame.obstacle_files:
+                add_flat_obstacle(plotter, file)
+            pixels = self._draw_pixels()
+        else:
             self._add_narrow_cracks(grid)
-        floors = self._add_floor(frame, frame_parts(grid)) if options.floor and not self._flat else []
-        named = zip(frame.obstacle_files, frame.obstacle_names, strict=True)
-        add_obstacles(plotter, [file for file, name in named if name not in floors], flat=self._flat)
+            pixels = self._draw_with_surroundings(frame, parts.surfaces)
+        return self._annotate(pixels, frame, title)
+
+    def _draw_pixels(self) -> Pixels:
+        """Picture (height, width, 3) of what has been added, without text."""
+        plotter = self._plotter
         plotter.reset_camera_clipping_range()
         plotter.suppress_rendering = False
         plotter.render()
-        return self._annotate(np.asarray(plotter.screenshot(return_img=True))[..., :3], frame, title)
+        return np.asarray(plotter.screenshot(return_img=True))[..., :3]
 
     # --- the body ---
 
@@ -241,56 +249,66 @@ class Renderer:
 
     # --- surroundings ---
 
-    def _add_floor(self, frame: FrameSource, parts: FrameParts) -> list[str]:
-        """Add a floor with shadows; returns the names of the obstacles that the floor replaces.
-
-        The floor lies at the most horizontal obstacle plane, or below everything if no plane is horizontal enough.
-        """
-        import pyvista
-
-        planes = plane_normals(self._study)
+    def _draw_with_surroundings(self, frame: FrameSource, body: list[Any]) -> Pixels:
+        """Picture (height, width, 3) with floor, obstacles and shadows; `body` are the surfaces of the body."""
+        plotter, planes = self._plotter, plane_normals(self._study)
         named = zip(frame.obstacle_files, frame.obstacle_names, strict=True)
-        drawn_planes = [(file, name) for file, name in named if name in planes]
-        floors = sorted(drawn_planes, key=lambda plane: -_vertical_component(planes[plane[1]]))[:1]
-        floors = [plane for plane in floors if _vertical_component(planes[plane[1]]) > SCENE_STYLE.min_floor_level]
-        centre = self._bounds.reshape(3, 2).mean(axis=1)
-        normal, point = np.array([0.0, 0, 1]), np.array([*centre[:2], self._bounds[4]])
-        if floors:
-            normal = planes[floors[0][1]] / np.linalg.norm(planes[floors[0][1]])
-            corners = np.asarray(pyvista.read(floors[0][0]).points, float)
-            point = corners[np.argmax(corners @ normal)]
-            point = centre - ((centre - point) @ normal) * normal
-        _add_floor_disc(self._plotter, point, normal, self._size, self.material.backdrop)
-        light = self._main_light_direction()
-        # a light near the horizon would cast endless shadows
-        light = light if light @ normal > 0.3 else normal
-        for part in parts.surfaces:
-            _add_shadow(self._plotter, part, point, normal, light, self._size, rgb(self.material.backdrop))
-        return [name for _, name in floors]
+        obstacles = {name: obstacle_surface(file) for file, name in named}
+        floor = find_floor(obstacles, planes, self._bounds) if self.options.floor else None
+        if floor is None and not obstacles:
+            return self._draw_pixels()
+        floor_actor = None
+        if floor is not None:
+            obstacles.pop(floor.plane, None)
+            floor_actor = add_floor(plotter, floor, self.material.backdrop)
+        actors = {name: add_obstacle(plotter, obstacles[name], is_plane=name in planes) for name in obstacles}
+        lit = self._draw_pixels()
+        with DepthWindow(*self.options.size) as window:
+            for name in hiding_obstacles(window, plotter.camera, body, obstacles):
+                make_translucent(actors[name])
+                del obstacles[name]
+            lit = self._draw_pixels() if len(obstacles) < len(actors) else lit
+            self._main_light.intensity *= SCENE_STYLE.shadow_light
+            if floor_actor is not None:
+                darken_floor(floor_actor, self.material.backdrop)
+            shaded = self._draw_pixels()
+            self._main_light.intensity /= SCENE_STYLE.shadow_light
+            window.set_surfaces(body if floor is None else [*body, floor.surface], [*obstacles.values()])
+            view_depth = window.depth_from(plotter.camera)
+        # a plane has no edge, but its slab has: it casts no shadow
+        casters = [surface for name, surface in obstacles.items() if name not in planes]
+        centre, radius = self._bounds.reshape(3, 2).mean(axis=1), self._size / 2
+        with DepthWindow(SHADOW_STYLE.map_side, SHADOW_STYLE.map_side) as maps:
+            maps.set_surfaces(body, casters)
+            cameras = [lamp_camera(ray, centre, radius) for ray in lamp_directions(self._light_direction(floor))]
+            # rows of depth images begin at the lower edge
+            share = shadow_shares(view_depth, maps, cameras, np.any(lit != shaded, axis=2)[::-1])[::-1, :, None]
+        return np.asarray(np.rint((1.0 - share) * lit + share * shaded), np.uint8)
 
-    def _main_light_direction(self) -> Values:
-        """Unit vector (3,) towards the main light."""
-        camera = self._plotter.camera
-        back = np.array(camera.position) - np.array(camera.focal_point)
-        back /= np.linalg.norm(back)
-        right = np.cross(camera.up, back)
-        right /= np.linalg.norm(right)
-        (x, y, z), _ = SCENE_STYLE.lamps[0]
-        light = x * right + y * np.cross(back, right) + z * back
-        return np.asarray(light / np.linalg.norm(light))
+    def _light_direction(self, floor: Floor | None) -> Values:
+        """Unit vector (3,) towards the main light, or towards the sky if a floor would have endless shadows."""
+        light = np.array(SCENE_STYLE.lamps[0][0]) @ camera_axes(self.options, self._flat)
+        light /= np.linalg.norm(light)
+        return light if floor is None or light @ floor.normal > SCENE_STYLE.min_light_level else floor.normal
 
-    def _add_lights(self) -> None:
+    def _add_lights(self) -> Any:
+        """Add lights and filters; returns the main light, None in 2D."""
         import pyvista
 
         plotter = self._plotter
         if self._flat:
             plotter.enable_anti_aliasing("ssaa")
-            return
-        for position, intensity in SCENE_STYLE.lamps:
-            plotter.add_light(pyvista.Light(position=position, intensity=intensity, light_type="camera light"))
+            return None
+        lights = [
+            pyvista.Light(position=position, intensity=intensity, light_type="camera light")
+            for position, intensity in SCENE_STYLE.lamps
+        ]
+        for light in lights:
+            plotter.add_light(light)
         plotter.enable_anti_aliasing("ssaa" if self.options.fine else "fxaa")
         radius, bias = SCENE_STYLE.occlusion_radius * self._size, 0.002 * self._size
         plotter.enable_ssao(radius=radius, bias=bias, kernel_size=64, blur=True)
+        return lights[0]
 
     # --- text ---
 
@@ -313,11 +331,6 @@ class Renderer:
         return annotate(pixels, title=title, time=time, pixel=width, legend=legend, keys=keys)
 
 
-def _vertical_component(normal: Values) -> float:
-    """Vertical component of the unit vector along `normal` (3,): 1 for a floor, 0 for a wall."""
-    return float(normal[2] / np.linalg.norm(normal))
-
-
 def field_range(frame: FrameSource, colour: str) -> tuple[float, float] | None:
     """Range of the colours of a frame; None if there is nothing to show, or for colours without a range.
 
@@ -333,74 +346,3 @@ def field_range(frame: FrameSource, colour: str) -> tuple[float, float] | None:
     arrays = [np.asarray(part[select_array(part, colour)], float) for part in shown]
     norms = [values if values.ndim == 1 else np.linalg.norm(values, axis=1) for values in arrays]
     return colour_range(np.concatenate(norms), signed=":" in colour)
-
-
-def add_obstacles(plotter: Any, files: Iterable[Path], *, flat: bool) -> None:
-    """Add the obstacles of a frame.
-
-    Args:
-        plotter: plotter of pyvista.
-        files: VTU files of the obstacles.
-        flat: the body is in 2D.
-    """
-    import pyvista
-
-    for file in files:
-        grid = pyvista.read(file)
-        for cell_type in (VTK_TRIANGLE, VTK_LINE):
-            cells = np.flatnonzero(grid.celltypes == cell_type)
-            if not len(cells):
-                continue
-            style: dict[str, Any] = {"color": OBSTACLE_COLOUR}
-            if cell_type == VTK_LINE:
-                style = {"color": _OBSTACLE_EDGE_COLOUR, "line_width": 2}
-            if not flat:
-                style |= {"opacity": SCENE_STYLE.obstacle_opacity, "smooth_shading": True}
-                style |= {"split_sharp_edges": True, "culling": "back"}
-            plotter.add_mesh(grid.extract_cells(cells), lighting=not flat, **style)
-
-
-def _add_floor_disc(plotter: Any, point: Values, normal: Values, size: float, colour: str) -> None:
-    """Add a floor as large as the eye can see, of the colour of the backdrop.
-
-    Args:
-        plotter: plotter of pyvista.
-        point: centre (3,), m.
-        normal: unit normal (3,).
-        size: diagonal of the bounds, m.
-        colour: colour "#rrggbb".
-    """
-    import pyvista
-
-    disc = pyvista.Disc(center=point, inner=0.0, outer=SCENE_STYLE.floor_radius * size, normal=normal, c_res=48)
-    plotter.add_mesh(disc, color=colour, lighting=False, ambient=0.0, diffuse=1.0)
-
-
-def _add_shadow(
-    plotter: Any, surface: Any, point: Values, normal: Values, light: Values, size: float, floor_colour: Any
-) -> None:
-    """Add the shadow of a surface on the floor.
-
-    Args:
-        plotter: plotter of pyvista.
-        surface: surface that casts the shadow.
-        point: point (3,) of the floor, m.
-        normal: unit normal (3,) of the floor.
-        light: unit vector (3,) towards the light.
-        size: diagonal of the bounds, m.
-        floor_colour: red, green and blue of the floor.
-    """
-    height = (np.asarray(surface.points) - point) @ normal
-    lift = SCENE_STYLE.shadow_height * size
-    shadow = surface.copy(deep=False)
-    shadow.clear_data()
-    shadow.points = surface.points - ((height - lift) / (light @ normal))[:, None] * light
-    if (height < 0).any():
-        # parts below the floor cast no shadow on it
-        faces = shadow.regular_faces
-        above = faces[(height[faces] > -lift).all(axis=1)]
-        if not len(above):
-            return
-        shadow = type(shadow).from_regular_faces(shadow.points, above)
-    dark = "#{:02x}{:02x}{:02x}".format(*(int(SCENE_STYLE.shadow_brightness * part) for part in floor_colour))
-    plotter.add_mesh(shadow, color=dark, lighting=False, ambient=0.0, diffuse=1.0)
