@@ -76,6 +76,8 @@ def test_each_row_names_its_differences_from_the_paper() -> None:
         assert ("e" in scene.differs) == bool(whole.fracture and whole.fracture.radius), name
         assert ("f" in scene.differs) == bool(whole.plasticity and whole.plasticity.flow_rate < math.inf), name
         assert ("j" in scene.differs) == bool(whole.obstacle), name
+        assert ("k" in scene.differs) == any(obstacle.name == "striker" for obstacle in whole.obstacle), name
+        assert ("l" in scene.differs) == (whole.brittle is not None), name
 
 
 @pytest.mark.usefixtures("little_built")
