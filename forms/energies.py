@@ -150,7 +150,6 @@ class Corotated(_PlaneStrain):
     """
 
     needs_rotation: ClassVar[bool] = True
-    min_stretch: ClassVar[float] = 0.1  # sum of two principal stretches, below which a cell counts as inverted
 
     def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
         """Return the energy density, J/m^3; `rotation` is R (d x d)."""
@@ -171,7 +170,8 @@ class Corotated(_PlaneStrain):
             2 a_w . M a_v,  M = (tr(T) I - T) (tr(S) I - S)^-1,  in 2D tr(T) / tr(S),    F = R S,  T = R^T P
 
         a is the axial vector of skew(R^T dF). The eigenvalues of M are (T_i + T_j) / (s_i + s_j): a cell in tension
-        resists rotation, one in compression gives way. 0 in inverted cells, where denominators may vanish.
+        resists rotation, one in compression gives way. Where a denominator vanishes, in an inverted cell, M is bounded:
+        1/x is x / (x^2 + 1e-8).
 
         Args:
             F: deformation gradient (d x d).
@@ -183,11 +183,10 @@ class Corotated(_PlaneStrain):
         T, S = elastic_stress(self, strain), strain + identity(strain)
         a_v, a_w = (_axial_vector(rotation.T * variation) for variation in (of_v, of_w))
         if F.ufl_shape[0] == 2:
-            product = 2 * a_w * ufl.tr(T) / ufl.tr(S) * a_v
-            return ufl.conditional(ufl.gt(ufl.tr(S), self.min_stretch), product, 0.0)
+            return 2 * ufl.tr(T) * _bounded_inverse(ufl.tr(S)) * a_w * a_v
         G_T, G_S = (ufl.tr(tensor) * identity(tensor) - tensor for tensor in (T, S))
-        product = 2 * ufl.inner(a_w, ufl.dot(ufl.sym(ufl.dot(G_T, ufl.inv(G_S))), a_v))
-        return ufl.conditional(ufl.gt(ufl.det(G_S), self.min_stretch**3), product, 0.0)
+        M = ufl.sym(ufl.dot(G_T, ufl.cofac(G_S))) * _bounded_inverse(ufl.det(G_S))
+        return 2 * ufl.inner(a_w, ufl.dot(M, a_v))
 
 
 @dataclass(frozen=True)
@@ -242,6 +241,11 @@ def first_piola_kirchhoff(energy: Energy, F: Expr, rotation: Expr | None = None)
     """Return P = d psi / d F, Pa (d x d)."""
     variable = ufl.variable(F)
     return ufl.diff(energy.psi(variable, rotation), variable)
+
+
+def _bounded_inverse(x: Expr) -> Expr:
+    """Return x / (x^2 + 1e-8): 1/x to 1e-8 / x^2, and at most 5,000."""
+    return x / (x**2 + 1e-8)
 
 
 def _axial_vector(tensor: Expr) -> Expr:

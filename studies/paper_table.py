@@ -118,7 +118,8 @@ SCENES = {
     "jade-figure": PaperScene("hammered-figure", 4.7, 0.04, "abdjl", {"mesh.h": 0.0145}, STRUCK_FIGURE),
     "porcelain-figure": PaperScene("hammered-figure", 41.1, 0.33, "abdjl", {"mesh.h": 5.05e-3}, STRUCK_FIGURE | {
         "mesh.wall": 5e-3, "brittle.spacing": 8e-3}),
-    "glass-vase": PaperScene("hammered-vase", 23.7, 0.18, "abdjl", {"mesh.h": 0.0105}, STRUCK_VASE | {"mesh.wall": 0.0}),
+    "glass-vase": PaperScene("hammered-vase", 23.7, 0.18, "abdjl", {"mesh.h": 0.0105}, STRUCK_VASE | {
+        "mesh.wall": 0.0}),
     "porcelain-vase": PaperScene("hammered-vase", 38.8, 0.29, "abdjl", {"mesh.h": 5.7e-3}, STRUCK_VASE),
     "granite-cylinder": PaperScene("granite-cylinder", 45.8, 0.39, "cghj", {"mesh.h": 7.2e-3}, GRANITE),
     "brittle-charpy": PaperScene("charpy", 27.8, 0.24, "bgijk", CHARPY_H, CHARPY | BRITTLE_STEEL),

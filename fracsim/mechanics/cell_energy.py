@@ -11,9 +11,8 @@ import numpy as np
 import numpy.typing as npt
 import ufl
 
-from ..forms.kinematics import deformation_gradient
 from .jit import point_expression
-from .stress import Stress
+from .stress import Stress, energy_derivatives
 
 Values = npt.NDArray[np.float64]
 
@@ -38,10 +37,8 @@ class CellEnergy:
     def __init__(self, stress: Stress) -> None:
         """Compile the energy and its derivatives by F (collective)."""
         domain, d = stress.domain, stress.domain.dim
-        F = ufl.variable(deformation_gradient(stress.u))
-        psi = stress.energy_factor * stress.energy.psi(F, stress.rotation_field)
-        P = ufl.diff(psi, F)
-        A, components = ufl.diff(P, F), [(i, j) for i in range(d) for j in range(d)]
+        psi, P, A = energy_derivatives(stress)
+        components = [(i, j) for i in range(d) for j in range(d)]
         parts = [psi, *(P[ij] for ij in components), *(A[ij + kl] for ij in components for kl in components)]
         self._parts = point_expression(domain, ufl.as_vector(parts))
         self._volumes, self._d = domain.volumes, d

@@ -21,10 +21,9 @@ import numpy.typing as npt
 import ufl
 
 from ..forms.balance import stress_quadrature
-from ..forms.kinematics import deformation_gradient
 from ..mesh.c_library import FAST_FLAGS, compile_library
 from .jit import CellForm, cell_measure, point_expression, point_field
-from .stress import Stress, turning_moduli
+from .stress import Stress, energy_derivatives
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.uint8]
@@ -44,12 +43,7 @@ class PsdProjection:
     def __init__(self, stress: Stress) -> None:
         """Compile the moduli and the form (collective)."""
         domain, d = stress.domain, stress.domain.dim
-        F = ufl.variable(deformation_gradient(stress.u))
-        P = stress.energy_factor * ufl.diff(stress.energy.psi(F, stress.rotation_field), F)
-        moduli = ufl.diff(P, F)
-        if (turning := turning_moduli(stress, F, F)) is not None:  # quadratic in a variation, for which F stands
-            moduli += ufl.diff(ufl.diff(turning / 2, F), F)
-        self._moduli = point_expression(domain, moduli, kernels=stress.kernels)
+        self._moduli = point_expression(domain, energy_derivatives(stress)[2], kernels=stress.kernels)
         self._field = point_field(domain, (d * d, d * d), "correction of moduli")
         self._size, self._cells = d * d, domain.cell_count
         self._correct = stress.kernels.psd_correction() or plain_psd_correction

@@ -339,6 +339,17 @@ def turning_moduli(stress: Stress, of_v: Expr, of_w: Expr) -> Expr | None:
     return stress.degradation_factor * moduli
 
 
+def energy_derivatives(stress: Stress) -> tuple[Expr, Expr, Expr]:
+    """psi, J/m^3, P, Pa (d, d), and the moduli dP/dF, Pa (d, d, d, d), of the damaged body."""
+    F = ufl.variable(deformation_gradient(stress.u))
+    psi = stress.energy_factor * stress.energy.psi(F, stress.rotation_field)
+    P = ufl.diff(psi, F)
+    moduli = ufl.diff(P, F)
+    if (turning := turning_moduli(stress, F, F)) is not None:  # quadratic in a variation, for which F stands
+        moduli += ufl.diff(ufl.diff(turning / 2, F), F)
+    return psi, P, moduli
+
+
 def _elastic_part(u: fem.Function, material: MaterialFields, dim: int) -> Expr:
     """(d, d) F, or its elastic part in a body with plastic flow."""
     F = deformation_gradient(u)
