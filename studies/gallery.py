@@ -156,7 +156,7 @@ ENTRIES = (
                    "--field stress:xx"),
     packaged_entry("granite-cylinder",
                    "A granite cylinder that splits between platens, while its load falls and at the end.",
-        "--sheet=-13,-1 --view top --magnify 20 --size 1400x700"),
+        "--sheet=-13,-1 --view top --magnify 5 --size 1400x700"),
     GalleryEntry(
         "steels", "Charpy and Izod bars of steel A516 at -40 C, which breaks, and of NVE 36 at 23 C, which bends.",
         (("charpy-A516", "charpy"), ("charpy-NVE36", f"charpy {NVE36}"),
