@@ -47,9 +47,9 @@ def main(path: str) -> None:
     comm = MPI.COMM_WORLD
     with pytest.MonkeyPatch.context() as patch:
         set_policy(patch, min_block_dofs=0)
-        scene, u = pressed(12)
+        scene, u = pressed(8)
         patch.setattr(Tangent, "switch_to_blocks", lambda _: None)
-        _, u_entries = pressed(12)
+        _, u_entries = pressed(8)
     tangent = scene.balance.tangent
     tangent.assemble()
     blocks, entries = tangent._assembler.blocks, tangent.matrix
