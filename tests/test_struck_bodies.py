@@ -182,6 +182,33 @@ def test_momentum_is_kept_through_a_fracture() -> None:
     assert after.bodies.mass.sum() == pytest.approx(state.bodies.mass.sum(), rel=1e-13)
 
 
+def test_mass_and_momenta_are_kept_through_many_fractures() -> None:
+    """A bar in flight is cut across, and its fragments again and again: cells that two fragments share are cut anew."""
+    stepper = stepper_of(bar(), 1e12, 1e-3, gravity=0 * DOWN, obstacles=[])
+    motion = {"velocity": np.array([[3.0, -2.0, 9.0]]), "spin": np.array([[4.0, 5.0, -6.0]])}
+    start = bodies = replace(stepper.start().bodies, **motion)
+    body, random = stepper.instances.get(0), np.random.default_rng(5)
+    edges, of_input = body.graph.edge_nodes, body.graph.domain.input_numbering.nodes
+    for _ in range(15):
+        inside = np.ptp(body.fragments.node_fragment[edges], axis=1) == 0
+        fragment = random.choice(body.fragments.node_fragment[edges[inside, 0]])
+        inside &= body.fragments.node_fragment[edges[:, 0]] == fragment
+        height = body.graph.domain.nodes[edges] @ random.normal(size=3)
+        at = height[inside].mean()
+        crosses = np.flatnonzero(inside & (height.min(axis=1) < at) & (height.max(axis=1) > at))
+        body._criterion.set_cuts(crosses, ((at - height[:, 0]) / np.diff(height)[:, 0])[crosses])
+        body.graph.break_edges(np.isin(np.arange(len(edges)), crosses))
+        name = int(of_input[body.fragments.node_fragment == fragment].min())
+        body.fragments.update()
+        bodies = stepper._replace_by_fragments(bodies, {name})
+    assert len(bodies) > 15
+    assert abs(bodies.mass / (DENSITY * stepper.shapes.moments.volume) - 1).max() > 1e-3
+    size = float(start.mass.sum()) * 10
+    assert bodies.mass.sum() == pytest.approx(start.mass.sum(), rel=1e-12)
+    assert np.allclose(bodies.momentum, start.momentum, rtol=0, atol=1e-12 * size)
+    assert np.allclose(bodies.angular_momentum, start.angular_momentum, rtol=0, atol=3e-12 * size)
+
+
 def test_a_body_broken_at_rest_stays_where_it_is() -> None:
     """Without gravity: hulls that overlap along the crack do not push the pieces apart."""
     stepper = stepper_of(bar(), 1e3, 1e-3, gravity=0 * DOWN, obstacles=[])

@@ -117,15 +117,25 @@ class Bodies:
 
     # --- other sets of bodies ---
 
-    def split_into(self, density: Values, moments: PolyhedronMoments, parent: Ints) -> Bodies:
-        """Return fragments (m,) that move as their parent body (m,) did at their centres.
+    def split_into(self, moments: PolyhedronMoments, parent: Ints) -> Bodies:
+        """Return fragments (m,) with the mass, momentum and angular momentum of their parent bodies (m,).
 
-        v_i = v + w x r_i, w_i = w (B07, section 7).
+        Fragments share the mass in proportion to their volumes and move as one rigid body about their joint centre of
+        mass: v_i = v + w x r_i, w_i = w. They move as the parent did if they fill its shape (B07, section 7).
         """
-        fragments = Bodies.at_rest(density, moments)
-        position = self.to_current(moments.centre, parent)
-        velocity, spin = self.velocity_at(position, parent), self.spin[parent]
-        return replace(fragments, position=position, rotation=self.rotation[parent], velocity=velocity, spin=spin)
+        fragments = Bodies.at_rest((self.mass / _sums(moments.volume, parent, len(self)))[parent], moments)
+        position, rotation = self.to_current(moments.centre, parent), self.rotation[parent]
+        centre = _sums(fragments.mass[:, None] * position, parent, len(self)) / self.mass[:, None]
+        arm = position - centre[parent]
+        about_centre = rotation @ fragments.inertia @ np.swapaxes(rotation, 1, 2)
+        about_centre += fragments.mass[:, None, None] * (
+            np.einsum("ni,ni->n", arm, arm)[:, None, None] * np.eye(3) - arm[:, :, None] * arm[:, None]
+        )
+        momentum = np.einsum("nij,nj->ni", self.spatial_inertia, self.spin)
+        momentum += self.mass[:, None] * np.cross(self.position - centre, self.velocity)
+        spin = np.linalg.solve(_sums(about_centre, parent, len(self)), momentum[:, :, None])[parent, :, 0]
+        velocity = self.velocity[parent] + np.cross(spin, arm)
+        return replace(fragments, position=position, rotation=rotation, velocity=velocity, spin=spin)
 
     def with_shapes(self, moments: PolyhedronMoments, changed: Ints) -> Bodies:
         """Return the bodies after those `changed` (k,) were given the shapes of `moments`.
@@ -186,6 +196,13 @@ class Bodies:
         """Total kinetic energy, J."""
         rotational = np.einsum("ni,nij,nj->", self.spin, self.spatial_inertia, self.spin)
         return float(self.mass @ np.einsum("ni,ni->n", self.velocity, self.velocity) + rotational) / 2
+
+
+def _sums(values: Values, group: Ints, count: int) -> Values:
+    """Return sums (count, ...) of values (m, ...) over groups (m,)."""
+    result = np.zeros((count, *values.shape[1:]))
+    np.add.at(result, group, values)
+    return result
 
 
 # --- motion between contacts: v' = v + dt (g + F / m), l' = l + dt M, x' = x + t v' ---

@@ -33,7 +33,6 @@ class FragmentShapes:
     Attributes:
         names: (n,) lowest nodes.
         moments: volume, centre of mass and second moments of each.
-        mesh_moments: of the solid within each split surface; those of round shapes differ.
         node_fragment: (N,).
         convex_parts: of each, corners (m, 3) or a shape, relative to its centre, in the axes of the mesh, m. Unbroken
             instances share theirs.
@@ -45,7 +44,6 @@ class FragmentShapes:
 
     names: Ints
     moments: PolyhedronMoments
-    mesh_moments: PolyhedronMoments
     node_fragment: Ints
     convex_parts: list[list[Part]]
     rotation: Values
@@ -65,7 +63,6 @@ class _InstanceShapes:
     pattern: Patterns
     names: Ints
     moments: PolyhedronMoments
-    mesh_moments: PolyhedronMoments
     node_fragment: Ints
     convex_parts: list[list[Part]]
     hull_points: list[Values]
@@ -132,9 +129,7 @@ class FragmentGeometry:
         """Return the shapes of all instances one after another."""
         placed = self._placed
         first = np.cumsum([0, *(len(shapes.names) for shapes in placed)])
-        total, of_meshes = (
-            _join_moments([getattr(shapes, name) for shapes in placed]) for name in ("moments", "mesh_moments")
-        )
+        total = _join_moments([shapes.moments for shapes in placed])
         fragment = np.concatenate([shapes.node_fragment + start for shapes, start in zip(placed, first, strict=False)])
         parts = [part for shapes in placed for part in shapes.convex_parts]
         hull_points = [points for shapes in placed for points in shapes.hull_points]
@@ -142,7 +137,7 @@ class FragmentGeometry:
         names = np.concatenate([shapes.names for shapes in placed])
         rotation = np.concatenate([shapes.rotation for shapes in placed])
         cores = self._make_core_contact(rotation)
-        return FragmentShapes(names, total, of_meshes, fragment, parts, rotation, hull_points, shells, cores)
+        return FragmentShapes(names, total, fragment, parts, rotation, hull_points, shells, cores)
 
     def _make_core_contact(self, rotation: Values) -> CoreContact | None:
         """Return the core contact of all fragments with rotations (n, 3, 3); None if there are no cores."""
@@ -157,7 +152,7 @@ class FragmentGeometry:
         """Return the shapes of an instance with patterns (C,) and nodes at `points` (N, 3)."""
         surface = build_split_surface(self.numbering.with_points(points), pattern, cut)
         fragment = surface.point_fragment[surface.elements[:, 0]]
-        mesh_moments = body_moments = moments(surface.points, surface.elements, fragment, surface.fragment_count)
+        body_moments = moments(surface.points, surface.elements, fragment, surface.fragment_count)
         names = np.unique(surface.node_fragment, return_index=True)[1]
         solids = _fragment_solids(surface, fragment)
         before = self._collision_shapes.get(number, {})
@@ -166,14 +161,14 @@ class FragmentGeometry:
         round_shape = self._round_shape_of(surface, points)
         if round_shape is not None:
             shapes, new = [(solids[0].content_key, round_shape.collision_parts, round_shape.plane_corners)], []
-            body_moments = round_shape.moments(mesh_moments.volume)
-        shell = self._shell_surface(surface, solids, mesh_moments.centre[0])
+            body_moments = round_shape.moments(body_moments.volume)
+        shell = self._shell_surface(surface, solids, body_moments.centre[0])
         if shell is not None:
             outer = hull_corners(np.concatenate(shell.prisms))
             shapes, new = [(solids[0].content_key, [*shell.prisms], outer)], []
         parts_of_new = self._convex_parts(surface, fragment, solids, np.array(new, np.int64))
         for k, parts in zip(new, parts_of_new, strict=True):
-            centre = mesh_moments.centre[k]
+            centre = body_moments.centre[k]
             extreme = hull_corners(solids[k].points if self._uses_clusters(surface) else np.concatenate(parts))
             shapes[k] = solids[k].content_key, [corners - centre for corners in parts], extreme - centre
         result = [shape for shape in shapes if shape is not None]
@@ -182,8 +177,7 @@ class FragmentGeometry:
         core = CoreGeometry.from_split_surface(surface, self.numbering) if has_cores else CoreGeometry.empty()
         parts_of_all, hull_points = [shape[1] for shape in result], [shape[2] for shape in result]
         return _InstanceShapes(
-            points, pattern, names, body_moments, mesh_moments, surface.node_fragment, parts_of_all, hull_points,
-            shell, core,
+            points, pattern, names, body_moments, surface.node_fragment, parts_of_all, hull_points, shell, core,
         )  # fmt: skip
 
     def _round_shape_of(self, surface: SplitSurface, points: Values) -> RoundShape | None:
@@ -234,11 +228,11 @@ class FragmentGeometry:
     def _place(self, number: int, shapes: _InstanceShapes) -> FragmentShapes:
         """Return the shapes of an instance at its pose at rest."""
         rotation, position = self.poses.rotation[number], self.poses.position[number]
-        placed, of_mesh = (_place_moments(local, rotation, position) for local in (shapes.moments, shapes.mesh_moments))
+        placed = _place_moments(shapes.moments, rotation, position)
         names = shapes.names + number * len(shapes.node_fragment)
         rotations = np.tile(rotation, (len(shapes.names), 1, 1))
         return FragmentShapes(
-            names, placed, of_mesh, shapes.node_fragment, shapes.convex_parts, rotations, shapes.hull_points,
+            names, placed, shapes.node_fragment, shapes.convex_parts, rotations, shapes.hull_points,
             [shapes.shell] * len(names),
         )  # fmt: skip
 

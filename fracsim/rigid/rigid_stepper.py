@@ -167,11 +167,8 @@ class RigidStepper:
 
     def start(self) -> RigidState:
         """Return the state at t = 0: the bodies at their place, without motion."""
-        fragments = Bodies.at_rest(self._densities(), self.shapes.moments)
+        fragments = Bodies.at_rest(np.full(self.fragment_count, self._density), self.shapes.moments)
         return RigidState(0.0, 0, fragments.concatenate(self.obstacles.free_bodies()))
-
-    def _densities(self) -> Values:
-        return np.full(self.fragment_count, self._density)
 
     @property
     def fragment_count(self) -> int:
@@ -327,15 +324,11 @@ class RigidStepper:
         self.update_shapes()
         after = self.shapes
         parent = np.searchsorted(before.names, before.names[before.node_fragment[after.names]])
-        # centre and inertia of a round body become those of its mesh, and of its fragments, with the same momenta
-        parted = np.bincount(parent, minlength=len(bodies)) > 1
-        is_round = np.any(before.moments.second != before.mesh_moments.second, axis=(1, 2))
-        bodies = bodies.with_shapes(before.mesh_moments, np.flatnonzero(parted & is_round))
-        fragments = bodies.split_into(self._densities(), after.moments, parent)
+        fragments = bodies.split_into(after.moments, parent)
         self.impact_detector.forget_bodies(np.array([*names], np.int64))
         self._broken_instances = {name // self.instances.node_count for name in names}
-        # bodies that did not break stay the same to the last digit
-        unbroken = ~np.isin(before.names[parent], list(names))
+        # bodies that did not break stay the same to the last digit, though cells that they share are cut anew
+        unbroken = ~np.isin(before.names[parent], list(names)) & (np.bincount(parent)[parent] == 1)
         values = {name: np.array(array) for name, array in vars(fragments).items()}
         for name, array in values.items():
             array[unbroken] = getattr(bodies, name)[parent[unbroken]]
