@@ -6,6 +6,7 @@ contact_time_weights        weights of contact forces in a step
 balance                     sum of the terms: residual, reactions, energies
 tangent                     derivative of the residual
 stress                      stress of a body with damage and plastic flow
+polar_rotation              rotations of the corotated energy (C)
 inertia, damping            mass matrix and inertia; drag and viscosity
 loads                       dead loads and pressures
 node_ties                   ties of nodes without an unsplit cell

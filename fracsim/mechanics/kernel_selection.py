@@ -103,6 +103,14 @@ class KernelSelection:
 
         return psd_correction
 
+    def polar_rotation(self, comm: MPI.Comm, dim: int) -> Callable[[Values], Values] | None:
+        """Function of the polar rotations of (n, d, d) matrices (collective)."""
+        if self.plain:
+            return None
+        from .polar_rotation import compiled_polar_rotation
+
+        return compiled_polar_rotation(comm, dim)
+
     def cell_subset(self, form: CellForm) -> CellSubsetAssembler | None:
         """Assembler of a linear form over a subset of its cells."""
         if self.plain:

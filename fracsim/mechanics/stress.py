@@ -26,11 +26,11 @@ from ..forms.energies import Energy
 from ..forms.kinematics import deformation_gradient
 from ..mesh.domain import Domain
 from ..mesh.simplices import local_edges
-from ..mesh.small_matrices import polar_rotation
-from .jit import CellForm, cell_measure, compile_form, point_expression, point_field
+from .jit import CellForm, cell_measure, compile_form
 from .kernel_selection import KernelCache
 from .material_fields import MaterialFields
 from .matrix_assembly import VectorAssembler
+from .polar_rotation import PolarRotation
 from .term import Form, Term, TimeLevel
 
 if TYPE_CHECKING:
@@ -56,28 +56,6 @@ class DegradationModel:
 
     approach: str = "chi"
     cracks_close: bool = False
-
-
-class PolarRotation:
-    """Rotation R of F = R U at each point where stress is integrated, for the corotated energy.
-
-    Attributes:
-        field: R (d x d); the identity for a body at rest.
-    """
-
-    def __init__(self, domain: Domain, F: Expr) -> None:
-        """`F`: (d, d) expression of the displacement."""
-        d = domain.dim
-        self.field = point_field(domain, (d, d), "rotation")
-        self.field.x.array.reshape(-1, d, d)[:] = np.eye(d)
-        self._gradient = point_expression(domain, F)
-        self._d = d
-
-    def update(self) -> None:
-        """Evaluate R at the current displacement (not collective)."""
-        # ghosts need no update: cells are not ghosted
-        F = self._gradient.evaluate_at_points().reshape(-1, self._d, self._d)
-        self.field.x.array[:] = polar_rotation(F).reshape(-1)
 
 
 class Stress(Term):
@@ -130,7 +108,9 @@ class Stress(Term):
         self.degradation_factor: Expr | float = _floored(self.chi, floor)
         self.energy_factor: Expr | float = _floored(self.energy_multiplier, floor)
         self.rotation = (
-            PolarRotation(domain, _elastic_part(u, material, domain.dim)) if material.energy.needs_rotation else None
+            PolarRotation(domain, _elastic_part(u, material, domain.dim), self.kernels)
+            if material.energy.needs_rotation
+            else None
         )
         self.rotation_field = None if self.rotation is None else self.rotation.field
         self.symmetric = material.plastic is None or not material.plastic.frobenius

@@ -54,7 +54,7 @@ def polar_rotation(F: Matrices, iterations: int = 20) -> Matrices:
     if not regular.all():
         result = np.empty_like(F)
         result[regular] = polar_rotation(F[regular], iterations)
-        result[~regular] = _rotation_by_svd(F[~regular])
+        result[~regular] = closest_rotation(F[~regular])
         return result
     R, moving = F.copy(), np.arange(len(F))  # most cells converge before the most stretched one
     for _ in range(iterations):
@@ -67,7 +67,7 @@ def polar_rotation(F: Matrices, iterations: int = 20) -> Matrices:
     return R
 
 
-def _rotation_by_svd(F: Matrices) -> Matrices:
+def closest_rotation(F: Matrices) -> Matrices:
     """(n, d, d) U diag(1, .., det(U V^T)) V^T, the rotation closest to F; the identity where F is not finite."""
     finite = np.isfinite(F.sum(axis=(1, 2)))
     safe = np.where(finite[:, None, None], F, np.eye(F.shape[1]))
