@@ -35,7 +35,6 @@ Surfaces with ipctk:
     ipc_surface, ipc_pairs, sample_points  split surface, pairs of elements, sample points and friction at them
     mesh_obstacles        pairs of a body and a triangle-mesh obstacle
     penalty_pairs         penalty between points and facets, and between edges, with friction
-    penalty_mesh_pairs    penalty between triangle-mesh obstacles
     penalty_contacts, penalty_point_facet, penalty_edges  energy of contacts; points before facets; edges
 
 Free obstacles:
@@ -44,6 +43,7 @@ Free obstacles:
     pose_derivatives      derivatives of contact by a pose
     rigid_pose            poses as unknowns of Newton's method
     obstacle_pairs, mesh_pairs  contact between obstacles: analytic ones, triangle meshes
+    penalty_obstacle_pairs  both in explicit steps
 
 Modules without DOLFINx and MPI: laws, closest_point, facet_contact, node_contact, obstacle, pose, shape_base, shapes,
 triangle_mesh_shape. Every rank evaluates its own points.

@@ -272,6 +272,12 @@ def tangential(normal: Values, motion: Values) -> Values:
     return np.asarray(motion - np.einsum("ni,ni->n", normal, motion)[:, None] * normal)
 
 
+def slipped(stretch: Values, max_length: Values) -> Values:
+    """(n, d) stretch (n, d) of springs of friction, m, after those longer than `max_length` (n,) have slipped."""
+    length = np.maximum(np.linalg.norm(stretch, axis=1), np.finfo(float).tiny)
+    return np.asarray(np.minimum(1.0, max_length / length)[:, None] * stretch)
+
+
 def _require_positive(kind: str, **lengths: float) -> None:
     for word, value in lengths.items():
         if not 0 < value < np.inf:

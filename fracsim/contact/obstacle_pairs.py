@@ -19,7 +19,7 @@ from typing import Protocol, cast
 import numpy as np
 import numpy.typing as npt
 
-from .laws import BARRIER, CoulombFriction, GapPotential, ObstacleLaw, Penalty, tangential
+from .laws import BARRIER, CoulombFriction, GapPotential, ObstacleLaw, tangential
 from .node_contact import ContactForces, StepStart, evaluate_points, lag_contact
 from .obstacle import RigidObstacle, free_pairs
 from .pose import Pose, PosedShape, rotate_vectors, rotation_second_derivative
@@ -435,37 +435,8 @@ class ObstaclePairs:
         }
         self._free = {number for number, obstacle in obstacles.items() if obstacle.free}
         self._law, self._width, self._time_averaged = law, law.barrier.width, False
-        self._barriers: dict[Numbers, GapPotential] = dict.fromkeys(self._pairs, law.barrier)
         self._start: dict[Numbers, PairStart] = {}
         self._started_near: set[Numbers] = set()  # pairs in contact at the start of the step
-
-    def set_penalties(self, penalty: Callable[[Numbers, float], Penalty]) -> None:
-        """Set the potential of each pair by its numbers and the area that may touch at once, m^2, of the smaller."""
-        for numbers, pair in self._pairs.items():
-            touching = [max(SAMPLES.touching_share * area.sum(), area.max()) for area in pair.areas if len(area)]
-            self._barriers[numbers] = penalty(numbers, float(min(touching, default=0.0)))
-
-    def are_far(self, posed: PosedObstacles) -> bool:
-        """Whether no obstacles can be in contact."""
-        bounds = (pair.gap_bound(posed[i].pose, posed[j].pose) for (i, j), pair in self._pairs.items())
-        return all(bound >= self._width for bound in bounds)
-
-    def accept_step(self, posed: PosedObstacles) -> None:
-        """Do nothing: forces depend on the poses alone."""
-
-    def near_springs(self, posed: PosedObstacles, max_gap: float) -> Iterator[tuple[Numbers, Values, Values]]:
-        """Pairs with points at gaps below `max_gap`, m: these (n, d), m, and their stiffness (n,) in contact, N/m."""
-        for (i, j), pair in self._pairs.items():
-            first, second = posed[i].pose, posed[j].pose
-            if pair.gap_bound(first, second) >= max_gap:
-                continue
-            points, stiffness = [], []
-            for (x, target), area in zip(pair.sides(first, second), pair.areas, strict=True):
-                near = target.distance(x) < max_gap
-                points.append(x[near])
-                stiffness.append(area[near] * self._barriers[i, j].curvature(np.zeros(int(near.sum()))))
-            if any(len(x) for x in points):
-                yield (i, j), np.concatenate(points), np.concatenate(stiffness)
 
     def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
         """Begin a step of dt, s; `time_averaged`: barriers are averaged over it."""
@@ -475,7 +446,7 @@ class ObstaclePairs:
             is_near = pair.gap_bound(first, second) < self._width
             if time_averaged or (is_near and pair.friction):
                 slip = partial(self._sticking_slip, motion, dt, (i, j))
-                self._start[i, j] = pair.begin_step(first, second, self._barriers[i, j], slip)
+                self._start[i, j] = pair.begin_step(first, second, self._law.barrier, slip)
             if is_near:
                 self._started_near.add((i, j))
 
@@ -570,8 +541,7 @@ class ObstaclePairs:
         for (i, j), pair in self._pairs.items():
             if (i, j) in self._started_near or pair.gap_bound(posed[i].pose, posed[j].pose) < self._width:
                 start = self._start[i, j].gaps if self._time_averaged else None
-                barrier = self._barriers[i, j]
-                contacts[i, j] = pair.contact_forces(posed[i].pose, posed[j].pose, barrier, start)
+                contacts[i, j] = pair.contact_forces(posed[i].pose, posed[j].pose, self._law.barrier, start)
         return {
             numbers: sides
             for numbers, sides in contacts.items()

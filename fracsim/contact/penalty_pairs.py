@@ -20,7 +20,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
 from .ipc_pairs import IpcPairs
-from .laws import tangential
+from .laws import slipped, tangential
 from .penalty_contacts import ContactStiffness, PenaltyContacts, concatenate_contacts
 from .penalty_edges import EdgeContacts, EdgePairHistory
 from .penalty_point_facet import POINT_FACET, PointFacetContacts, PointHistory
@@ -217,9 +217,7 @@ class PairSprings:
         """(k, d) stretch of the springs of the contacts at x, m; zero for new contacts."""
         contacts = self.pairs.contacts(x)
         slip = tangential(contacts.normal, contacts.slip + self._relative_motion(x))
-        max_length = self.coefficient * (self.pairs.width - contacts.gap)
-        length = np.maximum(np.linalg.norm(slip, axis=1), np.finfo(float).tiny)
-        return np.asarray(np.minimum(1.0, max_length / length)[:, None] * slip)
+        return slipped(slip, self.coefficient * (self.pairs.width - contacts.gap))
 
     def dissipated(self, x: Values) -> float:
         """Energy dissipated in the step, J: minus the work by the trapezoidal rule, minus the change of energy."""

@@ -12,7 +12,6 @@ Equations: docs/theory.md#rigid-obstacles.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Protocol, cast
 
 import numpy as np
@@ -23,10 +22,9 @@ from ..forms.schemes import Scheme
 from ..mechanics.term import Term, TimeLevel
 from ..mechanics.term_protocols import SurfaceData
 from ..mesh.domain import Domain
-from .laws import Penalty
 from .node_contact import LaggedContact
 from .obstacle import FreeMotions, FreeObstacle, MovingObstacle, RigidMotion, RigidObstacle, VerletObstacle
-from .obstacle_pairs import AllPairs, Numbers, ObstaclePairs
+from .obstacle_pairs import AllPairs
 from .obstacle_tessellation import ObstacleTessellations
 from .pose import PosedShape
 from .pose_derivatives import PoseDerivatives
@@ -35,28 +33,11 @@ from .rigid_pose import FreePose, PoseUnknowns
 from .step_limit import PoseMotion
 
 if TYPE_CHECKING:
-    from .penalty_mesh_pairs import PenaltyMeshPair  # with ipctk
-    from .penalty_pairs import PenaltyHistory
+    from .penalty_obstacle_pairs import PenaltyPair
 
 Values = npt.NDArray[np.float64]
 
 type Increments = Mapping[int, Values]  # (p,) of poses, by the numbers of obstacles
-
-
-@dataclass(frozen=True)
-class PairPenaltyPolicy:
-    """Tuned numbers of the penalty between two obstacles.
-
-    Attributes:
-        share: of what contact may add to the square of a frequency.
-        near_gap: gap, in widths of the penalty, up to which contacts are followed, since they may act a step later.
-    """
-
-    share: float = 0.2
-    near_gap: float = 3.0
-
-
-PAIR_PENALTY = PairPenaltyPolicy()
 
 
 class ObstacleContactTerm(Protocol):
@@ -516,9 +497,7 @@ class FreeRigidObstacles(RigidObstacles):
 
 
 class VerletRigidObstacles(RigidObstacles):
-    """Obstacles of which some are free, in explicit steps.
-
-    Between free ones and others a penalty acts, without friction.
+    """Obstacles of which some are free, in explicit steps; between these and others a penalty acts, with friction.
 
     Attributes:
         free: free obstacles by their numbers.
@@ -526,45 +505,12 @@ class VerletRigidObstacles(RigidObstacles):
 
     free: dict[int, VerletObstacle]
 
-    def __init__(
-        self,
-        domain: Domain,
-        obstacles: Sequence[RigidObstacle],
-        analytic_pairs: ObstaclePairs,
-        mesh_pairs: Sequence[PenaltyMeshPair],
-        penalty: Penalty,
-        max_added: float,
-    ) -> None:
-        """Build the term.
-
-        Args:
-            domain: mesh of the body.
-            obstacles: by their numbers in the study.
-            analytic_pairs: pairs of obstacles of which one at least is analytic.
-            mesh_pairs: pairs of triangle meshes.
-            penalty: of points in contact; less stiff where it would add more than a share of `max_added`.
-            max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
-        """
+    def __init__(self, domain: Domain, obstacles: Sequence[RigidObstacle], pairs: Sequence[PenaltyPair]) -> None:
+        """`obstacles`: by their numbers in the study; `pairs`: of free ones and others."""
         numbered = enumerate(obstacles)
         free = {n: VerletObstacle(obstacle) for n, obstacle in numbered if isinstance(obstacle, FreeObstacle)}
         self._contact_work = dict.fromkeys(free, 0.0)  # of the body on each in the last step, J
-        self._prescribed_work = 0.0  # of prescribed obstacles on free ones in the last step, J
-        self._pairs: list[ObstaclePairs | PenaltyMeshPair] = [analytic_pairs, *mesh_pairs]
-        self._mesh_pairs, self._width = mesh_pairs, penalty.width
-
-        tiny = np.finfo(float).tiny
-
-        def limited(numbers: Numbers, area: float) -> Penalty:
-            mass = min(free[number].body.mass for number in numbers if number in free)
-            return replace(
-                penalty,
-                stiffness=min(
-                    penalty.stiffness, PAIR_PENALTY.share * max_added * mass * penalty.width / max(area, tiny)
-                ),
-            )
-
-        for pairs in self._pairs:
-            pairs.set_penalties(limited)
+        self._pairs = pairs
         super().__init__(domain, obstacles, free)
 
     def _place(self, start: float, end: float) -> None:
@@ -575,51 +521,50 @@ class VerletRigidObstacles(RigidObstacles):
 
     def accept_step(self) -> None:
         """Give free obstacles their momentum (collective)."""
-        self._prescribed_work, ends = 0.0, (self.start_posed, self.posed)
-        of_pairs = [{number: np.zeros_like(self.increments[number]) for number in self.free} for _ in ends]
-        for pairs in self._pairs:
-            if all(pairs.are_far(posed) for posed in ends):
-                continue
-            for posed, total in zip(ends, of_pairs, strict=True):
-                for number, wrench in pairs.wrenches(posed).items():
-                    if number in total:
-                        total[number] += wrench
-                self._prescribed_work += 0.5 * pairs.work(posed, self.increments)[0]
-            pairs.accept_step(self.posed)
+        increments = list(self.increments)
+        for number, obstacle in self.free.items():
+            increments[number] = obstacle.increment
+        work_of_pairs = dict.fromkeys(range(len(self.obstacles)), 0.0)
+        of_pairs = [np.zeros_like(q) for q in increments]
+        for pair in self._pairs:
+            pair.end_step(self.start_posed, self.posed, increments)
+            for number, wrench, work in zip(pair.numbers, pair.forces.wrenches, pair.work, strict=True):
+                of_pairs[number] += wrench
+                work_of_pairs[number] += work
         for number, of_body in self._wrenches().items():
-            obstacle, (start, end) = self.free[number], (total[number] for total in of_pairs)
-            work = obstacle.end_step(self.posed[number], of_body + end)
-            self._contact_work[number] = work - 0.5 * float((start + end) @ obstacle.increment)
+            work = self.free[number].end_step(self.posed[number], of_body + of_pairs[number])
+            self._contact_work[number] = work - work_of_pairs[number]
 
     def stored_energy(self) -> float:
-        """Energy of the penalty between obstacles, on rank 0, J."""
-        return 0.0 if self.comm.rank else sum(pairs.energies(self.posed)[0] for pairs in self._pairs)
+        """Energy of penalty and springs between obstacles at the end of the last step, on rank 0, J."""
+        energies = [pair.forces.penalty_energy + pair.forces.spring_energy for pair in self._pairs]
+        return 0.0 if self.comm.rank else sum(energies)
 
-    # --- state: of motion, and contacts of triangle meshes ---
+    # --- state: of motion, and contacts between obstacles ---
 
     def snapshot(self) -> object:
         """States of motion, and contacts at the end of the last step."""
-        return super().snapshot(), [pair.history for pair in self._mesh_pairs]
+        return super().snapshot(), [pair.snapshot() for pair in self._pairs]
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective)."""
-        motions, contacts = cast("tuple[object, list[PenaltyHistory]]", memory)
+        motions, contacts = cast("tuple[object, list[object]]", memory)
         super().restore(motions)
-        for pair, history in zip(self._mesh_pairs, contacts, strict=True):
-            pair.set_history(history)
+        for pair, contact in zip(self._pairs, contacts, strict=True):
+            pair.restore(contact)
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Rows of states of motion, and contacts at the end of the last step."""
         arrays = super().to_checkpoint()
-        for index, pair in enumerate(self._mesh_pairs):
-            arrays |= {f"{name}_{index}": values for name, values in pair.history.to_checkpoint().items()}
+        for index, pair in enumerate(self._pairs):
+            arrays |= pair.to_checkpoint(f"_{index}")
         return arrays
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set states of motion and contacts from the arrays of a checkpoint."""
         super().from_checkpoint(saved)
-        for index, pair in enumerate(self._mesh_pairs):
-            pair.set_history(type(pair.history).from_checkpoint(saved, f"_{index}"))
+        for index, pair in enumerate(self._pairs):
+            pair.from_checkpoint(saved, f"_{index}")
 
     def frequency_bound(self) -> float:
         """Increase of the square of the highest frequency if all near points were in contact, 1/s^2.
@@ -628,12 +573,14 @@ class VerletRigidObstacles(RigidObstacles):
         l_i + sqrt(l_i l_j) over the pairs of an obstacle (Gershgorin's bound for blocks).
         """
         sums = dict.fromkeys(self.free, 0.0)
-        max_gap = PAIR_PENALTY.near_gap * self._width
-        springs = (spring for pairs in self._pairs for spring in pairs.near_springs(self.posed, max_gap))
-        for numbers, x, k in springs:
+        for pair in self._pairs:
+            if (springs := pair.contacts.near_springs(pair.poses(self.posed))) is None:
+                continue
             squares = {
-                number: obstacle.max_frequency(obstacle.spring_stiffness(x, k, posed), posed)
-                for number, (obstacle, posed) in ((n, (self.free[n], self.posed[n])) for n in numbers if n in self.free)
+                number: obstacle.max_frequency(obstacle.spring_stiffness(*springs, posed), posed)
+                for number in pair.numbers
+                if number in self.free
+                for obstacle, posed in [(self.free[number], self.posed[number])]
             }
             coupling = float(np.sqrt(np.prod(list(squares.values())))) if len(squares) == 2 else 0.0
             for number, square in squares.items():
@@ -651,7 +598,10 @@ class VerletRigidObstacles(RigidObstacles):
         return self.free[number].contact_point_motion(x, self.posed[number])
 
     def step_work(self) -> tuple[float, float]:
-        """Work of gravity and prescribed obstacles on free ones, on rank 0, J; nothing is dissipated."""
+        """Work of gravity and prescribed obstacles on free ones, and dissipation between obstacles, on rank 0, J."""
         if self.comm.rank:
             return 0.0, 0.0
-        return sum(obstacle.gravity_work for obstacle in self.free.values()) + self._prescribed_work, 0.0
+        items = [(number, work) for pair in self._pairs for number, work in zip(pair.numbers, pair.work, strict=True)]
+        by_prescribed = -sum(work for number, work in items if number not in self.free)
+        by_gravity = sum(obstacle.gravity_work for obstacle in self.free.values())
+        return by_gravity + by_prescribed, sum(pair.dissipated for pair in self._pairs)

@@ -144,18 +144,15 @@ def _build_motion(
     is_mesh = {number: isinstance(obstacle.shape, TriangleMeshShape) for number, obstacle in numbered.items()}
     check_free_obstacles({number: obstacle for number, obstacle in numbered.items() if not is_mesh[number]})
     in_pairs = pair_obstacles(obstacles, law.barrier.width, domain.mean_edge_length)
-    all_mesh_pairs = combinations([number for number in numbered if is_mesh[number]], 2)
-    free_mesh_pairs = [pair for pair in all_mesh_pairs if any(numbered[number].free for number in pair)]
     if not scheme.implicit:
-        without_friction = {number: replace(obstacle, friction=0.0) for number, obstacle in in_pairs.items()}
-        pairs, penalty, mesh_pairs = ObstaclePairs(without_friction, law), cast("Penalty", law.barrier), list[Any]()
-        for pair in free_mesh_pairs:
-            from ..contact.penalty_mesh_pairs import PenaltyMeshPair
+        from ..contact.penalty_obstacle_pairs import penalty_pairs_of
 
-            mesh_pairs.append(PenaltyMeshPair({number: in_pairs[number] for number in pair}, penalty))
-        return VerletRigidObstacles(domain, obstacles, pairs, mesh_pairs, penalty, max_added)
+        penalty = cast("Penalty", law.barrier)
+        return VerletRigidObstacles(domain, obstacles, penalty_pairs_of(in_pairs, penalty, max_added))
     kinds: list[PairContact] = [ObstaclePairs(in_pairs, law)]
-    for pair in free_mesh_pairs:
+    for pair in combinations([number for number in numbered if is_mesh[number]], 2):
+        if not any(numbered[number].free for number in pair):
+            continue
         from ..contact.mesh_pairs import MeshPair
 
         kinds.append(MeshPair({number: in_pairs[number] for number in pair}, law, mesh_stiffness))
