@@ -8,8 +8,10 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from scipy.linalg import block_diag
+from scipy.sparse import csr_matrix
 
 from fracsim.contact.closest_point import find_closest_points, minimise_on_simplex, smoothing_error
+from fracsim.contact.contact_surface import nodal_stiffness
 from fracsim.contact.facet_contact import ContactFacets, FacetForces, add_facet_friction, evaluate_facets, merge_forces
 from fracsim.contact.laws import Barrier, CoulombFriction
 from fracsim.contact.node_contact import ContactForces, evaluate_points, lag_contact, no_contact
@@ -191,6 +193,18 @@ def test_facets_before_what_turns_keep_a_tenth_of_their_gaps(name: str) -> None:
             seen = np.array([pose.to_body(places) for pose, places in ways])
             assert (find_closest_points(itself, seen, SOFTEN).gap > 0.1 * gap - 1e-9).all()
     assert max(apart) > 0.1
+
+
+@pytest.mark.parametrize(("d", "c"), [(3, 1), (3, 3), (2, 2)])
+def test_stiffness_of_points_at_their_nodes(d: int, c: int) -> None:
+    """Points that depend on none to several nodes, some in several groups, against products of dense matrices."""
+    rng = np.random.default_rng(1)
+    W = np.where(rng.random((9, 6)) < 0.4, rng.normal(size=(9, 6)), 0.0)
+    corners, blocks = rng.integers(0, 9, (7, c)), rng.normal(size=(7, c * d, c * d))
+    dense = sum((R := np.kron(W[points], np.eye(d))).T @ B @ R for points, B in zip(corners, blocks, strict=True))
+    found = nodal_stiffness(csr_matrix(W), corners, blocks).toarray()
+    np.testing.assert_allclose(found, dense, atol=1e-13)
+    assert not nodal_stiffness(csr_matrix(W), corners[:0], blocks[:0]).nnz
 
 
 @pytest.mark.parametrize("name", ["capsule", "box", "rectangle"])

@@ -17,7 +17,7 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
-from scipy.sparse import bsr_matrix, csr_matrix, kron
+from scipy.sparse import csr_matrix
 
 from ..mesh.domain import Domain
 from ..mesh.parallel import allgather, gather
@@ -249,23 +249,9 @@ class ContactSurface:
         local = fractions[self.area > 0].min(initial=1.0)
         return float(self.comm.allreduce(float(local), op=MPI.MIN))
 
-    def point_stiffness(self, points: Ints, blocks: Values) -> csr_matrix:
-        """W^T B W over `node_numbers`, N/m, of blocks B (k, d, d) at points (k,)."""
-        k, d = blocks.shape[:2]
-        W = kron(self._surface.point_map.weights[points], np.eye(d), format="csr")
-        B = bsr_matrix((blocks, np.arange(k), np.arange(k + 1)), shape=(k * d, k * d)).tocsr()
-        return (W.T @ B @ W).tocsr()
-
-    def facet_stiffness(self, corners: Ints, blocks: Values) -> csr_matrix:
-        """W^T B W over `node_numbers`, N/m, of blocks B (k, c d, c d) at facets with corners (k, c)."""
-        d = blocks.shape[1] // corners.shape[1]
-        points, local = np.unique(corners, return_inverse=True)
-        dofs = (d * local.reshape(corners.shape)[:, :, None] + np.arange(d)).reshape(len(corners), -1)
-        rows, columns = np.repeat(dofs, dofs.shape[1], axis=1), np.tile(dofs, dofs.shape[1])
-        size = d * len(points)
-        B = csr_matrix((blocks.reshape(-1), (rows.reshape(-1), columns.reshape(-1))), shape=(size, size))
-        W = kron(self._surface.point_map.weights[points], np.eye(d), format="csr")
-        return (W.T @ B @ W).tocsr()
+    def stiffness(self, corners: Ints, blocks: Values) -> csr_matrix:
+        """W^T B W over `node_numbers`, N/m, as of `nodal_stiffness`."""
+        return nodal_stiffness(self._surface.point_map.weights, corners, blocks)
 
     # --- new crack faces ---
 
@@ -440,6 +426,35 @@ class ContactSurface:
     def destroy(self) -> None:
         """Destroy the objects of PETSc."""
         self.interpolation.destroy()
+
+
+def nodal_stiffness(W: csr_matrix, corners: Ints, blocks: Values) -> csr_matrix:
+    """(m d, m d) W^T B W of blocks B at groups of points.
+
+    Entries are summed pair by pair: for few groups products of sparse matrices take ten times as long.
+
+    Args:
+        W: (n, m) weights of m nodes in the positions of n points.
+        corners: (k, c) points of each group.
+        blocks: (k, c d, c d) B.
+    """
+    (k, c), points = corners.shape, corners.reshape(-1)
+    d = blocks.shape[1] // c
+    # entries of the rows of W of all corners, those of a group one after another
+    lengths = np.diff(W.indptr)[points]
+    corner = np.repeat(np.arange(k * c), lengths)
+    entry = np.arange(len(corner)) - np.repeat(np.cumsum(lengths) - lengths, lengths) + W.indptr[points][corner]
+    node, weight, group = W.indices[entry], W.data[entry], corner // c
+    # pairs of entries of a group
+    counts = lengths.reshape(k, c).sum(axis=1)
+    partners, starts = counts[group], (np.cumsum(counts) - counts)[group]
+    first = np.repeat(np.arange(len(entry)), partners)
+    second = np.arange(len(first)) + np.repeat(starts - np.cumsum(partners) + partners, partners)
+    B = blocks.reshape(k, c, d, c, d)[group[first], corner[first] % c, :, corner[second] % c]
+    values = (weight[first] * weight[second])[:, None, None] * B
+    rows, columns = (d * node[side][:, None] + np.arange(d) for side in (first, second))
+    places = [np.broadcast_to(part, values.shape).reshape(-1) for part in (rows[:, :, None], columns[:, None])]
+    return csr_matrix((values.reshape(-1), places), shape=(d * W.shape[1],) * 2)
 
 
 def retract_from_obstacles(point_map: SurfaceMap, u: Values, gaps: GapFunction) -> SurfaceMap:

@@ -133,10 +133,10 @@ class ObstacleTerm(ContactState, Term):
         if not self.comm.allreduce(len(points)):
             return None
         blocks = np.concatenate([contact.tangent(exact=exact) for contact in contacts])
-        matrix = self.surface.point_stiffness(points, blocks)
+        matrix = self.surface.stiffness(points[:, None], blocks)
         for facets in (contact.facets for contact in contacts if contact.facets is not None):
             inner = facets.hessian if exact else facets.stiffness
-            matrix = matrix + self.surface.facet_stiffness(facets.corners, inner)
+            matrix = matrix + self.surface.stiffness(facets.corners, inner)
         return self._coupling((self._level.contact_weights.factor * matrix).tocsr(), self.surface.node_numbers)
 
     def uses_exact_tangent(self) -> bool:
