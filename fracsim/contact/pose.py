@@ -16,6 +16,7 @@ Equations: docs/theory.md#rigid-obstacles.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import factorial
@@ -27,6 +28,8 @@ from scipy.spatial.transform import Rotation
 from .shape_base import Shape
 
 Values = npt.NDArray[np.float64]
+
+_IDENTITY = np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,8 +83,9 @@ class Pose:
         """Pose after an increment q = (t, w); R stays a rotation to round-off however often this is done."""
         t, w = q[: self.dim], q[self.dim :]
         if self.dim == 3:
-            rotation = Rotation.from_rotvec(w) * Rotation.from_matrix(self.rotation)
-            return Pose(self.centre + t, rotation.as_matrix())
+            product = _rotation_matrix(w) @ self.rotation
+            # R (3 - R^T R) / 2: deviations from a rotation are squared
+            return Pose(self.centre + t, product @ (1.5 * _IDENTITY - 0.5 * product.T @ product))
         angle = np.arctan2(self.rotation[1, 0], self.rotation[0, 0]) + w[0]
         cos, sin = np.cos(angle), np.sin(angle)
         return Pose(self.centre + t, np.array([[cos, -sin], [sin, cos]]))
@@ -107,10 +111,9 @@ def rotation_derivative(y: Values) -> Values:
     """
     if y.shape[1] == 2:
         return np.stack([y[:, 1], -y[:, 0]], axis=1)[:, :, None]
-    zero = np.zeros(len(y))
-    a, b, c = y.T
-    rows = [[zero, -c, b], [c, zero, -a], [-b, a, zero]]
-    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)
+    G = np.zeros((len(y), 3, 3))
+    G[:, 2, 1], G[:, 0, 2], G[:, 1, 0] = y.T
+    return G - G.transpose(0, 2, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,12 +175,20 @@ def rotation_second_derivative(n: Values, y: Values) -> Values:
     if n.shape[1] == 2:
         return -scalar
     ny = n[:, :, None] * y[:, None, :]
-    return (ny + ny.transpose(0, 2, 1)) / 2 - scalar * np.eye(3)
+    return (ny + ny.transpose(0, 2, 1)) / 2 - scalar * _IDENTITY
 
 
 def min_distance(obstacles: Sequence[PosedShape], x: Values) -> Values:
     """(n,) distances of points x (n, d) to the nearest of several shapes, m."""
     return np.asarray(np.min([posed.distance(x) for posed in obstacles], axis=0))
+
+
+def _rotation_matrix(w: Values) -> Values:
+    """(3, 3) exp(w) of a rotation vector w (3,), rad (Rodrigues)."""
+    W, angle = _cross(w), math.sqrt(float(w @ w))
+    first, second = (math.sin(angle) / angle, 2 * (math.sin(angle / 2) / angle) ** 2) if angle else (1.0, 0.5)
+    result: Values = _IDENTITY + first * W + second * (W @ W)
+    return result
 
 
 # Left Jacobian of SO(3): exp(w + dw) = exp(J(w) dw) exp(w) to first order,
@@ -194,7 +205,7 @@ def left_jacobian(w: Values) -> Values:
     if len(w) == 1:
         return np.ones((1, 1))
     W = _cross(w)
-    result: Values = np.eye(3) + _series(_A, w) * W + _series(_B, w) * W @ W
+    result: Values = _IDENTITY + _series(_A, w) * W + _series(_B, w) * W @ W
     return result
 
 
@@ -204,12 +215,15 @@ def left_jacobian_derivative(w: Values, moment: Values) -> Values:
         return np.zeros((1, 1))
     across, along = np.cross(w, moment), float(w @ moment)
     slope = -_series(_A_SLOPE, w) * across + _series(_B_SLOPE, w) * np.cross(w, across)
-    derivative = _series(_B, w) * (along * np.eye(3) - np.outer(w, moment)) + np.outer(slope, w)
+    derivative = _series(_B, w) * (along * _IDENTITY - np.outer(w, moment)) + np.outer(slope, w)
     return np.asarray(derivative + derivative.T) / 2
 
 
 def _series(coefficients: list[float], w: Values) -> float:
-    return float(np.polynomial.polynomial.polyval(float(w @ w), coefficients))
+    square, result = float(w @ w), 0.0
+    for coefficient in reversed(coefficients):
+        result = result * square + coefficient
+    return result
 
 
 def _cross(w: Values) -> Values:

@@ -206,8 +206,10 @@ def _friction_arms(contact: ContactForces, arm: Values, pose: Pose, lagged: Lagg
 
 def _jacobian(arm: Values) -> Values:
     """(n, d, p) J of arms (n, d), m."""
-    translation = np.broadcast_to(-np.eye(arm.shape[1]), (len(arm), arm.shape[1], arm.shape[1]))
-    return np.concatenate([translation, rotation_derivative(arm)], axis=2)
+    d, by_rotation = arm.shape[1], rotation_derivative(arm)
+    J = np.empty((len(arm), d, d + by_rotation.shape[2]))
+    J[:, :, :d], J[:, :, d:] = -np.eye(d), by_rotation
+    return J
 
 
 def _facet_jacobian(facets: FacetCoupling, x: Values, pose: Pose) -> Values:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import comb, pi
 from typing import ClassVar, Protocol, Self
 
@@ -21,6 +21,7 @@ from ..errors import InputError
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
+Flags = npt.NDArray[np.bool_]
 Tessellation = tuple[Values, Ints]
 
 
@@ -210,13 +211,21 @@ def require_fillet(kind: str, rounding: float, largest: float) -> None:
         )
 
 
+def lengths(vectors: Values) -> Values:
+    """(n,) lengths of vectors (n, d); a third of the time of np.linalg.norm for few of them."""
+    return np.asarray(np.sqrt(np.einsum("nd,nd->n", vectors, vectors)))
+
+
+@lru_cache
 def unit_vector(direction: tuple[float, ...]) -> Values:
-    """(d,) unit vector along a direction; InputError if it has no direction."""
+    """(d,) unit vector along a direction, read-only; InputError if it has no direction."""
     vector = np.array(direction, float)
     length = float(np.linalg.norm(vector))
     if len(vector) not in (2, 3) or not 0 < length < np.inf:
         raise InputError(f"{direction} is no direction: give 2 or 3 numbers that are not all zero")
-    return np.asarray(vector / length)
+    vector /= length
+    vector.setflags(write=False)
+    return vector
 
 
 def frame_about(axis: Values) -> Values:
@@ -237,7 +246,7 @@ class QuadrantDistance:
     def __init__(self, q: Values) -> None:
         """`q`: (n, k) points, m."""
         self._q, self._outside = q, np.maximum(q, 0)
-        self._length = np.linalg.norm(self._outside, axis=1)
+        self._length = lengths(self._outside)
         # too close to the corner to divide by the length: as if inside
         self._inside = self._length < np.finfo(float).tiny
 

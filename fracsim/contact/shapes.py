@@ -16,11 +16,13 @@ from ..errors import InputError
 from .shape_base import (
     SHAPE,
     ConvexBody,
+    Flags,
     QuadrantDistance,
     Shape,
     Tessellation,
     Values,
     frame_about,
+    lengths,
     polygon,
     profile,
     require_fillet,
@@ -120,15 +122,18 @@ class _SweptSphere(ConvexBody):
         """Vectors (n, d) from the closest points of the core, their lengths (n,), and heights along it (n,), m."""
         axis, half, _ = self._core()
         height = x @ axis
-        away = x - np.clip(height, -half, half)[:, None] * axis
-        return away, np.linalg.norm(away, axis=1), height
+        away = x - np.minimum(np.maximum(height, -half), half)[:, None] * axis
+        return away, lengths(away), height
 
     def _distance(self, x: Values) -> Values:
         return self._from_core(x)[1] - self._core()[2]
 
     def _normal(self, x: Values) -> Values:
         away, length, _ = self._from_core(x)
-        on_core = length < np.finfo(float).tiny
+        return self._direction(away, length, length < np.finfo(float).tiny)
+
+    def _direction(self, away: Values, length: Values, on_core: Flags) -> Values:
+        """(n, d) unit vectors along `away` (n, d) of a length (n,), m; across the axis for points on the core (n,)."""
         if not on_core.any():
             return np.asarray(away / length[:, None])
         # on the core every direction across it is a closest one
@@ -138,12 +143,13 @@ class _SweptSphere(ConvexBody):
     def _curvature(self, x: Values) -> Values:
         """(n, d, d) (P - n n^T) / |x - closest|, P across the axis beside the core, the identity beyond its ends."""
         axis, half, _ = self._core()
-        _, length, height = self._from_core(x)
-        n, beside = self._normal(x), (abs(height) < half).astype(float)
-        P = np.eye(self.dim) - beside[:, None, None] * np.outer(axis, axis)
+        away, length, height = self._from_core(x)
         on_core = length < np.finfo(float).tiny
-        hessian = (P - n[:, :, None] * n[:, None, :]) / np.where(on_core, 1.0, length)[:, None, None]
-        return np.where(on_core[:, None, None], 0.0, hessian)
+        n, P = self._direction(away, length, on_core), np.eye(self.dim)
+        if half:
+            P = P - (abs(height) < half)[:, None, None] * np.outer(axis, axis)
+        inverse = np.where(on_core, 0.0, 1 / np.where(on_core, 1.0, length))
+        return np.asarray((P - n[:, :, None] * n[:, None, :]) * inverse[:, None, None])
 
     def _radius(self) -> float:
         return self._core()[2]
@@ -190,7 +196,7 @@ class Sphere(_SweptSphere):
         return True
 
     def _core(self) -> tuple[Values, float, float]:
-        return np.eye(self.dim)[-1], 0.0, self.radius
+        return unit_vector((*[0.0] * (self.dim - 1), 1.0)), 0.0, self.radius
 
 
 @dataclass(frozen=True)
@@ -347,7 +353,7 @@ class RoundedCylinder(ConvexBody):
         axis, (radius, half) = unit_vector(self.axis), self._core()
         height = x @ axis
         across = x - height[:, None] * axis
-        rho = np.linalg.norm(across, axis=1)
+        rho = lengths(across)
         on_axis = rho < np.finfo(float).tiny
         away = across / np.where(on_axis, 1.0, rho)[:, None]
         if on_axis.any():
@@ -366,11 +372,12 @@ class RoundedCylinder(ConvexBody):
         """(n, d, d) quadrant's Hessian in the half plane, and f_rho / rho around the axis (0 on it)."""
         corner, rho, away, up = self._polar(x)
         plane = np.stack([away, up], axis=1)
-        around = np.cross(away, up)
+        # across both, for which the sign does not matter
+        around = np.eye(3) - away[:, :, None] * away[:, None, :] - up[:, :, None] * up[:, None, :]
         on_axis = rho < np.finfo(float).tiny
         hoop = np.where(on_axis, 0.0, corner.gradient[:, 0] / np.where(on_axis, 1.0, rho))
         in_plane = plane.transpose(0, 2, 1) @ corner.hessian @ plane
-        return np.asarray(in_plane + hoop[:, None, None] * around[:, :, None] * around[:, None, :])
+        return np.asarray(in_plane + hoop[:, None, None] * around)
 
     def _radius(self) -> float:
         return self.fillet
