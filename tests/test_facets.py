@@ -17,7 +17,7 @@ from fracsim.contact.laws import Barrier, CoulombFriction
 from fracsim.contact.node_contact import ContactForces, evaluate_points, lag_contact, no_contact
 from fracsim.contact.obstacle_term import ObstacleTerm
 from fracsim.contact.pose import Pose, PosedShape, rotation_derivative
-from fracsim.contact.pose_derivatives import contact_wrench, point_pose_hessian, pose_derivatives
+from fracsim.contact.pose_derivatives import PoseCoupling, contact_wrench
 from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylinder, Shape, Sphere
 from fracsim.contact.step_limit import safe_motion_fractions
 from support.scenes import each_step, make_scene, march
@@ -221,7 +221,8 @@ def test_what_facets_do_to_a_pose_is_a_derivative(name: str) -> None:
 
     p, h = 3 * d - 3, 1e-5
     steps, found = h * np.eye(p), felt(np.zeros(p))
-    on = pose_derivatives(found, x, placed.pose, None, placed.pose)
+    exact, positive = (PoseCoupling(found, x, placed.pose, None, placed.pose, exact=exact) for exact in (True, False))
+    on = exact.derivatives()
     by_energy = [(felt(q).potential - felt(-q).potential) / (2 * h) for q in steps]
     np.testing.assert_allclose(on.gradient, by_energy, atol=1e-6 * abs(on.gradient).max())
     np.testing.assert_allclose(contact_wrench(found, x, placed.pose), -on.gradient, atol=1e-12 * abs(on.gradient).max())
@@ -230,8 +231,9 @@ def test_what_facets_do_to_a_pose_is_a_derivative(name: str) -> None:
         assert twice == pytest.approx(way @ on.hessian @ way, abs=1e-3 * abs(on.hessian).max())
     arm = x[found.points] - placed.pose.centre
     J = np.concatenate([np.broadcast_to(-np.eye(d), (len(arm), d, d)), rotation_derivative(arm)], axis=2)
-    both = np.einsum("nip,niq->pq", J, point_pose_hessian(found, x, placed.pose, None, placed.pose))
-    np.testing.assert_allclose(both, on.stiffness, atol=1e-9 * abs(on.stiffness).max())
+    both = np.einsum("nip,niq->pq", J, positive.mixed_hessian())
+    stiffness = positive.derivatives().hessian
+    np.testing.assert_allclose(both, stiffness, atol=1e-9 * abs(stiffness).max())
 
 
 @pytest.mark.parametrize("name", ["capsule", "box", "rectangle"])
@@ -256,16 +258,17 @@ def test_forces_before_an_obstacle_that_spins_and_rubs(name: str) -> None:
         )
 
     steps, found = h * np.eye(p), felt(np.zeros(p))
-    mixed = point_pose_hessian(found, x, placed.pose, held, then, exact=True)
+    exact, positive = (PoseCoupling(found, x, placed.pose, held, then, exact=exact) for exact in (True, False))
+    mixed = exact.mixed_hessian()
     for k, q in enumerate(steps):
         up, down = felt(q), felt(-q)
         forces = (down.normal + down.friction - up.normal - up.friction) / (2 * h)
         np.testing.assert_allclose(mixed[:, :, k], forces, atol=1e-5 * abs(mixed).max())
-    on = pose_derivatives(found, x, placed.pose, held, then)
+    on = exact.derivatives()
     by_energy = [(felt(q).potential - felt(-q).potential) / (2 * h) for q in steps]
     np.testing.assert_allclose(on.gradient, by_energy, atol=1e-5 * abs(on.gradient).max())
     # what is left of the points once the pose has given way is a potential that goes up: CG may solve with it
-    rough, C = point_pose_hessian(found, x, placed.pose, held, then), np.linalg.inv(on.stiffness + 1e-6 * np.eye(p))
+    rough, C = positive.mixed_hessian(), np.linalg.inv(positive.derivatives().hessian + 1e-6 * np.eye(p))
     K = block_diag(*found.stiffness)
     for of, block in zip(np.searchsorted(found.points, inner.corners), inner.stiffness, strict=True):
         at = (d * of[:, None] + np.arange(d)).reshape(-1)

@@ -52,9 +52,9 @@ def test_mixed_derivatives_by_both_poses(both: tuple[Shape, Shape], friction: fl
         return sum(contact.potential for contact, _ in sides) + (0.0 if rub is None else rub.energy(poses))
 
     (own, x), (its, y) = stop.contact_forces(slid, there, barrier, None)
-    found = mixed_pose_hessian(own, x, slid, there)[0] + mixed_pose_hessian(its, y, there, slid)[0].T
+    found = mixed_pose_hessian(own, x, slid, there, exact=True) + mixed_pose_hessian(its, y, there, slid, exact=True).T
     if rub is not None:
-        found = found + rub.derivatives((slid, there))[2]
+        found = found + rub.derivatives((slid, there), exact=True)[2]
     steps, assembled = 1e-4 * np.eye(d + turns), np.zeros_like(found)
     for i, q in enumerate(steps):
         for j, p in enumerate(steps):

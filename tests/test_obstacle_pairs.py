@@ -74,7 +74,7 @@ def test_derivatives_by_the_pose(both: tuple[Shape, Shape], along: bool, frictio
 
     further = here.incremented(np.concatenate([-0.05 * down, 0.05 * np.ones(turns)]))
     stops.begin_step(AtRest(placed(further)), 0.1, time_averaged=along)
-    found, h = stops.derivatives(placed(here))[0][0], 1e-6
+    found, h = stops.derivatives(placed(here), exact=True)[0][0], 1e-6
     steps = h * np.eye(d + turns)
 
     def potential(q: Values) -> float:

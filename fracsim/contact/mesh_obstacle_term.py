@@ -443,18 +443,22 @@ class MeshObstacleTerm(SelfContact):
 
     def wrenches(self, numbers: Sequence[int]) -> dict[int, Values]:
         """(p,) force and moment of the body on obstacles, N and N m (collective)."""
-        return {number: -derivatives.gradient for number, derivatives in self.pose_derivatives(numbers).items()}
+        return {
+            number: -derivatives.gradient for number, derivatives in self.pose_derivatives(numbers, exact=False).items()
+        }
 
-    def pose_derivatives(self, numbers: Sequence[int]) -> dict[int, PoseDerivatives]:
+    def pose_derivatives(self, numbers: Sequence[int], *, exact: bool) -> dict[int, PoseDerivatives]:
         """Energy and derivatives by the poses of obstacles (collective)."""
-        none = PoseDerivatives(0.0, np.zeros(6), np.zeros((6, 6)), np.zeros((6, 6)))
+        none = PoseDerivatives(0.0, np.zeros(6), np.zeros((6, 6)))
         if not numbers or self._is_far():
             return dict.fromkeys(numbers, none)
         x = self._end_positions()
-        by_number = from_root(self.comm, lambda: {number: self._derivatives_on_root(number, x) for number in numbers})
+        by_number = from_root(
+            self.comm, lambda: {number: self._derivatives_on_root(number, x, exact=exact) for number in numbers}
+        )
         return {number: none if derivatives is None else derivatives for number, derivatives in by_number.items()}
 
-    def _derivatives_on_root(self, number: int, x: Values | None) -> PoseDerivatives | None:
+    def _derivatives_on_root(self, number: int, x: Values | None, *, exact: bool) -> PoseDerivatives | None:
         """Derivatives by the pose of an obstacle with the body at x (n, 3), m; None: the body is far."""
         assert self._surface is not None and x is not None
         pairs, n = self._surface.pairs.pairs[self.numbers.index(number)], len(x)
@@ -462,12 +466,12 @@ class MeshObstacleTerm(SelfContact):
             return None
         points, mesh = pairs.with_mesh(x), slice(3 * n, None)
         energy, gradient = pairs.contact.energy(points), pairs.contact.gradient(points)
-        exact, positive = pairs.contact.hessian(points, exact=True), pairs.contact.hessian(points)
+        H = pairs.contact.hessian(points, exact=exact)
         if self._friction is not None and (friction := self._friction.friction_with(pairs)) is not None:
             energy, gradient = energy + friction.energy(points), gradient + friction.gradient(points)
-            exact, positive = exact + friction.hessian(points, exact=True), positive + friction.hessian(points)
+            H = H + friction.hessian(points, exact=exact)
         arms = pairs.mesh.positions - pairs.mesh.pose.centre
-        return point_set_derivatives(energy, gradient[n:], exact[mesh, mesh], positive[mesh, mesh], arms)
+        return point_set_derivatives(energy, gradient[n:], H[mesh, mesh], arms, exact=exact)
 
     def mixed_hessians(self, numbers: Sequence[int]) -> dict[int, Values]:
         """(owned dofs, p) second derivatives by nodes and the poses of obstacles in contact (collective)."""

@@ -19,7 +19,7 @@ from .mesh_obstacles import MESH, free_fraction_on_arcs
 from .obstacle import RigidObstacle
 from .obstacle_pairs import Numbers, PosedObstacles, StepMotion
 from .pose import Pose
-from .pose_derivatives import MixedHessian, PoseDerivatives, point_jacobian, point_set_derivatives
+from .pose_derivatives import PoseDerivatives, point_jacobian, point_set_derivatives
 from .sample_points import IpcFriction
 from .step_limit import PoseMotion
 
@@ -99,24 +99,25 @@ class MeshPair:
         H = self._pairs.hessian(x, exact=exact)
         return H if self._friction is None else csr_matrix(H + self._friction.hessian(x, exact=exact))
 
-    def derivatives(self, posed: PosedObstacles) -> tuple[dict[int, PoseDerivatives], dict[Numbers, MixedHessian]]:
+    def derivatives(
+        self, posed: PosedObstacles, *, exact: bool
+    ) -> tuple[dict[int, PoseDerivatives], dict[Numbers, Values]]:
         """Energies and derivatives by the poses of free obstacles, as of ObstaclePairs."""
         if (x := self._at(posed)) is None or not (gradient := self._gradient(x)).any():
             return {}, {}
-        energy, hessians = self.energies(posed)[1], [self._hessian(x, exact=exact) for exact in (True, False)]
+        energy, H = self.energies(posed)[1], self._hessian(x, exact=exact)
         first = 3 * len(self._points[0])
         dofs, bodies, J = (slice(0, first), slice(first, None)), dict[int, PoseDerivatives](), list[Values]()
         for number, rows, columns in zip(self._numbers, self._rows, dofs, strict=True):
             arm = x[rows] - posed[number].pose.centre
             J.append(point_jacobian(arm).reshape(arm.size, -1))
             if number in self._free:
-                exact, positive = (H[columns, columns] for H in hessians)
-                bodies[number] = point_set_derivatives(energy, gradient[rows], exact, positive, arm)
+                block = H[columns, columns]
+                bodies[number] = point_set_derivatives(energy, gradient[rows], block, arm, exact=exact)
                 energy = 0.0  # it counts once
         if len(self._free) < 2:
             return bodies, {}
-        exact, positive = (np.asarray(J[0].T @ (H[dofs[0], dofs[1]] @ J[1])) for H in hessians)
-        return bodies, {(self._numbers[0], self._numbers[1]): (exact, positive)}
+        return bodies, {(self._numbers[0], self._numbers[1]): np.asarray(J[0].T @ (H[dofs[0], dofs[1]] @ J[1]))}
 
     def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> tuple[float, float]:
         """Work of a prescribed obstacle on the free one by its own increment (6,) in the step; dissipation, J."""

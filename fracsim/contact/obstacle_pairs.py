@@ -24,12 +24,11 @@ from .node_contact import ContactForces, StepStart, evaluate_points, lag_contact
 from .obstacle import RigidObstacle, free_pairs
 from .pose import Pose, PosedShape, rotate_vectors, rotation_second_derivative
 from .pose_derivatives import (
-    MixedHessian,
+    PoseCoupling,
     PoseDerivatives,
     carried_point_derivatives,
     mixed_pose_hessian,
     point_jacobian,
-    pose_derivatives,
 )
 from .shape_base import ConvexBody, Shape, frame_about, unit_vector
 from .shapes import Capsule, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
@@ -202,17 +201,17 @@ class PairFriction:
         """(k, d) forces on the first obstacle, N."""
         return -self.law.gradient(self.force, self.normal, self.slip(poses))
 
-    def derivatives(self, poses: tuple[Pose, Pose]) -> tuple[PoseDerivatives, PoseDerivatives, Values]:
+    def derivatives(self, poses: tuple[Pose, Pose], *, exact: bool) -> tuple[PoseDerivatives, PoseDerivatives, Values]:
         """Derivatives by the pose of each, with the energy in the first; (p, p) second derivatives by both."""
         gradient, slip, d = -self.on_first(poses), self.slip(poses), poses[0].dim
         H, energies, result, J = self.law.hessian(self.force, self.normal, slip), (self.energy(poses), 0.0), [], []
         for pose, x, energy, sign in zip(poses, self._carried(poses), energies, (1.0, -1.0), strict=True):
             arm = x - pose.centre
             J.append(sign * point_jacobian(arm))
-            stiffness = np.einsum("kip,kij,kjq->pq", J[-1], H, J[-1])
-            hessian = stiffness.copy()
-            hessian[d:, d:] += rotation_second_derivative(sign * gradient, arm).sum(axis=0)
-            result.append(PoseDerivatives(energy, np.einsum("kdp,kd->p", J[-1], gradient), hessian, stiffness))
+            hessian = np.asarray(np.einsum("kip,kij,kjq->pq", J[-1], H, J[-1]))
+            if exact:
+                hessian[d:, d:] += rotation_second_derivative(sign * gradient, arm).sum(axis=0)
+            result.append(PoseDerivatives(energy, np.einsum("kdp,kd->p", J[-1], gradient), hessian))
         return result[0], result[1], np.asarray(np.einsum("kip,kij,kjq->pq", J[0], H, J[1]))
 
 
@@ -470,7 +469,9 @@ class ObstaclePairs:
         ]
         return min(fractions, default=1.0)
 
-    def derivatives(self, posed: PosedObstacles) -> tuple[dict[int, PoseDerivatives], dict[Numbers, MixedHessian]]:
+    def derivatives(
+        self, posed: PosedObstacles, *, exact: bool
+    ) -> tuple[dict[int, PoseDerivatives], dict[Numbers, Values]]:
         """Energies and derivatives of contact by the poses of free obstacles.
 
         Returns:
@@ -478,26 +479,28 @@ class ObstaclePairs:
             second derivatives of pairs of free ones.
         """
         bodies: dict[int, PoseDerivatives] = {}
-        mixed: dict[Numbers, MixedHessian] = {}
+        mixed: dict[Numbers, Values] = {}
         for (i, j), ((of_i, x), (of_j, y)) in self._contact_forces(posed).items():
             first, second = posed[i].pose, posed[j].pose
             by_pose = {
-                i: carried_point_derivatives(of_i, x, first) + pose_derivatives(of_j, y, first, None, first),
-                j: pose_derivatives(of_i, x, second, None, second) + carried_point_derivatives(of_j, y, second),
+                i: carried_point_derivatives(of_i, x, first, exact=exact)
+                + PoseCoupling(of_j, y, first, None, first, exact=exact).derivatives(),
+                j: PoseCoupling(of_i, x, second, None, second, exact=exact).derivatives()
+                + carried_point_derivatives(of_j, y, second, exact=exact),
             }
-            sides = mixed_pose_hessian(of_i, x, first, second), mixed_pose_hessian(of_j, y, second, first)
-            blocks = sides[0][0] + sides[1][0].T, sides[0][1] + sides[1][1].T
+            block = mixed_pose_hessian(of_i, x, first, second, exact=exact)
+            block = block + mixed_pose_hessian(of_j, y, second, first, exact=exact).T
             free = [number for number in (i, j) if number in self._free]
             if len(free) == 2:  # the energy counts once
                 by_pose[j] = replace(by_pose[j], energy=0.0)
             if (friction := self._friction((i, j))) is not None:
-                by_i, by_j, by_both = friction.derivatives((first, second))
+                by_i, by_j, by_both = friction.derivatives((first, second), exact=exact)
                 if i not in self._free:
                     by_j = replace(by_j, energy=by_i.energy)
                 by_pose = {i: by_pose[i] + by_i, j: by_pose[j] + by_j}
-                blocks = blocks[0] + by_both, blocks[1] + by_both
+                block = block + by_both
             if len(free) == 2:
-                mixed[i, j] = blocks
+                mixed[i, j] = block
             for number in free:
                 bodies[number] = bodies[number] + by_pose[number] if number in bodies else by_pose[number]
         return bodies, mixed
@@ -508,7 +511,7 @@ class ObstaclePairs:
 
     def wrenches(self, posed: PosedObstacles) -> dict[int, Values]:
         """(p,) force and moment of the others on each free obstacle in contact, N and N m."""
-        return {number: -body.gradient for number, body in self.derivatives(posed)[0].items()}
+        return {number: -body.gradient for number, body in self.derivatives(posed, exact=False)[0].items()}
 
     def energies(self, posed: PosedObstacles) -> tuple[float, float]:
         """Energy of the barriers, and potential of all forces in the step, J."""
@@ -561,7 +564,9 @@ class PairContact(Protocol):
     def safe_fraction(self, motions: Mapping[int, PoseMotion]) -> float:
         """Fraction of the motions of obstacles that leaves a tenth of each gap between them."""
 
-    def derivatives(self, posed: PosedObstacles) -> tuple[dict[int, PoseDerivatives], dict[Numbers, MixedHessian]]:
+    def derivatives(
+        self, posed: PosedObstacles, *, exact: bool
+    ) -> tuple[dict[int, PoseDerivatives], dict[Numbers, Values]]:
         """Energies and derivatives by the poses of free obstacles in contact."""
 
     def energies(self, posed: PosedObstacles) -> tuple[float, float]:
@@ -590,12 +595,14 @@ class AllPairs:
         """Fraction of the motions of obstacles that leaves a tenth of each gap between them."""
         return min((pairs.safe_fraction(motions) for pairs in self.kinds), default=1.0)
 
-    def derivatives(self, posed: PosedObstacles) -> tuple[dict[int, PoseDerivatives], dict[Numbers, MixedHessian]]:
+    def derivatives(
+        self, posed: PosedObstacles, *, exact: bool
+    ) -> tuple[dict[int, PoseDerivatives], dict[Numbers, Values]]:
         """Energies and derivatives by the poses of free obstacles in contact."""
         bodies: dict[int, PoseDerivatives] = {}
-        mixed: dict[Numbers, MixedHessian] = {}
+        mixed: dict[Numbers, Values] = {}
         for pairs in self.kinds:
-            of_bodies, of_pairs = pairs.derivatives(posed)
+            of_bodies, of_pairs = pairs.derivatives(posed, exact=exact)
             mixed |= of_pairs
             for number, body in of_bodies.items():
                 bodies[number] = bodies[number] + body if number in bodies else body
@@ -603,7 +610,7 @@ class AllPairs:
 
     def wrenches(self, posed: PosedObstacles) -> dict[int, Values]:
         """(p,) force and moment of the others on each free obstacle in contact, N and N m."""
-        return {number: -body.gradient for number, body in self.derivatives(posed)[0].items()}
+        return {number: -body.gradient for number, body in self.derivatives(posed, exact=False)[0].items()}
 
     def energies(self, posed: PosedObstacles) -> tuple[float, float]:
         """Energy of the barriers, and potential of their forces in the step, J."""

@@ -32,10 +32,9 @@ from .laws import ObstacleLaw
 from .node_contact import ContactForces
 from .pose import min_distance
 from .pose_derivatives import (
+    PoseCoupling,
     PoseDerivatives,
     contact_wrench,
-    point_pose_hessian,
-    pose_derivatives,
     resultant,
     sum_of_derivatives,
 )
@@ -70,6 +69,7 @@ class ObstacleTerm(ContactState, Term):
 
     name = "obstacles"
     allows_exact_tangent = True
+    _pose_couplings: dict[tuple[int, bool], PoseCoupling]  # index, whether exact -> at the current u and poses
 
     def __init__(
         self, domain: Domain, u: fem.Function, bodies: RigidObstacles, numbers: Sequence[int], law: ObstacleLaw
@@ -100,7 +100,7 @@ class ObstacleTerm(ContactState, Term):
     def discard_forces(self) -> None:
         """Discard forces, and whether the tangent is exact, as u or poses have changed."""
         super().discard_forces()
-        self._is_exact = None
+        self._is_exact, self._pose_couplings = None, {}
 
     def rest_gaps(self) -> Values:
         """(obstacles,) least gaps of the body at rest to each obstacle at t = 0, m (collective).
@@ -269,15 +269,20 @@ class ObstacleTerm(ContactState, Term):
         ]
         return dict(zip(numbers, sum_over_ranks(self.comm, np.array(local)), strict=True))
 
-    def pose_derivatives(self, numbers: Sequence[int]) -> dict[int, PoseDerivatives]:
+    def pose_derivatives(self, numbers: Sequence[int], *, exact: bool) -> dict[int, PoseDerivatives]:
         """Energy and derivatives by the poses of obstacles, of all ranks (collective)."""
         if not numbers:
             return {}
-        contacts, local = self.obstacle_forces(), []
-        for index in map(self.numbers.index, numbers):
-            pose, start = self.posed[index].pose, self.start_posed[index].pose
-            local.append(pose_derivatives(contacts[index], self.positions, pose, self._lagged[index], start))
+        local = [self._pose_coupling(self.numbers.index(number), exact=exact).derivatives() for number in numbers]
         return dict(zip(numbers, sum_of_derivatives(local, self.comm), strict=True))
+
+    def _pose_coupling(self, index: int, *, exact: bool) -> PoseCoupling:
+        """Coupling of the points and the pose of an obstacle at the current u and poses (collective)."""
+        contact = self.obstacle_forces()[index]
+        if (index, exact) not in self._pose_couplings:
+            poses = self.posed[index].pose, self._lagged[index], self.start_posed[index].pose
+            self._pose_couplings[index, exact] = PoseCoupling(contact, self.positions, *poses, exact=exact)
+        return self._pose_couplings[index, exact]
 
     def mixed_hessians(self, numbers: Sequence[int]) -> dict[int, Values]:
         """(owned dofs, p) derivatives of minus the nodal forces by poses, of obstacles in contact (collective)."""
@@ -292,9 +297,8 @@ class ObstacleTerm(ContactState, Term):
         }
 
     def _mixed_hessian(self, index: int, *, exact: bool) -> Values:
-        contact, pose, start = self.obstacle_forces()[index], self.posed[index].pose, self.start_posed[index].pose
-        by_pose = point_pose_hessian(contact, self.positions, pose, self._lagged[index], start, exact=exact)
-        return self.surface.interpolation.assemble_points_to_nodes(contact.points, by_pose)
+        by_pose = self._pose_coupling(index, exact=exact).mixed_hessian()
+        return self.surface.interpolation.assemble_points_to_nodes(self.obstacle_forces()[index].points, by_pose)
 
     # --- fracture, and surfaces for output ---
 

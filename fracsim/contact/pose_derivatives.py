@@ -18,13 +18,10 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
 from ..mesh.parallel import sum_over_ranks
-from .node_contact import ContactForces, FacetCoupling, LaggedContact
+from .node_contact import ContactForces, LaggedContact
 from .pose import Pose, rotation_derivative, rotation_second_derivative
 
 Values = npt.NDArray[np.float64]
-
-
-type MixedHessian = tuple[Values, Values]  # (p, p) by two poses: exact, and of the positive part
 
 
 @dataclass(frozen=True)
@@ -34,123 +31,138 @@ class PoseDerivatives:
     Attributes:
         energy: of barrier and friction, J.
         gradient: (p,) minus force and moment, N and N m.
-        hessian: (p, p).
-        stiffness: (p, p) positive semi-definite part of the Hessian.
+        hessian: (p, p), exact or its positive semi-definite part.
     """
 
     energy: float
     gradient: Values
     hessian: Values
-    stiffness: Values
 
     def __add__(self, second: PoseDerivatives) -> PoseDerivatives:
         """Sum of both."""
-        return PoseDerivatives(
-            self.energy + second.energy, self.gradient + second.gradient, self.hessian + second.hessian,
-            self.stiffness + second.stiffness,
-        )  # fmt: skip
+        sums = self.energy + second.energy, self.gradient + second.gradient, self.hessian + second.hessian
+        return PoseDerivatives(*sums)
 
 
-def pose_derivatives(
-    contact: ContactForces, x: Values, pose: Pose, lagged: LaggedContact | None, start: Pose
-) -> PoseDerivatives:
-    """Derivatives of contact of points by the pose of an obstacle.
+class PoseCoupling:
+    """Contact of points with one obstacle, and how it changes with the pose of the obstacle.
 
-    Args:
-        contact: forces on points.
-        x: (n, d) points, m.
-        pose: of the obstacle.
-        lagged: contact at the start of the step. Friction holds the points of the obstacle that were under it then.
-        start: pose of the obstacle at the start of the step.
+    Friction holds the points of the obstacle that were under the points in lagged contact: with other arms Newton's
+    method would creep.
     """
-    arm = x[contact.points] - pose.centre
-    J, gradient = _jacobian(arm), -contact.normal
-    stiffness, hessian = (_congruence(J, blocks) for blocks in (contact.normal_stiffness, contact.normal_hessian))
-    if (facets := contact.facets) is not None:
-        facet_J = _facet_jacobian(facets, x, pose)
-        stiffness, hessian = (
-            stiffness + _congruence(facet_J, facets.stiffness),
-            hessian + _congruence(facet_J, facets.hessian),
+
+    def __init__(
+        self, contact: ContactForces, x: Values, pose: Pose, lagged: LaggedContact | None, start: Pose, *, exact: bool
+    ) -> None:
+        """Coupling of points and pose.
+
+        Args:
+            contact: forces on points.
+            x: (n, d) points, m.
+            pose: of the obstacle.
+            lagged: contact at the start of the step.
+            start: pose of the obstacle at the start of the step.
+            exact: whether second derivatives are exact; else they are those of the positive semi-definite part.
+        """
+        self._contact, self._exact, self._arm = contact, exact, x[contact.points] - pose.centre
+        self._jacobian = _jacobian(self._arm)
+        self._by_normal = np.asarray(
+            (contact.normal_hessian if exact else contact.normal_stiffness) @ self._jacobian, np.float64
         )
-    hessian = hessian + _rotating_forces(gradient, arm)
-    pose_gradient = np.einsum("ndp,nd->p", J, gradient)
-    if lagged is not None and len(lagged.points):
-        arm = _friction_arms(contact, arm, pose, lagged, start)
-        J = _jacobian(arm)
-        friction = _congruence(J, contact.friction_hessian)
-        pose_gradient = pose_gradient - np.einsum("ndp,nd->p", J, contact.friction)
-        stiffness, hessian = stiffness + friction, hessian + friction
-        d = pose.dim
-        hessian[d:, d:] += rotation_second_derivative(contact.friction, arm).sum(axis=0)
-    return PoseDerivatives(contact.potential, pose_gradient, hessian, stiffness)
+        if (facets := contact.facets) is not None:
+            rows = np.searchsorted(contact.points, facets.corners)
+            J = self._jacobian[rows]
+            k, c, d, p = J.shape
+            forces = (facets.hessian if exact else facets.stiffness) @ J.reshape(k, c * d, p)
+            np.add.at(self._by_normal, rows, forces.reshape(J.shape))
+        self._has_friction = lagged is not None and bool(len(lagged.points))
+        if lagged is not None and self._has_friction:
+            self._friction_arm, rotation = self._arm.copy(), pose.rotation @ start.rotation.T
+            rows = np.searchsorted(contact.points, lagged.points)
+            self._friction_arm[rows] = (lagged.obstacle_point - start.centre) @ rotation.T
+            self._friction_jacobian = _jacobian(self._friction_arm)
+            self._by_friction = np.asarray(contact.friction_hessian @ self._friction_jacobian, np.float64)
+
+    def mixed_hessian(self) -> Values:
+        """(k, d, p) derivatives of minus the forces on points by an increment of the pose."""
+        result = self._by_normal + self._by_friction if self._has_friction else self._by_normal.copy()
+        if self._exact:
+            result[:, :, self._arm.shape[1] :] += rotation_derivative(self._contact.normal)
+        return result
+
+    def derivatives(self) -> PoseDerivatives:
+        """Derivatives of the energy of contact by the pose."""
+        contact, arm, d = self._contact, self._arm, self._arm.shape[1]
+        gradient = -np.einsum("ndp,nd->p", self._jacobian, contact.normal)
+        hessian = _product(self._jacobian, self._by_normal)
+        if self._exact:  # normal forces rotate with the obstacle
+            mixed = rotation_derivative(-contact.normal).sum(axis=0)
+            hessian[:d, d:] += mixed
+            hessian[d:, :d] += mixed.T
+            hessian[d:, d:] += rotation_second_derivative(-contact.normal, arm).sum(axis=0)
+        if self._has_friction:
+            gradient -= np.einsum("ndp,nd->p", self._friction_jacobian, contact.friction)
+            hessian += _product(self._friction_jacobian, self._by_friction)
+            if self._exact:
+                hessian[d:, d:] += rotation_second_derivative(contact.friction, self._friction_arm).sum(axis=0)
+        return PoseDerivatives(contact.potential, np.asarray(gradient), hessian)
 
 
 def sum_of_derivatives(local: Sequence[PoseDerivatives], comm: MPI.Intracomm) -> list[PoseDerivatives]:
     """Sums over all ranks of derivatives of several obstacles (collective)."""
-    rows = [
-        np.concatenate([[part.energy], part.gradient, part.hessian.reshape(-1), part.stiffness.reshape(-1)])
-        for part in local
-    ]
-    result = []
+    rows = [np.concatenate([[part.energy], part.gradient, part.hessian.reshape(-1)]) for part in local]
+    p, result = len(local[0].gradient), []
     for row in sum_over_ranks(comm, np.array(rows)):
-        p = len(local[0].gradient)
-        energy, gradient, *matrices = np.split(row, [1, 1 + p, 1 + p + p * p])
-        result.append(PoseDerivatives(float(energy[0]), gradient, *(matrix.reshape(p, p) for matrix in matrices)))
+        energy, gradient, hessian = np.split(row, [1, 1 + p])
+        result.append(PoseDerivatives(float(energy[0]), gradient, hessian.reshape(p, p)))
     return result
 
 
-def carried_point_derivatives(contact: ContactForces, x: Values, pose: Pose) -> PoseDerivatives:
+def carried_point_derivatives(contact: ContactForces, x: Values, pose: Pose, *, exact: bool) -> PoseDerivatives:
     """Derivatives of contact of points x (n, d), m, that the obstacle itself carries, by its pose."""
     arm = x[contact.points] - pose.centre
-    J, gradient = _jacobian(arm), -contact.normal
-    stiffness, hessian = (_congruence(J, blocks) for blocks in (contact.stiffness, contact.normal_hessian))
-    d = pose.dim
-    hessian[d:, d:] += rotation_second_derivative(gradient, arm).sum(axis=0)
+    J, d = _jacobian(arm), pose.dim
+    hessian = _product(J, contact.tangent(exact=exact) @ J)
+    if exact:
+        hessian[d:, d:] += rotation_second_derivative(-contact.normal, arm).sum(axis=0)
     # points move by -J q
-    return PoseDerivatives(contact.potential, -np.einsum("ndp,nd->p", J, gradient), hessian, stiffness)
+    return PoseDerivatives(contact.potential, np.einsum("ndp,nd->p", J, contact.normal), hessian)
 
 
-def mixed_pose_hessian(contact: ContactForces, x: Values, carrier: Pose, second: Pose) -> MixedHessian:
+def mixed_pose_hessian(contact: ContactForces, x: Values, carrier: Pose, second: Pose, *, exact: bool) -> Values:
     """(p, p) second derivatives of the energy by the poses of a carrier of points and of another obstacle.
 
     Args:
         contact: forces on points.
         x: (n, d) points, m.
         carrier: pose of the obstacle that carries the points.
-        other: pose of the obstacle before them.
-
-    Returns:
-        The exact one, and that of the positive part.
+        second: pose of the obstacle before them.
+        exact: whether they are exact; else those of the positive semi-definite part.
     """
     points, d = x[contact.points], carrier.dim
-    carrier_J, other_J = _jacobian(points - carrier.centre), _jacobian(points - second.centre)
-    rotating = other_J.copy()
-    n, p = len(points), other_J.shape[2]
-    exact, stiffness = (
-        -carrier_J.reshape(n * d, p).T @ (blocks @ other_J).reshape(n * d, p)
-        for blocks in (contact.normal_hessian, contact.stiffness)
-    )
-    rotating[:, :, :d], rotating[:, :, d:] = 0.0, rotation_derivative(-contact.normal)
-    exact = exact + carrier_J.reshape(n * d, p).T @ rotating.reshape(n * d, p)
-    return np.asarray(exact), np.asarray(stiffness)
+    by_second = contact.tangent(exact=exact) @ _jacobian(points - second.centre)
+    if exact:
+        by_second[:, :, d:] += rotation_derivative(contact.normal)
+    return -_product(_jacobian(points - carrier.centre), by_second)
 
 
 def point_set_derivatives(
-    energy: float, gradient: Values, exact: csr_matrix, stiff: csr_matrix, arm: Values
+    energy: float, gradient: Values, blocks: csr_matrix, arm: Values, *, exact: bool
 ) -> PoseDerivatives:
     """Derivatives by the pose of an energy of all points that the obstacle carries.
 
     Args:
         energy: J.
         gradient: (m, d) by the points, N.
-        exact: (m d, m d) second derivatives, N/m.
-        stiff: (m d, m d) their positive semi-definite part.
+        blocks: (m d, m d) second derivatives by the points, N/m, or their positive semi-definite part.
         arm: (m, d) of the points about the centre, m.
+        exact: whether the second derivatives are exact.
     """
     d, J = arm.shape[1], point_jacobian(arm).reshape(arm.size, -1)
-    hessian, stiffness = (np.asarray(J.T @ (blocks @ J)) for blocks in (exact, stiff))
-    hessian[d:, d:] += rotation_second_derivative(gradient, arm).sum(axis=0)
-    return PoseDerivatives(energy, J.T @ gradient.reshape(-1), hessian, stiffness)
+    hessian = np.asarray(J.T @ (blocks @ J))
+    if exact:
+        hessian[d:, d:] += rotation_second_derivative(gradient, arm).sum(axis=0)
+    return PoseDerivatives(energy, J.T @ gradient.reshape(-1), hessian)
 
 
 def point_jacobian(arm: Values) -> Values:
@@ -169,41 +181,6 @@ def resultant(force: Values, arm: Values) -> Values:
     return np.concatenate([force.sum(axis=0), moment])
 
 
-def point_pose_hessian(
-    contact: ContactForces,
-    x: Values,
-    pose: Pose,
-    lagged: LaggedContact | None,
-    start: Pose,
-    *,
-    exact: bool = False,
-) -> Values:
-    """(k, d, p) derivatives of minus the forces on points by an increment of the pose.
-
-    As `stiffness` has it, or `exact`. Friction as in `pose_derivatives`: with an arm other than that of the stiffness
-    Newton's method would creep.
-    """
-    arm = x[contact.points] - pose.centre
-    result = np.asarray((contact.normal_hessian if exact else contact.normal_stiffness) @ _jacobian(arm))
-    if lagged is not None and len(lagged.points):
-        friction_arm = _friction_arms(contact, arm, pose, lagged, start)
-        result = result + contact.friction_hessian @ _jacobian(friction_arm)
-    if exact:
-        result[:, :, pose.dim :] += rotation_derivative(contact.normal)
-    if (facets := contact.facets) is not None:
-        blocks = (facets.hessian if exact else facets.stiffness) @ _facet_jacobian(facets, x, pose)
-        rows = np.searchsorted(contact.points, facets.corners)
-        np.add.at(result, rows, blocks.reshape(*rows.shape, x.shape[1], -1))
-    return result
-
-
-def _friction_arms(contact: ContactForces, arm: Values, pose: Pose, lagged: LaggedContact, start: Pose) -> Values:
-    """(k, d) arms of the points of the obstacle that were under the points in lagged contact, m."""
-    arm, rotation = arm.copy(), pose.rotation @ start.rotation.T
-    arm[np.searchsorted(contact.points, lagged.points)] = (lagged.obstacle_point - start.centre) @ rotation.T
-    return arm
-
-
 def _jacobian(arm: Values) -> Values:
     """(n, d, p) J of arms (n, d), m."""
     d, by_rotation = arm.shape[1], rotation_derivative(arm)
@@ -212,22 +189,7 @@ def _jacobian(arm: Values) -> Values:
     return J
 
 
-def _facet_jacobian(facets: FacetCoupling, x: Values, pose: Pose) -> Values:
-    """(k, c d, p) J of the corners of facets."""
-    k, c = facets.corners.shape
-    d = x.shape[1]
-    return _jacobian(x[facets.corners.reshape(-1)] - pose.centre).reshape(k, c * d, -1)
-
-
-def _congruence(J: Values, blocks: Values) -> Values:
-    """(p, p) sum of J^T B J over blocks B (n, i, i) and J (n, i, p)."""
-    n, i, p = J.shape
-    return np.asarray(J.reshape(n * i, p).T @ (blocks @ J).reshape(n * i, p))
-
-
-def _rotating_forces(gradient: Values, arm: Values) -> Values:
-    """(p, p) second derivative due to normal forces, which rotate with the obstacle."""
-    d = arm.shape[1]
-    mixed = rotation_derivative(gradient).sum(axis=0)
-    by_rotation = rotation_second_derivative(gradient, arm).sum(axis=0)
-    return np.block([[np.zeros((d, d)), mixed], [mixed.T, by_rotation]])
+def _product(J: Values, values: Values) -> Values:
+    """(p, q) sum of J^T V over n points, J (n, d, p), V (n, d, q)."""
+    n, d, p = J.shape
+    return np.asarray(J.reshape(n * d, p).T @ values.reshape(n * d, values.shape[2]))

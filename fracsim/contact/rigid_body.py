@@ -64,12 +64,11 @@ class SystemDerivatives:
 
     Attributes:
         bodies: derivatives of each; their energies sum to that of all.
-        mixed: of pairs (i, j), i < j, second derivatives (p, p) of their energy by the increments of both poses, exact
-            and of the positive part.
+        mixed: of pairs (i, j), i < j, second derivatives (p, p) of their energy by the increments of both poses.
     """
 
     bodies: Sequence[PoseDerivatives]
-    mixed: Mapping[tuple[int, int], tuple[Values, Values]] = field(default_factory=dict)
+    mixed: Mapping[tuple[int, int], Values] = field(default_factory=dict)
 
     @property
     def energy(self) -> float:
@@ -96,39 +95,40 @@ class RigidSystem:
         """Values of each obstacle, of an array of all."""
         return np.split(values, self._ends[:-1])
 
-    def system(self, z: Sequence[Values], contact: SystemDerivatives) -> tuple[Values, Values, Values]:
-        """(K,) gradient of Phi / s, (K, K) Hessian of Phi / s^2, and its positive definite part."""
-        parts = [step.system(z_i, body) for step, z_i, body in zip(self._steps, z, contact.bodies, strict=True)]
-        size = int(self._ends[-1])
-        blocks = [slice(end - len(g), end) for end, (g, _, _) in zip(self._ends, parts, strict=True)]
-        hessian, stiffness = np.zeros((size, size)), np.zeros((size, size))
-        for block, (_, exact, positive) in zip(blocks, parts, strict=True):
-            hessian[block, block], stiffness[block, block] = exact, positive
-        for (i, j), mixed in contact.mixed.items():
+    def system(self, z: Sequence[Values], contact: SystemDerivatives, *, exact: bool) -> tuple[Values, Values]:
+        """(K,) gradient of Phi / s, and (K, K) Hessian of Phi / s^2; positive definite unless `exact`."""
+        items = zip(self._steps, z, contact.bodies, strict=True)
+        parts = [step.system(z_i, body, exact=exact) for step, z_i, body in items]
+        hessian = np.zeros((int(self._ends[-1]),) * 2)
+        blocks = [slice(end - len(g), end) for end, (g, _) in zip(self._ends, parts, strict=True)]
+        for block, (_, of_body) in zip(blocks, parts, strict=True):
+            hessian[block, block] = of_body
+        for (i, j), coupling in contact.mixed.items():
             T, S = self._steps[i].pose_jacobian(z[i]), self._steps[j].pose_jacobian(z[j])
-            for matrix, coupling in zip((hessian, stiffness), mixed, strict=True):
-                matrix[blocks[i], blocks[j]] = self._factor * T.T @ coupling @ S
-                matrix[blocks[j], blocks[i]] = matrix[blocks[i], blocks[j]].T
-        return np.concatenate([g for g, _, _ in parts]), hessian, stiffness
+            hessian[blocks[i], blocks[j]] = self._factor * T.T @ coupling @ S
+            hessian[blocks[j], blocks[i]] = hessian[blocks[i], blocks[j]].T
+        return np.concatenate([g for g, _ in parts]), hessian
 
     def minimise(
         self,
         z: Sequence[Values],
-        contact: Callable[[Sequence[Values]], SystemDerivatives],
+        contact: Callable[[Sequence[Values], bool], SystemDerivatives],
         free: Callable[[Sequence[Values], Sequence[Values]], float],
-    ) -> tuple[Sequence[Values], SystemDerivatives]:
-        """Minimiser of Phi by Newton's method from z, and the derivatives of contact there (collective).
+    ) -> Sequence[Values]:
+        """Minimiser of Phi by Newton's method from z (collective).
 
         Args:
             z: start.
-            contact: z -> derivatives of contact, of all ranks.
+            contact: z, whether exact -> derivatives of contact, of all ranks.
             free: z, dz -> fraction of dz on which no gap closes.
         """
-        derivatives, weight = contact(z), self._factor * self.level**2
+        derivatives, weight = contact(z, True), self._factor * self.level**2
         phi = self._free_potential(z) + weight * derivatives.energy
         for _ in range(SOLVER.max_iterations):
-            gradient, hessian, stiffness = self.system(z, derivatives)
-            step: Values = np.asarray(-_solve(hessian, stiffness, gradient) / self.level)
+            gradient, hessian = self.system(z, derivatives, exact=True)
+            if not is_positive_definite(hessian):
+                _, hessian = self.system(z, contact(z, False), exact=False)
+            step: Values = np.asarray(-solve_matrix(hessian, gradient) / self.level)
             decrement, dz = -self.level * float(gradient @ step), self.split(step)
             scale = self.energy_scale(z, derivatives)
             if not decrement > SOLVER.decrement_tolerance * scale:
@@ -136,7 +136,7 @@ class RigidSystem:
             fraction, tolerance = free(z, dz), SOLVER.round_off * (scale + abs(phi))
             while fraction > SOLVER.min_fraction:
                 trial = [z_i + fraction * dz_i for z_i, dz_i in zip(z, dz, strict=True)]
-                trial_derivatives = contact(trial)
+                trial_derivatives = contact(trial, True)
                 trial_phi = self._free_potential(trial) + weight * trial_derivatives.energy
                 if trial_phi <= phi - SOLVER.sufficient_decrease * fraction * decrement + tolerance:
                     break
@@ -144,7 +144,7 @@ class RigidSystem:
             else:
                 break
             z, derivatives, phi = trial, trial_derivatives, trial_phi
-        return z, derivatives
+        return z
 
     def energy_scale(self, z: Sequence[Values], contact: SystemDerivatives) -> float:
         """Size of the energies of which Phi is the difference, J."""
@@ -161,13 +161,6 @@ def _minimum_of_parabola(rise: float, decrement: float) -> float:
     if not np.isfinite(rise):
         return high
     return float(np.clip(decrement / (2 * (rise + decrement)), low, high))
-
-
-def _solve(hessian: Values, stiffness: Values, gradient: Values) -> Values:
-    """H^-1 g, where H is the Hessian if it is positive definite, else the stiffness."""
-    with np.errstate(all="ignore"):
-        matrix = hessian if is_positive_definite(hessian) else stiffness
-        return np.asarray(np.linalg.solve(matrix, gradient), np.float64)
 
 
 def is_positive_definite(matrix: Values) -> bool:
@@ -273,19 +266,20 @@ class RigidStep:
         weight = self.body.gravity_potential(self.pose(z))[0]
         return inertia + self.share**2 * weight - self.share * float(self.weight_load @ z)
 
-    def system(self, z: Values, contact: PoseDerivatives) -> tuple[Values, Values, Values]:
-        """(k,) gradient of Phi / s, (k, k) Hessian of Phi / s^2, and its positive definite part."""
+    def system(self, z: Values, contact: PoseDerivatives, *, exact: bool) -> tuple[Values, Values]:
+        """(k,) gradient of Phi / s, and (k, k) Hessian of Phi / s^2; positive definite unless `exact`."""
         d, T = self.start.pose.dim, self.pose_jacobian(z)
         _, weight_gradient, weight_hessian = self.body.gravity_potential(self.pose(z))
         forces = self.factor * contact.gradient + weight_gradient
         inertia = self.c_a * self.M @ (self.share * z - self.z_a)
         gradient = inertia + self.share * T.T @ forces - self.weight_load
-        stiffness = self.c_a * self.M + self.factor * T.T @ contact.stiffness @ T
+        if not exact:
+            return gradient, self.c_a * self.M + self.factor * T.T @ contact.hessian @ T
         by_jacobian = np.zeros_like(weight_hessian)
         by_jacobian[d:, d:] = left_jacobian_derivative(self.increment(z)[d:], forces[d:])
         by_pose = T.T @ (self.factor * contact.hessian + weight_hessian) @ T
-        hessian = self.c_a * self.M + by_pose + self.body.motion_basis.T @ by_jacobian @ self.body.motion_basis
-        return gradient, hessian, stiffness
+        by_pose = by_pose + self.body.motion_basis.T @ by_jacobian @ self.body.motion_basis
+        return gradient, self.c_a * self.M + by_pose
 
     def energy_scale(self, z: Values) -> float:
         """Size of the energies of which Phi is the difference, J."""

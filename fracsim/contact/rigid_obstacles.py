@@ -69,7 +69,7 @@ class ObstacleContactTerm(Protocol):
     def wrenches(self, numbers: Sequence[int]) -> Increments:
         """(p,) force and moment of the body on obstacles at the current u, N and N m, of all ranks (collective)."""
 
-    def pose_derivatives(self, numbers: Sequence[int]) -> Mapping[int, PoseDerivatives]:
+    def pose_derivatives(self, numbers: Sequence[int], *, exact: bool) -> Mapping[int, PoseDerivatives]:
         """Energy and derivatives by poses, of all ranks (collective)."""
 
     def mixed_hessians(self, numbers: Sequence[int]) -> Increments:
@@ -372,11 +372,12 @@ class FreeRigidObstacles(RigidObstacles):
         self._unknowns.discard()
         super()._tell_moved()
 
-    def pose_derivatives(self) -> dict[int, PoseDerivatives]:
+    def pose_derivatives(self, *, exact: bool) -> dict[int, PoseDerivatives]:
         """Energy and derivatives of contact with the body by the pose of each free obstacle (collective)."""
         result: dict[int, PoseDerivatives] = {}
         for contact in self._contacts:
-            result |= contact.pose_derivatives([number for number in self.free if number in contact.numbers])
+            numbers = [number for number in self.free if number in contact.numbers]
+            result |= contact.pose_derivatives(numbers, exact=exact)
         return result
 
     def mixed_hessians(self) -> dict[int, Values]:
@@ -395,7 +396,7 @@ class FreeRigidObstacles(RigidObstacles):
         if not self._in_step:
             return True
         allowed = all(contact.allows_exact_tangent for contact in self._contacts)
-        return allowed and self._unknowns.equations().exact_is_positive
+        return allowed and self._unknowns.equations(exact=True).is_positive
 
     def free_fraction(self, increments: Increments) -> float:
         """Fraction of increments of free poses on which no gap closes, the body at rest (collective)."""

@@ -120,7 +120,7 @@ class BodyContact(Protocol):
 
     posed: list[PosedShape]
 
-    def pose_derivatives(self) -> Mapping[int, PoseDerivatives]:
+    def pose_derivatives(self, *, exact: bool) -> Mapping[int, PoseDerivatives]:
         """Energy and derivatives by the poses of free obstacles, sums over all ranks (collective)."""
 
     def mixed_hessians(self) -> Mapping[int, Values]:
@@ -143,19 +143,17 @@ class PoseEquations:
     Attributes:
         contact: derivatives of contact.
         gradient: (K,) r_y, N and N m.
-        exact: (K, K) second derivatives of Phi.
-        positive: (K, K) positive definite part of these.
+        hessian: (K, K) second derivatives of Phi, exact or their positive definite part.
     """
 
     contact: SystemDerivatives
     gradient: Values
-    exact: Values
-    positive: Values
+    hessian: Values
 
     @cached_property
-    def exact_is_positive(self) -> bool:
+    def is_positive(self) -> bool:
         """Whether the second derivatives are positive definite."""
-        return is_positive_definite(self.exact)
+        return is_positive_definite(self.hessian)
 
 
 @dataclass(frozen=True)
@@ -163,21 +161,19 @@ class PoseSystem:
     """Part of the poses in the linear system of an iteration.
 
     Attributes:
-        gradient: (K,) r_y, N and N m.
-        D: (K, K) second derivatives of Phi, or their positive definite part.
+        equations: equations of the poses.
         touching: (K,) whether the obstacle of an unknown is in contact with the body; other columns of B are zero.
         B: (owned dofs, k) columns of these k, N/m and N.
     """
 
-    gradient: Values
-    D: Values
+    equations: PoseEquations
     touching: npt.NDArray[np.bool_]
     B: Values
 
     @cached_property
     def correction(self) -> Values:
         """(K,) D^-1 r_y, m and rad."""
-        return solve_matrix(self.D, self.gradient)
+        return solve_matrix(self.equations.hessian, self.equations.gradient)
 
 
 class PoseUnknowns:
@@ -192,7 +188,7 @@ class PoseUnknowns:
         """`body`: contact of the body with them."""
         self.free, self.pairs, self._comm, self._body = free, pairs, comm, body
         # at the current u and poses
-        self._equations: PoseEquations | None = None
+        self._equations: dict[bool, PoseEquations] = {}  # whether with exact second derivatives ->
         self._system: PoseSystem | None = None
         self._start: list[Values] = []  # z at the start of the correction
         self._change: list[Values] = []  # of z in the correction
@@ -204,7 +200,7 @@ class PoseUnknowns:
 
     def discard(self) -> None:
         """Discard equations, as u or poses have changed."""
-        self._equations = self._system = None
+        self._equations, self._system = {}, None
 
     def move_to(self, z: Sequence[Values]) -> None:
         """Move all to increments z (k,), in their order."""
@@ -223,27 +219,29 @@ class PoseUnknowns:
     def _z(self) -> list[Values]:
         return [pose.z for pose in self.free.values()]
 
-    def _contact(self) -> SystemDerivatives:
+    def _contact(self, *, exact: bool) -> SystemDerivatives:
         """Derivatives of all contact at the current poses (collective)."""
-        of_body, (of_pairs, mixed) = self._body.pose_derivatives(), self.pairs.derivatives(self._body.posed)
+        of_body = self._body.pose_derivatives(exact=exact)
+        of_pairs, mixed = self.pairs.derivatives(self._body.posed, exact=exact)
         index = {number: row for row, number in enumerate(self.free)}
         return SystemDerivatives(
             [of_body[number] + of_pairs[number] if number in of_pairs else of_body[number] for number in self.free],
-            {(index[i], index[j]): blocks for (i, j), blocks in mixed.items()},
+            {(index[i], index[j]): block for (i, j), block in mixed.items()},
         )
 
-    def equations(self) -> PoseEquations:
-        """Equations at the current u and poses (collective)."""
-        if self._equations is None:
-            contact = self._contact()
-            self._equations = PoseEquations(contact, *self._rigid_system.system(self._z, contact))
-        return self._equations
+    def equations(self, *, exact: bool) -> PoseEquations:
+        """Equations at the current u and poses, with exact second derivatives or their positive part (collective)."""
+        if exact not in self._equations:
+            contact = self._contact(exact=exact)
+            parts = self._rigid_system.system(self._z, contact, exact=exact)
+            self._equations[exact] = PoseEquations(contact, *parts)
+        return self._equations[exact]
 
     def system(self) -> PoseSystem:
         """Linear system at the current u and poses (collective)."""
         if self._system is None:
-            equations, mixed = self.equations(), self._body.mixed_hessians()
-            D = equations.exact if self._body.uses_exact_tangent() else equations.positive
+            equations = self.equations(exact=self._body.uses_exact_tangent())
+            mixed = self._body.mixed_hessians()
             touching = np.concatenate([np.full(len(pose.z), number in mixed) for number, pose in self.free.items()])
             columns = [
                 pose.step.factor * mixed[number] @ pose.step.pose_jacobian(pose.z)
@@ -251,7 +249,7 @@ class PoseUnknowns:
                 if number in mixed
             ]
             B = np.concatenate(columns, axis=1) if columns else np.empty((0, 0))
-            self._system = PoseSystem(equations.gradient, D, touching, B)
+            self._system = PoseSystem(equations, touching, B)
         return self._system
 
     # --- Newton's method ---
@@ -261,7 +259,7 @@ class PoseUnknowns:
         system = self.system()
         if not (touching := system.touching).any():
             return []
-        compliance: Values = np.asarray(np.linalg.inv(system.D), np.float64)
+        compliance: Values = np.asarray(np.linalg.inv(system.equations.hessian), np.float64)
         return [(system.B.copy(), compliance[np.ix_(touching, touching)])]
 
     def condensed_residual(self) -> Values | None:
@@ -274,10 +272,10 @@ class PoseUnknowns:
     def begin_correction(self, change: Values) -> None:
         """Compute the change of z that belongs to a change of u (owned dofs,), m (collective)."""
         system, rigid = self.system(), self._rigid_system
-        by_body = np.zeros_like(system.gradient)
+        equations, by_body = system.equations, np.zeros_like(system.equations.gradient)
         if system.touching.any():
             by_body[system.touching] = sum_over_ranks(self._comm, system.B.T @ change)
-        dy = -solve_matrix(system.D, system.gradient + by_body)
+        dy = -solve_matrix(equations.hessian, equations.gradient + by_body)
         self._start, self._change = self._z, rigid.split(np.asarray(dy / rigid.level, np.float64))
 
     def increments(self) -> dict[int, Values]:
@@ -293,21 +291,25 @@ class PoseUnknowns:
     def are_solved(self) -> bool:
         """Whether Newton's decrement of the poses is that of a solution (collective)."""
         system = self.system()
-        scale = self._rigid_system.energy_scale(self._z, self.equations().contact)
-        return float(system.gradient @ system.correction) <= SOLVER.solved_decrement * scale
+        scale = self._rigid_system.energy_scale(self._z, system.equations.contact)
+        return float(system.equations.gradient @ system.correction) <= SOLVER.solved_decrement * scale
 
     def solve(self) -> None:
         """Minimise Phi over all poses with the body held (collective)."""
-        solution, _ = self._rigid_system.minimise(self._z, self._contact_at, self._free_fraction)
-        self.move_to(solution)
+        self._leave_for(self._rigid_system.minimise(self._z, self._contact_at, self._free_fraction))
 
-    def _contact_at(self, z: Sequence[Values]) -> SystemDerivatives:
-        self.move_to(z)
-        return self._contact()
+    def _leave_for(self, z: Sequence[Values]) -> None:
+        """Move all to increments z (k,), unless they are there."""
+        if not all(np.array_equal(pose.z, z_i) for pose, z_i in zip(self.free.values(), z, strict=True)):
+            self.move_to(z)
+
+    def _contact_at(self, z: Sequence[Values], exact: bool) -> SystemDerivatives:
+        self._leave_for(z)
+        return self.equations(exact=exact).contact
 
     def _free_fraction(self, z: Sequence[Values], dz: Sequence[Values]) -> float:
         """Fraction of the changes dz from z that closes no gap, with the body at rest (collective)."""
-        self.move_to(z)
+        self._leave_for(z)
         items = zip(self.free.items(), z, dz, strict=True)
         increments = {number: pose.step.pose_change(z_i, dz_i) for (number, pose), z_i, dz_i in items}
         return self._body.free_fraction(increments)
