@@ -336,6 +336,30 @@ def test_a_cracked_body_touches_with_its_walls() -> None:
     assert inside.sum() > 10 and contact.surface.area[inside].min() > 0
 
 
+def test_crack_faces_far_from_obstacles_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk is driven along a crack and parts its walls: as with a surface of all crack faces, of which it needs only
+    those near the disk."""
+    ends, points = [], []
+    for shows_all in (False, True):
+        monkeypatch.setattr(ObstacleTerm, "shows_all_cells", shows_all)
+        disk = {"name": "wedge", "shape": "sphere", "at": [1.06, 0.26], "radius": 0.05, "velocity": [-1.0, 0.0]}
+        scene, state = make_scene(
+            mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.08, "pattern": "unstructured"},
+            boundary=[{"on": "left", "fix": "xy"}], material=SOFT, fracture={"strength": 1e9}, solver=FINE,
+            crack=[{"segment": [[0.2, 0.26], [1.0, 0.26]]}], obstacle=[disk],
+            time={"scheme": "backward-euler", "step": 0.02, "end": 0.24},
+        )  # fmt: skip
+        (contact,) = [term for term in scene.balance.terms if isinstance(term, ObstacleTerm)]
+        points.append([])
+        for _ in each_step(scene, state):
+            points[-1].append(len(contact.surface.area))
+        ends.append(state.u.copy())
+    limited, whole = points
+    assert limited[0] < limited[-1] < whole[-1] == whole[0]
+    assert np.abs(ends[1]).max() > 0.02
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-7)
+
+
 def test_an_obstacle_inside_the_body_is_refused() -> None:
     with pytest.raises(InputError, match=r"obstacle\.0: floor overlaps the body at the start, by 0\.05 m"):
         make_scene(obstacle=[floor(0.05)])

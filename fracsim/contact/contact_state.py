@@ -18,7 +18,7 @@ from .laws import CoulombFriction, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
 from .obstacle import RigidObstacle
 from .pose import PosedShape, min_distance
-from .proximity import ProximityCandidates
+from .proximity import ProximityCandidates, ShownCells, outline_radius
 from .rigid_obstacles import RigidObstacles
 from .step_limit import check_obstacles_apart, refuse_overlap
 
@@ -38,6 +38,7 @@ class ContactState:
         positions: (n, d) positions of these points at the end of the step that belongs to u, m.
     """
 
+    shows_all_cells = False  # whether crack faces far from all obstacles are part of the surface, too
     positions: Values
     _lagged: list[LaggedContact | None]  # contact at the start of the step, one per obstacle with friction
     _step_starts: list[StepStart | None]  # points at the start of the step, where barriers are averaged over it
@@ -50,6 +51,8 @@ class ContactState:
         self.bodies, self.numbers, self.law = bodies, tuple(numbers), law
         self.obstacles = tuple(bodies.obstacles[number] for number in numbers)
         self.surface = ContactSurface(domain, law.barrier.width)
+        self._shown = ShownCells(domain, law.barrier.width)
+        self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
         self._domain, self._u, self._owned = domain, u, domain.node_count * domain.dim
         self.comm = domain.comm
         self._contact_forces: list[ContactForces] | None = None
@@ -145,8 +148,44 @@ class ContactState:
         if level.dt:
             self._begin_new_step()
 
+    def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
+        """Add new crack faces near obstacles to the surface (collective)."""
+        self._pattern, u = pattern.copy(), self._end_displacement()
+        if self.shows_all_cells or not self._dt:  # before the first step obstacles need not be in place
+            self._shown.show_all()
+        elif not self._shown.update(pattern, self.posed, u, None, 0.0):
+            return
+        self._rebuild_surface(u, self.posed)
+
+    def _rebuild_surface(self, u: Values, posed: Sequence[PosedShape]) -> None:
+        """Make the surface again, with points retracted that would lie in an obstacle (collective).
+
+        Args:
+            u: (owned dofs,) displacement, m.
+            posed: obstacles at their poses.
+        """
+        gaps, facet_gaps = partial(min_distance, posed), self._facet_gap_function(posed)
+        self.surface.edges_broke(self._pattern, self._shown.flags, u, gaps, facet_gaps)
+        self._discard_start()
+
+    def _show_cells_of_step(self, posed: Sequence[PosedShape]) -> None:
+        """Make the surface again if it lacks crack faces that obstacles may reach in the step (collective)."""
+        level = self._level
+        motion, shift = level.dt * level.v_n, self._max_increment()
+        if not self.shows_all_cells and self._shown.update(self._pattern, posed, level.u_n, motion, shift):
+            self._rebuild_surface(level.u_n, posed)
+
+    def _max_increment(self) -> float:
+        """Largest motion of points of the obstacles in the step, m."""
+        d, motions = self._domain.dim, []
+        for posed, q in zip(self.posed, self.increments, strict=True):
+            rotation = float(np.linalg.norm(q[d:]))
+            motions.append(float(np.linalg.norm(q[:d])) + (rotation and rotation * outline_radius(posed)))
+        return max(motions)
+
     def _begin_new_step(self) -> None:
         posed, barrier = self.start_posed, self.law.barrier
+        self._show_cells_of_step(posed)
         self.surface.release_points(self._level.u_n, partial(min_distance, posed), self._facet_gap_function(posed))
         x = self.surface.positions(self._level.u_n)
         gaps = [shape.distance(x) for shape in posed]

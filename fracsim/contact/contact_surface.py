@@ -258,6 +258,7 @@ class ContactSurface:
     def edges_broke(
         self,
         pattern: npt.NDArray[np.uint8],
+        shown: Flags | None,
         u: Values,
         gaps: GapFunction,
         facet_gaps: FacetGapFunction | None = None,
@@ -266,6 +267,7 @@ class ContactSurface:
 
         Args:
             pattern: (cells,) broken edges of each cell.
+            shown: (cells,) flags of cells whose crack faces are part of the surface; None: all.
             u: (owned dofs,) displacements, m.
             gaps: gap function of points.
             facet_gaps: gap function of facets, where obstacles act on them.
@@ -275,7 +277,7 @@ class ContactSurface:
         gap = np.where(self.area > 0, gaps(self.positions(u)), np.nan)
         copies = old_map.copies
         retracted = RetractedPoints.select(old_identity, old_map.share[copies], gap[copies], self._width)
-        self._surface.update_damage(pattern)
+        self._surface.update_damage(pattern, shown)
         self.interpolation.destroy()
         self.interpolation, self._all, self._active = ParentMatrix(self._domain, self._surface), None, None
         point_map, nodal = self._surface.point_map, self.interpolation.nodal_values(u)
@@ -375,15 +377,15 @@ class ContactSurface:
 
     def snapshot(self) -> object:
         """Factors of arms, areas, and excluded facets."""
-        return self._surface.point_map.share, self.area, self._excluded_facets
+        return self._surface.point_map.share, self.area, self._excluded_facets, self._surface.columns
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot of this surface (not collective).
 
         Where edges have broken since, in an earlier pass of the step, the surface is another one and stays as it is.
         """
-        share, area, excluded_facets = cast("tuple[Values, Values, Ints]", memory)
-        if len(share) != len(self._surface.point_map.share):
+        share, area, excluded_facets, columns = cast("tuple[Values, Values, Ints, Ints]", memory)
+        if len(share) != len(self._surface.point_map.share) or not np.array_equal(columns, self._surface.columns):
             return
         self._excluded_facets = excluded_facets
         if share is not self._surface.point_map.share:

@@ -312,13 +312,6 @@ class ObstacleTerm(ContactState, Term):
         facets, curved = self.surface.facets_from(elements), [posed[number] for number in self._facet_obstacles]
         return retract_cut_elements(position, u, elements, lambda x: ~facets.are_open(curved, x))
 
-    def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
-        """Add new crack faces to the surface, retracted where they would lie in an obstacle (collective)."""
-        posed = self.posed
-        gaps, facet_gaps = partial(min_distance, posed), self._facet_gap_function(posed)
-        self.surface.edges_broke(pattern, self._end_displacement(), gaps, facet_gaps)
-        self._discard_start()
-
     def snapshot(self) -> object:
         """State of the surface between two steps."""
         return self.surface.snapshot()
@@ -341,6 +334,7 @@ class ObstacleTerm(ContactState, Term):
     def clear_search(self) -> None:
         """Discard results of searches, which a checkpoint does not hold (not collective)."""
         self.surface.clear_caches()
+        self._shown.discard()
         self.discard_forces()
 
     def destroy(self) -> None:

@@ -178,6 +178,8 @@ class PenaltyObstacleTerm(ObstacleTerm):
         stiffness: (n,) k_p of the points of this rank, N/m.
     """
 
+    shows_all_cells = True
+
     def __init__(
         self,
         domain: Domain,

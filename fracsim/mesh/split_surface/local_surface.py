@@ -49,19 +49,28 @@ class LocalSurface:
         self._topology = EntityNumbering(mesh)
         self.update_damage(np.zeros(len(mesh.cells), np.uint8))
 
-    def update_damage(self, pattern: npt.NDArray[np.uint8]) -> None:
-        """Rebuild the surface for patterns of broken edges (cells,) (collective)."""
-        surface = build_split_surface(self._topology, pattern)
+    def update_damage(self, pattern: npt.NDArray[np.uint8], shown: npt.NDArray[np.bool_] | None = None) -> None:
+        """Rebuild the surface (collective).
+
+        Args:
+            pattern: (cells,) broken edges of each cell.
+            shown: (cells,) flags of cells that are split; all others are drawn as if whole. None: all cells are.
+        """
+        of_shown = pattern if shown is None else np.where(shown, pattern, np.uint8(0))
+        surface = build_split_surface(self._topology, of_shown)
         if self._domain.order == 2:
             from .quadratic_surface import with_midside_points
 
-            surface = with_midside_points(surface, self._domain, pattern)
+            surface = with_midside_points(surface, self._domain, of_shown)
         area = _areas(surface, self._topology)
         self._contact_points = np.flatnonzero(area > 0)
         self.area, self._split_surface = area[self._contact_points], surface
         means = self._mean_matrix(surface)
         turning = self._domain.comm.allreduce(len(surface.parents.rotating_nodes)) > 0
-        arms = self._arm_matrix(surface, pattern) if turning else csr_matrix(means.shape)
+        intact = ~is_split(self._domain.dim)[pattern]
+        if shown is not None:
+            intact &= shown  # so that damage elsewhere changes no arm
+        arms = self._arm_matrix(surface, intact) if turning else csr_matrix(means.shape)
         self.columns, (means, arms) = _restrict_to_used_columns([means, arms])
         middle = mean_parent_positions(surface.points, surface.parents)[self._contact_points]
         out = surface.points[self._contact_points] - middle
@@ -88,8 +97,11 @@ class LocalSurface:
         start, entries = _parents_of(surface, self._contact_points)
         return self._global_matrix(start, self._global_numbers(surface.parents.parents[entries]), _shares(start))
 
-    def _arm_matrix(self, surface: SplitSurface, pattern: npt.NDArray[np.uint8]) -> csr_matrix:
-        """(points, global nodes) matrix of the means over parents of arm times averaged gradient (collective)."""
+    def _arm_matrix(self, surface: SplitSurface, intact: npt.NDArray[np.bool_]) -> csr_matrix:
+        """(points, global nodes) matrix of the means over parents of arm times averaged gradient (collective).
+
+        `intact`: (cells,) flags of the cells of which gradients are averaged.
+        """
         comm, d = self._domain.comm, self._domain.dim
         start, entries = _parents_of(surface, self._contact_points)
         parents, arm = surface.parents.parents[entries], surface.parents.arm[entries]
@@ -100,21 +112,21 @@ class LocalSurface:
         left = _assemble_petsc(
             comm, (count, d * self._domain.node_count), arms, rank_offset(comm, count) + np.arange(count)
         )
-        right = self._gradient_matrix(pattern, parents[np.any(arm != 0, axis=1)])
+        right = self._gradient_matrix(intact, parents[np.any(arm != 0, axis=1)])
         product = left.matMult(right)
         rows, nodes, values = product.getValuesCSR()
         for matrix in (left, right, product):
             matrix.destroy()
         return self._global_matrix(rows, nodes, values)
 
-    def _gradient_matrix(self, pattern: npt.NDArray[np.uint8], parents: Ints) -> PETSc.Mat:
+    def _gradient_matrix(self, intact: npt.NDArray[np.bool_], parents: Ints) -> PETSc.Mat:
         """(d nodes, nodes) matrix of d/dX_j of a nodal field, averaged over intact cells (collective).
 
         Rows are right for nodes that are among the `parents` of any rank.
         """
         domain, d = self._domain, self._domain.dim
         wanted = self._sum_over_ranks(parents, 1.0) > 0
-        cells = np.flatnonzero(~is_split(d)[pattern] & wanted[domain.cell_nodes].any(axis=1))
+        cells = np.flatnonzero(intact & wanted[domain.cell_nodes].any(axis=1))
         corners, volume = domain.cell_nodes[cells].astype(np.int64), domain.volumes[cells][:, None]
         # sums at other nodes lack cells: their rows are not used
         around = np.maximum(self._sum_over_ranks(corners, volume), np.finfo(float).tiny)
