@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from fracsim.contact.penalty_mesh_obstacles import PenaltyMeshObstacleTerm
+from fracsim.contact.penalty_contact import PenaltyMeshContact
 from fracsim.contact.pose import Pose
 from fracsim.contact.triangle_mesh_shape import is_inside
 from fracsim.scene import Scene
@@ -26,8 +26,8 @@ Values = npt.NDArray[np.float64]
 EXPLICIT = {"scheme": "explicit", "step": 5e-3}
 
 
-def term_of(scene: Scene) -> PenaltyMeshObstacleTerm:
-    (found,) = [term for term in scene.balance.terms if isinstance(term, PenaltyMeshObstacleTerm)]
+def term_of(scene: Scene) -> PenaltyMeshContact:
+    (found,) = [term for term in scene.balance.terms if isinstance(term, PenaltyMeshContact)]
     return found
 
 
@@ -39,7 +39,7 @@ def falling(obstacle: dict[str, Any], velocity: list[float], end: float, **table
     } | tables)  # fmt: skip
 
 
-def deepest(term: PenaltyMeshObstacleTerm) -> float:
+def deepest(term: PenaltyMeshContact) -> float:
     """How deep points of the body lie in the obstacle, or its points in the body: by trimesh, m."""
     x, surface = term._end_positions(), term._surface
     assert x is not None and surface is not None
@@ -222,5 +222,5 @@ def test_poses_are_those_of_the_path(tmp_path: Path) -> None:
     for _ in each_step(scene, state):
         pass
     term = term_of(scene)
-    assert term._is_far() and last(scene)["work_block"] == 0
-    np.testing.assert_allclose(term._meshes[0].pose.centre, Pose.at_point(np.array([9.02, 9.0, 9.0])).centre)
+    assert term._is_idle() and last(scene)["work_block"] == 0
+    np.testing.assert_allclose(term._all_meshes[0].pose.centre, Pose.at_point(np.array([9.02, 9.0, 9.0])).centre)

@@ -11,10 +11,10 @@ import numpy.typing as npt
 import pytest
 from scipy.sparse import eye
 
+from fracsim.contact.penalty_contact import PenaltyContact, PenaltySurface
 from fracsim.contact.penalty_contacts import ContactStiffness
 from fracsim.contact.penalty_pairs import PenaltyPairs
 from fracsim.contact.penalty_point_facet import penalty_stiffness
-from fracsim.contact.penalty_self_contact import PenaltyContactSurface, PenaltySelfContact
 from fracsim.meshes.builders.box import Box
 from fracsim.scene import Scene
 from support.resumed import assert_alike, going_stopped_resumed
@@ -25,8 +25,8 @@ from test_self_contact import SOFT, two_blocks
 Values = npt.NDArray[np.float64]
 
 
-def contact_of(scene: Scene) -> tuple[PenaltySelfContact, PenaltyContactSurface]:
-    (found,) = [term for term in scene.balance.terms if isinstance(term, PenaltySelfContact)]
+def contact_of(scene: Scene) -> tuple[PenaltyContact, PenaltySurface]:
+    (found,) = [term for term in scene.balance.terms if isinstance(term, PenaltyContact)]
     assert found._surface is not None
     return found, found._surface
 
@@ -189,7 +189,7 @@ def test_nothing_is_looked_for_where_nothing_is_near(tmp_path: Path, monkeypatch
     ends, looks = [], []
     for always in (False, True):
         if always:
-            monkeypatch.setattr(PenaltySelfContact, "_measure_clearance", lambda self: None)
+            monkeypatch.setattr(PenaltyContact, "_measure_clearance", lambda self, x: None)
         scene, state = make_scene(
             mesh={"file": two_blocks(tmp_path, 2, 0.1)}, material=SOFT, contact={},
             time={"scheme": "explicit", "step": 0.02, "end": 0.6},
@@ -272,9 +272,9 @@ def test_rubbing_is_in_the_books(tmp_path: Path) -> None:
         np.testing.assert_allclose(after, before, atol=1e-12 * before[0])
         assert report.kinetic + report.elastic + state.dissipated == pytest.approx(began, rel=0.02)
         x = contact._end_positions()
-        assert x is not None and contact._friction is not None
+        assert x is not None
         met = surface.pairs.contacts(x)
-        pull = met.spring_stiffness * np.linalg.norm(contact._friction.slips(x), axis=1)
+        pull = met.spring_stiffness * np.linalg.norm(surface.pairs.history.points.slip[met.points[:, 0]], axis=1)
         assert (pull <= 0.3 * met.spring_stiffness * (surface.pairs.width - met.gap) * (1 + 1e-12)).all()
         slid = max(slid, float(pull.sum()))
     right = X[:, 0] > 1.01

@@ -10,8 +10,7 @@ Terms of the balance:
     mesh_obstacle_term    the body before triangle-mesh obstacles
     self_contact          a body with itself, and its fragments with one another
     penalty_obstacles     the body before analytic obstacles in explicit steps
-    penalty_mesh_obstacles  the body before triangle-mesh obstacles in explicit steps
-    penalty_self_contact  a body with itself in explicit steps
+    penalty_contact       the body with itself, and before triangle-mesh obstacles, in explicit steps
 
 Laws and geometry:
 

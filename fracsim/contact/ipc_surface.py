@@ -147,7 +147,7 @@ class SelfContactSurface:
             fewer searches, and more candidates after them.
     """
 
-    face_gap: ClassVar[float] = SURFACE.face_gap
+    face_gap: float = SURFACE.face_gap
     closed_pressure: ClassVar[float] = SURFACE.closed_pressure
     search_all_faces: ClassVar[bool] = False
 

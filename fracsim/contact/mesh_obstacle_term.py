@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -163,7 +163,7 @@ class MeshObstacleTerm(SelfContact):
         self.allows_exact_tangent = not any(obstacle.free for obstacle in self.obstacles)
         # on rank 0 alone
         items = zip(self.numbers, self.obstacles, strict=True)
-        self._meshes = on_root(domain.comm, lambda: [_build_mesh(*item, edge) for item in items]) or []
+        self._meshes = on_root(domain.comm, lambda: [build_mesh_obstacle(*item, edge) for item in items]) or []
         self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
         self._proximity = ProximityTest(domain, self.obstacles, law.distance)
         self._started_near = True
@@ -546,17 +546,29 @@ class MeshObstacleTerm(SelfContact):
             return [0.0] * len(self.obstacles)
         motion, result = self._dt * (self._surface.point_map.weights @ v), []
         for pairs, start_pose in zip(self._surface.pairs.pairs, self._start_poses, strict=True):
-            force = -pairs.body_gradient(x)
-            size = np.linalg.norm(force, axis=1)
-            pushed = size > 0
-            obstacle_motion = x[pushed] - start_pose.points_to_space(pairs.mesh.pose.to_body(x[pushed]))
-            normal = force[pushed] / size[pushed, None]
-            approach = np.einsum("ni,ni->n", obstacle_motion - motion[pushed], normal)
-            result.append(float(approach.max(initial=0.0)))
+            result.append(approach(pairs, start_pose, x, motion))
         return result
 
 
-def _build_mesh(number: int, obstacle: RigidObstacle, edge: float) -> MeshObstacle:
+def approach(pairs: MeshObstaclePairs[Any], start_pose: Pose, x: Values, motion: Values) -> float:
+    """Largest approach in a step of an obstacle and the points that it pushes, m.
+
+    Args:
+        pairs: with the obstacle, at the end of the step.
+        start_pose: of the obstacle.
+        x: (n, 3) points of the body, m.
+        motion: (n, 3) of these without contact, m.
+    """
+    force = -pairs.body_gradient(x)
+    size = np.linalg.norm(force, axis=1)
+    pushed = size > 0
+    obstacle_motion = x[pushed] - start_pose.points_to_space(pairs.mesh.pose.to_body(x[pushed]))
+    normal = force[pushed] / size[pushed, None]
+    distance = np.einsum("ni,ni->n", obstacle_motion - motion[pushed], normal)
+    return float(distance.max(initial=0.0))
+
+
+def build_mesh_obstacle(number: int, obstacle: RigidObstacle, edge: float) -> MeshObstacle:
     """Obstacle at the start, with triangles as small as those of the body (rank 0)."""
     shape = obstacle.shape
     assert isinstance(shape, TriangleMeshShape)

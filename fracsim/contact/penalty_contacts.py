@@ -43,6 +43,14 @@ class ContactStiffness:
         """Stiffness of a surface in contact with itself, of k_p (n,), N/m."""
         return cls(stiffness, stiffness, np.ones(len(stiffness)))
 
+    def followed_by(self, other: ContactStiffness) -> ContactStiffness:
+        """Stiffness of these points, then of others."""
+        return ContactStiffness(
+            np.concatenate([self.point, other.point]),
+            np.concatenate([self.limit, other.limit]),
+            np.concatenate([self.reduction, other.reduction]),
+        )
+
 
 @dataclass(frozen=True)
 class PenaltyContacts:

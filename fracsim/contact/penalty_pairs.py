@@ -23,7 +23,7 @@ from .ipc_pairs import IpcPairs
 from .laws import slipped, tangential
 from .penalty_contacts import ContactStiffness, PenaltyContacts, concatenate_contacts
 from .penalty_edges import EdgeContacts, EdgePairHistory
-from .penalty_point_facet import POINT_FACET, PointFacetContacts, PointHistory
+from .penalty_point_facet import NO_FACET, POINT_FACET, PointFacetContacts, PointHistory
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -42,6 +42,11 @@ class PenaltyHistory:
 
     points: PointHistory
     edges: EdgePairHistory | None
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing was near contact."""
+        return not (self.points.facets != NO_FACET).any() and (self.edges is None or not len(self.edges.side))
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Arrays for a checkpoint."""

@@ -57,6 +57,10 @@ class Pose:
         """Dimension d, 2 or 3."""
         return len(self.centre)
 
+    def equals(self, other: Pose) -> bool:
+        """Whether both are the same."""
+        return bool(np.array_equal(self.centre, other.centre) and np.array_equal(self.rotation, other.rotation))
+
     def to_body(self, x: Values) -> Values:
         """(n, d) X = R^T (x - c) of points x (n, d), m."""
         return np.asarray((x - self.centre) @ self.rotation)

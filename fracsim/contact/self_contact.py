@@ -56,7 +56,7 @@ class SelfContact(Term):
         self._coupling = CouplingBuilder(domain)
         # m^(d-2), times a stiffness in Pa
         self._stiff_threshold = SURFACE.stiff_ratio * domain.mean_edge_length ** (domain.dim - 2)
-        mesh = _refined(domain) if self._is_refined(law) else domain.input_mesh
+        mesh = refined_mesh(domain) if self._is_refined(law) else domain.input_mesh
         self._skeleton = None if mesh is None else EntityNumbering(mesh)
         self._gather = node_gather(domain, law)
         first = domain.space.dofmap.index_map.local_range[0]
@@ -345,7 +345,7 @@ def node_gather(domain: Domain, law: SelfContactLaw) -> Gather:
     return domain.input_numbering.gather_corners if law.corners_only else domain.input_numbering.gather_nodes
 
 
-def _refined(domain: Domain) -> MeshData | None:
+def refined_mesh(domain: Domain) -> MeshData | None:
     """Input mesh with quadratic cells subdivided into linear ones."""
     from ..mesh.split_surface.quadratic_surface import subdivided_input_mesh
 

@@ -232,12 +232,12 @@ def _build_mesh_obstacle_term(
         _obstacle_law(contact, domain, material).barrier.width, stiffness, 0.0, obstacle_law.sticking_speed,
         obstacle_law.sticking_ratio, corners_only=_uses_corners_only(study),
     )  # fmt: skip
-    make: Callable[..., MeshObstacleTerm] = partial(MeshObstacleTerm, domain, u, motion, numbers)
+    make: Callable[..., Any] = partial(MeshObstacleTerm, domain, u, motion, numbers)
     if not scheme.implicit:
-        from ..contact.penalty_mesh_obstacles import PenaltyMeshObstacleTerm
+        from ..contact.penalty_contact import PenaltyMeshContact
 
         limit = _max_added_frequency(contact, domain, stress)
-        make = partial(PenaltyMeshObstacleTerm, domain, u, motion, numbers, mass=mass, max_added=limit)
+        make = partial(PenaltyMeshContact, domain, u, motion, numbers, mass=mass, max_added=limit)
     return _fit_distance(make, law, contact, "an obstacle from a file and the body")
 
 
@@ -284,8 +284,8 @@ def build_explicit_self_contact_term(
 ) -> Term:
     """Return the term of self-contact for explicit steps (collective); `mass`: (owned dofs,) lumped, kg."""
     limit = _max_added_frequency(_contact(study), domain, stress)
-    module = _import_with_ipctk("penalty_self_contact")
-    make = partial(module.PenaltySelfContact, domain, u, mass=mass, max_added=limit)
+    module = _import_with_ipctk("penalty_contact")
+    make = partial(module.PenaltyContact, domain, u, mass=mass, max_added=limit)
     return _build_self_contact(study, domain, stress.material, DEFAULTS.distance, make)
 
 
