@@ -307,6 +307,7 @@ class PenaltyContact(Term):
         """Discard positions and forces, as u has changed."""
         self._idle: bool | None = None  # at the current u; None: not known yet
         self._positions: Values | None = None
+        self._has_positions = False  # the same on all ranks
         self._nodal_forces: Values | None = None
         self._gradients: list[Values] | None = None
 
@@ -357,8 +358,8 @@ class PenaltyContact(Term):
 
     def _end_positions(self) -> Values | None:
         """(n, d) positions at the current u, m, on rank 0 (collective)."""
-        if self._positions is None:
-            nodal = self._gathered(self._current_u)
+        if not self._has_positions:
+            self._has_positions, nodal = True, self._gathered(self._current_u)
             if self._surface is not None and nodal is not None:
                 self._positions = self._surface.point_map(nodal)
         return self._positions
