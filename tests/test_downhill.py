@@ -43,6 +43,8 @@ ROUND = [100.0, 10.0, 0.1, *[0.11] * 30]  # exact below a hundredth: from the th
         (ROUND, None, None),
         ([1.0] * 30, EXACT_TANGENTS, DEFAULT_POLICY.max_stalled_iterations),
         ([100.0, 10.0, *[20.0] * 30], POSITIVE_TANGENTS[0], None),  # far away residuals may rise
+        # but not several times, which leaves an unstable equilibrium
+        ([100.0, 10.0, *(11.0 * 1.1**k for k in range(30))], POSITIVE_TANGENTS[2], 1 + 10),
         ([100.0, *(0.5 * 0.99**k for k in range(30))], POSITIVE_TANGENTS[0], None),
     ],
 )

@@ -222,9 +222,10 @@ class ModifiedNewton:
             clip_correction(self._balance.domain, y, self.snes.getFunction()[0], self._policy)
 
     def has_stalled(self, norm: float, its: int) -> bool:
-        """Return True if the attempt cycles between iterates.
+        """Return True if the attempt cycles between iterates, or leaves an unstable equilibrium.
 
-        Exact tangents that are indefinite without being noticed by CG lead past the solution again and again.
+        Exact tangents that are indefinite without being noticed by CG lead past the solution again and again. Positive
+        ones lead away from it: |r| grows for many iterations.
 
         Args:
             norm: |r|, N.
@@ -232,8 +233,10 @@ class ModifiedNewton:
         """
         if norm < self._smallest_norm or not its:
             self._smallest_norm, self._smallest_at = norm, its
-        is_exact = self._modification is not None and self.eigenvalue_floor() is None
-        return is_exact and its - self._smallest_at >= self._policy.max_stalled_iterations
+        is_exact, policy = self.eigenvalue_floor() is None, self._policy
+        if self._modification is None or its - self._smallest_at < policy.max_stalled_iterations:
+            return False
+        return is_exact or norm > policy.divergence_ratio * self._smallest_norm
 
     def destroy(self) -> None:
         """Free PETSc's objects."""

@@ -43,8 +43,11 @@ class SolverPolicy:
     near_solution_ratio: float = 1e3
     # Share of all nodes whose correction may be clipped. Clipping more would slow the motion of a whole fragment.
     max_clipped_nodes: float = 0.03
-    # Iterations with exact tangents without a smaller |r|, after which an attempt is given up: it cycles.
+    # Iterations without a smaller |r|, after which an attempt is given up: with exact tangents it cycles. With positive
+    # ones |r| has also to be this multiple of its smallest value: a granite cylinder that breaks took 50 iterations to
+    # diverge, and 3 with half the step.
     max_stalled_iterations: int = 10
+    divergence_ratio: float = 2.0
     # Share of the largest |r| of an attempt below which its tangents are exact, and mean moduli of a cell: negative
     # eigenvalues above minus this floor stay. Measured on a doormat and a jelly that tear.
     exact_below: float = 1e-2

@@ -267,8 +267,9 @@ class Preconditioner:
         `counts_solve`: whether the solve follows, so that iterations of the last one are added to the sums.
         """
         policy, equivalent = self._policy, self._equivalent
-        # Many edges broke.
-        if self._edges_since_update > policy.refresh_edges * self._node_count:
+        # Many edges broke. The V cycle has the fine level of each tangent, and is judged by its iterations.
+        is_old = self._edges_since_update > policy.refresh_edges * self._node_count
+        if is_old and self.applied.vcycle is None:
             self._due = max(self._due, Update.REFRESH)
         if self._due == Update.NONE:
             self._learn_from_solve(equivalent)
