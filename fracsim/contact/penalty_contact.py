@@ -659,7 +659,7 @@ class PenaltyMeshContact(PenaltyContact):
             if number in self.bodies.free and not part.is_far(x):
                 obstacle, posed = cast("VerletObstacle", self.bodies.free[number]), self.bodies.posed[number]
                 points = part.points(x)
-                near = part.contact.near_contacts(points)
+                near = part.contact.contacts_ahead(points)
                 positions = near.positions(points, np.arange(len(points)) >= len(x))
                 stiffness = obstacle.spring_stiffness(positions, near.stiffness, posed)
                 squares.append(obstacle.max_frequency(stiffness, posed))
@@ -682,10 +682,12 @@ class PenaltyMeshContact(PenaltyContact):
 
     def _wrenches_on_root(self, x: Values) -> list[Values]:
         """(6,) force and moment of the body at x (n, 3), m, on each obstacle about its reference point, N and N m."""
-        return [
-            resultant(-gradient[len(x) :], mesh.positions - mesh.pose.centre)
-            for mesh, gradient in zip(self._all_meshes, self._part_gradients(x), strict=True)
-        ]
+        result = []
+        for mesh, gradient in zip(self._all_meshes, self._part_gradients(x), strict=True):
+            force = -gradient[len(x) :]
+            pressed = force.any(axis=1)
+            result.append(resultant(force[pressed], mesh.positions[pressed] - mesh.pose.centre))
+        return result
 
     # --- columns of history.csv, and figures for the end of a run ---
 

@@ -287,7 +287,7 @@ class MeshContacts:
         """Positions (k, 3), m, and stiffness (k,), N/m, of contacts that may act a step later; None: none."""
         if (x := self._near_positions(poses)) is None:
             return None
-        near = self._pairs.near_contacts(x)
+        near = self._pairs.contacts_ahead(x)
         return (near.positions(x, np.arange(len(x)) < self._count), near.stiffness) if len(near.gap) else None
 
     def snapshot(self) -> PenaltyHistory:

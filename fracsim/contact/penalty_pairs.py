@@ -105,6 +105,7 @@ class PenaltyPairs(IpcPairs):
         )
         self._near: tuple[Values, PenaltyContacts, PenaltyContacts] | None = None  # of the last x
         self._touching: PenaltyContacts | None = None  # those of them in contact
+        self._ahead: tuple[Values, PenaltyContacts] | None = None  # of the end of the last step
 
     @property
     def history(self) -> PenaltyHistory:
@@ -116,7 +117,7 @@ class PenaltyPairs(IpcPairs):
         self._points.history = history.points
         if self._edges is not None and history.edges is not None:
             self._edges.set_history(history.edges)
-        self._near = None
+        self._near = self._ahead = None
 
     def energy(self, x: Values) -> float:
         """Energy E(x), J."""
@@ -141,6 +142,12 @@ class PenaltyPairs(IpcPairs):
         """Contacts that may be closed a step later, with points at x; those of the last x are kept."""
         return concatenate_contacts(self._near_parts(x))
 
+    def contacts_ahead(self, x: Values) -> PenaltyContacts:
+        """The same points, weights and stiffness; of the end of a step those that were found before it was stored."""
+        if self._ahead is None or not np.array_equal(x, self._ahead[0]):
+            return self.near_contacts(x)
+        return self._ahead[1]
+
     def _near_parts(self, x: Values) -> list[PenaltyContacts]:
         if self._near is None or not np.array_equal(x, self._near[0]):
             reach = POINT_FACET.ahead_gap * self.width
@@ -152,6 +159,7 @@ class PenaltyPairs(IpcPairs):
 
     def end_step(self, x: Values, slips: Values | None = None) -> None:
         """Store contacts at the end of a step, and slips (k, d) of the springs of `contacts`, m."""
+        self._ahead = x.copy(), self.near_contacts(x)
         points, *edges = self._near_parts(x)
         count = int((points.gap < self.width).sum())
         self._points.end_step(points, None if slips is None else slips[:count])
@@ -165,7 +173,7 @@ class PenaltyPairs(IpcPairs):
 
     def max_added_frequency(self, x: Values, nodes: csr_matrix, mass: Values) -> float:
         """Bound of the increase of the square of a frequency (PenaltyContacts.max_added_frequency), 1/s^2."""
-        return self.near_contacts(x).max_added_frequency(nodes, mass)
+        return self.contacts_ahead(x).max_added_frequency(nodes, mass)
 
     def clearance(self, x: Values) -> float:
         """Distance by which any two points at x may approach before anything is near, m; 0 if anything is."""
