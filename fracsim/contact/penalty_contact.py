@@ -452,6 +452,7 @@ class PenaltyContact(Term):
         self._friction_loss = 0.0
         if is_idle:
             return
+        self._idle_state = replace(self._idle_state)  # another object than that of the snapshot, as faces may move
         nodal = self._gathered(level.u_n)
         if self._surface is not None and nodal is not None:
             self._surface.extend_faces(nodal)
@@ -510,6 +511,9 @@ class PenaltyContact(Term):
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective)."""
         surface, contacts, idle = cast("tuple[SurfaceSnapshot, list[PenaltyHistory], IdleState]", memory)
+        self._starts = None
+        if idle is self._idle_state:
+            return
         if self._surface is not None:
             self._surface.restore(surface)
             for part, history in zip(self._surface.parts, contacts, strict=True):
@@ -517,7 +521,6 @@ class PenaltyContact(Term):
         # edges may have broken since: it is another surface
         count = self._idle_state.surface_count
         self._idle_state = idle if idle.surface_count == count else IdleState(idle.is_near, surface_count=count)
-        self._starts = None
         self.update_displacement()
 
     def to_checkpoint(self) -> dict[str, Values]:

@@ -106,15 +106,20 @@ class PenaltyPairs(IpcPairs):
         self._near: tuple[Values, PenaltyContacts, PenaltyContacts] | None = None  # of the last x
         self._touching: PenaltyContacts | None = None  # those of them in contact
         self._ahead: tuple[Values, PenaltyContacts] | None = None  # of the end of the last step
+        self._history: PenaltyHistory | None = None
 
     @property
     def history(self) -> PenaltyHistory:
-        """Contacts at the end of the last step."""
-        return PenaltyHistory(self._points.history, None if self._edges is None else self._edges.history)
+        """Contacts at the end of the last step; the same object as long as they are the same."""
+        if self._history is None:
+            self._history = PenaltyHistory(self._points.history, None if self._edges is None else self._edges.history)
+        return self._history
 
     def set_history(self, history: PenaltyHistory) -> None:
         """Set the contacts at the end of the last step."""
-        self._points.history = history.points
+        if history is self._history:
+            return
+        self._points.history, self._history = history.points, None
         if self._edges is not None and history.edges is not None:
             self._edges.set_history(history.edges)
         self._near = self._ahead = None
@@ -159,7 +164,7 @@ class PenaltyPairs(IpcPairs):
 
     def end_step(self, x: Values, slips: Values | None = None) -> None:
         """Store contacts at the end of a step, and slips (k, d) of the springs of `contacts`, m."""
-        self._ahead = x.copy(), self.near_contacts(x)
+        self._ahead, self._history = (x.copy(), self.near_contacts(x)), None
         points, *edges = self._near_parts(x)
         count = int((points.gap < self.width).sum())
         self._points.end_step(points, None if slips is None else slips[:count])
