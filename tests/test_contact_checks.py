@@ -70,17 +70,14 @@ def test_a_body_that_falls_fast_on_what_is_held(tmp_path: Path, capsys: pytest.C
     assert "at t = 0.005 s they closed in by 0.1 m in 0.005 s" in note
 
 
-def test_a_needle_passes_between_the_points(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """2 cm across, an edge of some 3.5; in explicit steps, since facets feel it in others, driven or free."""
-    tables = struck(radius=0.01, at=[0.5, 0.5])
-    tables["time"] = STRIP["time"] | {"scheme": "backward-euler"}
-    assert len(notes(tables, tmp_path / "driven", capsys)) == 1
-    tables["obstacle"][0]["mass"] = 1.0
-    assert len(notes(tables, tmp_path / "free", capsys)) == 1
-    tables["time"] = STRIP["time"] | {"scheme": "explicit"}
-    found = notes(tables, tmp_path / "explicit", capsys)
-    assert "the obstacle striker never met the body: it came no nearer than 0.37 m" in found[0]
-    assert "striker is 0.02 m across, and an edge of the mesh 0.0354 m" in found[1]
+@pytest.mark.parametrize("scheme", ("backward-euler", "explicit"))
+def test_a_needle_does_not_pass_between_the_points(
+    scheme: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """2 cm across, an edge of some 3.5: facets feel it; where it never comes, that alone is said."""
+    tables = struck(radius=0.01, at=[0.5, 0.5]) | {"time": STRIP["time"] | {"scheme": scheme}}
+    (note,) = notes(tables, tmp_path, capsys)
+    assert "the obstacle striker never met the body: it came no nearer than 0.37 m" in note
 
 
 def test_a_table_that_moves_along_is_not_fast(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

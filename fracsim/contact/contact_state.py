@@ -16,7 +16,6 @@ from .contact_surface import ContactSurface, FacetGapFunction
 from .facet_contact import ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
 from .laws import CoulombFriction, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
-from .obstacle import RigidObstacle
 from .pose import PosedShape, min_distance
 from .proximity import ProximityCandidates, ShownCells, outline_radius
 from .rigid_obstacles import RigidObstacles
@@ -86,22 +85,23 @@ class ContactState:
         """Gap from which on contact acts, m."""
         return self.law.barrier.width
 
-    def points_only_flags(self) -> list[tuple[RigidObstacle, bool]]:
-        """Each obstacle, and whether it acts on points alone and not on facets."""
-        return [(obstacle, number not in self._facet_obstacles) for number, obstacle in enumerate(self.obstacles)]
-
     def _check_facets(self) -> None:
         """Raise InputError where an obstacle cuts a facet of the body at rest (collective).
 
         Facets that are cut only by the smoothing are excluded until there is room.
         """
+        posed = self._refuse_cut_facets()
+        facet_gaps = self._facet_gap_function(posed)
+        assert facet_gaps is not None
+        self.surface.exclude_cut_facets(self.surface.rest_positions, facet_gaps)
+
+    def _refuse_cut_facets(self) -> list[PosedShape]:
+        """Raise InputError where an obstacle cuts a facet of the body at rest; the obstacles there (collective)."""
         x, posed = self.surface.rest_positions, [obstacle.posed_at(0.0) for obstacle in self.obstacles]
         for number in self._facet_obstacles:
             distances = self.surface.facets.distances(posed[number], x, 0.0)
             refuse_overlap(self.comm, distances, self.numbers[number], self.obstacles[number])
-        facet_gaps = self._facet_gap_function(posed)
-        assert facet_gaps is not None
-        self.surface.exclude_cut_facets(x, facet_gaps)
+        return posed
 
     def _facets_for(self, number: int) -> ContactFacets | None:
         """Facets on which an obstacle acts; None if it acts on points alone."""

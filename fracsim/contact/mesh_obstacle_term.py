@@ -184,10 +184,6 @@ class MeshObstacleTerm(SelfContact):
         """Gap from which on contact acts, m."""
         return self.law.distance
 
-    def points_only_flags(self) -> list[tuple[RigidObstacle, bool]]:
-        """Each obstacle and False: points, edges and faces are in contact with it."""
-        return [(obstacle, False) for obstacle in self.obstacles]
-
     # --- surface and obstacles ---
 
     def _rebuild(self) -> None:

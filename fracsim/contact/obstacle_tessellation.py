@@ -73,13 +73,6 @@ class ObstacleTessellations:
         return {obstacle.name: tessellation(shape) for obstacle, tessellation, shape in items}
 
 
-def min_extent(shape: Shape) -> float:
-    """Smallest side of the bounding box of a shape, m; infinite for a half space and a hollow shape."""
-    if isinstance(shape, HalfSpace) or not shape.convex:
-        return float("inf")
-    return float(np.ptp(shape.tessellate()[0], axis=0).min())
-
-
 def slab(normal: Values, middle: Values, side: float) -> tuple[Values, Ints]:
     """Tessellation of a slab behind the plane n . x = 0.
 

@@ -34,7 +34,7 @@ from .ipc_pairs import vertex_areas
 from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface, SurfacePairs, SurfaceSnapshot
 from .mesh_obstacle_term import approach, build_mesh_obstacle
 from .mesh_obstacles import AllMeshPairs, MeshObstacle, MeshObstaclePairs, Patches, ProximityTest, refuse_overlaps
-from .obstacle import RigidObstacle, VerletObstacle
+from .obstacle import VerletObstacle
 from .penalty_contacts import ContactStiffness
 from .penalty_pairs import PairSprings, PenaltyHistory, PenaltyPairs
 from .penalty_point_facet import penalty_stiffness
@@ -599,10 +599,6 @@ class PenaltyMeshContact(PenaltyContact):
     def barrier_width(self) -> float:
         """Gap from which on contact acts, m."""
         return self.law.distance
-
-    def points_only_flags(self) -> list[tuple[RigidObstacle, bool]]:
-        """Each obstacle and False: points, edges and faces are in contact with it."""
-        return [(obstacle, False) for obstacle in self.obstacles]
 
     # --- motion ---
 

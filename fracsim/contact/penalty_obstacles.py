@@ -2,9 +2,11 @@
 
     E(u) = sum over obstacles of  sum over points in contact of  k_p (d - gap)^2 / 2 + k_p |s|^2 / 2
 
-d is the gap below which the penalty acts, k_p the stiffness of a point, s the stretch of the spring of friction.
-k_p = kappa A_p / d, A_p the share of the point in the surface, but at most `max_added` M_p, M_p its share of its nodes'
-mass. So contact adds at most `max_added` to the square of the body's highest frequency, from which the step is taken.
+and where an obstacle is round, of the deepest points of facets off crack faces (facet_contact, with k_f in place of
+areas). d is the gap below which the penalty acts, k_p the stiffness of a point, s the stretch of the spring of
+friction. k_p = kappa A_p / d, A_p the share of the point in the surface, but at most `max_added` M_p, M_p its share of
+its nodes' mass. So contact adds at most `max_added` to the square of the body's highest frequency, from which the step
+is taken.
 Forces at the end of a step are those that the next one starts with; the work of both is summed by the trapezoidal rule,
 as in velocity Verlet.
 
@@ -18,7 +20,7 @@ Equations: docs/theory.md#explicit-contact.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import cast
 
@@ -32,7 +34,8 @@ from ..mesh.parallel import gather, sum_over_ranks
 from ..mesh.split_surface.local_surface import ParentMatrix
 from ..mesh.split_surface.point_matching import match_points
 from ..mesh.split_surface.surface_map import SurfaceMap
-from .laws import ObstacleLaw, tangential
+from .facet_contact import ContactFacets, evaluate_facets, merge_forces
+from .laws import ObstacleLaw, Penalty, tangential
 from .node_contact import ContactForces
 from .obstacle import VerletObstacle
 from .obstacle_term import ObstacleTerm
@@ -50,10 +53,14 @@ class PenaltyPolicy:
     Attributes:
         min_weight: weight of a node, in the sum of all of a point, below which it is round-off of arms that cancel.
         near_gap: gap, in widths of the penalty, of points that may be in contact a step later.
+        facet_share: part of what contact may add to the square of a frequency that facets may cause beside points.
+        max_stretch: of facets, up to which ranks agree on the points at facets in contact.
     """
 
     min_weight: float = 1e-6
     near_gap: float = 3.0
+    facet_share: float = 0.5
+    max_stretch: float = 1.5
 
 
 PENALTY = PenaltyPolicy()
@@ -149,13 +156,9 @@ class FrictionSprings:
         factor = np.divide(max_force, force, out=np.ones(len(force)), where=force > max_force)
         return FrictionSprings(points, factor[:, None] * slip, stiffness)
 
-    def dissipated(self, previous: FrictionSprings, motion: Values) -> float:
-        """Energy dissipated in a step in which points moved by `motion` (n, d), m, J.
-
-        Minus the work of friction by the trapezoidal rule, minus the change of the energy of the springs.
-        """
-        work = sum(float(np.vdot(springs.force, motion[springs.points])) for springs in (previous, self)) / 2
-        return previous.energy - self.energy - work
+    def work(self, motion: Values) -> float:
+        """Half the work of the forces by motions (k, d) of the points in a step, m, J."""
+        return 0.5 * float(np.vdot(self.force, motion))
 
 
 @dataclass(frozen=True)
@@ -212,8 +215,11 @@ class PenaltyObstacleTerm(ObstacleTerm):
         super().__init__(domain, u, bodies, numbers, law)
         self._update_stiffness()
 
-    def _find_facet_obstacles(self) -> list[int]:
-        return []  # facets have no penalty of their own
+    def _check_facets(self) -> None:
+        self._refuse_cut_facets()
+
+    def _facet_gap_function(self, posed: Sequence[PosedShape]) -> None:
+        return None  # facets may be penetrated, and crack faces have no penalty of their own
 
     # --- stiffness ---
 
@@ -225,6 +231,37 @@ class PenaltyObstacleTerm(ObstacleTerm):
         if np.isfinite(self._max_added):
             self.stiffness = np.minimum(self.stiffness, self._max_added * mass_share.point_masses(area))
         self._added_frequency, self._stiffness_of = mass_share.max_rate(self.stiffness), (point_map, area)
+        if self._facet_obstacles:
+            self._update_facets(mass_share)
+
+    def _update_facets(self, mass_share: NodalMassShare) -> None:
+        """Compute the stiffness k_f of facets off crack faces, kept as areas of ContactFacets (collective)."""
+        surface, is_copy = self.surface, np.zeros(len(self.surface.area), bool)
+        is_copy[surface.point_map.copies] = True
+        facets, k = surface.facets, self.law.barrier.curvature(np.zeros(1)) * surface.facets.area
+        if np.isfinite(self._max_added):
+            masses = mass_share.point_masses(surface.area)
+            per_mass = np.divide(surface.area, masses, out=np.zeros(len(masses)), where=masses > 0)
+            # in a row of Gershgorin's bound each facet at a node has a weight of at most 1
+            rate = facets.corners.shape[1] * per_mass[facets.corners].max(axis=1, initial=0.0)
+            limit = PENALTY.facet_share * self._max_added
+            k = np.minimum(k, limit * facets.area / np.where(rate > 0, rate, np.inf))
+        acts = ~is_copy[facets.corners].any(axis=1)
+        self._facets = ContactFacets(facets.corners[acts], k[acts], facets.smoothing)
+        self._mass_share = mass_share
+        corners = surface.rest_positions[self._facets.corners]
+        side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0.0))
+        self._facet_reach = self.law.barrier.width + PENALTY.max_stretch * self.comm.allreduce(side, op=MPI.MAX)
+
+    def _facet_frequency(self) -> float:
+        """Bound of what facets near obstacles add to the square of a frequency, 1/s^2 (collective)."""
+        if not self._facet_obstacles:
+            return 0.0
+        load, reach = np.zeros(len(self.stiffness)), PENALTY.near_gap * self.law.barrier.width
+        for number in self._facet_obstacles:
+            near = self._facets.within_reach(self.posed[number], self.positions, reach)
+            np.add.at(load, self._facets.corners[near], self._facets.area[near][:, None])
+        return self._mass_share.max_rate(load) if self.comm.allreduce(bool(load.any()), op=MPI.LOR) else 0.0
 
     def frequency_bound(self) -> float:
         """Increase of the square of the highest frequency if all points were in contact, 1/s^2 (collective).
@@ -233,13 +270,22 @@ class PenaltyObstacleTerm(ObstacleTerm):
         """
         free = {number: obstacle for number, obstacle in self.bodies.free.items() if number in self.numbers}
         of_free = cast("dict[int, VerletObstacle]", free)
-        return self._added_frequency + max(map(self._obstacle_frequency, of_free, of_free.values()), default=0.0)
+        self.obstacle_forces()
+        return (
+            self._added_frequency
+            + self._facet_frequency()
+            + max(map(self._obstacle_frequency, of_free, of_free.values()), default=0.0)
+        )
 
     def _obstacle_frequency(self, number: int, obstacle: VerletObstacle) -> float:
-        self.obstacle_forces()
-        posed = self.bodies.posed[number]
-        near = np.flatnonzero(posed.distance(self.positions) < PENALTY.near_gap * self.law.barrier.width)
+        posed, reach = self.bodies.posed[number], PENALTY.near_gap * self.law.barrier.width
+        near = self._point_candidates(posed, self.positions, reach)
+        near = near[posed.distance(self.positions[near]) < reach]
         stiffness = obstacle.spring_stiffness(self.positions[near], self.stiffness[near], posed)
+        if self.numbers.index(number) in self._facet_obstacles:
+            facets = self._facets.within_reach(posed, self.positions, reach)
+            x = self._facets.closest_points(posed, self.positions, facets).position
+            stiffness = stiffness + obstacle.spring_stiffness(x, self._facets.area[facets], posed)
         return obstacle.max_frequency(sum_over_ranks(self.comm, stiffness.reshape(-1)).reshape(stiffness.shape), posed)
 
     # --- steps ---
@@ -252,23 +298,57 @@ class PenaltyObstacleTerm(ObstacleTerm):
         self._start_points = self.surface.positions(self._level.u_n)
 
     def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
-        law, gap = self.law.barrier, posed.distance(self.positions)
-        points = np.flatnonzero((gap < law.width) & (self.surface.area > 0))
-        gap, k, normal = gap[points], self.stiffness[points], posed.normal(self.positions[points])
-        pressure = k * (law.width - gap)
-        energy, friction = 0.5 * float(pressure @ (law.width - gap)), np.zeros_like(normal)
-        if coefficient := self.obstacles[number].friction:
-            motion = self._relative_motion(number)[points]
-            springs = self._step_end.springs[number].stretched(points, motion, normal, k, coefficient * pressure)
-            self._springs[number], friction, energy = springs, springs.force, energy + springs.energy
-        return ContactForces(points, energy, pressure[:, None] * normal, friction, 0.0, _no_tangent)
+        """Forces of an obstacle at a given pose (collective)."""
+        forces = self._normal_forces(number, posed)
+        if not (coefficient := self.obstacles[number].friction):
+            return forces
+        if self.comm.size > 1 and number in self._facet_obstacles:
+            forces = self._at_shared_points(forces, posed)
+        points, k, normal = forces.points, self.stiffness[forces.points], forces.normal
+        total, k_total = normal, k
+        if self.comm.size > 1 and number in self._facet_obstacles:
+            # of a point and the facets at it ranks have other parts of the force than of the stiffness
+            sums = self.surface.sum_at_points(points, np.column_stack([normal, k]))
+            total, k_total = sums[:, :-1], sums[:, -1]
+        size = np.linalg.norm(total, axis=1)
+        direction = total / np.where(size > 0, size, 1.0)[:, None]
+        max_force = coefficient * size * k / np.where(k_total > 0, k_total, 1.0)
+        motion = self._relative_motion(number, points)
+        springs = self._step_end.springs[number].stretched(points, motion, direction, k, max_force)
+        self._springs[number] = springs
+        return replace(forces, friction=springs.force, energy=forces.energy + springs.energy)
 
-    def _relative_motion(self, number: int) -> Values:
-        """(n, d) motion of the points relative to an obstacle in the step, m; zero once the step is accepted."""
+    def _at_shared_points(self, forces: ContactForces, posed: PosedShape) -> ContactForces:
+        """The same forces, with all points at facets in contact, which other ranks may have, by distances alone."""
+        near = self._point_candidates(posed, self.positions, self._facet_reach)
+        near = near[posed.distance(self.positions[near]) < self._facet_reach]
+        points = np.union1d(forces.points, near)
+        normal = np.zeros((len(points), self._domain.dim))
+        normal[np.searchsorted(points, forces.points)] = forces.normal
+        return replace(forces, points=points, normal=normal, friction=np.zeros_like(normal))
+
+    def _normal_forces(self, number: int, posed: PosedShape) -> ContactForces:
+        """Forces of the penalty of points, and of facets that an obstacle acts on."""
+        law, points = self.law.barrier, self._point_candidates(posed, self.positions, self.law.barrier.width)
+        gap = posed.distance(self.positions[points])
+        touches = (gap < law.width) & (self.surface.area[points] > 0)
+        points, closure = points[touches], law.width - gap[touches]
+        pressure, normal = self.stiffness[points] * closure, posed.normal(self.positions[points])
+        energy, no_friction = 0.5 * float(pressure @ closure), np.zeros_like(normal)
+        forces = ContactForces(points, energy, pressure[:, None] * normal, no_friction, 0.0, _no_tangent)
+        is_round = number in self._facet_obstacles
+        if not is_round or not len(self._facets.candidates(posed, self.positions, law.width)):
+            return forces
+        of_unit_rate = Penalty(law.width, law.width)
+        return merge_forces(forces, *evaluate_facets(self._facets, posed, self.positions, of_unit_rate))
+
+    def _relative_motion(self, number: int, points: Ints) -> Values:
+        """(k, d) motion of points relative to an obstacle in the step, m; zero once the step is accepted."""
+        x = self.positions[points]
         if self._start_points is None:
-            return np.zeros_like(self.positions)
-        motion = self.bodies.point_motion(self.numbers[number], self._start_points)
-        return np.asarray(self.positions - self._start_points - motion)
+            return np.zeros_like(x)
+        start = self._start_points[points]
+        return np.asarray(x - start - self.bodies.point_motion(self.numbers[number], start))
 
     def obstacle_forces(self) -> list[ContactForces]:
         """Forces of each obstacle at the current u (collective)."""
@@ -283,8 +363,10 @@ class PenaltyObstacleTerm(ObstacleTerm):
         self._friction_loss, self._force_readings = 0.0, [-force for force in forces]
         for number, obstacle in enumerate(self.obstacles):
             if obstacle.friction:
-                motion = self._relative_motion(number)
-                self._friction_loss += self._springs[number].dissipated(previous.springs[number], motion)
+                # minus the work by the trapezoidal rule, minus the change of the energy of the springs
+                for springs, sign in ((previous.springs[number], 1.0), (self._springs[number], -1.0)):
+                    work = springs.work(self._relative_motion(number, springs.points))
+                    self._friction_loss += sign * springs.energy - work
         for number in (number for number, obstacle in enumerate(self.obstacles) if not obstacle.free):
             shift = self.increments[number][: self._domain.dim]
             self._obstacle_work[number] = float((forces[number] + previous.forces[number]) @ shift) / 2

@@ -1,4 +1,4 @@
-"""Monitors of obstacles: missed or too fast contact with the body, obstacles that are too small or overlap."""
+"""Monitors of obstacles: missed or too fast contact with the body, and obstacles that overlap."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, Protocol
 from mpi4py import MPI
 
 from ..contact.obstacle import RigidObstacle, find_overlaps, free_pairs
-from ..contact.obstacle_tessellation import min_extent
 from ..timestepping.state import State
 
 if TYPE_CHECKING:
@@ -37,9 +36,6 @@ class ObstacleContact(Protocol):
 
     def closing_distances(self) -> list[float]:
         """Largest decrease of each obstacle's gap in the last step without contact, m, on this rank (collective)."""
-
-    def points_only_flags(self) -> list[tuple[RigidObstacle, bool]]:
-        """ObstacleTerm, each with True if only points of the body's surface are in contact with it."""
 
 
 class ObstacleContactMonitor:
@@ -89,19 +85,10 @@ class ObstacleContactMonitor:
     def notes(self, *, done: bool) -> list[str]:
         """Sentences about obstacles; `done`: the run reached its end (collective)."""
         touched = [name for name, (gap, _) in self.least_gap.items() if gap < self._width[name]]
-        closing, sizes = self._closing_over_ranks(), zip(self.least_gap, self._sizes(), strict=True)
+        closing = self._closing_over_ranks()
         missed = [self._missed_note(name) for name in self.least_gap if done and name not in touched]
-        small = [_size_note(name, size, self._edge) for name, size in sizes if size < self._edge]
         fast = [_speed_note(name, self._edge, *closing[name]) for name in touched if closing[name][0] > self._edge]
-        return [*missed, *small, *fast]
-
-    def _sizes(self) -> list[float]:
-        """Least extent in m of each obstacle that only points of the surface touch, otherwise infinite.
-
-        Planes, and obstacles that contain the body, have infinite extent as well.
-        """
-        obstacles = [entry for contact in self._contacts for entry in contact.points_only_flags()]
-        return [min_extent(obstacle.shape) if points_only else math.inf for obstacle, points_only in obstacles]
+        return [*missed, *fast]
 
     def _closing_over_ranks(self) -> dict[str, tuple[float, float, float]]:
         """`largest_closing` of the rank on which it is largest (collective)."""
@@ -111,14 +98,6 @@ class ObstacleContactMonitor:
     def _missed_note(self, name: str) -> str:
         gap, t = self.least_gap[name]
         return f"the obstacle {name} never met the body: it came no nearer than {gap:.3g} m, at t = {t:g} s"
-
-
-def _size_note(name: str, size: float, edge: float) -> str:
-    """Sentence about an obstacle smaller than the mean edge of the mesh, both in m."""
-    return (
-        f"{name} is {size:.3g} m across, and an edge of the mesh {edge:.3g} m: it may pass between the points of the "
-        "surface, which alone feel obstacles; a smaller mesh.h would do"
-    )
 
 
 def _speed_note(name: str, edge: float, closing: float, t: float, dt: float) -> str:

@@ -101,6 +101,29 @@ def two_bodies(scheme: str, dim: int, folder: Path) -> tuple[Scene, Walk]:
     return make_scene(**tables)
 
 
+def stack(below: str, above: str, folder: Path) -> tuple[Scene, Walk]:
+    """A soft cube that falls askew on a free slab over a held one; analytic or from files, with friction,
+    in explicit steps in 3D."""
+    held, free = (obstacle(kind, "fixed", 3, folder) for kind in (below, above))
+    free |= {"name": "slab", "mass": 200.0, "velocity": [0.2, 0.1, 0.0], "friction": 0.4}
+    held |= {"at": [0.5, 0.5, TOP - 0.63]}
+    return make_scene(**{
+        "mesh": {"builder": "box", "size": [1.0] * 3, "h": 0.5}, "material": SOFT, "obstacle": [held, free],
+        "contact": {"itself": False, "distance": 0.02}, "initial": {"velocity": [0.3, 0.0, -1.0]},
+        "load": {"gravity": [0.0, 0.0, -5.0]}, "time": {"scheme": "explicit", "step": 5e-3, "end": 0.15},
+    })  # fmt: skip
+
+
+def small_ball(folder: Path) -> tuple[Scene, Walk]:
+    """A rubbing ball smaller than an edge that is thrown at facets of a soft cube, in explicit steps."""
+    ball = {"name": "it", "shape": "sphere", "radius": 0.15, "at": [0.55, 0.4, 1.17], "mass": 3.0, "friction": 0.4,
+            "velocity": [0.3, 0.1, -0.6]}  # fmt: skip
+    return make_scene(**{
+        "mesh": {"builder": "box", "size": [1.0] * 3, "h": 0.5}, "material": SOFT, "obstacle": [ball],
+        "contact": {"itself": False, "distance": 0.02}, "time": {"scheme": "explicit", "step": 5e-3, "end": 0.15},
+    })  # fmt: skip
+
+
 def momentum(scene: Scene, state: Walk) -> Values:
     """(d,) linear momentum of the body and free obstacles, kg m/s (serial)."""
     d = scene.domain.dim
@@ -127,6 +150,8 @@ CELLS = (
     ("mesh", "free", "backward-euler", 3), ("mesh", "prescribed", "generalized-alpha", 3),
     ("mesh", "free", "explicit", 3), ("mesh", "prescribed", "explicit", 3),
     ("bodies", "", "backward-euler", 2), ("bodies", "", "explicit", 3),
+    ("stack", "analytic", "analytic", 3), ("stack", "analytic", "mesh", 3), ("stack", "mesh", "mesh", 3),
+    ("ball", "", "explicit", 3),
 )  # fmt: skip
 
 
@@ -134,9 +159,14 @@ def main(target: str) -> None:
     """The end of some cells of the grid."""
     folder, found = Path(target).parent, {}
     for kind, motion, scheme, dim in CELLS:
-        scene, state = (
-            two_bodies(scheme, dim, folder) if kind == "bodies" else scene_of(kind, motion, scheme, dim, folder)
-        )
+        if kind == "bodies":
+            scene, state = two_bodies(scheme, dim, folder)
+        elif kind == "stack":
+            scene, state = stack(motion, scheme, folder)
+        elif kind == "ball":
+            scene, state = small_ball(folder)
+        else:
+            scene, state = scene_of(kind, motion, scheme, dim, folder)
         found[f"{kind} {motion} {scheme} {dim}"] = end_of(scene, state)
     if scene.domain.comm.rank == 0:
         np.savez(target, **found)
