@@ -100,8 +100,13 @@ def stiff_directions(H: csr_matrix, least: float) -> tuple[csr_matrix, Values] |
     sizes = np.bincount(group)
     if sizes.max(initial=0) > LIMITS.group_dofs:
         return None
+    # no eigenvalue is above the largest sum of absolute values of a row (Gershgorin)
+    bound = np.zeros(len(sizes))
+    np.maximum.at(bound, group, np.asarray(abs(coupled).sum(axis=1)).reshape(-1))
     columns, values = [csr_matrix((H.shape[0], 0))], list[Values]()
-    for part in np.split(np.argsort(group, kind="stable"), np.cumsum(sizes)[:-1]):
+    for part in np.split(np.argsort(group, kind="stable"), np.cumsum(sizes)[:-1]) if len(rows) else []:
+        if bound[group[part[0]]] <= least:
+            continue
         eigenvalues, vectors = np.linalg.eigh(coupled[part][:, part].toarray())
         stiff = eigenvalues > least
         count = int(stiff.sum())

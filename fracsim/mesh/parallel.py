@@ -278,7 +278,8 @@ class Gather:
         """`input_index`: (n,) index in the input mesh of each entity that this rank owns."""
         self.comm = comm
         self.count = len(input_index)
-        parts = gather(comm, np.ascontiguousarray(input_index))
+        self._owned = np.ascontiguousarray(input_index)
+        parts = gather(comm, self._owned)
         self._counts = [len(part) for part in parts] if parts is not None else None
         self._order = np.concatenate(parts) if parts is not None else None
 
@@ -316,6 +317,21 @@ class Gather:
             self.comm.Scatterv(_received(values[self._order], self._counts), _sent(result))
         return result
 
+    def to_all_ranks(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """(N, ...) rows of all ranks in input order, on every rank (collective); `values` (n, ...) as for a call."""
+        result = self(values)
+        if self.comm.size == 1:
+            assert result is not None
+            return result
+        kind = self.comm.bcast(None if result is None else (result.dtype.str, result.shape))
+        rows = np.empty(kind[1], kind[0]) if result is None else result
+        self.comm.Bcast(_sent(rows))
+        return rows
+
+    def sum_owned(self, parts: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """(n, ...) sums over the ranks of their `parts` (N, ...) in input order, in the owned rows (collective)."""
+        return np.asarray(sum_over_ranks(self.comm, parts)[self._owned])
+
 
 class GatherSubset(Gather):
     """Gathers a subset of the owned rows; the other rows are 0 when scattered."""
@@ -331,7 +347,14 @@ class GatherSubset(Gather):
 
     def scatter(self, values: npt.NDArray[Any] | None) -> npt.NDArray[Any]:
         """(n, ...) rows of the owned entities, 0 outside the subset, of `values` (N, ...) on rank 0."""
-        rows = super().scatter(values)
+        return self._spread(super().scatter(values))
+
+    def sum_owned(self, parts: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+        """(n, ...) sums over the ranks of their `parts` (N, ...) in the rows of owned entities, 0 outside the subset."""
+        return self._spread(super().sum_owned(parts))
+
+    def _spread(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """(entities, ...) rows of the subset among zeros."""
         result = np.zeros((len(self._which), *rows.shape[1:]), rows.dtype)
         result[self._which] = rows
         return result
