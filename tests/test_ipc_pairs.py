@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 import pytest
+from mpi4py import MPI
 from scipy.spatial import Delaunay
 
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
@@ -13,7 +14,7 @@ from fracsim.meshes.data import MeshData
 from support.solids import four_cells, lattice, separated, torn, two_cells
 
 pytest.importorskip("ipctk", reason="an environment made without a network")
-from fracsim.contact.ipc_pairs import PAIRS, IpcPairs
+from fracsim.contact.ipc_pairs import PAIRS, IpcPairs, PairShare
 from fracsim.contact.ipc_surface import offset_crack_faces
 
 Values = npt.NDArray[np.float64]
@@ -102,6 +103,54 @@ def test_derivatives_of_friction(dim):
     friction = pairs.lag_friction(x, x, 1e-3)
     for size in (2e-4, 2e-2):  # sticking, sliding
         assert_derivatives(friction, x + np.random.default_rng(1).normal(size=x.shape) * size, 1e-7)
+
+
+class OneOfSeveral:
+    """Rank `rank` of `size`, alone: nothing is reduced."""
+
+    def __init__(self, rank: int, size: int) -> None:
+        self.rank, self.size = rank, size
+
+    def allreduce(self, value, op=MPI.SUM):
+        return value
+
+
+def shares_of(points: Values, elements: Ints, ranks: int, obstacle: int | None) -> list[IpcPairs]:
+    """The pairs of each rank; `obstacle`: its number of points behind those of a body, None: a body with itself."""
+    law, shares = {"distance": REACH, "stiffness": STIFF, "friction": 0.5}, []
+    patch = np.repeat(np.arange(2, dtype=np.int32), [len(points) - (obstacle or 0), obstacle or 0])
+    for rank in range(ranks):
+        share = PairShare.by_slabs(OneOfSeveral(rank, ranks), points[patch == 0])
+        share = share if obstacle is None else share.with_others(obstacle)
+        shares.append(IpcPairs(points, elements, **law, share=share))
+        if obstacle is not None:
+            shares[-1].restrict_to_patches(patch)
+    return shares
+
+
+@pytest.mark.parametrize("of_obstacle", [False, True])
+@pytest.mark.parametrize(("dim", "ranks"), [(2, 2), (2, 5), (3, 2), (3, 5)])
+def test_shares_of_ranks_add_up(dim, ranks, of_obstacle):
+    """Of all pairs at all points, whose features are corners, edges and faces; with friction. No share is all."""
+    whole, x, upper = rough(dim)
+    points, elements, _ = stacked(dim, 0.7 * REACH, (3, 4))
+    end = x - upper[:, None] * np.array([0.0, 0.0, 2 * REACH])[3 - dim :]
+    points = whole.collision_mesh.rest_positions
+    parts = shares_of(points, elements, ranks, int(upper.sum()) if of_obstacle else None)
+    moved = x + np.random.default_rng(1).normal(size=x.shape) * 2e-3
+    for of in (lambda pairs: pairs, lambda pairs: pairs.lag_friction(x, x, 1e-3)):
+        made, shares = of(whole), [of(part) for part in parts]
+        assert sum(part.energy(moved) for part in shares) == pytest.approx(made.energy(moved), rel=1e-12)
+        gradient, shared = made.gradient(moved), [part.gradient(moved) for part in shares]
+        np.testing.assert_allclose(np.sum(shared, axis=0), gradient, atol=1e-12 * np.abs(gradient).max())
+        assert sum(part.any() for part in shared) > 1
+        for exact in (True, False):
+            H = made.hessian(moved, exact=exact).toarray()
+            total = sum(part.hessian(moved, exact=exact) for part in shares).toarray()
+            np.testing.assert_allclose(total, H, atol=1e-12 * np.abs(H).max())
+    assert min(part.min_gap(x) for part in parts) == whole.min_gap(x)
+    assert min(part.free_fraction(x, end) for part in parts) == pytest.approx(whole.free_fraction(x, end), rel=1e-12)
+    assert whole.free_fraction(x, end) < 1
 
 
 @pytest.mark.parametrize("dim", [2, 3])

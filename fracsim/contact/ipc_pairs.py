@@ -1,4 +1,4 @@
-"""Contact between the elements of one surface: barrier, lagged friction and collision detection of ipctk, on one rank.
+"""Contact between the elements of one surface: barrier, lagged friction and collision detection of ipctk.
 
     E(x) = k int b(d(x)) dA,   b(d) = -D (s - 1)^2 ln s where s = (d / D)^2 < 1, 0 elsewhere   (m)
 
@@ -10,6 +10,9 @@ differentiable. Vertices, and edges against edges in 3D, have barriers of their 
 share a point do not touch each other.
 
 The caller maps nodes to points of the surface and forces back: x = W u and W^T f; ipctk's displacement map is unused.
+
+Ranks share the pairs of a surface that all of them hold (PairShare): energies, gradients and second derivatives are
+those of a rank's own pairs, and their sums over the ranks are the totals.
 
 Equations: docs/theory.md#barrier, docs/theory.md#friction.
 """
@@ -23,8 +26,10 @@ from functools import cached_property
 import ipctk
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
+from ..mesh.parallel import sum_over_ranks
 from .laws import BARRIER
 from .sample_points import Centroids, IpcFriction, Vertices, measures, projection
 
@@ -48,6 +53,8 @@ class PairPolicy:
         max_box_growth: mean measure of the bounding boxes of a piece, in that of one around an edge.
         max_ccd_iterations: of additive collision detection. Faces that slide on each other would take forever; with
             1,000 iterations pairs at a thousandth of D held Newton's method to a fifth of its steps.
+        slabs: slabs of points of a rank. With several a rank has part of a contact that is somewhere alone; with 8
+            candidates at their borders cost a fifth.
     """
 
     vertex_distance: float = 0.8
@@ -56,10 +63,61 @@ class PairPolicy:
     max_pieces: int = 128
     max_box_growth: float = 3.0
     max_ccd_iterations: int = 10_000
+    slabs: int = 2
 
 
 PAIRS = PairPolicy()
 CCD = ipctk.AdditiveCCD(PAIRS.max_ccd_iterations, 1.0 - BARRIER.min_gap_ratio)
+
+
+@dataclass(frozen=True)
+class PairShare:
+    """Part of the pairs of a surface that belongs to this rank: those whose lowest point is one of its own.
+
+    The centroid of an element counts as the lowest point of the element. To have these pairs with their weights, a rank
+    searches all candidates that have one of its points. The weights of ipctk's "improved max" set depend on all
+    candidates between the points of a pair, and on no others.
+
+    Attributes:
+        comm: ranks that share the pairs. Each of them holds the whole surface.
+        points: (n,) flags of the points of this rank.
+    """
+
+    comm: MPI.Intracomm
+    points: Flags
+
+    @classmethod
+    def by_slabs(cls, comm: MPI.Intracomm, x: Values) -> PairShare:
+        """Points x (n, d) in slabs of equally many points across the longest side, which are dealt to the ranks."""
+        order = np.argsort(x[:, np.ptp(x, axis=0).argmax()], kind="stable")
+        slab = np.empty(len(x), np.int64)
+        slab[order] = np.arange(len(x)) * PAIRS.slabs * comm.size // max(len(x), 1)
+        return cls(comm, slab % comm.size == comm.rank)
+
+    def with_others(self, count: int) -> PairShare:
+        """The share of a surface with `count` more points that are in pairs with the first ones alone."""
+        return PairShare(self.comm, np.append(self.points, np.zeros(count, bool)))
+
+
+class OwnPairs:
+    """Pairs of this rank among the pairs of sample points, edges and triangles."""
+
+    def __init__(self, samples: Vertices | Centroids, vertices: Flags) -> None:
+        """`vertices`: (n,) flags of those of this rank."""
+        mesh, low = samples.mesh, samples.lowest_vertices
+        faces = np.asarray(mesh.faces).reshape(-1, 3)
+        # lists, as items are read one by one
+        self._flags, self._point = [bool(flag) for flag in vertices], [int(vertex) for vertex in low]
+        self._edge = [int(vertex) for vertex in mesh.edges.min(axis=1)]
+        self._face = [int(vertex) for vertex in faces.min(axis=1, initial=len(low))]
+
+    def select(self, pairs: ipctk.NormalCollisions) -> None:
+        """Remove the pairs of other ranks."""
+        flags, point, edge, face = self._flags, self._point, self._edge, self._face
+        pairs.vv_collisions = [p for p in pairs.vv_collisions if flags[min(point[p.vertex0_id], point[p.vertex1_id])]]
+        pairs.ev_collisions = [p for p in pairs.ev_collisions if flags[min(edge[p.edge_id], point[p.vertex_id])]]
+        pairs.ee_collisions = [p for p in pairs.ee_collisions if flags[min(edge[p.edge0_id], edge[p.edge1_id])]]
+        pairs.fv_collisions = [p for p in pairs.fv_collisions if flags[min(face[p.face_id], point[p.vertex_id])]]
 
 
 @dataclass(frozen=True)
@@ -71,17 +129,24 @@ class PairKind:
         stiffness: Pa.
         name: list of ipctk's candidates; empty for centroids, which have candidates of their own.
         samples: sample points.
+        vertices: (n,) flags of the vertices of this rank; None: all pairs are its own.
     """
 
     distance: float
     stiffness: float
     name: str
     samples: Vertices | Centroids
+    vertices: Flags | None = None
 
     @cached_property
     def barrier(self) -> ipctk.BarrierPotential:
         """Barrier of ipctk."""
         return ipctk.BarrierPotential(self.distance, self.stiffness, True)
+
+    @cached_property
+    def own_pairs(self) -> OwnPairs | None:
+        """Pairs of this rank; None: all pairs are its own."""
+        return None if self.vertices is None else OwnPairs(self.samples, self.vertices)
 
     def active_pairs(self, candidates: ipctk.Candidates, x: Values) -> ActivePairs:
         """Candidates on which the barrier acts, with vertices at x (n, d), m."""
@@ -90,6 +155,8 @@ class PairKind:
         pairs.collision_set_type = ipctk.NormalCollisions.IMPROVED_MAX_APPROX
         positions = self.samples.positions(x)
         pairs.build(candidates, self.samples.mesh, positions, self.distance)
+        if self.own_pairs is not None:
+            self.own_pairs.select(pairs)
         self.samples.weight(pairs)
         return ActivePairs(self, pairs, positions)
 
@@ -283,10 +350,21 @@ def _as_pairs(numbers: list[tuple[int, int]]) -> Ints:
 
 
 class IpcPairs:
-    """Barrier and lagged Coulomb friction between the elements of a surface; x is always (n, d), m."""
+    """Barrier and lagged Coulomb friction between the elements of a surface; x is always (n, d), m.
+
+    Attributes:
+        comm: ranks that share the pairs.
+    """
 
     def __init__(
-        self, rest_positions: Values, elements: Ints, *, distance: float, stiffness: float, friction: float = 0.0
+        self,
+        rest_positions: Values,
+        elements: Ints,
+        *,
+        distance: float,
+        stiffness: float,
+        friction: float = 0.0,
+        share: PairShare | None = None,
     ) -> None:
         """Pairs of a surface; points of no element are ignored.
 
@@ -296,6 +374,7 @@ class IpcPairs:
             distance: D, m.
             stiffness: k, Pa.
             friction: coefficient of friction.
+            share: of this rank in the pairs; None: all of them.
         """
         # one thread a rank, and sums in the same order each time
         ipctk.set_num_threads(1)
@@ -305,14 +384,21 @@ class IpcPairs:
         edges = ipctk.edges(corners) if is_3d else corners
         self._mesh = ipctk.CollisionMesh.build_from_full_mesh(rest_positions, edges, *faces)
         # in 3D ipctk weights points as half of all pairs of a triangle, and edges as the other half
-        vertices = Vertices(self._mesh)
+        at_vertices = Vertices(self._mesh)
         kinds: list[tuple[float, float, str, Vertices | Centroids]] = [(1.0 + is_3d, 1.0, "", Centroids(self._mesh))]
         point_list = "fv_candidates" if is_3d else "ev_candidates"
-        kinds += [(1.0 + is_3d, PAIRS.vertex_distance, point_list, vertices)]
-        kinds += [(1.0, PAIRS.edge_distance, "ee_candidates", vertices)] if is_3d else []
-        self._weights = [weight for weight, *_ in kinds]
+        kinds += [(1.0 + is_3d, PAIRS.vertex_distance, point_list, at_vertices)]
+        kinds += [(1.0, PAIRS.edge_distance, "ee_candidates", at_vertices)] if is_3d else []
+        self._weights, self.comm = [weight for weight, *_ in kinds], MPI.COMM_SELF if share is None else share.comm
+        vertices = None if share is None or share.comm.size == 1 else share.points[np.unique(elements)]
+        self._own_filter = None
+        if vertices is not None:
+            # two points of other ranks have the same number and do not touch
+            number = np.where(vertices, 1 + np.arange(len(vertices)), 0).astype(np.int32)
+            self._mesh.can_collide = self._own_filter = ipctk.make_vertex_patches_filter(number)
         pair_kinds = [
-            PairKind(ratio * distance, weight * stiffness, name, samples) for weight, ratio, name, samples in kinds
+            PairKind(ratio * distance, weight * stiffness, name, samples, vertices)
+            for weight, ratio, name, samples in kinds
         ]
         self._search = PairSearch(self._mesh, pair_kinds, distance, PAIRS.search_margin * distance)
         self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
@@ -331,23 +417,24 @@ class IpcPairs:
 
     def restrict_to_patches(self, patch: npt.NDArray[np.int32]) -> None:
         """Let elements touch those of other patches alone; `patch`: (n,) number of the patch of each point."""
-        self._mesh.can_collide = ipctk.make_vertex_patches_filter(patch[np.unique(self._elements)])
+        of_patches = ipctk.make_vertex_patches_filter(patch[np.unique(self._elements)])
+        self._mesh.can_collide = of_patches if self._own_filter is None else of_patches & self._own_filter
 
     # --- barrier ---
 
     def energy(self, x: Values) -> float:
-        """Energy E(x), J."""
+        """Energy E(x) of this rank's pairs, J."""
         vertices = self._mesh.vertices(x)
         return sum(pairs.energy() for pairs in self._search.active_pairs(vertices))
 
     def gradient(self, x: Values) -> Values:
-        """(n, d) dE/dx, N: minus the forces on the points."""
+        """(n, d) dE/dx of this rank's pairs, N: minus the forces on the points."""
         vertices = self._mesh.vertices(x)
         total = sum(pairs.gradient() for pairs in self._search.active_pairs(vertices))
         return np.asarray(self._mesh.to_full_dof(total)).reshape(x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
-        """(n d, n d) d2E/dx2, N/m; unless `exact`, each pair without its negative eigenvalues."""
+        """(n d, n d) d2E/dx2 of this rank's pairs, N/m; unless `exact`, each without its negative eigenvalues."""
         vertices, method = self._mesh.vertices(x), projection(exact=exact)
         total = sum(pairs.hessian(method) for pairs in self._search.active_pairs(vertices))
         return csr_matrix(self._mesh.to_full_dof(total))
@@ -361,7 +448,7 @@ class IpcPairs:
         self._search.clear_caches()
 
     def min_gap(self, x: Values) -> float:
-        """Least distance between elements on which the barrier acts, m; infinite where there is none."""
+        """Least distance of this rank's pairs on which the barrier acts, m; infinite where there is none."""
         return self._gap_at(self._mesh.vertices(x))
 
     def _gap_at(self, vertices: Values) -> float:
@@ -374,7 +461,7 @@ class IpcPairs:
     # --- friction ---
 
     def lag_friction(self, x: Values, start: Values, slip: float) -> IpcFriction:
-        """Friction with pressures and tangents at x.
+        """Friction of this rank's pairs with pressures and tangents at x.
 
         Args:
             x: (n, d) positions at which friction is lagged, m.
@@ -392,11 +479,15 @@ class IpcPairs:
     # --- collisions ---
 
     def free_fraction(self, x: Values, end: Values) -> float:
-        """Fraction in (0, 1] of the straight motion from x to `end` without a collision.
+        """Fraction in (0, 1] of the straight motion from x to `end` without a collision on any rank (collective).
 
         The motion is divided into pieces. A pair that would collide keeps at least `BARRIER.min_gap_ratio` of its
         distance at the begin of the piece.
         """
+        return float(self.comm.allreduce(self._own_free_fraction(x, end), op=MPI.MIN))
+
+    def _own_free_fraction(self, x: Values, end: Values) -> float:
+        """Fraction of the motion from x to `end` (n, d) without a collision of this rank's pairs."""
         vertices, motion = self._mesh.vertices(x), self._mesh.vertices(end) - self._mesh.vertices(x)
         motion -= motion.mean(axis=0)  # the mean motion brings nothing together
         if self._is_short(vertices, motion):
@@ -432,15 +523,18 @@ class IpcPairs:
         return pieces
 
     def intersections(self, x: Values) -> Ints:
-        """(k, 2) elements that intersect."""
+        """(k, 2) elements that intersect, of all ranks (collective)."""
         vertices = self._mesh.vertices(x)
-        if not ipctk.has_intersections(self._mesh, vertices, ipctk.LBVH()):
+        if not self.comm.allreduce(ipctk.has_intersections(self._mesh, vertices, ipctk.LBVH()), op=MPI.LOR):
             return NO_PAIRS
         return intersecting_elements(self._mesh, vertices)
 
     def pressure(self, x: Values) -> Values:
-        """(n,) force of the barrier on each point by its share of the reference area, Pa; 0 where it has none."""
-        force, area = np.linalg.norm(self.gradient(x), axis=1), self._area
+        """(n,) force of the barrier on each point by its share of the reference area, Pa; 0 where it has none.
+
+        Of the pairs of all ranks (collective).
+        """
+        force, area = np.linalg.norm(sum_over_ranks(self.comm, self.gradient(x)), axis=1), self._area
         return np.asarray(np.divide(force, area, out=np.zeros_like(area), where=area > 0))
 
 

@@ -1,4 +1,6 @@
-"""Surface of a body for contact with itself, on rank 0, with crack faces retracted where there is no room.
+"""Surface of a body for contact with itself, with crack faces retracted where there is no room.
+
+Each rank holds the whole surface and decides alike; the pairs are shared (ipc_pairs.PairShare).
 
 The two sides of a new crack coincide. They are offset by a gap of twice the distance of the barrier, so that no
 barrier acts as an edge breaks; with the default distance there is room for a strain of about 1 %. Where that is not
@@ -17,17 +19,17 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 from scipy.sparse import csr_matrix, kron
 
 from ..errors import InputError
-from ..mechanics.extra_couplings import stiff_directions
 from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from ..mesh.split_surface.entity_numbering import CRACK, EntityNumbering
 from ..mesh.split_surface.fragment_surface import build_fragment_surface, has_same_fragments, project_onto_fragments
 from ..mesh.split_surface.point_matching import match_points, point_identity
 from ..mesh.split_surface.surface_map import SurfaceMap, make_surface_map
 from ..meshes.data import format_point
-from .ipc_pairs import IpcPairs, max_length
+from .ipc_pairs import IpcPairs, PairShare, max_length
 from .sample_points import SlipFriction
 
 Values = npt.NDArray[np.float64]
@@ -159,8 +161,9 @@ class SelfContactSurface:
         u: Values,
         previous: SelfContactSurface | None,
         cut: Values | None = None,
+        comm: MPI.Intracomm = MPI.COMM_SELF,
     ) -> None:
-        """Build the surface.
+        """Build the surface (collective).
 
         Args:
             skeleton: of the mesh.
@@ -170,6 +173,7 @@ class SelfContactSurface:
             previous: surface until now.
             cut: (edges,) positions at which edges are cut, for contact between fragments; other edges are cut in the
                 middle, which leaves both sides most room.
+            comm: ranks that share the pairs.
         """
         self._skeleton, self._pattern, self._fragments_only = skeleton, pattern, law.fragments_only
         if law.fragments_only:
@@ -178,6 +182,7 @@ class SelfContactSurface:
             self.split = build_split_surface(skeleton, pattern)
         self._rest_positions = offset_crack_faces(self.split, self.face_gap * law.distance)
         self.point_map = make_surface_map(self.split, skeleton, pattern, self._rest_positions)
+        self._share = PairShare.by_slabs(comm, self._rest_positions)
         self._parameters = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
         is_copy = np.zeros(len(self._rest_positions), bool)
         is_copy[self.point_map.copies] = True
@@ -216,7 +221,7 @@ class SelfContactSurface:
         return self._build_pairs(self.split.elements)
 
     def _build_pairs(self, elements: Ints) -> SurfacePairs:
-        return IpcPairs(self._rest_positions, elements, **self._parameters)
+        return IpcPairs(self._rest_positions, elements, **self._parameters, share=self._share)
 
     def _exclude(self, elements: Ints) -> None:
         """Build pairs without these elements (k,)."""
@@ -381,23 +386,22 @@ class SelfContactSurface:
         """(nodes, d) forces on nodes of forces (n, d) on the points, N."""
         return np.asarray(self.point_map.weights.T @ forces)
 
-    def nodal_stiffness(self, H: csr_matrix, threshold: float) -> tuple[csr_matrix, tuple[Values, Values] | None]:
-        """Stiffness at the nodes of second derivatives H (n d, n d) at the points, N/m.
+    def nodal_stiffness(self, H: csr_matrix) -> csr_matrix:
+        """(nodes d, nodes d) stiffness at the nodes of second derivatives H (n d, n d) at the points, N/m."""
+        W, used = self._used_weights(H)
+        return (W.T @ H[used][:, used] @ W).tocsr()
 
-        Returns:
-            (nodes d, nodes d) stiffness; and where few directions are stiffer than `threshold`, N/m, these
-            (nodes d, m) with their stiffness (m,).
-        """
+    def nodal_directions(self, directions: csr_matrix) -> Values:
+        """(nodes, d m) directions of the nodes of directions (n d, m) of the points."""
+        W, used = self._used_weights(directions)
+        return np.asarray((W.T @ directions[used]).toarray().reshape(self._nodes, -1))
+
+    def _used_weights(self, rows: csr_matrix) -> tuple[csr_matrix, Ints]:
+        """(k d, nodes d) weights of the points with entries in `rows` (n d, m), and (k d,) their rows: mostly few."""
         d = self._rest_positions.shape[1]
-        # mostly few points have entries
-        points = np.unique(np.flatnonzero(np.diff(H.indptr)) // d)
-        rows = (d * points[:, None] + np.arange(d)).reshape(-1)
-        W, H = kron(self.point_map.weights[points], np.eye(d), format="csr"), H[rows][:, rows]
-        K = (W.T @ H @ W).tocsr()
-        if (stiff := stiff_directions(H, threshold)) is None:
-            return K, None
-        directions, stiffness = stiff
-        return K, ((W.T @ directions).toarray().reshape(self._nodes, d * len(stiffness)), stiffness)
+        points = np.unique(np.flatnonzero(np.diff(rows.indptr)) // d)
+        used = (d * points[:, None] + np.arange(d)).reshape(-1)
+        return kron(self.point_map.weights[points], np.eye(d), format="csr"), used
 
 
 # --- offset of new crack faces ---

@@ -1,8 +1,8 @@
 """Term of the balance for contact of a body with triangle-mesh obstacles, held or driven.
 
-As for contact of a body with itself (self_contact), the split surface is on rank 0, which finds pairs in contact and
-maps forces and stiffness to the nodes. The points of an obstacle are no unknowns; they are where its motion says at the
-end of a step. Nothing is gathered on rank 0 while bounding boxes of body and obstacles are apart.
+As for contact of a body with itself (self_contact), each rank holds the split surface and has a share of the pairs in
+contact. The points of an obstacle are no unknowns; they are where its motion says at the end of a step. Nothing is
+gathered while bounding boxes of body and obstacles are apart.
 
 Equations: docs/theory.md#contact.
 """
@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -24,11 +24,11 @@ from ..mechanics.extra_couplings import StiffCoupling
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
-from ..mesh.parallel import from_root, on_root
+from ..mesh.parallel import sum_over_ranks
 from ..mesh.split_surface.surface_map import SurfaceMap
 from ..meshes.data import AXES
 from .ipc_pairs import IpcPairs, max_length
-from .ipc_surface import SelfContactLaw
+from .ipc_surface import SelfContactLaw, SelfContactSurface
 from .laws import BARRIER
 from .mesh_obstacles import (
     AllMeshPairs,
@@ -40,7 +40,7 @@ from .mesh_obstacles import (
 )
 from .obstacle import RigidObstacle
 from .pose import Pose
-from .pose_derivatives import PoseDerivatives, point_jacobian, point_set_derivatives
+from .pose_derivatives import PoseDerivatives, point_jacobian, point_set_derivatives, sum_of_derivatives
 from .rigid_obstacles import RigidObstacles
 from .self_contact import SelfContact
 from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
@@ -139,7 +139,7 @@ class MeshObstacleTerm(SelfContact):
     """
 
     name = "solids"
-    _surface: MeshContactSurface | None
+    _surface: MeshContactSurface
     _friction: MeshFriction | None
 
     def __init__(
@@ -161,9 +161,8 @@ class MeshObstacleTerm(SelfContact):
         self.obstacles = tuple(bodies.obstacles[number] for number in numbers)
         # the tangent by points and poses has a positive semi-definite form alone
         self.allows_exact_tangent = not any(obstacle.free for obstacle in self.obstacles)
-        # on rank 0 alone
         items = zip(self.numbers, self.obstacles, strict=True)
-        self._meshes = on_root(domain.comm, lambda: [build_mesh_obstacle(*item, edge) for item in items]) or []
+        self._meshes = [build_mesh_obstacle(*item, edge) for item in items]
         self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
         self._proximity = ProximityTest(domain, self.obstacles, law.distance)
         self._started_near = True
@@ -186,25 +185,13 @@ class MeshObstacleTerm(SelfContact):
 
     # --- surface and obstacles ---
 
-    def _rebuild(self) -> None:
-        pattern, u = self._gathered_pattern(), self._gathered(self._u.x.array[: self._owned])
-
-        def build() -> MeshContactSurface:
-            assert pattern is not None and u is not None
-            return self._build_mesh_surface(pattern, u)
-
-        self._surface = on_root(self.comm, build)
-        self._positions = self._start_positions = self._tangent_positions = self._friction = None
-        self._is_stale = True
-
-    def _build_mesh_surface(self, pattern: npt.NDArray[np.uint8], u: Values) -> MeshContactSurface:
-        """Surface of a pattern of damage at displacements u (nodes, 3), m, on rank 0."""
-        assert self._skeleton is not None
-        return MeshContactSurface(self._skeleton, pattern, self._meshes, self.law, u, self._surface)
+    def _build_surface(
+        self, pattern: npt.NDArray[np.uint8], u: Values, previous: SelfContactSurface | None, cut: Values | None
+    ) -> SelfContactSurface:
+        return MeshContactSurface(self._skeleton, pattern, self._meshes, self.law, u, previous, self.comm)
 
     def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
         """Retract points of a surface for output as those of contact are."""
-        assert self._surface is not None
         return at.with_arm_share(np.minimum(self._surface.point_map.share, at.share))
 
     @property
@@ -218,8 +205,8 @@ class MeshObstacleTerm(SelfContact):
         return [self.bodies.start_posed[number].pose for number in self.numbers]
 
     def _place_meshes(self, poses: Sequence[Pose]) -> None:
-        """Move the meshes to poses; they are on rank 0 alone."""
-        for mesh, pose in zip(self._meshes, poses, strict=False):
+        """Move the meshes to poses."""
+        for mesh, pose in zip(self._meshes, poses, strict=True):
             mesh.move_to(pose)
 
     def _step_poses(self) -> list[tuple[Pose, Pose]]:
@@ -254,7 +241,7 @@ class MeshObstacleTerm(SelfContact):
         return None if self._is_far() else super().coupling_matrix()
 
     def stored_energy(self) -> float:
-        """Energy of the barrier at the current u, on rank 0, J (collective)."""
+        """Energy of the barrier at the current u, of this rank's pairs, J (collective)."""
         return 0.0 if self._is_far() else super().stored_energy()
 
     def stiffen_contact(self) -> float:
@@ -262,7 +249,7 @@ class MeshObstacleTerm(SelfContact):
         return 0.0 if self._is_far() else super().stiffen_contact()
 
     def potential(self) -> float:
-        """Potential of barrier and friction as they enter the residual, on rank 0, J (collective)."""
+        """Potential of barrier and friction as they enter the residual, of this rank's pairs, J (collective)."""
         return 0.0 if self._is_far() else super().potential()
 
     # --- steps ---
@@ -281,14 +268,13 @@ class MeshObstacleTerm(SelfContact):
         zero: Values = np.zeros((1, 3))
         self._start_gradients = [zero for _ in self.obstacles]
         if level.dt and self._started_near:
-            nodal, sticking_speed = self._gathered(level.u_n), self._sticking_speed(level.v_n)
-            if self._surface is not None and nodal is not None:
-                self._place_meshes(self._start_poses)
-                self._begin_on_root(self._surface, nodal, sticking_speed * level.dt)
+            nodal, sticking_speed = self._all_nodes(level.u_n), self._sticking_speed(level.v_n)
+            self._place_meshes(self._start_poses)
+            self._begin_near(self._surface, nodal, sticking_speed * level.dt)
         self._place_meshes(self._poses)
 
-    def _begin_on_root(self, surface: MeshContactSurface, nodal: Values, slip: float) -> None:
-        """Begin a step on rank 0 at displacements (nodes, 3), m; `slip`: that counts as sticking, m."""
+    def _begin_near(self, surface: MeshContactSurface, nodal: Values, slip: float) -> None:
+        """Begin a step near obstacles at displacements (nodes, 3), m; `slip`: that counts as sticking, m."""
         surface.extend_faces(nodal)
         self._start_positions = x = surface.point_map(nodal)
         self._start_gradients = [pairs.full_gradient(x)[len(x) :] for pairs in surface.pairs.pairs]
@@ -300,11 +286,11 @@ class MeshObstacleTerm(SelfContact):
         self._friction_loss, self._obstacle_work = 0.0, [0.0] * len(self.obstacles)
         forces: list[Values] = [np.zeros(3) for _ in self.obstacles]
         self._force_readings = forces
-        if not self._is_far() and (x := self._end_positions()) is not None and self._surface is not None:
-            self._record_work(x, self._surface, forces)
+        if not self._is_far():
+            self._record_work(self._end_positions(), self._surface, forces)
 
     def _record_work(self, x: Values, surface: MeshContactSurface, forces: list[Values]) -> None:
-        """Record work on rank 0 with the body at x (n, 3), m; forces on obstacles are added to `forces`, N."""
+        """Record work of this rank's pairs with the body at x (n, 3), m, and add forces on obstacles to `forces`, N."""
         end_weight, start_gradients, n = self._level.contact_weights.end_work_share, self._start_gradients, len(x)
         for number, (pairs, start_pose) in enumerate(zip(surface.pairs.pairs, self._start_poses, strict=True)):
             # of the obstacle on the body, at the points of the obstacle
@@ -320,7 +306,7 @@ class MeshObstacleTerm(SelfContact):
             self._obstacle_work[number] = float(np.vdot(mean_gradient, motion)) + friction_work
 
     def step_work(self) -> tuple[float, float]:
-        """Work of prescribed obstacles in the step, and dissipation by friction, on rank 0, J."""
+        """Work of prescribed obstacles in the step, and dissipation by friction, of this rank's pairs, J."""
         prescribed = [number for number, obstacle in enumerate(self.obstacles) if not obstacle.free]
         return sum(self._obstacle_work[number] for number in prescribed), self._friction_loss
 
@@ -346,18 +332,14 @@ class MeshObstacleTerm(SelfContact):
                 poses[index] = poses[index][0], poses[index][0].incremented(increments[number])
         if self._proximity.is_far([u] if change is None else [u, u + change], poses):
             return 1.0
-        x, motion = self._positions_at(u), None if change is None else self._gathered(change)
-
-        def fraction_on_root() -> float:
-            assert self._surface is not None and x is not None
-            end = x if motion is None else x + self._surface.point_map.weights @ motion
-            starts, ends = zip(*poses, strict=True)
-            self._place_meshes(ends)
-            fraction = self._surface.pairs.moving_free_fraction(x, end, starts)
-            self._place_meshes(starts)
-            return fraction
-
-        return from_root(self.comm, fraction_on_root)
+        surface, x = self._surface, self._positions_at(u)
+        assert surface is not None and x is not None
+        end = x if change is None else x + surface.point_map.weights @ self._all_nodes(change)
+        starts, ends = zip(*poses, strict=True)
+        self._place_meshes(ends)
+        fraction = surface.pairs.moving_free_fraction(x, end, starts)
+        self._place_meshes(starts)
+        return fraction
 
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) first guess of u, m, that crosses no obstacle on its way from the start (collective)."""
@@ -366,23 +348,16 @@ class MeshObstacleTerm(SelfContact):
             return u
         if self._proximity.is_far([level.u_n, level.displacement_at_end(u)], self._step_poses()):
             return u
-        start, end = self._gathered(level.u_n), self._gathered(level.displacement_at_end(u))
-
-        def correction_on_root() -> Values | None:
-            assert self._surface is not None and start is not None and end is not None
-            guess = self._first_guess(self._surface, start, end)
-            return None if guess is end else guess - end
-
-        correction = on_root(self.comm, correction_on_root)
-        if not self.comm.bcast(correction is not None):
+        start, end = self._all_nodes(level.u_n), self._all_nodes(level.displacement_at_end(u))
+        if (guess := self._first_guess(self._surface, start, end)) is end:
             return u
-        change: Values = np.asarray(self._gather.scatter(correction)).reshape(-1)
+        change: Values = self._gather.owned(guess - end).reshape(-1)
         if self.law.corners_only:
             change = with_straight_edges(self._domain, change)
         return np.asarray(u + level.fraction * change)
 
     def _first_guess(self, surface: MeshContactSurface, start: Values, end: Values) -> Values:
-        """(nodes, 3) displacements that the body reaches on its way from `start` to `end`, m, on rank 0."""
+        """(nodes, 3) displacements that the body reaches on its way from `start` to `end`, m (collective)."""
         prescribed = [index for index, obstacle in enumerate(self.obstacles) if not obstacle.free]
         start_poses = [self._start_poses[index] for index in prescribed]
         return stop_before_meshes(surface, surface.pairs.select(prescribed), start, end, start_poses)
@@ -392,14 +367,8 @@ class MeshObstacleTerm(SelfContact):
         u_n, u_end = self._level.u_n, self._level.displacement_at_end(u)
         if self._proximity.is_far([u_n, u_end], self._step_poses()):
             return True
-        start, end = self._gathered(u_n), self._gathered(u_end)
-
-        def is_free() -> bool:
-            assert self._surface is not None and start is not None and end is not None
-            point_map, pairs = self._surface.point_map, self._surface.pairs
-            return pairs.moving_free_fraction(point_map(start), point_map(end), self._start_poses) == 1
-
-        return from_root(self.comm, is_free)
+        start, end = self._positions_at(u_n), self._positions_at(u_end)
+        return self._surface.pairs.moving_free_fraction(start, end, self._start_poses) == 1
 
     # --- contact of the body, as the obstacles see it (rigid_obstacles.ObstacleContactTerm) ---
 
@@ -427,15 +396,11 @@ class MeshObstacleTerm(SelfContact):
             return 1.0
         x, end = self._positions_at(level.u_n), self._positions_at(u_end)
 
-        def fraction_on_root() -> float:
-            assert self._surface is not None and x is not None and end is not None
-            pairs = self._surface.pairs.pairs[index]
-            pairs.mesh.move_to(poses[index][1])
-            fraction = pairs.moving_free_fraction(x, end, start)
-            pairs.mesh.move_to(self._poses[index])
-            return fraction
-
-        return from_root(self.comm, fraction_on_root)
+        pairs = self._surface.pairs.pairs[index]
+        pairs.mesh.move_to(poses[index][1])
+        fraction = pairs.moving_free_fraction(x, end, start)
+        pairs.mesh.move_to(self._poses[index])
+        return fraction
 
     def wrenches(self, numbers: Sequence[int]) -> dict[int, Values]:
         """(p,) force and moment of the body on obstacles, N and N m (collective)."""
@@ -449,14 +414,11 @@ class MeshObstacleTerm(SelfContact):
         if not numbers or self._is_far():
             return dict.fromkeys(numbers, none)
         x = self._end_positions()
-        by_number = from_root(
-            self.comm, lambda: {number: self._derivatives_on_root(number, x, exact=exact) for number in numbers}
-        )
-        return {number: none if derivatives is None else derivatives for number, derivatives in by_number.items()}
+        parts = [self._own_derivatives(number, x, exact=exact) or none for number in numbers]
+        return dict(zip(numbers, sum_of_derivatives(parts, self.comm), strict=True))
 
-    def _derivatives_on_root(self, number: int, x: Values | None, *, exact: bool) -> PoseDerivatives | None:
-        """Derivatives by the pose of an obstacle with the body at x (n, 3), m; None: the body is far."""
-        assert self._surface is not None and x is not None
+    def _own_derivatives(self, number: int, x: Values, *, exact: bool) -> PoseDerivatives | None:
+        """Derivatives by the pose of an obstacle of this rank's pairs, the body at x (n, 3), m; None: it is far."""
         pairs, n = self._surface.pairs.pairs[self.numbers.index(number)], len(x)
         if pairs.is_far(x):
             return None
@@ -474,23 +436,23 @@ class MeshObstacleTerm(SelfContact):
         if not numbers or self._is_far():
             return {}
         x = self._end_positions()
-        mixed = on_root(self.comm, lambda: {number: self._mixed_on_root(number, x) for number in numbers}) or {}
-        touching = self.comm.bcast([number for number, blocks in mixed.items() if blocks is not None])
-        return {number: self._gather.scatter(mixed.get(number)).reshape(self._owned, -1) for number in touching}
+        parts = {number: self._own_mixed(number, x) for number in numbers}
+        touching = sum_over_ranks(self.comm, [float(part.any()) for part in parts.values()])
+        near = [number for number, touches in zip(numbers, touching, strict=True) if touches]
+        return {number: self._gather.sum_owned(parts[number]).reshape(self._owned, -1) for number in near}
 
-    def _mixed_on_root(self, number: int, x: Values | None) -> Values | None:
-        """(nodes, 3 p) second derivatives by nodes and pose with the body at x (n, 3), m; None: no contact."""
-        assert self._surface is not None and x is not None
+    def _own_mixed(self, number: int, x: Values) -> Values:
+        """(nodes, 18) second derivatives by nodes and pose of this rank's pairs, the body at x (n, 3), m."""
         pairs, body = self._surface.pairs.pairs[self.numbers.index(number)], slice(0, x.size)
         if pairs.is_far(x):
-            return None
+            return np.zeros((len(self._input_nodes), 18))
         points = pairs.with_mesh(x)
         H = pairs.contact.hessian(points)
         if self._friction is not None and (friction := self._friction.friction_with(pairs)) is not None:
             H = H + friction.hessian(points)
         J = point_jacobian(pairs.mesh.positions - pairs.mesh.pose.centre).reshape(-1, 6)
         mixed = H[body, x.size :] @ J
-        return self._surface.nodal_forces(mixed.reshape(len(x), -1)) if mixed.any() else None
+        return self._surface.nodal_forces(mixed.reshape(len(x), -1))
 
     def uses_exact_tangent(self) -> bool:
         """Whether the tangent at the current u may have negative eigenvalues: not with free obstacles."""
@@ -499,7 +461,7 @@ class MeshObstacleTerm(SelfContact):
     # --- columns of history.csv, and figures for the end of a run ---
 
     def summed_columns(self) -> dict[str, Callable[[], Values]]:
-        """contact_NAME_AXIS: (1,) force of the body on each obstacle in the last step, on rank 0, N."""
+        """contact_NAME_AXIS: (1,) force of the body on each obstacle in the last step, of this rank's pairs, N."""
         return {
             f"contact_{obstacle.name}_{axis_name}": partial(self._force_reading, number, axis)
             for number, obstacle in enumerate(self.obstacles)
@@ -508,20 +470,17 @@ class MeshObstacleTerm(SelfContact):
 
     def _force_reading(self, number: int, axis: int) -> Values:
         if self._force_readings is None:
-            x, surface, force = self._end_positions(), self._surface, cast("Values", np.zeros(3))
-            if x is not None and surface is not None:
-                force = surface.pairs.pairs[number].body_gradient(x).sum(axis=0)
+            force = self._surface.pairs.pairs[number].body_gradient(self._end_positions()).sum(axis=0)
         else:
             force = self._force_readings[number]
         return np.asarray(force[axis : axis + 1])
 
     def minimum_columns(self) -> dict[str, Callable[[], float]]:
-        """gap_NAME: least distance between each obstacle and the body, m (on rank 0; infinite elsewhere)."""
+        """gap_NAME: least distance between each obstacle and the body, m, of this rank's pairs."""
         return {f"gap_{obstacle.name}": partial(self._gap, number) for number, obstacle in enumerate(self.obstacles)}
 
     def _gap(self, number: int) -> float:
-        x = self._end_positions()
-        return np.inf if x is None or self._surface is None else self._surface.pairs.pairs[number].gap(x)
+        return self._surface.pairs.pairs[number].gap(self._end_positions())
 
     def work_columns(self) -> dict[str, Callable[[], float]]:
         """work_NAME: work of each obstacle on the body in the last step, J."""
@@ -533,13 +492,11 @@ class MeshObstacleTerm(SelfContact):
     def closing_distances(self) -> list[float]:
         """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
 
-        It is that of the velocities at the start, without any contact; on rank 0.
+        It is that of the velocities at the start, without any contact.
         """
         if self._is_far():
             return [0.0] * len(self.obstacles)
-        x, v = self._end_positions(), self._gathered(self._start_velocity)
-        if x is None or v is None or self._surface is None:
-            return [0.0] * len(self.obstacles)
+        x, v = self._end_positions(), self._all_nodes(self._start_velocity)
         motion, result = self._dt * (self._surface.point_map.weights @ v), []
         for pairs, start_pose in zip(self._surface.pairs.pairs, self._start_poses, strict=True):
             result.append(approach(pairs, start_pose, x, motion))
@@ -547,7 +504,7 @@ class MeshObstacleTerm(SelfContact):
 
 
 def approach(pairs: MeshObstaclePairs[Any], start_pose: Pose, x: Values, motion: Values) -> float:
-    """Largest approach in a step of an obstacle and the points that it pushes, m.
+    """Largest approach in a step of an obstacle and the points that it pushes, m (collective).
 
     Args:
         pairs: with the obstacle, at the end of the step.
@@ -555,7 +512,7 @@ def approach(pairs: MeshObstaclePairs[Any], start_pose: Pose, x: Values, motion:
         x: (n, 3) points of the body, m.
         motion: (n, 3) of these without contact, m.
     """
-    force = -pairs.body_gradient(x)
+    force = -sum_over_ranks(pairs.contact.comm, pairs.body_gradient(x))
     size = np.linalg.norm(force, axis=1)
     pushed = size > 0
     obstacle_motion = x[pushed] - start_pose.points_to_space(pairs.mesh.pose.to_body(x[pushed]))
@@ -565,7 +522,7 @@ def approach(pairs: MeshObstaclePairs[Any], start_pose: Pose, x: Values, motion:
 
 
 def build_mesh_obstacle(number: int, obstacle: RigidObstacle, edge: float) -> MeshObstacle:
-    """Obstacle at the start, with triangles as small as those of the body (rank 0)."""
+    """Obstacle at the start, with triangles as small as those of the body."""
     shape = obstacle.shape
     assert isinstance(shape, TriangleMeshShape)
     points, triangles = refine_triangles(shape.points, shape.triangles, edge)

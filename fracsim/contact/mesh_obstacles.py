@@ -21,7 +21,7 @@ from ..errors import InputError
 from ..mesh.domain import Domain
 from ..mesh.split_surface.closed_surface import SplitSurface
 from ..mesh.split_surface.entity_numbering import EntityNumbering
-from .ipc_pairs import NO_PAIRS, IpcPairs
+from .ipc_pairs import NO_PAIRS, IpcPairs, PairShare
 from .ipc_surface import SelfContactLaw, SelfContactSurface
 from .laws import BARRIER
 from .obstacle import RigidObstacle
@@ -296,12 +296,16 @@ class MeshObstaclePairs[Contact: IpcPairs]:
         return gap if gap < float("inf") else max(self.mesh.vertex_distance(x[self._body_points]), self._reach)
 
     def safe_distances(self, x: Values, limit: float) -> Values:
-        """(n,) distances that each point of the body at x (n, 3) may move by itself, m; infinite from `limit` on."""
+        """(n,) distances that each point of the body at x (n, 3) may move by itself, m; infinite from `limit` on.
+
+        Of the pairs of all ranks (collective).
+        """
         collision_mesh = self.contact.collision_mesh
         vertices, candidates = collision_mesh.vertices(self.with_mesh(x)), ipctk.Candidates()
         candidates.build(collision_mesh, vertices, limit, ipctk.LBVH())
         safe = candidates.compute_per_vertex_safe_distances(collision_mesh, vertices, limit)
-        distances = np.asarray(collision_mesh.to_full_dof(np.repeat(safe, 3))).reshape(-1, 3)[: self.body_count, 0]
+        distances = np.array(collision_mesh.to_full_dof(np.repeat(safe, 3))[: 3 * self.body_count : 3])
+        self.contact.comm.Allreduce(MPI.IN_PLACE, distances, MPI.MIN)
         unlimited = np.ones(self.body_count, bool)
         unlimited[self._body_points] = distances[self._body_points] >= MESH.unlimited * limit
         return np.where(unlimited, np.inf, distances)
@@ -443,10 +447,11 @@ class MeshContactSurface(SelfContactSurface):
         law: SelfContactLaw,
         u: Values,
         previous: SelfContactSurface | None,
+        comm: MPI.Intracomm = MPI.COMM_SELF,
     ) -> None:
         """As for SelfContactSurface. Raises InputError where an obstacle overlaps the body at rest."""
         self._obstacles = obstacles
-        super().__init__(skeleton, pattern, law, u, previous)
+        super().__init__(skeleton, pattern, law, u, previous, comm=comm)
 
     def _check_apart(self) -> None:
         refuse_overlaps(self.split, self.pairs)
@@ -454,7 +459,7 @@ class MeshContactSurface(SelfContactSurface):
     def _build_pairs(self, elements: Ints) -> AllMeshPairs[IpcPairs]:
         # the coefficient of friction is that of each obstacle
         parameters = {name: self._parameters[name] for name in ("distance", "stiffness")}
-        return all_mesh_pairs(self._rest_positions, elements, self._obstacles, **parameters)
+        return all_mesh_pairs(self._rest_positions, elements, self._obstacles, **parameters, share=self._share)
 
 
 def refuse_overlaps(split: SplitSurface, pairs: AllMeshPairs[Any]) -> None:
@@ -475,12 +480,15 @@ def all_mesh_pairs(
     *,
     distance: float,
     stiffness: float,
+    share: PairShare | None = None,
 ) -> AllMeshPairs[IpcPairs]:
     """Pairs of a body, `rest_positions` (n, 3), m, and `elements` (k, 3), and obstacles; the others as for IpcPairs."""
 
     def build(mesh: MeshObstacle) -> MeshObstaclePairs[IpcPairs]:
         def make_contact(points: Values, triangles: Ints, patches: Patches) -> IpcPairs:
-            contact = IpcPairs(points, triangles, distance=distance, stiffness=stiffness, friction=mesh.friction)
+            of_both = None if share is None else share.with_others(len(mesh.points))
+            parameters = {"distance": distance, "stiffness": stiffness, "friction": mesh.friction}
+            contact = IpcPairs(points, triangles, **parameters, share=of_both)
             contact.restrict_to_patches(patches)
             return contact
 

@@ -34,6 +34,11 @@ class Vertices:
 
     mesh: ipctk.CollisionMesh
 
+    @property
+    def lowest_vertices(self) -> Ints:
+        """(p,) lowest vertex of which each sample point consists: itself."""
+        return np.arange(self.mesh.num_vertices)
+
     def positions(self, x: Values) -> Values:
         """(p, d) sample points with the vertices at x (n, d), m."""
         return x
@@ -88,6 +93,11 @@ class Centroids:
         rest_positions = np.asfortranarray(self._map @ self._surface.rest_positions)
         faces = (self._surface.faces,) if self._surface.dim == 3 else ()
         return ipctk.CollisionMesh(rest_positions, self._surface.edges, *faces)
+
+    @property
+    def lowest_vertices(self) -> Ints:
+        """(n + m,) lowest vertex of which each sample point consists."""
+        return np.append(np.arange(self._count), self.elements.min(axis=1))
 
     @cached_property
     def _weights(self) -> list[float]:

@@ -1,7 +1,7 @@
 """Term of the balance for contact of a body with itself, and of its fragments with one another, in implicit steps.
 
-Rank 0 has the split surface, finds pairs in contact (ipc_pairs), and maps forces and stiffness to the nodes: x = W u,
-f = W^T dE/dx, K = W^T d2E/dx2 W. All other parts of the balance stay distributed.
+Each rank holds the split surface, finds its share of the pairs in contact (ipc_pairs), and maps their forces and
+stiffness to the nodes: x = W u, f = W^T dE/dx, K = W^T d2E/dx2 W. Nodal values are summed over the ranks.
 
 Equations: docs/theory.md#contact.
 """
@@ -9,22 +9,23 @@ Equations: docs/theory.md#contact.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
-from ..mechanics.extra_couplings import CouplingBuilder, StiffCoupling
+from ..mechanics.extra_couplings import CouplingBuilder, StiffCoupling, stiff_directions
 from ..mechanics.term import Term, TimeLevel
 from ..mechanics.term_protocols import CutPositions
 from ..mesh.domain import Domain
-from ..mesh.parallel import Gather, from_root, on_root, sum_over_ranks
+from ..mesh.parallel import Gather, bcast, sum_over_ranks
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.surface_map import SurfaceMap
-from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface
+from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface, SurfaceSnapshot
 from .laws import stiffness_factor
 from .sample_points import SlipFriction
 
@@ -57,27 +58,21 @@ class SelfContact(Term):
         # m^(d-2), times a stiffness in Pa
         self._stiff_threshold = SURFACE.stiff_ratio * domain.mean_edge_length ** (domain.dim - 2)
         mesh = refined_mesh(domain) if self._is_refined(law) else domain.input_mesh
-        self._skeleton = None if mesh is None else EntityNumbering(mesh)
+        self._skeleton = EntityNumbering(bcast(domain.comm, mesh))
         self._gather = node_gather(domain, law)
         first = domain.space.dofmap.index_map.local_range[0]
-        self._input_nodes = self._gather(first + np.arange(domain.node_count))  # numbers of input nodes, on rank 0
+        self._input_nodes = self._gather.to_all_ranks(first + np.arange(domain.node_count))  # numbers of input nodes
         self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
-        self._surface: SelfContactSurface | None = None
-        self._rebuild()
+        self._rebuild(None)
 
     # --- surface ---
 
-    def _rebuild(self) -> None:
-        """Build the surface of the current damage (collective)."""
-        pattern, u = self._gathered_pattern(), self._gathered(self._u.x.array[: self._owned])
-        cuts = None if self._cuts is None else self._cuts()
-
-        def build() -> SelfContactSurface:
-            assert pattern is not None and u is not None and self._skeleton is not None
-            cut = None if cuts is None else self._skeleton.edge_values(cuts[0], cuts[1][:, 0])
-            return self._build_surface(pattern, u, cut)
-
-        self._surface = on_root(self.comm, build)
+    def _rebuild(self, previous: SelfContactSurface | None) -> None:
+        """Build the surface of the current damage; `previous`: the one until now (collective)."""
+        pattern, u = self._all_patterns(), self._all_nodes(self._u.x.array[: self._owned])
+        cuts = None if self._cuts is None else bcast(self.comm, self._cuts())
+        cut = None if cuts is None else self._skeleton.edge_values(cuts[0], cuts[1][:, 0])
+        self._surface = self._build_surface(pattern, u, previous, cut)
         self._positions: Values | None = None
         self._contact_force: Values | None = None
         self._stored: float | None = None
@@ -86,30 +81,30 @@ class SelfContact(Term):
         self._friction: SlipFriction | None = None
         self._is_stale = True
 
-    def _build_surface(self, pattern: npt.NDArray[np.uint8], u: Values, cut: Values | None) -> SelfContactSurface:
-        """Surface of a pattern of damage, on rank 0."""
-        assert self._skeleton is not None
-        if self._surface is not None and self._surface.represents(pattern):
-            return self._surface
-        return SelfContactSurface(self._skeleton, pattern, self.law, u, self._surface, cut)
+    def _build_surface(
+        self, pattern: npt.NDArray[np.uint8], u: Values, previous: SelfContactSurface | None, cut: Values | None
+    ) -> SelfContactSurface:
+        """Surface of a pattern of damage."""
+        if previous is not None and previous.represents(pattern):
+            return previous
+        return SelfContactSurface(self._skeleton, pattern, self.law, u, previous, cut, self.comm)
 
-    def _gathered_pattern(self) -> npt.NDArray[np.uint8] | None:
-        """(cells,) broken edges of the skeleton's cells, on rank 0; subdivided quadratic cells do not break."""
-        pattern = self._domain.input_numbering.gather_cells(self._pattern)
+    def _all_patterns(self) -> npt.NDArray[np.uint8]:
+        """(cells,) broken edges of the skeleton's cells (collective); subdivided quadratic cells do not break."""
+        pattern = self._domain.input_numbering.gather_cells.to_all_ranks(self._pattern)
         parts = 2**self._domain.dim if self._is_refined(self.law) else 1
-        return None if pattern is None else np.repeat(pattern, parts)
+        return np.repeat(pattern, parts)
 
     def _is_refined(self, law: SelfContactLaw) -> bool:
         """Whether quadratic cells are subdivided into linear ones."""
         return self._domain.order == 2 and not law.corners_only
 
-    def _gathered(self, u: Values) -> Values | None:
-        """(nodes, d) in the order of the input mesh on rank 0 (collective)."""
-        return self._gather(np.asarray(u).reshape(-1, self._domain.dim))
+    def _all_nodes(self, u: Values) -> Values:
+        """(nodes, d) displacements of all nodes in the order of the input mesh, of owned ones u (collective)."""
+        return np.asarray(self._gather.to_all_ranks(np.asarray(u).reshape(-1, self._domain.dim)))
 
     def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
         """Move points of a surface for output to the crack faces of contact, which are offset."""
-        assert self._surface is not None
         contact_map = self._surface.point_map
         if self.law.fragments_only:
             return self._surface.place_faces(at)
@@ -123,46 +118,39 @@ class SelfContact(Term):
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Add new crack faces, retracted where there is no room (collective)."""
         self._pattern = pattern
-        self._rebuild()
-        self._friction, self._is_stale = None, True
+        self._rebuild(self._surface)
 
     def snapshot(self) -> object:
-        """Retracted and excluded parts of the surface, on rank 0."""
-        return (self._surface and self._surface.snapshot(),)
+        """Retracted and excluded parts of the surface."""
+        return self._surface.snapshot()
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective)."""
-        assert isinstance(memory, tuple)
-        if self._surface is not None:
-            self._surface.restore(memory[0])
+        self._surface.restore(cast("SurfaceSnapshot", memory))
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Factors of arms, numbers of excluded elements, steps to the next release of faces, and stiffness."""
-        empty: tuple[Values, Values, tuple[int, int]] = np.empty(0), np.empty(0), (0, 0)
-        share, excluded, pause = empty if self._surface is None else self._surface.snapshot()
+        share, excluded, pause = self._surface.snapshot()
         return {"share": share, "left_out": np.asarray(excluded, float), "pause": np.array(pause, float),
                 "stiffness": np.array([self.law.stiffness])}  # fmt: skip
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint."""
         self._set_stiffness(float(saved["stiffness"][0]))
-        if self._surface is not None:
-            if len(saved["share"]) != len(self._surface.point_map.share):
-                raise ValueError(f"{len(saved['share'])} points of the contact surface instead of those of its damage")
-            pause, remaining = (int(number) for number in saved.get("pause", (1, 1)))
-            self._surface.restore((saved["share"], saved["left_out"].astype(np.int64), (pause, remaining)))
+        if len(saved["share"]) != len(self._surface.point_map.share):
+            raise ValueError(f"{len(saved['share'])} points of the contact surface instead of those of its damage")
+        pause, remaining = (int(number) for number in saved.get("pause", (1, 1)))
+        self._surface.restore((saved["share"], saved["left_out"].astype(np.int64), (pause, remaining)))
 
     def begin_step(self, level: TimeLevel) -> None:
         """Lag friction with the contact at the start of the step."""
         self._level, self._is_stale, self._friction, self._attempts = level, True, None, 0
         if not level.dt:
             return
-        nodal, sticking_speed = self._gathered(level.u_n), self._sticking_speed(level.v_n)
-        if self._surface is not None and nodal is not None:
-            self._surface.extend_faces(nodal)
-            self._start_positions = self._surface.point_map(nodal)
-        if self.law.friction and self._surface is not None and self._start_positions is not None:
-            x, slip = self._start_positions, sticking_speed * level.dt
+        nodal, slip = self._all_nodes(level.u_n), self._sticking_speed(level.v_n) * level.dt
+        self._surface.extend_faces(nodal)
+        self._start_positions = x = self._surface.point_map(nodal)
+        if self.law.friction:
             self._friction = self._surface.pairs.lag_friction(x, x, slip)
 
     def _sticking_speed(self, v: Values) -> float:
@@ -178,37 +166,31 @@ class SelfContact(Term):
         """Discard positions and forces, as u has changed."""
         self._is_stale = True
 
-    def _end_positions(self) -> Values | None:
-        """(n, d) positions at the end of the step that belongs to the current u, m, on rank 0 (collective)."""
-        if self._is_stale:
+    def _end_positions(self) -> Values:
+        """(n, d) positions at the end of the step that belongs to the current u, m (collective)."""
+        if self._is_stale or self._positions is None:
             u = self._level.displacement_at_end(self._u.x.array[: self._owned])
             self._positions, self._is_stale = self._positions_at(u), False
             self._contact_force = self._stored = None
         return self._positions
 
-    def _positions_at(self, u: Values) -> Values | None:
-        """(n, d) positions for owned displacements u, m, on rank 0 (collective)."""
-        nodal = self._gathered(u)
-        return None if self._surface is None or nodal is None else self._surface.point_map(nodal)
+    def _positions_at(self, u: Values) -> Values:
+        """(n, d) positions for owned displacements u, m (collective)."""
+        return self._surface.point_map(self._all_nodes(u))
 
     # --- forces, tangent and energy ---
 
-    def _nodal_forces(self, x: Values | None, *, normal: bool = True) -> Values:
+    def _nodal_forces(self, x: Values, *, normal: bool = True) -> Values:
         """(owned dofs,) forces on the nodes, N (collective).
 
         Args:
-            x: (n, d) positions of the surface on rank 0, m.
+            x: (n, d) positions of the surface, m.
             normal: whether normal forces are included; otherwise those of friction alone.
         """
-
-        def forces() -> Values:
-            assert self._surface is not None and x is not None
-            gradient = self._surface.pairs.gradient(x) if normal else np.zeros_like(x)
-            if self._friction is not None:
-                gradient = gradient + self._friction.gradient(x)
-            return self._surface.nodal_forces(-gradient)
-
-        return np.asarray(self._gather.scatter(on_root(self.comm, forces))).reshape(-1)
+        gradient = self._surface.pairs.gradient(x) if normal else np.zeros_like(x)
+        if self._friction is not None:
+            gradient = gradient + self._friction.gradient(x)
+        return self._gather.sum_owned(self._surface.nodal_forces(-gradient)).reshape(-1)
 
     def contact_forces(self) -> Values | None:
         """(owned dofs,) contact forces at the end of the step, N; None where there are none (collective)."""
@@ -229,78 +211,62 @@ class SelfContact(Term):
         Where few directions are much stiffer than the body, they come apart from the matrix (StiffCoupling).
         """
         x = self._end_positions()
-
-        def stiffness_on_root() -> tuple[csr_matrix, tuple[Values, Values] | None]:
-            assert self._surface is not None and x is not None
-            is_near = self._surface.is_near_tangent(x, self._tangent_positions, again=self._attempts > 1)
-            self._tangent_positions = x
-            exact = is_near and self.allows_exact_tangent
-            H = self._surface.pairs.hessian(x, exact=exact)
-            if self._friction is not None:
-                H = (H + self._friction.hessian(x, exact=exact)).tocsr()
-            threshold = self._stiff_threshold * self.law.stiffness
-            return self._surface.nodal_stiffness(self._level.contact_weights.factor * H, threshold)
-
-        K, stiff = on_root(self.comm, stiffness_on_root) or (None, None)
-        if not self.comm.bcast(K is not None and K.nnz):
+        is_near = self._surface.is_near_tangent(x, self._tangent_positions, again=self._attempts > 1)
+        self._tangent_positions = x
+        exact = is_near and self.allows_exact_tangent
+        H = self._surface.pairs.hessian(x, exact=exact)
+        if self._friction is not None:
+            H = H + self._friction.hessian(x, exact=exact)
+        H = csr_matrix(self._level.contact_weights.factor * H)
+        if not self.comm.allreduce(H.nnz):
             return None
-        if K is None or self._input_nodes is None:
-            matrix = self._coupling(csr_matrix((0, 0)), np.empty(0, np.int64))
-        else:
-            matrix = self._coupling(K, self._input_nodes)
-        if (stiffness := self.comm.bcast(stiff and stiff[1])) is None:
+        matrix = self._coupling(self._surface.nodal_stiffness(H), self._input_nodes)
+        stiff = stiff_directions(H, self._stiff_threshold * self.law.stiffness, self.comm)
+        if stiff is None:
             return matrix
-        directions = self._gather.scatter(stiff and stiff[0])
+        directions, stiffness = self._gather.owned(self._surface.nodal_directions(stiff[0])), stiff[1]
         return StiffCoupling(matrix, directions.reshape(self._owned, len(stiffness)), stiffness)
 
     def min_gap(self) -> float:
         """Least distance within the barrier at the current u, m; infinite where none is active (collective)."""
         x = self._positions_at(self._u.x.array[: self._owned])
-
-        def gap() -> float:
-            assert self._surface is not None and x is not None
-            return self._surface.pairs.min_gap(x)
-
-        return from_root(self.comm, gap)
+        return float(self.comm.allreduce(self._surface.pairs.min_gap(x), op=MPI.MIN))
 
     def stored_energy(self) -> float:
-        """Energy of the barrier at the current u, on rank 0, J (collective)."""
+        """Energy of the barrier at the current u, of this rank's pairs, J (collective)."""
         x = self._end_positions()
         # kept, as the line search and the energy balance both need it
         if self._stored is None:
-            self._stored = 0.0 if self._surface is None or x is None else self._surface.pairs.energy(x)
+            self._stored = self._surface.pairs.energy(x)
         return self._stored
 
     def stiffen_contact(self) -> float:
-        """Make a barrier stiffer whose gaps have nearly closed; returns the energy that this adds, J (collective)."""
+        """Make a barrier stiffer whose gaps have nearly closed; returns the energy that this adds, J (collective).
+
+        The energy is that of this rank's pairs.
+        """
         x = self._end_positions()
-
-        def factor_and_energy() -> tuple[float, float]:
-            assert self._surface is not None and x is not None
-            pairs = self._surface.pairs
-            factor = stiffness_factor(pairs.min_gap(x) / self.law.distance)
-            return factor, (factor - 1) * pairs.energy(x) if factor > 1 else 0.0
-
-        factor, energy = from_root(self.comm, factor_and_energy)
-        if factor > 1:
-            self._set_stiffness(factor * self.law.stiffness)
-        return energy if self.comm.rank == 0 else 0.0
+        gap = self.comm.allreduce(self._surface.pairs.min_gap(x), op=MPI.MIN)
+        if (factor := stiffness_factor(gap / self.law.distance)) <= 1:
+            return 0.0
+        energy = (factor - 1) * self._surface.pairs.energy(x)
+        self._set_stiffness(factor * self.law.stiffness)
+        return energy
 
     def _set_stiffness(self, stiffness: float) -> None:
         if stiffness == self.law.stiffness:
             return
         self.law = replace(self.law, stiffness=stiffness)
-        if self._surface is not None:
-            self._surface.set_stiffness(stiffness)
+        self._surface.set_stiffness(stiffness)
 
     def damping_forces(self) -> Values | None:
         """(owned dofs,) minus the forces of friction, N (collective)."""
         return -self._nodal_forces(self._end_positions(), normal=False) if self.law.friction else None
 
     def potential(self) -> float:
-        """Potential of barrier and friction as they enter the residual, on rank 0, J (collective)."""
+        """Potential of barrier and friction as they enter the residual, of this rank's pairs, J (collective)."""
         x, energy = self._end_positions(), self.stored_energy()
-        if self._friction is not None and x is not None:
+        if self._friction is not None:
             energy += self._friction.energy(x)
         return self._level.contact_weight * self._level.fraction * energy
 
@@ -308,13 +274,11 @@ class SelfContact(Term):
 
     def max_step_fraction(self, change: Values) -> float:
         """Fraction of a change of u (owned dofs,), m, without a collision (collective)."""
-        x, motion = self._end_positions(), self._gathered(np.divide(change, self._level.fraction))
-        return from_root(self.comm, lambda: self._free_fraction(x, motion))
+        return self._free_fraction(self._end_positions(), np.divide(change, self._level.fraction))
 
-    def _free_fraction(self, x: Values | None, motion: Values | None) -> float:
-        """Fraction of a motion (nodes, d) from positions x (n, d), m, without a collision, on rank 0."""
-        assert self._surface is not None and x is not None and motion is not None
-        return self._surface.pairs.free_fraction(x, x + self._surface.point_map.weights @ motion)
+    def _free_fraction(self, x: Values, motion: Values) -> float:
+        """Fraction of a motion (owned dofs,) from positions x (n, d), m, without a collision (collective)."""
+        return self._surface.pairs.free_fraction(x, x + self._surface.point_map.weights @ self._all_nodes(motion))
 
     def begin_solve(self) -> None:
         """Count an attempt of Newton's method; after a failure tangents become exact later."""
@@ -325,15 +289,14 @@ class SelfContact(Term):
         level = self._level
         if not level.dt:
             return u
-        x, motion = self._start_positions, self._gathered(self._level.displacement_at_end(u) - level.u_n)
-        fraction = from_root(self.comm, lambda: self._free_fraction(x, motion))
+        assert self._start_positions is not None
+        fraction = self._free_fraction(self._start_positions, level.displacement_at_end(u) - level.u_n)
         return u if fraction == 1 else np.asarray(level.u_n + fraction * (u - level.u_n))
 
     def clear_search(self) -> None:
         """Discard the candidates of collision detection (not collective)."""
         self._is_stale = True
-        if self._surface is not None:
-            self._surface.pairs.clear_caches()
+        self._surface.pairs.clear_caches()
 
     def destroy(self) -> None:
         """Destroy the objects of PETSc."""

@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..mesh.domain import Domain
+from ..mesh.parallel import allgather
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -44,8 +46,9 @@ class CouplingBuilder:
         matrix.setType(PETSc.Mat.Type.AIJ)
         matrix.setUp()
         dofs = (d * nodes[:, None] + np.arange(d)).reshape(-1).astype(PETSc.IntType)
-        start, columns = part.indptr.astype(PETSc.IntType), dofs[part.indices]
-        matrix.setValuesIJV(start, columns, part.data, PETSc.InsertMode.ADD_VALUES, dofs)
+        rows = np.flatnonzero(np.diff(part.indptr))
+        start, columns = part.indptr[np.append(rows, len(dofs))].astype(PETSc.IntType), dofs[part.indices]
+        matrix.setValuesIJV(start, columns, part.data, PETSc.InsertMode.ADD_VALUES, dofs[rows])
         matrix.assemble()
         return matrix
 
@@ -89,17 +92,23 @@ class StiffDirectionLimits:
 LIMITS = StiffDirectionLimits()
 
 
-def stiff_directions(H: csr_matrix, least: float) -> tuple[csr_matrix, Values] | None:
-    """Eigenvectors (n, m) and eigenvalues (m,), N/m, of a symmetric H (n, n) above `least`; None beyond LIMITS."""
-    from scipy.sparse import csr_matrix, hstack  # a run without contact does without SciPy
-    from scipy.sparse.csgraph import connected_components
+def stiff_directions(H: csr_matrix, least: float, comm: MPI.Comm = MPI.COMM_SELF) -> tuple[csr_matrix, Values] | None:
+    """Eigenvectors (n, m) and eigenvalues (m,), N/m, above `least`, of a symmetric matrix; None beyond LIMITS.
 
-    rows = np.flatnonzero(np.diff(H.indptr))
-    coupled = H[rows][:, rows]
-    _, group = connected_components(coupled, directed=False)
-    sizes = np.bincount(group)
-    if sizes.max(initial=0) > LIMITS.group_dofs:
+    The matrix is the sum of H (n, n) over the ranks (collective).
+    """
+    from scipy.sparse import csr_matrix, hstack  # a run without contact does without SciPy
+
+    rows, group, sizes = _coupled_groups(H)
+    # groups of the sum are no smaller
+    if comm.allreduce(int(sizes.max(initial=0)), op=MPI.MAX) > LIMITS.group_dofs:
         return None
+    if comm.size > 1:
+        H = csr_matrix(sum(allgather(comm, H)))
+        rows, group, sizes = _coupled_groups(H)
+        if sizes.max(initial=0) > LIMITS.group_dofs:
+            return None
+    coupled = H[rows][:, rows]
     # no eigenvalue is above the largest sum of absolute values of a row (Gershgorin)
     bound = np.zeros(len(sizes))
     np.maximum.at(bound, group, np.asarray(abs(coupled).sum(axis=1)).reshape(-1))
@@ -115,3 +124,12 @@ def stiff_directions(H: csr_matrix, least: float) -> tuple[csr_matrix, Values] |
         values.append(eigenvalues[stiff])
     stiffness: Values = np.concatenate(values) if values else np.empty(0)
     return None if len(stiffness) > LIMITS.directions else (csr_matrix(hstack(columns)), stiffness)
+
+
+def _coupled_groups(H: csr_matrix) -> tuple[Ints, Ints, Ints]:
+    """(k,) rows with entries of a symmetric matrix, (k,) their groups that the entries couple, and sizes of these."""
+    from scipy.sparse.csgraph import connected_components
+
+    rows = np.flatnonzero(np.diff(H.indptr))
+    _, group = connected_components(H[rows][:, rows], directed=False)
+    return rows, group, np.bincount(group)

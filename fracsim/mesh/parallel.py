@@ -330,7 +330,11 @@ class Gather:
 
     def sum_owned(self, parts: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
         """(n, ...) sums over the ranks of their `parts` (N, ...) in input order, in the owned rows (collective)."""
-        return np.asarray(sum_over_ranks(self.comm, parts)[self._owned])
+        return self.owned(sum_over_ranks(self.comm, parts))
+
+    def owned(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """(n, ...) owned rows of values (N, ...) in input order."""
+        return np.asarray(values[self._owned])
 
 
 class GatherSubset(Gather):
@@ -349,9 +353,9 @@ class GatherSubset(Gather):
         """(n, ...) rows of the owned entities, 0 outside the subset, of `values` (N, ...) on rank 0."""
         return self._spread(super().scatter(values))
 
-    def sum_owned(self, parts: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """(n, ...) sums over the ranks of their `parts` (N, ...) in the rows of owned entities, 0 outside the subset."""
-        return self._spread(super().sum_owned(parts))
+    def owned(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """(n, ...) rows of owned entities, 0 outside the subset, of values (N, ...) of the subset."""
+        return self._spread(super().owned(values))
 
     def _spread(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """(entities, ...) rows of the subset among zeros."""
