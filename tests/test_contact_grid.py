@@ -1,73 +1,119 @@
-"""The grid of contact: each kind of obstacle, motion and scheme, in 2D and 3D; what has no meaning is refused."""
+"""The grid of contact: what is touched, its motion and the scheme, in 2D and 3D; what has no meaning is refused."""
 
 from __future__ import annotations
 
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pytest
 
 from fracsim.errors import InputError
+from support.intersections import intersecting_elements
 from support.ranks import run_on_ranks
-from support.scenes import displacement, each_step, positions
-from support.touching import CELLS, MOTIONS, SCHEMES, momentum, scene_of, two_bodies
+from support.scenes import each_step
+from support.touching import (
+    COS,
+    EVERY,
+    FEW,
+    OBSTACLES,
+    SIN,
+    TAN,
+    Cell,
+    DrawnSurfaces,
+    G,
+    contact_energy,
+    incline,
+    momentum,
+    refusal,
+    scene_of,
+    sliding_part,
+)
 
 pytest.importorskip("ipctk", reason="an environment made without a network")
 
+Values = npt.NDArray[np.float64]
 
-def refusal(kind: str, motion: str, scheme: str, dim: int) -> str:
-    """What a study of a cell is told; empty if it runs."""
-    if motion in ("free", "hinge") and scheme == "quasi-static":
-        return "inertia"
-    if kind == "mesh" and dim == 2:
-        return "a 2D mesh has none"
-    return ""
+
+def as_parameters(cells: list[Cell], slow: Any) -> list[Any]:
+    """Parameters of a test, those of which `slow` is true marked so."""
+    return [pytest.param(cell, id="-".join(map(str, cell)), marks=[pytest.mark.slow] * slow(cell)) for cell in cells]
+
+
+def is_slow(cell: Cell) -> bool:
+    """Whether another cell of the same terms is fast."""
+    return cell.scheme in ("backward-euler", "generalized-alpha") and (cell.dim == 3 or cell.motion != "free")
 
 
 @pytest.mark.parametrize("dim", (2, 3))
-@pytest.mark.parametrize("scheme", SCHEMES)
-@pytest.mark.parametrize("motion", MOTIONS)
-@pytest.mark.parametrize("kind", ("analytic", "mesh"))
-def test_a_body_and_an_obstacle(kind: str, motion: str, scheme: str, dim: int, tmp_path: Path) -> None:
-    """They meet: no node of the body comes into the obstacle, which is tested without the code of contact; a free
-    obstacle and the body keep their momentum."""
-    if why := refusal(kind, motion, scheme, dim):
+def test_intersections_are_found(dim: int) -> None:
+    """Of a simplex and a copy of it, moved by a share of its size: none beside it, some where it is cut."""
+    points = np.vstack([np.zeros(dim), np.eye(dim)])
+    sides = np.array([np.delete(np.arange(dim + 1), k) for k in range(dim + 1)])
+    for shift, cut in ((1.1, False), (0.3, True), (-0.3, True)):
+        moved = np.concatenate([points, points @ np.diag(np.linspace(1.0, 0.9, dim)) + shift / dim])
+        found = intersecting_elements(moved, np.concatenate([sides, sides + dim + 1]))
+        assert (len(found) > 0) == cut
+        assert np.all(found[:, 0] <= dim) and np.all(found[:, 1] > dim)
+
+
+@pytest.mark.parametrize("cell", as_parameters(EVERY, is_slow))
+def test_what_meets_does_not_intersect(cell: Cell, tmp_path: Path) -> None:
+    """In no frame, by a test of its own; what is free keeps its momentum."""
+    if why := refusal(cell):
         with pytest.raises((InputError, ValueError), match=why):
-            scene_of(kind, motion, scheme, dim, tmp_path)
+            scene_of(cell, tmp_path)
         return
-    scene, state = scene_of(kind, motion, scheme, dim, tmp_path)
-    (bodies,) = [term for term in scene.balance.terms if term.name == "rigid"]
-    start, least, touched = momentum(scene, state), np.inf, 0.0
-    for _ in each_step(scene, state):
-        pose = bodies.posed_at(state.t)[0].pose
-        heights = pose.to_body(positions(scene) + displacement(scene, state))[:, -1]
-        least = min(least, float(heights.min()) - 0.2)
-        told = dict(zip(scene.probes.columns, scene.probes(), strict=True))
-        touched = max(touched, abs(told[f"contact_it_{'xyz'[dim - 1]}"]))
-        if motion == "free":
-            np.testing.assert_allclose(momentum(scene, state), start, atol=1e-9 * 200)
-    assert touched > 1.0
-    # a penalty is penetrated by less than half an edge times v / sqrt(E / rho)
-    assert least > (-0.25 * 1.0 / 10.0 if scheme == "explicit" else 0.0)
+    scene, state = scene_of(cell, tmp_path)
+    drawn, start, stored = DrawnSurfaces(scene), momentum(scene, state), 0.0
+    size = 100.0  # kg m/s, of either side
+    for number, _ in enumerate(each_step(scene, state)):
+        stored = max(stored, contact_energy(scene))
+        if cell.scheme != "explicit" or number % 3 == 0:
+            assert not len(intersecting_elements(*drawn.at(state)))
+        if cell.motion == "free":
+            np.testing.assert_allclose(momentum(scene, state), start, atol=1e-9 * size)
+    assert stored > 0.01
 
 
-@pytest.mark.parametrize("dim", (2, 3))
-@pytest.mark.parametrize("scheme", SCHEMES)
-def test_two_bodies_of_one_mesh(scheme: str, dim: int, tmp_path: Path) -> None:
-    """The upper one falls, or is pressed, on the lower one, and stays above it."""
-    scene, state = two_bodies(scheme, dim, tmp_path)
-    upper, least = positions(scene)[:, -1] > 1.02, np.inf
-    for _ in each_step(scene, state):
-        x = (positions(scene) + displacement(scene, state))[:, -1]
-        least = min(least, float(x[upper].min() - x[~upper].max()))
-    assert least > (-0.05 if scheme == "explicit" else -0.01)  # corners of different columns
-    assert least < 0.03
+def slides(cell: Cell) -> bool:
+    """Whether a cell has an incline: parts do so on a fixed one."""
+    return not refusal(cell) and cell.scheme != "quasi-static" and (cell.partner in OBSTACLES or cell.motion == "fixed")
+
+
+def slides_slowly(cell: Cell) -> bool:
+    """Whether its incline is slow."""
+    if cell == Cell("mesh", "fixed", "newmark", 3):
+        return False
+    return cell.dim == 3 or (cell.motion, cell.scheme) not in (("fixed", "newmark"), ("free", "explicit"))
+
+
+@pytest.mark.parametrize("cell", as_parameters([cell for cell in EVERY if slides(cell)], slides_slowly))
+def test_coulomb_on_an_incline(cell: Cell, tmp_path: Path) -> None:
+    """With mu = 0.9 tan(theta) it slides, held back by mu times the impulse of the pressure; with 1.1 it stays."""
+    speeds, ratios = [], []
+    for ratio in (0.9, 1.1):
+        scene, state = incline(cell, ratio, tmp_path)
+        of, mass = sliding_part(scene, cell)
+        carried = mass * (cell.motion == "prescribed")  # at 1 m/s
+        rows = np.array([(state.t, *momentum(scene, state, of)) for _ in each_step(scene, state)])
+        late = rows[rows[:, 0] > 0.45 * rows[-1, 0]]
+        change = late[-1] - late[0]
+        friction = mass * G * SIN * change[0] - change[1]
+        pressure = mass * G * COS * change[0] + change[-1]
+        ratios.append(friction / pressure / TAN)
+        speeds.append((late[-1, 1] - carried) / mass)
+    assert ratios[0] == pytest.approx(0.9, rel=0.03)
+    assert speeds[0] > 0.02 and abs(speeds[1]) < 0.45 * speeds[0]
+    assert 0.95 < ratios[1] < 1.13
 
 
 @pytest.mark.ranks
-@pytest.mark.parametrize("ranks", (2, 3))
-def test_cells_are_equal_on_any_number_of_ranks(ranks: int, tmp_path: Path) -> None:
-    alone, together = (run_on_ranks("support.touching", count, tmp_path, 200) for count in (1, ranks))
-    assert len(alone) == len(CELLS)
-    for name, values in alone.items():
+@pytest.mark.parametrize("module", ("touching", pytest.param("touching_all", marks=pytest.mark.slow)))
+def test_cells_are_equal_on_any_number_of_ranks(module: str, tmp_path: Path) -> None:
+    alone, *others = (run_on_ranks(f"support.{module}", count, tmp_path, 580) for count in (1, 2, 3))
+    assert len(alone) >= len(FEW)
+    for together, (name, values) in product(others, alone.items()):
         np.testing.assert_allclose(together[name], values, rtol=1e-5, atol=1e-6 * abs(values).max(), err_msg=name)
