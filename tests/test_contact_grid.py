@@ -87,7 +87,7 @@ def slides_slowly(cell: Cell) -> bool:
     """Whether its incline is slow."""
     if cell == Cell("mesh", "fixed", "newmark", 3):
         return False
-    return cell.dim == 3 or (cell.motion, cell.scheme) not in (("fixed", "newmark"), ("free", "explicit"))
+    return cell.dim == 3 or (cell.motion, cell.scheme) not in (("fixed", "newmark"), ("prescribed", "explicit"))
 
 
 @pytest.mark.parametrize("cell", as_parameters([cell for cell in EVERY if slides(cell)], slides_slowly))
