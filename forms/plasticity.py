@@ -4,9 +4,10 @@ F_p is 3 x 3 in 2D as well: under plane strain (F33 = 1) a body flows across the
 elastic stretches relax along their deviator (eq. 30, mechanics.return_mapping). A step that is solved with its own flow
 is balanced by the stress after the return,
 
-    tau = tau_t - beta s,    beta = share softness (1 - Y_s / |s|) where |s| > Y_s, else 0,
+    tau = (1 - beta) tau_t + beta m I,    beta = share softness (1 - Y_s / |s|) where |s| > Y_s, else 0,
 
-with s = dev tau_t of the trial stress (F_p of the start of the step), share = 1 - exp(-nu dt) of the flow rate nu, and
+with s = dev tau_t of the trial stress (F_p of the start of the step), the mean stress m that the change of volume alone
+causes, share = 1 - exp(-nu dt) of the flow rate nu, and
 softness 1 / (1 + K / (3 mu)), the part of the return that hardening by K leaves (Simo and Hughes 1998, box 3.1). The
 norms |s| and Y_s are of Cauchy stress.
 
@@ -65,6 +66,8 @@ class TrialStress:
         J: det F_e = det F.
         inverse_transpose: F_e^-T.
         mean: tr tau / 3, Pa.
+        mean_of_volume: mean that the change of volume causes without a deviator, J d psi / d J, Pa.
+        bulk_modulus: J d mean_of_volume / d J, Pa.
         s: s F_e^-T of the deviator s = dev tau, Pa.
         deviator_norm: |s|, Pa.
     """
@@ -78,6 +81,11 @@ class TrialStress:
         tau = self.P * self.elastic_gradient.T
         self.mean, deviator = ufl.tr(tau) / 3, ufl.dev(tau)
         self.s = self.P - self.mean * self.inverse_transpose
+        # bounded, as an iterate may have inverted cells
+        J, unit = ufl.variable(ufl.max_value(self.J, 0.01)), ufl.Identity(3)
+        of_volume = energy.base.psi(J ** (1 / 3) * unit, unit if rotation is not None else None)
+        self.mean_of_volume = J * ufl.diff(of_volume, J)
+        self.bulk_modulus = J * ufl.diff(self.mean_of_volume, J)
         self.deviator_norm = ufl.sqrt(ufl.inner(deviator, deviator))
 
     def measures(self) -> Expr:
@@ -110,13 +118,18 @@ class ImplicitFlow:
     frobenius: bool
 
     def work(self, u: Expr, w: Expr, dx: ufl.Measure, *, chi: Expr | float, rotation: Expr | None) -> Form:
-        """Return int chi (tau_t - beta s) : grad w F^-1 dX, N m; grad w F_p^-1 is the variation of F_e."""
+        """Return int chi tau : grad w F^-1 dX, N m; grad w F_p^-1 is the variation of F_e.
+
+        The mean of the trial stress grows with the square of a trial shear. It would be many times the yield stress in
+        a step whose strain is many times that of yield, and is no part of the stress after the return.
+        """
         trial = TrialStress(self.energy, u, rotation)
-        stress = trial.P - self._flow_factors(trial)[0] * trial.s
+        beta = self._flow_factors(trial)[0]
+        stress = (1 - beta) * trial.P + beta * trial.mean_of_volume * trial.inverse_transpose
         return chi * ufl.inner(stress, self._elastic_variation(w)) * dx(metadata=stress_quadrature(w))
 
     def tangent(self, u: Expr, v: Expr, w: Expr, dx: ufl.Measure, *, chi: Expr | float, rotation: Expr | None) -> Form:
-        """Return the derivative of the work in direction v, with d tau_t = C : d.
+        """Return the derivative of the work in direction v, with d tau_t = C : d and d m = kappa tr d.
 
             int chi [(1 - beta) d P : grad w F_p^-1 + beta kappa tr d(v) tr d(w)
                      - 2 mu share softness Y_s/|s| (n : d(v)) (n : d(w))] dX,    n = s / |s|,  d(v) = grad v F^-1.
@@ -129,12 +142,12 @@ class ImplicitFlow:
             self._flow_factors(trial),
             (self._elastic_variation(field) for field in (v, w)),
         )
-        # C = 2 mu dev + kappa I x I holds at small elastic strain. Newton's method converges slightly less than
-        # quadratically, since terms of the order of that strain are left out.
+        # d|s| = 2 mu n : d holds at small elastic strain. Newton's method converges less than quadratically, since
+        # terms of the order of that strain are left out, and - beta m tr(d(v) d(w)), which makes tangents indefinite.
         elastic = ufl.derivative(ufl.inner(trial.P, of_w), u, v)
         if rotation is not None:
             elastic += energy.turning_moduli(deformation_gradient(u), rotation, ufl.grad(v), ufl.grad(w))
-        kappa = energy.lmbda + 2 / 3 * energy.mu
+        kappa = trial.bulk_modulus
         volumes, shapes = (ufl.inner(part, of_v) * ufl.inner(part, of_w) for part in (trial.inverse_transpose, trial.s))
         total = (1 - beta) * elastic + beta * kappa * volumes - 2 * energy.mu * turning * shapes
         if self.frobenius:
