@@ -48,6 +48,20 @@ def test_a_crack_does_not_slow_the_linear_solver(scheme: str) -> None:
     assert more[0] < more[1] / 2, f"{more[0]} iterations more than before the crack, {more[1]} with such aggregates"
 
 
+def test_a_set_up_that_failed_does_not_spoil_the_next() -> None:
+    """PETSc keeps the reason of a failure on the preconditioner, whatever is set up after it."""
+    data = study(BAR, mesh={"size": [0.6, 0.2, 0.2], "h": 0.05}, time={"end": 1.0, "scheme": "backward-euler"})
+    scene = build_scene(MPI.COMM_SELF, data)
+    Walk(scene).advance()
+    linear = scene.stepper.solver.linear
+    applied, operators = linear.preconditioner.applied, linear.operators
+    applied.pc.setFailedReason(PETSc.PC.FailedReason.SUBPC_ERROR)
+    applied.set_up(operators, rebuild=True)
+    linear.balance.work_vector.set(1.0)
+    linear.ksp.solve(linear.balance.work_vector, linear.correction)
+    assert linear.ksp.reason > 0
+
+
 def test_multigrid_of_another_kind_takes_over_where_a_body_is_in_pieces() -> None:
     """Ten planes through a bar, and none: a user who asks for a kind keeps it."""
     assert [smoother(planes, {}) for planes in (0, 10)] == ["chebyshev", "richardson"]

@@ -116,6 +116,8 @@ class AppliedPreconditioner:
         """
         if rebuild:
             self.pc.reset()
+            # PETSc would call the next set-up failed as well after one that failed
+            self.pc.setFailedReason(PETSc.PC.FailedReason.NOERROR)
         self.release_vcycle()
         operators.attach_to(self._ksp, self.pc)
         if self._is_default and operators.blocks is not None:

@@ -346,7 +346,15 @@ def _following(modification: TangentModification, earlier: TangentModification) 
 
 
 def _needs_fresh_preconditioner(solvers: Solvers, last: Attempt | None) -> bool:
-    return not solvers.balance.conservative and _exact_tangents_failed(last)
+    """Whether exact tangents may be solved with another preconditioner, or from another start.
+
+    From the same start a tangent stays indefinite, and one whose preconditioner could not be set up stays as it is.
+    """
+    if solvers.balance.conservative or not _exact_tangents_failed(last):
+        return False
+    reason = PETSc.KSP.ConvergedReason
+    is_final = solvers.ksp.reason in (reason.DIVERGED_INDEFINITE_MAT, reason.DIVERGED_PCSETUP_FAILED)
+    return solvers.restart_at_step_start or not is_final
 
 
 def _fresh_preconditioner(solvers: Solvers, task: Task, last: Attempt | None) -> Attempt:
@@ -363,12 +371,15 @@ def _fresh_preconditioner(solvers: Solvers, task: Task, last: Attempt | None) ->
 def _needs_gmres(solvers: Solvers, last: Attempt | None) -> bool:
     """Whether CG met negative curvature, as in a buckling, softening or nearly incompressible body.
 
-    Not where factors take no longer, nor where CG ran out of iterations, as GMRES would.
+    Not where factors take no longer, nor where CG ran out of iterations or had no preconditioner, as GMRES would.
     """
+    reason = PETSc.KSP.ConvergedReason
     if last is None or not last.linear_solves_failed or solvers.ksp.getType() != "cg":
         return False
-    linear, max_it = solvers.linear, PETSc.KSP.ConvergedReason.DIVERGED_MAX_IT
-    if solvers.ksp.reason == max_it and linear.may_factorise():
+    if solvers.ksp.reason == reason.DIVERGED_PCSETUP_FAILED:
+        return False
+    linear = solvers.linear
+    if solvers.ksp.reason == reason.DIVERGED_MAX_IT and linear.may_factorise():
         return False
     return not linear.may_factorise(solvers.policy.max_direct_before_gmres(solvers.balance.domain.dim))
 
