@@ -11,6 +11,7 @@ import numpy.typing as npt
 import pytest
 from scipy.sparse import eye
 
+from fracsim.contact.ipc_pairs import IpcPairs
 from fracsim.contact.penalty_contact import PenaltyContact, PenaltySurface
 from fracsim.contact.penalty_contacts import ContactStiffness
 from fracsim.contact.penalty_pairs import PenaltyPairs
@@ -281,3 +282,15 @@ def test_rubbing_is_in_the_books(tmp_path: Path) -> None:
     assert slid > 0 and state.dissipated > 0.005 * began
     given = (m * state.v.reshape(-1, 2))[right].sum(axis=0)
     assert 0 < given[1] <= 0.3 * given[0] * (1 + 1e-9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_surface_without_elements_touches_nothing(dim: int) -> None:
+    """As where all cells are split and fragments alone are in contact: no energy, forces, gaps or candidates."""
+    x = np.random.default_rng(1).random((4, dim))
+    none, stiffness = np.empty((0, dim), np.int64), ContactStiffness.of_one_body(np.ones(4))
+    barrier = IpcPairs(x, none, distance=0.1, stiffness=1.0)
+    assert barrier.free_fraction(x, x + 1.0) == 1.0 and not barrier.hessian(x).nnz
+    for pairs in (barrier, PenaltyPairs(x, none, stiffness, distance=0.1)):
+        assert pairs.energy(x) == 0.0 and not pairs.gradient(x).any() and pairs.min_gap(x) == np.inf
+        assert not pairs.pressure(x).any() and not len(pairs.intersections(x))

@@ -208,14 +208,16 @@ class PairSearch:
 
     def clear_caches(self) -> None:
         """Discard all candidates and pairs."""
-        self._candidates: list[ipctk.Candidates] = []
+        # a surface without elements has no candidates, wherever it is
+        is_empty = not len(self._mesh.rest_positions)
+        self._candidates = [ipctk.Candidates() for _ in self._kinds] if is_empty else []
         self._active: list[ActivePairs] = []
         unknown = np.full(self._mesh.rest_positions.shape, np.nan)
         self._search_start = self._search_motion = self._active_positions = unknown
 
     def active_pairs(self, x: Values) -> list[ActivePairs]:
         """Pairs of each kind on which its barrier acts; those of the last x are kept."""
-        if not np.array_equal(x, self._active_positions):
+        if not self._active or not np.array_equal(x, self._active_positions):
             items = zip(self._kinds, self.candidates(x), strict=True)
             self._active = [kind.active_pairs(candidates, x) for kind, candidates in items]
             self._active_positions = x.copy()
@@ -237,7 +239,7 @@ class PairSearch:
         self.search_along(x, end)
         named = [pairs for kind, pairs in zip(self._kinds, self._candidates, strict=True) if kind.name]
         steps = (pairs.compute_collision_free_stepsize(self._mesh, x, end, 0.0, CCD) for pairs in named)
-        return float(min(steps))
+        return float(min(steps, default=1.0))
 
     def search_along(self, x: Values, end: Values) -> None:
         """Search candidates for the whole motion from x to `end`, unless they are valid."""
@@ -280,7 +282,7 @@ def _extract(candidates: ipctk.Candidates, name: str) -> ipctk.Candidates:
 
 def centred(x: Values) -> Values:
     """(n, d) positions relative to their mean, m."""
-    result: Values = x - x.mean(axis=0)
+    result: Values = x - x.mean(axis=0) if len(x) else x
     return result
 
 
@@ -295,6 +297,8 @@ def max_length(vectors: Values) -> float:
 def intersecting_elements(mesh: ipctk.CollisionMesh, x: Values) -> Ints:
     """(k, 2) elements that intersect and are not neighbours, with vertices at x (n, d), m."""
     phase = ipctk.LBVH()
+    if not len(x):
+        return NO_PAIRS
     phase.build(x, mesh.edges, mesh.faces, 0.0)
     return _intersecting_triangles(phase, mesh, x) if x.shape[1] == 3 else _intersecting_segments(phase, mesh, x)
 
@@ -381,7 +385,7 @@ class IpcPairs:
         self._elements, corners = elements, elements.astype(np.int32)
         is_3d = rest_positions.shape[1] == 3
         faces = (corners,) if is_3d else ()
-        edges = ipctk.edges(corners) if is_3d else corners
+        edges = ipctk.edges(corners) if is_3d and len(corners) else corners.reshape(-1, 2)
         self._mesh = ipctk.CollisionMesh.build_from_full_mesh(rest_positions, edges, *faces)
         # in 3D ipctk weights points as half of all pairs of a triangle, and edges as the other half
         at_vertices = Vertices(self._mesh)
@@ -431,12 +435,16 @@ class IpcPairs:
         """(n, d) dE/dx of this rank's pairs, N: minus the forces on the points."""
         vertices = self._mesh.vertices(x)
         total = sum(pairs.gradient() for pairs in self._search.active_pairs(vertices))
+        if not len(self._mesh.rest_positions):
+            return np.zeros_like(x)
         return np.asarray(self._mesh.to_full_dof(total)).reshape(x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2 of this rank's pairs, N/m; unless `exact`, each without its negative eigenvalues."""
         vertices, method = self._mesh.vertices(x), projection(exact=exact)
         total = sum(pairs.hessian(method) for pairs in self._search.active_pairs(vertices))
+        if not len(self._mesh.rest_positions):
+            return csr_matrix((x.size, x.size))
         return csr_matrix(self._mesh.to_full_dof(total))
 
     def set_stiffness(self, stiffness: float) -> None:
@@ -489,7 +497,8 @@ class IpcPairs:
     def _own_free_fraction(self, x: Values, end: Values) -> float:
         """Fraction of the motion from x to `end` (n, d) without a collision of this rank's pairs."""
         vertices, motion = self._mesh.vertices(x), self._mesh.vertices(end) - self._mesh.vertices(x)
-        motion -= motion.mean(axis=0)  # the mean motion brings nothing together
+        if len(motion):
+            motion -= motion.mean(axis=0)  # the mean motion brings nothing together
         if self._is_short(vertices, motion):
             return 1.0
         pieces = self._piece_count(motion)
