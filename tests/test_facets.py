@@ -186,6 +186,11 @@ def test_facets_before_what_turns_keep_a_tenth_of_their_gaps(name: str) -> None:
         every = safe_motion_fractions(placed, flat, moved, q, facets)
         apart.append(float((safe_motion_fractions(placed, flat, moved, q) > every).mean()))
         gap = facets.closest_points(placed, flat, np.arange(len(corners))).gap
+        # a known least gap changes nothing, however long the motion
+        for part in (1e-3, 1e-2, 0.1, 1.0):
+            way = placed, flat, part * moved, part * q, facets
+            known = safe_motion_fractions(*way, min_gap=min(gap.min(), placed.distance(flat).min()))
+            np.testing.assert_array_equal(known, safe_motion_fractions(*way))
         least = every[corners].min(axis=1)
         for part in np.linspace(0.0, 1.0, 5):
             ways = [(placed.pose.incremented(part * s * q), flat[c] + part * s * moved[c])

@@ -55,6 +55,7 @@ class ContactState:
         self._domain, self._u, self._owned = domain, u, domain.node_count * domain.dim
         self.comm = domain.comm
         self._contact_forces: list[ContactForces] | None = None
+        self._nodal_forces: Values | None = None  # of the present contact forces
         self._sticking_slips: list[float] | None = None  # m, of each obstacle in the step; None: not known yet
         self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
         self._attempts = 0  # of Newton's method in the step
@@ -220,7 +221,7 @@ class ContactState:
 
     def discard_forces(self) -> None:
         """Discard forces, as u or poses have changed."""
-        self._contact_forces = None
+        self._contact_forces = self._nodal_forces = None
 
     def _end_displacement(self) -> Values:
         """(owned dofs,) displacement at the end of the step that belongs to the current u, m."""
@@ -238,7 +239,7 @@ class ContactState:
     def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
         """Forces of an obstacle at a given pose on the points."""
         if self._is_out_of_range(number, posed):
-            return no_contact(self._domain.dim)
+            return no_contact(self._domain.dim, self.barrier_width)
         obstacle, lagged = self.obstacles[number], self._lagged[number]
         friction = None
         if lagged is not None and self._sticking_slips is not None:
@@ -301,10 +302,12 @@ class ContactState:
 
     def nodal_forces(self) -> Values:
         """(owned dofs,) forces of the obstacles on the nodes at the end of the step, N (collective)."""
-        forces = np.zeros_like(self.surface.rest_positions)
-        for contact in self.obstacle_forces():
-            forces[contact.points] += contact.normal + contact.friction
-        return self.surface.interpolation.assemble_to_nodes(forces)
+        contacts = self.obstacle_forces()
+        if self._nodal_forces is None:
+            points = np.concatenate([contact.points for contact in contacts])
+            forces = np.concatenate([contact.normal + contact.friction for contact in contacts])
+            self._nodal_forces = self.surface.interpolation.assemble_points_to_nodes(points, forces[..., None])[:, 0]
+        return self._nodal_forces
 
     def friction_work(self, number: int) -> tuple[float, float]:
         """Work of friction on the body in the step, and the part of it done by the obstacle's own motion.

@@ -23,7 +23,7 @@ from ..mesh.domain import Domain
 from ..mesh.parallel import allgather, gather
 from ..mesh.split_surface.local_surface import LocalSurface, ParentMatrix
 from ..mesh.split_surface.point_matching import match_points
-from ..mesh.split_surface.surface_map import SurfaceMap
+from ..mesh.split_surface.surface_map import SurfaceMap, row_entries
 from .facet_contact import FACETS, ContactFacets
 
 Values = npt.NDArray[np.float64]
@@ -442,13 +442,10 @@ def nodal_stiffness(W: csr_matrix, corners: Ints, blocks: Values) -> csr_matrix:
     """
     (k, c), points = corners.shape, corners.reshape(-1)
     d = blocks.shape[1] // c
-    # entries of the rows of W of all corners, those of a group one after another
-    lengths = np.diff(W.indptr)[points]
-    corner = np.repeat(np.arange(k * c), lengths)
-    entry = np.arange(len(corner)) - np.repeat(np.cumsum(lengths) - lengths, lengths) + W.indptr[points][corner]
+    entry, corner = row_entries(W, points)
     node, weight, group = W.indices[entry], W.data[entry], corner // c
     # pairs of entries of a group
-    counts = lengths.reshape(k, c).sum(axis=1)
+    counts = np.bincount(group, minlength=k)
     partners, starts = counts[group], (np.cumsum(counts) - counts)[group]
     first = np.repeat(np.arange(len(entry)), partners)
     second = np.arange(len(first)) + np.repeat(starts - np.cumsum(partners) + partners, partners)

@@ -90,6 +90,8 @@ class ContactFacets:
     def closest_points(self, posed: PosedShape, x: Values, facets: Ints) -> FacetClosestPoints:
         """Closest points of facets (k,), with points at x (n, d), m."""
         corners, start = x[self.corners[facets]], self._last_barycentric[facets]
+        if not len(facets):
+            return FacetClosestPoints(posed, corners, self.smoothing, start)
         if (new := np.isnan(start[:, 0])).any():
             start[new] = initial_barycentric(posed, corners[new], self.smoothing)
         closest = find_closest_points(posed, corners, self.smoothing, start)
@@ -198,7 +200,7 @@ class FacetForces:
     def _plane_gap(self) -> SoftMinGap:
         return SoftMinGap(self._corner_gaps, self.closest.smoothing)
 
-    @property
+    @cached_property
     def energy(self) -> Values:
         """(k,) F, J; infinite where a facet is cut."""
         inner = self.potential.energy(self.closest.gap)
@@ -274,6 +276,9 @@ def evaluate_facets(
     near = facets.within_reach(posed, x, law.width)
     if start is not None:
         near = np.union1d(near, facets.within_reach(*start, law.width))
+    if not len(near):
+        closest = facets.closest_points(posed, x, near)
+        return FacetForces(facets.corners[near], facets.area[near], closest, law, law, law), 0.0
     closest = facets.closest_points(posed, x, near)
     start_gap, acting = None, closest.gap < law.width  # elsewhere gap' >= gap, and F = 0 with its derivatives
     if start is not None:
@@ -346,6 +351,7 @@ def merge_forces(of_points: ContactForces, inner: FacetForces, stored: float) ->
     """Forces on points and on facets together; `stored`: energy of the facets, J."""
     if not len(inner.area):
         return of_points
+    min_gap = min(of_points.min_gap, float(inner.closest.gap.min()))
     points = np.union1d(of_points.points, inner.corners.reshape(-1))
     rows, d = np.searchsorted(points, of_points.points), of_points.normal.shape[1]
     normal, friction = np.zeros((2, len(points), d))
@@ -358,4 +364,5 @@ def merge_forces(of_points: ContactForces, inner: FacetForces, stored: float) ->
         return of_normal, of_friction
 
     potential = of_points.potential + float(inner.energy.sum())
-    return ContactForces(points, of_points.energy + stored, normal, friction, potential, hessians, inner)
+    energy = of_points.energy + stored
+    return ContactForces(points, energy, normal, friction, potential, hessians, min_gap, inner)

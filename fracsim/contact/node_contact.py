@@ -148,6 +148,7 @@ class ContactForces:
         friction: (k, d) friction forces on the points, N.
         potential: J; both forces are minus its derivatives.
         make_hessians: returns `normal_hessian` and `friction_hessian`; called once, when they are needed.
+        min_gap: lower bound of the gaps of all points and facets, m.
         facets: coupling of corners of facets, whose forces are in `normal`; None without any.
     """
 
@@ -157,6 +158,7 @@ class ContactForces:
     friction: Values
     potential: float
     make_hessians: Callable[[], tuple[Values, Values]]
+    min_gap: float = 0.0
     facets: FacetCoupling | None = None
 
     @cached_property
@@ -249,15 +251,17 @@ def evaluate_points(
             of_friction[np.searchsorted(points, lagged.points)] = friction.hessian(lagged.force, lagged.normal, motion)
         return of_normal, of_friction
 
-    energy, total = float(point_area @ barrier.energy(gap)), float(point_area @ potential.energy(value))
+    energy = float(point_area @ barrier.energy(gap))
+    total = energy if start is None else float(point_area @ potential.energy(value))
     normal_force = -(point_area * slope)[:, None] * gradient
-    return ContactForces(points, energy, normal_force, friction_force, total + friction_energy, hessians)
+    min_gap = float(gap.min(initial=barrier.width))
+    return ContactForces(points, energy, normal_force, friction_force, total + friction_energy, hessians, min_gap)
 
 
-def no_contact(d: int) -> ContactForces:
-    """Forces of an obstacle that is out of range."""
+def no_contact(d: int, width: float = 0.0) -> ContactForces:
+    """Forces of an obstacle from which all points are farther away than the width of its barrier, m."""
     empty = np.empty((0, d))
-    return ContactForces(np.empty(0, np.int64), 0.0, empty, empty, 0.0, lambda: (np.empty((0, d, d)),) * 2)
+    return ContactForces(np.empty(0, np.int64), 0.0, empty, empty, 0.0, lambda: (np.empty((0, d, d)),) * 2, width)
 
 
 def positive_part(blocks: Values) -> Values:

@@ -206,7 +206,10 @@ class ObstacleTerm(ContactState, Term):
         if q is None:
             q = np.zeros_like(self.increments[number])
         facets = self._facets_for(number)
-        return safe_motion_fractions(self.posed[number], self.positions, motion, q, facets, self._point_candidates)
+        min_gap = self.obstacle_forces()[number].min_gap
+        return safe_motion_fractions(
+            self.posed[number], self.positions, motion, q, facets, self._point_candidates, min_gap
+        )
 
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) first guess of u, m, that crosses no obstacle on its way from the start (collective)."""

@@ -25,6 +25,7 @@ from .laws import BARRIER
 from .obstacle import RigidObstacle
 from .pose import PosedShape, rotate_vectors
 from .proximity import ProximityCandidates
+from .shape_base import lengths
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -227,6 +228,7 @@ def safe_motion_fractions(
     q: Values,
     facets: ContactFacets | None = None,
     candidates: ProximityCandidates | None = None,
+    min_gap: float = 0.0,
 ) -> Values:
     """(n,) fractions in [0, 1] of motions that leave a tenth of each gap to an obstacle; 0 where a gap is closed.
 
@@ -237,14 +239,17 @@ def safe_motion_fractions(
         q: (p,) increment of the obstacle's pose.
         facets: facets on which the obstacle acts; corners get the fractions of their facets as well.
         candidates: search for points near the obstacle; None: all are tested.
+        min_gap: lower bound of all gaps at the start, m.
     """
     rotation = (q := posed.effective_increment(q))[posed.pose.dim :]
     relative = motion - q[: posed.pose.dim]
-    reach, rotation_motion = np.linalg.norm(relative, axis=1), None
+    reach, rotation_motion = lengths(relative), None
     if rotation.any():
         rotation_motion = np.linalg.norm(rotation) * (np.linalg.norm(x - posed.pose.centre, axis=1) + reach)
         reach = reach + rotation_motion
     max_reach, fraction = LIMITS.reach * float(reach.max(initial=0.0)), np.ones(len(x))
+    if max_reach < min_gap:
+        return fraction
     if candidates is not None:
         tested = candidates(posed, x, max_reach)
     elif posed.distance_bound(x) > max_reach:
@@ -259,9 +264,10 @@ def safe_motion_fractions(
         fraction[near] = safe_fractions(points.gap, points.speed, len(near))
     if facets is not None:
         near = facets.closing_facets(posed, x, relative, rotation_motion, LIMITS.reach * reach)
-        closest, corners = facets.closest_points(posed, x, near), facets.corners[near]
-        facet_fraction = _facet_fractions(FacetMotion(closest, relative[corners], rotation))
-        np.minimum.at(fraction, corners, facet_fraction[:, None])
+        if len(near):
+            closest, corners = facets.closest_points(posed, x, near), facets.corners[near]
+            facet_fraction = _facet_fractions(FacetMotion(closest, relative[corners], rotation))
+            np.minimum.at(fraction, corners, facet_fraction[:, None])
     return fraction
 
 

@@ -272,15 +272,18 @@ class Tangent:
 
     def _assemble_all(self, psd_tolerance: float | None) -> None:
         reused = self._is_reusable(psd_tolerance)
-        if not reused:
-            self._assemble_body(psd_tolerance)
+        # single entries are sums of the body's part and of couplings, blocks have no couplings
+        has_old_couplings = self.couplings.varying and self._assembler.blocks is None
+        if not reused or has_old_couplings:
+            self._assemble_body(psd_tolerance, reuse=reused)
         with_contact = self._with_contact
         if (blocks := self._assembler.blocks) is not None:
             self.couplings.put_beside(blocks, with_contact=with_contact)
             # entries have the couplings of the last tangent, also where its blocks are reused
             self._assembler.entries_outdated = True
         else:
-            changed = self.couplings.add_to_entries(self.matrix, with_contact=with_contact, only_varying=reused)
+            has_constant = reused and not has_old_couplings
+            changed = self.couplings.add_to_entries(self.matrix, with_contact=with_contact, only_varying=has_constant)
             self.pattern_version += changed
         eliminating = self._eliminating if with_contact else []
         self.low_rank_updates = [update for term in eliminating for update in term.low_rank_updates()]
@@ -289,21 +292,25 @@ class Tangent:
 
     # --- the body's part ---
 
-    def _assemble_body(self, psd_tolerance: float | None) -> None:
-        """Assemble forms and inertia, without couplings."""
+    def _assemble_body(self, psd_tolerance: float | None, *, reuse: bool) -> None:
+        """Assemble forms and inertia, without couplings; `reuse`: the forms are those of the last assembly."""
         if self.couplings.in_entries:
             self.matrix.zeroEntries()  # entries beyond the pattern of the cells
-        psd_form = None if psd_tolerance is None else self._psd_form(psd_tolerance)
+        psd_form = None if reuse or psd_tolerance is None else self._psd_form(psd_tolerance)
         factor = sum(term.mass_factor for term in self._inertial)
         if self._assembler.blocks is not None:
             mass = self._mass.block_values(self._assembler, factor) if factor else None
             self._assembler(self._motion.bcs, psd_form, mass)
         else:
-            self._assembler(self._motion.bcs, psd_form)
+            if reuse:
+                self._assembler.set_entries()
+            else:
+                self._assembler(self._motion.bcs, psd_form)
             if factor:
                 self._mass.add_to(self.matrix, factor, more_entries=self.couplings.in_entries)
-        u = self._u.x.array[: self._owned]
-        self._assembled_at = (psd_tolerance, u.copy()) if self._depends_on_u_alone else None
+        if not reuse:
+            u = self._u.x.array[: self._owned]
+            self._assembled_at = (psd_tolerance, u.copy()) if self._depends_on_u_alone else None
 
     def _is_reusable(self, psd_tolerance: float | None) -> bool:
         """Whether the last K of this attempt is the body's part, and u has hardly changed since (collective).
@@ -311,9 +318,7 @@ class Tangent:
         In contact most Newton steps are small against a mean edge, and only the barrier is nonlinear. While fragments
         come into contact one after another, the same step is found again and again.
         """
-        # blocks have no couplings, but single entries are sums of both
-        has_old_couplings = self.couplings.varying and self._assembler.blocks is None
-        if self._assembled_at is None or has_old_couplings or not self.couplings.has_contact:
+        if self._assembled_at is None or not self.couplings.has_contact:
             return False
         tolerance, u = self._assembled_at
         if tolerance != psd_tolerance:

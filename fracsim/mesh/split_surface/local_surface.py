@@ -27,7 +27,7 @@ from ..simplices import is_split
 from .closed_surface import SplitSurface, build_split_surface
 from .entity_numbering import CRACK, EntityNumbering
 from .point_matching import point_identity
-from .surface_map import SurfaceMap, gradient_entries, mean_parent_positions
+from .surface_map import SurfaceMap, gradient_entries, mean_parent_positions, row_entries
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -264,9 +264,11 @@ class ParentMatrix:
 
     def assemble_points_to_nodes(self, points: Ints, forces: Values) -> Values:
         """(owned dofs, m) nodal forces equivalent to m sets of forces (k, d, m) at points (k,) (collective)."""
-        k, d, m = forces.shape
-        at_nodes = self._surface.point_map.weights[points].T @ forces.reshape(k, d * m)
-        return np.stack([self.sum_at_nodes(part) for part in np.moveaxis(at_nodes.reshape(-1, d, m), 2, 0)], axis=1)
+        W, m = self._surface.point_map.weights, forces.shape[2]
+        entry, row = row_entries(W, points)
+        at_nodes = np.zeros((W.shape[1], *forces.shape[1:]))
+        np.add.at(at_nodes, W.indices[entry], W.data[entry][:, None, None] * forces[row])
+        return np.stack([self.sum_at_nodes(at_nodes[:, :, i]) for i in range(m)], axis=1)
 
     def sum_at_nodes(self, parts: Values) -> Values:
         """(owned dofs,) sums over ranks of `parts` (columns, d) at the nodes in the columns (collective)."""

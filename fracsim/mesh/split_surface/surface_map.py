@@ -78,6 +78,17 @@ class SurfaceMap:
         return np.asarray(middle + share[:, None] * (self._out[points] + self._arms[points] @ u))
 
 
+def row_entries(matrix: csr_matrix, rows: Ints) -> tuple[Ints, Ints]:
+    """(e,) entries of rows (k,) of a matrix, one row after another, and (e,) which of the rows each belongs to.
+
+    For few rows a third of the time of SciPy's selection of rows.
+    """
+    lengths = np.diff(matrix.indptr)[rows]
+    row = np.repeat(np.arange(len(rows)), lengths)
+    starts = matrix.indptr[rows] - np.cumsum(lengths) + lengths
+    return np.arange(len(row)) + starts[row], row
+
+
 def mean_parent_positions(points: Values, follow: PointParents) -> Values:
     """(n, d) mean reference positions of the parents of `points` (n, d), m."""
     start = follow.start
