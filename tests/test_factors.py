@@ -31,7 +31,8 @@ def pressed(**more: Any) -> Any:
 
 
 def test_a_body_that_cg_is_dear_for_is_factorised() -> None:
-    """Nearly incompressible, in the plane: the same displacement, a fifth of the iterations. Who asks for CG has it."""
+    """Nearly incompressible, in the plane: the same displacement, after the first step a fifth of the iterations. Who
+    asks for CG has it."""
     found = {}
     for way, solver in solver_comparison.SOLVERS.items():
         study = solver_comparison.loaded_box(
@@ -39,7 +40,7 @@ def test_a_body_that_cg_is_dear_for_is_factorised() -> None:
         )
         tight = solver | {"snes_rtol": 1e-9}
         scene, walk = make_scene(**{key: study[key] for key in TABLES}, solver=tight)
-        krylov = sum(walk.advance().solve.krylov_iterations for _ in range(2))
+        krylov = [walk.advance().solve.krylov_iterations for _ in range(2)][-1]
         found[way] = krylov, displacement(scene, walk)
         scene.destroy()
     assert found["default"][0] < found["CG"][0] / 5

@@ -47,6 +47,13 @@ class SolveResult:
     reason: str
     stopped_for_cost: bool = False
 
+    def with_iterations_of(self, other: SolveResult) -> SolveResult:
+        """Return this result with the iterations of both."""
+        newton = self.newton_iterations + other.newton_iterations
+        return replace(
+            self, newton_iterations=newton, krylov_iterations=self.krylov_iterations + other.krylov_iterations
+        )
+
 
 class CostLimit:
     """Bound on the Krylov iterations of an attempt; this one has none."""
@@ -203,6 +210,7 @@ class NewtonSolver:
     Attributes:
         snes: SNES of the last attempt.
         linear: linear solver.
+        spent: numbers of all Newton and Krylov iterations so far.
     """
 
     def __init__(self, balance: Balance, given: PetscOptions, policy: SolverPolicy, *, plain: bool = False) -> None:
@@ -211,7 +219,7 @@ class NewtonSolver:
         chosen = chosen_options(balance, given, plain=plain, policy=policy)
         self._options = PetscOptionSet(chosen)
         snes = self.snes = self._first = PETSc.SNES().create(balance.domain.comm)
-        self._all_snes = [snes]
+        self._all_snes, self.spent = [snes], (0, 0)
         snes.setOptionsPrefix(self._options.prefix)
         snes.setFunction(lambda _, x, b: balance.assemble_free_residual(x, b), balance.work_vector)
         self._x = balance.work_vector.duplicate()
@@ -324,10 +332,12 @@ class NewtonSolver:
         if self._modified is not None:
             self._modified.use_modification(modification)
         try:
-            return self._attempt(guess)
+            result = self._attempt(guess)
         finally:
             if self._modified is not None:
                 self._modified.use_modification(None)
+        self.spent = self.spent[0] + result.newton_iterations, self.spent[1] + result.krylov_iterations
+        return result
 
     def _attempt(self, guess: Values | None) -> SolveResult:
         self.shrink_tangent()

@@ -6,6 +6,7 @@ Equations: docs/theory.md#newtons-method.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -107,13 +108,14 @@ class NonlinearSolver:
     def solve(self, guess: Values) -> SolveResult:
         """Solve r(u) = 0 from `guess`, (owned dofs,) m (collective).
 
-        u of the balance holds the result, also where it is no solution.
+        u of the balance holds the result, also where it is no solution. Iterations are those of all strategies tried.
 
         Raises:
             StepAborted: if a stop was requested.
             InputError: if PETSc cannot solve with the options of the study.
         """
         self.attempts = []
+        newton, krylov = self._newton.spent
         with option_errors(self._given):
             attempt = try_in_turn(STRATEGIES, self._solvers, Task(guess, self.selector, self.attempts))
         if attempt.strategy in ITERATIVE_NAMES:
@@ -121,7 +123,8 @@ class NonlinearSolver:
                 self.selector.start_spell(preferred=True)
             elif not attempt.linear_solves_failed:
                 self.selector.iterations_served()
-        return attempt.result
+        newton, krylov = self._newton.spent[0] - newton, self._newton.spent[1] - krylov
+        return replace(attempt.result, newton_iterations=newton, krylov_iterations=krylov)
 
     def destroy(self) -> None:
         """Free PETSc's objects and remove the options from its database; the solver cannot be used any more."""

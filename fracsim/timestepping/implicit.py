@@ -82,7 +82,7 @@ class ImplicitStepper(BalanceStepper):
             broken, released = broken + result.broken_edges, released + result.released_energy
             inelastic.damage_changed(result)
             again = self._attempt(state, dt)
-            solve = sum_of_iterations(solve, again)
+            solve = solve.with_iterations_of(again)
             if not again.converged:
                 self.failures.unbalanced_steps += 1
                 self._return_to(solved, state, dt)
@@ -101,13 +101,3 @@ class ImplicitStepper(BalanceStepper):
 
     def _release(self, end: State, solved: Values, result: PassResultProtocol) -> State:
         return released_state(self.balance, end, solved, result.previous_damage, self.solver.linear_response)
-
-
-def sum_of_iterations(first: SolveResult, second: SolveResult) -> SolveResult:
-    """Return a converged result with the iterations of two solves of a step."""
-    return SolveResult(
-        True,
-        first.newton_iterations + second.newton_iterations,
-        first.krylov_iterations + second.krylov_iterations,
-        "",
-    )

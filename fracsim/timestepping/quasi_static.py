@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 from ..solvers.newton import SolveResult
 from .energy_balance import StepEnergies, balanced_forces
-from .implicit import ImplicitStepper, sum_of_iterations
+from .implicit import ImplicitStepper
 from .inelastic_update import PassResultProtocol
 from .state import State
 from .stepper import StepReport
@@ -98,7 +98,7 @@ class QuasiStaticStepper(ImplicitStepper):
             if path.out_of_balance is None or number + 1 == limit:
                 break
             again = self._solve(state, dt, path.u)
-            solve = sum_of_iterations(solve, again)
+            solve = solve.with_iterations_of(again)
             if again.converged and (result.broken_edges or again.newton_iterations):
                 continue
             if not again.converged:

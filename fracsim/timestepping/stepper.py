@@ -209,11 +209,11 @@ class BalanceStepper:
             raise
 
     def _advance(self, state: State) -> tuple[State, StepReport]:
-        began = time.perf_counter()
+        began, spent = time.perf_counter(), SolveResult(False, 0, 0, "")
         self.inelastic.restore_damage(state)
         while True:
             dt = self._next_step(state)
-            solve = self._attempt(state, dt)
+            spent = solve = self._attempt(state, dt).with_iterations_of(spent)
             if not solve.converged:
                 self.failures.steps_failed += 1
                 state = self._ease(state, dt, solve)
