@@ -23,6 +23,9 @@ Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
+# weight of a node, in the sum of all of a point, below which it is round-off of arms that cancel
+MIN_WEIGHT = 1e-6
+
 
 @dataclass(frozen=True)
 class ContactStiffness:
@@ -134,6 +137,24 @@ class PenaltyContacts:
         size = abs(csr_matrix(entries, shape=(k, nodes.shape[0])) @ nodes)
         load = size.T @ (self.stiffness * np.asarray(size.sum(axis=1)).ravel())
         return float((load / mass).max(initial=0.0))
+
+
+def point_masses(size: csr_matrix, area: Values, rate: Values) -> Values:
+    """(n,) parts M_p of points in the mass of their nodes, kg.
+
+    Springs k_p = M_p at all points have no frequency above 1: with k_p = A_p the rows of M^-1 K, which bound its
+    eigenvalues (Gershgorin), are the rates of the nodes, and M_p is A_p by the largest rate of its nodes.
+
+    Args:
+        size: (n, nodes) sizes |w| of the weights with which points follow nodes.
+        area: (n,) m^2.
+        rate: (nodes,) sum over points p of |w_p| A_p S_p by the mass of the node, S_p the sum of |w_p|, m^2/kg.
+    """
+    entries, row_sum = size.tocoo(), np.asarray(size.sum(axis=1)).ravel()
+    counts = entries.data > MIN_WEIGHT * row_sum[entries.row]
+    max_rate = np.zeros(len(area))
+    np.maximum.at(max_rate, entries.row, np.where(counts, rate[entries.col], 0.0))
+    return np.where(max_rate > 0, area / np.where(max_rate > 0, max_rate, 1.0), 0.0)
 
 
 def concatenate_contacts(parts: list[PenaltyContacts]) -> PenaltyContacts:

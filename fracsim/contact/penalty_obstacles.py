@@ -35,10 +35,11 @@ from ..mesh.split_surface.local_surface import ParentMatrix
 from ..mesh.split_surface.point_matching import match_points
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .facet_contact import ContactFacets, evaluate_facets, merge_forces
-from .laws import ObstacleLaw, Penalty, tangential
+from .laws import ObstacleLaw, Penalty, slipped, tangential
 from .node_contact import ContactForces
 from .obstacle import VerletObstacle
 from .obstacle_term import ObstacleTerm
+from .penalty_contacts import point_masses
 from .pose import PosedShape, min_distance
 from .rigid_obstacles import RigidObstacles, VerletRigidObstacles
 
@@ -51,13 +52,11 @@ class PenaltyPolicy:
     """Tuned numbers of penalty contact.
 
     Attributes:
-        min_weight: weight of a node, in the sum of all of a point, below which it is round-off of arms that cancel.
         near_gap: gap, in widths of the penalty, of points that may be in contact a step later.
         facet_share: part of what contact may add to the square of a frequency that facets may cause beside points.
         max_stretch: of facets, up to which ranks agree on the points at facets in contact.
     """
 
-    min_weight: float = 1e-6
     near_gap: float = 3.0
     facet_share: float = 0.5
     max_stretch: float = 1.5
@@ -73,8 +72,6 @@ class NodalMassShare:
     rows of M^-1 K bound its eigenvalues (Gershgorin), whatever the directions of the springs:
 
         omega^2  <=  max over nodes a of  1/m_a  sum_p |w_pa| k_p S_p,    S_p = sum_b |w_pb|
-
-    With k_p = M_p the bound is 1, where M_p = A_p min over nodes a of p of  m_a / (sum_q |w_qa| A_q S_q).
     """
 
     def __init__(self, point_map: SurfaceMap, interpolation: ParentMatrix, mass: Values) -> None:
@@ -98,11 +95,7 @@ class NodalMassShare:
 
     def point_masses(self, area: Values) -> Values:
         """(n,) masses M_p of points with areas `area` (n,), kg (collective)."""
-        rate, weights = self.node_rates(area), self._weights.tocoo()
-        counts = weights.data > PENALTY.min_weight * self._sum[weights.row]
-        max_rate = np.zeros(len(area))
-        np.maximum.at(max_rate, weights.row[counts], rate[weights.col[counts]])
-        return np.where(max_rate > 0, area / np.where(max_rate > 0, max_rate, 1.0), 0.0)
+        return point_masses(self._weights, area, self.node_rates(area))
 
 
 @dataclass(frozen=True)
@@ -152,9 +145,8 @@ class FrictionSprings:
             stays = points[rows] == self.points
             slip[rows[stays]] += self.slip[stays]
         slip = tangential(normal, slip)
-        force = stiffness * np.linalg.norm(slip, axis=1)
-        factor = np.divide(max_force, force, out=np.ones(len(force)), where=force > max_force)
-        return FrictionSprings(points, factor[:, None] * slip, stiffness)
+        max_slip = np.divide(max_force, stiffness, out=np.zeros(len(slip)), where=stiffness > 0)
+        return FrictionSprings(points, slipped(slip, max_slip), stiffness)
 
     def work(self, motion: Values) -> float:
         """Half the work of the forces by motions (k, d) of the points in a step, m, J."""

@@ -22,7 +22,7 @@ from scipy.sparse import csr_matrix
 from .closest_point import minimise_on_simplex
 from .ipc_pairs import PairKind, PairSearch, centred
 from .ipc_surface import unit_normals
-from .penalty_contacts import ContactStiffness, PenaltyContacts
+from .penalty_contacts import ContactStiffness, PenaltyContacts, point_masses
 from .sample_points import Vertices
 
 Values = npt.NDArray[np.float64]
@@ -45,7 +45,6 @@ class PointFacetPolicy:
         clearance_gap: gaps that are searched where nothing is within reach.
         ahead_gap: gap of points that may be in contact a step later.
         max_added: part of the allowed increase of the square of a frequency that the points at a node may cause.
-        min_weight: weight of a node, in the sum of all of a point, below which it is round-off of arms that cancel.
     """
 
     max_gap: float = 3.0
@@ -55,7 +54,6 @@ class PointFacetPolicy:
     clearance_gap: float = 10.0
     ahead_gap: float = 2.0
     max_added: float = 0.25
-    min_weight: float = 1e-6
 
 
 POINT_FACET = PointFacetPolicy()
@@ -347,11 +345,6 @@ def penalty_stiffness(weights: csr_matrix, area: Values, mass: Values, pressure:
         max_added: 1/s^2.
     """
     size = abs(weights)
-    row_sum = np.asarray(size.sum(axis=1)).ravel()
-    rate = (size.T @ (area * row_sum)) / mass
-    entries = size.tocoo()
-    counts = entries.data > POINT_FACET.min_weight * row_sum[entries.row]
-    max_rate = np.zeros(len(area))
-    np.maximum.at(max_rate, entries.row, np.where(counts, rate[entries.col], 0.0))
-    point_mass = np.where(max_rate > 0, area / np.where(max_rate > 0, max_rate, 1.0), 0.0)
-    return np.minimum(0.5 * pressure * area, POINT_FACET.max_added * max_added * point_mass)
+    rate = (size.T @ (area * np.asarray(size.sum(axis=1)).ravel())) / mass
+    max_stiffness = POINT_FACET.max_added * max_added * point_masses(size, area, rate)
+    return np.minimum(0.5 * pressure * area, max_stiffness)
