@@ -452,8 +452,8 @@ def nodal_stiffness(W: csr_matrix, corners: Ints, blocks: Values) -> csr_matrix:
     B = blocks.reshape(k, c, d, c, d)[group[first], corner[first] % c, :, corner[second] % c]
     values = (weight[first] * weight[second])[:, None, None] * B
     rows, columns = (d * node[side][:, None] + np.arange(d) for side in (first, second))
-    places = [np.broadcast_to(part, values.shape).reshape(-1) for part in (rows[:, :, None], columns[:, None])]
-    return csr_matrix((values.reshape(-1), places), shape=(d * W.shape[1],) * 2)
+    indices = [np.broadcast_to(part, values.shape).reshape(-1) for part in (rows[:, :, None], columns[:, None])]
+    return csr_matrix((values.reshape(-1), indices), shape=(d * W.shape[1],) * 2)
 
 
 def retract_from_obstacles(point_map: SurfaceMap, u: Values, gaps: GapFunction) -> SurfaceMap:

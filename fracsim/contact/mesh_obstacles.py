@@ -26,6 +26,7 @@ from .ipc_surface import SelfContactLaw, SelfContactSurface
 from .laws import BARRIER
 from .obstacle import RigidObstacle
 from .pose import Pose
+from .proximity import bounding_box
 from .sample_points import IpcFriction
 from .triangle_mesh_shape import penetration_depth
 
@@ -182,9 +183,9 @@ class MeshObstacle:
     def is_far(self, x: Values, distance: float) -> bool:
         """Whether its bounding box is farther than `distance` from that of points x (n, 3), m."""
         if self._bounds is None:
-            self._bounds = self.positions.min(axis=0), self.positions.max(axis=0)
-        low, high = self._bounds
-        return bool(np.any(x.min(axis=0) - high > distance) or np.any(low - x.max(axis=0) > distance))
+            self._bounds = bounding_box(self.positions)
+        (low, high), (x_low, x_high) = self._bounds, bounding_box(x)
+        return bool(np.any(x_low - high > distance) or np.any(low - x_high > distance))
 
     def vertex_distance(self, x: Values) -> float:
         """Least distance from points x (n, 3) to its vertices, m: at most half an edge more than to its surface."""

@@ -23,6 +23,7 @@ from .obstacle import FreeObstacle, RigidObstacle, free_pairs
 from .obstacle_pairs import SAMPLES, Numbers, ObstaclePair
 from .pose import Pose, PosedShape
 from .pose_derivatives import resultant
+from .proximity import bounding_box
 from .triangle_mesh_shape import TriangleMeshShape
 
 if TYPE_CHECKING:
@@ -235,6 +236,8 @@ class MeshContacts:
         self._reference = np.concatenate(self._points)
         self._elements = np.concatenate([meshes[0][1], meshes[1][1] + self._count]).astype(np.int64)
         self._area, self._friction = vertex_areas(self._reference, self._elements), max(first.friction, second.friction)
+        # sum of the radii of both about their reference points
+        self._radii = sum(float(np.linalg.norm(X, axis=1).max()) for X in self._points)
         areas = self._area[: self._count].sum(), self._area[self._count :].sum()
         self.touching_area = SAMPLES.touching_share * float(min(areas))
         self._start = self._positions((first.posed_at(0.0).pose, second.posed_at(0.0).pose))
@@ -259,11 +262,13 @@ class MeshContacts:
         return np.concatenate([pose.points_to_space(X) for pose, X in zip(poses, self._points, strict=True)])
 
     def _near_positions(self, poses: Poses) -> Values | None:
-        """(n, 3) points of both obstacles, m; None: their bounding boxes are too far apart to act a step later."""
+        """(n, 3) points of both obstacles, m; None: their bounding spheres or boxes are too far apart."""
+        max_gap = PAIR_PENALTY.near_gap * self._pairs.width
+        if float(np.linalg.norm(poses[0].centre - poses[1].centre)) - self._radii > max_gap:
+            return None
         x = self._positions(poses)
-        first, second = x[: self._count], x[self._count :]
-        gap = np.maximum(first.min(axis=0) - second.max(axis=0), second.min(axis=0) - first.max(axis=0)).max()
-        return x if gap < PAIR_PENALTY.near_gap * self._pairs.width else None
+        (low, high), (second_low, second_high) = bounding_box(x[: self._count]), bounding_box(x[self._count :])
+        return x if np.maximum(low - second_high, second_low - high).max() < max_gap else None
 
     def end_step(self, starts: Poses, ends: Poses) -> PairForces | None:
         """Forces at the end of a step, of which the contacts are stored; None: out of contact."""

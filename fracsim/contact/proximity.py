@@ -25,6 +25,15 @@ Flags = npt.NDArray[np.bool_]
 Pattern = npt.NDArray[np.uint8]
 
 
+def bounding_box(x: Values) -> tuple[Values, Values]:
+    """(d,) lowest and highest coordinates of points (n, d), m.
+
+    By columns: minima along the first axis take twenty times as long.
+    """
+    columns = x.T
+    return np.array([column.min() for column in columns]), np.array([column.max() for column in columns])
+
+
 def outline_radius(posed: PosedShape) -> float:
     """Bound of the radius of a shape about its reference point, m; of a half space that of its patch: it never turns.
 
