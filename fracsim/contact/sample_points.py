@@ -12,6 +12,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
+from operator import attrgetter
 from typing import Protocol
 
 import ipctk
@@ -133,27 +135,33 @@ class Centroids:
         tree.can_vertices_collide = self._surface.can_collide
         no_faces = np.empty((0, 3), np.int32)
         tree.build(start, end, no_faces[:, :2] if is_3d else self._surface.edges, self._surface.faces, radius)
-        if is_3d:
-            ids = [(pair.face0_id, pair.face1_id) for pair in tree.detect_face_face_candidates()]
-        else:
-            ids = [(pair.edge0_id, pair.edge1_id) for pair in tree.detect_edge_edge_candidates()]
-        pairs = np.array(ids, np.int64).reshape(-1, 2)
+        near = tree.detect_face_face_candidates() if is_3d else tree.detect_edge_edge_candidates()
+        first_and_second = attrgetter("face0_id", "face1_id") if is_3d else attrgetter("edge0_id", "edge1_id")
+        numbers_of_both = chain.from_iterable(map(first_and_second, near))
+        pairs = np.fromiter(numbers_of_both, np.int64, 2 * len(near)).reshape(-1, 2)
         centre, element = np.concatenate([pairs, pairs[:, ::-1]]).T
         overlap = self._boxes_overlap(centre, element, start, end, radius)
-        numbers = zip(element[overlap].tolist(), (self._count + centre[overlap]).tolist(), strict=True)
+        numbers = element[overlap].tolist(), (self._count + centre[overlap]).tolist()
         candidates = ipctk.Candidates()
         if is_3d:
-            candidates.fv_candidates = [ipctk.FaceVertexCandidate(*pair) for pair in numbers]
+            candidates.fv_candidates = list(map(ipctk.FaceVertexCandidate, *numbers))
         else:
-            candidates.ev_candidates = [ipctk.EdgeVertexCandidate(*pair) for pair in numbers]
+            candidates.ev_candidates = list(map(ipctk.EdgeVertexCandidate, *numbers))
         return candidates
 
     def _boxes_overlap(self, centre: Ints, element: Ints, start: Values, end: Values, radius: float) -> Flags:
         """(k,) whether the box of the motion of a centroid and that of an element overlap, both grown by `radius`."""
         corners = np.concatenate([start[self.elements], end[self.elements]], axis=1)
-        low, high = corners.min(axis=1)[element] - 2 * radius, corners.max(axis=1)[element] + 2 * radius
-        first, last = (x[self.elements].mean(axis=1)[centre] for x in (start, end))
-        return np.asarray(np.all((np.minimum(first, last) <= high) & (np.maximum(first, last) >= low), axis=1))
+        centres = np.stack([x[self.elements].mean(axis=1) for x in (start, end)], axis=1)
+        # (axes, elements) each: contiguous numbers of one axis at a time take half as long
+        bounds = corners.min(axis=1) - 2 * radius, corners.max(axis=1) + 2 * radius
+        low, high, first, last = (
+            np.ascontiguousarray(bound.T) for bound in (*bounds, centres.min(axis=1), centres.max(axis=1))
+        )
+        overlap = np.ones(len(centre), bool)
+        for axis in range(len(low)):
+            overlap &= (first[axis][centre] <= high[axis][element]) & (last[axis][centre] >= low[axis][element])
+        return overlap
 
 
 def measures(x: Values, elements: Ints) -> Values:
