@@ -18,6 +18,7 @@ from support.touching import (
     COS,
     EVERY,
     FEW,
+    MOTIONS,
     OBSTACLES,
     SIN,
     TAN,
@@ -25,8 +26,11 @@ from support.touching import (
     DrawnSurfaces,
     G,
     contact_energy,
+    dragged,
     incline,
     momentum,
+    obstacle_surfaces,
+    obstacles_meet,
     refusal,
     scene_of,
     sliding_part,
@@ -108,6 +112,44 @@ def test_coulomb_on_an_incline(cell: Cell, tmp_path: Path) -> None:
     assert ratios[0] == pytest.approx(0.9, rel=0.03)
     assert speeds[0] > 0.02 and abs(speeds[1]) < 0.45 * speeds[0]
     assert 0.95 < ratios[1] < 1.13
+
+
+STILL = [cell for cell in EVERY if cell.scheme == "quasi-static" and not refusal(cell)]
+
+
+@pytest.mark.parametrize("cell", as_parameters(STILL, lambda cell: cell.dim == 3 or cell.motion != "fixed"))
+def test_coulomb_without_inertia(cell: Cell, tmp_path: Path) -> None:
+    """What is pressed down and dragged has T = r N if it sticks. With mu = 1.2 r it does, with 0.8 r it slides; crack
+    faces are a little rough, and what the soft back of a C carries does not slide."""
+    reached = []
+    for ratio in (None, 0.8, 1.2):
+        scene, state = dragged(cell, 5.0 if ratio is None else ratio * reached[0], tmp_path)
+        for _ in each_step(scene, state):
+            pass
+        told = dict(zip(scene.probes.columns, scene.probes(), strict=True))
+        reached.append(abs(told["reaction_grip_x"] / told[f"reaction_grip_{'xyz'[cell.dim - 1]}"]))
+    glued, slid, stuck = reached
+    assert 0.66 < slid / glued < 0.86 and 0.93 < stuck / glued < 1.05
+
+
+PAIRS = [(2, "analytic", "analytic"), *((3, *pair) for pair in product(OBSTACLES, OBSTACLES))]
+
+
+@pytest.mark.parametrize("scheme", ("newmark", "explicit"))
+@pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.parametrize(("dim", "above", "below"), PAIRS)
+def test_obstacles_that_meet(dim: int, above: str, below: str, motion: str, scheme: str, tmp_path: Path) -> None:
+    """A free one falls on another: they do not intersect, and two free ones keep their momentum."""
+    scene, state = obstacles_meet(above, below, motion, scheme, dim, tmp_path)
+    start, stored = momentum(scene, state), 0.0
+    for _ in each_step(scene, state):
+        stored = max(stored, contact_energy(scene))
+        (upper, sides), (lower, others) = obstacle_surfaces(scene, state)
+        both = np.concatenate([upper, lower]), np.concatenate([sides, others + len(upper)])
+        assert not len(intersecting_elements(*both))
+        if motion == "free":
+            np.testing.assert_allclose(momentum(scene, state), start, atol=1e-9 * 200.0)
+    assert stored > 1.0
 
 
 @pytest.mark.ranks

@@ -342,8 +342,10 @@ def penalty_stiffness(weights: csr_matrix, area: Values, mass: Values, pressure:
         area: (n,) m^2.
         mass: (nodes,) kg.
         pressure: penalty's stiffness, Pa/m.
-        max_added: 1/s^2.
+        max_added: 1/s^2; infinite: no limit.
     """
+    if np.isinf(max_added):
+        return 0.5 * pressure * area
     size = abs(weights)
     rate = (size.T @ (area * np.asarray(size.sum(axis=1)).ravel())) / mass
     max_stiffness = POINT_FACET.max_added * max_added * point_masses(size, area, rate)

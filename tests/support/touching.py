@@ -99,15 +99,15 @@ def box_obstacle(kind: str, dim: int, folder: Path) -> dict[str, Any]:
     return {"shape": "mesh", "file": str(folder / "box.stl")}
 
 
-def with_motion(entry: dict[str, Any], motion: str, dim: int) -> dict[str, Any]:
-    """An obstacle that moves upwards, or about an axis on its left that lifts its right end."""
+def with_motion(entry: dict[str, Any], motion: str, dim: int, rate: float = 1.0) -> dict[str, Any]:
+    """An obstacle that moves upwards at `rate`, m/s, or about an axis on its left that lifts its right end."""
     if motion == "prescribed":
-        return entry | {"velocity": _up(dim)}
+        return entry | {"velocity": _up(dim, rate)}
     if motion == "free":
-        return entry | {"mass": 200.0, "velocity": _up(dim)}
+        return entry | {"mass": 200.0, "velocity": _up(dim, rate)}
     if motion == "hinge":
         axis = {} if dim == 2 else {"axis": [0.0, -1.0, 0.0]}
-        return entry | {"mass": 200.0, "hinge": {"point": [-2.0, *entry["at"][1:]]} | axis, "spin": [0.4]}
+        return entry | {"mass": 200.0, "hinge": {"point": [-2.0, *entry["at"][1:]]} | axis, "spin": [0.4 * rate]}
     return entry
 
 
@@ -330,6 +330,68 @@ def press(scene: Scene, state: Walk, along: Values, above: float = 0.0) -> float
     return far
 
 
+def dragged(cell: Cell, mu: float, folder: Path) -> tuple[Scene, Walk]:
+    """A soft cube or upper part, without inertia, whose top is pressed down and then moved along; or, prescribed, what
+    lies below moves. Its top has the probe "grip"."""
+    partner, motion, scheme, dim = cell
+    gap, push, way = {"fragments": START, "bodies": GAP, "itself": GAP}.get(partner, START), 0.02, 0.01
+    push += 0.04 * (partner == "fragments")  # whose faces are drawn in
+    lifted = gap if partner == "fragments" else 0.0
+
+    def course(press: float, move: float, start: float = 0.0) -> dict[str, Any]:
+        across = [0.0] * (dim - 2)
+        return {
+            "time": [0.0, 0.4, 0.8],
+            "value": [_up(dim, start), _up(dim, start - press), [move, *across, start - press]],
+        }
+
+    top, below = (course(gap + push, way, lifted), course(0.0, 0.0))
+    if motion == "prescribed":
+        top, below = (course(gap + push, 0.0, lifted), course(0.0, -way))
+    material = {"poisson": 0.0, "energy": "linear" if partner in OBSTACLES else "neo-hookean"}
+    tables: dict[str, Any] = {
+        "contact": {"distance": 0.02},
+        "solver": {"snes_rtol": 1e-9, "ksp_rtol": 1e-10},
+        "time": {"scheme": scheme, "step": 0.1, "end": 0.8},
+    }
+    if partner in PARTS:
+        tables |= block_tables(partner, dim, folder, soft_back=True, still=True)
+        tables["material"] |= material
+        tables["contact"] |= {"friction": mu} | ({"itself": "pieces"} if partner == "fragments" else {})
+        at = side(dim, 1.5 if partner == "fragments" else 1.0 + GAP)
+        tables["boundary"] = [{"on": at, "displacement": top}, {"on": side(dim, 0.0), "displacement": below}]
+    else:
+        at = "top"
+        middle = [0.5, 0.5, -gap - SIZE[2] / 2][-dim:]
+        entry = box_obstacle(partner, dim, folder) | {"name": "it", "at": middle, "friction": mu}
+        tables["obstacle"] = [entry | ({"displacement": below} if motion == "prescribed" else {})]
+        tables["contact"]["itself"] = False
+        tables["mesh"] = {"builder": "box", "size": [0.5] * dim, "h": 0.5, "origin": [0.25] * (dim - 1) + [0.0]}
+        tables["material"] = SOFT | material
+        tables["boundary"] = [{"on": "top", "displacement": top}]
+    scene, state = make_scene(**tables | {"probe": [{"name": "grip", "on": at}]})
+    if partner == "fragments":
+        begin(scene, state, gap, np.zeros(dim), np.zeros(dim), bends=False)
+    return scene, state
+
+
+def obstacles_meet(above: str, below: str, motion: str, scheme: str, dim: int, folder: Path) -> tuple[Scene, Walk]:
+    """A free obstacle that falls on another one, beside a body that is out of the way."""
+    # the penalty of explicit steps lets heavy obstacles overlap that meet faster
+    explicit = scheme == "explicit"
+    rate = 0.2 if explicit else 1.0
+    entry = with_motion(box_obstacle(below, dim, folder) | {"at": [0.5, 0.5, -0.2 - START][-dim:]}, motion, dim, rate)
+    upper = with_motion(box_obstacle(above, dim, folder) | {"at": [0.5, 0.5, 0.2][-dim:]}, "free", dim)
+    upper["velocity"] = _up(dim, -rate)
+    return make_scene(**{
+        "mesh": {"builder": "box", "size": [1.0] * dim, "h": 1.0, "origin": [-9.0] * dim}, "material": SOFT,
+        "boundary": [{"on": "bottom", "fix": "xyz"[:dim]}], "contact": {"itself": False, "distance": 0.02},
+        "obstacle": [entry | {"name": "lower", "friction": 0.3}, upper | {"name": "upper"}],
+        "solver": {} if explicit else {"snes_rtol": 1e-9, "ksp_rtol": 1e-10},
+        "time": {"scheme": scheme, "step": 0.01, "end": 0.2 if explicit else 0.07},
+    })  # fmt: skip
+
+
 # --- what is measured ---
 
 
@@ -359,9 +421,11 @@ class DrawnSurfaces:
 
 
 def momentum(scene: Scene, state: Walk, of: npt.NDArray[np.bool_] | None = None) -> Values:
-    """(d,) linear momentum of nodes (nodes,), or of all, and of free obstacles, kg m/s (serial)."""
+    """(d,) linear momentum of nodes (nodes,), or of all and of free obstacles, kg m/s (serial)."""
     p = (scene.balance.mass.lumped * state.v).reshape(-1, scene.domain.dim)
-    total = p.sum(axis=0) if of is None else p[of].sum(axis=0)
+    if of is not None and of.any():
+        return np.asarray(p[of].sum(axis=0))
+    total = p.sum(axis=0)
     for term in scene.balance.terms:
         if term.name == "rigid":
             total = total + sum(free.motion.momentum[: len(total)] for free in term.free.values())
@@ -369,7 +433,7 @@ def momentum(scene: Scene, state: Walk, of: npt.NDArray[np.bool_] | None = None)
 
 
 def sliding_part(scene: Scene, cell: Cell) -> tuple[npt.NDArray[np.bool_], float]:
-    """(nodes,) nodes of what slides on an incline, none of a free obstacle; and its mass, kg (serial)."""
+    """(nodes,) nodes of what slides on an incline, none for a free obstacle; and its mass, kg (serial)."""
     mass = scene.balance.mass.lumped.reshape(-1, cell.dim)[:, 0]
     of = is_upper(scene) if cell.partner in PARTS else np.full(len(mass), cell.motion != "free")
     return of, float(mass[of].sum()) or MASS
