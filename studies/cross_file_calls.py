@@ -1,9 +1,10 @@
-"""Count calls from one file of fracsim to another in an implicit step without contact.
+"""Count calls from one file of fracsim to another in an implicit step.
 
-    python -m fracsim.studies.cross_file_calls [--plain] [--list]
+    python -m fracsim.studies.cross_file_calls [--ball] [--plain] [--list]
 
 The count measures how many modules a reader has to follow. A block of rubber hangs from one face and is pulled at the
-other. The first two steps, which set up the solver, are not counted.
+other. With `--ball` a free ball lands on a block of 243 nodes and begins to roll. The first two steps, which set up the
+solver, are not counted.
 """
 
 from __future__ import annotations
@@ -24,6 +25,18 @@ STUDY: dict[str, Any] = {
     "time": {"scheme": "backward-euler", "step": 5e-3, "end": 1.0},
     "output": {"picture": False},
 }
+
+BALL: dict[str, Any] = {
+    "title": "ball",
+    "mesh": {"builder": "box", "size": [0.08, 0.08, 0.02], "h": 0.01},
+    "material": {"energy": "neo-hookean", "young": 1e6, "poisson": 0.3, "density": 1000.0},
+    "boundary": [{"on": "bottom", "fix": "xyz"}],
+    "load": {"gravity": [0.0, 0.0, -9.81]},
+    "obstacle": [{"name": "ball", "shape": "sphere", "radius": 0.015, "at": [0.04, 0.04, 0.0351], "density": 3000.0,
+                  "friction": 0.3, "velocity": [0.1, 0.0, -0.3]}],
+    "time": {"scheme": "backward-euler", "step": 5e-4, "end": 6e-3},
+    "output": {"picture": False},
+}  # fmt: skip
 
 
 def count_calls(study: dict[str, Any]) -> Counter[tuple[str, str]]:
@@ -59,10 +72,11 @@ def count_calls(study: dict[str, Any]) -> Counter[tuple[str, str]]:
 def main() -> None:
     """Print the number of calls and, if asked, the calls from file to file."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--ball", action="store_true", help="a step of a free ball in contact with a block")
     parser.add_argument("--plain", action="store_true", help="with [solver] plain = true")
     parser.add_argument("--list", action="store_true", help="the calls from file to file as well")
     given = parser.parse_args()
-    calls = count_calls(STUDY | {"solver": {"plain": True} if given.plain else {}})
+    calls = count_calls((BALL if given.ball else STUDY) | {"solver": {"plain": True} if given.plain else {}})
     if given.list:
         for (first, second), count in calls.most_common():
             print(f"{count:5}  {first} -> {second}")

@@ -122,7 +122,7 @@ class FacetClosestPoints:
         """(k, d) unit normals n of the distance at the closest points."""
         return self.posed.normal(self.position)
 
-    @property
+    @cached_property
     def gradient(self) -> Values:
         """(k, c, d) dG/dx."""
         return np.asarray(self.barycentric[:, :, None] * self.normal[:, None, :])
@@ -298,7 +298,7 @@ class SoftMinGap:
         k, c = self.gaps.shape
         return minimise_on_simplex(np.tile(self.smoothing * np.eye(c), (k, 1, 1)), self.gaps, np.full((k, c), 1 / c))
 
-    @property
+    @cached_property
     def gap(self) -> Values:
         """(k,) G' minus its largest possible excess over the minimum, m."""
         c = self.gaps.shape[1]

@@ -82,7 +82,7 @@ class ContactFacets:
         """(k,) facets that may have a gap below `reach`, m, to an obstacle, with points at x (n, d), m; others too."""
         return self._candidates(posed, x, reach + self.max_gap_error)
 
-    @property
+    @cached_property
     def max_gap_error(self) -> float:
         """Largest amount by which smoothing makes a gap smaller, m."""
         return smoothing_error(self.corners.shape[1], self.smoothing)

@@ -117,13 +117,17 @@ class FreeObstacle(RigidObstacle):
         full[d:, d:] = rotation @ self.inertia @ rotation.T if d == 3 else self.inertia
         return np.asarray(self.motion_basis.T @ full @ self.motion_basis)
 
-    def gravity_potential(self, pose: Pose) -> tuple[float, Values, Values]:
-        """Potential -m g . x of the centre of mass, J, and its derivatives (p,), (p, p) by an increment of the pose."""
+    def gravity_potential(self, pose: Pose) -> float:
+        """Potential -m g . x of the centre of mass, J."""
+        return -self.mass * float(self.gravity @ (pose.centre + pose.rotation @ self.mass_centre))
+
+    def gravity_derivatives(self, pose: Pose) -> tuple[Values, Values]:
+        """(p,) and (p, p) derivatives of the potential of gravity by an increment of the pose."""
         d, arm, force = len(self.start_point), pose.rotation @ self.mass_centre, self.mass * self.gravity
         gradient, hessian = np.zeros(self.pose_size), np.zeros((self.pose_size, self.pose_size))
         gradient[:d], gradient[d:] = -force, force @ rotation_derivative(arm[None])[0]
         hessian[d:, d:] = -rotation_second_derivative(force[None], arm[None])[0]
-        return -float(force @ (pose.centre + arm)), gradient, hessian
+        return gradient, hessian
 
     def history_values(self, motion: RigidMotion) -> Values:
         """(2 d + 2 r + 1,) position and velocity of the centre of mass, rotation, angular velocity, kinetic energy."""
@@ -138,7 +142,7 @@ class FreeObstacle(RigidObstacle):
         """Motion at t = 0, before any contact."""
         pose = Pose.at_point(self.start_point)
         momentum = self.mass_matrix(pose.rotation) @ self.start_rate
-        force = -self.motion_basis.T @ self.gravity_potential(pose)[1]
+        force = -self.motion_basis.T @ self.gravity_derivatives(pose)[0]
         return RigidMotion(pose, momentum, force, np.zeros(self._rotations))
 
 
@@ -311,10 +315,10 @@ class VerletObstacle:
             wrench: (p,) force and moment of the body on it there, N and N m.
         """
         start, body, pose = self.motion, self.body, posed.pose
-        force = body.motion_basis.T @ (wrench - body.gravity_potential(pose)[1])
+        force = body.motion_basis.T @ (wrench - body.gravity_derivatives(pose)[0])
         rotation = pose.rotation_vector() if pose.dim == 3 else start.rotation + self.increment[2:]
         self.motion = RigidMotion(pose, self._half_momentum + self._dt / 2 * force, force, rotation)
-        self.gravity_work = body.gravity_potential(start.pose)[0] - body.gravity_potential(pose)[0]
+        self.gravity_work = body.gravity_potential(start.pose) - body.gravity_potential(pose)
         change = float(body.history_values(self.motion)[-1] - body.history_values(start)[-1])
         return change - self.gravity_work
 

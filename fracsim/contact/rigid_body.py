@@ -216,13 +216,13 @@ class RigidStep:
     def weight_load(self) -> Values:
         """(k,) b."""
         return np.asarray(
-            -(1 - self.share) * self.body.motion_basis.T @ self.body.gravity_potential(self.start.pose)[1]
+            -(1 - self.share) * self.body.motion_basis.T @ self.body.gravity_derivatives(self.start.pose)[0]
         )
 
     @cached_property
     def free_flight(self) -> Values:
         """(k,) z without contact, with the weight of the start."""
-        weight = -self.body.motion_basis.T @ self.body.gravity_potential(self.start.pose)[1]
+        weight = -self.body.motion_basis.T @ self.body.gravity_derivatives(self.start.pose)[0]
         acceleration = solve_matrix(self.M, self.weight_load + self.share * weight) / self.c_a
         return np.asarray((self.z_a + acceleration) / self.share)
 
@@ -239,22 +239,34 @@ class RigidStep:
 
     def pose(self, z: Values) -> Pose:
         """Pose at z (k,)."""
-        return self.start.pose.incremented(self.increment(z))
+        key = z.tobytes()
+        if key not in self._last_pose:
+            self._last_pose.clear()
+            self._last_pose[key] = self.start.pose.incremented(self.increment(z))
+        return self._last_pose[key]
+
+    @cached_property
+    def _last_pose(self) -> dict[bytes, Pose]:
+        """The pose that was asked for last, by its z: energies, derivatives and contact ask for the same one."""
+        return {}
+
+    @cached_property
+    def _dim(self) -> int:
+        return self.start.pose.dim
 
     def pose_change(self, z: Values, dz: Values) -> Values:
         """(p,) increment of the pose at z for a change dz (k,), to first order."""
         q = self.increment(dz)
-        q[self.start.pose.dim :] = self._left_jacobian(z) @ q[self.start.pose.dim :]
+        q[self._dim :] = self._left_jacobian(z) @ q[self._dim :]
         return q
 
     def _left_jacobian(self, z: Values) -> Values:
-        return left_jacobian(self.increment(z)[self.start.pose.dim :])
+        return left_jacobian(self.increment(z)[self._dim :])
 
     def pose_jacobian(self, z: Values) -> Values:
         """(p, k) derivative of the increment of the pose at z by z."""
         T = self.body.motion_basis.copy()
-        d = self.start.pose.dim
-        T[d:] = self._left_jacobian(z) @ T[d:]
+        T[self._dim :] = self._left_jacobian(z) @ T[self._dim :]
         return T
 
     # --- potential ---
@@ -263,13 +275,13 @@ class RigidStep:
         """Phi without contact, J."""
         offset = self.share * z - self.z_a
         inertia = self.c_a / 2 * float(offset @ self.M @ offset)
-        weight = self.body.gravity_potential(self.pose(z))[0]
+        weight = self.body.gravity_potential(self.pose(z))
         return inertia + self.share**2 * weight - self.share * float(self.weight_load @ z)
 
     def system(self, z: Values, contact: PoseDerivatives, *, exact: bool) -> tuple[Values, Values]:
         """(k,) gradient of Phi / s, and (k, k) Hessian of Phi / s^2; positive definite unless `exact`."""
-        d, T = self.start.pose.dim, self.pose_jacobian(z)
-        _, weight_gradient, weight_hessian = self.body.gravity_potential(self.pose(z))
+        d, T = self._dim, self.pose_jacobian(z)
+        weight_gradient, weight_hessian = self.body.gravity_derivatives(self.pose(z))
         forces = self.factor * contact.gradient + weight_gradient
         inertia = self.c_a * self.M @ (self.share * z - self.z_a)
         gradient = inertia + self.share * T.T @ forces - self.weight_load
@@ -289,7 +301,7 @@ class RigidStep:
     def end_motion(self, z: Values, force: Values) -> RigidMotion:
         """State of motion at the end, with force and moment (p,) of the body on the obstacle there, N and N m."""
         pose = self.pose(z)
-        weight = self.body.motion_basis.T @ -self.body.gravity_potential(pose)[1]
+        weight = self.body.motion_basis.T @ -self.body.gravity_derivatives(pose)[0]
         by_contact = self.share * self.factor * solve_matrix(self.M, self.body.motion_basis.T @ force) / self.c_a
         by_weight = solve_matrix(self.M, self.share * weight + self.weight_load) / self.c_a
         end = self.z_a + by_weight + by_contact

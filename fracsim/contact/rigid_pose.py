@@ -323,6 +323,6 @@ class PoseUnknowns:
     def gravity_work(self) -> float:
         """Work of gravity in the step, J."""
         return sum(
-            pose.body.gravity_potential(pose.step.start.pose)[0] - pose.body.gravity_potential(pose.posed.pose)[0]
+            pose.body.gravity_potential(pose.step.start.pose) - pose.body.gravity_potential(pose.posed.pose)
             for pose in self.free.values()
         )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import ClassVar, Self
 
 import numpy as np
@@ -114,19 +115,20 @@ class HalfSpace:
 class _SweptSphere(ConvexBody):
     """All points within a radius of a point or segment, the core."""
 
+    @property
     @abstractmethod
     def _core(self) -> tuple[Values, float, float]:
         """Unit vector along the segment, half its length and the radius, m."""
 
     def _from_core(self, x: Values) -> tuple[Values, Values, Values]:
         """Vectors (n, d) from the closest points of the core, their lengths (n,), and heights along it (n,), m."""
-        axis, half, _ = self._core()
+        axis, half, _ = self._core
         height = x @ axis
         away = x - np.minimum(np.maximum(height, -half), half)[:, None] * axis
-        return away, lengths(away), height
+        return away, np.sqrt(np.einsum("nd,nd->n", away, away)), height
 
     def _distance(self, x: Values) -> Values:
-        return self._from_core(x)[1] - self._core()[2]
+        return self._from_core(x)[1] - self._core[2]
 
     def _normal(self, x: Values) -> Values:
         away, length, _ = self._from_core(x)
@@ -137,12 +139,12 @@ class _SweptSphere(ConvexBody):
         if not on_core.any():
             return np.asarray(away / length[:, None])
         # on the core every direction across it is a closest one
-        across = frame_about(self._core()[0])[:, 0]
+        across = frame_about(self._core[0])[:, 0]
         return np.where(on_core[:, None], across, away / np.where(on_core, 1.0, length)[:, None])
 
     def _curvature(self, x: Values) -> Values:
         """(n, d, d) (P - n n^T) / |x - closest|, P across the axis beside the core, the identity beyond its ends."""
-        axis, half, _ = self._core()
+        axis, half, _ = self._core
         away, length, height = self._from_core(x)
         on_core = length < np.finfo(float).tiny
         n, P = self._direction(away, length, on_core), np.eye(self.dim)
@@ -152,7 +154,7 @@ class _SweptSphere(ConvexBody):
         return np.asarray((P - n[:, :, None] * n[:, None, :]) * inverse[:, None, None])
 
     def _radius(self) -> float:
-        return self._core()[2]
+        return self._core[2]
 
     def _depth(self) -> float:
         return self._radius()
@@ -161,13 +163,13 @@ class _SweptSphere(ConvexBody):
         return replace(self, radius=self._radius() + by)  # type: ignore[call-arg]
 
     def _tessellate(self) -> Tessellation:
-        axis, half, radius = self._core()
+        axis, half, radius = self._core
         side = profile(0.0, half, radius)
         points, elements = polygon(side) if self.dim == 2 else surface_of_revolution(side)
         return points @ frame_about(axis).T, elements
 
     def _moments(self) -> tuple[float, Values]:
-        axis, half, radius = self._core()
+        axis, half, radius = self._core
         return revolved(axis, 0.0, half, radius)
 
 
@@ -195,6 +197,7 @@ class Sphere(_SweptSphere):
         """True."""
         return True
 
+    @cached_property
     def _core(self) -> tuple[Values, float, float]:
         return unit_vector((*[0.0] * (self.dim - 1), 1.0)), 0.0, self.radius
 
@@ -224,6 +227,7 @@ class Capsule(_SweptSphere):
         """Dimension, 2 or 3."""
         return len(self.axis)
 
+    @cached_property
     def _core(self) -> tuple[Values, float, float]:
         return unit_vector(self.axis), self.length / 2, self.radius
 
