@@ -280,7 +280,8 @@ class Preconditioner:
         # Too many iterations. Also where a refresh is due: coarse spaces from before a crack carry the motion of one
         # side to the other.
         fresh = self._fresh_iterations
-        if self.applied.vcycle is None and fresh and equivalent > self._rebuild_ratio * fresh + 2:
+        may_be_old = is_old or self.applied.vcycle is None
+        if may_be_old and fresh and equivalent > self._rebuild_ratio * fresh + 2:
             self._due = Update.REBUILD
         # Factors and coarse spaces of another pattern would be written past the end of their arrays.
         if self._pattern_is_new:
