@@ -13,7 +13,7 @@ import pytest
 from fracsim.errors import InputError
 from support.intersections import intersecting_elements
 from support.ranks import run_on_ranks
-from support.scenes import each_step
+from support.scenes import each_step, march
 from support.touching import (
     COS,
     EVERY,
@@ -112,6 +112,18 @@ def test_coulomb_on_an_incline(cell: Cell, tmp_path: Path) -> None:
     assert ratios[0] == pytest.approx(0.9, rel=0.03)
     assert speeds[0] > 0.02 and abs(speeds[1]) < 0.45 * speeds[0]
     assert 0.95 < ratios[1] < 1.13
+
+
+@pytest.mark.parametrize("partner", (pytest.param("analytic", marks=pytest.mark.slow), "mesh"))
+def test_friction_is_the_same_in_a_moving_frame(partner: str, tmp_path: Path) -> None:
+    """A cube on a plate at rest, and both carried at 1 m/s: it creeps alike where it sticks."""
+    ends = []
+    for motion in ("fixed", "prescribed"):
+        scene, state = incline(Cell(partner, motion, "newmark", 3), 1.1, tmp_path)
+        march(scene, state)
+        _, mass = sliding_part(scene, Cell(partner, motion, "newmark", 3))
+        ends.append(momentum(scene, state)[0] / mass - (motion == "prescribed"))
+    assert ends[1] == pytest.approx(ends[0], abs=1e-4)
 
 
 STILL = [cell for cell in EVERY if cell.scheme == "quasi-static" and not refusal(cell)]

@@ -85,7 +85,7 @@ class SelfContactLaw:
         stiffness: of the barrier, Pa.
         friction: coefficient of friction.
         sticking_speed: slip velocity below which friction counts as sticking, m/s.
-        sticking_speed_ratio: the same in the speed of the body; the larger one counts.
+        sticking_speed_ratio: the same in the speed of the nodes (SelfContact._speed); the larger one counts.
         fragments_only: contact between fragments alone, without crack faces inside one and single-node fragments.
         corners_only: quadratic cells are in contact by their corners alone, as crack faces are.
     """

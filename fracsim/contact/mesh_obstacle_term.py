@@ -273,6 +273,14 @@ class MeshObstacleTerm(SelfContact):
             self._begin_near(self._surface, nodal, sticking_speed * level.dt)
         self._place_meshes(self._poses)
 
+    def _speed(self, v: Values) -> float:
+        """Largest root mean square of the nodes' speeds relative to an obstacle, m/s (collective)."""
+        square, mean = self._mean_velocities(v)
+        centres = [pose.centre[None] for pose in self._start_poses]
+        placed = zip(self.numbers, centres, strict=True)
+        velocities = [self.bodies.velocity(number, centre).reshape(-1) for number, centre in placed]
+        return float(np.sqrt(max(0.0, *(float(square - 2 * mean @ V + V @ V) for V in velocities))))
+
     def _begin_near(self, surface: MeshContactSurface, nodal: Values, slip: float) -> None:
         """Begin a step near obstacles at displacements (nodes, 3), m; `slip`: that counts as sticking, m."""
         surface.extend_faces(nodal)

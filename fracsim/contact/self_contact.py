@@ -158,9 +158,15 @@ class SelfContact(Term):
         return max(self.law.sticking_speed, self.law.sticking_speed_ratio * self._speed(v))
 
     def _speed(self, v: Values) -> float:
-        """Root mean square of the nodes' speeds, m/s (collective)."""
-        squares, count = sum_over_ranks(self.comm, np.array([v @ v, len(v) / self._domain.dim]))
-        return float(np.sqrt(squares / count))
+        """Root mean square of the nodes' speeds relative to their mean velocity, m/s (collective)."""
+        square, mean = self._mean_velocities(v)
+        return float(np.sqrt(max(float(square - mean @ mean), 0.0)))
+
+    def _mean_velocities(self, v: Values) -> tuple[float, Values]:
+        """Mean square speed of the nodes, (m/s)^2, and their mean velocity (d,), m/s (collective)."""
+        nodal = v.reshape(-1, self._domain.dim)
+        square, count, *total = sum_over_ranks(self.comm, np.array([v @ v, len(nodal), *nodal.sum(axis=0)]))
+        return float(square / count), np.array(total) / count
 
     def update_displacement(self) -> None:
         """Discard positions and forces, as u has changed."""

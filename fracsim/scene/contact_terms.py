@@ -53,9 +53,10 @@ class ContactDefaults:
         added_frequency: what the penalty of explicit steps may add to the square of the highest frequency of the body,
             relative to it. Steps are at least 0.82 of those without contact.
         creep: sizes of the body per second; speed below which friction sticks.
-        creep_ratio: likewise, in the speed of the body for self-contact, and in the largest slip velocity at the start
-            of a step for obstacles. Fragments at metres a second that change from sticking to slipping within
-            micrometres a second take forty Newton iterations in place of fourteen, a rolling ball eight instead of six.
+        creep_ratio: likewise, in the speed of the nodes relative to their mean or an obstacle from a file, and in the
+            largest slip velocity at the start of a step for others. Fragments at metres a second that change from
+            sticking to slipping within micrometres a second take forty Newton iterations in place of fourteen, a
+            rolling ball eight instead of six.
     """
 
     distance: float = 0.05
