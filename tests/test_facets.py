@@ -212,6 +212,29 @@ def test_stiffness_of_points_at_their_nodes(d: int, c: int) -> None:
     assert not nodal_stiffness(csr_matrix(W), corners[:0], blocks[:0]).nnz
 
 
+@pytest.mark.parametrize("name", ["capsule", "rectangle"])
+def test_gaps_at_the_start_of_a_step_are_those_of_its_points(name: str) -> None:
+    """Facets asked for again with the same start, and then with that of another step, against facets that are new."""
+    placed, corners = facets_near(name, 6)
+    d, x = placed.shape.dim, corners.reshape(-1, placed.shape.dim)
+    rng = np.random.default_rng(3)
+    starts = [x + 0.01 * rng.normal(size=x.shape) for _ in range(2)]
+
+    def made() -> ContactFacets:
+        return ContactFacets(np.arange(len(x)).reshape(-1, d), np.ones(len(corners)), SOFTEN)
+
+    kept, forces = made(), []
+    for begun in (starts[0], starts[0], starts[1]):
+        now = x + 0.005 * rng.normal(size=x.shape)
+        found, _ = evaluate_facets(kept, placed, now, LAW, (placed, begun))
+        anew, _ = evaluate_facets(made(), placed, now, LAW, (placed, begun.copy()))
+        assert len(found.area) > 2
+        np.testing.assert_allclose(found.forces, anew.forces, atol=1e-7 * abs(anew.forces).max())
+        other, _ = evaluate_facets(made(), placed, now, LAW, (placed, x))
+        forces.append(abs(found.forces - other.forces).max() / abs(other.forces).max())
+    assert min(forces) > 1e-3  # the start matters
+
+
 @pytest.mark.parametrize("name", ["capsule", "box", "rectangle"])
 def test_what_facets_do_to_a_pose_is_a_derivative(name: str) -> None:
     """Gradient and Hessian of their energy by an increment of the pose, against differences; the same forces and

@@ -98,6 +98,19 @@ class ContactFacets:
         self._last_barycentric[facets] = closest.barycentric
         return closest
 
+    def start(self, posed: PosedShape, x: Values, reach: float) -> FacetStart:
+        """Facets before an obstacle at the start of a step, with points at x (n, d), m; searched once for a step."""
+        last = self._starts.get(id(posed.shape))
+        if last is None or last.posed is not posed or last.x is not x:
+            near, unknown = self.within_reach(posed, x, reach), np.full(len(self.area), np.nan)
+            last = self._starts[id(posed.shape)] = FacetStart(self, posed, x, near, unknown)
+        return last
+
+    @cached_property
+    def _starts(self) -> dict[int, FacetStart]:
+        """By the id of the shape."""
+        return {}
+
     def within_reach(self, posed: PosedShape, x: Values, reach: float) -> Ints:
         """(k,) facets that may come nearer than `reach`, m, to an obstacle, with points at x (n, d), m."""
         near, _, corner_bounds, _ = self._tangent_planes(posed, x, np.full(1, reach))
@@ -162,6 +175,33 @@ class ContactFacets:
         near, gaps = self.within_reach(posed, x, reach), np.full(len(self.area), np.inf)
         gaps[near] = self.closest_points(posed, x, near).gap
         return gaps
+
+
+@dataclass(frozen=True, eq=False)
+class FacetStart:
+    """Facets before an obstacle at the start of a step.
+
+    Attributes:
+        facets: all facets.
+        posed: the obstacle then.
+        x: (n, d) points then, m.
+        near: (k,) facets within the width of the barrier.
+        stored_gaps: (m,) gaps, m; nan: not searched for yet.
+    """
+
+    facets: ContactFacets
+    posed: PosedShape
+    x: Values
+    near: Ints
+    stored_gaps: Values
+
+    def gaps(self, facets: Ints, barycentric: Values) -> Values:
+        """(k,) gaps of facets (k,), m; `barycentric`: (k, c) coordinates to search from."""
+        if (new := np.isnan(self.stored_gaps[facets])).any():
+            corners = self.x[self.facets.corners[facets[new]]]
+            closest = find_closest_points(self.posed, corners, self.facets.smoothing, barycentric[new])
+            self.stored_gaps[facets[new]] = closest.gap
+        return np.asarray(self.stored_gaps[facets])
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,17 +314,16 @@ def evaluate_facets(
         start: obstacle and points (n, d) at the start of the step, where the barrier is averaged over the step.
     """
     near = facets.within_reach(posed, x, law.width)
-    if start is not None:
-        near = np.union1d(near, facets.within_reach(*start, law.width))
+    step_start = None if start is None else facets.start(*start, law.width)
+    if step_start is not None:
+        near = np.union1d(near, step_start.near)
     if not len(near):
         closest = facets.closest_points(posed, x, near)
         return FacetForces(facets.corners[near], facets.area[near], closest, law, law, law), 0.0
     closest = facets.closest_points(posed, x, near)
     start_gap, acting = None, closest.gap < law.width  # elsewhere gap' >= gap, and F = 0 with its derivatives
-    if start is not None:
-        start_gap = find_closest_points(
-            start[0], start[1][facets.corners[near]], facets.smoothing, closest.barycentric
-        ).gap
+    if step_start is not None:
+        start_gap = step_start.gaps(near, closest.barycentric)
         acting |= start_gap < law.width
     rows = np.flatnonzero(acting)
     corners, area, closest = facets.corners[near[rows]], facets.area[near[rows]], closest.select(rows)
