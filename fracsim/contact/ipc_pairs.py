@@ -87,12 +87,16 @@ class PairShare:
     points: Flags
 
     @classmethod
-    def by_slabs(cls, comm: MPI.Intracomm, x: Values) -> PairShare:
-        """Points x (n, d) in slabs of equally many points across the longest side, which are dealt to the ranks."""
-        order = np.argsort(x[:, np.ptp(x, axis=0).argmax()], kind="stable")
-        slab = np.empty(len(x), np.int64)
-        slab[order] = np.arange(len(x)) * PAIRS.slabs * comm.size // max(len(x), 1)
-        return cls(comm, slab % comm.size == comm.rank)
+    def by_slabs(cls, comm: MPI.Intracomm, x: Values, on_cracks: Ints) -> PairShare:
+        """Points x (n, d) in slabs of equally many points on cracks, or of all where there are none, in turn.
+
+        The slabs lie across the axis along which these points spread most: a slab along a crack would have points of
+        all its pairs. `on_cracks`: (k,) numbers of points.
+        """
+        spread, count = x[on_cracks] if len(on_cracks) else x, PAIRS.slabs * comm.size
+        axis = int(spread.std(axis=0).argmax())
+        bounds = np.quantile(spread[:, axis], np.arange(1, count) / count)
+        return cls(comm, np.searchsorted(bounds, x[:, axis], "right") % comm.size == comm.rank)
 
     def with_others(self, count: int) -> PairShare:
         """The share of a surface with `count` more points that are in pairs with the first ones alone."""

@@ -182,7 +182,7 @@ class SelfContactSurface:
             self.split = build_split_surface(skeleton, pattern)
         self._rest_positions = offset_crack_faces(self.split, self.face_gap * law.distance)
         self.point_map = make_surface_map(self.split, skeleton, pattern, self._rest_positions)
-        self._share = PairShare.by_slabs(comm, self._rest_positions)
+        self._share = PairShare.by_slabs(comm, self._rest_positions, self.point_map.copies)
         self._parameters = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
         is_copy = np.zeros(len(self._rest_positions), bool)
         is_copy[self.point_map.copies] = True
