@@ -128,7 +128,8 @@ class SolverPolicy:
     # Iterations of a fresh set-up as a multiple of those of the whole body, plus 2, above which aggregates are not
     # smoothed any more. Measured: a step in 0.85 of the time (33,000 tetrahedra, 10 planes), 0.7 after 100 planes.
     fragmented_ratio: float = 1.5
-    # Edges that broke for each node of the body, after which operators are refreshed.
+    # Edges that broke for each node of the body, after which operators are refreshed; beside the V cycle it is set up
+    # again if its iterations have grown as well.
     refresh_edges: float = 0.02
     # Iterations that a refresh costs.
     refresh_cost: int = 10
