@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 from mpi4py import MPI
-from scipy.integrate import quad
 from scipy.optimize import brentq
 
 from fracsim.fracture.energy.configurational_force import (
@@ -101,12 +100,6 @@ def test_the_springs_of_closed_edges(linear: bool) -> None:
     np.testing.assert_allclose(np.sum(P * B, axis=(1, 2)), (up - down) / (2 * step), atol=1e-8)
     longer, _ = closure_spring_stress(vectors, modulus, np.tile(0.1 * np.eye(2), (5, 1, 1)), linear=linear)
     np.testing.assert_array_equal(longer, 0.0)
-
-
-def test_the_mean_square_near_a_tip() -> None:
-    """0.334: sigma_1 = cos(t/2) (1 + |sin(t/2)|) K / sqrt(2 pi r), its square averaged over a disc, by quadrature."""
-    around, _ = quad(lambda t: (np.cos(t / 2) * (1 + abs(np.sin(t / 2)))) ** 2, -np.pi, np.pi, points=[0.0])
-    assert around / (2 * np.pi * np.pi) == pytest.approx(TIP.near_tip_factor[2], rel=1e-3)
 
 
 def test_a_line_cuts_a_triangle_where_it_crosses() -> None:

@@ -16,7 +16,6 @@ from fracsim.fracture.energy.cut_plane import plane_crossings, plane_cuts
 from fracsim.fracture.energy.front_advance import FrontTipCriterion
 from fracsim.fracture.energy.neighbour_search import find_pairs
 from fracsim.fracture.energy.tip_criterion import TipCriterion
-from fracsim.fracture.energy.tip_parameters import TIP
 from fracsim.mesh.simplices import is_split
 from fracsim.scene import Scene, build_scene
 from support.scenes import make_study
@@ -86,15 +85,6 @@ def test_a_plane_cuts_a_tetrahedron_apart() -> None:
         assert set(after.sum(axis=1)) == {3, 4}
         as_it_is = crossed[:, other]
         np.testing.assert_array_equal(after[as_it_is], crossed[as_it_is])
-
-
-def test_the_mean_square_in_a_ball() -> None:
-    """A disc's c / rho_z over its slices, rho_z^2 = rho^2 - z^2: c / rho times 3 pi / 8, by quadrature."""
-    z = (np.arange(100_000) + 0.5) / 50_000 - 1
-    slices = np.sqrt(1 - z**2)
-    assert TIP.near_tip_factor[3] / TIP.near_tip_factor[2] == pytest.approx(
-        np.mean(slices) / np.mean(slices**2), rel=1e-4
-    )
 
 
 def forces(scene: Scene) -> Values:

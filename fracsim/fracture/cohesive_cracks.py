@@ -48,6 +48,7 @@ from .energy.crack_initiation import (
     cell_strength,
     rank_rows,
 )
+from .energy.critical_distance import CriticalDistance
 from .energy.cut_cells import CutGeometry
 from .energy.tip_criterion import TipCriterion, input_numbers
 from .energy.tip_fields import TipFieldEvaluator, TipFields
@@ -264,6 +265,11 @@ class CohesiveTipCriterion(TipCriterion):
             self._initiation, self._graph, self.strength, self.field_evaluator, self._h
         )
         self._initiation = self._cohesive_initiation
+
+    def _critical_distance(self) -> CriticalDistance:
+        """Return no length: the strength alone starts cohesive cracks."""
+        none = np.zeros(self._domain.cell_count)
+        return CriticalDistance(none, none)
 
     def allow_initiation(self, allowed: bool) -> None:
         """Allow or forbid new cracks in the following calls."""

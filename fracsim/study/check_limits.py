@@ -23,6 +23,7 @@ class CheckLimits:
         tip_radius: radius of the domain of a crack tip, in h (`fracture.energy.tip_criterion`, whose import is slow).
         tip_clearance: distance of a tip from boundaries and other tips, in h.
         min_zone_cells: Irwin's length in h from which cells resolve the process zone.
+        min_start_cells: L of the critical distance in h from which cells resolve the stress ahead of a notch.
         min_zone_share: times that Irwin's length fits into the body, below which the process zone has no space.
         max_energy_ratio: factor between the energy of single edges and that of the material without a note.
         max_small_strain: strain at the strength below which large strains do not matter.
@@ -62,6 +63,7 @@ class CheckLimits:
     tip_radius: float = 5.0
     tip_clearance: float = 6.0
     min_zone_cells: float = 8.0
+    min_start_cells: float = 2.5
     min_zone_share: float = 5.0
     max_energy_ratio: float = 3.0
     max_small_strain: float = 0.005

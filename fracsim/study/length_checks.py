@@ -100,6 +100,7 @@ def energy_criterion_notes(study: Study, h: float, max_side: float) -> Iterator[
         if table.law == "cohesive":
             yield from _cohesive_notes(length, h)
             continue
+        yield _start_note(length / np.pi, h)
         yield from _process_zone_notes(length, strength, h, max_side)
         if length >= LIMITS.min_zone_cells * h and study.time.scheme == "quasi-static":
             yield 'cells resolve the process zone: with law = "cohesive" cracks soften as they open, as in concrete'
@@ -145,6 +146,14 @@ def _cohesive_notes(length: float, h: float) -> Iterator[str]:
     if length < cells * h:
         yield f'note: that is less than {cells:g} h: cells are too coarse for law = "cohesive";'
         yield f'h = {length / cells:.2g} m is sufficient, or law = "griffith"'
+
+
+def _start_note(length: float, h: float) -> str:
+    """Return by what a crack starts at a notch; `length` is L of the critical distance, `h` the size of cells, m."""
+    start = f"cracks start by strength and energy: L = E' G_c / (pi f_t^2) = {length:.3g} m = {length / h:.3g} h;"
+    if length >= LIMITS.min_start_cells * h:
+        return f"{start} cells resolve the stress ahead of a notch"
+    return f"{start} at a notch the energy decides, elsewhere the strength"
 
 
 def _process_zone_notes(length: float, strength: float, h: float, max_side: float) -> Iterator[str]:

@@ -18,7 +18,9 @@ from ...mesh.parallel import allgather, sum_over_ranks
 from ..edge_stress import frobenius_norm
 from ..principal_stress import first_principal_stress, principal_stress_bound, symmetric_tensors
 from ..strength import EdgeStrength, hash_points
+from .critical_distance import CriticalDistance, start_points
 from .tip_fields import TipFieldEvaluator
+from .tip_parameters import TIP
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -33,8 +35,8 @@ class CutProposal:
     """Cells of this rank that cracks would cut: those of tips, or those in which cracks would start.
 
     Attributes:
-        rank: (n, d + 4) order of the cells: kind, - sigma_1 in Pa, a hash, the point (d) in m, and the distance in m
-            within which no other cell of the pass may be cut.
+        rank: (n, d + 4) order of the cells: kind, - sigma_1 in Pa or - load, a hash, the point (d) in m, and the
+            distance in m within which no other cell of the pass may be cut.
         cells: (n,) local cells.
         stress: (n, d, d) averaged stress, Pa.
         entry: (n,) local edges by which cracks came in; None for new cracks, as the following.
@@ -77,7 +79,7 @@ def rank_rows(kind: int, sigma: Values, key: Values, points: Values, exclusion: 
 
     Args:
         kind: TIP_ADVANCE or NEW_CRACK.
-        sigma: (n,) first principal stress, Pa; cells are selected from the largest on.
+        sigma: (n,) first principal stress, Pa, or load; cells are selected from the largest on.
         key: (n, ...) numbers that the hash is of, the same on any number of ranks.
         points: (n, d) m.
         exclusion: (n,) distance within which no other cell may be cut, m.
@@ -128,14 +130,26 @@ class Initiation(Protocol):
 
 
 class CrackInitiation:
-    """A crack starts where the averaged first principal stress reaches the strength, farther than R from any crack."""
+    """A crack starts where strength and energy are reached, farther than R from any crack.
+
+    The first principal stress over the strength of a cell is at least 1, and the largest within the critical distance.
+    The mean stress ahead of the cell is at least the threshold of `CriticalDistance`.
+    """
 
     def __init__(
-        self, stress: Stress, graph: EdgeGraph, strength: EdgeStrength, evaluator: TipFieldEvaluator, disc: Values
+        self,
+        stress: Stress,
+        graph: EdgeGraph,
+        strength: EdgeStrength,
+        evaluator: TipFieldEvaluator,
+        disc: Values,
+        start: CriticalDistance,
     ) -> None:
-        """Build the rule; `disc`: (cells,) R, m."""
+        """Build the rule (collective); `disc`: (cells,) R, m; `start`: the critical distance."""
         self._graph, self._strength, self._evaluator, self._disc = graph, strength, evaluator, disc
-        self._dim = stress.domain.dim
+        self._dim, self._start, self._points = stress.domain.dim, start, start_points(stress.domain)
+        # The most loaded cell as far as a crack of the critical distance, or its tip, may reach.
+        self._distance = np.maximum(TIP.start_distance / TIP.disc_radius[self._dim] * disc, start.radius)
 
     def find_cells(self, stress: Values, excluded: Flags) -> Ints:
         """Find intact cells, farther than R from any crack, whose local stress (cells, 3 or 6) may be large enough."""
@@ -152,11 +166,22 @@ class CrackInitiation:
         return cells
 
     def propose_cuts(self, cells: Ints, stress: Values) -> CutProposal:
-        """Propose the cells (m,) of (n,) whose averaged stress reaches the strength (collective)."""
-        mean = self._evaluator.mean_stress_at(cells, stress)
-        sigma = first_principal_stress(mean)
-        overloaded = sigma >= cell_strength(self._strength, self._graph, cells)
+        """Propose the cells (m,) of (n,) in which cracks start (collective)."""
+        load = self._load(stress)
+        cells = cells[load[cells] >= 1]
+        cells = cells[self._evaluator.find_largest(cells, load, self._distance[cells])]
+        normals = self._evaluator.crack_normals(symmetric_tensors(stress[cells], self._dim), cells)
+        mean = self._evaluator.mean_stress_ahead(self._points[cells], normals, self._start.radius[cells], stress)
+        overloaded = first_principal_stress(mean) >= self._start.threshold[cells]
         cells = cells[overloaded]
-        centres = self._evaluator.centres[cells]
-        rank = rank_rows(NEW_CRACK, sigma[overloaded], centres, centres, self._disc[cells])
+        centres, exclusion = self._evaluator.centres[cells], np.maximum(self._disc, self._start.radius)[cells]
+        rank = rank_rows(NEW_CRACK, load[cells], centres, centres, exclusion)
         return CutProposal(rank, cells, mean[overloaded])
+
+    def _load(self, stress: Values) -> Values:
+        """Return the first principal stress over the strength (cells,) of unsplit cells, 0 far below the strength."""
+        load = np.zeros(len(stress))
+        cells = np.flatnonzero(~self._graph.split & (frobenius_norm(stress, self._dim) >= self._strength.minimum))
+        sigma = first_principal_stress(symmetric_tensors(stress[cells], self._dim))
+        load[cells] = sigma / cell_strength(self._strength, self._graph, cells)
+        return load

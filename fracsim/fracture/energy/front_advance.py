@@ -60,7 +60,7 @@ class FrontTipCriterion(TipCriterion):
     def _propose_advances(self, fields: TipFields) -> CutProposal:
         """Propose the cells of tips that advance, each on its plane; mature tips lead their planes."""
         advances = super()._propose_advances(fields)
-        normals = self._normals(advances.stress, advances.cells)
+        _, normals = self.field_evaluator.crack_normals(advances.stress, advances.cells)
         mature = fields.tips.mature[np.searchsorted(fields.tips.cell, advances.cells)]
         # The plane of a tip passes through its point, across the first principal stress.
         planes = np.column_stack([advances.point, normals, -advances.rank[:, 1]])

@@ -1,9 +1,8 @@
 """Criterion of a body with a fracture energy G_c: which crack tips advance, and where cracks start.
 
 A tip advances by a cell if the configurational force over a disc of 5 h (3D: a ball of 4 h) reaches G_c, once the crack
-behind it is longer than the disc (a mature tip). The criterion of young tips and of undamaged material is the average
-stress, which has to reach the strength f_t; or, at a young tip, the mean square over 3 h, which has to reach that of a
-crack with G = G_c.
+behind it is longer than the disc (a mature tip). Young tips advance, and cracks start, by the mean stress ahead
+(critical_distance); where a crack starts the stress has to reach the strength, too.
 
 Equations: docs/theory.md#tip-criterion.
 """
@@ -23,7 +22,7 @@ from ...mesh.parallel import allgather, sum_over_ranks
 from ...mesh.simplices import local_edges
 from ..criterion import Edges
 from ..node_retention import NodeAttachment
-from ..principal_stress import first_principal_directions, first_principal_stress, material_normals
+from ..principal_stress import first_principal_stress
 from ..strength import EdgeStrength
 from .branching import release_rate, rotate, unit_or_zero
 from .crack_initiation import (
@@ -36,6 +35,7 @@ from .crack_initiation import (
     rank_rows,
     select_proposals,
 )
+from .critical_distance import CriticalDistance, critical_distance
 from .cut_plane import EdgeCuts, branching_cuts, centroid_cuts, exit_cuts, plane_cuts
 from .mixed_mode import kink_angle, kink_gain
 from .neighbour_search import local_mesh_size
@@ -93,16 +93,22 @@ class TipCriterion:
         self._h = local_mesh_size(domain)
         self.disc_radius_ratio = TIP.disc_radius[domain.dim]
         disc = self.disc_radius_ratio * self._h
-        radii = TipRadii(disc, TIP.average_radius * self._h, TIP.mature_length * self._h)
+        self._start = self._critical_distance()
+        radii = TipRadii(disc, TIP.average_radius * self._h, TIP.mature_length * self._h, self._start.radius)
         self.field_evaluator = TipFieldEvaluator(stress, graph, radii, may_branch=self.may_branch, shares=self.shares)
-        self._initiation: Initiation = CrackInitiation(stress, graph, strength, self.field_evaluator, disc)
-        mu, lmbda = np.asarray(stress.material.mu), np.asarray(stress.material.lmbda)
-        # E' of plane strain; lambda is reduced in plane stress, where this is E' of plane stress.
-        modulus = 4 * mu * (lmbda + mu) / (lmbda + 2 * mu)
-        self._modulus = np.broadcast_to(modulus, (domain.cell_count,))
+        self._initiation: Initiation = CrackInitiation(stress, graph, strength, self.field_evaluator, disc, self._start)
         self._now, self._dt = 0.0, np.inf
         self.cells: Ints = np.empty(0, np.int64)
         self._excluded_cells: Flags = np.zeros(domain.cell_count, bool)
+
+    def _critical_distance(self) -> CriticalDistance:
+        """Return the length and the threshold of the mean stress ahead of places at which cracks start."""
+        material, cells = self._stress.material, np.arange(self._domain.cell_count)
+        mu, lmbda = np.asarray(material.mu), np.asarray(material.lmbda)
+        # E' of plane strain; lambda is reduced in plane stress, where this is E' of plane stress.
+        modulus = 4 * mu * (lmbda + mu) / (lmbda + 2 * mu)
+        strength = cell_strength(self.strength, self._graph, cells)
+        return critical_distance(self._domain.dim, modulus, np.asarray(self.toughness), strength, self._h)
 
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """Find the local edges (n,) that cracks cut, with loads of 1 (collective).
@@ -205,17 +211,12 @@ class TipCriterion:
         # A branch is inactive behind the other unless there is enough energy for both.
         is_inactive = (tips.is_inactive & (size < TIP.branching_ratio * toughness)) | self._excluded_cells[tips.cell]
         candidates = np.flatnonzero((~mature | enough) & ~is_inactive)
-        if not len(candidates):
-            return empty_proposal(d, self.course_width)
         mean = fields.mean_stress(candidates)
         sigma = first_principal_stress(mean)
-        strong_enough = sigma >= cell_strength(self.strength, self._graph, tips.cell[candidates])
-        active = (sigma > 0) & (mature[candidates] | strong_enough)
-        # Young tips below the strength: the near field of a crack with G = G_c.
-        weak = np.flatnonzero(~active & (sigma > 0))
-        near_field = TIP.near_tip_factor[d] * self._modulus[tips.cell] * toughness / (TIP.average_radius * h)
-        threshold = np.sqrt(near_field)[candidates[weak]]
-        active[weak] = np.sqrt(fields.mean_square_stress(candidates[weak])) >= threshold
+        active = (sigma > 0) & mature[candidates]
+        # The stress ahead of a young tip is that ahead of a place at which a crack starts.
+        young = np.flatnonzero(~mature[candidates] & (sigma > 0))
+        active[young] = self._is_overloaded(fields, candidates[young], mean[young])
         rows = candidates[active]
         cells = tips.cell[rows]
         rank = rank_rows(
@@ -224,17 +225,17 @@ class TipCriterion:
         entry = self._graph.first_broken_edge(cells)
         return CutProposal(rank, cells, mean[active], entry, ahead[rows], turns[rows], branches[rows])
 
+    def _is_overloaded(self, fields: TipFields, rows: Ints, mean: Values) -> Flags:
+        """Return whether the stress ahead of tips `rows` (m,) with averaged stress (m, d, d) is enough (collective)."""
+        cells, evaluator = fields.tips.cell[rows], self.field_evaluator
+        ahead = evaluator.mean_stress_ahead(
+            fields.tips.point[rows], evaluator.crack_normals(mean, cells), self._start.radius[cells], fields.cell_stress
+        )
+        return np.asarray(first_principal_stress(ahead) >= self._start.threshold[cells])
+
     def _find_critical_tips(self, size: Values, toughness: Values, tips: CrackTips) -> tuple[Flags, Flags]:
         """Return which tips (n,) with release rates `size` (n,) reach G_c, and which branch (collective)."""
         return size >= toughness, np.zeros(len(tips), bool)
-
-    def _normals(self, stress: Values, cells: Ints) -> Values:
-        """Return unit normals (n, d), in the reference configuration, across the first principal stress (n, d, d)."""
-        direction = first_principal_directions(stress, self.field_evaluator.centres[cells], 0)
-        if self._stress.energy.linear:
-            return direction
-        H = self.field_evaluator.mean_gradients(cells, self._stress.u.x.array)
-        return material_normals(direction, np.eye(stress.shape[1]) + H)
 
     # --- cuts ---
 
@@ -242,7 +243,8 @@ class TipCriterion:
         """Store the cuts of selected cells on every rank; return the local edges (n,) of this one (collective)."""
         advance_rows = self._cut_rows(advances, self._exit_cuts(advances))
         through_centroid = centroid_cuts(
-            reference_corners(self._domain, starts.cells), self._normals(starts.stress, starts.cells)
+            reference_corners(self._domain, starts.cells),
+            self.field_evaluator.crack_normals(starts.stress, starts.cells)[1],
         )
         start_rows = self._cut_rows(starts, through_centroid)
         edges, courses = self._store_cuts(np.concatenate([advance_rows, start_rows]))
@@ -316,7 +318,10 @@ class TipCriterion:
         """Return the cuts of the cells of tips that advance (collective)."""
         assert advances.entry is not None and advances.ahead is not None
         cells, ahead = advances.cells, advances.ahead
-        corners, normals = reference_corners(self._domain, cells), self._normals(advances.stress, cells)
+        corners, normals = (
+            reference_corners(self._domain, cells),
+            self.field_evaluator.crack_normals(advances.stress, cells)[1],
+        )
         if self._domain.dim == 3:
             return plane_cuts(corners, ~self._graph.intact(cells), advances.point, normals)
         assert advances.turns is not None and advances.branches is not None

@@ -15,12 +15,13 @@ from ...mesh.ghost_exchange import with_ghosts
 from ...mesh.simplices import local_edges
 from ...mesh.small_matrices import barycentric_gradients
 from ..effective_stress import UndamagedStress
-from ..principal_stress import symmetric_tensors
+from ..principal_stress import first_principal_directions, material_normals, symmetric_tensors
 from .configurational_force import closure_spring_stress, eshelby_stress, first_piola_stress, transposed_product
 from .cut_cells import CutCells, CutGeometry
 from .gradient_operators import GradientOperators
-from .neighbour_search import NearbyCells, RemoteCellValues, weighted_mean
+from .neighbour_search import NearbyCells, NeighbourPairs, RemoteCellValues, weighted_mean
 from .tip_neighbourhoods import CrackTips, TipNeighbourhoods, TipRadii
+from .tip_parameters import TIP
 
 Cells = npt.NDArray[np.integer]
 Ints = npt.NDArray[np.int64]
@@ -34,7 +35,8 @@ class TipFields:
     Attributes:
         neighbourhoods: tips and sums around them.
         disc_radius: (tips,) R, m.
-        stress: (requested, 3 or 6) Cauchy stress of the undamaged material, Pa.
+        cell_stress: (cells, 3 or 6) Cauchy stress of the undamaged material in all cells of this rank, Pa.
+        stress: (requested, 3 or 6) that stress in the cells around tips, Pa.
         sigma: (requested, d, d) Eshelby stress of the damaged body, Pa.
         inertia: (requested, d) rho (H^T a - (grad v)^T v), N/m^3; 0 without inertia.
         H: (requested, 2, 2) displacement gradient; empty in 3D.
@@ -45,6 +47,7 @@ class TipFields:
 
     neighbourhoods: TipNeighbourhoods
     disc_radius: Values
+    cell_stress: Values
     stress: Values
     sigma: Values
     inertia: Values
@@ -72,10 +75,6 @@ class TipFields:
     def mean_stress(self, rows: Ints) -> Values:
         """Return the mean stress (m, d, d) around tips `rows` (m,), Pa."""
         return self.neighbourhoods.mean_stress(rows, self.stress)
-
-    def mean_square_stress(self, rows: Ints) -> Values:
-        """Return the mean square (m,) of the positive first principal stress around tips `rows` (m,), Pa^2."""
-        return self.neighbourhoods.mean_square_stress(rows, self.stress)
 
     def phase_angles(self) -> Values:
         """Return atan2(K_II, K_I) (tips,) of tips in 2D, rad."""
@@ -110,7 +109,8 @@ class TipFieldEvaluator:
         self.centres: Values = domain.nodes[domain.cell_nodes].mean(axis=1)
         self._motion: tuple[Values, Values] | None = None
         # All ranks search within the same radius.
-        largest_radius = domain.comm.allreduce(float(np.max(radii.disc, initial=0.0)), op=MPI.MAX)
+        largest = max(float(np.max(radius, initial=0.0)) for radius in (radii.disc, radii.start))
+        largest_radius = domain.comm.allreduce(largest, op=MPI.MAX)
         self._nearby, self._geometry = NearbyCells(domain, largest_radius), CutGeometry(domain, graph)
         self.cut_cells = CutCells(graph, self._geometry, self.centres)
         self.neighbourhoods = TipNeighbourhoods(
@@ -179,7 +179,8 @@ class TipFieldEvaluator:
         remote_stress, sigma, inertia, H, inertia_force = exchange(cell_stress, sigma, inertia, *in_plane)
         elastic, rotates = (mu[tips.cell], kappa[tips.cell]), not self._stress.energy.linear
         radius = self._radii.disc[tips.cell]
-        return TipFields(self.neighbourhoods, radius, remote_stress, sigma, inertia, H, inertia_force, elastic, rotates)
+        fields = remote_stress, sigma, inertia, H, inertia_force
+        return TipFields(self.neighbourhoods, radius, stress, *fields, elastic, rotates)
 
     @property
     def operators(self) -> GradientOperators:
@@ -202,12 +203,62 @@ class TipFieldEvaluator:
         """
         average = self._radii.average[cells]
         pairs = self._nearby.find_pairs(self.centres[cells], average)
+        weight = self._nearby.volumes[pairs.second] * (1 - pairs.distance / average[pairs.first])
+        mean = weighted_mean(pairs.sum(weight[:, None] * self._near_values(pairs, stress)), pairs.sum(weight)[:, None])
+        return symmetric_tensors(mean, self._domain.dim)
+
+    def crack_normals(self, stress: Values, cells: Ints) -> tuple[Values, Values]:
+        """Return the normals (n, d) of cracks across the first principal stress (n, d, d) in cells (n,).
+
+        The first ones are unit vectors in space, the second ones those in the reference configuration.
+        """
+        normals = first_principal_directions(stress, self.centres[cells], 0)
+        if self._stress.energy.linear:
+            return normals, normals
+        H = self.mean_gradients(cells, self._stress.u.x.array)
+        return normals, material_normals(normals, np.eye(stress.shape[1]) + H)
+
+    def mean_stress_ahead(
+        self, points: Values, normals: tuple[Values, Values], radius: Values, stress: Values
+    ) -> Values:
+        """Return the mean stress (n, d, d), Pa, over half discs, in 3D half balls, ahead of points (collective).
+
+        Ahead is the direction of the tension across the coming crack: sum V <n . s n>+ (X - X_0), less its part along
+        the normal. Split cells do not count, nor do cells that are compressed along n, before which the crack ends.
+
+        Args:
+            points: (n, d) reference points X_0, m.
+            normals: (n, d) normals of the coming cracks, n in space and those in the reference configuration.
+            radius: (n,) m.
+            stress: (cells, 3 or 6) Cauchy stress, Pa.
+        """
+        d, (spatial, material) = self._domain.dim, normals
+        pairs = self._nearby.find_pairs(points, radius)
+        near = self._near_values(pairs, stress)
+        n = spatial[pairs.first]
+        tension = np.einsum("ni,nij,nj->n", n, symmetric_tensors(near, d), n)
+        counts = ~self.neighbourhoods.split_cells[pairs.second] & (tension > 0)
+        volume = self._nearby.volumes[pairs.second] * counts
+        ahead = pairs.sum((volume * tension)[:, None] * pairs.apart)
+        ahead -= np.einsum("ni,ni->n", ahead, material)[:, None] * material
+        volume = volume * (np.einsum("ni,ni->n", ahead[pairs.first], pairs.apart) >= 0)
+        return symmetric_tensors(weighted_mean(pairs.sum(volume[:, None] * near), pairs.sum(volume)[:, None]), d)
+
+    def find_largest(self, cells: Ints, values: Values, radius: Values) -> npt.NDArray[np.bool_]:
+        """Return whether the value of cells (n,) is the largest within radius (n,), m, of their centroids (collective).
+
+        `values` are those of all cells (cells,). Values that are equal but for rounding are all the largest.
+        """
+        pairs = self._nearby.find_pairs(self.centres[cells], radius)
+        near = self._near_values(pairs, values)
+        return ~pairs.any(near * (1 - TIP.force_round_off) > values[cells][pairs.first])
+
+    def _near_values(self, pairs: NeighbourPairs, values: Values) -> Values:
+        """Return the values (pairs, ...) of the second cells of pairs, from those (cells, ...) of all (collective)."""
         needed, index = np.unique(pairs.second, return_inverse=True)
         exchange = self._nearby.request_values(needed)
-        (near,) = exchange(stress[exchange.owned_cells])
-        weight = self._nearby.volumes[pairs.second] * (1 - pairs.distance / average[pairs.first])
-        mean = weighted_mean(pairs.sum(weight[:, None] * near[index]), pairs.sum(weight)[:, None])
-        return symmetric_tensors(mean, self._domain.dim)
+        (near,) = exchange(values[exchange.owned_cells])
+        return np.ascontiguousarray(near)[index]
 
     def mean_gradients(self, cells: Ints, field: Values) -> Values:
         """Return the mean gradients (n, d, d) of a nodal field (nodes * d,) in cells (n,)."""

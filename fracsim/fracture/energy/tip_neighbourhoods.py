@@ -15,7 +15,7 @@ from scipy.sparse import csc_matrix, csr_matrix, hstack
 from scipy.spatial import cKDTree
 
 from ...mesh.edge_graph import EdgeGraph
-from ..principal_stress import first_principal_stress, symmetric_tensors
+from ..principal_stress import symmetric_tensors
 from . import branching, mixed_mode
 from .configurational_force import plateau, plateau_gradient
 from .crack_front import FrontReleaseRate, advance_vectors, project_on_surface
@@ -36,11 +36,13 @@ class TipRadii:
         disc: R of the configurational force.
         average: radius within which stress is averaged, at most R.
         beyond: a tip is mature if a split cell lies between R and R plus this length.
+        start: radius of the half disc ahead of a place at which a crack starts; 0 without such discs.
     """
 
     disc: Values
     average: Values
     beyond: Values
+    start: Values
 
 
 @dataclass(frozen=True)
@@ -83,7 +85,6 @@ class _Weight(IntEnum):
 
     INSIDE = 0  # V q
     MEAN = 1  # V (1 - r / radius of the average)
-    UNIFORM = 2  # V
 
 
 class TipNeighbourhoods:
@@ -133,6 +134,11 @@ class TipNeighbourhoods:
         self._surface_weights: Values = no_points
         self._matrices: dict[int, csr_matrix] = {}
         self._force_matrices: tuple[csc_matrix, csc_matrix] | None = None
+
+    @property
+    def split_cells(self) -> Flags:
+        """(near,) whether the near cells are split."""
+        return self._split
 
     def update(self, cut: Values) -> None:
         """Update the neighbourhoods near changed cells; `cut`: (edges,) cut positions (collective)."""
@@ -200,19 +206,6 @@ class TipNeighbourhoods:
         weights = self._weight_matrix(d + _Weight.MEAN)[rows]
         sums = np.column_stack([weights @ column for column in stress.T])
         return symmetric_tensors(weighted_mean(sums, np.asarray(weights.sum(axis=1))), d)
-
-    def mean_square_stress(self, rows: Ints, stress: Values) -> Values:
-        """Return the mean square (m,), Pa^2, of the positive first principal stress around tips `rows` (m,).
-
-        It is over the disc of the average, with uniform weight; `stress` is (requested, 3 or 6), Pa.
-        """
-        d = self._graph.domain.dim
-        weights = self._weight_matrix(d + _Weight.UNIFORM)[rows]
-        # Eigenvalues are computed for the cells with a weight alone.
-        cells = np.unique(weights.indices)
-        squares = np.zeros(len(stress))
-        squares[cells] = np.maximum(first_principal_stress(symmetric_tensors(stress[cells], d)), 0.0) ** 2
-        return weighted_mean(weights @ squares, np.asarray(weights.sum(axis=1)).ravel())
 
     def stress_intensities(
         self, fields: tuple[Values, Values, Values], elastic: tuple[Values, Values], *, rotates: bool
@@ -314,14 +307,14 @@ class TipNeighbourhoods:
         """Find the pairs of tips and cells around them.
 
         Returns:
-            Tip (pairs,) and cell (pairs,), the weights (pairs, d + 3), and int q n dA (pairs, d) of the cell's surface.
+            Tip (pairs,) and cell (pairs,), the weights (pairs, d + 2), and int q n dA (pairs, d) of the cell's surface.
         """
         disc, average = self._radii.disc[cell], self._radii.average[cell]
         pairs = self._nearby.find_pairs(point, disc)
         volume, r, R = self._nearby.volumes[pairs.second], pairs.distance, disc[pairs.first]
         slope = volume[:, None] * plateau_gradient(pairs.apart, R)
         share = 1 - r / average[pairs.first]
-        columns = [plateau(r, R), np.maximum(share, 0.0), share > 0]
+        columns = [plateau(r, R), np.maximum(share, 0.0)]
         weights = np.column_stack([slope, *(volume * column for column in columns)])
         distance = np.linalg.norm(self._nearby.surface_points[pairs.second] - point[pairs.first], axis=1)
         surface_weights = plateau(distance, R)[:, None] * self._nearby.surface_vectors[pairs.second]

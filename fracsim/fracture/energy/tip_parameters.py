@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from math import pi, radians
+from math import radians
 
 
 def _by_dimension(in_plane: float, in_space: float) -> Mapping[int, float]:
@@ -25,9 +25,13 @@ class TipParameters:
         mature_length: a tip is mature once a split cell lies between R and R plus this length.
         passes_per_size: fracture passes in which a crack advances by h.
         exclusion_radius: distance between tips that advance in one pass.
-        near_tip_factor: mean square of the first principal stress over a disc of radius rho around a tip, in units of
-            E' G / rho. With sigma_1 = K / sqrt(2 pi r) cos(t/2) (1 + |sin(t/2)|) it is
-            (1 / 2 pi^2) int cos^2 (1 + |sin|)^2 dt = 0.334, and 3 pi / 8 of that over a ball.
+        near_field_mean: mean stress across a crack over the half disc of radius R ahead of its tip, in units of
+            K / sqrt(2 pi R). With sigma = K / sqrt(2 pi r) cos(t/2) (1 + sin(t/2) sin(3t/2)) it is
+            4/3 of (1 / pi) int cos(t/2) (1 + sin(t/2) sin(3t/2)) dt; over a half ball more, by
+            9/10 of int sqrt(sin(s)) ds / 2.
+        min_start_radius: least radius of the half disc ahead of a place at which a crack starts.
+        max_start_radius: largest radius of that half disc, which bounds the number of cells in it.
+        start_distance: distance within which a crack starts at the most loaded cell alone.
         branching_ratio: mean of G over G_c from which on a crack branches: there is energy for two.
         branching_angle: angle between a branch and the crack it comes from, rad. At 27 degrees short branches open
             without sliding.
@@ -46,7 +50,10 @@ class TipParameters:
     mature_length: float = 1.5
     passes_per_size: Mapping[int, float] = _by_dimension(2.5, 5.0)
     exclusion_radius: Mapping[int, float] = _by_dimension(5.0, 0.5)
-    near_tip_factor: Mapping[int, float] = _by_dimension(0.334, 0.334 * 3 * pi / 8)
+    near_field_mean: Mapping[int, float] = _by_dimension(1.5605, 1.6827)
+    min_start_radius: float = 3.0
+    max_start_radius: Mapping[int, float] = _by_dimension(60.0, 8.0)
+    start_distance: float = 2.0
     branching_ratio: float = 2.0
     branching_angle: float = radians(27.0)
     side_by_side: float = 0.5
