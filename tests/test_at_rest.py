@@ -45,7 +45,11 @@ def test_a_thrown_corner_comes_to_rest_by_itself(monkeypatch: pytest.MonkeyPatch
     of Newton's method, with fewer tangents; without damage nothing of it is made."""
     made: list[int] = []
     assemble = Tangent._assemble_body
-    monkeypatch.setattr(Tangent, "_assemble_body", lambda self, *given: made.append(1) or assemble(self, *given))
+    monkeypatch.setattr(
+        Tangent,
+        "_assemble_body",
+        lambda self, *given, reuse: (reuse or made.append(1), assemble(self, *given, reuse=reuse))[1],
+    )
     set_policy(monkeypatch, max_relaxed_nodes=0.2)
     scene, state = thrown()
     u, tangents = state.u.copy(), len(made)

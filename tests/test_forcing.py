@@ -90,7 +90,9 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     made: list[int] = []
     assemble = tangent_module.Tangent._assemble_body
     monkeypatch.setattr(
-        tangent_module.Tangent, "_assemble_body", lambda self, *given: made.append(1) or assemble(self, *given)
+        tangent_module.Tangent,
+        "_assemble_body",
+        lambda self, *given, reuse: (reuse or made.append(1), assemble(self, *given, reuse=reuse))[1],
     )
     return made
 
