@@ -187,7 +187,7 @@ SOURCES = sorted(PACKAGE.rglob("*.c"))
 # sizes that sources are compiled for; simd_kernels.c needs a kernel of FFCx, and is compiled in test_simd_kernels
 MACROS = {
     "block_matrix": ["-DD=3"], "psd_projection": ["-DN=9", "-DLANES=4"], "bcsr": ["-DR=3", "-DLANES=8"],
-    "prolongation": ["-DR=3", "-DC=6"],
+    "prolongation": ["-DR=3", "-DC=6"], "polar_rotation": ["-DD=3", "-DLANES=4"],
 }  # fmt: skip
 
 

@@ -121,7 +121,7 @@ def test_cracks_that_take_an_energy_cut_no_node_off(dim: int) -> None:
 
 def burst(dim: int, crumbs: bool, forgetful: bool = False) -> Scene:
     """A body that has flown apart; `forgetful`: nothing is remembered from step to step but what a checkpoint has."""
-    size, h, step = {2: ([1.0, 1.0], 0.08, 5e-3), 3: ([1.0, 1.0, 0.5], 0.2, 1e-2)}[dim]
+    size, h, step = {2: ([1.0, 1.0], 0.04, 2.5e-3), 3: ([1.0, 1.0, 0.5], 0.2, 1e-2)}[dim]
     scene, state = make_scene(
         mesh={"builder": "box", "size": size, "h": h, "pattern": "unstructured"},
         material={"energy": "linear", "young": 1.0, "poisson": 0.3, "density": 1.0},

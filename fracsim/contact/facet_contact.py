@@ -63,11 +63,14 @@ class ContactFacets:
         corners: (m, c) points.
         area: (m,) m^2 (2D: m).
         smoothing: mu of closest points, m.
+        warm_start: searches begin at the closest points found last. Without it these depend on positions alone, so that
+            a run that goes on from a checkpoint takes the same explicit steps.
     """
 
     corners: Ints
     area: Values
     smoothing: float
+    warm_start: bool = True
 
     @cached_property
     def _last_barycentric(self) -> Values:
@@ -95,7 +98,8 @@ class ContactFacets:
         if (new := np.isnan(start[:, 0])).any():
             start[new] = initial_barycentric(posed, corners[new], self.smoothing)
         closest = find_closest_points(posed, corners, self.smoothing, start)
-        self._last_barycentric[facets] = closest.barycentric
+        if self.warm_start:
+            self._last_barycentric[facets] = closest.barycentric
         return closest
 
     def start(self, posed: PosedShape, x: Values, reach: float) -> FacetStart:

@@ -213,6 +213,9 @@ class PenaltyObstacleTerm(ObstacleTerm):
     def _facet_gap_function(self, posed: Sequence[PosedShape]) -> None:
         return None  # facets may be penetrated, and crack faces have no penalty of their own
 
+    def _facets_for(self, number: int) -> ContactFacets | None:
+        return self._facets if number in self._facet_obstacles else None
+
     # --- stiffness ---
 
     def _update_stiffness(self) -> None:
@@ -239,7 +242,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
             limit = PENALTY.facet_share * self._max_added
             k = np.minimum(k, limit * facets.area / np.where(rate > 0, rate, np.inf))
         acts = ~is_copy[facets.corners].any(axis=1)
-        self._facets = ContactFacets(facets.corners[acts], k[acts], facets.smoothing)
+        self._facets = ContactFacets(facets.corners[acts], k[acts], facets.smoothing, warm_start=False)
         self._mass_share = mass_share
         corners = surface.rest_positions[self._facets.corners]
         side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0.0))
