@@ -14,7 +14,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 from ufl.core.expr import Expr
 
-from ..mesh.c_library import FAST_FLAGS, compile_on_all_ranks
+from ..mesh.c_library import FAST_FLAGS, LANES, compile_on_all_ranks
 from ..mesh.domain import Domain
 from ..mesh.small_matrices import closest_rotation, polar_rotation
 from .jit import point_expression, point_field
@@ -26,7 +26,6 @@ Values = npt.NDArray[np.float64]
 Rotations = Callable[[Values], Values]  # (n, d, d) rotations of (n, d, d) matrices
 
 SOURCE = Path(__file__).with_suffix(".c")
-LANES = 4  # matrices at a time: doubles in a vector register of AVX2
 
 
 class PolarRotation:

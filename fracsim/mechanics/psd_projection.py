@@ -21,7 +21,7 @@ import numpy.typing as npt
 import ufl
 
 from ..forms.balance import stress_quadrature
-from ..mesh.c_library import FAST_FLAGS, compile_library
+from ..mesh.c_library import FAST_FLAGS, LANES, compile_library
 from .jit import CellForm, cell_measure, point_expression, point_field
 from .stress import Stress, energy_derivatives
 
@@ -29,7 +29,6 @@ Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.uint8]
 
 SOURCE = Path(__file__).with_suffix(".c")
-LANES = 4  # matrices at a time: doubles in a vector register of AVX2
 BLOCK = 1024  # cells at a time: their moduli stay in the processor's cache
 
 

@@ -20,7 +20,7 @@ from dolfinx import fem, la
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
 
-from ..mesh.c_library import Float64, Int32, compile_on_all_ranks, struct_pointer
+from ..mesh.c_library import LANES, Float64, Int32, compile_on_all_ranks, struct_pointer
 from ..mesh.dolfinx_compat import (
     FormField,
     expression_fields,
@@ -34,7 +34,6 @@ from ..mesh.dolfinx_compat import (
 
 Values = npt.NDArray[np.float64]
 
-LANES = 4  # cells at a time: doubles in a vector register of AVX2
 FUNCTIONS = ("fabs", "sqrt", "log", "exp")  # evaluated lane by lane
 SOURCE = Path(__file__).with_suffix(".c")
 _LANE_BY_LANE = """

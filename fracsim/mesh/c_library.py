@@ -40,6 +40,7 @@ from .library_cache import (
     write_digest,
 )
 
+LANES = 4  # numbers at a time: doubles in a vector register of AVX2
 # square roots set no errno, and operations on the three components of a vector are vectorised; both within IEEE 754
 FAST_FLAGS = ["-fno-math-errno", "-fvect-cost-model=unlimited"]
 # a product is rounded before it is added, as in array code: no fused multiply-add
