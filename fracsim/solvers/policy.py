@@ -131,6 +131,9 @@ class SolverPolicy:
     # Edges that broke for each node of the body, after which operators are refreshed; beside the V cycle it is set up
     # again if its iterations have grown as well.
     refresh_edges: float = 0.02
+    # Edges that broke for each node of the body, after which the V cycle is set up again as well: where all cells
+    # are split its old levels take three times the time of a step.
+    many_edges: float = 0.5
     # Iterations that a refresh costs.
     refresh_cost: int = 10
     # Iterations that a set-up and, where no edge broke, a refresh cost beside the V cycle in single precision.

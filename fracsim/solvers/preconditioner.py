@@ -271,7 +271,8 @@ class Preconditioner:
         policy, equivalent = self._policy, self._equivalent
         # Many edges broke. The V cycle has the fine level of each tangent, and is judged by its iterations.
         is_old = self._edges_since_update > policy.refresh_edges * self._node_count
-        if is_old and self.applied.vcycle is None:
+        is_other_body = self._edges_since_update > policy.many_edges * self._node_count
+        if is_other_body or (is_old and self.applied.vcycle is None):
             self._due = max(self._due, Update.REFRESH)
         if self._due == Update.NONE:
             self._learn_from_solve(equivalent)
