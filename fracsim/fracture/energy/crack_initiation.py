@@ -6,6 +6,7 @@ Equations: docs/theory.md#tip-criterion.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -147,9 +148,14 @@ class CrackInitiation:
     ) -> None:
         """Build the rule (collective); `disc`: (cells,) R, m; `start`: the critical distance."""
         self._graph, self._strength, self._evaluator, self._disc = graph, strength, evaluator, disc
-        self._dim, self._start, self._points = stress.domain.dim, start, start_points(stress.domain)
+        self._domain, self._dim, self._start = stress.domain, stress.domain.dim, start
         # The most loaded cell as far as a crack of the critical distance, or its tip, may reach.
         self._distance = np.maximum(TIP.start_distance / TIP.disc_radius[self._dim] * disc, start.radius)
+
+    @cached_property
+    def _points(self) -> Values:
+        """(cells, d) points from which cracks start, m (collective where they are first asked for)."""
+        return start_points(self._domain)
 
     def find_cells(self, stress: Values, excluded: Flags) -> Ints:
         """Find intact cells, farther than R from any crack, whose local stress (cells, 3 or 6) may be large enough."""

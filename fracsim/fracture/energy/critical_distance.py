@@ -19,7 +19,8 @@ class CriticalDistance:
     """Length and threshold of the mean stress ahead of a place, in each cell.
 
     With L = E' G_c / (pi f_t^2) a crack starts where the mean over a half disc of radius R = max(c^2 L / 2, 3 h)
-    reaches min(f_t, c sqrt(E' G_c / (2 pi R))). c is the mean around a crack tip in units of K / sqrt(2 pi R).
+    reaches min(f_t, c sqrt(E' G_c / (2 pi R))). c is the mean around a crack tip in units of K / sqrt(2 pi R). R is at
+    most 60 h in 2D and 8 h in 3D.
 
     Attributes:
         radius: (cells,) R, m.
