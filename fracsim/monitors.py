@@ -145,7 +145,7 @@ def _obstacle_monitors(scene: Scene) -> tuple[ObstacleContactMonitor | None, Obs
     from .output.contact_checks import ObstacleContactMonitor, ObstacleOverlapMonitor
 
     terms = [term for term in scene.balance.terms if term.name in ("obstacles", "solids")]
-    contact_monitor = ObstacleContactMonitor(cast("list[ObstacleContact]", terms))
+    contact_monitor = ObstacleContactMonitor(scene.domain, cast("list[ObstacleContact]", terms))
     motions = [term for term in scene.balance.terms if isinstance(term, VerletRigidObstacles)]
     if not motions or len(obstacles) == 1:
         return contact_monitor, None

@@ -13,7 +13,7 @@ from fracsim.contact.obstacle import RigidObstacle
 from fracsim.contact.obstacle_pairs import ObstaclePair
 from fracsim.contact.pose import Pose
 from fracsim.contact.pose_derivatives import mixed_pose_hessian
-from fracsim.contact.rigid_obstacles import FreeRigidObstacles
+from fracsim.contact.rigid_pose import FreeRigidObstacles
 from fracsim.contact.shapes import Capsule, RoundedBox, RoundedCylinder, Shape, Sphere
 from support.scenes import Scene, Walk, each_step, make_scene, march
 

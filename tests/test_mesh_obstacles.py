@@ -261,7 +261,7 @@ def test_moments_are_those_of_a_box() -> None:
 
 def free_solid(scene: Scene) -> tuple[MeshObstacleTerm, FreePose]:
     (term,) = [each for each in scene.balance.terms if isinstance(each, MeshObstacleTerm)]
-    return term, term.bodies.free[0]
+    return term, term.group.bodies.free[0]
 
 
 def momenta(scene: Scene, state: Walk) -> tuple[Values, Values]:
@@ -286,11 +286,11 @@ def test_what_is_pushed_by_a_body_is_the_derivative_by_its_pose(tmp_path: Path) 
     scene.balance.set_displacement(state.u)
     term, solid = free_solid(scene)
     z, h = 1e-3 * np.array([1.0, -2.0, 1.0, 3.0, 1.0, -2.0]), 1e-6
-    term.bodies._unknowns.move_to([z])
+    term.group.bodies._unknowns.move_to([z])
     here, pose, ends = term.pose_derivatives([0], exact=True)[0], solid.posed.pose, []
     assert here.energy > 0 and term._friction is not None and np.abs(here.gradient).min() > 0
     for q in np.concatenate([h * np.eye(6), -h * np.eye(6)]):
-        term.bodies.posed[0] = PosedShape(solid.posed.shape, pose.incremented(q))
+        term.group.bodies.posed[0] = PosedShape(solid.posed.shape, pose.incremented(q))
         term.poses_moved()
         ends.append(((found := term.pose_derivatives([0], exact=True)[0]).energy, found.gradient))
     slope = np.array([(ends[k][0] - ends[k + 6][0]) / (2 * h) for k in range(6)])
@@ -305,7 +305,7 @@ def test_an_isolated_pair_keeps_its_momenta(tmp_path: Path) -> None:
     tables = thrown(tmp_path, velocity=[0.2, 0.0, -2.0], spin=[1.0, 0.5, 0.2])
     scene, state = make_scene(**tables, time={"scheme": "backward-euler", "step": 0.01, "end": 0.08})
     (linear, angular), (term, _) = momenta(scene, state), free_solid(scene)
-    held = term.bodies.kinetic_energy()
+    held = term.group.bodies.motions.kinetic_energy()
     for report in each_step(scene, state):
         now = momenta(scene, state)
         np.testing.assert_allclose(now[0], linear, atol=1e-9 * 40)
@@ -423,7 +423,7 @@ def test_a_driven_one_turns_and_drags(tmp_path: Path) -> None:
         assert report.kinetic + report.elastic + state.dissipated <= state.work * (1 + 1e-6) + 1e-9
     pressed = np.array(forces)
     assert pressed[:, 1].max() > 500 and abs(pressed[:, 0]).max() > 0.2 * pressed[:, 1].max()
-    pose = term.bodies.posed_at(state.t)[0].pose
+    pose = term.group.bodies.posed_at(state.t)[0].pose
     np.testing.assert_allclose(pose.rotation_vector(), [0.0, 1.6, 0.0], atol=1e-12)
     assert last(scene)["gap_block"] > 0.1  # it is through
 
@@ -510,7 +510,7 @@ def test_a_free_solid_hits_a_free_ball(tmp_path: Path) -> None:
         mesh=CUBE, material=SOFT, solver=FINE, obstacle=[thrown_block, ball],
         contact={"itself": False, "distance": 0.02}, time={"scheme": "newmark", "step": 4e-3, "end": 0.12},
     )  # fmt: skip
-    free = free_solid(scene)[0].bodies.free
+    free = free_solid(scene)[0].group.bodies.free
     for report in each_step(scene, state):
         total = sum(pose.motion.momentum[:3] for pose in free.values())
         np.testing.assert_allclose(total, [2.0, 0.0, 0.0], atol=1e-9)
@@ -535,7 +535,7 @@ def test_free_solids_hit_one_another(turned: bool, tmp_path: Path) -> None:
     pytest.importorskip("ipctk")
     spin = {"spin": [0.0, 0.5, 1.5]} if turned else {}
     scene, state = two_solids(tmp_path, {"at": [3.35, 0.55, 0.52], "mass": 5.0} | spin)
-    bodies = free_solid(scene)[0].bodies
+    bodies = free_solid(scene)[0].group.bodies
     free = bodies.free.values()
 
     def angular() -> Values:

@@ -13,7 +13,7 @@ from fracsim.contact.laws import Barrier, ObstacleLaw
 from fracsim.contact.obstacle import FreeObstacle, RigidObstacle, overlap_depth
 from fracsim.contact.obstacle_pairs import ObstaclePairs
 from fracsim.contact.pose import Pose, PosedShape
-from fracsim.contact.rigid_obstacles import FreeRigidObstacles
+from fracsim.contact.rigid_pose import FreeRigidObstacles
 from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylinder, Shape, Sphere
 from support.scenes import each_step, make_scene
 

@@ -142,7 +142,7 @@ def test_a_ball_that_strikes_a_block(mass: float) -> None:
     X, m = positions(scene), masses(scene)
 
     def momentum() -> Values:
-        flight, p = contact.bodies.free[0].motion, m * state.v.reshape(-1, 3)
+        flight, p = contact.group.bodies.free[0].motion, m * state.v.reshape(-1, 3)
         spun = np.cross(flight.pose.centre, flight.momentum[:3]) + flight.momentum[3:]
         turning = np.cross(X + state.u.reshape(-1, 3), p).sum(axis=0) + spun
         return np.concatenate([p.sum(axis=0) + flight.momentum[:3], turning])
@@ -173,7 +173,7 @@ def test_a_ball_smaller_than_an_edge_does_not_pass_a_facet(radius: float, fricti
     corners, X, m = contact.surface.facets.corners, positions(scene), masses(scene)
 
     def momentum() -> Values:
-        flight, p = contact.bodies.free[0].motion, m * state.v.reshape(-1, 3)
+        flight, p = contact.group.bodies.free[0].motion, m * state.v.reshape(-1, 3)
         spun = np.cross(flight.pose.centre, flight.momentum[:3]) + flight.momentum[3:]
         turning = np.cross(X + state.u.reshape(-1, 3), p).sum(axis=0) + spun
         return np.concatenate([p.sum(axis=0) + flight.momentum[:3], turning])
@@ -181,7 +181,7 @@ def test_a_ball_smaller_than_an_edge_does_not_pass_a_facet(radius: float, fricti
     before, energies, gap = momentum(), [], np.inf
     for report in each_step(scene, state):
         energies.append(report.kinetic + report.elastic + state.dissipated - state.work)
-        centre = contact.bodies.free[0].motion.pose.centre
+        centre = contact.group.bodies.free[0].motion.pose.centre
         triangles = contact.surface.positions(state.u)[corners]
         nearest = trimesh.triangles.closest_point(triangles, np.repeat(centre[None], len(triangles), axis=0))
         gap = min(gap, float(np.linalg.norm(nearest - centre, axis=1).min()) - radius)

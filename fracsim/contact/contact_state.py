@@ -18,7 +18,7 @@ from .laws import CoulombFriction, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
 from .pose import PosedShape, min_distance
 from .proximity import ProximityCandidates, ShownCells, outline_radius
-from .rigid_obstacles import RigidObstacles
+from .rigid_obstacles import ObstacleGroup
 from .step_limit import check_obstacles_apart, refuse_overlap
 
 Values = npt.NDArray[np.float64]
@@ -29,10 +29,11 @@ class ContactState:
     """Obstacles, and the points of a body that they act on at the end of a step.
 
     Attributes:
-        obstacles: analytic obstacles.
+        group: the obstacles, and what they did to the body in the last step.
+        obstacles: these obstacles, which are analytic.
         numbers: their numbers in the study.
-        bodies: motion of all obstacles.
         law: contact law.
+        barrier_width: gap from which on contact acts, m.
         surface: points of the body that may touch.
         positions: (n, d) positions of these points at the end of the step that belongs to u, m.
     """
@@ -43,12 +44,10 @@ class ContactState:
     _step_starts: list[StepStart | None]  # points at the start of the step, where barriers are averaged over it
     _started_near: list[Ints]  # points on which each obstacle acted then
 
-    def __init__(
-        self, domain: Domain, u: fem.Function, bodies: RigidObstacles, numbers: Sequence[int], law: ObstacleLaw
-    ) -> None:
+    def __init__(self, domain: Domain, u: fem.Function, group: ObstacleGroup, law: ObstacleLaw) -> None:
         """Raise InputError where the body at rest, or a free obstacle, overlaps an obstacle (collective)."""
-        self.bodies, self.numbers, self.law = bodies, tuple(numbers), law
-        self.obstacles = tuple(bodies.obstacles[number] for number in numbers)
+        self.group, self.numbers, self.obstacles, self.law = group, group.numbers, group.obstacles, law
+        self.barrier_width = law.barrier.width
         self.surface = ContactSurface(domain, law.barrier.width)
         self._shown = ShownCells(domain, law.barrier.width)
         self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
@@ -75,16 +74,6 @@ class ContactState:
             for number, obstacle in enumerate(self.obstacles)
             if facets_matter(obstacle.shape.min_radius, edge, width)
         ]
-
-    @property
-    def mean_edge_length(self) -> float:
-        """Mean edge length of the body's mesh, m (collective)."""
-        return self.surface.mean_edge_length
-
-    @property
-    def barrier_width(self) -> float:
-        """Gap from which on contact acts, m."""
-        return self.law.barrier.width
 
     def _check_facets(self) -> None:
         """Raise InputError where an obstacle cuts a facet of the body at rest (collective).
@@ -117,28 +106,13 @@ class ContactState:
 
     def _facets_are_open(self, x: Values) -> bool:
         """Whether no facet is cut with points at x (n, d), m (collective)."""
-        if (facet_gaps := self._facet_gap_function(self.posed)) is None:
+        if (facet_gaps := self._facet_gap_function(self.group.posed)) is None:
             return True
         return bool(self.comm.allreduce(bool((facet_gaps(self.surface.facets, x) > 0).all()), op=MPI.LAND))
 
-    @property
-    def posed(self) -> list[PosedShape]:
-        """Obstacles at their current poses."""
-        return [self.bodies.posed[number] for number in self.numbers]
-
-    @property
-    def start_posed(self) -> list[PosedShape]:
-        """Obstacles at the start of the step."""
-        return [self.bodies.start_posed[number] for number in self.numbers]
-
-    @property
-    def increments(self) -> list[Values]:
-        """(p,) increment of each pose in the step."""
-        return [self.bodies.increments[number] for number in self.numbers]
-
     def begin_step(self, level: TimeLevel) -> None:
         """Move obstacles to the end of the step, and store the contact at its start for friction."""
-        self.bodies.begin_step(level)
+        self.group.bodies.begin_step(level)
         self._level, self._attempts = level, 0
         self.discard_forces()
         end = level.t + (1 - level.fraction) * level.dt
@@ -154,9 +128,9 @@ class ContactState:
         self._pattern, u = pattern.copy(), self._end_displacement()
         if self.shows_all_cells or not self._dt:  # before the first step obstacles need not be in place
             self._shown.show_all()
-        elif not self._shown.update(pattern, self.posed, u, None, 0.0):
+        elif not self._shown.update(pattern, self.group.posed, u, None, 0.0):
             return
-        self._rebuild_surface(u, self.posed)
+        self._rebuild_surface(u, self.group.posed)
 
     def _rebuild_surface(self, u: Values, posed: Sequence[PosedShape]) -> None:
         """Make the surface again, with points retracted that would lie in an obstacle (collective).
@@ -179,13 +153,13 @@ class ContactState:
     def _max_increment(self) -> float:
         """Largest motion of points of the obstacles in the step, m."""
         d, motions = self._domain.dim, []
-        for posed, q in zip(self.posed, self.increments, strict=True):
+        for posed, q in zip(self.group.posed, self.group.increments, strict=True):
             rotation = float(np.linalg.norm(q[d:]))
             motions.append(float(np.linalg.norm(q[:d])) + (rotation and rotation * outline_radius(posed)))
         return max(motions)
 
     def _begin_new_step(self) -> None:
-        posed, barrier = self.start_posed, self.law.barrier
+        posed, barrier = self.group.start_posed, self.law.barrier
         self._show_cells_of_step(posed)
         self.surface.release_points(self._level.u_n, partial(min_distance, posed), self._facet_gap_function(posed))
         x = self.surface.positions(self._level.u_n)
@@ -233,19 +207,21 @@ class ContactState:
             if self._sticking_slips is None:
                 self._sticking_slips = self._compute_sticking_slips()
             self.positions = self.surface.positions(self._end_displacement())
-            self._contact_forces = [self._evaluate_obstacle(number, posed) for number, posed in enumerate(self.posed)]
+            self._contact_forces = [
+                self._evaluate_obstacle(number, posed) for number, posed in enumerate(self.group.posed)
+            ]
         return self._contact_forces
 
     def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
         """Forces of an obstacle at a given pose on the points."""
         if self._is_out_of_range(number, posed):
-            return no_contact(self._domain.dim, self.barrier_width)
+            return no_contact(self._domain.dim, self.law.barrier.width)
         obstacle, lagged = self.obstacles[number], self._lagged[number]
         friction = None
         if lagged is not None and self._sticking_slips is not None:
             friction = CoulombFriction(obstacle.friction, self._sticking_slips[number])
         obstacle_motion, start = self._contact_point_motion(number), self._step_starts[number]
-        start_posed, candidates = self.start_posed[number], self._candidates(number, posed)
+        start_posed, candidates = self.group.start_posed[number], self._candidates(number, posed)
         if start is not None:
             start = start.carried_with(start_posed.pose, posed.pose)
         of_points = evaluate_points(
@@ -274,7 +250,7 @@ class ContactState:
             return True
         ends = [(posed, self.positions)]
         if self._step_starts[number] is not None:
-            ends.append((self.start_posed[number], self._start_positions))
+            ends.append((self.group.start_posed[number], self._start_positions))
         return not any(len(self.surface.facets.candidates(*end, width)) for end in ends)
 
     def _candidates(self, number: int, posed: PosedShape) -> Ints:
@@ -289,16 +265,18 @@ class ContactState:
             velocity = self.surface.interpolation(self._start_velocity)
             for number, lagged in enumerate(self._lagged):
                 if lagged is not None and len(lagged.points):
-                    relative = velocity[lagged.points] - self.bodies.velocity(self.numbers[number], lagged.position)
+                    relative = velocity[lagged.points] - self.group.bodies.velocity(
+                        self.numbers[number], lagged.position
+                    )
                     speeds[number] = np.linalg.norm(tangential(lagged.normal, relative), axis=1).max()
             self.comm.Allreduce(MPI.IN_PLACE, speeds, MPI.MAX)
         return [self._dt * max(self.law.sticking_speed, self.law.sticking_ratio * speed) for speed in speeds]
 
     def _contact_point_motion(self, number: int) -> Values:
         """(d,) motion of an obstacle in the step, or (k, d) of its points in lagged contact, m."""
-        lagged = self._lagged[number]
-        no_motion = np.zeros(self._domain.dim)
-        return no_motion if lagged is None else self.bodies.contact_point_motion(self.numbers[number], lagged)
+        if (lagged := self._lagged[number]) is None:
+            return np.zeros(self._domain.dim)
+        return self.group.bodies.point_motion(self.numbers[number], lagged.obstacle_point)
 
     def nodal_forces(self) -> Values:
         """(owned dofs,) forces of the obstacles on the nodes at the end of the step, N (collective)."""

@@ -154,7 +154,7 @@ def extend_points(point_map: SurfaceMap, u: Values, min_gap: float, gaps: GapFun
 
 
 class ContactSurface:
-    """Points of this rank's split surface, and their interpolation from the nodes.
+    """Points of this rank's split surface, and their interpolation from the nodes (HistoryTerm).
 
     Attributes:
         area: (n,) shares of the points in the reference area, m^2; 0 of excluded points.
@@ -392,34 +392,32 @@ class ContactSurface:
             self._surface.point_map = self._surface.point_map.with_arm_share(share)
         self.area = area
 
-    def to_checkpoint(self) -> Values:
-        """Rows of points that are retracted or excluded: identity, factor, whether excluded; on rank 0 (collective)."""
+    def to_checkpoint(self) -> dict[str, Values]:
+        """Rows of points that are retracted or excluded, and of corners of excluded facets; on rank 0 (collective).
+
+        Of points: identity, factor, whether excluded.
+        """
         point_map = self._surface.point_map
         excluded = self.area[point_map.copies] == 0
         selected = np.flatnonzero((point_map.share[point_map.copies] < 1) | excluded)
         identity = self._surface.identify_points()[selected]
         points = point_map.copies[selected]
         rows = np.column_stack([identity, point_map.share[points], self.area[points] == 0])
-        gathered = gather(self.comm, rows)
-        return np.concatenate(gathered) if gathered is not None else rows
+        gathered = gather(self.comm, (rows, self._corner_identities(self._excluded_facets)))
+        if gathered is None:
+            return {}
+        points, corners = zip(*gathered, strict=True)
+        return {"drawn_in": np.concatenate(points), "cut": np.concatenate(corners)}
 
-    def from_checkpoint(self, rows: Values) -> None:
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the rows of a checkpoint."""
-        point_map = self._surface.point_map
+        rows, point_map = saved["drawn_in"], self._surface.point_map
         matched = match_points(rows[:, :-2], self._surface.identify_points())
         points, share = point_map.copies[matched[matched >= 0]], np.ones(len(point_map.share))
         share[points] = rows[matched >= 0, -2]
         self._surface.point_map = point_map.with_arm_share(share)
         self._exclude_points(points[rows[matched >= 0, -1] > 0])
-
-    def cut_to_checkpoint(self) -> Values:
-        """Rows that identify the corners of excluded facets, on rank 0 (collective)."""
-        gathered = gather(self.comm, self._corner_identities(self._excluded_facets))
-        return np.concatenate(gathered) if gathered is not None else np.empty((0, 2 * self._domain.dim + 1))
-
-    def cut_from_checkpoint(self, rows: Values) -> None:
-        """Set the excluded facets from the rows of a checkpoint."""
-        self._excluded_facets = self._match_facets(rows)
+        self._excluded_facets = self._match_facets(saved["cut"])
 
     def clear_caches(self) -> None:
         """Discard facets and their closest points, from which searches start."""

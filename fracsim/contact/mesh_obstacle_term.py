@@ -9,9 +9,8 @@ Equations: docs/theory.md#contact.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,6 @@ from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
 from ..mesh.parallel import sum_over_ranks
 from ..mesh.split_surface.surface_map import SurfaceMap
-from ..meshes.data import AXES
 from .ipc_pairs import IpcPairs, max_length
 from .ipc_surface import SelfContactLaw, SelfContactSurface
 from .laws import BARRIER
@@ -41,7 +39,7 @@ from .mesh_obstacles import (
 from .obstacle import RigidObstacle
 from .pose import Pose
 from .pose_derivatives import PoseDerivatives, point_jacobian, point_set_derivatives, sum_of_derivatives
-from .rigid_obstacles import RigidObstacles
+from .rigid_obstacles import ObstacleGroup, RigidObstacles
 from .self_contact import SelfContact
 from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
 
@@ -132,9 +130,10 @@ class MeshObstacleTerm(SelfContact):
     """Triangle-mesh obstacles that the body cannot penetrate (rigid_obstacles.ObstacleContactTerm).
 
     Attributes:
-        bodies: motion of all obstacles.
-        numbers: numbers of the triangle meshes.
+        group: the obstacles, and what they did to the body in the last step.
         obstacles: these.
+        numbers: their numbers in the study.
+        barrier_width: gap from which on contact acts, m.
         law: contact law, except for the coefficient of friction, which is that of each obstacle.
     """
 
@@ -157,8 +156,9 @@ class MeshObstacleTerm(SelfContact):
         Raises:
             InputError: if an obstacle overlaps the body at rest.
         """
-        self.bodies, self.numbers, edge = bodies, tuple(numbers), domain.mean_edge_length
-        self.obstacles = tuple(bodies.obstacles[number] for number in numbers)
+        self.group, edge = ObstacleGroup(bodies, numbers, self._gap, self._current_force), domain.mean_edge_length
+        self.numbers, self.obstacles, self.parts = self.group.numbers, self.group.obstacles, (self.group,)
+        self.barrier_width = law.distance
         # the tangent by points and poses has a positive semi-definite form alone
         self.allows_exact_tangent = not any(obstacle.free for obstacle in self.obstacles)
         items = zip(self.numbers, self.obstacles, strict=True)
@@ -167,21 +167,8 @@ class MeshObstacleTerm(SelfContact):
         self._proximity = ProximityTest(domain, self.obstacles, law.distance)
         self._started_near = True
         self._far: bool | None = None  # at the current u; None: not known yet
-        # of the last step: work of each obstacle, J, dissipation by friction, J, and forces on each, N
-        self._obstacle_work, self._friction_loss = [0.0] * len(numbers), 0.0
-        self._force_readings: list[Values] | None = None  # None: no step yet
-        self._place_meshes(self._poses)
+        self._place_meshes(self.group.poses)
         super().__init__(domain, u, law)
-
-    @property
-    def mean_edge_length(self) -> float:
-        """Mean edge length of the body's mesh, m."""
-        return self._domain.mean_edge_length
-
-    @property
-    def barrier_width(self) -> float:
-        """Gap from which on contact acts, m."""
-        return self.law.distance
 
     # --- surface and obstacles ---
 
@@ -194,16 +181,6 @@ class MeshObstacleTerm(SelfContact):
         """Retract points of a surface for output as those of contact are."""
         return at.with_arm_share(np.minimum(self._surface.point_map.share, at.share))
 
-    @property
-    def _poses(self) -> list[Pose]:
-        """Current poses of the obstacles."""
-        return [self.bodies.posed[number].pose for number in self.numbers]
-
-    @property
-    def _start_poses(self) -> list[Pose]:
-        """Poses of the obstacles at the start of the step."""
-        return [self.bodies.start_posed[number].pose for number in self.numbers]
-
     def _place_meshes(self, poses: Sequence[Pose]) -> None:
         """Move the meshes to poses."""
         for mesh, pose in zip(self._meshes, poses, strict=True):
@@ -211,11 +188,11 @@ class MeshObstacleTerm(SelfContact):
 
     def _step_poses(self) -> list[tuple[Pose, Pose]]:
         """Poses of each obstacle at the start of the step, and now."""
-        return list(zip(self._start_poses, self._poses, strict=True))
+        return list(zip(self.group.start_poses, self.group.poses, strict=True))
 
     def poses_moved(self) -> None:
         """Move the meshes to the poses of the obstacles, and discard forces."""
-        self._place_meshes(self._poses)
+        self._place_meshes(self.group.poses)
         self._far = self._contact_force = self._stored = None
 
     def _is_far(self) -> bool:
@@ -256,7 +233,7 @@ class MeshObstacleTerm(SelfContact):
 
     def begin_step(self, level: TimeLevel) -> None:
         """Move obstacles to the end of the step, and lag friction with the contact at its start."""
-        self.bodies.begin_step(level)
+        self.group.bodies.begin_step(level)
         self._level, self._is_stale, self._far, self._attempts = level, True, None, 0
         end = level.t + (1 - level.fraction) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
@@ -269,16 +246,16 @@ class MeshObstacleTerm(SelfContact):
         self._start_gradients = [zero for _ in self.obstacles]
         if level.dt and self._started_near:
             nodal, sticking_speed = self._all_nodes(level.u_n), self._sticking_speed(level.v_n)
-            self._place_meshes(self._start_poses)
+            self._place_meshes(self.group.start_poses)
             self._begin_near(self._surface, nodal, sticking_speed * level.dt)
-        self._place_meshes(self._poses)
+        self._place_meshes(self.group.poses)
 
     def _speed(self, v: Values) -> float:
         """Largest root mean square of the nodes' speeds relative to an obstacle, m/s (collective)."""
         square, mean = self._mean_velocities(v)
-        centres = [pose.centre[None] for pose in self._start_poses]
+        centres = [pose.centre[None] for pose in self.group.start_poses]
         placed = zip(self.numbers, centres, strict=True)
-        velocities = [self.bodies.velocity(number, centre).reshape(-1) for number, centre in placed]
+        velocities = [self.group.bodies.velocity(number, centre).reshape(-1) for number, centre in placed]
         return float(np.sqrt(max(0.0, *(float(square - 2 * mean @ V + V @ V) for V in velocities))))
 
     def _begin_near(self, surface: MeshContactSurface, nodal: Values, slip: float) -> None:
@@ -291,16 +268,15 @@ class MeshObstacleTerm(SelfContact):
 
     def accept_step(self) -> None:
         """Record forces and work of contact in the step (collective)."""
-        self._friction_loss, self._obstacle_work = 0.0, [0.0] * len(self.obstacles)
         forces: list[Values] = [np.zeros(3) for _ in self.obstacles]
-        self._force_readings = forces
+        self.group.friction_loss, self.group.work, self.group.forces = 0.0, [0.0] * len(forces), forces
         if not self._is_far():
             self._record_work(self._end_positions(), self._surface, forces)
 
     def _record_work(self, x: Values, surface: MeshContactSurface, forces: list[Values]) -> None:
         """Record work of this rank's pairs with the body at x (n, 3), m, and add forces on obstacles to `forces`, N."""
         end_weight, start_gradients, n = self._level.contact_weights.end_work_share, self._start_gradients, len(x)
-        for number, (pairs, start_pose) in enumerate(zip(surface.pairs.pairs, self._start_poses, strict=True)):
+        for number, (pairs, start_pose) in enumerate(zip(surface.pairs.pairs, self.group.start_poses, strict=True)):
             # of the obstacle on the body, at the points of the obstacle
             gradient, friction_work = pairs.full_gradient(x)[n:], 0.0
             forces[number] -= gradient.sum(axis=0)
@@ -308,15 +284,14 @@ class MeshObstacleTerm(SelfContact):
             if self._friction is not None and self._start_positions is not None:
                 friction = self._friction.full_gradient(pairs, x)
                 friction_work = float(np.vdot(friction[n:], motion))
-                self._friction_loss += friction_work + float(np.vdot(friction[:n], x - self._start_positions))
+                self.group.friction_loss += friction_work + float(np.vdot(friction[:n], x - self._start_positions))
                 forces[number] -= friction[n:].sum(axis=0)
             mean_gradient = end_weight * gradient + (1 - end_weight) * start_gradients[number]
-            self._obstacle_work[number] = float(np.vdot(mean_gradient, motion)) + friction_work
+            self.group.work[number] = float(np.vdot(mean_gradient, motion)) + friction_work
 
     def step_work(self) -> tuple[float, float]:
         """Work of prescribed obstacles in the step, and dissipation by friction, of this rank's pairs, J."""
-        prescribed = [number for number, obstacle in enumerate(self.obstacles) if not obstacle.free]
-        return sum(self._obstacle_work[number] for number in prescribed), self._friction_loss
+        return self.group.step_work()
 
     def damping_forces(self) -> None:
         """Return None: dissipation is summed step by step (`step_work`)."""
@@ -325,7 +300,7 @@ class MeshObstacleTerm(SelfContact):
 
     def max_step_fraction(self, change: Values) -> float:
         """Fraction of a correction of u (owned dofs,), m, and free poses without a collision (collective)."""
-        u, increments = self._u.x.array[: self._owned], self.bodies.correction_increments()
+        u, increments = self._u.x.array[: self._owned], self.group.bodies.correction_increments()
         motion = np.asarray(change / self._level.fraction, np.float64)
         return self._fraction_along(self._level.displacement_at_end(u), increments, motion)
 
@@ -334,7 +309,7 @@ class MeshObstacleTerm(SelfContact):
 
         `u`, `change`: (owned dofs,) displacement at the start, and its change, m; None: the body is at rest.
         """
-        poses = [(pose, pose) for pose in self._poses]
+        poses = [(pose, pose) for pose in self.group.poses]
         for index, number in enumerate(self.numbers):
             if number in increments:
                 poses[index] = poses[index][0], poses[index][0].incremented(increments[number])
@@ -367,7 +342,7 @@ class MeshObstacleTerm(SelfContact):
     def _first_guess(self, surface: MeshContactSurface, start: Values, end: Values) -> Values:
         """(nodes, 3) displacements that the body reaches on its way from `start` to `end`, m (collective)."""
         prescribed = [index for index, obstacle in enumerate(self.obstacles) if not obstacle.free]
-        start_poses = [self._start_poses[index] for index in prescribed]
+        start_poses = [self.group.start_poses[index] for index in prescribed]
         return stop_before_meshes(surface, surface.pairs.select(prescribed), start, end, start_poses)
 
     def is_feasible(self, u: Values) -> bool:
@@ -376,7 +351,7 @@ class MeshObstacleTerm(SelfContact):
         if self._proximity.is_far([u_n, u_end], self._step_poses()):
             return True
         start, end = self._positions_at(u_n), self._positions_at(u_end)
-        return self._surface.pairs.moving_free_fraction(start, end, self._start_poses) == 1
+        return self._surface.pairs.moving_free_fraction(start, end, self.group.start_poses) == 1
 
     # --- contact of the body, as the obstacles see it (rigid_obstacles.ObstacleContactTerm) ---
 
@@ -397,8 +372,8 @@ class MeshObstacleTerm(SelfContact):
         Both from the start of the step; `u`: (owned dofs,) displacement of the level after the motion, m.
         """
         level, index = self._level, self.numbers.index(number)
-        start, u_end = self._start_poses[index], level.displacement_at_end(u)
-        poses = [(pose, pose) for pose in self._poses]
+        start, u_end = self.group.start_poses[index], level.displacement_at_end(u)
+        poses = [(pose, pose) for pose in self.group.poses]
         poses[index] = start, start.incremented(q)
         if self._proximity.is_far([level.u_n, u_end], poses):
             return 1.0
@@ -407,7 +382,7 @@ class MeshObstacleTerm(SelfContact):
         pairs = self._surface.pairs.pairs[index]
         pairs.mesh.move_to(poses[index][1])
         fraction = pairs.moving_free_fraction(x, end, start)
-        pairs.mesh.move_to(self._poses[index])
+        pairs.mesh.move_to(self.group.poses[index])
         return fraction
 
     def wrenches(self, numbers: Sequence[int]) -> dict[int, Values]:
@@ -466,36 +441,15 @@ class MeshObstacleTerm(SelfContact):
         """Whether the tangent at the current u may have negative eigenvalues: not with free obstacles."""
         return self.allows_exact_tangent
 
-    # --- columns of history.csv, and figures for the end of a run ---
+    # --- readings ---
 
-    def summed_columns(self) -> dict[str, Callable[[], Values]]:
-        """contact_NAME_AXIS: (1,) force of the body on each obstacle in the last step, of this rank's pairs, N."""
-        return {
-            f"contact_{obstacle.name}_{axis_name}": partial(self._force_reading, number, axis)
-            for number, obstacle in enumerate(self.obstacles)
-            for axis, axis_name in enumerate(AXES)
-        }
-
-    def _force_reading(self, number: int, axis: int) -> Values:
-        if self._force_readings is None:
-            force = self._surface.pairs.pairs[number].body_gradient(self._end_positions()).sum(axis=0)
-        else:
-            force = self._force_readings[number]
-        return np.asarray(force[axis : axis + 1])
-
-    def minimum_columns(self) -> dict[str, Callable[[], float]]:
-        """gap_NAME: least distance between each obstacle and the body, m, of this rank's pairs."""
-        return {f"gap_{obstacle.name}": partial(self._gap, number) for number, obstacle in enumerate(self.obstacles)}
+    def _current_force(self, number: int) -> Values:
+        """(3,) force of the body on an obstacle at the current u, of this rank's pairs, N (collective)."""
+        return np.asarray(self._surface.pairs.pairs[number].body_gradient(self._end_positions()).sum(axis=0))
 
     def _gap(self, number: int) -> float:
+        """Least distance between an obstacle and the body, m, of this rank's pairs (collective)."""
         return self._surface.pairs.pairs[number].gap(self._end_positions())
-
-    def work_columns(self) -> dict[str, Callable[[], float]]:
-        """work_NAME: work of each obstacle on the body in the last step, J."""
-        return {f"work_{obstacle.name}": partial(self._work, number) for number, obstacle in enumerate(self.obstacles)}
-
-    def _work(self, number: int) -> float:
-        return self._obstacle_work[number]
 
     def closing_distances(self) -> list[float]:
         """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
@@ -506,7 +460,7 @@ class MeshObstacleTerm(SelfContact):
             return [0.0] * len(self.obstacles)
         x, v = self._end_positions(), self._all_nodes(self._start_velocity)
         motion, result = self._dt * (self._surface.point_map.weights @ v), []
-        for pairs, start_pose in zip(self._surface.pairs.pairs, self._start_poses, strict=True):
+        for pairs, start_pose in zip(self._surface.pairs.pairs, self.group.start_poses, strict=True):
             result.append(approach(pairs, start_pose, x, motion))
         return result
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import combinations
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import numpy as np
 
@@ -175,103 +175,12 @@ class RigidMotion:
         return RigidMotion(Pose(centre, R.reshape(d, d)), momentum, force, rotation)
 
 
-def motion_rows(motions: Iterable[RigidMotion]) -> Values:
-    """(n, m) numbers of states of motion, one row each; shorter rows, as of a pendulum, end with zeros."""
-    rows = [motion.to_array() for motion in motions]
-    length = max(map(len, rows), default=0)
-    return np.array([np.pad(row, (0, length - len(row))) for row in rows])
-
-
 def column_names(body: FreeObstacle) -> list[str]:
     """Names of the numbers that `history_values` returns."""
     d = len(body.start_point)
     axes, rotation_axes = AXES[:d], AXES[2:] if d == 2 else AXES
     kinds = [("position", axes), ("velocity", axes), ("turn", rotation_axes), ("spin", rotation_axes)]
     return [*[f"{kind}_{body.name}_{axis}" for kind, names in kinds for axis in names], f"kinetic_{body.name}"]
-
-
-# --- state of motion of free obstacles ---
-
-
-class MovingObstacle(Protocol):
-    """Free obstacle, with its state of motion at the start of a step until that is accepted."""
-
-    body: FreeObstacle
-    motion: RigidMotion
-
-
-@dataclass(frozen=True)
-class FreeMotions:
-    """States of motion of free obstacles: history of a term, and columns of history.csv.
-
-    Attributes:
-        free: free obstacles by their numbers.
-        is_root: whether this is rank 0.
-    """
-
-    free: Mapping[int, MovingObstacle]
-    is_root: bool
-
-    def snapshot(self) -> dict[int, RigidMotion]:
-        """State of motion of each, by its number."""
-        return {number: obstacle.motion for number, obstacle in self.free.items()}
-
-    def restore(self, motions: Mapping[int, RigidMotion]) -> None:
-        """Restore states of motion."""
-        for number, obstacle in self.free.items():
-            obstacle.motion = motions[number]
-
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Rows of numbers for a checkpoint."""
-        return {"flights": motion_rows(obstacle.motion for obstacle in self.free.values())}
-
-    def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set states of motion from the rows of a checkpoint."""
-        for row, obstacle in enumerate(self.free.values()):
-            obstacle.motion = obstacle.motion.from_array(saved["flights"][row])
-
-    def place(self, posed: list[PosedShape]) -> list[PosedShape]:
-        """All obstacles, by their numbers, with free ones at the poses of their states of motion."""
-        for number, obstacle in self.free.items():
-            posed[number] = PosedShape(posed[number].shape, obstacle.motion.pose)
-        return posed
-
-    def kinetic_energy(self) -> float:
-        """Kinetic energy of the free obstacles, on rank 0, J."""
-        if not self.is_root:
-            return 0.0
-        return float(sum(obstacle.body.history_values(obstacle.motion)[-1] for obstacle in self.free.values()))
-
-    def columns(self) -> dict[str, Callable[[], Values]]:
-        """Columns of history.csv, each with a function that returns this rank's share, (1,).
-
-        position_NAME_x and velocity_NAME_x of the centre of mass, m and m/s; turn_NAME_z and spin_NAME_z, rad and
-        rad/s; kinetic_NAME, J.
-        """
-        return {
-            name: partial(reader, index)
-            for obstacle in self.free.values()
-            for reader in [_MotionReader(obstacle, self.is_root)]
-            for index, name in enumerate(column_names(obstacle.body))
-        }
-
-
-class _MotionReader:
-    """Numbers of an obstacle for history.csv: read column by column, evaluated once for each state of motion."""
-
-    def __init__(self, obstacle: MovingObstacle, is_root: bool) -> None:
-        self._obstacle, self._is_root = obstacle, is_root
-        self._motion: RigidMotion | None = None
-        self._values: Values = np.empty(0)
-
-    def __call__(self, index: int) -> Values:
-        """(1,) value of a column; 0 on other ranks than 0."""
-        if not self._is_root:
-            return np.zeros(1)
-        if self._motion is not self._obstacle.motion:
-            self._motion = self._obstacle.motion
-            self._values = self._obstacle.body.history_values(self._motion)
-        return self._values[index : index + 1]
 
 
 # --- free obstacles in explicit steps ---
@@ -321,10 +230,6 @@ class VerletObstacle:
         self.gravity_work = body.gravity_potential(start.pose) - body.gravity_potential(pose)
         change = float(body.history_values(self.motion)[-1] - body.history_values(start)[-1])
         return change - self.gravity_work
-
-    def contact_point_motion(self, x: Values, posed: PosedShape) -> Values:
-        """(n, d) motion in the step of the obstacle's points that were at x (n, d) at its start, m."""
-        return posed.pose.points_to_space(self.motion.pose.to_body(x)) - x
 
     def spring_stiffness(self, x: Values, k: Values, posed: PosedShape) -> Values:
         """(k, k) stiffness by z of springs k (n,), N/m, in any direction at positions x (n, d), m."""

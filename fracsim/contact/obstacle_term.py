@@ -10,7 +10,7 @@ Equations: docs/theory.md#contact.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -25,11 +25,9 @@ from ..mechanics.term import Term
 from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
 from ..mesh.split_surface.surface_map import SurfaceMap
-from ..meshes.data import AXES
 from .contact_state import ContactState
 from .contact_surface import retract_cut_elements, retract_from_obstacles
 from .laws import ObstacleLaw
-from .node_contact import ContactForces
 from .pose import min_distance
 from .pose_derivatives import (
     PoseCoupling,
@@ -38,7 +36,7 @@ from .pose_derivatives import (
     resultant,
     sum_of_derivatives,
 )
-from .rigid_obstacles import RigidObstacles
+from .rigid_obstacles import ObstacleGroup, RigidObstacles
 from .step_limit import safe_motion_fractions, stop_before_obstacles
 
 Values = npt.NDArray[np.float64]
@@ -86,11 +84,9 @@ class ObstacleTerm(ContactState, Term):
         Raises:
             InputError: if the body at rest overlaps an obstacle.
         """
-        super().__init__(domain, u, bodies, numbers, law)
+        super().__init__(domain, u, ObstacleGroup(bodies, numbers, self._gap, self._current_force), law)
+        self.parts = self.surface, self.group
         self._coupling = CouplingBuilder(domain)
-        # of the last step: work of each obstacle, J, dissipation by friction, J, and forces on each, N
-        self._obstacle_work, self._friction_loss = [0.0] * len(self.obstacles), 0.0
-        self._force_readings: list[Values] | None = None  # None: no step yet
         self._is_exact: bool | None = None  # whether the tangent at the current u and poses is; None: not known yet
 
     def update_displacement(self) -> None:
@@ -110,7 +106,7 @@ class ObstacleTerm(ContactState, Term):
         x, posed = self.surface.rest_positions, [obstacle.posed_at(0.0) for obstacle in self.obstacles]
         gaps = np.array([self.surface.min_distance(shape.distance(x)) for shape in posed])
         for number in self._facet_obstacles:
-            facet_gaps = self.surface.facets.gaps(posed[number], x, self.barrier_width)
+            facet_gaps = self.surface.facets.gaps(posed[number], x, self.law.barrier.width)
             gaps[number] = min(gaps[number], float(facet_gaps.min(initial=np.inf)))
         self.comm.Allreduce(MPI.IN_PLACE, gaps, MPI.MIN)
         return gaps
@@ -146,7 +142,7 @@ class ObstacleTerm(ContactState, Term):
             motion = self.comm.allreduce(self._max_motion(points), op=MPI.MAX)
             first = self._attempts <= 1
             limit = EXACT_TANGENT.first_attempt if first else EXACT_TANGENT.later_attempts
-            self._is_exact = bool(motion < limit * self.barrier_width) and self.bodies.may_use_exact_tangent()
+            self._is_exact = bool(motion < limit * self.law.barrier.width) and self.group.bodies.may_use_exact_tangent()
         return self._is_exact
 
     def _max_motion(self, points: Ints) -> float:
@@ -171,24 +167,23 @@ class ObstacleTerm(ContactState, Term):
 
     def accept_step(self) -> None:
         """Record forces and work of contact in the step (collective)."""
-        self._friction_loss, contacts = 0.0, self.obstacle_forces()
-        self._force_readings = [_force_on_obstacle(contact) for contact in contacts]
-        for number in range(len(self.obstacles)):
+        group, indices = self.group, range(len(self.obstacles))
+        group.friction_loss, group.forces = 0.0, [self._current_force(number) for number in indices]
+        for number in indices:
             on_body, by_obstacle = self.friction_work(number)
-            self._obstacle_work[number] = self._normal_work(number) + by_obstacle
-            self._friction_loss += by_obstacle - on_body
+            group.work[number] = self._normal_work(number) + by_obstacle
+            group.friction_loss += by_obstacle - on_body
 
     def _normal_work(self, number: int) -> float:
         """Work of normal forces on the body by the motion of an obstacle in the step, this rank's share, J."""
-        end_weight, q = self._level.contact_weights.end_work_share, self.increments[number]
-        contact, centre = self.obstacle_forces()[number], self.posed[number].pose.centre
+        end_weight, q = self._level.contact_weights.end_work_share, self.group.increments[number]
+        contact, centre = self.obstacle_forces()[number], self.group.posed[number].pose.centre
         end = float(resultant(contact.normal, self.positions[contact.points] - centre) @ q)
         return end_weight * end + (1 - end_weight) * float(self._start_forces[number] @ q[: self._domain.dim])
 
     def step_work(self) -> tuple[float, float]:
         """Work of prescribed obstacles in the step, and dissipation by friction, this rank's share, J."""
-        prescribed = [number for number, obstacle in enumerate(self.obstacles) if not obstacle.free]
-        return sum(self._obstacle_work[number] for number in prescribed), self._friction_loss
+        return self.group.step_work()
 
     # --- step limits ---
 
@@ -196,7 +191,7 @@ class ObstacleTerm(ContactState, Term):
         """Fraction of a change of u (owned dofs,), m, that leaves a tenth of every gap (collective)."""
         self.obstacle_forces()
         motion = self.surface.interpolation(np.divide(change, self._level.fraction))
-        increments = self.bodies.correction_increments()
+        increments = self.group.bodies.correction_increments()
         by_obstacle = [self._fractions(number, motion, increments.get(n)) for number, n in enumerate(self.numbers)]
         fractions = [values[self.surface.area > 0] for values in by_obstacle]
         return float(min(values.min(initial=1.0) for values in fractions))
@@ -204,11 +199,11 @@ class ObstacleTerm(ContactState, Term):
     def _fractions(self, number: int, motion: Values, q: Values | None) -> Values:
         """(n,) fractions of the motion (n, d) of points, m, and an increment (p,), None: none, that close no gap."""
         if q is None:
-            q = np.zeros_like(self.increments[number])
+            q = np.zeros_like(self.group.increments[number])
         facets = self._facets_for(number)
         min_gap = self.obstacle_forces()[number].min_gap
         return safe_motion_fractions(
-            self.posed[number], self.positions, motion, q, facets, self._point_candidates, min_gap
+            self.group.posed[number], self.positions, motion, q, facets, self._point_candidates, min_gap
         )
 
     def feasible_guess(self, u: Values) -> Values:
@@ -216,7 +211,7 @@ class ObstacleTerm(ContactState, Term):
         level = self._level
         if not level.dt:
             return u
-        prescribed = self.bodies.prescribed_motions()
+        prescribed = self.group.bodies.prescribed_motions()
         motions = [(*prescribed[n], self._facets_for(i)) for i, n in enumerate(self.numbers) if n in prescribed]
         end = stop_before_obstacles(self.surface, motions, level.u_n, level.displacement_at_end(u))
         return np.asarray(level.u_n + level.fraction * (end - level.u_n))
@@ -224,7 +219,7 @@ class ObstacleTerm(ContactState, Term):
     def is_feasible(self, u: Values) -> bool:
         """Whether every gap is open with the body at u (collective)."""
         x = self.surface.positions(self._level.displacement_at_end(u))
-        return self.surface.gaps_are_open(min_distance(self.posed, x)) and self._facets_are_open(x)
+        return self.surface.gaps_are_open(min_distance(self.group.posed, x)) and self._facets_are_open(x)
 
     # --- contact of the body, as the obstacles see it (rigid_obstacles.ObstacleContactTerm) ---
 
@@ -245,7 +240,7 @@ class ObstacleTerm(ContactState, Term):
             if n in increments:
                 facets = self._facets_for(number)
                 motion = np.zeros_like(x), increments[n], facets, self._point_candidates
-                fractions.append(safe_motion_fractions(self.posed[number], x, *motion))
+                fractions.append(safe_motion_fractions(self.group.posed[number], x, *motion))
         return self.surface.min_fraction(np.min(fractions, axis=0))
 
     def start_fraction(self, number: int, q: Values, u: Values) -> float:
@@ -258,7 +253,7 @@ class ObstacleTerm(ContactState, Term):
         motion = self.surface.positions(level.displacement_at_end(u)) - x
         facets = self._facets_for(index)
         return self.surface.min_fraction(
-            safe_motion_fractions(self.start_posed[index], x, motion, q, facets, self._point_candidates)
+            safe_motion_fractions(self.group.start_posed[index], x, motion, q, facets, self._point_candidates)
         )
 
     def wrenches(self, numbers: Sequence[int]) -> dict[int, Values]:
@@ -267,7 +262,7 @@ class ObstacleTerm(ContactState, Term):
             return {}
         contacts = self.obstacle_forces()
         local = [
-            contact_wrench(contacts[index], self.positions, self.posed[index].pose)
+            contact_wrench(contacts[index], self.positions, self.group.posed[index].pose)
             for index in map(self.numbers.index, numbers)
         ]
         return dict(zip(numbers, sum_over_ranks(self.comm, np.array(local)), strict=True))
@@ -283,7 +278,7 @@ class ObstacleTerm(ContactState, Term):
         """Coupling of the points and the pose of an obstacle at the current u and poses (collective)."""
         contact = self.obstacle_forces()[index]
         if (index, exact) not in self._pose_couplings:
-            poses = self.posed[index].pose, self._lagged[index], self.start_posed[index].pose
+            poses = self.group.posed[index].pose, self._lagged[index], self.group.start_posed[index].pose
             self._pose_couplings[index, exact] = PoseCoupling(contact, self.positions, *poses, exact=exact)
         return self._pose_couplings[index, exact]
 
@@ -307,32 +302,13 @@ class ObstacleTerm(ContactState, Term):
 
     def separate_surface(self, position: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
         """Retract points of a surface for output that would lie in an obstacle, as those of contact are."""
-        all_posed = self.bodies.posed_at(t)
+        all_posed = self.group.bodies.posed_at(t)
         posed = [all_posed[number] for number in self.numbers]
         position = retract_from_obstacles(position, u, partial(min_distance, posed))
         if not self._facet_obstacles:
             return position
         facets, curved = self.surface.facets_from(elements), [posed[number] for number in self._facet_obstacles]
         return retract_cut_elements(position, u, elements, lambda x: ~facets.are_open(curved, x))
-
-    def snapshot(self) -> object:
-        """State of the surface between two steps."""
-        return self.surface.snapshot()
-
-    def restore(self, memory: object) -> None:
-        """Restore the state of the surface (not collective)."""
-        self.surface.restore(memory)
-
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Arrays for a checkpoint (collective)."""
-        facets = {"cut": self.surface.cut_to_checkpoint()} if self._facet_obstacles else {}
-        return {"drawn_in": self.surface.to_checkpoint()} | facets
-
-    def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set the state from the arrays of a checkpoint."""
-        self.surface.from_checkpoint(saved["drawn_in"])
-        if "cut" in saved:
-            self.surface.cut_from_checkpoint(saved["cut"])
 
     def clear_search(self) -> None:
         """Discard results of searches, which a checkpoint does not hold (not collective)."""
@@ -345,42 +321,22 @@ class ObstacleTerm(ContactState, Term):
         self.surface.destroy()
         self._coupling.destroy()
 
-    # --- columns of history.csv, and figures for the end of a run ---
+    # --- readings ---
 
-    def summed_columns(self) -> dict[str, Callable[[], Values]]:
-        """contact_NAME_AXIS: (1,) force of the body on each obstacle in the last step, this rank's share, N."""
-        return {
-            f"contact_{obstacle.name}_{axis_name}": partial(self._force_reading, number, axis)
-            for number, obstacle in enumerate(self.obstacles)
-            for axis, axis_name in enumerate(AXES[: self._domain.dim])
-        }
-
-    def _force_reading(self, number: int, axis: int) -> Values:
-        if self._force_readings is None:
-            force = _force_on_obstacle(self.obstacle_forces()[number])
-        else:
-            force = self._force_readings[number]
-        return force[axis : axis + 1]
-
-    def minimum_columns(self) -> dict[str, Callable[[], float]]:
-        """gap_NAME: least distance between each obstacle and this rank's surface, m; infinite without a surface."""
-        return {f"gap_{obstacle.name}": partial(self._gap, number) for number, obstacle in enumerate(self.obstacles)}
+    def _current_force(self, number: int) -> Values:
+        """(d,) force of the body on an obstacle at the current u, this rank's share, N (collective)."""
+        contact = self.obstacle_forces()[number]
+        return np.asarray(-(contact.normal + contact.friction).sum(axis=0))
 
     def _gap(self, number: int) -> float:
+        """Least distance between an obstacle and this rank's surface, m; infinite without a surface (collective)."""
         self.obstacle_forces()
-        posed = self.posed[number]
+        posed = self.group.posed[number]
         point_gap = self.surface.min_distance(posed.distance(self.positions))
         if (facets := self._facets_for(number)) is None:
             return point_gap
         facet_distances = facets.distances(posed, self.positions, self.law.barrier.width)
         return min(point_gap, float(facet_distances.min(initial=np.inf)))
-
-    def work_columns(self) -> dict[str, Callable[[], float]]:
-        """work_NAME: work of each obstacle on the body in the last step, J."""
-        return {
-            f"work_{obstacle.name}": partial(self._obstacle_work.__getitem__, number)
-            for number, obstacle in enumerate(self.obstacles)
-        }
 
     def closing_distances(self) -> list[float]:
         """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
@@ -388,15 +344,12 @@ class ObstacleTerm(ContactState, Term):
         It is that of the velocities at the start, without any contact; of this rank's points.
         """
         motion, result = self._dt * self.surface.interpolation(self._start_velocity), list[float]()
-        for increment, posed, contact in zip(self.increments, self.posed, self.obstacle_forces(), strict=True):
+        for increment, posed, contact in zip(
+            self.group.increments, self.group.posed, self.obstacle_forces(), strict=True
+        ):
             # points with a normal force, not with friction alone
             pushed = contact.points[contact.normal.any(axis=1)]
             relative = increment[: self._domain.dim] - motion[pushed]
             approach = np.einsum("ni,ni->n", relative, posed.normal(self.positions[pushed]))
             result.append(float(approach.max(initial=0.0)))
         return result
-
-
-def _force_on_obstacle(contact: ContactForces) -> Values:
-    """(d,) force of the body on an obstacle, this rank's share, N."""
-    return np.asarray(-(contact.normal + contact.friction).sum(axis=0))

@@ -12,9 +12,8 @@ Equations: docs/theory.md#explicit-contact.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import ClassVar, cast
 
 import numpy as np
@@ -29,7 +28,6 @@ from ..mesh.domain import Domain
 from ..mesh.parallel import from_root, on_root
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.surface_map import SurfaceMap
-from ..meshes.data import AXES
 from .ipc_pairs import vertex_areas
 from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface, SurfacePairs, SurfaceSnapshot
 from .mesh_obstacle_term import approach, build_mesh_obstacle
@@ -40,7 +38,7 @@ from .penalty_pairs import PairSprings, PenaltyHistory, PenaltyPairs
 from .penalty_point_facet import penalty_stiffness
 from .pose import Pose, PosedShape
 from .pose_derivatives import resultant
-from .rigid_obstacles import RigidObstacles, VerletRigidObstacles
+from .rigid_obstacles import ObstacleGroup, RigidObstacles
 from .self_contact import node_gather, refined_mesh
 
 Values = npt.NDArray[np.float64]
@@ -553,9 +551,10 @@ class PenaltyMeshContact(PenaltyContact):
     """Contact of a body with triangle-mesh obstacles in explicit steps (rigid_obstacles.ObstacleContactTerm).
 
     Attributes:
-        bodies: motion of all obstacles.
-        numbers: numbers of the triangle meshes.
+        group: the obstacles, and what they did to the body in the last step.
         obstacles: these.
+        numbers: their numbers in the study.
+        barrier_width: gap from which on contact acts, m.
     """
 
     name = "solids"
@@ -572,14 +571,14 @@ class PenaltyMeshContact(PenaltyContact):
         max_added: float,
     ) -> None:
         """`bodies`: motion of all obstacles; `numbers`: of the triangle meshes; the others as for PenaltyContact."""
-        self.bodies, self.numbers, edge = bodies, tuple(numbers), domain.mean_edge_length
-        self.obstacles = tuple(bodies.obstacles[number] for number in numbers)
+        self.group, edge = ObstacleGroup(bodies, numbers, self._gap, self._wrench), domain.mean_edge_length
+        self.numbers, self.obstacles, self.parts = self.group.numbers, self.group.obstacles, (self.group,)
+        self.barrier_width = law.distance
         items = zip(self.numbers, self.obstacles, strict=True)
         self._all_meshes = on_root(domain.comm, lambda: [build_mesh_obstacle(*item, edge) for item in items]) or []
         self._proximity = ProximityTest(domain, self.obstacles, law.distance)
         self._dt = 0.0  # s, of the current or last step
-        # of the last step, on rank 0: work of each obstacle on the body, J, and force and moment on each, N and N m
-        self._work = [0.0] * len(numbers)
+        # of the last step, on rank 0: force and moment on each, N and N m
         self._wrenches: list[Values] = [np.zeros(6) for _ in numbers]
         self._poses: list[Pose] = [bodies.posed[number].pose for number in numbers]
         for mesh, pose in zip(self._all_meshes, self._poses, strict=False):
@@ -589,16 +588,6 @@ class PenaltyMeshContact(PenaltyContact):
     @property
     def _meshes(self) -> list[MeshObstacle]:
         return self._all_meshes
-
-    @property
-    def mean_edge_length(self) -> float:
-        """Mean edge length of the body's mesh, m."""
-        return self._domain.mean_edge_length
-
-    @property
-    def barrier_width(self) -> float:
-        """Gap from which on contact acts, m."""
-        return self.law.distance
 
     # --- motion ---
 
@@ -614,7 +603,7 @@ class PenaltyMeshContact(PenaltyContact):
 
     def poses_moved(self) -> None:
         """Move the meshes to the poses of the obstacles."""
-        self._move_to(self.bodies.posed)
+        self._move_to(self.group.bodies.posed)
 
     def _nothing_is_near(self) -> bool:
         return self._proximity.is_far([self._current_u], [(pose, pose) for pose in self._poses])
@@ -626,18 +615,18 @@ class PenaltyMeshContact(PenaltyContact):
 
     def begin_step(self, level: TimeLevel) -> None:
         """Move obstacles to the end of the step; springs of friction begin with those of the last one (collective)."""
-        self.bodies.begin_step(level)
+        self.group.bodies.begin_step(level)
         self._start_velocity, self._dt = level.v_n, level.dt or self._dt
-        self._move_to(self.bodies.start_posed)
+        self._move_to(self.group.bodies.start_posed)
         super().begin_step(level)
-        self._move_to(self.bodies.posed)
+        self._move_to(self.group.bodies.posed)
 
     def accept_step(self) -> None:
         """Store contacts, forces, work and dissipation of the step (collective)."""
         last, self._wrenches = self._wrenches, [np.zeros(6) for _ in self.numbers]
         super().accept_step()
-        self._work = [
-            -0.5 * float((start + end) @ self.bodies.increments[number])
+        self.group.work = [
+            -0.5 * float((start + end) @ self.group.bodies.increments[number])
             for start, end, number in zip(last, self._wrenches, self.numbers, strict=True)
         ]
 
@@ -647,16 +636,18 @@ class PenaltyMeshContact(PenaltyContact):
 
     def step_work(self) -> tuple[float, float]:
         """Work of prescribed obstacles in the step, and dissipation by friction, on rank 0, J."""
-        items = zip(self._work, self.obstacles, strict=True)
-        return sum(work for work, obstacle in items if not obstacle.free), self._friction_loss
+        return self.group.step_work()[0], self._friction_loss
 
     def _obstacle_frequency(self, x: Values) -> float:
         # the squares of a body and an obstacle on one spring add up
         assert self._surface is not None
         squares = [0.0]
         for number, part in zip(self.numbers, self._surface.parts, strict=True):
-            if number in self.bodies.free and not part.is_far(x):
-                obstacle, posed = cast("VerletObstacle", self.bodies.free[number]), self.bodies.posed[number]
+            if number in self.group.bodies.free and not part.is_far(x):
+                obstacle, posed = (
+                    cast("VerletObstacle", self.group.bodies.free[number]),
+                    self.group.bodies.posed[number],
+                )
                 points = part.points(x)
                 near = part.contact.contacts_ahead(points)
                 positions = near.positions(points, np.arange(len(points)) >= len(x))
@@ -688,39 +679,18 @@ class PenaltyMeshContact(PenaltyContact):
             result.append(resultant(force[pressed], mesh.positions[pressed] - mesh.pose.centre))
         return result
 
-    # --- columns of history.csv, and figures for the end of a run ---
+    # --- readings ---
 
-    def summed_columns(self) -> dict[str, Callable[[], Values]]:
-        """contact_NAME_AXIS: (1,) force of the body on each obstacle in the last step, on rank 0, N."""
-        return {
-            f"contact_{obstacle.name}_{axis_name}": partial(self._force_reading, index, axis)
-            for index, obstacle in enumerate(self.obstacles)
-            for axis, axis_name in enumerate(AXES)
-        }
-
-    def _force_reading(self, index: int, axis: int) -> Values:
-        return self._wrenches[index][axis : axis + 1]
-
-    def minimum_columns(self) -> dict[str, Callable[[], float]]:
-        """gap_NAME: least distance between each obstacle and the body, m (on rank 0; infinite elsewhere)."""
-        return {f"gap_{obstacle.name}": partial(self._gap, index) for index, obstacle in enumerate(self.obstacles)}
+    def _wrench(self, index: int) -> Values:
+        """(6,) force and moment of the body on an obstacle at the end of the last step, on rank 0, N and N m."""
+        return self._wrenches[index]
 
     def _gap(self, index: int) -> float:
+        """Least distance between an obstacle and the body, m; on rank 0, infinite elsewhere (collective)."""
         x = self._end_positions()
         if x is None or self._surface is None or (pairs := self._surface.parts[index].obstacle) is None:
             return np.inf
         return pairs.gap(x)
-
-    def work_columns(self) -> dict[str, Callable[[], float]]:
-        """work_NAME: work of each obstacle on the body in the last step, J; of a free one that of its momentum."""
-        columns: dict[str, Callable[[], float]] = {
-            f"work_{obstacle.name}": partial(lambda index: self._work[index], index)
-            for index, obstacle in enumerate(self.obstacles)
-        }
-        if isinstance(self.bodies, VerletRigidObstacles):
-            of_free = [number for number in self.bodies.free if number in self.numbers]
-            columns |= {f"work_{self.bodies.obstacles[n].name}": partial(self.bodies.work_on_body, n) for n in of_free}
-        return columns
 
     def closing_distances(self) -> list[float]:
         """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
@@ -734,9 +704,8 @@ class PenaltyMeshContact(PenaltyContact):
         if x is None or v is None or self._surface is None:
             return none
         motion = self._dt * (self._surface.point_map.weights @ v)
-        start_poses = [self.bodies.start_posed[number].pose for number in self.numbers]
         pairs = [part.obstacle for part in self._surface.parts if part.obstacle is not None]
-        return [approach(*item, x, motion) for item in zip(pairs, start_poses, strict=True)]
+        return [approach(*item, x, motion) for item in zip(pairs, self.group.start_poses, strict=True)]
 
     # --- state ---
 

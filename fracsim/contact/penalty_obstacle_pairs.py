@@ -322,8 +322,9 @@ class PenaltyPair:
         work: (2,) of the forces on each obstacle in that step, J.
     """
 
-    def __init__(self, numbers: Numbers, obstacles: Mapping[int, RigidObstacle]) -> None:
-        """`obstacles`: all by their numbers."""
+    def __init__(self, numbers: Numbers, obstacles: Mapping[int, RigidObstacle], suffix: str) -> None:
+        """`obstacles`: all by their numbers; `suffix`: of the names of its arrays in checkpoints."""
+        self._suffix = suffix
         first, second = (obstacles[number] for number in numbers)
         meshes = [isinstance(obstacle.shape, TriangleMeshShape) for obstacle in (first, second)]
         if meshes[1] and not meshes[0]:  # a triangle mesh comes first, since it is in contact at its own points
@@ -355,15 +356,15 @@ class PenaltyPair:
         contacts, self.forces = cast("tuple[object, PairForces]", memory)
         self.contacts.restore(contacts)
 
-    def to_checkpoint(self, suffix: str) -> dict[str, Values]:
-        """Arrays for a checkpoint, of names with a suffix."""
+    def to_checkpoint(self) -> dict[str, Values]:
+        """Arrays for a checkpoint."""
         arrays = {"forces": self.forces.to_array()} | self.contacts.to_checkpoint()
-        return {f"{name}{suffix}": values for name, values in arrays.items()}
+        return {f"{name}{self._suffix}": values for name, values in arrays.items()}
 
-    def from_checkpoint(self, saved: dict[str, Values], suffix: str) -> None:
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set contacts and forces from the arrays of a checkpoint."""
-        self.forces = PairForces.from_array(saved[f"forces{suffix}"])
-        self.contacts.from_checkpoint(saved, suffix)
+        self.forces = PairForces.from_array(saved[f"forces{self._suffix}"])
+        self.contacts.from_checkpoint(saved, self._suffix)
 
 
 def penalty_pairs_of(obstacles: Mapping[int, RigidObstacle], penalty: Penalty, max_added: float) -> list[PenaltyPair]:
@@ -374,7 +375,8 @@ def penalty_pairs_of(obstacles: Mapping[int, RigidObstacle], penalty: Penalty, m
         penalty: of points in contact; less stiff where it would add more than a share of `max_added`.
         max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
     """
-    pairs = [PenaltyPair(numbers, obstacles) for numbers in free_pairs([obstacles[n] for n in range(len(obstacles))])]
+    all_numbers = free_pairs([obstacles[n] for n in range(len(obstacles))])
+    pairs = [PenaltyPair(numbers, obstacles, f"_{index}") for index, numbers in enumerate(all_numbers)]
     for pair in pairs:
         members = (obstacles[number] for number in pair.numbers)
         mass = min(obstacle.mass for obstacle in members if isinstance(obstacle, FreeObstacle))

@@ -19,7 +19,7 @@ Equations: docs/theory.md#explicit-contact.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import cast
@@ -41,7 +41,7 @@ from .obstacle import VerletObstacle
 from .obstacle_term import ObstacleTerm
 from .penalty_contacts import point_masses
 from .pose import PosedShape, min_distance
-from .rigid_obstacles import RigidObstacles, VerletRigidObstacles
+from .rigid_obstacles import RigidObstacles
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -254,7 +254,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
             return 0.0
         load, reach = np.zeros(len(self.stiffness)), PENALTY.near_gap * self.law.barrier.width
         for number in self._facet_obstacles:
-            near = self._facets.within_reach(self.posed[number], self.positions, reach)
+            near = self._facets.within_reach(self.group.posed[number], self.positions, reach)
             np.add.at(load, self._facets.corners[near], self._facets.area[near][:, None])
         return self._mass_share.max_rate(load) if self.comm.allreduce(bool(load.any()), op=MPI.LOR) else 0.0
 
@@ -263,7 +263,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
         With that of the lightest free obstacle: the squares of a body and an obstacle on one spring add up.
         """
-        free = {number: obstacle for number, obstacle in self.bodies.free.items() if number in self.numbers}
+        free = {number: obstacle for number, obstacle in self.group.bodies.free.items() if number in self.numbers}
         of_free = cast("dict[int, VerletObstacle]", free)
         self.obstacle_forces()
         return (
@@ -273,7 +273,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
         )
 
     def _obstacle_frequency(self, number: int, obstacle: VerletObstacle) -> float:
-        posed, reach = self.bodies.posed[number], PENALTY.near_gap * self.law.barrier.width
+        posed, reach = self.group.bodies.posed[number], PENALTY.near_gap * self.law.barrier.width
         near = self._point_candidates(posed, self.positions, reach)
         near = near[posed.distance(self.positions[near]) < reach]
         stiffness = obstacle.spring_stiffness(self.positions[near], self.stiffness[near], posed)
@@ -286,7 +286,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
     # --- steps ---
 
     def _begin_new_step(self) -> None:
-        self.surface.release_points(self._level.u_n, partial(min_distance, self.start_posed))
+        self.surface.release_points(self._level.u_n, partial(min_distance, self.group.start_posed))
         point_map, area = self._stiffness_of
         if self.comm.allreduce(point_map is not self.surface.point_map or area is not self.surface.area):
             self._update_stiffness()
@@ -343,7 +343,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
         if self._start_points is None:
             return np.zeros_like(x)
         start = self._start_points[points]
-        return np.asarray(x - start - self.bodies.point_motion(self.numbers[number], start))
+        return np.asarray(x - start - self.group.bodies.point_motion(self.numbers[number], start))
 
     def obstacle_forces(self) -> list[ContactForces]:
         """Forces of each obstacle at the current u (collective)."""
@@ -353,27 +353,22 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
     def accept_step(self) -> None:
         """Sum the work of the step, and store springs and forces for the next one (collective)."""
-        contacts, previous = self.obstacle_forces(), self._step_end
-        forces = [(contact.normal + contact.friction).sum(axis=0) for contact in contacts]
-        self._friction_loss, self._force_readings = 0.0, [-force for force in forces]
+        forces, previous, group = (
+            [-self._current_force(n) for n in range(len(self.obstacles))],
+            self._step_end,
+            self.group,
+        )
+        group.friction_loss, group.forces = 0.0, [-force for force in forces]
         for number, obstacle in enumerate(self.obstacles):
             if obstacle.friction:
                 # minus the work by the trapezoidal rule, minus the change of the energy of the springs
                 for springs, sign in ((previous.springs[number], 1.0), (self._springs[number], -1.0)):
                     work = springs.work(self._relative_motion(number, springs.points))
-                    self._friction_loss += sign * springs.energy - work
+                    group.friction_loss += sign * springs.energy - work
         for number in (number for number, obstacle in enumerate(self.obstacles) if not obstacle.free):
-            shift = self.increments[number][: self._domain.dim]
-            self._obstacle_work[number] = float((forces[number] + previous.forces[number]) @ shift) / 2
+            shift = self.group.increments[number][: self._domain.dim]
+            group.work[number] = float((forces[number] + previous.forces[number]) @ shift) / 2
         self._step_end, self._start_points = StepEnd(self._springs, forces), None
-
-    def work_columns(self) -> dict[str, Callable[[], float]]:
-        """work_NAME: work of each obstacle on the body in the last step, J; of a free one that of its momentum."""
-        columns, bodies = super().work_columns(), self.bodies
-        if isinstance(bodies, VerletRigidObstacles):
-            of_free = [number for number in bodies.free if number in self.numbers]
-            columns |= {f"work_{bodies.obstacles[n].name}": partial(bodies.work_on_body, n) for n in of_free}
-        return columns
 
     # --- state ---
 
@@ -393,19 +388,20 @@ class PenaltyObstacleTerm(ObstacleTerm):
         matched = matched[np.argsort(points[matched])]
         return FrictionSprings(points[matched], spring.slip[matched], spring.stiffness[matched])
 
-    def snapshot(self) -> object:
-        """State of the surface, and contact at the end of the last step."""
-        return super().snapshot(), self._step_end
+    # --- state: contact at the end of the last step (HistoryTerm) ---
+
+    def snapshot(self) -> StepEnd:
+        """Contact at the end of the last step."""
+        return self._step_end
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective)."""
-        surface, self._step_end = cast("tuple[object, StepEnd]", memory)
-        super().restore(surface)
+        self._step_end = cast("StepEnd", memory)
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Arrays for a checkpoint (collective).
 
-        With rows of springs on rank 0: obstacle, rank, area, identity, stretch, stiffness; and sums of forces on each
+        Rows of springs on rank 0: obstacle, rank, area, identity, stretch, stiffness; and sums of forces on each
         rank. Ranks that share a point have a spring each.
         """
         rows = [
@@ -416,13 +412,12 @@ class PenaltyObstacleTerm(ObstacleTerm):
         ]  # fmt: skip
         gathered = gather(self.comm, (np.concatenate(rows), np.array(self._step_end.forces)))
         if gathered is None:
-            return super().to_checkpoint()
+            return {}
         springs, forces = zip(*gathered, strict=True)
-        return super().to_checkpoint() | {"springs": np.concatenate(springs), "pushed": np.array(forces)}
+        return {"springs": np.concatenate(springs), "pushed": np.array(forces)}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint."""
-        super().from_checkpoint(saved)
         rows, forces = saved["springs"], saved["pushed"]
         springs = [self._springs_from_rows(rows[rows[:, 0] == number, 1:]) for number in range(len(self.obstacles))]
         if len(forces) == self.comm.size:

@@ -1,35 +1,32 @@
-"""Rigid obstacles of a study: their motion in a step, and terms of the balance for free ones.
+"""Rigid obstacles of a study: their motion in a step, and the groups of them that terms of contact are about.
 
     RigidObstacles         held and driven obstacles: motion prescribed, or restricted to a part of it
-    FreeRigidObstacles     with free ones in implicit steps: poses are unknowns of Newton's method (rigid_pose)
     VerletRigidObstacles   with free ones in explicit steps: velocity Verlet
+    ObstacleGroup          obstacles of one term of contact, and what they did to the body in a step
 
-Terms of contact have the obstacles' poses from here. Inertia, weight and contact between obstacles are in these terms.
+With free ones in implicit steps: rigid_pose. Terms of contact have the obstacles' poses from here.
 
 Equations: docs/theory.md#rigid-obstacles.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Protocol, cast
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import InputError
-from ..forms.schemes import Scheme
 from ..mechanics.term import Term, TimeLevel
-from ..mechanics.term_protocols import SurfaceData
+from ..mechanics.term_protocols import SurfaceData, TermColumns
 from ..mesh.domain import Domain
-from .node_contact import LaggedContact
-from .obstacle import FreeMotions, FreeObstacle, MovingObstacle, RigidMotion, RigidObstacle, VerletObstacle
-from .obstacle_pairs import AllPairs
+from ..meshes.data import AXES
+from .obstacle import FreeObstacle, RigidMotion, RigidObstacle, VerletObstacle, column_names
 from .obstacle_tessellation import ObstacleTessellations
-from .pose import PosedShape
+from .pose import Pose, PosedShape
 from .pose_derivatives import PoseDerivatives
-from .rigid_body import RigidStep
-from .rigid_pose import FreePose, PoseUnknowns
 from .step_limit import PoseMotion
 
 if TYPE_CHECKING:
@@ -79,6 +76,98 @@ class ObstacleContactTerm(Protocol):
         """Whether the tangent at the current u has negative eigenvalues of contact (collective)."""
 
 
+class MovingObstacle(Protocol):
+    """Free obstacle, with its state of motion at the start of a step until that is accepted."""
+
+    body: FreeObstacle
+    motion: RigidMotion
+
+
+@dataclass(frozen=True)
+class FreeMotions:
+    """States of motion of free obstacles: history of a term, kinetic energy, and columns of history.csv.
+
+    Attributes:
+        free: free obstacles by their numbers.
+        is_root: whether this is rank 0.
+        restored: called when motions are those of a checkpoint.
+    """
+
+    free: Mapping[int, MovingObstacle]
+    is_root: bool
+    restored: Callable[[], None]
+
+    def snapshot(self) -> dict[int, RigidMotion]:
+        """State of motion of each, by its number."""
+        return {number: obstacle.motion for number, obstacle in self.free.items()}
+
+    def restore(self, motions: Mapping[int, RigidMotion]) -> None:
+        """Restore states of motion."""
+        for number, obstacle in self.free.items():
+            obstacle.motion = motions[number]
+
+    def to_checkpoint(self) -> dict[str, Values]:
+        """Rows of numbers for a checkpoint."""
+        return {"flights": motion_rows(obstacle.motion for obstacle in self.free.values())}
+
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
+        """Set states of motion from the rows of a checkpoint."""
+        for row, obstacle in enumerate(self.free.values()):
+            obstacle.motion = obstacle.motion.from_array(saved["flights"][row])
+        self.restored()
+
+    def place(self, posed: list[PosedShape]) -> list[PosedShape]:
+        """All obstacles, by their numbers, with free ones at the poses of their states of motion."""
+        for number, obstacle in self.free.items():
+            posed[number] = PosedShape(posed[number].shape, obstacle.motion.pose)
+        return posed
+
+    def kinetic_energy(self) -> float:
+        """Kinetic energy of the free obstacles, on rank 0, J."""
+        if not self.is_root:
+            return 0.0
+        return float(sum(obstacle.body.history_values(obstacle.motion)[-1] for obstacle in self.free.values()))
+
+    def history_columns(self) -> TermColumns:
+        """Columns of history.csv.
+
+        position_NAME_x and velocity_NAME_x of the centre of mass, m and m/s; turn_NAME_z and spin_NAME_z, rad and
+        rad/s; kinetic_NAME, J.
+        """
+        columns = {
+            name: partial(reader, index)
+            for obstacle in self.free.values()
+            for reader in [_MotionReader(obstacle, self.is_root)]
+            for index, name in enumerate(column_names(obstacle.body))
+        }
+        return TermColumns(columns)
+
+
+def motion_rows(motions: Iterable[RigidMotion]) -> Values:
+    """(n, m) numbers of states of motion, one row each; shorter rows, as of a pendulum, end with zeros."""
+    rows = [motion.to_array() for motion in motions]
+    length = max(map(len, rows), default=0)
+    return np.array([np.pad(row, (0, length - len(row))) for row in rows])
+
+
+class _MotionReader:
+    """Numbers of an obstacle for history.csv: read column by column, evaluated once for each state of motion."""
+
+    def __init__(self, obstacle: MovingObstacle, is_root: bool) -> None:
+        self._obstacle, self._is_root = obstacle, is_root
+        self._motion: RigidMotion | None = None
+        self._values: Values = np.empty(0)
+
+    def __call__(self, index: int) -> Values:
+        """(1,) value of a column; 0 on other ranks than 0."""
+        if not self._is_root:
+            return np.zeros(1)
+        if self._motion is not self._obstacle.motion:
+            self._motion = self._obstacle.motion
+            self._values = self._obstacle.body.history_values(self._motion)
+        return self._values[index : index + 1]
+
+
 class RigidObstacles(Term):
     """Held and driven obstacles.
 
@@ -89,6 +178,7 @@ class RigidObstacles(Term):
         posed: obstacles at their current poses.
         start_posed: obstacles at the start of the step.
         increments: (p,) increment of each pose in the step.
+        motions: states of motion of free ones.
     """
 
     name = "rigid"
@@ -109,6 +199,8 @@ class RigidObstacles(Term):
         self._level: TimeLevel | None = None
         self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
         self._travelled = 1.0  # fraction of the prescribed motion
+        self.motions = FreeMotions(self.free, self.comm.rank == 0, self._motions_restored)
+        self.parts = (self.motions,) if self.free else ()
         self._place(0.0, 0.0)
 
     def add_contact(self, contact: ObstacleContactTerm) -> None:
@@ -140,7 +232,7 @@ class RigidObstacles(Term):
 
     def posed_at(self, t: float) -> list[PosedShape]:
         """Each obstacle at the time t of the state, s (not collective)."""
-        return self._motions.place([obstacle.posed_at(t) for obstacle in self.obstacles])
+        return self.motions.place([obstacle.posed_at(t) for obstacle in self.obstacles])
 
     def output_surfaces(self, t: float) -> dict[str, SurfaceData]:
         """Tessellation of each obstacle at the time t of the state, s, by its name."""
@@ -150,11 +242,10 @@ class RigidObstacles(Term):
         """Potential of their motion, J: prescribed obstacles have none."""
         return 0.0
 
-    # --- states of motion of free obstacles, and their columns ---
-
-    @property
-    def _motions(self) -> FreeMotions:
-        return FreeMotions(self.free, self.comm.rank == 0)
+    def _motions_restored(self) -> None:
+        """Place free obstacles by their states of motion."""
+        self.motions.place(self.posed)
+        self._tell_moved()
 
     def _wrenches(self) -> dict[int, Values]:
         """(p,) force and moment of the body on each free obstacle, N and N m, of all ranks (collective)."""
@@ -163,49 +254,13 @@ class RigidObstacles(Term):
             result |= contact.wrenches([number for number in self.free if number in contact.numbers])
         return result
 
-    def kinetic_energy(self) -> float:
-        """Kinetic energy of the free obstacles, on rank 0, J."""
-        return self._motions.kinetic_energy()
-
-    def summed_columns(self) -> dict[str, Callable[[], Values]]:
-        """Columns of the motion of free obstacles (FreeMotions.columns)."""
-        return self._motions.columns()
-
-    def minimum_columns(self) -> dict[str, Callable[[], float]]:
-        """No columns."""
-        return {}
-
-    def work_columns(self) -> dict[str, Callable[[], float]]:
-        """No columns."""
-        return {}
-
-    def snapshot(self) -> object:
-        """States of motion."""
-        return self._motions.snapshot()
-
-    def restore(self, memory: object) -> None:
-        """Restore a snapshot (not collective)."""
-        self._motions.restore(cast("dict[int, RigidMotion]", memory))
-
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Rows of states of motion."""
-        return self._motions.to_checkpoint() if self.free else {}
-
-    def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set states of motion from the rows of a checkpoint."""
-        self._motions.from_checkpoint(saved)
-        self._motions.place(self.posed)
-        self._tell_moved()
-
     # --- motion of points of obstacles ---
 
-    def contact_point_motion(self, number: int, lagged: LaggedContact) -> Values:
-        """(d,) motion of an obstacle in the step to its current pose, or (k, d) of its points in lagged contact, m."""
-        return np.asarray(self.increments[number][: self.dim])
-
     def point_motion(self, number: int, x: Values) -> Values:
-        """(d,) motion of an obstacle in the step, or (n, d) of its points that were at x (n, d), m."""
-        return np.asarray(self.increments[number][: self.dim])
+        """(d,) motion of an obstacle in the step, or (n, d) of its points that were at x (n, d) at its start, m."""
+        if number not in self.free:
+            return np.asarray(self.increments[number][: self.dim])
+        return self.posed[number].pose.points_to_space(self.start_posed[number].pose.to_body(x)) - x
 
     def velocity(self, number: int, x: Values) -> Values:
         """(d,) velocity of an obstacle at the start of the step, or (n, d) of its points at x (n, d), m/s."""
@@ -276,227 +331,6 @@ class RigidObstacles(Term):
             contact.poses_moved()
 
 
-class FreeRigidObstacles(RigidObstacles):
-    """Obstacles of which some are free, in implicit steps.
-
-    Attributes:
-        free: free obstacles by their numbers.
-        pairs: contact of these with other obstacles.
-    """
-
-    leaves_tangent_incomplete = True
-    free: dict[int, FreePose]
-
-    def __init__(
-        self,
-        domain: Domain,
-        obstacles: Sequence[RigidObstacle],
-        scheme: Scheme,
-        pairs: AllPairs,
-    ) -> None:
-        """Build the term.
-
-        Args:
-            domain: mesh of the body.
-            obstacles: by their numbers in the study.
-            scheme: of time integration.
-            pairs: contact between obstacles.
-
-        Raises:
-            InputError: if a free obstacle overlaps another one.
-        """
-        free = {n: FreePose(obstacle) for n, obstacle in enumerate(obstacles) if isinstance(obstacle, FreeObstacle)}
-        self.pairs, self._scheme = pairs, scheme
-        self._unknowns = PoseUnknowns(domain.comm, free, self.pairs, self)
-        super().__init__(domain, obstacles, free)
-        if not self.pairs.are_open(self.posed):
-            names = " or ".join(pose.body.name for pose in free.values())
-            raise InputError(
-                f"{names} moves freely and overlaps another obstacle at the start; move it away or make it smaller"
-            )
-
-    # --- steps ---
-
-    def begin_step(self, level: TimeLevel) -> None:
-        """Move obstacles to the end of a step, free ones to its start."""
-        is_new = level is not self._level
-        super().begin_step(level)
-        if not is_new or not level.dt:
-            return
-        weights = level.contact_weights
-        for number, pose in self.free.items():
-            pose.begin_step(
-                RigidStep(pose.body, pose.motion, self._scheme, level.dt, level.c_a, level.fraction, weights.factor)
-            )
-            self.increments[number] = pose.step.increment(pose.step.free_flight)
-        self.pairs.begin_step(self, level.dt, time_averaged=weights.time_averaged)
-        self._unknowns.discard()
-
-    def update_displacement(self) -> None:
-        """Discard the equations of the poses, as u has changed."""
-        self._unknowns.discard()
-
-    def accept_step(self) -> None:
-        """Give free obstacles their momentum (collective)."""
-        of_body, of_pairs = self._wrenches(), self.pairs.wrenches(self.posed)
-        for number, pose in self.free.items():
-            pose.motion = pose.end_motion(of_body[number] + of_pairs.get(number, 0.0))
-
-    @property
-    def _in_step(self) -> bool:
-        """Whether a step has begun and is not accepted yet."""
-        return self._level is not None and bool(self._level.dt) and self._unknowns.in_step
-
-    # --- motion of points of obstacles ---
-
-    def contact_point_motion(self, number: int, lagged: LaggedContact) -> Values:
-        """(d,) motion of an obstacle in the step to its current pose, or (k, d) of its points in lagged contact, m."""
-        if number not in self.free:
-            return super().contact_point_motion(number, lagged)
-        return self.free[number].contact_point_motion(lagged)
-
-    def velocity(self, number: int, x: Values) -> Values:
-        """(d,) velocity of an obstacle at the start of the step, or (n, d) of its points at x (n, d), m/s."""
-        return self.free[number].step.start_velocity(x) if number in self.free else super().velocity(number, x)
-
-    # --- contact with free obstacles (rigid_pose.BodyContact) ---
-
-    def poses_moved(self) -> None:
-        """Take over the poses of free obstacles."""
-        for number, pose in self.free.items():
-            self.posed[number] = pose.posed
-            self.increments[number] = pose.step.increment(pose.z)
-        self._tell_moved()
-
-    def _tell_moved(self) -> None:
-        self._unknowns.discard()
-        super()._tell_moved()
-
-    def pose_derivatives(self, *, exact: bool) -> dict[int, PoseDerivatives]:
-        """Energy and derivatives of contact with the body by the pose of each free obstacle (collective)."""
-        result: dict[int, PoseDerivatives] = {}
-        for contact in self._contacts:
-            numbers = [number for number in self.free if number in contact.numbers]
-            result |= contact.pose_derivatives(numbers, exact=exact)
-        return result
-
-    def mixed_hessians(self) -> dict[int, Values]:
-        """(owned dofs, p) second derivatives by nodes and the poses of obstacles in contact (collective)."""
-        result: dict[int, Values] = {}
-        for contact in self._contacts:
-            result |= contact.mixed_hessians([number for number in self.free if number in contact.numbers])
-        return result
-
-    def uses_exact_tangent(self) -> bool:
-        """Whether the tangents of all contact have negative eigenvalues (collective)."""
-        return all([contact.uses_exact_tangent() for contact in self._contacts])
-
-    def may_use_exact_tangent(self) -> bool:
-        """Whether exact tangents of contact leave the equations of the poses positive definite (collective)."""
-        if not self._in_step:
-            return True
-        allowed = all(contact.allows_exact_tangent for contact in self._contacts)
-        return allowed and self._unknowns.equations(exact=True).is_positive
-
-    def free_fraction(self, increments: Increments) -> float:
-        """Fraction of increments of free poses on which no gap closes, the body at rest (collective)."""
-        return min(self._rest_fraction(increments, None), self._fraction_between(increments))
-
-    # --- unknowns of Newton's method (EliminatingTerm) ---
-
-    def low_rank_updates(self) -> list[tuple[Values, Values]]:
-        """B (owned dofs, k) and D^-1 (k, k) of obstacles in contact with the body (collective)."""
-        return self._unknowns.low_rank_updates() if self._in_step else []
-
-    def condensed_residual(self) -> Values | None:
-        """(owned dofs,) B D^-1 r_y, N; None where no obstacle touches the body (collective)."""
-        return self._unknowns.condensed_residual() if self._in_step else None
-
-    def begin_correction(self, change: Values) -> None:
-        """Compute the change of the poses that belongs to a change of u (owned dofs,), m (collective)."""
-        self._unknowns.begin_correction(change)
-
-    def correction_increments(self) -> Increments:
-        """Increments of free poses in a correction of Newton's method."""
-        return self._unknowns.increments()
-
-    def move_along(self, fraction: float) -> None:
-        """Move free obstacles to a fraction of the correction."""
-        self._unknowns.move_along(fraction)
-
-    def unknowns_are_solved(self) -> bool:
-        """Whether the poses are a solution (collective)."""
-        return not self._in_step or self._unknowns.are_solved()
-
-    def solve_unknowns(self) -> None:
-        """Solve for the poses with the body held (collective)."""
-        self._unknowns.solve()
-
-    # --- energies ---
-
-    def potential(self) -> float:
-        """Potential of inertia, weight and contact between obstacles, on rank 0, J."""
-        if self.comm.rank or self._level is None or not self._level.dt:
-            return 0.0
-        weight = self._level.contact_weight * self._level.fraction
-        return self._unknowns.free_potential() + weight * self.pairs.energies(self.posed)[1]
-
-    def stored_energy(self) -> float:
-        """Energy of the barriers between obstacles, on rank 0, J."""
-        return 0.0 if self.comm.rank else self.pairs.energies(self.posed)[0]
-
-    def step_work(self) -> tuple[float, float]:
-        """Work of gravity and prescribed obstacles on free ones, and dissipation between obstacles, on rank 0, J."""
-        if self.comm.rank:
-            return 0.0, 0.0
-        work, dissipated = self.pairs.work(self.posed, self.increments)
-        return self._unknowns.gravity_work() + work, dissipated
-
-    # --- step limits ---
-
-    def max_step_fraction(self, change: Values) -> float:
-        """Fraction of the correction on which no gap between obstacles closes."""
-        return self._fraction_between(self._unknowns.increments())
-
-    def _fraction_between(self, increments: Increments) -> float:
-        at_rest = np.zeros_like(self.increments[0])
-        motions = {number: (posed, increments.get(number, at_rest)) for number, posed in enumerate(self.posed)}
-        return self.pairs.safe_fraction(motions)
-
-    def feasible_guess(self, u: Values) -> Values:
-        """(owned dofs,) first guess of u, m, with poses that meet neither the body nor one another (collective)."""
-        level = self._level
-        if level is None or not level.dt:
-            return u
-        guesses = {number: self._first_guess(number, u) for number in self.free}
-        motions = self.prescribed_motions()
-        motions |= {n: (self.start_posed[n], self.free[n].step.increment(z)) for n, (z, _) in guesses.items()}
-        fraction = min(self.pairs.safe_fraction(motions), *(safe for _, safe in guesses.values()))
-        self._unknowns.move_to([fraction * z for z, _ in guesses.values()])
-        return u if fraction == 1 else np.asarray(level.u_n + fraction * (u - level.u_n))
-
-    def _first_guess(self, number: int, u: Values) -> tuple[Values, float]:
-        """First guess (k,) of an increment, and its fraction that closes no gap with the body on its way to u."""
-        pose, prescribed = self.free[number], self.prescribed_motions()
-        contacts = [contact for contact in self._contacts if number in contact.numbers]
-
-        def safe_fraction(z: Values) -> float:
-            q = pose.step.increment(z)
-            between = self.pairs.safe_fraction(prescribed | {number: (self.start_posed[number], q)})
-            return min(between, *(contact.start_fraction(number, q, u) for contact in contacts))
-
-        return pose.first_guess([increment for _, increment in prescribed.values()], safe_fraction)
-
-    def is_feasible(self, u: Values) -> bool:
-        """Whether every gap between obstacles is open."""
-        return self.pairs.are_open(self.posed)
-
-    def restrict_motion(self) -> None:
-        """Hold all obstacles at the start of the step (collective)."""
-        self._unknowns.move_to([0 * pose.z for pose in self.free.values()])
-        super().restrict_motion()
-
-
 class VerletRigidObstacles(RigidObstacles):
     """Obstacles of which some are free, in explicit steps; between these and others a penalty acts, with friction.
 
@@ -513,22 +347,21 @@ class VerletRigidObstacles(RigidObstacles):
         self._contact_work = dict.fromkeys(free, 0.0)  # of the body on each in the last step, J
         self._pairs = pairs
         super().__init__(domain, obstacles, free)
+        self.parts = (*self.parts, *pairs)
 
     def _place(self, start: float, end: float) -> None:
         super()._place(start, end)
         if end > start:
             for number, obstacle in self.free.items():
                 self.posed[number] = obstacle.begin_step(end - start)
+                self.increments[number] = obstacle.increment
 
     def accept_step(self) -> None:
         """Give free obstacles their momentum (collective)."""
-        increments = list(self.increments)
-        for number, obstacle in self.free.items():
-            increments[number] = obstacle.increment
         work_of_pairs = dict.fromkeys(range(len(self.obstacles)), 0.0)
-        of_pairs = [np.zeros_like(q) for q in increments]
+        of_pairs = [np.zeros_like(q) for q in self.increments]
         for pair in self._pairs:
-            pair.end_step(self.start_posed, self.posed, increments)
+            pair.end_step(self.start_posed, self.posed, self.increments)
             for number, wrench, work in zip(pair.numbers, pair.forces.wrenches, pair.work, strict=True):
                 of_pairs[number] += wrench
                 work_of_pairs[number] += work
@@ -540,32 +373,6 @@ class VerletRigidObstacles(RigidObstacles):
         """Energy of penalty and springs between obstacles at the end of the last step, on rank 0, J."""
         energies = [pair.forces.penalty_energy + pair.forces.spring_energy for pair in self._pairs]
         return 0.0 if self.comm.rank else sum(energies)
-
-    # --- state: of motion, and contacts between obstacles ---
-
-    def snapshot(self) -> object:
-        """States of motion, and contacts at the end of the last step."""
-        return super().snapshot(), [pair.snapshot() for pair in self._pairs]
-
-    def restore(self, memory: object) -> None:
-        """Restore a snapshot (not collective)."""
-        motions, contacts = cast("tuple[object, list[object]]", memory)
-        super().restore(motions)
-        for pair, contact in zip(self._pairs, contacts, strict=True):
-            pair.restore(contact)
-
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Rows of states of motion, and contacts at the end of the last step."""
-        arrays = super().to_checkpoint()
-        for index, pair in enumerate(self._pairs):
-            arrays |= pair.to_checkpoint(f"_{index}")
-        return arrays
-
-    def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set states of motion and contacts from the arrays of a checkpoint."""
-        super().from_checkpoint(saved)
-        for index, pair in enumerate(self._pairs):
-            pair.from_checkpoint(saved, f"_{index}")
 
     def frequency_bound(self) -> float:
         """Increase of the square of the highest frequency if all near points were in contact, 1/s^2.
@@ -592,12 +399,6 @@ class VerletRigidObstacles(RigidObstacles):
         """Work of a free obstacle on the body in the last step, on rank 0, J."""
         return 0.0 if self.comm.rank else -self._contact_work[number]
 
-    def point_motion(self, number: int, x: Values) -> Values:
-        """(d,) motion of an obstacle in the step, or (n, d) of its points that were at x (n, d), m."""
-        if number not in self.free:
-            return super().point_motion(number, x)
-        return self.free[number].contact_point_motion(x, self.posed[number])
-
     def step_work(self) -> tuple[float, float]:
         """Work of gravity and prescribed obstacles on free ones, and dissipation between obstacles, on rank 0, J."""
         if self.comm.rank:
@@ -606,3 +407,96 @@ class VerletRigidObstacles(RigidObstacles):
         by_prescribed = -sum(work for number, work in items if number not in self.free)
         by_gravity = sum(obstacle.gravity_work for obstacle in self.free.values())
         return by_gravity + by_prescribed, sum(pair.dissipated for pair in self._pairs)
+
+
+class ObstacleGroup:
+    """Obstacles that one term of contact is about, and what they did to the body in the last step.
+
+    Work, dissipation and forces are parts of this rank.
+
+    Attributes:
+        bodies: motion of all obstacles of the study.
+        numbers: numbers of those of the group.
+        obstacles: these.
+        work: of each on the body in the last step, J.
+        friction_loss: dissipation by friction in the last step, J.
+        forces: (d,) of the body on each at the end of the last step, N; further numbers may follow. None: no step yet.
+    """
+
+    forces: list[Values] | None = None
+
+    def __init__(
+        self,
+        bodies: RigidObstacles,
+        numbers: Sequence[int],
+        gap: Callable[[int], float],
+        current_force: Callable[[int], Values],
+    ) -> None:
+        """Group obstacles.
+
+        Args:
+            bodies: motion of all obstacles of the study.
+            numbers: numbers of those of the group.
+            gap: index in the group -> least distance from the body at the current u, m; of this rank's surface.
+            current_force: index -> force (d,) of the body at the current u, N, which counts before the first step.
+        """
+        self.bodies, self.numbers, self._gap, self._current_force = bodies, tuple(numbers), gap, current_force
+        self.obstacles = tuple(bodies.obstacles[number] for number in numbers)
+        self.work, self.friction_loss = [0.0] * len(self.obstacles), 0.0
+
+    # --- motion ---
+
+    @property
+    def posed(self) -> list[PosedShape]:
+        """Obstacles at their current poses."""
+        return [self.bodies.posed[number] for number in self.numbers]
+
+    @property
+    def start_posed(self) -> list[PosedShape]:
+        """Obstacles at the start of the step."""
+        return [self.bodies.start_posed[number] for number in self.numbers]
+
+    @property
+    def increments(self) -> list[Values]:
+        """(p,) increment of each pose in the step."""
+        return [self.bodies.increments[number] for number in self.numbers]
+
+    @property
+    def poses(self) -> list[Pose]:
+        """Current poses."""
+        return [posed.pose for posed in self.posed]
+
+    @property
+    def start_poses(self) -> list[Pose]:
+        """Poses at the start of the step."""
+        return [posed.pose for posed in self.start_posed]
+
+    # --- the last step ---
+
+    def step_work(self) -> tuple[float, float]:
+        """Work of prescribed obstacles in the last step, and dissipation by friction, J."""
+        items = zip(self.work, self.obstacles, strict=True)
+        return sum(work for work, obstacle in items if not obstacle.free), self.friction_loss
+
+    def history_columns(self) -> TermColumns:
+        """contact_NAME_AXIS: force of the body, N; work_NAME: work on the body, J; gap_NAME: least distance, m."""
+        items = list(enumerate(self.obstacles))
+        return TermColumns(
+            sums={
+                f"contact_{obstacle.name}_{axis_name}": partial(self._force_reading, index, axis)
+                for index, obstacle in items
+                for axis, axis_name in enumerate(AXES[: self.bodies.dim])
+            },
+            works={f"work_{obstacle.name}": partial(self._work_reading, index) for index, obstacle in items},
+            minima={f"gap_{obstacle.name}": partial(self._gap, index) for index, obstacle in items},
+        )
+
+    def _force_reading(self, index: int, axis: int) -> Values:
+        force = self._current_force(index) if self.forces is None else self.forces[index]
+        return force[axis : axis + 1]
+
+    def _work_reading(self, index: int) -> float:
+        """Work of an obstacle in the last step, J; of a free one in explicit steps that of its momentum."""
+        if isinstance(self.bodies, VerletRigidObstacles) and self.obstacles[index].free:
+            return self.bodies.work_on_body(self.numbers[index])
+        return self.work[index]

@@ -1,4 +1,4 @@
-"""Poses of free obstacles in implicit steps, as unknowns of Newton's method beside the displacement of the body.
+"""Free obstacles in implicit steps: their poses are unknowns of Newton's method beside the displacement of the body.
 
 A pose z minimises the incremental potential Phi (rigid_body), together with u. Each iteration eliminates the poses from
 its linear system (mechanics.eliminated_unknowns) and moves them along with u. With y = s z,
@@ -19,13 +19,17 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from ..errors import InputError
+from ..forms.schemes import Scheme
+from ..mechanics.term import TimeLevel
+from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
-from .node_contact import LaggedContact
-from .obstacle import FreeObstacle, RigidMotion
+from .obstacle import FreeObstacle, RigidMotion, RigidObstacle
 from .obstacle_pairs import AllPairs
 from .pose import PosedShape, solve_matrix
 from .pose_derivatives import PoseDerivatives
 from .rigid_body import SOLVER, RigidStep, RigidSystem, SystemDerivatives, is_positive_definite
+from .rigid_obstacles import Increments, RigidObstacles
 
 Values = npt.NDArray[np.float64]
 
@@ -72,11 +76,6 @@ class FreePose:
         """State of motion at the end of the step; `wrench`: (p,) force and moment on the obstacle, N and N m."""
         self._solution = self.z
         return self.step.end_motion(self.z, wrench)
-
-    def contact_point_motion(self, lagged: LaggedContact) -> Values:
-        """(k, d) motion in the step of the obstacle's points in lagged contact, m."""
-        start = self.step.start.pose
-        return self.posed.pose.points_to_space(start.to_body(lagged.obstacle_point)) - lagged.obstacle_point
 
     def first_guess(
         self, increments: Sequence[Values], safe_fraction: Callable[[Values], float]
@@ -177,16 +176,17 @@ class PoseSystem:
 
 
 class PoseUnknowns:
-    """Poses of all free obstacles of a term as unknowns of Newton's method; the same on all ranks.
+    """Poses of all free obstacles of a term as unknowns of Newton's method (EliminatingTerm); the same on all ranks.
 
     Attributes:
         free: free obstacles by their numbers.
         pairs: contact of these with other obstacles.
+        has_step: whether a step has begun, and not the evaluation of a state.
     """
 
     def __init__(self, comm: MPI.Intracomm, free: Mapping[int, FreePose], pairs: AllPairs, body: BodyContact) -> None:
         """`body`: contact of the body with them."""
-        self.free, self.pairs, self._comm, self._body = free, pairs, comm, body
+        self.free, self.pairs, self._comm, self._body, self.has_step = free, pairs, comm, body, False
         # at the current u and poses
         self._equations: dict[bool, PoseEquations] = {}  # whether with exact second derivatives ->
         self._system: PoseSystem | None = None
@@ -196,7 +196,7 @@ class PoseUnknowns:
     @property
     def in_step(self) -> bool:
         """Whether a step has begun and is not accepted yet."""
-        return all(pose.in_step for pose in self.free.values())
+        return self.has_step and all(pose.in_step for pose in self.free.values())
 
     def discard(self) -> None:
         """Discard equations, as u or poses have changed."""
@@ -206,7 +206,6 @@ class PoseUnknowns:
         """Move all to increments z (k,), in their order."""
         for pose, z_i in zip(self.free.values(), z, strict=True):
             pose.move_to(z_i)
-        self.discard()
         self._body.poses_moved()
 
     # --- equations ---
@@ -256,16 +255,14 @@ class PoseUnknowns:
 
     def low_rank_updates(self) -> list[tuple[Values, Values]]:
         """B (owned dofs, k) and D^-1 (k, k) of obstacles in contact with the body (collective)."""
-        system = self.system()
-        if not (touching := system.touching).any():
+        if not self.in_step or not (touching := (system := self.system()).touching).any():
             return []
         compliance: Values = np.asarray(np.linalg.inv(system.equations.hessian), np.float64)
         return [(system.B.copy(), compliance[np.ix_(touching, touching)])]
 
     def condensed_residual(self) -> Values | None:
         """(owned dofs,) B D^-1 r_y, N; None where no obstacle touches the body (collective)."""
-        system = self.system()
-        if not system.touching.any():
+        if not self.in_step or not (system := self.system()).touching.any():
             return None
         return np.asarray(system.B @ system.correction[system.touching])
 
@@ -288,13 +285,15 @@ class PoseUnknowns:
         if self.in_step:
             self.move_to([z + fraction * dz for z, dz in zip(self._start, self._change, strict=True)])
 
-    def are_solved(self) -> bool:
+    def unknowns_are_solved(self) -> bool:
         """Whether Newton's decrement of the poses is that of a solution (collective)."""
+        if not self.in_step:
+            return True
         system = self.system()
         scale = self._rigid_system.energy_scale(self._z, system.equations.contact)
         return float(system.equations.gradient @ system.correction) <= SOLVER.solved_decrement * scale
 
-    def solve(self) -> None:
+    def solve_unknowns(self) -> None:
         """Minimise Phi over all poses with the body held (collective)."""
         self._leave_for(self._rigid_system.minimise(self._z, self._contact_at, self._free_fraction))
 
@@ -326,3 +325,187 @@ class PoseUnknowns:
             pose.body.gravity_potential(pose.step.start.pose) - pose.body.gravity_potential(pose.posed.pose)
             for pose in self.free.values()
         )
+
+
+class FreeRigidObstacles(RigidObstacles):
+    """Obstacles of which some are free, in implicit steps.
+
+    Attributes:
+        free: free obstacles by their numbers.
+        pairs: contact of these with other obstacles.
+    """
+
+    leaves_tangent_incomplete = True
+    free: dict[int, FreePose]
+
+    def __init__(
+        self,
+        domain: Domain,
+        obstacles: Sequence[RigidObstacle],
+        scheme: Scheme,
+        pairs: AllPairs,
+    ) -> None:
+        """Build the term.
+
+        Args:
+            domain: mesh of the body.
+            obstacles: by their numbers in the study.
+            scheme: of time integration.
+            pairs: contact between obstacles.
+
+        Raises:
+            InputError: if a free obstacle overlaps another one.
+        """
+        free = {n: FreePose(obstacle) for n, obstacle in enumerate(obstacles) if isinstance(obstacle, FreeObstacle)}
+        self.pairs, self._scheme = pairs, scheme
+        self._unknowns = PoseUnknowns(domain.comm, free, self.pairs, self)
+        super().__init__(domain, obstacles, free)
+        self.parts = (*self.parts, self._unknowns)
+        if not self.pairs.are_open(self.posed):
+            names = " or ".join(pose.body.name for pose in free.values())
+            raise InputError(
+                f"{names} moves freely and overlaps another obstacle at the start; move it away or make it smaller"
+            )
+
+    # --- steps ---
+
+    def begin_step(self, level: TimeLevel) -> None:
+        """Move obstacles to the end of a step, free ones to its start."""
+        is_new = level is not self._level
+        super().begin_step(level)
+        self._unknowns.has_step = bool(level.dt)
+        if not is_new or not level.dt:
+            return
+        weights = level.contact_weights
+        for number, pose in self.free.items():
+            pose.begin_step(
+                RigidStep(pose.body, pose.motion, self._scheme, level.dt, level.c_a, level.fraction, weights.factor)
+            )
+            self.increments[number] = pose.step.increment(pose.step.free_flight)
+        self.pairs.begin_step(self, level.dt, time_averaged=weights.time_averaged)
+        self._unknowns.discard()
+
+    def update_displacement(self) -> None:
+        """Discard the equations of the poses, as u has changed."""
+        self._unknowns.discard()
+
+    def accept_step(self) -> None:
+        """Give free obstacles their momentum (collective)."""
+        of_body, of_pairs = self._wrenches(), self.pairs.wrenches(self.posed)
+        for number, pose in self.free.items():
+            pose.motion = pose.end_motion(of_body[number] + of_pairs.get(number, 0.0))
+
+    def velocity(self, number: int, x: Values) -> Values:
+        """(d,) velocity of an obstacle at the start of the step, or (n, d) of its points at x (n, d), m/s."""
+        return self.free[number].step.start_velocity(x) if number in self.free else super().velocity(number, x)
+
+    # --- contact with free obstacles (rigid_pose.BodyContact) ---
+
+    def poses_moved(self) -> None:
+        """Take over the poses of free obstacles."""
+        for number, pose in self.free.items():
+            self.posed[number] = pose.posed
+            self.increments[number] = pose.step.increment(pose.z)
+        self._tell_moved()
+
+    def _tell_moved(self) -> None:
+        self._unknowns.discard()
+        super()._tell_moved()
+
+    def pose_derivatives(self, *, exact: bool) -> dict[int, PoseDerivatives]:
+        """Energy and derivatives of contact with the body by the pose of each free obstacle (collective)."""
+        result: dict[int, PoseDerivatives] = {}
+        for contact in self._contacts:
+            numbers = [number for number in self.free if number in contact.numbers]
+            result |= contact.pose_derivatives(numbers, exact=exact)
+        return result
+
+    def mixed_hessians(self) -> dict[int, Values]:
+        """(owned dofs, p) second derivatives by nodes and the poses of obstacles in contact (collective)."""
+        result: dict[int, Values] = {}
+        for contact in self._contacts:
+            result |= contact.mixed_hessians([number for number in self.free if number in contact.numbers])
+        return result
+
+    def uses_exact_tangent(self) -> bool:
+        """Whether the tangents of all contact have negative eigenvalues (collective)."""
+        return all([contact.uses_exact_tangent() for contact in self._contacts])
+
+    def may_use_exact_tangent(self) -> bool:
+        """Whether exact tangents of contact leave the equations of the poses positive definite (collective)."""
+        if not self._unknowns.in_step:
+            return True
+        allowed = all(contact.allows_exact_tangent for contact in self._contacts)
+        return allowed and self._unknowns.equations(exact=True).is_positive
+
+    def free_fraction(self, increments: Increments) -> float:
+        """Fraction of increments of free poses on which no gap closes, the body at rest (collective)."""
+        return min(self._rest_fraction(increments, None), self._fraction_between(increments))
+
+    def correction_increments(self) -> Increments:
+        """Increments of free poses in a correction of Newton's method."""
+        return self._unknowns.increments()
+
+    # --- energies ---
+
+    def potential(self) -> float:
+        """Potential of inertia, weight and contact between obstacles, on rank 0, J."""
+        if self.comm.rank or self._level is None or not self._level.dt:
+            return 0.0
+        weight = self._level.contact_weight * self._level.fraction
+        return self._unknowns.free_potential() + weight * self.pairs.energies(self.posed)[1]
+
+    def stored_energy(self) -> float:
+        """Energy of the barriers between obstacles, on rank 0, J."""
+        return 0.0 if self.comm.rank else self.pairs.energies(self.posed)[0]
+
+    def step_work(self) -> tuple[float, float]:
+        """Work of gravity and prescribed obstacles on free ones, and dissipation between obstacles, on rank 0, J."""
+        if self.comm.rank:
+            return 0.0, 0.0
+        work, dissipated = self.pairs.work(self.posed, self.increments)
+        return self._unknowns.gravity_work() + work, dissipated
+
+    # --- step limits ---
+
+    def max_step_fraction(self, change: Values) -> float:
+        """Fraction of the correction on which no gap between obstacles closes."""
+        return self._fraction_between(self._unknowns.increments())
+
+    def _fraction_between(self, increments: Increments) -> float:
+        at_rest = np.zeros_like(self.increments[0])
+        motions = {number: (posed, increments.get(number, at_rest)) for number, posed in enumerate(self.posed)}
+        return self.pairs.safe_fraction(motions)
+
+    def feasible_guess(self, u: Values) -> Values:
+        """(owned dofs,) first guess of u, m, with poses that meet neither the body nor one another (collective)."""
+        level = self._level
+        if level is None or not level.dt:
+            return u
+        guesses = {number: self._first_guess(number, u) for number in self.free}
+        motions = self.prescribed_motions()
+        motions |= {n: (self.start_posed[n], self.free[n].step.increment(z)) for n, (z, _) in guesses.items()}
+        fraction = min(self.pairs.safe_fraction(motions), *(safe for _, safe in guesses.values()))
+        self._unknowns.move_to([fraction * z for z, _ in guesses.values()])
+        return u if fraction == 1 else np.asarray(level.u_n + fraction * (u - level.u_n))
+
+    def _first_guess(self, number: int, u: Values) -> tuple[Values, float]:
+        """First guess (k,) of an increment, and its fraction that closes no gap with the body on its way to u."""
+        pose, prescribed = self.free[number], self.prescribed_motions()
+        contacts = [contact for contact in self._contacts if number in contact.numbers]
+
+        def safe_fraction(z: Values) -> float:
+            q = pose.step.increment(z)
+            between = self.pairs.safe_fraction(prescribed | {number: (self.start_posed[number], q)})
+            return min(between, *(contact.start_fraction(number, q, u) for contact in contacts))
+
+        return pose.first_guess([increment for _, increment in prescribed.values()], safe_fraction)
+
+    def is_feasible(self, u: Values) -> bool:
+        """Whether every gap between obstacles is open."""
+        return self.pairs.are_open(self.posed)
+
+    def restrict_motion(self) -> None:
+        """Hold all obstacles at the start of the step (collective)."""
+        self._unknowns.move_to([0 * pose.z for pose in self.free.values()])
+        super().restrict_motion()

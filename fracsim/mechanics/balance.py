@@ -33,7 +33,7 @@ from .prescribed_motion import PrescribedMotion
 from .stress import Stress
 from .tangent import Tangent
 from .term import Term, TimeLevel, Values, overriding, sum_of_forms
-from .term_protocols import ContactTerms, RigidMotionTerm, TermHistories
+from .term_protocols import ContactTerms, RigidMotionTerm, TermHistories, fulfilling
 
 # methods of terms that are called in every step, of those terms alone that override them
 _STEP_METHODS = (
@@ -335,7 +335,7 @@ class EnergySums:
 
     def __init__(self, balance: Balance) -> None:
         self._balance, self._comm = balance, balance.domain.comm
-        self._rigid_motion = [term for term in balance.terms if isinstance(term, RigidMotionTerm)]
+        self._rigid_motion = fulfilling(balance.terms, RigidMotionTerm)
 
     def kinetic_energy(self, v: Values) -> float:
         """Kinetic energy of the body and of rigid obstacles, part of this rank, J; v: (owned dofs,), m/s."""

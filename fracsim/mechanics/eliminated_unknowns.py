@@ -22,7 +22,8 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ..mesh.parallel import sum_over_ranks
-from .term_protocols import EliminatingTerm
+from .term import Term
+from .term_protocols import EliminatingTerm, fulfilling
 
 Values = npt.NDArray[np.float64]
 
@@ -71,8 +72,8 @@ class EliminatedUnknowns:
         version: number of times that they were solved for.
     """
 
-    def __init__(self, comm: MPI.Comm, terms: Iterable[object]) -> None:
-        self._comm, self._terms = comm, [term for term in terms if isinstance(term, EliminatingTerm)]
+    def __init__(self, comm: MPI.Comm, terms: Iterable[Term]) -> None:
+        self._comm, self._terms = comm, fulfilling(terms, EliminatingTerm)
         self._path: CorrectionPath | None = None
         self._allowed, self._fraction = 1.0, 1.0  # fractions of the correction: that contact allows, and of current u
         self.exist, self.version = bool(self._terms), 0

@@ -30,7 +30,7 @@ from .matrix_assembly import TangentAssembler
 from .prescribed_motion import PrescribedMotion
 from .stress import Stress
 from .term import Term, overriding, sum_of_forms
-from .term_protocols import EliminatingTerm, StepLimiter, TieTerm
+from .term_protocols import EliminatingTerm, StepLimiter, TieTerm, fulfilling
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -172,7 +172,7 @@ class Tangent:
         self._owned = u.x.index_map.size_local * u.x.block_size
         self.pattern_version, self.couplings = 0, Couplings(terms, motion, self.domain)
         self.low_rank_updates: list[tuple[Values, Values]] = []
-        self._eliminating = [term for term in terms if isinstance(term, EliminatingTerm)]
+        self._eliminating = fulfilling(terms, EliminatingTerm)
         self._inertial = overriding(terms, "mass_factor")
         self.may_be_incomplete = any(term.leaves_tangent_incomplete for term in terms)
         self._linear = all(term.linear for term in terms)
@@ -332,7 +332,7 @@ class Tangent:
     def _depends_on_u_alone(self) -> bool:
         """Whether terms add only couplings to K, and its other part is a function of u alone (collective)."""
         adds_entries = bool(overriding(self._terms, "add_stiffness"))
-        limited = any(isinstance(term, StepLimiter) for term in self._terms)
+        limited = bool(fulfilling(self._terms, StepLimiter))
         return limited and all([term.potential() is not None for term in self._terms]) and not adds_entries
 
     def _psd_form(self, tolerance: float) -> fem.Form:

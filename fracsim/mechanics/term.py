@@ -11,7 +11,7 @@ What only contact has to tell is in the protocols of `term_protocols`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, ClassVar
 
@@ -75,16 +75,18 @@ class Term:
 
     A subclass overrides the contributions that it has. Signs are those of r: internal and inertial forces are positive,
     external forces on the body are negative. Terms with a history, of contact or with output fulfil the protocols of
-    `term_protocols` as well.
+    `term_protocols` as well, or have parts that do.
 
     Attributes:
         name: of its columns and of its arrays in checkpoints.
+        parts: objects that fulfil protocols of `term_protocols` for the term.
         symmetric: whether its part of the tangent is symmetric.
         linear: whether its part of the tangent depends on damage and on the rates of the scheme alone, not on u and t.
         leaves_tangent_incomplete: whether part of its tangent stays beside the matrix (low-rank update, StiffCoupling).
     """
 
     name: ClassVar[str] = ""
+    parts: Sequence[object] = ()
     symmetric: bool = True
     linear: bool = False
     leaves_tangent_incomplete: ClassVar[bool] = False

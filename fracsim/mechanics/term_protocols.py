@@ -1,14 +1,14 @@
 """Protocols of terms that do more than add forces, and the terms of a balance that fulfil them.
 
 A term of contact limits the steps of Newton's method, keeps the surface for output free of overlaps, or moves rigid
-bodies. Terms with a history are restored when a step is repeated. Each protocol is one such ability: a class of a term
-fulfils those whose methods it has. `ContactTerms` and `TermHistories` run over the terms of a balance.
+bodies. Terms with a history are restored when a step is repeated. Each protocol is one such ability: a term, or one of
+its parts, fulfils those whose methods it has. `ContactTerms` and `TermHistories` run over the terms of a balance.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
 
 import numpy as np
@@ -39,6 +39,21 @@ class SurfaceData:
     points: Values
     triangles: npt.NDArray[np.integer]
     segments: npt.NDArray[np.integer]
+
+
+@dataclass(frozen=True)
+class TermColumns:
+    """Columns of history.csv by name.
+
+    Attributes:
+        sums: summed over ranks: functions that return the part of this rank, (1,).
+        works: summed over steps and ranks: functions that return the part of this rank in the last step, J.
+        minima: functions that return a value of this rank, of which the least counts (collective).
+    """
+
+    sums: Mapping[str, Callable[[], Values]]
+    works: Mapping[str, Callable[[], float]] = field(default_factory=dict)
+    minima: Mapping[str, Callable[[], float]] = field(default_factory=dict)
 
 
 # --- what a term may be able to do ----------------------------------------------------------------------------------
@@ -179,14 +194,8 @@ class HistoryTerm(Protocol):
 class HistoryColumns(Protocol):
     """Term with columns in history.csv."""
 
-    def summed_columns(self) -> dict[str, Callable[[], Values]]:
-        """Columns that are summed over ranks: functions that return the part of this rank, (1,)."""
-
-    def minimum_columns(self) -> dict[str, Callable[[], float]]:
-        """Columns of a minimum over ranks (collective)."""
-
-    def work_columns(self) -> dict[str, Callable[[], float]]:
-        """Columns that are summed over steps: functions that return the part of this rank in the last step, J."""
+    def history_columns(self) -> TermColumns:
+        """Columns with their functions."""
 
 
 @runtime_checkable
@@ -215,6 +224,11 @@ class OutputSurfaces(Protocol):
 # --- the terms of a balance -----------------------------------------------------------------------------------------
 
 
+def fulfilling[P](terms: Iterable[Term], protocol: type[P]) -> list[P]:
+    """Parts of terms, and terms, that fulfil a protocol; parts before their term."""
+    return [part for term in terms for part in (*term.parts, term) if isinstance(part, protocol)]
+
+
 class ContactTerms:
     """Contact of a balance: the sum of contact forces, and the bounds of all terms on the steps of Newton's method.
 
@@ -225,12 +239,13 @@ class ContactTerms:
     def __init__(self, comm: MPI.Comm, terms: Iterable[Term]) -> None:
         terms = tuple(terms)
         self._comm = comm
-        self._limiters = [term for term in terms if isinstance(term, StepLimiter)]
-        self._contacts = [term for term in terms if isinstance(term, ContactTerm)]
-        self._guessing = [term for term in terms if isinstance(term, InitialGuess)]
-        self._tests = [term for term in terms if isinstance(term, FeasibilityTest)]
-        self._prescribed = [term for term in terms if isinstance(term, RestrictedMotion)]
-        self._crack_faces = [term for term in terms if isinstance(term, CrackFaceContact)]
+        self._limiters = fulfilling(terms, StepLimiter)
+        self._contacts = fulfilling(terms, ContactTerm)
+        self._guessing = fulfilling(terms, InitialGuess)
+        self._tests = fulfilling(terms, FeasibilityTest)
+        self._prescribed = fulfilling(terms, RestrictedMotion)
+        self._crack_faces = fulfilling(terms, CrackFaceContact)
+        self._limiting_terms = [term for term in terms if fulfilling([term], StepLimiter)]
         self.limits_newton_steps = bool(self._limiters)
 
     def forces(self) -> Values | None:
@@ -240,7 +255,7 @@ class ContactTerms:
 
     def is_active(self) -> bool:
         """Whether a term that limits steps has a nonzero potential at the current u (collective)."""
-        potentials = (term.potential() for term in self._limiters if isinstance(term, Term))
+        potentials = (term.potential() for term in self._limiting_terms)
         return bool(sum_over_ranks(self._comm, sum(abs(potential or 0.0) for potential in potentials))[0] > 0)
 
     def begin_solve(self) -> None:
@@ -300,29 +315,32 @@ class TermHistories:
     """History variables of all terms of a balance, by the names of the terms."""
 
     def __init__(self, terms: Iterable[Term]) -> None:
-        self._terms = {term.name: term for term in terms if isinstance(term, HistoryTerm)}
+        owners = {term.name: fulfilling([term], HistoryTerm) for term in terms}
+        self._owners = {name: parts for name, parts in owners.items() if parts}
 
     def snapshot(self) -> dict[str, object]:
         """History variables of the terms between two steps."""
-        return {name: term.snapshot() for name, term in self._terms.items()}
+        return {name: [part.snapshot() for part in parts] for name, parts in self._owners.items()}
 
     def restore(self, snapshot: object) -> None:
         """Restore the history variables of `snapshot`, together with the damage of that time (collective)."""
         assert isinstance(snapshot, dict)
-        for name, term in self._terms.items():
+        for name, parts in self._owners.items():
             if name in snapshot:
-                term.restore(snapshot[name])
+                for part, of_part in zip(parts, snapshot[name], strict=True):
+                    part.restore(of_part)
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Arrays of the terms by "term.array", whole on rank 0 (collective)."""
-        items = self._terms.items()
-        return {f"{name}.{array}": values for name, term in items for array, values in term.to_checkpoint().items()}
+        items = [(name, part) for name, parts in self._owners.items() for part in parts]
+        return {f"{name}.{array}": values for name, part in items for array, values in part.to_checkpoint().items()}
 
     def from_checkpoint(self, saved: object) -> None:
         """Restore the arrays of `to_checkpoint`, given on all ranks (collective)."""
         assert isinstance(saved, dict)
-        for name, term in self._terms.items():
+        for name, parts in self._owners.items():
             prefix = f"{name}."
             arrays = {key.removeprefix(prefix): values for key, values in saved.items() if key.startswith(prefix)}
             if arrays:
-                term.from_checkpoint(arrays)
+                for part in parts:
+                    part.from_checkpoint(arrays)

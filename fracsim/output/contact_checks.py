@@ -6,9 +6,8 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
-from mpi4py import MPI
-
 from ..contact.obstacle import RigidObstacle, find_overlaps, free_pairs
+from ..mesh.domain import Domain
 from ..timestepping.state import State
 
 if TYPE_CHECKING:
@@ -20,19 +19,11 @@ class ObstacleContact(Protocol):
 
     Attributes:
         obstacles: obstacles with their names.
-        comm: the ranks of the run.
+        barrier_width: distance below which they act, m.
     """
 
     obstacles: tuple[RigidObstacle, ...]
-    comm: MPI.Intracomm
-
-    @property
-    def mean_edge_length(self) -> float:
-        """Mean edge length of the body's mesh, m."""
-
-    @property
-    def barrier_width(self) -> float:
-        """Distance below which the contact barrier acts, m."""
+    barrier_width: float
 
     def closing_distances(self) -> list[float]:
         """Largest decrease of each obstacle's gap in the last step without contact, m, on this rank (collective)."""
@@ -47,9 +38,9 @@ class ObstacleContactMonitor:
             size of that step in s), on this rank.
     """
 
-    def __init__(self, contacts: Sequence[ObstacleContact]) -> None:
+    def __init__(self, domain: Domain, contacts: Sequence[ObstacleContact]) -> None:
         """Start without any step; `contacts` are the contact terms of the obstacles (collective)."""
-        self._contacts, self._edge = contacts, contacts[0].mean_edge_length
+        self._contacts, self._comm, self._edge = contacts, domain.comm, domain.mean_edge_length
         self._width = {obstacle.name: contact.barrier_width for contact in contacts for obstacle in contact.obstacles}
         self.least_gap = dict.fromkeys(self._width, (math.inf, 0.0))
         self.largest_closing = dict.fromkeys(self.least_gap, (0.0, 0.0, 0.0))
@@ -92,7 +83,7 @@ class ObstacleContactMonitor:
 
     def _closing_over_ranks(self) -> dict[str, tuple[float, float, float]]:
         """`largest_closing` of the rank on which it is largest (collective)."""
-        ranks: Sequence[dict[str, tuple[float, float, float]]] = self._contacts[0].comm.allgather(self.largest_closing)
+        ranks: Sequence[dict[str, tuple[float, float, float]]] = self._comm.allgather(self.largest_closing)
         return {name: max(closing[name] for closing in ranks) for name in self.largest_closing}
 
     def _missed_note(self, name: str) -> str:

@@ -16,7 +16,7 @@ from ..forms.kinematics import deformation_gradient, embed, green_strain
 from ..mechanics.balance import Balance
 from ..mechanics.jit import CellExpression
 from ..mechanics.stress import Stress
-from ..mechanics.term_protocols import OutputSurfaces, SurfaceSeparator
+from ..mechanics.term_protocols import OutputSurfaces, SurfaceSeparator, fulfilling
 from ..mesh.midside_nodes import mesh_of_nodes
 from ..timestepping.state import State
 from .atomic_write import write_on_root
@@ -229,6 +229,6 @@ def _surface_output(
     density, terms = balance.stress.material.density * thickness, balance.terms
     return SurfaceOutput(
         folder, balance.domain, density, breaks.record, passing=passing, resume_at=resume_at, smooth=smooth,
-        apart=[term.separate_surface for term in terms if isinstance(term, SurfaceSeparator)],
-        beside=[term for term in terms if isinstance(term, OutputSurfaces)],
+        apart=[part.separate_surface for part in fulfilling(terms, SurfaceSeparator)],
+        beside=fulfilling(terms, OutputSurfaces),
     )  # fmt: skip

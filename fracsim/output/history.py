@@ -17,7 +17,7 @@ from mpi4py import MPI
 
 from ..errors import InputError
 from ..mechanics.balance import Balance
-from ..mechanics.term_protocols import HistoryColumns
+from ..mechanics.term_protocols import HistoryColumns, fulfilling
 from ..mechanics.time_functions import TimeFunction
 from ..mesh.domain import Ints
 from ..mesh.parallel import sum_over_ranks
@@ -85,10 +85,11 @@ class ProbeReader:
         term_readings: dict[str, VectorReading] = {}
         works: dict[str, ScalarReading] = {}
         minima: dict[str, ScalarReading] = {}
-        for term in (term for term in balance.terms if isinstance(term, HistoryColumns)):
-            term_readings |= term.summed_columns()
-            works |= term.work_columns()
-            minima |= term.minimum_columns()
+        for owner in fulfilling(balance.terms, HistoryColumns):
+            columns = owner.history_columns()
+            term_readings |= columns.sums
+            works |= columns.works
+            minima |= columns.minima
         probed = {f"{PROBE_PREFIXES[probe.quantity]}_{probe.name}": self._probe_reading(probe) for probe in probes}
         loaded = [probe for probe in probes if probe.quantity == "reaction"]
         moved = {f"motion_{probe.name}": self._mean_displacement(probe) for probe in loaded}

@@ -112,7 +112,7 @@ def build_obstacle_terms(
         shapes = [obstacles[number] for number in analytic]
         mutual = any(obstacle.free for obstacle in shapes)
         terms = [build_inactive_at_rest(domain, shapes, law, make, mutual=mutual)]
-    motion = terms[0].bodies if terms else _build_motion(domain, obstacles, scheme, law, mesh_stiffness, limit)
+    motion = terms[0].group.bodies if terms else _build_motion(domain, obstacles, scheme, law, mesh_stiffness, limit)
     if meshes:
         terms.append(_build_mesh_obstacle_term(study, domain, u, motion, meshes, law, stress, mass, scheme))
     for term in terms:
@@ -137,7 +137,8 @@ def _build_motion(
         return RigidObstacles(domain, obstacles)
     from ..contact.obstacle import check_free_obstacles
     from ..contact.obstacle_pairs import AllPairs, ObstaclePairs, PairContact
-    from ..contact.rigid_obstacles import FreeRigidObstacles, VerletRigidObstacles
+    from ..contact.rigid_obstacles import VerletRigidObstacles
+    from ..contact.rigid_pose import FreeRigidObstacles
     from ..contact.supporting_obstacles import pair_obstacles
     from ..contact.triangle_mesh_shape import TriangleMeshShape
 

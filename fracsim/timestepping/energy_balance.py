@@ -14,7 +14,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ..mechanics.balance import Balance
-from ..mechanics.term_protocols import SurfaceSeparator
+from ..mechanics.term_protocols import SurfaceSeparator, fulfilling
 from ..mesh.parallel import sum_over_ranks
 from .state import State
 
@@ -158,7 +158,7 @@ def released_state(
         # K is that before the breaks. With K after them, or with M^-1 f, slivers and cells that are attached by one
         # edge begin to vibrate: the error of the energy balance was twice the energy where it is 1 % now.
         current = balance.stress.exchange_damage(previous_damage)
-        if any(isinstance(term, SurfaceSeparator) for term in balance.terms):
+        if fulfilling(balance.terms, SurfaceSeparator):
             # New crack faces are apart at the end of the step, and may not be where its forces balance.
             balance.set_displacement(end.u)
         # The response leaves contact out: contact forces are not part of the acceleration that is carried on

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from fracsim.fracture.edge_history import EdgeHistory
-from fracsim.mechanics.term_protocols import SurfaceSeparator
+from fracsim.mechanics.term_protocols import SurfaceSeparator, fulfilling
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.write import write_mesh
 from fracsim.output.surface.body_surface import BodySurface
@@ -402,7 +402,7 @@ class DrawnSurfaces:
         self._scene = scene
         assert scene.domain.input_mesh is not None
         self._body = BodySurface(scene.domain.input_mesh, 1.0)
-        terms = [term for term in scene.balance.terms if isinstance(term, SurfaceSeparator)]
+        terms = fulfilling(scene.balance.terms, SurfaceSeparator)
         self._corrections = [term.separate_surface for term in terms]
 
     def at(self, state: Walk) -> tuple[Values, Ints]:
