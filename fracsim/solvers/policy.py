@@ -131,8 +131,8 @@ class SolverPolicy:
     # Edges that broke for each node of the body, after which operators are refreshed; beside the V cycle it is set up
     # again if its iterations have grown as well.
     refresh_edges: float = 0.02
-    # Edges that broke for each node of the body, after which the V cycle is set up again as well: where all cells
-    # are split its old levels take three times the time of a step.
+    # Edges that broke for each node of the body, after which the V cycle is refreshed as well: where all cells are
+    # split its old levels take three times the time of a step.
     many_edges: float = 0.5
     # Iterations that a refresh costs.
     refresh_cost: int = 10
