@@ -39,7 +39,7 @@ WORK_PREFIX = "work_"
 PROBE_PREFIXES = {"reaction": "reaction", "displacement": "probe"}
 # Columns, and prefixes of columns, that are per metre of thickness in 2D before they are written.
 THICKNESS_PREFIXES = (
-    "kinetic", "elastic", "dissipated", "external_work", "reaction_", "contact_", WORK_PREFIX, "kinetic_",
+    "kinetic", "elastic", "dissipated", "external_work", "reaction_", "onset_", "contact_", WORK_PREFIX, "kinetic_",
 )  # fmt: skip
 # ranges of missing rows listed in a note
 _MAX_NAMED_GAPS = 5
@@ -70,7 +70,7 @@ class ProbeReader:
 
     def __init__(
         self, balance: Balance, probes: Sequence[ProbeGroup] = (), *, motions: dict[str, TimeFunction] | None = None,
-        thickness: float = 1.0,
+        onset_reactions: Callable[[], npt.NDArray[np.float64] | None] | None = None, thickness: float = 1.0,
     ) -> None:  # fmt: skip
         """Count the nodes of each probe (collective).
 
@@ -78,6 +78,8 @@ class ProbeReader:
             balance: balance of forces; its terms have readings as well.
             probes: groups of nodes.
             motions: prescribed displacement (d,) in m of each driven obstacle, by name.
+            onset_reactions: (owned dofs,) reactions before edges broke in the step, N, or None before the first step;
+                None: they are not recorded.
             thickness: thickness of a 2D body, m; 1 in 3D.
         """
         self._balance, self._domain = balance, balance.domain
@@ -92,6 +94,8 @@ class ProbeReader:
             minima |= columns.minima
         probed = {f"{PROBE_PREFIXES[probe.quantity]}_{probe.name}": self._probe_reading(probe) for probe in probes}
         loaded = [probe for probe in probes if probe.quantity == "reaction"]
+        if onset_reactions is not None:
+            probed |= {f"onset_{probe.name}": self._reaction(probe, onset_reactions) for probe in loaded}
         moved = {f"motion_{probe.name}": self._mean_displacement(probe) for probe in loaded}
         moved |= {f"motion_{name}": partial(self._obstacle_motion, motion) for name, motion in (motions or {}).items()}
         self.columns = [f"{name}_{axis}" for name in probed for axis in axes] + [*term_readings]
@@ -120,8 +124,17 @@ class ProbeReader:
         """Function that returns this rank's share (d,) of a probe's displacement or reaction (collective)."""
         if probe.quantity == "displacement":
             return self._mean_displacement(probe)
-        owned = self._owned_nodes(probe)
-        return lambda: self._balance.reactions.reshape(-1, self._domain.dim)[owned].sum(axis=0)
+        return self._reaction(probe, lambda: self._balance.reactions)
+
+    def _reaction(self, probe: ProbeGroup, reactions: Callable[[], npt.NDArray[np.float64] | None]) -> VectorReading:
+        """Function that returns this rank's share (d,) of the sum of `reactions` (owned dofs,), N, on a probe."""
+        owned, d = self._owned_nodes(probe), self._domain.dim
+
+        def read() -> npt.NDArray[np.float64]:
+            forces = reactions()
+            return np.zeros(d) if forces is None else forces.reshape(-1, d)[owned].sum(axis=0)
+
+        return read
 
     def _mean_displacement(self, probe: ProbeGroup) -> VectorReading:
         """Function that returns this rank's share (d,) of a probe's mean displacement (collective)."""
@@ -149,7 +162,7 @@ class History:
     Attributes:
         comm: the ranks of the run.
         columns: names of the columns.
-        reaction_peaks: largest absolute value of each reaction so far, N.
+        reaction_peaks: largest absolute value of each reaction so far, also before edges broke in a step, N.
         obstacle_work: sum of the work of each obstacle so far, J.
         last_step: step of the last row.
         notes: sentences about rows that a restart did not find (rank 0).
@@ -212,7 +225,9 @@ class History:
     def append_row(self, values: Sequence[int | float]) -> None:
         """Append a row of values in the order of `columns`. Raises CannotWrite (collective)."""
         row = dict(zip(self.columns, values, strict=True))
-        self.reaction_peaks = {name: max(peak, abs(float(row[name]))) for name, peak in self.reaction_peaks.items()}
+        for name, peak in self.reaction_peaks.items():
+            onset = row.get(name.replace("reaction_", "onset_", 1), 0.0)
+            self.reaction_peaks[name] = max(peak, abs(float(row[name])), abs(float(onset)))
         self.obstacle_work = {name: done + float(row[name]) for name, done in self.obstacle_work.items()}
         row |= self.obstacle_work
         line = _csv_line([str(value) if isinstance(value, int) else f"{value:.12g}" for value in row.values()])

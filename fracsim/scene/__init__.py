@@ -145,7 +145,11 @@ def build_scene_on(
     stepper = make_stepper(balance, study.time, flow, breaks, solver, frames)
     placements = obstacle_placements(study, domain.dim)
     motions = {obstacle.name: obstacle.displacement for obstacle in placements if obstacle.displacement is not None}
-    probes = ProbeReader(balance, _probes(study, domain), motions=motions, thickness=study.thickness)
+    solves_again = breaking is not None and not scheme.inertia
+    probes = ProbeReader(
+        balance, _probes(study, domain), motions=motions, thickness=study.thickness,
+        onset_reactions=(lambda: stepper.onset_reactions) if solves_again else None,
+    )  # fmt: skip
     return Scene(study, domain, balance, solver, stepper, breaking, probes)
 
 

@@ -91,6 +91,8 @@ class QuasiStaticStepper(ImplicitStepper):
         broken, released, limit = 0, 0.0, self.inelastic.max_passes
         for number in range(limit):
             self.balance.accept_step()
+            if number == 0:
+                self.onset_reactions = self.balance.reactions.copy()
             path.continue_to(self._solution(), *balanced_forces(self.balance, lumped=False))
             flow_loss = self._flow()
             result = self._fracture_pass(path, dt)

@@ -95,9 +95,12 @@ class Stepper(Protocol):
 
     Attributes:
         failures: numbers of failures on this rank.
+        onset_reactions: (owned dofs,) reactions in the first equilibrium of the last step, before edges broke, N; None:
+            no step has been solved again after edges broke.
     """
 
     failures: FailureCounts
+    onset_reactions: Values | None
 
     @property
     def phases(self) -> dict[str, float]:
@@ -139,6 +142,8 @@ class BalanceStepper:
         inelastic: plastic flow, fracture and history variables.
         failures: numbers of failures.
     """
+
+    onset_reactions: Values | None = None
 
     def __init__(
         self,

@@ -86,13 +86,15 @@ def measure_specimen(run: Path, specimen: slit_specimens.Specimen) -> Record:
     area, centres = crack_faces(run)
     stray = np.abs(centres[:, specimen.axis] - specimen.plane)
     load = np.abs(rows[f"reaction_load_{specimen.pull}"])
+    # A crack that advances in a step lowers its load: the peak is that before.
+    onset = np.abs(rows.get(f"onset_load_{specimen.pull}", load))
     return {
-        "peak_load": float(load.max()),
-        "at": float(rows["time"][load.argmax()] * abs(specimen.travel)),
+        "peak_load": float(onset.max()),
+        "at": float(rows["time"][onset.argmax()] * abs(specimen.travel)),
         "broken_area": float(area.sum() / 2),
         "dissipated": float(rows["dissipated"][-1]),
         "stray": float(stray @ area / area.sum()) if area.sum() else 0.0,
-        "left": float(load[-1] / load.max()),
+        "left": float(load[-1] / onset.max()),
         "broken_edges": float(rows["broken_edges"][-1]),
         "path": crack_path(centres[:, 1 - specimen.axis], centres[:, specimen.axis] - specimen.plane),
     }

@@ -141,7 +141,7 @@ def _run_fracsim(n: int, pull: GripMotion) -> dict[str, float]:
 
     with tempfile.TemporaryDirectory() as folder:
         run = Run(build_scene(MPI.COMM_WORLD, validate(plate_study(n, pull), "notched plate")), Path(folder, "ours"))
-        column, began = run.scene.probes.columns.index(f"reaction_grip_{'xy'[pull.axis]}"), time.process_time()
+        column, began = run.scene.probes.columns.index(f"onset_grip_{'xy'[pull.axis]}"), time.process_time()
         load, solves = [], 0
         for _ in range(pull.steps):
             solves += run.step().solve.newton_iterations
