@@ -41,8 +41,8 @@ def falling(obstacle: dict[str, Any], velocity: list[float], end: float, **table
 
 def deepest(term: PenaltyMeshContact) -> float:
     """How deep points of the body lie in the obstacle, or its points in the body: by trimesh, m."""
-    x, surface = term._end_positions(), term._surface
-    assert x is not None and surface is not None
+    x, surface = term._end_positions(), term.surface.current
+    assert x is not None
     mesh = surface.pairs.pairs[0].mesh
     body = trimesh.Trimesh(x, surface.split.elements, process=False)
     obstacle = trimesh.Trimesh(mesh.positions, mesh.triangles, process=False)
@@ -64,8 +64,7 @@ def test_a_point_over_a_facet_and_a_facet_over_a_point(tmp_path: Path) -> None:
         contact={"itself": False, "distance": 0.005},
     )
     term = term_of(scene)
-    surface = term._surface
-    assert surface is not None
+    surface = term.surface.current
     x, pairs = surface.split.points.copy(), surface.pairs.pairs[0]
     lowest = np.flatnonzero(x[:, 2] == x[:, 2].min())
     x[lowest, 2] -= 0.007  # 0.003 apart, of 0.005

@@ -28,8 +28,7 @@ Values = npt.NDArray[np.float64]
 
 def contact_of(scene: Scene) -> tuple[PenaltyContact, PenaltySurface]:
     (found,) = [term for term in scene.balance.terms if isinstance(term, PenaltyContact)]
-    assert found._surface is not None
-    return found, found._surface
+    return found, found.surface.current
 
 
 def pushed(dim: int) -> tuple[PenaltyPairs, Values]:
@@ -196,7 +195,7 @@ def test_nothing_is_looked_for_where_nothing_is_near(tmp_path: Path, monkeypatch
             time={"scheme": "explicit", "step": 0.02, "end": 0.6},
         )  # fmt: skip
         contact, _ = contact_of(scene)
-        X, gathered, m = positions(scene), contact._gathered, scene.balance.mass.lumped.reshape(-1, 2)
+        X, gathered, m = positions(scene), contact.surface.nodal_values, scene.balance.mass.lumped.reshape(-1, 2)
         v = np.zeros_like(X)
         v[X[:, 0] < 1.01, 0] = 0.2
         state.v = v.reshape(-1)
@@ -207,7 +206,7 @@ def test_nothing_is_looked_for_where_nothing_is_near(tmp_path: Path, monkeypatch
             count[0] += 1
             return gathered(u)
 
-        monkeypatch.setattr(contact, "_gathered", counted)
+        monkeypatch.setattr(contact.surface, "nodal_values", counted)
         march(scene, state, 10)
         looks.append(count[0])
         march(scene, state)

@@ -57,7 +57,7 @@ def test_two_bodies_collide(tmp_path: Path, dim: int, scheme: str, order: int) -
     for report in each_step(scene, state):
         assert report.kinetic + report.elastic < 0.5 * before[0] * (1 + 1e-6)
         x = contact._end_positions()
-        assert len(contact._surface.pairs.intersections(x)) == 0
+        assert len(contact.surface.current.pairs.intersections(x)) == 0
         touched += contact.stored_energy() > 0
         after = (m * state.v.reshape(-1, dim)).sum(axis=0)
         np.testing.assert_allclose(after, before, atol=1e-5 * np.abs(before).max())
@@ -77,7 +77,7 @@ def test_a_block_meets_one_that_is_held(tmp_path: Path) -> None:
     m, before, impulse = scene.balance.mass.lumped[::2], state.v[::2].copy(), 0.0
     (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
     for report in each_step(scene, state):
-        assert len(contact._surface.pairs.intersections(contact._end_positions())) == 0
+        assert len(contact.surface.current.pairs.intersections(contact._end_positions())) == 0
         assert (positions(scene) + state.u.reshape(-1, 2))[:, 0].max() > 1.8
         impulse += report.dt * scene.probes()[0]
     right = positions(scene)[:, 0] > 1.01
@@ -124,17 +124,17 @@ def test_contact_that_is_too_soft_is_made_stiffer(tmp_path: Path) -> None:
         (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
         reports = march(scene, state)
         assert len(reports) == 10
-        gaps.append(contact.min_gap() / contact.law.distance)
+        gaps.append(contact.min_gap() / contact.surface.law.distance)
         its.append([report.solve.newton_iterations for report in reports])
         forces.append(scene.probes()[0])
     assert min(gaps) > BARRIER.tight_gap
     assert sum(its[1][5:]) <= sum(its[0][5:]) + 5
     assert forces[1] == pytest.approx(forces[0], rel=0.05)  # the gap itself is 3 % of the way
-    assert contact.law.stiffness > 100 * 3e-3
+    assert contact.surface.law.stiffness > 100 * 3e-3
     again, _ = make_scene(mesh={"file": two_blocks(tmp_path, 2, 0.05)}, material=SOFT, contact={"stiffness": 3e-3})
     (other,) = [term for term in again.balance.terms if isinstance(term, SelfContact)]
-    other.from_checkpoint(contact.to_checkpoint())
-    assert other.law.stiffness == pytest.approx(contact.law.stiffness)
+    other.surface.from_checkpoint(contact.surface.to_checkpoint())
+    assert other.surface.law.stiffness == pytest.approx(contact.surface.law.stiffness)
 
 
 def test_what_stiffer_contact_stores_is_known(tmp_path: Path) -> None:
@@ -145,11 +145,11 @@ def test_what_stiffer_contact_stores_is_known(tmp_path: Path) -> None:
     for gap, stiffer in ((0.01, False), (2e-5, True)):
         u = np.where(X[:, :1] > 1.01, [[gap - 0.05, 0.0]], 0.0).reshape(-1)
         scene.balance.evaluate_at(0.0, u, 0 * u, dt=1e-3)
-        before, stiffness = contact.stored_energy(), contact.law.stiffness
+        before, stiffness = contact.stored_energy(), contact.surface.law.stiffness
         gained = contact.stiffen_contact()
         scene.balance.evaluate_at(0.0, u, 0 * u, dt=1e-3)
         assert contact.stored_energy() - before == pytest.approx(gained, abs=1e-9 * before)
-        assert (contact.law.stiffness > 2 * stiffness) == stiffer == (gained > 0)
+        assert (contact.surface.law.stiffness > 2 * stiffness) == stiffer == (gained > 0)
 
 
 def test_bodies_that_touch_at_the_start_are_refused(tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ def test_walls_thinner_than_the_barrier_do_not_push(dim: int, tmp_path: Path) ->
     thin = {"mesh": {"file": two_blocks(tmp_path, dim, 0.004)}, "material": SOFT}
     scene, _ = make_scene(**thin, contact={})
     (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
-    assert contact.stored_energy() == 0 and contact.law.distance == pytest.approx(0.002)
+    assert contact.stored_energy() == 0 and contact.surface.law.distance == pytest.approx(0.002)
     with pytest.raises(InputError, match=r"lies between parts of the body at rest, 0[.]004 m; give at most 0[.]002"):
         make_scene(**thin, contact={"distance": 0.01})
 
@@ -203,6 +203,5 @@ def test_a_hammer_goes_on_through_crumbs() -> None:
     for _ in each_step(scene, state):
         hammer = at + state.t * velocity
         assert np.linalg.norm(positions(scene) + state.u.reshape(-1, 2) - hammer, axis=1).min() > 0.15
-    assert contact._surface is not None
-    assert len(contact._surface.pairs.intersections(contact._end_positions())) == 0
+    assert len(contact.surface.current.pairs.intersections(contact._end_positions())) == 0
     assert scene.fracture.graph.broken_count > 10

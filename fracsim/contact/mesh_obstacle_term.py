@@ -11,19 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
-from ..mechanics.extra_couplings import StiffCoupling
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
 from ..mesh.parallel import sum_over_ranks
+from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .ipc_pairs import IpcPairs, max_length
 from .ipc_surface import SelfContactLaw, SelfContactSurface
@@ -40,7 +39,7 @@ from .obstacle import RigidObstacle
 from .pose import Pose
 from .pose_derivatives import PoseDerivatives, point_jacobian, point_set_derivatives, sum_of_derivatives
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
-from .self_contact import SelfContact
+from .self_contact import Pattern, SelfContact, mean_velocities
 from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
 
 Values = npt.NDArray[np.float64]
@@ -70,18 +69,17 @@ GUESS = MeshGuessPolicy()
 
 
 def stop_before_meshes(
-    surface: MeshContactSurface, pairs: AllMeshPairs[IpcPairs], start: Values, end: Values, start_poses: Sequence[Pose]
+    point_map: SurfaceMap, pairs: AllMeshPairs[IpcPairs], start: Values, end: Values, start_poses: Sequence[Pose]
 ) -> Values:
     """First guess with points stopped where they would cross an obstacle; the same array where none would.
 
     Args:
-        surface: of the body.
+        point_map: map from nodes to the points of the body's surface.
         pairs: of obstacles, which are at the end of their motion.
         start: (nodes, 3) displacements at the start, m.
         end: (nodes, 3) first guess of displacements at the end, m.
         start_poses: of the obstacles at the start.
     """
-    point_map = surface.point_map
     x = point_map(start)
     for _ in range(GUESS.max_rounds):
         x_end = point_map(end)
@@ -134,11 +132,9 @@ class MeshObstacleTerm(SelfContact):
         obstacles: these.
         numbers: their numbers in the study.
         barrier_width: gap from which on contact acts, m.
-        law: contact law, except for the coefficient of friction, which is that of each obstacle.
     """
 
     name = "solids"
-    _surface: MeshContactSurface
     _friction: MeshFriction | None
 
     def __init__(
@@ -157,7 +153,7 @@ class MeshObstacleTerm(SelfContact):
             InputError: if an obstacle overlaps the body at rest.
         """
         self.group, edge = ObstacleGroup(bodies, numbers, self._gap, self._current_force), domain.mean_edge_length
-        self.numbers, self.obstacles, self.parts = self.group.numbers, self.group.obstacles, (self.group,)
+        self.numbers, self.obstacles = self.group.numbers, self.group.obstacles
         self.barrier_width = law.distance
         # the tangent by points and poses has a positive semi-definite form alone
         self.allows_exact_tangent = not any(obstacle.free for obstacle in self.obstacles)
@@ -169,26 +165,30 @@ class MeshObstacleTerm(SelfContact):
         self._far: bool | None = None  # at the current u; None: not known yet
         self._place_meshes(self.group.poses)
         super().__init__(domain, u, law)
+        self.parts = (self.surface, self.group)
 
     # --- surface and obstacles ---
 
     def _build_surface(
-        self, pattern: npt.NDArray[np.uint8], u: Values, previous: SelfContactSurface | None, cut: Values | None
+        self,
+        skeleton: EntityNumbering,
+        pattern: Pattern,
+        law: SelfContactLaw,
+        u: Values,
+        previous: SelfContactSurface | None,
+        cut: Values | None,
     ) -> SelfContactSurface:
-        return MeshContactSurface(self._skeleton, pattern, self._meshes, self.law, u, previous, self.comm)
+        return MeshContactSurface(skeleton, pattern, self._meshes, law, u, previous, self.comm)
 
-    def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
-        """Retract points of a surface for output as those of contact are."""
-        return at.with_arm_share(np.minimum(self._surface.point_map.share, at.share))
+    @property
+    def _pairs(self) -> AllMeshPairs[IpcPairs]:
+        """Pairs of the surface and the obstacles."""
+        return cast("AllMeshPairs[IpcPairs]", self.surface.current.pairs)
 
     def _place_meshes(self, poses: Sequence[Pose]) -> None:
         """Move the meshes to poses."""
         for mesh, pose in zip(self._meshes, poses, strict=True):
             mesh.move_to(pose)
-
-    def _step_poses(self) -> list[tuple[Pose, Pose]]:
-        """Poses of each obstacle at the start of the step, and now."""
-        return list(zip(self.group.start_poses, self.group.poses, strict=True))
 
     def poses_moved(self) -> None:
         """Move the meshes to the poses of the obstacles, and discard forces."""
@@ -199,35 +199,13 @@ class MeshObstacleTerm(SelfContact):
         """Whether nothing can be in contact at the current u, nor could at the start of the step (collective)."""
         if self._far is None:
             end = self._level.displacement_at_end(self._u.x.array[: self._owned])
-            self._far = not self._started_near and self._proximity.is_far([self._level.u_n, end], self._step_poses())
+            self._far = not self._started_near and self._proximity.is_far([self._level.u_n, end], self.group.step_poses)
         return self._far
 
     def update_displacement(self) -> None:
         """Discard positions and forces, as u has changed."""
         super().update_displacement()
         self._far = None
-
-    # --- forces, tangent and energy: nothing is gathered where obstacles are far ---
-
-    def contact_forces(self) -> Values | None:
-        """(owned dofs,) contact forces at the end of the step, N; None: nothing is near (collective)."""
-        return None if self._is_far() else super().contact_forces()
-
-    def coupling_matrix(self) -> PETSc.Mat | StiffCoupling | None:
-        """Minus the derivative of the forces; as of SelfContact (collective)."""
-        return None if self._is_far() else super().coupling_matrix()
-
-    def stored_energy(self) -> float:
-        """Energy of the barrier at the current u, of this rank's pairs, J (collective)."""
-        return 0.0 if self._is_far() else super().stored_energy()
-
-    def stiffen_contact(self) -> float:
-        """Make a barrier stiffer whose gaps have nearly closed; as of SelfContact (collective)."""
-        return 0.0 if self._is_far() else super().stiffen_contact()
-
-    def potential(self) -> float:
-        """Potential of barrier and friction as they enter the residual, of this rank's pairs, J (collective)."""
-        return 0.0 if self._is_far() else super().potential()
 
     # --- steps ---
 
@@ -240,43 +218,43 @@ class MeshObstacleTerm(SelfContact):
             return  # evaluation of a step's result: friction and motions are still those of the step
         self._end, self._dt, self._start_velocity = end, level.dt, level.v_n
         self._friction = self._tangent_positions = None
-        self._started_near = not self._proximity.is_far([level.u_n], self._step_poses())
+        self._started_near = not self._proximity.is_far([level.u_n], self.group.step_poses)
         self._start_positions = None
         zero: Values = np.zeros((1, 3))
         self._start_gradients = [zero for _ in self.obstacles]
         if level.dt and self._started_near:
-            nodal, sticking_speed = self._all_nodes(level.u_n), self._sticking_speed(level.v_n)
+            nodal, slip, surface = (
+                self.surface.nodal_values(level.u_n),
+                self._sticking_slip(level),
+                self.surface.current,
+            )
             self._place_meshes(self.group.start_poses)
-            self._begin_near(self._surface, nodal, sticking_speed * level.dt)
+            surface.extend_faces(nodal)
+            self._start_positions = x = surface.point_map(nodal)
+            self._start_gradients = [pairs.full_gradient(x)[len(x) :] for pairs in self._pairs.pairs]
+            if any(mesh.friction for mesh in self._meshes):
+                self._friction = self._pairs.lag_friction(x, x, slip)
         self._place_meshes(self.group.poses)
 
     def _speed(self, v: Values) -> float:
         """Largest root mean square of the nodes' speeds relative to an obstacle, m/s (collective)."""
-        square, mean = self._mean_velocities(v)
+        square, mean = mean_velocities(self.comm, v.reshape(-1, self._domain.dim))
         centres = [pose.centre[None] for pose in self.group.start_poses]
         placed = zip(self.numbers, centres, strict=True)
         velocities = [self.group.bodies.velocity(number, centre).reshape(-1) for number, centre in placed]
         return float(np.sqrt(max(0.0, *(float(square - 2 * mean @ V + V @ V) for V in velocities))))
-
-    def _begin_near(self, surface: MeshContactSurface, nodal: Values, slip: float) -> None:
-        """Begin a step near obstacles at displacements (nodes, 3), m; `slip`: that counts as sticking, m."""
-        surface.extend_faces(nodal)
-        self._start_positions = x = surface.point_map(nodal)
-        self._start_gradients = [pairs.full_gradient(x)[len(x) :] for pairs in surface.pairs.pairs]
-        if any(mesh.friction for mesh in self._meshes):
-            self._friction = surface.pairs.lag_friction(x, x, slip)
 
     def accept_step(self) -> None:
         """Record forces and work of contact in the step (collective)."""
         forces: list[Values] = [np.zeros(3) for _ in self.obstacles]
         self.group.friction_loss, self.group.work, self.group.forces = 0.0, [0.0] * len(forces), forces
         if not self._is_far():
-            self._record_work(self._end_positions(), self._surface, forces)
+            self._record_work(self._end_positions(), forces)
 
-    def _record_work(self, x: Values, surface: MeshContactSurface, forces: list[Values]) -> None:
+    def _record_work(self, x: Values, forces: list[Values]) -> None:
         """Record work of this rank's pairs with the body at x (n, 3), m, and add forces on obstacles to `forces`, N."""
         end_weight, start_gradients, n = self._level.contact_weights.end_work_share, self._start_gradients, len(x)
-        for number, (pairs, start_pose) in enumerate(zip(surface.pairs.pairs, self.group.start_poses, strict=True)):
+        for number, (pairs, start_pose) in enumerate(zip(self._pairs.pairs, self.group.start_poses, strict=True)):
             # of the obstacle on the body, at the points of the obstacle
             gradient, friction_work = pairs.full_gradient(x)[n:], 0.0
             forces[number] -= gradient.sum(axis=0)
@@ -288,10 +266,6 @@ class MeshObstacleTerm(SelfContact):
                 forces[number] -= friction[n:].sum(axis=0)
             mean_gradient = end_weight * gradient + (1 - end_weight) * start_gradients[number]
             self.group.work[number] = float(np.vdot(mean_gradient, motion)) + friction_work
-
-    def step_work(self) -> tuple[float, float]:
-        """Work of prescribed obstacles in the step, and dissipation by friction, of this rank's pairs, J."""
-        return self.group.step_work()
 
     def damping_forces(self) -> None:
         """Return None: dissipation is summed step by step (`step_work`)."""
@@ -315,12 +289,11 @@ class MeshObstacleTerm(SelfContact):
                 poses[index] = poses[index][0], poses[index][0].incremented(increments[number])
         if self._proximity.is_far([u] if change is None else [u, u + change], poses):
             return 1.0
-        surface, x = self._surface, self._positions_at(u)
-        assert surface is not None and x is not None
-        end = x if change is None else x + surface.point_map.weights @ self._all_nodes(change)
+        x = self.surface.positions(u)
+        end = x if change is None else x + self.surface.current.point_map.weights @ self.surface.nodal_values(change)
         starts, ends = zip(*poses, strict=True)
         self._place_meshes(ends)
-        fraction = surface.pairs.moving_free_fraction(x, end, starts)
+        fraction = self._pairs.moving_free_fraction(x, end, starts)
         self._place_meshes(starts)
         return fraction
 
@@ -329,29 +302,26 @@ class MeshObstacleTerm(SelfContact):
         level = self._level
         if not level.dt:
             return u
-        if self._proximity.is_far([level.u_n, level.displacement_at_end(u)], self._step_poses()):
+        if self._proximity.is_far([level.u_n, level.displacement_at_end(u)], self.group.step_poses):
             return u
-        start, end = self._all_nodes(level.u_n), self._all_nodes(level.displacement_at_end(u))
-        if (guess := self._first_guess(self._surface, start, end)) is end:
-            return u
-        change: Values = self._gather.owned(guess - end).reshape(-1)
-        if self.law.corners_only:
-            change = with_straight_edges(self._domain, change)
-        return np.asarray(u + level.fraction * change)
-
-    def _first_guess(self, surface: MeshContactSurface, start: Values, end: Values) -> Values:
-        """(nodes, 3) displacements that the body reaches on its way from `start` to `end`, m (collective)."""
+        start, end = (self.surface.nodal_values(nodal) for nodal in (level.u_n, level.displacement_at_end(u)))
         prescribed = [index for index, obstacle in enumerate(self.obstacles) if not obstacle.free]
         start_poses = [self.group.start_poses[index] for index in prescribed]
-        return stop_before_meshes(surface, surface.pairs.select(prescribed), start, end, start_poses)
+        point_map, pairs = self.surface.current.point_map, self._pairs.select(prescribed)
+        if (guess := stop_before_meshes(point_map, pairs, start, end, start_poses)) is end:
+            return u
+        change: Values = self.surface.gather.owned(guess - end).reshape(-1)
+        if self.surface.law.corners_only:
+            change = with_straight_edges(self._domain, change)
+        return np.asarray(u + level.fraction * change)
 
     def is_feasible(self, u: Values) -> bool:
         """Whether nothing is crossed on the straight way from the start to u (collective)."""
         u_n, u_end = self._level.u_n, self._level.displacement_at_end(u)
-        if self._proximity.is_far([u_n, u_end], self._step_poses()):
+        if self._proximity.is_far([u_n, u_end], self.group.step_poses):
             return True
-        start, end = self._positions_at(u_n), self._positions_at(u_end)
-        return self._surface.pairs.moving_free_fraction(start, end, self.group.start_poses) == 1
+        start, end = self.surface.positions(u_n), self.surface.positions(u_end)
+        return self._pairs.moving_free_fraction(start, end, self.group.start_poses) == 1
 
     # --- contact of the body, as the obstacles see it (rigid_obstacles.ObstacleContactTerm) ---
 
@@ -377,23 +347,20 @@ class MeshObstacleTerm(SelfContact):
         poses[index] = start, start.incremented(q)
         if self._proximity.is_far([level.u_n, u_end], poses):
             return 1.0
-        x, end = self._positions_at(level.u_n), self._positions_at(u_end)
-
-        pairs = self._surface.pairs.pairs[index]
+        x, end = self.surface.positions(level.u_n), self.surface.positions(u_end)
+        pairs = self._pairs.pairs[index]
         pairs.mesh.move_to(poses[index][1])
         fraction = pairs.moving_free_fraction(x, end, start)
         pairs.mesh.move_to(self.group.poses[index])
         return fraction
 
-    def wrenches(self, numbers: Sequence[int]) -> dict[int, Values]:
-        """(p,) force and moment of the body on obstacles, N and N m (collective)."""
-        return {
-            number: -derivatives.gradient for number, derivatives in self.pose_derivatives(numbers, exact=False).items()
-        }
+    def wrenches(self) -> dict[int, Values]:
+        """(p,) force and moment of the body on free obstacles, N and N m (collective)."""
+        return {number: -derivatives.gradient for number, derivatives in self.pose_derivatives(exact=False).items()}
 
-    def pose_derivatives(self, numbers: Sequence[int], *, exact: bool) -> dict[int, PoseDerivatives]:
-        """Energy and derivatives by the poses of obstacles (collective)."""
-        none = PoseDerivatives(0.0, np.zeros(6), np.zeros((6, 6)))
+    def pose_derivatives(self, *, exact: bool) -> dict[int, PoseDerivatives]:
+        """Energy and derivatives by the poses of free obstacles (collective)."""
+        numbers, none = self.group.free, PoseDerivatives(0.0, np.zeros(6), np.zeros((6, 6)))
         if not numbers or self._is_far():
             return dict.fromkeys(numbers, none)
         x = self._end_positions()
@@ -402,7 +369,7 @@ class MeshObstacleTerm(SelfContact):
 
     def _own_derivatives(self, number: int, x: Values, *, exact: bool) -> PoseDerivatives | None:
         """Derivatives by the pose of an obstacle of this rank's pairs, the body at x (n, 3), m; None: it is far."""
-        pairs, n = self._surface.pairs.pairs[self.numbers.index(number)], len(x)
+        pairs, n = self._pairs.pairs[self.numbers.index(number)], len(x)
         if pairs.is_far(x):
             return None
         points, mesh = pairs.with_mesh(x), slice(3 * n, None)
@@ -414,19 +381,20 @@ class MeshObstacleTerm(SelfContact):
         arms = pairs.mesh.positions - pairs.mesh.pose.centre
         return point_set_derivatives(energy, gradient[n:], H[mesh, mesh], arms, exact=exact)
 
-    def mixed_hessians(self, numbers: Sequence[int]) -> dict[int, Values]:
-        """(owned dofs, p) second derivatives by nodes and the poses of obstacles in contact (collective)."""
+    def mixed_hessians(self) -> dict[int, Values]:
+        """(owned dofs, p) second derivatives by nodes and the poses of free obstacles in contact (collective)."""
+        numbers = self.group.free
         if not numbers or self._is_far():
             return {}
         x = self._end_positions()
         parts = {number: self._own_mixed(number, x) for number in numbers}
         touching = sum_over_ranks(self.comm, [float(part.any()) for part in parts.values()])
         near = [number for number, touches in zip(numbers, touching, strict=True) if touches]
-        return {number: self._gather.sum_owned(parts[number]).reshape(self._owned, -1) for number in near}
+        return {number: self.surface.gather.sum_owned(parts[number]).reshape(self._owned, -1) for number in near}
 
     def _own_mixed(self, number: int, x: Values) -> Values:
         """(nodes, 18) second derivatives by nodes and pose of this rank's pairs, the body at x (n, 3), m."""
-        pairs, body = self._surface.pairs.pairs[self.numbers.index(number)], slice(0, x.size)
+        pairs, body = self._pairs.pairs[self.numbers.index(number)], slice(0, x.size)
         if pairs.is_far(x):
             return np.zeros((len(self._input_nodes), 18))
         points = pairs.with_mesh(x)
@@ -435,7 +403,7 @@ class MeshObstacleTerm(SelfContact):
             H = H + friction.hessian(points)
         J = point_jacobian(pairs.mesh.positions - pairs.mesh.pose.centre).reshape(-1, 6)
         mixed = H[body, x.size :] @ J
-        return self._surface.nodal_forces(mixed.reshape(len(x), -1))
+        return self.surface.current.nodal_forces(mixed.reshape(len(x), -1))
 
     def uses_exact_tangent(self) -> bool:
         """Whether the tangent at the current u may have negative eigenvalues: not with free obstacles."""
@@ -445,11 +413,11 @@ class MeshObstacleTerm(SelfContact):
 
     def _current_force(self, number: int) -> Values:
         """(3,) force of the body on an obstacle at the current u, of this rank's pairs, N (collective)."""
-        return np.asarray(self._surface.pairs.pairs[number].body_gradient(self._end_positions()).sum(axis=0))
+        return np.asarray(self._pairs.pairs[number].body_gradient(self._end_positions()).sum(axis=0))
 
     def _gap(self, number: int) -> float:
         """Least distance between an obstacle and the body, m, of this rank's pairs (collective)."""
-        return self._surface.pairs.pairs[number].gap(self._end_positions())
+        return self._pairs.pairs[number].gap(self._end_positions())
 
     def closing_distances(self) -> list[float]:
         """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
@@ -458,9 +426,9 @@ class MeshObstacleTerm(SelfContact):
         """
         if self._is_far():
             return [0.0] * len(self.obstacles)
-        x, v = self._end_positions(), self._all_nodes(self._start_velocity)
-        motion, result = self._dt * (self._surface.point_map.weights @ v), []
-        for pairs, start_pose in zip(self._surface.pairs.pairs, self.group.start_poses, strict=True):
+        x, v = self._end_positions(), self.surface.nodal_values(self._start_velocity)
+        motion, result = self._dt * (self.surface.current.point_map.weights @ v), []
+        for pairs, start_pose in zip(self._pairs.pairs, self.group.start_poses, strict=True):
             result.append(approach(pairs, start_pose, x, motion))
         return result
 

@@ -181,10 +181,6 @@ class ObstacleTerm(ContactState, Term):
         end = float(resultant(contact.normal, self.positions[contact.points] - centre) @ q)
         return end_weight * end + (1 - end_weight) * float(self._start_forces[number] @ q[: self._domain.dim])
 
-    def step_work(self) -> tuple[float, float]:
-        """Work of prescribed obstacles in the step, and dissipation by friction, this rank's share, J."""
-        return self.group.step_work()
-
     # --- step limits ---
 
     def max_step_fraction(self, change: Values) -> float:
@@ -256,20 +252,20 @@ class ObstacleTerm(ContactState, Term):
             safe_motion_fractions(self.group.start_posed[index], x, motion, q, facets, self._point_candidates)
         )
 
-    def wrenches(self, numbers: Sequence[int]) -> dict[int, Values]:
-        """(p,) force and moment of the body on obstacles, N and N m, of all ranks (collective)."""
-        if not numbers:
+    def wrenches(self) -> dict[int, Values]:
+        """(p,) force and moment of the body on free obstacles, N and N m, of all ranks (collective)."""
+        if not (numbers := self.group.free):
             return {}
         contacts = self.obstacle_forces()
         local = [
-            contact_wrench(contacts[index], self.positions, self.group.posed[index].pose)
+            contact_wrench(contacts[index], self.positions, self.group.poses[index])
             for index in map(self.numbers.index, numbers)
         ]
         return dict(zip(numbers, sum_over_ranks(self.comm, np.array(local)), strict=True))
 
-    def pose_derivatives(self, numbers: Sequence[int], *, exact: bool) -> dict[int, PoseDerivatives]:
-        """Energy and derivatives by the poses of obstacles, of all ranks (collective)."""
-        if not numbers:
+    def pose_derivatives(self, *, exact: bool) -> dict[int, PoseDerivatives]:
+        """Energy and derivatives by the poses of free obstacles, of all ranks (collective)."""
+        if not (numbers := self.group.free):
             return {}
         local = [self._pose_coupling(self.numbers.index(number), exact=exact).derivatives() for number in numbers]
         return dict(zip(numbers, sum_of_derivatives(local, self.comm), strict=True))
@@ -282,9 +278,9 @@ class ObstacleTerm(ContactState, Term):
             self._pose_couplings[index, exact] = PoseCoupling(contact, self.positions, *poses, exact=exact)
         return self._pose_couplings[index, exact]
 
-    def mixed_hessians(self, numbers: Sequence[int]) -> dict[int, Values]:
-        """(owned dofs, p) derivatives of minus the nodal forces by poses, of obstacles in contact (collective)."""
-        if not numbers:
+    def mixed_hessians(self) -> dict[int, Values]:
+        """(owned dofs, p) derivatives of minus the nodal forces by poses, of free obstacles in contact (collective)."""
+        if not (numbers := self.group.free):
             return {}
         contacts, exact, indices = self.obstacle_forces(), self.uses_exact_tangent(), map(self.numbers.index, numbers)
         touching = sum_over_ranks(self.comm, np.array([len(contacts[index].points) for index in indices])) > 0

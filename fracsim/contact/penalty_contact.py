@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -23,13 +23,11 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix, vstack
 
 from ..mechanics.term import Term, TimeLevel
-from ..mechanics.term_protocols import CutPositions
 from ..mesh.domain import Domain
 from ..mesh.parallel import from_root, on_root
 from ..mesh.split_surface.entity_numbering import EntityNumbering
-from ..mesh.split_surface.surface_map import SurfaceMap
 from .ipc_pairs import vertex_areas
-from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface, SurfacePairs, SurfaceSnapshot
+from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface, SurfacePairs
 from .mesh_obstacle_term import approach, build_mesh_obstacle
 from .mesh_obstacles import AllMeshPairs, MeshObstacle, MeshObstaclePairs, Patches, ProximityTest, refuse_overlaps
 from .obstacle import VerletObstacle
@@ -39,7 +37,7 @@ from .penalty_point_facet import penalty_stiffness
 from .pose import Pose, PosedShape
 from .pose_derivatives import resultant
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
-from .self_contact import node_gather, refined_mesh
+from .self_contact import BreakingSurface, Pattern, node_gather
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -217,11 +215,14 @@ class IdleState:
 
 
 class PenaltyContact(Term):
-    """Contact of a body with itself in explicit steps."""
+    """Contact of a body with itself in explicit steps.
+
+    Attributes:
+        law: contact law.
+        surface: surface of the body, on rank 0.
+    """
 
     name = "contact"
-    _cuts: CutPositions | None = None
-    _surface: PenaltySurface | None = None  # on rank 0
 
     def __init__(self, domain: Domain, u: fem.Function, law: SelfContactLaw, mass: Values, max_added: float) -> None:
         """Build the term (collective).
@@ -238,68 +239,47 @@ class PenaltyContact(Term):
         """
         self.law, self._domain, self._u, self.comm = law, domain, u, domain.comm
         self._owned = domain.node_count * domain.dim
-        self._is_refined = domain.order == 2 and not law.corners_only
-        mesh = refined_mesh(domain) if self._is_refined else domain.input_mesh
-        self._skeleton = None if mesh is None else EntityNumbering(mesh)
-        self._gather = node_gather(domain, law)
-        nodal_mass = self._gathered(mass)
+        nodal_mass = node_gather(domain, law)(mass.reshape(-1, domain.dim))
         self._body = None if nodal_mass is None else BodyMass(nodal_mass[:, 0].copy(), max_added)
-        self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
         self._friction_loss = 0.0
         self._idle_state = IdleState()
-        self._rebuild()
+        self.surface = BreakingSurface(domain, u, law, self._build_surface, everywhere=False)
+        self.parts = (self.surface,)
+        self._discard_surface()
+
+    # --- surface, on rank 0 ---
+
+    def _build_surface(
+        self,
+        skeleton: EntityNumbering,
+        pattern: Pattern,
+        law: SelfContactLaw,
+        u: Values,
+        previous: PenaltySurface | None,
+        cut: Values | None,
+    ) -> PenaltySurface:
+        assert self._body is not None
+        return PenaltySurface(skeleton, pattern, law, u, previous, cut, self._body, self._meshes)
 
     @property
     def _meshes(self) -> list[MeshObstacle]:
-        """Obstacles, on rank 0; none: the body touches itself."""
+        """Obstacles; none: the body touches itself."""
         return []
 
-    # --- surface ---
+    @property
+    def _parts(self) -> list[PenaltyPart]:
+        return self.surface.current.parts
 
-    def _rebuild(self) -> None:
-        """Build the surface of the current damage (collective)."""
-        pattern, u = self._domain.input_numbering.gather_cells(self._pattern), self._gathered(self._current_u)
-        cuts = None if self._cuts is None else self._cuts()
+    def edges_broke(self, pattern: Pattern) -> None:
+        """Add new crack faces, retracted where there is no room (collective)."""
+        self.surface.edges_broke(pattern)
+        self._discard_surface()
 
-        def build() -> PenaltySurface:
-            assert pattern is not None and u is not None and self._skeleton is not None and self._body is not None
-            # subdivided quadratic cells do not break
-            cells = np.repeat(pattern, 2**self._domain.dim if self._is_refined else 1)
-            if self._surface is not None and self._surface.represents(cells):
-                return self._surface
-            cut = None if cuts is None else self._skeleton.edge_values(cuts[0], cuts[1][:, 0])
-            return PenaltySurface(self._skeleton, cells, self.law, u, self._surface, cut, self._body, self._meshes)
-
-        self._surface = on_root(self.comm, build)
+    def _discard_surface(self) -> None:
+        """Discard all that belongs to the points of the surface until now."""
         self._idle_state = IdleState(self._idle_state.is_near, surface_count=self._idle_state.surface_count + 1)
         self._starts: list[Values] | None = None  # (n + m, d) points of each part at the start of the step, m
         self.update_displacement()
-
-    @property
-    def _current_u(self) -> Values:
-        return np.asarray(self._u.x.array[: self._owned])
-
-    def _gathered(self, u: Values) -> Values | None:
-        """(nodes, d) in the order of the input mesh on rank 0 (collective)."""
-        return self._gather(np.asarray(u).reshape(-1, self._domain.dim))
-
-    def set_cuts(self, cuts: CutPositions) -> None:
-        """Set where edges are cut; used for faces between fragments."""
-        if self.law.fragments_only:
-            self._cuts = cuts
-
-    def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
-        """Move points of a surface for output to the crack faces of contact, which are offset."""
-        assert self._surface is not None
-        if self.law.fragments_only:
-            return self._surface.place_faces(at)
-        contact_map = self._surface.point_map
-        return contact_map.with_arm_share(np.minimum(contact_map.share, at.share))
-
-    def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
-        """Add new crack faces, retracted where there is no room (collective)."""
-        self._pattern = pattern
-        self._rebuild()
 
     def update_displacement(self) -> None:
         """Discard positions and forces, as u has changed."""
@@ -312,8 +292,8 @@ class PenaltyContact(Term):
     def clear_search(self) -> None:
         """Discard the candidates of collision detection (not collective)."""
         self.update_displacement()
-        if self._surface is not None:
-            self._surface.pairs.clear_caches()
+        if self.surface.is_held:
+            self.surface.current.pairs.clear_caches()
 
     # --- idle steps ---
 
@@ -333,7 +313,7 @@ class PenaltyContact(Term):
 
         It is the diagonal of the bounding box of all motions.
         """
-        motion, d = self._current_u - reference, self._domain.dim
+        motion, d = self._u.x.array[: self._owned] - reference, self._domain.dim
         # by columns: minima along the first axis take twenty times as long
         lowest = [motion[axis::d].min(initial=np.inf) for axis in range(d)]
         bounds = np.array([*lowest, *(-motion[axis::d].max(initial=-np.inf) for axis in range(d))])
@@ -344,33 +324,25 @@ class PenaltyContact(Term):
         """Store how far nodes may approach from the current u before anything is near (collective)."""
 
         def clearance() -> float:
-            assert self._surface is not None and x is not None
-            reach = self._surface.reach_of_points()
-            return 0.0 if np.isinf(reach) else self._surface.parts[0].contact.clearance(x) / reach
+            reach = self.surface.current.reach_of_points()
+            return 0.0 if x is None or np.isinf(reach) else self._parts[0].contact.clearance(x) / reach
 
         clear = from_root(self.comm, clearance)
-        displacement = self._current_u.copy() if clear else None
+        displacement = self._u.x.array[: self._owned].copy() if clear else None
         self._idle_state = replace(self._idle_state, displacement=displacement, clearance=clear)
 
     # --- forces and energy ---
 
-    def _end_positions(self) -> Values | None:
+    def _end_positions(self) -> Any:
         """(n, d) positions at the current u, m, on rank 0 (collective)."""
         if not self._has_positions:
-            self._has_positions, nodal = True, self._gathered(self._current_u)
-            if self._surface is not None and nodal is not None:
-                self._positions = self._surface.point_map(nodal)
+            self._has_positions, self._positions = True, self.surface.positions(self._u.x.array[: self._owned])
         return self._positions
 
     def min_gap(self) -> float:
         """Least gap within the penalty at the current u, m; infinite where none is (collective)."""
         x = self._end_positions()
-
-        def gap() -> float:
-            assert self._surface is not None and x is not None
-            return self._surface.pairs.min_gap(x)
-
-        return from_root(self.comm, gap)
+        return from_root(self.comm, lambda: self.surface.current.pairs.min_gap(x))
 
     def _springs(self, index: int, part: PenaltyPart) -> PairSprings:
         """Springs of friction of a part, on rank 0."""
@@ -379,9 +351,8 @@ class PenaltyContact(Term):
     def _part_gradients(self, x: Values) -> list[Values]:
         """(n + m, d) minus the forces of each part, friction included, with the body at x (n, d), m; on rank 0."""
         if self._gradients is None:
-            assert self._surface is not None
             self._gradients = []
-            for index, part in enumerate(self._surface.parts):
+            for index, part in enumerate(self._parts):
                 points = part.points(x)
                 gradient = np.zeros_like(points)
                 if not part.is_far(x):
@@ -399,19 +370,18 @@ class PenaltyContact(Term):
         if self._nodal_forces is None:
 
             def forces() -> Values:
-                assert self._surface is not None and x is not None
                 total = np.sum([gradient[: len(x)] for gradient in self._part_gradients(x)], axis=0)
-                return self._surface.nodal_forces(-total)
+                return self.surface.current.nodal_forces(-total)
 
-            self._nodal_forces = np.asarray(self._gather.scatter(on_root(self.comm, forces))).reshape(-1)
+            self._nodal_forces = np.asarray(self.surface.gather.scatter(on_root(self.comm, forces))).reshape(-1)
             self._measure_clearance(x)
         return self._nodal_forces
 
     def stored_energy(self) -> float:
         """Energy of the penalty and of the springs of friction at the current u, on rank 0, J (collective)."""
         x, energy = None if self._is_idle() else self._end_positions(), 0.0
-        if x is not None and self._surface is not None:
-            for index, part in enumerate(self._surface.parts):
+        if x is not None:
+            for index, part in enumerate(self._parts):
                 if not part.is_far(x):
                     points = part.points(x)
                     springs = self._springs(index, part).energy(points) if part.friction else 0.0
@@ -427,12 +397,7 @@ class PenaltyContact(Term):
         if self._is_idle():
             return 0.0
         x = self._end_positions()
-
-        def bound() -> float:
-            assert self._surface is not None and x is not None
-            return self._surface.max_added_frequency(x) + self._obstacle_frequency(x)
-
-        return from_root(self.comm, bound)
+        return from_root(self.comm, lambda: self.surface.current.max_added_frequency(x) + self._obstacle_frequency(x))
 
     def _obstacle_frequency(self, x: Values) -> float:
         """Square of the highest frequency of obstacles on their contacts, the body at x (n, d), m; 1/s^2; rank 0."""
@@ -451,29 +416,25 @@ class PenaltyContact(Term):
         if is_idle:
             return
         self._idle_state = replace(self._idle_state)  # another object than that of the snapshot, as faces may move
-        nodal = self._gathered(level.u_n)
-        if self._surface is not None and nodal is not None:
-            self._surface.extend_faces(nodal)
-            x = self._surface.point_map(nodal)
-            self._starts = [part.points(x) for part in self._surface.parts]
+        nodal = self.surface.nodal_values(level.u_n)
+        if self.surface.is_held:
+            self.surface.current.extend_faces(nodal)
+            x = self.surface.current.point_map(nodal)
+            self._starts = [part.points(x) for part in self._parts]
 
     def accept_step(self) -> None:
         """Store contacts and dissipation of the step (collective)."""
         if self._is_idle():
             return
         x = self._end_positions()
-
-        def end() -> bool:
-            assert self._surface is not None and x is not None
-            return self._end_on_root(x, self._surface.parts)
-
-        self._idle_state = replace(self._idle_state, is_near=from_root(self.comm, end))
+        is_near = from_root(self.comm, lambda: self._end_on_root(x))
+        self._idle_state = replace(self._idle_state, is_near=is_near)
         self._starts = None
 
-    def _end_on_root(self, x: Values, parts: Sequence[PenaltyPart]) -> bool:
+    def _end_on_root(self, x: Values) -> bool:
         """Store contacts at the end of a step with the body at x (n, d), m, on rank 0; whether any are near."""
         is_near = False
-        for index, part in enumerate(parts):
+        for index, part in enumerate(self._parts):
             if part.is_far(x) and part.contact.history.is_empty:
                 continue
             points, slips = part.points(x), None
@@ -485,7 +446,7 @@ class PenaltyContact(Term):
             is_near |= not part.contact.history.is_empty
         return is_near
 
-    # --- of implicit steps (ContactTerm, CrackFaceContact): nothing to do ---
+    # --- of implicit steps (ContactTerm): nothing to do ---
 
     def begin_solve(self) -> None:
         """Do nothing: no system is solved."""
@@ -494,42 +455,36 @@ class PenaltyContact(Term):
         """Return 1: gaps may close."""
         return 1.0
 
-    def stiffen_contact(self) -> float:
-        """Return 0: gaps of a penalty may close."""
-        return 0.0
-
-    # --- state ---
+    # --- state (HistoryTerm) ---
 
     def snapshot(self) -> object:
-        """State of the surface, contacts, and idle state."""
-        if self._surface is None:
-            return None, [], self._idle_state
-        return self._surface.snapshot(), [part.contact.history for part in self._surface.parts], self._idle_state
+        """Contacts, and idle state."""
+        return [part.contact.history for part in self._parts] if self.surface.is_held else [], self._idle_state
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective)."""
-        surface, contacts, idle = cast("tuple[SurfaceSnapshot, list[PenaltyHistory], IdleState]", memory)
+        contacts, idle = cast("tuple[list[PenaltyHistory], IdleState]", memory)
         self._starts = None
         if idle is self._idle_state:
             return
-        if self._surface is not None:
-            self._surface.restore(surface)
-            for part, history in zip(self._surface.parts, contacts, strict=True):
-                part.contact.set_history(history)
+        self._set_contacts(contacts)
         # edges may have broken since: it is another surface
         count = self._idle_state.surface_count
         self._idle_state = idle if idle.surface_count == count else IdleState(idle.is_near, surface_count=count)
+
+    def _set_contacts(self, contacts: Sequence[PenaltyHistory]) -> None:
+        """Set contacts of each part at the end of the last step, on rank 0."""
+        if self.surface.is_held:
+            for part, history in zip(self._parts, contacts, strict=True):
+                part.contact.set_history(history)
         self.update_displacement()
 
     def to_checkpoint(self) -> dict[str, Values]:
-        """Arrays for a checkpoint: state of the surface, and contacts of each part."""
-        if self._surface is None:
-            return dict.fromkeys(("share", "left_out", "pause"), np.empty(0))
-        share, excluded, pause = self._surface.snapshot()
-        arrays = {"share": share, "left_out": np.asarray(excluded, float), "pause": np.array(pause, float)}
-        for index, part in enumerate(self._surface.parts):
-            arrays |= {f"{name}_{index}": values for name, values in part.contact.history.to_checkpoint().items()}
-        return arrays
+        """Contacts of each part, on rank 0."""
+        if not self.surface.is_held:
+            return {}
+        histories = [part.contact.history.to_checkpoint() for part in self._parts]
+        return {f"{name}_{index}": values for index, arrays in enumerate(histories) for name, values in arrays.items()}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint."""
@@ -537,14 +492,7 @@ class PenaltyContact(Term):
         contacts = [PenaltyHistory.from_checkpoint(saved, f"_{index}") for index in range(count)]
         is_near = not all(history.is_empty for history in contacts)
         self._idle_state = IdleState(is_near, surface_count=self._idle_state.surface_count)
-        if self._surface is not None:
-            if len(saved["share"]) != len(self._surface.point_map.share):
-                raise ValueError(f"{len(saved['share'])} points of the contact surface instead of those of its damage")
-            pause, remaining = (int(number) for number in saved["pause"])
-            self._surface.restore((saved["share"], saved["left_out"].astype(np.int64), (pause, remaining)))
-            for part, history in zip(self._surface.parts, contacts, strict=True):
-                part.contact.set_history(history)
-        self.update_displacement()
+        self._set_contacts(contacts)
 
 
 class PenaltyMeshContact(PenaltyContact):
@@ -572,7 +520,7 @@ class PenaltyMeshContact(PenaltyContact):
     ) -> None:
         """`bodies`: motion of all obstacles; `numbers`: of the triangle meshes; the others as for PenaltyContact."""
         self.group, edge = ObstacleGroup(bodies, numbers, self._gap, self._wrench), domain.mean_edge_length
-        self.numbers, self.obstacles, self.parts = self.group.numbers, self.group.obstacles, (self.group,)
+        self.numbers, self.obstacles = self.group.numbers, self.group.obstacles
         self.barrier_width = law.distance
         items = zip(self.numbers, self.obstacles, strict=True)
         self._all_meshes = on_root(domain.comm, lambda: [build_mesh_obstacle(*item, edge) for item in items]) or []
@@ -584,6 +532,7 @@ class PenaltyMeshContact(PenaltyContact):
         for mesh, pose in zip(self._all_meshes, self._poses, strict=False):
             mesh.move_to(pose)
         super().__init__(domain, u, law, mass, max_added)
+        self.parts = (self.surface, self.group)
 
     @property
     def _meshes(self) -> list[MeshObstacle]:
@@ -606,7 +555,7 @@ class PenaltyMeshContact(PenaltyContact):
         self._move_to(self.group.bodies.posed)
 
     def _nothing_is_near(self) -> bool:
-        return self._proximity.is_far([self._current_u], [(pose, pose) for pose in self._poses])
+        return self._proximity.is_far([self._u.x.array[: self._owned]], [(pose, pose) for pose in self._poses])
 
     def _measure_clearance(self, x: Values | None) -> None:
         """Do nothing: bounding boxes are compared in each step."""
@@ -630,19 +579,14 @@ class PenaltyMeshContact(PenaltyContact):
             for start, end, number in zip(last, self._wrenches, self.numbers, strict=True)
         ]
 
-    def _end_on_root(self, x: Values, parts: Sequence[PenaltyPart]) -> bool:
+    def _end_on_root(self, x: Values) -> bool:
         self._wrenches = self._wrenches_on_root(x)
-        return super()._end_on_root(x, parts)
-
-    def step_work(self) -> tuple[float, float]:
-        """Work of prescribed obstacles in the step, and dissipation by friction, on rank 0, J."""
-        return self.group.step_work()[0], self._friction_loss
+        return super()._end_on_root(x)
 
     def _obstacle_frequency(self, x: Values) -> float:
         # the squares of a body and an obstacle on one spring add up
-        assert self._surface is not None
         squares = [0.0]
-        for number, part in zip(self.numbers, self._surface.parts, strict=True):
+        for number, part in zip(self.numbers, self._parts, strict=True):
             if number in self.group.bodies.free and not part.is_far(x):
                 obstacle, posed = (
                     cast("VerletObstacle", self.group.bodies.free[number]),
@@ -657,17 +601,13 @@ class PenaltyMeshContact(PenaltyContact):
 
     # --- contact of the body, as the obstacles see it (rigid_obstacles.ObstacleContactTerm) ---
 
-    def wrenches(self, numbers: Sequence[int]) -> dict[int, Values]:
-        """(6,) force and moment of the body on obstacles, N and N m (collective)."""
+    def wrenches(self) -> dict[int, Values]:
+        """(6,) force and moment of the body on free obstacles, N and N m (collective)."""
+        numbers = self.group.free
         if not numbers or self._is_idle():
             return {number: np.zeros(6) for number in numbers}
         x = self._end_positions()
-
-        def on_obstacles() -> list[Values]:
-            assert x is not None
-            return self._wrenches_on_root(x)
-
-        all_wrenches = from_root(self.comm, on_obstacles)
+        all_wrenches = from_root(self.comm, lambda: self._wrenches_on_root(x))
         return {number: all_wrenches[self.numbers.index(number)] for number in numbers}
 
     def _wrenches_on_root(self, x: Values) -> list[Values]:
@@ -688,9 +628,8 @@ class PenaltyMeshContact(PenaltyContact):
     def _gap(self, index: int) -> float:
         """Least distance between an obstacle and the body, m; on rank 0, infinite elsewhere (collective)."""
         x = self._end_positions()
-        if x is None or self._surface is None or (pairs := self._surface.parts[index].obstacle) is None:
-            return np.inf
-        return pairs.gap(x)
+        pairs = None if x is None else self._parts[index].obstacle
+        return np.inf if pairs is None else pairs.gap(x)
 
     def closing_distances(self) -> list[float]:
         """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
@@ -700,23 +639,23 @@ class PenaltyMeshContact(PenaltyContact):
         none = [0.0] * len(self.obstacles)
         if self._is_idle():
             return none
-        x, v = self._end_positions(), self._gathered(self._start_velocity)
-        if x is None or v is None or self._surface is None:
+        x, v = self._end_positions(), self.surface.nodal_values(self._start_velocity)
+        if x is None:
             return none
-        motion = self._dt * (self._surface.point_map.weights @ v)
-        pairs = [part.obstacle for part in self._surface.parts if part.obstacle is not None]
+        motion = self._dt * (self.surface.current.point_map.weights @ v)
+        pairs = [part.obstacle for part in self._parts if part.obstacle is not None]
         return [approach(*item, x, motion) for item in zip(pairs, self.group.start_poses, strict=True)]
 
     # --- state ---
 
     def snapshot(self) -> object:
-        """State of the surface, contacts, idle state, and wrenches at the end of the last step."""
+        """Contacts, idle state, and wrenches at the end of the last step."""
         return super().snapshot(), self._wrenches
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective)."""
-        surface, self._wrenches = cast("tuple[object, list[Values]]", memory)
-        super().restore(surface)
+        contacts, self._wrenches = cast("tuple[object, list[Values]]", memory)
+        super().restore(contacts)
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Arrays for a checkpoint, with wrenches."""

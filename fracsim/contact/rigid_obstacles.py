@@ -41,11 +41,11 @@ class ObstacleContactTerm(Protocol):
     """Contact of the body with some obstacles, as the obstacles see it.
 
     Attributes:
-        numbers: numbers of these obstacles.
+        group: these obstacles.
         allows_exact_tangent: whether tangents are exact near the solution.
     """
 
-    numbers: tuple[int, ...]
+    group: ObstacleGroup
     allows_exact_tangent: bool
 
     def poses_moved(self) -> None:
@@ -63,14 +63,14 @@ class ObstacleContactTerm(Protocol):
         Both from the start of the step; `u`: (owned dofs,) displacement of the level after the motion, m.
         """
 
-    def wrenches(self, numbers: Sequence[int]) -> Increments:
-        """(p,) force and moment of the body on obstacles at the current u, N and N m, of all ranks (collective)."""
+    def wrenches(self) -> Increments:
+        """(p,) force and moment of the body on free ones at the current u, N and N m, of all ranks (collective)."""
 
-    def pose_derivatives(self, numbers: Sequence[int], *, exact: bool) -> Mapping[int, PoseDerivatives]:
-        """Energy and derivatives by poses, of all ranks (collective)."""
+    def pose_derivatives(self, *, exact: bool) -> Mapping[int, PoseDerivatives]:
+        """Energy and derivatives by the poses of free ones, of all ranks (collective)."""
 
-    def mixed_hessians(self, numbers: Sequence[int]) -> Increments:
-        """(owned dofs, p) d2E/dx dq by the increments q of poses, of obstacles in contact (collective)."""
+    def mixed_hessians(self) -> Increments:
+        """(owned dofs, p) d2E/dx dq by the increments q of poses, of free ones in contact (collective)."""
 
     def uses_exact_tangent(self) -> bool:
         """Whether the tangent at the current u has negative eigenvalues of contact (collective)."""
@@ -179,6 +179,7 @@ class RigidObstacles(Term):
         start_posed: obstacles at the start of the step.
         increments: (p,) increment of each pose in the step.
         motions: states of motion of free ones.
+        contacts: terms of contact of the body with some of the obstacles each.
     """
 
     name = "rigid"
@@ -194,7 +195,7 @@ class RigidObstacles(Term):
         """`obstacles`: by their numbers in the study; `free`: free ones, None: there are none."""
         self.comm, self.dim, self.obstacles, self.free = domain.comm, domain.dim, tuple(obstacles), free or {}
         self.prescribed = [number for number in range(len(obstacles)) if number not in self.free]
-        self._contacts: list[ObstacleContactTerm] = []
+        self.contacts: list[ObstacleContactTerm] = []
         self._tessellations = ObstacleTessellations(self.obstacles, domain.bounds.lower, domain.bounds.upper)
         self._level: TimeLevel | None = None
         self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
@@ -202,10 +203,6 @@ class RigidObstacles(Term):
         self.motions = FreeMotions(self.free, self.comm.rank == 0, self._motions_restored)
         self.parts = (self.motions,) if self.free else ()
         self._place(0.0, 0.0)
-
-    def add_contact(self, contact: ObstacleContactTerm) -> None:
-        """Add contact of the body with some of the obstacles."""
-        self._contacts.append(contact)
 
     # --- steps ---
 
@@ -247,12 +244,9 @@ class RigidObstacles(Term):
         self.motions.place(self.posed)
         self._tell_moved()
 
-    def _wrenches(self) -> dict[int, Values]:
+    def _body_wrenches(self) -> dict[int, Values]:
         """(p,) force and moment of the body on each free obstacle, N and N m, of all ranks (collective)."""
-        result = {number: np.zeros_like(self.increments[number]) for number in self.free}
-        for contact in self._contacts:
-            result |= contact.wrenches([number for number in self.free if number in contact.numbers])
-        return result
+        return {number: wrench for contact in self.contacts for number, wrench in contact.wrenches().items()}
 
     # --- motion of points of obstacles ---
 
@@ -308,8 +302,8 @@ class RigidObstacles(Term):
     def _rest_fraction(self, increments: Increments, u: Values | None) -> float:
         """Fraction of increments on which no gap to the body at rest closes, as of ObstacleContactTerm (collective)."""
         fractions = [
-            contact.rest_fraction({number: q for number, q in increments.items() if number in contact.numbers}, u)
-            for contact in self._contacts
+            contact.rest_fraction({number: q for number, q in increments.items() if number in contact.group.numbers}, u)
+            for contact in self.contacts
         ]
         return min(fractions, default=1.0)
 
@@ -327,7 +321,7 @@ class RigidObstacles(Term):
         self._tell_moved()
 
     def _tell_moved(self) -> None:
-        for contact in self._contacts:
+        for contact in self.contacts:
             contact.poses_moved()
 
 
@@ -365,7 +359,7 @@ class VerletRigidObstacles(RigidObstacles):
             for number, wrench, work in zip(pair.numbers, pair.forces.wrenches, pair.work, strict=True):
                 of_pairs[number] += wrench
                 work_of_pairs[number] += work
-        for number, of_body in self._wrenches().items():
+        for number, of_body in self._body_wrenches().items():
             work = self.free[number].end_step(self.posed[number], of_body + of_pairs[number])
             self._contact_work[number] = work - work_of_pairs[number]
 
@@ -418,6 +412,7 @@ class ObstacleGroup:
         bodies: motion of all obstacles of the study.
         numbers: numbers of those of the group.
         obstacles: these.
+        free: numbers of the free ones among them.
         work: of each on the body in the last step, J.
         friction_loss: dissipation by friction in the last step, J.
         forces: (d,) of the body on each at the end of the last step, N; further numbers may follow. None: no step yet.
@@ -442,6 +437,7 @@ class ObstacleGroup:
         """
         self.bodies, self.numbers, self._gap, self._current_force = bodies, tuple(numbers), gap, current_force
         self.obstacles = tuple(bodies.obstacles[number] for number in numbers)
+        self.free = [number for number in numbers if bodies.obstacles[number].free]
         self.work, self.friction_loss = [0.0] * len(self.obstacles), 0.0
 
     # --- motion ---
@@ -470,6 +466,11 @@ class ObstacleGroup:
     def start_poses(self) -> list[Pose]:
         """Poses at the start of the step."""
         return [posed.pose for posed in self.start_posed]
+
+    @property
+    def step_poses(self) -> list[tuple[Pose, Pose]]:
+        """Poses of each at the start of the step, and now."""
+        return list(zip(self.start_poses, self.poses, strict=True))
 
     # --- the last step ---
 

@@ -29,7 +29,7 @@ from .obstacle_pairs import AllPairs
 from .pose import PosedShape, solve_matrix
 from .pose_derivatives import PoseDerivatives
 from .rigid_body import SOLVER, RigidStep, RigidSystem, SystemDerivatives, is_positive_definite
-from .rigid_obstacles import Increments, RigidObstacles
+from .rigid_obstacles import Increments, ObstacleContactTerm, RigidObstacles
 
 Values = npt.NDArray[np.float64]
 
@@ -115,18 +115,11 @@ class BodyContact(Protocol):
 
     Attributes:
         posed: all obstacles at their poses, by their numbers.
+        contacts: terms of contact of the body with some of the obstacles each.
     """
 
     posed: list[PosedShape]
-
-    def pose_derivatives(self, *, exact: bool) -> Mapping[int, PoseDerivatives]:
-        """Energy and derivatives by the poses of free obstacles, sums over all ranks (collective)."""
-
-    def mixed_hessians(self) -> Mapping[int, Values]:
-        """(owned dofs, p) d2E/dx dq by the increment q of the pose, of free obstacles in contact (collective)."""
-
-    def uses_exact_tangent(self) -> bool:
-        """Whether the tangent has negative eigenvalues of contact (collective)."""
+    contacts: list[ObstacleContactTerm]
 
     def free_fraction(self, increments: Mapping[int, Values]) -> float:
         """Fraction of increments (p,) of free poses on which no gap closes, the body at rest (collective)."""
@@ -220,7 +213,9 @@ class PoseUnknowns:
 
     def _contact(self, *, exact: bool) -> SystemDerivatives:
         """Derivatives of all contact at the current poses (collective)."""
-        of_body = self._body.pose_derivatives(exact=exact)
+        of_body: dict[int, PoseDerivatives] = {}
+        for contact in self._body.contacts:
+            of_body |= contact.pose_derivatives(exact=exact)
         of_pairs, mixed = self.pairs.derivatives(self._body.posed, exact=exact)
         index = {number: row for row, number in enumerate(self.free)}
         return SystemDerivatives(
@@ -239,8 +234,11 @@ class PoseUnknowns:
     def system(self) -> PoseSystem:
         """Linear system at the current u and poses (collective)."""
         if self._system is None:
-            equations = self.equations(exact=self._body.uses_exact_tangent())
-            mixed = self._body.mixed_hessians()
+            # all are asked, since the question is collective
+            equations = self.equations(exact=all([contact.uses_exact_tangent() for contact in self._body.contacts]))
+            mixed: dict[int, Values] = {}
+            for contact in self._body.contacts:
+                mixed |= contact.mixed_hessians()
             touching = np.concatenate([np.full(len(pose.z), number in mixed) for number, pose in self.free.items()])
             columns = [
                 pose.step.factor * mixed[number] @ pose.step.pose_jacobian(pose.z)
@@ -319,13 +317,6 @@ class PoseUnknowns:
         """Potential of inertia and weight in the step, J."""
         return sum(pose.step.free_potential(pose.z) for pose in self.free.values())
 
-    def gravity_work(self) -> float:
-        """Work of gravity in the step, J."""
-        return sum(
-            pose.body.gravity_potential(pose.step.start.pose) - pose.body.gravity_potential(pose.posed.pose)
-            for pose in self.free.values()
-        )
-
 
 class FreeRigidObstacles(RigidObstacles):
     """Obstacles of which some are free, in implicit steps.
@@ -391,7 +382,7 @@ class FreeRigidObstacles(RigidObstacles):
 
     def accept_step(self) -> None:
         """Give free obstacles their momentum (collective)."""
-        of_body, of_pairs = self._wrenches(), self.pairs.wrenches(self.posed)
+        of_body, of_pairs = self._body_wrenches(), self.pairs.wrenches(self.posed)
         for number, pose in self.free.items():
             pose.motion = pose.end_motion(of_body[number] + of_pairs.get(number, 0.0))
 
@@ -399,7 +390,7 @@ class FreeRigidObstacles(RigidObstacles):
         """(d,) velocity of an obstacle at the start of the step, or (n, d) of its points at x (n, d), m/s."""
         return self.free[number].step.start_velocity(x) if number in self.free else super().velocity(number, x)
 
-    # --- contact with free obstacles (rigid_pose.BodyContact) ---
+    # --- contact with free obstacles (BodyContact) ---
 
     def poses_moved(self) -> None:
         """Take over the poses of free obstacles."""
@@ -412,30 +403,11 @@ class FreeRigidObstacles(RigidObstacles):
         self._unknowns.discard()
         super()._tell_moved()
 
-    def pose_derivatives(self, *, exact: bool) -> dict[int, PoseDerivatives]:
-        """Energy and derivatives of contact with the body by the pose of each free obstacle (collective)."""
-        result: dict[int, PoseDerivatives] = {}
-        for contact in self._contacts:
-            numbers = [number for number in self.free if number in contact.numbers]
-            result |= contact.pose_derivatives(numbers, exact=exact)
-        return result
-
-    def mixed_hessians(self) -> dict[int, Values]:
-        """(owned dofs, p) second derivatives by nodes and the poses of obstacles in contact (collective)."""
-        result: dict[int, Values] = {}
-        for contact in self._contacts:
-            result |= contact.mixed_hessians([number for number in self.free if number in contact.numbers])
-        return result
-
-    def uses_exact_tangent(self) -> bool:
-        """Whether the tangents of all contact have negative eigenvalues (collective)."""
-        return all([contact.uses_exact_tangent() for contact in self._contacts])
-
     def may_use_exact_tangent(self) -> bool:
         """Whether exact tangents of contact leave the equations of the poses positive definite (collective)."""
         if not self._unknowns.in_step:
             return True
-        allowed = all(contact.allows_exact_tangent for contact in self._contacts)
+        allowed = all(contact.allows_exact_tangent for contact in self.contacts)
         return allowed and self._unknowns.equations(exact=True).is_positive
 
     def free_fraction(self, increments: Increments) -> float:
@@ -464,7 +436,10 @@ class FreeRigidObstacles(RigidObstacles):
         if self.comm.rank:
             return 0.0, 0.0
         work, dissipated = self.pairs.work(self.posed, self.increments)
-        return self._unknowns.gravity_work() + work, dissipated
+        for pose in self.free.values():
+            start, end = pose.step.start.pose, pose.posed.pose
+            work += pose.body.gravity_potential(start) - pose.body.gravity_potential(end)
+        return work, dissipated
 
     # --- step limits ---
 
@@ -492,7 +467,7 @@ class FreeRigidObstacles(RigidObstacles):
     def _first_guess(self, number: int, u: Values) -> tuple[Values, float]:
         """First guess (k,) of an increment, and its fraction that closes no gap with the body on its way to u."""
         pose, prescribed = self.free[number], self.prescribed_motions()
-        contacts = [contact for contact in self._contacts if number in contact.numbers]
+        contacts = [contact for contact in self.contacts if number in contact.group.numbers]
 
         def safe_fraction(z: Values) -> float:
             q = pose.step.increment(z)

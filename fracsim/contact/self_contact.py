@@ -8,8 +8,9 @@ Equations: docs/theory.md#contact.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -22,25 +23,153 @@ from ..mechanics.extra_couplings import CouplingBuilder, StiffCoupling, stiff_di
 from ..mechanics.term import Term, TimeLevel
 from ..mechanics.term_protocols import CutPositions
 from ..mesh.domain import Domain
-from ..mesh.parallel import Gather, bcast, sum_over_ranks
+from ..mesh.parallel import Gather, bcast, on_root, sum_over_ranks
 from ..mesh.split_surface.entity_numbering import EntityNumbering
+from ..mesh.split_surface.quadratic_surface import subdivided_input_mesh
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface, SurfaceSnapshot
 from .laws import stiffness_factor
 from .sample_points import SlipFriction
 
-if TYPE_CHECKING:
-    from ..meshes.data import MeshData
-
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Pattern = npt.NDArray[np.uint8]
+
+# skeleton, pattern (cells,), law, u (nodes, d), surface until now, positions of cuts (edges,) -> surface
+type SurfaceBuilder[S] = Callable[[EntityNumbering, Pattern, SelfContactLaw, Values, S | None, Values | None], S]
+
+
+class BreakingSurface[S: SelfContactSurface]:
+    """Contact surface of a body, built again when edges break (HistoryTerm, CutFaces, SurfaceSeparator).
+
+    Attributes:
+        law: contact law, whose stiffness may grow.
+        gather: gathering of the nodes that the surface depends on.
+    """
+
+    _cuts: CutPositions | None = None
+    _surface: S | None = None
+
+    def __init__(
+        self, domain: Domain, u: fem.Function, law: SelfContactLaw, build: SurfaceBuilder[S], *, everywhere: bool
+    ) -> None:
+        """Build the surface of the whole body (collective).
+
+        Args:
+            domain: mesh.
+            u: displacement.
+            law: contact law.
+            build: function that builds a surface. It refuses bodies that intersect at rest.
+            everywhere: whether all ranks hold the surface; otherwise rank 0 alone.
+        """
+        self.law, self._domain, self._u, self._build, self._everywhere = law, domain, u, build, everywhere
+        self.gather, is_refined = node_gather(domain, law), domain.order == 2 and not law.corners_only
+        # subdivided quadratic cells do not break
+        self._parts = 2**domain.dim if is_refined else 1
+        mesh = subdivided_input_mesh(domain) if is_refined else domain.input_mesh
+        if everywhere:
+            mesh = bcast(domain.comm, mesh)
+        self._skeleton = None if mesh is None else EntityNumbering(mesh)
+        self._pattern: Pattern = np.zeros(domain.cell_count, np.uint8)
+        self._rebuild()
+
+    def _rebuild(self) -> None:
+        """Build the surface of the current damage (collective)."""
+        pattern = self._gathered(self._domain.input_numbering.gather_cells, self._pattern)
+        u = self.nodal_values(self._u.x.array[: self._domain.node_count * self._domain.dim])
+        cuts = None if self._cuts is None else self._cuts()
+        if self._cuts is not None and self._everywhere:
+            cuts = bcast(self._domain.comm, cuts)
+
+        def build() -> S:
+            assert self._skeleton is not None
+            cells = np.repeat(pattern, self._parts)
+            if self._surface is not None and self._surface.represents(cells):
+                return self._surface
+            cut = None if cuts is None else self._skeleton.edge_values(cuts[0], cuts[1][:, 0])
+            return self._build(self._skeleton, cells, self.law, u, self._surface, cut)
+
+        self._surface = build() if self._everywhere else on_root(self._domain.comm, build)
+
+    @property
+    def is_held(self) -> bool:
+        """Whether this rank holds the surface."""
+        return self._surface is not None
+
+    @property
+    def current(self) -> S:
+        """Surface of the current damage, on ranks that hold it."""
+        assert self._surface is not None
+        return self._surface
+
+    def _gathered(self, gather: Gather, values: npt.NDArray[Any]) -> Any:
+        return gather.to_all_ranks(values) if self._everywhere else gather(values)
+
+    def nodal_values(self, u: Values) -> Any:
+        """(nodes, d) owned displacements u in the order of the input mesh; None where not held (collective)."""
+        return self._gathered(self.gather, np.asarray(u).reshape(-1, self._domain.dim))
+
+    def positions(self, u: Values) -> Any:
+        """(n, d) positions of its points for owned displacements u, m; None where not held (collective)."""
+        nodal = self.nodal_values(u)
+        return self._surface.point_map(nodal) if self._surface is not None else None
+
+    def set_cuts(self, cuts: CutPositions) -> None:
+        """Set where edges are cut; used for faces between fragments."""
+        if self.law.fragments_only:
+            self._cuts = cuts
+
+    def edges_broke(self, pattern: Pattern) -> None:
+        """Add new crack faces, retracted where there is no room (collective)."""
+        self._pattern = pattern
+        self._rebuild()
+
+    def set_stiffness(self, stiffness: float) -> None:
+        """Set the stiffness of the barrier, Pa."""
+        if stiffness != self.law.stiffness:
+            self.law = replace(self.law, stiffness=stiffness)
+            self.current.set_stiffness(stiffness)
+
+    def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
+        """Move points of a surface for output to the crack faces of contact, which are offset and retracted."""
+        if self.law.fragments_only:
+            return self.current.place_faces(at)
+        point_map = self.current.point_map
+        return (point_map if self.current.face_gap else at).with_arm_share(np.minimum(point_map.share, at.share))
+
+    def snapshot(self) -> SurfaceSnapshot | None:
+        """Retracted and excluded parts of the surface."""
+        return None if self._surface is None else self._surface.snapshot()
+
+    def restore(self, memory: object) -> None:
+        """Restore a snapshot (not collective)."""
+        if self._surface is not None:
+            self._surface.restore(cast("SurfaceSnapshot", memory))
+
+    def to_checkpoint(self) -> dict[str, Values]:
+        """Factors of arms, numbers of excluded elements, steps to the next release of faces, and stiffness."""
+        if self._surface is None:
+            return {}
+        share, excluded, pause = self._surface.snapshot()
+        return {"share": share, "left_out": np.asarray(excluded, float), "pause": np.array(pause, float),
+                "stiffness": np.array([self.law.stiffness])}  # fmt: skip
+
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
+        """Set the state from the arrays of a checkpoint."""
+        if self._surface is None:
+            return
+        self.set_stiffness(float(saved["stiffness"][0]))
+        if len(saved["share"]) != len(self._surface.point_map.share):
+            raise ValueError(f"{len(saved['share'])} points of the contact surface instead of those of its damage")
+        pause, remaining = (int(number) for number in saved["pause"])
+        self._surface.restore((saved["share"], saved["left_out"].astype(np.int64), (pause, remaining)))
 
 
 class SelfContact(Term):
     """A body that cannot penetrate itself.
 
     Attributes:
-        law: contact law.
+        surface: its surface.
         allows_exact_tangent: whether tangents are exact near the solution.
     """
 
@@ -48,31 +177,36 @@ class SelfContact(Term):
     leaves_tangent_incomplete = True
     allows_exact_tangent: bool = True
     _attempts = 0  # of Newton's method in the step
-    _cuts: CutPositions | None = None
 
     def __init__(self, domain: Domain, u: fem.Function, law: SelfContactLaw) -> None:
         """Raise InputError where the surface at rest intersects itself (collective)."""
-        self.law, self._domain, self._u = law, domain, u
+        self._domain, self._u = domain, u
         self._owned, self.comm = domain.node_count * domain.dim, domain.comm
         self._coupling = CouplingBuilder(domain)
         # m^(d-2), times a stiffness in Pa
         self._stiff_threshold = SURFACE.stiff_ratio * domain.mean_edge_length ** (domain.dim - 2)
-        mesh = refined_mesh(domain) if self._is_refined(law) else domain.input_mesh
-        self._skeleton = EntityNumbering(bcast(domain.comm, mesh))
-        self._gather = node_gather(domain, law)
+        self.surface = BreakingSurface(domain, u, law, self._build_surface, everywhere=True)
+        self.parts = (self.surface,)
         first = domain.space.dofmap.index_map.local_range[0]
-        self._input_nodes = self._gather.to_all_ranks(first + np.arange(domain.node_count))  # numbers of input nodes
-        self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
-        self._rebuild(None)
+        # numbers of input nodes
+        self._input_nodes = self.surface.gather.to_all_ranks(first + np.arange(domain.node_count))
+        self._discard_surface()
 
     # --- surface ---
 
-    def _rebuild(self, previous: SelfContactSurface | None) -> None:
-        """Build the surface of the current damage; `previous`: the one until now (collective)."""
-        pattern, u = self._all_patterns(), self._all_nodes(self._u.x.array[: self._owned])
-        cuts = None if self._cuts is None else bcast(self.comm, self._cuts())
-        cut = None if cuts is None else self._skeleton.edge_values(cuts[0], cuts[1][:, 0])
-        self._surface = self._build_surface(pattern, u, previous, cut)
+    def _build_surface(
+        self,
+        skeleton: EntityNumbering,
+        pattern: Pattern,
+        law: SelfContactLaw,
+        u: Values,
+        previous: SelfContactSurface | None,
+        cut: Values | None,
+    ) -> SelfContactSurface:
+        return SelfContactSurface(skeleton, pattern, law, u, previous, cut, self.comm)
+
+    def _discard_surface(self) -> None:
+        """Discard all that belongs to the points of the surface until now."""
         self._positions: Values | None = None
         self._contact_force: Values | None = None
         self._stored: float | None = None
@@ -81,92 +215,33 @@ class SelfContact(Term):
         self._friction: SlipFriction | None = None
         self._is_stale = True
 
-    def _build_surface(
-        self, pattern: npt.NDArray[np.uint8], u: Values, previous: SelfContactSurface | None, cut: Values | None
-    ) -> SelfContactSurface:
-        """Surface of a pattern of damage."""
-        if previous is not None and previous.represents(pattern):
-            return previous
-        return SelfContactSurface(self._skeleton, pattern, self.law, u, previous, cut, self.comm)
-
-    def _all_patterns(self) -> npt.NDArray[np.uint8]:
-        """(cells,) broken edges of the skeleton's cells (collective); subdivided quadratic cells do not break."""
-        pattern = self._domain.input_numbering.gather_cells.to_all_ranks(self._pattern)
-        parts = 2**self._domain.dim if self._is_refined(self.law) else 1
-        return np.repeat(pattern, parts)
-
-    def _is_refined(self, law: SelfContactLaw) -> bool:
-        """Whether quadratic cells are subdivided into linear ones."""
-        return self._domain.order == 2 and not law.corners_only
-
-    def _all_nodes(self, u: Values) -> Values:
-        """(nodes, d) displacements of all nodes in the order of the input mesh, of owned ones u (collective)."""
-        return np.asarray(self._gather.to_all_ranks(np.asarray(u).reshape(-1, self._domain.dim)))
-
-    def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
-        """Move points of a surface for output to the crack faces of contact, which are offset."""
-        contact_map = self._surface.point_map
-        if self.law.fragments_only:
-            return self._surface.place_faces(at)
-        return contact_map.with_arm_share(np.minimum(contact_map.share, at.share))
-
-    def set_cuts(self, cuts: CutPositions) -> None:
-        """Set where edges are cut; used for faces between fragments."""
-        if self.law.fragments_only:
-            self._cuts = cuts
-
-    def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
+    def edges_broke(self, pattern: Pattern) -> None:
         """Add new crack faces, retracted where there is no room (collective)."""
-        self._pattern = pattern
-        self._rebuild(self._surface)
+        self.surface.edges_broke(pattern)
+        self._discard_surface()
 
-    def snapshot(self) -> object:
-        """Retracted and excluded parts of the surface."""
-        return self._surface.snapshot()
-
-    def restore(self, memory: object) -> None:
-        """Restore a snapshot (not collective)."""
-        self._surface.restore(cast("SurfaceSnapshot", memory))
-
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Factors of arms, numbers of excluded elements, steps to the next release of faces, and stiffness."""
-        share, excluded, pause = self._surface.snapshot()
-        return {"share": share, "left_out": np.asarray(excluded, float), "pause": np.array(pause, float),
-                "stiffness": np.array([self.law.stiffness])}  # fmt: skip
-
-    def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set the state from the arrays of a checkpoint."""
-        self._set_stiffness(float(saved["stiffness"][0]))
-        if len(saved["share"]) != len(self._surface.point_map.share):
-            raise ValueError(f"{len(saved['share'])} points of the contact surface instead of those of its damage")
-        pause, remaining = (int(number) for number in saved.get("pause", (1, 1)))
-        self._surface.restore((saved["share"], saved["left_out"].astype(np.int64), (pause, remaining)))
+    # --- steps ---
 
     def begin_step(self, level: TimeLevel) -> None:
         """Lag friction with the contact at the start of the step."""
         self._level, self._is_stale, self._friction, self._attempts = level, True, None, 0
         if not level.dt:
             return
-        nodal, slip = self._all_nodes(level.u_n), self._sticking_speed(level.v_n) * level.dt
-        self._surface.extend_faces(nodal)
-        self._start_positions = x = self._surface.point_map(nodal)
-        if self.law.friction:
-            self._friction = self._surface.pairs.lag_friction(x, x, slip)
+        nodal, slip, surface = self.surface.nodal_values(level.u_n), self._sticking_slip(level), self.surface.current
+        surface.extend_faces(nodal)
+        self._start_positions = x = surface.point_map(nodal)
+        if self.surface.law.friction:
+            self._friction = surface.pairs.lag_friction(x, x, slip)
 
-    def _sticking_speed(self, v: Values) -> float:
-        """Slip velocity that counts as sticking at nodal velocities v (owned dofs,), m/s (collective)."""
-        return max(self.law.sticking_speed, self.law.sticking_speed_ratio * self._speed(v))
+    def _sticking_slip(self, level: TimeLevel) -> float:
+        """Slip in the step that counts as sticking, m (collective)."""
+        law = self.surface.law
+        return level.dt * max(law.sticking_speed, law.sticking_speed_ratio * self._speed(level.v_n))
 
     def _speed(self, v: Values) -> float:
-        """Root mean square of the nodes' speeds relative to their mean velocity, m/s (collective)."""
-        square, mean = self._mean_velocities(v)
+        """Root mean square of the speeds of nodes relative to their mean, of v (owned dofs,), m/s (collective)."""
+        square, mean = mean_velocities(self.comm, v.reshape(-1, self._domain.dim))
         return float(np.sqrt(max(float(square - mean @ mean), 0.0)))
-
-    def _mean_velocities(self, v: Values) -> tuple[float, Values]:
-        """Mean square speed of the nodes, (m/s)^2, and their mean velocity (d,), m/s (collective)."""
-        nodal = v.reshape(-1, self._domain.dim)
-        square, count, *total = sum_over_ranks(self.comm, np.array([v @ v, len(nodal), *nodal.sum(axis=0)]))
-        return float(square / count), np.array(total) / count
 
     def update_displacement(self) -> None:
         """Discard positions and forces, as u has changed."""
@@ -176,13 +251,13 @@ class SelfContact(Term):
         """(n, d) positions at the end of the step that belongs to the current u, m (collective)."""
         if self._is_stale or self._positions is None:
             u = self._level.displacement_at_end(self._u.x.array[: self._owned])
-            self._positions, self._is_stale = self._positions_at(u), False
+            self._positions, self._is_stale = self.surface.positions(u), False
             self._contact_force = self._stored = None
-        return self._positions
+        return cast("Values", self._positions)
 
-    def _positions_at(self, u: Values) -> Values:
-        """(n, d) positions for owned displacements u, m (collective)."""
-        return self._surface.point_map(self._all_nodes(u))
+    def _is_far(self) -> bool:
+        """Whether nothing can be in contact at the current u (collective); of a body with itself it is not asked."""
+        return False
 
     # --- forces, tangent and energy ---
 
@@ -193,13 +268,15 @@ class SelfContact(Term):
             x: (n, d) positions of the surface, m.
             normal: whether normal forces are included; otherwise those of friction alone.
         """
-        gradient = self._surface.pairs.gradient(x) if normal else np.zeros_like(x)
+        gradient = self.surface.current.pairs.gradient(x) if normal else np.zeros_like(x)
         if self._friction is not None:
             gradient = gradient + self._friction.gradient(x)
-        return self._gather.sum_owned(self._surface.nodal_forces(-gradient)).reshape(-1)
+        return self.surface.gather.sum_owned(self.surface.current.nodal_forces(-gradient)).reshape(-1)
 
     def contact_forces(self) -> Values | None:
-        """(owned dofs,) contact forces at the end of the step, N; None where there are none (collective)."""
+        """(owned dofs,) contact forces at the end of the step, N; None: nothing is near (collective)."""
+        if self._is_far():
+            return None
         x = self._end_positions()
         # kept, as residual and reference forces both need them
         if self._contact_force is None:
@@ -216,34 +293,38 @@ class SelfContact(Term):
 
         Where few directions are much stiffer than the body, they come apart from the matrix (StiffCoupling).
         """
-        x = self._end_positions()
-        is_near = self._surface.is_near_tangent(x, self._tangent_positions, again=self._attempts > 1)
+        if self._is_far():
+            return None
+        x, surface = self._end_positions(), self.surface.current
+        is_near = surface.is_near_tangent(x, self._tangent_positions, again=self._attempts > 1)
         self._tangent_positions = x
         exact = is_near and self.allows_exact_tangent
-        H = self._surface.pairs.hessian(x, exact=exact)
+        H = surface.pairs.hessian(x, exact=exact)
         if self._friction is not None:
             H = H + self._friction.hessian(x, exact=exact)
         H = csr_matrix(self._level.contact_weights.factor * H)
         if not self.comm.allreduce(H.nnz):
             return None
-        matrix = self._coupling(self._surface.nodal_stiffness(H), self._input_nodes)
-        stiff = stiff_directions(H, self._stiff_threshold * self.law.stiffness, self.comm)
+        matrix = self._coupling(surface.nodal_stiffness(H), self._input_nodes)
+        stiff = stiff_directions(H, self._stiff_threshold * self.surface.law.stiffness, self.comm)
         if stiff is None:
             return matrix
-        directions, stiffness = self._gather.owned(self._surface.nodal_directions(stiff[0])), stiff[1]
+        directions, stiffness = self.surface.gather.owned(surface.nodal_directions(stiff[0])), stiff[1]
         return StiffCoupling(matrix, directions.reshape(self._owned, len(stiffness)), stiffness)
 
     def min_gap(self) -> float:
         """Least distance within the barrier at the current u, m; infinite where none is active (collective)."""
-        x = self._positions_at(self._u.x.array[: self._owned])
-        return float(self.comm.allreduce(self._surface.pairs.min_gap(x), op=MPI.MIN))
+        x = self.surface.positions(self._u.x.array[: self._owned])
+        return float(self.comm.allreduce(self.surface.current.pairs.min_gap(x), op=MPI.MIN))
 
     def stored_energy(self) -> float:
         """Energy of the barrier at the current u, of this rank's pairs, J (collective)."""
+        if self._is_far():
+            return 0.0
         x = self._end_positions()
         # kept, as the line search and the energy balance both need it
         if self._stored is None:
-            self._stored = self._surface.pairs.energy(x)
+            self._stored = self.surface.current.pairs.energy(x)
         return self._stored
 
     def stiffen_contact(self) -> float:
@@ -251,26 +332,24 @@ class SelfContact(Term):
 
         The energy is that of this rank's pairs.
         """
-        x = self._end_positions()
-        gap = self.comm.allreduce(self._surface.pairs.min_gap(x), op=MPI.MIN)
-        if (factor := stiffness_factor(gap / self.law.distance)) <= 1:
+        if self._is_far():
             return 0.0
-        energy = (factor - 1) * self._surface.pairs.energy(x)
-        self._set_stiffness(factor * self.law.stiffness)
+        x, pairs, law = self._end_positions(), self.surface.current.pairs, self.surface.law
+        gap = self.comm.allreduce(pairs.min_gap(x), op=MPI.MIN)
+        if (factor := stiffness_factor(gap / law.distance)) <= 1:
+            return 0.0
+        energy = (factor - 1) * pairs.energy(x)
+        self.surface.set_stiffness(factor * law.stiffness)
         return energy
-
-    def _set_stiffness(self, stiffness: float) -> None:
-        if stiffness == self.law.stiffness:
-            return
-        self.law = replace(self.law, stiffness=stiffness)
-        self._surface.set_stiffness(stiffness)
 
     def damping_forces(self) -> Values | None:
         """(owned dofs,) minus the forces of friction, N (collective)."""
-        return -self._nodal_forces(self._end_positions(), normal=False) if self.law.friction else None
+        return -self._nodal_forces(self._end_positions(), normal=False) if self.surface.law.friction else None
 
     def potential(self) -> float:
         """Potential of barrier and friction as they enter the residual, of this rank's pairs, J (collective)."""
+        if self._is_far():
+            return 0.0
         x, energy = self._end_positions(), self.stored_energy()
         if self._friction is not None:
             energy += self._friction.energy(x)
@@ -284,7 +363,8 @@ class SelfContact(Term):
 
     def _free_fraction(self, x: Values, motion: Values) -> float:
         """Fraction of a motion (owned dofs,) from positions x (n, d), m, without a collision (collective)."""
-        return self._surface.pairs.free_fraction(x, x + self._surface.point_map.weights @ self._all_nodes(motion))
+        surface, nodal = self.surface.current, self.surface.nodal_values(motion)
+        return surface.pairs.free_fraction(x, x + surface.point_map.weights @ nodal)
 
     def begin_solve(self) -> None:
         """Count an attempt of Newton's method; after a failure tangents become exact later."""
@@ -302,20 +382,19 @@ class SelfContact(Term):
     def clear_search(self) -> None:
         """Discard the candidates of collision detection (not collective)."""
         self._is_stale = True
-        self._surface.pairs.clear_caches()
+        self.surface.current.pairs.clear_caches()
 
     def destroy(self) -> None:
         """Destroy the objects of PETSc."""
         self._coupling.destroy()
 
 
+def mean_velocities(comm: MPI.Intracomm, v: Values) -> tuple[float, Values]:
+    """Mean square speed of nodes, (m/s)^2, and their mean velocity (d,), m/s; v: (n, d) of owned ones (collective)."""
+    square, count, *total = sum_over_ranks(comm, np.array([np.vdot(v, v), len(v), *v.sum(axis=0)]))
+    return float(square / count), np.array(total) / count
+
+
 def node_gather(domain: Domain, law: SelfContactLaw) -> Gather:
     """Gathering of the nodes that the surface depends on."""
     return domain.input_numbering.gather_corners if law.corners_only else domain.input_numbering.gather_nodes
-
-
-def refined_mesh(domain: Domain) -> MeshData | None:
-    """Input mesh with quadratic cells subdivided into linear ones."""
-    from ..mesh.split_surface.quadratic_surface import subdivided_input_mesh
-
-    return subdivided_input_mesh(domain)

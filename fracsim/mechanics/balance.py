@@ -33,12 +33,12 @@ from .prescribed_motion import PrescribedMotion
 from .stress import Stress
 from .tangent import Tangent
 from .term import Term, TimeLevel, Values, overriding, sum_of_forms
-from .term_protocols import ContactTerms, RigidMotionTerm, TermHistories, fulfilling
+from .term_protocols import ContactTerms, RigidMotionTerm, StepWork, TermHistories, fulfilling
 
 # methods of terms that are called in every step, of those terms alone that override them
 _STEP_METHODS = (
     "begin_step", "update_displacement", "accept_step", "add_nodal_forces", "acceleration", "applied_forces",
-    "damping_forces", "reference_forces", "stored_energy", "step_work", "edges_broke", "damage_changed",
+    "damping_forces", "reference_forces", "stored_energy", "edges_broke", "damage_changed",
 )  # fmt: skip
 
 
@@ -335,7 +335,10 @@ class EnergySums:
 
     def __init__(self, balance: Balance) -> None:
         self._balance, self._comm = balance, balance.domain.comm
-        self._rigid_motion = fulfilling(balance.terms, RigidMotionTerm)
+        self._rigid_motion, self._working = (
+            fulfilling(balance.terms, RigidMotionTerm),
+            fulfilling(balance.terms, StepWork),
+        )
 
     def kinetic_energy(self, v: Values) -> float:
         """Kinetic energy of the body and of rigid obstacles, part of this rank, J; v: (owned dofs,), m/s."""
@@ -361,7 +364,7 @@ class EnergySums:
 
     def step_work(self) -> tuple[float, float]:
         """(work, dissipated) external work of the last step that no nodal force shows, of this rank, J (collective)."""
-        works = [term.step_work() for term in self._balance.terms_with["step_work"]]
+        works = [owner.step_work() for owner in self._working]
         return sum(work for work, _ in works), sum(dissipated for _, dissipated in works)
 
     def applied_forces(self) -> Values:

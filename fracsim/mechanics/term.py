@@ -158,13 +158,6 @@ class Term:
         """(owned dofs,) forces in equilibrium in r, N: their norm scales the residual in the convergence test."""
         return None
 
-    def step_work(self) -> tuple[float, float]:
-        """External work of the last step that `applied_forces` does not show, and the part of it that is dissipated.
-
-        Parts of this rank, J; asked once a step (collective).
-        """
-        return 0.0, 0.0
-
     def frequency_bound(self) -> float:
         """Bound of its part of the square of the highest frequency, on all ranks, 1/s^2: limits explicit steps."""
         return 0.0

@@ -116,17 +116,33 @@ class RestrictedMotion(Protocol):
 
 
 @runtime_checkable
-class CrackFaceContact(Protocol):
-    """Contact between crack faces."""
+class CutFaces(Protocol):
+    """Crack faces that are in contact."""
 
     def set_cuts(self, cuts: CutPositions) -> None:
         """Cut broken edges at the positions of `cuts`, asked after they broke; otherwise in the middle."""
+
+
+@runtime_checkable
+class StiffeningContact(Protocol):
+    """Contact whose stiffness grows where it is too small."""
 
     def stiffen_contact(self) -> float:
         """Raise the contact stiffness if gaps at the end of the step are too small (collective).
 
         Returns:
             Energy that this adds at the same u, part of this rank, J.
+        """
+
+
+@runtime_checkable
+class StepWork(Protocol):
+    """Term with work that its forces at the end of a step do not show."""
+
+    def step_work(self) -> tuple[float, float]:
+        """External work of the last step that `applied_forces` does not show, and the part of it that is dissipated.
+
+        Parts of this rank, J; asked once a step (collective).
         """
 
 
@@ -244,7 +260,8 @@ class ContactTerms:
         self._guessing = fulfilling(terms, InitialGuess)
         self._tests = fulfilling(terms, FeasibilityTest)
         self._prescribed = fulfilling(terms, RestrictedMotion)
-        self._crack_faces = fulfilling(terms, CrackFaceContact)
+        self._cut_faces = fulfilling(terms, CutFaces)
+        self._stiffening = fulfilling(terms, StiffeningContact)
         self._limiting_terms = [term for term in terms if fulfilling([term], StepLimiter)]
         self.limits_newton_steps = bool(self._limiters)
 
@@ -298,12 +315,12 @@ class ContactTerms:
 
     def stiffen(self) -> float:
         """Raise contact stiffness where gaps are too small; energy that this adds on this rank, J (collective)."""
-        return sum(term.stiffen_contact() for term in self._crack_faces)
+        return sum(term.stiffen_contact() for term in self._stiffening)
 
     def set_cuts(self, cuts: CutPositions) -> None:
         """Cut broken edges at the positions of `cuts`."""
-        for term in self._crack_faces:
-            term.set_cuts(cuts)
+        for faces in self._cut_faces:
+            faces.set_cuts(cuts)
 
     def clear_search(self) -> None:
         """Clear caches of the contact search (collective)."""

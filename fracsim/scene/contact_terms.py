@@ -116,7 +116,7 @@ def build_obstacle_terms(
     if meshes:
         terms.append(_build_mesh_obstacle_term(study, domain, u, motion, meshes, law, stress, mass, scheme))
     for term in terms:
-        motion.add_contact(term)
+        motion.contacts.append(term)
     return [*terms, motion]
 
 
