@@ -250,8 +250,8 @@ def test_ways_too_short_to_meet_ask_no_collision_detection(dim, gap, monkeypatch
     x, elements, upper = stacked(dim, gap)
     pairs = IpcPairs(x, elements, distance=REACH, stiffness=STIFF)
     asked = []
-    free = pairs._search.free_fraction
-    monkeypatch.setattr(pairs._search, "free_fraction", lambda *ends: asked.append(1) or free(*ends))
+    free = pairs._piece_fraction
+    monkeypatch.setattr(pairs, "_piece_fraction", lambda *ends: asked.append(1) or free(*ends))
     for length in np.linspace(0.02, 1.5, 60) * gap:
         asked.clear()
         way = -length * upper[:, None] * np.eye(dim)[-1]

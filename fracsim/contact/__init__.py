@@ -31,6 +31,7 @@ Points and facets before analytic obstacles:
 
 Surfaces with ipctk:
 
+    pair_search           points, edges and triangles that may come near one another in a motion
     ipc_surface, ipc_pairs, sample_points  split surface, pairs of elements, sample points and friction at them
     mesh_obstacles        pairs of a body and a triangle-mesh obstacle
     penalty_pairs         penalty between points and facets, and between edges, with friction

@@ -19,7 +19,6 @@ Equations: docs/theory.md#barrier, docs/theory.md#friction.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -31,6 +30,7 @@ from scipy.sparse import csr_matrix
 
 from ..mesh.parallel import sum_over_ranks
 from .laws import BARRIER
+from .pair_search import PairFilter, PairSearch, SimplexPairs, max_length
 from .sample_points import Centroids, IpcFriction, Vertices, measures, projection
 
 Values = npt.NDArray[np.float64]
@@ -110,10 +110,8 @@ class OwnPairs:
         """`vertices`: (n,) flags of those of this rank."""
         mesh, low = samples.mesh, samples.lowest_vertices
         faces = np.asarray(mesh.faces).reshape(-1, 3)
-        # lists, as items are read one by one
-        self._flags, self._point = [bool(flag) for flag in vertices], [int(vertex) for vertex in low]
-        self._edge = [int(vertex) for vertex in mesh.edges.min(axis=1)]
-        self._face = [int(vertex) for vertex in faces.min(axis=1, initial=len(low))]
+        self._flags, self._point = vertices, low
+        self._edge, self._face = mesh.edges.min(axis=1), faces.min(axis=1, initial=len(low))
 
     def select(self, pairs: ipctk.NormalCollisions) -> None:
         """Remove the pairs of other ranks."""
@@ -129,18 +127,21 @@ class PairKind:
     """Barrier between sample points, or edges, and elements.
 
     Attributes:
-        distance: at which the barrier begins, m.
+        simplices: pairs that are searched, and the distance at which the barrier begins.
         stiffness: Pa.
-        name: list of ipctk's candidates; empty for centroids, which have candidates of their own.
         samples: sample points.
         vertices: (n,) flags of the vertices of this rank; None: all pairs are its own.
     """
 
-    distance: float
+    simplices: SimplexPairs
     stiffness: float
-    name: str
     samples: Vertices | Centroids
     vertices: Flags | None = None
+
+    @property
+    def distance(self) -> float:
+        """Distance at which the barrier begins, m."""
+        return self.simplices.distance
 
     @cached_property
     def barrier(self) -> ipctk.BarrierPotential:
@@ -151,6 +152,20 @@ class PairKind:
     def own_pairs(self) -> OwnPairs | None:
         """Pairs of this rank; None: all pairs are its own."""
         return None if self.vertices is None else OwnPairs(self.samples, self.vertices)
+
+    def candidates(self, pairs: Ints) -> ipctk.Candidates:
+        """Candidates of ipctk of pairs (k, 2) of simplices."""
+        before = self.samples.mesh.num_vertices - len(self.simplices.first) if self.simplices.centroids else 0
+        columns, result = (before + pairs[:, 0], pairs[:, 1]), ipctk.Candidates()
+        first, second = (list[int](column) for column in columns)
+        if self.simplices.is_one_set:
+            result.ee_candidates = list(map(ipctk.EdgeEdgeCandidate, first, second))
+            return result
+        if self.simplices.second.shape[1] == 3:
+            result.fv_candidates = list(map(ipctk.FaceVertexCandidate, second, first))
+        else:
+            result.ev_candidates = list(map(ipctk.EdgeVertexCandidate, second, first))
+        return result
 
     def active_pairs(self, candidates: ipctk.Candidates, x: Values) -> ActivePairs:
         """Candidates on which the barrier acts, with vertices at x (n, d), m."""
@@ -196,103 +211,6 @@ class ActivePairs:
     def least_squared_distance(self) -> float:
         """Least squared distance of a pair, m^2."""
         return float(self.pairs.compute_minimum_distance(self.kind.samples.mesh, self.positions))
-
-
-class PairSearch:
-    """Candidates within `distance` + 2 `margin` (m) of each other; x (n, d) of the mesh's points, m.
-
-    Candidates are searched along a whole step of Newton's method and serve all positions within `margin` of it: the
-    trials of the line search, the steps after it, and mostly the next one.
-    """
-
-    def __init__(self, mesh: ipctk.CollisionMesh, kinds: list[PairKind], distance: float, margin: float) -> None:
-        """`kinds`: kinds of pairs, of which the last one takes the remaining candidates."""
-        self._mesh, self._kinds, self._margin, self._radius = mesh, kinds, margin, 0.5 * distance + margin
-        self.clear_caches()
-
-    def clear_caches(self) -> None:
-        """Discard all candidates and pairs."""
-        # a surface without elements has no candidates, wherever it is
-        is_empty = not len(self._mesh.rest_positions)
-        self._candidates = [ipctk.Candidates() for _ in self._kinds] if is_empty else []
-        self._active: list[ActivePairs] = []
-        unknown = np.full(self._mesh.rest_positions.shape, np.nan)
-        self._search_start = self._search_motion = self._active_positions = unknown
-
-    def active_pairs(self, x: Values) -> list[ActivePairs]:
-        """Pairs of each kind on which its barrier acts; those of the last x are kept."""
-        if not self._active or not np.array_equal(x, self._active_positions):
-            items = zip(self._kinds, self.candidates(x), strict=True)
-            self._active = [kind.active_pairs(candidates, x) for kind, candidates in items]
-            self._active_positions = x.copy()
-        return self._active
-
-    def set_stiffness(self, stiffness: Sequence[float]) -> None:
-        """Set the stiffness of each kind, Pa; active pairs stay."""
-        self._kinds = [replace(kind, stiffness=k) for kind, k in zip(self._kinds, stiffness, strict=True)]
-        self._active = [replace(pairs, kind=kind) for kind, pairs in zip(self._kinds, self._active, strict=False)]
-
-    def candidates(self, x: Values) -> list[ipctk.Candidates]:
-        """Candidates of each kind; the same ones while they are valid."""
-        if not self._is_valid(x):
-            self._search(x, x)
-        return self._candidates
-
-    def free_fraction(self, x: Values, end: Values) -> float:
-        """Fraction in (0, 1] of the motion from x to `end` that leaves `BARRIER.min_gap_ratio` of each gap."""
-        self.search_along(x, end)
-        named = [pairs for kind, pairs in zip(self._kinds, self._candidates, strict=True) if kind.name]
-        steps = (pairs.compute_collision_free_stepsize(self._mesh, x, end, 0.0, CCD) for pairs in named)
-        return float(min(steps, default=1.0))
-
-    def search_along(self, x: Values, end: Values) -> None:
-        """Search candidates for the whole motion from x to `end`, unless they are valid."""
-        if not (self._is_valid(x) and self._is_valid(end)):
-            self._search(x, end)
-
-    def _search(self, x: Values, end: Values) -> None:
-        """Search candidates along a motion; the mean motion brings nothing together."""
-        start, centred_end = centred(x), centred(end)
-        all_candidates = ipctk.Candidates()
-        # one tree for all kinds, as it takes most of the time
-        all_candidates.build(self._mesh, start, centred_end, self._radius, ipctk.LBVH())
-        self._candidates = [self._of_kind(kind, all_candidates, start, centred_end) for kind in self._kinds[:-1]] + [
-            all_candidates
-        ]
-        self._search_start, self._search_motion = start, centred_end - start
-
-    def _of_kind(
-        self, kind: PairKind, all_candidates: ipctk.Candidates, start: Values, end: Values
-    ) -> ipctk.Candidates:
-        if isinstance(kind.samples, Centroids):
-            return kind.samples.candidates(start, end, self._radius)
-        return _extract(all_candidates, kind.name)
-
-    def _is_valid(self, x: Values) -> bool:
-        """Whether no pair within reach can be missing: all points are near their motion in the last search."""
-        offset, squares = centred(x) - self._search_start, np.sum(self._search_motion**2, axis=1)
-        along = np.sum(offset * self._search_motion, axis=1) / np.where(squares > 0, squares, 1.0)
-        along = np.clip(along, 0.0, 1.0)
-        return max_length(offset - along[:, None] * self._search_motion) <= self._margin
-
-
-def _extract(candidates: ipctk.Candidates, name: str) -> ipctk.Candidates:
-    """Candidates in the list of that name, which `candidates` loses."""
-    part = ipctk.Candidates()
-    setattr(part, name, getattr(candidates, name))
-    setattr(candidates, name, [])
-    return part
-
-
-def centred(x: Values) -> Values:
-    """(n, d) positions relative to their mean, m."""
-    result: Values = x - x.mean(axis=0) if len(x) else x
-    return result
-
-
-def max_length(vectors: Values) -> float:
-    """Largest length of the rows of an array (n, d)."""
-    return float(np.sqrt(np.max(np.sum(vectors**2, axis=1), initial=0.0)))
 
 
 # --- intersections ---
@@ -391,24 +309,31 @@ class IpcPairs:
         faces = (corners,) if is_3d else ()
         edges = ipctk.edges(corners) if is_3d and len(corners) else corners.reshape(-1, 2)
         self._mesh = ipctk.CollisionMesh.build_from_full_mesh(rest_positions, edges, *faces)
+        mesh, at_vertices, centroids = self._mesh, Vertices(self._mesh), Centroids(self._mesh)
+        points, surface_edges = np.arange(mesh.num_vertices)[:, None], np.ascontiguousarray(mesh.edges, np.int32)
+        surface = np.ascontiguousarray(mesh.faces, np.int32) if is_3d else surface_edges
+        sets = [
+            SimplexPairs.of(surface, surface, distance, centroids=True),
+            SimplexPairs.of(points, surface, PAIRS.vertex_distance * distance),
+        ]
+        if is_3d:
+            sets.append(SimplexPairs.of(surface_edges, surface_edges, PAIRS.edge_distance * distance))
         # in 3D ipctk weights points as half of all pairs of a triangle, and edges as the other half
-        at_vertices = Vertices(self._mesh)
-        kinds: list[tuple[float, float, str, Vertices | Centroids]] = [(1.0 + is_3d, 1.0, "", Centroids(self._mesh))]
-        point_list = "fv_candidates" if is_3d else "ev_candidates"
-        kinds += [(1.0 + is_3d, PAIRS.vertex_distance, point_list, at_vertices)]
-        kinds += [(1.0, PAIRS.edge_distance, "ee_candidates", at_vertices)] if is_3d else []
-        self._weights, self.comm = [weight for weight, *_ in kinds], MPI.COMM_SELF if share is None else share.comm
+        self._weights = [2.0, 2.0, 1.0] if is_3d else [1.0, 1.0]
+        self.comm = MPI.COMM_SELF if share is None else share.comm
         vertices = None if share is None or share.comm.size == 1 else share.points[np.unique(elements)]
+        self._search = PairSearch(mesh.num_vertices, sets, PAIRS.search_margin * distance)
         self._own_filter = None
         if vertices is not None:
             # two points of other ranks have the same number and do not touch
             number = np.where(vertices, 1 + np.arange(len(vertices)), 0).astype(np.int32)
-            self._mesh.can_collide = self._own_filter = ipctk.make_vertex_patches_filter(number)
-        pair_kinds = [
-            PairKind(ratio * distance, weight * stiffness, name, samples, vertices)
-            for weight, ratio, name, samples in kinds
+            mesh.can_collide = self._own_filter = ipctk.make_vertex_patches_filter(number)
+            self._search.filter = PairFilter(self._search.filter.patches, vertices)
+        self._kinds = [
+            PairKind(pairs, weight * stiffness, centroids if pairs.centroids else at_vertices, vertices)
+            for pairs, weight in zip(sets, self._weights, strict=True)
         ]
-        self._search = PairSearch(self._mesh, pair_kinds, distance, PAIRS.search_margin * distance)
+        self._clear_active()
         self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
         self._friction, self._distance = friction, distance
         self._area = vertex_areas(rest_positions, elements)
@@ -425,20 +350,46 @@ class IpcPairs:
 
     def restrict_to_patches(self, patch: npt.NDArray[np.int32]) -> None:
         """Let elements touch those of other patches alone; `patch`: (n,) number of the patch of each point."""
-        of_patches = ipctk.make_vertex_patches_filter(patch[np.unique(self._elements)])
+        patch = np.ascontiguousarray(patch[np.unique(self._elements)])
+        self._search.filter = PairFilter(patch, self._search.filter.is_owned)
+        of_patches = ipctk.make_vertex_patches_filter(patch)
         self._mesh.can_collide = of_patches if self._own_filter is None else of_patches & self._own_filter
+
+    # --- candidates and active pairs ---
+
+    def _clear_active(self) -> None:
+        """Discard the candidates of ipctk and the pairs on which barriers act."""
+        self._found: list[Ints] = []  # pairs whose candidates these are
+        self._candidates: list[ipctk.Candidates] = []
+        self._active: list[ActivePairs] = []
+        self._active_positions: Values = np.empty(0)
+
+    def _candidates_of(self, pairs: list[Ints]) -> list[ipctk.Candidates]:
+        """Candidates of ipctk of each kind; kept while the pairs are the same."""
+        if pairs is not self._found:
+            items = zip(self._kinds, pairs, strict=True)
+            self._found, self._candidates = pairs, [kind.candidates(of_kind) for kind, of_kind in items]
+        return self._candidates
+
+    def _active_pairs(self, vertices: Values) -> list[ActivePairs]:
+        """Pairs of each kind on which its barrier acts; those of the last positions are kept."""
+        if not self._active or not np.array_equal(vertices, self._active_positions):
+            items = zip(self._kinds, self._candidates_of(self._search.pairs(vertices)), strict=True)
+            self._active = [kind.active_pairs(candidates, vertices) for kind, candidates in items]
+            self._active_positions = vertices.copy()
+        return self._active
 
     # --- barrier ---
 
     def energy(self, x: Values) -> float:
         """Energy E(x) of this rank's pairs, J."""
         vertices = self._mesh.vertices(x)
-        return sum(pairs.energy() for pairs in self._search.active_pairs(vertices))
+        return sum(pairs.energy() for pairs in self._active_pairs(vertices))
 
     def gradient(self, x: Values) -> Values:
         """(n, d) dE/dx of this rank's pairs, N: minus the forces on the points."""
         vertices = self._mesh.vertices(x)
-        total = sum(pairs.gradient() for pairs in self._search.active_pairs(vertices))
+        total = sum(pairs.gradient() for pairs in self._active_pairs(vertices))
         if not len(self._mesh.rest_positions):
             return np.zeros_like(x)
         return np.asarray(self._mesh.to_full_dof(total)).reshape(x.shape)
@@ -446,29 +397,32 @@ class IpcPairs:
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2 of this rank's pairs, N/m; unless `exact`, each without its negative eigenvalues."""
         vertices, method = self._mesh.vertices(x), projection(exact=exact)
-        total = sum(pairs.hessian(method) for pairs in self._search.active_pairs(vertices))
+        total = sum(pairs.hessian(method) for pairs in self._active_pairs(vertices))
         if not len(self._mesh.rest_positions):
             return csr_matrix((x.size, x.size))
         return csr_matrix(self._mesh.to_full_dof(total))
 
     def set_stiffness(self, stiffness: float) -> None:
         """Set the stiffness k, Pa."""
-        self._search.set_stiffness([weight * stiffness for weight in self._weights])
+        items = zip(self._kinds, self._weights, strict=True)
+        self._kinds = [replace(kind, stiffness=weight * stiffness) for kind, weight in items]
+        self._active = [replace(pairs, kind=kind) for kind, pairs in zip(self._kinds, self._active, strict=False)]
 
     def clear_caches(self) -> None:
         """Discard the candidates of collision detection."""
         self._search.clear_caches()
+        self._clear_active()
 
     def min_gap(self, x: Values) -> float:
         """Least distance of this rank's pairs on which the barrier acts, m; infinite where there is none."""
         return self._gap_at(self._mesh.vertices(x))
 
     def _gap_at(self, vertices: Values) -> float:
-        return float(np.sqrt(min(pairs.least_squared_distance() for pairs in self._search.active_pairs(vertices))))
+        return float(np.sqrt(min(pairs.least_squared_distance() for pairs in self._active_pairs(vertices))))
 
     def search_along(self, x: Values, end: Values) -> None:
         """Search candidates for the whole motion from x to `end` (n, d), m."""
-        self._search.search_along(self._mesh.vertices(x), self._mesh.vertices(end))
+        self._search.pairs_along(self._mesh.vertices(x), self._mesh.vertices(end))
 
     # --- friction ---
 
@@ -482,7 +436,7 @@ class IpcPairs:
         """
         vertices = self._mesh.vertices(x)
         parts = []
-        for pairs in self._search.active_pairs(vertices):
+        for pairs in self._active_pairs(vertices):
             part = ipctk.TangentialCollisions()
             part.build(pairs.kind.samples.mesh, pairs.positions, pairs.pairs, pairs.kind.barrier, self._friction)
             parts.append((pairs.kind.samples, part))
@@ -508,10 +462,16 @@ class IpcPairs:
         pieces = self._piece_count(motion)
         for piece in range(min(pieces, PAIRS.max_pieces)):
             start, stop = piece / pieces, (piece + 1) / pieces
-            fraction = self._search.free_fraction(vertices + start * motion, vertices + stop * motion)
+            fraction = self._piece_fraction(vertices + start * motion, vertices + stop * motion)
             if fraction < 1.0:
                 return (piece + fraction) / pieces
         return min(pieces, PAIRS.max_pieces) / pieces
+
+    def _piece_fraction(self, x: Values, end: Values) -> float:
+        """Fraction in (0, 1] of the motion from x to `end` that leaves `BARRIER.min_gap_ratio` of each gap."""
+        items = zip(self._kinds, self._candidates_of(self._search.pairs_along(x, end)), strict=True)
+        named = [candidates for kind, candidates in items if not kind.simplices.centroids]
+        return float(min(pairs.compute_collision_free_stepsize(self._mesh, x, end, 0.0, CCD) for pairs in named))
 
     def _is_short(self, vertices: Values, motion: Values) -> bool:
         """Whether a motion (n, d) is safe in whatever direction points move, as half of Newton's steps are.

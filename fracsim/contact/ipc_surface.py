@@ -29,7 +29,8 @@ from ..mesh.split_surface.fragment_surface import build_fragment_surface, has_sa
 from ..mesh.split_surface.point_matching import match_points, point_identity
 from ..mesh.split_surface.surface_map import SurfaceMap, make_surface_map
 from ..meshes.data import format_point
-from .ipc_pairs import IpcPairs, PairShare, max_length
+from .ipc_pairs import IpcPairs, PairShare
+from .pair_search import max_length
 from .sample_points import SlipFriction
 
 Values = npt.NDArray[np.float64]

@@ -24,7 +24,7 @@ from ..mesh.ghost_exchange import with_straight_edges
 from ..mesh.parallel import sum_over_ranks
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.surface_map import SurfaceMap
-from .ipc_pairs import IpcPairs, max_length
+from .ipc_pairs import IpcPairs
 from .ipc_surface import SelfContactLaw, SelfContactSurface
 from .laws import BARRIER
 from .mesh_obstacles import (
@@ -36,6 +36,7 @@ from .mesh_obstacles import (
     ProximityTest,
 )
 from .obstacle import RigidObstacle
+from .pair_search import max_length
 from .pose import Pose
 from .pose_derivatives import PoseDerivatives, point_jacobian, point_set_derivatives, sum_of_derivatives
 from .rigid_obstacles import ObstacleGroup, RigidObstacles

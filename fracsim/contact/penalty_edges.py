@@ -17,14 +17,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import ipctk
 import numpy as np
 import numpy.typing as npt
 
-from .ipc_pairs import PairKind, PairSearch, centred
 from .ipc_surface import unit_normals
+from .pair_search import PairFilter, PairSearch, SimplexPairs, near_pairs
 from .penalty_contacts import PenaltyContacts
-from .sample_points import Vertices
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -172,18 +170,11 @@ class EdgeContacts:
         ends = self._sharp.ends
         self._stiffness = limit[ends].min(axis=1, initial=np.inf)
         self._used, local = np.unique(ends, return_inverse=True)
-        self._search: PairSearch | None = None
-        self._candidates: ipctk.Candidates | None = None
-        self._pairs: Ints = np.empty((0, 2), np.int64)  # those of the candidates
-        if len(ends) > 1:
-            edges = np.asfortranarray(local.reshape(-1, 2), np.int32)
-            mesh = ipctk.CollisionMesh(np.asfortranarray(rest_positions[self._used]), edges)
-            if patch is not None:
-                mesh.can_collide = ipctk.make_vertex_patches_filter(patch[self._used])
-            kind = PairKind(distance, 1.0, "ee_candidates", Vertices(mesh))
-            reach, margin = EDGES.max_gap * distance, EDGES.search_margin * distance
-            self._search = PairSearch(mesh, [kind], reach, margin)
-            self._mesh = mesh
+        edges = local.reshape(-1, 2)
+        self._sets = SimplexPairs.of(edges, edges, EDGES.max_gap * distance)
+        self._search = PairSearch(len(self._used), [self._sets], EDGES.search_margin * distance)
+        if patch is not None:
+            self._search.filter = PairFilter(np.ascontiguousarray(patch[self._used]), self._search.filter.is_owned)
         self.set_history(EdgePairHistory.none())
 
     def set_history(self, history: EdgePairHistory) -> None:
@@ -261,30 +252,20 @@ class EdgeContacts:
 
     def search_along(self, x: Values, end: Values) -> None:
         """Search candidates for the motion from x to `end` (n, 3), m."""
-        if self._search is not None:
-            self._search.search_along(x[self._used], end[self._used])
+        self._search.pairs_along(x[self._used], end[self._used])
 
     def clear_caches(self) -> None:
         """Discard the candidates."""
-        if self._search is not None:
-            self._search.clear_caches()
+        self._search.clear_caches()
 
     def _near_pairs(self, x: Values) -> Ints:
         """(k, 2) sharp edges that may be near each other with points at x (n, 3), m, the lower number first."""
-        if self._search is None:
-            return self._pairs
-        (candidates,) = self._search.candidates(x[self._used])
-        if candidates is not self._candidates:
-            self._candidates, self._pairs = candidates, _edge_pairs(candidates)
-        return self._pairs
+        return self._search.pairs(x[self._used])[0]
 
     def clearance(self, x: Values, reach: float) -> float:
         """Least distance between sharp edges, m, at most `reach`; that of their lines, or 0 where they are parallel."""
-        if self._search is None:
-            return reach
-        vertices, candidates = centred(x[self._used]), ipctk.Candidates()
-        candidates.build(self._mesh, vertices, vertices, reach / 2, ipctk.LBVH())
-        pairs = _edge_pairs(candidates)
+        vertices = x[self._used]
+        pairs = near_pairs(self._sets, self._search.filter, vertices, vertices, reach)
         ends = np.concatenate([self._sharp.ends[pairs[:, 0]], self._sharp.ends[pairs[:, 1]]], axis=1)
         return min(reach, float(_segment_distances(x[ends]).min(initial=reach)))
 
@@ -305,12 +286,6 @@ def _swapped(history: EdgePairHistory, rows: Flags) -> EdgePairHistory:
         return history
     points, sign = np.where(rows[:, None], history.points[:, [2, 3, 0, 1]], history.points), np.where(rows, -1.0, 1.0)
     return replace(history, points=points, slip=sign[:, None] * history.slip)
-
-
-def _edge_pairs(candidates: ipctk.Candidates) -> Ints:
-    """(k, 2) edges of candidates, the lower number first."""
-    numbers = [(pair.edge0_id, pair.edge1_id) for pair in candidates.ee_candidates]
-    return np.sort(np.array(numbers, np.int64).reshape(-1, 2), axis=1)
 
 
 @dataclass(frozen=True)

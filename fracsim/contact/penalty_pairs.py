@@ -99,7 +99,7 @@ class PenaltyPairs(IpcPairs):
         if patch is not None:
             self.restrict_to_patches(patch)
         edge = self.mean_edge_length
-        self._points = PointFacetContacts(self.collision_mesh, elements, stiffness, distance=distance, edge=edge)
+        self._points = PointFacetContacts(elements, stiffness, distance=distance, edge=edge, patch=patch)
         self._edges = (
             EdgeContacts(rest_positions, elements, stiffness.limit, distance=distance, patch=patch) if is_3d else None
         )

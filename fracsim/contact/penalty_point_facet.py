@@ -14,16 +14,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import ipctk
 import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
 from .closest_point import minimise_on_simplex
-from .ipc_pairs import PairKind, PairSearch, centred
 from .ipc_surface import unit_normals
+from .pair_search import PairFilter, PairSearch, SimplexPairs, centred, near_pairs
 from .penalty_contacts import ContactStiffness, PenaltyContacts, point_masses
-from .sample_points import Vertices
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -201,30 +199,32 @@ class PointFacetContacts:
 
     def __init__(
         self,
-        mesh: ipctk.CollisionMesh,
         elements: Ints,
         stiffness: ContactStiffness,
         *,
         distance: float,
         edge: float,
+        patch: npt.NDArray[np.int32] | None = None,
     ) -> None:
         """Points and facets of a surface.
 
         Args:
-            mesh: of ipctk.
             elements: (k, d) facets.
             stiffness: of points.
             distance: D, m.
             edge: mean length of edges, m.
+            patch: (n,) numbers of parts of the surface that touch others alone; None: all touch.
         """
         count, dim = len(stiffness.point), elements.shape[1]
         self.history = PointHistory.none(count, dim)
-        self._mesh, self._stiffness, self._width, self._elements, self._edge = mesh, stiffness, distance, elements, edge
-        self._used = np.unique(elements)  # the points of ipctk's mesh
-        kind = PairKind(distance, 1.0, "ee_candidates", Vertices(mesh))
-        reach, margin = POINT_FACET.max_gap * distance, POINT_FACET.search_margin * distance
-        self._search = PairSearch(mesh, [kind], reach, margin)
-        self._candidates: ipctk.Candidates | None = None  # those of which closest points are cached
+        self._stiffness, self._width, self._elements, self._edge = stiffness, distance, elements, edge
+        self._used, local = np.unique(elements, return_inverse=True)  # points that are searched
+        facets, reach = local.reshape(elements.shape), POINT_FACET.max_gap * distance
+        self._sets = SimplexPairs.of(np.arange(len(self._used))[:, None], facets, reach)
+        self._search = PairSearch(len(self._used), [self._sets], POINT_FACET.search_margin * distance)
+        if patch is not None:
+            self._search.filter = PairFilter(np.ascontiguousarray(patch[self._used]), self._search.filter.is_owned)
+        self._candidates: list[Ints] | None = None  # those of which closest points are cached
         self._cache: ClosestPointCache
         self._is_close: Flags  # (k,) cached pairs that were close at the positions of their last check
         self._check_positions: Values
@@ -270,14 +270,13 @@ class PointFacetContacts:
 
     def clearance(self, x: Values, reach: float) -> float:
         """Least distance between points and facets at x (n, d), m, at most `reach`."""
-        vertices, candidates = centred(self._mesh.vertices(x)), ipctk.Candidates()
-        candidates.build(self._mesh, vertices, vertices, reach / 2, ipctk.LBVH())
-        points, facets = self._points_and_facets(candidates).T
-        return closest_distance(x, points, self._elements[facets], reach)
+        vertices = x[self._used]
+        points, facets = near_pairs(self._sets, self._search.filter, vertices, vertices, reach).T
+        return closest_distance(x, self._used[points], self._elements[facets], reach)
 
     def search_along(self, x: Values, end: Values) -> None:
         """Search candidates for the motion from x to `end` (n, d), m."""
-        self._search.search_along(self._mesh.vertices(x), self._mesh.vertices(end))
+        self._search.pairs_along(x[self._used], end[self._used])
 
     def clear_caches(self) -> None:
         """Discard the candidates."""
@@ -304,13 +303,13 @@ class PointFacetContacts:
 
         A pair is checked again when one of its points has moved by the margin since its last check.
         """
-        vertices = self._mesh.vertices(x)
-        (candidates,) = self._search.candidates(vertices)
+        vertices = x[self._used]
+        candidates = self._search.pairs(vertices)
         margin = POINT_FACET.search_margin
         positions, reach = centred(vertices), (POINT_FACET.max_gap + 3 * margin) * self._width
         if candidates is not self._candidates:
-            points, facets = self._points_and_facets(candidates).T
-            self._candidates, self._cache = candidates, ClosestPointCache(points, self._elements[facets])
+            points, facets = candidates[0].T
+            self._candidates, self._cache = candidates, ClosestPointCache(self._used[points], self._elements[facets])
             self._check_positions = positions
             self._is_close = self._cache.are_within(x.copy(), np.arange(len(points)), reach)
         elif (far := np.sum((positions - self._check_positions) ** 2, axis=1) > (margin * self._width) ** 2).any():
@@ -320,15 +319,6 @@ class PointFacetContacts:
             self._is_close[rows] = self._cache.are_within(x.copy(), rows, reach)
             self._check_positions = np.where(far[:, None], positions, self._check_positions)
         return np.flatnonzero(self._is_close)
-
-    def _points_and_facets(self, candidates: ipctk.Candidates) -> Ints:
-        """(k, 2) points and facets of ipctk's candidates."""
-        if self._elements.shape[1] == 3:
-            numbers = [(pair.vertex_id, pair.face_id) for pair in candidates.fv_candidates]
-        else:
-            numbers = [(pair.vertex_id, pair.edge_id) for pair in candidates.ev_candidates]
-        pairs = np.array(numbers, np.int64).reshape(-1, 2)
-        return np.column_stack([self._used[pairs[:, 0]], pairs[:, 1]])
 
 
 def penalty_stiffness(weights: csr_matrix, area: Values, mass: Values, pressure: float, max_added: float) -> Values:

@@ -12,8 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import chain
-from operator import attrgetter
 from typing import Protocol
 
 import ipctk
@@ -23,7 +21,6 @@ from scipy.sparse import csr_matrix, identity, kron, vstack
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -102,9 +99,9 @@ class Centroids:
         return np.append(np.arange(self._count), self.elements.min(axis=1))
 
     @cached_property
-    def _weights(self) -> list[float]:
+    def _weights(self) -> Values:
         """Measures of the elements, m^2 (2D: m), behind a 0 for each vertex."""
-        return [0.0] * self._count + list(measures(self._surface.rest_positions, self.elements))
+        return np.append(np.zeros(self._count), measures(self._surface.rest_positions, self.elements))
 
     def positions(self, x: Values) -> Values:
         """(n + m, d) sample points with the vertices at x (n, d), m."""
@@ -125,43 +122,6 @@ class Centroids:
             pair.weight *= measure[pair.vertex_id]
         for pair in pairs.vv_collisions:
             pair.weight *= measure[max(pair.vertex0_id, pair.vertex1_id)]
-
-    def candidates(self, start: Values, end: Values, radius: float) -> ipctk.Candidates:
-        """Centroids and elements whose boxes, grown by `radius` (m), overlap on the motion from start to end (n, d), m.
-
-        Elements that share a vertex are excluded.
-        """
-        tree, is_3d = ipctk.LBVH(), self._surface.dim == 3
-        tree.can_vertices_collide = self._surface.can_collide
-        no_faces = np.empty((0, 3), np.int32)
-        tree.build(start, end, no_faces[:, :2] if is_3d else self._surface.edges, self._surface.faces, radius)
-        near = tree.detect_face_face_candidates() if is_3d else tree.detect_edge_edge_candidates()
-        first_and_second = attrgetter("face0_id", "face1_id") if is_3d else attrgetter("edge0_id", "edge1_id")
-        numbers_of_both = chain.from_iterable(map(first_and_second, near))
-        pairs = np.fromiter(numbers_of_both, np.int64, 2 * len(near)).reshape(-1, 2)
-        centre, element = np.concatenate([pairs, pairs[:, ::-1]]).T
-        overlap = self._boxes_overlap(centre, element, start, end, radius)
-        numbers = element[overlap].tolist(), (self._count + centre[overlap]).tolist()
-        candidates = ipctk.Candidates()
-        if is_3d:
-            candidates.fv_candidates = list(map(ipctk.FaceVertexCandidate, *numbers))
-        else:
-            candidates.ev_candidates = list(map(ipctk.EdgeVertexCandidate, *numbers))
-        return candidates
-
-    def _boxes_overlap(self, centre: Ints, element: Ints, start: Values, end: Values, radius: float) -> Flags:
-        """(k,) whether the box of the motion of a centroid and that of an element overlap, both grown by `radius`."""
-        corners = np.concatenate([start[self.elements], end[self.elements]], axis=1)
-        centres = np.stack([x[self.elements].mean(axis=1) for x in (start, end)], axis=1)
-        # (axes, elements) each: contiguous numbers of one axis at a time take half as long
-        bounds = corners.min(axis=1) - 2 * radius, corners.max(axis=1) + 2 * radius
-        low, high, first, last = (
-            np.ascontiguousarray(bound.T) for bound in (*bounds, centres.min(axis=1), centres.max(axis=1))
-        )
-        overlap = np.ones(len(centre), bool)
-        for axis in range(len(low)):
-            overlap &= (first[axis][centre] <= high[axis][element]) & (last[axis][centre] >= low[axis][element])
-        return overlap
 
 
 def measures(x: Values, elements: Ints) -> Values:

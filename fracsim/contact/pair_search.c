@@ -1,0 +1,254 @@
+/* Pairs of simplices that may come near each other in a motion (contact.pair_search). Coordinates are 3D. */
+
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define MAX_CELLS_PER_SIMPLEX 4
+
+typedef struct {
+    double low[3], high[3];
+} Box;
+
+static void subtract(double *r, const double *a, const double *b)
+{
+    for (int k = 0; k < 3; k++) r[k] = a[k] - b[k];
+}
+
+static double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+static double clip(double t) { return t < 0 ? 0 : t > 1 ? 1 : t; }
+
+static double ratio(double a, double b) { return b > 0 ? a / b : 0; }
+
+/* Squared distance of a point from a segment (2, 3). */
+static double point_segment(const double *p, const double *x)
+{
+    double side[3], arm[3];
+    subtract(side, x + 3, x);
+    subtract(arm, p, x);
+    double t = clip(ratio(dot(arm, side), dot(side, side)));
+    for (int k = 0; k < 3; k++) arm[k] -= t * side[k];
+    return dot(arm, arm);
+}
+
+/* Squared distance of a point from a triangle (3, 3): from its plane, or from its sides. */
+static double point_triangle(const double *p, const double *x)
+{
+    double a[3], b[3], arm[3];
+    subtract(a, x + 3, x);
+    subtract(b, x + 6, x);
+    subtract(arm, p, x);
+    double aa = dot(a, a), ab = dot(a, b), bb = dot(b, b), pa = dot(arm, a), pb = dot(arm, b);
+    double determinant = aa * bb - ab * ab, s = bb * pa - ab * pb, t = aa * pb - ab * pa;
+    if (s >= 0 && t >= 0 && s + t <= determinant && determinant > 0) {
+        for (int k = 0; k < 3; k++) arm[k] -= (s * a[k] + t * b[k]) / determinant;
+        return dot(arm, arm);
+    }
+    double closing[6];
+    memcpy(closing, x + 6, 3 * sizeof(double));
+    memcpy(closing + 3, x, 3 * sizeof(double));
+    return fmin(point_segment(p, x), fmin(point_segment(p, x + 3), point_segment(p, closing)));
+}
+
+/* Squared distance of two segments (2, 3): of their lines, or of an end from the other segment. */
+static double segment_segment(const double *x, const double *y)
+{
+    double a[3], b[3], r[3];
+    subtract(a, x + 3, x);
+    subtract(b, y + 3, y);
+    subtract(r, x, y);
+    double aa = dot(a, a), ab = dot(a, b), bb = dot(b, b), ra = dot(r, a), rb = dot(r, b);
+    double determinant = aa * bb - ab * ab, s = ab * rb - bb * ra, t = aa * rb - ab * ra;
+    if (determinant > 1e-12 * aa * bb && s >= 0 && s <= determinant && t >= 0 && t <= determinant) {
+        for (int k = 0; k < 3; k++) r[k] += (s * a[k] - t * b[k]) / determinant;
+        return dot(r, r);
+    }
+    return fmin(fmin(point_segment(x, y), point_segment(x + 3, y)), fmin(point_segment(y, x), point_segment(y + 3, x)));
+}
+
+static double distance(int a, const double *x, int b, const double *y)
+{
+    return sqrt(a == 2 ? segment_segment(x, y) : b == 2 ? point_segment(x, y) : point_triangle(x, y));
+}
+
+/* Positions (n, 3) of a simplex of `corners` vertices, or of its centroid; the number n of these points. */
+static int gather(const double *x, const int32_t *vertices, int corners, int centroid, double *points)
+{
+    if (!centroid) {
+        for (int c = 0; c < corners; c++) memcpy(points + 3 * c, x + 3 * vertices[c], 3 * sizeof(double));
+        return corners;
+    }
+    for (int k = 0; k < 3; k++) {
+        points[k] = 0;
+        for (int c = 0; c < corners; c++) points[k] += x[3 * vertices[c] + k] / corners;
+    }
+    return 1;
+}
+
+/* Box around the motion of n points (n, 3), grown by `reach`. */
+static Box box_of(int n, const double *start, const double *end, double reach)
+{
+    Box box;
+    for (int k = 0; k < 3; k++) {
+        double low = INFINITY, high = -INFINITY;
+        for (int c = 0; c < n; c++) {
+            low = fmin(low, fmin(start[3 * c + k], end[3 * c + k]));
+            high = fmax(high, fmax(start[3 * c + k], end[3 * c + k]));
+        }
+        box.low[k] = low - reach, box.high[k] = high + reach;
+    }
+    return box;
+}
+
+/* Lower bound of the distance of two simplices that move straight from `start` to `end`, with the same clock. */
+static double least_distance(int a, const double *xs, const double *xe, int b, const double *ys, const double *ye,
+                             double reach)
+{
+    double relative = 0;
+    for (int i = 0; i < 3 * a; i += 3)
+        for (int j = 0; j < 3 * b; j += 3) {
+            double m[3];
+            for (int k = 0; k < 3; k++) m[k] = (xe[i + k] - xs[i + k]) - (ye[j + k] - ys[j + k]);
+            relative = fmax(relative, dot(m, m));
+        }
+    relative = sqrt(relative);
+    double first = distance(a, xs, b, ys);
+    if (relative == 0 || first - relative > reach || first <= reach) return first - relative;
+    return (first + distance(a, xe, b, ye) - relative) / 2;
+}
+
+static int share_vertex(int a, const int32_t *x, int b, const int32_t *y)
+{
+    for (int i = 0; i < a; i++)
+        for (int j = 0; j < b; j++)
+            if (x[i] == y[j]) return 1;
+    return 0;
+}
+
+/* Grid of cubes over `low` to `high`. */
+typedef struct {
+    double low[3], scale;
+    int count[3];
+} Grid;
+
+static void cells_of(const Grid *grid, const Box *box, int *first, int *last)
+{
+    for (int k = 0; k < 3; k++) {
+        double a = (box->low[k] - grid->low[k]) * grid->scale, b = (box->high[k] - grid->low[k]) * grid->scale;
+        double most = grid->count[k] - 1;
+        /* positions that are no numbers are in the first cell */
+        first[k] = (int)(a > 0 ? a < most ? a : most : 0);
+        last[k] = (int)(b > 0 ? b < most ? b : most : 0);
+    }
+}
+
+static Grid grid_of(int64_t n, const Box *boxes)
+{
+    Grid grid;
+    double high[3], size = 0;
+    for (int k = 0; k < 3; k++) grid.low[k] = INFINITY, high[k] = -INFINITY;
+    for (int64_t i = 0; i < n; i++) {
+        double largest = 0;
+        for (int k = 0; k < 3; k++) {
+            grid.low[k] = fmin(grid.low[k], boxes[i].low[k]), high[k] = fmax(high[k], boxes[i].high[k]);
+            largest = fmax(largest, boxes[i].high[k] - boxes[i].low[k]);
+        }
+        size += largest / n;
+    }
+    for (double cells = INFINITY; cells > MAX_CELLS_PER_SIMPLEX * (double)n + 64; size *= 1.25) {
+        cells = 1, grid.scale = size > 0 ? 1 / size : 0;
+        for (int k = 0; k < 3; k++) cells *= floor((high[k] - grid.low[k]) * grid.scale) + 1;
+    }
+    for (int k = 0; k < 3; k++) {
+        double cells = (high[k] - grid.low[k]) * grid.scale + 1;
+        grid.count[k] = cells >= 1 && cells < 1e9 ? (int)cells : 1;
+    }
+    return grid;
+}
+
+/* Pairs of a simplex of `first` (m, a) and one of `second` (n, b), without common vertices, that may come as near as
+   `reach` while the vertices (count, 3) move from `start` to `end`. Of `first`, the centroids count if `centroids`.
+   With `same` both are one set, and each pair is found once. Pairs have different patches, unless those are negative,
+   and one of them is marked as `own`. Up to `capacity` pairs (k, 2) are written; returns k, or -1 without memory. */
+int64_t find_near_pairs(const double *start, const double *end, int64_t m, int a, const int32_t *first, int64_t n, int b,
+                        const int32_t *second, int centroids, int same, const int32_t *patches, const uint8_t *own,
+                        double reach, int64_t capacity, int32_t *pairs)
+{
+    if (m == 0 || n == 0) return 0;
+    double xs[9], xe[9], ys[9], ye[9];
+    Box *boxes = malloc(n * sizeof(Box));
+    if (!boxes) return -1;
+    for (int64_t j = 0; j < n; j++) {
+        gather(start, second + b * j, b, 0, ys);
+        gather(end, second + b * j, b, 0, ye);
+        boxes[j] = box_of(b, ys, ye, reach);
+    }
+    const Grid grid = grid_of(n, boxes);
+    const int *count = grid.count;
+    const int64_t cells = (int64_t)count[0] * count[1] * count[2];
+    int64_t *begin = calloc(cells + 2, sizeof(int64_t)), found = 0;
+    int32_t *inside = NULL;
+    /* counts, then sums, then numbers, as in a counting sort */
+    for (int round = 0; begin && round < 2; round++) {
+        for (int64_t j = 0; j < n; j++) {
+            int low[3], high[3];
+            cells_of(&grid, &boxes[j], low, high);
+            for (int u = low[0]; u <= high[0]; u++)
+                for (int v = low[1]; v <= high[1]; v++)
+                    for (int w = low[2]; w <= high[2]; w++) {
+                        int64_t cell = ((int64_t)u * count[1] + v) * count[2] + w;
+                        if (round) inside[begin[cell + 1]++] = (int32_t)j;
+                        else begin[cell + 2]++;
+                    }
+        }
+        if (round) break;
+        for (int64_t cell = 0; cell < cells; cell++) begin[cell + 2] += begin[cell + 1];
+        inside = malloc((begin[cells + 1] + 1) * sizeof(int32_t));
+        if (!inside) break;
+    }
+    if (!begin || !inside) {
+        free(boxes), free(begin), free(inside);
+        return -1;
+    }
+    for (int64_t i = 0; i < m; i++) {
+        const int32_t *x = first + a * i;
+        int points = gather(start, x, a, centroids, xs), low[3], high[3];
+        gather(end, x, a, centroids, xe);
+        Box box = box_of(points, xs, xe, 0);
+        cells_of(&grid, &box, low, high);
+        for (int u = low[0]; u <= high[0]; u++)
+            for (int v = low[1]; v <= high[1]; v++)
+                for (int w = low[2]; w <= high[2]; w++) {
+                    int64_t cell = ((int64_t)u * count[1] + v) * count[2] + w;
+                    for (int64_t k = begin[cell]; k < begin[cell + 1]; k++) {
+                        int64_t j = inside[k];
+                        const int32_t *y = second + b * j;
+                        const Box *other = &boxes[j];
+                        if (same && j <= i) continue;
+                        if (box.low[0] > other->high[0] || box.high[0] < other->low[0] || box.low[1] > other->high[1]
+                            || box.high[1] < other->low[1] || box.low[2] > other->high[2] || box.high[2] < other->low[2])
+                            continue;
+                        if (patches[x[0]] == patches[y[0]] && patches[x[0]] >= 0) continue;
+                        if (share_vertex(a, x, b, y)) continue;
+                        int is_own = 0, from[3], to[3];
+                        for (int c = 0; c < a; c++) is_own |= own[x[c]];
+                        for (int c = 0; c < b; c++) is_own |= own[y[c]];
+                        if (!is_own) continue;
+                        /* each pair in the first of the cells that its boxes share */
+                        cells_of(&grid, other, from, to);
+                        if (u != (low[0] > from[0] ? low[0] : from[0]) || v != (low[1] > from[1] ? low[1] : from[1])
+                            || w != (low[2] > from[2] ? low[2] : from[2]))
+                            continue;
+                        gather(start, y, b, 0, ys);
+                        gather(end, y, b, 0, ye);
+                        if (least_distance(points, xs, xe, b, ys, ye, reach) > reach) continue;
+                        if (found < capacity) pairs[2 * found] = (int32_t)i, pairs[2 * found + 1] = (int32_t)j;
+                        found++;
+                    }
+                }
+    }
+    free(boxes), free(begin), free(inside);
+    return found;
+}

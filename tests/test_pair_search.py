@@ -1,0 +1,116 @@
+"""The search for pairs beside all pairs, with distances from points that are spread over both simplices."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+
+from fracsim.contact.pair_search import PairFilter, PairSearch, SimplexPairs, near_pairs
+
+COUNT, SIZE, STEPS = 40, 0.15, 16
+
+
+def soup(dim, corners, seed):
+    """(COUNT corners, d) points of simplices that lie about, and (COUNT, corners) their vertices; some share one."""
+    rng = np.random.default_rng(seed)
+    x = (rng.random((COUNT, 1, dim)) + SIZE * rng.random((COUNT, corners, dim))).reshape(-1, dim)
+    simplices = np.arange(COUNT * corners).reshape(COUNT, corners)
+    simplices[1::4, 0] = simplices[::4, 0]
+    return x, simplices
+
+
+def spread(corners):
+    """(k, corners) barycentric coordinates of points spread over a simplex."""
+    numbers = np.array([n for n in product(range(STEPS + 1), repeat=corners) if sum(n) == STEPS])
+    return numbers / STEPS
+
+
+def all_distances(x, pairs):
+    """(m, n) distances of all pairs, too large by up to the mesh of the points that are spread."""
+    sets = []
+    for simplices, centroids in ((pairs.first, pairs.centroids), (pairs.second, False)):
+        weights = np.full((1, simplices.shape[1]), 1 / simplices.shape[1]) if centroids else spread(simplices.shape[1])
+        sets.append(np.einsum("pc,ncd->npd", weights, x[simplices]))
+    return np.array([[np.linalg.norm(a[:, None] - b[None], axis=2).min() for b in sets[1]] for a in sets[0]])
+
+
+CASES = {"point-segment": (2, 1), "centroid-segment": (2, 2), "point-triangle": (3, 1), "centroid-triangle": (3, 3),
+         "edge-edge": (3, 2)}  # fmt: skip
+
+
+def case(name, seed=1):
+    """Points, pairs of a case, and (m, n) flags of those that count."""
+    dim, corners = CASES[name]
+    x, second = soup(dim, 2 if name.endswith(("segment", "edge")) else 3, seed)
+    first = np.arange(len(x))[:, None] if corners == 1 else second
+    pairs = SimplexPairs.of(first, second, 0.05, centroids=name.startswith("centroid"))
+    counts = ~(first[:, None, :, None] == second[None, :, None, :]).any(axis=(2, 3))
+    return x, pairs, np.triu(counts, 1) if name == "edge-edge" else counts
+
+
+def flags(found, shape):
+    result = np.zeros(shape, int)
+    np.add.at(result, tuple(found.T), 1)
+    assert result.max(initial=0) <= 1
+    return result.astype(bool)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_pairs_at_rest_are_those_within_the_distance(name):
+    x, pairs, counts = case(name)
+    distance = all_distances(x, pairs)
+    found = flags(near_pairs(pairs, PairFilter.none(len(x)), x, x, pairs.distance), distance.shape)
+    assert (distance[counts & found] < pairs.distance + 2 * SIZE / STEPS).all()
+    assert found[counts & (distance <= pairs.distance)].all() and not found[~counts].any() and found.any()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_no_pair_that_comes_near_on_the_way_is_missed(name):
+    x, pairs, counts = case(name)
+    motion = 0.3 * np.random.default_rng(2).normal(size=x.shape)
+    found = near_pairs(pairs, PairFilter.none(len(x)), x, x + motion, pairs.distance)
+    found = flags(found, counts.shape)
+    near = [all_distances(x + t * motion, pairs) <= pairs.distance for t in np.linspace(0, 1, 9)]
+    assert found[counts & np.any(near, axis=0)].all() and found.sum() < counts.sum()
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_pairs_of_a_search_serve_all_positions_within_its_margin(name):
+    """Near the way, at any time of it; farther away, and beside it, pairs are searched again."""
+    x, pairs, counts = case(name)
+    rng, margin = np.random.default_rng(3), 0.03
+    search, way = PairSearch(len(x), [pairs], margin), 0.1 * rng.normal(size=x.shape)
+    along = search.pairs_along(x, x + way)
+    for t in (0.0, 0.4, 1.0):
+        noise = rng.normal(size=x.shape)
+        y = x + t * way + 0.4 * margin * noise / np.linalg.norm(noise, axis=1).max() + 7.0
+        assert search.pairs(y) is along
+        assert flags(along[0], counts.shape)[counts & (all_distances(y, pairs) <= pairs.distance)].all()
+    assert search.pairs_along(x, x + 0.5 * way) is along
+    one = x.copy()
+    one[0] += 2 * margin
+    assert search.pairs(one) is not along
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_patches_and_marks_leave_out_pairs(name):
+    x, pairs, _ = case(name)
+    all_pairs, reach = near_pairs(pairs, PairFilter.none(len(x)), x, x, 0.1), 0.1
+    patches, own = np.zeros(len(x), np.int32), np.zeros(len(x), bool)
+    patches[np.unique(pairs.second[: COUNT // 2])] = 1
+    patches[pairs.second[COUNT // 2 :]] = 2
+    own[pairs.second[: COUNT // 4]] = True
+    first, second = pairs.first[all_pairs[:, 0]], pairs.second[all_pairs[:, 1]]
+    differ, marked = patches[first[:, 0]] != patches[second[:, 0]], own[first].any(axis=1) | own[second].any(axis=1)
+    for where, wanted in ((PairFilter(patches, np.ones(len(x), bool)), differ),
+                          (PairFilter(PairFilter.none(len(x)).patches, own), marked)):  # fmt: skip
+        assert 0 < wanted.sum() < len(wanted)
+        assert np.array_equal(near_pairs(pairs, where, x, x, reach), all_pairs[wanted])
+
+
+def test_positions_that_are_no_numbers_end_the_search():
+    x, pairs, _ = case("point-triangle")
+    for value in (np.nan, np.inf):
+        y = x.copy()
+        y[5] = value
+        near_pairs(pairs, PairFilter.none(len(x)), x, y, 0.05)
