@@ -46,7 +46,7 @@ def facets_near(name: str, count: int) -> tuple[PosedShape, Values]:
 
 def acting(placed: PosedShape, x: Values) -> FacetForces:
     corners = np.arange(x.shape[0] * x.shape[1]).reshape(x.shape[:2])
-    return FacetForces(corners, np.ones(len(x)), find_closest_points(placed, x, SOFTEN), LAW, LAW, LAW)
+    return FacetForces.from_closest(corners, np.ones(len(x)), find_closest_points(placed, x, SOFTEN), LAW)
 
 
 @pytest.mark.parametrize("name", SHAPES)

@@ -18,6 +18,7 @@ Laws and geometry:
     pose, obstacle        rigid poses and distances to shapes; obstacles, their motion and overlaps
     obstacle_tessellation  tessellation of obstacles for output
     shape_base, shapes    signed distances, moments and tessellations of half space, sphere, capsule, box, cylinder
+    shape_kernels         compiled distances, closest points of facets and their energy; the modules beside it are plain
     triangle_mesh_shape   closed surfaces of triangles
     proximity             points and facets that may be near an obstacle
     supporting_obstacles  obstacles that a body is set down on

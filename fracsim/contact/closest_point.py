@@ -172,11 +172,16 @@ def find_closest_points(
         posed: convex obstacle.
         x: (k, c, d) corners, m.
         smoothing: mu, m.
-        start: (k, c) barycentric coordinates to start from.
+        start: (k, c) barycentric coordinates to start from; nan, or None for all: from `initial_barycentric`.
         tolerance: remaining derivative by barycentric coordinates, in facet sizes.
     """
+    lam = np.full(x.shape[:2], np.nan) if start is None else start.copy()
+    if (kernels := posed.shape.kernels) is not None:
+        kernels.find_closest_points(posed.packed, x, smoothing, tolerance, lam)
+        return FacetClosestPoints(posed, x, smoothing, lam)
     max_residual = tolerance * np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
-    lam = initial_barycentric(posed, x, smoothing) if start is None else start.copy()
+    if (new := np.isnan(lam[:, 0])).any():
+        lam[new] = initial_barycentric(posed, x[new], smoothing)
     slope, active = _SlopeFunction(posed, x, smoothing)(lam), np.arange(len(x))
     for _ in range(SEARCH.max_iterations):
         rise = _rise(slope[active], lam[active])

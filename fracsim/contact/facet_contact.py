@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 import numpy.typing as npt
 
-from .closest_point import FacetClosestPoints, SoftMinGap, find_closest_points, initial_barycentric, smoothing_error
-from .laws import BARRIER, GapPotential, TimeAveragedPotential
+from .closest_point import FacetClosestPoints, SoftMinGap, find_closest_points, smoothing_error
+from .laws import BARRIER, Barrier, GapPotential, TimeAveragedPotential
 from .node_contact import ContactForces, LaggedContact, positive_part
 from .pose import PosedShape
 from .proximity import ProximityCandidates
@@ -95,8 +95,6 @@ class ContactFacets:
         corners, start = x[self.corners[facets]], self._last_barycentric[facets]
         if not len(facets):
             return FacetClosestPoints(posed, corners, self.smoothing, start)
-        if (new := np.isnan(start[:, 0])).any():
-            start[new] = initial_barycentric(posed, corners[new], self.smoothing)
         closest = find_closest_points(posed, corners, self.smoothing, start)
         if self.warm_start:
             self._last_barycentric[facets] = closest.barycentric
@@ -209,24 +207,24 @@ class FacetStart:
 
 
 @dataclass(frozen=True, eq=False)
-class FacetForces:
-    """Energy F of facets near an obstacle, its forces and second derivatives.
+class FacetEnergy:
+    """Energy F of facets near an obstacle, and its derivatives.
 
     Attributes:
-        corners: (k, c) points.
         area: (k,) m^2.
         closest: closest points.
-        potential: b of the gap of the closest points.
-        plane_potential: b of the smoothed minimum of the nodal gaps.
-        corner_potential: b of the nodal gaps.
+        law: b.
+        start: (k, c + 2) gaps at the start of the step, of the closest points, the smoothed minima, and the corners, m;
+            None: b is not averaged over the step.
     """
 
-    corners: Ints
     area: Values
     closest: FacetClosestPoints
-    potential: GapPotential | TimeAveragedPotential
-    plane_potential: GapPotential | TimeAveragedPotential
-    corner_potential: GapPotential | TimeAveragedPotential
+    law: GapPotential
+    start: Values | None
+
+    def _potential(self, column: int | slice) -> GapPotential | TimeAveragedPotential:
+        return self.law if self.start is None else TimeAveragedPotential(self.law, self.start[:, column])
 
     @cached_property
     def _corner_gaps(self) -> Values:
@@ -244,37 +242,38 @@ class FacetForces:
     def _plane_gap(self) -> SoftMinGap:
         return SoftMinGap(self._corner_gaps, self.closest.smoothing)
 
-    @cached_property
     def energy(self) -> Values:
         """(k,) F, J; infinite where a facet is cut."""
-        inner = self.potential.energy(self.closest.gap)
-        plane = self.plane_potential.energy(self._plane_gap.gap)
+        inner = self._potential(0).energy(self.closest.gap)
+        plane = self._potential(1).energy(self._plane_gap.gap)
         cut = ~np.isfinite(inner)
         return np.where(cut, np.inf, self.area * (np.where(cut, 0.0, inner) - np.where(cut, 0.0, plane)))
 
-    @cached_property
     def forces(self) -> Values:
         """(k, c, d) forces on the corners, N."""
-        of_closest = self.potential.slope(self.closest.gap)[:, None, None] * self.closest.gradient
-        slope = self.plane_potential.slope(self._plane_gap.gap)[:, None]
+        of_closest = self._potential(0).slope(self.closest.gap)[:, None, None] * self.closest.gradient
+        slope = self._potential(1).slope(self._plane_gap.gap)[:, None]
         of_plane = (slope * self._plane_gap.barycentric)[:, :, None] * self._corner_normals
         return np.asarray(-self.area[:, None, None] * (of_closest - of_plane))
 
-    @cached_property
-    def hessian(self) -> Values:
+    def _hessian(self) -> Values:
         """(k, c d, c d) second derivative of F, N/m."""
         k, c, d = self.closest.x.shape
         n = self.closest.gradient.reshape(k, c * d)
-        of_closest = self.potential.curvature(self.closest.gap)[:, None, None] * n[:, :, None] * n[:, None, :]
-        of_closest = of_closest + self.potential.slope(self.closest.gap)[:, None, None] * self.closest.curvature()
+        of_closest = self._potential(0).curvature(self.closest.gap)[:, None, None] * n[:, :, None] * n[:, None, :]
+        of_closest = of_closest + self._potential(0).slope(self.closest.gap)[:, None, None] * self.closest.curvature()
         return np.asarray(self.area[:, None, None] * (of_closest - self._plane_hessian()))
+
+    def hessians(self) -> tuple[Values, Values]:
+        """(k, c d, c d) second derivatives of F, N/m, and (k, c, d, d) of b at the corners, Pa/m."""
+        return self._hessian(), self._corner_hessians()
 
     def _plane_hessian(self) -> Values:
         """(k, c d, c d) second derivative of b(gap'), Pa/m."""
         k, c, d = self.closest.x.shape
         plane, n = self._plane_gap, self._corner_normals
-        slope, lam = self.plane_potential.slope(plane.gap)[:, None, None], plane.barycentric
-        by_gaps = self.plane_potential.curvature(plane.gap)[:, None, None] * lam[:, :, None] * lam[:, None, :]
+        slope, lam = self._potential(1).slope(plane.gap)[:, None, None], plane.barycentric
+        by_gaps = self._potential(1).curvature(plane.gap)[:, None, None] * lam[:, :, None] * lam[:, None, :]
         blocks = np.einsum("kce,kci,kej->kciej", by_gaps + slope * plane.curvature(), n, n)
         H = self.closest.posed.curvature(self.closest.x.reshape(-1, d)).reshape(k, c, d, d)
         blocks[:, range(c), :, range(c), :] += (slope[..., None] * lam[:, :, None, None] * H).transpose(1, 0, 2, 3)
@@ -283,10 +282,59 @@ class FacetForces:
     def _corner_hessians(self) -> Values:
         """(k, c, d, d) second derivative of b at each node, Pa/m."""
         k, c, d = self.closest.x.shape
-        gap = self._corner_gaps.reshape(-1)
-        n, H = self._corner_normals.reshape(-1, d), self.closest.posed.curvature(self.closest.x.reshape(-1, d))
-        blocks = self.corner_potential.curvature(gap)[:, None, None] * n[:, :, None] * n[:, None, :]
-        return np.asarray(blocks + self.corner_potential.slope(gap)[:, None, None] * H).reshape(k, c, d, d)
+        gap, potential = self._corner_gaps, self._potential(slice(2, None))
+        n, H = self._corner_normals, self.closest.posed.curvature(self.closest.x.reshape(-1, d)).reshape(k, c, d, d)
+        blocks = potential.curvature(gap)[..., None, None] * n[..., :, None] * n[..., None, :]
+        return np.asarray(blocks + potential.slope(gap)[..., None, None] * H)
+
+
+@dataclass(frozen=True, eq=False)
+class FacetForces:
+    """Forces on facets near an obstacle.
+
+    Attributes:
+        corners: (k, c) points.
+        closest: closest points.
+        area: (k,) m^2.
+        energy: (k,) F, J; infinite where a facet is cut.
+        forces: (k, c, d) forces on the corners, N.
+        make_hessians: returns second derivatives of F (k, c d, c d), N/m, and of b at the corners (k, c, d, d), Pa/m;
+            called once, when they are needed.
+    """
+
+    corners: Ints
+    closest: FacetClosestPoints
+    area: Values
+    energy: Values
+    forces: Values
+    make_hessians: Callable[[], tuple[Values, Values]]
+
+    @classmethod
+    def from_closest(
+        cls, corners: Ints, area: Values, closest: FacetClosestPoints, law: GapPotential, start: Values | None = None
+    ) -> FacetForces:
+        """Forces on facets with closest points; `start`: as of `FacetEnergy`."""
+        kernels = closest.posed.shape.kernels
+        if kernels is None or not isinstance(law, Barrier):
+            plain = FacetEnergy(area, closest, law, start)
+            return cls(corners, closest, area, plain.energy(), plain.forces(), plain.hessians)
+        packed = closest.posed.packed, closest.x, closest.barycentric, closest.smoothing
+        evaluate = partial(kernels.facet_energy, *packed, law, start, area)
+        return cls(corners, closest, area, *evaluate(second=False), partial(evaluate, second=True))
+
+    @cached_property
+    def _hessians(self) -> tuple[Values, Values]:
+        return self.make_hessians()
+
+    @property
+    def hessian(self) -> Values:
+        """(k, c d, c d) second derivative of F, N/m."""
+        return self._hessians[0]
+
+    @property
+    def corner_hessians(self) -> Values:
+        """(k, c, d, d) second derivative of b at each node, Pa/m."""
+        return self._hessians[1]
 
     @cached_property
     def stiffness(self) -> Values:
@@ -296,7 +344,7 @@ class FacetForces:
         node_contact adds.
         """
         k, c, d = self.closest.x.shape
-        of_nodes = (self.area / c)[:, None, None, None] * self._corner_hessians()
+        of_nodes = (self.area / c)[:, None, None, None] * self.corner_hessians
         node_stiffness = positive_part(of_nodes.reshape(-1, d, d)).reshape(k, c, d, d)
         return np.asarray(positive_part(self.hessian + _block_diagonal(of_nodes)) - _block_diagonal(node_stiffness))
 
@@ -321,23 +369,22 @@ def evaluate_facets(
     step_start = None if start is None else facets.start(*start, law.width)
     if step_start is not None:
         near = np.union1d(near, step_start.near)
-    if not len(near):
-        closest = facets.closest_points(posed, x, near)
-        return FacetForces(facets.corners[near], facets.area[near], closest, law, law, law), 0.0
     closest = facets.closest_points(posed, x, near)
+    if not len(near):
+        return FacetForces.from_closest(facets.corners[near], facets.area[near], closest, law), 0.0
     start_gap, acting = None, closest.gap < law.width  # elsewhere gap' >= gap, and F = 0 with its derivatives
     if step_start is not None:
         start_gap = step_start.gaps(near, closest.barycentric)
         acting |= start_gap < law.width
     rows = np.flatnonzero(acting)
     corners, area, closest = facets.corners[near[rows]], facets.area[near[rows]], closest.select(rows)
-    stored = FacetForces(corners, area, closest, law, law, law)
+    stored = FacetForces.from_closest(corners, area, closest, law)
     if start is None or start_gap is None:
         return stored, float(stored.energy.sum())
-    corner_gaps = start[0].distance(start[1][corners].reshape(-1, x.shape[1]))
-    plane_gap = SoftMinGap(corner_gaps.reshape(corners.shape), facets.smoothing).gap
-    laws = (TimeAveragedPotential(law, gap) for gap in (start_gap[rows], plane_gap, corner_gaps))
-    return FacetForces(corners, area, closest, *laws), float(stored.energy.sum())
+    corner_gaps = start[0].distance(start[1][corners].reshape(-1, x.shape[1])).reshape(corners.shape)
+    plane_gap = SoftMinGap(corner_gaps, facets.smoothing).gap
+    gaps = np.column_stack([start_gap[rows], plane_gap, corner_gaps])
+    return FacetForces.from_closest(corners, area, closest, law, gaps), float(stored.energy.sum())
 
 
 def _block_diagonal(blocks: Values) -> Values:

@@ -182,17 +182,17 @@ class TimeAveragedPotential:
     def energy(self, g: Values) -> Values:
         """(n,) potential of p, J/m^2; infinite where a gap is closed."""
         early, late = self._evaluate_both(self.barrier.energy, g)
-        return np.asarray(3 * _EARLY_WEIGHT * early + (1 - _EARLY_WEIGHT) * late)
+        return np.asarray(3 * EARLY_WEIGHT * early + (1 - EARLY_WEIGHT) * late)
 
     def slope(self, g: Values) -> Values:
         """(n,) p, Pa: minus the pressure; never positive."""
         early, late = self._evaluate_both(self.barrier.slope, g)
-        return np.asarray(_EARLY_WEIGHT * early + (1 - _EARLY_WEIGHT) * late)
+        return np.asarray(EARLY_WEIGHT * early + (1 - EARLY_WEIGHT) * late)
 
     def curvature(self, g: Values) -> Values:
         """(n,) dp/dg, Pa/m; never negative."""
         early, late = self._evaluate_both(self.barrier.curvature, g)
-        return np.asarray(_EARLY_WEIGHT / 3 * early + (1 - _EARLY_WEIGHT) * late)
+        return np.asarray(EARLY_WEIGHT / 3 * early + (1 - EARLY_WEIGHT) * late)
 
     def _evaluate_both(self, function: Callable[[Values], Values], g: Values) -> tuple[Values, Values]:
         """(n,) values after a third of the step and at its end; a gap closed at the end counts as closed before."""
@@ -200,7 +200,7 @@ class TimeAveragedPotential:
 
 
 # weight of the force after a third of the step
-_EARLY_WEIGHT = 0.75 * BARRIER.averaging
+EARLY_WEIGHT = 0.75 * BARRIER.averaging
 
 
 def stiffness_factor(relative_gap: float) -> float:

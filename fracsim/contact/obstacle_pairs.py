@@ -31,7 +31,7 @@ from .pose_derivatives import (
     point_jacobian,
 )
 from .shape_base import ConvexBody, Shape, frame_about, unit_vector
-from .shapes import Capsule, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
+from .shapes import Capsule, OffsetShape, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
 from .step_limit import PoseMotion, safe_fractions
 from .triangle_mesh_shape import TriangleMeshShape
 
@@ -124,41 +124,6 @@ def _circle_points(shape: RoundedCylinder) -> Values:
     heights = np.linspace(-half, half, SAMPLES.edge_points)
     rings = [np.column_stack([circle, np.full(SAMPLES.circle_points, height)]) for height in heights]
     return np.concatenate(rings) @ frame_about(unit_vector(shape.axis)).T
-
-
-@dataclass(frozen=True, eq=False)
-class OffsetShape:
-    """All points within an offset of a shape: its distance minus the offset.
-
-    Attributes:
-        shape: original shape.
-        offset: m.
-    """
-
-    shape: Shape
-    offset: float
-
-    @property
-    def convex(self) -> bool:
-        """Whether the shape is convex."""
-        return self.shape.convex
-
-    @property
-    def rotation_invariant(self) -> bool:
-        """Whether no rotation about the reference point changes the shape."""
-        return self.shape.rotation_invariant
-
-    def distance(self, x: Values) -> Values:
-        """(n,) signed distances, m."""
-        return self.shape.distance(x) - self.offset
-
-    def normal(self, x: Values) -> Values:
-        """(n, d) gradients of the distance."""
-        return self.shape.normal(x)
-
-    def curvature(self, x: Values) -> Values:
-        """(n, d, d) Hessians of the distance, 1/m."""
-        return self.shape.curvature(x)
 
 
 @dataclass(frozen=True, eq=False)

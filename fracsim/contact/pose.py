@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from math import factorial
 
 import numpy as np
@@ -127,6 +128,12 @@ class PosedShape:
     shape: Shape
     pose: Pose
 
+    @cached_property
+    def packed(self) -> Values:
+        """Numbers of the shape and its pose for the shape's compiled functions, if it has some."""
+        assert self.shape.kernels is not None
+        return self.shape.kernels.pack(self.shape, self.pose.centre, self.pose.rotation)
+
     def effective_increment(self, q: Values) -> Values:
         """(p,) part of an increment of the pose that changes gaps: no rotation of a sphere."""
         if not self.shape.rotation_invariant:
@@ -135,14 +142,20 @@ class PosedShape:
 
     def distance(self, x: Values) -> Values:
         """(n,) signed distances, m; positive outside."""
+        if (kernels := self.shape.kernels) is not None:
+            return kernels.distance(self.packed, x)
         return self.shape.distance(self.pose.to_body(x))
 
     def normal(self, x: Values) -> Values:
         """(n, d) gradients of the distance."""
+        if (kernels := self.shape.kernels) is not None:
+            return kernels.normal(self.packed, x)
         return self.pose.vectors_to_space(self.shape.normal(self.pose.to_body(x)))
 
     def curvature(self, x: Values) -> Values:
         """(n, d, d) Hessians of the distance, 1/m."""
+        if (kernels := self.shape.kernels) is not None:
+            return kernels.curvature(self.packed, x)
         return self.pose.tensors_to_space(self.shape.curvature(self.pose.to_body(x)))
 
     def distance_bound(self, x: Values) -> float:

@@ -7,10 +7,10 @@ are exact, by slices.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, lru_cache
 from math import comb, pi
-from typing import ClassVar, Protocol, Self
+from typing import TYPE_CHECKING, ClassVar, Protocol, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +18,9 @@ from numpy.polynomial import Polynomial
 from scipy.special import beta
 
 from ..errors import InputError
+
+if TYPE_CHECKING:
+    from .laws import Barrier
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
@@ -43,6 +46,49 @@ class ShapePolicy:
 SHAPE = ShapePolicy()
 
 
+class ShapeKernels(Protocol):
+    """Compiled functions of shapes at a pose (shape_kernels); x (n, d) are points of space, m."""
+
+    def pack(self, shape: Shape, centre: Values, rotation: Values) -> Values:
+        """Numbers of a shape at a pose, as the functions take them."""
+
+    def distance(self, packed: Values, x: Values) -> Values:
+        """(n,) signed distances, m."""
+
+    def normal(self, packed: Values, x: Values) -> Values:
+        """(n, d) gradients of the distance."""
+
+    def curvature(self, packed: Values, x: Values) -> Values:
+        """(n, d, d) Hessians of the distance, 1/m."""
+
+    def find_closest_points(
+        self, packed: Values, x: Values, smoothing: float, tolerance: float, barycentric: Values
+    ) -> None:
+        """Search for the closest points of facets (closest_point).
+
+        Args:
+            packed: the shape at its pose.
+            x: (k, c, d) corners, m.
+            smoothing: mu, m.
+            tolerance: remaining derivative by barycentric coordinates, in facet sizes.
+            barycentric: (k, c) coordinates to start from, nan: a guess; overwritten by those of the closest points.
+        """
+
+    def facet_energy(
+        self,
+        packed: Values,
+        x: Values,
+        barycentric: Values,
+        smoothing: float,
+        law: Barrier,
+        start: Values | None,
+        area: Values,
+        *,
+        second: bool,
+    ) -> tuple[Values, Values]:
+        """Energy of facets and its derivatives (shape_kernels)."""
+
+
 class Shape(Protocol):
     """Shape in its own frame, centred at its reference point; d = 2 or 3, lengths in m.
 
@@ -51,6 +97,10 @@ class Shape(Protocol):
     """
 
     kind: ClassVar[str]
+
+    @property
+    def kernels(self) -> ShapeKernels | None:
+        """Compiled functions for the shape at a pose; None: the methods here are used."""
 
     @property
     def dim(self) -> int:
@@ -95,10 +145,12 @@ class ConvexBody(ABC):
     Attributes:
         kind: name in messages.
         hollow: the obstacle is the space outside the body, as for what lies in a container.
+        kernels: compiled functions; None: array code.
     """
 
     kind: ClassVar[str]
     hollow: bool = False
+    kernels: ShapeKernels | None = field(default=None, compare=False, repr=False)
 
     @property
     @abstractmethod

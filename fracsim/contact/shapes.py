@@ -7,7 +7,7 @@ capsule a stadium, a box a rectangle.
 from __future__ import annotations
 
 from abc import abstractmethod
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import ClassVar, Self
 
@@ -20,6 +20,7 @@ from .shape_base import (
     Flags,
     QuadrantDistance,
     Shape,
+    ShapeKernels,
     Tessellation,
     Values,
     frame_about,
@@ -37,7 +38,7 @@ from .shape_base import (
 )
 
 __all__ = [
-    "SHAPES", "Capsule", "HalfSpace", "RoundedBox", "RoundedCylinder", "Shape", "Sphere",
+    "SHAPES", "Capsule", "HalfSpace", "OffsetShape", "RoundedBox", "RoundedCylinder", "Shape", "Sphere",
     "TranslatedShape",
 ]  # fmt: skip
 
@@ -49,11 +50,13 @@ class HalfSpace:
     Attributes:
         direction: (d,) along n, of any length, out of the half space.
         extent: edge of the patch that `tessellate` returns, m.
+        kernels: compiled functions; None: array code.
     """
 
     kind: ClassVar[str] = "plane"
     direction: tuple[float, ...]
     extent: float = 1.0
+    kernels: ShapeKernels | None = field(default=None, compare=False, repr=False, kw_only=True)
 
     def __post_init__(self) -> None:
         """Raise InputError without a direction or extent."""
@@ -117,18 +120,18 @@ class _SweptSphere(ConvexBody):
 
     @property
     @abstractmethod
-    def _core(self) -> tuple[Values, float, float]:
+    def core(self) -> tuple[Values, float, float]:
         """Unit vector along the segment, half its length and the radius, m."""
 
     def _from_core(self, x: Values) -> tuple[Values, Values, Values]:
         """Vectors (n, d) from the closest points of the core, their lengths (n,), and heights along it (n,), m."""
-        axis, half, _ = self._core
+        axis, half, _ = self.core
         height = x @ axis
         away = x - np.minimum(np.maximum(height, -half), half)[:, None] * axis
         return away, np.sqrt(np.einsum("nd,nd->n", away, away)), height
 
     def _distance(self, x: Values) -> Values:
-        return self._from_core(x)[1] - self._core[2]
+        return self._from_core(x)[1] - self.core[2]
 
     def _normal(self, x: Values) -> Values:
         away, length, _ = self._from_core(x)
@@ -139,12 +142,12 @@ class _SweptSphere(ConvexBody):
         if not on_core.any():
             return np.asarray(away / length[:, None])
         # on the core every direction across it is a closest one
-        across = frame_about(self._core[0])[:, 0]
+        across = frame_about(self.core[0])[:, 0]
         return np.where(on_core[:, None], across, away / np.where(on_core, 1.0, length)[:, None])
 
     def _curvature(self, x: Values) -> Values:
         """(n, d, d) (P - n n^T) / |x - closest|, P across the axis beside the core, the identity beyond its ends."""
-        axis, half, _ = self._core
+        axis, half, _ = self.core
         away, length, height = self._from_core(x)
         on_core = length < np.finfo(float).tiny
         n, P = self._direction(away, length, on_core), np.eye(self.dim)
@@ -154,7 +157,7 @@ class _SweptSphere(ConvexBody):
         return np.asarray((P - n[:, :, None] * n[:, None, :]) * inverse[:, None, None])
 
     def _radius(self) -> float:
-        return self._core[2]
+        return self.core[2]
 
     def _depth(self) -> float:
         return self._radius()
@@ -163,13 +166,13 @@ class _SweptSphere(ConvexBody):
         return replace(self, radius=self._radius() + by)  # type: ignore[call-arg]
 
     def _tessellate(self) -> Tessellation:
-        axis, half, radius = self._core
+        axis, half, radius = self.core
         side = profile(0.0, half, radius)
         points, elements = polygon(side) if self.dim == 2 else surface_of_revolution(side)
         return points @ frame_about(axis).T, elements
 
     def _moments(self) -> tuple[float, Values]:
-        axis, half, radius = self._core
+        axis, half, radius = self.core
         return revolved(axis, 0.0, half, radius)
 
 
@@ -198,7 +201,8 @@ class Sphere(_SweptSphere):
         return True
 
     @cached_property
-    def _core(self) -> tuple[Values, float, float]:
+    def core(self) -> tuple[Values, float, float]:
+        """Unit vector along the segment, half its length and the radius, m."""
         return unit_vector((*[0.0] * (self.dim - 1), 1.0)), 0.0, self.radius
 
 
@@ -228,7 +232,8 @@ class Capsule(_SweptSphere):
         return len(self.axis)
 
     @cached_property
-    def _core(self) -> tuple[Values, float, float]:
+    def core(self) -> tuple[Values, float, float]:
+        """Unit vector along the segment, half its length and the radius, m."""
         return unit_vector(self.axis), self.length / 2, self.radius
 
 
@@ -348,13 +353,14 @@ class RoundedCylinder(ConvexBody):
         """Radius of the edges, m; of a thin disk at most half its thickness."""
         return min(SHAPE.fillet_ratio * self.radius, self.length / 2) if self.rounding is None else self.rounding
 
-    def _core(self) -> tuple[float, float]:
+    @property
+    def core(self) -> tuple[float, float]:
         """Radius and half length of the sharp core that the fillet grows, m."""
         return self.radius - self.fillet, self.length / 2 - self.fillet
 
     def _polar(self, x: Values) -> tuple[QuadrantDistance, Values, Values, Values]:
         """Quadrant distance, distances from the axis (n,), m, unit vectors (n, d) away from the axis and along it."""
-        axis, (radius, half) = unit_vector(self.axis), self._core()
+        axis, (radius, half) = unit_vector(self.axis), self.core
         height = x @ axis
         across = x - height[:, None] * axis
         rho = lengths(across)
@@ -394,13 +400,13 @@ class RoundedCylinder(ConvexBody):
         return replace(self, radius=self.radius + by, length=self.length + 2 * by, rounding=rounding)
 
     def _tessellate(self) -> Tessellation:
-        radius, half = self._core()
+        radius, half = self.core
         side = profile(radius, half, self.fillet)
         points, triangles = surface_of_revolution(side)
         return points @ frame_about(unit_vector(self.axis)).T, triangles
 
     def _moments(self) -> tuple[float, Values]:
-        radius, half = self._core()
+        radius, half = self.core
         return revolved(unit_vector(self.axis), radius, half, self.fillet)
 
 
@@ -416,6 +422,11 @@ class TranslatedShape:
     kind: ClassVar[str] = "shape on a hinge"
     shape: Shape
     offset: Values
+
+    @property
+    def kernels(self) -> ShapeKernels | None:
+        """Compiled functions of the original shape."""
+        return self.shape.kernels
 
     @property
     def dim(self) -> int:
@@ -466,6 +477,46 @@ class TranslatedShape:
         if self.dim == 2:
             return np.asarray(central + mass * (o @ o))
         return np.asarray(central + mass * ((o @ o) * np.eye(3) - np.outer(o, o)))
+
+
+@dataclass(frozen=True, eq=False)
+class OffsetShape:
+    """All points within an offset of a shape: its distance minus the offset.
+
+    Attributes:
+        shape: original shape.
+        offset: m.
+    """
+
+    shape: Shape
+    offset: float
+
+    @property
+    def kernels(self) -> ShapeKernels | None:
+        """Compiled functions of the original shape."""
+        return self.shape.kernels
+
+    @property
+    def convex(self) -> bool:
+        """Whether the shape is convex."""
+        return self.shape.convex
+
+    @property
+    def rotation_invariant(self) -> bool:
+        """Whether no rotation about the reference point changes the shape."""
+        return self.shape.rotation_invariant
+
+    def distance(self, x: Values) -> Values:
+        """(n,) signed distances, m."""
+        return self.shape.distance(x) - self.offset
+
+    def normal(self, x: Values) -> Values:
+        """(n, d) gradients of the distance."""
+        return self.shape.normal(x)
+
+    def curvature(self, x: Values) -> Values:
+        """(n, d, d) Hessians of the distance, 1/m."""
+        return self.shape.curvature(x)
 
 
 # the name that a study gives -> class

@@ -56,6 +56,7 @@ class TriangleMeshShape:
     convex: bool = False
     rotation_invariant: bool = False
     min_radius: float = 0.0
+    kernels: None = None
 
     def tessellate(self) -> Tessellation:
         """Points and triangles."""

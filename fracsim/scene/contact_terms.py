@@ -34,6 +34,7 @@ from ..study.overlap_checks import build_shape
 
 if TYPE_CHECKING:
     from ..contact.laws import Penalty
+    from ..contact.shape_kernels import CompiledShapeKernels
     from ..contact.triangle_mesh_shape import TriangleMeshShape
 
 Values = npt.NDArray[np.float64]
@@ -81,9 +82,12 @@ def build_obstacle_terms(
 
     `mass`: (owned dofs,) lumped, kg. Raises InputError if an obstacle overlaps the body, or a free one another.
     """
+    from ..contact.shape_kernels import compile_shape_kernels
+
     placements, contact = obstacle_placements(study, domain.dim), _contact(study)
+    kernels = None if stress.kernels.plain else compile_shape_kernels(domain.comm)
     obstacles = [
-        _read_obstacle(domain.comm, entry, number) if entry.shape == "mesh" else _build_obstacle(entry, number)
+        _read_obstacle(domain.comm, entry, number) if entry.shape == "mesh" else _build_obstacle(entry, number, kernels)
         for number, entry in enumerate(placements)
     ]
     meshes = [number for number, entry in enumerate(placements) if entry.shape == "mesh"]
@@ -179,9 +183,13 @@ def build_rigid_obstacles(study: Study) -> list[RigidObstacle]:
     ]
 
 
-def _build_obstacle(entry: ObstaclePlacement, number: int) -> RigidObstacle:
+def _build_obstacle(
+    entry: ObstaclePlacement, number: int, kernels: CompiledShapeKernels | None = None
+) -> RigidObstacle:
     """Return the obstacle of an entry of [[obstacle]]; `number`: of the entry, for messages."""
     shape = build_shape(entry, number)
+    if kernels is not None:
+        shape = kernels.used_for(shape)
     if entry.free_motion is not None:
         return _build_free_obstacle(entry, entry.free_motion, shape)
     return RigidObstacle(entry.name, shape, entry.reference_point, entry.displacement, entry.friction)

@@ -1,0 +1,175 @@
+"""Compiled distances to analytic shapes at a pose, closest points of facets, and energies of facets.
+
+They replace dozens of array operations on a few rows each. Their plain counterparts are `shapes`, `closest_point` and
+`facet_contact.FacetEnergy`, with `[solver] plain = true` or without a compiler.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Hashable
+from ctypes import CDLL, byref, c_double, c_int64
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import numpy.typing as npt
+from mpi4py import MPI
+
+from ..mesh.c_library import FAST_FLAGS, array_pointer, compile_on_all_ranks, unchecked_function
+from .closest_point import SEARCH
+from .laws import BARRIER, EARLY_WEIGHT, Barrier
+from .shape_base import ConvexBody, Shape, frame_about, unit_vector
+from .shapes import Capsule, HalfSpace, OffsetShape, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
+
+Values = npt.NDArray[np.float64]
+
+SOURCE = Path(__file__).with_suffix(".c")
+_SEARCH = np.array([
+    SEARCH.max_iterations, SEARCH.max_trials, SEARCH.slope_reduction, SEARCH.flat_distance, SEARCH.min_change
+])  # fmt: skip
+# as in shape_kernels.c
+HALF_SPACE, SWEPT_SPHERE, BOX, CYLINDER = range(4)
+
+
+class CompiledShapeKernels:
+    """Functions of shape_kernels.c (shape_base.ShapeKernels)."""
+
+    def __init__(self, code: CDLL) -> None:
+        names = "evaluate_shape", "find_closest_points", "evaluate_facets"
+        self._shape, self._closest, self._facets = (unchecked_function(code, name) for name in names)
+
+    def used_for(self, shape: Shape) -> Shape:
+        """The shape, evaluated by these functions."""
+        return cast("Shape", replace(cast("Any", shape), kernels=self))
+
+    def pack(self, shape: Shape, centre: Values, rotation: Values) -> Values:
+        """Numbers of a shape at a pose of centre (d,), m, and rotation (d, d): `Obstacle` of shape_kernels.c."""
+        d, packed = len(centre), _pack_shape(cast("Hashable", shape)).copy()
+        packed[3 : 3 + d] = centre
+        packed[6:15].reshape(3, 3)[:d, :d] = rotation
+        return packed
+
+    def distance(self, packed: Values, x: Values) -> Values:
+        """(n,) signed distances of points x (n, d), m."""
+        result = np.empty(len(x))
+        self._shape(*_sizes(x), _pointer(packed), _pointer(x), _pointer(result), None, None)
+        return result
+
+    def normal(self, packed: Values, x: Values) -> Values:
+        """(n, d) gradients of the distance."""
+        result = np.empty(x.shape)
+        self._shape(*_sizes(x), _pointer(packed), _pointer(x), None, _pointer(result), None)
+        return result
+
+    def curvature(self, packed: Values, x: Values) -> Values:
+        """(n, d, d) Hessians of the distance, 1/m."""
+        result = np.empty((*x.shape, x.shape[1]))
+        self._shape(*_sizes(x), _pointer(packed), _pointer(x), None, None, _pointer(result))
+        return result
+
+    def find_closest_points(
+        self, packed: Values, x: Values, smoothing: float, tolerance: float, barycentric: Values
+    ) -> None:
+        """Search for the closest points of facets (shape_base.ShapeKernels)."""
+        self._closest(
+            *_sizes(x), _pointer(packed), _pointer(x), c_double(smoothing), c_double(tolerance), _pointer(_SEARCH),
+            _pointer(barycentric),
+        )  # fmt: skip
+
+    def facet_energy(
+        self,
+        packed: Values,
+        x: Values,
+        barycentric: Values,
+        smoothing: float,
+        law: Barrier,
+        start: Values | None,
+        area: Values,
+        *,
+        second: bool,
+    ) -> tuple[Values, Values]:
+        """Energy F of facets and its derivatives (facet_contact).
+
+        Args:
+            packed: the shape at its pose.
+            x: (k, c, d) corners, m.
+            barycentric: (k, c) of the closest points.
+            smoothing: mu, m.
+            law: b.
+            start: (k, c + 2) gaps at the start of the step, of the closest points, the smoothed minima and the corners,
+                m; None: the barrier is not averaged.
+            area: (k,) m^2.
+            second: which derivatives are computed.
+
+        Returns:
+            (k,) F, J, and (k, c, d) forces, N; or (k, c d, c d) second derivatives of F, N/m, and (k, c, d, d) of b at
+            the corners, Pa/m.
+        """
+        k, c, d = x.shape
+        shapes = ((k, c * d, c * d), (k, c, d, d)) if second else ((k,), (k, c, d))
+        results = np.empty(shapes[0]), np.empty(shapes[1])
+        pointers = _pointer(results[0]), _pointer(results[1])
+        self._facets(
+            *_sizes(x), _pointer(packed), _pointer(x), _pointer(barycentric), c_double(smoothing),
+            _pointer(np.array([law.stiffness, law.width, EARLY_WEIGHT, BARRIER.closed_value])),
+            None if start is None else _pointer(start), _pointer(area),
+            *((None, None, *pointers) if second else (*pointers, None, None)),
+        )  # fmt: skip
+        return results
+
+
+def _sizes(values: Values) -> list[c_int64]:
+    return [c_int64(size) for size in values.shape]
+
+
+def _pointer(values: Values) -> Any:
+    """Pointer to the first entry of an array; an array that is not contiguous, or of other numbers, is copied."""
+    try:
+        if values.dtype.char == "d":
+            return byref(c_double.from_buffer(values))
+    except (TypeError, ValueError, BufferError):
+        pass  # empty, read-only, or not contiguous
+    return array_pointer(np.ascontiguousarray(values, np.float64))
+
+
+def compile_shape_kernels(comm: MPI.Comm) -> CompiledShapeKernels | None:
+    """Compiled functions of shapes; None without a compiler (collective)."""
+    code = compile_on_all_ranks(comm, SOURCE.stem, SOURCE.read_text(encoding="utf-8"), FAST_FLAGS)
+    return None if code is None else CompiledShapeKernels(code)
+
+
+@lru_cache(maxsize=256)
+def _pack_shape(original: Hashable) -> Values:
+    """Numbers of a shape at the origin: `Obstacle` of shape_kernels.c."""
+    growth, origin, shape = 0.0, np.zeros(3), cast("Any", original)
+    min_radius = getattr(shape, "min_radius", np.inf)
+    if isinstance(shape, OffsetShape):
+        growth, shape = shape.offset, shape.shape
+    if isinstance(shape, TranslatedShape):
+        origin[: shape.dim], shape = shape.offset, shape.shape
+    sign = -1.0 if isinstance(shape, ConvexBody) and shape.hollow else 1.0
+    kind, axis, half, radius, fillet = _parameters(shape)
+    axes = np.zeros((2, 3))
+    axes[0, : len(axis)] = axis
+    if kind in (SWEPT_SPHERE, CYLINDER):
+        axes[1, : len(axis)] = frame_about(axis)[:, 0]
+    sizes = np.full(3, np.inf)
+    sizes[: len(half)] = half
+    fixed = [kind, sign, growth], np.zeros(3), np.eye(3).reshape(-1), origin, [min_radius], axes.reshape(-1)
+    return np.concatenate([*fixed, sizes, [radius, fillet]])
+
+
+def _parameters(shape: Shape) -> tuple[int, Values, Values, float, float]:
+    """Kind, axis (d,), half sizes (m,), radius and fillet of a shape, m."""
+    if isinstance(shape, HalfSpace):
+        return HALF_SPACE, unit_vector(shape.direction), np.empty(0), 0.0, 0.0
+    if isinstance(shape, Sphere | Capsule):
+        axis, half, radius = shape.core
+        return SWEPT_SPHERE, axis, np.array([half]), radius, 0.0
+    if isinstance(shape, RoundedBox):
+        return BOX, np.empty(0), np.array(shape.size) / 2 - shape.fillet, 0.0, shape.fillet
+    assert isinstance(shape, RoundedCylinder)
+    radius, half = shape.core
+    return CYLINDER, unit_vector(shape.axis), np.array([half]), radius, shape.fillet
