@@ -51,6 +51,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from .output.crack_length import CrackExtent
+    from .output.tip_file import TipFile
 
 
 class Run:
@@ -65,6 +66,7 @@ class Run:
         frames: fields and surface.
         breaks: log of the edges that broke.
         front: extent of the cracks; None without [[crack]] and fracture energy.
+        tips: rows of tips.csv; None if cracks have no release rate.
         monitors: doubtful results, an early end, resources used.
         interrupt: signals and the limit of wall time.
     """
@@ -148,6 +150,7 @@ class Run:
         on_root(self.comm, lambda: make_output_folder(folder, self._text, restart=restart))
         self._saved_at = t  # s, of the last checkpoint
         self.history = History(self.comm, folder / "history.csv", names, step, study.thickness)
+        self.tips = self._tip_file(step)
         self.monitors = RunMonitors(self.scene, self.history, self._meter)
         if notes is not None:
             self.monitors.from_checkpoint(notes.monitors)
@@ -160,7 +163,11 @@ class Run:
         )  # fmt: skip
         if notes is not None:
             had = notes.monitors["frames"]
-            print_notes(self.comm, [*self.history.notes, *missing_frame_notes(folder, had, self.frames.frame_counts)])
+            tip_notes = self.tips.notes if self.tips is not None else []
+            print_notes(
+                self.comm,
+                [*self.history.notes, *tip_notes, *missing_frame_notes(folder, had, self.frames.frame_counts)],
+            )
         self._clock = FrameSchedule(study.output.every, study.frame_interval)
         self._clock.record_frame(self.state.t)
         self._frame_of: int | None = None  # the step of the last frame of this part of the run
@@ -176,6 +183,16 @@ class Run:
 
         assert self.breaks.record is not None
         return CrackExtent(self.breaks.record, initial_cracks(study, self.scene.domain.dim))
+
+    def _tip_file(self, resume_at: int | None) -> TipFile | None:
+        """Open tips.csv (collective); None if cracks have no release rate."""
+        record = self.scene.fracture.tip_record if self.scene.fracture is not None else None
+        if record is None or self.front is None:
+            return None
+        from .output.tip_file import TipFile
+
+        inertia = self.scene.balance.scheme.inertia
+        return TipFile(self.folder / "tips.csv", record, self.front, inertia=inertia, resume_at=resume_at)
 
     @property
     def ended(self) -> bool:
@@ -194,6 +211,8 @@ class Run:
             self._forgets = False
         self.interrupt.begin_step()
         self.state, report = self.scene.stepper.advance(self.state)
+        if self.tips is not None:
+            self.tips.append(self.state.step, self.state.t)
         if report.broken:
             self.record_breaks()
         probes = self.scene.probes()
@@ -208,6 +227,8 @@ class Run:
         self.breaks.record_breaks(self.state.t)
         if self.front is not None:
             self.front.update()
+        if self.tips is not None:
+            self.tips.update_cracks()
 
     def write_frame(self) -> None:
         """Write a frame of the present state, and check the cells (collective). Raises CannotWrite."""

@@ -20,7 +20,7 @@ from fracsim.errors import InputError
 from fracsim.fracture.energy.branching import branch_directions, release_rate, rotate
 from fracsim.fracture.energy.crack_speed import RateDependentTipCriterion, relax_slowness
 from fracsim.fracture.energy.cut_plane import branching_cuts, exit_cuts
-from fracsim.fracture.energy.mixed_mode import kink_gain
+from fracsim.fracture.energy.mixed_mode import kink_gain, phase_angles
 from fracsim.fracture.energy.neighbour_search import NeighbourPairs
 from fracsim.fracture.energy.tip_parameters import TIP
 from fracsim.mesh.domain import distribute
@@ -158,7 +158,7 @@ def test_a_tip_that_is_ahead_waits_unless_there_is_enough_for_both() -> None:
         ahead = int(np.argmax(found.point[:, 0]))
         assert found.is_inactive[ahead] and found.is_inactive.sum() == 1
         released = release_rate(now.evaluate_forces(), found.ahead, tangent) * kink_gain(
-            now.phase_angles() * ~np.any(found.branch_direction, axis=1)
+            phase_angles(now.stress_intensities()) * ~np.any(found.branch_direction, axis=1)
         )
         criterion.toughness = released[ahead] / share
         criterion(*scene.fracture.evaluate_undamaged_stress())

@@ -11,10 +11,9 @@ COUNT, SIZE, STEPS = 40, 0.15, 16
 
 
 def soup(dim, corners, seed):
-    """(COUNT corners, d) points of simplices of all sizes, and (COUNT, corners) their vertices; some share one."""
+    """(COUNT corners, d) points of simplices that lie about, and (COUNT, corners) their vertices; some share one."""
     rng = np.random.default_rng(seed)
-    sizes = SIZE * 0.5 ** rng.integers(0, 6, (COUNT, 1, 1))
-    x = (rng.random((COUNT, 1, dim)) + sizes * rng.random((COUNT, corners, dim))).reshape(-1, dim)
+    x = (rng.random((COUNT, 1, dim)) + SIZE * rng.random((COUNT, corners, dim))).reshape(-1, dim)
     simplices = np.arange(COUNT * corners).reshape(COUNT, corners)
     simplices[1::4, 0] = simplices[::4, 0]
     return x, simplices

@@ -31,7 +31,7 @@ from scipy.sparse import csr_matrix
 from ..mesh.parallel import sum_over_ranks
 from .laws import BARRIER
 from .pair_search import PairFilter, PairSearch, SimplexPairs, max_length
-from .sample_points import Centroids, IpcFriction, UsedDofs, Vertices, measures, projection
+from .sample_points import Centroids, IpcFriction, Vertices, measures, projection
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -336,7 +336,6 @@ class IpcPairs:
         self._clear_active()
         self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
         self._friction, self._distance = friction, distance
-        self._dofs = UsedDofs.of_points(np.unique(elements), rest_positions.shape[1])
         self._area = vertex_areas(rest_positions, elements)
 
     @property
@@ -391,13 +390,17 @@ class IpcPairs:
         """(n, d) dE/dx of this rank's pairs, N: minus the forces on the points."""
         vertices = self._mesh.vertices(x)
         total = sum(pairs.gradient() for pairs in self._active_pairs(vertices))
-        return self._dofs.vectors(np.asarray(total), x.shape)
+        if not len(self._mesh.rest_positions):
+            return np.zeros_like(x)
+        return np.asarray(self._mesh.to_full_dof(total)).reshape(x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2 of this rank's pairs, N/m; unless `exact`, each without its negative eigenvalues."""
         vertices, method = self._mesh.vertices(x), projection(exact=exact)
         total = sum(pairs.hessian(method) for pairs in self._active_pairs(vertices))
-        return self._dofs.matrix(csr_matrix(total), x.size)
+        if not len(self._mesh.rest_positions):
+            return csr_matrix((x.size, x.size))
+        return csr_matrix(self._mesh.to_full_dof(total))
 
     def set_stiffness(self, stiffness: float) -> None:
         """Set the stiffness k, Pa."""
@@ -437,7 +440,7 @@ class IpcPairs:
             part = ipctk.TangentialCollisions()
             part.build(pairs.kind.samples.mesh, pairs.positions, pairs.pairs, pairs.kind.barrier, self._friction)
             parts.append((pairs.kind.samples, part))
-        return IpcFriction(self._mesh, self._dofs, parts, self._mesh.vertices(start), ipctk.FrictionPotential(slip))
+        return IpcFriction(self._mesh, parts, self._mesh.vertices(start), ipctk.FrictionPotential(slip))
 
     # --- collisions ---
 

@@ -5,9 +5,7 @@
 #include <stdlib.h>
 #include <string.h>
 
-#define MAX_CELLS_PER_BOX 8
-/* levels of sizes, each half of the one before; the last has all that is smaller */
-#define LEVELS 12
+#define MAX_CELLS_PER_SIMPLEX 4
 
 typedef struct {
     double low[3], high[3];
@@ -129,77 +127,45 @@ static int share_vertex(int a, const int32_t *x, int b, const int32_t *y)
     return 0;
 }
 
-/* Boxes of similar size in a grid of cubes, each in the cube of its low corner. */
+/* Grid of cubes over `low` to `high`. */
 typedef struct {
-    double low[3], scale, size[3]; /* corner of the grid, 1 / side of a cube, largest sides of a box */
+    double low[3], scale;
     int count[3];
-    int64_t boxes, *begin; /* (cubes + 1,) first of the numbers of each cube */
-    int32_t *numbers;
-    Box *sorted; /* boxes in the order of their numbers here */
 } Grid;
 
-static void cell_of(const Grid *grid, const double *x, int *cell)
+static void cells_of(const Grid *grid, const Box *box, int *first, int *last)
 {
     for (int k = 0; k < 3; k++) {
-        double c = (x[k] - grid->low[k]) * grid->scale, most = grid->count[k] - 1;
-        /* positions that are no numbers are in the first cube */
-        cell[k] = (int)(c > 0 ? c < most ? c : most : 0);
+        double a = (box->low[k] - grid->low[k]) * grid->scale, b = (box->high[k] - grid->low[k]) * grid->scale;
+        double most = grid->count[k] - 1;
+        /* positions that are no numbers are in the first cell */
+        first[k] = (int)(a > 0 ? a < most ? a : most : 0);
+        last[k] = (int)(b > 0 ? b < most ? b : most : 0);
     }
 }
 
-static int64_t number_of(const Grid *grid, const int *cell)
+static Grid grid_of(int64_t n, const Box *boxes)
 {
-    return ((int64_t)cell[0] * grid->count[1] + cell[1]) * grid->count[2] + cell[2];
-}
-
-/* Size of a box: the largest side. */
-static double size_of(const Box *box)
-{
-    double size = 0;
-    for (int k = 0; k < 3; k++) size = fmax(size, box->high[k] - box->low[k]);
-    return size;
-}
-
-/* Grid of the boxes (n,) of a level. Returns 0 without memory. */
-static int make_grid(Grid *grid, int level, int64_t n, const Box *boxes, const int8_t *levels)
-{
-    double high[3];
-    grid->boxes = 0, grid->begin = NULL, grid->numbers = NULL, grid->sorted = NULL;
-    for (int k = 0; k < 3; k++) grid->low[k] = INFINITY, high[k] = -INFINITY, grid->size[k] = 0;
-    for (int64_t j = 0; j < n; j++) {
-        if (levels[j] != level) continue;
-        grid->boxes++;
+    Grid grid;
+    double high[3], size = 0;
+    for (int k = 0; k < 3; k++) grid.low[k] = INFINITY, high[k] = -INFINITY;
+    for (int64_t i = 0; i < n; i++) {
+        double largest = 0;
         for (int k = 0; k < 3; k++) {
-            grid->low[k] = fmin(grid->low[k], boxes[j].low[k]), high[k] = fmax(high[k], boxes[j].low[k]);
-            grid->size[k] = fmax(grid->size[k], boxes[j].high[k] - boxes[j].low[k]);
+            grid.low[k] = fmin(grid.low[k], boxes[i].low[k]), high[k] = fmax(high[k], boxes[i].high[k]);
+            largest = fmax(largest, boxes[i].high[k] - boxes[i].low[k]);
         }
+        size += largest / n;
     }
-    if (!grid->boxes) return 1;
-    double side = fmax(grid->size[0], fmax(grid->size[1], grid->size[2])) / 2;
-    for (double cells = INFINITY; cells > MAX_CELLS_PER_BOX * (double)grid->boxes + 64; side *= 1.25) {
-        cells = 1, grid->scale = side > 0 ? 1 / side : 0;
-        for (int k = 0; k < 3; k++) {
-            double c = floor((high[k] - grid->low[k]) * grid->scale) + 1;
-            cells *= c, grid->count[k] = c >= 1 && c < 1e9 ? (int)c : 1;
-        }
+    for (double cells = INFINITY; cells > MAX_CELLS_PER_SIMPLEX * (double)n + 64; size *= 1.25) {
+        cells = 1, grid.scale = size > 0 ? 1 / size : 0;
+        for (int k = 0; k < 3; k++) cells *= floor((high[k] - grid.low[k]) * grid.scale) + 1;
     }
-    int64_t cells = (int64_t)grid->count[0] * grid->count[1] * grid->count[2];
-    grid->begin = calloc(cells + 2, sizeof(int64_t)), grid->numbers = malloc(grid->boxes * sizeof(int32_t));
-    grid->sorted = malloc(grid->boxes * sizeof(Box));
-    if (!grid->begin || !grid->numbers || !grid->sorted) return 0;
-    /* counts, then sums, then numbers, as in a counting sort */
-    for (int round = 0; round < 2; round++) {
-        for (int64_t j = 0; j < n; j++) {
-            if (levels[j] != level) continue;
-            int cell[3];
-            cell_of(grid, boxes[j].low, cell);
-            int64_t number = number_of(grid, cell);
-            if (round) grid->sorted[grid->begin[number + 1]] = boxes[j], grid->numbers[grid->begin[number + 1]++] = (int32_t)j;
-            else grid->begin[number + 2]++;
-        }
-        for (int64_t cell = 0; !round && cell < cells; cell++) grid->begin[cell + 2] += grid->begin[cell + 1];
+    for (int k = 0; k < 3; k++) {
+        double cells = (high[k] - grid.low[k]) * grid.scale + 1;
+        grid.count[k] = cells >= 1 && cells < 1e9 ? (int)cells : 1;
     }
-    return 1;
+    return grid;
 }
 
 /* Pairs of a simplex of `first` (m, a) and one of `second` (n, b), without common vertices, that may come as near as
@@ -213,55 +179,68 @@ int64_t find_near_pairs(const double *start, const double *end, int64_t m, int a
     if (m == 0 || n == 0) return 0;
     double xs[9], xe[9], ys[9], ye[9];
     Box *boxes = malloc(n * sizeof(Box));
-    int8_t *levels = malloc(n);
-    Grid grids[LEVELS] = {0};
-    int complete = boxes && levels;
-    double largest = 0;
-    for (int64_t j = 0; complete && j < n; j++) {
+    if (!boxes) return -1;
+    for (int64_t j = 0; j < n; j++) {
         gather(start, second + b * j, b, 0, ys);
         gather(end, second + b * j, b, 0, ye);
         boxes[j] = box_of(b, ys, ye, reach);
-        largest = fmax(largest, size_of(&boxes[j]));
     }
-    for (int64_t j = 0; complete && j < n; j++) {
-        levels[j] = 0;
-        for (double size = 2 * size_of(&boxes[j]); size <= largest && levels[j] < LEVELS - 1; size *= 2) levels[j]++;
+    const Grid grid = grid_of(n, boxes);
+    const int *count = grid.count;
+    const int64_t cells = (int64_t)count[0] * count[1] * count[2];
+    int64_t *begin = calloc(cells + 2, sizeof(int64_t)), found = 0;
+    int32_t *inside = NULL;
+    /* counts, then sums, then numbers, as in a counting sort */
+    for (int round = 0; begin && round < 2; round++) {
+        for (int64_t j = 0; j < n; j++) {
+            int low[3], high[3];
+            cells_of(&grid, &boxes[j], low, high);
+            for (int u = low[0]; u <= high[0]; u++)
+                for (int v = low[1]; v <= high[1]; v++)
+                    for (int w = low[2]; w <= high[2]; w++) {
+                        int64_t cell = ((int64_t)u * count[1] + v) * count[2] + w;
+                        if (round) inside[begin[cell + 1]++] = (int32_t)j;
+                        else begin[cell + 2]++;
+                    }
+        }
+        if (round) break;
+        for (int64_t cell = 0; cell < cells; cell++) begin[cell + 2] += begin[cell + 1];
+        inside = malloc((begin[cells + 1] + 1) * sizeof(int32_t));
+        if (!inside) break;
     }
-    for (int level = 0; complete && level < LEVELS; level++)
-        complete = make_grid(&grids[level], level, n, boxes, levels);
-    int64_t found = complete ? 0 : -1;
-    for (int64_t i = 0; complete && i < m; i++) {
+    if (!begin || !inside) {
+        free(boxes), free(begin), free(inside);
+        return -1;
+    }
+    for (int64_t i = 0; i < m; i++) {
         const int32_t *x = first + a * i;
-        int points = gather(start, x, a, centroids, xs);
+        int points = gather(start, x, a, centroids, xs), low[3], high[3];
         gather(end, x, a, centroids, xe);
-        const Box box = box_of(points, xs, xe, 0);
-        for (const Grid *grid = grids; grid < grids + LEVELS; grid++) {
-            if (!grid->boxes) continue;
-            double low[3];
-            int from[3], to[3], cell[3];
-            for (int k = 0; k < 3; k++) low[k] = box.low[k] - grid->size[k];
-            cell_of(grid, low, from), cell_of(grid, box.high, to);
-            for (cell[0] = from[0]; cell[0] <= to[0]; cell[0]++)
-                for (cell[1] = from[1]; cell[1] <= to[1]; cell[1]++) {
-                    /* the cubes of a column follow one another */
-                    cell[2] = from[2];
-                    int64_t number = number_of(grid, cell);
-                    for (int64_t k = grid->begin[number]; k < grid->begin[number + to[2] - from[2] + 1]; k++) {
-                        const Box *other = &grid->sorted[k];
-                        /* no branches: most boxes of neighbouring cubes are apart in one of the axes */
-                        int apart = 0;
-                        for (int axis = 0; axis < 3; axis++)
-                            apart |= (box.low[axis] > other->high[axis]) | (box.high[axis] < other->low[axis]);
-                        if (apart) continue;
-                        int64_t j = grid->numbers[k];
+        Box box = box_of(points, xs, xe, 0);
+        cells_of(&grid, &box, low, high);
+        for (int u = low[0]; u <= high[0]; u++)
+            for (int v = low[1]; v <= high[1]; v++)
+                for (int w = low[2]; w <= high[2]; w++) {
+                    int64_t cell = ((int64_t)u * count[1] + v) * count[2] + w;
+                    for (int64_t k = begin[cell]; k < begin[cell + 1]; k++) {
+                        int64_t j = inside[k];
                         const int32_t *y = second + b * j;
+                        const Box *other = &boxes[j];
                         if (same && j <= i) continue;
+                        if (box.low[0] > other->high[0] || box.high[0] < other->low[0] || box.low[1] > other->high[1]
+                            || box.high[1] < other->low[1] || box.low[2] > other->high[2] || box.high[2] < other->low[2])
+                            continue;
                         if (patches[x[0]] == patches[y[0]] && patches[x[0]] >= 0) continue;
                         if (share_vertex(a, x, b, y)) continue;
-                        int is_own = 0;
+                        int is_own = 0, from[3], to[3];
                         for (int c = 0; c < a; c++) is_own |= own[x[c]];
                         for (int c = 0; c < b; c++) is_own |= own[y[c]];
                         if (!is_own) continue;
+                        /* each pair in the first of the cells that its boxes share */
+                        cells_of(&grid, other, from, to);
+                        if (u != (low[0] > from[0] ? low[0] : from[0]) || v != (low[1] > from[1] ? low[1] : from[1])
+                            || w != (low[2] > from[2] ? low[2] : from[2]))
+                            continue;
                         gather(start, y, b, 0, ys);
                         gather(end, y, b, 0, ye);
                         if (least_distance(points, xs, xe, b, ys, ye, reach) > reach) continue;
@@ -269,9 +248,7 @@ int64_t find_near_pairs(const double *start, const double *end, int64_t m, int a
                         found++;
                     }
                 }
-        }
     }
-    for (int level = 0; level < LEVELS; level++) free(grids[level].begin), free(grids[level].numbers), free(grids[level].sorted);
-    free(boxes), free(levels);
+    free(boxes), free(begin), free(inside);
     return found;
 }

@@ -1,8 +1,8 @@
 """Search for points, edges and triangles of a surface that may come near one another in a motion, in C (pair_search.c).
 
-Grids of cubes, one for each size of boxes, give pairs whose bounding boxes meet. Of these the pairs remain that can
-come within a distance r: with the distances d_0 and d_1 at both ends of a straight motion, and the largest relative
-motion s of their vertices, they stay at least (d_0 + d_1 - s) / 2 apart.
+A grid of cubes gives pairs whose bounding boxes meet. Of these the pairs remain that can come within a distance r: with
+the distances d_0 and d_1 at both ends of a straight motion, and the largest relative motion s of their vertices, they
+stay at least (d_0 + d_1 - s) / 2 apart.
 
 Source: C. Ericson (2005), Real-time collision detection, chapters 5 and 7.
 """

@@ -131,33 +131,6 @@ def measures(x: Values, elements: Ints) -> Values:
     return np.asarray(np.linalg.norm(spanned, axis=1))
 
 
-@dataclass(frozen=True)
-class UsedDofs:
-    """Dofs of the points of elements among those of all points of a surface.
-
-    Attributes:
-        numbers: (k d,).
-    """
-
-    numbers: Ints
-
-    @classmethod
-    def of_points(cls, points: Ints, dim: int) -> UsedDofs:
-        """Dofs of points (k,)."""
-        return cls((dim * points[:, None] + np.arange(dim)).reshape(-1))
-
-    def vectors(self, values: Values, shape: tuple[int, ...]) -> Values:
-        """(n, d) values at all points, of values (k d,); 0 elsewhere."""
-        result = np.zeros(shape[0] * shape[1])
-        result[self.numbers] = values
-        return result.reshape(shape)
-
-    def matrix(self, H: csr_matrix, count: int) -> csr_matrix:
-        """(n d, n d) matrix of all `count` dofs, of one (k d, k d)."""
-        entries, numbers = H.tocoo(), self.numbers
-        return csr_matrix((entries.data, (numbers[entries.row], numbers[entries.col])), shape=(count, count))
-
-
 class SlipFriction(Protocol):
     """Lagged friction of a surface at positions x (n, d), m: a potential of the slip."""
 
@@ -182,14 +155,12 @@ class IpcFriction:
 
     Attributes:
         mesh: surface.
-        dofs: of the points of its elements.
         parts: sample points and pairs of each kind.
         start: (n, d) x_0, m.
         potential: of ipctk.
     """
 
     mesh: ipctk.CollisionMesh
-    dofs: UsedDofs
     parts: list[tuple[Vertices | Centroids, ipctk.TangentialCollisions]]
     start: Values
     potential: ipctk.FrictionPotential
@@ -208,7 +179,7 @@ class IpcFriction:
             samples.gradient(self.potential.gradient(pairs, samples.mesh, samples.positions(motion)))
             for samples, pairs in self.parts
         )
-        return self.dofs.vectors(np.asarray(total), x.shape)
+        return np.asarray(self.mesh.to_full_dof(total)).reshape(x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2, N/m; unless `exact`, each pair without its negative eigenvalues."""
@@ -217,7 +188,7 @@ class IpcFriction:
             samples.hessian(self.potential.hessian(pairs, samples.mesh, samples.positions(motion), method))
             for samples, pairs in self.parts
         )
-        return self.dofs.matrix(csr_matrix(total), x.size)
+        return csr_matrix(self.mesh.to_full_dof(total))
 
     def _motion(self, x: Values) -> Values:
         motion: Values = self.mesh.vertices(x) - self.start

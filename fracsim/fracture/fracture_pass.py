@@ -14,6 +14,7 @@ from ..mesh.edge_graph import EdgeGraph
 from .criterion import FractureCriterion
 from .degradation import Degradation, make_degradation
 from .effective_stress import UndamagedStress
+from .energy.tip_record import TipRecord
 from .node_retention import NodeAttachment
 
 Values = npt.NDArray[np.float64]
@@ -90,6 +91,7 @@ class FracturePass:
         degradation: energy that broken edges take out of their cells.
         max_passes: largest number of passes in a step; None: until nothing changes.
         initial_cuts: (edges,) cut positions of edges broken before the start, NaN elsewhere; None without such edges.
+        tip_record: crack tips of the step; None: the criterion has no tips with a release rate.
     """
 
     phase = "fracture"
@@ -106,6 +108,7 @@ class FracturePass:
         degradation: Degradation | None = None,
         passes_per_second: float | None = None,
         node_attachment: NodeAttachment | None = None,
+        tip_record: TipRecord | None = None,
     ) -> None:
         """Assemble a pass from its parts (collective).
 
@@ -119,12 +122,13 @@ class FracturePass:
             degradation: by default that of the fields of `stress`.
             passes_per_second: rate of passes, instead of `max_passes`: short steps may have none.
             node_attachment: spares edges that attach nodes without an unsplit cell.
+            tip_record: of the crack tips in each step; None: the criterion has no tips with a release rate.
         """
         self.stress, self.graph, self.criterion, self.max_passes = stress, graph, criterion, max_passes
         self.law: EdgeLaw = law or BrittleEdgeLaw()
         self.degradation: Degradation = degradation or make_degradation(stress, graph)
         self.initial_cuts, self._passes_per_second = initial_cuts, passes_per_second
-        self._node_attachment = node_attachment
+        self._node_attachment, self.tip_record = node_attachment, tip_record
         self._is_due, self._now, self._dt = True, 0.0, math.inf
         # Moving tips change their states in every pass, also where no edge breaks.
         self._has_tip_states = criterion.tip_states is not None
@@ -150,6 +154,8 @@ class FracturePass:
     def begin_step(self, t: float, dt: float) -> None:
         """Prepare a step of `dt` (s) from `t`: its number of passes, and the energy that may be released in it."""
         self.degradation.begin_step(t, dt)
+        if self.tip_record is not None:
+            self.tip_record.begin_step(t, dt)
         self._now, self._dt = t + dt, dt
         if self._passes_per_second is not None:
             self.max_passes = max(1, math.ceil(self._passes_per_second * dt))

@@ -97,7 +97,7 @@ def stiff_directions(H: csr_matrix, least: float, comm: MPI.Comm = MPI.COMM_SELF
 
     The matrix is the sum of H (n, n) over the ranks (collective).
     """
-    from scipy.sparse import csr_matrix  # a run without contact does without SciPy
+    from scipy.sparse import csr_matrix, hstack  # a run without contact does without SciPy
 
     rows, group, sizes = _coupled_groups(H)
     # groups of the sum are no smaller
@@ -112,22 +112,18 @@ def stiff_directions(H: csr_matrix, least: float, comm: MPI.Comm = MPI.COMM_SELF
     # no eigenvalue is above the largest sum of absolute values of a row (Gershgorin)
     bound = np.zeros(len(sizes))
     np.maximum.at(bound, group, np.asarray(abs(coupled).sum(axis=1)).reshape(-1))
-    entries, values, count = [(np.empty(0), *np.empty((2, 0), np.int64))], list[Values](), 0
+    columns, values = [csr_matrix((H.shape[0], 0))], list[Values]()
     for part in np.split(np.argsort(group, kind="stable"), np.cumsum(sizes)[:-1]) if len(rows) else []:
         if bound[group[part[0]]] <= least:
             continue
         eigenvalues, vectors = np.linalg.eigh(coupled[part][:, part].toarray())
         stiff = eigenvalues > least
-        columns = np.arange(count, count := count + int(stiff.sum()))
-        entries.append(
-            (vectors[:, stiff].reshape(-1), np.repeat(rows[part], len(columns)), np.tile(columns, len(part)))
-        )
+        count = int(stiff.sum())
+        entries = np.repeat(rows[part], count), np.tile(np.arange(count), len(part))
+        columns.append(csr_matrix((vectors[:, stiff].reshape(-1), entries), shape=(H.shape[0], count)))
         values.append(eigenvalues[stiff])
     stiffness: Values = np.concatenate(values) if values else np.empty(0)
-    if count > LIMITS.directions:
-        return None
-    vectors, row, column = (np.concatenate(parts) for parts in zip(*entries, strict=True))
-    return csr_matrix((vectors, (row, column)), shape=(H.shape[0], count)), stiffness
+    return None if len(stiffness) > LIMITS.directions else (csr_matrix(hstack(columns)), stiffness)
 
 
 def _coupled_groups(H: csr_matrix) -> tuple[Ints, Ints, Ints]:

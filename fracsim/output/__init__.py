@@ -18,4 +18,5 @@ rigid_frames      frames of rigid bodies
 run_folder        output folder: checks before a run or restart, schedule of frames
 summary           summary.json: outcome, times, memory
 surface           the split surface: surface.pvd, surface/*.vtu and pieces.csv
+tip_file          tips.csv: crack tips that are followed from step to step
 """

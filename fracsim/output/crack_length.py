@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from ..fracture.edge_history import EdgeHistory
 from ..fracture.initial_cracks import edge_ends_in_input_order
@@ -16,6 +19,29 @@ from ..meshes.data import AXES
 
 Ints = npt.NDArray[np.integer]
 Values = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CrackTable:
+    """Cut cells of all ranks, and the cracks that they belong to.
+
+    Attributes:
+        cell: (n,) numbers in the input mesh, ascending.
+        crack: (n,) number of the crack: cut cells that share broken edges.
+        size: (n,) length of that crack, m, in 3D its area, m^2.
+    """
+
+    cell: Ints
+    crack: Ints
+    size: Values
+
+    def find(self, cells: Ints) -> tuple[Ints, Values]:
+        """Return the crack (m,) of cells (m,), -1 for one that is not cut, and its size (m,), there 0."""
+        row = np.minimum(np.searchsorted(self.cell, cells), len(self.cell) - 1)
+        is_cut = self.cell[row] == cells if len(self.cell) else np.zeros(len(cells), bool)
+        crack, size = np.full(len(cells), -1), np.zeros(len(cells))
+        crack[is_cut], size[is_cut] = self.crack[row[is_cut]], self.size[row[is_cut]]
+        return crack, size
 
 
 class CrackExtent:
@@ -56,6 +82,37 @@ class CrackExtent:
             for end in () if crack.corners is None else crack.corners:
                 self._locate_segment_end(end)
         self.update()
+
+    @property
+    def comm(self) -> MPI.Comm:
+        """Ranks of the body."""
+        return self._domain.comm
+
+    @property
+    def dim(self) -> int:
+        """Dimension of the body, 2 or 3."""
+        return self._domain.dim
+
+    def gather_cracks(self) -> CrackTable | None:
+        """Return the cut cells and their cracks on rank 0, None elsewhere (collective)."""
+        graph, cells = self._graph, np.flatnonzero(self._pattern)
+        size = self._cut_size.copy()
+        for cell, end in self._segment_ends.items():
+            if not graph.split[cell]:
+                size[cell] += np.linalg.norm(end - self._segment_entry(cell))
+        row, side = np.nonzero(graph.broken[graph.cell_edges[cells]])
+        keys = graph.keys.of_edges(graph.cell_edges[cells][row, side].astype(np.int64))
+        parts = self.comm.gather((self._domain.input_numbering.cells[cells][row], size[cells][row], keys))
+        if parts is None:
+            return None
+        of_side, size_of_side, edges = (np.concatenate(part) for part in zip(*parts, strict=True))
+        number, first, member = np.unique(of_side, return_index=True, return_inverse=True)
+        edge = np.unique(edges, axis=0, return_inverse=True)[1].reshape(-1)
+        # Cells and edges are the nodes of a graph, whose parts are the cracks.
+        count = len(number) + len(edges)
+        links = coo_array((np.ones(len(edge)), (member, len(number) + edge)), (count, count))
+        crack = connected_components(links, directed=False)[1][: len(number)]
+        return CrackTable(number, crack, np.bincount(crack, size_of_side[first])[crack])
 
     def to_checkpoint(self) -> dict[str, list[float]]:
         """Values for `from_checkpoint`: the last tip, which stays once a crack has crossed the body."""

@@ -20,7 +20,8 @@ STUDY_HEADER_WORDS = ("fracsim", "dolfinx", "petsc", "python", "ranks")
 STUDY_FILE, CHECKPOINT_FILE = "study.toml", "checkpoint/state.h5"
 OUTPUT_FOLDERS = ("surface", "checkpoint")
 OUTPUT_FILES = (
-    "history.csv", "fields.xdmf", "fields.h5", "surface.pvd", "pieces.csv", "summary.json", "last.png", CHECKPOINT_FILE,
+    "history.csv", "tips.csv", "fields.xdmf", "fields.h5", "surface.pvd", "pieces.csv", "summary.json", "last.png",
+    CHECKPOINT_FILE,
 )  # fmt: skip
 FRAME_FILE_PATTERN = re.compile(r"(?:surface|obstacle_[A-Za-z][A-Za-z0-9-]*)_\d{6,}\.vtu")
 # Files that may exist before study.toml does: the log of a sweep, and a temporary file of a run killed at its start.

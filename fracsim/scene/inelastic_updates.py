@@ -73,6 +73,7 @@ def _build_energy_pass(
     from ..fracture.degradation import CrackClosureDegradation, Degradation, SplitCellDegradation
     from ..fracture.energy.front_advance import FrontTipCriterion
     from ..fracture.energy.tip_criterion import TipCriterion
+    from ..fracture.energy.tip_record import TipRecord
     from ..fracture.fracture_pass import FracturePass
 
     assert study.fracture is not None and study.fracture.energy is not None
@@ -89,7 +90,8 @@ def _build_energy_pass(
         from ..fracture.energy.crack_speed import RateDependentTipCriterion
 
         criterion_type = RateDependentTipCriterion
-    tips = criterion_type(stress, graph, strength, toughness, initial_cuts)
+    record = TipRecord()
+    tips = criterion_type(stress, graph, strength, toughness, initial_cuts, record)
     limits_passes = inertia and study.fracture.passes is None
     passes_per_second = tips.passes_per_second() if limits_passes else None
     degradation: Degradation = SplitCellDegradation(stress, graph, tips.release_rate() if inertia else None)
@@ -108,6 +110,7 @@ def _build_energy_pass(
         initial_cuts=initial_cuts,
         degradation=degradation,
         passes_per_second=passes_per_second,
+        tip_record=record,
     )
 
 

@@ -17,6 +17,7 @@ cut_cells              cut positions, cut polygons, and the cut cells of all ran
 gradient_operators     gradients of fields around tips, as matrices
 neighbour_search       cells near points, and values of cells of other ranks
 tip_parameters         lengths and thresholds
+tip_record             tips of a step before they advance, for tips.csv
 
 Equations: docs/theory.md#fracture-energy; what was tried: docs/theory.md#rejected-alternatives. A tip is a cell that is
 cut and not split.

@@ -106,6 +106,11 @@ def rotate_back(angle: Values, stress: Values, F: Values, inertia_force: Values)
     return Q @ stress @ Q.transpose(0, 2, 1), Q @ F - np.eye(2), np.einsum("nij,nj->ni", Q, inertia_force)
 
 
+def phase_angles(intensities: Values) -> Values:
+    """Return psi = atan2(K_II, K_I) (n,), rad, of stress intensities (n, 2)."""
+    return np.asarray(np.arctan2(intensities[:, 1], intensities[:, 0]))
+
+
 def kink_angle(psi: Values) -> Values:
     """Return the kink angle (n,), rad, anti-clockwise from the tangent, at phase angles psi (n,)."""
     # A closed crack has no K_I.

@@ -37,11 +37,12 @@ from .crack_initiation import (
 )
 from .critical_distance import CriticalDistance, critical_distance
 from .cut_plane import EdgeCuts, branching_cuts, centroid_cuts, exit_cuts, plane_cuts
-from .mixed_mode import kink_angle, kink_gain
+from .mixed_mode import kink_angle, kink_gain, phase_angles
 from .neighbour_search import local_mesh_size
 from .tip_fields import TipFieldEvaluator, TipFields
 from .tip_neighbourhoods import CrackTips, TipRadii
 from .tip_parameters import TIP
+from .tip_record import TipReading, TipRecord
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -77,6 +78,7 @@ class TipCriterion:
         strength: EdgeStrength,
         toughness: PerCell,
         initial_cuts: Values | None = None,
+        record: TipRecord | None = None,
     ) -> None:
         """Build the criterion (collective).
 
@@ -86,7 +88,9 @@ class TipCriterion:
             strength: strength of edges.
             toughness: G_c, J/m^2.
             initial_cuts: (edges,) cut positions of initial cracks.
+            record: is given the tips of each pass.
         """
+        self._record = record
         self._stress, self._graph, self.strength, self.toughness = stress, graph, strength, toughness
         domain = self._domain = stress.domain
         self.cut_positions: Values = np.full(len(graph.broken), np.nan) if initial_cuts is None else initial_cuts.copy()
@@ -196,14 +200,21 @@ class TipCriterion:
         size, turns, branches = np.linalg.norm(force, axis=1), *np.zeros((2, len(tips)), bool)
         ahead = np.where(mature[:, None], force, tips.point - tips.behind)
         exclusion = TIP.exclusion_radius[d] * h
+        K: Values = np.empty((len(tips), 0))
         if d == 2:
-            size, kinked = kinked_release(fields.phase_angles(), tips, force)
+            K = fields.stress_intensities()
+            size, kinked = kinked_release(phase_angles(K), tips, force)
             # A force backwards belongs to other tips in the disc.
             mature &= size > 0
             turns, side_by_side = mature & np.any(kinked, axis=1), np.any(tips.branch_direction, axis=1)
             ahead = np.where(turns[:, None], kinked, ahead)
             # Branches that are side by side advance in the same pass.
             exclusion = np.where(side_by_side, TIP.exclusion_radius[3] * h, exclusion)
+        if self._record is not None:
+            # The disc of a young tip reaches beyond its crack.
+            factor = np.where(tips.mature, 1.0, np.nan)
+            numbers = self._domain.input_numbering.cells[tips.cell]
+            self._record.add(TipReading(numbers, tips.point, size * factor, K * factor[:, None]))
         enough, enough_for_branches = self._find_critical_tips(size, toughness, tips)
         if self.may_branch:
             branches = turns & enough_for_branches

@@ -76,11 +76,10 @@ class TipFields:
         """Return the mean stress (m, d, d) around tips `rows` (m,), Pa."""
         return self.neighbourhoods.mean_stress(rows, self.stress)
 
-    def phase_angles(self) -> Values:
-        """Return atan2(K_II, K_I) (tips,) of tips in 2D, rad."""
+    def stress_intensities(self) -> Values:
+        """Return K_I and K_II (tips, 2) of tips in 2D, Pa sqrt(m)."""
         fields = self.stress, self.H, self.inertia_force
-        K = self.neighbourhoods.stress_intensities(fields, self.elastic, rotates=self.rotates)
-        return np.asarray(np.arctan2(K[:, 1], K[:, 0]))
+        return self.neighbourhoods.stress_intensities(fields, self.elastic, rotates=self.rotates)
 
 
 class TipFieldEvaluator:

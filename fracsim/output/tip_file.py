@@ -1,0 +1,180 @@
+"""File tips.csv: place, energy release rate and stress intensities of every crack tip, a row per tip and step."""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from ..fracture.energy.tip_record import TipRecord
+from ..mesh.parallel import allgather
+from ..meshes.data import AXES
+from .atomic_write import append_bytes, replace_text, write_on_root
+from .crack_length import CrackExtent, CrackTable
+from .history import rename_unreadable
+
+Ints = npt.NDArray[np.integer]
+Values = npt.NDArray[np.float64]
+
+# rows of a tip over which its speed is the mean: the time of a Rayleigh wave through the disc of the tip in 2D
+SPEED_ROWS = 10
+
+
+class TrackedTip:
+    """Crack tip that is followed from step to step.
+
+    Attributes:
+        cell: number of its cell in the input mesh.
+        course: time, s, and position (d,), m, in the last rows.
+    """
+
+    def __init__(self) -> None:
+        self.cell = -1
+        self.course: deque[tuple[float, Values]] = deque(maxlen=SPEED_ROWS + 1)
+
+    def move(self, t: float, cell: int, point: Values) -> None:
+        """Add the position (d,), m, at time t, s."""
+        self.cell = cell
+        self.course.append((t, point))
+
+    @property
+    def speed(self) -> float:
+        """Mean speed over the last rows, m/s; NaN in the first one."""
+        (began, first), (ended, last) = self.course[0], self.course[-1]
+        return float(np.linalg.norm(last - first) / (ended - began)) if ended > began else np.nan
+
+
+class TipFile:
+    """Writer of tips.csv on rank 0.
+
+    A row is that of a tip in balance at the end of a step, before it advances there.
+
+    Attributes:
+        columns: names of the columns.
+        notes: sentences about rows that a restart did not find (rank 0).
+    """
+
+    def __init__(
+        self, path: Path, record: TipRecord, extent: CrackExtent, *, inertia: bool, resume_at: int | None = None
+    ) -> None:
+        """Open the file (collective).
+
+        Args:
+            path: the file.
+            record: tips of the last step.
+            extent: lengths or areas of cracks.
+            inertia: tips have a speed.
+            resume_at: keep the rows up to this step; None: a new run.
+
+        Raises:
+            CannotWrite: the file cannot be written.
+        """
+        self._path, self._record, self._extent = path, record, extent
+        self._comm, d = extent.comm, extent.dim
+        plane = ["K_I", "K_II"] if d == 2 else []
+        speed = ["speed"] if inertia else []
+        self.columns = [
+            "step", "time", "tip", "cell", *AXES[:d], "length" if d == 2 else "area", "G", *plane, *speed,
+        ]  # fmt: skip
+        self._has_speed, self.notes = inertia, list[str]()
+        self._tips: dict[int, TrackedTip] = {}
+        self._newest = 0  # the largest number of a tip
+        self._cracks: CrackTable | None = None
+        write_on_root(self._comm, path, lambda: self._open(resume_at))
+        self.update_cracks()
+
+    def _open(self, resume_at: int | None) -> None:
+        """Write the header and earlier rows, and follow their tips (rank 0)."""
+        rows = [] if resume_at is None else self._read_rows(resume_at)
+        self._newest = max((int(row[2]) for row in rows), default=0)
+        tips = {int(row[2]) for row in rows if row[0] == rows[-1][0]}
+        for row in (row for row in rows if int(row[2]) in tips):
+            point = np.array(row[4 : 4 + self._extent.dim], float)
+            self._tips.setdefault(int(row[2]), TrackedTip()).move(float(row[1]), int(row[3]), point)
+        replace_text(self._path, "".join(",".join(row) + "\r\n" for row in [self.columns, *rows]))
+
+    def _read_rows(self, until: int) -> list[list[str]]:
+        """Return the complete rows up to a step; a file that is not such a table is renamed."""
+        if not self._path.exists():
+            self.notes.append(f"{self._path} is gone: it has the tips from here on")
+            return []
+        try:
+            lines = self._path.read_bytes().decode("utf-8-sig").splitlines()
+        except UnicodeDecodeError:
+            lines = []
+        if not lines or lines[0].split(",") != self.columns:
+            moved = rename_unreadable(self._path)
+            self.notes.append(
+                f"{self._path} has other columns than this run: it is {moved} from here on, and begins anew"
+            )
+            return []
+        rows = [line.split(",") for line in lines[1:]]
+        complete = [row for row in rows if self._is_complete(row)]
+        if len(complete) < len(rows):
+            self.notes.append(f"{len(rows) - len(complete)} rows of {self._path} are damaged and left out")
+        return [row for row in complete if int(row[0]) <= until]
+
+    def _is_complete(self, row: list[str]) -> bool:
+        """Return whether a row has a number in each column."""
+        try:
+            return len([float(value) for value in row]) == len(self.columns) and row[0].isdecimal()
+        except ValueError:
+            return False
+
+    def update_cracks(self) -> None:
+        """Find the cracks and their lengths after edges have broken (collective)."""
+        self._cracks = self._extent.gather_cracks()
+
+    def append(self, step: int, t: float) -> None:
+        """Append the rows of a step that ends at t, s; lengths are those at the last update (collective).
+
+        Raises:
+            CannotWrite: the file cannot be written.
+        """
+        reading = self._record.reading
+        if reading is None:
+            return
+        own = np.column_stack([reading.cell, reading.point, reading.release_rate, reading.intensities])
+        rows: Values = np.concatenate(allgather(self._comm, own))
+        write_on_root(self._comm, self._path, lambda: append_bytes(self._path, self._lines(step, t, rows).encode()))
+
+    def _lines(self, step: int, t: float, rows: Values) -> str:
+        """Return the lines of tips, given as rows (n, 2 + d or 4 + d) of cell, position, G and K (rank 0)."""
+        assert self._cracks is not None
+        rows, d = rows[np.argsort(rows[:, 0])], self._extent.dim
+        cells: Ints = rows[:, 0].astype(np.int64)
+        points = rows[:, 1 : 1 + d]
+        crack, size = self._cracks.find(cells)
+        tips = self._follow(cells, points, crack)
+        lines = []
+        for k in np.argsort(tips):
+            tip = self._tips[tips[k]]
+            tip.move(t, int(cells[k]), points[k])
+            measured = [*points[k], size[k], *rows[k, 1 + d :], *([tip.speed] if self._has_speed else [])]
+            numbers = [str(step), f"{t:.12g}", str(tips[k]), str(cells[k])]
+            lines.append(",".join([*numbers, *(f"{value:.12g}" for value in measured)]) + "\r\n")
+        return "".join(lines)
+
+    def _follow(self, cells: Ints, points: Values, crack: Ints) -> list[int]:
+        """Return the numbers (n,) of tips: that of the nearest tip of the last rows in the same crack, or a new one."""
+        assert self._cracks is not None
+        numbers = list(self._tips)
+        last_crack = self._cracks.find(np.array([self._tips[number].cell for number in numbers], np.int64))[0]
+        pairs = sorted(
+            (float(np.linalg.norm(points[k] - self._tips[number].course[-1][1])), number, k)
+            for number, in_crack in zip(numbers, last_crack, strict=True)
+            for k in np.flatnonzero(crack == in_crack)
+        )
+        tips: dict[int, int] = {}
+        for _, number, k in pairs:
+            if k not in tips and number not in tips.values():
+                tips[int(k)] = number
+        # A tip that ended is not taken up again by another one.
+        self._tips = {number: tip for number, tip in self._tips.items() if number in tips.values()}
+        for k in range(len(cells)):
+            if k not in tips:
+                tips[k] = self._newest = self._newest + 1
+                self._tips[tips[k]] = TrackedTip()
+        return [tips[k] for k in range(len(cells))]
