@@ -207,9 +207,13 @@ def test_stiffness_of_points_at_their_nodes(d: int, c: int) -> None:
     W = np.where(rng.random((9, 6)) < 0.4, rng.normal(size=(9, 6)), 0.0)
     corners, blocks = rng.integers(0, 9, (7, c)), rng.normal(size=(7, c * d, c * d))
     dense = sum((R := np.kron(W[points], np.eye(d))).T @ B @ R for points, B in zip(corners, blocks, strict=True))
-    found = nodal_stiffness(csr_matrix(W), corners, blocks).toarray()
-    np.testing.assert_allclose(found, dense, atol=1e-13)
-    assert not nodal_stiffness(csr_matrix(W), corners[:0], blocks[:0]).nnz
+    found = nodal_stiffness(csr_matrix(W), [(corners, blocks)])
+    np.testing.assert_allclose(found.toarray(), dense, atol=1e-13)
+    points, of_points = rng.integers(0, 9, (4, 1)), rng.normal(size=(4, d, d))
+    both = nodal_stiffness(csr_matrix(W), [(corners, blocks), (points, of_points)])
+    alone = nodal_stiffness(csr_matrix(W), [(points, of_points)])
+    np.testing.assert_allclose(both.toarray(), found.toarray() + alone.toarray(), atol=1e-13)
+    assert not nodal_stiffness(csr_matrix(W), [(corners[:0], blocks[:0])]).nnz
 
 
 @pytest.mark.parametrize("name", ["capsule", "rectangle"])

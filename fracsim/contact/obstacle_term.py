@@ -128,12 +128,11 @@ class ObstacleTerm(ContactState, Term):
         points = np.concatenate([contact.points for contact in contacts])
         if not self.comm.allreduce(len(points)):
             return None
-        blocks = np.concatenate([contact.tangent(exact=exact) for contact in contacts])
-        matrix = self.surface.stiffness(points[:, None], blocks)
+        groups = [(points[:, None], np.concatenate([contact.tangent(exact=exact) for contact in contacts]))]
         for facets in (contact.facets for contact in contacts if contact.facets is not None):
-            inner = facets.hessian if exact else facets.stiffness
-            matrix = matrix + self.surface.stiffness(facets.corners, inner)
-        return self._coupling((self._level.contact_weights.factor * matrix).tocsr(), self.surface.node_numbers)
+            groups.append((facets.corners, facets.hessian if exact else facets.stiffness))
+        matrix = self.surface.stiffness(groups)
+        return self._coupling(self._level.contact_weights.factor * matrix, self.surface.node_numbers)
 
     def uses_exact_tangent(self) -> bool:
         """Whether the tangent has negative eigenvalues of contact: near the solution (collective)."""
