@@ -369,15 +369,15 @@ def test_what_breaks_under_a_ball_gains_nothing() -> None:
     assert contact.stored_energy() <= before * (1 + 1e-6)
     skin, placed = contact.surface, contact.group.posed[0]
     x = skin.positions(contact._end_displacement())
-    assert (skin.facets.gaps(placed, x, 1.0) > 0).all()
-    left_out = skin._excluded_facets
-    assert len(left_out) > 0 and len(skin.facets.area) > 100
-    skin.from_checkpoint(skin.to_checkpoint())
-    np.testing.assert_array_equal(skin._excluded_facets, left_out)
+    assert (contact.facets.active.gaps(placed, x, 1.0) > 0).all()
+    left_out = contact.facets._excluded
+    assert len(left_out) > 0 and len(contact.facets.active.area) > 100
+    contact.facets.from_checkpoint(contact.facets.to_checkpoint())
+    np.testing.assert_array_equal(contact.facets._excluded, left_out)
     # what is drawn: all of it, beside the ball
     at, (elements, _), u = (
-        skin.point_map,
-        skin._surface.facets(),
+        skin.local.point_map,
+        skin.local.facets(),
         skin.interpolation.nodal_values(contact._end_displacement()),
     )
     whole = at.with_arm_share(np.ones(len(at.share)))

@@ -181,7 +181,7 @@ def test_a_striker_far_faster_than_its_steps_does_not_tunnel(tmp_path: Path) -> 
     )  # fmt: skip
     (term,) = [each for each in scene.balance.terms if each.name == "solids"]
     for _ in each_step(scene, state):
-        assert len(term.surface.current.pairs.pairs[0].cut_elements(term._end_positions())) == 0
+        assert len(term.surface.current.pairs.pairs[0].cut_elements(term.end_positions())) == 0
     x = positions(scene) + state.u.reshape(-1, 3)
     assert x[:, 2].mean() < 0.5 - 0.9 and mean_velocity(scene, state)[2] < -50
 
@@ -216,7 +216,7 @@ def test_walls_that_come_to_light_are_outside(order: int) -> None:
     broken, drawn_in = 0, 0
     for report in each_step(scene, state):
         broken += report.broken
-        x, facing = term._end_positions(), term.surface.current.pairs.pairs[0]
+        x, facing = term.end_positions(), term.surface.current.pairs.pairs[0]
         assert len(facing.cut_elements(x)) == 0
         used = np.unique(np.delete(term.surface.current.split.elements, term.surface.current._excluded, axis=0))
         assert not is_inside(x[used], facing.mesh.positions[facing.mesh.triangles]).any()
@@ -242,7 +242,7 @@ def test_beside_contact_of_the_body_with_itself(itself: bool | str) -> None:
     terms = {each.name: each for each in scene.balance.terms}
     for _ in each_step(scene, state):
         for name in ("solids", "contact"):
-            assert len(terms[name].surface.current.pairs.intersections(terms[name]._end_positions())) == 0
+            assert len(terms[name].surface.current.pairs.intersections(terms[name].end_positions())) == 0
 
 
 # --- free, and turning ----------------------------------------------------------------------------------------------
@@ -287,12 +287,12 @@ def test_what_is_pushed_by_a_body_is_the_derivative_by_its_pose(tmp_path: Path) 
     term, solid = free_solid(scene)
     z, h = 1e-3 * np.array([1.0, -2.0, 1.0, 3.0, 1.0, -2.0]), 1e-6
     term.group.bodies._unknowns.move_to([z])
-    here, pose, ends = term.pose_derivatives(exact=True)[0], solid.posed.pose, []
-    assert here.energy > 0 and term._friction is not None and np.abs(here.gradient).min() > 0
+    here, pose, ends = term.pose_contact.pose_derivatives(exact=True)[0], solid.posed.pose, []
+    assert here.energy > 0 and term.friction is not None and np.abs(here.gradient).min() > 0
     for q in np.concatenate([h * np.eye(6), -h * np.eye(6)]):
         term.group.bodies.posed[0] = PosedShape(solid.posed.shape, pose.incremented(q))
         term.poses_moved()
-        ends.append(((found := term.pose_derivatives(exact=True)[0]).energy, found.gradient))
+        ends.append(((found := term.pose_contact.pose_derivatives(exact=True)[0]).energy, found.gradient))
     slope = np.array([(ends[k][0] - ends[k + 6][0]) / (2 * h) for k in range(6)])
     np.testing.assert_allclose(here.gradient, slope, atol=1e-5 * np.abs(slope).max())
     bent = np.array([(ends[k][1] - ends[k + 6][1]) / (2 * h) for k in range(6)])
@@ -312,7 +312,7 @@ def test_an_isolated_pair_keeps_its_momenta(tmp_path: Path) -> None:
         np.testing.assert_allclose(now[1], angular, atol=4e-3 * np.linalg.norm(angular))
         assert report.kinetic + report.elastic < held * (1 + 1e-9)
         held = report.kinetic + report.elastic
-        assert len(term.surface.current.pairs.pairs[0].cut_elements(term._end_positions())) == 0
+        assert len(term.surface.current.pairs.pairs[0].cut_elements(term.end_positions())) == 0
     found = last(scene)
     assert found["velocity_block_z"] > -0.5 and abs(found["spin_block_y"] - 0.5) > 0.3
     assert found["position_block_x"] == pytest.approx(0.55 + 0.08 * 0.2, rel=0.05)
@@ -403,7 +403,7 @@ def test_a_free_striker_far_faster_than_its_steps_does_not_tunnel(tmp_path: Path
     term, _ = free_solid(scene)
     for _ in each_step(scene, state):
         np.testing.assert_allclose(momenta(scene, state)[0], [0.0, 0.0, -1e4], atol=1e-4)
-        assert len(term.surface.current.pairs.pairs[0].cut_elements(term._end_positions())) == 0
+        assert len(term.surface.current.pairs.pairs[0].cut_elements(term.end_positions())) == 0
     assert mean_velocity(scene, state)[2] < -40
 
 
@@ -418,7 +418,7 @@ def test_a_driven_one_turns_and_drags(tmp_path: Path) -> None:
     (term,) = [each for each in scene.balance.terms if each.name == "solids"]
     forces = []
     for report in each_step(scene, state):
-        assert len(term.surface.current.pairs.pairs[0].cut_elements(term._end_positions())) == 0
+        assert len(term.surface.current.pairs.pairs[0].cut_elements(term.end_positions())) == 0
         forces.append([last(scene)[f"contact_block_{axis}"] for axis in "xz"])
         assert report.kinetic + report.elastic + state.dissipated <= state.work * (1 + 1e-6) + 1e-9
     pressed = np.array(forces)

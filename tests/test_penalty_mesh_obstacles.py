@@ -221,5 +221,5 @@ def test_poses_are_those_of_the_path(tmp_path: Path) -> None:
     for _ in each_step(scene, state):
         pass
     term = term_of(scene)
-    assert term._is_idle() and last(scene)["work_block"] == 0
+    assert term.state.is_idle() and last(scene)["work_block"] == 0
     np.testing.assert_allclose(term._all_meshes[0].pose.centre, Pose.at_point(np.array([9.02, 9.0, 9.0])).centre)

@@ -170,7 +170,7 @@ def test_a_ball_smaller_than_an_edge_does_not_pass_a_facet(radius: float, fricti
         time={"scheme": "explicit", "step": 0.02, "end": 0.12},
     )  # fmt: skip
     (contact,) = [term for term in scene.balance.terms if isinstance(term, PenaltyObstacleTerm)]
-    corners, X, m = contact.surface.facets.corners, positions(scene), masses(scene)
+    corners, X, m = contact.facets.active.corners, positions(scene), masses(scene)
 
     def momentum() -> Values:
         flight, p = contact.group.bodies.free[0].motion, m * state.v.reshape(-1, 3)
@@ -256,7 +256,7 @@ def test_what_breaks_in_touch_gains_nothing() -> None:
         march(scene, state, 5)
     before, held, graph = contact.stored_energy(), contact._step_end.springs[0], scene.fracture.graph
     assert before > 0
-    pushed = contact.nodal_forces()
+    pushed = contact.contact_forces()
     graph.break_edges(np.random.default_rng(2).random(len(graph.broken)) < 0.4)
     scene.fracture.mark_changed()
     scene.balance.edges_broke(graph.pattern)
@@ -264,7 +264,7 @@ def test_what_breaks_in_touch_gains_nothing() -> None:
     assert len(springs.points) == len(held.points)
     np.testing.assert_array_equal(np.sort(springs.slip[:, 0]), np.sort(held.slip[:, 0]))
     assert 0.3 * before < contact.stored_energy() <= before * (1 + 1e-9)
-    assert abs(contact.nodal_forces()).sum() < 1.01 * abs(pushed).sum()
+    assert abs(contact.contact_forces()).sum() < 1.01 * abs(pushed).sum()
 
 
 def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:

@@ -12,9 +12,9 @@ import pytest
 from scipy.sparse import eye
 
 from fracsim.contact.ipc_pairs import IpcPairs
-from fracsim.contact.penalty_contact import PenaltyContact, PenaltySurface
+from fracsim.contact.penalty_contact import PenaltyContact, PenaltyState
 from fracsim.contact.penalty_contacts import ContactStiffness
-from fracsim.contact.penalty_pairs import PenaltyPairs
+from fracsim.contact.penalty_pairs import PenaltyPairs, PenaltySurface
 from fracsim.contact.penalty_point_facet import penalty_stiffness
 from fracsim.meshes.builders.box import Box
 from fracsim.scene import Scene
@@ -189,7 +189,7 @@ def test_nothing_is_looked_for_where_nothing_is_near(tmp_path: Path, monkeypatch
     ends, looks = [], []
     for always in (False, True):
         if always:
-            monkeypatch.setattr(PenaltyContact, "_measure_clearance", lambda self, x: None)
+            monkeypatch.setattr(PenaltyState, "measure_clearance", lambda self, x: None)
         scene, state = make_scene(
             mesh={"file": two_blocks(tmp_path, 2, 0.1)}, material=SOFT, contact={},
             time={"scheme": "explicit", "step": 0.02, "end": 0.6},

@@ -56,7 +56,7 @@ def test_two_bodies_collide(tmp_path: Path, dim: int, scheme: str, order: int) -
     before, touched = (m * v).sum(axis=0), 0
     for report in each_step(scene, state):
         assert report.kinetic + report.elastic < 0.5 * before[0] * (1 + 1e-6)
-        x = contact._end_positions()
+        x = contact.end_positions()
         assert len(contact.surface.current.pairs.intersections(x)) == 0
         touched += contact.stored_energy() > 0
         after = (m * state.v.reshape(-1, dim)).sum(axis=0)
@@ -77,7 +77,7 @@ def test_a_block_meets_one_that_is_held(tmp_path: Path) -> None:
     m, before, impulse = scene.balance.mass.lumped[::2], state.v[::2].copy(), 0.0
     (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
     for report in each_step(scene, state):
-        assert len(contact.surface.current.pairs.intersections(contact._end_positions())) == 0
+        assert len(contact.surface.current.pairs.intersections(contact.end_positions())) == 0
         assert (positions(scene) + state.u.reshape(-1, 2))[:, 0].max() > 1.8
         impulse += report.dt * scene.probes()[0]
     right = positions(scene)[:, 0] > 1.01
@@ -203,5 +203,5 @@ def test_a_hammer_goes_on_through_crumbs() -> None:
     for _ in each_step(scene, state):
         hammer = at + state.t * velocity
         assert np.linalg.norm(positions(scene) + state.u.reshape(-1, 2) - hammer, axis=1).min() > 0.15
-    assert len(contact.surface.current.pairs.intersections(contact._end_positions())) == 0
+    assert len(contact.surface.current.pairs.intersections(contact.end_positions())) == 0
     assert scene.fracture.graph.broken_count > 10

@@ -1,9 +1,10 @@
-"""State of contact between a body and obstacles in a time step: points, obstacles and lagged friction."""
+"""State of contact between a body and obstacles in a time step: points, facets, obstacles and lagged friction."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from functools import partial
+from collections.abc import Callable, Sequence
+from functools import cached_property, partial
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -12,8 +13,11 @@ from mpi4py import MPI
 
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
-from .contact_surface import ContactSurface, FacetGapFunction
-from .facet_contact import ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
+from ..mesh.parallel import gather
+from ..mesh.split_surface.point_matching import match_points
+from ..mesh.split_surface.surface_map import SurfaceMap
+from .contact_surface import RETRACTION, TINY, ContactSurface, SurfaceVersion, retract_cut_elements
+from .facet_contact import FACETS, ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
 from .laws import CoulombFriction, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
 from .pose import PosedShape, min_distance
@@ -23,6 +27,203 @@ from .step_limit import check_obstacles_apart, refuse_overlap
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+
+
+class SurfaceFacets:
+    """Facets of a surface before obstacles so curved that they touch facets between their nodes (HistoryTerm).
+
+    Facets of new crack faces without room are excluded.
+
+    Attributes:
+        numbers: numbers in their group of the obstacles that act on facets.
+    """
+
+    def __init__(
+        self, surface: ContactSurface, group: ObstacleGroup, width: float, edge: float, *, may_be_cut: bool
+    ) -> None:
+        """Raise InputError where an obstacle cuts a facet of the body at rest (collective).
+
+        Args:
+            surface: points of the body.
+            group: obstacles.
+            width: of the barrier, m.
+            edge: mean edge length of the mesh, m.
+            may_be_cut: whether facets may be cut later on: none is excluded.
+        """
+        self._surface, self._group, self._width, self._may_be_cut = surface, group, width, may_be_cut
+        shapes = [obstacle.shape for obstacle in group.obstacles]
+        self.numbers = [n for n, shape in enumerate(shapes) if facets_matter(shape.min_radius, edge, width)]
+        self._excluded: Ints = np.empty(0, np.int64)
+        # areas and excluded facets for which the active facets were selected, and these
+        self._active: tuple[Values, Ints, ContactFacets] | None = None
+        if self.numbers:
+            self._check_at_rest()
+
+    def _check_at_rest(self) -> None:
+        """Refuse facets that are cut; those that are cut only by the smoothing are excluded until there is room."""
+        x, group = self._surface.rest_positions, self._group
+        posed = [obstacle.posed_at(0.0) for obstacle in group.obstacles]
+        for number in self.numbers:
+            distances = self.active.distances(posed[number], x, 0.0)
+            refuse_overlap(self._surface.comm, distances, group.numbers[number], group.obstacles[number])
+        if not self._may_be_cut:
+            self._excluded = np.flatnonzero(self.gaps(posed, self._all_facets, x) <= 0)
+
+    @cached_property
+    def _all_facets(self) -> ContactFacets:
+        return ContactFacets(*self._surface.local.facets(), FACETS.smoothing * self._width)
+
+    @property
+    def active(self) -> ContactFacets:
+        """Facets of which neither a corner nor the facet itself is excluded (not collective)."""
+        cached, area = self._active, self._surface.area
+        if cached is None or cached[0] is not area or cached[1] is not self._excluded:
+            selected = facets = self._all_facets
+            if len(self._excluded) or (area == 0).any():
+                active = np.asarray((area > 0)[facets.corners].all(axis=1))
+                active[self._excluded] = False
+                selected = ContactFacets(facets.corners[active], facets.area[active], facets.smoothing)
+            cached = self._active = area, self._excluded, selected
+        return cached[2]
+
+    def gaps(self, posed: Sequence[PosedShape], facets: ContactFacets, x: Values) -> Values:
+        """(m,) least gaps between facets, their points at x (n, d), m, and the curved ones of the obstacles."""
+        return np.asarray(np.min([facets.gaps(posed[n], x, self._width) for n in self.numbers], axis=0))
+
+    def are_open(self, posed: Sequence[PosedShape], x: Values) -> bool:
+        """Whether no facet is cut with points at x (n, d), m (collective)."""
+        if not self.numbers or self._may_be_cut:
+            return True
+        is_open = bool((self.gaps(posed, self.active, x) > 0).all())
+        return bool(self._surface.comm.allreduce(is_open, op=MPI.LAND))
+
+    def separate(self, at: SurfaceMap, elements: Ints, u: Values, posed: Sequence[PosedShape]) -> SurfaceMap:
+        """Surface for output of elements (m, d) with its points retracted where curved obstacles cut elements."""
+        if not self.numbers:
+            return at
+        facets = ContactFacets(elements, np.ones(len(elements)), FACETS.smoothing * self._width)
+        curved = [posed[number] for number in self.numbers]
+        return retract_cut_elements(at, u, elements, lambda x: ~facets.are_open(curved, x))
+
+    # --- new crack faces ---
+
+    def edges_broke(self, add_faces: Callable[[], Values], u: Values, posed: Sequence[PosedShape]) -> None:
+        """Retract new points of facets that would be cut or in contact; exclude facets for which this fails.
+
+        Args:
+            add_faces: function that adds new faces to the surface, and returns the identity of its points until then.
+            u: (owned dofs,) displacement, m.
+            posed: obstacles.
+        """
+        excluded = self._corner_identities(self._excluded)
+        old_identity, surface = add_faces(), self._surface
+        self.clear_caches()
+        if not self.numbers or self._may_be_cut:
+            return
+        self._excluded, copies = self._match(excluded), surface.local.point_map.copies
+        is_new = np.zeros(len(surface.area), bool)
+        is_new[copies] = True
+        rows = match_points(old_identity, surface.local.identify_points())
+        is_new[copies[rows[rows >= 0]]] = False
+        nodal = surface.interpolation.nodal_values(u)
+        for _ in range(RETRACTION.facet_rounds):
+            point_map, facets = surface.local.point_map, self.active
+            has_new = is_new[facets.corners].any(axis=1)
+            too_close = self.gaps(posed, facets, point_map(nodal)) < np.where(has_new, self._width, TINY)
+            points = np.unique(facets.corners[too_close])
+            points = points[is_new[points] & (point_map.share[points] > RETRACTION.min_arm)]
+            if not len(points):
+                break
+            share = point_map.share.copy()
+            share[points] *= RETRACTION.facet_factor
+            surface.set_arms(share)
+        closed = np.flatnonzero(is_new & (surface.area > 0))
+        closed = closed[min_distance(posed, surface.local.point_map(nodal)[closed]) <= 0]
+        if len(closed):
+            surface.exclude_points(np.union1d(closed, np.flatnonzero(surface.area == 0)))
+        self._exclude(np.flatnonzero(self._too_close(is_new, nodal, posed)))
+
+    def release(self, release_points: Callable[[], None], u: Values, posed: Sequence[PosedShape]) -> None:
+        """Undo releases of points that bring a facet into contact; include facets that are not in contact.
+
+        Args:
+            release_points: function that releases points of the surface.
+            u: (owned dofs,) displacement, m.
+            posed: obstacles.
+        """
+        surface = self._surface
+        old_map, excluded = surface.local.point_map, surface.area == 0
+        release_points()
+        changed = surface.local.point_map is not old_map or excluded.any() or len(self._excluded)
+        if not self.numbers or self._may_be_cut or not changed:
+            return
+        point_map, nodal = surface.local.point_map, surface.interpolation.nodal_values(u)
+        moved = (point_map.share != old_map.share) | excluded
+        undone = np.unique(self._all_facets.corners[self._too_close(moved, nodal, posed)])
+        undone = undone[moved[undone]]
+        if len(undone):
+            share = point_map.share.copy()
+            share[undone] = old_map.share[undone]
+            surface.set_arms(share)
+        if len(self._excluded):
+            gap = self.gaps(posed, self._all_facets, surface.local.point_map(nodal))[self._excluded]
+            if (gap >= self._width).any():
+                self._excluded = self._excluded[gap < self._width]
+        self._exclude(np.flatnonzero(self._too_close(excluded, nodal, posed)))
+
+    def _too_close(self, moved: Flags, u: Values, posed: Sequence[PosedShape]) -> Flags:
+        """(m,) facets that are cut, or have a point that has `moved` (n,) and would be in contact; u (nodes, d), m."""
+        facets = self._all_facets
+        min_gap = np.where(moved[facets.corners].any(axis=1), self._width, TINY)
+        return np.asarray(self.gaps(posed, facets, self._surface.local.point_map(u)) < min_gap)
+
+    def _exclude(self, facets: Ints) -> None:
+        """Exclude these facets as well."""
+        if len(np.setdiff1d(facets, self._excluded)):
+            self._excluded = np.union1d(facets, self._excluded)
+
+    def _corner_identities(self, facets: Ints) -> Values:
+        """(k c, 2 d + 1) rows that identify the corners of facets (k,)."""
+        corners = self._all_facets.corners[facets].reshape(-1) if len(facets) else facets
+        return self._surface.local.identify_points(corners)
+
+    def _match(self, identity: Values) -> Ints:
+        """Facets whose corners have the rows that `_corner_identities` returned."""
+        if not len(identity):
+            return np.empty(0, np.int64)
+        corners = np.sort(self._all_facets.corners, axis=1)
+        all_identities = self._surface.local.identify_points(np.arange(len(self._surface.area)))
+        matched = match_points(identity, all_identities).reshape(-1, corners.shape[1])
+        matched = np.sort(matched[(matched >= 0).all(axis=1)], axis=1)
+        _, group = np.unique(np.concatenate([matched, corners]), axis=0, return_inverse=True)
+        return np.flatnonzero(np.isin(group.reshape(-1)[len(matched) :], group.reshape(-1)[: len(matched)]))
+
+    # --- state ---
+
+    def snapshot(self) -> object:
+        """Excluded facets, and the surface that they are of."""
+        return self._excluded, self._surface.version
+
+    def restore(self, memory: object) -> None:
+        """Restore a snapshot (not collective); where edges have broken since it stays as it is."""
+        excluded, version = cast("tuple[Ints, SurfaceVersion]", memory)
+        if self._surface.has_version(version):
+            self._excluded = excluded
+
+    def to_checkpoint(self) -> dict[str, Values]:
+        """Rows that identify the corners of excluded facets, on rank 0 (collective)."""
+        gathered = gather(self._surface.comm, self._corner_identities(self._excluded))
+        return {} if gathered is None else {"cut": np.concatenate(gathered)}
+
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
+        """Set the excluded facets from the rows of a checkpoint."""
+        self._excluded = self._match(saved["cut"])
+
+    def clear_caches(self) -> None:
+        """Discard facets and their closest points, from which searches start."""
+        vars(self).pop("_all_facets", None)
+        self._active = None
 
 
 class ContactState:
@@ -35,12 +236,18 @@ class ContactState:
         law: contact law.
         barrier_width: gap from which on contact acts, m.
         surface: points of the body that may touch.
+        facets: facets between them.
         positions: (n, d) positions of these points at the end of the step that belongs to u, m.
+        level: time level of the current or last step.
+        lagged: contact of each obstacle at the start of the step; None: without friction.
+        point_candidates: search for points near an obstacle.
     """
 
     shows_all_cells = False  # whether crack faces far from all obstacles are part of the surface, too
+    facets_may_be_cut = False  # by curved obstacles
     positions: Values
-    _lagged: list[LaggedContact | None]  # contact at the start of the step, one per obstacle with friction
+    lagged: list[LaggedContact | None]
+    level: TimeLevel
     _step_starts: list[StepStart | None]  # points at the start of the step, where barriers are averaged over it
     _started_near: list[Ints]  # points on which each obstacle acted then
 
@@ -61,60 +268,19 @@ class ContactState:
         self._tangent_positions: Values | None = None  # of the points at the last tangent of this attempt
         items = dict(zip(self.numbers, self.obstacles, strict=True))
         check_obstacles_apart(self.comm, self.surface.rest_positions, items)
-        self._facet_obstacles = self._find_facet_obstacles()
-        self._point_candidates = ProximityCandidates(self.surface.mean_edge_length)
-        if self._facet_obstacles:
-            self._check_facets()
+        self.point_candidates = ProximityCandidates(domain.mean_edge_length)
+        edge, may_be_cut = domain.mean_edge_length, self.facets_may_be_cut
+        self.facets = SurfaceFacets(self.surface, group, law.barrier.width, edge, may_be_cut=may_be_cut)
 
-    def _find_facet_obstacles(self) -> list[int]:
-        """Numbers of obstacles so curved that facets touch them between their nodes (collective)."""
-        edge, width = self.surface.mean_edge_length, self.law.barrier.width
-        return [
-            number
-            for number, obstacle in enumerate(self.obstacles)
-            if facets_matter(obstacle.shape.min_radius, edge, width)
-        ]
-
-    def _check_facets(self) -> None:
-        """Raise InputError where an obstacle cuts a facet of the body at rest (collective).
-
-        Facets that are cut only by the smoothing are excluded until there is room.
-        """
-        posed = self._refuse_cut_facets()
-        facet_gaps = self._facet_gap_function(posed)
-        assert facet_gaps is not None
-        self.surface.exclude_cut_facets(self.surface.rest_positions, facet_gaps)
-
-    def _refuse_cut_facets(self) -> list[PosedShape]:
-        """Raise InputError where an obstacle cuts a facet of the body at rest; the obstacles there (collective)."""
-        x, posed = self.surface.rest_positions, [obstacle.posed_at(0.0) for obstacle in self.obstacles]
-        for number in self._facet_obstacles:
-            distances = self.surface.facets.distances(posed[number], x, 0.0)
-            refuse_overlap(self.comm, distances, self.numbers[number], self.obstacles[number])
-        return posed
-
-    def _facets_for(self, number: int) -> ContactFacets | None:
+    def facets_for(self, number: int) -> ContactFacets | None:
         """Facets on which an obstacle acts; None if it acts on points alone."""
-        return self.surface.facets if number in self._facet_obstacles else None
-
-    def _facet_gap_function(self, posed: Sequence[PosedShape]) -> FacetGapFunction | None:
-        """Function for the gaps between facets and obstacles that act on them; None if none does."""
-        if not self._facet_obstacles:
-            return None
-        curved, width = [posed[number] for number in self._facet_obstacles], self.law.barrier.width
-        return lambda facets, x: np.asarray(np.min([facets.gaps(shape, x, width) for shape in curved], axis=0))
-
-    def _facets_are_open(self, x: Values) -> bool:
-        """Whether no facet is cut with points at x (n, d), m (collective)."""
-        if (facet_gaps := self._facet_gap_function(self.group.posed)) is None:
-            return True
-        return bool(self.comm.allreduce(bool((facet_gaps(self.surface.facets, x) > 0).all()), op=MPI.LAND))
+        return self.facets.active if number in self.facets.numbers else None
 
     def begin_step(self, level: TimeLevel) -> None:
         """Move obstacles to the end of the step, and store the contact at its start for friction."""
         self.group.bodies.begin_step(level)
-        self._level, self._attempts = level, 0
-        self.discard_forces()
+        self.level, self._attempts = level, 0
+        self.update_displacement()
         end = level.t + (1 - level.fraction) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
             return  # evaluation of a step's result: lagged contact and motions are still those of the step
@@ -139,13 +305,13 @@ class ContactState:
             u: (owned dofs,) displacement, m.
             posed: obstacles at their poses.
         """
-        gaps, facet_gaps = partial(min_distance, posed), self._facet_gap_function(posed)
-        self.surface.edges_broke(self._pattern, self._shown.flags, u, gaps, facet_gaps)
+        gaps = partial(min_distance, posed)
+        self.facets.edges_broke(partial(self.surface.edges_broke, self._pattern, self._shown.flags, u, gaps), u, posed)
         self._discard_start()
 
     def _show_cells_of_step(self, posed: Sequence[PosedShape]) -> None:
         """Make the surface again if it lacks crack faces that obstacles may reach in the step (collective)."""
-        level = self._level
+        level = self.level
         motion, shift = level.dt * level.v_n, self._max_increment()
         if not self.shows_all_cells and self._shown.update(self._pattern, posed, level.u_n, motion, shift):
             self._rebuild_surface(level.u_n, posed)
@@ -161,13 +327,14 @@ class ContactState:
     def _begin_new_step(self) -> None:
         posed, barrier = self.group.start_posed, self.law.barrier
         self._show_cells_of_step(posed)
-        self.surface.release_points(self._level.u_n, partial(min_distance, posed), self._facet_gap_function(posed))
-        x = self.surface.positions(self._level.u_n)
+        u_n = self.level.u_n
+        self.facets.release(partial(self.surface.release_points, u_n, partial(min_distance, posed)), u_n, posed)
+        x = self.surface.positions(u_n)
         gaps = [shape.distance(x) for shape in posed]
         lagged = [
             lag_contact(x, gap, self.surface.area, shape, barrier) for gap, shape in zip(gaps, posed, strict=True)
         ]
-        if self._level.contact_weights.time_averaged:
+        if self.level.contact_weights.time_averaged:
             width, area = barrier.width, self.surface.area
             self._started_near = [np.flatnonzero((gap < width) & (area > 0)) for gap in gaps]
             self._step_starts = [
@@ -176,12 +343,12 @@ class ContactState:
             ]
         self._start_forces = [contact.force @ contact.normal for contact in lagged]
         sum_at_points = None if self.comm.size == 1 else self.surface.sum_at_points
-        for number in self._facet_obstacles:
-            of_facets, _ = evaluate_facets(self.surface.facets, posed[number], x, barrier)
+        for number in self.facets.numbers:
+            of_facets, _ = evaluate_facets(self.facets.active, posed[number], x, barrier)
             self._start_forces[number] = self._start_forces[number] + of_facets.forces.sum(axis=(0, 1))
             if self.obstacles[number].friction:
                 lagged[number] = add_facet_friction(lagged[number], of_facets, x, sum_at_points)
-        self._lagged = [
+        self.lagged = [
             contact if obstacle.friction else None for contact, obstacle in zip(lagged, self.obstacles, strict=True)
         ]
         self._start_positions = x
@@ -189,17 +356,17 @@ class ContactState:
     def _discard_start(self) -> None:
         """Discard the contact at the start of the step, as the points are no longer the same."""
         none = [None] * len(self.obstacles)
-        self._lagged, self._step_starts, self._tangent_positions = [*none], [*none], None
+        self.lagged, self._step_starts, self._tangent_positions = [*none], [*none], None
         self._sticking_slips = None
-        self.discard_forces()
+        self.update_displacement()
 
-    def discard_forces(self) -> None:
+    def update_displacement(self) -> None:
         """Discard forces, as u or poses have changed."""
         self._contact_forces = self._nodal_forces = None
 
     def _end_displacement(self) -> Values:
         """(owned dofs,) displacement at the end of the step that belongs to the current u, m."""
-        return self._level.displacement_at_end(self._u.x.array[: self._owned])
+        return self.level.displacement_at_end(self._u.x.array[: self._owned])
 
     def obstacle_forces(self) -> list[ContactForces]:
         """Forces of each obstacle at the current u (collective)."""
@@ -216,7 +383,7 @@ class ContactState:
         """Forces of an obstacle at a given pose on the points."""
         if self._is_out_of_range(number, posed):
             return no_contact(self._domain.dim, self.law.barrier.width)
-        obstacle, lagged = self.obstacles[number], self._lagged[number]
+        obstacle, lagged = self.obstacles[number], self.lagged[number]
         friction = None
         if lagged is not None and self._sticking_slips is not None:
             friction = CoulombFriction(obstacle.friction, self._sticking_slips[number])
@@ -235,27 +402,27 @@ class ContactState:
             start,
             candidates,
         )
-        if number not in self._facet_obstacles:
+        if number not in self.facets.numbers:
             return of_points
         facet_start = None if start is None else (start_posed, self._start_positions)
-        inner, stored = evaluate_facets(self.surface.facets, posed, self.positions, self.law.barrier, facet_start)
+        inner, stored = evaluate_facets(self.facets.active, posed, self.positions, self.law.barrier, facet_start)
         return merge_forces(of_points, inner, stored)
 
     def _is_out_of_range(self, number: int, posed: PosedShape) -> bool:
         """Whether an obstacle is too far from all points and facets to act, now and at the start of the step."""
-        lagged, width = self._lagged[number], self.law.barrier.width
+        lagged, width = self.lagged[number], self.law.barrier.width
         if (lagged is not None and len(lagged.points)) or len(self._candidates(number, posed)):
             return False
-        if number not in self._facet_obstacles:
+        if number not in self.facets.numbers:
             return True
         ends = [(posed, self.positions)]
         if self._step_starts[number] is not None:
             ends.append((self.group.start_posed[number], self._start_positions))
-        return not any(len(self.surface.facets.candidates(*end, width)) for end in ends)
+        return not any(len(self.facets.active.candidates(*end, width)) for end in ends)
 
     def _candidates(self, number: int, posed: PosedShape) -> Ints:
         """(k,) points on which an obstacle may act, or acted at the start of the step."""
-        near, start = self._point_candidates(posed, self.positions, self.law.barrier.width), self._step_starts[number]
+        near, start = self.point_candidates(posed, self.positions, self.law.barrier.width), self._step_starts[number]
         return near if start is None else np.union1d(near, self._started_near[number])
 
     def _compute_sticking_slips(self) -> list[float]:
@@ -263,7 +430,7 @@ class ContactState:
         speeds = np.zeros(len(self.obstacles))
         if self.law.sticking_ratio and any(obstacle.friction for obstacle in self.obstacles):
             velocity = self.surface.interpolation(self._start_velocity)
-            for number, lagged in enumerate(self._lagged):
+            for number, lagged in enumerate(self.lagged):
                 if lagged is not None and len(lagged.points):
                     relative = velocity[lagged.points] - self.group.bodies.velocity(
                         self.numbers[number], lagged.position
@@ -274,11 +441,11 @@ class ContactState:
 
     def _contact_point_motion(self, number: int) -> Values:
         """(d,) motion of an obstacle in the step, or (k, d) of its points in lagged contact, m."""
-        if (lagged := self._lagged[number]) is None:
+        if (lagged := self.lagged[number]) is None:
             return np.zeros(self._domain.dim)
         return self.group.bodies.point_motion(self.numbers[number], lagged.obstacle_point)
 
-    def nodal_forces(self) -> Values:
+    def contact_forces(self) -> Values:
         """(owned dofs,) forces of the obstacles on the nodes at the end of the step, N (collective)."""
         contacts = self.obstacle_forces()
         if self._nodal_forces is None:
@@ -292,7 +459,7 @@ class ContactState:
 
         The difference is dissipated. Both of this rank, J (collective).
         """
-        contact, lagged = self.obstacle_forces()[number], self._lagged[number]
+        contact, lagged = self.obstacle_forces()[number], self.lagged[number]
         if lagged is None or not len(lagged.points):
             return 0.0, 0.0
         force = contact.friction[np.searchsorted(contact.points, lagged.points)]

@@ -24,7 +24,6 @@ from ..mesh.parallel import allgather, gather
 from ..mesh.split_surface.local_surface import LocalSurface, ParentMatrix
 from ..mesh.split_surface.point_matching import match_points
 from ..mesh.split_surface.surface_map import SurfaceMap, row_entries
-from .facet_contact import FACETS, ContactFacets
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -57,8 +56,8 @@ class RetractionPolicy:
 RETRACTION = RetractionPolicy()
 TINY = float(np.finfo(float).tiny)
 
+type SurfaceVersion = tuple[int, Ints]
 type GapFunction = Callable[[Values], Values]  # (n,) distances of positions (n, d) to the nearest obstacle, m
-type FacetGapFunction = Callable[[ContactFacets, Values], Values]  # (m,) gaps of facets with points at (n, d), m
 
 
 @dataclass(frozen=True)
@@ -157,6 +156,7 @@ class ContactSurface:
     """Points of this rank's split surface, and their interpolation from the nodes (HistoryTerm).
 
     Attributes:
+        local: the surface.
         area: (n,) shares of the points in the reference area, m^2; 0 of excluded points.
         interpolation: map between nodes and points.
     """
@@ -164,53 +164,13 @@ class ContactSurface:
     def __init__(self, domain: Domain, width: float) -> None:
         """`width`: of the barrier, m (collective)."""
         self._domain, self._width, self.comm = domain, width, domain.comm
-        self._surface = LocalSurface(domain)
-        self.interpolation = ParentMatrix(domain, self._surface)
-        self.area: Values = self._surface.area
-        self._all: ContactFacets | None = None
-        # areas and excluded facets for which the active facets were selected, and these
-        self._active: tuple[Values, Ints, ContactFacets] | None = None
-        self._excluded_facets: Ints = np.empty(0, np.int64)
-
-    @property
-    def facets(self) -> ContactFacets:
-        """Facets of which neither a corner nor the facet itself is excluded (not collective)."""
-        cached = self._active
-        if cached is None or cached[0] is not self.area or cached[1] is not self._excluded_facets:
-            selected = facets = self._all_facets()
-            if len(self._excluded_facets) or (self.area == 0).any():
-                active = np.asarray((self.area > 0)[facets.corners].all(axis=1))
-                active[self._excluded_facets] = False
-                selected = ContactFacets(facets.corners[active], facets.area[active], facets.smoothing)
-            cached = self._active = self.area, self._excluded_facets, selected
-        return cached[2]
-
-    def _all_facets(self) -> ContactFacets:
-        if self._all is None:
-            self._all = ContactFacets(*self._surface.facets(), FACETS.smoothing * self._width)
-        return self._all
-
-    def facets_from(self, elements: Ints) -> ContactFacets:
-        """Facets made of the elements (m, d) of a surface for output."""
-        return ContactFacets(elements, np.ones(len(elements)), FACETS.smoothing * self._width)
-
-    def exclude_cut_facets(self, x: Values, facet_gaps: FacetGapFunction) -> None:
-        """Exclude facets that are cut with points at x (n, d), m, until there is room."""
-        facets = self._all_facets()
-        self._excluded_facets = np.flatnonzero(facet_gaps(facets, x) <= 0)
-
-    @property
-    def point_map(self) -> SurfaceMap:
-        """Map from nodal displacements to positions of points."""
-        return self._surface.point_map
-
-    def identity(self, points: Ints) -> Values:
-        """(k, 2 d + 1) rows that identify points (k,), whatever breaks."""
-        return self._surface.identify_points(points)
+        self.local = LocalSurface(domain)
+        self.interpolation = ParentMatrix(domain, self.local)
+        self.area: Values = self.local.area
 
     def sum_at_points(self, points: Ints, values: Values) -> Values:
         """(k, m) sums over all ranks of values (k, m) at points (k,) that ranks share (collective)."""
-        parts = allgather(self.comm, (self.identity(points), values))
+        parts = allgather(self.comm, (self.local.identify_points(points), values))
         _, row = np.unique(np.concatenate([identity for identity, _ in parts]), axis=0, return_inverse=True)
         sums = np.zeros((len(row), values.shape[1]))
         np.add.at(sums, row.reshape(-1), np.concatenate([part for _, part in parts]))
@@ -220,17 +180,7 @@ class ContactSurface:
     @property
     def rest_positions(self) -> Values:
         """(n, d) reference positions of the points, m."""
-        return self._surface.point_map.rest
-
-    @property
-    def node_numbers(self) -> Ints:
-        """Global numbers of the nodes that the points depend on."""
-        return self._surface.columns
-
-    @property
-    def mean_edge_length(self) -> float:
-        """Mean edge length of the body's mesh, m (collective)."""
-        return self._domain.mean_edge_length
+        return self.local.point_map.rest
 
     def positions(self, u: Values) -> Values:
         """(n, d) positions of the points for owned displacements u, m (collective)."""
@@ -250,178 +200,102 @@ class ContactSurface:
         return float(self.comm.allreduce(float(local), op=MPI.MIN))
 
     def stiffness(self, groups: Sequence[tuple[Ints, Values]]) -> csr_matrix:
-        """W^T B W over `node_numbers`, N/m, as of `nodal_stiffness`."""
-        return nodal_stiffness(self._surface.point_map.weights, groups)
+        """W^T B W over the columns of the weights, N/m, as of `nodal_stiffness`."""
+        return nodal_stiffness(self.local.point_map.weights, groups)
 
     # --- new crack faces ---
 
-    def edges_broke(
-        self,
-        pattern: npt.NDArray[np.uint8],
-        shown: Flags | None,
-        u: Values,
-        gaps: GapFunction,
-        facet_gaps: FacetGapFunction | None = None,
-    ) -> None:
-        """Add new crack faces, retracted where they would lie in an obstacle (collective).
+    def edges_broke(self, pattern: npt.NDArray[np.uint8], shown: Flags | None, u: Values, gaps: GapFunction) -> Values:
+        """Add new crack faces, retracted where they would lie in an obstacle; identity of the old ones (collective).
 
         Args:
             pattern: (cells,) broken edges of each cell.
             shown: (cells,) flags of cells whose crack faces are part of the surface; None: all.
             u: (owned dofs,) displacements, m.
             gaps: gap function of points.
-            facet_gaps: gap function of facets, where obstacles act on them.
+
+        Returns:
+            (k, 2 d + 1) rows that identify the points of crack faces until now.
         """
-        old_map, old_identity = self._surface.point_map, self._surface.identify_points()
-        excluded = self._corner_identities(self._excluded_facets)
+        old_map, old_identity = self.local.point_map, self.local.identify_points()
         gap = np.where(self.area > 0, gaps(self.positions(u)), np.nan)
         copies = old_map.copies
         retracted = RetractedPoints.select(old_identity, old_map.share[copies], gap[copies], self._width)
-        self._surface.update_damage(pattern, shown)
+        self.local.update_damage(pattern, shown)
         self.interpolation.destroy()
-        self.interpolation, self._all, self._active = ParentMatrix(self._domain, self._surface), None, None
-        point_map, nodal = self._surface.point_map, self.interpolation.nodal_values(u)
-        share, gap = retracted.match(self._surface.identify_points(), self._width)
-        self._surface.point_map, without_room = retract_points(point_map, nodal, point_map.copies, share, gap, gaps)
-        self._exclude_points(without_room)
-        if facet_gaps is not None:
-            is_new = np.zeros(len(point_map.share), bool)
-            is_new[point_map.copies] = True
-            rows = match_points(old_identity, self._surface.identify_points())
-            is_new[point_map.copies[rows[rows >= 0]]] = False
-            self._excluded_facets = self._match_facets(excluded)
-            self._retract_new_facets(is_new, nodal, gaps, facet_gaps)
+        self.interpolation = ParentMatrix(self._domain, self.local)
+        point_map, nodal = self.local.point_map, self.interpolation.nodal_values(u)
+        share, gap = retracted.match(self.local.identify_points(), self._width)
+        self.local.point_map, without_room = retract_points(point_map, nodal, point_map.copies, share, gap, gaps)
+        self.exclude_points(without_room)
+        return old_identity
 
-    def _retract_new_facets(self, is_new: Flags, u: Values, gaps: GapFunction, facet_gaps: FacetGapFunction) -> None:
-        """Retract new points (n,) of facets that would be cut or in contact; exclude facets for which this fails."""
-        for _ in range(RETRACTION.facet_rounds):
-            point_map, facets = self._surface.point_map, self.facets
-            has_new = is_new[facets.corners].any(axis=1)
-            too_close = facet_gaps(facets, point_map(u)) < np.where(has_new, self._width, TINY)
-            points = np.unique(facets.corners[too_close])
-            points = points[is_new[points] & (point_map.share[points] > RETRACTION.min_arm)]
-            if not len(points):
-                break
-            share = point_map.share.copy()
-            share[points] *= RETRACTION.facet_factor
-            self._surface.point_map = point_map.with_arm_share(share)
-        closed = np.flatnonzero(is_new & (self.area > 0))
-        closed = closed[gaps(self._surface.point_map(u)[closed]) <= 0]
-        if len(closed):
-            self._exclude_points(np.union1d(closed, np.flatnonzero(self.area == 0)))
-        self._exclude_facets(np.flatnonzero(self._facets_too_close(is_new, u, facet_gaps)))
-
-    def _facets_too_close(self, moved: Flags, u: Values, facet_gaps: FacetGapFunction) -> Flags:
-        """(m,) facets that are cut, or have a point that has `moved` (n,) and would be in contact."""
-        facets = self._all_facets()
-        min_gap = np.where(moved[facets.corners].any(axis=1), self._width, TINY)
-        return np.asarray(facet_gaps(facets, self._surface.point_map(u)) < min_gap)
-
-    def _exclude_facets(self, facets: Ints) -> None:
-        """Exclude these facets as well."""
-        if len(np.setdiff1d(facets, self._excluded_facets)):
-            self._excluded_facets = np.union1d(facets, self._excluded_facets)
-
-    def release_points(self, u: Values, gaps: GapFunction, facet_gaps: FacetGapFunction | None = None) -> None:
-        """Extend retracted points, and include excluded points and facets, as far as there is room (collective)."""
-        nodal, old_map, excluded = self.interpolation.nodal_values(u), self._surface.point_map, self.area == 0
-        point_map = extend_points(old_map, nodal, self._width, gaps)
+    def release_points(self, u: Values, gaps: GapFunction) -> None:
+        """Extend retracted points, and include excluded ones, as far as there is room (collective)."""
+        nodal, excluded = self.interpolation.nodal_values(u), self.area == 0
+        point_map = extend_points(self.local.point_map, nodal, self._width, gaps)
         if len(points := np.flatnonzero(excluded)):
             full, min_gap = np.ones(len(points)), np.full(len(points), self._width)
             point_map, points = retract_points(point_map, nodal, points, full, min_gap, gaps)
-            self._exclude_points(points)
-        self._surface.point_map = point_map
-        changed = point_map is not old_map or len(points) or len(self._excluded_facets)
-        if facet_gaps is not None and changed:
-            self._restore_facets(old_map, excluded, nodal, facet_gaps)
+            self.exclude_points(points)
+        self.local.point_map = point_map
 
-    def _restore_facets(self, old_map: SurfaceMap, excluded: Flags, u: Values, facet_gaps: FacetGapFunction) -> None:
-        """Undo extensions that bring a facet into contact; include facets that are not in contact."""
-        point_map = self._surface.point_map
-        moved = (point_map.share != old_map.share) | excluded
-        too_close = self._facets_too_close(moved, u, facet_gaps)
-        undone = np.unique(self._all_facets().corners[too_close])
-        undone = undone[moved[undone]]
-        if len(undone):
-            share = point_map.share.copy()
-            share[undone] = old_map.share[undone]
-            self._surface.point_map = point_map.with_arm_share(share)
-        if len(self._excluded_facets):
-            gap = facet_gaps(self._all_facets(), self._surface.point_map(u))[self._excluded_facets]
-            if (gap >= self._width).any():
-                self._excluded_facets = self._excluded_facets[gap < self._width]
-        self._exclude_facets(np.flatnonzero(self._facets_too_close(excluded, u, facet_gaps)))
+    def set_arms(self, share: Values) -> None:
+        """Set the factors (n,) of the arms of all points."""
+        self.local.point_map = self.local.point_map.with_arm_share(share)
 
-    def _corner_identities(self, facets: Ints) -> Values:
-        """(k c, 2 d + 1) rows that identify the corners of facets (k,)."""
-        if not len(facets):
-            return np.empty((0, 2 * self._domain.dim + 1))
-        return self._surface.identify_points(self._all_facets().corners[facets].reshape(-1))
-
-    def _match_facets(self, identity: Values) -> Ints:
-        """Facets whose corners have the rows that `_corner_identities` returned."""
-        if not len(identity):
-            return np.empty(0, np.int64)
-        corners = np.sort(self._all_facets().corners, axis=1)
-        all_identities = self._surface.identify_points(np.arange(len(self.area)))
-        matched = match_points(identity, all_identities).reshape(-1, corners.shape[1])
-        matched = np.sort(matched[(matched >= 0).all(axis=1)], axis=1)
-        _, group = np.unique(np.concatenate([matched, corners]), axis=0, return_inverse=True)
-        return np.flatnonzero(np.isin(group.reshape(-1)[len(matched) :], group.reshape(-1)[: len(matched)]))
-
-    def _exclude_points(self, points: Ints) -> None:
-        self.area = self._surface.area.copy()
+    def exclude_points(self, points: Ints) -> None:
+        """Exclude these points (k,) and no others."""
+        self.area = self.local.area.copy()
         self.area[points] = 0.0
 
     # --- state ---
 
+    @property
+    def version(self) -> SurfaceVersion:
+        """Number of points, and columns of their weights: another surface once edges have broken has others."""
+        return len(self.local.point_map.share), self.local.columns
+
+    def has_version(self, version: SurfaceVersion) -> bool:
+        """Whether the surface is still that of a version."""
+        count, columns = version
+        return count == len(self.local.point_map.share) and np.array_equal(columns, self.local.columns)
+
     def snapshot(self) -> object:
-        """Factors of arms, areas, and excluded facets."""
-        return self._surface.point_map.share, self.area, self._excluded_facets, self._surface.columns
+        """Factors of arms, areas, and version."""
+        return self.local.point_map.share, self.area, self.version
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot of this surface (not collective).
 
         Where edges have broken since, in an earlier pass of the step, the surface is another one and stays as it is.
         """
-        share, area, excluded_facets, columns = cast("tuple[Values, Values, Ints, Ints]", memory)
-        if len(share) != len(self._surface.point_map.share) or not np.array_equal(columns, self._surface.columns):
+        share, area, version = cast("tuple[Values, Values, SurfaceVersion]", memory)
+        if not self.has_version(version):
             return
-        self._excluded_facets = excluded_facets
-        if share is not self._surface.point_map.share:
-            self._surface.point_map = self._surface.point_map.with_arm_share(share)
+        if share is not self.local.point_map.share:
+            self.set_arms(share)
         self.area = area
 
     def to_checkpoint(self) -> dict[str, Values]:
-        """Rows of points that are retracted or excluded, and of corners of excluded facets; on rank 0 (collective).
-
-        Of points: identity, factor, whether excluded.
-        """
-        point_map = self._surface.point_map
+        """Rows of points that are retracted or excluded: identity, factor, whether excluded; on rank 0 (collective)."""
+        point_map = self.local.point_map
         excluded = self.area[point_map.copies] == 0
         selected = np.flatnonzero((point_map.share[point_map.copies] < 1) | excluded)
-        identity = self._surface.identify_points()[selected]
+        identity = self.local.identify_points()[selected]
         points = point_map.copies[selected]
         rows = np.column_stack([identity, point_map.share[points], self.area[points] == 0])
-        gathered = gather(self.comm, (rows, self._corner_identities(self._excluded_facets)))
-        if gathered is None:
-            return {}
-        points, corners = zip(*gathered, strict=True)
-        return {"drawn_in": np.concatenate(points), "cut": np.concatenate(corners)}
+        gathered = gather(self.comm, rows)
+        return {} if gathered is None else {"drawn_in": np.concatenate(gathered)}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the rows of a checkpoint."""
-        rows, point_map = saved["drawn_in"], self._surface.point_map
-        matched = match_points(rows[:, :-2], self._surface.identify_points())
+        rows, point_map = saved["drawn_in"], self.local.point_map
+        matched = match_points(rows[:, :-2], self.local.identify_points())
         points, share = point_map.copies[matched[matched >= 0]], np.ones(len(point_map.share))
         share[points] = rows[matched >= 0, -2]
-        self._surface.point_map = point_map.with_arm_share(share)
-        self._exclude_points(points[rows[matched >= 0, -1] > 0])
-        self._excluded_facets = self._match_facets(saved["cut"])
-
-    def clear_caches(self) -> None:
-        """Discard facets and their closest points, from which searches start."""
-        self._all = self._active = None
+        self.set_arms(share)
+        self.exclude_points(points[rows[matched >= 0, -1] > 0])
 
     def destroy(self) -> None:
         """Destroy the objects of PETSc."""

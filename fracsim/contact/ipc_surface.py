@@ -20,7 +20,7 @@ from typing import ClassVar, Protocol
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
-from scipy.sparse import csr_matrix, kron
+from scipy.sparse import csr_matrix
 
 from ..errors import InputError
 from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
@@ -30,7 +30,6 @@ from ..mesh.split_surface.point_matching import match_points, point_identity
 from ..mesh.split_surface.surface_map import SurfaceMap, make_surface_map
 from ..meshes.data import format_point
 from .ipc_pairs import IpcPairs, PairShare
-from .pair_search import max_length
 from .sample_points import SlipFriction
 
 Values = npt.NDArray[np.float64]
@@ -86,7 +85,7 @@ class SelfContactLaw:
         stiffness: of the barrier, Pa.
         friction: coefficient of friction.
         sticking_speed: slip velocity below which friction counts as sticking, m/s.
-        sticking_speed_ratio: the same in the speed of the nodes (SelfContact._speed); the larger one counts.
+        sticking_speed_ratio: the same in the speed of the nodes (SelfContact); the larger one counts.
         fragments_only: contact between fragments alone, without crack faces inside one and single-node fragments.
         corners_only: quadratic cells are in contact by their corners alone, as crack faces are.
     """
@@ -98,6 +97,10 @@ class SelfContactLaw:
     sticking_speed_ratio: float = 0.0
     fragments_only: bool = False
     corners_only: bool = False
+
+    def sticking_speed_at(self, speed: float) -> float:
+        """Slip velocity that counts as sticking, m/s, of nodes with a speed of `speed`, m/s."""
+        return max(self.sticking_speed, self.sticking_speed_ratio * speed)
 
 
 class SurfacePairs(Protocol):
@@ -189,7 +192,7 @@ class SelfContactSurface:
         is_copy[self.point_map.copies] = True
         self._crack_faces = np.flatnonzero(is_copy[self.split.elements].any(axis=1))
         self._nodes, self._size = len(skeleton.points), float(np.linalg.norm(np.ptp(skeleton.points, axis=0)))
-        self.pairs: SurfacePairs = self._build_all_pairs()
+        self.pairs: SurfacePairs = self._build_pairs(self.split.elements)
         self._excluded: Ints = np.empty(0, np.int64)
         self._release_interval = (1, 1)  # steps between two attempts to release faces, and to the next one
         if previous is None:
@@ -217,9 +220,6 @@ class SelfContactSurface:
                 f"[contact]: {len(cut_pairs)} pairs of surface elements cut or touch each other at the start, the "
                 f"first near {position}; move the bodies apart"
             )
-
-    def _build_all_pairs(self) -> SurfacePairs:
-        return self._build_pairs(self.split.elements)
 
     def _build_pairs(self, elements: Ints) -> SurfacePairs:
         return IpcPairs(self._rest_positions, elements, **self._parameters, share=self._share)
@@ -251,7 +251,7 @@ class SelfContactSurface:
         if share is not self.point_map.share:
             self.point_map = self.point_map.with_arm_share(share)
         if excluded is not self._excluded:
-            self.pairs = self._build_all_pairs()
+            self.pairs = self._build_pairs(self.split.elements)
             self._exclude(excluded)
 
     # --- retraction and release of crack faces ---
@@ -350,7 +350,7 @@ class SelfContactSurface:
         if np.any(share < 1):
             self._extend_retracted(u, load)
         if len(excluded):
-            self.pairs = self._build_all_pairs()
+            self.pairs = self._build_pairs(self.split.elements)
             self._retract_faces(u, load)
         unchanged = np.array_equal(share, self.point_map.share) and np.array_equal(excluded, self._excluded)
         pause = min(2 * pause, SURFACE.max_pause) if unchanged else 1
@@ -369,40 +369,6 @@ class SelfContactSurface:
             self.point_map = self.point_map.with_arm_share(share)
         if len(self._crowded_faces(u, load)):
             self.point_map = self.point_map.with_arm_share(previous)
-
-    def is_near_tangent(self, x: Values, tangent_x: Values | None, *, again: bool) -> bool:
-        """Whether positions x (n, d), m, are so near to those of the last tangent that a tangent may be exact.
-
-        Args:
-            x: positions.
-            tangent_x: positions of the last tangent; None: there was none.
-            again: whether Newton's method has failed before.
-        """
-        limit = SURFACE.exact_later if again else SURFACE.exact_first
-        return tangent_x is not None and max_length(x - tangent_x) < limit * self._parameters["distance"]
-
-    # --- from nodes to points and back ---
-
-    def nodal_forces(self, forces: Values) -> Values:
-        """(nodes, d) forces on nodes of forces (n, d) on the points, N."""
-        return np.asarray(self.point_map.weights.T @ forces)
-
-    def nodal_stiffness(self, H: csr_matrix) -> csr_matrix:
-        """(nodes d, nodes d) stiffness at the nodes of second derivatives H (n d, n d) at the points, N/m."""
-        W, used = self._used_weights(H)
-        return (W.T @ H[used][:, used] @ W).tocsr()
-
-    def nodal_directions(self, directions: csr_matrix) -> Values:
-        """(nodes, d m) directions of the nodes of directions (n d, m) of the points."""
-        W, used = self._used_weights(directions)
-        return np.asarray((W.T @ directions[used]).toarray().reshape(self._nodes, -1))
-
-    def _used_weights(self, rows: csr_matrix) -> tuple[csr_matrix, Ints]:
-        """(k d, nodes d) weights of the points with entries in `rows` (n d, m), and (k d,) their rows: mostly few."""
-        d = self._rest_positions.shape[1]
-        points = np.unique(np.flatnonzero(np.diff(rows.indptr)) // d)
-        used = (d * points[:, None] + np.arange(d)).reshape(-1)
-        return kron(self.point_map.weights[points], np.eye(d), format="csr"), used
 
 
 # --- offset of new crack faces ---

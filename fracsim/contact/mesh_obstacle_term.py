@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -22,10 +23,9 @@ from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
 from ..mesh.parallel import sum_over_ranks
-from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .ipc_pairs import IpcPairs
-from .ipc_surface import SelfContactLaw, SelfContactSurface
+from .ipc_surface import SelfContactLaw
 from .laws import BARRIER
 from .mesh_obstacles import (
     AllMeshPairs,
@@ -33,14 +33,14 @@ from .mesh_obstacles import (
     MeshFriction,
     MeshObstacle,
     MeshObstaclePairs,
-    ProximityTest,
 )
 from .obstacle import RigidObstacle
 from .pair_search import max_length
 from .pose import Pose
 from .pose_derivatives import PoseDerivatives, point_jacobian, point_set_derivatives, sum_of_derivatives
+from .proximity import ProximityTest
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
-from .self_contact import Pattern, SelfContact, mean_velocities
+from .self_contact import SelfContact, mean_velocities
 from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
 
 Values = npt.NDArray[np.float64]
@@ -126,17 +126,19 @@ def motion_corrections(pairs: MeshObstaclePairs[IpcPairs], start_pose: Pose, x: 
 
 
 class MeshObstacleTerm(SelfContact):
-    """Triangle-mesh obstacles that the body cannot penetrate (rigid_obstacles.ObstacleContactTerm).
+    """Triangle-mesh obstacles that the body cannot penetrate.
 
     Attributes:
         group: the obstacles, and what they did to the body in the last step.
         obstacles: these.
         numbers: their numbers in the study.
         barrier_width: gap from which on contact acts, m.
+        proximity: test whether the body can be near the obstacles.
+        pose_contact: contact as the obstacles see it.
     """
 
     name = "solids"
-    _friction: MeshFriction | None
+    friction: MeshFriction | None
 
     def __init__(
         self, domain: Domain, u: fem.Function, bodies: RigidObstacles, numbers: Sequence[int], law: SelfContactLaw
@@ -161,28 +163,17 @@ class MeshObstacleTerm(SelfContact):
         items = zip(self.numbers, self.obstacles, strict=True)
         self._meshes = [build_mesh_obstacle(*item, edge) for item in items]
         self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
-        self._proximity = ProximityTest(domain, self.obstacles, law.distance)
+        self.proximity = ProximityTest(domain, self.obstacles, law.distance)
         self._started_near = True
         self._far: bool | None = None  # at the current u; None: not known yet
         self._place_meshes(self.group.poses)
-        super().__init__(domain, u, law)
-        self.parts = (self.surface, self.group)
+        super().__init__(domain, u, law, partial(MeshContactSurface, obstacles=self._meshes, comm=domain.comm))
+        self.parts, self.pose_contact = (self.surface, self.group), MeshPoseContact(self)
 
     # --- surface and obstacles ---
 
-    def _build_surface(
-        self,
-        skeleton: EntityNumbering,
-        pattern: Pattern,
-        law: SelfContactLaw,
-        u: Values,
-        previous: SelfContactSurface | None,
-        cut: Values | None,
-    ) -> SelfContactSurface:
-        return MeshContactSurface(skeleton, pattern, self._meshes, law, u, previous, self.comm)
-
     @property
-    def _pairs(self) -> AllMeshPairs[IpcPairs]:
+    def pairs(self) -> AllMeshPairs[IpcPairs]:
         """Pairs of the surface and the obstacles."""
         return cast("AllMeshPairs[IpcPairs]", self.surface.current.pairs)
 
@@ -196,11 +187,11 @@ class MeshObstacleTerm(SelfContact):
         self._place_meshes(self.group.poses)
         self._far = self._contact_force = self._stored = None
 
-    def _is_far(self) -> bool:
+    def is_far(self) -> bool:
         """Whether nothing can be in contact at the current u, nor could at the start of the step (collective)."""
         if self._far is None:
-            end = self._level.displacement_at_end(self._u.x.array[: self._owned])
-            self._far = not self._started_near and self._proximity.is_far([self._level.u_n, end], self.group.step_poses)
+            ends = [self.level.u_n, self.end_displacement]
+            self._far = not self._started_near and self.proximity.is_far(ends, self.group.step_poses)
         return self._far
 
     def update_displacement(self) -> None:
@@ -213,14 +204,14 @@ class MeshObstacleTerm(SelfContact):
     def begin_step(self, level: TimeLevel) -> None:
         """Move obstacles to the end of the step, and lag friction with the contact at its start."""
         self.group.bodies.begin_step(level)
-        self._level, self._is_stale, self._far, self._attempts = level, True, None, 0
+        self.level, self._is_stale, self._far, self._attempts = level, True, None, 0
         end = level.t + (1 - level.fraction) * level.dt
         if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
             return  # evaluation of a step's result: friction and motions are still those of the step
         self._end, self._dt, self._start_velocity = end, level.dt, level.v_n
-        self._friction = self._tangent_positions = None
-        self._started_near = not self._proximity.is_far([level.u_n], self.group.step_poses)
-        self._start_positions = None
+        self.friction = self._tangent_positions = None
+        self._started_near = not self.proximity.is_far([level.u_n], self.group.step_poses)
+        self.start_positions = None
         zero: Values = np.zeros((1, 3))
         self._start_gradients = [zero for _ in self.obstacles]
         if level.dt and self._started_near:
@@ -231,39 +222,40 @@ class MeshObstacleTerm(SelfContact):
             )
             self._place_meshes(self.group.start_poses)
             surface.extend_faces(nodal)
-            self._start_positions = x = surface.point_map(nodal)
-            self._start_gradients = [pairs.full_gradient(x)[len(x) :] for pairs in self._pairs.pairs]
+            self.start_positions = x = surface.point_map(nodal)
+            self._start_gradients = [pairs.full_gradient(x)[len(x) :] for pairs in self.pairs.pairs]
             if any(mesh.friction for mesh in self._meshes):
-                self._friction = self._pairs.lag_friction(x, x, slip)
+                self.friction = self.pairs.lag_friction(x, x, slip)
         self._place_meshes(self.group.poses)
 
-    def _speed(self, v: Values) -> float:
-        """Largest root mean square of the nodes' speeds relative to an obstacle, m/s (collective)."""
-        square, mean = mean_velocities(self.comm, v.reshape(-1, self._domain.dim))
+    def _sticking_slip(self, level: TimeLevel) -> float:
+        """Slip in the step that counts as sticking, m, with the largest speed relative to an obstacle (collective)."""
+        square, mean = mean_velocities(self.comm, level.v_n.reshape(-1, self._domain.dim))
         centres = [pose.centre[None] for pose in self.group.start_poses]
         placed = zip(self.numbers, centres, strict=True)
         velocities = [self.group.bodies.velocity(number, centre).reshape(-1) for number, centre in placed]
-        return float(np.sqrt(max(0.0, *(float(square - 2 * mean @ V + V @ V) for V in velocities))))
+        speed = float(np.sqrt(max(0.0, *(float(square - 2 * mean @ V + V @ V) for V in velocities))))
+        return level.dt * self.surface.law.sticking_speed_at(speed)
 
     def accept_step(self) -> None:
         """Record forces and work of contact in the step (collective)."""
         forces: list[Values] = [np.zeros(3) for _ in self.obstacles]
         self.group.friction_loss, self.group.work, self.group.forces = 0.0, [0.0] * len(forces), forces
-        if not self._is_far():
-            self._record_work(self._end_positions(), forces)
+        if not self.is_far():
+            self._record_work(self.end_positions(), forces)
 
     def _record_work(self, x: Values, forces: list[Values]) -> None:
         """Record work of this rank's pairs with the body at x (n, 3), m, and add forces on obstacles to `forces`, N."""
-        end_weight, start_gradients, n = self._level.contact_weights.end_work_share, self._start_gradients, len(x)
-        for number, (pairs, start_pose) in enumerate(zip(self._pairs.pairs, self.group.start_poses, strict=True)):
+        end_weight, start_gradients, n = self.level.contact_weights.end_work_share, self._start_gradients, len(x)
+        for number, (pairs, start_pose) in enumerate(zip(self.pairs.pairs, self.group.start_poses, strict=True)):
             # of the obstacle on the body, at the points of the obstacle
             gradient, friction_work = pairs.full_gradient(x)[n:], 0.0
             forces[number] -= gradient.sum(axis=0)
             motion = pairs.mesh.positions - pairs.mesh.positions_at(start_pose)
-            if self._friction is not None and self._start_positions is not None:
-                friction = self._friction.full_gradient(pairs, x)
+            if self.friction is not None and self.start_positions is not None:
+                friction = self.friction.full_gradient(pairs, x)
                 friction_work = float(np.vdot(friction[n:], motion))
-                self.group.friction_loss += friction_work + float(np.vdot(friction[:n], x - self._start_positions))
+                self.group.friction_loss += friction_work + float(np.vdot(friction[:n], x - self.start_positions))
                 forces[number] -= friction[n:].sum(axis=0)
             mean_gradient = end_weight * gradient + (1 - end_weight) * start_gradients[number]
             self.group.work[number] = float(np.vdot(mean_gradient, motion)) + friction_work
@@ -275,11 +267,10 @@ class MeshObstacleTerm(SelfContact):
 
     def max_step_fraction(self, change: Values) -> float:
         """Fraction of a correction of u (owned dofs,), m, and free poses without a collision (collective)."""
-        u, increments = self._u.x.array[: self._owned], self.group.bodies.correction_increments()
-        motion = np.asarray(change / self._level.fraction, np.float64)
-        return self._fraction_along(self._level.displacement_at_end(u), increments, motion)
+        motion = np.asarray(change / self.level.fraction, np.float64)
+        return self.fraction_along(self.end_displacement, self.group.bodies.correction_increments(), motion)
 
-    def _fraction_along(self, u: Values, increments: Mapping[int, Values], change: Values | None) -> float:
+    def fraction_along(self, u: Values, increments: Mapping[int, Values], change: Values | None) -> float:
         """Fraction of increments (p,) from current poses and a motion of the body without a collision (collective).
 
         `u`, `change`: (owned dofs,) displacement at the start, and its change, m; None: the body is at rest.
@@ -288,27 +279,27 @@ class MeshObstacleTerm(SelfContact):
         for index, number in enumerate(self.numbers):
             if number in increments:
                 poses[index] = poses[index][0], poses[index][0].incremented(increments[number])
-        if self._proximity.is_far([u] if change is None else [u, u + change], poses):
+        if self.proximity.is_far([u] if change is None else [u, u + change], poses):
             return 1.0
         x = self.surface.positions(u)
         end = x if change is None else x + self.surface.current.point_map.weights @ self.surface.nodal_values(change)
         starts, ends = zip(*poses, strict=True)
         self._place_meshes(ends)
-        fraction = self._pairs.moving_free_fraction(x, end, starts)
+        fraction = self.pairs.moving_free_fraction(x, end, starts)
         self._place_meshes(starts)
         return fraction
 
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) first guess of u, m, that crosses no obstacle on its way from the start (collective)."""
-        level = self._level
+        level = self.level
         if not level.dt:
             return u
-        if self._proximity.is_far([level.u_n, level.displacement_at_end(u)], self.group.step_poses):
+        if self.proximity.is_far([level.u_n, level.displacement_at_end(u)], self.group.step_poses):
             return u
         start, end = (self.surface.nodal_values(nodal) for nodal in (level.u_n, level.displacement_at_end(u)))
         prescribed = [index for index, obstacle in enumerate(self.obstacles) if not obstacle.free]
         start_poses = [self.group.start_poses[index] for index in prescribed]
-        point_map, pairs = self.surface.current.point_map, self._pairs.select(prescribed)
+        point_map, pairs = self.surface.current.point_map, self.pairs.select(prescribed)
         if (guess := stop_before_meshes(point_map, pairs, start, end, start_poses)) is end:
             return u
         change: Values = self.surface.gather.owned(guess - end).reshape(-1)
@@ -318,13 +309,45 @@ class MeshObstacleTerm(SelfContact):
 
     def is_feasible(self, u: Values) -> bool:
         """Whether nothing is crossed on the straight way from the start to u (collective)."""
-        u_n, u_end = self._level.u_n, self._level.displacement_at_end(u)
-        if self._proximity.is_far([u_n, u_end], self.group.step_poses):
+        u_n, u_end = self.level.u_n, self.level.displacement_at_end(u)
+        if self.proximity.is_far([u_n, u_end], self.group.step_poses):
             return True
         start, end = self.surface.positions(u_n), self.surface.positions(u_end)
-        return self._pairs.moving_free_fraction(start, end, self.group.start_poses) == 1
+        return self.pairs.moving_free_fraction(start, end, self.group.start_poses) == 1
 
-    # --- contact of the body, as the obstacles see it (rigid_obstacles.ObstacleContactTerm) ---
+    # --- readings ---
+
+    def _current_force(self, number: int) -> Values:
+        """(3,) force of the body on an obstacle at the current u, of this rank's pairs, N (collective)."""
+        return np.asarray(self.pairs.pairs[number].body_gradient(self.end_positions()).sum(axis=0))
+
+    def _gap(self, number: int) -> float:
+        """Least distance between an obstacle and the body, m, of this rank's pairs (collective)."""
+        return self.pairs.pairs[number].gap(self.end_positions())
+
+    def closing_distances(self) -> list[float]:
+        """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
+
+        It is that of the velocities at the start, without any contact.
+        """
+        if self.is_far():
+            return [0.0] * len(self.obstacles)
+        x, v = self.end_positions(), self.surface.nodal_values(self._start_velocity)
+        motion, result = self._dt * (self.surface.current.point_map.weights @ v), []
+        for pairs, start_pose in zip(self.pairs.pairs, self.group.start_poses, strict=True):
+            result.append(approach(pairs, start_pose, x, motion))
+        return result
+
+
+class MeshPoseContact:
+    """Contact of the body with triangle meshes, as the obstacles see it (rigid_obstacles.PoseContact)."""
+
+    def __init__(self, term: MeshObstacleTerm) -> None:
+        self._term, self.group, self.allows_exact_tangent = term, term.group, term.allows_exact_tangent
+
+    def poses_moved(self) -> None:
+        """Move the meshes to the poses of the obstacles, and discard forces."""
+        self._term.poses_moved()
 
     def rest_fraction(self, increments: Mapping[int, Values], u: Values | None) -> float:
         """Fraction of increments (p,) from current poses on which no gap to the body closes (collective).
@@ -334,22 +357,22 @@ class MeshObstacleTerm(SelfContact):
         if not increments:
             return 1.0
         if u is None:
-            u = self._level.displacement_at_end(self._u.x.array[: self._owned])
-        return self._fraction_along(u, increments, None)
+            u = self._term.end_displacement
+        return self._term.fraction_along(u, increments, None)
 
     def start_fraction(self, number: int, q: Values, u: Values) -> float:
         """Fraction of an increment (p,) of an obstacle and the motion of the body that closes no gap (collective).
 
         Both from the start of the step; `u`: (owned dofs,) displacement of the level after the motion, m.
         """
-        level, index = self._level, self.numbers.index(number)
+        level, index = self._term.level, self.group.numbers.index(number)
         start, u_end = self.group.start_poses[index], level.displacement_at_end(u)
         poses = [(pose, pose) for pose in self.group.poses]
         poses[index] = start, start.incremented(q)
-        if self._proximity.is_far([level.u_n, u_end], poses):
+        if self._term.proximity.is_far([level.u_n, u_end], poses):
             return 1.0
-        x, end = self.surface.positions(level.u_n), self.surface.positions(u_end)
-        pairs = self._pairs.pairs[index]
+        x, end = self._term.surface.positions(level.u_n), self._term.surface.positions(u_end)
+        pairs = self._term.pairs.pairs[index]
         pairs.mesh.move_to(poses[index][1])
         fraction = pairs.moving_free_fraction(x, end, start)
         pairs.mesh.move_to(self.group.poses[index])
@@ -362,21 +385,21 @@ class MeshObstacleTerm(SelfContact):
     def pose_derivatives(self, *, exact: bool) -> dict[int, PoseDerivatives]:
         """Energy and derivatives by the poses of free obstacles (collective)."""
         numbers, none = self.group.free, PoseDerivatives(0.0, np.zeros(6), np.zeros((6, 6)))
-        if not numbers or self._is_far():
+        if not numbers or self._term.is_far():
             return dict.fromkeys(numbers, none)
-        x = self._end_positions()
+        x = self._term.end_positions()
         parts = [self._own_derivatives(number, x, exact=exact) or none for number in numbers]
-        return dict(zip(numbers, sum_of_derivatives(parts, self.comm), strict=True))
+        return dict(zip(numbers, sum_of_derivatives(parts, self._term.comm), strict=True))
 
     def _own_derivatives(self, number: int, x: Values, *, exact: bool) -> PoseDerivatives | None:
         """Derivatives by the pose of an obstacle of this rank's pairs, the body at x (n, 3), m; None: it is far."""
-        pairs, n = self._pairs.pairs[self.numbers.index(number)], len(x)
+        pairs, n = self._term.pairs.pairs[self.group.numbers.index(number)], len(x)
         if pairs.is_far(x):
             return None
         points, mesh = pairs.with_mesh(x), slice(3 * n, None)
         energy, gradient = pairs.contact.energy(points), pairs.contact.gradient(points)
         H = pairs.contact.hessian(points, exact=exact)
-        if self._friction is not None and (friction := self._friction.friction_with(pairs)) is not None:
+        if self._term.friction is not None and (friction := self._term.friction.friction_with(pairs)) is not None:
             energy, gradient = energy + friction.energy(points), gradient + friction.gradient(points)
             H = H + friction.hessian(points, exact=exact)
         arms = pairs.mesh.positions - pairs.mesh.pose.centre
@@ -385,53 +408,30 @@ class MeshObstacleTerm(SelfContact):
     def mixed_hessians(self) -> dict[int, Values]:
         """(owned dofs, p) second derivatives by nodes and the poses of free obstacles in contact (collective)."""
         numbers = self.group.free
-        if not numbers or self._is_far():
+        if not numbers or self._term.is_far():
             return {}
-        x = self._end_positions()
+        x = self._term.end_positions()
         parts = {number: self._own_mixed(number, x) for number in numbers}
-        touching = sum_over_ranks(self.comm, [float(part.any()) for part in parts.values()])
+        touching = sum_over_ranks(self._term.comm, [float(part.any()) for part in parts.values()])
         near = [number for number, touches in zip(numbers, touching, strict=True) if touches]
-        return {number: self.surface.gather.sum_owned(parts[number]).reshape(self._owned, -1) for number in near}
+        return {number: self._term.surface.gather.sum_owned(parts[number]).reshape(-1, 6) for number in near}
 
     def _own_mixed(self, number: int, x: Values) -> Values:
         """(nodes, 18) second derivatives by nodes and pose of this rank's pairs, the body at x (n, 3), m."""
-        pairs, body = self._pairs.pairs[self.numbers.index(number)], slice(0, x.size)
+        pairs, body = self._term.pairs.pairs[self.group.numbers.index(number)], slice(0, x.size)
         if pairs.is_far(x):
-            return np.zeros((len(self._input_nodes), 18))
+            return np.zeros((self._term.surface.current.point_map.weights.shape[1], 18))
         points = pairs.with_mesh(x)
         H = pairs.contact.hessian(points)
-        if self._friction is not None and (friction := self._friction.friction_with(pairs)) is not None:
+        if self._term.friction is not None and (friction := self._term.friction.friction_with(pairs)) is not None:
             H = H + friction.hessian(points)
         J = point_jacobian(pairs.mesh.positions - pairs.mesh.pose.centre).reshape(-1, 6)
         mixed = H[body, x.size :] @ J
-        return self.surface.current.nodal_forces(mixed.reshape(len(x), -1))
+        return self._term.surface.current.point_map.nodal_forces(mixed.reshape(len(x), -1))
 
     def uses_exact_tangent(self) -> bool:
         """Whether the tangent at the current u may have negative eigenvalues: not with free obstacles."""
         return self.allows_exact_tangent
-
-    # --- readings ---
-
-    def _current_force(self, number: int) -> Values:
-        """(3,) force of the body on an obstacle at the current u, of this rank's pairs, N (collective)."""
-        return np.asarray(self._pairs.pairs[number].body_gradient(self._end_positions()).sum(axis=0))
-
-    def _gap(self, number: int) -> float:
-        """Least distance between an obstacle and the body, m, of this rank's pairs (collective)."""
-        return self._pairs.pairs[number].gap(self._end_positions())
-
-    def closing_distances(self) -> list[float]:
-        """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
-
-        It is that of the velocities at the start, without any contact.
-        """
-        if self._is_far():
-            return [0.0] * len(self.obstacles)
-        x, v = self._end_positions(), self.surface.nodal_values(self._start_velocity)
-        motion, result = self._dt * (self.surface.current.point_map.weights @ v), []
-        for pairs, start_pose in zip(self._pairs.pairs, self.group.start_poses, strict=True):
-            result.append(approach(pairs, start_pose, x, motion))
-        return result
 
 
 def approach(pairs: MeshObstaclePairs[Any], start_pose: Pose, x: Values, motion: Values) -> float:

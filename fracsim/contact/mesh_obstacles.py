@@ -18,13 +18,11 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from ..errors import InputError
-from ..mesh.domain import Domain
 from ..mesh.split_surface.closed_surface import SplitSurface
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from .ipc_pairs import NO_PAIRS, IpcPairs, PairShare
 from .ipc_surface import SelfContactLaw, SelfContactSurface
 from .laws import BARRIER
-from .obstacle import RigidObstacle
 from .pose import Pose
 from .proximity import bounding_box
 from .sample_points import IpcFriction
@@ -41,7 +39,6 @@ class MeshObstaclePolicy:
 
     Attributes:
         query_points: points nearest to an obstacle's bounding box that bound its distance first.
-        max_arm: distance of points of crack faces from the nodes that they follow, in longest edges.
         max_rotation: rotation of an obstacle in one piece of a motion, rad.
         min_fraction: of a piece, below which nothing moves.
         gap_share: distance of the barrier between obstacles in their gap at the start, where that is the smaller one.
@@ -49,7 +46,6 @@ class MeshObstaclePolicy:
     """
 
     query_points: int = 500
-    max_arm: float = 2.0
     max_rotation: float = 0.3
     min_fraction: float = 1e-4
     gap_share: float = 0.5
@@ -81,70 +77,6 @@ def free_fraction_on_arcs(
         if fraction < 1:
             return first + fraction / pieces
     return 1.0
-
-
-class ProximityTest:
-    """Test by bounding boxes whether a body can be near an obstacle; nothing is gathered."""
-
-    def __init__(self, domain: Domain, obstacles: Sequence[RigidObstacle], distance: float) -> None:
-        """`distance`: of the barrier, m (collective)."""
-        corners = domain.nodes[domain.cell_nodes]
-        diameter = float(np.ptp(corners, axis=1).max(initial=0.0)) * np.sqrt(domain.dim)
-        self._reach = distance + MESH.max_arm * float(domain.comm.allreduce(diameter, op=MPI.MAX))
-        self._comm, self._X = domain.comm, np.ascontiguousarray(domain.nodes[: domain.node_count].T)
-        self._rest_box = self._X.min(axis=1, initial=np.inf), self._X.max(axis=1, initial=-np.inf)
-        self._boxes = [_BoundingBox(obstacle.shape.tessellate()[0]) for obstacle in obstacles]
-
-    def is_far(self, displacements: Sequence[Values], poses: Sequence[tuple[Pose, Pose]]) -> bool:
-        """Whether no point of the body can be within the barrier of an obstacle (collective).
-
-        Args:
-            displacements: (owned dofs,) of the body, m; positions between them count as well.
-            poses: of each obstacle at the start and the end of its motion.
-        """
-        boxes = [box.swept(*ends) for box, ends in zip(self._boxes, poses, strict=True)]
-        # of all components together at first, which takes a third of the time
-        return any(
-            not self._box_meets(np.concatenate([-low, high]), boxes)
-            for low, high in (bounds(displacements) for bounds in (self._rough_bounds, self._bounds))
-        )
-
-    def _rough_bounds(self, displacements: Sequence[Values]) -> tuple[Values, Values]:
-        """(3,) corners of a box around this rank's nodes, m."""
-        low, high = self._rest_box
-        return (
-            low + min(float(u.min(initial=np.inf)) for u in displacements),
-            high + max(float(u.max(initial=-np.inf)) for u in displacements),
-        )
-
-    def _bounds(self, displacements: Sequence[Values]) -> tuple[Values, Values]:
-        """(3,) corners of the bounding box of this rank's nodes, m."""
-        # by columns: minima along the first axis take twenty times as long
-        x = [[self._X[axis] + u[axis::3] for u in displacements] for axis in range(3)]
-        low = [min(float(part.min(initial=np.inf)) for part in parts) for parts in x]
-        high = [max(float(part.max(initial=-np.inf)) for part in parts) for parts in x]
-        return np.array(low), np.array(high)
-
-    def _box_meets(self, bounds: Values, boxes: Sequence[tuple[Values, Values]]) -> bool:
-        """Whether the box of all ranks, of bounds (6,), and its reach meet one of the boxes (collective)."""
-        self._comm.Allreduce(MPI.IN_PLACE, bounds, MPI.MAX)
-        low, high = -bounds[:3] - self._reach, bounds[3:] + self._reach
-        return any(np.all(low < box_high) and np.all(high > box_low) for box_low, box_high in boxes)
-
-
-class _BoundingBox:
-    """Bounding box of an obstacle in its own frame."""
-
-    def __init__(self, points: Values) -> None:
-        """`points`: (m, 3) in its own frame, m."""
-        self._low, self._high = points.min(axis=0), points.max(axis=0)
-        self._radius = float(np.linalg.norm(points, axis=1).max())
-
-    def swept(self, start: Pose, end: Pose) -> tuple[Values, Values]:
-        """(3,) corners of a box around the motion between two poses, m; with a rotation, around a sphere."""
-        rotated = not all(np.array_equal(pose.rotation, np.eye(3)) for pose in (start, end))
-        low, high = (-self._radius, self._radius) if rotated else (self._low, self._high)
-        return np.minimum(start.centre, end.centre) + low, np.maximum(start.centre, end.centre) + high
 
 
 class MeshObstacle:
@@ -444,15 +376,17 @@ class MeshContactSurface(SelfContactSurface):
         self,
         skeleton: EntityNumbering,
         pattern: npt.NDArray[np.uint8],
-        obstacles: Sequence[MeshObstacle],
         law: SelfContactLaw,
         u: Values,
         previous: SelfContactSurface | None,
+        cut: Values | None = None,
+        *,
+        obstacles: Sequence[MeshObstacle],
         comm: MPI.Intracomm = MPI.COMM_SELF,
     ) -> None:
         """As for SelfContactSurface. Raises InputError where an obstacle overlaps the body at rest."""
         self._obstacles = obstacles
-        super().__init__(skeleton, pattern, law, u, previous, comm=comm)
+        super().__init__(skeleton, pattern, law, u, previous, cut, comm)
 
     def _check_apart(self) -> None:
         refuse_overlaps(self.split, self.pairs)

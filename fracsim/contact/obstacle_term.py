@@ -26,8 +26,9 @@ from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .contact_state import ContactState
-from .contact_surface import retract_cut_elements, retract_from_obstacles
+from .contact_surface import retract_from_obstacles
 from .laws import ObstacleLaw
+from .node_contact import ContactForces
 from .pose import min_distance
 from .pose_derivatives import (
     PoseCoupling,
@@ -63,11 +64,13 @@ EXACT_TANGENT = ExactTangentPolicy()
 
 
 class ObstacleTerm(ContactState, Term):
-    """Analytic obstacles that the body cannot penetrate (rigid_obstacles.ObstacleContactTerm)."""
+    """Analytic obstacles that the body cannot penetrate.
+
+    Attributes:
+        pose_contact: contact as the obstacles see it.
+    """
 
     name = "obstacles"
-    allows_exact_tangent = True
-    _pose_couplings: dict[tuple[int, bool], PoseCoupling]  # index, whether exact -> at the current u and poses
 
     def __init__(
         self, domain: Domain, u: fem.Function, bodies: RigidObstacles, numbers: Sequence[int], law: ObstacleLaw
@@ -85,41 +88,17 @@ class ObstacleTerm(ContactState, Term):
             InputError: if the body at rest overlaps an obstacle.
         """
         super().__init__(domain, u, ObstacleGroup(bodies, numbers, self._gap, self._current_force), law)
-        self.parts = self.surface, self.group
-        self._coupling = CouplingBuilder(domain)
+        # facets after the points that they are made of
+        self.parts = (self.surface, self.facets, self.group) if self.facets.numbers else (self.surface, self.group)
+        self.pose_contact, self._coupling = PointPoseContact(self), CouplingBuilder(domain)
         self._is_exact: bool | None = None  # whether the tangent at the current u and poses is; None: not known yet
 
     def update_displacement(self) -> None:
-        """Discard contact forces, as u has changed."""
-        self.discard_forces()
-
-    def discard_forces(self) -> None:
         """Discard forces, and whether the tangent is exact, as u or poses have changed."""
-        super().discard_forces()
-        self._is_exact, self._pose_couplings = None, {}
-
-    def rest_gaps(self) -> Values:
-        """(obstacles,) least gaps of the body at rest to each obstacle at t = 0, m (collective).
-
-        Gaps of points, and of facets where the obstacle acts on them.
-        """
-        x, posed = self.surface.rest_positions, [obstacle.posed_at(0.0) for obstacle in self.obstacles]
-        gaps = np.array([self.surface.min_distance(shape.distance(x)) for shape in posed])
-        for number in self._facet_obstacles:
-            facet_gaps = self.surface.facets.gaps(posed[number], x, self.law.barrier.width)
-            gaps[number] = min(gaps[number], float(facet_gaps.min(initial=np.inf)))
-        self.comm.Allreduce(MPI.IN_PLACE, gaps, MPI.MIN)
-        return gaps
+        super().update_displacement()
+        self._is_exact = None
 
     # --- forces, tangent and energy ---
-
-    def contact_forces(self) -> Values:
-        """(owned dofs,) contact forces at the end of the step, N (collective)."""
-        return self.nodal_forces()
-
-    def reference_forces(self) -> Values:
-        """(owned dofs,) contact forces with their weight in the residual, N (collective)."""
-        return np.asarray(self._level.contact_weight * self.nodal_forces())
 
     def coupling_matrix(self) -> PETSc.Mat | None:
         """Minus the derivative of the forces; None where nothing is in contact (collective)."""
@@ -132,24 +111,20 @@ class ObstacleTerm(ContactState, Term):
         for facets in (contact.facets for contact in contacts if contact.facets is not None):
             groups.append((facets.corners, facets.hessian if exact else facets.stiffness))
         matrix = self.surface.stiffness(groups)
-        return self._coupling(self._level.contact_weights.factor * matrix, self.surface.node_numbers)
+        return self._coupling(self.level.contact_weights.factor * matrix, self.surface.local.columns)
 
     def uses_exact_tangent(self) -> bool:
         """Whether the tangent has negative eigenvalues of contact: near the solution (collective)."""
         if self._is_exact is None:
-            points = np.concatenate([contact.points for contact in self.obstacle_forces()])
-            motion = self.comm.allreduce(self._max_motion(points), op=MPI.MAX)
+            points, motion = np.concatenate([contact.points for contact in self.obstacle_forces()]), np.inf
+            if self._tangent_positions is not None:
+                moved = np.linalg.norm((self.positions - self._tangent_positions)[points], axis=1)
+                motion = float(moved.max(initial=0.0))
+            motion = self.comm.allreduce(motion, op=MPI.MAX)
             first = self._attempts <= 1
             limit = EXACT_TANGENT.first_attempt if first else EXACT_TANGENT.later_attempts
             self._is_exact = bool(motion < limit * self.law.barrier.width) and self.group.bodies.may_use_exact_tangent()
         return self._is_exact
-
-    def _max_motion(self, points: Ints) -> float:
-        """Largest motion of points (k,) since the last tangent, m; infinite without one."""
-        if self._tangent_positions is None:
-            return np.inf
-        motion = (self.positions - self._tangent_positions)[points]
-        return float(np.linalg.norm(motion, axis=1).max(initial=0.0))
 
     def begin_solve(self) -> None:
         """Count an attempt of Newton's method; after a failure tangents become exact later."""
@@ -162,7 +137,7 @@ class ObstacleTerm(ContactState, Term):
     def potential(self) -> float:
         """Potential of barriers and friction as they enter the residual, this rank's share, J (collective)."""
         potentials = sum(contact.potential for contact in self.obstacle_forces())
-        return self._level.contact_weight * self._level.fraction * potentials
+        return self.level.contact_weight * self.level.fraction * potentials
 
     def accept_step(self) -> None:
         """Record forces and work of contact in the step (collective)."""
@@ -175,7 +150,7 @@ class ObstacleTerm(ContactState, Term):
 
     def _normal_work(self, number: int) -> float:
         """Work of normal forces on the body by the motion of an obstacle in the step, this rank's share, J."""
-        end_weight, q = self._level.contact_weights.end_work_share, self.group.increments[number]
+        end_weight, q = self.level.contact_weights.end_work_share, self.group.increments[number]
         contact, centre = self.obstacle_forces()[number], self.group.posed[number].pose.centre
         end = float(resultant(contact.normal, self.positions[contact.points] - centre) @ q)
         return end_weight * end + (1 - end_weight) * float(self._start_forces[number] @ q[: self._domain.dim])
@@ -185,7 +160,7 @@ class ObstacleTerm(ContactState, Term):
     def max_step_fraction(self, change: Values) -> float:
         """Fraction of a change of u (owned dofs,), m, that leaves a tenth of every gap (collective)."""
         self.obstacle_forces()
-        motion = self.surface.interpolation(np.divide(change, self._level.fraction))
+        motion = self.surface.interpolation(np.divide(change, self.level.fraction))
         increments = self.group.bodies.correction_increments()
         by_obstacle = [self._fractions(number, motion, increments.get(n)) for number, n in enumerate(self.numbers)]
         fractions = [values[self.surface.area > 0] for values in by_obstacle]
@@ -195,103 +170,28 @@ class ObstacleTerm(ContactState, Term):
         """(n,) fractions of the motion (n, d) of points, m, and an increment (p,), None: none, that close no gap."""
         if q is None:
             q = np.zeros_like(self.group.increments[number])
-        facets = self._facets_for(number)
+        facets = self.facets_for(number)
         min_gap = self.obstacle_forces()[number].min_gap
         return safe_motion_fractions(
-            self.group.posed[number], self.positions, motion, q, facets, self._point_candidates, min_gap
+            self.group.posed[number], self.positions, motion, q, facets, self.point_candidates, min_gap
         )
 
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) first guess of u, m, that crosses no obstacle on its way from the start (collective)."""
-        level = self._level
+        level = self.level
         if not level.dt:
             return u
         prescribed = self.group.bodies.prescribed_motions()
-        motions = [(*prescribed[n], self._facets_for(i)) for i, n in enumerate(self.numbers) if n in prescribed]
+        motions = [(*prescribed[n], self.facets_for(i)) for i, n in enumerate(self.numbers) if n in prescribed]
         end = stop_before_obstacles(self.surface, motions, level.u_n, level.displacement_at_end(u))
         return np.asarray(level.u_n + level.fraction * (end - level.u_n))
 
     def is_feasible(self, u: Values) -> bool:
         """Whether every gap is open with the body at u (collective)."""
-        x = self.surface.positions(self._level.displacement_at_end(u))
-        return self.surface.gaps_are_open(min_distance(self.group.posed, x)) and self._facets_are_open(x)
-
-    # --- contact of the body, as the obstacles see it (rigid_obstacles.ObstacleContactTerm) ---
-
-    def poses_moved(self) -> None:
-        """Discard forces, as obstacles have moved."""
-        self.discard_forces()
-
-    def rest_fraction(self, increments: Mapping[int, Values], u: Values | None) -> float:
-        """Fraction of increments (p,) from current poses on which no gap to the body closes (collective).
-
-        `u`: (owned dofs,) displacement of the body at rest, m; None: the current one at the end of the step.
-        """
-        if u is None:
-            self.obstacle_forces()
-        x = self.positions if u is None else self.surface.positions(u)
-        fractions: list[Values] = [np.ones(len(x))]
-        for number, n in enumerate(self.numbers):
-            if n in increments:
-                facets = self._facets_for(number)
-                motion = np.zeros_like(x), increments[n], facets, self._point_candidates
-                fractions.append(safe_motion_fractions(self.group.posed[number], x, *motion))
-        return self.surface.min_fraction(np.min(fractions, axis=0))
-
-    def start_fraction(self, number: int, q: Values, u: Values) -> float:
-        """Fraction of an increment (p,) of an obstacle and the motion of the body that closes no gap (collective).
-
-        Both from the start of the step; `u`: (owned dofs,) displacement of the level after the motion, m.
-        """
-        level, index = self._level, self.numbers.index(number)
-        x = self.surface.positions(level.u_n)
-        motion = self.surface.positions(level.displacement_at_end(u)) - x
-        facets = self._facets_for(index)
-        return self.surface.min_fraction(
-            safe_motion_fractions(self.group.start_posed[index], x, motion, q, facets, self._point_candidates)
+        x = self.surface.positions(self.level.displacement_at_end(u))
+        return self.surface.gaps_are_open(min_distance(self.group.posed, x)) and self.facets.are_open(
+            self.group.posed, x
         )
-
-    def wrenches(self) -> dict[int, Values]:
-        """(p,) force and moment of the body on free obstacles, N and N m, of all ranks (collective)."""
-        if not (numbers := self.group.free):
-            return {}
-        contacts = self.obstacle_forces()
-        local = [
-            contact_wrench(contacts[index], self.positions, self.group.poses[index])
-            for index in map(self.numbers.index, numbers)
-        ]
-        return dict(zip(numbers, sum_over_ranks(self.comm, np.array(local)), strict=True))
-
-    def pose_derivatives(self, *, exact: bool) -> dict[int, PoseDerivatives]:
-        """Energy and derivatives by the poses of free obstacles, of all ranks (collective)."""
-        if not (numbers := self.group.free):
-            return {}
-        local = [self._pose_coupling(self.numbers.index(number), exact=exact).derivatives() for number in numbers]
-        return dict(zip(numbers, sum_of_derivatives(local, self.comm), strict=True))
-
-    def _pose_coupling(self, index: int, *, exact: bool) -> PoseCoupling:
-        """Coupling of the points and the pose of an obstacle at the current u and poses (collective)."""
-        contact = self.obstacle_forces()[index]
-        if (index, exact) not in self._pose_couplings:
-            poses = self.group.posed[index].pose, self._lagged[index], self.group.start_posed[index].pose
-            self._pose_couplings[index, exact] = PoseCoupling(contact, self.positions, *poses, exact=exact)
-        return self._pose_couplings[index, exact]
-
-    def mixed_hessians(self) -> dict[int, Values]:
-        """(owned dofs, p) derivatives of minus the nodal forces by poses, of free obstacles in contact (collective)."""
-        if not (numbers := self.group.free):
-            return {}
-        contacts, exact, indices = self.obstacle_forces(), self.uses_exact_tangent(), map(self.numbers.index, numbers)
-        touching = sum_over_ranks(self.comm, np.array([len(contacts[index].points) for index in indices])) > 0
-        return {
-            number: self._mixed_hessian(self.numbers.index(number), exact=exact)
-            for number, touches in zip(numbers, touching, strict=True)
-            if touches
-        }
-
-    def _mixed_hessian(self, index: int, *, exact: bool) -> Values:
-        by_pose = self._pose_coupling(index, exact=exact).mixed_hessian()
-        return self.surface.interpolation.assemble_points_to_nodes(self.obstacle_forces()[index].points, by_pose)
 
     # --- fracture, and surfaces for output ---
 
@@ -300,16 +200,13 @@ class ObstacleTerm(ContactState, Term):
         all_posed = self.group.bodies.posed_at(t)
         posed = [all_posed[number] for number in self.numbers]
         position = retract_from_obstacles(position, u, partial(min_distance, posed))
-        if not self._facet_obstacles:
-            return position
-        facets, curved = self.surface.facets_from(elements), [posed[number] for number in self._facet_obstacles]
-        return retract_cut_elements(position, u, elements, lambda x: ~facets.are_open(curved, x))
+        return self.facets.separate(position, elements, u, posed)
 
     def clear_search(self) -> None:
         """Discard results of searches, which a checkpoint does not hold (not collective)."""
-        self.surface.clear_caches()
+        self.facets.clear_caches()
         self._shown.discard()
-        self.discard_forces()
+        self.update_displacement()
 
     def destroy(self) -> None:
         """Destroy the objects of PETSc."""
@@ -328,7 +225,7 @@ class ObstacleTerm(ContactState, Term):
         self.obstacle_forces()
         posed = self.group.posed[number]
         point_gap = self.surface.min_distance(posed.distance(self.positions))
-        if (facets := self._facets_for(number)) is None:
+        if (facets := self.facets_for(number)) is None:
             return point_gap
         facet_distances = facets.distances(posed, self.positions, self.law.barrier.width)
         return min(point_gap, float(facet_distances.min(initial=np.inf)))
@@ -348,3 +245,96 @@ class ObstacleTerm(ContactState, Term):
             approach = np.einsum("ni,ni->n", relative, posed.normal(self.positions[pushed]))
             result.append(float(approach.max(initial=0.0)))
         return result
+
+
+class PointPoseContact:
+    """Contact of the body with analytic obstacles, as the obstacles see it (rigid_obstacles.PoseContact)."""
+
+    allows_exact_tangent = True
+
+    def __init__(self, term: ObstacleTerm) -> None:
+        self._term, self.group = term, term.group
+        # index of an obstacle, whether exact -> forces that the coupling is of, and the coupling
+        self._couplings: dict[tuple[int, bool], tuple[ContactForces, PoseCoupling]] = {}
+
+    def poses_moved(self) -> None:
+        """Discard forces, as obstacles have moved."""
+        self._term.update_displacement()
+
+    def rest_fraction(self, increments: Mapping[int, Values], u: Values | None) -> float:
+        """Fraction of increments (p,) from current poses on which no gap to the body closes (collective).
+
+        `u`: (owned dofs,) displacement of the body at rest, m; None: the current one at the end of the step.
+        """
+        if u is None:
+            self._term.obstacle_forces()
+        x = self._term.positions if u is None else self._term.surface.positions(u)
+        fractions: list[Values] = [np.ones(len(x))]
+        for number, n in enumerate(self.group.numbers):
+            if n in increments:
+                facets = self._term.facets_for(number)
+                motion = np.zeros_like(x), increments[n], facets, self._term.point_candidates
+                fractions.append(safe_motion_fractions(self.group.posed[number], x, *motion))
+        return self._term.surface.min_fraction(np.min(fractions, axis=0))
+
+    def start_fraction(self, number: int, q: Values, u: Values) -> float:
+        """Fraction of an increment (p,) of an obstacle and the motion of the body that closes no gap (collective).
+
+        Both from the start of the step; `u`: (owned dofs,) displacement of the level after the motion, m.
+        """
+        level, index = self._term.level, self.group.numbers.index(number)
+        x = self._term.surface.positions(level.u_n)
+        motion = self._term.surface.positions(level.displacement_at_end(u)) - x
+        facets = self._term.facets_for(index)
+        return self._term.surface.min_fraction(
+            safe_motion_fractions(self.group.start_posed[index], x, motion, q, facets, self._term.point_candidates)
+        )
+
+    def wrenches(self) -> dict[int, Values]:
+        """(p,) force and moment of the body on free obstacles, N and N m, of all ranks (collective)."""
+        if not (numbers := self.group.free):
+            return {}
+        contacts = self._term.obstacle_forces()
+        local = [
+            contact_wrench(contacts[index], self._term.positions, self.group.poses[index])
+            for index in map(self.group.numbers.index, numbers)
+        ]
+        return dict(zip(numbers, sum_over_ranks(self._term.comm, np.array(local)), strict=True))
+
+    def pose_derivatives(self, *, exact: bool) -> dict[int, PoseDerivatives]:
+        """Energy and derivatives by the poses of free obstacles, of all ranks (collective)."""
+        if not (numbers := self.group.free):
+            return {}
+        local = [self._coupling(self.group.numbers.index(number), exact=exact).derivatives() for number in numbers]
+        return dict(zip(numbers, sum_of_derivatives(local, self._term.comm), strict=True))
+
+    def _coupling(self, index: int, *, exact: bool) -> PoseCoupling:
+        """Coupling of the points and the pose of an obstacle at the current u and poses (collective)."""
+        term, group = self._term, self.group
+        contact, cached = term.obstacle_forces()[index], self._couplings.get((index, exact))
+        # forces are evaluated anew where u or poses have changed
+        if cached is None or cached[0] is not contact:
+            poses = group.poses[index], term.lagged[index], group.start_poses[index]
+            cached = contact, PoseCoupling(contact, term.positions, *poses, exact=exact)
+            self._couplings[index, exact] = cached
+        return cached[1]
+
+    def mixed_hessians(self) -> dict[int, Values]:
+        """(owned dofs, p) derivatives of minus the nodal forces by poses, of free obstacles in contact (collective)."""
+        if not (numbers := self.group.free):
+            return {}
+        contacts, exact = self._term.obstacle_forces(), self.uses_exact_tangent()
+        indices = [self.group.numbers.index(number) for number in numbers]
+        touching = sum_over_ranks(self._term.comm, np.array([len(contacts[index].points) for index in indices])) > 0
+        interpolation = self._term.surface.interpolation
+        return {
+            number: interpolation.assemble_points_to_nodes(
+                contacts[index].points, self._coupling(index, exact=exact).mixed_hessian()
+            )
+            for number, index, touches in zip(numbers, indices, touching, strict=True)
+            if touches
+        }
+
+    def uses_exact_tangent(self) -> bool:
+        """Whether the tangent at the current u has negative eigenvalues of contact (collective)."""
+        return self._term.uses_exact_tangent()

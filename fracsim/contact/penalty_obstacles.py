@@ -174,6 +174,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
     """
 
     shows_all_cells = True
+    facets_may_be_cut = True  # and crack faces have no penalty of their own
 
     def __init__(
         self,
@@ -207,33 +208,28 @@ class PenaltyObstacleTerm(ObstacleTerm):
         super().__init__(domain, u, bodies, numbers, law)
         self._update_stiffness()
 
-    def _check_facets(self) -> None:
-        self._refuse_cut_facets()
-
-    def _facet_gap_function(self, posed: Sequence[PosedShape]) -> None:
-        return None  # facets may be penetrated, and crack faces have no penalty of their own
-
-    def _facets_for(self, number: int) -> ContactFacets | None:
-        return self._facets if number in self._facet_obstacles else None
+    def facets_for(self, number: int) -> ContactFacets | None:
+        """Facets on which an obstacle acts, with their stiffness as areas; None if it acts on points alone."""
+        return self._facets if number in self.facets.numbers else None
 
     # --- stiffness ---
 
     def _update_stiffness(self) -> None:
         """Compute the stiffness of the points of the current surface (collective)."""
-        point_map, area = self.surface.point_map, self.surface.area
+        point_map, area = self.surface.local.point_map, self.surface.area
         mass_share = NodalMassShare(point_map, self.surface.interpolation, self._mass)
         self.stiffness: Values = self.law.barrier.curvature(np.zeros(len(area))) * area
         if np.isfinite(self._max_added):
             self.stiffness = np.minimum(self.stiffness, self._max_added * mass_share.point_masses(area))
         self._added_frequency, self._stiffness_of = mass_share.max_rate(self.stiffness), (point_map, area)
-        if self._facet_obstacles:
+        if self.facets.numbers:
             self._update_facets(mass_share)
 
     def _update_facets(self, mass_share: NodalMassShare) -> None:
         """Compute the stiffness k_f of facets off crack faces, kept as areas of ContactFacets (collective)."""
         surface, is_copy = self.surface, np.zeros(len(self.surface.area), bool)
-        is_copy[surface.point_map.copies] = True
-        facets, k = surface.facets, self.law.barrier.curvature(np.zeros(1)) * surface.facets.area
+        is_copy[surface.local.point_map.copies] = True
+        facets, k = self.facets.active, self.law.barrier.curvature(np.zeros(1)) * self.facets.active.area
         if np.isfinite(self._max_added):
             masses = mass_share.point_masses(surface.area)
             per_mass = np.divide(surface.area, masses, out=np.zeros(len(masses)), where=masses > 0)
@@ -248,36 +244,29 @@ class PenaltyObstacleTerm(ObstacleTerm):
         side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0.0))
         self._facet_reach = self.law.barrier.width + PENALTY.max_stretch * self.comm.allreduce(side, op=MPI.MAX)
 
-    def _facet_frequency(self) -> float:
-        """Bound of what facets near obstacles add to the square of a frequency, 1/s^2 (collective)."""
-        if not self._facet_obstacles:
-            return 0.0
-        load, reach = np.zeros(len(self.stiffness)), PENALTY.near_gap * self.law.barrier.width
-        for number in self._facet_obstacles:
-            near = self._facets.within_reach(self.group.posed[number], self.positions, reach)
-            np.add.at(load, self._facets.corners[near], self._facets.area[near][:, None])
-        return self._mass_share.max_rate(load) if self.comm.allreduce(bool(load.any()), op=MPI.LOR) else 0.0
-
     def frequency_bound(self) -> float:
         """Increase of the square of the highest frequency if all points were in contact, 1/s^2 (collective).
 
         With that of the lightest free obstacle: the squares of a body and an obstacle on one spring add up.
         """
         free = {number: obstacle for number, obstacle in self.group.bodies.free.items() if number in self.numbers}
-        of_free = cast("dict[int, VerletObstacle]", free)
+        of_free, added = cast("dict[int, VerletObstacle]", free), self._added_frequency
         self.obstacle_forces()
-        return (
-            self._added_frequency
-            + self._facet_frequency()
-            + max(map(self._obstacle_frequency, of_free, of_free.values()), default=0.0)
-        )
+        if self.facets.numbers:
+            load, reach = np.zeros(len(self.stiffness)), PENALTY.near_gap * self.law.barrier.width
+            for number in self.facets.numbers:
+                near = self._facets.within_reach(self.group.posed[number], self.positions, reach)
+                np.add.at(load, self._facets.corners[near], self._facets.area[near][:, None])
+            if self.comm.allreduce(bool(load.any()), op=MPI.LOR):
+                added += self._mass_share.max_rate(load)
+        return added + max(map(self._obstacle_frequency, of_free, of_free.values()), default=0.0)
 
     def _obstacle_frequency(self, number: int, obstacle: VerletObstacle) -> float:
         posed, reach = self.group.bodies.posed[number], PENALTY.near_gap * self.law.barrier.width
-        near = self._point_candidates(posed, self.positions, reach)
+        near = self.point_candidates(posed, self.positions, reach)
         near = near[posed.distance(self.positions[near]) < reach]
         stiffness = obstacle.spring_stiffness(self.positions[near], self.stiffness[near], posed)
-        if self.numbers.index(number) in self._facet_obstacles:
+        if self.numbers.index(number) in self.facets.numbers:
             facets = self._facets.within_reach(posed, self.positions, reach)
             x = self._facets.closest_points(posed, self.positions, facets).position
             stiffness = stiffness + obstacle.spring_stiffness(x, self._facets.area[facets], posed)
@@ -286,22 +275,22 @@ class PenaltyObstacleTerm(ObstacleTerm):
     # --- steps ---
 
     def _begin_new_step(self) -> None:
-        self.surface.release_points(self._level.u_n, partial(min_distance, self.group.start_posed))
+        self.surface.release_points(self.level.u_n, partial(min_distance, self.group.start_posed))
         point_map, area = self._stiffness_of
-        if self.comm.allreduce(point_map is not self.surface.point_map or area is not self.surface.area):
+        if self.comm.allreduce(point_map is not self.surface.local.point_map or area is not self.surface.area):
             self._update_stiffness()
-        self._start_points = self.surface.positions(self._level.u_n)
+        self._start_points = self.surface.positions(self.level.u_n)
 
     def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
         """Forces of an obstacle at a given pose (collective)."""
         forces = self._normal_forces(number, posed)
         if not (coefficient := self.obstacles[number].friction):
             return forces
-        if self.comm.size > 1 and number in self._facet_obstacles:
+        if self.comm.size > 1 and number in self.facets.numbers:
             forces = self._at_shared_points(forces, posed)
         points, k, normal = forces.points, self.stiffness[forces.points], forces.normal
         total, k_total = normal, k
-        if self.comm.size > 1 and number in self._facet_obstacles:
+        if self.comm.size > 1 and number in self.facets.numbers:
             # of a point and the facets at it ranks have other parts of the force than of the stiffness
             sums = self.surface.sum_at_points(points, np.column_stack([normal, k]))
             total, k_total = sums[:, :-1], sums[:, -1]
@@ -315,7 +304,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
     def _at_shared_points(self, forces: ContactForces, posed: PosedShape) -> ContactForces:
         """The same forces, with all points at facets in contact, which other ranks may have, by distances alone."""
-        near = self._point_candidates(posed, self.positions, self._facet_reach)
+        near = self.point_candidates(posed, self.positions, self._facet_reach)
         near = near[posed.distance(self.positions[near]) < self._facet_reach]
         points = np.union1d(forces.points, near)
         normal = np.zeros((len(points), self._domain.dim))
@@ -324,14 +313,14 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
     def _normal_forces(self, number: int, posed: PosedShape) -> ContactForces:
         """Forces of the penalty of points, and of facets that an obstacle acts on."""
-        law, points = self.law.barrier, self._point_candidates(posed, self.positions, self.law.barrier.width)
+        law, points = self.law.barrier, self.point_candidates(posed, self.positions, self.law.barrier.width)
         gap = posed.distance(self.positions[points])
         touches = (gap < law.width) & (self.surface.area[points] > 0)
         points, closure = points[touches], law.width - gap[touches]
         pressure, normal = self.stiffness[points] * closure, posed.normal(self.positions[points])
         energy, no_friction = 0.5 * float(pressure @ closure), np.zeros_like(normal)
         forces = ContactForces(points, energy, pressure[:, None] * normal, no_friction, 0.0, _no_tangent)
-        is_round = number in self._facet_obstacles
+        is_round = number in self.facets.numbers
         if not is_round or not len(self._facets.candidates(posed, self.positions, law.width)):
             return forces
         of_unit_rate = Penalty(law.width, law.width)
@@ -374,7 +363,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Add new crack faces; springs of points that still exist stay (collective)."""
-        springs = [(spring, self.surface.identity(spring.points)) for spring in self._step_end.springs]
+        springs = [(spring, self.surface.local.identify_points(spring.points)) for spring in self._step_end.springs]
         super().edges_broke(pattern)
         self._step_end = StepEnd([self._matched_springs(*item) for item in springs], self._step_end.forces)
         self._update_stiffness()
@@ -383,7 +372,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
         """Springs of points with rows of `identity`, on the current surface."""
         points = spring.points
         if len(identity):
-            points = match_points(identity, self.surface.identity(np.arange(len(self.surface.area))))
+            points = match_points(identity, self.surface.local.identify_points(np.arange(len(self.surface.area))))
         matched = np.flatnonzero(points >= 0)
         matched = matched[np.argsort(points[matched])]
         return FrictionSprings(points[matched], spring.slip[matched], spring.stiffness[matched])
@@ -406,8 +395,8 @@ class PenaltyObstacleTerm(ObstacleTerm):
         """
         rows = [
             np.column_stack([np.full(len(spring.points), number), np.full(len(spring.points), self.comm.rank),
-                             self.surface.area[spring.points], self.surface.identity(spring.points), spring.slip,
-                             spring.stiffness])
+                             self.surface.area[spring.points], self.surface.local.identify_points(spring.points),
+                             spring.slip, spring.stiffness])
             for number, spring in enumerate(self._step_end.springs)
         ]  # fmt: skip
         gathered = gather(self.comm, (np.concatenate(rows), np.array(self._step_end.forces)))
@@ -434,7 +423,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
         that this rank has now.
         """
         rank, area, identity, slip, k = np.split(rows, [1, 2, -1 - self._domain.dim, -1], axis=1)
-        matched = match_points(identity, self.surface.identity(np.arange(len(self.surface.area))))
+        matched = match_points(identity, self.surface.local.identify_points(np.arange(len(self.surface.area))))
         order = np.lexsort((rank[:, 0], rank[:, 0] != self.comm.rank, matched))
         order = order[matched[order] >= 0]
         points, first = np.unique(matched[order], return_index=True)

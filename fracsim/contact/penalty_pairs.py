@@ -1,5 +1,7 @@
 """Penalty between points and facets, and between edges, of surfaces in explicit steps, with friction; on one rank.
 
+Of a body with itself, of bodies and triangle meshes, and of triangle meshes with one another.
+
     E(x) = sum over points p of k_p (D - g_p)^2 / 2 + sum over edges of k h (D - g)^2 / 2    where g < D
 
 (penalty_contacts). Points before facets: penalty_point_facet; edges against edges, in 3D: penalty_edges.
@@ -13,17 +15,23 @@ Equations: docs/theory.md#explicit-contact.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
+from scipy.sparse import csr_matrix, vstack
 
-from .ipc_pairs import IpcPairs
+from ..mesh.split_surface.entity_numbering import EntityNumbering
+from .ipc_pairs import IpcPairs, vertex_areas
+from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface, SurfacePairs
 from .laws import slipped, tangential
+from .mesh_obstacles import AllMeshPairs, MeshObstacle, MeshObstaclePairs, Patches, refuse_overlaps
 from .penalty_contacts import ContactStiffness, PenaltyContacts, concatenate_contacts
 from .penalty_edges import EdgeContacts, EdgePairHistory
-from .penalty_point_facet import NO_FACET, POINT_FACET, PointFacetContacts, PointHistory
+from .penalty_point_facet import NO_FACET, POINT_FACET, PointFacetContacts, PointHistory, penalty_stiffness
+from .pose import Pose
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -256,3 +264,161 @@ class PairSprings:
         if self.start is None:
             return np.zeros_like(contacts.normal)
         return np.where((contacts.start_stiffness > 0)[:, None], contacts.relative(x - self.start), 0.0)
+
+
+# --- surface of a body, and its pairs with itself or with obstacles ---
+
+
+@dataclass(frozen=True)
+class BodyMass:
+    """Mass of a body, and what contact may add to its frequencies.
+
+    Attributes:
+        mass: (nodes,) kg.
+        max_added: 1/s^2 (penalty_stiffness).
+    """
+
+    mass: Values
+    max_added: float
+
+
+@dataclass(frozen=True)
+class PenaltyPart:
+    """Contact of the surface of a body with itself, or with one obstacle.
+
+    Its points are (n + m, d): those of the body, then those of the obstacle.
+
+    Attributes:
+        contact: penalty.
+        friction: coefficient.
+        obstacle: pairs with the obstacle; None: the body with itself.
+    """
+
+    contact: PenaltyPairs
+    friction: float
+    obstacle: MeshObstaclePairs[PenaltyPairs] | None = None
+
+    def is_far(self, x: Values) -> bool:
+        """Whether the obstacle is out of contact with the body at x (n, d), m."""
+        return self.obstacle is not None and self.obstacle.is_far(x)
+
+    def points(self, x: Values, pose: Pose | None = None) -> Values:
+        """(n + m, d) points with the body at x (n, d), m, and the obstacle at a pose; None: the current one."""
+        if self.obstacle is None:
+            return x
+        mesh = self.obstacle.mesh
+        return np.concatenate([x, mesh.positions if pose is None else mesh.positions_at(pose)])
+
+
+class PenaltySurface(SelfContactSurface):
+    """Surface of a body with penalty contact, on rank 0.
+
+    Before obstacles alone crack faces are not offset from one another.
+    """
+
+    pairs: PenaltyPairs | AllMeshPairs[PenaltyPairs]
+    closed_pressure: ClassVar[float] = 0.0  # a face that is pressed at all has no room
+    search_all_faces: ClassVar[bool] = True  # to read candidates takes longer than to have more of them
+
+    def __init__(
+        self,
+        skeleton: EntityNumbering,
+        pattern: npt.NDArray[np.uint8],
+        law: SelfContactLaw,
+        u: Values,
+        previous: PenaltySurface | None,
+        cut: Values | None,
+        *,
+        body: BodyMass,
+        meshes: Sequence[MeshObstacle],
+    ) -> None:
+        """Build the surface; `body`: its mass; `meshes`: obstacles, none: it touches itself; others as of the base."""
+        self._law, self._body, self._meshes, self._previous = law, body, meshes, previous
+        self._stiffness: ContactStiffness | None = None
+        self.face_gap = 0.0 if meshes else SURFACE.face_gap
+        super().__init__(skeleton, pattern, law, u, previous, cut)
+        self._previous = None
+
+    @property
+    def parts(self) -> list[PenaltyPart]:
+        """Contact with itself, or with each obstacle."""
+        if isinstance(self.pairs, PenaltyPairs):
+            return [PenaltyPart(self.pairs, self._law.friction)]
+        return [PenaltyPart(pairs.contact, pairs.mesh.friction, pairs) for pairs in self.pairs.pairs]
+
+    def _check_apart(self) -> None:
+        if isinstance(self.pairs, PenaltyPairs):
+            super()._check_apart()
+        else:
+            refuse_overlaps(self.split, self.pairs)
+
+    def _build_pairs(self, elements: Ints) -> SurfacePairs:
+        stiffness, distance = self._own_stiffness(), self._law.distance
+        pairs: PenaltyPairs | AllMeshPairs[PenaltyPairs]
+        if not self._meshes:
+            pairs = PenaltyPairs(self._rest_positions, elements, stiffness, distance=distance)
+            self._transfer_contacts([pairs])
+            return pairs
+        pairs = AllMeshPairs([self._pairs_with(mesh, elements, stiffness) for mesh in self._meshes])
+        self._transfer_contacts([of_mesh.contact for of_mesh in pairs.pairs])
+        return pairs
+
+    def _own_stiffness(self) -> ContactStiffness:
+        """Stiffness of the body's points, by all elements and full arms: constant while a surface lasts."""
+        if self._stiffness is None:
+            pressure, area = self._pressure, vertex_areas(self._rest_positions, self.split.elements)
+            # before obstacles twice that of self-contact, where both sides yield
+            limit = (2 if self._meshes else 1) * self._body.max_added
+            k = penalty_stiffness(self.point_map.weights, area, self._body.mass, pressure, limit)
+            reduction: Values = np.ones(len(k))
+            if self._meshes:
+                reduction = np.divide(k, 0.5 * pressure * area, out=reduction, where=area > 0)
+            self._stiffness = ContactStiffness(k, k, reduction)
+        return self._stiffness
+
+    @property
+    def _pressure(self) -> float:
+        return self._law.stiffness / self._law.distance
+
+    def _pairs_with(self, mesh: MeshObstacle, elements: Ints, own: ContactStiffness) -> MeshObstaclePairs[PenaltyPairs]:
+        area = vertex_areas(mesh.points, mesh.triangles)
+        of_mesh = ContactStiffness(0.5 * self._pressure * area, np.full(len(area), np.inf), np.ones(len(area)))
+        stiffness = own.followed_by(of_mesh)
+
+        def make_contact(points: Values, triangles: Ints, patches: Patches) -> PenaltyPairs:
+            return PenaltyPairs(points, triangles, stiffness, distance=self._law.distance, patch=patches)
+
+        return MeshObstaclePairs(self._rest_positions, elements, mesh, self._law.distance, make_contact)
+
+    def _transfer_contacts(self, contacts: Sequence[PenaltyPairs]) -> None:
+        """Give pairs the contacts of this surface until now, or of the previous one."""
+        k = self._own_stiffness().point
+        number: Ints = np.arange(len(k))
+        if hasattr(self, "pairs"):
+            last = self.parts
+        elif self._previous is not None:
+            last, number = self._previous.parts, self.new_numbers(self._previous, len(k))
+        else:
+            return
+        for old, new in zip(last, contacts, strict=True):
+            m = 0 if old.obstacle is None else len(old.obstacle.mesh.points)
+            numbers, limit = np.r_[number, len(k) + np.arange(m)], np.r_[k, np.full(m, np.inf)]
+            new.set_history(old.contact.history.renumbered(numbers, limit))
+
+    def max_added_frequency(self, x: Values) -> float:
+        """Bound of what contact adds to the square of a frequency of the body at x (n, d), m; 1/s^2."""
+        weights, total = self.point_map.weights, 0.0
+        for part in self.parts:
+            if not part.is_far(x):
+                points = part.points(x)
+                no_nodes = csr_matrix((len(points) - len(x), weights.shape[1]))
+                nodes = vstack([weights, no_nodes], format="csr")
+                total += part.contact.max_added_frequency(points, nodes, self._body.mass)
+        return total
+
+    def reach_of_points(self) -> float:
+        """Largest motion of a point where no node moves by more than 1; infinite with retracted faces."""
+        share, excluded, _ = self.snapshot()
+        if len(excluded) or np.any(share < 1):
+            return np.inf
+        return float(abs(self.point_map.weights).sum(axis=1).max())

@@ -1,4 +1,6 @@
-"""Motion of free obstacles in an implicit step: the pose as minimiser of an incremental potential.
+"""Motion of free obstacles: states of motion, and the pose at the end of an implicit step.
+
+The pose is the minimiser of an incremental potential.
 
 z (k,) is the increment of the step, pose(z) the start incremented by q = motion_basis @ z. E(z) and V(z) are the
 energies of contact and weight. The scheme steps the momentum M dz/dt as that of every node, with M at the middle of
@@ -15,17 +17,19 @@ Equations: docs/theory.md#rigid-obstacles.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from ..forms.schemes import Scheme
 from ..mechanics.contact_time_weights import acceleration_change
-from .obstacle import FreeObstacle, RigidMotion
-from .pose import Pose, left_jacobian, left_jacobian_derivative, rotation_derivative, solve_matrix
+from ..mechanics.term_protocols import TermColumns
+from .obstacle import FreeObstacle, RigidMotion, column_names
+from .pose import Pose, PosedShape, left_jacobian, left_jacobian_derivative, rotation_derivative, solve_matrix
 from .pose_derivatives import PoseDerivatives
 
 Values = npt.NDArray[np.float64]
@@ -314,3 +318,98 @@ class RigidStep:
         if pose.dim == 2:
             return self.start.rotation + self.increment(z)[2:]
         return pose.rotation_vector()
+
+
+# --- states of motion as history and columns of a term ---
+
+
+class MovingObstacle(Protocol):
+    """Free obstacle, with its state of motion at the start of a step until that is accepted."""
+
+    body: FreeObstacle
+    motion: RigidMotion
+
+
+@dataclass(frozen=True)
+class FreeMotions:
+    """States of motion of free obstacles: history of a term, kinetic energy, and columns of history.csv.
+
+    Attributes:
+        free: free obstacles by their numbers.
+        is_root: whether this is rank 0.
+        restored: called when motions are those of a checkpoint.
+    """
+
+    free: Mapping[int, MovingObstacle]
+    is_root: bool
+    restored: Callable[[], None]
+
+    def snapshot(self) -> dict[int, RigidMotion]:
+        """State of motion of each, by its number."""
+        return {number: obstacle.motion for number, obstacle in self.free.items()}
+
+    def restore(self, motions: Mapping[int, RigidMotion]) -> None:
+        """Restore states of motion."""
+        for number, obstacle in self.free.items():
+            obstacle.motion = motions[number]
+
+    def to_checkpoint(self) -> dict[str, Values]:
+        """Rows of numbers for a checkpoint."""
+        return {"flights": motion_rows(obstacle.motion for obstacle in self.free.values())}
+
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
+        """Set states of motion from the rows of a checkpoint."""
+        for row, obstacle in enumerate(self.free.values()):
+            obstacle.motion = obstacle.motion.from_array(saved["flights"][row])
+        self.restored()
+
+    def place(self, posed: list[PosedShape]) -> list[PosedShape]:
+        """All obstacles, by their numbers, with free ones at the poses of their states of motion."""
+        for number, obstacle in self.free.items():
+            posed[number] = PosedShape(posed[number].shape, obstacle.motion.pose)
+        return posed
+
+    def kinetic_energy(self) -> float:
+        """Kinetic energy of the free obstacles, on rank 0, J."""
+        if not self.is_root:
+            return 0.0
+        return float(sum(obstacle.body.history_values(obstacle.motion)[-1] for obstacle in self.free.values()))
+
+    def history_columns(self) -> TermColumns:
+        """Columns of history.csv.
+
+        position_NAME_x and velocity_NAME_x of the centre of mass, m and m/s; turn_NAME_z and spin_NAME_z, rad and
+        rad/s; kinetic_NAME, J.
+        """
+        columns = {
+            name: partial(reader, index)
+            for obstacle in self.free.values()
+            for reader in [_MotionReader(obstacle, self.is_root)]
+            for index, name in enumerate(column_names(obstacle.body))
+        }
+        return TermColumns(columns)
+
+
+def motion_rows(motions: Iterable[RigidMotion]) -> Values:
+    """(n, m) numbers of states of motion, one row each; shorter rows, as of a pendulum, end with zeros."""
+    rows = [motion.to_array() for motion in motions]
+    length = max(map(len, rows), default=0)
+    return np.array([np.pad(row, (0, length - len(row))) for row in rows])
+
+
+class _MotionReader:
+    """Numbers of an obstacle for history.csv: read column by column, evaluated once for each state of motion."""
+
+    def __init__(self, obstacle: MovingObstacle, is_root: bool) -> None:
+        self._obstacle, self._is_root = obstacle, is_root
+        self._motion: RigidMotion | None = None
+        self._values: Values = np.empty(0)
+
+    def __call__(self, index: int) -> Values:
+        """(1,) value of a column; 0 on other ranks than 0."""
+        if not self._is_root:
+            return np.zeros(1)
+        if self._motion is not self._obstacle.motion:
+            self._motion = self._obstacle.motion
+            self._values = self._obstacle.body.history_values(self._motion)
+        return self._values[index : index + 1]

@@ -11,8 +11,7 @@ Equations: docs/theory.md#rigid-obstacles.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Protocol
 
@@ -23,10 +22,11 @@ from ..mechanics.term import Term, TimeLevel
 from ..mechanics.term_protocols import SurfaceData, TermColumns
 from ..mesh.domain import Domain
 from ..meshes.data import AXES
-from .obstacle import FreeObstacle, RigidMotion, RigidObstacle, VerletObstacle, column_names
+from .obstacle import FreeObstacle, RigidObstacle, VerletObstacle
 from .obstacle_tessellation import ObstacleTessellations
 from .pose import Pose, PosedShape
 from .pose_derivatives import PoseDerivatives
+from .rigid_body import FreeMotions, MovingObstacle
 from .step_limit import PoseMotion
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ Values = npt.NDArray[np.float64]
 type Increments = Mapping[int, Values]  # (p,) of poses, by the numbers of obstacles
 
 
-class ObstacleContactTerm(Protocol):
+class PoseContact(Protocol):
     """Contact of the body with some obstacles, as the obstacles see it.
 
     Attributes:
@@ -76,98 +76,6 @@ class ObstacleContactTerm(Protocol):
         """Whether the tangent at the current u has negative eigenvalues of contact (collective)."""
 
 
-class MovingObstacle(Protocol):
-    """Free obstacle, with its state of motion at the start of a step until that is accepted."""
-
-    body: FreeObstacle
-    motion: RigidMotion
-
-
-@dataclass(frozen=True)
-class FreeMotions:
-    """States of motion of free obstacles: history of a term, kinetic energy, and columns of history.csv.
-
-    Attributes:
-        free: free obstacles by their numbers.
-        is_root: whether this is rank 0.
-        restored: called when motions are those of a checkpoint.
-    """
-
-    free: Mapping[int, MovingObstacle]
-    is_root: bool
-    restored: Callable[[], None]
-
-    def snapshot(self) -> dict[int, RigidMotion]:
-        """State of motion of each, by its number."""
-        return {number: obstacle.motion for number, obstacle in self.free.items()}
-
-    def restore(self, motions: Mapping[int, RigidMotion]) -> None:
-        """Restore states of motion."""
-        for number, obstacle in self.free.items():
-            obstacle.motion = motions[number]
-
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Rows of numbers for a checkpoint."""
-        return {"flights": motion_rows(obstacle.motion for obstacle in self.free.values())}
-
-    def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set states of motion from the rows of a checkpoint."""
-        for row, obstacle in enumerate(self.free.values()):
-            obstacle.motion = obstacle.motion.from_array(saved["flights"][row])
-        self.restored()
-
-    def place(self, posed: list[PosedShape]) -> list[PosedShape]:
-        """All obstacles, by their numbers, with free ones at the poses of their states of motion."""
-        for number, obstacle in self.free.items():
-            posed[number] = PosedShape(posed[number].shape, obstacle.motion.pose)
-        return posed
-
-    def kinetic_energy(self) -> float:
-        """Kinetic energy of the free obstacles, on rank 0, J."""
-        if not self.is_root:
-            return 0.0
-        return float(sum(obstacle.body.history_values(obstacle.motion)[-1] for obstacle in self.free.values()))
-
-    def history_columns(self) -> TermColumns:
-        """Columns of history.csv.
-
-        position_NAME_x and velocity_NAME_x of the centre of mass, m and m/s; turn_NAME_z and spin_NAME_z, rad and
-        rad/s; kinetic_NAME, J.
-        """
-        columns = {
-            name: partial(reader, index)
-            for obstacle in self.free.values()
-            for reader in [_MotionReader(obstacle, self.is_root)]
-            for index, name in enumerate(column_names(obstacle.body))
-        }
-        return TermColumns(columns)
-
-
-def motion_rows(motions: Iterable[RigidMotion]) -> Values:
-    """(n, m) numbers of states of motion, one row each; shorter rows, as of a pendulum, end with zeros."""
-    rows = [motion.to_array() for motion in motions]
-    length = max(map(len, rows), default=0)
-    return np.array([np.pad(row, (0, length - len(row))) for row in rows])
-
-
-class _MotionReader:
-    """Numbers of an obstacle for history.csv: read column by column, evaluated once for each state of motion."""
-
-    def __init__(self, obstacle: MovingObstacle, is_root: bool) -> None:
-        self._obstacle, self._is_root = obstacle, is_root
-        self._motion: RigidMotion | None = None
-        self._values: Values = np.empty(0)
-
-    def __call__(self, index: int) -> Values:
-        """(1,) value of a column; 0 on other ranks than 0."""
-        if not self._is_root:
-            return np.zeros(1)
-        if self._motion is not self._obstacle.motion:
-            self._motion = self._obstacle.motion
-            self._values = self._obstacle.body.history_values(self._motion)
-        return self._values[index : index + 1]
-
-
 class RigidObstacles(Term):
     """Held and driven obstacles.
 
@@ -195,7 +103,7 @@ class RigidObstacles(Term):
         """`obstacles`: by their numbers in the study; `free`: free ones, None: there are none."""
         self.comm, self.dim, self.obstacles, self.free = domain.comm, domain.dim, tuple(obstacles), free or {}
         self.prescribed = [number for number in range(len(obstacles)) if number not in self.free]
-        self.contacts: list[ObstacleContactTerm] = []
+        self.contacts: list[PoseContact] = []
         self._tessellations = ObstacleTessellations(self.obstacles, domain.bounds.lower, domain.bounds.upper)
         self._level: TimeLevel | None = None
         self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
@@ -243,10 +151,6 @@ class RigidObstacles(Term):
         """Place free obstacles by their states of motion."""
         self.motions.place(self.posed)
         self._tell_moved()
-
-    def _body_wrenches(self) -> dict[int, Values]:
-        """(p,) force and moment of the body on each free obstacle, N and N m, of all ranks (collective)."""
-        return {number: wrench for contact in self.contacts for number, wrench in contact.wrenches().items()}
 
     # --- motion of points of obstacles ---
 
@@ -296,16 +200,19 @@ class RigidObstacles(Term):
         """Advance prescribed obstacles as far as the body and free obstacles at rest allow (collective)."""
         remaining = 1.0 - self._travelled
         increments = {number: remaining * self.increments[number] for number in self.prescribed}
-        fraction = min(self._rest_fraction(increments, u), self._fraction_between(increments))
+        fraction = self.free_fraction(increments, u)
         self._move_prescribed(1.0 if fraction == 1 else self._travelled + fraction * remaining)
 
-    def _rest_fraction(self, increments: Increments, u: Values | None) -> float:
-        """Fraction of increments on which no gap to the body at rest closes, as of ObstacleContactTerm (collective)."""
+    def free_fraction(self, increments: Increments, u: Values | None = None) -> float:
+        """Fraction of increments from current poses on which no gap closes, with the body at rest (collective).
+
+        `u`: (owned dofs,) displacement of the body, m; None: the current one at the end of the step.
+        """
         fractions = [
             contact.rest_fraction({number: q for number, q in increments.items() if number in contact.group.numbers}, u)
             for contact in self.contacts
         ]
-        return min(fractions, default=1.0)
+        return min([*fractions, self._fraction_between(increments)])
 
     def _fraction_between(self, increments: Increments) -> float:
         """Fraction of increments from current poses on which no gap between obstacles closes."""
@@ -359,8 +266,9 @@ class VerletRigidObstacles(RigidObstacles):
             for number, wrench, work in zip(pair.numbers, pair.forces.wrenches, pair.work, strict=True):
                 of_pairs[number] += wrench
                 work_of_pairs[number] += work
-        for number, of_body in self._body_wrenches().items():
-            work = self.free[number].end_step(self.posed[number], of_body + of_pairs[number])
+        of_body = {number: wrench for contact in self.contacts for number, wrench in contact.wrenches().items()}
+        for number, wrench_of_body in of_body.items():
+            work = self.free[number].end_step(self.posed[number], wrench_of_body + of_pairs[number])
             self._contact_work[number] = work - work_of_pairs[number]
 
     def stored_energy(self) -> float:

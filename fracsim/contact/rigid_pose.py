@@ -29,7 +29,7 @@ from .obstacle_pairs import AllPairs
 from .pose import PosedShape, solve_matrix
 from .pose_derivatives import PoseDerivatives
 from .rigid_body import SOLVER, RigidStep, RigidSystem, SystemDerivatives, is_positive_definite
-from .rigid_obstacles import Increments, ObstacleContactTerm, RigidObstacles
+from .rigid_obstacles import Increments, PoseContact, RigidObstacles
 
 Values = npt.NDArray[np.float64]
 
@@ -119,7 +119,7 @@ class BodyContact(Protocol):
     """
 
     posed: list[PosedShape]
-    contacts: list[ObstacleContactTerm]
+    contacts: list[PoseContact]
 
     def free_fraction(self, increments: Mapping[int, Values]) -> float:
         """Fraction of increments (p,) of free poses on which no gap closes, the body at rest (collective)."""
@@ -382,7 +382,8 @@ class FreeRigidObstacles(RigidObstacles):
 
     def accept_step(self) -> None:
         """Give free obstacles their momentum (collective)."""
-        of_body, of_pairs = self._body_wrenches(), self.pairs.wrenches(self.posed)
+        of_body = {number: wrench for contact in self.contacts for number, wrench in contact.wrenches().items()}
+        of_pairs = self.pairs.wrenches(self.posed)
         for number, pose in self.free.items():
             pose.motion = pose.end_motion(of_body[number] + of_pairs.get(number, 0.0))
 
@@ -409,10 +410,6 @@ class FreeRigidObstacles(RigidObstacles):
             return True
         allowed = all(contact.allows_exact_tangent for contact in self.contacts)
         return allowed and self._unknowns.equations(exact=True).is_positive
-
-    def free_fraction(self, increments: Increments) -> float:
-        """Fraction of increments of free poses on which no gap closes, the body at rest (collective)."""
-        return min(self._rest_fraction(increments, None), self._fraction_between(increments))
 
     def correction_increments(self) -> Increments:
         """Increments of free poses in a correction of Newton's method."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -29,6 +30,7 @@ from ..mesh.split_surface.quadratic_surface import subdivided_input_mesh
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface, SurfaceSnapshot
 from .laws import stiffness_factor
+from .pair_search import max_length
 from .sample_points import SlipFriction
 
 Values = npt.NDArray[np.float64]
@@ -170,23 +172,37 @@ class SelfContact(Term):
 
     Attributes:
         surface: its surface.
+        level: time level of the current or last step.
+        friction: lagged friction of the step; None: without.
+        start_positions: (n, d) of the surface at the start of the step, m.
         allows_exact_tangent: whether tangents are exact near the solution.
     """
 
     name = "contact"
     leaves_tangent_incomplete = True
     allows_exact_tangent: bool = True
+    level: TimeLevel
     _attempts = 0  # of Newton's method in the step
 
-    def __init__(self, domain: Domain, u: fem.Function, law: SelfContactLaw) -> None:
-        """Raise InputError where the surface at rest intersects itself (collective)."""
+    def __init__(
+        self,
+        domain: Domain,
+        u: fem.Function,
+        law: SelfContactLaw,
+        build: SurfaceBuilder[SelfContactSurface] | None = None,
+    ) -> None:
+        """Raise InputError where the surface at rest intersects itself (collective).
+
+        `build`: function that builds its surface; None: in contact with itself.
+        """
         self._domain, self._u = domain, u
         self._owned, self.comm = domain.node_count * domain.dim, domain.comm
         self._coupling = CouplingBuilder(domain)
         # m^(d-2), times a stiffness in Pa
         self._stiff_threshold = SURFACE.stiff_ratio * domain.mean_edge_length ** (domain.dim - 2)
-        self.surface = BreakingSurface(domain, u, law, self._build_surface, everywhere=True)
-        self.parts = (self.surface,)
+        build = build or partial(SelfContactSurface, comm=domain.comm)
+        self.surface = BreakingSurface(domain, u, law, build, everywhere=True)
+        self.parts = self.surface, CollisionLimit(self)
         first = domain.space.dofmap.index_map.local_range[0]
         # numbers of input nodes
         self._input_nodes = self.surface.gather.to_all_ranks(first + np.arange(domain.node_count))
@@ -194,25 +210,14 @@ class SelfContact(Term):
 
     # --- surface ---
 
-    def _build_surface(
-        self,
-        skeleton: EntityNumbering,
-        pattern: Pattern,
-        law: SelfContactLaw,
-        u: Values,
-        previous: SelfContactSurface | None,
-        cut: Values | None,
-    ) -> SelfContactSurface:
-        return SelfContactSurface(skeleton, pattern, law, u, previous, cut, self.comm)
-
     def _discard_surface(self) -> None:
         """Discard all that belongs to the points of the surface until now."""
         self._positions: Values | None = None
         self._contact_force: Values | None = None
         self._stored: float | None = None
-        self._start_positions: Values | None = None
+        self.start_positions: Values | None = None
         self._tangent_positions: Values | None = None
-        self._friction: SlipFriction | None = None
+        self.friction: SlipFriction | None = None
         self._is_stale = True
 
     def edges_broke(self, pattern: Pattern) -> None:
@@ -224,38 +229,38 @@ class SelfContact(Term):
 
     def begin_step(self, level: TimeLevel) -> None:
         """Lag friction with the contact at the start of the step."""
-        self._level, self._is_stale, self._friction, self._attempts = level, True, None, 0
+        self.level, self._is_stale, self.friction, self._attempts = level, True, None, 0
         if not level.dt:
             return
         nodal, slip, surface = self.surface.nodal_values(level.u_n), self._sticking_slip(level), self.surface.current
         surface.extend_faces(nodal)
-        self._start_positions = x = surface.point_map(nodal)
+        self.start_positions = x = surface.point_map(nodal)
         if self.surface.law.friction:
-            self._friction = surface.pairs.lag_friction(x, x, slip)
+            self.friction = surface.pairs.lag_friction(x, x, slip)
 
     def _sticking_slip(self, level: TimeLevel) -> float:
-        """Slip in the step that counts as sticking, m (collective)."""
-        law = self.surface.law
-        return level.dt * max(law.sticking_speed, law.sticking_speed_ratio * self._speed(level.v_n))
-
-    def _speed(self, v: Values) -> float:
-        """Root mean square of the speeds of nodes relative to their mean, of v (owned dofs,), m/s (collective)."""
-        square, mean = mean_velocities(self.comm, v.reshape(-1, self._domain.dim))
-        return float(np.sqrt(max(float(square - mean @ mean), 0.0)))
+        """Slip in the step that counts as sticking, m, with speeds relative to the body's mean (collective)."""
+        square, mean = mean_velocities(self.comm, level.v_n.reshape(-1, self._domain.dim))
+        speed = float(np.sqrt(max(float(square - mean @ mean), 0.0)))
+        return level.dt * self.surface.law.sticking_speed_at(speed)
 
     def update_displacement(self) -> None:
         """Discard positions and forces, as u has changed."""
         self._is_stale = True
 
-    def _end_positions(self) -> Values:
+    @property
+    def end_displacement(self) -> Values:
+        """(owned dofs,) displacement at the end of the step that belongs to the current u, m."""
+        return self.level.displacement_at_end(self._u.x.array[: self._owned])
+
+    def end_positions(self) -> Values:
         """(n, d) positions at the end of the step that belongs to the current u, m (collective)."""
         if self._is_stale or self._positions is None:
-            u = self._level.displacement_at_end(self._u.x.array[: self._owned])
-            self._positions, self._is_stale = self.surface.positions(u), False
+            self._positions, self._is_stale = self.surface.positions(self.end_displacement), False
             self._contact_force = self._stored = None
         return cast("Values", self._positions)
 
-    def _is_far(self) -> bool:
+    def is_far(self) -> bool:
         """Whether nothing can be in contact at the current u (collective); of a body with itself it is not asked."""
         return False
 
@@ -269,47 +274,43 @@ class SelfContact(Term):
             normal: whether normal forces are included; otherwise those of friction alone.
         """
         gradient = self.surface.current.pairs.gradient(x) if normal else np.zeros_like(x)
-        if self._friction is not None:
-            gradient = gradient + self._friction.gradient(x)
-        return self.surface.gather.sum_owned(self.surface.current.nodal_forces(-gradient)).reshape(-1)
+        if self.friction is not None:
+            gradient = gradient + self.friction.gradient(x)
+        return self.surface.gather.sum_owned(self.surface.current.point_map.nodal_forces(-gradient)).reshape(-1)
 
     def contact_forces(self) -> Values | None:
         """(owned dofs,) contact forces at the end of the step, N; None: nothing is near (collective)."""
-        if self._is_far():
+        if self.is_far():
             return None
-        x = self._end_positions()
+        x = self.end_positions()
         # kept, as residual and reference forces both need them
         if self._contact_force is None:
             self._contact_force = self._nodal_forces(x)
         return self._contact_force
-
-    def reference_forces(self) -> Values | None:
-        """(owned dofs,) contact forces with their weight in the residual, N (collective)."""
-        forces = self.contact_forces()
-        return None if forces is None else np.asarray(self._level.contact_weight * forces)
 
     def coupling_matrix(self) -> PETSc.Mat | StiffCoupling | None:
         """Minus the derivative of the forces; None where nothing is in contact (collective).
 
         Where few directions are much stiffer than the body, they come apart from the matrix (StiffCoupling).
         """
-        if self._is_far():
+        if self.is_far():
             return None
-        x, surface = self._end_positions(), self.surface.current
-        is_near = surface.is_near_tangent(x, self._tangent_positions, again=self._attempts > 1)
-        self._tangent_positions = x
+        x, surface = self.end_positions(), self.surface.current
+        limit = SURFACE.exact_later if self._attempts > 1 else SURFACE.exact_first
+        last, self._tangent_positions = self._tangent_positions, x
+        is_near = last is not None and max_length(x - last) < limit * self.surface.law.distance
         exact = is_near and self.allows_exact_tangent
         H = surface.pairs.hessian(x, exact=exact)
-        if self._friction is not None:
-            H = H + self._friction.hessian(x, exact=exact)
-        H = csr_matrix(self._level.contact_weights.factor * H)
+        if self.friction is not None:
+            H = H + self.friction.hessian(x, exact=exact)
+        H = csr_matrix(self.level.contact_weights.factor * H)
         if not self.comm.allreduce(H.nnz):
             return None
-        matrix = self._coupling(surface.nodal_stiffness(H), self._input_nodes)
+        matrix = self._coupling(surface.point_map.nodal_stiffness(H), self._input_nodes)
         stiff = stiff_directions(H, self._stiff_threshold * self.surface.law.stiffness, self.comm)
         if stiff is None:
             return matrix
-        directions, stiffness = self.surface.gather.owned(surface.nodal_directions(stiff[0])), stiff[1]
+        directions, stiffness = self.surface.gather.owned(surface.point_map.nodal_directions(stiff[0])), stiff[1]
         return StiffCoupling(matrix, directions.reshape(self._owned, len(stiffness)), stiffness)
 
     def min_gap(self) -> float:
@@ -319,9 +320,9 @@ class SelfContact(Term):
 
     def stored_energy(self) -> float:
         """Energy of the barrier at the current u, of this rank's pairs, J (collective)."""
-        if self._is_far():
+        if self.is_far():
             return 0.0
-        x = self._end_positions()
+        x = self.end_positions()
         # kept, as the line search and the energy balance both need it
         if self._stored is None:
             self._stored = self.surface.current.pairs.energy(x)
@@ -332,9 +333,9 @@ class SelfContact(Term):
 
         The energy is that of this rank's pairs.
         """
-        if self._is_far():
+        if self.is_far():
             return 0.0
-        x, pairs, law = self._end_positions(), self.surface.current.pairs, self.surface.law
+        x, pairs, law = self.end_positions(), self.surface.current.pairs, self.surface.law
         gap = self.comm.allreduce(pairs.min_gap(x), op=MPI.MIN)
         if (factor := stiffness_factor(gap / law.distance)) <= 1:
             return 0.0
@@ -344,40 +345,20 @@ class SelfContact(Term):
 
     def damping_forces(self) -> Values | None:
         """(owned dofs,) minus the forces of friction, N (collective)."""
-        return -self._nodal_forces(self._end_positions(), normal=False) if self.surface.law.friction else None
+        return -self._nodal_forces(self.end_positions(), normal=False) if self.surface.law.friction else None
 
     def potential(self) -> float:
         """Potential of barrier and friction as they enter the residual, of this rank's pairs, J (collective)."""
-        if self._is_far():
+        if self.is_far():
             return 0.0
-        x, energy = self._end_positions(), self.stored_energy()
-        if self._friction is not None:
-            energy += self._friction.energy(x)
-        return self._level.contact_weight * self._level.fraction * energy
-
-    # --- step limits ---
-
-    def max_step_fraction(self, change: Values) -> float:
-        """Fraction of a change of u (owned dofs,), m, without a collision (collective)."""
-        return self._free_fraction(self._end_positions(), np.divide(change, self._level.fraction))
-
-    def _free_fraction(self, x: Values, motion: Values) -> float:
-        """Fraction of a motion (owned dofs,) from positions x (n, d), m, without a collision (collective)."""
-        surface, nodal = self.surface.current, self.surface.nodal_values(motion)
-        return surface.pairs.free_fraction(x, x + surface.point_map.weights @ nodal)
+        x, energy = self.end_positions(), self.stored_energy()
+        if self.friction is not None:
+            energy += self.friction.energy(x)
+        return self.level.contact_weight * self.level.fraction * energy
 
     def begin_solve(self) -> None:
         """Count an attempt of Newton's method; after a failure tangents become exact later."""
         self._tangent_positions, self._attempts = None, self._attempts + 1
-
-    def feasible_guess(self, u: Values) -> Values:
-        """(owned dofs,) first guess of u, m, as far on its way from the start as there is no collision (collective)."""
-        level = self._level
-        if not level.dt:
-            return u
-        assert self._start_positions is not None
-        fraction = self._free_fraction(self._start_positions, level.displacement_at_end(u) - level.u_n)
-        return u if fraction == 1 else np.asarray(level.u_n + fraction * (u - level.u_n))
 
     def clear_search(self) -> None:
         """Discard the candidates of collision detection (not collective)."""
@@ -387,6 +368,30 @@ class SelfContact(Term):
     def destroy(self) -> None:
         """Destroy the objects of PETSc."""
         self._coupling.destroy()
+
+
+class CollisionLimit:
+    """Step limits of a body that moves along straight lines and cannot collide with itself."""
+
+    def __init__(self, term: SelfContact) -> None:
+        self._term = term
+
+    def max_step_fraction(self, change: Values) -> float:
+        """Fraction of a change of u (owned dofs,), m, without a collision (collective)."""
+        return self._free_fraction(self._term.end_positions(), np.divide(change, self._term.level.fraction))
+
+    def _free_fraction(self, x: Values, motion: Values) -> float:
+        """Fraction of a motion (owned dofs,) from positions x (n, d), m, without a collision (collective)."""
+        surface, nodal = self._term.surface.current, self._term.surface.nodal_values(motion)
+        return surface.pairs.free_fraction(x, x + surface.point_map.weights @ nodal)
+
+    def feasible_guess(self, u: Values) -> Values:
+        """(owned dofs,) first guess of u, m, as far on its way from the start as there is no collision (collective)."""
+        level, start = self._term.level, self._term.start_positions
+        if not level.dt or start is None:
+            return u
+        fraction = self._free_fraction(start, level.displacement_at_end(u) - level.u_n)
+        return u if fraction == 1 else np.asarray(level.u_n + fraction * (u - level.u_n))
 
 
 def mean_velocities(comm: MPI.Intracomm, v: Values) -> tuple[float, Values]:

@@ -164,15 +164,15 @@ class ConvexBody(ABC):
 
     def distance(self, x: Values) -> Values:
         """(n,) signed distances of points x (n, d), m."""
-        return self._sign * self._distance(x)
+        return _sign(self.hollow) * self._distance(x)
 
     def normal(self, x: Values) -> Values:
         """(n, d) gradients of the distance."""
-        return self._sign * self._normal(x)
+        return _sign(self.hollow) * self._normal(x)
 
     def curvature(self, x: Values) -> Values:
         """(n, d, d) Hessians of the distance, 1/m."""
-        return self._sign * self._curvature(x)
+        return _sign(self.hollow) * self._curvature(x)
 
     def tessellate(self) -> Tessellation:
         """Closed surface or polygon; that of a hollow body faces inwards."""
@@ -203,16 +203,12 @@ class ConvexBody(ABC):
 
     def inset(self, by: float) -> Self:
         """The obstacle with its surface receded by `by` <= `max_inset`, m: distances grow by at least as much."""
-        return self._resized(-self._sign * by)
+        return self._resized(-_sign(self.hollow) * by)
 
     @property
     def max_inset(self) -> float:
         """Largest inset, m; infinite for a hollow body."""
         return float("inf") if self.hollow else self._depth() / 2
-
-    @property
-    def _sign(self) -> float:
-        return -1.0 if self.hollow else 1.0
 
     @abstractmethod
     def _resized(self, by: float) -> Self:
@@ -240,6 +236,10 @@ class ConvexBody(ABC):
     @abstractmethod
     def _moments(self) -> tuple[float, Values]:
         """Volume and second moments S (d, d) of the filled body."""
+
+
+def _sign(hollow: bool) -> float:
+    return -1.0 if hollow else 1.0
 
 
 def resized_fillet(fillet: float, by: float) -> float:

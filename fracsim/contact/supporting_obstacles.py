@@ -76,12 +76,26 @@ def build_inactive_at_rest[Term: ObstacleTerm](
         offsets = np.clip(SET_DOWN.clearance * width - gaps, 0.0, limits)
         moved = [offset_obstacle(*item) for item in zip(obstacles, offsets, strict=True)]
         term = build(moved, _with_width(law, width))
-        rest_gaps = term.rest_gaps()
+        rest_gaps = _rest_gaps(term)
         if number == SET_DOWN.max_rounds - 1 or (rest_gaps >= width).all():
             break
         term.destroy()
         gaps = np.minimum(gaps, rest_gaps - offsets)
     return term
+
+
+def _rest_gaps(term: ObstacleTerm) -> Values:
+    """(obstacles,) least gaps of the body at rest to each obstacle at t = 0, m (collective).
+
+    Gaps of points, and of facets where the obstacle acts on them.
+    """
+    x, posed = term.surface.rest_positions, [obstacle.posed_at(0.0) for obstacle in term.obstacles]
+    gaps = np.array([term.surface.min_distance(shape.distance(x)) for shape in posed])
+    for number in term.facets.numbers:
+        facet_gaps = term.facets.active.gaps(posed[number], x, term.barrier_width)
+        gaps[number] = min(gaps[number], float(facet_gaps.min(initial=np.inf)))
+    term.comm.Allreduce(MPI.IN_PLACE, gaps, MPI.MIN)
+    return gaps
 
 
 def pair_obstacles(obstacles: Sequence[RigidObstacle], width: float, edge: float) -> dict[int, RigidObstacle]:

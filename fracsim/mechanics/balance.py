@@ -393,6 +393,8 @@ class EnergySums:
         references = [
             forces for term in balance.terms_with["reference_forces"] if (forces := term.reference_forces()) is not None
         ]
+        # contact forces with their weight in the residual
+        references += [balance.level.contact_weight * forces for forces in balance.contact.forces_of_terms()]
         inertia = balance.mass.lumped * u if balance.c_a else 0.0
         parts = (*references, balance.reactions[balance.motion.owned_dofs], u, inertia)
         *loads, moved, carried = np.sqrt(

@@ -68,7 +68,7 @@ class StepLimiter(Protocol):
 
 
 @runtime_checkable
-class ContactTerm(StepLimiter, Protocol):
+class ContactTerm(Protocol):
     """Term whose forces act at the end of the step, with gaps that stay open."""
 
     def contact_forces(self) -> Values | None:
@@ -265,9 +265,13 @@ class ContactTerms:
         self._limiting_terms = [term for term in terms if fulfilling([term], StepLimiter)]
         self.limits_newton_steps = bool(self._limiters)
 
+    def forces_of_terms(self) -> list[Values]:
+        """(owned dofs,) forces at the end of the step of each term with something in contact, N (collective)."""
+        return [force for term in self._contacts if (force := term.contact_forces()) is not None]
+
     def forces(self) -> Values | None:
         """(owned dofs,) contact forces at the end of the step, N; None if nothing is in contact (collective)."""
-        forces = [force for term in self._contacts if (force := term.contact_forces()) is not None]
+        forces = self.forces_of_terms()
         return sum(forces[1:], forces[0]) if forces else None
 
     def is_active(self) -> bool:

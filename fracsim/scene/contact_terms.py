@@ -120,7 +120,7 @@ def build_obstacle_terms(
     if meshes:
         terms.append(_build_mesh_obstacle_term(study, domain, u, motion, meshes, law, stress, mass, scheme))
     for term in terms:
-        motion.contacts.append(term)
+        motion.contacts.append(term.pose_contact)
     return [*terms, motion]
 
 

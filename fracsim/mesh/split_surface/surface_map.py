@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix, diags
+from scipy.sparse import csr_matrix, diags, kron
 
 from ..simplices import is_split
 from .closed_surface import SplitSurface, SurfacePoints
@@ -76,6 +76,29 @@ class SurfaceMap:
         """(k, d) positions x of `points` (k,) with other shares (k,); u (nodes, d), m."""
         middle = self._middle[points] + self._mean[points] @ u
         return np.asarray(middle + share[:, None] * (self._out[points] + self._arms[points] @ u))
+
+    # --- from points to nodes ---
+
+    def nodal_forces(self, forces: Values) -> Values:
+        """(nodes, d) forces on nodes of forces (n, d) on the points, N."""
+        return np.asarray(self.weights.T @ forces)
+
+    def nodal_stiffness(self, H: csr_matrix) -> csr_matrix:
+        """(nodes d, nodes d) stiffness at the nodes of second derivatives H (n d, n d) at the points, N/m."""
+        W, used = self._used_weights(H)
+        return (W.T @ H[used][:, used] @ W).tocsr()
+
+    def nodal_directions(self, directions: csr_matrix) -> Values:
+        """(nodes, d m) directions of the nodes of directions (n d, m) of the points."""
+        W, used = self._used_weights(directions)
+        return np.asarray((W.T @ directions[used]).toarray().reshape(self.weights.shape[1], -1))
+
+    def _used_weights(self, rows: csr_matrix) -> tuple[csr_matrix, Ints]:
+        """(k d, nodes d) weights of the points with entries in `rows` (n d, m), and (k d,) their rows: mostly few."""
+        d = self.rest.shape[1]
+        points = np.unique(np.flatnonzero(np.diff(rows.indptr)) // d)
+        used = (d * points[:, None] + np.arange(d)).reshape(-1)
+        return kron(self.weights[points], np.eye(d), format="csr"), used
 
 
 def row_entries(matrix: csr_matrix, rows: Ints) -> tuple[Ints, Ints]:
