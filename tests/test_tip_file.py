@@ -13,13 +13,7 @@ from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.studies.evidence.run_results import columns
 from support.ranks import OnRanks, Results, starting
-from support.tip_rows import LENGTH, STRESS, strip, wedged
-
-
-def edge_crack_intensity(a: float) -> float:
-    """K_I, Pa sqrt(m), of an edge crack of length a, m, in a strip (Tada, Paris, Irwin: Stress analysis of cracks)."""
-    factor = 1.122 - 0.231 * a + 10.55 * a**2 - 21.71 * a**3 + 30.382 * a**4
-    return float(STRESS * np.sqrt(np.pi * a) * factor)
+from support.tip_rows import LENGTH, edge_crack_intensity, strip, wedged
 
 
 def test_stress_intensities_are_those_of_the_handbook(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ balance                     sum of the terms: residual, reactions, energies
 tangent                     derivative of the residual
 stress                      stress of a body with damage and plastic flow
 polar_rotation              rotations of the corotated energy (C)
+contour_integral            J-integral around a point
 inertia, damping            mass matrix and inertia; drag and viscosity
 loads                       dead loads and pressures
 node_ties                   ties of nodes without an unsplit cell

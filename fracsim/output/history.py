@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from io import RawIOBase
@@ -70,6 +70,7 @@ class ProbeReader:
 
     def __init__(
         self, balance: Balance, probes: Sequence[ProbeGroup] = (), *, motions: dict[str, TimeFunction] | None = None,
+        contours: Mapping[str, VectorReading] | None = None,
         onset_reactions: Callable[[], npt.NDArray[np.float64] | None] | None = None, thickness: float = 1.0,
     ) -> None:  # fmt: skip
         """Count the nodes of each probe (collective).
@@ -80,6 +81,7 @@ class ProbeReader:
             motions: prescribed displacement (d,) in m of each driven obstacle, by name.
             onset_reactions: (owned dofs,) reactions before edges broke in the step, N, or None before the first step;
                 None: they are not recorded.
+            contours: J-integrals (d,), J/m^2, by name.
             thickness: thickness of a 2D body, m; 1 in 3D.
         """
         self._balance, self._domain = balance, balance.domain
@@ -96,6 +98,7 @@ class ProbeReader:
         loaded = [probe for probe in probes if probe.quantity == "reaction"]
         if onset_reactions is not None:
             probed |= {f"onset_{probe.name}": self._reaction(probe, onset_reactions) for probe in loaded}
+        probed |= {f"J_{name}": contour for name, contour in (contours or {}).items()}
         moved = {f"motion_{probe.name}": self._mean_displacement(probe) for probe in loaded}
         moved |= {f"motion_{name}": partial(self._obstacle_motion, motion) for name, motion in (motions or {}).items()}
         self.columns = [f"{name}_{axis}" for name in probed for axis in axes] + [*term_readings]

@@ -136,8 +136,8 @@ class TipFile:
         reading = self._record.reading
         if reading is None:
             return
-        own = np.column_stack([reading.cell, reading.point, reading.release_rate, reading.intensities])
-        rows: Values = np.concatenate(allgather(self._comm, own))
+        local_rows = np.column_stack([reading.cell, reading.point, reading.release_rate, reading.intensities])
+        rows: Values = np.concatenate(allgather(self._comm, local_rows))
         write_on_root(self._comm, self._path, lambda: append_bytes(self._path, self._lines(step, t, rows).encode()))
 
     def _lines(self, step: int, t: float, rows: Values) -> str:

@@ -45,6 +45,7 @@ from .terms import TERMS, TermInputs, build_balance, build_material  # noqa: E40
 
 if TYPE_CHECKING:
     from ..fracture.fracture_pass import FracturePass as EdgeBreaking
+    from ..mechanics.contour_integral import ContourIntegral
 
 __all__ = [
     "TERMS",
@@ -147,7 +148,7 @@ def build_scene_on(
     motions = {obstacle.name: obstacle.displacement for obstacle in placements if obstacle.displacement is not None}
     solves_again = breaking is not None and not scheme.inertia
     probes = ProbeReader(
-        balance, _probes(study, domain), motions=motions, thickness=study.thickness,
+        balance, _probes(study, domain), motions=motions, contours=_contours(study, balance), thickness=study.thickness,
         onset_reactions=(lambda: stepper.onset_reactions) if solves_again else None,
     )  # fmt: skip
     return Scene(study, domain, balance, solver, stepper, breaking, probes)
@@ -197,6 +198,8 @@ def _probes(study: Study, domain: Domain) -> list[ProbeGroup]:
     """Return the entries of [[probe]] with their nodes (collective)."""
     probes = []
     for i, entry in enumerate(study.probe):
+        if entry.quantity == "J":
+            continue
         if entry.point is not None:
             key = f"probe.{i}.point"
             nodes = nearest_node(domain, check_size(entry.point, domain.dim, key), key)
@@ -206,3 +209,16 @@ def _probes(study: Study, domain: Domain) -> list[ProbeGroup]:
             nodes = select_nodes(domain, find_selector(entry.on, domain.dim, key), key)
         probes.append(ProbeGroup(entry.name, entry.quantity, nodes))
     return probes
+
+
+def _contours(study: Study, balance: Balance) -> dict[str, ContourIntegral]:
+    """Return the J-integrals of [[probe]] by name (collective)."""
+    contours = {}
+    for i, entry in enumerate(study.probe):
+        if entry.contour is not None:
+            from ..mechanics.contour_integral import ContourIntegral
+
+            assert entry.point is not None
+            centre, key = check_size(entry.point, balance.domain.dim, f"probe.{i}.point"), f"probe.{i}.contour"
+            contours[entry.name] = ContourIntegral(balance.stress, centre, entry.contour, key)
+    return contours

@@ -142,6 +142,10 @@ def _check_dimensions(study: Study, summary: MeshSummary) -> None:
     for i, probe in enumerate(study.probe):
         if probe.point is not None:
             _check_inside(probe.point, summary, f"probe.{i}.point")
+        if probe.contour is not None and study.time.scheme != "quasi-static":
+            raise InputError(
+                f'probe.{i}.contour: the J-integral is that of a body in equilibrium; give time.scheme = "quasi-static"'
+            )
     if dim == 3 and study.material.thickness is not None:
         raise InputError("material.thickness is that of 2D meshes; this one has 3 dimensions: remove it")
     if dim == 3 and study.material.plane == "stress":

@@ -127,12 +127,16 @@ class ProbeSettings(StudyTable):
 
     name: Name = key(
         "Name in the columns of history.csv: reaction_NAME_x and motion_NAME_x (mean displacement) of a group, "
-        "probe_NAME_x of a point.",
+        "probe_NAME_x of a point, J_NAME_x of a contour.",
         example="grip",
     )  # fmt: skip
     point: Vector | None = key(
         "Position at rest; the nearest node is recorded.", "m", default=None, example=[0.4, 0.05, 0.05]
     )
+    contour: Positive | None = key(
+        "Radius around `point` of the ring of cells over which the J-integral is evaluated (quasi-static).", "m",
+        default=None, example=0.01, otherwise="no J-integral",
+    )  # fmt: skip
     on: Selector | None = key(
         "Name of a facet group, or a table that selects a box or a plane.", default=None, example="right"
     )
@@ -149,11 +153,15 @@ class ProbeSettings(StudyTable):
             raise ValueError("give either point or on")
         if self.point is not None and self.record == "reaction":
             raise ValueError("a reaction is summed over a group or selection: give on instead of point")
+        if self.contour is not None and (self.point is None or self.record is not None):
+            raise ValueError("contour is the radius of a J-integral around a point: give point, neither on nor record")
         return self
 
     @property
-    def quantity(self) -> Literal["displacement", "reaction"]:
+    def quantity(self) -> Literal["displacement", "reaction", "J"]:
         """The recorded quantity, with its default."""
+        if self.contour is not None:
+            return "J"
         return self.record or ("displacement" if self.point is not None else "reaction")
 
 

@@ -34,6 +34,12 @@ def strip(**tables: Any) -> Any:
     } | tables)  # fmt: skip
 
 
+def edge_crack_intensity(a: float) -> float:
+    """K_I, Pa sqrt(m), of an edge crack of length a, m, in a strip (Tada, Paris, Irwin: Stress analysis of cracks)."""
+    factor = 1.122 - 0.231 * a + 10.55 * a**2 - 21.71 * a**3 + 30.382 * a**4
+    return float(STRESS * np.sqrt(np.pi * a) * factor)
+
+
 def wedged(**tables: Any) -> Any:
     """A beam of 3 m by 0.6 m with cracks from both ends that open by the same displacement: each grows step by step."""
     up, down = ([[0.0, sign * value] for value in (0.0, 2.2e-3)] for sign in (1, -1))
