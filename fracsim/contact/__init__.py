@@ -5,10 +5,11 @@ with itself, is computed by ipctk.
 
 Terms of the balance:
 
-    rigid_obstacles       motion of all obstacles: prescribed, and inertia, weight and poses of free ones
-    obstacle_term         the body before analytic obstacles; contact_state: points and obstacles in a step
+    rigid_obstacles       motion of all obstacles; groups of obstacles, and what they did to the body in a step
+    rigid_pose            free obstacles in implicit steps: poses as unknowns of Newton's method
+    obstacle_term         the body before analytic obstacles; contact_state: points, facets and obstacles in a step
     mesh_obstacle_term    the body before triangle-mesh obstacles
-    self_contact          a body with itself, and its fragments with one another
+    self_contact          a body with itself, and its fragments with one another; its surface as edges break
     penalty_obstacles     the body before analytic obstacles in explicit steps
     penalty_contact       the body with itself, and before triangle-mesh obstacles, in explicit steps
 
@@ -40,9 +41,8 @@ Surfaces with ipctk:
 
 Free obstacles:
 
-    rigid_body            incremental potential of poses
+    rigid_body            states of motion; incremental potential of poses
     pose_derivatives      derivatives of contact by a pose
-    rigid_pose            poses as unknowns of Newton's method
     obstacle_pairs, mesh_pairs  contact between obstacles: analytic ones, triangle meshes
     penalty_obstacle_pairs  both in explicit steps
 

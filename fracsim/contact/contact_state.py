@@ -117,6 +117,7 @@ class SurfaceFacets:
             posed: obstacles.
         """
         excluded = self._corner_identities(self._excluded)
+        # identified before, as their points have other numbers afterwards
         old_identity, surface = add_faces(), self._surface
         self.clear_caches()
         if not self.numbers or self._may_be_cut:
@@ -263,7 +264,6 @@ class ContactState:
         self._contact_forces: list[ContactForces] | None = None
         self._nodal_forces: Values | None = None  # of the present contact forces
         self._sticking_slips: list[float] | None = None  # m, of each obstacle in the step; None: not known yet
-        self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
         self._attempts = 0  # of Newton's method in the step
         self._tangent_positions: Values | None = None  # of the points at the last tangent of this attempt
         items = dict(zip(self.numbers, self.obstacles, strict=True))
@@ -281,10 +281,9 @@ class ContactState:
         self.group.bodies.begin_step(level)
         self.level, self._attempts = level, 0
         self.update_displacement()
-        end = level.t + (1 - level.fraction) * level.dt
-        if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
-            return  # evaluation of a step's result: lagged contact and motions are still those of the step
-        self._end, self._dt, self._start_velocity = end, level.dt, level.v_n
+        if self.group.bodies.evaluates_result:
+            return  # lagged contact is still that of the step
+        self._start_velocity = level.v_n
         self._discard_start()
         if level.dt:
             self._begin_new_step()
@@ -292,7 +291,7 @@ class ContactState:
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Add new crack faces near obstacles to the surface (collective)."""
         self._pattern, u = pattern.copy(), self._end_displacement()
-        if self.shows_all_cells or not self._dt:  # before the first step obstacles need not be in place
+        if self.shows_all_cells or not self.group.bodies.dt:  # before the first step obstacles need not be in place
             self._shown.show_all()
         elif not self._shown.update(pattern, self.group.posed, u, None, 0.0):
             return
@@ -311,18 +310,14 @@ class ContactState:
 
     def _show_cells_of_step(self, posed: Sequence[PosedShape]) -> None:
         """Make the surface again if it lacks crack faces that obstacles may reach in the step (collective)."""
-        level = self.level
-        motion, shift = level.dt * level.v_n, self._max_increment()
-        if not self.shows_all_cells and self._shown.update(self._pattern, posed, level.u_n, motion, shift):
-            self._rebuild_surface(level.u_n, posed)
-
-    def _max_increment(self) -> float:
-        """Largest motion of points of the obstacles in the step, m."""
-        d, motions = self._domain.dim, []
-        for posed, q in zip(self.group.posed, self.group.increments, strict=True):
+        if self.shows_all_cells:
+            return
+        level, d, shift = self.level, self._domain.dim, 0.0
+        for shape, q in zip(self.group.posed, self.group.increments, strict=True):
             rotation = float(np.linalg.norm(q[d:]))
-            motions.append(float(np.linalg.norm(q[:d])) + (rotation and rotation * outline_radius(posed)))
-        return max(motions)
+            shift = max(shift, float(np.linalg.norm(q[:d])) + (rotation and rotation * outline_radius(shape)))
+        if self._shown.update(self._pattern, posed, level.u_n, level.dt * level.v_n, shift):
+            self._rebuild_surface(level.u_n, posed)
 
     def _begin_new_step(self) -> None:
         posed, barrier = self.group.start_posed, self.law.barrier
@@ -341,6 +336,7 @@ class ContactState:
                 StepStart(gap, contact.points, contact.normal, contact.position)
                 for gap, contact in zip(gaps, lagged, strict=True)
             ]
+        # for the work of normal forces by the trapezoidal rule
         self._start_forces = [contact.force @ contact.normal for contact in lagged]
         sum_at_points = None if self.comm.size == 1 else self.surface.sum_at_points
         for number in self.facets.numbers:
@@ -387,21 +383,12 @@ class ContactState:
         friction = None
         if lagged is not None and self._sticking_slips is not None:
             friction = CoulombFriction(obstacle.friction, self._sticking_slips[number])
-        obstacle_motion, start = self._contact_point_motion(number), self._step_starts[number]
+        obstacle_motion, start = self.contact_point_motion(number), self._step_starts[number]
         start_posed, candidates = self.group.start_posed[number], self._candidates(number, posed)
         if start is not None:
             start = start.carried_with(start_posed.pose, posed.pose)
-        of_points = evaluate_points(
-            self.positions,
-            self.surface.area,
-            posed,
-            self.law.barrier,
-            lagged,
-            friction,
-            obstacle_motion,
-            start,
-            candidates,
-        )
+        points = self.positions, self.surface.area, posed, self.law.barrier
+        of_points = evaluate_points(*points, lagged, friction, obstacle_motion, start, candidates)
         if number not in self.facets.numbers:
             return of_points
         facet_start = None if start is None else (start_posed, self._start_positions)
@@ -432,14 +419,15 @@ class ContactState:
             velocity = self.surface.interpolation(self._start_velocity)
             for number, lagged in enumerate(self.lagged):
                 if lagged is not None and len(lagged.points):
-                    relative = velocity[lagged.points] - self.group.bodies.velocity(
-                        self.numbers[number], lagged.position
-                    )
+                    of_obstacle = self.group.bodies.velocity(self.numbers[number], lagged.position)
+                    relative = velocity[lagged.points] - of_obstacle
                     speeds[number] = np.linalg.norm(tangential(lagged.normal, relative), axis=1).max()
             self.comm.Allreduce(MPI.IN_PLACE, speeds, MPI.MAX)
-        return [self._dt * max(self.law.sticking_speed, self.law.sticking_ratio * speed) for speed in speeds]
+        return [
+            self.group.bodies.dt * max(self.law.sticking_speed, self.law.sticking_ratio * speed) for speed in speeds
+        ]
 
-    def _contact_point_motion(self, number: int) -> Values:
+    def contact_point_motion(self, number: int) -> Values:
         """(d,) motion of an obstacle in the step, or (k, d) of its points in lagged contact, m."""
         if (lagged := self.lagged[number]) is None:
             return np.zeros(self._domain.dim)
@@ -453,16 +441,3 @@ class ContactState:
             forces = np.concatenate([contact.normal + contact.friction for contact in contacts])
             self._nodal_forces = self.surface.interpolation.assemble_points_to_nodes(points, forces[..., None])[:, 0]
         return self._nodal_forces
-
-    def friction_work(self, number: int) -> tuple[float, float]:
-        """Work of friction on the body in the step, and the part of it done by the obstacle's own motion.
-
-        The difference is dissipated. Both of this rank, J (collective).
-        """
-        contact, lagged = self.obstacle_forces()[number], self.lagged[number]
-        if lagged is None or not len(lagged.points):
-            return 0.0, 0.0
-        force = contact.friction[np.searchsorted(contact.points, lagged.points)]
-        obstacle_motion = self._contact_point_motion(number)
-        motion = self.positions[lagged.points] - lagged.position
-        return float(np.vdot(force, motion)), float((force * obstacle_motion).sum())

@@ -218,6 +218,7 @@ class ContactSurface:
             (k, 2 d + 1) rows that identify the points of crack faces until now.
         """
         old_map, old_identity = self.local.point_map, self.local.identify_points()
+        # nan: excluded points have no gap to keep
         gap = np.where(self.area > 0, gaps(self.positions(u)), np.nan)
         copies = old_map.copies
         retracted = RetractedPoints.select(old_identity, old_map.share[copies], gap[copies], self._width)
@@ -225,6 +226,7 @@ class ContactSurface:
         self.interpolation.destroy()
         self.interpolation = ParentMatrix(self._domain, self.local)
         point_map, nodal = self.local.point_map, self.interpolation.nodal_values(u)
+        # points keep their identity, whatever numbers they have on the new surface
         share, gap = retracted.match(self.local.identify_points(), self._width)
         self.local.point_map, without_room = retract_points(point_map, nodal, point_map.copies, share, gap, gaps)
         self.exclude_points(without_room)

@@ -15,12 +15,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from itertools import chain, repeat
-from typing import ClassVar, Protocol
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
-from scipy.sparse import csr_matrix
 
 from ..errors import InputError
 from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
@@ -30,12 +29,16 @@ from ..mesh.split_surface.point_matching import match_points, point_identity
 from ..mesh.split_surface.surface_map import SurfaceMap, make_surface_map
 from ..meshes.data import format_point
 from .ipc_pairs import IpcPairs, PairShare
-from .sample_points import SlipFriction
+
+if TYPE_CHECKING:
+    from .mesh_obstacles import AllMeshPairs
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
+# pairs of a body with itself, or with several obstacles
+type SurfacePairs = IpcPairs | AllMeshPairs[Any]
 # factors of arms, excluded elements, steps between two releases of faces and steps to the next
 SurfaceSnapshot = tuple[Values, Ints, tuple[int, int]]
 
@@ -101,43 +104,6 @@ class SelfContactLaw:
     def sticking_speed_at(self, speed: float) -> float:
         """Slip velocity that counts as sticking, m/s, of nodes with a speed of `speed`, m/s."""
         return max(self.sticking_speed, self.sticking_speed_ratio * speed)
-
-
-class SurfacePairs(Protocol):
-    """Contact of the points of a surface at x (n, d), m; methods as of IpcPairs."""
-
-    def energy(self, x: Values) -> float:
-        """Energy, J."""
-
-    def gradient(self, x: Values) -> Values:
-        """(n, d) derivatives of the energy, N."""
-
-    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
-        """(n d, n d) second derivatives of the energy, N/m."""
-
-    def lag_friction(self, x: Values, start: Values, slip: float) -> SlipFriction:
-        """Friction with pressures and tangents at x."""
-
-    def pressure(self, x: Values) -> Values:
-        """(n,) pressure on each point, Pa."""
-
-    def min_gap(self, x: Values) -> float:
-        """Least distance within the barrier, m."""
-
-    def intersections(self, x: Values) -> Ints:
-        """(k, 2) elements that intersect."""
-
-    def free_fraction(self, x: Values, end: Values) -> float:
-        """Fraction of the motion from x to `end` without a collision."""
-
-    def search_along(self, x: Values, end: Values) -> None:
-        """Search candidates for the motion from x to `end`."""
-
-    def set_stiffness(self, stiffness: float) -> None:
-        """Set the stiffness, Pa."""
-
-    def clear_caches(self) -> None:
-        """Discard the candidates of collision detection."""
 
 
 class SelfContactSurface:
@@ -262,6 +228,7 @@ class SelfContactSurface:
 
     def _previous_state(self, previous: SelfContactSurface, u: Values) -> tuple[Values, Values]:
         """(n,) factors of arms and pressures, Pa, of points on the previous surface; of new points 1 and 0."""
+        # new points have full arms and no pressure that they may keep
         share, load = np.ones(len(self.split.points)), np.zeros(len(self.split.points))
         pressure, old = previous.pairs.pressure(previous.point_map(u)), previous.point_map.copies
         selected = np.flatnonzero((pressure[old] > 0) | (previous.point_map.share[old] < 1))

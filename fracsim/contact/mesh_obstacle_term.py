@@ -10,23 +10,19 @@ Equations: docs/theory.md#contact.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from scipy.sparse import csr_matrix
 
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
 from ..mesh.parallel import sum_over_ranks
-from ..mesh.split_surface.surface_map import SurfaceMap
 from .ipc_pairs import IpcPairs
 from .ipc_surface import SelfContactLaw
-from .laws import BARRIER
 from .mesh_obstacles import (
     AllMeshPairs,
     MeshContactSurface,
@@ -35,94 +31,16 @@ from .mesh_obstacles import (
     MeshObstaclePairs,
 )
 from .obstacle import RigidObstacle
-from .pair_search import max_length
 from .pose import Pose
 from .pose_derivatives import PoseDerivatives, point_jacobian, point_set_derivatives, sum_of_derivatives
 from .proximity import ProximityTest
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
 from .self_contact import SelfContact, mean_velocities
+from .step_limit import stop_before_meshes
 from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class MeshGuessPolicy:
-    """Tuned numbers of first guesses before triangle-mesh obstacles.
-
-    Attributes:
-        max_rounds: rounds in which points that depend on several nodes are stopped.
-        max_pieces: pieces of a motion, each of an edge's length.
-        min_weight: sum of weights of stopped points from which on a node is moved back.
-        search_margin: factor of the search distance for safe motions.
-        max_search_edges: largest search distance for safe motions, in edges.
-    """
-
-    max_rounds: int = 5
-    max_pieces: int = 50
-    min_weight: float = 1e-3
-    search_margin: float = 1.01
-    max_search_edges: float = 2.0
-
-
-GUESS = MeshGuessPolicy()
-
-
-def stop_before_meshes(
-    point_map: SurfaceMap, pairs: AllMeshPairs[IpcPairs], start: Values, end: Values, start_poses: Sequence[Pose]
-) -> Values:
-    """First guess with points stopped where they would cross an obstacle; the same array where none would.
-
-    Args:
-        point_map: map from nodes to the points of the body's surface.
-        pairs: of obstacles, which are at the end of their motion.
-        start: (nodes, 3) displacements at the start, m.
-        end: (nodes, 3) first guess of displacements at the end, m.
-        start_poses: of the obstacles at the start.
-    """
-    x = point_map(start)
-    for _ in range(GUESS.max_rounds):
-        x_end = point_map(end)
-        if pairs.moving_free_fraction(x, x_end, start_poses) == 1:
-            return end
-        items = zip(pairs.pairs, start_poses, strict=True)
-        correction = np.sum([motion_corrections(*item, x, x_end) for item in items], axis=0)
-        if not correction.any():
-            return end
-        end = end + _node_means(abs(point_map.weights).T, correction)
-    return end
-
-
-def _node_means(weights: csr_matrix, correction: Values) -> Values:
-    """(nodes, 3) means of corrections (n, 3) over the points that are stopped, by `weights` (nodes, n) >= 0."""
-    weight = weights @ correction.any(axis=1).astype(float)
-    counts = weight > GUESS.min_weight
-    return np.where(counts[:, None], (weights @ correction) / np.where(counts, weight, 1.0)[:, None], 0.0)
-
-
-def motion_corrections(pairs: MeshObstaclePairs[IpcPairs], start_pose: Pose, x: Values, end: Values) -> Values:
-    """(n, 3) differences of safe motions of points and their motions from x to `end`, m.
-
-    In the frame of the obstacle a point stops where it comes as near to it as a tenth of its distance; piece by piece,
-    each point by itself.
-    """
-    # motion relative to the obstacle
-    motion = end - pairs.mesh.pose.points_to_space(start_pose.to_body(x))
-    edge = pairs.contact.mean_edge_length
-    count = min(max(1, int(np.ceil(max_length(motion) / edge))), GUESS.max_pieces)
-    # safe and unlimited positions, before the obstacle at its end
-    safe_x, free_x = end - motion, end - motion
-    is_moving = np.ones(len(x), bool)
-    open_ratio = 1 - BARRIER.min_gap_ratio
-    for piece in range(count):
-        step = end - motion * (1 - (piece + 1) / count) - free_x
-        length = np.linalg.norm(step, axis=1)
-        limit = min(GUESS.search_margin * max_length(step) / open_ratio, GUESS.max_search_edges * edge)
-        is_moving &= length <= open_ratio * pairs.safe_distances(safe_x, limit)
-        safe_x = safe_x + np.where(is_moving[:, None], step, 0.0)
-        free_x = free_x + step
-    return np.where(is_moving[:, None], 0.0, safe_x - end)
 
 
 class MeshObstacleTerm(SelfContact):
@@ -162,7 +80,6 @@ class MeshObstacleTerm(SelfContact):
         self.allows_exact_tangent = not any(obstacle.free for obstacle in self.obstacles)
         items = zip(self.numbers, self.obstacles, strict=True)
         self._meshes = [build_mesh_obstacle(*item, edge) for item in items]
-        self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
         self.proximity = ProximityTest(domain, self.obstacles, law.distance)
         self._started_near = True
         self._far: bool | None = None  # at the current u; None: not known yet
@@ -205,13 +122,13 @@ class MeshObstacleTerm(SelfContact):
         """Move obstacles to the end of the step, and lag friction with the contact at its start."""
         self.group.bodies.begin_step(level)
         self.level, self._is_stale, self._far, self._attempts = level, True, None, 0
-        end = level.t + (1 - level.fraction) * level.dt
-        if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
-            return  # evaluation of a step's result: friction and motions are still those of the step
-        self._end, self._dt, self._start_velocity = end, level.dt, level.v_n
+        if self.group.bodies.evaluates_result:
+            return  # friction is still that of the step
+        self._start_velocity = level.v_n
         self.friction = self._tangent_positions = None
         self._started_near = not self.proximity.is_far([level.u_n], self.group.step_poses)
         self.start_positions = None
+        # one row that stands for all points of an obstacle
         zero: Values = np.zeros((1, 3))
         self._start_gradients = [zero for _ in self.obstacles]
         if level.dt and self._started_near:
@@ -284,6 +201,7 @@ class MeshObstacleTerm(SelfContact):
         x = self.surface.positions(u)
         end = x if change is None else x + self.surface.current.point_map.weights @ self.surface.nodal_values(change)
         starts, ends = zip(*poses, strict=True)
+        # pairs take obstacles from the given poses to where they are
         self._place_meshes(ends)
         fraction = self.pairs.moving_free_fraction(x, end, starts)
         self._place_meshes(starts)
@@ -333,7 +251,7 @@ class MeshObstacleTerm(SelfContact):
         if self.is_far():
             return [0.0] * len(self.obstacles)
         x, v = self.end_positions(), self.surface.nodal_values(self._start_velocity)
-        motion, result = self._dt * (self.surface.current.point_map.weights @ v), []
+        motion, result = self.group.bodies.dt * (self.surface.current.point_map.weights @ v), []
         for pairs, start_pose in zip(self.pairs.pairs, self.group.start_poses, strict=True):
             result.append(approach(pairs, start_pose, x, motion))
         return result
@@ -394,6 +312,7 @@ class MeshPoseContact:
     def _own_derivatives(self, number: int, x: Values, *, exact: bool) -> PoseDerivatives | None:
         """Derivatives by the pose of an obstacle of this rank's pairs, the body at x (n, 3), m; None: it is far."""
         pairs, n = self._term.pairs.pairs[self.group.numbers.index(number)], len(x)
+        # far on this rank; others may be near
         if pairs.is_far(x):
             return None
         points, mesh = pairs.with_mesh(x), slice(3 * n, None)

@@ -103,6 +103,7 @@ class ObstacleTerm(ContactState, Term):
     def coupling_matrix(self) -> PETSc.Mat | None:
         """Minus the derivative of the forces; None where nothing is in contact (collective)."""
         contacts, exact = self.obstacle_forces(), self.uses_exact_tangent()
+        # the next tangent is exact where points have hardly moved since
         self._tangent_positions = self.positions
         points = np.concatenate([contact.points for contact in contacts])
         if not self.comm.allreduce(len(points)):
@@ -144,9 +145,22 @@ class ObstacleTerm(ContactState, Term):
         group, indices = self.group, range(len(self.obstacles))
         group.friction_loss, group.forces = 0.0, [self._current_force(number) for number in indices]
         for number in indices:
-            on_body, by_obstacle = self.friction_work(number)
+            on_body, by_obstacle = self._friction_work(number)
             group.work[number] = self._normal_work(number) + by_obstacle
             group.friction_loss += by_obstacle - on_body
+
+    def _friction_work(self, number: int) -> tuple[float, float]:
+        """Work of friction on the body in the step, and the part of it done by the obstacle's own motion.
+
+        The difference is dissipated. Both of this rank, J (collective).
+        """
+        contact, lagged = self.obstacle_forces()[number], self.lagged[number]
+        if lagged is None or not len(lagged.points):
+            return 0.0, 0.0
+        force = contact.friction[np.searchsorted(contact.points, lagged.points)]
+        obstacle_motion = self.contact_point_motion(number)
+        motion = self.positions[lagged.points] - lagged.position
+        return float(np.vdot(force, motion)), float((force * obstacle_motion).sum())
 
     def _normal_work(self, number: int) -> float:
         """Work of normal forces on the body by the motion of an obstacle in the step, this rank's share, J."""
@@ -181,6 +195,7 @@ class ObstacleTerm(ContactState, Term):
         level = self.level
         if not level.dt:
             return u
+        # free obstacles have a first guess of their own (rigid_pose)
         prescribed = self.group.bodies.prescribed_motions()
         motions = [(*prescribed[n], self.facets_for(i)) for i, n in enumerate(self.numbers) if n in prescribed]
         end = stop_before_obstacles(self.surface, motions, level.u_n, level.displacement_at_end(u))
@@ -235,7 +250,7 @@ class ObstacleTerm(ContactState, Term):
 
         It is that of the velocities at the start, without any contact; of this rank's points.
         """
-        motion, result = self._dt * self.surface.interpolation(self._start_velocity), list[float]()
+        motion, result = self.group.bodies.dt * self.surface.interpolation(self._start_velocity), list[float]()
         for increment, posed, contact in zip(
             self.group.increments, self.group.posed, self.obstacle_forces(), strict=True
         ):

@@ -326,6 +326,7 @@ class PenaltyContact(Term):
 
     def begin_step(self, level: TimeLevel) -> None:
         """Begin a step with the springs of friction of the last one (collective)."""
+        # of the end of the last step, before it is discarded
         is_idle = self.state.is_idle()
         self.update_displacement()
         self._starts = None
@@ -439,12 +440,14 @@ class PenaltyMeshContact(PenaltyContact):
         """Move obstacles to the end of the step; springs of friction begin with those of the last one (collective)."""
         self.group.bodies.begin_step(level)
         self._start_velocity, self._dt = level.v_n, level.dt or self._dt
+        # springs of friction begin with both sides at the start
         self._move_to(self.group.bodies.start_posed)
         super().begin_step(level)
         self._move_to(self.group.bodies.posed)
 
     def accept_step(self) -> None:
         """Store contacts, forces, work and dissipation of the step (collective)."""
+        # work by the trapezoidal rule, as of velocity Verlet
         last, self._wrenches = self._wrenches, [np.zeros(6) for _ in self.numbers]
         super().accept_step()
         self.group.work = [

@@ -272,6 +272,7 @@ class _BoundingBox:
 
     def swept(self, start: Pose, end: Pose) -> tuple[Values, Values]:
         """(3,) corners of a box around the motion between two poses, m; with a rotation, around a sphere."""
+        # a rotated box would have to be rotated too; the sphere is valid for any rotation
         rotated = not all(np.array_equal(pose.rotation, np.eye(3)) for pose in (start, end))
         low, high = (-self._radius, self._radius) if rotated else (self._low, self._high)
         return np.minimum(start.centre, end.centre) + low, np.maximum(start.centre, end.centre) + high

@@ -88,6 +88,8 @@ class RigidObstacles(Term):
         increments: (p,) increment of each pose in the step.
         motions: states of motion of free ones.
         contacts: terms of contact of the body with some of the obstacles each.
+        dt: size of the current or last step, s; 0 before the first one.
+        evaluates_result: whether the current level is the result of the last step, not a new step or state.
     """
 
     name = "rigid"
@@ -106,7 +108,7 @@ class RigidObstacles(Term):
         self.contacts: list[PoseContact] = []
         self._tessellations = ObstacleTessellations(self.obstacles, domain.bounds.lower, domain.bounds.upper)
         self._level: TimeLevel | None = None
-        self._end, self._dt = -np.inf, 0.0  # s, of the current or last step
+        self._end, self.dt, self.evaluates_result = -np.inf, 0.0, False
         self._travelled = 1.0  # fraction of the prescribed motion
         self.motions = FreeMotions(self.free, self.comm.rank == 0, self._motions_restored)
         self.parts = (self.motions,) if self.free else ()
@@ -120,9 +122,10 @@ class RigidObstacles(Term):
             return
         self._level = level
         end = level.t + (1 - level.fraction) * level.dt
-        if not level.dt and abs(end - self._end) <= 1e-9 * self._dt:
-            return  # evaluation of a step's result: motions are still those of the step
-        self._end, self._dt = end, level.dt
+        self.evaluates_result = not level.dt and abs(end - self._end) <= 1e-9 * self.dt
+        if self.evaluates_result:
+            return  # motions are still those of the step
+        self._end, self.dt = end, level.dt
         self._place(end - level.dt, end)
 
     def _place(self, start: float, end: float) -> None:
@@ -131,6 +134,7 @@ class RigidObstacles(Term):
         self.posed = [obstacle.posed_at(end) for obstacle in self.obstacles]
         self.start_posed = [obstacle.posed_at(start) for obstacle in self.obstacles]
         self.increments = [obstacle.pose_increment(start, end) for obstacle in self.obstacles]
+        # free ones start where their last step ended
         for number, obstacle in self.free.items():
             shape = self.obstacles[number].shape
             self.posed[number] = self.start_posed[number] = PosedShape(shape, obstacle.motion.pose)
@@ -162,7 +166,7 @@ class RigidObstacles(Term):
 
     def velocity(self, number: int, x: Values) -> Values:
         """(d,) velocity of an obstacle at the start of the step, or (n, d) of its points at x (n, d), m/s."""
-        return np.asarray(self.increments[number][: self.dim] / self._dt)
+        return np.asarray(self.increments[number][: self.dim] / self.dt)
 
     def correction_increments(self) -> Increments:
         """Increments of free poses in a correction of Newton's method."""
@@ -201,6 +205,7 @@ class RigidObstacles(Term):
         remaining = 1.0 - self._travelled
         increments = {number: remaining * self.increments[number] for number in self.prescribed}
         fraction = self.free_fraction(increments, u)
+        # exactly 1, as Newton's method ends when nothing remains
         self._move_prescribed(1.0 if fraction == 1 else self._travelled + fraction * remaining)
 
     def free_fraction(self, increments: Increments, u: Values | None = None) -> float:
@@ -267,6 +272,7 @@ class VerletRigidObstacles(RigidObstacles):
                 of_pairs[number] += wrench
                 work_of_pairs[number] += work
         of_body = {number: wrench for contact in self.contacts for number, wrench in contact.wrenches().items()}
+        # each obstacle ends its step once, with all that acts on it
         for number, wrench_of_body in of_body.items():
             work = self.free[number].end_step(self.posed[number], wrench_of_body + of_pairs[number])
             self._contact_work[number] = work - work_of_pairs[number]

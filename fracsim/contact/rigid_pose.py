@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -29,7 +28,7 @@ from .obstacle_pairs import AllPairs
 from .pose import PosedShape, solve_matrix
 from .pose_derivatives import PoseDerivatives
 from .rigid_body import SOLVER, RigidStep, RigidSystem, SystemDerivatives, is_positive_definite
-from .rigid_obstacles import Increments, PoseContact, RigidObstacles
+from .rigid_obstacles import Increments, RigidObstacles
 
 Values = npt.NDArray[np.float64]
 
@@ -110,24 +109,6 @@ class FreePose:
                 yield np.asarray(np.linalg.lstsq(self.body.motion_basis[:d], increment[:d], rcond=None)[0])
 
 
-class BodyContact(Protocol):
-    """Contact of the body with free obstacles, at the current u and poses.
-
-    Attributes:
-        posed: all obstacles at their poses, by their numbers.
-        contacts: terms of contact of the body with some of the obstacles each.
-    """
-
-    posed: list[PosedShape]
-    contacts: list[PoseContact]
-
-    def free_fraction(self, increments: Mapping[int, Values]) -> float:
-        """Fraction of increments (p,) of free poses on which no gap closes, the body at rest (collective)."""
-
-    def poses_moved(self) -> None:
-        """Take over the poses of free obstacles, and discard forces (not collective)."""
-
-
 @dataclass(frozen=True)
 class PoseEquations:
     """Equations of the poses of all free obstacles; K: number of their unknowns.
@@ -177,8 +158,10 @@ class PoseUnknowns:
         has_step: whether a step has begun, and not the evaluation of a state.
     """
 
-    def __init__(self, comm: MPI.Intracomm, free: Mapping[int, FreePose], pairs: AllPairs, body: BodyContact) -> None:
-        """`body`: contact of the body with them."""
+    def __init__(
+        self, comm: MPI.Intracomm, free: Mapping[int, FreePose], pairs: AllPairs, body: FreeRigidObstacles
+    ) -> None:
+        """`body`: the term, which has contact of the body with them."""
         self.free, self.pairs, self._comm, self._body, self.has_step = free, pairs, comm, body, False
         # at the current u and poses
         self._equations: dict[bool, PoseEquations] = {}  # whether with exact second derivatives ->
@@ -372,6 +355,7 @@ class FreeRigidObstacles(RigidObstacles):
             pose.begin_step(
                 RigidStep(pose.body, pose.motion, self._scheme, level.dt, level.c_a, level.fraction, weights.factor)
             )
+            # an estimate, by which the cells are chosen whose crack faces may be touched
             self.increments[number] = pose.step.increment(pose.step.free_flight)
         self.pairs.begin_step(self, level.dt, time_averaged=weights.time_averaged)
         self._unknowns.discard()
@@ -391,7 +375,7 @@ class FreeRigidObstacles(RigidObstacles):
         """(d,) velocity of an obstacle at the start of the step, or (n, d) of its points at x (n, d), m/s."""
         return self.free[number].step.start_velocity(x) if number in self.free else super().velocity(number, x)
 
-    # --- contact with free obstacles (BodyContact) ---
+    # --- contact with the body ---
 
     def poses_moved(self) -> None:
         """Take over the poses of free obstacles."""
@@ -457,6 +441,7 @@ class FreeRigidObstacles(RigidObstacles):
         guesses = {number: self._first_guess(number, u) for number in self.free}
         motions = self.prescribed_motions()
         motions |= {n: (self.start_posed[n], self.free[n].step.increment(z)) for n, (z, _) in guesses.items()}
+        # one fraction for all, and for the body: each guess was tested against the whole motion of the others
         fraction = min(self.pairs.safe_fraction(motions), *(safe for _, safe in guesses.values()))
         self._unknowns.move_to([fraction * z for z, _ in guesses.values()])
         return u if fraction == 1 else np.asarray(level.u_n + fraction * (u - level.u_n))

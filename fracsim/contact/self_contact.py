@@ -86,6 +86,7 @@ class BreakingSurface[S: SelfContactSurface]:
         def build() -> S:
             assert self._skeleton is not None
             cells = np.repeat(pattern, self._parts)
+            # most edges break within fragments
             if self._surface is not None and self._surface.represents(cells):
                 return self._surface
             cut = None if cuts is None else self._skeleton.edge_values(cuts[0], cuts[1][:, 0])
@@ -137,6 +138,7 @@ class BreakingSurface[S: SelfContactSurface]:
         if self.law.fragments_only:
             return self.current.place_faces(at)
         point_map = self.current.point_map
+        # faces without an offset stay where other terms have moved them
         return (point_map if self.current.face_gap else at).with_arm_share(np.minimum(point_map.share, at.share))
 
     def snapshot(self) -> SurfaceSnapshot | None:

@@ -1,4 +1,4 @@
-"""Step limits of points and facets before obstacles, and the motion of obstacles in a step.
+"""Step limits of points and facets before obstacles, first guesses, and the motion of obstacles in a step.
 
 Conservative advancement: from a gap g a point may move on by (g - g_min) / speed, where the speed bounds how fast its
 gap closes. First guesses that would cross an obstacle are stopped in front of it. Obstacles that would crush a jammed
@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -23,9 +24,14 @@ from .contact_surface import ContactSurface
 from .facet_contact import ContactFacets
 from .laws import BARRIER
 from .obstacle import RigidObstacle
-from .pose import PosedShape, rotate_vectors
+from .pose import Pose, PosedShape, rotate_vectors
 from .proximity import ProximityCandidates
 from .shape_base import lengths
+
+if TYPE_CHECKING:
+    from ..mesh.split_surface.surface_map import SurfaceMap
+    from .ipc_pairs import IpcPairs
+    from .mesh_obstacles import AllMeshPairs, MeshObstaclePairs
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -43,6 +49,10 @@ class StepLimitPolicy:
         reach: points nearer to an obstacle than this times their motion are looked at.
         max_rounds: rounds in which points that depend on several nodes are stopped before obstacles.
         min_weight: sum of weights of stopped points from which on a node is moved back.
+        mesh_rounds: like max_rounds, before triangle meshes.
+        max_pieces: pieces of a motion before triangle meshes, each of an edge's length.
+        search_margin: factor of the search distance for safe motions before triangle meshes.
+        max_search_edges: largest search distance for these, in edges.
     """
 
     max_iterations: int = 50
@@ -51,6 +61,10 @@ class StepLimitPolicy:
     reach: float = 1.2
     max_rounds: int = 20
     min_weight: float = 1e-3
+    mesh_rounds: int = 5
+    max_pieces: int = 50
+    search_margin: float = 1.01
+    max_search_edges: float = 2.0
 
 
 LIMITS = StepLimitPolicy()
@@ -316,6 +330,58 @@ def _corrections(area: Values, motions: Sequence[ObstacleMotion], x: Values, mot
         correction[limited] = ((fraction - 1)[:, None] * (motion - q[: x.shape[1]]))[limited]
         stopped |= limited
     return correction, stopped
+
+
+def stop_before_meshes(
+    point_map: SurfaceMap, pairs: AllMeshPairs[IpcPairs], start: Values, end: Values, start_poses: Sequence[Pose]
+) -> Values:
+    """First guess with points stopped where they would cross a triangle mesh; the same array where none would.
+
+    Args:
+        point_map: map from nodes to the points of the body's surface.
+        pairs: of obstacles, which are at the end of their motion.
+        start: (nodes, 3) displacements at the start, m.
+        end: (nodes, 3) first guess of displacements at the end, m.
+        start_poses: of the obstacles at the start.
+    """
+    x, weights = point_map(start), abs(point_map.weights).T
+    for _ in range(LIMITS.mesh_rounds):
+        x_end = point_map(end)
+        if pairs.moving_free_fraction(x, x_end, start_poses) == 1:
+            return end
+        items = zip(pairs.pairs, start_poses, strict=True)
+        correction = np.sum([_mesh_corrections(*item, x, x_end) for item in items], axis=0)
+        if not correction.any():
+            return end
+        # of each node the mean over its points that are stopped
+        weight = (weights @ correction.any(axis=1).astype(float))[:, None]
+        counts = weight > LIMITS.min_weight
+        end = end + np.where(counts, (weights @ correction) / np.where(counts, weight, 1.0), 0.0)
+    return end
+
+
+def _mesh_corrections(pairs: MeshObstaclePairs[IpcPairs], start_pose: Pose, x: Values, end: Values) -> Values:
+    """(n, 3) differences of safe motions of points and their motions from x to `end`, m.
+
+    In the frame of the obstacle a point stops where it comes as near to it as a tenth of its distance; piece by piece,
+    each point by itself.
+    """
+    # motion relative to the obstacle
+    motion = end - pairs.mesh.pose.points_to_space(start_pose.to_body(x))
+    edge = pairs.contact.mean_edge_length
+    count = min(max(1, int(np.ceil(lengths(motion).max(initial=0.0) / edge))), LIMITS.max_pieces)
+    # safe and unlimited positions, before the obstacle at its end
+    safe_x, free_x = end - motion, end - motion
+    is_moving = np.ones(len(x), bool)
+    open_ratio = 1 - BARRIER.min_gap_ratio
+    for piece in range(count):
+        step = end - motion * (1 - (piece + 1) / count) - free_x
+        length = lengths(step)
+        reach = LIMITS.search_margin * float(length.max(initial=0.0)) / open_ratio
+        is_moving &= length <= open_ratio * pairs.safe_distances(safe_x, min(reach, LIMITS.max_search_edges * edge))
+        safe_x = safe_x + np.where(is_moving[:, None], step, 0.0)
+        free_x = free_x + step
+    return np.where(is_moving[:, None], 0.0, safe_x - end)
 
 
 def check_obstacles_apart(comm: MPI.Intracomm, x: Values, obstacles: Mapping[int, RigidObstacle]) -> None:
