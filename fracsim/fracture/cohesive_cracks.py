@@ -5,18 +5,21 @@
 A cell is cut where the stress reaches the strength, and dissipates the fracture energy as it opens. The force on a tip
 has no part in the criterion, since the energy would count twice. A cut cell keeps
 
-    chi = exp(-(r - 1) / b) / r,   r = max (psi / psi_0)^1/2 >= 1,   psi_0 = f_t^2 / 2 E
-    b = (G_c / l psi_0 - 1) / 2,   l = 1 / |grad N . n|
+    chi = rho exp(-(rho - 1) / b) psi_0 / psi,   rho = |w| E / (l f_t),   1 <= rho <= (psi / psi_0)^1/2
+    psi_0 = f_t^2 / 2 E,   l = 1 / |grad N . n|,   b = (G_c / l psi_0 - 1) / 2 - ln m
 
-of its energy. n is the normal of the cut. N is linear in the cell, 1 at the nodes on one side of the cut and 0 on the
-other, so that l is the width over which the cell opens (Oliver 1989). In uniaxial tension the stress is
-f_t exp(-(r - 1) / b), and until it is 0 the cell has dissipated, on any path,
+of its energy, or less if it had less before. n is the normal of the cut. N is linear in the cell, 1 at the nodes on one
+side of the cut and 0 on the other, so that l is the width over which the cell opens (Oliver 1989). Sides that part
+rigidly by w strain the cell by sym(w grad N); then psi = (m rho)^2 psi_0. The forces on its nodes do the work
 
-    V int psi (-dchi) = V psi_0 (1 + 2 b) = G_c V / l.
+    chi dpsi V = V / l f_t exp(-(rho - 1) / b) d|w|
+
+of a flat crack, and G_c V / l in all. A cell that is oblique to the crack is sheared by the opening, m > 1. With
+chi as a function of psi alone, as in a cell across the crack (m = 1), it would carry m f_t.
 
 The areas V / l add up to that of a flat crack, by the divergence theorem, wherever it cuts the edges. The areas of the
 cuts themselves do so as well, but vary from cell to cell: cells cut near a corner would release their energy at once.
-Where G_c < l psi_0 a cell releases its energy at r = 1. A cut edge breaks once no cut cell around it carries stress.
+Where G_c < l psi_0 a cell releases its energy at rho = 1. A cut edge breaks once no cut cell around it carries stress.
 
 A crack starts only where nothing grows or softens any more, and one at a time: in a bar the whole length reaches the
 strength at once, and all but one place unload. Equations: docs/theory.md#cohesive-cracks.
@@ -31,7 +34,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..mechanics.material_fields import MaterialFields, PerCell
+from ..mechanics.material_fields import PerCell
 from ..mechanics.stress import Stress
 from ..mesh.edge_graph import EdgeGraph
 from ..mesh.parallel import allgather, sum_over_ranks
@@ -54,7 +57,7 @@ from .energy.tip_criterion import TipCriterion, input_numbers
 from .energy.tip_fields import TipFieldEvaluator, TipFields
 from .energy.tip_parameters import TIP
 from .fracture_pass import FracturePass, FracturePassResult
-from .principal_stress import first_principal_stress, symmetric_tensors
+from .principal_stress import first_principal_stress, symmetric_tensors, tensile_part
 from .strength import EdgeStrength
 
 Flags = npt.NDArray[np.bool_]
@@ -69,8 +72,7 @@ class SofteningParameters:
     Attributes:
         min_stress_ratio: stress over strength below which a cell carries nothing.
         min_chi_drop: relative decrease of chi that is applied; smaller ones accumulate, or passes would follow them
-            down
-            to rounding.
+            down to rounding.
         min_softening: least softening parameter b.
         cut_integrity: integrity of an edge that is cut and not broken.
         load_digits: decimal digits of stress over strength by which the place of a new crack is chosen; more digits
@@ -87,28 +89,16 @@ class SofteningParameters:
 SOFTENING = SofteningParameters()
 
 
-def uniaxial_modulus(material: MaterialFields, dim: int) -> Values:
-    """Return E () or (cells,), Pa, of a body pulled along one axis; in 2D of plane strain."""
-    mu, lmbda = np.asarray(material.mu), np.asarray(material.lmbda)
+def uniaxial_modulus(mu: Values, lmbda: Values, dim: int) -> Values:
+    """Return E (n,), Pa, of a body pulled along one axis; in 2D of plane strain."""
     return 4 * mu * (lmbda + mu) / (lmbda + 2 * mu) if dim == 2 else mu * (3 * lmbda + 2 * mu) / (lmbda + mu)
 
 
-def softening_parameter(energy: Values, width: Values, onset: Values) -> Values:
-    """Return b (n,) from G_c (n,), J/m^2, l (n,), m, and psi_0 (n,), J/m^3."""
-    return np.maximum((energy / (width * onset) - 1) / 2, SOFTENING.min_softening)
-
-
-def stress_ratio(r: Values, b: Values) -> Values:
-    """Return stress over strength (n,) at r (n,) >= 1."""
-    return np.exp(-(r - 1) / b)
-
-
-def opening_widths(corners: Values, first: npt.NDArray[np.bool_], points: Values, cut: npt.NDArray[np.bool_]) -> Values:
+def opening_widths(gradient: Values, points: Values, cut: Flags) -> Values:
     """Return l (n,), m, of cut cells.
 
     Args:
-        corners: (n, d + 1, d) corners, m.
-        first: (n, d + 1) corners on one side of the cut.
+        gradient: (n, d) grad N, 1/m.
         points: (n, k, d) points at which edges are cut, m.
         cut: (n, k) edges that are cut.
     """
@@ -116,8 +106,71 @@ def opening_widths(corners: Values, first: npt.NDArray[np.bool_], points: Values
     apart = np.where(cut[..., None], points - middle[:, None], 0.0)
     # The normal of the plane fitted to the cut points is the eigenvector of the least eigenvalue.
     normal = np.linalg.eigh(apart.transpose(0, 2, 1) @ apart)[1][:, :, 0]
-    slope = np.einsum("nc,nci,ni->n", first, barycentric_gradients(corners), normal)
-    return np.asarray(1 / np.abs(slope))
+    return np.asarray(1 / np.abs(np.einsum("ni,ni->n", gradient, normal)))
+
+
+@dataclass(frozen=True)
+class OpeningCells:
+    """Law of cells across which a crack opens.
+
+    Attributes:
+        gradient: (n, d) grad N, 1/m.
+        width: (n,) l, m.
+        strength: (n,) f_t, Pa.
+        toughness: (n,) G_c, J/m^2.
+        mu: (n,) Pa.
+        lmbda: (n,) Pa.
+    """
+
+    gradient: Values
+    width: Values
+    strength: Values
+    toughness: Values
+    mu: Values
+    lmbda: Values
+
+    @property
+    def young(self) -> Values:
+        """(n,) E, Pa."""
+        return uniaxial_modulus(self.mu, self.lmbda, self.gradient.shape[1])
+
+    @property
+    def onset_density(self) -> Values:
+        """(n,) psi_0, J/m^3."""
+        return np.asarray(self.strength**2 / (2 * self.young))
+
+    @property
+    def shear_factor(self) -> Values:
+        """(n,) m: (psi / psi_0)^1/2 over rho in a cell that opens across the cut."""
+        stretch = self.mu * np.einsum("ni,ni->n", self.gradient, self.gradient) * self.width**2
+        return np.asarray(np.sqrt((stretch + self.lmbda + self.mu) / self.young))
+
+    @property
+    def softening(self) -> Values:
+        """(n,) b."""
+        b = (self.toughness / (self.width * self.onset_density) - 1) / 2 - np.log(self.shear_factor)
+        return np.maximum(b, SOFTENING.min_softening)
+
+    def openings(self, stress: Values) -> Values:
+        """Return w (n, d), m, at the stress (n, d, d) of the undamaged material, Pa.
+
+        w is the opening whose strain sym(w grad N) has the same stress on planes normal to grad N.
+        """
+        steepness = np.linalg.norm(self.gradient, axis=1)
+        a = self.gradient / steepness[:, None]
+        traction = np.einsum("nij,nj->ni", stress, a)
+        # The inverse of the acoustic tensor mu I + (lambda + mu) a a.
+        share = (self.lmbda + self.mu) / (self.lmbda + 2 * self.mu) * np.einsum("ni,ni->n", traction, a)
+        return np.asarray((traction - share[:, None] * a) / (self.mu * steepness)[:, None])
+
+    def chi(self, stress: Values, psi: Values) -> Values:
+        """Return chi (n,) at stress (n, d, d), Pa, and energy density psi (n,), J/m^3, of the undamaged material."""
+        r2 = psi / self.onset_density
+        rho = np.linalg.norm(self.openings(stress), axis=1) * self.young / (self.width * self.strength)
+        # An elastic strain is no opening: rho is 1 at the onset, and at most r, as in a cell across the crack.
+        rho = np.clip(rho, 1.0, np.sqrt(r2))
+        stress_ratio = np.exp(-(rho - 1) / self.softening)
+        return np.where(stress_ratio < SOFTENING.min_stress_ratio, 0.0, stress_ratio * rho / r2)
 
 
 class CohesiveSoftening:
@@ -143,9 +196,11 @@ class CohesiveSoftening:
         domain = self._domain = stress.domain
         self._cut_graph, self._cut, self._geometry = cut_graph, cut, CutGeometry(domain, cut_graph)
         self._chi = stress.chi.x.array[: domain.cell_count]
-        mean = strength(np.arange(domain.cell_count), cut_graph.cell_edges).mean(axis=1)
-        self.onset_density = np.asarray(mean**2 / (2 * uniaxial_modulus(stress.material, domain.dim)))
-        self._toughness = np.broadcast_to(toughness, (domain.cell_count,))
+        self._strength = strength(np.arange(domain.cell_count), cut_graph.cell_edges).mean(axis=1)
+        material, count = stress.material, (domain.cell_count,)
+        self._toughness = np.broadcast_to(toughness, count)
+        self._mu, self._lmbda = np.broadcast_to(material.mu, count), np.broadcast_to(material.lmbda, count)
+        self.onset_density = np.asarray(self._strength**2 / (2 * uniaxial_modulus(self._mu, self._lmbda, domain.dim)))
 
     def __call__(self, stress: Values, psi: Values) -> EnergyRelease:
         """Lower chi of cells that are stretched farther than before; compressed cells do not soften.
@@ -159,8 +214,10 @@ class CohesiveSoftening:
         """
         chi, volumes = self._chi, self._domain.volumes
         cells = np.flatnonzero(self._cut_graph.split & (chi > 0) & (psi > self.onset_density))
-        cells = cells[first_principal_stress(symmetric_tensors(stress[cells], self._domain.dim)) > 0]
-        target = np.minimum(self._softened_chi(cells, psi[cells]), chi[cells])
+        tensors = symmetric_tensors(stress[cells], self._domain.dim)
+        pulled = first_principal_stress(tensors) > 0
+        cells, tensors = cells[pulled], tensors[pulled]
+        target = np.minimum(self.opening_cells(cells).chi(tensors, psi[cells]), chi[cells])
         lower = target < (1 - SOFTENING.min_chi_drop) * chi[cells]
         cells, target = cells[lower], target[lower]
         drop = chi[cells] - target
@@ -168,20 +225,17 @@ class CohesiveSoftening:
         released, elastic = volumes[cells] @ (drop * psi[cells]), volumes @ (chi * psi)
         return EnergyRelease(float(released), float(elastic), float(np.max(drop, initial=0.0)), not target.all())
 
-    def _softened_chi(self, cells: Ints, psi: Values) -> Values:
-        """Return chi (n,) of cells at their largest energy density psi (n,), J/m^3."""
-        onset, r = self.onset_density[cells], np.sqrt(psi / self.onset_density[cells])
-        b = softening_parameter(self._toughness[cells], self.opening_widths(cells), onset)
-        ratio = stress_ratio(r, b)
-        return np.where(ratio < SOFTENING.min_stress_ratio, 0.0, ratio / r)
-
-    def opening_widths(self, cells: Ints) -> Values:
-        """Return l (n,) of cut cells (n,), m."""
+    def opening_cells(self, cells: Ints) -> OpeningCells:
+        """Return the law of cut cells (n,)."""
         graph, domain = self._cut_graph, self._domain
-        points = self._geometry.cut_points(graph.cell_edges[cells], self._cut)
         # Corners on the side of the first one.
         first = node_groups(domain.dim)[graph.pattern[cells]] == 0
-        return opening_widths(domain.nodes[domain.cell_nodes[cells]], first, points, ~graph.intact(cells))
+        gradients = barycentric_gradients(domain.nodes[domain.cell_nodes[cells]])
+        gradient = np.asarray(np.einsum("nc,nci->ni", first, gradients))
+        points = self._geometry.cut_points(graph.cell_edges[cells], self._cut)
+        width = opening_widths(gradient, points, ~graph.intact(cells))
+        properties = self._strength, self._toughness, self._mu, self._lmbda
+        return OpeningCells(gradient, width, *(values[cells] for values in properties))
 
     def find_released_edges(self) -> npt.NDArray[np.bool_]:
         """Flag the cut edges (edges,) around which no cut cell carries stress, and some did (collective)."""
@@ -247,11 +301,13 @@ class CohesiveInitiation:
 class CohesiveTipCriterion(TipCriterion):
     """Criterion of cohesive cracks: a cell is cut where the stress of the softened body reaches the strength.
 
+    Averages are of the tensile part of the stress. With the compression ahead of a crack in a bent beam the average has
+    no direction, and the crack would turn along the beam.
+
     A tip grows across the first principal direction of s - (t . s t) t t, s the averaged stress and t the direction
-    from
-    which the crack came: ahead of a tip the stress along t is nearly as large as that across it. A tip is loaded by the
-    averaged stress or by that of its own cell, whichever is larger: the average of a tip with soft cells on one side is
-    too small, and so is that at an inner corner.
+    from which the crack came: ahead of a tip the stress along t is nearly as large as that across it. A tip is loaded
+    by the averaged stress or by that of its own cell, whichever is larger: the average of a tip with soft cells on one
+    side is too small, and so is that at an inner corner.
 
     In 3D cells beside a crack that share an edge with it are not tips of a front, and are not cut.
     """
@@ -278,14 +334,15 @@ class CohesiveTipCriterion(TipCriterion):
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """Find the local edges (n,) that cracks cut, with loads of 1, from undamaged stress and energy (collective)."""
         assert self._stress.chi is not None
-        self._softened_stress = self._stress.chi.x.array[: len(stress), None] * stress
-        return super().__call__(self._softened_stress, psi)
+        softened = self._stress.chi.x.array[: len(stress), None] * stress
+        self._tensile_stress = tensile_part(softened, self._domain.dim)
+        return super().__call__(self._tensile_stress, psi)
 
     def _propose_advances(self, fields: TipFields) -> CutProposal:
         """Propose the cells of loaded tips, each of which advances by a cell."""
         tips, d = fields.tips, self._domain.dim
         mean = fields.mean_stress(np.arange(len(tips)))
-        sigma = _larger_principal_stress(mean, self._softened_stress[tips.cell])
+        sigma = _larger_principal_stress(mean, self._tensile_stress[tips.cell])
         loaded = sigma >= cell_strength(self.strength, self._graph, tips.cell)
         if d == 3:
             is_front = np.linalg.norm(tips.ahead, axis=1) > TIP.min_front_advance * fields.disc_radius

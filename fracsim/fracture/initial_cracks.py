@@ -21,10 +21,11 @@ Values = npt.NDArray[np.float64]
 MIN_CUT_SHARE = 0.02
 
 
-def cut_edges(graph: EdgeGraph, crack: CrackPlane) -> Values:
+def cut_edges(graph: EdgeGraph, crack: CrackPlane, *, to_nearest: bool) -> Values:
     """Return the cut positions (edges,) of local edges, NaN where the crack does not cut (collective).
 
-    A position is 0 at the end that comes first in the input mesh and 1 at the other.
+    A position is 0 at the end that comes first in the input mesh and 1 at the other. In 2D a crack ends where it enters
+    its last cell, or, with `to_nearest`, at the edge that is nearest to its end.
     """
     domain, tolerance = graph.domain, 1e-9 * graph.domain.bounds.diagonal
     ends = domain.nodes[edge_ends_in_input_order(graph)]
@@ -34,8 +35,7 @@ def cut_edges(graph: EdgeGraph, crack: CrackPlane) -> Values:
     crossed = (height[:, 0] >= 0) != (height[:, 1] >= 0)
     share = np.divide(height[:, 0], height[:, 0] - height[:, 1], out=np.zeros(len(height)), where=crossed)
     points = ends[:, 0] + share[:, None] * (ends[:, 1] - ends[:, 0])
-    if domain.dim == 2:
-        # The crack ends where it enters its last cell.
+    if domain.dim == 2 and not to_nearest:
         crossed[crossed] = crack.contains(points[crossed], tolerance)
     else:
         # A cell with some of its crossed edges cut would not be split: the crack would be about 0.4 h short along its
@@ -65,12 +65,15 @@ def edge_ends_in_input_order(graph: EdgeGraph) -> npt.NDArray[np.int32]:
     return np.where(swap[:, None], ends[:, ::-1], ends)
 
 
-def open_initial_cracks(graph: EdgeGraph, cracks: Sequence[CrackPlane], *, keep_connected: bool) -> Values:
+def open_initial_cracks(
+    graph: EdgeGraph, cracks: Sequence[CrackPlane], *, keep_connected: bool, to_nearest: bool = False
+) -> Values:
     """Break the edges that cracks cut; return the cut positions (edges,), NaN elsewhere (collective).
 
     Args:
         graph: edges of the body; they are broken in place.
         cracks: the cracks, in the order of the study.
+        to_nearest: end cracks at the edges nearest to their ends (2D).
         keep_connected: refuse cracks that cut off a fragment, which has no equilibrium without inertia.
 
     Raises:
@@ -79,7 +82,7 @@ def open_initial_cracks(graph: EdgeGraph, cracks: Sequence[CrackPlane], *, keep_
     domain, positions = graph.domain, np.full(len(graph.broken), np.nan)
     for crack in cracks:
         fragments_before = find_fragments(graph).count if keep_connected else 0
-        crack_positions = cut_edges(graph, crack)
+        crack_positions = cut_edges(graph, crack, to_nearest=to_nearest)
         if not sum_over_ranks(domain.comm, np.count_nonzero(~np.isnan(crack_positions)))[0]:
             raise InputError(
                 f"{crack.name} cuts no edge of the mesh: it lies outside the body, which spans {domain.bounds}, or "

@@ -35,6 +35,13 @@ def first_principal_stress(stress: Values) -> Values:
     return np.asarray(np.linalg.eigvalsh(stress)[:, -1])
 
 
+def tensile_part(components: Values, dim: int) -> Values:
+    """Return the components (n, 3 or 6) of sum max(s_i, 0) n_i n_i, s_i the principal stresses of (n, 3 or 6)."""
+    values, vectors = np.linalg.eigh(symmetric_tensors(components, dim))
+    scaled = np.maximum(values, 0)[:, None] * vectors
+    return np.stack([np.einsum("nk,nk->n", scaled[:, i], vectors[:, j]) for i, j in SYMMETRIC_COMPONENTS[dim]], axis=1)
+
+
 def first_principal_directions(stress: Values, points: Values, seed: int) -> Values:
     """Return unit directions (n, d) of the largest principal stress; their sign is arbitrary.
 

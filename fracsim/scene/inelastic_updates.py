@@ -137,9 +137,10 @@ def _open_initial_cracks(study: Study, balance: Balance, graph: EdgeGraph) -> Va
         return None
     from ..fracture.initial_cracks import open_initial_cracks
 
-    return open_initial_cracks(
-        graph, initial_cracks(study, balance.domain.dim), keep_connected=not balance.scheme.inertia
-    )
+    # The load of a cohesive crack depends on the length of its ligament, of which a tip has no measure.
+    is_cohesive = study.fracture is not None and study.fracture.law == "cohesive"
+    cracks = initial_cracks(study, balance.domain.dim)
+    return open_initial_cracks(graph, cracks, keep_connected=not balance.scheme.inertia, to_nearest=is_cohesive)
 
 
 def _build_criterion(
