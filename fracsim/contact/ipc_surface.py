@@ -57,8 +57,9 @@ class SurfacePolicy:
         max_pause: largest number of steps between two attempts to release faces.
         closed_pressure: pressure, in stiffnesses, of faces without room: that of a fifth of the barrier's distance.
         round_off: relative tolerance of pressures.
-        exact_first, exact_later: length of steps of Newton's method, in distances of the barrier, below which
-            tangents are exact, in the first attempt and in later ones. Farther away CG may find no solution.
+        exact_tangent: length of steps of Newton's method, in distances of the barrier, below which tangents of the
+            first attempt are exact; those of later ones are positive. CG finds no solution with indefinite ones: a
+            torn loaf failed in all attempts and converged in the second one with positive ones.
         stiff_ratio: stiffness, in that of a face of an edge's size, from which on directions are kept apart from
             the matrix.
     """
@@ -71,8 +72,7 @@ class SurfacePolicy:
     max_pause: int = 16
     closed_pressure: float = 10.0
     round_off: float = 1e-6
-    exact_first: float = 1.0
-    exact_later: float = 0.1
+    exact_tangent: float = 1.0
     stiff_ratio: float = 100.0
 
 
