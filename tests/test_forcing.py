@@ -120,6 +120,26 @@ def test_a_swinging_bar_moves_as_with_exact_solves(made: list[int], monkeypatch:
     assert krylov < more_krylov and tangents < 0.8 * more_tangents
 
 
+def test_an_obstacle_far_away_costs_no_tangent(made: list[int], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A soft cantilever let go over a floor that it never reaches: as many tangents as without, and the same motion."""
+    set_policy(monkeypatch, max_plain_direct_dofs=0)
+    floor = {"name": "floor", "shape": "plane", "at": [0.0, 0.0, -20.0], "normal": [0.0, 0.0, 1.0]}
+    counts, ends = [], []
+    for obstacles in ([], [floor]):
+        made.clear()
+        scene, state = make_scene(
+            mesh={"builder": "box", "size": [4.0, 1.0, 1.0], "h": 0.35}, obstacle=obstacles,
+            material={"energy": "neo-hookean", "young": 1e6, "poisson": 0.3, "density": 1e3},
+            boundary=[{"on": "left", "fix": "xyz"}], load={"gravity": [0.0, 0.0, -100.0]},
+            time={"scheme": "backward-euler", "step": 0.005, "end": 0.06},
+        )  # fmt: skip
+        march(scene, state)
+        counts.append(len(made))
+        ends.append(state.u.copy())
+    assert counts[1] == counts[0] > 10 and np.abs(ends[0]).max() > 0.05
+    np.testing.assert_allclose(ends[1], ends[0], atol=1e-6 * np.abs(ends[0]).max())
+
+
 def test_a_load_on_an_end_takes_no_more_corrections_than_with_exact_solves() -> None:
     """CG leaves fifteen times as much of r there as of the preconditioned residual by which it stops. Taken for what
     the tangent leaves, that let it stop earlier from step to step, until every step took a correction more."""

@@ -157,6 +157,10 @@ class LinearSolver:
         is_single_cg = self.steps_are_linear and self.is_iterative
         self._step_cg = LinearStepCG(ksp.comm, int(ksp.max_it), policy) if is_single_cg else None
         self.forcing = None if self._asked_rtol else _forcing(balance, chosen, policy)
+        # of attempts of a body that may touch something, until it does
+        self._free_forcing = ContractionForcing(float(chosen["ksp_rtol"]), policy)
+        self._touches = not (isinstance(self.forcing, EisenstatWalkerForcing) and balance.scheme.inertia)
+        self._last_forcing = self.forcing  # of the last solve
         dofs = balance.work_vector.getSize()
         self.direct = DirectSolver(symmetric=balance.symmetric, dofs=dofs, dim=balance.domain.dim, policy=policy)
         self.operators.add_pattern_listeners(self.preconditioner, self.direct)
@@ -204,11 +208,13 @@ class LinearSolver:
             solved_norm: |r| of a solution, N.
             eigenvalue_floor: see `TangentOperators`.
         """
-        forcing = self.forcing
+        forcing = self._forcing_at_iterate()
         if forcing is None:
             self._prepare(eigenvalue_floor)
             return
-        self._equivalent = forcing.equivalent_iterations(self.ksp.its)
+        assert self._last_forcing is not None
+        self._equivalent = self._last_forcing.equivalent_iterations(self.ksp.its)
+        self._last_forcing = forcing
         if isinstance(forcing, EisenstatWalkerForcing):
             self._prepare(eigenvalue_floor)
             in_contact = self.tangent.couplings.has_contact
@@ -222,6 +228,18 @@ class LinearSolver:
                     self.operators.multiply_by(self.preconditioner.fine_level)
             rtol = forcing.tolerance_for(solved_norm, kept=keeps_tangent)
         self.ksp.setTolerances(rtol=rtol)
+
+    def begin_attempt(self) -> None:
+        """Begin an attempt of Newton's method."""
+        if self.forcing is not None:
+            self.forcing.begin_attempt()
+            self._free_forcing.begin_attempt()
+            self._touches = not (isinstance(self.forcing, EisenstatWalkerForcing) and self.balance.scheme.inertia)
+
+    def _forcing_at_iterate(self) -> EisenstatWalkerForcing | ContractionForcing | None:
+        """Return the tolerances of the present solve: those of a body without contact until it touches (collective)."""
+        self._touches = self._touches or self.balance.contact.is_active()
+        return self.forcing if self._touches else self._free_forcing
 
     def _residual_left_by_cg(self) -> float:
         """Return |r| that the last solve of CG has left of the linear system, N; 0 of other methods (collective)."""
@@ -318,6 +336,7 @@ class LinearSolver:
         self._equivalent = None
         if self.forcing is not None:
             ksp.setTolerances(rtol=self.forcing.tight_tolerance())
+            self._last_forcing = self.forcing
         ksp.setOperators(self.operators.operator, self.operators.matrix)
         ksp.solve(self.balance.work_vector, self.correction)
         return bool(ksp.reason > 0)

@@ -383,8 +383,7 @@ class NewtonSolver:
             self._convergence.begin_solve(intermediate=bool(remaining))
             if self._modified is not None:
                 self._modified.merit.begin_solve()
-            if self.linear.forcing is not None:
-                self.linear.forcing.begin_attempt()
+            self.linear.begin_attempt()
             self.snes.solve(None, self._x)
             if self._convergence.aborted:
                 raise StepAborted
