@@ -125,25 +125,21 @@ def forked(upper: float, lower: float, n: int = 40) -> Scene:
 
 
 def test_two_tips_in_a_disc_share_its_force() -> None:
-    """G of branches shorter than R, whose discs lie over each other, is what the plate lets go as both get longer, to a
-    fifth; the force on each is twice that."""
-    books = []
-    for length in (0.03, 0.05, 0.07):
+    """G of branches of 1 to 5 h is what the plate lets go as both get longer, to 15 %, of those below 3 h to 30 %. The
+    force on short ones, whose discs lie over each other, is that of both."""
+    rows = []
+    for length in np.arange(1.0, 5.6, 0.4) / 40:
         scene = forked(length, length)
         now, reached = seen(scene), tips(scene)
-        assert len(reached) == 2
-        along = now.tips.point - now.tips.behind
-        tangent = along / np.linalg.norm(along, axis=1)[:, None]
-        force = now.evaluate_forces()
-        released = release_rate(force, now.tips.ahead, tangent)
+        along, force = now.tips.point - now.tips.behind, now.evaluate_forces()
+        released = release_rate(force, now.tips.ahead, along / np.linalg.norm(along, axis=1)[:, None])
         size = np.linalg.norm(reached - [0.5, 0.503], axis=1).sum()
-        books.append(
-            (scene.balance.stress.stored_energy(), size, released.mean(), np.linalg.norm(force, axis=1).mean())
-        )
-    (before, start, *_), (_, _, G, whole), (after, end, *_) = books
-    taken = (before - after) / (end - start)
-    assert pytest.approx(taken, rel=0.2) == G
-    assert whole > 1.8 * taken
+        rows.append((size, scene.balance.stress.stored_energy(), released.mean(), np.linalg.norm(force, axis=1).mean()))
+    size, stored, G, whole = np.array(rows).T
+    taken = -np.polyval(np.polyder(np.polyfit(size, stored, 2)), size)
+    np.testing.assert_allclose(G, taken, rtol=0.3)
+    np.testing.assert_allclose(G[size > 6 / 40], taken[size > 6 / 40], rtol=0.15)
+    assert whole[0] > 1.8 * taken[0] and whole[-1] < 1.2 * taken[-1]
 
 
 def test_a_tip_that_is_ahead_waits_unless_there_is_enough_for_both() -> None:
@@ -262,8 +258,10 @@ def test_a_crack_that_is_loaded_slowly_does_not_branch() -> None:
     state = scene.start()
     while not scene.ended(state):
         state, _ = scene.stepper.advance(state)
-    assert scene.fracture.graph.split.sum() > 10
-    assert not np.any(scene.fracture.graph.pattern == 7)
+    graph, cells = scene.fracture.graph, scene.domain.nodes[scene.domain.cell_nodes].mean(axis=1)
+    assert graph.split.sum() > 10
+    # In the last row of cells a crack may cut off a node.
+    assert not np.any((graph.pattern == 7) & (cells[:, 0] < 1 - 1 / 16))
 
 
 def test_a_step_that_sees_no_waves_makes_no_branches() -> None:

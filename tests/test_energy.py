@@ -18,7 +18,6 @@ from fracsim.fracture.energy.configurational_force import (
     eshelby_stress,
     first_piola_stress,
     plateau,
-    plateau_gradient,
 )
 from fracsim.fracture.energy.cut_plane import centroid_cuts, exit_cuts, plane_crossings, points_on_edges
 from fracsim.fracture.energy.gradient_operators import GradientOperators
@@ -27,6 +26,7 @@ from fracsim.fracture.energy.mixed_mode import (
     intensity_contributions,
     kink_angle,
     kink_gain,
+    kink_matrix,
     phase_angles,
 )
 from fracsim.fracture.energy.tip_criterion import TipCriterion, kinked_release
@@ -36,7 +36,18 @@ from fracsim.mesh.domain import distribute
 from fracsim.mesh.small_matrices import barycentric_gradients
 from fracsim.scene import build_scene, build_scene_on
 from fracsim.study.check import check_study
-from support.notched import POISSON, STIFF, YOUNG, near_tip, notched, plate, plate_tables, torn
+from support.notched import (
+    POISSON,
+    STIFF,
+    YOUNG,
+    balanced,
+    near_tip,
+    notched,
+    plate,
+    plate_tables,
+    put_in_balance,
+    torn,
+)
 from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import DIRECT, make_study
 from support.squares import KINDS, square
@@ -49,16 +60,15 @@ Values = npt.NDArray[np.float64]
 # --- parts -----------------------------------------------------------------------------------------------------------
 
 
-def test_the_disc_function_and_its_gradient() -> None:
-    """q falls from 1 at R / 2 to 0 at R; its gradient is that of finite differences."""
-    apart = np.random.default_rng(1).uniform(-1.2, 1.2, (200, 2))
-    radius, step = np.full(200, 1.1), 1e-7
+def test_the_disc_function() -> None:
+    """q is 1 to R / 2 and falls to 0 at R along a line."""
+    np.testing.assert_allclose(plateau(np.array([0.0, 0.5, 0.8, 1.1, 1.3]), np.full(5, 1.1)), [1, 1, 0.6 / 1.1, 0, 0])
+
+
+def disc_gradient(apart: Values, radius: float) -> Values:
+    """(n, 2) 1/m, of the disc function at places (n, 2) from the tip."""
     r = np.linalg.norm(apart, axis=1)
-    smooth = (np.abs(r - 0.55) > 1e-5) & (np.abs(r - 1.1) > 1e-5)
-    for axis in range(2):
-        moved = [plateau(np.linalg.norm(apart + s * step * np.eye(2)[axis], axis=1), radius) for s in (1, -1)]
-        found = plateau_gradient(apart, radius)[:, axis]
-        np.testing.assert_allclose(found[smooth], ((moved[0] - moved[1]) / (2 * step))[smooth], atol=1e-7)
+    return np.where((r > radius / 2) & (r < radius), -2 / (radius * r), 0.0)[:, None] * apart
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -157,27 +167,26 @@ def test_a_cell_is_let_go_in_the_time_of_a_rayleigh_wave() -> None:
 @pytest.mark.parametrize("order", (1, 2))
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_force_of_a_known_field(kind: str, order: int) -> None:
-    """g of the fields around a tip: K^2 / E' ahead, and - 2 K_I K_II / E' across where both are there; to 10 %, since
-    the tip is somewhere in its cell, the crack as wide as those it cuts, and the field that of no mesh, at any h."""
-    scene = plate(kind, 30, order=order, crack=[{"segment": [[0.0, 0.507], [0.5, 0.507]]}])
-    point = tips(scene)
+    """g of a body whose sides are moved as the fields around a tip ask: K^2 / E' ahead, and - 2 K_I K_II / E' across
+    where both are there; to 6 % in tension. With sliding to 18 %, since the crack is as wide as the cells it cuts."""
+    scene = balanced(kind, 24, order=order)
+    point = tips(scene)[0]
     for first, second in ((1.0, 0.0), (0.0, 1.0), (1.0, 0.4)):
-        u = near_tip(scene.domain.nodes - [point[0, 0] + 0.5 / 30, 0.507], first, second)
-        scene.balance.set_displacement(u.ravel())
+        put_in_balance(scene, near_tip(scene.domain.nodes - point, first, second))
         force = seen(scene).evaluate_forces()[0] * STIFF
         expected = np.array([first**2 + second**2, -2 * first * second])
-        np.testing.assert_allclose(force, expected, atol=0.1 * expected[0])
+        np.testing.assert_allclose(force, expected, atol=(0.18 if second else 0.06) * expected[0])
 
 
 @pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize(("end", "least"), ((0.9, 0.3), (0.95, 1.1)))
+@pytest.mark.parametrize(("end", "least"), ((0.94, 0.3), (0.97, 1.1)))
 def test_a_uniform_body_pulls_at_no_tip(kind: str, end: float, least: float) -> None:
     """However near the edge that it goes for: an advance would move that edge as well, sum V grad q = int q n ds, which
-    a tip feels otherwise as an energy that it takes to get on."""
+    a tip feels otherwise as an energy that it takes to get on. With q linear in cells both sums are the same."""
     look = seen(plate(kind, 30, crack=[{"segment": [[0.0, 0.507], [end, 0.507]]}]))
     density, none = np.tile(np.eye(2), (len(look.sigma), 1, 1)), np.zeros((len(look.sigma), 2))
     assert look.tips.surface[0, 0] > least * look.disc_radius[0]
-    assert np.linalg.norm(look.neighbourhoods.evaluate_forces(density, none)[0]) < 0.1 * look.disc_radius[0]
+    assert np.linalg.norm(look.neighbourhoods.evaluate_forces(density, none)[0]) < 1e-12 * look.disc_radius[0]
 
 
 @pytest.mark.parametrize("order", (1, 2))
@@ -208,7 +217,7 @@ def test_no_force_of_waves_that_pass(kind: str, order: int) -> None:
     area = np.repeat(r, len(t)) * (TIP.disc_radius[2] / 24 / 40) * (2 * np.pi / 80)
     velocity = np.sqrt(YOUNG / 7800.0) * 3.0
     kinetic = 7800.0 / 2 * velocity**2 * np.sum(waves(point + apart)[0] ** 2, axis=1)
-    slope = plateau_gradient(apart, np.full(len(apart), TIP.disc_radius[2] / 24))
+    slope = disc_gradient(apart, TIP.disc_radius[2] / 24)
     carried = float(np.linalg.norm((area * kinetic) @ slope))
     assert carried > 0.3 * still
     scene.balance.set_displacement(np.zeros(shape.size))
@@ -227,18 +236,27 @@ def waves(places: Values) -> tuple[Values, Values]:
     return whole, push
 
 
-def test_where_a_crack_turns_in_closed_form() -> None:
-    """The greatest hoop stress over all angles, by looking at them (Erdogan and Sih 1963): 70.5 degrees in pure
-    sliding, where its K^2 is 4/3, and where the sides press on each other, too."""
-    psi, t = np.linspace(-2, 2, 41), np.linspace(-np.pi, np.pi, 200_001)
-    for each in psi:
-        hoop = np.cos(t / 2) * (max(np.cos(each), 0) * np.cos(t / 2) ** 2 - 1.5 * np.sin(each) * np.sin(t))
-        best = np.argmax(hoop)
-        if each:
-            assert kink_angle(np.array([each]))[0] == pytest.approx(t[best], abs=1e-4)
-        assert kink_gain(np.array([each]))[0] == pytest.approx(hoop[best] ** 2, rel=1e-6)
-    assert np.degrees(kink_angle(np.array([np.pi / 2]))[0]) == pytest.approx(-70.53, abs=0.01)
-    assert kink_gain(np.array([np.pi / 2]))[0] == pytest.approx(4 / 3)
+def test_a_short_kink_in_closed_form() -> None:
+    """To the first order in the angle (Cotterell and Rice 1980), where a crack turns in pure sliding and what it
+    releases (Amestoy and Leblond 1992: 75.8 degrees, 1.517), and no sliding at a kink, but for a degree or two."""
+    t, step = 0.3, 1e-6
+    slope = (kink_matrix(np.array([step])) - kink_matrix(np.array([-step])))[0] / (2 * step)
+    np.testing.assert_allclose(slope, [[0.0, -1.5], [0.5, 0.0]], atol=1e-9)
+    mirrored = kink_matrix(np.array([-t]))[0] * [[1, -1], [-1, 1]]
+    np.testing.assert_allclose(kink_matrix(np.array([t]))[0], mirrored, rtol=1e-12)
+    psi = np.linspace(-1.57, 1.57, 21)
+    for each, angle, gain in zip(psi, kink_angle(psi), kink_gain(psi), strict=True):
+        first, second = kink_matrix(np.array([angle]))[0] @ [np.cos(each), np.sin(each)]
+        assert first**2 + second**2 == pytest.approx(gain, rel=1e-4)
+        assert abs(second) < 0.03 * first
+        for other in (angle - 0.1, angle + 0.1):
+            K = kink_matrix(np.array([other]))[0] @ [np.cos(each), np.sin(each)]
+            assert gain > K @ K
+    assert np.degrees(kink_angle(np.array([np.pi / 2]))[0]) == pytest.approx(-75.8, abs=0.1)
+    assert kink_gain(np.array([np.pi / 2]))[0] == pytest.approx(1.517, abs=1e-3)
+    # Where the sides press on each other, what they press with does not count.
+    assert kink_angle(np.array([2.0, np.pi]))[0] == kink_angle(np.array([np.pi / 2]))[0]
+    assert kink_gain(np.array([2.0]))[0] == pytest.approx(np.sin(2.0) ** 2 * kink_gain(np.array([np.pi / 2]))[0])
 
 
 def test_intensities_in_closed_form() -> None:
@@ -264,7 +282,7 @@ def test_intensities_in_closed_form() -> None:
     c, s = np.cos(0.7), np.sin(0.7)
     Q = np.array([[c, -s], [s, c]])
     discs = [radius * many, np.repeat([[c, s]], len(many), axis=0), np.repeat([Q @ [0, load]], len(many), axis=0)]
-    slope = area[:, None] * plateau_gradient(apart, discs[0]) @ Q.T
+    slope = area[:, None] * disc_gradient(apart, radius) @ Q.T
     inside = area * plateau(np.linalg.norm(apart, axis=1), discs[0])
     push = discs[2]
     around = TipDiscFields(
@@ -291,51 +309,47 @@ def tilted(points: Values, first: float, second: float, half: float) -> Values:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_both_tips_of_a_tilted_crack_are_told(kind: str) -> None:
-    """A crack of 12 h, whose discs have a radius of 5 h and all of the stress along it, under tension at 30 to 90
-    degrees: K_II / K_I = cot, to 2.5 degrees, as near as a field is that no mesh made; the mean is 4 to 7 off."""
-    scene = plate(kind, 40, crack=[{"segment": [[0.35, 0.507], [0.65, 0.507]]}])
+    """A crack of 12 h with all of the stress along it, in a body whose sides move as under tension at 30 to 90 degrees:
+    K_II / K_I = cot, to 2.5 degrees."""
+    scene = balanced(kind, 40, 0.65, 1, 0.35)
     ends = tips(scene)
-    half = np.ptp(ends[:, 0]) / 2 + 0.5 / 40
+    half = np.ptp(ends[:, 0]) / 2
     for angle in np.radians([30, 45, 60, 90]):
         first, second = np.sin(angle) ** 2, np.sin(angle) * np.cos(angle)
-        scene.balance.set_displacement(
-            tilted(scene.domain.nodes - [ends[:, 0].mean(), 0.507], first, second, half).ravel()
-        )
+        put_in_balance(scene, tilted(scene.domain.nodes - [ends[:, 0].mean(), 0.507], first, second, half))
         off = np.degrees(phase_angles(seen(scene).stress_intensities()) - (np.pi / 2 - angle))
         assert np.abs(off).max() < 2.5
 
 
 def test_who_turns_with_a_tip_sees_no_turn() -> None:
     """A neo-Hookean body spun by 70 degrees, its crack under K_I and K_II: the phase of before, to round-off."""
-    scene = plate("unstructured", 20, crack=[{"segment": [[0.0, 0.507], [0.5, 0.507]]}],
-                  material=plate_tables()["material"] | {"energy": "neo-hookean"})  # fmt: skip
-    nodes, tip = scene.domain.nodes, tips(scene)[0]
-    u, phases = near_tip(nodes - [tip[0] + 0.5 / 20, 0.507], 1e6, 0.5e6), []
+    scene = balanced("unstructured", 20, material=plate_tables()["material"] | {"energy": "neo-hookean"})
+    nodes, phases = scene.domain.nodes, []
+    put_in_balance(scene, near_tip(nodes - tips(scene)[0], 1e6, 0.5e6))
+    u = scene.balance.stress.u.x.array.reshape(-1, 2).copy()
     c, s = np.cos(1.2), np.sin(1.2)
     for Q in (np.eye(2), np.array([[c, -s], [s, c]])):
         scene.balance.set_displacement(((nodes + u) @ Q.T - nodes).ravel())
         phases.append(phase_angles(seen(scene).stress_intensities())[0])
-    assert phases[0] == pytest.approx(np.arctan2(0.5, 1), abs=0.03)
+    assert phases[0] == pytest.approx(np.arctan2(0.5, 1), abs=0.05)
     assert phases[1] == pytest.approx(phases[0], abs=1e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_crack_turns_as_the_field_around_it_asks(kind: str) -> None:
-    """Fields of K_I and K_II put on a mesh: the direction of the greatest hoop stress to 3 degrees, and what the crack
-    that turns releases to a tenth, as near as a field is that no mesh made; the first principal stress of the mean is
-    30 degrees off."""
-    scene = plate(kind, 30, crack=[{"segment": [[0.0, 0.507], [0.5, 0.507]]}])
-    point = tips(scene)
+    """Sides moved as fields of K_I and K_II ask: the direction in which most is released to 4 degrees, and what the
+    crack that turns releases to 12 %; the first principal stress of the mean is 30 degrees off."""
+    scene = balanced(kind, 30)
+    point = tips(scene)[0]
     for first, second in ((1.0, 0.5), (1.0, 1.0), (0.0, 1.0)):
-        u = near_tip(scene.domain.nodes - [point[0, 0] + 0.5 / 30, 0.507], first, second)
-        scene.balance.set_displacement(u.ravel())
+        put_in_balance(scene, near_tip(scene.domain.nodes - point, first, second))
         now = seen(scene)
         released, ahead = kinked_release(phase_angles(now.stress_intensities()), now.tips, now.evaluate_forces())
         psi = np.arctan2([second], [first])
         angle = np.arctan2(ahead[0, 1], ahead[0, 0])
-        assert np.degrees(angle - kink_angle(psi)[0]) == pytest.approx(0, abs=3)
+        assert np.degrees(angle - kink_angle(psi)[0]) == pytest.approx(0, abs=4)
         expected = (first**2 + second**2) * kink_gain(psi)[0]
-        assert released[0] * STIFF == pytest.approx(expected, rel=0.1)
+        assert released[0] * STIFF == pytest.approx(expected, rel=0.12)
 
 
 # --- a notched plate -------------------------------------------------------------------------------------------------

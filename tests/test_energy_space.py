@@ -10,13 +10,14 @@ import pytest
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
-from fracsim.fracture.energy.configurational_force import plateau, plateau_gradient
+from fracsim.fracture.energy.configurational_force import plateau
 from fracsim.fracture.energy.crack_front import FrontReleaseRate, advance_vectors
 from fracsim.fracture.energy.cut_plane import plane_crossings, plane_cuts
 from fracsim.fracture.energy.front_advance import FrontTipCriterion
 from fracsim.fracture.energy.neighbour_search import find_pairs
 from fracsim.fracture.energy.tip_criterion import TipCriterion
 from fracsim.mesh.simplices import is_split
+from fracsim.mesh.small_matrices import barycentric_gradients
 from fracsim.scene import Scene, build_scene
 from support.scenes import make_study
 from support.tips import criterion_of, run_when_ready, seen
@@ -172,7 +173,7 @@ def test_the_force_along_a_front_is_that_of_what_is_near() -> None:
     np.testing.assert_allclose(both[:n], expected)
 
 
-@pytest.mark.parametrize(("end", "least"), ((0.75, 0.08), (0.8, 0.3), (0.85, 0.8), (0.9, 1.1)))
+@pytest.mark.parametrize(("end", "least"), ((0.75, 0.08), (0.8, 0.3), (0.85, 0.75), (0.9, 1.1)))
 def test_a_uniform_body_pulls_at_no_front(end: float, least: float) -> None:
     """However near the face that it goes for: an advance would move that face as well, sum V grad q = int q n dA, which
     a front feels otherwise as an energy that it takes to get on."""
@@ -182,20 +183,20 @@ def test_a_uniform_body_pulls_at_no_front(end: float, least: float) -> None:
     face = np.einsum("ni,ni->n", look.tips.surface, ahead)
     density, none = np.tile(np.eye(3), (len(look.sigma), 1, 1)), np.zeros((len(look.sigma), 3))
     pulls = np.einsum("ni,ni->n", look.neighbourhoods.evaluate_forces(density, none), ahead)
-    assert (face / look.disc_radius**2).max() > least and (np.abs(pulls) / look.disc_radius**2).max() < 0.05
+    assert (face / look.disc_radius**2).max() > least and (np.abs(pulls) / look.disc_radius**2).max() < 1e-12
 
 
 def test_forces_are_sums_over_all_cells() -> None:
-    """Forces of any Sigma and f are those of sums over the whole body."""
+    """Forces of any Sigma and f are those of sums over the whole body, with q of the nodes, linear in each cell."""
     scene = plate(8, {"time": [0, 1], "value": [[0, 0, 0], [0, 0, 1e-6]]}, 1.0)
     look, domain, rng = seen(scene).neighbourhoods, scene.domain, np.random.default_rng(7)
     own, volumes, count = look.remote_values.owned_cells, domain.volumes, len(look.tips)
     sigma, push = np.zeros((domain.cell_count, 3, 3)), np.zeros((domain.cell_count, 3))
     sigma[own], push[own] = rng.standard_normal((len(own), 3, 3)), 3e4 * rng.standard_normal((len(own), 3))
-    radius = criterion_of(scene).field_evaluator._radii.disc[look.tips.cell]
-    apart = domain.nodes[domain.cell_nodes].mean(axis=1)[None] - look.tips.point[:, None]
-    slope = np.array([plateau_gradient(each, np.full(len(each), R)) for each, R in zip(apart, radius, strict=True)])
-    q = plateau(np.linalg.norm(apart, axis=2), radius[:, None])
+    points, corners = domain.nodes, domain.cell_nodes
+    distance = np.linalg.norm(points[None] - look.tips.point[:, None], axis=2)
+    at_nodes = plateau(distance, seen(scene).disc_radius[:, None])[:, corners]
+    slope, q = np.einsum("tck,cki->tci", at_nodes, barycentric_gradients(points[corners])), at_nodes.mean(axis=2)
     expected = np.einsum("c,tc,ci->ti", volumes, q, push) - np.einsum("c,tck,cik->ti", volumes, slope, sigma)
     np.testing.assert_allclose(
         look.evaluate_forces(sigma[own], push[own]), expected, atol=1e-12 * np.abs(expected).max()

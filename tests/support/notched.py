@@ -14,7 +14,7 @@ from fracsim.scene import Scene, build_scene_on
 
 from .scenes import make_study
 from .squares import square
-from .tips import tips
+from .tips import criterion_of, tips
 
 Values = npt.NDArray[np.float64]
 
@@ -44,6 +44,23 @@ def plate(kind: str, n: int, side: float = 1.0, order: int = 1, **tables: Any) -
     mesh = {"builder": "box", "size": [side, side], "h": side, "order": order}
     study = make_study(**plate_tables() | tables, mesh=mesh)
     return build_scene_on(distribute(MPI.COMM_SELF, square(kind, n, side), order), study)
+
+
+def balanced(kind: str, n: int, end: float = 0.5, order: int = 1, start: float = 0.0, **tables: Any) -> Scene:
+    """A square of 1 m with a crack from x = start to x = end, m, whose sides `put_in_balance` moves."""
+    return plate(
+        kind, n, order=order, crack=[{"segment": [[start, 0.507], [end, 0.507]]}],
+        boundary=[{"on": side, "fix": "xy"} for side in ("left", "right", "bottom", "top")],
+        time={"scheme": "quasi-static", "step": 1.0, "end": 1.0}, **tables,
+    )  # fmt: skip
+
+
+def put_in_balance(scene: Scene, u: Values) -> None:
+    """Move the sides of a scene by the displacement (n, 2) of its nodes, m; its cracks are held."""
+    motion, values = scene.balance.motion, u.ravel()
+    criterion_of(scene).toughness = np.inf
+    motion.displacements_at = lambda t, dofs=motion.dofs: values[dofs]  # type: ignore[method-assign,misc]
+    scene.stepper.advance(scene.start())
 
 
 def torn(scene: Scene) -> Iterator[tuple[float, float, Any]]:

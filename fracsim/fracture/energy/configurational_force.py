@@ -47,14 +47,6 @@ def plateau(distance: Values, radius: Values) -> Values:
     return np.clip(2 * (1 - distance / radius), 0.0, 1.0)
 
 
-def plateau_gradient(apart: Values, radius: Values) -> Values:
-    """Return grad q (n, d), 1/m, at positions (n, d) relative to a tip, for radii R (n,)."""
-    r = np.linalg.norm(apart, axis=1)
-    ring = (r > radius / 2) & (r < radius)
-    slope = np.where(ring, -2 / (radius * np.where(ring, r, 1.0)), 0.0)
-    return slope[:, None] * apart
-
-
 def closure_spring_stress(vectors: Values, modulus: Values, H: Values, *, linear: bool) -> tuple[Values, Values]:
     """Return psi (n,), J/m^3, and P (n, d, d), Pa, of the springs along shortened edges (forms.crack_closure).
 

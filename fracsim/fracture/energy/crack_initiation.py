@@ -41,7 +41,7 @@ class CutProposal:
         cells: (n,) local cells.
         stress: (n, d, d) averaged stress, Pa.
         entry: (n,) local edges by which cracks came in; None for new cracks, as the following.
-        ahead: (n, d) directions of the cracks.
+        ahead: (n, d) directions of the cracks; of those that turn, as long as they are cut beyond the cell, m.
         turns: (n,) the crack follows `ahead` exactly, not the plane across the first principal stress.
         branches: (n,) the crack branches.
     """

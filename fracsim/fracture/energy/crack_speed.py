@@ -25,7 +25,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...mesh.simplices import local_edges
 from ..criterion import Edges
 from .crack_initiation import CutProposal
 from .cut_plane import EdgeCuts
@@ -146,10 +145,9 @@ class RateDependentTipCriterion(TipCriterion):
         if proposal.entry is None:
             return np.column_stack([rows, np.tile(AT_REST, (len(rows), 1))])
         states = self.tip_states[self._graph.cell_edges[cells, proposal.entry[cuts.row]]]
-        ends = reference_corners(self._domain, cells)[np.arange(len(cells))[:, None], local_edges(2)[cuts.edge]]
-        exit_point = ends[:, 0] + cuts.share[:, None] * (ends[:, 1] - ends[:, 0])
+        exit_points = cuts.points(reference_corners(self._domain, proposal.cells))
         # The distance through the next cell adds to what remained.
-        states[:, TipState.REMAINING] += np.linalg.norm(exit_point - proposal.point[cuts.row], axis=1)
+        states[:, TipState.REMAINING] += np.linalg.norm(exit_points - proposal.point[cuts.row], axis=1)
         return np.column_stack([rows, states])
 
     def _store_cuts(self, rows: Values) -> tuple[Edges, Values]:

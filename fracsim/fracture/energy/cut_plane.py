@@ -36,6 +36,12 @@ class EdgeCuts:
     edge: Ints
     share: Values
 
+    def points(self, corners: Values) -> Values:
+        """Return the points (n, 2) of the cuts, m, from the corners (cells, 3, 2) of the triangles that were passed."""
+        first, second = local_edges(2)[self.edge].T
+        a, b = corners[self.row, first], corners[self.row, second]
+        return np.asarray(a + self.share[:, None] * (b - a))
+
 
 def plane_crossings(corners: Values, through: Values, normal: Values) -> tuple[Flags, Values]:
     """Return whether lines (planes) cross local edges of cells (n, k), and the nearest position on each edge (n, k).

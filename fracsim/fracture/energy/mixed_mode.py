@@ -8,11 +8,11 @@ and Dunham 1976; with inertia Rethore et al. 2005). Fields that do not belong to
 crack faces, drop out at any size of the disc.
 
     psi = atan2(K_II, K_I)
-    tan(t/2) = - 2 K_II / (K_I + (K_I^2 + 8 K_II^2)^1/2)        the largest hoop stress (Erdogan and Sih 1963)
-    K = cos(t/2) (K_I cos^2(t/2) - 3/2 K_II sin t)              of the crack that kinks by t
+    K_k(t) = F_kI(t) K_I + F_kII(t) K_II        at the tip of a kink by t that is short (Amestoy and Leblond 1992)
 
-The force along the crack, (K_I^2 + K_II^2) / E', is that of straight growth. In pure sliding a kinked crack releases a
-third more. Where K_I < 0 the crack faces press on each other, and K_I counts as 0.
+The crack turns to the t of the largest K_I(t)^2 + K_II(t)^2. The force along the crack, (K_I^2 + K_II^2) / E', is that
+of straight growth: in pure sliding a kink by 75.8 degrees releases 1.517 times as much. Where K_I < 0 the crack faces
+press on each other, and K_I counts as 0.
 
 Equations: docs/theory.md#tension-and-sliding.
 """
@@ -20,6 +20,8 @@ Equations: docs/theory.md#tension-and-sliding.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from math import pi
 
 import numpy as np
 import numpy.typing as npt
@@ -111,16 +113,57 @@ def phase_angles(intensities: Values) -> Values:
     return np.asarray(np.arctan2(intensities[:, 1], intensities[:, 0]))
 
 
+def kink_matrix(angle: Values) -> Values:
+    """Return F (n, 2, 2), which takes K_I and K_II of a crack to those of a short kink by angles (n,), rad.
+
+    Series in m = angle / pi (Amestoy and Leblond 1992, equation 66), valid up to 80 degrees.
+    """
+    m = np.asarray(angle) / pi
+    even = m[:, None] ** np.arange(0, 22, 2)
+    odd = m[:, None] ** np.arange(1, 21, 2)
+    return np.stack([even @ _F_11, odd @ _F_12, odd @ _F_21, even @ _F_22], axis=1).reshape(-1, 2, 2)
+
+
+_F_11 = np.array([
+    1, -3 * pi**2 / 8, pi**2 - 5 * pi**4 / 128, pi**2 / 9 - 11 * pi**4 / 72 + 119 * pi**6 / 15360, 5.07790, -2.88312,
+    -0.0925, 2.996, -4.059, 1.63, 4.1,
+])  # fmt: skip
+_F_12 = np.array([
+    -3 * pi / 2, 10 * pi / 3 + pi**3 / 16, -2 * pi - 133 * pi**3 / 180 + 59 * pi**5 / 1280, 12.313906, -7.32433, 1.5793,
+    4.0216, -6.915, 4.21, 4.56,
+])  # fmt: skip
+_F_21 = np.array([
+    pi / 2, -4 * pi / 3 - pi**3 / 48, -2 * pi / 3 + 13 * pi**3 / 30 - 59 * pi**5 / 3840, -6.176023, 4.44112, -1.5340,
+    -2.0700, 4.684, -3.95, -1.32,
+])  # fmt: skip
+_F_22 = np.array([
+    1, -4 - 3 * pi**2 / 8, 8 / 3 + 29 * pi**2 / 18 - 5 * pi**4 / 128,
+    -32 / 15 - 4 * pi**2 / 9 - 1159 * pi**4 / 7200 + 119 * pi**6 / 15360, 10.58254, -4.78511, -1.8804, 7.280, -7.591,
+    0.25, 12.5,
+])  # fmt: skip
+
+
+@cache
+def _kink_table() -> tuple[Values, Values, Values]:
+    """Return phase angles (361,) from 0 to pi / 2, and the kinks' angles, rad, and energy release rates there."""
+    # Up to 80 degrees.
+    angle: Values = np.asarray(np.linspace(0, 4 / 9 * pi, 8001), np.float64)
+    psi: Values = np.asarray(np.linspace(0, pi / 2, 361), np.float64)
+    K = kink_matrix(-angle) @ np.array([np.cos(psi), np.sin(psi)])
+    released: Values = np.einsum("nij,nij->nj", K, K)
+    best = released.argmax(axis=0)
+    return psi, np.asarray(angle[best]), np.asarray(released[best, np.arange(len(psi))])
+
+
 def kink_angle(psi: Values) -> Values:
     """Return the kink angle (n,), rad, anti-clockwise from the tangent, at phase angles psi (n,)."""
+    phases, angles, _ = _kink_table()
     # A closed crack has no K_I.
-    first, second = np.maximum(np.cos(psi), 0.0), np.sin(psi)
-    root = first + np.sqrt(first**2 + 8 * second**2)
-    return np.asarray(-2 * np.arctan2(2 * second, root))
+    return -np.sign(np.sin(psi)) * np.interp(np.arctan2(np.abs(np.sin(psi)), np.cos(psi)), phases, angles)
 
 
 def kink_gain(psi: Values) -> Values:
     """Return the energy release of the kinked crack over that of straight growth (n,), at phase angles psi (n,)."""
-    t = kink_angle(psi)
-    turned = np.cos(t / 2) * (np.maximum(np.cos(psi), 0.0) * np.cos(t / 2) ** 2 - 1.5 * np.sin(psi) * np.sin(t))
-    return np.asarray(turned**2)
+    phases, _, gains = _kink_table()
+    closed = np.where(np.cos(psi) < 0, np.sin(psi) ** 2, 1.0)
+    return closed * np.interp(np.arctan2(np.abs(np.sin(psi)), np.cos(psi)), phases, gains)

@@ -13,7 +13,6 @@ from scipy.spatial import cKDTree
 
 from ...mesh.domain import Domain
 from ...mesh.parallel import RankHalo, alltoall
-from ...mesh.small_matrices import barycentric_gradients
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -69,19 +68,6 @@ def local_mesh_size(domain: Domain) -> Values:
     at_corners = rows[nodes]
     mean = (at_corners[..., 0] / at_corners[..., 1]).mean(axis=1)
     return np.asarray((factorial(domain.dim) * mean) ** (1 / domain.dim))
-
-
-def surface_vectors(domain: Domain) -> tuple[Values, Values]:
-    """Return int n dA (cells, d), m^(d-1), over the facets of cells in the body's surface, and their middle (cells, d).
-
-    n is the outward normal; the middle is the mean of the centroids of these facets, m.
-    """
-    corners, outside = domain.nodes[domain.cell_nodes], domain.facets.boundary_sides
-    areas = -domain.dim * domain.volumes[:, None, None] * barycentric_gradients(corners)
-    facet_centroids = (corners.sum(axis=1, keepdims=True) - corners) / domain.dim
-    count = np.maximum(outside.sum(axis=1), 1)[:, None]
-    area, middle = (np.einsum("nk,nki->ni", outside, vectors) for vectors in (areas, facet_centroids))
-    return area, middle / count
 
 
 @dataclass(frozen=True)
@@ -148,21 +134,18 @@ class NearbyCells:
         number: (near,) numbers in the input mesh, ascending.
         volumes: (near,) m^d.
         centres: (near, d) centroids, m.
-        surface_vectors: (near, d) int n dA over the facets in the body's surface, m^(d-1).
-        surface_points: (near, d) middle of these facets, m.
     """
 
     def __init__(self, domain: Domain, reach: float) -> None:
         """Exchange cells (collective); `reach`: largest distance of any later search, m."""
         centroids = domain.nodes[domain.cell_nodes].mean(axis=1)
-        halo, self._comm = RankHalo(domain.comm, centroids, reach), domain.comm
+        halo, self._comm, self._domain = RankHalo(domain.comm, centroids, reach), domain.comm, domain
         rank, index = np.full(len(centroids), float(domain.comm.rank)), np.arange(float(len(centroids)))
-        columns = [domain.input_numbering.cells, rank, index, domain.volumes, centroids, *surface_vectors(domain)]
+        columns = [domain.input_numbering.cells, rank, index, domain.volumes, centroids]
         rows = halo(np.column_stack(columns))
         rows = rows[np.argsort(rows[:, 0], kind="stable")]
         self.number, self._rank, self._index = rows[:, :3].T.astype(np.int64)
-        self.volumes = rows[:, 3].copy()
-        self.centres, self.surface_vectors, self.surface_points = (part.copy() for part in np.split(rows[:, 4:], 3, 1))
+        self.volumes, self.centres = rows[:, 3].copy(), rows[:, 4:].copy()
         self._tree = cKDTree(self.centres)
 
     def find_pairs(self, points: Values, radius: Values) -> NeighbourPairs:
@@ -172,6 +155,17 @@ class NearbyCells:
     def request_values(self, cells: Ints) -> RemoteCellValues:
         """Return an exchange of the values of near cells (n,) (collective)."""
         return RemoteCellValues(self._comm, self._rank[cells], self._index[cells])
+
+    def corners(self, cells: Ints) -> tuple[Values, npt.NDArray[np.bool_]]:
+        """Return the corners (n, d + 1, d), m, of near cells (n,), and the sides in the body's surface (collective).
+
+        Flags (n, d + 1) of sides have the number of the corner opposite to it.
+        """
+        exchange = self.request_values(cells)
+        owned = exchange.owned_cells
+        corners = self._domain.nodes[self._domain.cell_nodes[owned]]
+        corners, outside = exchange(corners, self._domain.facets.boundary_sides[owned].astype(float))
+        return corners, outside > 0
 
     def find_cells(self, number: Ints) -> tuple[Ints, npt.NDArray[np.bool_]]:
         """Return the positions (n,) of cells of the input mesh among the near ones, and whether they are there."""

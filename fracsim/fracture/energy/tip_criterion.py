@@ -98,7 +98,16 @@ class TipCriterion:
         self.disc_radius_ratio = TIP.disc_radius[domain.dim]
         disc = self.disc_radius_ratio * self._h
         self._start = self._critical_distance()
-        radii = TipRadii(disc, TIP.average_radius * self._h, TIP.mature_length * self._h, self._start.radius)
+        radii = TipRadii(
+            disc,
+            # Branches share a disc of one size.
+            disc if self.may_branch else TIP.kinked_radius[domain.dim] * self._h,
+            TIP.average_radius * self._h,
+            TIP.mature_length * self._h,
+            self._start.radius,
+            TIP.cell_reach * self._h,
+            TIP.straightness * self._h,
+        )
         self.field_evaluator = TipFieldEvaluator(stress, graph, radii, may_branch=self.may_branch, shares=self.shares)
         self._initiation: Initiation = CrackInitiation(stress, graph, strength, self.field_evaluator, disc, self._start)
         self._now, self._dt = 0.0, np.inf
@@ -207,7 +216,11 @@ class TipCriterion:
             # A force backwards belongs to other tips in the disc.
             mature &= size > 0
             turns, side_by_side = mature & np.any(kinked, axis=1), np.any(tips.branch_direction, axis=1)
-            ahead = np.where(turns[:, None], kinked, ahead)
+            # A crack that turns is cut on straight, at least by one cell: the fields at a kink that is short are those
+            # of the tip before it.
+            sine = np.abs(np.einsum("ni,ni->n", rotate(unit_or_zero(tips.point - tips.behind), np.pi / 2), kinked))
+            length = np.maximum(TIP.kink_length * sine, TIP.force_round_off) * h
+            ahead = np.where(turns[:, None], length[:, None] * kinked, ahead)
             # Branches that are side by side advance in the same pass.
             exclusion = np.where(side_by_side, TIP.exclusion_radius[3] * h, exclusion)
         if self._record is not None:
@@ -301,29 +314,35 @@ class TipCriterion:
 
         Args:
             edges: (n,) edges that were cut just now.
-            courses: (n, 2) directions of the cracks; 0 for those that are not extended.
+            courses: (n, 2) directions of the cracks, as long as what they still advance, m; 0 for those that end here.
         """
         if self._domain.dim == 3:
             return edges
-        graph, course = self._graph, np.zeros((len(self._graph.broken), self.course_width))
-        course[edges] = courses
-        entered = np.any(course[graph.cell_edges], axis=2)
-        # Cells with one cut edge, on the far side of a cut, are next on the course of the crack. They are cut in the
-        # same pass: the force over a disc of 5 h changes by some per cent from one cell to the next, and before a solve
-        # it would be that of a body out of balance.
-        is_next = (entered.sum(axis=1) == 1) & ~(graph.damaged | self._excluded_cells)
-        cells = np.flatnonzero(is_next).astype(np.int64)
-        entry, turns = np.argmax(entered[cells], axis=1), np.ones(len(cells), bool)
-        entry_edges = graph.cell_edges[cells, entry]
-        point, ahead = self.field_evaluator.cut_points(entry_edges, self.cut_positions), course[entry_edges]
-        split_beyond = split_cell_edges(graph)[graph.cell_edges[cells]]
-        cuts = exit_cuts(
-            reference_corners(self._domain, cells), entry, point, rotate(ahead, np.pi / 2), ahead, split_beyond
-        )
-        self.cells = np.concatenate([self.cells, cells])
-        rank = rank_rows(TIP_ADVANCE, np.zeros(len(cells)), point, point, np.zeros(len(cells)))
-        proposal = CutProposal(rank, cells, np.empty((len(cells), 2, 2)), entry, ahead, turns, ~turns)
-        return np.concatenate([edges, self._store_cuts(self._cut_rows(proposal, cuts))[0]])
+        graph, domain, all_edges = self._graph, self._domain, [edges]
+        while True:
+            course = np.zeros((len(graph.broken), self.course_width))
+            course[edges] = courses
+            entered = np.any(course[graph.cell_edges], axis=2)
+            # Cells with one cut edge, on the far side of a cut, are next on the course of the crack. They are cut in
+            # the same pass: before a solve the force would be that of a body out of balance.
+            is_cut_once = (~np.isnan(self.cut_positions))[graph.cell_edges].sum(axis=1) == 1
+            is_next = entered.any(axis=1) & is_cut_once & ~(graph.damaged | self._excluded_cells)
+            cells = np.flatnonzero(is_next).astype(np.int64)
+            if not sum_over_ranks(domain.comm, len(cells))[0]:
+                return np.concatenate(all_edges)
+            entry, corners = np.argmax(entered[cells], axis=1), reference_corners(domain, cells)
+            entry_edges = graph.cell_edges[cells, entry]
+            point, ahead = self.field_evaluator.cut_points(entry_edges, self.cut_positions), course[entry_edges]
+            split_beyond = split_cell_edges(graph)[graph.cell_edges[cells]]
+            cuts = exit_cuts(corners, entry, point, rotate(ahead, np.pi / 2), ahead, split_beyond)
+            passed = np.linalg.norm(cuts.points(corners) - point, axis=1) / np.linalg.norm(ahead, axis=1)
+            ahead = np.maximum(1 - passed, 0.0)[:, None] * ahead
+            self.cells = np.concatenate([self.cells, cells])
+            turns, zeros = entry >= 0, np.zeros(len(cells))
+            rank = rank_rows(TIP_ADVANCE, zeros, point, point, zeros)
+            proposal = CutProposal(rank, cells, np.empty((len(cells), 2, 2)), entry, ahead, turns, ~turns)
+            edges, courses = self._store_cuts(self._cut_rows(proposal, cuts))
+            all_edges.append(edges)
 
     def _exit_cuts(self, advances: CutProposal) -> EdgeCuts:
         """Return the cuts of the cells of tips that advance (collective)."""

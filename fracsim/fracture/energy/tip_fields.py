@@ -34,7 +34,7 @@ class TipFields:
 
     Attributes:
         neighbourhoods: tips and sums around them.
-        disc_radius: (tips,) R, m.
+        disc_radius: (tips,) radius of the disc, in 3D ball, of the force, m.
         cell_stress: (cells, 3 or 6) Cauchy stress of the undamaged material in all cells of this rank, Pa.
         stress: (requested, 3 or 6) that stress in the cells around tips, Pa.
         sigma: (requested, d, d) Eshelby stress of the damaged body, Pa.
@@ -108,7 +108,7 @@ class TipFieldEvaluator:
         self.centres: Values = domain.nodes[domain.cell_nodes].mean(axis=1)
         self._motion: tuple[Values, Values] | None = None
         # All ranks search within the same radius.
-        largest = max(float(np.max(radius, initial=0.0)) for radius in (radii.disc, radii.start))
+        largest = max(float(np.max(radius, initial=0.0)) for radius in (radii.disc + radii.cell_reach, radii.start))
         largest_radius = domain.comm.allreduce(largest, op=MPI.MAX)
         self._nearby, self._geometry = NearbyCells(domain, largest_radius), CutGeometry(domain, graph)
         self.cut_cells = CutCells(graph, self._geometry, self.centres)
@@ -177,7 +177,7 @@ class TipFieldEvaluator:
         in_plane = (H, inertia_force) if self._domain.dim == 2 else (np.empty((len(cells), 0)),) * 2
         remote_stress, sigma, inertia, H, inertia_force = exchange(cell_stress, sigma, inertia, *in_plane)
         elastic, rotates = (mu[tips.cell], kappa[tips.cell]), not self._stress.energy.linear
-        radius = self._radii.disc[tips.cell]
+        radius = tips.radius
         fields = remote_stress, sigma, inertia, H, inertia_force
         return TipFields(self.neighbourhoods, radius, stress, *fields, elastic, rotates)
 

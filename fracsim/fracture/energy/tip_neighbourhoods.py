@@ -15,9 +15,10 @@ from scipy.sparse import csc_matrix, csr_matrix, hstack
 from scipy.spatial import cKDTree
 
 from ...mesh.edge_graph import EdgeGraph
+from ...mesh.small_matrices import barycentric_gradients
 from ..principal_stress import symmetric_tensors
 from . import branching, mixed_mode
-from .configurational_force import plateau, plateau_gradient
+from .configurational_force import plateau
 from .crack_front import FrontReleaseRate, advance_vectors, project_on_surface
 from .cut_cells import CutCells, CutGeometry
 from .neighbour_search import NearbyCells, NeighbourPairs, find_pairs, weighted_mean
@@ -33,16 +34,22 @@ class TipRadii:
     """Radii of the neighbourhood of a tip in each cell (cells,), m.
 
     Attributes:
-        disc: R of the configurational force.
+        disc: R of the domain of a tip.
+        kinked: least radius of the part of it over which the force is summed, where the crack kinks.
         average: radius within which stress is averaged, at most R.
         beyond: a tip is mature if a split cell lies between R and R plus this length.
         start: radius of the half disc ahead of a place at which a crack starts; 0 without such discs.
+        cell_reach: bound of the distance from the centroid of a cell to its corners.
+        straight: distance from the tangent at the tip within which the crack counts as straight.
     """
 
     disc: Values
+    kinked: Values
     average: Values
     beyond: Values
     start: Values
+    cell_reach: Values
+    straight: Values
 
 
 @dataclass(frozen=True)
@@ -53,20 +60,22 @@ class CrackTips:
         cell: (n,) local cells, ascending.
         pattern: (n,) broken edges of the cells, one bit each.
         point: (n, d) positions, m.
-        behind: (n, d) mean of the cuts of the crack nearer than R, m.
+        behind: (n, d) mean of the cuts of the crack nearer than the least radius of the force, m.
+        radius: (n,) radius of the force, m.
         mature: (n,) whether the crack is longer than R.
         ahead: (n, d) advance that the force is divided by: in 3D the crack area it makes, m; in 2D see `branching`.
         course: (n, d) from the mean of the crack nearer than 2 R to the tip, m; 0 unless cracks may branch.
         branch_direction: (n, d) direction of a tip that advances side by side with another; 0 without one, and in 3D.
         is_inactive: (n,) whether the other one of two branches advances first.
         alone: (n,) whether no disc of another tip overlaps that of the tip.
-        surface: (n, d) int q n dA over the surface of the body in the disc, m^(d-1).
+        surface: (n, d) int q n dA over the surface of the body, m^(d-1).
     """
 
     cell: Ints
     pattern: npt.NDArray[np.uint8]
     point: Values
     behind: Values
+    radius: Values
     mature: Flags
     ahead: Values
     course: Values
@@ -78,6 +87,10 @@ class CrackTips:
     def __len__(self) -> int:
         """Return the number of tips."""
         return len(self.cell)
+
+
+# Attributes of tips that stay the same until the crack near them changes.
+_KEPT = "behind", "radius", "mature", "ahead", "course", "branch_direction", "is_inactive", "alone", "surface"
 
 
 class _Weight(IntEnum):
@@ -123,7 +136,18 @@ class TipNeighbourhoods:
         self.front_release_rate = FrontReleaseRate(graph.domain.comm, averaged=shares)
         none, no_points, no = np.empty(0, np.int64), np.empty((0, graph.domain.dim)), np.empty(0, bool)
         self.tips = CrackTips(
-            none, none.astype(np.uint8), no_points, no_points, no, no_points, no_points, no_points, no, no, no_points
+            none,
+            none.astype(np.uint8),
+            no_points,
+            no_points,
+            np.empty(0),
+            no,
+            no_points,
+            no_points,
+            no_points,
+            no,
+            no,
+            no_points,
         )
         self._split = np.zeros(len(nearby.number), bool)
         # Pairs of a tip and a cell (among the near ones), and the weights of the cell in sums around the tip.
@@ -134,6 +158,7 @@ class TipNeighbourhoods:
         self._surface_weights: Values = no_points
         self._matrices: dict[int, csr_matrix] = {}
         self._force_matrices: tuple[csc_matrix, csc_matrix] | None = None
+        self._shape = 0, 0
 
     @property
     def split_cells(self) -> Flags:
@@ -147,8 +172,8 @@ class TipNeighbourhoods:
         for cells, split in ((number, False), (self._cut_cells.number[self._cut_cells.split], True)):
             position, is_near = self._nearby.find_cells(cells)
             self._split[position[is_near]] = split
-        new = self._find_tips(cut)
-        self._update_cracks_behind(np.flatnonzero(new | self._flag_near(centre)))
+        old_row = self._find_tips(cut)
+        self._update_cracks_behind(np.flatnonzero((old_row < 0) | self._flag_near(centre)), old_row)
         # Only the cells around tips are requested from their ranks.
         needed = np.zeros(len(self._split), bool)
         needed[self._pair_cell] = True
@@ -162,8 +187,8 @@ class TipNeighbourhoods:
         self._force_matrices = None
         if self.tips.point.shape[1] == 3:
             cell, domain = self.tips.cell, self._graph.domain
-            number, radius = domain.input_numbering.cells[cell], self._radii.disc[cell]
-            self.front_release_rate.update(number, self.tips.point, self.tips.ahead, radius)
+            number = domain.input_numbering.cells[cell]
+            self.front_release_rate.update(number, self.tips.point, self.tips.ahead, self.tips.radius)
 
     # --- sums around tips; `requested` counts the cells of `remote_values` ---
 
@@ -258,39 +283,26 @@ class TipNeighbourhoods:
 
     # --- update of tips, and of the cracks behind them ---
 
-    def _find_tips(self, cut: Values) -> Flags:
-        """Find the tips, and the cells around new ones; return flags (n,) of the new ones."""
+    def _find_tips(self, cut: Values) -> Ints:
+        """Find the tips; return the rows (n,) that they had at the last update, -1 for new ones."""
         graph, old = self._graph, self.tips
         cell = np.flatnonzero(graph.damaged & ~graph.split).astype(np.int64)
-        # The neighbourhood of a tip is unchanged if its cell is cut as before.
         old_row = np.full(graph.domain.cell_count, -1)
         old_row[old.cell] = np.arange(len(old))
         row = old_row[cell]
+        # A tip is the same if its cell is cut as before.
         unchanged = row >= 0
         unchanged[unchanged] = old.pattern[row[unchanged]] == graph.pattern[cell[unchanged]]
-        new = np.flatnonzero(~unchanged)
+        row[~unchanged] = -1
         point = self._geometry.mean_cut_points(cell, cut)
-        pair_tip, pair_cell, weights, surface_weights = self._find_surroundings(cell[new], point[new])
-        # Merge the pairs of old and new tips, ordered by tips.
-        new_row = np.full(len(old), -1)
-        new_row[row[unchanged]] = np.flatnonzero(unchanged)
-        old_pairs = np.flatnonzero(new_row[self._pair_tip] >= 0)
-        all_tips = np.concatenate([new_row[self._pair_tip[old_pairs]], new[pair_tip]])
-        order = np.argsort(all_tips, kind="stable")
-        self._pair_tip = all_tips[order]
-        self._pair_cell = np.concatenate([self._pair_cell[old_pairs], pair_cell])[order]
-        self._weights = np.concatenate([self._weights[old_pairs], weights])[order]
-        self._surface_weights = np.concatenate([self._surface_weights[old_pairs], surface_weights])[order]
         behind, ahead, course, branch_direction, surfaces = np.zeros((5, *point.shape))
         mature, is_inactive, alone = np.zeros((3, len(cell)), bool)
-        size, slope = len(new), weights[:, : point.shape[1]]
-        # The integral of grad q over the body is that of q n over its surface.
-        surfaces[new] = np.column_stack([np.bincount(pair_tip, component, size) for component in slope.T])
         self.tips = CrackTips(
             cell,
             graph.pattern[cell],
             point,
             behind,
+            np.zeros(len(cell)),
             mature,
             ahead,
             course,
@@ -299,26 +311,54 @@ class TipNeighbourhoods:
             alone,
             surfaces,
         )
-        for name in ("behind", "mature", "ahead", "course", "branch_direction", "is_inactive", "alone", "surface"):
+        for name in _KEPT:
             getattr(self.tips, name)[unchanged] = getattr(old, name)[row[unchanged]]
-        return ~unchanged
+        return row
 
-    def _find_surroundings(self, cell: Ints, point: Values) -> tuple[Ints, Ints, Values, Values]:
-        """Find the pairs of tips and cells around them.
+    def _update_surroundings(self, old_row: Ints) -> None:
+        """Find the cells around tips with -1 in `old_row` (n,), and keep those around the others (collective)."""
+        tips, new = self.tips, np.flatnonzero(old_row < 0)
+        pair_tip, pair_cell, weights, surface_weights = self._find_surroundings(
+            tips.cell[new], tips.point[new], tips.radius[new]
+        )
+        # The integral of grad q over the body is that of q n over its surface.
+        slope = weights[:, : tips.point.shape[1]]
+        tips.surface[new] = np.column_stack([np.bincount(pair_tip, component, len(new)) for component in slope.T])
+        # Merge the pairs of old and new tips, ordered by tips.
+        new_row = np.full(self._shape[0], -1)
+        new_row[old_row[old_row >= 0]] = np.flatnonzero(old_row >= 0)
+        old_pairs = np.flatnonzero(new_row[self._pair_tip] >= 0)
+        all_tips = np.concatenate([new_row[self._pair_tip[old_pairs]], new[pair_tip]])
+        order = np.argsort(all_tips, kind="stable")
+        self._pair_tip = all_tips[order]
+        self._pair_cell = np.concatenate([self._pair_cell[old_pairs], pair_cell])[order]
+        self._weights = np.concatenate([self._weights[old_pairs], weights])[order]
+        self._surface_weights = np.concatenate([self._surface_weights[old_pairs], surface_weights])[order]
+
+    def _find_surroundings(self, cell: Ints, point: Values, radius: Values) -> tuple[Ints, Ints, Values, Values]:
+        """Find the pairs of tips and cells around them (collective).
+
+        q is that of the nodes, linear in each cell: a uniform Eshelby stress exerts no force.
 
         Returns:
             Tip (pairs,) and cell (pairs,), the weights (pairs, d + 2), and int q n dA (pairs, d) of the cell's surface.
         """
-        disc, average = self._radii.disc[cell], self._radii.average[cell]
-        pairs = self._nearby.find_pairs(point, disc)
-        volume, r, R = self._nearby.volumes[pairs.second], pairs.distance, disc[pairs.first]
-        slope = volume[:, None] * plateau_gradient(pairs.apart, R)
-        share = 1 - r / average[pairs.first]
-        columns = [plateau(r, R), np.maximum(share, 0.0)]
+        average = self._radii.average[cell]
+        pairs = self._nearby.find_pairs(point, radius + self._radii.cell_reach[cell])
+        needed, index = np.unique(pairs.second, return_inverse=True)
+        corners, outside = self._nearby.corners(needed)
+        distance = np.linalg.norm(corners[index] - point[pairs.first, None], axis=2)
+        q, share = plateau(distance, radius[pairs.first, None]), 1 - pairs.distance / average[pairs.first]
+        rows = np.flatnonzero((q > 0).any(axis=1) | (share > 0))
+        q, share, index, tip, cells = q[rows], share[rows], index[rows], pairs.first[rows], pairs.second[rows]
+        volume, gradients = self._nearby.volumes[cells], barycentric_gradients(corners)[index]
+        slope = volume[:, None] * np.einsum("pk,pki->pi", q, gradients)
+        columns = [q.mean(axis=1), np.maximum(share, 0.0)]
         weights = np.column_stack([slope, *(volume * column for column in columns)])
-        distance = np.linalg.norm(self._nearby.surface_points[pairs.second] - point[pairs.first], axis=1)
-        surface_weights = plateau(distance, R)[:, None] * self._nearby.surface_vectors[pairs.second]
-        return pairs.first, pairs.second, weights, surface_weights
+        # The outward area of the side opposite to a corner is - d V grad N; q is averaged over its corners.
+        side_mean = outside[index] * (q.sum(axis=1, keepdims=True) - q)
+        surface_weights = -volume[:, None] * np.einsum("pk,pki->pi", side_mean, gradients)
+        return tip, cells, weights, surface_weights
 
     def _flag_near(self, changed: Values) -> Flags:
         """Return whether tips (n,) depend on any of the changed cells with centroids (m, d)."""
@@ -330,27 +370,48 @@ class TipNeighbourhoods:
         reach = disc * (1 + 1 / TIP.min_disc_radius) if changed.shape[1] == 3 else 2 * (1 + self._may_branch) * disc
         return np.asarray(distance <= np.maximum(disc + beyond, reach))
 
-    def _update_cracks_behind(self, rows: Ints) -> None:
-        """Update the cracks behind tips `rows` (m,)."""
-        tips, cut_cells = self.tips, self._cut_cells
-        point, disc = tips.point[rows], self._radii.disc[tips.cell[rows]]
-        mature_radius, split = disc + self._radii.beyond[tips.cell[rows]], np.flatnonzero(cut_cells.split)
+    def _update_cracks_behind(self, rows: Ints, old_row: Ints) -> None:
+        """Update the cracks behind tips `rows` (m,), and the cells around new tips and those with a new radius.
+
+        `old_row` (n,) are the rows at the last update, -1 for new tips (collective).
+        """
+        tips, cut_cells, cell = self.tips, self._cut_cells, self.tips.cell[rows]
+        point, disc = tips.point[rows], self._radii.disc[cell]
+        mature_radius, split = disc + self._radii.beyond[cell], np.flatnonzero(cut_cells.split)
         reach = np.maximum(mature_radius, disc * (1 + 1 / TIP.min_disc_radius))
         pairs = find_pairs(cKDTree(cut_cells.centre[split]), point, reach)
         cells, r = split[pairs.second], disc[pairs.first]
-        tips.behind[rows] = self._mean_cut_point_behind(pairs, cells, point, disc)
+        tips.behind[rows] = self._mean_cut_point_behind(pairs, cells, point, self._radii.kinked[cell])
         tips.mature[rows] = pairs.any((pairs.distance >= r) & (pairs.distance < mature_radius[pairs.first]))
-        if point.shape[1] == 3:
+        old_radius, in_plane = tips.radius[rows], point.shape[1] == 2
+        tips.radius[rows] = self._straight_length(rows, pairs, cells) if in_plane else disc
+        old_row[rows[tips.radius[rows] != old_radius]] = -1
+        self._update_surroundings(old_row)
+        if in_plane:
+            self._update_shared_advance(rows, disc)
+        else:
             near = np.flatnonzero(pairs.distance < r * (1 + 1 / TIP.min_disc_radius))
             advance = advance_vectors(cut_cells.polygon, (pairs.first[near], cells[near]), point, disc)
             tips.ahead[rows] = project_on_surface(advance, tips.surface[rows], disc)
-        else:
-            self._update_shared_advance(rows, disc)
 
-    def _mean_cut_point_behind(self, pairs: NeighbourPairs, cells: Ints, point: Values, disc: Values) -> Values:
-        """Return the mean (n, d), m, of the cuts of split cells (pairs,) nearer than `disc` to points (n, d)."""
+    def _straight_length(self, rows: Ints, pairs: NeighbourPairs, cells: Ints) -> Values:
+        """Return the distance (m,), m, from tips `rows` (m,) in 2D up to which the crack behind is straight.
+
+        It is between the least and the largest radius of the force. `pairs` are those of the tips and split `cells`.
+        """
+        tips, first = self.tips, pairs.first
+        tangent, cell = branching.unit_or_zero(tips.point - tips.behind)[rows], tips.cell[rows]
+        back = self._cut_cells.cut_point[cells] - tips.point[rows][first]
+        aside = np.abs(tangent[first, 0] * back[:, 1] - tangent[first, 1] * back[:, 0])
+        leaves = aside > self._radii.straight[cell][first]
+        length = self._radii.disc[cell].copy()
+        np.minimum.at(length, first[leaves], np.linalg.norm(back[leaves], axis=1))
+        return np.maximum(length, self._radii.kinked[cell])
+
+    def _mean_cut_point_behind(self, pairs: NeighbourPairs, cells: Ints, point: Values, radius: Values) -> Values:
+        """Return the mean (n, d), m, of the cuts of split cells (pairs,) nearer than `radius` to points."""
         # Relative to the point, so that a tip without a crack behind it has the point itself.
-        within = (pairs.distance < disc[pairs.first]).astype(float)
+        within = (pairs.distance < radius[pairs.first]).astype(float)
         back = within[:, None] * (self._cut_cells.cut_point[cells] - point[pairs.first])
         return point + weighted_mean(pairs.sum(back), pairs.sum(within)[:, None])
 
@@ -360,8 +421,8 @@ class TipNeighbourhoods:
         all_tips = np.flatnonzero(~cut_cells.split)
         pairs = find_pairs(cKDTree(cut_cells.cut_point[all_tips]), tips.point[rows], (1 + self._may_branch) * disc)
         other_points = cut_cells.cut_point[all_tips[pairs.second]]
-        directions = self._direction_from_crack(other_points, disc[pairs.first])
-        tips.ahead[rows] = branching.shared_advance(pairs, directions, disc)
+        directions = self._direction_from_crack(other_points, self._radii.kinked[tips.cell[rows]][pairs.first])
+        tips.ahead[rows] = branching.shared_advance(pairs, directions, tips.radius[rows])
         if self._may_branch:
             tips.alone[rows] = np.bincount(pairs.first, minlength=len(rows)) == 1
             tips.course[rows] = course = self._direction_from_crack(tips.point[rows], 2 * disc)

@@ -20,7 +20,10 @@ class TipParameters:
     Lengths are in units of the local mesh size h unless a unit is given.
 
     Attributes:
-        disc_radius: radius R of the disc, in 3D ball, over which the force on a tip is summed.
+        disc_radius: radius R of the domain of a tip: the disc, in 3D ball, over which the force on it is summed.
+        kinked_radius: least radius of the part of the disc over which the force is summed, where the crack behind the
+            tip is straight for less than R.
+        straightness: distance from the tangent at its tip within which a crack counts as straight.
         average_radius: radius within which stress is averaged.
         mature_length: a tip is mature once a split cell lies between R and R plus this length.
         passes_per_size: fracture passes in which a crack advances by h.
@@ -40,12 +43,17 @@ class TipParameters:
         min_front_advance: least length of an advance, in R, that belongs to a crack front.
         min_surface_area: area of the body's surface in a ball, in R^2, from which on a front follows the surface.
         min_disc_radius: lower bound of R: cut polygons reach as far as a cell beyond their cell's centre.
+        cell_reach: distance from the centroid of a cell within which its corners are.
+        kink_length: length, times the sine of its angle, by which a kink is cut beyond its first cell. The forces at
+            shorter ones are off by a third.
         front_lag: relative lack of G below G_c with which tips of a front advance with their neighbours.
         lead_distance: distance up to which a tip of a front leads its plane.
         force_round_off: relative rounding error of a sum over some thousand cells.
     """
 
     disc_radius: Mapping[int, float] = _by_dimension(5.0, 4.0)
+    kinked_radius: Mapping[int, float] = _by_dimension(2.5, 4.0)
+    straightness: float = 0.5
     average_radius: float = 3.0
     mature_length: float = 1.5
     passes_per_size: Mapping[int, float] = _by_dimension(2.5, 5.0)
@@ -61,6 +69,8 @@ class TipParameters:
     min_front_advance: float = 0.05
     min_surface_area: float = 0.1
     min_disc_radius: float = 3.0
+    cell_reach: float = 1.5
+    kink_length: float = 1.5
     front_lag: float = 0.03
     lead_distance: float = 0.65
     force_round_off: float = 1e-9
