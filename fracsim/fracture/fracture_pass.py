@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -14,8 +14,10 @@ from ..mesh.edge_graph import EdgeGraph
 from .criterion import FractureCriterion
 from .degradation import Degradation, make_degradation
 from .effective_stress import UndamagedStress
-from .energy.tip_record import TipRecord
 from .node_retention import NodeAttachment
+
+if TYPE_CHECKING:
+    from .energy.tip_record import TipRecord
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]

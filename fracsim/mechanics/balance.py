@@ -394,7 +394,8 @@ class EnergySums:
             forces for term in balance.terms_with["reference_forces"] if (forces := term.reference_forces()) is not None
         ]
         # contact forces with their weight in the residual
-        references += [balance.level.contact_weight * forces for forces in balance.contact.forces_of_terms()]
+        contact_forces = [term.contact_forces() for term in balance.contact.contacts]
+        references += [balance.level.contact_weight * forces for forces in contact_forces if forces is not None]
         inertia = balance.mass.lumped * u if balance.c_a else 0.0
         parts = (*references, balance.reactions[balance.motion.owned_dofs], u, inertia)
         *loads, moved, carried = np.sqrt(

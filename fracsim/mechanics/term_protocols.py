@@ -249,6 +249,7 @@ class ContactTerms:
     """Contact of a balance: the sum of contact forces, and the bounds of all terms on the steps of Newton's method.
 
     Attributes:
+        contacts: terms with contact forces at the end of a step.
         limits_newton_steps: whether any term limits the length of a Newton step.
     """
 
@@ -256,7 +257,7 @@ class ContactTerms:
         terms = tuple(terms)
         self._comm = comm
         self._limiters = fulfilling(terms, StepLimiter)
-        self._contacts = fulfilling(terms, ContactTerm)
+        self.contacts = fulfilling(terms, ContactTerm)
         self._guessing = fulfilling(terms, InitialGuess)
         self._tests = fulfilling(terms, FeasibilityTest)
         self._prescribed = fulfilling(terms, RestrictedMotion)
@@ -265,13 +266,9 @@ class ContactTerms:
         self._limiting_terms = [term for term in terms if fulfilling([term], StepLimiter)]
         self.limits_newton_steps = bool(self._limiters)
 
-    def forces_of_terms(self) -> list[Values]:
-        """(owned dofs,) forces at the end of the step of each term with something in contact, N (collective)."""
-        return [force for term in self._contacts if (force := term.contact_forces()) is not None]
-
     def forces(self) -> Values | None:
         """(owned dofs,) contact forces at the end of the step, N; None if nothing is in contact (collective)."""
-        forces = self.forces_of_terms()
+        forces = [force for term in self.contacts if (force := term.contact_forces()) is not None]
         return sum(forces[1:], forces[0]) if forces else None
 
     def is_active(self) -> bool:
@@ -281,7 +278,7 @@ class ContactTerms:
 
     def begin_solve(self) -> None:
         """Begin an attempt of Newton's method at the step."""
-        for term in self._contacts:
+        for term in self.contacts:
             term.begin_solve()
 
     def max_step_fraction(self, change: Values) -> float:
@@ -328,7 +325,7 @@ class ContactTerms:
 
     def clear_search(self) -> None:
         """Clear caches of the contact search (collective)."""
-        for term in self._contacts:
+        for term in self.contacts:
             term.clear_search()
 
 

@@ -83,7 +83,7 @@ def measure(kind: str, n: int) -> dict[str, Any]:
         run = Run(build_scene(MPI.COMM_WORLD, validate(study, kind)), Path(folder, "run"))
         contact: Any = next(term for term in run.scene.balance.terms if term.name == "contact")
         steps = _time_contact_steps(run, contact)
-        figures = time_pair_operations(contact._surface, contact._end_positions())
+        figures = time_pair_operations(contact.surface, contact.end_positions())
     seconds, newton = zip(*steps, strict=True)
     own = {"triangles": 12 * (n**2 + (n + 1) ** 2), "newton": float(np.mean(newton)), "step": float(np.mean(seconds))}
     return own | figures

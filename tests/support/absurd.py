@@ -175,6 +175,10 @@ fix = "xy"
 [[boundary]]
 on = "right"
 displacement = { time = [0.0, 1.0], value = [[0.0, 0.0], [0.01, 0.0]] }
+[[probe]]
+name = "tip"
+point = [0.5, 0.1]
+contour = 0.2
 [time]
 scheme = "quasi-static"
 step = 0.5
