@@ -158,8 +158,10 @@ class LinearSolver:
         self._step_cg = LinearStepCG(ksp.comm, int(ksp.max_it), policy) if is_single_cg else None
         self.forcing = None if self._asked_rtol else _forcing(balance, chosen, policy)
         # of attempts of a body that may touch something, until it does
-        self._free_forcing = ContractionForcing(float(chosen["ksp_rtol"]), policy)
-        self._touches = not (isinstance(self.forcing, EisenstatWalkerForcing) and balance.scheme.inertia)
+        self._free_forcing: ContractionForcing | None = None
+        if isinstance(self.forcing, EisenstatWalkerForcing) and balance.scheme.inertia:
+            self._free_forcing = ContractionForcing(float(chosen["ksp_rtol"]), policy)
+        self._touches = self._free_forcing is None
         self._last_forcing = self.forcing  # of the last solve
         dofs = balance.work_vector.getSize()
         self.direct = DirectSolver(symmetric=balance.symmetric, dofs=dofs, dim=balance.domain.dim, policy=policy)
@@ -233,8 +235,9 @@ class LinearSolver:
         """Begin an attempt of Newton's method."""
         if self.forcing is not None:
             self.forcing.begin_attempt()
+        if self._free_forcing is not None:
             self._free_forcing.begin_attempt()
-            self._touches = not (isinstance(self.forcing, EisenstatWalkerForcing) and self.balance.scheme.inertia)
+            self._touches = False
 
     def _forcing_at_iterate(self) -> EisenstatWalkerForcing | ContractionForcing | None:
         """Return the tolerances of the present solve: those of a body without contact until it touches (collective)."""

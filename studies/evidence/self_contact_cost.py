@@ -83,7 +83,7 @@ def measure(kind: str, n: int) -> dict[str, Any]:
         run = Run(build_scene(MPI.COMM_WORLD, validate(study, kind)), Path(folder, "run"))
         contact: Any = next(term for term in run.scene.balance.terms if term.name == "contact")
         steps = _time_contact_steps(run, contact)
-        figures = time_pair_operations(contact.surface, contact.end_positions())
+        figures = time_pair_operations(contact.surface.current, contact.end_positions())
     seconds, newton = zip(*steps, strict=True)
     own = {"triangles": 12 * (n**2 + (n + 1) ** 2), "newton": float(np.mean(newton)), "step": float(np.mean(seconds))}
     return own | figures
@@ -113,7 +113,7 @@ def time_pair_operations(surface: Any, x: Any) -> dict[str, Any]:
         "gradient": lambda k: pairs.gradient(away if k % 2 else x),
         "hessian": lambda k: pairs.hessian(away if k % 2 else x),
     }
-    touching = sum(len(active.pairs) for active in pairs._search.active_pairs(pairs._mesh.vertices(x)))
+    touching = sum(len(active.pairs) for active in pairs._active_pairs(pairs._mesh.vertices(x)))
     return {"touching": touching} | {
         name: median(map(_timer(work), range(REPEATS))) for name, work in operations.items()
     }
