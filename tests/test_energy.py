@@ -506,12 +506,12 @@ def test_a_strip_tears_where_it_stores_enough(scheme: str, n: int, order: int) -
 @pytest.mark.parametrize("order", (1, 2))
 @pytest.mark.parametrize("kind", ("structured", "unstructured"))
 def test_explicit_and_implicit_cracks_run_alike(kind: str, order: int) -> None:
-    """Faster the more is stored, slower than Rayleigh waves, and by both schemes within a tenth of c_R."""
+    """Faster the more is stored, slower than Rayleigh waves, and by both schemes within 0.12 c_R."""
     assert run_of_a_strip(0.95, "explicit", kind, 12, order).length < 1e-9
     speeds = []
     for ratio in (1.1, 1.5, 2.5):
         speeds.append(run_of_a_strip(ratio, "explicit", kind, 12, order).speed)
-        assert run_of_a_strip(ratio, "newmark", kind, 12, order).speed == pytest.approx(speeds[-1], abs=0.1)
+        assert run_of_a_strip(ratio, "newmark", kind, 12, order).speed == pytest.approx(speeds[-1], abs=0.12)
     assert 0.3 < speeds[0] < speeds[1] < speeds[2] < 0.95
 
 

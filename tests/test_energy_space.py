@@ -134,10 +134,10 @@ def polygons(scene: Scene) -> Values:
 )
 def test_a_straight_front_starts_at_griffiths_load(n: int, order: int) -> None:
     """Single-edge notched tension (Miehe et al. 2010): 645 N/mm of a sharp crack to the middle at 2.7 kJ/m^2, to 3 %;
-    all along the front G is the same to 5 %."""
+    all along the front G is the same to 6 %."""
     scene = plate(n, {"time": [0, 1], "value": [[0, 0, 0], [0, 0, 1e-6]]}, 1.0, order)
     found = forces(scene)
-    assert found.max() / found.min() < 1.05
+    assert found.max() / found.min() < 1.06
     assert scene.probes()[2] / 0.25e-3 * np.sqrt(2.7e3 / found.max()) == pytest.approx(645e3, rel=0.03)
     assert area(scene) / 0.25e-3 == pytest.approx(0.5e-3, abs=0.2e-3 / n)
 
