@@ -448,7 +448,7 @@ def test_section_of_experiments() -> None:
         records.append(record("brazilian", f"{h}", 1, figures=figures, settings={"h": h}))
     records.append(record("charpy-klst", "x", 1, outcome="out of time", figures={}, settings={"h": 1.6e-4}))
     (section,) = experiments.sections(records)
-    assert [claim.holds for claim in section.claims] == [False, True, True, *[None] * 11]
+    assert [claim.holds for claim in section.claims] == [False, True, True, *[None] * 12]
     every, spreads = section.tables
     assert len(every.rows) == 4 and every.rows[3][2] == "out of time"
     assert spreads.rows[0][:4] == ("brazilian", 3, pytest.approx(exact * 3.2 / 3), pytest.approx(0.25 / (3.2 / 3)))
