@@ -146,7 +146,7 @@ class SurfaceFacets:
         self._exclude(np.flatnonzero(self._too_close(is_new, nodal, posed)))
 
     def release(self, release_points: Callable[[], None], u: Values, posed: Sequence[PosedShape]) -> None:
-        """Undo releases of points that bring a facet into contact; include facets that are not in contact.
+        """Undo releases of points that bring a facet into contact; include facets not in contact (collective).
 
         Args:
             release_points: function that releases points of the surface.
@@ -156,10 +156,12 @@ class SurfaceFacets:
         surface = self._surface
         old_map, excluded = surface.local.point_map, surface.area == 0
         release_points()
-        changed = surface.local.point_map is not old_map or excluded.any() or len(self._excluded)
-        if not self.numbers or self._may_be_cut or not changed:
+        if not self.numbers or self._may_be_cut:
             return
+        # Every rank takes part, also those on which nothing has changed.
         point_map, nodal = surface.local.point_map, surface.interpolation.nodal_values(u)
+        if point_map is old_map and not excluded.any() and not len(self._excluded):
+            return
         moved = (point_map.share != old_map.share) | excluded
         undone = np.unique(self._all_facets.corners[self._too_close(moved, nodal, posed)])
         undone = undone[moved[undone]]
