@@ -34,7 +34,7 @@ CASES: dict[str, tuple[dict[str, Any], int, tuple[int, ...]]] = {
     "explicit-obstacles": (torn.RUNS["rapped"], 17, (7, 12)),
     "explicit-contact": (torn.RUNS["rammed"], 15, (5, 12)),
     "explicit-energy": (tearing.RUNS["begun"], 12, (5, 11)),
-    "explicit-joined": (tearing.RUNS["shivered"], 27, (7, 19)),
+    "explicit-joined": (tearing.RUNS["shivered"], 25, (7, 19)),
     "explicit-ductile": (
         torn.RUNS["ductile"] | {
             "time": {"scheme": "explicit", "step": 0.05, "end": 1.0}, "fracture": {"strength": 0.2, "radius": 0.15},
