@@ -41,6 +41,11 @@ class BarrierPolicy:
     averaging: float = 0.8
     closed_value: float = 1e200
 
+    @property
+    def early_weight(self) -> float:
+        """Weight in the mean of the force after a third of the step."""
+        return 0.75 * self.averaging
+
 
 BARRIER = BarrierPolicy()
 
@@ -182,25 +187,21 @@ class TimeAveragedPotential:
     def energy(self, g: Values) -> Values:
         """(n,) potential of p, J/m^2; infinite where a gap is closed."""
         early, late = self._evaluate_both(self.barrier.energy, g)
-        return np.asarray(3 * EARLY_WEIGHT * early + (1 - EARLY_WEIGHT) * late)
+        return np.asarray(3 * BARRIER.early_weight * early + (1 - BARRIER.early_weight) * late)
 
     def slope(self, g: Values) -> Values:
         """(n,) p, Pa: minus the pressure; never positive."""
         early, late = self._evaluate_both(self.barrier.slope, g)
-        return np.asarray(EARLY_WEIGHT * early + (1 - EARLY_WEIGHT) * late)
+        return np.asarray(BARRIER.early_weight * early + (1 - BARRIER.early_weight) * late)
 
     def curvature(self, g: Values) -> Values:
         """(n,) dp/dg, Pa/m; never negative."""
         early, late = self._evaluate_both(self.barrier.curvature, g)
-        return np.asarray(EARLY_WEIGHT / 3 * early + (1 - EARLY_WEIGHT) * late)
+        return np.asarray(BARRIER.early_weight / 3 * early + (1 - BARRIER.early_weight) * late)
 
     def _evaluate_both(self, function: Callable[[Values], Values], g: Values) -> tuple[Values, Values]:
         """(n,) values after a third of the step and at its end; a gap closed at the end counts as closed before."""
         return function(np.where(g > 0, (2 * self.start_gap + g) / 3, g)), function(g)
-
-
-# weight of the force after a third of the step
-EARLY_WEIGHT = 0.75 * BARRIER.averaging
 
 
 def stiffness_factor(relative_gap: float) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Hashable
 from ctypes import CDLL, byref, c_double, c_int64
 from dataclasses import replace
+from enum import IntEnum
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
@@ -19,7 +20,7 @@ from mpi4py import MPI
 
 from ..mesh.c_library import FAST_FLAGS, array_pointer, compile_on_all_ranks, unchecked_function
 from .closest_point import SEARCH
-from .laws import BARRIER, EARLY_WEIGHT, Barrier
+from .laws import BARRIER, Barrier
 from .shape_base import ConvexBody, Shape, frame_about, unit_vector
 from .shapes import Capsule, HalfSpace, OffsetShape, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
 
@@ -29,8 +30,15 @@ SOURCE = Path(__file__).with_suffix(".c")
 _SEARCH = np.array([
     SEARCH.max_iterations, SEARCH.max_trials, SEARCH.slope_reduction, SEARCH.flat_distance, SEARCH.min_change
 ])  # fmt: skip
-# as in shape_kernels.c
-HALF_SPACE, SWEPT_SPHERE, BOX, CYLINDER = range(4)
+
+
+class ShapeKind(IntEnum):
+    """Kinds of shapes, numbered as in shape_kernels.c."""
+
+    HALF_SPACE = 0
+    SWEPT_SPHERE = 1
+    BOX = 2
+    CYLINDER = 3
 
 
 class CompiledShapeKernels:
@@ -113,7 +121,7 @@ class CompiledShapeKernels:
         pointers = _pointer(results[0]), _pointer(results[1])
         self._facets(
             *_sizes(x), _pointer(packed), _pointer(x), _pointer(barycentric), c_double(smoothing),
-            _pointer(np.array([law.stiffness, law.width, EARLY_WEIGHT, BARRIER.closed_value])),
+            _pointer(np.array([law.stiffness, law.width, BARRIER.early_weight, BARRIER.closed_value])),
             None if start is None else _pointer(start), _pointer(area),
             *((None, None, *pointers) if second else (*pointers, None, None)),
         )  # fmt: skip
@@ -153,7 +161,7 @@ def _pack_shape(original: Hashable) -> Values:
     kind, axis, half, radius, fillet = _parameters(shape)
     axes = np.zeros((2, 3))
     axes[0, : len(axis)] = axis
-    if kind in (SWEPT_SPHERE, CYLINDER):
+    if kind in (ShapeKind.SWEPT_SPHERE, ShapeKind.CYLINDER):
         axes[1, : len(axis)] = frame_about(axis)[:, 0]
     sizes = np.full(3, np.inf)
     sizes[: len(half)] = half
@@ -164,12 +172,12 @@ def _pack_shape(original: Hashable) -> Values:
 def _parameters(shape: Shape) -> tuple[int, Values, Values, float, float]:
     """Kind, axis (d,), half sizes (m,), radius and fillet of a shape, m."""
     if isinstance(shape, HalfSpace):
-        return HALF_SPACE, unit_vector(shape.direction), np.empty(0), 0.0, 0.0
+        return ShapeKind.HALF_SPACE, unit_vector(shape.direction), np.empty(0), 0.0, 0.0
     if isinstance(shape, Sphere | Capsule):
         axis, half, radius = shape.core
-        return SWEPT_SPHERE, axis, np.array([half]), radius, 0.0
+        return ShapeKind.SWEPT_SPHERE, axis, np.array([half]), radius, 0.0
     if isinstance(shape, RoundedBox):
-        return BOX, np.empty(0), np.array(shape.size) / 2 - shape.fillet, 0.0, shape.fillet
+        return ShapeKind.BOX, np.empty(0), np.array(shape.size) / 2 - shape.fillet, 0.0, shape.fillet
     assert isinstance(shape, RoundedCylinder)
     radius, half = shape.core
-    return CYLINDER, unit_vector(shape.axis), np.array([half]), radius, shape.fillet
+    return ShapeKind.CYLINDER, unit_vector(shape.axis), np.array([half]), radius, shape.fillet

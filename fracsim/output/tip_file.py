@@ -18,12 +18,11 @@ from .history import rename_unreadable
 Ints = npt.NDArray[np.integer]
 Values = npt.NDArray[np.float64]
 
-# rows of a tip over which its speed is the mean: the time of a Rayleigh wave through the disc of the tip in 2D
-SPEED_ROWS = 10
-
 
 class TrackedTip:
     """Crack tip that is followed from step to step.
+
+    Its speed is the mean over 10 rows: in 2D passes are so frequent that a Rayleigh wave crosses the disc meanwhile.
 
     Attributes:
         cell: number of its cell in the input mesh.
@@ -32,7 +31,7 @@ class TrackedTip:
 
     def __init__(self) -> None:
         self.cell = -1
-        self.course: deque[tuple[float, Values]] = deque(maxlen=SPEED_ROWS + 1)
+        self.course: deque[tuple[float, Values]] = deque(maxlen=11)
 
     def move(self, t: float, cell: int, point: Values) -> None:
         """Add the position (d,), m, at time t, s."""
