@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +16,7 @@ from fracsim.meshes.data import MeshData, MeshError
 from fracsim.meshes.directions import preferred_directions
 from fracsim.meshes.quality import mesh_quality
 from fracsim.meshes.random_points.outline import Outline
-from fracsim.meshes.random_points.points import SAMPLING, scatter
+from fracsim.meshes.random_points.points import SAMPLING, circumcircles, scatter
 from fracsim.meshes.sizing import SizeField
 from fracsim.meshes.topology import boundary_facets, edges_of, signed_measures
 from fracsim.study.mesh_source import build_mesh
@@ -108,6 +111,27 @@ def test_holes_and_narrow_slits() -> None:
     outline = Outline(np.concatenate([p.points for p in parts]), np.concatenate([p.pieces for p in parts]))
     points, cells = scatter(outline, SizeField(0.1).at)
     assert signed_measures(points, cells).sum() == pytest.approx(1 - 0.09 + 0.01 - 0.23 * 0.004 / 2, rel=1e-12)
+
+
+def test_points_do_not_depend_on_the_processor(tmp_path: Path) -> None:
+    """OpenBLAS rounds otherwise for other processors; the points that are drawn are equal to the last digit."""
+    code = "import sys, numpy; from support.squares import square\n"
+    code += "numpy.save(sys.argv[1], square('unstructured', 30).points)"
+    drawn = []
+    for processor in ("Prescott", "Haswell", "SkylakeX"):
+        target = tmp_path / f"{processor}.npy"
+        environment = os.environ | {"OPENBLAS_CORETYPE": processor, "PYTHONPATH": str(Path(__file__).parent)}
+        subprocess.run([sys.executable, "-c", code, str(target)], env=environment, check=True)
+        drawn.append(np.load(target))
+    assert all(np.array_equal(points, drawn[0]) for points in drawn)
+
+
+def test_circles_through_three_points() -> None:
+    """The three corners have the same distance from the centre, also where the first span has no x."""
+    corners = np.concatenate([np.random.default_rng(3).random((100, 3, 2)), [[[0, 0], [0, 1], [2, 1]]]])
+    centres, radii = circumcircles(corners)
+    apart = np.linalg.norm(corners - centres[:, None], axis=2)
+    np.testing.assert_allclose(apart, np.outer(radii, [1, 1, 1]), rtol=1e-9)
 
 
 def test_an_outline_that_crosses_itself_is_refused() -> None:

@@ -99,7 +99,7 @@ def _in_body(triangles: Any, inside: Mask, points: Points) -> Mask:
 
 def _gap_points(corners: Points, size: Size, random: np.random.Generator) -> Points:
     """(k, 2) a random point in the gap of each triangle (m, 3, 2) with too large a circumcircle."""
-    centres, radii = _circumcircles(corners)
+    centres, radii = circumcircles(corners)
     apart = SAMPLING.distance * size(centres)
     wide = radii > 1.0001 * apart  # more than round-off
     centres, gap = centres[wide], (radii - apart)[wide]
@@ -108,12 +108,24 @@ def _gap_points(corners: Points, size: Size, random: np.random.Generator) -> Poi
     return centres + distance[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
 
 
-def _circumcircles(corners: Points) -> tuple[Points, Floats]:
+def circumcircles(corners: Points) -> tuple[Points, Floats]:
     """Circumcentres (m, 2) and circumradii (m,) of triangles (m, 3, 2): 2 (x_i - x_0) . c = |x_i - x_0|^2."""
     spans = corners[:, 1:] - corners[:, :1]
-    squares = np.einsum("mij,mij->mi", spans, spans)
-    centre = np.linalg.solve(2 * spans, squares[:, :, None])[:, :, 0]
+    centre = _solve_pairs(2 * spans, np.einsum("mij,mij->mi", spans, spans))
     return corners[:, 0] + centre, np.linalg.norm(centre, axis=1)
+
+
+def _solve_pairs(A: Floats, b: Floats) -> Floats:
+    """Solutions x (m, 2) of A x = b by elimination with pivots, for A (m, 2, 2) and b (m, 2).
+
+    LAPACK's round-off depends on the processor, and with it the points that are drawn next: the mesh of a study.
+    """
+    row = np.arange(len(A))
+    pivot = (np.abs(A[:, 1, 0]) > np.abs(A[:, 0, 0])).astype(int)
+    first, second = A[row, pivot], A[row, 1 - pivot]
+    factor = second[:, 0] * (1.0 / first[:, 0])
+    y = (b[row, 1 - pivot] - factor * b[row, pivot]) / (second[:, 1] - factor * first[:, 1])
+    return np.stack([(b[row, pivot] - y * first[:, 1]) / first[:, 0], y], axis=1)
 
 
 def _spaced(points: Points, apart: Floats) -> Mask:

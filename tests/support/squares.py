@@ -43,6 +43,7 @@ def _rotated(n: int) -> tuple[Points, Indices]:
     outline = Outline(rim, np.column_stack([number, np.roll(number, -1)]))
     c, s = np.cos(np.pi / 8), np.sin(np.pi / 8)
     lattice = np.stack(np.meshgrid(*[np.arange(-2 * n, 2 * n) + 0.01] * 2, indexing="ij"), axis=-1).reshape(-1, 2) / n
+    lattice[:, 0] += 1e-6 * lattice[:, 1]  # no four points on a circle: else round-off would choose the diagonals
     turned = lattice @ np.array([[c, s], [-s, c]]) + 0.5
     inner = turned[((turned > 0.6 / n) & (turned < 1 - 0.6 / n)).all(axis=1)]
     points = np.concatenate([rim, inner])
