@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.optimize import brentq
 
 from fracsim.contact import laws
 from fracsim.contact.facet_contact import ContactFacets, evaluate_facets
-from fracsim.contact.laws import Barrier, CoulombFriction, TimeAveragedPotential, tangential
+from fracsim.contact.laws import Barrier, CoulombFriction, FrictionDirection, TimeAveragedPotential, tangential
 from fracsim.contact.node_contact import StepStart, evaluate_points
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, Shape, Sphere
@@ -262,6 +265,57 @@ def test_no_slip_no_force() -> None:
     n, rest = np.array([[0.0, 0.0, 1.0]]), np.zeros((1, 3))
     np.testing.assert_array_equal(FRICTION.gradient(np.ones(1), n, rest), 0)
     np.testing.assert_allclose(FRICTION.hessian(np.ones(1), n, rest)[0], np.diag([800.0, 800.0, 0.0]))
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+@given(seed=st.integers(0, 10**6))
+def test_tangents_of_friction_with_directions(dim: int, seed: int) -> None:
+    """Symmetric and never negative after any two iterates; |w| <= 1; exact where the slip is that of the last tangent
+    and w belongs to it."""
+    force, n, moved = sliding(dim, seed)
+    at_first = FrictionDirection(FRICTION, n)
+    last = at_first.updated(moved).updated(sliding(dim, seed + 1)[2])
+    for direction in (at_first, last):
+        w, H = direction(tangential(n, moved)), FRICTION.hessian(force, n, moved, direction)
+        assert (np.linalg.norm(w, axis=1) <= 1 + 10 * EPS).all()
+        np.testing.assert_array_equal(H, H.transpose(0, 2, 1))
+        assert (np.linalg.eigvalsh(H).min(axis=1) >= -1e-12 * np.abs(H).max()).all()
+        np.testing.assert_allclose(np.einsum("nij,nj->ni", H, n), 0, atol=1e-12 * np.abs(H).max())
+    s = tangential(n, moved)
+    there = FrictionDirection(FRICTION, n, (s, FRICTION.direction(s)))
+    exact = FRICTION.hessian(force, n, moved)
+    np.testing.assert_allclose(FRICTION.hessian(force, n, moved, there), exact, atol=1e-12 * np.abs(exact).max())
+
+
+def spring_iterates(primal_dual: bool, stiffness: float, end: float) -> list[float]:
+    """Slips, m, of whole Newton steps from 20 h for a spring k/2 (s - end)^2 on a point that rubs with 2 N."""
+    n, direction, slips = np.array([[0.0, 1.0]]), FrictionDirection(FRICTION, np.array([[0.0, 1.0]])), [20e-3]
+    for _ in range(30):
+        motion = np.array([[slips[-1], 0.0]])
+        residual = stiffness * (slips[-1] - end) + FRICTION.gradient(np.full(1, 5.0), n, motion)[0, 0]
+        if abs(residual) < 1e-9:
+            break
+        H = FRICTION.hessian(np.full(1, 5.0), n, motion, direction if primal_dual else None)
+        direction = direction.updated(motion)
+        slips.append(slips[-1] - residual / (stiffness + H[0, 0, 0]))
+    return slips
+
+
+@pytest.mark.parametrize("end", (-0.01, 0.0, 0.01, 0.1))
+@pytest.mark.parametrize("stiffness", (1.0, 30.0, 100.0))
+def test_a_point_that_comes_to_stick_takes_few_whole_newton_steps(stiffness: float, end: float) -> None:
+    """A point on a spring that ends in sticking (k |end| < 2 N) or slips on: the balance of spring and Coulomb by
+    bisection. Exact tangents overshoot by 2 N / k, and come back and forth without end for the soft spring."""
+    slips = spring_iterates(primal_dual=True, stiffness=stiffness, end=end)
+
+    def excess(s: float) -> float:
+        z = min(abs(s) / 1e-3, 1.0)
+        return stiffness * (s - end) + math.copysign(2.0 * (2 * z - z**2), s)
+
+    assert len(slips) <= 9
+    assert slips[-1] == pytest.approx(brentq(excess, -1.0, 1.0, xtol=1e-15), abs=1e-9)
+    if stiffness == 1 and end == 0:
+        assert len(spring_iterates(primal_dual=False, stiffness=stiffness, end=end)) == 31
 
 
 def test_a_turn_of_a_ball_is_no_bound() -> None:

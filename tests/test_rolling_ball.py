@@ -20,3 +20,21 @@ def test_a_ball_begins_to_roll_alike_on_any_number_of_ranks(ranks: int, tmp_path
     assert alone[-1, COLUMNS.index("spin_ball_y")] > 1.0
     scale = np.abs(alone).max(axis=0)
     np.testing.assert_allclose(together / scale, alone / scale, atol=1e-8)
+
+
+def test_a_ball_that_begins_to_roll_takes_few_iterations() -> None:
+    """Points that slip come to stick, and slip again: 12 iterations in a step with exact tangents of friction alone,
+    where the line search took steps of a hundredth."""
+    from mpi4py import MPI
+
+    from fracsim.scene import build_scene
+    from fracsim.studies.cross_file_calls import BALL
+    from fracsim.study.reader import validate
+
+    scene = build_scene(MPI.COMM_SELF, validate(BALL, "ball"))
+    state, iterations = scene.start(), []
+    for _ in range(12):
+        state, report = scene.stepper.advance(state)
+        iterations.append(report.solve.newton_iterations)
+    scene.destroy()
+    assert max(iterations) <= 8 and sum(iterations) <= 60  # 6 and 53

@@ -18,7 +18,7 @@ from ..mesh.split_surface.point_matching import match_points
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .contact_surface import RETRACTION, TINY, ContactSurface, SurfaceVersion, retract_cut_elements
 from .facet_contact import FACETS, ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
-from .laws import CoulombFriction, ObstacleLaw, tangential
+from .laws import CoulombFriction, FrictionDirection, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
 from .pose import PosedShape, min_distance
 from .proximity import ProximityCandidates, ShownCells, outline_radius
@@ -266,6 +266,7 @@ class ContactState:
         self._contact_forces: list[ContactForces] | None = None
         self._nodal_forces: Values | None = None  # of the present contact forces
         self._sticking_slips: list[float] | None = None  # m, of each obstacle in the step; None: not known yet
+        self._directions: dict[int, FrictionDirection] = {}  # in this attempt, by the numbers of obstacles
         self._attempts = 0  # of Newton's method in the step
         self._tangent_positions: Values | None = None  # of the points at the last tangent of this attempt
         items = dict(zip(self.numbers, self.obstacles, strict=True))
@@ -355,7 +356,7 @@ class ContactState:
         """Discard the contact at the start of the step, as the points are no longer the same."""
         none = [None] * len(self.obstacles)
         self.lagged, self._step_starts, self._tangent_positions = [*none], [*none], None
-        self._sticking_slips = None
+        self._sticking_slips, self._directions = None, {}
         self.update_displacement()
 
     def update_displacement(self) -> None:
@@ -385,12 +386,14 @@ class ContactState:
         friction = None
         if lagged is not None and self._sticking_slips is not None:
             friction = CoulombFriction(obstacle.friction, self._sticking_slips[number])
+            self._directions.setdefault(number, FrictionDirection(friction, lagged.normal))
         obstacle_motion, start = self.contact_point_motion(number), self._step_starts[number]
         start_posed, candidates = self.group.start_posed[number], self._candidates(number, posed)
         if start is not None:
             start = start.carried_with(start_posed.pose, posed.pose)
         points = self.positions, self.surface.area, posed, self.law.barrier
-        of_points = evaluate_points(*points, lagged, friction, obstacle_motion, start, candidates)
+        direction = self._directions.get(number)
+        of_points = evaluate_points(*points, lagged, friction, obstacle_motion, start, candidates, direction)
         if number not in self.facets.numbers:
             return of_points
         facet_start = None if start is None else (start_posed, self._start_positions)

@@ -48,6 +48,9 @@ class BarrierPolicy:
 
 
 BARRIER = BarrierPolicy()
+# Share of f1 e that is w at the first tangent. A ball that begins to roll took 58 iterations in ten steps with exact
+# tangents, 48 with 1, 43 with 0.5, and 44 with 0, which takes more where points slide on.
+FIRST_DIRECTION = 0.5
 
 
 class GapPotential(Protocol):
@@ -251,21 +254,75 @@ class CoulombFriction:
         secant, _ = self._secant_and_tangent(np.linalg.norm(s, axis=1))
         return (self.coefficient * force * secant)[:, None] * s
 
-    def hessian(self, force: Values, normal: Values, motion: Values) -> Values:
-        """(n, d, d) mu lambda (f1 / |s| (T - e e^T) + f1' e e^T), e = s / |s|, N/m; positive semi-definite."""
+    def hessian(
+        self, force: Values, normal: Values, motion: Values, direction: FrictionDirection | None = None
+    ) -> Values:
+        """(n, d, d) mu lambda (f1 / |s| (T - e e^T) + f1' e e^T), e = s / |s|, N/m; positive semi-definite.
+
+        `direction`: w in place of f1 e, with which f1 / |s| T + (f1' - f1 / |s|) / f1 w e^T is made symmetric. It is
+        semi-definite for |w| <= 1.
+        """
         s = tangential(normal, motion)
-        y = np.linalg.norm(s, axis=1)
+        blocks = self.direction_derivative(normal, s, None if direction is None else direction(s))
+        if direction is not None:
+            blocks = (blocks + blocks.transpose(0, 2, 1)) / 2
+        return np.asarray((self.coefficient * force)[:, None, None] * blocks)
+
+    def direction(self, slip: Values) -> Values:
+        """(n, d) f1 e at slips (n, d), m."""
+        return np.asarray(self._secant_and_tangent(np.linalg.norm(slip, axis=1))[0][:, None] * slip)
+
+    def direction_derivative(self, normal: Values, slip: Values, direction: Values | None = None) -> Values:
+        """(n, d, d) derivative of f1 e by slips (n, d), 1/m; `direction`: (n, d) w in place of f1 e in it."""
+        y = np.linalg.norm(slip, axis=1)
         secant, tangent = self._secant_and_tangent(y)
-        e = s / np.maximum(y, np.finfo(float).tiny)[:, None]
-        T = np.eye(s.shape[1]) - normal[:, :, None] * normal[:, None, :]
-        blocks = secant[:, None, None] * T + (tangent - secant)[:, None, None] * e[:, :, None] * e[:, None, :]
-        return (self.coefficient * force)[:, None, None] * blocks
+        e = slip / np.maximum(y, np.finfo(float).tiny)[:, None]
+        T = np.eye(slip.shape[1]) - normal[:, :, None] * normal[:, None, :]
+        if direction is None:
+            by_length, direction = tangent - secant, e
+        else:  # (f1' - f1 / |s|) / f1, which is -1 / (2 h - |s|) below h
+            by_length = -1 / np.where(y < self.sticking_slip, 2 * self.sticking_slip - y, y)
+        return np.asarray(secant[:, None, None] * T + (by_length[:, None] * direction)[:, :, None] * e[:, None, :])
 
     def _secant_and_tangent(self, y: Values) -> tuple[Values, Values]:
         """(n,) f1 / y and f1', 1/m."""
         h = self.sticking_slip
         sticks = y < h
         return np.where(sticks, (2 - y / h) / h, 1 / np.maximum(y, h)), np.where(sticks, 2 * (1 - y / h) / h, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class FrictionDirection:
+    """Direction w of friction as an unknown of Newton's method beside the slip s, where w = f1(|s|) s / |s|, |w| <= 1.
+
+    Friction of a slip has no stiffness along it. Where a point comes to stick, Newton's method overshoots, and the line
+    search takes short steps. The primal-dual method of T. F. Chan, G. H. Golub and P. Mulet (1999), A nonlinear
+    primal-dual method for total variation-based image restoration, follows the linearised w instead: a point that has
+    overshot keeps the direction in which it slipped, and is stiff against the new one. The solution is the same.
+
+    Attributes:
+        law: f1.
+        normal: (n, d) unit normals.
+        last: (n, d) slips, m, and w of the last tangent; None: there is none.
+    """
+
+    law: CoulombFriction
+    normal: Values
+    last: tuple[Values, Values] | None = None
+
+    def __call__(self, slip: Values) -> Values:
+        """(n, d) w at slips (n, d), m."""
+        if self.last is None:
+            return FIRST_DIRECTION * self.law.direction(slip)
+        s, w = self.last
+        change = np.einsum("nij,nj->ni", self.law.direction_derivative(self.normal, s, w), slip - s)
+        w = self.law.direction(s) + change
+        return np.asarray(w / np.maximum(1.0, np.linalg.norm(w, axis=1))[:, None])
+
+    def updated(self, motion: Values) -> FrictionDirection:
+        """Directions after a tangent at motions (n, d), m."""
+        s = tangential(self.normal, motion)
+        return FrictionDirection(self.law, self.normal, (s, self(s)))
 
 
 def tangential(normal: Values, motion: Values) -> Values:

@@ -22,7 +22,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from .laws import CoulombFriction, GapPotential, TimeAveragedPotential
+from .laws import CoulombFriction, FrictionDirection, GapPotential, TimeAveragedPotential
 from .pose import Pose, PosedShape
 
 Values = npt.NDArray[np.float64]
@@ -206,6 +206,7 @@ def evaluate_points(
     obstacle_motion: Values,
     start: StepStart | None = None,
     candidates: Ints | None = None,
+    direction: FrictionDirection | None = None,
 ) -> ContactForces:
     """Forces of an obstacle on points; the energy is the integral of b(gap) over the surface.
 
@@ -219,6 +220,7 @@ def evaluate_points(
         obstacle_motion: (d,) motion of the obstacle in the step, or (k, d) of its points in lagged contact, m.
         start: points at the start of the step, where the barrier is averaged over the step.
         candidates: (m,) points, ascending, that may be in contact now or were at the start; None: all.
+        direction: of friction, for its tangent; None: the tangent is exact.
     """
     points = np.arange(len(x)) if candidates is None else candidates
     gap = posed.distance(x[points])
@@ -248,7 +250,8 @@ def evaluate_points(
         of_normal = point_area[:, None, None] * (along_normal + slope[:, None, None] * gap_hessian)
         of_friction = np.zeros_like(of_normal)
         if friction is not None and lagged is not None and len(lagged.points):
-            of_friction[np.searchsorted(points, lagged.points)] = friction.hessian(lagged.force, lagged.normal, motion)
+            blocks = friction.hessian(lagged.force, lagged.normal, motion, direction)
+            of_friction[np.searchsorted(points, lagged.points)] = blocks
         return of_normal, of_friction
 
     energy = float(point_area @ barrier.energy(gap))

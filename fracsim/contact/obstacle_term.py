@@ -105,6 +105,7 @@ class ObstacleTerm(ContactState, Term):
         contacts, exact = self.obstacle_forces(), self.uses_exact_tangent()
         # the next tangent is exact where points have hardly moved since
         self._tangent_positions = self.positions
+        self._update_directions()
         points = np.concatenate([contact.points for contact in contacts])
         if not self.comm.allreduce(len(points)):
             return None
@@ -113,6 +114,13 @@ class ObstacleTerm(ContactState, Term):
             groups.append((facets.corners, facets.hessian if exact else facets.stiffness))
         matrix = self.surface.stiffness(groups)
         return self._coupling(self.level.contact_weights.factor * matrix, self.surface.local.columns)
+
+    def _update_directions(self) -> None:
+        """Take the directions of friction of this iterate, of which the tangent is, as the last ones."""
+        for number, direction in self._directions.items():
+            if (lagged := self.lagged[number]) is not None:
+                motion = self.positions[lagged.points] - lagged.position - self.contact_point_motion(number)
+                self._directions[number] = direction.updated(motion)
 
     def uses_exact_tangent(self) -> bool:
         """Whether the tangent has negative eigenvalues of contact: near the solution (collective)."""
@@ -130,6 +138,7 @@ class ObstacleTerm(ContactState, Term):
     def begin_solve(self) -> None:
         """Count an attempt of Newton's method; after a failure tangents become exact later."""
         self._tangent_positions, self._is_exact, self._attempts = None, None, self._attempts + 1
+        self._directions = {}
 
     def stored_energy(self) -> float:
         """Energy of the barriers at the current u, this rank's share, J (collective)."""
