@@ -22,7 +22,10 @@ cuts themselves do so as well, but vary from cell to cell: cells cut near a corn
 Where G_c < l psi_0 a cell releases its energy at rho = 1. A cut edge breaks once no cut cell around it carries stress.
 
 A crack starts only where nothing grows or softens any more, and one at a time: in a bar the whole length reaches the
-strength at once, and all but one place unload. Equations: docs/theory.md#cohesive-cracks.
+strength at once, and all but one place unload. Explicit steps have one pass, in which cells soften, tips advance and
+cracks start one after another: a place learns of others by waves.
+
+Equations: docs/theory.md#cohesive-cracks.
 """
 
 from __future__ import annotations
@@ -222,8 +225,12 @@ class CohesiveSoftening:
         cells, target = cells[lower], target[lower]
         drop = chi[cells] - target
         chi[cells] = target
-        released, elastic = volumes[cells] @ (drop * psi[cells]), volumes @ (chi * psi)
-        return EnergyRelease(float(released), float(elastic), float(np.max(drop, initial=0.0)), not target.all())
+        released = float(volumes[cells] @ (drop * psi[cells]))
+        return EnergyRelease(released, self.elastic_energy(psi), float(np.max(drop, initial=0.0)), not target.all())
+
+    def elastic_energy(self, psi: Values) -> float:
+        """Return the elastic energy of this rank, J; `psi`: (cells,) of the undamaged material, J/m^3."""
+        return float(self._domain.volumes @ (self._chi * psi))
 
     def opening_cells(self, cells: Ints) -> OpeningCells:
         """Return the law of cut cells (n,)."""
@@ -377,18 +384,38 @@ class CohesiveFracturePass(FracturePass):
         *,
         max_passes: int | None = None,
         initial_cuts: Values | None = None,
+        has_inertia: bool = False,
     ) -> None:
-        """Build the pass; the arguments are those of `FracturePass`, with the parts of cohesive cracks."""
+        """Build the pass; the arguments are those of `FracturePass`, with the parts of cohesive cracks.
+
+        `has_inertia`: energy is released in the course of a step, and not at rest at the end of it.
+        """
         self.cut_graph, self._tips, self.softening = cut_graph, tips, softening
         super().__init__(stress, graph, tips, max_passes=max_passes, initial_cuts=initial_cuts)
+        self.softens_gradually, self._step_start = has_inertia, -np.inf
+        self._start_fields: list[Values] = []
+        self._released, self._is_settled = 0.0, False
         self._update_cut_graph()
 
+    def begin_step(self, t: float, dt: float) -> None:
+        """Prepare a step of `dt` (s) from `t`, which may be a repeated step: it starts from the same damage."""
+        super().begin_step(t, dt)
+        if self.softens_gradually and t != self._step_start:
+            self._step_start, self.softened_fields = t, None
+            self._released, self._is_settled = 0.0, False
+            self._start_fields = [damage.x.array.copy() for damage in self.stress.damage_fields]
+
     def __call__(self) -> FracturePassResult:
-        """Carry out one pass at the present displacement, until a cell softens (collective)."""
+        """Carry out one pass at the present displacement; with further passes, until a cell softens (collective)."""
         stress, psi = self.evaluate_undamaged_stress()
-        release = self._advance_tips(stress, psi)
-        if not self._has_softened(release) and self._cut_cells(stress, psi, new_cracks=True):
-            release = self._advance_tips(stress, psi)
+        before = [damage.x.array.copy() for damage in self.stress.damage_fields]
+        if self.softens_gradually and self._is_settled:
+            # The step is in balance: what is left is to sum its energies.
+            release = EnergyRelease(0.0, self.softening.elastic_energy(psi))
+        elif self.softens_gradually and self.max_passes == 1:
+            release = self._soften_and_cut(stress, psi)
+        else:
+            release = self._cut_until_softening(stress, psi)
         broken = 0
         # Edges can only be released where a cell lost its last stress.
         if sum_over_ranks(self.graph.domain.comm, int(release.exhausted))[0]:
@@ -397,7 +424,39 @@ class CohesiveFracturePass(FracturePass):
                 broken += self.graph.break_unloaded_edges()
         if broken or release.chi_drop:
             self.mark_changed()
-        return FracturePassResult(broken, release.chi_drop, release.released, release.elastic, release.exhausted)
+        softened = self._has_softened(release)
+        if self.softens_gradually and softened:
+            self.softened_fields = self._start_fields
+        self._is_settled = not softened and not broken
+        previous, released = before if broken or softened else [], release.released
+        if self.softens_gradually:
+            released = self._released_since_start(psi)
+        return FracturePassResult(broken, release.chi_drop, released, release.elastic, release.exhausted, previous)
+
+    def _released_since_start(self, psi: Values) -> float:
+        """Return the energy of this rank, J, released since the start of the step, less that of its earlier passes.
+
+        All of it is released at the displacement of the last pass: `psi` (cells,), J/m^3.
+        """
+        start, now = self._start_fields[0][: len(psi)], self.stress.damage_fields[0].x.array[: len(psi)]
+        total = float(self.stress.domain.volumes @ ((start - now) * psi))
+        earlier, self._released = self._released, total
+        return total - earlier
+
+    def _cut_until_softening(self, stress: Values, psi: Values) -> EnergyRelease:
+        """Advance tips or start a crack, until a cut cell softens or nothing is left to cut (collective)."""
+        release = self._advance_tips(stress, psi)
+        if not self._has_softened(release) and self._cut_cells(stress, psi, new_cracks=True):
+            return self._advance_tips(stress, psi)
+        return release
+
+    def _soften_and_cut(self, stress: Values, psi: Values) -> EnergyRelease:
+        """Soften cut cells, advance all tips and start all cracks, one after another (collective)."""
+        release = self.softening(stress, psi)
+        # A crack under a uniform stress goes through the body before another one starts.
+        while self._cut_cells(stress, psi, new_cracks=False) or self._cut_cells(stress, psi, new_cracks=True):
+            release = release.followed_by(self.softening(stress, psi))
+        return release
 
     def _advance_tips(self, stress: Values, psi: Values) -> EnergyRelease:
         """Advance tips until a cut cell softens, or no tip advances (collective)."""
@@ -432,6 +491,7 @@ class CohesiveFracturePass(FracturePass):
 
     def restore(self, saved: object) -> bool:
         """Restore the damage that `snapshot` returned; returns True if it changed."""
+        self._released, self._is_settled = 0.0, False
         changed = super().restore(saved)
         if changed:
             self._update_cut_graph()

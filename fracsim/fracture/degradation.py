@@ -42,6 +42,15 @@ class EnergyRelease:
     chi_drop: float = 0.0
     exhausted: bool = False
 
+    def followed_by(self, later: EnergyRelease) -> EnergyRelease:
+        """Return what this release and a later one at the same displacement come to."""
+        return EnergyRelease(
+            self.released + later.released,
+            later.elastic,
+            max(self.chi_drop, later.chi_drop),
+            self.exhausted or later.exhausted,
+        )
+
 
 class Degradation(Protocol):
     """Interface of a degradation."""

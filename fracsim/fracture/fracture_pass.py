@@ -56,7 +56,7 @@ class FracturePassResult:
         released_energy: elastic energy released on this rank, J.
         elastic_energy: elastic energy left on this rank, J.
         cells_died: whether chi of some cell of this rank fell to 0.
-        previous_damage: copies of the damage fields before the pass, if edges broke.
+        previous_damage: copies of the damage fields before the pass, if edges broke or cohesive cracks softened.
     """
 
     broken_edges: int
@@ -94,9 +94,14 @@ class FracturePass:
         max_passes: largest number of passes in a step; None: until nothing changes.
         initial_cuts: (edges,) cut positions of edges broken before the start, NaN elsewhere; None without such edges.
         tip_record: crack tips of the step; None: the criterion has no tips with a release rate.
+        softens_gradually: cells soften in the course of a step with inertia, where its forces balance; otherwise
+            energy is released at once, at the end of a step.
+        softened_fields: damage fields at the start of the step, if cells softened in its course on any rank.
     """
 
     phase = "fracture"
+    softens_gradually = False
+    softened_fields: list[Values] | None = None
 
     def __init__(
         self,

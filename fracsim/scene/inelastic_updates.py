@@ -46,8 +46,9 @@ def build_fracture_pass(study: Study, balance: Balance) -> FracturePass | None:
     from ..mesh.edge_graph import EdgeGraph
 
     graph = EdgeGraph(balance.domain)
-    passes = study.fracture.passes
-    if passes is None and balance.scheme.inertia:
+    passes, is_cohesive = study.fracture.passes, study.fracture.law == "cohesive"
+    # Cohesive cracks soften until the step is in balance, where steps are solved.
+    if passes is None and balance.scheme.inertia and not (is_cohesive and study.time.scheme_class.implicit):
         passes = 1
     cuts = _open_initial_cracks(study, balance, graph)
     if study.fracture.energy is not None:
@@ -128,7 +129,16 @@ def _build_cohesive_pass(
     toughness = per_cell(study, balance.domain, study.fracture, "energy", "fracture_energy")
     tips = CohesiveTipCriterion(stress, cut_graph, strength, toughness, initial_cuts)
     softening = CohesiveSoftening(stress, cut_graph, strength, toughness, tips.cut_positions)
-    return CohesiveFracturePass(stress, graph, cut_graph, tips, softening, max_passes=passes, initial_cuts=initial_cuts)
+    return CohesiveFracturePass(
+        stress,
+        graph,
+        cut_graph,
+        tips,
+        softening,
+        max_passes=passes,
+        initial_cuts=initial_cuts,
+        has_inertia=balance.scheme.inertia,
+    )
 
 
 def _open_initial_cracks(study: Study, balance: Balance, graph: EdgeGraph) -> Values | None:

@@ -46,8 +46,7 @@ class FractureSettings(StudyTable):
         "J/m^2", default=None, example=20.0, otherwise="edges break one by one",
     )  # fmt: skip
     law: Literal["griffith", "cohesive"] = key(
-        "Law of a crack with `energy`: sharp, or cohesive with exponential softening. Cohesive cracks are for "
-        "quasi-static studies.",
+        "Law of a crack with `energy`: sharp, or cohesive with exponential softening.",
         default="griffith", example="cohesive",
     )  # fmt: skip
     branching: Flag = key(

@@ -125,9 +125,7 @@ def _check_cohesive(study: Study, table: FractureSettings) -> None:
     if table.energy is None:
         raise ValueError('fracture.law = "cohesive" needs fracture.energy: what a crack takes as it opens')
     conflicts = {
-        f'time.scheme = "{study.time.scheme}"': (
-            study.time.scheme != "quasi-static", 'cohesive cracks are slow ones: choose "quasi-static"'
-        ),
+        "fracture.branching": (table.branching, "its tips have no speed of their own: remove it"),
         "fracture.unilateral": (
             table.unilateral, "cells that are cut and pressed keep what stiffness they have left: remove it"
         ),

@@ -119,6 +119,22 @@ def _check_finite(comm: MPI.Comm, end: State, energies: float) -> None:
         raise NonFiniteState
 
 
+def softening_work(balance: Balance, start: State, u: Values, start_fields: Sequence[Values]) -> float:
+    """Return the work, J, on this rank that forces did which softening took away in the course of a step (collective).
+
+    The energy released at the displacement at the end is too large by it: forces decrease while cells open.
+
+    Args:
+        balance: at the end of the step.
+        start: state at the start of the step.
+        u: displacement at its end, (owned dofs,), m.
+        start_fields: damage fields at the start of the step.
+    """
+    # The share of `step_work` that the forces of this step have, which are those after softening.
+    share = 0.5 + balance.scheme.alpha_f
+    return share * float(balance.stress.assemble_released_forces(start_fields) @ (u - start.u))
+
+
 def released_state(
     balance: Balance,
     end: State,

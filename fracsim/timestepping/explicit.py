@@ -68,8 +68,12 @@ class ExplicitStepper(BalanceStepper):
         self.balance.accept_step()
         return self._end_of_step
 
-    def _release(self, end: State, solved: Values, result: PassResultProtocol) -> State:
-        return released_state(self.balance, end, solved, result.previous_damage, None)
+    def _release(self, end: State, solved: Values, dt: float, result: PassResultProtocol) -> State:
+        released = released_state(self.balance, end, solved, result.previous_damage, None)
+        if self.inelastic.fracture.softened_fields is None:
+            return released
+        # Cells that soften in the course of a step have the forces of its end in the second half of it.
+        return replace(released, v=end.v + dt / 2 * (released.a - end.a))
 
     def _close_step(
         self, end: State, dt: float, solve: SolveResult, began: float, broken: int, energies: StepEnergies

@@ -75,8 +75,10 @@ class ImplicitStepper(BalanceStepper):
             _, v, a = self._complete_step(state, dt)
             self._flow()
             inelastic.fracture.set_rates(v, a)
+            if inelastic.fracture.softens_gradually:
+                self.balance.set_displacement(solved)
             result = inelastic.fracture_pass(dt)
-            if not result.broken_edges:
+            if not result.previous_damage:
                 self._return_to(solved, state, dt)
                 break
             broken, released = broken + result.broken_edges, released + result.released_energy
@@ -99,5 +101,5 @@ class ImplicitStepper(BalanceStepper):
         self.balance.set_displacement(solved)
         self.balance.update_reactions()
 
-    def _release(self, end: State, solved: Values, result: PassResultProtocol) -> State:
+    def _release(self, end: State, solved: Values, dt: float, result: PassResultProtocol) -> State:
         return released_state(self.balance, end, solved, result.previous_damage, self.solver.linear_response)

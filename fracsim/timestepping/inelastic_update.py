@@ -41,7 +41,7 @@ class PassResultProtocol(Protocol):
 
     @property
     def previous_damage(self) -> list[Values]:
-        """Copies of the damage fields before the pass, if edges broke."""
+        """Copies of the damage fields before the pass, if edges broke or cohesive cracks softened."""
 
 
 class FractureProtocol(HistoryVariables, Protocol):
@@ -50,10 +50,15 @@ class FractureProtocol(HistoryVariables, Protocol):
     Attributes:
         max_passes: largest number of passes in a step; None: until nothing changes.
         phase: name of the phase to which the time of a pass counts.
+        softens_gradually: cells soften in the course of a step with inertia, where its forces balance; otherwise
+            energy is released at once, at the end of a step.
+        softened_fields: damage fields at the start of the step, if cells softened in its course on any rank.
     """
 
     max_passes: int | None
     phase: str
+    softens_gradually: bool
+    softened_fields: list[Values] | None
 
     @property
     def nonfinite_cells(self) -> int:
@@ -137,6 +142,8 @@ class NoFracture:
     nonfinite_cells = 0
     phase = "energies"
     broken_edge_patterns = None
+    softens_gradually = False
+    softened_fields: list[Values] | None = None
 
     def __init__(self, balance: Balance, flow: PlasticFlowProtocol | None = None) -> None:
         self._balance, self._flow = balance, flow or NoPlasticFlow()

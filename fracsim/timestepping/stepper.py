@@ -21,7 +21,7 @@ import numpy.typing as npt
 from ..errors import StepAborted
 from ..mechanics.balance import Balance
 from ..solvers.newton import SolveResult
-from .energy_balance import NonFiniteState, StepEnergies, add_step_energies, balanced_forces, step_work
+from .energy_balance import NonFiniteState, StepEnergies, add_step_energies, balanced_forces, softening_work, step_work
 from .inelastic_update import (
     DamageListener,
     FractureProtocol,
@@ -266,6 +266,8 @@ class BalanceStepper:
         flow_loss = self._flow()
         end, result = self._break_edges(end, solved, dt)
         lost = viscous + (result.released_energy + released + flow_loss)
+        if (softened := self.inelastic.fracture.softened_fields) is not None:
+            lost -= softening_work(balance, state, u, softened)
         energies = StepEnergies(work, lost, result.elastic_energy)
         return self._close_step(end, dt, solve, began, result.broken_edges + broken, energies)
 
@@ -315,13 +317,13 @@ class BalanceStepper:
         with self._timer.measure(inelastic.fracture.phase):
             inelastic.fracture.set_rates(end.v, end.a)
             result = inelastic.fracture_pass(dt)
-            if result.broken_edges:
-                end = self._release(end, solved, result)
+            if result.previous_damage:
+                end = self._release(end, solved, dt, result)
             inelastic.damage_changed(result)
         return end, result
 
-    def _release(self, end: State, solved: Values, result: PassResultProtocol) -> State:
-        """Return the state with the forces and the acceleration after the edges of a pass broke (collective)."""
+    def _release(self, end: State, solved: Values, dt: float, result: PassResultProtocol) -> State:
+        """Return the state with the forces and the acceleration after a pass of a step of dt (s) (collective)."""
         raise NotImplementedError
 
     def _close_step(

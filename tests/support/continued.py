@@ -85,6 +85,7 @@ CASES: dict[str, tuple[dict[str, Any], int, tuple[int, ...]]] = {
     "quasi-static": (torn.RUNS["ties"], 6, (2, 4)),
     "quasi-static-energy": (tearing.RUNS["notched"], 5, (1, 3)),
     "quasi-static-cohesive": (tearing.RUNS["cohesive"], 12, (3, 8)),
+    "cohesive": (tearing.RUNS["drawn"], 30, (12, 21)),
     # one linear solve a step, whose guess is made of earlier ones
     "one-solve": (
         {"mesh": {"builder": "box", "size": [1.0, 0.25, 0.25], "h": 0.0625}, "material": SOFT | {"energy": "linear"},

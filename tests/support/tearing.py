@@ -64,6 +64,12 @@ RUNS["cohesive"] = {
     ],
     "time": {"scheme": "quasi-static", "step": 0.05, "end": 1.0},
 }  # fmt: skip
+# torn apart by waves from both ends
+RUNS["torn"] = RUNS["cohesive"] | {
+    "crack": [], "boundary": [{"on": "left", "velocity": [-2.0, 0.0]}, {"on": "right", "velocity": [2.0, 0.0]}],
+    "time": {"scheme": "explicit", "step": 1e-3, "end": 0.02},
+}  # fmt: skip
+RUNS["drawn"] = RUNS["torn"] | {"time": {"scheme": "generalized-alpha", "step": 5e-4, "end": 0.02}}
 # a front that is passed over until it has nearly what it takes
 RUNS["waiting"] = {
     "mesh": {"builder": "box", "size": [2.0, 0.3, 1.0], "h": 1 / 6, "pattern": "unstructured"},
