@@ -438,8 +438,8 @@ class CohesiveFracturePass(FracturePass):
 
         All of it is released at the displacement of the last pass: `psi` (cells,), J/m^3.
         """
-        start, now = self._start_fields[0][: len(psi)], self.stress.damage_fields[0].x.array[: len(psi)]
-        total = float(self.stress.domain.volumes @ ((start - now) * psi))
+        chi, start_chi = self.stress.damage_fields[0].x.array, self._start_fields[0]
+        total = float(self.stress.domain.volumes @ ((start_chi - chi)[: len(psi)] * psi))
         earlier, self._released = self._released, total
         return total - earlier
 
