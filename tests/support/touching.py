@@ -421,11 +421,12 @@ class DrawnSurfaces:
 
 
 def momentum(scene: Scene, state: Walk, of: npt.NDArray[np.bool_] | None = None) -> Values:
-    """(d,) linear momentum of nodes (nodes,), or of all and of free obstacles, kg m/s (serial)."""
+    """(d,) linear momentum, kg m/s, of nodes (nodes,); of free obstacles if none is flagged; without flags of both
+    (serial)."""
     p = (scene.balance.mass.lumped * state.v).reshape(-1, scene.domain.dim)
     if of is not None and of.any():
         return np.asarray(p[of].sum(axis=0))
-    total = p.sum(axis=0)
+    total = p.sum(axis=0) if of is None else np.zeros(scene.domain.dim)
     for term in scene.balance.terms:
         if term.name == "rigid":
             total = total + sum(free.motion.momentum[: len(total)] for free in term.free.values())
