@@ -21,8 +21,8 @@ LONG_LIMITS = {  # s of steps, of rows that are left to `make report-full`
 TIME_LIMIT = 30.0  # s of steps, of the others
 TEXT = (
     "The paper's scenes at its cells (within a tenth; the loaf has 13 % more) and materials, with its platens, anvils "
-    "and hammers as obstacles, on one rank; the paper has 12 threads at 2.6 GHz. Medians over the steps of a run, which "
-    "ends with its scene or at a limit. What differs from the paper, by letter: "
+    "and hammers as obstacles, on one rank; the paper has 12 threads at 2.6 GHz. Medians over the steps of a run, "
+    "which ends with its scene or at a limit. What differs from the paper, by letter: "
     + "; ".join(f"{letter}: {note}" for letter, note in NOTES.items())
     + "."
 )
