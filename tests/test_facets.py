@@ -368,7 +368,7 @@ def test_what_breaks_under_a_ball_gains_nothing() -> None:
     scene.balance.edges_broke(graph.pattern)
     assert contact.stored_energy() <= before * (1 + 1e-6)
     skin, placed = contact.surface, contact.group.posed[0]
-    x = skin.positions(contact._end_displacement())
+    x = skin.positions(contact.end_displacement)
     assert (contact.facets.active.gaps(placed, x, 1.0) > 0).all()
     left_out = contact.facets._excluded
     assert len(left_out) > 0 and len(contact.facets.active.area) > 100
@@ -378,7 +378,7 @@ def test_what_breaks_under_a_ball_gains_nothing() -> None:
     at, (elements, _), u = (
         skin.local.point_map,
         skin.local.facets(),
-        skin.interpolation.nodal_values(contact._end_displacement()),
+        skin.interpolation.nodal_values(contact.end_displacement),
     )
     whole = at.with_arm_share(np.ones(len(at.share)))
     shares = np.random.default_rng(1).dirichlet(np.full(3, 0.7), 200)

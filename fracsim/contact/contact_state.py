@@ -16,6 +16,7 @@ from ..mesh.domain import Domain
 from ..mesh.parallel import gather
 from ..mesh.split_surface.point_matching import match_points
 from ..mesh.split_surface.surface_map import SurfaceMap
+from .clearance import Clearance, FollowingPoints, ShapeDistance
 from .contact_surface import RETRACTION, TINY, ContactSurface, SurfaceVersion, retract_cut_elements
 from .facet_contact import FACETS, ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
 from .laws import CoulombFriction, FrictionDirection, ObstacleLaw, tangential
@@ -86,6 +87,11 @@ class SurfaceFacets:
                 selected = ContactFacets(facets.corners[active], facets.area[active], facets.smoothing)
             cached = self._active = area, self._excluded, selected
         return cached[2]
+
+    @property
+    def excluded_count(self) -> int:
+        """Number of excluded facets of this rank."""
+        return len(self._excluded)
 
     def gaps(self, posed: Sequence[PosedShape], facets: ContactFacets, x: Values) -> Values:
         """(m,) least gaps between facets, their points at x (n, d), m, and the curved ones of the obstacles."""
@@ -211,7 +217,7 @@ class SurfaceFacets:
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective); where edges have broken since it stays as it is."""
         excluded, version = cast("tuple[Ints, SurfaceVersion]", memory)
-        if self._surface.has_version(version):
+        if excluded is not self._excluded and self._surface.has_version(version):
             self._excluded = excluded
 
     def to_checkpoint(self) -> dict[str, Values]:
@@ -244,8 +250,10 @@ class ContactState:
         level: time level of the current or last step.
         lagged: contact of each obstacle at the start of the step; None: without friction.
         point_candidates: search for points near an obstacle.
+        clearance: whether the body is far from the obstacles.
     """
 
+    near_widths = 1.0  # distance, in widths of the barrier, within which an obstacle is not far
     shows_all_cells = False  # whether crack faces far from all obstacles are part of the surface, too
     facets_may_be_cut = False  # by curved obstacles
     positions: Values
@@ -263,6 +271,13 @@ class ContactState:
         self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
         self._domain, self._u, self._owned = domain, u, domain.node_count * domain.dim
         self.comm = domain.comm
+        self._is_damaged = False
+        self._end_u: Values | None = None
+        self._far: bool | None = None  # whether all obstacles are, at the current u and poses; None: not known yet
+        self._start_is_known = True  # whether the contact at the start of the step is
+        distances = [ShapeDistance(obstacle) for obstacle in self.obstacles]
+        reach = self.near_widths * law.barrier.width
+        self.clearance = Clearance(domain, distances, reach, self._following_points, self._hidden_distances)
         self._contact_forces: list[ContactForces] | None = None
         self._nodal_forces: Values | None = None  # of the present contact forces
         self._sticking_slips: list[float] | None = None  # m, of each obstacle in the step; None: not known yet
@@ -283,17 +298,61 @@ class ContactState:
         """Move obstacles to the end of the step, and store the contact at its start for friction."""
         self.group.bodies.begin_step(level)
         self.level, self._attempts = level, 0
-        self.update_displacement()
+        self.discard_forces()
         if self.group.bodies.evaluates_result:
             return  # lagged contact is still that of the step
         self._start_velocity = level.v_n
         self._discard_start()
-        if level.dt:
+        self._start_is_known = not level.dt
+        if level.dt and not self._starts_far():
+            self._find_start()
+
+    def _starts_far(self) -> bool:
+        """Whether all obstacles are far at the start of the step (collective)."""
+        return self.clearance.is_far([self.level.u_n], self.group.step_motions)
+
+    def _find_start(self) -> None:
+        """Store the contact at the start of the step, if it is not known yet (collective)."""
+        if not self._start_is_known:
+            self._start_is_known = True
             self._begin_new_step()
+
+    # --- far obstacles ---
+
+    def is_far(self) -> bool:
+        """Whether nothing is in contact at the current u, nor was at the start of the step (collective)."""
+        if self._far is None:
+            self._far = self.clearance.is_far([self.level.u_n, self.end_displacement], self.group.step_motions)
+        return self._far
+
+    def evaluate_near(self) -> None:
+        """Evaluate forces at the current u as if no obstacle were far, for motions that may come near (collective)."""
+        if self.is_far():
+            self._far, self._contact_forces = False, None
+        self.obstacle_forces()
+
+    def _following_points(self) -> FollowingPoints:
+        """Points of this rank."""
+        local, dim, area = self.surface.local, self._domain.dim, self.surface.area
+        corners = self.facets.active.corners if self.facets.numbers else np.empty((0, dim), np.int64)
+        retracted = (area == 0).any() or (local.point_map.share < 1).any() or self.facets.excluded_count
+        return FollowingPoints(
+            local.point_map.rest, local.point_map.weights, local.columns, corners, may_stay=not retracted
+        )
+
+    def _hidden_distances(self, u: Values, posed: Sequence[PosedShape]) -> Sequence[float]:
+        """Bounds of the distances of crack faces outside the surface from each obstacle, m (collective)."""
+        if self.shows_all_cells or not self._is_damaged:
+            return [np.inf] * len(posed)
+        return self._shown.face_distances(posed, u)
+
+    # --- surface ---
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Add new crack faces near obstacles to the surface (collective)."""
-        self._pattern, u = pattern.copy(), self._end_displacement()
+        self._pattern, u = pattern.copy(), self.end_displacement
+        self._is_damaged = self.comm.allreduce(bool(pattern.any()), op=MPI.LOR)
+        self.clearance.discard()
         if self.shows_all_cells or not self.group.bodies.dt:  # before the first step obstacles need not be in place
             self._shown.show_all()
         elif not self._shown.update(pattern, self.group.posed, u, None, 0.0):
@@ -308,6 +367,7 @@ class ContactState:
             posed: obstacles at their poses.
         """
         gaps = partial(min_distance, posed)
+        self.clearance.discard()
         self.facets.edges_broke(partial(self.surface.edges_broke, self._pattern, self._shown.flags, u, gaps), u, posed)
         self._discard_start()
 
@@ -357,22 +417,30 @@ class ContactState:
         none = [None] * len(self.obstacles)
         self.lagged, self._step_starts, self._tangent_positions = [*none], [*none], None
         self._sticking_slips, self._directions = None, {}
-        self.update_displacement()
+        self.discard_forces()
 
-    def update_displacement(self) -> None:
-        """Discard forces, as u or poses have changed."""
-        self._contact_forces = self._nodal_forces = None
+    def discard_forces(self) -> None:
+        """Discard all that belongs to the last u and poses."""
+        self._contact_forces = self._nodal_forces = self._far = self._end_u = None
 
-    def _end_displacement(self) -> Values:
-        """(owned dofs,) displacement at the end of the step that belongs to the current u, m."""
-        return self.level.displacement_at_end(self._u.x.array[: self._owned])
+    @property
+    def end_displacement(self) -> Values:
+        """(owned dofs,) displacement at the end of the step that belongs to u, m: one array as long as u stays."""
+        if self._end_u is None:
+            self._end_u = self.level.displacement_at_end(self._u.x.array[: self._owned])
+        return self._end_u
 
     def obstacle_forces(self) -> list[ContactForces]:
-        """Forces of each obstacle at the current u (collective)."""
+        """Forces of each obstacle at the current u; of none that is far (collective)."""
         if self._contact_forces is None:
+            if self.is_far():
+                none = no_contact(self._domain.dim, self.law.barrier.width)
+                self._contact_forces = [none for _ in self.obstacles]
+                return self._contact_forces
+            self._find_start()
             if self._sticking_slips is None:
                 self._sticking_slips = self._compute_sticking_slips()
-            self.positions = self.surface.positions(self._end_displacement())
+            self.positions = self.surface.positions(self.end_displacement)
             self._contact_forces = [
                 self._evaluate_obstacle(number, posed) for number, posed in enumerate(self.group.posed)
             ]
@@ -438,8 +506,10 @@ class ContactState:
             return np.zeros(self._domain.dim)
         return self.group.bodies.point_motion(self.numbers[number], lagged.obstacle_point)
 
-    def contact_forces(self) -> Values:
-        """(owned dofs,) forces of the obstacles on the nodes at the end of the step, N (collective)."""
+    def contact_forces(self) -> Values | None:
+        """(owned dofs,) forces of the obstacles on the nodes at the end of the step, N; None: far (collective)."""
+        if self.is_far():
+            return None
         contacts = self.obstacle_forces()
         if self._nodal_forces is None:
             points = np.concatenate([contact.points for contact in contacts])

@@ -273,6 +273,8 @@ class ContactSurface:
         Where edges have broken since, in an earlier pass of the step, the surface is another one and stays as it is.
         """
         share, area, version = cast("tuple[Values, Values, SurfaceVersion]", memory)
+        if share is self.local.point_map.share and area is self.area:
+            return
         if not self.has_version(version):
             return
         if share is not self.local.point_map.share:

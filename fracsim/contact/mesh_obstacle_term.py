@@ -21,6 +21,7 @@ from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
 from ..mesh.parallel import sum_over_ranks
+from .clearance import Clearance
 from .ipc_pairs import IpcPairs
 from .ipc_surface import SelfContactLaw
 from .mesh_obstacles import (
@@ -33,9 +34,8 @@ from .mesh_obstacles import (
 from .obstacle import RigidObstacle
 from .pose import Pose
 from .pose_derivatives import PoseDerivatives, point_jacobian, point_set_derivatives, sum_of_derivatives
-from .proximity import ProximityTest
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
-from .self_contact import SelfContact, mean_velocities
+from .self_contact import Pattern, SelfContact, mean_velocities
 from .step_limit import stop_before_meshes
 from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
 
@@ -51,7 +51,7 @@ class MeshObstacleTerm(SelfContact):
         obstacles: these.
         numbers: their numbers in the study.
         barrier_width: gap from which on contact acts, m.
-        proximity: test whether the body can be near the obstacles.
+        clearance: whether the body is far from the obstacles.
         pose_contact: contact as the obstacles see it.
     """
 
@@ -80,12 +80,12 @@ class MeshObstacleTerm(SelfContact):
         self.allows_exact_tangent = not any(obstacle.free for obstacle in self.obstacles)
         items = zip(self.numbers, self.obstacles, strict=True)
         self._meshes = [build_mesh_obstacle(*item, edge) for item in items]
-        self.proximity = ProximityTest(domain, self.obstacles, law.distance)
         self._started_near = True
         self._far: bool | None = None  # at the current u; None: not known yet
         self._place_meshes(self.group.poses)
         super().__init__(domain, u, law, partial(MeshContactSurface, obstacles=self._meshes, comm=domain.comm))
-        self.parts, self.pose_contact = (self.surface, self.group), MeshPoseContact(self)
+        self.clearance = Clearance(domain, self._meshes, law.distance, self.surface.following_points)
+        self.parts, self.pose_contact = (self.surface, self.group, self.clearance), MeshPoseContact(self)
 
     # --- surface and obstacles ---
 
@@ -99,6 +99,11 @@ class MeshObstacleTerm(SelfContact):
         for mesh, pose in zip(self._meshes, poses, strict=True):
             mesh.move_to(pose)
 
+    def edges_broke(self, pattern: Pattern) -> None:
+        """Add new crack faces, retracted where there is no room (collective)."""
+        super().edges_broke(pattern)
+        self.clearance.discard()
+
     def poses_moved(self) -> None:
         """Move the meshes to the poses of the obstacles, and discard forces."""
         self._place_meshes(self.group.poses)
@@ -108,7 +113,7 @@ class MeshObstacleTerm(SelfContact):
         """Whether nothing can be in contact at the current u, nor could at the start of the step (collective)."""
         if self._far is None:
             ends = [self.level.u_n, self.end_displacement]
-            self._far = not self._started_near and self.proximity.is_far(ends, self.group.step_poses)
+            self._far = not self._started_near and self.clearance.is_far(ends, self.group.step_motions)
         return self._far
 
     def update_displacement(self) -> None:
@@ -126,7 +131,7 @@ class MeshObstacleTerm(SelfContact):
             return  # friction is still that of the step
         self._start_velocity = level.v_n
         self.friction = self._tangent_positions = None
-        self._started_near = not self.proximity.is_far([level.u_n], self.group.step_poses)
+        self._started_near = not self.clearance.is_far([level.u_n], self.group.step_motions)
         self.start_positions = None
         # one row that stands for all points of an obstacle
         zero: Values = np.zeros((1, 3))
@@ -192,15 +197,12 @@ class MeshObstacleTerm(SelfContact):
 
         `u`, `change`: (owned dofs,) displacement at the start, and its change, m; None: the body is at rest.
         """
-        poses = [(pose, pose) for pose in self.group.poses]
-        for index, number in enumerate(self.numbers):
-            if number in increments:
-                poses[index] = poses[index][0], poses[index][0].incremented(increments[number])
-        if self.proximity.is_far([u] if change is None else [u, u + change], poses):
+        motions = self.group.motions(increments)
+        if self.clearance.is_far([u] if change is None else [u, u + change], motions):
             return 1.0
         x = self.surface.positions(u)
         end = x if change is None else x + self.surface.current.point_map.weights @ self.surface.nodal_values(change)
-        starts, ends = zip(*poses, strict=True)
+        starts, ends = ([posed.pose for posed in side] for side in zip(*motions, strict=True))
         # pairs take obstacles from the given poses to where they are
         self._place_meshes(ends)
         fraction = self.pairs.moving_free_fraction(x, end, starts)
@@ -212,7 +214,7 @@ class MeshObstacleTerm(SelfContact):
         level = self.level
         if not level.dt:
             return u
-        if self.proximity.is_far([level.u_n, level.displacement_at_end(u)], self.group.step_poses):
+        if self.clearance.is_far([level.u_n, level.displacement_at_end(u)], self.group.step_motions):
             return u
         start, end = (self.surface.nodal_values(nodal) for nodal in (level.u_n, level.displacement_at_end(u)))
         prescribed = [index for index, obstacle in enumerate(self.obstacles) if not obstacle.free]
@@ -228,7 +230,7 @@ class MeshObstacleTerm(SelfContact):
     def is_feasible(self, u: Values) -> bool:
         """Whether nothing is crossed on the straight way from the start to u (collective)."""
         u_n, u_end = self.level.u_n, self.level.displacement_at_end(u)
-        if self.proximity.is_far([u_n, u_end], self.group.step_poses):
+        if self.clearance.is_far([u_n, u_end], self.group.step_motions):
             return True
         start, end = self.surface.positions(u_n), self.surface.positions(u_end)
         return self.pairs.moving_free_fraction(start, end, self.group.start_poses) == 1
@@ -241,6 +243,8 @@ class MeshObstacleTerm(SelfContact):
 
     def _gap(self, number: int) -> float:
         """Least distance between an obstacle and the body, m, of this rank's pairs (collective)."""
+        if self.is_far():
+            return self.clearance.least_gap(number, self.end_displacement, self.group.posed)
         return self.pairs.pairs[number].gap(self.end_positions())
 
     def closing_distances(self) -> list[float]:
@@ -285,13 +289,12 @@ class MeshPoseContact:
         """
         level, index = self._term.level, self.group.numbers.index(number)
         start, u_end = self.group.start_poses[index], level.displacement_at_end(u)
-        poses = [(pose, pose) for pose in self.group.poses]
-        poses[index] = start, start.incremented(q)
-        if self._term.proximity.is_far([level.u_n, u_end], poses):
+        motions = self.group.motions({number: q}, from_start=True)
+        if self._term.clearance.is_far([level.u_n, u_end], motions):
             return 1.0
         x, end = self._term.surface.positions(level.u_n), self._term.surface.positions(u_end)
         pairs = self._term.pairs.pairs[index]
-        pairs.mesh.move_to(poses[index][1])
+        pairs.mesh.move_to(motions[index][1].pose)
         fraction = pairs.moving_free_fraction(x, end, start)
         pairs.mesh.move_to(self.group.poses[index])
         return fraction
@@ -376,4 +379,5 @@ def build_mesh_obstacle(number: int, obstacle: RigidObstacle, edge: float) -> Me
     shape = obstacle.shape
     assert isinstance(shape, TriangleMeshShape)
     points, triangles = refine_triangles(shape.points, shape.triangles, edge)
-    return MeshObstacle(f"obstacle.{number}: {obstacle.name}", points, triangles, obstacle.friction)
+    name, rotates = f"obstacle.{number}: {obstacle.name}", obstacle.free or obstacle.spin is not None
+    return MeshObstacle(name, points, triangles, obstacle.friction, rotates=rotates)

@@ -23,7 +23,7 @@ from ..mesh.split_surface.entity_numbering import EntityNumbering
 from .ipc_pairs import NO_PAIRS, IpcPairs, PairShare
 from .ipc_surface import SelfContactLaw, SelfContactSurface
 from .laws import BARRIER
-from .pose import Pose
+from .pose import Pose, PosedShape
 from .proximity import bounding_box
 from .sample_points import IpcFriction
 from .triangle_mesh_shape import penetration_depth
@@ -80,18 +80,24 @@ def free_fraction_on_arcs(
 
 
 class MeshObstacle:
-    """Triangle-mesh obstacle at a pose.
+    """Triangle-mesh obstacle at a pose (clearance.ObstacleDistance, by its vertices).
 
     Attributes:
         name: in messages.
         points: (m, 3) in its own frame, m.
         triangles: (k, 3).
         friction: coefficient of friction.
+        rotates: whether its rotation may change.
+        radius: largest distance of a point from the reference point, m.
+        max_error: largest distance of a point of a triangle from its nearest corner, m.
         pose: current pose.
     """
 
-    def __init__(self, name: str, points: Values, triangles: Ints, friction: float) -> None:
+    def __init__(self, name: str, points: Values, triangles: Ints, friction: float, *, rotates: bool = True) -> None:
         self.name, self.points, self.triangles, self.friction = name, points, triangles, friction
+        self.rotates, self.radius = rotates, float(np.linalg.norm(points, axis=1).max())
+        sides = points[triangles] - points[np.roll(triangles, 1, axis=1)]
+        self.max_error = float(np.linalg.norm(sides, axis=2).max() / np.sqrt(3))
         self._tree, self._box = cKDTree(points), (points.min(axis=0), points.max(axis=0))
         self.move_to(Pose.at_point(np.zeros(3)))
 
@@ -119,16 +125,26 @@ class MeshObstacle:
         (low, high), (x_low, x_high) = self._bounds, bounding_box(x)
         return bool(np.any(x_low - high > distance) or np.any(low - x_high > distance))
 
+    def distance(self, posed: PosedShape, x: Values) -> Values:
+        """(n,) distances of points x (n, 3) from its vertices at a pose, m."""
+        return np.asarray(self._tree.query(posed.pose.to_body(x))[0])
+
+    def lower_bounds(self, posed: PosedShape, x: Values) -> Values:
+        """(n,) distances from its vertices, m; of points that are not the nearest from its bounding box."""
+        return self._lower_bounds(posed.pose.to_body(x))
+
     def vertex_distance(self, x: Values) -> float:
         """Least distance from points x (n, 3) to its vertices, m: at most half an edge more than to its surface."""
-        x = self.pose.to_body(x)
-        box_distance = np.linalg.norm(np.maximum(np.maximum(self._box[0] - x, x - self._box[1]), 0.0), axis=1)
-        count = MESH.query_points
-        first = np.argpartition(box_distance, min(count, len(box_distance)) - 1)[:count]
-        distance = float(self._tree.query(x[first])[0].min())
+        return float(self._lower_bounds(self.pose.to_body(x)).min())
+
+    def _lower_bounds(self, x: Values) -> Values:
+        distance: Values = np.linalg.norm(np.maximum(np.maximum(self._box[0] - x, x - self._box[1]), 0.0), axis=1)
+        first = np.argpartition(distance, min(MESH.query_points, len(x)) - 1)[: MESH.query_points]
+        distance[first] = self._tree.query(x[first])[0]
         # points whose box distance is larger cannot be nearer
-        candidates = np.flatnonzero(box_distance < distance)
-        return float(self._tree.query(x[candidates])[0].min(initial=distance))
+        near = np.flatnonzero(distance < distance[first].min())
+        distance[near] = self._tree.query(x[near])[0]
+        return distance
 
 
 class MeshObstaclePairs[Contact: IpcPairs]:

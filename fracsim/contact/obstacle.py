@@ -57,8 +57,16 @@ class RigidObstacle:
     spin: Values | None = None
     free: ClassVar[bool] = False  # whether it has a mass and moves by itself
 
+    @cached_property
+    def _at_rest(self) -> PosedShape | None:
+        """Shape where it stays; None: it moves."""
+        moves = self.free or self.spin is not None or self.prescribed_displacement is not None
+        return None if moves else PosedShape(self.shape, Pose.at_point(self.start_point))
+
     def posed_at(self, t: float) -> PosedShape:
-        """Shape at its pose at time t, s."""
+        """Shape at its pose at time t, s; the same object where it stays."""
+        if self._at_rest is not None:
+            return self._at_rest
         pose = Pose.at_point(self.start_point + self.displacement(t))
         if self.spin is not None:
             pose = pose.incremented(np.append(0 * self.start_point, t * self.spin))

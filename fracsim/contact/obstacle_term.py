@@ -89,19 +89,29 @@ class ObstacleTerm(ContactState, Term):
         """
         super().__init__(domain, u, ObstacleGroup(bodies, numbers, self._gap, self._current_force), law)
         # facets after the points that they are made of
-        self.parts = (self.surface, self.facets, self.group) if self.facets.numbers else (self.surface, self.group)
+        facets = (self.facets,) if self.facets.numbers else ()
+        self.parts = (self.surface, *facets, self.group, self.clearance)
+        self._has_tangent = False  # in this attempt of Newton's method
         self.pose_contact, self._coupling = PointPoseContact(self), CouplingBuilder(domain)
         self._is_exact: bool | None = None  # whether the tangent at the current u and poses is; None: not known yet
 
     def update_displacement(self) -> None:
+        """Discard forces, as u has changed."""
+        self.discard_forces()
+
+    def discard_forces(self) -> None:
         """Discard forces, and whether the tangent is exact, as u or poses have changed."""
-        super().update_displacement()
+        super().discard_forces()
         self._is_exact = None
 
     # --- forces, tangent and energy ---
 
     def coupling_matrix(self) -> PETSc.Mat | None:
         """Minus the derivative of the forces; None where nothing is in contact (collective)."""
+        self._has_tangent = True
+        if self.is_far():
+            self._tangent_positions = None
+            return None
         contacts, exact = self.obstacle_forces(), self.uses_exact_tangent()
         # the next tangent is exact where points have hardly moved since
         self._tangent_positions = self.positions
@@ -126,7 +136,9 @@ class ObstacleTerm(ContactState, Term):
         """Whether the tangent has negative eigenvalues of contact: near the solution (collective)."""
         if self._is_exact is None:
             points, motion = np.concatenate([contact.points for contact in self.obstacle_forces()]), np.inf
-            if self._tangent_positions is not None:
+            if self.is_far():
+                motion = 0.0 if self._has_tangent else np.inf
+            elif self._tangent_positions is not None:
                 moved = np.linalg.norm((self.positions - self._tangent_positions)[points], axis=1)
                 motion = float(moved.max(initial=0.0))
             motion = self.comm.allreduce(motion, op=MPI.MAX)
@@ -138,7 +150,7 @@ class ObstacleTerm(ContactState, Term):
     def begin_solve(self) -> None:
         """Count an attempt of Newton's method; after a failure tangents become exact later."""
         self._tangent_positions, self._is_exact, self._attempts = None, None, self._attempts + 1
-        self._directions = {}
+        self._directions, self._has_tangent = {}, False
 
     def stored_energy(self) -> float:
         """Energy of the barriers at the current u, this rank's share, J (collective)."""
@@ -153,7 +165,8 @@ class ObstacleTerm(ContactState, Term):
         """Record forces and work of contact in the step (collective)."""
         group, indices = self.group, range(len(self.obstacles))
         group.friction_loss, group.forces = 0.0, [self._current_force(number) for number in indices]
-        for number in indices:
+        group.work = [0.0] * len(self.obstacles)
+        for number in indices if not self.is_far() else ():
             on_body, by_obstacle = self._friction_work(number)
             group.work[number] = self._normal_work(number) + by_obstacle
             group.friction_loss += by_obstacle - on_body
@@ -182,9 +195,12 @@ class ObstacleTerm(ContactState, Term):
 
     def max_step_fraction(self, change: Values) -> float:
         """Fraction of a change of u (owned dofs,), m, that leaves a tenth of every gap (collective)."""
-        self.obstacle_forces()
-        motion = self.surface.interpolation(np.divide(change, self.level.fraction))
-        increments = self.group.bodies.correction_increments()
+        increments, u = self.group.bodies.correction_increments(), self.end_displacement
+        change_at_end = np.divide(change, self.level.fraction)
+        if self.clearance.is_far([u, u + change_at_end], self.group.motions(increments)):
+            return 1.0
+        self.evaluate_near()
+        motion = self.surface.interpolation(change_at_end)
         by_obstacle = [self._fractions(number, motion, increments.get(n)) for number, n in enumerate(self.numbers)]
         fractions = [values[self.surface.area > 0] for values in by_obstacle]
         return float(min(values.min(initial=1.0) for values in fractions))
@@ -193,8 +209,7 @@ class ObstacleTerm(ContactState, Term):
         """(n,) fractions of the motion (n, d) of points, m, and an increment (p,), None: none, that close no gap."""
         if q is None:
             q = np.zeros_like(self.group.increments[number])
-        facets = self.facets_for(number)
-        min_gap = self.obstacle_forces()[number].min_gap
+        facets, min_gap = self.facets_for(number), self.obstacle_forces()[number].min_gap
         return safe_motion_fractions(
             self.group.posed[number], self.positions, motion, q, facets, self.point_candidates, min_gap
         )
@@ -202,16 +217,22 @@ class ObstacleTerm(ContactState, Term):
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) first guess of u, m, that crosses no obstacle on its way from the start (collective)."""
         level = self.level
-        if not level.dt:
+        if not level.dt or self.clearance.is_far([level.u_n, level.displacement_at_end(u)], self.group.step_motions):
             return u
+        self._find_start()
         # free obstacles have a first guess of their own (rigid_pose)
         prescribed = self.group.bodies.prescribed_motions()
         motions = [(*prescribed[n], self.facets_for(i)) for i, n in enumerate(self.numbers) if n in prescribed]
-        end = stop_before_obstacles(self.surface, motions, level.u_n, level.displacement_at_end(u))
+        guess = level.displacement_at_end(u)
+        if (end := stop_before_obstacles(self.surface, motions, level.u_n, guess)) is guess:
+            return u
         return np.asarray(level.u_n + level.fraction * (end - level.u_n))
 
     def is_feasible(self, u: Values) -> bool:
         """Whether every gap is open with the body at u (collective)."""
+        u_n = self.level.u_n
+        if self.clearance.is_far([u_n, self.level.displacement_at_end(u)], self.group.step_motions):
+            return True
         x = self.surface.positions(self.level.displacement_at_end(u))
         return self.surface.gaps_are_open(min_distance(self.group.posed, x)) and self.facets.are_open(
             self.group.posed, x
@@ -230,7 +251,7 @@ class ObstacleTerm(ContactState, Term):
         """Discard results of searches, which a checkpoint does not hold (not collective)."""
         self.facets.clear_caches()
         self._shown.discard()
-        self.update_displacement()
+        self.discard_forces()
 
     def destroy(self) -> None:
         """Destroy the objects of PETSc."""
@@ -246,6 +267,8 @@ class ObstacleTerm(ContactState, Term):
 
     def _gap(self, number: int) -> float:
         """Least distance between an obstacle and this rank's surface, m; infinite without a surface (collective)."""
+        if self.is_far():
+            return self.clearance.least_gap(number, self.end_displacement, self.group.posed)
         self.obstacle_forces()
         posed = self.group.posed[number]
         point_gap = self.surface.min_distance(posed.distance(self.positions))
@@ -259,6 +282,8 @@ class ObstacleTerm(ContactState, Term):
 
         It is that of the velocities at the start, without any contact; of this rank's points.
         """
+        if self.is_far():
+            return [0.0] * len(self.obstacles)
         motion, result = self.group.bodies.dt * self.surface.interpolation(self._start_velocity), list[float]()
         for increment, posed, contact in zip(
             self.group.increments, self.group.posed, self.obstacle_forces(), strict=True
@@ -283,15 +308,18 @@ class PointPoseContact:
 
     def poses_moved(self) -> None:
         """Discard forces, as obstacles have moved."""
-        self._term.update_displacement()
+        self._term.discard_forces()
 
     def rest_fraction(self, increments: Mapping[int, Values], u: Values | None) -> float:
         """Fraction of increments (p,) from current poses on which no gap to the body closes (collective).
 
         `u`: (owned dofs,) displacement of the body at rest, m; None: the current one at the end of the step.
         """
+        end = self._term.end_displacement if u is None else u
+        if self._term.clearance.is_far([end], self.group.motions(increments)):
+            return 1.0
         if u is None:
-            self._term.obstacle_forces()
+            self._term.evaluate_near()
         x = self._term.positions if u is None else self._term.surface.positions(u)
         fractions: list[Values] = [np.ones(len(x))]
         for number, n in enumerate(self.group.numbers):
@@ -307,6 +335,9 @@ class PointPoseContact:
         Both from the start of the step; `u`: (owned dofs,) displacement of the level after the motion, m.
         """
         level, index = self._term.level, self.group.numbers.index(number)
+        motions = self.group.motions({number: q}, from_start=True)
+        if self._term.clearance.is_far([level.u_n, level.displacement_at_end(u)], motions):
+            return 1.0
         x = self._term.surface.positions(level.u_n)
         motion = self._term.surface.positions(level.displacement_at_end(u)) - x
         facets = self._term.facets_for(index)
@@ -318,6 +349,8 @@ class PointPoseContact:
         """(p,) force and moment of the body on free obstacles, N and N m, of all ranks (collective)."""
         if not (numbers := self.group.free):
             return {}
+        if self._term.is_far():
+            return {number: np.zeros(len(self.group.bodies.increments[number])) for number in numbers}
         contacts = self._term.obstacle_forces()
         local = [
             contact_wrench(contacts[index], self._term.positions, self.group.poses[index])
@@ -329,6 +362,10 @@ class PointPoseContact:
         """Energy and derivatives by the poses of free obstacles, of all ranks (collective)."""
         if not (numbers := self.group.free):
             return {}
+        if self._term.is_far():
+            sizes = [len(self.group.bodies.increments[number]) for number in numbers]
+            none = [PoseDerivatives(0.0, np.zeros(size), np.zeros((size, size))) for size in sizes]
+            return dict(zip(numbers, none, strict=True))
         local = [self._coupling(self.group.numbers.index(number), exact=exact).derivatives() for number in numbers]
         return dict(zip(numbers, sum_of_derivatives(local, self._term.comm), strict=True))
 
@@ -345,7 +382,7 @@ class PointPoseContact:
 
     def mixed_hessians(self) -> dict[int, Values]:
         """(owned dofs, p) derivatives of minus the nodal forces by poses, of free obstacles in contact (collective)."""
-        if not (numbers := self.group.free):
+        if not (numbers := self.group.free) or self._term.is_far():
             return {}
         contacts, exact = self._term.obstacle_forces(), self.uses_exact_tangent()
         indices = [self.group.numbers.index(number) for number in numbers]

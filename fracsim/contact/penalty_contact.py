@@ -25,14 +25,15 @@ from mpi4py import MPI
 from ..mechanics.term import Term, TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import from_root, on_root
+from .clearance import Clearance, NoDistance, ObstacleDistance
 from .ipc_surface import SelfContactLaw
 from .mesh_obstacle_term import approach, build_mesh_obstacle
 from .mesh_obstacles import MeshObstacle
 from .obstacle import VerletObstacle
 from .penalty_pairs import BodyMass, PairSprings, PenaltyHistory, PenaltyPart, PenaltySurface
-from .pose import Pose, PosedShape
+from .penalty_point_facet import POINT_FACET
+from .pose import PosedShape
 from .pose_derivatives import resultant
-from .proximity import ProximityTest
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
 from .self_contact import BreakingSurface, Pattern, node_gather
 
@@ -387,6 +388,7 @@ class PenaltyMeshContact(PenaltyContact):
 
     name = "solids"
     allows_exact_tangent = False
+    _end_u: Values | None = None
 
     def __init__(
         self,
@@ -404,26 +406,28 @@ class PenaltyMeshContact(PenaltyContact):
         self.barrier_width = law.distance
         items = zip(self.numbers, self.obstacles, strict=True)
         self._all_meshes = on_root(domain.comm, lambda: [build_mesh_obstacle(*item, edge) for item in items]) or []
-        self._proximity = ProximityTest(domain, self.obstacles, law.distance)
         self._dt = 0.0  # s, of the current or last step
         # of the last step, on rank 0: force and moment on each, N and N m
         self._wrenches: list[Values] = [np.zeros(6) for _ in numbers]
-        self._poses: list[Pose] = [bodies.posed[number].pose for number in numbers]
-        for mesh, pose in zip(self._all_meshes, self._poses, strict=False):
-            mesh.move_to(pose)
+        self._posed = [bodies.posed[number] for number in numbers]
+        for mesh, posed in zip(self._all_meshes, self._posed, strict=False):
+            mesh.move_to(posed.pose)
         super().__init__(domain, u, law, mass, max_added, self._all_meshes, self._is_far)
-        self.parts, self.pose_contact = (*self.parts, self.group), self
+        sizes = from_root(domain.comm, lambda: [(mesh.radius, mesh.rotates) for mesh in self._all_meshes])
+        distances: list[ObstacleDistance] = [*self._all_meshes] or [NoDistance(*size) for size in sizes]
+        reach = POINT_FACET.max_gap * law.distance
+        self._clearance = Clearance(domain, distances, reach, self.surface.following_points)
+        self.parts, self.pose_contact = (*self.parts, self.group, self._clearance), self
 
     # --- motion ---
 
     def _move_to(self, posed: Sequence[PosedShape]) -> None:
         """Move the meshes, on rank 0, to the poses of all obstacles; discard forces where they have moved."""
-        poses = [posed[number].pose for number in self.numbers]
-        if all(map(Pose.equals, poses, self._poses)):
+        last, self._posed = self._posed, [posed[number] for number in self.numbers]
+        if all(new is old or new.pose.equals(old.pose) for new, old in zip(self._posed, last, strict=True)):
             return
-        self._poses = poses
-        for mesh, pose in zip(self._all_meshes, poses, strict=False):
-            mesh.move_to(pose)
+        for mesh, shape in zip(self._all_meshes, self._posed, strict=False):
+            mesh.move_to(shape.pose)
         self.update_displacement()
 
     def poses_moved(self) -> None:
@@ -432,7 +436,23 @@ class PenaltyMeshContact(PenaltyContact):
 
     def _is_far(self) -> bool:
         """Whether the body is far from the obstacles at the current u and poses (collective)."""
-        return self._proximity.is_far([self._u.x.array[: self._owned]], [(pose, pose) for pose in self._poses])
+        return self._clearance.is_far([self._end_displacement()], [(posed, posed) for posed in self._posed])
+
+    def _end_displacement(self) -> Values:
+        """(owned dofs,) displacement, m: one array as long as it is the same."""
+        if self._end_u is None:
+            self._end_u = self._u.x.array[: self._owned]
+        return self._end_u
+
+    def update_displacement(self) -> None:
+        """Discard positions and forces, as u or poses have changed."""
+        self._end_u = None
+        super().update_displacement()
+
+    def edges_broke(self, pattern: Pattern) -> None:
+        """Add new crack faces, retracted where there is no room (collective)."""
+        super().edges_broke(pattern)
+        self._clearance.discard()
 
     # --- steps ---
 
@@ -503,6 +523,8 @@ class PenaltyMeshContact(PenaltyContact):
 
     def _gap(self, index: int) -> float:
         """Least distance between an obstacle and the body, m; on rank 0, infinite elsewhere (collective)."""
+        if self.state.is_idle():
+            return self._clearance.least_gap(index, self._end_displacement(), self._posed)
         x = self._end_positions()
         pairs = None if x is None else self._parts[index].obstacle
         return np.inf if pairs is None else pairs.gap(x)

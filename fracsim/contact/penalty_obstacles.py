@@ -160,10 +160,12 @@ class StepEnd:
     Attributes:
         springs: of each obstacle.
         forces: (d,) sum of the forces of each obstacle on the body, N.
+        all_far: whether the body is known to be far from all obstacles.
     """
 
     springs: list[FrictionSprings]
     forces: list[Values]
+    all_far: bool = False
 
 
 class PenaltyObstacleTerm(ObstacleTerm):
@@ -173,6 +175,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
         stiffness: (n,) k_p of the points of this rank, N/m.
     """
 
+    near_widths = PENALTY.near_gap
     shows_all_cells = True
     facets_may_be_cut = True  # and crack faces have no penalty of their own
 
@@ -251,6 +254,8 @@ class PenaltyObstacleTerm(ObstacleTerm):
         """
         free = {number: obstacle for number, obstacle in self.group.bodies.free.items() if number in self.numbers}
         of_free, added = cast("dict[int, VerletObstacle]", free), self._added_frequency
+        if self.is_far():
+            return added
         self.obstacle_forces()
         if self.facets.numbers:
             load, reach = np.zeros(len(self.stiffness)), PENALTY.near_gap * self.law.barrier.width
@@ -273,6 +278,24 @@ class PenaltyObstacleTerm(ObstacleTerm):
         return obstacle.max_frequency(sum_over_ranks(self.comm, stiffness.reshape(-1)).reshape(stiffness.shape), posed)
 
     # --- steps ---
+
+    def update_displacement(self) -> None:
+        """Discard forces, and test whether obstacles are far while u is in the cache (collective)."""
+        super().update_displacement()
+        self.is_far()
+
+    def is_far(self) -> bool:
+        """Whether nothing is in contact at the current u, nor was at the end of the last step (collective)."""
+        if self._far is None:
+            self._far = self._step_end.all_far and self._ends_far()
+        return self._far
+
+    def _ends_far(self) -> bool:
+        """Whether all obstacles are far at the current u (collective)."""
+        return self.clearance.is_far([self.end_displacement], [(posed, posed) for posed in self.group.posed])
+
+    def _starts_far(self) -> bool:
+        return self._step_end.all_far
 
     def _begin_new_step(self) -> None:
         self.surface.release_points(self.level.u_n, partial(min_distance, self.group.start_posed))
@@ -342,6 +365,10 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
     def accept_step(self) -> None:
         """Sum the work of the step, and store springs and forces for the next one (collective)."""
+        if self.is_far():
+            zeros: list[Values] = [np.zeros(self._domain.dim) for _ in self.obstacles]
+            self.group.friction_loss, self.group.work, self.group.forces = 0.0, [0.0] * len(zeros), zeros
+            return
         forces, previous, group = (
             [-self._current_force(n) for n in range(len(self.obstacles))],
             self._step_end,
@@ -357,7 +384,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
         for number in (number for number, obstacle in enumerate(self.obstacles) if not obstacle.free):
             shift = self.group.increments[number][: self._domain.dim]
             group.work[number] = float((forces[number] + previous.forces[number]) @ shift) / 2
-        self._step_end, self._start_points = StepEnd(self._springs, forces), None
+        self._step_end, self._start_points = StepEnd(self._springs, forces, self._ends_far()), None
 
     # --- state ---
 
@@ -365,7 +392,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
         """Add new crack faces; springs of points that still exist stay (collective)."""
         springs = [(spring, self.surface.local.identify_points(spring.points)) for spring in self._step_end.springs]
         super().edges_broke(pattern)
-        self._step_end = StepEnd([self._matched_springs(*item) for item in springs], self._step_end.forces)
+        self._step_end = replace(self._step_end, springs=[self._matched_springs(*item) for item in springs])
         self._update_stiffness()
 
     def _matched_springs(self, spring: FrictionSprings, identity: Values) -> FrictionSprings:

@@ -13,13 +13,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from dolfinx import la
-from mpi4py import MPI
 
 from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
 from ..mesh.simplices import local_edges
-from .obstacle import RigidObstacle
-from .pose import Pose, PosedShape, min_distance
+from .pose import PosedShape, min_distance
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -139,12 +137,10 @@ class CellReachPolicy:
     Attributes:
         required: distance within which crack faces of a cell have to be part of the surface.
         shown: distance within which they are part of it once it is made.
-        max_arm: distance of points of crack faces from the nodes that they follow.
     """
 
     required: float = 1.5
     shown: float = 2.5
-    max_arm: float = 2.0
 
 
 CELL_REACH = CellReachPolicy()
@@ -191,8 +187,7 @@ class ShownCells:
         distance = min_distance(obstacles, self._domain.nodes + self._at_nodes(u))
         if motion is not None:
             distance = distance - np.linalg.norm(self._at_nodes(motion), axis=1)
-        corners = np.minimum.reduce([distance[nodes] for nodes in self._domain.cell_nodes.T])
-        beyond = (corners - shift - self._width) / self._longest_edge
+        beyond = (self._at_cells(distance) - shift - self._width) / self._longest_edge
         if not sum_over_ranks(self._domain.comm, int(self._is_outdated(pattern, beyond)))[0]:
             return False
         self.flags, self._pattern = beyond < CELL_REACH.shown, pattern.copy()
@@ -205,74 +200,18 @@ class ShownCells:
         required = self.flags | (beyond < CELL_REACH.required)
         return bool((pattern != np.where(self.flags, self._pattern, 0))[required].any())
 
+    def face_distances(self, obstacles: Sequence[PosedShape], u: Values) -> list[float]:
+        """Bounds of the distances of crack faces of this rank's cells from each obstacle, m; as of `update`."""
+        x, faces = self._domain.nodes + self._at_nodes(u), CELL_REACH.required * self._longest_edge
+        return [float((self._at_cells(posed.distance(x)) - faces).min(initial=np.inf)) for posed in obstacles]
+
+    def _at_cells(self, values: Values) -> Values:
+        """(cells,) least of the values (nodes,) at the corners."""
+        return np.asarray(np.minimum.reduce([values[nodes] for nodes in self._domain.cell_nodes.T]))
+
     def _at_nodes(self, owned: Values) -> Values:
         """(nodes, d) values of a field at the nodes of this rank, with ghosts, for its owned dofs (collective)."""
         field = la.vector(self._domain.space.dofmap.index_map, self._domain.dim, np.float64)
         field.array[: len(owned)] = owned
         field.scatter_forward()
         return np.asarray(field.array.reshape(-1, self._domain.dim))
-
-
-class ProximityTest:
-    """Test by bounding boxes whether a body can be near an obstacle; nothing is gathered."""
-
-    def __init__(self, domain: Domain, obstacles: Sequence[RigidObstacle], distance: float) -> None:
-        """`distance`: of the barrier, m (collective)."""
-        corners = domain.nodes[domain.cell_nodes]
-        diameter = float(np.ptp(corners, axis=1).max(initial=0.0)) * np.sqrt(domain.dim)
-        self._reach = distance + CELL_REACH.max_arm * float(domain.comm.allreduce(diameter, op=MPI.MAX))
-        self._comm, self._X = domain.comm, np.ascontiguousarray(domain.nodes[: domain.node_count].T)
-        self._rest_box = self._X.min(axis=1, initial=np.inf), self._X.max(axis=1, initial=-np.inf)
-        self._boxes = [_BoundingBox(obstacle.shape.tessellate()[0]) for obstacle in obstacles]
-
-    def is_far(self, displacements: Sequence[Values], poses: Sequence[tuple[Pose, Pose]]) -> bool:
-        """Whether no point of the body can be within the barrier of an obstacle (collective).
-
-        Args:
-            displacements: (owned dofs,) of the body, m; positions between them count as well.
-            poses: of each obstacle at the start and the end of its motion.
-        """
-        boxes = [box.swept(*ends) for box, ends in zip(self._boxes, poses, strict=True)]
-        # of all components together at first, which takes a third of the time
-        return any(
-            not self._box_meets(np.concatenate([-low, high]), boxes)
-            for low, high in (bounds(displacements) for bounds in (self._rough_bounds, self._bounds))
-        )
-
-    def _rough_bounds(self, displacements: Sequence[Values]) -> tuple[Values, Values]:
-        """(3,) corners of a box around this rank's nodes, m."""
-        low, high = self._rest_box
-        return (
-            low + min(float(u.min(initial=np.inf)) for u in displacements),
-            high + max(float(u.max(initial=-np.inf)) for u in displacements),
-        )
-
-    def _bounds(self, displacements: Sequence[Values]) -> tuple[Values, Values]:
-        """(3,) corners of the bounding box of this rank's nodes, m."""
-        # by columns: minima along the first axis take twenty times as long
-        x = [[self._X[axis] + u[axis::3] for u in displacements] for axis in range(3)]
-        low = [min(float(part.min(initial=np.inf)) for part in parts) for parts in x]
-        high = [max(float(part.max(initial=-np.inf)) for part in parts) for parts in x]
-        return np.array(low), np.array(high)
-
-    def _box_meets(self, bounds: Values, boxes: Sequence[tuple[Values, Values]]) -> bool:
-        """Whether the box of all ranks, of bounds (6,), and its reach meet one of the boxes (collective)."""
-        self._comm.Allreduce(MPI.IN_PLACE, bounds, MPI.MAX)
-        low, high = -bounds[:3] - self._reach, bounds[3:] + self._reach
-        return any(np.all(low < box_high) and np.all(high > box_low) for box_low, box_high in boxes)
-
-
-class _BoundingBox:
-    """Bounding box of an obstacle in its own frame."""
-
-    def __init__(self, points: Values) -> None:
-        """`points`: (m, 3) in its own frame, m."""
-        self._low, self._high = points.min(axis=0), points.max(axis=0)
-        self._radius = float(np.linalg.norm(points, axis=1).max())
-
-    def swept(self, start: Pose, end: Pose) -> tuple[Values, Values]:
-        """(3,) corners of a box around the motion between two poses, m; with a rotation, around a sphere."""
-        # a rotated box would have to be rotated too; the sphere is valid for any rotation
-        rotated = not all(np.array_equal(pose.rotation, np.eye(3)) for pose in (start, end))
-        low, high = (-self._radius, self._radius) if rotated else (self._low, self._high)
-        return np.minimum(start.centre, end.centre) + low, np.maximum(start.centre, end.centre) + high

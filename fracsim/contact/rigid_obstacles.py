@@ -381,10 +381,21 @@ class ObstacleGroup:
         """Poses at the start of the step."""
         return [posed.pose for posed in self.start_posed]
 
+    def motions(self, increments: Increments, *, from_start: bool = False) -> list[tuple[PosedShape, PosedShape]]:
+        """Each now, and after increments (p,) by their numbers in the study, of now or of the start of the step."""
+        result = []
+        for number, posed in zip(self.numbers, self.posed, strict=True):
+            start = self.bodies.start_posed[number] if from_start and number in increments else posed
+            end = start
+            if number in increments:
+                end = PosedShape(start.shape, start.pose.incremented(increments[number]))
+            result.append((start, end))
+        return result
+
     @property
-    def step_poses(self) -> list[tuple[Pose, Pose]]:
-        """Poses of each at the start of the step, and now."""
-        return list(zip(self.start_poses, self.poses, strict=True))
+    def step_motions(self) -> list[tuple[PosedShape, PosedShape]]:
+        """Each at the start of the step, and now."""
+        return list(zip(self.start_posed, self.posed, strict=True))
 
     # --- the last step ---
 

@@ -28,6 +28,7 @@ from ..mesh.parallel import Gather, bcast, on_root, sum_over_ranks
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.quadratic_surface import subdivided_input_mesh
 from ..mesh.split_surface.surface_map import SurfaceMap
+from .clearance import FollowingPoints
 from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface, SurfaceSnapshot
 from .laws import stiffness_factor
 from .pair_search import max_length
@@ -47,6 +48,7 @@ class BreakingSurface[S: SelfContactSurface]:
     Attributes:
         law: contact law, whose stiffness may grow.
         gather: gathering of the nodes that the surface depends on.
+        node_numbers: (nodes,) global numbers of these, where the surface is held.
     """
 
     _cuts: CutPositions | None = None
@@ -73,6 +75,9 @@ class BreakingSurface[S: SelfContactSurface]:
             mesh = bcast(domain.comm, mesh)
         self._skeleton = None if mesh is None else EntityNumbering(mesh)
         self._pattern: Pattern = np.zeros(domain.cell_count, np.uint8)
+        first = domain.space.dofmap.index_map.local_range[0]
+        # (nodes,) global numbers of nodes in input order
+        self.node_numbers = self._gathered(self.gather, first + np.arange(domain.node_count))
         self._rebuild()
 
     def _rebuild(self) -> None:
@@ -116,6 +121,18 @@ class BreakingSurface[S: SelfContactSurface]:
         """(n, d) positions of its points for owned displacements u, m; None where not held (collective)."""
         nodal = self.nodal_values(u)
         return self._surface.point_map(nodal) if self._surface is not None else None
+
+    def following_points(self) -> FollowingPoints:
+        """Points of the surface; none where it is not held."""
+        if self._surface is None:
+            none, d = np.empty(0, np.int64), self._domain.dim
+            return FollowingPoints(np.empty((0, d)), csr_matrix((0, 0)), none, np.empty((0, d), np.int64))
+        share, excluded, _ = self._surface.snapshot()
+        point_map, elements = self._surface.point_map, self._surface.split.elements
+        nodes = np.unique(point_map.weights.indices)
+        may_stay = not len(excluded) and bool(np.all(share == 1))
+        weights = point_map.weights[:, nodes]
+        return FollowingPoints(point_map.rest, weights, self.node_numbers[nodes], elements, may_stay=may_stay)
 
     def set_cuts(self, cuts: CutPositions) -> None:
         """Set where edges are cut; used for faces between fragments."""
@@ -205,9 +222,6 @@ class SelfContact(Term):
         build = build or partial(SelfContactSurface, comm=domain.comm)
         self.surface = BreakingSurface(domain, u, law, build, everywhere=True)
         self.parts = self.surface, CollisionLimit(self)
-        first = domain.space.dofmap.index_map.local_range[0]
-        # numbers of input nodes
-        self._input_nodes = self.surface.gather.to_all_ranks(first + np.arange(domain.node_count))
         self._discard_surface()
 
     # --- surface ---
@@ -308,7 +322,7 @@ class SelfContact(Term):
         H = csr_matrix(self.level.contact_weights.factor * H)
         if not self.comm.allreduce(H.nnz):
             return None
-        matrix = self._coupling(surface.point_map.nodal_stiffness(H), self._input_nodes)
+        matrix = self._coupling(surface.point_map.nodal_stiffness(H), self.surface.node_numbers)
         stiff = stiff_directions(H, self._stiff_threshold * self.surface.law.stiffness, self.comm)
         if stiff is None:
             return matrix

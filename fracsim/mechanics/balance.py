@@ -171,7 +171,7 @@ class Balance:
 
     def set_displacement(self, u: Values) -> None:
         """Put (owned dofs,) displacements into u, ghosts included (collective)."""
-        if self.contact.limits_newton_steps:
+        if self.contact.limits_newton_steps and self.scheme.implicit:
             # Newton's method comes to each iterate twice, and terms of contact search once
             unchanged = np.array_equal(self.u.x.array[: self.owned_dof_count], u)
             if self.domain.comm.allreduce(unchanged, op=MPI.LAND):

@@ -230,33 +230,56 @@ def _restrict_to_used_columns(matrices: list[csr_matrix]) -> tuple[Ints, list[cs
     ]
 
 
+class NodeExchange:
+    """Values of nodes of all ranks at the nodes that this rank selects, and sums of their parts back."""
+
+    def __init__(self, domain: Domain, nodes: Ints) -> None:
+        """`nodes`: (k,) global numbers of the selected nodes (collective)."""
+        self._dim = domain.dim
+        self._nodes = PETSc.Vec().createMPI((domain.node_count * domain.dim, PETSc.DETERMINE), bsize=domain.dim,
+                                            comm=domain.comm)  # fmt: skip
+        self._local = PETSc.Vec().createSeq(len(nodes) * domain.dim, bsize=domain.dim)
+        selected = PETSc.IS().createBlock(domain.dim, nodes.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
+        self._scatter = PETSc.Scatter().create(self._nodes, selected, self._local, None)
+        selected.destroy()
+
+    def __call__(self, owned: Values) -> Values:
+        """(k, d) values at the selected nodes of a field with `owned` dofs (collective)."""
+        self._nodes.placeArray(np.ascontiguousarray(owned))
+        self._scatter.scatter(self._nodes, self._local, PETSc.InsertMode.INSERT, PETSc.ScatterMode.FORWARD)
+        self._nodes.resetArray(force=True)
+        return np.asarray(self._local.array_r.reshape(-1, self._dim))
+
+    def sum_at_nodes(self, parts: Values) -> Values:
+        """(owned dofs,) sums over ranks of `parts` (k, d) at the selected nodes (collective)."""
+        self._local.array_w[:] = parts.reshape(-1)
+        self._nodes.set(0.0)
+        self._scatter.scatter(self._local, self._nodes, PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
+        return self._nodes.array_r.copy()
+
+    def destroy(self) -> None:
+        """Free the PETSc objects."""
+        for petsc_object in (self._nodes, self._local, self._scatter):
+            petsc_object.destroy()
+
+
 class ParentMatrix:
     """The matrix from nodes of all ranks to the surface points of this rank, and its transpose.
 
     Attributes:
         dim: dimension of the body.
         comm: communicator of the body.
+        nodal_values: values (columns, d) at the nodes in the columns.
     """
 
     def __init__(self, domain: Domain, surface: LocalSurface) -> None:
         """For the present state of `surface` (collective)."""
         self._surface, self.dim, self.comm = surface, domain.dim, domain.comm
-        self._nodes = PETSc.Vec().createMPI((domain.node_count * domain.dim, PETSc.DETERMINE), bsize=domain.dim,
-                                            comm=domain.comm)  # fmt: skip
-        self._local = PETSc.Vec().createSeq(len(surface.columns) * domain.dim, bsize=domain.dim)
-        columns = PETSc.IS().createBlock(domain.dim, surface.columns.astype(PETSc.IntType), comm=PETSc.COMM_SELF)
-        self._scatter = PETSc.Scatter().create(self._nodes, columns, self._local, None)
-        columns.destroy()
+        self.nodal_values = NodeExchange(domain, surface.columns)
 
     def __call__(self, owned: Values) -> Values:
         """(n, d) values at the points of a field with `owned` dofs (collective)."""
         return np.asarray(self._surface.point_map.weights @ self.nodal_values(owned))
-
-    def nodal_values(self, owned: Values) -> Values:
-        """(columns, d) values of a field at the nodes in the columns (collective)."""
-        self._nodes.array_w[:] = owned
-        self._scatter.scatter(self._nodes, self._local, PETSc.InsertMode.INSERT, PETSc.ScatterMode.FORWARD)
-        return np.asarray(self._local.array_r.reshape(-1, self.dim))
 
     def assemble_to_nodes(self, forces: Values) -> Values:
         """(owned dofs,) nodal forces equivalent to `forces` (n, d) at the points, N (collective)."""
@@ -272,12 +295,8 @@ class ParentMatrix:
 
     def sum_at_nodes(self, parts: Values) -> Values:
         """(owned dofs,) sums over ranks of `parts` (columns, d) at the nodes in the columns (collective)."""
-        self._local.array_w[:] = parts.reshape(-1)
-        self._nodes.set(0.0)
-        self._scatter.scatter(self._local, self._nodes, PETSc.InsertMode.ADD, PETSc.ScatterMode.REVERSE)
-        return self._nodes.array_r.copy()
+        return self.nodal_values.sum_at_nodes(parts)
 
     def destroy(self) -> None:
         """Free the PETSc objects."""
-        for petsc_object in (self._nodes, self._local, self._scatter):
-            petsc_object.destroy()
+        self.nodal_values.destroy()
