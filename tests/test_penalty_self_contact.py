@@ -293,3 +293,34 @@ def test_a_surface_without_elements_touches_nothing(dim: int) -> None:
     for pairs in (barrier, PenaltyPairs(x, none, stiffness, distance=0.1)):
         assert pairs.energy(x) == 0.0 and not pairs.gradient(x).any() and pairs.min_gap(x) == np.inf
         assert not pairs.pressure(x).any() and not len(pairs.intersections(x))
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_forces_do_not_depend_on_the_order_of_facets(dim: int) -> None:
+    """Two lattices, one over the other, with points over edges and nodes, and masses that differ from point to point:
+    of facets that share a closest point any may be found first. Their order and that of corners change nothing."""
+    n, gap, width = 3, 0.02, 0.05
+    grid = np.stack(np.meshgrid(*[np.arange(n + 1) / n] * (dim - 1), indexing="ij"), axis=-1).reshape(-1, dim - 1)
+    if dim == 2:
+        facets = np.array([[i + 1, i] for i in range(n)])
+    else:
+        first = np.array([i * (n + 1) + j for i in range(n) for j in range(n)])[:, None]
+        facets = np.concatenate([first + np.array(corners) for corners in ((0, n + 1, n + 2), (0, n + 2, 1))])
+    lower = np.column_stack([grid, np.zeros(len(grid))])
+    upper = np.column_stack([grid + (0.5 / n if dim == 3 else 0.0), np.full(len(grid), gap)])
+    x, count = np.concatenate([lower, upper]), len(grid)
+    elements = np.concatenate([facets, facets[:, ::-1] + count])
+    random = np.random.default_rng(0)
+    k, reduction = random.uniform(1.0, 2.0, 2 * count), random.uniform(0.3, 1.0, 2 * count)
+    patch = np.repeat(np.array([0, 1], np.int32), count)
+
+    def forces(order: npt.NDArray[np.int64], first: int) -> Values:
+        stiffness = ContactStiffness(k, 2 * k, reduction)
+        pairs = PenaltyPairs(x, np.roll(elements[order], first, axis=1), stiffness, distance=width, patch=patch)
+        return pairs.gradient(x)
+
+    expected = forces(np.arange(len(elements)), 0)
+    assert abs(expected).max() > 0.3 * (width - gap)
+    for first in range(3) if dim == 3 else (0,):
+        for _ in range(4):
+            np.testing.assert_allclose(forces(random.permutation(len(elements)), first), expected, atol=1e-14)

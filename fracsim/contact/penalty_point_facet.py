@@ -39,7 +39,7 @@ class PointFacetPolicy:
         max_gap: largest gap, or depth, of a pair; a deeper point has passed through.
         search_margin: motion of points after which candidates are searched again.
         same_distance: difference of distances, in mean edges, of facets that share a closest point.
-        min_barycentric: coordinate of a corner below which the corner does not limit the stiffness.
+        min_barycentric: coordinate of a corner below which the corner does not carry a point.
         clearance_gap: gaps that are searched where nothing is within reach.
         ahead_gap: gap of points that may be in contact a step later.
         max_added: part of the allowed increase of the square of a frequency that the points at a node may cause.
@@ -291,10 +291,15 @@ class PointFacetContacts:
         return self._last[1]
 
     def _stiffness_of(self, pairs: PointFacetPairs) -> Values:
-        """(k,) k_p, N/m: at most what a corner of the facet may have; constant during contact."""
-        allowed, weight = self._stiffness, np.maximum(pairs.barycentric, POINT_FACET.min_barycentric)
-        limit = (allowed.limit[pairs.corners] / weight).min(axis=1, initial=np.inf)
-        largest = allowed.point[pairs.points] * allowed.reduction[pairs.corners].min(axis=1, initial=np.inf)
+        """(k,) k_p, N/m: at most what a corner that carries the point may have; constant during contact.
+
+        So all facets that share a closest point give the same stiffness.
+        """
+        allowed, carries = self._stiffness, pairs.barycentric > POINT_FACET.min_barycentric
+        weight = np.where(carries, pairs.barycentric, 1.0)
+        limit = np.where(carries, allowed.limit[pairs.corners] / weight, np.inf).min(axis=1, initial=np.inf)
+        reduction = np.where(carries, allowed.reduction[pairs.corners], 1.0).min(axis=1, initial=1.0)
+        largest = allowed.point[pairs.points] * reduction
         previous = self.history.stiffness[pairs.points]
         return np.where(previous > 0, previous, np.minimum(largest, limit))
 
@@ -308,7 +313,8 @@ class PointFacetContacts:
         margin = POINT_FACET.search_margin
         positions, reach = centred(vertices), (POINT_FACET.max_gap + 3 * margin) * self._width
         if candidates is not self._candidates:
-            points, facets = candidates[0].T
+            # in an order that does not depend on the search: of equally near facets the first one counts
+            points, facets = candidates[0][np.lexsort(candidates[0].T[::-1])].T
             self._candidates, self._cache = candidates, ClosestPointCache(self._used[points], self._elements[facets])
             self._check_positions = positions
             self._is_close = self._cache.are_within(x.copy(), np.arange(len(points)), reach)
