@@ -276,6 +276,35 @@ def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
     assert_alike(again, going, 1e-9)
 
 
+AXE = str(Path(__file__).parent / "support" / "axe.obj")
+
+
+@pytest.mark.parametrize(
+    "obstacle",
+    [
+        {"shape": "sphere", "radius": 0.12, "at": [0.41, 0.45, 1.13]},
+        {"shape": "box", "size": [0.4, 0.3, 0.3], "rounding": 0.02, "at": [0.41, 0.45, 1.17]},
+        {"shape": "mesh", "file": AXE, "at": [0.4, 0.5, 1.02]},
+    ],
+    ids=("ball", "box", "file"),
+)
+def test_a_restart_takes_the_same_steps(obstacle: dict[str, Any], tmp_path: Path) -> None:
+    """A driven obstacle deep in a body: the next steps, whose size depends on what is near it, are the same bit by bit.
+    The axe is 3 m wide: its points are not in the body, but its triangles are."""
+    tables = {
+        "mesh": {"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.34, "pattern": "unstructured"},
+        "material": RUBBER, "boundary": [{"on": "bottom", "fix": "xyz"}],
+        "contact": {"itself": False, "distance": 0.01},
+        "obstacle": [{"name": "it", "velocity": [0.3, 0.1, -6.0], "friction": 0.3} | obstacle],
+        "time": {"scheme": "explicit", "step": 0.05, "end": 1.0}, "output": {"picture": False, "interval": 1.0},
+    }  # fmt: skip
+    going, _, again = going_stopped_resumed(tables, tmp_path, 12, 3)
+    assert abs(going.scene.probes()[:3]).max() > 1.0
+    assert again.state.t == going.state.t
+    np.testing.assert_array_equal(again.state.u, going.state.u)
+    np.testing.assert_array_equal(again.scene.probes(), going.scene.probes())
+
+
 @pytest.mark.parametrize(
     ("tables", "message"),
     [

@@ -41,6 +41,13 @@ class ExplicitStepper(BalanceStepper):
         self._stable_step.edges_broke(None)
         return replace(super().with_forces(state), frequencies=cell_frequencies(self.balance.stress))
 
+    def from_checkpoint(self, state: State) -> State:
+        """Return the state of a checkpoint, whose damage and plastic strain the body has read (collective)."""
+        state = super().from_checkpoint(state)
+        # The stable step depends on where obstacles are at this time.
+        self.balance.evaluate_at(state.t, state.u, state.v)
+        return state
+
     def _next_step(self, state: State) -> float:
         return self._stable_step.next_step(state, self.sizes)
 
