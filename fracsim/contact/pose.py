@@ -174,12 +174,6 @@ class PosedShape:
         decrease = np.minimum(n * (lower - nearest), n * (upper - nearest)).sum()
         return float((self.distance(nearest) + decrease).item())
 
-    def pose_gradient(self, x: Values) -> Values:
-        """(n, p) derivatives of the distances of fixed points by q = (t, w)."""
-        n = self.normal(x)
-        by_rotation = np.einsum("nip,ni->np", rotation_derivative(x - self.pose.centre), n)
-        return np.concatenate([-n, by_rotation], axis=1)
-
     def mixed_hessian(self, x: Values) -> Values:
         """(n, d, p) second derivatives by the point and q."""
         H, G = self.curvature(x), rotation_derivative(x - self.pose.centre)
