@@ -142,12 +142,21 @@ def point_facet_pairs(
     order = np.lexsort((distance, points))
     is_new = (np.diff(points[order]) > 0) | (np.diff(distance[order]) > tolerance)
     group = np.cumsum(np.r_[False, is_new][: len(order)])
-    best = order[np.lexsort((-abs(height[order]), group))]
-    selected = best[np.unique(group, return_index=True)[1]]
+    steepest = np.zeros(len(order))
+    np.maximum.at(steepest, group, abs(height[order]))
+    # round-off decides nothing: of several facets the first one of the cache
+    level = abs(height[order]) >= steepest[group] - tolerance
+    selected = np.sort(_first_rows(group[level], order[level]))
     gap = np.where(height < 0, -1.0, 1.0) * distance
     is_clear = distance > tolerance
     normal = np.where(is_clear[:, None], offset / np.where(is_clear, gap, 1.0)[:, None], normal)
     return PointFacetPairs(points, corners, barycentric, gap, normal).select(selected)
+
+
+def _first_rows(groups: Ints, rows: Ints) -> Ints:
+    """(g,) lowest of the rows (k,) of each group (k,), in the order of the groups."""
+    order = np.lexsort((rows, groups))
+    return rows[order[np.unique(groups[order], return_index=True)[1]]]
 
 
 def _closest_points(x: Values, points: Ints, corners: Ints) -> tuple[Values, Values]:
@@ -237,10 +246,12 @@ class PointFacetContacts:
         # facets of the last step, or beside them, may be in front of a point that lies behind
         stays = (previous[:, :, None] == pairs.corners[:, None]).any(axis=(1, 2))
         pairs = pairs.select((pairs.gap > 0) | stays)
-        order = np.lexsort((abs(pairs.gap), pairs.points))
-        is_nearest = np.zeros(len(order), bool)
-        is_nearest[order[np.unique(pairs.points[order], return_index=True)[1]]] = True
-        pairs = pairs.select(is_nearest & (pairs.gap < reach))
+        depth = np.full(len(x), np.inf)
+        np.minimum.at(depth, pairs.points, abs(pairs.gap))
+        # of equally near facets the first one, whatever round-off
+        near = np.flatnonzero(abs(pairs.gap) <= depth[pairs.points] + POINT_FACET.same_distance * self._edge)
+        pairs = pairs.select(_first_rows(pairs.points[near], near))
+        pairs = pairs.select(pairs.gap < reach)
         return PenaltyContacts(
             points=np.column_stack([pairs.points, pairs.corners]),
             weights=np.column_stack([np.ones(len(pairs.points)), -pairs.barycentric]),
