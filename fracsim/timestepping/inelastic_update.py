@@ -7,6 +7,7 @@ from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from ..mechanics.balance import Balance
 from ..mesh.parallel import sum_over_ranks
@@ -239,7 +240,11 @@ class InelasticUpdate:
 
     def restore_damage(self, state: State) -> None:
         """Restore the damage of a state (collective)."""
-        if "damage" in state.history and self.fracture.restore(state.history["damage"]):
+        if "damage" not in state.history:
+            return
+        changed = self.fracture.restore(state.history["damage"])
+        # The damage of another rank may have changed alone.
+        if self._balance.domain.comm.allreduce(changed, op=MPI.LOR):
             self._damage_restored()
 
     def restore_flow_and_terms(self, state: State) -> None:
