@@ -32,6 +32,7 @@ from .tensor_functions import multiply_unimodular
 
 Values = npt.NDArray[np.float64]
 Points = npt.NDArray[np.int32]
+Flags = npt.NDArray[np.bool_]
 
 # weights of xx, yy, zz, xy, xz, yz in the squared norm of a symmetric tensor, and the unit tensor
 NORM_WEIGHTS = np.array([1.0, 1.0, 1.0, 2.0, 2.0, 2.0])
@@ -100,6 +101,7 @@ class ExtrapolatedPlasticFlow:
     def __init__(self, inverse: Values) -> None:
         """`inverse`: (points, 9) F_p^-1, which is replaced for the duration of a solve."""
         self._inverse = inverse
+        self.elastic: Flags | None = None  # (points,) points that do not flow; None: all may
         self._points: Points = np.empty(0, np.int32)
         self._rate: Values = np.empty((6, 0))
         self._replaced: Values | None = None  # (9, n) F_p^-1 of the points during a solve
@@ -114,6 +116,8 @@ class ExtrapolatedPlasticFlow:
             self._replaced = np.ascontiguousarray(self._inverse[self._points].T)
         longest = LIMITS.extrapolation
         duration = longest / np.maximum(np.sqrt(NORM_WEIGHTS @ self._rate**2), longest / dt)
+        if self.elastic is not None:
+            duration = np.where(self.elastic[self._points], 0.0, duration)
         self._inverse[self._points] = multiply_unimodular(self._replaced, IDENTITY + duration * self._rate).T
 
     def record_flow(self, points: Points, power: Values, dt: float) -> None:
@@ -164,6 +168,7 @@ class PlasticHistory:
         accumulated_strain: (points,) accumulated plastic strain alpha.
         prediction: flow while a step is solved; None for staggered steps.
         dt: size of the step that is solved, s; 0 between steps.
+        elastic: (points,) flags of points that do not flow; None: all may.
         fraction: 1 - exp(-nu dt), the part of the return to the yield surface in a step; 0 between steps.
         rate: nu, 1/s.    hardening: K, Pa.    frobenius: as for YieldLaw.
     """
@@ -179,6 +184,7 @@ class PlasticHistory:
         """
         self.rate, self.hardening, self.frobenius = law.flow_rate, law.hardening, law.frobenius
         self.dt, self.fraction = 0.0, 0.0
+        self.elastic: Flags | None = None
         count = self.points_per_cell = points_per_cell(domain)
         self._yield, self._modulus = self._at_points(law.yield_stress), self._at_points(3 * material.mu)
         self.volumes = np.repeat(domain.volumes / count, count) if count > 1 else domain.volumes
@@ -207,9 +213,25 @@ class PlasticHistory:
         return ExtrapolatedPlasticFlow(self.inverse_rows) if update == "extrapolated" else None
 
     def flow_stress(self, strain: Values, points: Points | slice = slice(None)) -> Values:
-        """Y = yield_stress + K alpha, Pa, of points with strain alpha; never below a share of yield_stress."""
+        """Y = yield_stress + K alpha, Pa, of points with strain alpha; never below a share of yield_stress.
+
+        It is infinite where the body is elastic.
+        """
         start = self._yield[points] if isinstance(self._yield, np.ndarray) else self._yield
-        return np.maximum(start + self.hardening * strain, LIMITS.softened_share * start)
+        Y = np.maximum(start + self.hardening * strain, LIMITS.softened_share * start)
+        return Y if self.elastic is None else np.where(self.elastic[points], np.inf, Y)
+
+    def set_elastic(self, cells: Flags) -> None:
+        """Let the flagged ones of all cells (cells,) of this rank keep their plastic strain, and the others flow."""
+        self.elastic = np.repeat(cells, self.points_per_cell)
+        if isinstance(self.prediction, ExtrapolatedPlasticFlow):
+            self.prediction.elastic = self.elastic
+        self.update_flow_stress()
+
+    def flowing_points(self, before: Flags | None) -> Points:
+        """Return the points (n,) that may flow and were elastic `before`, (points,) flags; None: all that may flow."""
+        flows = np.ones(len(self.accumulated_strain), bool) if self.elastic is None else ~self.elastic
+        return np.flatnonzero(flows if before is None else flows & before).astype(np.int32)
 
     def update_flow_stress(self) -> None:
         """Give the prediction the flow stress of the current strain."""

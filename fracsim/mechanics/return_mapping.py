@@ -19,15 +19,17 @@ Equations: docs/theory.md#plasticity.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 
 from ..forms.plasticity import TrialStress
 from .jit import point_expression
-from .plasticity import PlasticHistory
+from .plasticity import ImplicitPlasticFlow, PlasticHistory
 from .stress import Stress
 from .tensor_functions import deviatoric_power, eigenvalues, multiply_unimodular
 
@@ -54,21 +56,35 @@ class ReturnMappingPolicy:
 POLICY = ReturnMappingPolicy()
 
 
+class ElasticZoneProtocol(Protocol):
+    """Interface of a zone around crack tips in which nothing flows."""
+
+    def update(self) -> None:
+        """Move the zone to the present tips (collective)."""
+
+
 class ReturnMapping:
     """Plastic flow of a step whose displacement is known (a protocol of timestepping.inelastic_update).
 
     Attributes:
+        elastic_zone: zone around crack tips; None: the body may flow everywhere.
         stored: stored energy int psi dX after it, without damage, part of this rank, J.
         plastic: history of plastic flow.
+        continues: whether a step that is solved again continues from the flow before.
     """
 
     elastic_energy: float | None = 0.0
+    elastic_zone: ElasticZoneProtocol | None = None
 
     def __init__(self, stress: Stress) -> None:
         plastic, domain = stress.material.plastic, stress.domain
         assert plastic is not None
         self.plastic: PlasticHistory = plastic
         self._stress, self._flowed = stress, True
+        # (points,) stress above Y of points that have left the elastic zone since the last flow, Pa
+        self._excess = np.zeros(len(plastic.accumulated_strain))
+        # An extrapolated flow would be extrapolated anew.
+        self.continues = math.isinf(plastic.rate) and isinstance(plastic.prediction, ImplicitPlasticFlow)
         trial = TrialStress(plastic.energy, stress.u, stress.rotation_field)
         self._state, self._measures = (
             point_expression(domain, expression, kernels=stress.kernels)
@@ -78,6 +94,16 @@ class ReturnMapping:
     def begin_step(self, dt: float) -> None:
         """Begin a step of dt (s)."""
         self.plastic.begin_step(dt)
+
+    def edges_broke(self) -> None:
+        """Move the elastic zone to the present crack tips (collective)."""
+        if self.elastic_zone is None:
+            return
+        before = self.plastic.elastic
+        self.elastic_zone.update()
+        points = self.plastic.flowing_points(before)
+        Y = self.plastic.flow_stress(self.plastic.accumulated_strain[points], points)
+        self._excess[points] = np.maximum(self.measured(self.measures(points)) - Y, 0.0)
 
     def __call__(self) -> float:
         """Return points beyond yield to the yield surface; energy dissipated on this rank, J."""
@@ -99,6 +125,8 @@ class ReturnMapping:
         if plastic.prediction is not None and dt:
             plastic.prediction.record_flow(points, power, dt)
         plastic.begin_step(0.0)
+        if self.elastic_zone is not None:
+            self._excess[:] = 0.0
         if len(points) and plastic.hardening:
             plastic.update_flow_stress()
         if len(points) or self._flowed:
@@ -147,6 +175,8 @@ class ReturnMapping:
         # the loss of psi starts at the trial stress, which the body never had: it flowed at the yield stress
         (vm, _, psi), (vm_trial, _, psi_trial) = block.after.T, block.trial.T
         over = block.J * (vm_trial - vm) + gain
+        if self.elastic_zone is not None:
+            over -= np.minimum(self._excess[points], over)
         chi = 1.0 if self._stress.chi is None else self._stress.chi.x.array[points // plastic.points_per_cell]
         return float(np.sum(chi * plastic.volumes[points] * (psi_trial - psi - over / 2 * flowed)))
 

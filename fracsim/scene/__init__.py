@@ -137,7 +137,7 @@ def build_scene_on(
         check_supports(domain, balance.motion)
     stage("setting up what breaks and what solves")
     flow = build_flow(study, balance)
-    breaking = build_fracture_pass(study, balance)
+    breaking = build_fracture_pass(study, balance, flow)
     solver = None
     if scheme.implicit:
         options, plain = solver_options.without_plain(study.solver), solver_options.uses_plain_solver(study.solver)

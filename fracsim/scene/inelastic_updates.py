@@ -38,8 +38,8 @@ def build_flow(study: Study, balance: Balance) -> PlasticFlowProtocol:
     return ReturnMapping(balance.stress)
 
 
-def build_fracture_pass(study: Study, balance: Balance) -> FracturePass | None:
-    """Return the fracture pass of a study (collective); None without [fracture]."""
+def build_fracture_pass(study: Study, balance: Balance, flow: PlasticFlowProtocol) -> FracturePass | None:
+    """Return the fracture pass of a study with this plastic flow (collective); None without [fracture]."""
     if study.fracture is None:
         return None
     from ..fracture.fracture_pass import FracturePass
@@ -52,7 +52,7 @@ def build_fracture_pass(study: Study, balance: Balance) -> FracturePass | None:
         passes = 1
     cuts = _open_initial_cracks(study, balance, graph)
     if study.fracture.energy is not None:
-        fracture = _build_energy_pass(study, balance, graph, passes, cuts)
+        fracture = _build_energy_pass(study, balance, flow, graph, passes, cuts)
     else:
         criterion = _build_criterion(study, balance.stress, graph)
         attachment = _build_node_attachment(study, balance, graph, criterion.strength)
@@ -68,7 +68,12 @@ def build_fracture_pass(study: Study, balance: Balance) -> FracturePass | None:
 
 
 def _build_energy_pass(
-    study: Study, balance: Balance, graph: EdgeGraph, passes: int | None, initial_cuts: Values | None
+    study: Study,
+    balance: Balance,
+    flow: PlasticFlowProtocol,
+    graph: EdgeGraph,
+    passes: int | None,
+    initial_cuts: Values | None,
 ) -> FracturePass:
     """Return the fracture pass for cracks with a fracture energy (collective)."""
     from ..fracture.degradation import CrackClosureDegradation, Degradation, SplitCellDegradation
@@ -93,6 +98,8 @@ def _build_energy_pass(
         criterion_type = RateDependentTipCriterion
     record = TipRecord()
     tips = criterion_type(stress, graph, strength, toughness, initial_cuts, record)
+    if study.plasticity is not None:
+        _add_elastic_zone(flow, tips, graph)
     limits_passes = inertia and study.fracture.passes is None
     passes_per_second = tips.passes_per_second() if limits_passes else None
     degradation: Degradation = SplitCellDegradation(stress, graph, tips.release_rate() if inertia else None)
@@ -113,6 +120,15 @@ def _build_energy_pass(
         passes_per_second=passes_per_second,
         tip_record=record,
     )
+
+
+def _add_elastic_zone(flow: PlasticFlowProtocol, tips: TipCriterion, graph: EdgeGraph) -> None:
+    """Let the body stay elastic around its crack tips (collective)."""
+    from ..fracture.energy.elastic_zone import ElasticZone
+    from ..mechanics.return_mapping import ReturnMapping
+
+    assert isinstance(flow, ReturnMapping)
+    flow.elastic_zone = ElasticZone(tips, graph, flow.plastic)
 
 
 def _build_cohesive_pass(

@@ -101,6 +101,8 @@ def energy_criterion_notes(study: Study, h: float, max_side: float) -> Iterator[
             yield from _cohesive_notes(length, h)
             continue
         yield _start_note(length / np.pi, h)
+        if study.plasticity is not None:
+            yield from _elastic_zone_notes(length / np.pi, h)
         yield from _process_zone_notes(length, strength, h, max_side)
         if length >= LIMITS.min_zone_cells * h and study.time.scheme == "quasi-static":
             yield 'cells resolve the process zone: with law = "cohesive" cracks soften as they open, as in concrete'
@@ -154,6 +156,15 @@ def _start_note(length: float, h: float) -> str:
     if length >= LIMITS.min_start_cells * h:
         return f"{start} cells resolve the stress ahead of a notch"
     return f"{start} at a notch the energy decides, elsewhere the strength"
+
+
+def _elastic_zone_notes(length: float, h: float) -> Iterator[str]:
+    """Yield the radius of the elastic zone around tips; `length` is L of the critical distance, both in m."""
+    disc = LIMITS.tip_radius * h
+    yield f"the body stays elastic within {max(length / 2, disc):.3g} m of a crack tip"
+    if length / 2 < disc:
+        yield f"note: that is {LIMITS.tip_radius:g} h, since L / 2 is less: the toughness depends on h;"
+        yield f"h = {length / 2 / LIMITS.tip_radius:.2g} m is sufficient"
 
 
 def _process_zone_notes(length: float, strength: float, h: float, max_side: float) -> Iterator[str]:

@@ -114,7 +114,6 @@ def _check_energy_criterion(study: Study) -> None:
         "fracture.cap": (table.cap is not None, "a tip advances by one cell a pass: remove cap"),
         'output.cut = "forces"': (study.output.cut == "forces", "cracks say where they cut: remove it"),
         "[brittle]": (study.brittle is not None, "surfaces take no energy: remove [brittle], or fracture.energy"),
-        "[plasticity]": (study.plasticity is not None, "the force on a tip is that of an elastic body: remove it"),
     }
     for name, (present, why) in conflicts.items():
         if present:
@@ -129,6 +128,7 @@ def _check_cohesive(study: Study, table: FractureSettings) -> None:
         "fracture.unilateral": (
             table.unilateral, "cells that are cut and pressed keep what stiffness they have left: remove it"
         ),
+        "[plasticity]": (study.plasticity is not None, "the law of the crack is that of an elastic body: remove it"),
         "fracture.crumbs = false": (not table.crumbs, "no node is held while cells are half open: remove crumbs"),
     }  # fmt: skip
     for name, (present, why) in conflicts.items():

@@ -87,9 +87,12 @@ class PlasticFlowProtocol(HistoryVariables, Protocol):
 
     Attributes:
         elastic_energy: elastic energy of the undamaged body after the last flow, J, on this rank; None without flow.
+        continues: a step that is solved again after a break continues from the flow before the break, which does not
+            depend on time; else from the start of the step.
     """
 
     elastic_energy: float | None
+    continues: bool
 
     def begin_step(self, dt: float) -> None:
         """Prepare the flow of a step of dt (s)."""
@@ -97,11 +100,15 @@ class PlasticFlowProtocol(HistoryVariables, Protocol):
     def __call__(self) -> float:
         """Let the body flow at the present displacement; return the dissipated energy on this rank, J."""
 
+    def edges_broke(self) -> None:
+        """Note that other edges are broken than before (collective)."""
+
 
 class NoPlasticFlow:
     """Plastic flow of an elastic body."""
 
     elastic_energy: float | None = None
+    continues = False
 
     def begin_step(self, dt: float) -> None:
         """Do nothing."""
@@ -109,6 +116,9 @@ class NoPlasticFlow:
     def __call__(self) -> float:
         """Return 0: nothing is dissipated."""
         return 0.0
+
+    def edges_broke(self) -> None:
+        """Do nothing."""
 
     def snapshot(self) -> object:
         """Return None: there are no history variables."""
@@ -207,7 +217,7 @@ class InelasticUpdate:
     ) -> None:
         """Connect the parts; `listener` is told of broken edges."""
         self._balance, self.flow, self.fracture = balance, flow, fracture
-        self._sizes, self._listener = sizes, listener
+        self._sizes, self._listener, self._comm = sizes, listener, balance.domain.comm
 
     @property
     def max_passes(self) -> int:
@@ -232,6 +242,10 @@ class InelasticUpdate:
         """Return the state with the present history variables."""
         return replace(state, history=self.snapshot())
 
+    def with_flow(self, state: State) -> State:
+        """Return the state with the present plastic strain."""
+        return replace(state, history=state.history | {"flow": self.flow.snapshot()})
+
     def restore(self, state: State) -> None:
         """Restore all history variables and the displacement of a state (collective)."""
         self.restore_damage(state)
@@ -244,7 +258,7 @@ class InelasticUpdate:
             return
         changed = self.fracture.restore(state.history["damage"])
         # The damage of another rank may have changed alone.
-        if self._balance.domain.comm.allreduce(changed, op=MPI.LOR):
+        if self._comm.allreduce(changed, op=MPI.LOR):
             self._damage_restored()
 
     def restore_flow_and_terms(self, state: State) -> None:
@@ -307,6 +321,7 @@ class InelasticUpdate:
         self.tell_listener()
 
     def _update_edges(self) -> None:
-        """Give the broken edges to the balance."""
+        """Give the broken edges to the balance and to the plastic flow (collective)."""
         if (pattern := self.fracture.broken_edge_patterns) is not None:
             self._balance.edges_broke(pattern)
+            self.flow.edges_broke()

@@ -88,25 +88,28 @@ class QuasiStaticStepper(ImplicitStepper):
     def _finish(self, state: State, dt: float, solve: SolveResult, began: float) -> tuple[State, StepReport]:
         """Break edges and solve in turn, until a pass changes nothing, or nothing that the solver would correct."""
         path = EquilibriumPath(state.u, state.forces, state.damping, state.out_of_balance)
-        broken, released, limit = 0, 0.0, self.inelastic.max_passes
+        broken, released, flow_loss, limit = 0, 0.0, 0.0, self.inelastic.max_passes
+        start, continues = state, self.inelastic.flow.continues
         for number in range(limit):
             self.balance.accept_step()
             if number == 0:
                 self.onset_reactions = self.balance.reactions.copy()
             path.continue_to(self._solution(), *balanced_forces(self.balance, lumped=False))
-            flow_loss = self._flow()
+            flow_loss = self._flow() + (flow_loss if continues else 0.0)
             result = self._fracture_pass(path, dt)
             broken, released = broken + result.broken_edges, released + result.released_energy
             if path.out_of_balance is None or number + 1 == limit:
                 break
-            again = self._solve(state, dt, path.u)
+            if continues:
+                start = self.inelastic.with_flow(start)
+            again = self._solve(start, dt, path.u)
             solve = solve.with_iterations_of(again)
             if again.converged and (result.broken_edges or again.newton_iterations):
                 continue
             if not again.converged:
                 self.failures.unbalanced_steps += 1
-                self._return_to(path.u, state, dt)
-            flow_loss = self._flow()
+                self._return_to(path.u, start, dt)
+            flow_loss = self._flow() + (flow_loss if continues else 0.0)
             break
         energies = StepEnergies(path.work, path.lost + (released + flow_loss), result.elastic_energy)
         return self._close_step(self._end(state, dt, path), dt, solve, began, broken, energies)

@@ -70,6 +70,12 @@ RUNS["torn"] = RUNS["cohesive"] | {
     "time": {"scheme": "explicit", "step": 1e-3, "end": 0.02},
 }  # fmt: skip
 RUNS["drawn"] = RUNS["torn"] | {"time": {"scheme": "generalized-alpha", "step": 5e-4, "end": 0.02}}
+# the plate of "notched", which yields outside the elastic zone of its tip
+RUNS["yielding"] = RUNS["notched"] | {
+    "material": _SOFT | {"energy": "corotated"},
+    "plasticity": {"yield_stress": 40.0, "hardening": 500.0, "update": "implicit"},
+    "time": {"scheme": "quasi-static", "step": 0.5, "end": 5.0},
+}  # fmt: skip
 # a front that is passed over until it has nearly what it takes
 RUNS["waiting"] = {
     "mesh": {"builder": "box", "size": [2.0, 0.3, 1.0], "h": 1 / 6, "pattern": "unstructured"},

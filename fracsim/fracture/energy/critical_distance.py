@@ -23,10 +23,12 @@ class CriticalDistance:
     most 60 h in 2D and 8 h in 3D.
 
     Attributes:
+        length: (cells,) L, m.
         radius: (cells,) R, m.
         threshold: (cells,) mean stress at which a crack starts, Pa.
     """
 
+    length: Values
     radius: Values
     threshold: Values
 
@@ -44,7 +46,7 @@ def critical_distance(dim: int, modulus: Values, toughness: Values, strength: Va
     c, energy = TIP.near_field_mean[dim], modulus * toughness
     length = energy / (np.pi * strength**2)
     radius = np.clip(c**2 / 2 * length, TIP.min_start_radius * h, TIP.max_start_radius[dim] * h)
-    return CriticalDistance(radius, np.minimum(strength, c * np.sqrt(energy / (2 * np.pi * radius))))
+    return CriticalDistance(length, radius, np.minimum(strength, c * np.sqrt(energy / (2 * np.pi * radius))))
 
 
 def start_points(domain: Domain) -> Values:
