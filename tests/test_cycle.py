@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -149,22 +150,24 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
 
 
 def test_more_is_done_with_coarser_levels_of_what_is_slender(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A strip that is bent slowly takes fewer iterations for it; with a block nothing more is done."""
+    """A strip that is bent slowly takes a fifth fewer iterations for it, on three meshes together (17 to 28 % each);
+    with a block nothing more is done."""
     set_policy(monkeypatch, min_block_dofs=0)
     set_policy(monkeypatch, slow_iterations=99)  # aggregates stay of one kind
-    strip, block, its = [3.0, 0.04, 0.02], [0.2, 0.2, 0.2], []
-    for size, slowly in (
+    strip, block, its = [3.0, 0.04, 0.02], [0.2, 0.2, 0.2], np.zeros(3)
+    cases = (
         (strip, DEFAULT_POLICY.slow_cycle_ratio),
         (strip, 1.0),
         (block, DEFAULT_POLICY.slow_cycle_ratio),
-    ):
+    )
+    for (number, (size, slowly)), seed in product(enumerate(cases), (1, 2, 3)):
         set_policy(monkeypatch, slow_cycle_ratio=slowly)
         scene = bar(
-            3, {}, mesh={"size": size, "h": 0.02, "pattern": "unstructured"},
+            3, {}, mesh={"size": size, "h": 0.02, "pattern": "unstructured", "seed": seed},
             boundary=[{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [0.0, 0.0, 0.01]}],
             time={"end": 9.0, "scheme": "backward-euler", "step": 3.0},
         )  # fmt: skip
-        its.append(Walk(scene).advance().solve.krylov_iterations)
+        its[number] += Walk(scene).advance().solve.krylov_iterations
         made = linear_of(scene).preconditioner.applied.vcycle
         assert made is not None
         assert (made._levels[-2].smoothing == vcycle.THOROUGH_SMOOTHING[0]) == (size is strip and slowly < 1)

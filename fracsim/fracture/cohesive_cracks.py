@@ -23,7 +23,7 @@ Where G_c < l psi_0 a cell releases its energy at rho = 1. A cut edge breaks onc
 
 A crack starts only where nothing grows or softens any more, and one at a time: in a bar the whole length reaches the
 strength at once, and all but one place unload. Explicit steps have one pass, in which cells soften, tips advance and
-cracks start one after another: a place learns of others by waves.
+cracks start one after another: a place learns of others by waves (docs/theory.md#spall-of-a-bar).
 
 Equations: docs/theory.md#cohesive-cracks.
 """
