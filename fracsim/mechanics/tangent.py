@@ -294,7 +294,7 @@ class Tangent:
 
     def _assemble_body(self, psd_tolerance: float | None, *, reuse: bool) -> None:
         """Assemble forms and inertia, without couplings; `reuse`: the forms are those of the last assembly."""
-        if self.couplings.in_entries:
+        if self.couplings.in_entries and self._assembler.blocks is None:
             self.matrix.zeroEntries()  # entries beyond the pattern of the cells
         psd_form = None if reuse or psd_tolerance is None else self._psd_form(psd_tolerance)
         factor = sum(term.mass_factor for term in self._inertial)
