@@ -5,7 +5,14 @@ from itertools import product
 import numpy as np
 import pytest
 
-from fracsim.contact.pair_search import PairFilter, PairSearch, SimplexPairs, near_pairs
+from fracsim.contact.pair_search import (
+    PairFilter,
+    PairSearch,
+    SimplexPairs,
+    free_fractions,
+    near_pairs,
+    pair_distances,
+)
 
 COUNT, SIZE, STEPS = 40, 0.15, 16
 
@@ -114,3 +121,41 @@ def test_positions_that_are_no_numbers_end_the_search():
         y = x.copy()
         y[5] = value
         near_pairs(pairs, PairFilter.none(len(x)), x, y, 0.05)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_distances_of_pairs_are_those_of_points_spread_over_both(name):
+    x, pairs, counts = case(name)
+    numbers = np.argwhere(counts)
+    found, above = pair_distances(pairs, numbers, x), all_distances(x, pairs)[counts]
+    sizes = [np.ptp(x[corners], axis=1).sum(axis=1) for corners in (pairs.first, pairs.second)]
+    spacing = (sizes[0][numbers[:, 0]] + sizes[1][numbers[:, 1]]) / STEPS
+    assert (found <= above + 1e-12).all() and (found >= above - spacing).all()
+
+
+@pytest.mark.parametrize("name", ["point-segment", "point-triangle", "edge-edge"])
+def test_pairs_keep_a_tenth_of_their_distance_and_move_as_far_as_they_may(name):
+    """Along the free part of the way no pair is nearer; beyond it, pairs that were stopped are."""
+    x, pairs, counts = case(name)
+    numbers, end = np.argwhere(counts), x + 0.3 * np.random.default_rng(3).normal(size=x.shape)
+    free, first = free_fractions(pairs, numbers, x, end, 0.1, 100), pair_distances(pairs, numbers, x)
+    stopped = free < 1
+    assert 20 < stopped.sum() < len(free) and (free[first > 0] > 0).all()
+    for pair, fraction, least in zip(numbers, free, 0.1 * first, strict=True):
+        way = [float(pair_distances(pairs, pair[None], x + t * (end - x))[0]) for t in np.linspace(0, fraction, 20)]
+        assert min(way) >= least * (1 - 1e-9)
+    beyond = np.linspace(1, 1.03, 13)
+    for pair, fraction, least in zip(numbers[stopped], free[stopped], 0.1 * first[stopped], strict=True):
+        ways = fraction * beyond
+        assert min(float(pair_distances(pairs, pair[None], x + t * (end - x))[0]) for t in ways) < 1.3 * least
+
+
+@pytest.mark.parametrize("height", [1e-9, 1e-3])
+def test_pairs_that_slide_are_free(height):
+    """A point and an edge over a triangle and an edge, moved along them by many times the height."""
+    x = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.2, 0.2, height], [0.6, 0.2, height]])
+    end = x + np.array([[0, 0, 0]] * 3 + [[0.3, 0.3, 0]] * 2)
+    over_triangle = SimplexPairs.of(np.array([[3]]), np.array([[0, 1, 2]]), 0.1)
+    edges = np.array([[0, 1], [3, 4]])
+    for pairs, numbers in ((over_triangle, [[0, 0]]), (SimplexPairs.of(edges, edges, 0.1), [[0, 1]])):
+        assert free_fractions(pairs, np.array(numbers), x, end, 0.1, 100)[0] == 1

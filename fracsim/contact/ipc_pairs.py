@@ -30,7 +30,7 @@ from scipy.sparse import csr_matrix
 
 from ..mesh.parallel import sum_over_ranks
 from .laws import BARRIER
-from .pair_search import PairFilter, PairSearch, SimplexPairs, max_length
+from .pair_search import PairFilter, PairSearch, SimplexPairs, free_fractions, max_length, pair_distances
 from .sample_points import Centroids, IpcFriction, Vertices, measures, projection
 
 Values = npt.NDArray[np.float64]
@@ -51,8 +51,8 @@ class PairPolicy:
         search_margin: motion of points, in D, after which candidates are searched again.
         max_pieces: pieces of one motion, so that bounding boxes of long motions do not all overlap.
         max_box_growth: mean measure of the bounding boxes of a piece, in that of one around an edge.
-        max_ccd_iterations: of additive collision detection. Faces that slide on each other would take forever; with
-            1,000 iterations pairs at a thousandth of D held Newton's method to a fifth of its steps.
+        max_ccd_rounds: evaluations of the distance of a pair in collision detection.
+        distance_tolerance: relative tolerance of distances of pairs on which a barrier may act.
         slabs: slabs of points of a rank. With several a rank has part of a contact that is somewhere alone; with 8
             candidates at their borders cost a fifth.
     """
@@ -62,12 +62,12 @@ class PairPolicy:
     search_margin: float = 0.5
     max_pieces: int = 128
     max_box_growth: float = 3.0
-    max_ccd_iterations: int = 10_000
+    max_ccd_rounds: int = 100
+    distance_tolerance: float = 1e-6
     slabs: int = 2
 
 
 PAIRS = PairPolicy()
-CCD = ipctk.AdditiveCCD(PAIRS.max_ccd_iterations, 1.0 - BARRIER.min_gap_ratio)
 
 
 @dataclass(frozen=True)
@@ -153,8 +153,13 @@ class PairKind:
         """Pairs of this rank; None: all pairs are its own."""
         return None if self.vertices is None else OwnPairs(self.samples, self.vertices)
 
-    def candidates(self, pairs: Ints) -> ipctk.Candidates:
-        """Candidates of ipctk of pairs (k, 2) of simplices."""
+    def candidates(self, pairs: Ints, x: Values) -> ipctk.Candidates:
+        """Candidates of ipctk among pairs (k, 2) of simplices with vertices at x (n, d), m.
+
+        ipctk finds the pairs on which the barrier acts among those within its distance alone.
+        """
+        limit = (1.0 + PAIRS.distance_tolerance) * self.distance
+        pairs = pairs[pair_distances(self.simplices, pairs, x) < limit]
         before = self.samples.mesh.num_vertices - len(self.simplices.first) if self.simplices.centroids else 0
         columns, result = (before + pairs[:, 0], pairs[:, 1]), ipctk.Candidates()
         first, second = (list[int](column) for column in columns)
@@ -167,13 +172,13 @@ class PairKind:
             result.ev_candidates = list(map(ipctk.EdgeVertexCandidate, second, first))
         return result
 
-    def active_pairs(self, candidates: ipctk.Candidates, x: Values) -> ActivePairs:
-        """Candidates on which the barrier acts, with vertices at x (n, d), m."""
+    def active_pairs(self, near: Ints, x: Values) -> ActivePairs:
+        """Pairs on which the barrier acts among near ones (k, 2), with vertices at x (n, d), m."""
         pairs = ipctk.NormalCollisions()
         pairs.use_area_weighting = True
         pairs.collision_set_type = ipctk.NormalCollisions.IMPROVED_MAX_APPROX
         positions = self.samples.positions(x)
-        pairs.build(candidates, self.samples.mesh, positions, self.distance)
+        pairs.build(self.candidates(near, x), self.samples.mesh, positions, self.distance)
         if self.own_pairs is not None:
             self.own_pairs.select(pairs)
         self.samples.weight(pairs)
@@ -358,24 +363,15 @@ class IpcPairs:
     # --- candidates and active pairs ---
 
     def _clear_active(self) -> None:
-        """Discard the candidates of ipctk and the pairs on which barriers act."""
-        self._found: list[Ints] = []  # pairs whose candidates these are
-        self._candidates: list[ipctk.Candidates] = []
+        """Discard the pairs on which barriers act."""
         self._active: list[ActivePairs] = []
         self._active_positions: Values = np.empty(0)
-
-    def _candidates_of(self, pairs: list[Ints]) -> list[ipctk.Candidates]:
-        """Candidates of ipctk of each kind; kept while the pairs are the same."""
-        if pairs is not self._found:
-            items = zip(self._kinds, pairs, strict=True)
-            self._found, self._candidates = pairs, [kind.candidates(of_kind) for kind, of_kind in items]
-        return self._candidates
 
     def _active_pairs(self, vertices: Values) -> list[ActivePairs]:
         """Pairs of each kind on which its barrier acts; those of the last positions are kept."""
         if not self._active or not np.array_equal(vertices, self._active_positions):
-            items = zip(self._kinds, self._candidates_of(self._search.pairs(vertices)), strict=True)
-            self._active = [kind.active_pairs(candidates, vertices) for kind, candidates in items]
+            items = zip(self._kinds, self._search.pairs(vertices), strict=True)
+            self._active = [kind.active_pairs(near, vertices) for kind, near in items]
             self._active_positions = vertices.copy()
         return self._active
 
@@ -469,9 +465,12 @@ class IpcPairs:
 
     def _piece_fraction(self, x: Values, end: Values) -> float:
         """Fraction in (0, 1] of the motion from x to `end` that leaves `BARRIER.min_gap_ratio` of each gap."""
-        items = zip(self._kinds, self._candidates_of(self._search.pairs_along(x, end)), strict=True)
-        named = [candidates for kind, candidates in items if not kind.simplices.centroids]
-        return float(min(pairs.compute_collision_free_stepsize(self._mesh, x, end, 0.0, CCD) for pairs in named))
+        fractions = (
+            free_fractions(kind.simplices, near, x, end, BARRIER.min_gap_ratio, PAIRS.max_ccd_rounds)
+            for kind, near in zip(self._kinds, self._search.pairs_along(x, end), strict=True)
+            if not kind.simplices.centroids
+        )
+        return min(float(of_kind.min(initial=1.0)) for of_kind in fractions)
 
     def _is_short(self, vertices: Values, motion: Values) -> bool:
         """Whether a motion (n, d) is safe in whatever direction points move, as half of Newton's steps are.

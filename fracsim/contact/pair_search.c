@@ -22,40 +22,50 @@ static double clip(double t) { return t < 0 ? 0 : t > 1 ? 1 : t; }
 
 static double ratio(double a, double b) { return b > 0 ? a / b : 0; }
 
-/* Squared distance of a point from a segment (2, 3). */
-static double point_segment(const double *p, const double *x)
+/* Shortest vector `r` from a segment (2, 3) to a point; returns its square. */
+static double from_segment(const double *x, const double *p, double *r)
 {
-    double side[3], arm[3];
+    double side[3];
     subtract(side, x + 3, x);
-    subtract(arm, p, x);
-    double t = clip(ratio(dot(arm, side), dot(side, side)));
-    for (int k = 0; k < 3; k++) arm[k] -= t * side[k];
-    return dot(arm, arm);
+    subtract(r, p, x);
+    double t = clip(ratio(dot(r, side), dot(side, side)));
+    for (int k = 0; k < 3; k++) r[k] -= t * side[k];
+    return dot(r, r);
 }
 
-/* Squared distance of a point from a triangle (3, 3): from its plane, or from its sides. */
-static double point_triangle(const double *p, const double *x)
+/* Replace `r` by another vector, times `sign`, if that is shorter; returns the square of the shorter one. */
+static double shorter(double square, double *r, double other_square, const double *other, double sign)
 {
-    double a[3], b[3], arm[3];
+    if (other_square >= square) return square;
+    for (int k = 0; k < 3; k++) r[k] = sign * other[k];
+    return other_square;
+}
+
+/* Shortest vector `r` from a triangle (3, 3) to a point: from its plane, or from its sides; returns its square. */
+static double from_triangle(const double *x, const double *p, double *r)
+{
+    double a[3], b[3], other[3];
     subtract(a, x + 3, x);
     subtract(b, x + 6, x);
-    subtract(arm, p, x);
-    double aa = dot(a, a), ab = dot(a, b), bb = dot(b, b), pa = dot(arm, a), pb = dot(arm, b);
+    subtract(r, p, x);
+    double aa = dot(a, a), ab = dot(a, b), bb = dot(b, b), pa = dot(r, a), pb = dot(r, b);
     double determinant = aa * bb - ab * ab, s = bb * pa - ab * pb, t = aa * pb - ab * pa;
     if (s >= 0 && t >= 0 && s + t <= determinant && determinant > 0) {
-        for (int k = 0; k < 3; k++) arm[k] -= (s * a[k] + t * b[k]) / determinant;
-        return dot(arm, arm);
+        for (int k = 0; k < 3; k++) r[k] -= (s * a[k] + t * b[k]) / determinant;
+        return dot(r, r);
     }
     double closing[6];
     memcpy(closing, x + 6, 3 * sizeof(double));
     memcpy(closing + 3, x, 3 * sizeof(double));
-    return fmin(point_segment(p, x), fmin(point_segment(p, x + 3), point_segment(p, closing)));
+    double square = from_segment(x, p, r);
+    square = shorter(square, r, from_segment(x + 3, p, other), other, 1);
+    return shorter(square, r, from_segment(closing, p, other), other, 1);
 }
 
-/* Squared distance of two segments (2, 3): of their lines, or of an end from the other segment. */
-static double segment_segment(const double *x, const double *y)
+/* Shortest vector `r` from segment y to segment x (2, 3): of their lines, or at an end; returns its square. */
+static double from_segment_to_segment(const double *y, const double *x, double *r)
 {
-    double a[3], b[3], r[3];
+    double a[3], b[3], other[3];
     subtract(a, x + 3, x);
     subtract(b, y + 3, y);
     subtract(r, x, y);
@@ -65,12 +75,22 @@ static double segment_segment(const double *x, const double *y)
         for (int k = 0; k < 3; k++) r[k] += (s * a[k] - t * b[k]) / determinant;
         return dot(r, r);
     }
-    return fmin(fmin(point_segment(x, y), point_segment(x + 3, y)), fmin(point_segment(y, x), point_segment(y + 3, x)));
+    double square = from_segment(y, x, r);
+    square = shorter(square, r, from_segment(y, x + 3, other), other, 1);
+    square = shorter(square, r, from_segment(x, y, other), other, -1);
+    return shorter(square, r, from_segment(x, y + 3, other), other, -1);
+}
+
+/* Shortest vector `r` from simplex y, of b vertices, to simplex x, of a vertices; returns its length. */
+static double shortest_vector(int a, const double *x, int b, const double *y, double *r)
+{
+    return sqrt(a == 2 ? from_segment_to_segment(y, x, r) : b == 2 ? from_segment(y, x, r) : from_triangle(y, x, r));
 }
 
 static double distance(int a, const double *x, int b, const double *y)
 {
-    return sqrt(a == 2 ? segment_segment(x, y) : b == 2 ? point_segment(x, y) : point_triangle(x, y));
+    double r[3];
+    return shortest_vector(a, x, b, y, r);
 }
 
 /* Positions (n, 3) of a simplex of `corners` vertices, or of its centroid; the number n of these points. */
@@ -102,19 +122,24 @@ static Box box_of(int n, const double *start, const double *end, double reach)
     return box;
 }
 
-/* Lower bound of the distance of two simplices that move straight from `start` to `end`, with the same clock. */
-static double least_distance(int a, const double *xs, const double *xe, int b, const double *ys, const double *ye,
-                             double reach)
+/* Largest length of the relative motion of two vertices of simplices that move straight from `start` to `end`. */
+static double relative_motion(int a, const double *xs, const double *xe, int b, const double *ys, const double *ye)
 {
-    double relative = 0;
+    double square = 0;
     for (int i = 0; i < 3 * a; i += 3)
         for (int j = 0; j < 3 * b; j += 3) {
             double m[3];
             for (int k = 0; k < 3; k++) m[k] = (xe[i + k] - xs[i + k]) - (ye[j + k] - ys[j + k]);
-            relative = fmax(relative, dot(m, m));
+            square = fmax(square, dot(m, m));
         }
-    relative = sqrt(relative);
-    double first = distance(a, xs, b, ys);
+    return sqrt(square);
+}
+
+/* Lower bound of the distance of two simplices that move straight from `start` to `end`, with the same clock. */
+static double least_distance(int a, const double *xs, const double *xe, int b, const double *ys, const double *ye,
+                             double reach)
+{
+    double relative = relative_motion(a, xs, xe, b, ys, ye), first = distance(a, xs, b, ys);
     if (relative == 0 || first - relative > reach || first <= reach) return first - relative;
     return (first + distance(a, xe, b, ye) - relative) / 2;
 }
@@ -251,4 +276,63 @@ int64_t find_near_pairs(const double *start, const double *end, int64_t m, int a
     }
     free(boxes), free(begin), free(inside);
     return found;
+}
+
+/* Distances (count,) of pairs (count, 2) of a simplex of `first` (m, a), or its centroid, and one of `second` (n, b). */
+void pair_distances(const double *x, int a, const int32_t *first, int b, const int32_t *second, int centroids,
+                    int64_t count, const int64_t *pairs, double *distances)
+{
+    double xs[9], ys[9];
+    for (int64_t i = 0; i < count; i++) {
+        int points = gather(x, first + a * pairs[2 * i], a, centroids, xs);
+        gather(x, second + b * pairs[2 * i + 1], b, 0, ys);
+        distances[i] = distance(points, xs, b, ys);
+    }
+}
+
+/* Fraction in [0, 1] of the straight motion of two simplices that leaves the part `least` of their distance.
+
+   Conservative advancement: convex sets whose distance is d lie on two sides of a slab of that thickness. They stay
+   apart until a vertex of one and a vertex of the other have closed the slab between them along its normal, and until
+   the fastest relative motion has closed d: where two edges are almost parallel, the normal is inaccurate. */
+static double free_fraction(int a, const double *xs, const double *xe, int b, const double *ys, const double *ye,
+                            double least, int rounds)
+{
+    double x[9], y[9], r[3], t = 0, stop = 0;
+    const double fastest = relative_motion(a, xs, xe, b, ys, ye);
+    for (int round = 0; round < rounds; round++) {
+        for (int k = 0; k < 3 * a; k++) x[k] = xs[k] + t * (xe[k] - xs[k]);
+        for (int k = 0; k < 3 * b; k++) y[k] = ys[k] + t * (ye[k] - ys[k]);
+        double d = shortest_vector(a, x, b, y, r), advance = INFINITY;
+        if (!(d > 0)) return t;
+        if (round == 0) stop = least * d;
+        for (int i = 0; i < 3 * a; i += 3)
+            for (int j = 0; j < 3 * b; j += 3) {
+                double gap = 0, closing = 0;
+                for (int k = 0; k < 3; k++) {
+                    gap += (x[i + k] - y[j + k]) * r[k] / d;
+                    closing -= ((xe[i + k] - xs[i + k]) - (ye[j + k] - ys[j + k])) * r[k] / d;
+                }
+                if (closing > 0) advance = fmin(advance, fmax(gap - stop, 0) / closing);
+            }
+        advance = fmax(advance, fastest > 0 ? (d - stop) / fastest : INFINITY);
+        if (t + advance >= 1) return 1;
+        t += advance;
+        if (advance <= 1e-3 * t) return t;
+    }
+    return t;
+}
+
+/* Fractions (count,) of the motions of pairs (count, 2) of simplices from `start` to `end` that leave `least` of their
+   distances. */
+void free_fractions(const double *start, const double *end, int a, const int32_t *first, int b, const int32_t *second,
+                    int64_t count, const int64_t *pairs, double least, int rounds, double *fractions)
+{
+    double xs[9], xe[9], ys[9], ye[9];
+    for (int64_t i = 0; i < count; i++) {
+        const int32_t *x = first + a * pairs[2 * i], *y = second + b * pairs[2 * i + 1];
+        gather(start, x, a, 0, xs), gather(end, x, a, 0, xe);
+        gather(start, y, b, 0, ys), gather(end, y, b, 0, ye);
+        fractions[i] = free_fraction(a, xs, xe, b, ys, ye, least, rounds);
+    }
 }

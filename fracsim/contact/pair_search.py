@@ -89,6 +89,32 @@ def near_pairs(pairs: SimplexPairs, where: PairFilter, start: Values, end: Value
         capacity = count
 
 
+def pair_distances(pairs: SimplexPairs, numbers: Ints, x: Values) -> Values:
+    """(k,) distances of pairs (k, 2) of simplices, m, with vertices at x (n, d), m."""
+    result = np.empty(len(numbers))
+    sets = [item for simplices in (pairs.first, pairs.second) for item in (simplices.shape[1], simplices)]
+    arguments = int(pairs.centroids), len(numbers), np.ascontiguousarray(numbers), result
+    load_library(SOURCE).pair_distances(_in_space(x), *sets, *arguments)
+    return result
+
+
+def free_fractions(
+    pairs: SimplexPairs, numbers: Ints, start: Values, end: Values, min_gap_ratio: float, rounds: int
+) -> Values:
+    """(k,) fractions in [0, 1] of the motion in which each of the pairs (k, 2) has no collision.
+
+    A pair that would collide keeps the part `min_gap_ratio` of its distance, and more where `rounds` evaluations of its
+    distance are not enough. Vertices move straight from `start` to `end`, (n, d), m.
+
+    Source: B. Mirtich (1996), Impulse-based dynamic simulation of rigid body systems, section 2.3.
+    """
+    result = np.empty(len(numbers))
+    sets = [item for simplices in (pairs.first, pairs.second) for item in (simplices.shape[1], simplices)]
+    arguments = len(numbers), np.ascontiguousarray(numbers), min_gap_ratio, rounds, result
+    load_library(SOURCE).free_fractions(_in_space(start), _in_space(end), *sets, *arguments)
+    return result
+
+
 def _in_space(x: Values) -> Values:
     """(n, 3) contiguous positions of (n, d), with zeros in the plane."""
     result = np.zeros((len(x), 3))

@@ -312,7 +312,7 @@ class SelfContact(Term):
         if self.is_far():
             return None
         x, surface = self.end_positions(), self.surface.current
-        limit = 0.0 if self._attempts > 1 else SURFACE.exact_tangent
+        limit = SURFACE.exact_tangent if self._attempts <= 1 else SURFACE.later_exact_tangent
         last, self._tangent_positions = self._tangent_positions, x
         is_near = last is not None and max_length(x - last) < limit * self.surface.law.distance
         exact = is_near and self.allows_exact_tangent
