@@ -241,15 +241,17 @@ class Clearance:
             motions: obstacles at the start and the end of their motions.
         """
         if self._search is not None:
-            search, losses = self._search, self._losses(self._search, displacements, motions)
-            if all(map(le, losses, search.clearance)):
+            search = self._search
+            if self._remains_far(search, displacements, motions):
                 return True
-            # what is near stays so until it has moved by as much as it lacks
-            min_clearance, items = CLEARANCE.min_clearance * self._edge, zip(losses, search.clearance, strict=True)
-            if any(room <= 0 and loss <= min(min_clearance - room, self._edge) for loss, room in items):
-                return False
+            # What is near stays so until it has moved by as much as it lacks. Bounds of losses are many times as large
+            # as motions, and a search in each iterate costs more than contact.
+            moved, min_clearance = self._largest_motion(search, displacements), CLEARANCE.min_clearance * self._edge
+            for room, of_pose in zip(search.clearance, _pose_motions(search, motions), strict=True):
+                if room == -np.inf or (room <= 0 and moved + of_pose <= min(min_clearance - room, self._edge)):
+                    return False
         search = self._measure(displacements[-1], [end for _, end in motions])
-        return all(map(le, self._losses(search, displacements, motions), search.clearance))
+        return self._remains_far(search, displacements, motions)
 
     def least_gap(self, number: int, u: Values, posed: Sequence[PosedShape]) -> float:
         """Least distance of this rank's points from an obstacle, m; infinite where others are nearer (collective).
@@ -270,13 +272,15 @@ class Clearance:
             return np.inf
         return float(obstacle.distance(posed[number], points.positions(nodal, count)).min())
 
-    def _losses(self, search: GapSearch, displacements: Sequence[Values], motions: Sequence[Motion]) -> list[float]:
-        """(obstacles,) bounds of what gaps have lost since the search, m (collective)."""
-        of_body = search.growth * max([self._node_motion(search, u)[1] for u in displacements])
-        return [
-            of_body + max(_pose_motion(pose, start.pose, 0.0), _pose_motion(pose, end.pose, 0.0))
-            for pose, (start, end) in zip(search.poses, motions, strict=True)
-        ]
+    def _remains_far(self, search: GapSearch, displacements: Sequence[Values], motions: Sequence[Motion]) -> bool:
+        """Whether no gap can have lost its clearance since the search (collective)."""
+        of_body = search.growth * self._largest_motion(search, displacements)
+        losses = [of_body + of_pose for of_pose in _pose_motions(search, motions)]
+        return all(map(le, losses, search.clearance))
+
+    def _largest_motion(self, search: GapSearch, displacements: Sequence[Values]) -> float:
+        """Bound of the motion of any node since the search, m (collective)."""
+        return max([self._node_motion(search, u)[1] for u in displacements])
 
     def _node_motion(self, search: GapSearch, u: Values) -> tuple[Values, float]:
         """(nodes, d) values at the nodes of this rank's points, and a bound of the motion of any node, m (collective).
@@ -348,6 +352,14 @@ class Clearance:
 
 def _largest_component(vectors: Values) -> float:
     return max(float(vectors.max(initial=0.0)), -float(vectors.min(initial=0.0)))
+
+
+def _pose_motions(search: GapSearch, motions: Sequence[Motion]) -> list[float]:
+    """(obstacles,) motions of the centres since the search, m."""
+    return [
+        max(_pose_motion(pose, start.pose, 0.0), _pose_motion(pose, end.pose, 0.0))
+        for pose, (start, end) in zip(search.poses, motions, strict=True)
+    ]
 
 
 def _pose_motion(start: Pose, end: Pose, radius: float) -> float:
