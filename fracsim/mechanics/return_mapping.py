@@ -81,8 +81,8 @@ class ReturnMapping:
         assert plastic is not None
         self.plastic: PlasticHistory = plastic
         self._stress, self._flowed = stress, True
-        # (points,) stress above Y of points that have left the elastic zone since the last flow, Pa
-        self._excess = np.zeros(len(plastic.accumulated_strain))
+        # (points,) stress above Y of points that have left the elastic zone since the last flow, Pa; None: none has
+        self._excess: Values | None = None
         # An extrapolated flow would be extrapolated anew.
         self.continues = math.isinf(plastic.rate) and isinstance(plastic.prediction, ImplicitPlasticFlow)
         trial = TrialStress(plastic.energy, stress.u, stress.rotation_field)
@@ -103,6 +103,7 @@ class ReturnMapping:
         self.elastic_zone.update()
         points = self.plastic.flowing_points(before)
         Y = self.plastic.flow_stress(self.plastic.accumulated_strain[points], points)
+        self._excess = np.zeros(len(self.plastic.accumulated_strain)) if self._excess is None else self._excess
         self._excess[points] = np.maximum(self.measured(self.measures(points)) - Y, 0.0)
 
     def __call__(self) -> float:
@@ -125,8 +126,7 @@ class ReturnMapping:
         if plastic.prediction is not None and dt:
             plastic.prediction.record_flow(points, power, dt)
         plastic.begin_step(0.0)
-        if self.elastic_zone is not None:
-            self._excess[:] = 0.0
+        self._excess = None
         if len(points) and plastic.hardening:
             plastic.update_flow_stress()
         if len(points) or self._flowed:
@@ -175,7 +175,7 @@ class ReturnMapping:
         # the loss of psi starts at the trial stress, which the body never had: it flowed at the yield stress
         (vm, _, psi), (vm_trial, _, psi_trial) = block.after.T, block.trial.T
         over = block.J * (vm_trial - vm) + gain
-        if self.elastic_zone is not None:
+        if self._excess is not None:
             over -= np.minimum(self._excess[points], over)
         chi = 1.0 if self._stress.chi is None else self._stress.chi.x.array[points // plastic.points_per_cell]
         return float(np.sum(chi * plastic.volumes[points] * (psi_trial - psi - over / 2 * flowed)))
