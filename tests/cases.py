@@ -141,7 +141,8 @@ def swept_here(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
     """A sweep in this process, and its runs too: for tests of what it makes of their ends, not of how they start."""
     import h5py  # noqa: F401  # Debian's starts a process when it is first imported: a real one
 
-    with mock.patch("fracsim.report.sweep.subprocess.Popen", _RunHere):
+    # not subprocess.Popen itself, which compilers of new kernels are started by
+    with mock.patch("fracsim.report.sweep.subprocess", mock.Mock(Popen=_RunHere)):
         return fracsim_here("sweep", *arguments)
 
 

@@ -18,8 +18,9 @@ from fracsim.fracture.cohesive_cracks import (
 )
 from fracsim.scene import Scene
 from fracsim.studies import folder as packaged
+from fracsim.studies.evidence.cohesive_beam import DEPTH, load_by_springs
 from fracsim.study.check import check_study
-from support.cohesive_beam import DEPTH, bend, load_by_springs
+from support.cohesive_beam import bend
 from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import DIRECT, Walk, make_scene, make_study, march
 from support.tearing import RUNS

@@ -10,6 +10,7 @@ import pytest
 
 from fracsim.forms.schemes import BackwardEuler, GeneralizedAlpha, Newmark, QuasiStatic, Scheme
 from fracsim.mechanics.contact_time_weights import ContactTimeWeights, acceleration_change
+from fracsim.studies.evidence.precision.bouncing_block import block_study, return_height
 from support.scenes import each_step, make_scene, march
 
 Values = npt.NDArray[np.float64]
@@ -36,18 +37,10 @@ def test_without_inertia_there_are_no_blows() -> None:
     assert ContactTimeWeights.for_scheme(QuasiStatic()) == ContactTimeWeights()
 
 
-def bounce(scheme: str, step: float, **more: Any) -> float:
+def bounce(scheme: str, step: float) -> float:
     """Share of its height that a stiff block returns to which is thrown on the floor at 1 m/s as if from 0.05 m, by the
     place and the velocity of its centre as it leaves. The barrier is wide: it takes 50 ms to turn it round."""
-    G, gap = 10.0, 0.031
-    scene, state = make_scene(
-        mesh={"builder": "box", "size": [1.0, 1.0], "h": 1.0}, load={"gravity": [0.0, -G]},
-        material={"energy": "linear", "young": 1e7, "poisson": 0.0, "density": 100.0},
-        initial={"velocity": [0.0, -1.0]}, contact={"distance": 0.03, "stiffness": 3e3, "itself": False},
-        obstacle=[{"name": "floor", "shape": "plane", "at": [0.0, -gap], "normal": [0.0, 1.0]}],
-        solver={"snes_rtol": 1e-9, "ksp_rtol": 1e-9}, time={"scheme": scheme, "step": step, "end": 0.4}, **more,
-    )  # fmt: skip
-    mass = scene.balance.mass.lumped.reshape(-1, 2)[:, :1]
+    scene, state = make_scene(**block_study(scheme, step))
     energy, touched = 0.5 * 100, False
     for report in each_step(scene, state):
         now = report.kinetic + report.elastic - state.work
@@ -57,8 +50,7 @@ def bounce(scheme: str, step: float, **more: Any) -> float:
         if touched and force == 0:
             break
         touched |= force != 0
-    y, v = ((mass * field.reshape(-1, 2))[:, 1].sum() / 100 for field in (state.u, state.v))
-    return float((v**2 / (2 * G) + y) / 0.05)
+    return return_height(scene, state)
 
 
 @pytest.mark.parametrize(

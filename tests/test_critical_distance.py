@@ -15,6 +15,7 @@ from fracsim.fracture.energy.critical_distance import critical_distance, start_p
 from fracsim.fracture.energy.neighbour_search import NearbyCells
 from fracsim.fracture.energy.tip_parameters import TIP
 from fracsim.scene import Scene
+from fracsim.studies.evidence.fracture_specimens import notched_beam
 from support.scenes import each_step, make_scene
 
 Values = npt.NDArray[np.float64]
@@ -170,30 +171,13 @@ def test_points_of_the_surface() -> None:
         np.testing.assert_allclose(point, corner[flags].mean(axis=0))
 
 
-def beam(folder: Path, h: float, seed: int, strength: float, **time: Any) -> dict[str, Any]:
-    """Tables of a beam of 8 x 2 mm with a V notch of 0.4 x 0.4 mm cut out of it, bent in plane strain."""
-    sides = [(-4, 0, ""), (-0.2, 0, ""), (0, 0.4, ""), (0.2, 0, ""), (4, 0, ""), (4, 2, ""), (0.05, 2, "load"),
-             (-0.05, 2, ""), (-4, 2, "")]  # fmt: skip
-    rows = [f"{x}, {y}, {group}".rstrip(", ") for x, y, group in sides]
-    (folder / "beam.csv").write_text("\n".join(rows))
-    supports = [{"box": [[x - 1e-7, -1e-7], [x + 1e-7, 1e-7]]} for x in (-4e-3, 4e-3)]
-    return {
-        "mesh": {"outline": str(folder / "beam.csv"), "scale": 1e-3, "h": h, "seed": seed},
-        "material": MATERIAL | {"plane": "strain", "thickness": 1e-3},
-        "fracture": {"strength": strength, "energy": TOUGHNESS},
-        "boundary": [{"on": supports[0], "fix": "xy"}, {"on": supports[1], "fix": "y"},
-                     {"on": "load", "displacement": {"time": [0.0, 1.0], "value": [["free", 0.0], ["free", -1e-4]]}}],
-        "probe": [{"name": "load", "on": "load"}],
-        "time": {"scheme": "quasi-static"} | time,
-    }  # fmt: skip
-
-
 @pytest.mark.parametrize("strength", (150e6, 200e6, 400e6))
 def test_a_notched_beam_starts_to_crack_at_a_load_that_hardly_depends_on_the_strength(
     strength: float, tmp_path: Path
 ) -> None:
     """35 N by the critical distance on quadratic elements; the strength alone gave 31, 40 and 80 N."""
-    tables = beam(tmp_path, 5e-5, 1, strength, step=1e-3, end=1e-3)
+    time = {"scheme": "quasi-static", "step": 1e-3, "end": 1e-3}
+    tables = notched_beam(tmp_path, 5e-5, 1, strength) | {"time": time}
     scene = bodies(**{key: value for key, value in tables.items() if key != "material"})
     told = dict(zip(scene.probes.columns, scene.probes(), strict=True))
     # per metre of thickness
@@ -208,7 +192,8 @@ def test_a_notched_beam_starts_to_crack_at_a_load_that_hardly_depends_on_the_str
 def test_a_notched_beam_breaks(h: float, seed: int, strength: float, tmp_path: Path) -> None:
     """Once begun, the crack runs: the load at which it starts is the largest."""
     step = {"time": [0.0, 0.38], "value": [0.38, 0.005]}
-    scene, state = make_scene(**beam(tmp_path, h, seed, strength, step=step, end=0.7), solver={})
+    time = {"scheme": "quasi-static", "step": step, "end": 0.7}
+    scene, state = make_scene(**notched_beam(tmp_path, h, seed, strength) | {"time": time}, solver={})
     loads = []
     for _ in each_step(scene, state):
         loads.append(-dict(zip(scene.probes.columns, scene.probes(), strict=True))["reaction_load_y"])

@@ -19,8 +19,9 @@ from fracsim.fracture.energy.tip_criterion import TipCriterion
 from fracsim.mesh.simplices import is_split
 from fracsim.mesh.small_matrices import barycentric_gradients
 from fracsim.scene import Scene, build_scene
+from fracsim.studies.evidence.precision.torn_strip import run_when_ready
 from support.scenes import make_study
-from support.tips import criterion_of, run_when_ready, seen
+from support.tips import criterion_of, seen
 
 Values = npt.NDArray[np.float64]
 

@@ -28,6 +28,7 @@ from fracsim.studies.evidence.precision import (
     plastic_bar,
     vibrating_beam,
 )
+from fracsim.studies.evidence.report_section import Plot, PlotGrid, Section
 from fracsim.studies.evidence.trial import Trial
 from fracsim.study.check import check_study
 from fracsim.study.reader import validate
@@ -212,7 +213,7 @@ def test_studies_are_valid(trial: Trial) -> None:
 def test_trials_have_places_of_their_own_and_sections() -> None:
     places = [(trial.case, trial.name) for trial in TRIALS]
     assert len(set(places)) == len(places)
-    cases = [case for family in precision.FAMILIES for case in family.CASES]
+    cases = precision.accuracy_cases()
     assert {trial.case for trial in TRIALS} | {"plastic"} == {case.name for case in cases}
     names = {case: {name for of, name in places if of == case} for case, _ in places}
     for case in cases:
@@ -390,7 +391,14 @@ def test_a_section_says_that_its_reference_is_missing() -> None:
 
 
 def test_all_sections_can_be_made_of_nothing() -> None:
-    assert len(precision.sections([])) == sum(len(family.CASES) for family in precision.FAMILIES)
+    assert len(precision.sections([])) == len(precision.accuracy_cases())
+
+
+def panels_of(section: Section) -> tuple[Plot, ...]:
+    """Panels of the only plot of a section."""
+    (grid,) = section.plots
+    assert isinstance(grid, PlotGrid)
+    return grid.panels
 
 
 def test_the_first_screen_has_the_cheapest_of_each_case_and_its_peers() -> None:
@@ -401,15 +409,17 @@ def test_the_first_screen_has_the_cheapest_of_each_case_and_its_peers() -> None:
     assert found.first and row["s for 5%"] == 5.0 and row["s for 1%"] is None
     assert row["cheapest setting for 5%"] == "scheme = generalized-alpha, dt = 0.2"
     assert row["DOLFINx alone, quadratic: s for 5%"] == 1.0 and row["DOLFINx alone, quadratic: s for 1%"] is None
-    assert found.plots[0].series[0].x == (2.5, 5.0, 10.0)
+    (panel,) = panels_of(found)
+    assert panel.caption == "Made up" and [series.label for series in panel.series] == [
+        "fracsim", "DOLFINx alone, quadratic"
+    ]  # fmt: skip
+    assert panel.series[0].x == (2.5, 5.0, 10.0) and panel.series[1].y == (0.03,)
     exact = [
         record(f"x{cost}", error, cost, scheme="newmark", dt=cost) for error, cost in ((1e-9, 20.0), (1e-12, 40.0))
     ]
     (found,) = accuracy_summary.summary_sections([MADE], [*EULER, *exact])
-    assert (
-        found.plots[0].series[0].x == (2.5, 5.0, 10.0, 20.0)
-        and found.plots[0].series[0].y[-1] == accuracy_summary.FINEST
-    )
+    (panel,) = panels_of(found)
+    assert panel.series[0].x == (2.5, 5.0, 10.0, 20.0) and panel.series[0].y[-1] == accuracy_summary.FINEST
     assert accuracy_summary.summary_sections([MADE], []) == []
 
 

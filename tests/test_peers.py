@@ -79,7 +79,7 @@ def test_where_akantu_is_missing_nothing_runs_and_the_page_says_so(
 ) -> None:
     assert [trial.case for trial in peers.trials()] == ["start-up"], "which measures this program by itself, too"
     assert precision_trials.akantu_trials("plate", 0.01, 1) == []
-    assert [section.text for section in peers.sections([])] == [akantu.ABSENT, phase_field.ABSENT]
+    assert [section.text for section in peers.sections([])] == [akantu.ABSENT]
     with pytest.raises(RuntimeError, match="AKANTU_PYTHON"):
         akantu.AkantuProcess({}, None)  # type: ignore[arg-type]
     monkeypatch.setenv(akantu.VARIABLE, "/nowhere")

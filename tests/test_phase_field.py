@@ -1,12 +1,16 @@
-"""PhaseFieldX beside us: the slit that it gets, and what the page says where it is not installed."""
+"""PhaseFieldX beside us: the problems that it gets are those of our studies, and what the page says without it."""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.topology import boundary_facets, signed_measures
+from fracsim.studies.evidence import precision
+from fracsim.studies.evidence.fracture_specimens import PLATE_COURSES, PLATE_SIDE, V_BEAM_COURSE
 from fracsim.studies.evidence.peers import phase_field
 
 
@@ -25,19 +29,10 @@ def test_a_slit_parts_the_nodes_of_half_a_row() -> None:
 def test_the_page_says_where_it_is_not_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(phase_field.VARIABLE, raising=False)
     phase_field.phasefieldx_python.cache_clear()
-    assert phase_field.trials() == []
-    (section,) = phase_field.sections([])
-    assert "not installed" in section.text and phase_field.VARIABLE in section.text
-
-
-def test_the_table_has_both_programs() -> None:
-    one = {"peak": 645.0, "at": 5e-6, "turn": 0.0, "seconds": 1.0, "solves": 9.0}
-    figures = {"ours": one, "theirs": one, "cells": 8, "pull": "tension"}
-    record = {"case": "notched-plate", "figures": figures, "message": ""}
-    (section,) = phase_field.sections([record])
-    (table,) = section.tables
-    assert [row[1:4] for row in table.rows] == [(8, "PhaseFieldX", 645.0), (8, "fracsim", 645.0)]
-    assert all(len(row) == len(phase_field.COLUMNS) for row in table.rows)
+    assert phase_field.trials("notched-tension", "tension", 644.9, {1e-4: False}) == []
+    record = {"case": "bounce", "name": "a", "settings": {"scheme": "newmark", "dt": 0.1}, "ranks": 1, "wall": [1.0],
+              "cpu": [], "outcome": "done", "figures": {"height of the return": 0.1, "seconds": 1.0}}  # fmt: skip
+    assert phase_field.VARIABLE in precision.sections([record])[0].text
 
 
 def test_the_direction_of_a_crack() -> None:
@@ -48,9 +43,25 @@ def test_the_direction_of_a_crack() -> None:
     assert np.isnan(phase_field.crack_direction(behind))
 
 
-def test_the_plate_is_pulled_as_it_is_said() -> None:
-    """The last place of the grip's course is where the study moves it."""
-    for name, pull in phase_field.GRIP_MOTIONS.items():
-        moved = phase_field.plate_study(8, pull)["boundary"][1]["displacement"]["value"][1]
-        assert moved[{"tension": 1, "shear": 0}[name]] == pytest.approx(pull.course[-1])
-        assert np.count_nonzero(moved) == 1
+@pytest.mark.parametrize("load", PLATE_COURSES)
+def test_plates_are_held_and_moved_as_in_our_studies(load: str) -> None:
+    """Both ends of the grip's course, and every node of bottom and top; sides keep their height in one case alone."""
+    problem = phase_field.plate_problem(load, PLATE_SIDE / 8)
+    (x, _), course = PLATE_COURSES[load]
+    assert problem.axis == (0 if x else 1) and problem.split == bool(x)
+    assert problem.course[[0, -1]] == pytest.approx([course.start * course.travel, course.travel])
+    at = problem.points[:, 1]
+    assert problem.driven.sum() == 9 and (at[problem.driven] == PLATE_SIDE).all()
+    assert problem.fixed[at == 0].all() and problem.fixed[problem.driven, 1 - problem.axis].all()
+    inside = (at > 0) & (at < PLATE_SIDE)
+    # seven nodes of a side, one of them doubled by the slit
+    assert problem.fixed[inside].sum() == (15 if load == "held-shear" else 0)
+
+
+def test_the_beam_is_held_and_moved_as_in_our_study(tmp_path: Path) -> None:
+    problem = phase_field.beam_problem(2e-4, tmp_path)
+    held = problem.points[problem.fixed.any(axis=1)]
+    np.testing.assert_allclose(held[np.argsort(held[:, 0])], [[-4e-3, 0.0], [4e-3, 0.0]], atol=1e-12)
+    assert problem.fixed.sum() == 3
+    np.testing.assert_allclose(problem.points[problem.driven, 1], 2e-3)
+    assert problem.course[-1] == pytest.approx(-V_BEAM_COURSE.travel)

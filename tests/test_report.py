@@ -16,9 +16,10 @@ import pytest
 
 from cases import BAR, DUCTILE_TABLES, STRIP, fracsim, swept_here, write_study
 from fracsim.errors import FalseClaim, InputError
-from fracsim.report.content import Claim, Picture, Plot, ReportTable, Section, Series, from_data, to_data
+from fracsim.report.content import Claim, Picture, Plot, PlotGrid, ReportTable, Section, Series, from_data, to_data
 from fracsim.report.html_report import make_report
 from fracsim.report.page import write_page
+from fracsim.report.plots import SERIES_COLOURS, draw_plot
 from fracsim.report.runs import find_runs, flatten_tables
 
 
@@ -223,7 +224,8 @@ def test_sections_survive_json() -> None:
         "c", "x", "y", (Series("l", (1.0, None), (2.0, 3.0), "points", ("a", "b"), (0.1, 0.2)),), "loglog", True, (1.0,)
     )
     table_ = ReportTable("t", "c", ("a", "b"), ((1, 2.5), ("x", None)), "run it", (1,))
-    sections = [Section("s", "t", (Claim("c", "m", None),), (table_,), (plot,), (Picture("p", "a/b.png"),))]
+    grid = PlotGrid("several", (plot, plot), 2)
+    sections = [Section("s", "t", (Claim("c", "m", None),), (table_,), (plot, grid), (Picture("p", "a/b.png"),))]
     assert from_data(json.loads(json.dumps(to_data(sections)))) == sections
 
 
@@ -276,6 +278,19 @@ def test_what_is_first_lies_open_and_the_rest_is_folded(tmp_path: Path) -> None:
     assert places[-1] < folded < text.index("Far down", folded)
     assert text.index("deep text") > folded and "1 of 3 claims do not hold" in text
     assert '<details class="part">' not in (tmp_path / "long" / "report.html").read_text()
+
+
+def test_small_multiples_have_a_panel_for_each_plot_and_one_legend() -> None:
+    """A label that two panels share is in the legend once, in one colour; titles are captions; numbers have scales of
+    their own."""
+    ours, theirs = Series("we", (1.0, 2.0), (3.0, 4.0)), Series("they", (10.0, 20.0), (0.1, 0.2))
+    panels = (Plot("First", "s", "error", (ours,)), Plot("Second", "s", "error", (theirs, ours)))
+    text = draw_plot(PlotGrid("both", panels, columns=2), "grid")
+    assert [text.count(f">{words}</text>") for words in ("First", "Second", "we", "they")] == [1, 1, 1, 1]
+    assert text.count(">error</text>") == 1 and text.count(">s</text>") == 2
+    first, second = SERIES_COLOURS[:2]
+    # lines and markers of both panels and of the legend
+    assert text.count(f"stroke: {first}") > text.count(f"stroke: {second}") > 0
 
 
 def test_names_in_a_plot_are_clear_of_one_another() -> None:

@@ -13,8 +13,8 @@ from fracsim.fracture.cohesive_cracks import CohesiveFracturePass
 from fracsim.mesh.domain import distribute
 from fracsim.meshes import BUILDERS
 from fracsim.scene import build_scene_on
+from fracsim.studies.evidence.spalling import Pulse, spall
 from support.scenes import Walk, make_study
-from support.spalling import Pulse, spall
 
 # 10 MPa on 250 mm: the front is sharp, and the pulse 100 mm long.
 SHARP = Pulse(young=5e10, density=2500.0, length=0.25, peak=1e7, rise=0.0, fall=22.36e-6)

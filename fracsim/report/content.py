@@ -91,6 +91,23 @@ class Plot:
 
 
 @dataclass(frozen=True)
+class PlotGrid:
+    """Small multiples: plots side by side with one legend; series of the same label look the same in all of them.
+
+    Attributes:
+        caption: caption of the whole.
+        panels: plots; the caption of each is its title, and axes are labelled at the left and at the bottom.
+        columns: plots in a row.
+        command: command that reproduces the grid.
+    """
+
+    caption: str
+    panels: tuple[Plot, ...]
+    columns: int = 4
+    command: str = ""
+
+
+@dataclass(frozen=True)
 class Picture:
     """PNG of a page. A missing file is replaced by a remark.
 
@@ -120,7 +137,7 @@ class Section:
     text: str = ""
     claims: tuple[Claim, ...] = ()
     tables: tuple[ReportTable, ...] = ()
-    plots: tuple[Plot, ...] = ()
+    plots: tuple[Plot | PlotGrid, ...] = ()
     pictures: tuple[Picture, ...] = ()
     first: bool = False
 
@@ -151,7 +168,13 @@ def _table(data: dict[str, Any]) -> ReportTable:
     return ReportTable(**data | {"columns": tuple(data["columns"]), "rows": rows, "marked": tuple(data["marked"])})
 
 
-def _plot(data: dict[str, Any]) -> Plot:
+def _plot(data: dict[str, Any]) -> Plot | PlotGrid:
+    if "panels" in data:
+        return PlotGrid(**data | {"panels": tuple(_single_plot(panel) for panel in data["panels"])})
+    return _single_plot(data)
+
+
+def _single_plot(data: dict[str, Any]) -> Plot:
     series = tuple(
         Series(**part | {key: tuple(part[key]) for key in ("x", "y", "names", "spread")}) for part in data["series"]
     )

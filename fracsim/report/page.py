@@ -11,7 +11,7 @@ from typing import Any
 
 from ..errors import InputError
 from ..meshes.plain_files import atomic_replacement_of_all, check_replaceable
-from .content import Picture, ReportTable, Section, TableCell
+from .content import Picture, PlotGrid, ReportTable, Section, TableCell
 from .plots import draw_plot
 
 
@@ -83,7 +83,12 @@ def _section_data(section: Section, number: int, pictures: Path, csv_folder: str
         "paragraphs": [part for part in re.split(r"\n\s*\n", section.text.strip()) if part],
         "tables": [_table_data(table, csv_folder) for table in section.tables],
         "plots": [
-            {"svg": draw_plot(plot, f"{number}-{index}"), "caption": plot.caption, "command": plot.command}
+            {
+                "svg": draw_plot(plot, f"{number}-{index}"),
+                "caption": plot.caption,
+                "command": plot.command,
+                "wide": isinstance(plot, PlotGrid),
+            }
             for index, plot in enumerate(section.plots)
         ],
         "pictures": [_picture_data(picture, pictures) for picture in section.pictures],

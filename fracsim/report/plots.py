@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import math
 import re
+import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,7 +17,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from .content import Plot, Series
+from .content import Plot, PlotGrid, Series
 
 Values = npt.NDArray[np.float64]
 # left, bottom, right, top, pixels
@@ -60,20 +61,34 @@ class LabelStyle:
 LABEL_STYLE = LabelStyle()
 
 
-def draw_plot(plot: Plot, name: str) -> str:
-    """SVG element of a plot; `name` makes the ids inside it unique on the page."""
+@dataclass(frozen=True)
+class GridStyle:
+    """Sizes of small multiples.
+
+    Attributes:
+        width, height: of a panel, inches.
+        legend_height: height of the common legend, inches.
+        font: size of titles and labels, points.
+        title_letters: letters in a line of a title.
+    """
+
+    width: float = 2.6
+    height: float = 2.15
+    legend_height: float = 0.35
+    font: float = 8.5
+    title_letters: int = 34
+
+
+GRID_STYLE = GridStyle()
+
+
+def draw_plot(plot: Plot | PlotGrid, name: str) -> str:
+    """SVG element of a plot or of small multiples; `name` makes the ids inside it unique on the page."""
+    if isinstance(plot, PlotGrid):
+        return _draw_grid(plot, name)
     with _figure(name) as figure:
         axes = figure.add_subplot()
-        for number, series in enumerate(plot.series):
-            _draw_series(axes, series, number)
-        _set_scales(axes, plot)
-        if plot.pareto:
-            _draw_pareto_front(axes, plot)
-        for level in plot.levels:
-            axes.axhline(level, color=_FAINT, linestyle=":", linewidth=1)
-        if plot.kind == "loglog":
-            for slope in plot.slopes:
-                _draw_slope(axes, plot, slope)
+        _fill_axes(axes, plot, range(len(plot.series)))
         axes.set(xlabel=plot.x, ylabel=plot.y)
         if axes.get_legend_handles_labels()[1]:
             is_long = len(plot.series) > _MAX_INSIDE_LEGEND
@@ -83,15 +98,50 @@ def draw_plot(plot: Plot, name: str) -> str:
         return _to_svg(figure)
 
 
+def _draw_grid(grid: PlotGrid, name: str) -> str:
+    """SVG element of small multiples."""
+    style = GRID_STYLE
+    labels = list(dict.fromkeys(series.label for panel in grid.panels for series in panel.series))
+    columns = min(grid.columns, len(grid.panels))
+    rows = -(-len(grid.panels) // columns)
+    with _figure(name, (style.width * columns, style.height * rows + style.legend_height)) as figure:
+        figure.get_layout_engine().set(rect=(0, 0, 1, 1 - style.legend_height / figure.get_figheight()))
+        handles: dict[str, Any] = {}
+        for index, panel in enumerate(grid.panels):
+            axes = figure.add_subplot(rows, columns, index + 1)
+            _fill_axes(axes, panel, [labels.index(series.label) for series in panel.series])
+            axes.set_title(textwrap.fill(panel.caption, style.title_letters), fontsize=style.font)
+            axes.tick_params(labelsize=style.font - 1)
+            axes.set_xlabel(panel.x if index + columns >= len(grid.panels) else "", fontsize=style.font)
+            axes.set_ylabel(panel.y if index % columns == 0 else "", fontsize=style.font)
+            handles |= {label: line for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+        figure.legend(handles.values(), handles.keys(), loc="upper center", ncols=len(handles))
+        return _to_svg(figure)
+
+
+def _fill_axes(axes: Any, plot: Plot, numbers: Sequence[int]) -> None:
+    """Draw all series of a plot; numbers choose their colours and markers."""
+    for number, series in zip(numbers, plot.series, strict=True):
+        _draw_series(axes, series, number)
+    _set_scales(axes, plot)
+    if plot.pareto:
+        _draw_pareto_front(axes, plot)
+    for level in plot.levels:
+        axes.axhline(level, color=_FAINT, linestyle=":", linewidth=1)
+    if plot.kind == "loglog":
+        for slope in plot.slopes:
+            _draw_slope(axes, plot, slope)
+
+
 @contextmanager
-def _figure(name: str) -> Iterator[Any]:
-    """Figure of matplotlib with the style of the page."""
+def _figure(name: str, size: tuple[float, float] = (6.4, 3.8)) -> Iterator[Any]:
+    """Figure of matplotlib of a size in inches with the style of the page."""
     import matplotlib
     from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
     with matplotlib.rc_context(_STYLE | {"svg.hashsalt": name}):
-        figure = Figure(figsize=(6.4, 3.8))
+        figure = Figure(figsize=size)
         FigureCanvasSVG(figure)
         yield figure
 

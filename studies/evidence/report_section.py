@@ -10,8 +10,8 @@ the tables. A record has group, case, name, settings, ranks, command, outcome, m
 one a run), summary (of the run, or None) and figures (of `Trial.measure` or the script). The folder of the trial is
 OUT/group/case/name; `record_folder(record)` is its path inside OUT, as `Picture.path` expects it.
 
-Section, Claim, ReportTable, Plot, Series and Picture are frozen dataclasses of fracsim/report/content.py. They are
-stored in evidence.json, from which `fracsim report` makes the page without importing a study.
+Section, Claim, ReportTable, Plot, PlotGrid, Series and Picture are frozen dataclasses of fracsim/report/content.py.
+They are stored in evidence.json, from which `fracsim report` makes the page without importing a study.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
-from ...report.content import Claim, Picture, Plot, ReportTable, Section, Series, TableCell
+from ...report.content import Claim, Picture, Plot, PlotGrid, ReportTable, Section, Series, TableCell
 from ...report.plots import pareto_front
 from .trial import Setting
 
 __all__ = [
-    "Claim", "CostPoint", "Picture", "Plot", "ReportTable", "Section", "Series", "TableCell",
+    "Claim", "CostPoint", "Picture", "Plot", "PlotGrid", "ReportTable", "Section", "Series", "TableCell",
     "cheapest_point", "fitted_order", "median_and_half_range", "pareto_front", "record_folder", "rerun_hint",
 ]  # fmt: skip
 

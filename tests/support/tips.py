@@ -28,17 +28,3 @@ def seen(scene: Scene) -> TipFields:
     criterion = criterion_of(scene)
     criterion.find_tips()
     return criterion.field_evaluator.evaluate_fields(*scene.fracture.evaluate_undamaged_stress())
-
-
-def run_when_ready(scene: Scene, ready: float) -> tuple[Values, list[Values]]:
-    """(n,) s since `ready`, and (m, d) the tips then, m, of each step in which a crack gets on, held until `ready`."""
-    criterion, state = criterion_of(scene), scene.start()
-    toughness, times, places = criterion.toughness, [], []
-    criterion.toughness = np.inf
-    while not scene.ended(state):
-        state, report = scene.stepper.advance(state)
-        criterion.toughness = toughness if state.t > ready else np.inf
-        if report.broken and len(now := tips(scene)):
-            times.append(state.t - ready)
-            places.append(now)
-    return np.array(times), places

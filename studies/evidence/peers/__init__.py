@@ -14,7 +14,7 @@ from ..report_section import Section
 from ..trial import Trial
 
 # by name: they are scripts as well, which must not be imported before they run
-FAMILIES = ("linear_step", "phase_field", "start_up")
+FAMILIES = ("linear_step", "start_up")
 
 
 def _families() -> list[Any]:

@@ -1,16 +1,13 @@
-"""Single-edge notched plates in tension and in shear by PhaseFieldX and by fracsim, on the triangles of one lattice.
+"""Notched plates and a notched beam by PhaseFieldX, as trials beside fracsim's of the same problems (peak_loads.py).
 
     python3 -m venv --system-site-packages DIR && DIR/bin/pip install "phasefieldx==0.1.4" "scifem<0.5" pandas
     export PHASEFIELDX_PYTHON=DIR/bin/python
-    python -m fracsim.studies.evidence.peers.phase_field --n 40 [--pull shear] -o figures.json
+    python -m fracsim.studies.evidence.peers.phase_field --problem tension --h 2.5e-5 --reference 644.9 -o figures.json
 
-PhaseFieldX is a library on DOLFINx; 0.1.4 works with DOLFINx 0.9, 0.4 does not. Its notch is a slit along a row of
-doubled nodes. fracsim's crack cuts the row of cells above it, since a node at the tip is a hinge
-(docs/theory.md#cell-cutting).
-
-The length scale is two cells, the smallest that counts as resolved. In tension the whole energy drives the crack. In
-shear only the energy of positive principal strains does (hybrid: Ambati et al. 2015); otherwise cracks grow in both
-directions.
+PhaseFieldX is a library on DOLFINx; 0.1.4 works with DOLFINx 0.9, 0.4 does not. The notch of the plate is a slit
+along a row of doubled nodes; that of the beam is cut out of the mesh, which is fracsim's. The length scale is two
+cells, the smallest that counts as resolved. In tension and bending the whole energy drives the crack. In shear only the
+energy of positive principal strains does (hybrid: Ambati et al. 2015); otherwise cracks grow in both directions.
 """
 
 from __future__ import annotations
@@ -19,7 +16,6 @@ import argparse
 import json
 import subprocess
 import tempfile
-import time
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -28,43 +24,49 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..report_section import ReportTable, Section, TableCell
+from ..fracture_specimens import PLATE_COURSES, PLATE_SIDE, V_BEAM_COURSE, Course, notched_beam, notched_plate
 from ..trial import Trial
 from . import working_python
 
 VARIABLE = "PHASEFIELDX_PYTHON"
 ABSENT = f"PhaseFieldX is not installed here ({VARIABLE} names no Python that can import it)."
 WORKER = Path(__file__).with_name("phase_field_worker.py")
-SIZES = (40, 80)  # cells along a side: 3,200 and 12,800 triangles
-SIDE, YOUNG, POISSON, FRACTURE_ENERGY = 1e-3, 2.1e11, 0.3, 2700.0  # m, Pa, J/m^2 (Miehe et al. 2010)
 LENGTH_SCALE = 2.0  # length scale over h
-GRIFFITH_LOAD = 645.0  # N, of a sharp crack (experiments)
 MM_PER_M = 1e3
 DIRECTION_RADII = 0.08e-3, 0.25e-3  # m from the notch: where the crack direction is measured
+PROBLEMS = (*PLATE_COURSES, "beam")
 Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class GripMotion:
-    """Motion of the upper side.
+class PhaseFieldProblem:
+    """A plane strain body that a part of its boundary moves.
 
     Attributes:
-        axis: 0 tangential, 1 normal.
-        displacement: final displacement, m.
-        steps: number of steps.
+        points: nodes (n, 2), m.
+        cells: nodes of triangles (m, 3).
+        fixed: components (n, 2) that are held at zero.
+        driven: nodes (n,) whose component `axis` is prescribed.
+        axis: 0 or 1.
+        course: displacement at the end of each step (steps,), m; with its sign.
+        material: [material] of the study.
+        energy: fracture energy, J/m^2.
+        length: length scale, m.
+        split: only the energy of positive principal strains drives the crack.
+        drop: share of the peak load at whose loss the run ends.
     """
 
+    points: Values
+    cells: npt.NDArray[np.int64]
+    fixed: npt.NDArray[np.bool_]
+    driven: npt.NDArray[np.bool_]
     axis: int
-    displacement: float
-    steps: int
-
-    @property
-    def course(self) -> Values:
-        """Displacement of the grip at the end of each step (steps,), m."""
-        return self.displacement * np.arange(1.0, self.steps + 1) / self.steps
-
-
-GRIP_MOTIONS = {"tension": GripMotion(1, 6.5e-6, 65), "shear": GripMotion(0, 1.5e-5, 75)}
+    course: Values
+    material: dict[str, Any]
+    energy: float
+    length: float
+    split: bool
+    drop: float
 
 
 @cache
@@ -73,25 +75,50 @@ def phasefieldx_python() -> str | None:
     return working_python(VARIABLE, "from phasefieldx.Element.Phase_Field_Fracture.solver.solver import solve")
 
 
-def plate_study(n: int, pull: GripMotion) -> dict[str, Any]:
-    """Study for fracsim with n cells along a side."""
-    moved = [0.0, 0.0]
-    moved[pull.axis] = pull.displacement
-    at = SIDE * (0.5 + 0.5 / n)
-    return {
-        "title": f"a notched plate of {2 * n * n} triangles",
-        "mesh": {"builder": "box", "size": [SIDE, SIDE], "h": SIDE / n},
-        "material": {"energy": "linear", "young": YOUNG, "poisson": POISSON, "density": 7850.0, "thickness": SIDE},
-        "fracture": {"strength": 2e10, "energy": FRACTURE_ENERGY},
-        "crack": [{"segment": [[-SIDE, at], [SIDE / 2, at]]}],
-        "boundary": [
-            {"on": "bottom", "fix": "xy"},
-            {"on": "top", "displacement": {"time": [0.0, 1.0], "value": [[0.0, 0.0], moved]}},
-        ],
-        "time": {"scheme": "quasi-static", "step": 1 / pull.steps, "end": 1.0},
-        "probe": [{"name": "grip", "on": "top"}],
-        "output": {"every": 1_000_000, "fields": [], "picture": False},
-    }
+def course_steps(course: Course, end: float = 1.0) -> Values:
+    """Displacement at the end of each step of a course, m."""
+    shares = np.arange(course.start, end + 1e-9, course.step)
+    return np.asarray(course.travel * shares)
+
+
+def plate_problem(load: str, h: float) -> PhaseFieldProblem:
+    """Notched plate under a load of PLATE_COURSES, on a lattice with a slit."""
+    from ....meshes.builders.box import Box
+
+    (along, _), course = PLATE_COURSES[load]
+    mesh = Box(size=(1.0, 1.0), h=h / PLATE_SIDE).build()
+    points, cells = double_slit_nodes(mesh.points, np.asarray(mesh.cells, np.int64))
+    x, y = points.T
+    bottom, top, sides = np.isclose(y, 0.0), np.isclose(y, 1.0), np.isclose(x, 0.0) | np.isclose(x, 1.0)
+    axis = 0 if along else 1
+    fixed = np.repeat(bottom[:, None], 2, axis=1)
+    fixed[top, 1 - axis] = True
+    if load == "held-shear":
+        fixed[sides, 1] = True
+    study = notched_plate(load, {"h": h})
+    return PhaseFieldProblem(
+        points * PLATE_SIDE, cells, fixed, top, axis, course_steps(course), study["material"],
+        study["fracture"]["energy"], LENGTH_SCALE * h, axis == 0, course.drop,
+    )  # fmt: skip
+
+
+def beam_problem(h: float, folder: Path) -> PhaseFieldProblem:
+    """Beam with a V notch, on a mesh of fracsim."""
+    from ....study.check import build_checked_mesh
+    from ....study.reader import validate
+
+    study = notched_beam(folder, h, 1, 2e8) | {"time": V_BEAM_COURSE.time_table}
+    mesh = build_checked_mesh(validate(study, "beam"))
+    fixed = np.zeros(mesh.points.shape, bool)
+    for entry in study["boundary"][:2]:
+        low, high = np.array(entry["on"]["box"])
+        at = np.all((mesh.points >= low) & (mesh.points <= high), axis=1)
+        fixed[at] |= [axis in entry["fix"] for axis in "xy"]
+    driven = np.isin(np.arange(len(mesh.points)), mesh.facet_groups["load"])
+    return PhaseFieldProblem(
+        mesh.points, np.asarray(mesh.cells, np.int64), fixed, driven, 1, -course_steps(V_BEAM_COURSE),
+        study["material"], study["fracture"]["energy"], LENGTH_SCALE * h, split=False, drop=V_BEAM_COURSE.drop,
+    )  # fmt: skip
 
 
 def double_slit_nodes(points: Values, cells: npt.NDArray[np.int64]) -> tuple[Values, npt.NDArray[np.int64]]:
@@ -103,82 +130,50 @@ def double_slit_nodes(points: Values, cells: npt.NDArray[np.int64]) -> tuple[Val
     return np.concatenate([points, points[parted]]), np.where(above[:, None], other[cells], cells)
 
 
-def trials() -> list[Trial]:
-    """Trials of both sizes in tension and the larger one in shear; empty if PhaseFieldX is not installed."""
-    cases = [*((n, "tension") for n in SIZES), (SIZES[-1], "shear")]
-    return [] if phasefieldx_python() is None else [_trial(n, pull) for n, pull in cases]
+def trials(case: str, problem: str, reference: float, sizes: dict[float, bool]) -> list[Trial]:
+    """Trials of a problem in a case of the group precision; empty if PhaseFieldX is not installed.
+
+    Args:
+        case: name of the case.
+        problem: one of PROBLEMS.
+        reference: peak load, N.
+        sizes: h, m -> whether the full report alone runs it.
+    """
+    if phasefieldx_python() is None:
+        return []
+    module = "fracsim.studies.evidence.peers.phase_field"
+    return [
+        Trial("precision", case, f"phasefieldx-h-{h:g}", settings={"h": h, "elements": "PhaseFieldX"}, limit=600.0,
+              script=(module, "--problem", problem, "--h", f"{h:g}", "--reference", f"{reference:g}"), full=full)
+        for h, full in sizes.items()
+    ]  # fmt: skip
 
 
-def _trial(n: int, pull: str) -> Trial:
-    """Trial with n cells along a side."""
-    script = ("fracsim.studies.evidence.peers.phase_field", "--n", str(n), "--pull", pull)
-    settings: dict[str, Any] = {"n": n, "pull": pull, "peer": "PhaseFieldX"}
-    return Trial("peers", "notched-plate", f"{pull}-n-{n}", script=script, settings=settings, limit=15.0 * n)
-
-
-def compare(n: int, pull: str) -> dict[str, Any]:
-    """Peak load (N), displacement there (m), crack direction and processor time of both programs.
+def solve_problem(problem: PhaseFieldProblem) -> tuple[Values, Values, dict[str, float]]:
+    """Load at each step (N), points of the crack (n, 2) in m, and processor time and number of solves.
 
     Raises:
-        RuntimeError: PhaseFieldX is not installed.
+        RuntimeError: PhaseFieldX is not installed, or failed.
     """
-    return {
-        "cells": 2 * n * n,
-        "pull": pull,
-        "ours": _run_fracsim(n, GRIP_MOTIONS[pull]),
-        "theirs": _run_phasefieldx(n, pull),
-    }
-
-
-def _run_fracsim(n: int, pull: GripMotion) -> dict[str, float]:
-    """Figures of fracsim."""
-    from mpi4py import MPI
-
-    from ....fracture.energy.tip_criterion import TipCriterion
-    from ....run import Run
-    from ....scene import build_scene
-    from ....study.reader import validate
-
-    with tempfile.TemporaryDirectory() as folder:
-        run = Run(build_scene(MPI.COMM_WORLD, validate(plate_study(n, pull), "notched plate")), Path(folder, "ours"))
-        column, began = run.scene.probes.columns.index(f"onset_grip_{'xy'[pull.axis]}"), time.process_time()
-        load, solves = [], 0
-        for _ in range(pull.steps):
-            solves += run.step().solve.newton_iterations
-            load.append(abs(run.scene.probes()[column]))
-        seconds = time.process_time() - began
-        assert run.scene.fracture is not None
-        criterion = run.scene.fracture.criterion
-        assert isinstance(criterion, TipCriterion)
-        criterion.find_tips()
-        notch = np.array([SIDE / 2, SIDE * (0.5 + 0.5 / n)])
-        crack = criterion.field_evaluator.cut_cells.cut_point - notch
-    return _figures(np.array(load), pull.course, crack, seconds, solves)
-
-
-def _run_phasefieldx(n: int, pull: str) -> dict[str, float]:
-    """Figures of PhaseFieldX."""
-    from ....meshes.builders.box import Box
-
-    python, given = phasefieldx_python(), GRIP_MOTIONS[pull]
+    python = phasefieldx_python()
     if python is None:
         raise RuntimeError(ABSENT)
-    mesh = Box(size=(1.0, 1.0), h=1 / n).build()
-    points, cells = double_slit_nodes(mesh.points, np.asarray(mesh.cells, np.int64))
+    material = problem.material
     with tempfile.TemporaryDirectory() as folder:
-        problem, result = Path(folder, "problem.npz"), Path(folder, "result.npz")
+        path, result = Path(folder, "problem.npz"), Path(folder, "result.npz")
         np.savez(
-            problem, points=points * SIDE * MM_PER_M, cells=cells, course=given.course * MM_PER_M, young=YOUNG * 1e-9,
-            poisson=POISSON, energy=FRACTURE_ENERGY * 1e-6, length=LENGTH_SCALE * SIDE * MM_PER_M / n, axis=given.axis,
-            split=pull == "shear",
+            path, points=problem.points * MM_PER_M, cells=problem.cells, fixed=problem.fixed, driven=problem.driven,
+            axis=problem.axis, course=problem.course * MM_PER_M, young=material["young"] * 1e-9,
+            poisson=material["poisson"], energy=problem.energy * 1e-6, length=problem.length * MM_PER_M,
+            split=problem.split, drop=problem.drop,
         )  # fmt: skip
-        done = subprocess.run([python, str(WORKER), str(problem), str(result)], capture_output=True, text=True)
+        done = subprocess.run([python, str(WORKER), str(path), str(result)], capture_output=True, text=True)
         if done.returncode:
             raise RuntimeError(f"PhaseFieldX ended with code {done.returncode}: {done.stderr[-500:]}")
         totals = json.loads(done.stdout.splitlines()[-1])
         with np.load(result) as results:  # kN for a thickness of 1 mm
-            crack = results["crack"] / MM_PER_M - SIDE / 2
-            return _figures(results["load"] * 1e3, given.course, crack, totals["cpu"], totals["solves"])
+            load = results["load"] * 1e3 * material["thickness"] * MM_PER_M
+            return load, results["crack"] / MM_PER_M, totals
 
 
 def crack_direction(crack: Values) -> float:
@@ -191,57 +186,31 @@ def crack_direction(crack: Values) -> float:
     return float(np.degrees(np.arctan2(-near[:, 1].mean(), near[:, 0].mean()))) if len(near) else float("nan")
 
 
-def _figures(load: Values, course: Values, crack: Values, seconds: float, solves: int) -> dict[str, float]:
-    """Figures of one program."""
+def measure(name: str, h: float, reference: float) -> dict[str, float]:
+    """Error of the peak load, peak (N), displacement there (m), direction of the crack, seconds and solves."""
+    with tempfile.TemporaryDirectory() as folder:
+        problem = beam_problem(h, Path(folder)) if name == "beam" else plate_problem(name, h)
+    load, crack, totals = solve_problem(problem)
     at = int(load.argmax())
-    return {
-        "peak": float(load[at]), "at": float(course[at]), "turn": crack_direction(crack), "seconds": seconds,
-        "solves": float(solves),
+    figures = {
+        "peak load": abs(float(load[at]) / reference - 1), "peak": float(load[at]),
+        "at": abs(float(problem.course[at])), "seconds": totals["cpu"], "solves": float(totals["solves"]),
     }  # fmt: skip
+    if problem.split:
+        figures["direction"] = crack_direction(crack - PLATE_SIDE / 2)
+    return {key: value for key, value in figures.items() if np.isfinite(value)}
 
 
 def main() -> None:
-    """Compare and write the figures."""
+    """Measure and write the figures."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--n", type=int, default=SIZES[0])
-    parser.add_argument("--pull", choices=GRIP_MOTIONS, default="tension")
+    parser.add_argument("--problem", choices=PROBLEMS, default="tension")
+    parser.add_argument("--h", type=float, required=True, help="cell size, m")
+    parser.add_argument("--reference", type=float, required=True, help="peak load, N")
     parser.add_argument("-o", "--out", type=Path, required=True)
     given = parser.parse_args()
-    given.out.write_text(json.dumps(compare(given.n, given.pull), indent=1) + "\n")
-
-
-# --- the section ----------------------------------------------------------------------------------------------------
-
-TITLE = "Notched plate: fracsim and a phase field"
-TEXT = (
-    "Single-edge notched plates on one lattice: PhaseFieldX 0.1.4 (AT2, history field, length scale of two cells, each "
-    "step solved in turn to a change of 1e-4; in shear hybrid, by positive principal strains) and this program, as "
-    f"many steps each, one process. In tension a sharp crack breaks at {GRIFFITH_LOAD:g} N; in shear a kink starts "
-    "at 388.7 N, at 75.8 degrees. Direction: of the crack 0.08 to 0.25 mm from the notch, below straight ahead. "
-    "Core-seconds are those of all steps, without reading the mesh and compiling."
-)
-COLUMNS = (
-    "pull", "triangles", "program", "peak, N", "at, m", "direction, degrees", "core-seconds", "solves of displacement",
-)  # fmt: skip
-
-
-def sections(records: list[dict[str, Any]]) -> list[Section]:
-    """Section with a table; a sentence if PhaseFieldX is not installed."""
-    results = [record for record in records if record["case"] == "notched-plate"]
-    done = [record["figures"] for record in results if record["figures"]]
-    if not done:
-        return [Section(TITLE, results[0]["message"] if results else ABSENT)]
-    rows = tuple(row for figures in done for row in _rows(figures))
-    return [Section(TITLE, TEXT, tables=(ReportTable("peers-notched-plate", TITLE, COLUMNS, rows),))]
-
-
-def _rows(figures: dict[str, Any]) -> list[tuple[TableCell, ...]]:
-    """Rows of a comparison, one a program."""
-    programs = {"PhaseFieldX": figures["theirs"], "fracsim": figures["ours"]}
-    return [
-        (figures["pull"], figures["cells"], name, *(item[key] for key in ("peak", "at", "turn", "seconds", "solves")))
-        for name, item in programs.items()
-    ]
+    figures = measure(given.problem, given.h, given.reference)
+    given.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

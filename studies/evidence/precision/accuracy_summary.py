@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
+from ..peers import phase_field
 from ..peers.akantu import ABSENT, akantu_python
-from ..report_section import Plot, ReportTable, Section, Series, TableCell, pareto_front
+from ..report_section import Plot, PlotGrid, ReportTable, Section, Series, TableCell, pareto_front
 from .case_section import (
     ERROR_LIMITS,
     AccuracyCase,
@@ -18,6 +19,7 @@ from .case_section import (
 )
 
 FINEST = 1e-4  # of errors that are told apart in the plot
+OWN = "fracsim"
 PEERS = {"quadratic": "DOLFINx alone, quadratic"}  # by the setting `elements` of their trials
 
 
@@ -33,14 +35,16 @@ def summary_sections(cases: list[AccuracyCase], records: Records) -> list[Sectio
         "precision-short", "Core-seconds in the steps that an error takes. Empty: no setting that ran is that good.",
         ("case", "error of", *own, *seconds), tuple(_case_row(case, rows, peers) for case, rows in results),
     )  # fmt: skip
-    plot = Plot(
-        f"Error against core-seconds: the best settings of each case. Errors below {FINEST:g} count as that.",
-        "core-seconds in the steps", "relative error",
-        tuple(_pareto_series(case, rows) for case, rows in results), "loglog", levels=ERROR_LIMITS,
+    panels = tuple(_panel(case, rows, peers) for case, rows in results)
+    plot = PlotGrid(
+        f"Relative error against core-seconds in the steps, a panel for each case: the best settings of each program. "
+        f"Dotted: 5 % and 1 %. Errors below {FINEST:g} count as that.", panels,
     )  # fmt: skip
     without = "" if peers else " No other program has run beside them here."
     if "Akantu" not in peers and akantu_python() is None:
         without += f" {ABSENT}"
+    if "PhaseFieldX" not in peers and phase_field.phasefieldx_python() is None:
+        without += f" {phase_field.ABSENT}"
     text = f"What an error of 5 % and of 1 % costs.{without} What does not hold comes next, everything else below."
     return [Section("Error against run time", text, tables=(table,), plots=(plot,), first=True)]
 
@@ -72,8 +76,20 @@ def _setting_name(row: AccuracyRow) -> str:
     return f"solver = {settings['solver']}" if "solver" in settings else describe_setting(row)
 
 
-def _pareto_series(case: AccuracyCase, rows: list[AccuracyRow]) -> Series:
+def _panel(case: AccuracyCase, rows: list[AccuracyRow], peers: list[str]) -> Plot:
+    """Plot of a case: Pareto-optimal settings of fracsim and of other programs."""
+    programs = {OWN: [row for row in rows if is_comparable(case, row)]}
+    for peer in peers:
+        programs[peer] = [
+            row for row in rows if other_program(row.record) == peer and case.errors[0] in row.errors
+            and row.record["outcome"] == "done"
+        ]  # fmt: skip
+    series = tuple(_pareto_series(name, case, own) for name, own in programs.items() if own)
+    return Plot(case.title, "core-seconds", f"error of {case.errors[0]}", series, "loglog", levels=ERROR_LIMITS)
+
+
+def _pareto_series(label: str, case: AccuracyCase, rows: list[AccuracyRow]) -> Series:
     """Pareto-optimal settings in cost and error, the cheapest first."""
-    points = [(row.core_seconds, max(row.errors[case.errors[0]], FINEST)) for row in rows if is_comparable(case, row)]
+    points = [(row.core_seconds, max(row.errors[case.errors[0]], FINEST)) for row in rows]
     best = sorted(points[place] for place in pareto_front(points))
-    return Series(case.title, tuple(x for x, _ in best), tuple(y for _, y in best))
+    return Series(label, tuple(x for x, _ in best), tuple(y for _, y in best))

@@ -12,11 +12,12 @@ runs as fast. So there is one plane for a sharp front alone (T_r = 0) and f_t < 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-Values = npt.NDArray[np.float64]
+Values = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,7 @@ class Pulse:
 
     @property
     def impedance(self) -> float:
-        """rho c, Pa s/m."""
+        """Rho c, Pa s/m."""
         return self.density * self.wave_speed
 
     def pressure(self, t: float) -> float:
@@ -74,7 +75,11 @@ def spall(pulse: Pulse, strength: Values, energy: float, end: float) -> SpalledB
     """
     count, z = len(strength), pulse.impedance
     dt = pulse.length / (count - 1) / pulse.wave_speed
-    sigma, before, after, opened, largest = np.zeros((5, count))
+    sigma: Values = np.zeros(count)
+    before: Values = np.zeros(count)
+    after: Values = np.zeros(count)
+    opened = np.zeros(count)
+    largest: Values = np.zeros(count)
     from_left, from_right = np.zeros((2, count))
     inside = np.arange(count)[1:-1]
     for step in range(1, round(end / dt) + 1):
