@@ -65,3 +65,7 @@ def test_the_beam_is_held_and_moved_as_in_our_study(tmp_path: Path) -> None:
     assert problem.fixed.sum() == 3
     np.testing.assert_allclose(problem.points[problem.driven, 1], 2e-3)
     assert problem.course[-1] == pytest.approx(-V_BEAM_COURSE.travel)
+    # no damage where single nodes carry the load, and none prevented at the notch
+    assert problem.intact[problem.driven].all() and problem.intact[problem.fixed.any(axis=1)].all()
+    notch = np.linalg.norm(problem.points - [0.0, 0.4e-3], axis=1) < 4e-4
+    assert notch.sum() > 5 and not problem.intact[notch].any()

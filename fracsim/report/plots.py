@@ -110,6 +110,7 @@ def _draw_grid(grid: PlotGrid, name: str) -> str:
         for index, panel in enumerate(grid.panels):
             axes = figure.add_subplot(rows, columns, index + 1)
             _fill_axes(axes, panel, [labels.index(series.label) for series in panel.series])
+            _widen_log_axes(axes)
             axes.set_title(textwrap.fill(panel.caption, style.title_letters), fontsize=style.font)
             axes.tick_params(labelsize=style.font - 1)
             axes.set_xlabel(panel.x if index + columns >= len(grid.panels) else "", fontsize=style.font)
@@ -189,6 +190,15 @@ def _label_decades(axis: Any, numbers: Values) -> None:
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if is_short else (1.0,)))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
+
+
+def _widen_log_axes(axes: Any) -> None:
+    """Let logarithmic axes span a decade at least: over less, matplotlib labels more numbers than fit."""
+    for axis in ("x", "y"):
+        low, high = getattr(axes, f"get_{axis}lim")()
+        if getattr(axes, f"get_{axis}scale")() == "log" and high < 10 * low:
+            middle = math.sqrt(low * high)
+            getattr(axes, f"set_{axis}lim")(middle / math.sqrt(10), middle * math.sqrt(10))
 
 
 def _points(plot: Plot) -> list[tuple[float, float]]:

@@ -48,6 +48,10 @@ def main() -> None:
     moved = fem.Constant(mesh, np.float64(0.0))
     grip = _condition(V, moved, problem["driven"][node], axis)
     held = [_condition(V, fem.Constant(mesh, np.float64(0.0)), problem["fixed"][node, i], i) for i in (0, 1)]
+    row = cKDTree(points).query(W.tabulate_dof_coordinates()[:, :2])[1]
+    intact = fem.dirichletbc(
+        fem.Constant(mesh, np.float64(0.0)), np.flatnonzero(problem["intact"][row]).astype(np.int32), W
+    )
     phase: list[Any] = []
 
     with tempfile.TemporaryDirectory() as folder:
@@ -71,7 +75,8 @@ def main() -> None:
         began = time.process_time()
         with contextlib.suppress(LoadHasFallen):
             solve(
-                data, mesh, len(course) - 0.5, V, W, bc_list_u=[grip, *held], update_boundary_conditions=pull,
+                data, mesh, len(course) - 0.5, V, W, bc_list_u=[grip, *held], bc_list_phi=[intact],
+                update_boundary_conditions=pull,
                 path=folder, bcs_list_u_names=["grip", "held x", "held y"], max_stagger_iter=MAX_STAGGERED_ITERATIONS,
                 stagger_error_tol=STAGGERED_TOLERANCE,
             )  # fmt: skip

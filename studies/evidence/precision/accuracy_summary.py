@@ -85,7 +85,7 @@ def _panel(case: AccuracyCase, rows: list[AccuracyRow], peers: list[str]) -> Plo
             and row.record["outcome"] == "done"
         ]  # fmt: skip
     series = tuple(_pareto_series(name, case, own) for name, own in programs.items() if own)
-    return Plot(case.title, "core-seconds", f"error of {case.errors[0]}", series, "loglog", levels=ERROR_LIMITS)
+    return Plot(case.title, "core-seconds", "relative error", series, "loglog", levels=ERROR_LIMITS)
 
 
 def _pareto_series(label: str, case: AccuracyCase, rows: list[AccuracyRow]) -> Series:

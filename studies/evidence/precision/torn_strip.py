@@ -119,6 +119,6 @@ CASE = FractureCase(
     "`fracture.branching` the energy drives the crack up to the largest speed of the law, c_R / 2, which is the "
     "reference: what is measured is whether mesh and steps follow the law. `n`: cells over the height.",
     measure, (ERROR,),
-    short=(_settings(6), _settings(12), _settings(12, scheme="newmark"), _settings(6, 2)),
+    short=(_settings(6), _settings(12), _settings(12, scheme="generalized-alpha"), _settings(6, 2)),
     full=(_settings(24), _settings(12, 2)), excluded=("explicit",), figures=("speed over c_R", "tips"),
 )  # fmt: skip
