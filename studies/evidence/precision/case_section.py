@@ -69,6 +69,7 @@ class AccuracyCase:
         limit_share: share of an error limit that the case may use; less than 1 if mesh and step add their errors.
         claims: records -> further claims.
         compare_cost: compare the cost of errors; False if the settings are unrelated bodies.
+        figures: measured figures that the table shows beside the errors.
     """
 
     name: str
@@ -83,6 +84,7 @@ class AccuracyCase:
     limit_share: float = 1.0
     claims: Callable[[Records], tuple[Claim, ...]] = lambda records: ()
     compare_cost: bool = True
+    figures: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -340,7 +342,7 @@ def _default_claim(case: AccuracyCase, advice: Recommendation) -> Claim:
 def _error_table(case: AccuracyCase, rows: list[AccuracyRow], marked: list[int]) -> ReportTable:
     """Table of errors and times."""
     front = _pareto_rows(case, rows)
-    columns = ("trial", *case.columns, "ranks", *(f"error of {name}" for name in case.errors),
+    columns = ("trial", *case.columns, "ranks", *(f"error of {name}" for name in case.errors), *case.figures,
                "wall s", "core-seconds", "front", "outcome")  # fmt: skip
     caption = f"{case.title}: relative errors and times. Marked: recommended for 5 % and 1 %; *: on the front."
     cells = tuple(_table_cells(case, row, number in front) for number, row in enumerate(rows))
@@ -352,8 +354,9 @@ def _table_cells(case: AccuracyCase, row: AccuracyRow, best: bool) -> tuple[Tabl
     record = row.record
     settings = (record["settings"].get(key) for key in case.columns)
     errors = (row.errors.get(name) for name in case.errors)
-    return (record["name"], *settings, record["ranks"], *errors, row.wall, row.core_seconds, "*" if best else "",
-            record["outcome"])  # fmt: skip
+    figures = (record["figures"].get(name) for name in case.figures)
+    return (record["name"], *settings, record["ranks"], *errors, *figures, row.wall, row.core_seconds,
+            "*" if best else "", record["outcome"])  # fmt: skip
 
 
 def _outcome_table(case: AccuracyCase, records: Records) -> ReportTable:

@@ -6,14 +6,14 @@ A case with random meshes is run on several of them: its error is the largest, i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
 from time import process_time
 from typing import Any
 
 from ..trial import Setting, Trial
-from .case_section import AccuracyCase, Records, measured_errors
+from .case_section import AccuracyCase, measured_errors
 from .precision_trials import GROUP, SCRIPTS, Settings, Study
 
 Figures = dict[str, float]
@@ -36,7 +36,7 @@ class FractureCase:
         split: setting whose values are series of the plots.
         excluded: values of settings that cannot be defaults.
         limit: wall time of a trial, s.
-        figures: names of figures that the section's text shows.
+        figures: names of figures that the table shows beside the errors.
     """
 
     name: str
@@ -50,7 +50,7 @@ class FractureCase:
     split: str = "order"
     excluded: tuple[Setting, ...] = ()
     limit: float = 120.0
-    figures: tuple[str, ...] = field(default=())
+    figures: tuple[str, ...] = ()
 
     def trials(self) -> list[Trial]:
         """Trials of all settings, and those of other programs."""
@@ -68,21 +68,9 @@ class FractureCase:
         """The case as the report shows it."""
         columns = tuple(dict.fromkeys(key for settings in (*self.short, *self.full) for key in settings))
         return AccuracyCase(
-            self.name, self.title, self._text, columns, measured_errors(*self.errors), self.errors,
-            split=self.split, excluded=self.excluded,
+            self.name, self.title, lambda records: self.text, columns, measured_errors(*self.errors), self.errors,
+            split=self.split, excluded=self.excluded, figures=self.figures,
         )  # fmt: skip
-
-    def _text(self, records: Records) -> str:
-        """Text of the section with the measured figures."""
-        shown = [record for record in records if any(key in record["figures"] for key in self.figures)]
-        parts = (f"{record['name']}: {_figures_text(record['figures'], self.figures)}" for record in shown)
-        values = "; ".join(parts)
-        return f"{self.text}\n\n{values}." if values else self.text
-
-
-def _figures_text(figures: Figures, keys: tuple[str, ...]) -> str:
-    """Some figures as text."""
-    return ", ".join(f"{key} {figures[key]:.4g}" for key in keys if key in figures)
 
 
 def parse_settings(words: list[str]) -> Settings:
