@@ -162,6 +162,12 @@ ENTRIES = (
         (("charpy-A516", "charpy"), ("charpy-NVE36", f"charpy {NVE36}"),
          ("izod-A516", "izod"), ("izod-NVE36", f"izod {NVE36}")), "--size 1400x600",
     ),
+    GalleryEntry(
+        "charpy-3d",
+        "Charpy bars in space: A516 at -40 C breaks in two, NVE 36 at 23 C bends and cracks to a third of its height.",
+        (("charpy-3d", "charpy-3d"), ("charpy-3d-ductile", "charpy-3d-ductile")),
+        "--view 0.5,-1.1,-0.45 --field crack --size 1400x560",
+    ),
     packaged_entry("kalthoff", "A notched steel plate under impact on the side below its notch: vertical stress.",
                    "--field stress:yy"),
     packaged_entry("l-panel", "Degradation `chi` of the elastic energy in a cracked concrete panel.",

@@ -29,6 +29,8 @@ COARSE = {
     "branching": ["mesh.h=0.003"],
     "bread": ["mesh.h=0.02"],
     "charpy": ["mesh.h=0.002", "mesh.h_notch=0.0006"],
+    "charpy-3d": ["mesh.h=0.005", "mesh.h_notch=0.0015"],
+    "charpy-3d-ductile": ["mesh.h=0.005", "mesh.h_notch=0.0015"],
     "charpy-klst": ["mesh.h=0.001", "mesh.h_notch=0.0003"],
     "cylinder": ["mesh.h=0.01"],
     "doormat": ["mesh.h=0.025"],

@@ -17,6 +17,7 @@ from .effective_stress import UndamagedStress
 from .node_retention import NodeAttachment
 
 if TYPE_CHECKING:
+    from .energy.hinges import HingeRelease
     from .energy.tip_record import TipRecord
 
 Values = npt.NDArray[np.float64]
@@ -116,6 +117,7 @@ class FracturePass:
         passes_per_second: float | None = None,
         node_attachment: NodeAttachment | None = None,
         tip_record: TipRecord | None = None,
+        hinges: HingeRelease | None = None,
     ) -> None:
         """Assemble a pass from its parts (collective).
 
@@ -130,12 +132,13 @@ class FracturePass:
             passes_per_second: rate of passes, instead of `max_passes`: short steps may have none.
             node_attachment: spares edges that attach nodes without an unsplit cell.
             tip_record: of the crack tips in each step; None: the criterion has no tips with a release rate.
+            hinges: finds the edges by which parts hang on one another without a ligament; None: they stay.
         """
         self.stress, self.graph, self.criterion, self.max_passes = stress, graph, criterion, max_passes
         self.law: EdgeLaw = law or BrittleEdgeLaw()
         self.degradation: Degradation = degradation or make_degradation(stress, graph)
         self.initial_cuts, self._passes_per_second = initial_cuts, passes_per_second
-        self._node_attachment, self.tip_record = node_attachment, tip_record
+        self._node_attachment, self.tip_record, self._hinges = node_attachment, tip_record, hinges
         self._is_due, self._now, self._dt = True, 0.0, math.inf
         # Moving tips change their states in every pass, also where no edge breaks.
         self._has_tip_states = criterion.tip_states is not None
@@ -177,6 +180,9 @@ class FracturePass:
         """Carry out one pass at the present displacement (collective)."""
         stress, psi = self.evaluate_undamaged_stress()
         broken, weakened = self._weaken_failing_edges(stress, psi) if self._is_due else (0, 0)
+        if self._hinges is not None and self._is_due:
+            released = self.graph.break_edges(self._hinges(stress))
+            broken, weakened = broken + released, weakened + released
         # Edges between split cells alone carry nothing any more.
         if broken and self.degradation.breaks_idle_edges:
             broken += self.graph.break_unloaded_edges()

@@ -78,6 +78,7 @@ def _build_energy_pass(
     """Return the fracture pass for cracks with a fracture energy (collective)."""
     from ..fracture.degradation import CrackClosureDegradation, Degradation, SplitCellDegradation
     from ..fracture.energy.front_advance import FrontTipCriterion
+    from ..fracture.energy.hinges import HingeRelease
     from ..fracture.energy.tip_criterion import TipCriterion
     from ..fracture.energy.tip_record import TipRecord
     from ..fracture.fracture_pass import FracturePass
@@ -119,6 +120,7 @@ def _build_energy_pass(
         degradation=degradation,
         passes_per_second=passes_per_second,
         tip_record=record,
+        hinges=HingeRelease(graph, tips.disc_radius, attachment),
     )
 
 

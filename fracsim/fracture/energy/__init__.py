@@ -13,6 +13,7 @@ configurational_force  Eshelby stress, weight function, springs of closed cracks
 crack_front            3D: area that an advance makes, energy release rate along a front
 mixed_mode             2D: stress intensities, kink angle, energy release of a kink
 cut_plane              the line or plane that cuts a cell
+hinges                 nodes by which parts without a ligament still hang on one another
 cut_cells              cut positions, cut polygons, and the cut cells of all ranks
 gradient_operators     gradients of fields around tips, as matrices
 neighbour_search       cells near points, and values of cells of other ranks

@@ -124,9 +124,14 @@ class TipCriterion:
         return critical_distance(self._domain.dim, modulus, np.asarray(self.toughness), strength, self._h)
 
     @property
+    def disc_radius(self) -> Values:
+        """(cells,) radius R, m, of the disc (3D: ball) of a tip in a cell."""
+        return self.disc_radius_ratio * self._h
+
+    @property
     def elastic_radius(self) -> Values:
         """(cells,) radius, m, of the zone around a tip in a cell in which a body that yields stays elastic."""
-        return np.maximum(self._start.length / 2, self.disc_radius_ratio * self._h)
+        return np.maximum(self._start.length / 2, self.disc_radius)
 
     def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
         """Find the local edges (n,) that cracks cut, with loads of 1 (collective).
