@@ -164,7 +164,7 @@ ENTRIES = (
     ),
     GalleryEntry(
         "charpy-3d",
-        "Charpy bars in space: A516 at -40 C breaks in two, NVE 36 at 23 C bends and cracks to a third of its height.",
+        "Charpy bars in space: A516 at -40 C breaks, NVE 36 at 23 C bends and cracks over a third of its ligament.",
         (("charpy-3d", "charpy-3d"), ("charpy-3d-ductile", "charpy-3d-ductile")),
         "--view 0.5,-1.1,-0.45 --field crack --size 1400x560",
     ),

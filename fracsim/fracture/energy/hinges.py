@@ -101,21 +101,21 @@ def assign_parts(links: Ints, large: Ints) -> tuple[Ints, Ints]:
     numbers, ends = np.unique(np.concatenate([links.reshape(-1), large]), return_inverse=True)
     ends = ends[: links.size].reshape(-1, 2)
     body = np.where(np.isin(numbers, large), numbers, -1)
-    both = np.concatenate([ends, ends[:, ::-1]])
+    directed = np.concatenate([ends, ends[:, ::-1]])
     while True:
-        open_links = both[(body[both[:, 0]] < 0) & (body[both[:, 1]] >= 0)]
-        if not len(open_links):
+        leading = directed[(body[directed[:, 0]] < 0) & (body[directed[:, 1]] >= 0)]
+        if not len(leading):
             return numbers, body
-        ways, count = np.unique(np.column_stack([open_links[:, 0], body[open_links[:, 1]]]), axis=0, return_counts=True)
+        pairs = np.column_stack([leading[:, 0], body[leading[:, 1]]])
+        pairs, count = np.unique(pairs, axis=0, return_counts=True)
         # of equally many links those to the larger part, which has the lower number
-        order = np.lexsort((ways[:, 1], -count, ways[:, 0]))
-        row, first = np.unique(ways[order, 0], return_index=True)
-        body[row] = ways[order[first], 1]
+        order = np.lexsort((pairs[:, 1], -count, pairs[:, 0]))
+        row, first = np.unique(pairs[order, 0], return_index=True)
+        body[row] = pairs[order[first], 1]
 
 
 def _are_apart(labels: Ints, numbers: Ints, body: Ints) -> Flags:
     """Return whether the ends (n, 2) of edges belong to different large parts."""
-    place = np.searchsorted(numbers, labels)
-    is_listed = numbers[np.minimum(place, len(numbers) - 1)] == labels
-    bodies = np.where(is_listed, body[np.minimum(place, len(numbers) - 1)], labels)
+    index = np.minimum(np.searchsorted(numbers, labels), len(numbers) - 1)
+    bodies = np.where(numbers[index] == labels, body[index], labels)
     return (labels[:, 0] != labels[:, 1]) & (bodies[:, 0] != bodies[:, 1]) & (bodies >= 0).all(axis=1)
