@@ -161,8 +161,8 @@ CASES = (
         "of squares (NumPy and SciPy alone). Another solution by elements and springs gives 1236 to 1247 N. `cells`: "
         "ligament over h. Errors are the largest of three random meshes.",
         PeakLoad(_concrete, "reaction_load_y", springs_peak), (ERROR,),
-        short=tuple({"cells": cells, "step": step} for cells, step in ((5.0, 0.01), (8.0, 0.01), (12.5, 0.01))),
-        full=({"cells": 8.0, "step": 0.005}, {"cells": 20.0, "step": 0.01}), split="step",
-        figures=("peak", "least", "largest"), limit=600.0,
+        short=tuple({"cells": cells, "step": step} for cells, step in ((5.0, 0.01), (8.0, 0.01))),
+        full=({"cells": 12.5, "step": 0.01}, {"cells": 8.0, "step": 0.005}, {"cells": 20.0, "step": 0.01}),
+        split="step", figures=("peak", "least", "largest"), limit=600.0,
     ),
 )  # fmt: skip
