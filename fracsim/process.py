@@ -23,7 +23,8 @@ from typing import NoReturn, TextIO, cast
 
 from .errors import STOP_SIGNALS, Exit, InputError
 
-DOLFINX = "0.9"
+# Versions of DOLFINx that fracsim runs with.
+DOLFINX = ("0.9", "0.10", "0.11")
 # Exit code after SIGINT, as typer and shells have it.
 INTERRUPTED = 130
 # Errors of a stream without a reader; EIO: its terminal was closed.
@@ -265,6 +266,8 @@ def import_dolfinx() -> None:
     if "dolfinx" in sys.modules:
         return
     with outside_working_folder():
+        # it loads the MPI library that wheels of PETSc and DOLFINx are linked with
+        importlib.import_module("mpi4py.MPI")
         # the handlers of PETSc would answer SIGHUP and SIGQUIT by MPI_Abort
         if _is_own_process:
             importlib.import_module("petsc4py").init([sys.argv[0], "-no_signal_handler"])
@@ -291,10 +294,9 @@ def _read_settings(library: str, module: str) -> None:
 
 
 def _check_dolfinx(version: str) -> None:
-    """Raise InputError if it is another version than the one that fracsim runs with."""
-    if version.split(".")[:2] != DOLFINX.split("."):
+    """Raise InputError if it is a version that fracsim does not run with."""
+    if ".".join(version.split(".")[:2]) not in DOLFINX:
         raise InputError(
-            f"DOLFINx {version} is installed, and fracsim runs with {DOLFINX} (0.10 and later: not yet): install "
-            f"python3-dolfinx {DOLFINX}, as Debian 13 has it, or start commands by ./env, which finds or makes an "
-            "environment with it"
+            f"DOLFINx {version} is installed, and fracsim runs with {DOLFINX[0]} to {DOLFINX[-1]}: install one of "
+            "these, for example by pip install fracsim[dolfinx], or start commands by ./env, which makes an environment"
         )

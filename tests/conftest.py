@@ -9,6 +9,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import mpi4py.MPI  # noqa: F401  before dolfinx, whose wheel needs its MPI library
 import pytest
 from hypothesis import settings
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,6 @@ import pytest
 import ufl
 from dolfinx import fem
 from dolfinx.fem.petsc import LinearProblem
-from dolfinx.io import gmshio
 from mpi4py import MPI
 from scipy.optimize import brentq
 
@@ -33,6 +33,11 @@ from support.squares import square
 from support.strip import run_of_a_strip
 from support.tearing import RUNS
 from support.tips import criterion_of, seen, tips
+
+try:
+    from dolfinx.io.gmsh import model_to_mesh
+except ImportError:  # DOLFINx 0.9
+    from dolfinx.io.gmshio import model_to_mesh
 
 Values = npt.NDArray[np.float64]
 
@@ -185,7 +190,7 @@ def branch(angle: float, length: float = 0.02, finest: float = 5e-5) -> tuple[fl
     for dim, tags, number in ((2, [wedge, rest], 1), (1, [axis], 2), (1, arcs, 3)):
         gmsh.model.addPhysicalGroup(dim, tags, number)
     gmsh.model.mesh.generate(2)
-    mesh, _, facets = gmshio.model_to_mesh(gmsh.model, MPI.COMM_SELF, 0, gdim=2)
+    mesh, _, facets, *_ = model_to_mesh(gmsh.model, MPI.COMM_SELF, 0, gdim=2)
     gmsh.finalize()
 
     def field(x: Values) -> Values:
@@ -211,8 +216,10 @@ def branch(angle: float, length: float = 0.02, finest: float = 5e-5) -> tuple[fl
     u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
     stress = 2 * mu * strain(u) + lmbda * ufl.tr(strain(u)) * ufl.Identity(2)
     nothing = ufl.inner(fem.Constant(mesh, (0.0, 0.0)), v) * ufl.dx
-    options = {"ksp_type": "preonly", "pc_type": "lu"}
-    solved = LinearProblem(ufl.inner(stress, strain(v)) * ufl.dx, nothing, conditions, petsc_options=options).solve()
+    options: dict[str, Any] = {"petsc_options": {"ksp_type": "preonly", "pc_type": "lu"}}
+    if "petsc_options_prefix" in signature(LinearProblem).parameters:  # not in DOLFINx 0.9
+        options["petsc_options_prefix"] = "branch_"
+    solved = LinearProblem(ufl.inner(stress, strain(v)) * ufl.dx, nothing, bcs=conditions, **options).solve()
 
     x, moved = V.tabulate_dof_coordinates()[:, :2], solved.x.array.reshape(-1, 2)
     along, off = x @ [c, s], np.abs(x @ [-s, c])

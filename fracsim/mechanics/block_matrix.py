@@ -19,6 +19,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..mesh.c_library import FAST_FLAGS, compile_on_all_ranks
+from ..mesh.dolfinx_compat import create_vector
 from ..mesh.parallel import allgather, sum_over_ranks
 
 if TYPE_CHECKING:
@@ -65,7 +66,7 @@ class BlockMatrix:
         self.couplings: list[NodeCoupling] = []
         columns = matrix.index_map(1)
         self._rows = matrix.index_map(0).size_local
-        self._ghosted = la.create_petsc_vector(columns, matrix.block_size[1]) if columns.comm.size > 1 else None
+        self._ghosted = create_vector(columns, matrix.block_size[1]) if columns.comm.size > 1 else None
 
     def mult(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Product y = K x (collective)."""

@@ -4,7 +4,9 @@
 #include <stdint.h>
 #include <string.h>
 
-typedef void (*Kernel)(double *, const double *, const double *, const double *, const int *, const uint8_t *);
+/* The last argument is DOLFINx 0.10's; a kernel of 0.9 does not read it. */
+typedef void (*Kernel)(double *, const double *, const double *, const double *, const int *, const uint8_t *,
+                       void *);
 
 /* Field with `size` values at each of the `nodes` of a cell; dofs: (cells, nodes). */
 typedef struct {
@@ -40,7 +42,7 @@ void add(const Form *form, const Field *fields, int64_t count, const int64_t *ce
         for (int64_t i = 0; i < form->corners; i++)
             memcpy(x + 3 * i, form->x + 3 * (int64_t)form->points[form->corners * cells[n] + i], 3 * sizeof(double));
         memset(A, 0, rows * sizeof(double));
-        form->kernel(A, w, form->constants, x, 0, 0);
+        form->kernel(A, w, form->constants, x, 0, 0, 0);
         for (int64_t node = 0; node < form->nodes; node++)
             for (int64_t i = 0; i < form->size; i++)
                 b[form->size * form->dofs[form->nodes * cells[n] + node] + i] += A[form->size * node + i];

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mesh.c_library import Float64, Int32, load_library, struct_pointer
-from ..mesh.dolfinx_compat import compiled_constants, form_cell_nodes, form_fields, kernel_address
+from ..mesh.dolfinx_compat import cell_geometry, compiled_constants, form_cell_nodes, form_fields, kernel_address
 from .jit import CellForm
 
 Values = npt.NDArray[np.float64]
@@ -45,11 +45,12 @@ class CellSubsetAssembler:
 
     def __init__(self, form: CellForm) -> None:
         self._form, self._fields = form, form_fields(form)
-        nodes, geometry, size = form_cell_nodes(form), form.mesh.geometry, form.function_spaces[0].dofmap.index_map_bs
+        nodes, size = form_cell_nodes(form), form.function_spaces[0].dofmap.index_map_bs
+        points, corners = form.mesh.geometry.x, cell_geometry(form.mesh.geometry)
         self._constants = compiled_constants(form.all_cells_form)
-        self._pointers = [struct_pointer(array) for array in (nodes, geometry.dofmap, geometry.x, self._constants)]
+        self._pointers = [struct_pointer(array) for array in (nodes, corners, points, self._constants)]
         width = sum(field.dofs.shape[1] * field.size for field in self._fields)
-        sizes = nodes.shape[1], size, geometry.dofmap.shape[1], len(self._fields), width
+        sizes = nodes.shape[1], size, corners.shape[1], len(self._fields), width
         self._arguments = _SubsetForm(kernel_address(form), *sizes, *self._pointers)
         self._current_fields = self._field_table({})
 

@@ -217,7 +217,8 @@ class VectorAssembler:
 
     def create_vector(self) -> PETSc.Vec:
         """New vector over the dofs, ghosts included."""
-        return create_vector(self.domain.space)
+        dofs = self.domain.space.dofmap
+        return create_vector(dofs.index_map, dofs.index_map_bs)
 
     def __call__(self, form: fem.Form) -> Values:
         """(owned dofs,) copy of an assembled form (collective)."""

@@ -23,6 +23,8 @@ from mpi4py import MPI
 from ..mesh.c_library import LANES, Float64, Int32, compile_on_all_ranks, struct_pointer
 from ..mesh.dolfinx_compat import (
     FormField,
+    cell_geometry,
+    cell_node_count,
     expression_fields,
     form_cell_nodes,
     form_fields,
@@ -89,13 +91,13 @@ class SimdKernel:
     def __init__(self, form: fem.Form, code: CDLL) -> None:
         """`code`: library of `compile_simd_form`."""
         self._form, self._code = form, code
-        self._nodes = form_cell_nodes(form) if form.rank else form.mesh.geometry.dofmap
+        self._nodes = form_cell_nodes(form) if form.rank else cell_geometry(form.mesh.geometry)
         self._fields = _KernelFields(form_fields(form))
 
     def _call(self, function: Any, *arguments: npt.NDArray[Any]) -> int:
         """Result of a C function of the form and further arrays."""
         cells, geometry, c = integrated_cells_of(self._form), self._form.mesh.geometry, kernel_constants(self._form)
-        arrays = cells, self._nodes, geometry.dofmap, geometry.x, c
+        arrays = cells, self._nodes, cell_geometry(geometry), geometry.x, c
         form = _SimdForm(len(cells), self._fields.width, len(c), *map(struct_pointer, arrays), self._fields.pointer)
         return int(function(byref(form), *arguments) or 0)
 
@@ -154,7 +156,7 @@ class SimdExpression:
         kernel = vectorise_kernel(source.read_text(encoding="utf-8"))
         if kernel is None:
             return None
-        sizes = {"RANK": 0, "D": 1, "NODES": expression.value_size, "CORNERS": mesh.geometry.cmap.dim}
+        sizes = {"RANK": 0, "D": 1, "NODES": expression.value_size, "CORNERS": cell_node_count(mesh.geometry)}
         code = _compile(mesh.comm, kernel, sizes, expression_fields(expression), "-O3")
         return None if code is None else cls(expression, mesh, code)
 
@@ -166,7 +168,7 @@ class SimdExpression:
     def __call__(self, cells: npt.NDArray[np.int32], values: Values) -> None:
         """Evaluate the expression in cells (n,) into values (n, components)."""
         c = kernel_constants(self._expression)
-        geometry = struct_pointer(self._geometry.dofmap), struct_pointer(self._geometry.x)
+        geometry = struct_pointer(cell_geometry(self._geometry)), struct_pointer(self._geometry.x)
         form = _SimdForm(
             len(cells),
             self._fields.width,
@@ -187,7 +189,7 @@ def compile_simd_form(form: fem.Form) -> CDLL | None:
     """Library of the vectorised kernel of a form; None if it cannot be vectorised (collective)."""
     if form_integral_types(form) != [fem.IntegralType.cell]:
         return None
-    fields, corners = form_fields(form), form.mesh.geometry.cmap.dim
+    fields, corners = form_fields(form), cell_node_count(form.mesh.geometry)
     bs, nodes = 1, 1
     if form.rank:
         space = form.function_spaces[0]

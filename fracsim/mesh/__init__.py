@@ -15,6 +15,6 @@ connected_bodies            bodies of the input mesh; rigid motions that support
 node_cells                  cells around nodes, and facet-connected components
 interpenetration            nodes of one fragment in cells of another
 c_library, library_cache    functions in C and the types of their arguments; the folder of compiled libraries
-dolfinx_compat              calls of DOLFINx that a newer version touches
+dolfinx_compat              calls of DOLFINx that differ between versions
 split_surface               geometry of the split surface
 """

@@ -1,24 +1,25 @@
 """Calls of DOLFINx, FFCx and Basix that differ between versions, or that no version promises to keep.
 
-fracsim runs with DOLFINx 0.9 alone. What newer versions change is from the sources, release notes and pull requests of
-0.10 and 0.11:
+fracsim runs with DOLFINx 0.9 and 0.11; 0.10 has the interface of 0.11 as far as its sources tell, and was not tried.
 
-0.10        create_vector           la.create_petsc_vector is la.petsc.create_vector.
-            create_mesh             The element comes before the points (pull request 3826).
+0.10, 0.11  create_mesh             takes the cells, the element and the points in this order; create_cell_partitioner
+                                    takes the number of cells of a facet.
+            cell_geometry,          A mesh has an array of nodes and a map for each type of cell.
+            cell_node_count
             exterior_facet_domain   fem.compute_integration_domains takes no dimension.
-            find_facets             graph.AdjacencyList has a class in Python; graph.adjacencylist, as here, makes it.
-            bind_to_cells           The class of a form takes a list of kernels, and entity maps as a list
-                                    (mesh.EntityMap). It has not been tried whether integrals still have `integral_ids`.
-            assemble_matrix         `bcs` and the diagonal are positional: versions differ in their names.
-0.11        evaluate                Entities of facets are rows (cell, facet) (4140); cells, as here, are as before.
+            bind_to_cells           The class of a form takes a list of kernels.
+            form_domains            Integrals of a form are numbered by place, and no longer known by their identifier.
+            kernel_address          Integrals of a compiled form lie one type after another (`form_integral_offsets`).
+            evaluate                Values have the shape (cells, points, components ...).
+            make_index_map          takes a tag of its messages.
 after 0.11  create_mesh             takes `ghost_mode`; create_cell_partitioner is gone (4403).
 
 any         CachedCellElement       subclasses a private class of Basix; basix.ufl.element returns an equal element.
             cache_kernels           replaces two functions of FFCx; without it kernels are found all the same, more
                                     slowly, and damaged ones are not noticed.
 
-No change was found for the other functions. mechanics.simd_kernels reads the C code that FFCx writes. Where
-bind_to_cells does not fit, `tests/test_kernels.py` and `tests/test_dead_cells.py` fail first.
+mechanics.simd_kernels reads the C code that FFCx writes. Where bind_to_cells does not fit, `tests/test_kernels.py` and
+`tests/test_dead_cells.py` fail first.
 """
 
 from __future__ import annotations
@@ -38,6 +39,7 @@ import numpy.typing as npt
 import ufl
 from basix.ufl import _BlockedElement, _ElementBase
 from dolfinx import fem, graph, la
+from dolfinx.common import IndexMap
 from dolfinx.cpp.la import SparsityPattern
 from dolfinx.cpp.la.petsc import create_matrix as create_petsc_matrix
 from dolfinx.fem import petsc as fem_petsc
@@ -50,6 +52,8 @@ from ufl.algorithms import extract_coefficients
 from .library_cache import kernel_file, load_kernel, write_digest
 
 Ints = npt.NDArray[np.int32]
+VERSION = str(dolfinx.__version__)  # type: ignore[attr-defined]
+IS_0_9 = VERSION.split(".")[:2] == ["0", "9"]
 
 # --- mesh -----------------------------------------------------------------------------------------------------------
 
@@ -80,8 +84,27 @@ def create_mesh(
     """
     # with threads the partition would differ between runs
     os.environ.setdefault("SCOTCH_PTHREAD_NUMBER", "1")
-    partitioner = dolfinx.mesh.create_cell_partitioner(dolfinx.mesh.GhostMode.none)
-    return dolfinx.mesh.create_mesh(comm, cells, points, element, partitioner)
+    cells_of_facet = () if IS_0_9 else (2,)
+    partitioner = dolfinx.mesh.create_cell_partitioner(dolfinx.mesh.GhostMode.none, *cells_of_facet)
+    return dolfinx.mesh.create_mesh(comm, cells, x=points, e=element, partitioner=partitioner)
+
+
+def cell_geometry(geometry: Any) -> Ints:
+    """(cells, nodes) nodes of each cell in the geometry of a mesh; `geometry`: of DOLFINx, or of its C++ mesh."""
+    nodes: Ints = geometry.dofmap if IS_0_9 else geometry.dofmaps[0]
+    return nodes
+
+
+def cell_node_count(geometry: Any) -> int:
+    """Number of geometry nodes of a cell."""
+    return int((geometry.cmap if IS_0_9 else geometry.cmaps[0]).dim)
+
+
+def make_index_map(comm: MPI.Comm, size: int, ghosts: npt.NDArray[np.int64], owners: Ints) -> IndexMap:
+    """Numbers of `size` owned entities and of ghosts, given by global number and owner (collective)."""
+    if IS_0_9:
+        return IndexMap(comm, size, ghosts, owners)
+    return IndexMap(comm, size, ghosts, owners, 1220)
 
 
 def find_facets(
@@ -101,7 +124,9 @@ def find_facets(
 def exterior_facet_domain(mesh: dolfinx.mesh.Mesh, facets: Ints) -> Ints:
     """Subdomain data of a surface measure: pairs (cell, local facet) of local exterior facets."""
     topology = mesh.topology
-    return fem.compute_integration_domains(fem.IntegralType.exterior_facet, topology, facets, topology.dim - 1)
+    dimension = (topology.dim - 1,) if IS_0_9 else ()
+    domain: Ints = fem.compute_integration_domains(fem.IntegralType.exterior_facet, topology, facets, *dimension)
+    return domain
 
 
 # --- forms ----------------------------------------------------------------------------------------------------------
@@ -138,21 +163,55 @@ def bind_to_cells(form: fem.Form, whole: Any, constants: Sequence[Any], keep: Ca
     """
     module: Any = form.module
     cell = fem.IntegralType.cell
-    domains = {
-        kind: [(number, whole.domains(kind, number).reshape(-1)) for number in whole.integral_ids(kind)]
-        for kind in whole.integral_types
-    }
+    domains = {kind: form_domains(form, whole, kind) for kind in whole.integral_types}
     domains[cell] = [(number, keep(cells)) for number, cells in domains.get(cell, [])]
-    kernels = module.ffi.cast("uintptr_t", module.ffi.addressof(form.ufcx_form))
+    kernels: Any = module.ffi.cast("uintptr_t", module.ffi.addressof(form.ufcx_form))
+    entity_maps: Any = {}
+    if not IS_0_9:
+        kernels, entity_maps = [kernels], []
     bind = fem.form_cpp_class(whole.dtype)
-    return bind(kernels, whole.function_spaces, whole.coefficients, constants, domains, {}, whole.mesh)
+    return bind(kernels, whole.function_spaces, whole.coefficients, constants, domains, entity_maps, whole.mesh)
+
+
+def form_domains(form: fem.Form, compiled: Any, kind: Any) -> list[tuple[int, Ints]]:
+    """Identifier and flat array of entities of each integral of a type; `compiled`: C++ form of `form`."""
+    if IS_0_9:
+        return [(number, compiled.domains(kind, number).reshape(-1)) for number in compiled.integral_ids(kind)]
+    first, last = _integral_places(form.ufcx_form, kind)
+    identifiers = [int(form.ufcx_form.form_integral_ids[place]) for place in range(first, last)]
+    return [(number, compiled.domains(kind, place).reshape(-1)) for place, number in enumerate(identifiers)]
+
+
+def _integral_places(ufcx_form: Any, kind: Any) -> tuple[int, int]:
+    """First and last place, exclusive, of the integrals of a type in a compiled form."""
+    # in the order of ufcx.h: cell, exterior facet, interior facet, ...
+    position = [fem.IntegralType.cell, fem.IntegralType.exterior_facet, fem.IntegralType.interior_facet].index(kind)
+    offsets = ufcx_form.form_integral_offsets
+    return int(offsets[position]), int(offsets[position + 1])
+
+
+def _integral_count(compiled: Any, kind: Any) -> int:
+    """Number of integrals of a type of a C++ form."""
+    return len(compiled.integral_ids(kind)) if IS_0_9 else int(compiled.num_integrals(kind, 0))
+
+
+def _single_domain(compiled: Any) -> Ints:
+    """Cells of a C++ form with one integral, over cells."""
+    kind = fem.IntegralType.cell
+    place = compiled.integral_ids(kind)[0] if IS_0_9 else 0
+    return np.asarray(compiled.domains(kind, place))
 
 
 def evaluate(
     expression: fem.Expression, mesh: dolfinx.mesh.Mesh, cells: Ints, values: npt.NDArray[np.float64]
 ) -> npt.NDArray[np.float64]:
     """Evaluate an expression in cells into `values` (cells, points times components); returns them."""
-    return expression.eval(mesh, cells, values)
+    if IS_0_9:
+        expression.eval(mesh, cells, values)
+    else:
+        shape = len(cells), expression.X().shape[0], *expression.ufl_expression.ufl_shape
+        expression.eval(mesh, cells, values.reshape(shape))
+    return values
 
 
 def kernel_source(expression: fem.Expression, mesh: dolfinx.mesh.Mesh, options: dict[str, Any]) -> Path:
@@ -213,17 +272,14 @@ def kernel_address(form: fem.Form) -> int:
 
 def integrated_cells_of(form: fem.Form) -> Ints:
     """Present cells of a form with one integral, over cells."""
-    compiled: Any = form._cpp_object
-    (number,) = compiled.integral_ids(fem.IntegralType.cell)
-    return np.asarray(compiled.domains(fem.IntegralType.cell, number))
+    return _single_domain(form._cpp_object)
 
 
 def single_integral_cells(compiled: Any) -> npt.NDArray[np.int64] | None:
     """Cells of a C++ form with one integral, over cells; None for any other form."""
     if compiled_integral_types(compiled) != [fem.IntegralType.cell]:
         return None
-    (number,) = compiled.integral_ids(fem.IntegralType.cell)
-    return np.array(compiled.domains(fem.IntegralType.cell, number), np.int64)
+    return np.array(_single_domain(compiled), np.int64)
 
 
 def form_integral_types(form: fem.Form) -> list[Any]:
@@ -233,7 +289,7 @@ def form_integral_types(form: fem.Form) -> list[Any]:
 
 def compiled_integral_types(compiled: Any) -> list[Any]:
     """Type of each integral of a C++ form."""
-    return [kind for kind in compiled.integral_types for _ in compiled.integral_ids(kind)]
+    return [kind for kind in compiled.integral_types for _ in range(_integral_count(compiled, kind))]
 
 
 def form_cell_nodes(form: fem.Form) -> Ints:
@@ -252,9 +308,10 @@ def set_identity_rows(matrix: la.MatrixCSR, form: fem.Form, bcs: list[fem.Dirich
 # --- vectors and matrices -------------------------------------------------------------------------------------------
 
 
-def create_vector(space: fem.FunctionSpace) -> PETSc.Vec:
-    """A vector of the dofs of a space, with ghosts."""
-    return la.create_petsc_vector(space.dofmap.index_map, space.dofmap.index_map_bs)
+def create_vector(nodes: IndexMap, size: int) -> PETSc.Vec:
+    """A vector with `size` values for each node, with ghosts."""
+    ghosts, sizes = nodes.ghosts.astype(PETSc.IntType), (size * nodes.size_local, size * nodes.size_global)
+    return PETSc.Vec().createGhost(ghosts, sizes, bsize=size, comm=nodes.comm)
 
 
 def assemble_local_vector(b: PETSc.Vec, form: fem.Form) -> None:

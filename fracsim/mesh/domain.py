@@ -13,7 +13,7 @@ from mpi4py import MPI
 
 from ..meshes.data import MeshData, format_point
 from ..meshes.topology import signed_measures
-from .dolfinx_compat import CachedCellElement, coordinate_element, create_mesh
+from .dolfinx_compat import CachedCellElement, cell_geometry, coordinate_element, create_mesh
 from .facets import Facets, find_group_facets
 from .midside_nodes import CellMidsideNodes, MidsideNodes, find_midside_nodes, with_midside_nodes
 from .parallel import Gather, GatherSubset, bcast, sum_over_ranks
@@ -178,9 +178,9 @@ class Domain:
         count = self.node_count + self.space.dofmap.index_map.num_ghosts
         result = np.empty((count, self.dim))
         if self.has_curved_cells:
-            result[self.all_cell_nodes] = self.mesh.geometry.x[self.mesh.geometry.dofmap, : self.dim]
+            result[self.all_cell_nodes] = self.mesh.geometry.x[cell_geometry(self.mesh.geometry), : self.dim]
             return result
-        result[self.cell_nodes] = self.mesh.geometry.x[self.mesh.geometry.dofmap, : self.dim]
+        result[self.cell_nodes] = self.mesh.geometry.x[cell_geometry(self.mesh.geometry), : self.dim]
         if self.midside_nodes is not None:
             self.cell_midside_nodes.straighten_edges(result)
         return result
@@ -188,7 +188,7 @@ class Domain:
     @property
     def corner_geometry(self) -> Ints:
         """(cells, d + 1) geometry nodes of `mesh` at the corners of the owned cells."""
-        return self.mesh.geometry.dofmap[:, : self.dim + 1]
+        return cell_geometry(self.mesh.geometry)[:, : self.dim + 1]
 
     @cached_property
     def input_numbering(self) -> InputNumbering:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import platform
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from petsc4py import PETSc
 
 from .. import __version__
 from ..errors import InputError
+from ..mesh.dolfinx_compat import VERSION as DOLFINX_VERSION
 from ..timestepping.step_sizes import count_intervals
 from .atomic_write import error_reason, replace_text
 from .checkpoint_file import checkpoint_path, read_notes
@@ -208,7 +208,7 @@ def software_versions(comm: MPI.Comm) -> dict[str, str]:
     """Versions of the programs and the number of ranks, by `STUDY_HEADER_WORDS`."""
     return {
         "fracsim": __version__,
-        "dolfinx": version("fenics-dolfinx"),
+        "dolfinx": DOLFINX_VERSION,
         "petsc": ".".join(map(str, PETSc.Sys.getVersion())),
         "python": platform.python_version(),
         "ranks": str(comm.size),

@@ -15,7 +15,8 @@ from .content import Section, from_data
 from .page import write_page
 from .runs import RunData, find_runs
 
-_PROGRAM_PACKAGES = ("fenics-dolfinx", "petsc4py", "mpi4py", "numpy", "scipy")
+# dolfinx-solver-real is the wheel of DOLFINx, with PETSc and petsc4py
+_PROGRAM_PACKAGES = ("fenics-dolfinx", "dolfinx-solver-real", "petsc4py", "mpi4py", "numpy", "scipy")
 
 
 def make_report(

@@ -17,6 +17,7 @@ from fracsim.fracture import nonlocal_average as average_module
 from fracsim.fracture.node_retention import CellRetention
 from fracsim.fracture.nonlocal_average import NonlocalAverage
 from fracsim.fracture.strength import hash_points
+from fracsim.mesh.dolfinx_compat import form_domains
 from fracsim.mesh.domain import Domain
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.fragments import find_fragments
@@ -178,7 +179,8 @@ def weaken(scene: Scene) -> None:
 
 def integrated_cells(scene: Scene) -> npt.NDArray[np.int32]:
     """Owned cells that the residual is assembled over."""
-    return np.array(scene.balance._work._cpp_object.domains(IntegralType.cell, 1))
+    work = scene.balance._work
+    return dict(form_domains(work, work._cpp_object, IntegralType.cell))[1]
 
 
 def dead_cells(mass: str, *ways: str) -> Found:

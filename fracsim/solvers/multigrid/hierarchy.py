@@ -11,6 +11,8 @@ from dolfinx.common import IndexMap
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
+from ...mesh.dolfinx_compat import make_index_map
+
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
@@ -105,7 +107,7 @@ def _level_nodes(matrix: PETSc.Mat, size: int, read: list[Ints]) -> IndexMap:
     first, last = (end // size for end in matrix.getOwnershipRange())
     ghosts = np.unique(np.concatenate([item[(item < first) | (item >= last)] for item in read])).astype(np.int64)
     owners = np.searchsorted(matrix.getOwnershipRanges() // size, ghosts, side="right") - 1
-    return IndexMap(matrix.comm.tompi4py(), last - first, ghosts, owners.astype(np.int32))
+    return make_index_map(matrix.comm.tompi4py(), last - first, ghosts, owners.astype(np.int32))
 
 
 def _to_local(numbers: Ints, nodes: IndexMap) -> Ints:
