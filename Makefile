@@ -8,7 +8,7 @@ sources := fracsim forms meshes studies tests
 
 # Tear a loaf of bread in two.
 demo:
-	./env mpirun --oversubscribe --timeout 1800 -n $(ranks) fracsim run loaf -o out/loaf
+	./env env MPIEXEC_TIMEOUT=1800 mpirun -n $(ranks) fracsim run loaf -o out/loaf
 	@echo
 	@echo "The torn loaf is in out/loaf:"
 	@ls -1 out/loaf

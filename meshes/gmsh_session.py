@@ -26,7 +26,13 @@ class Algorithm(IntEnum):
 @contextmanager
 def session() -> Iterator[Any]:
     """The module gmsh with an empty model; a failure inside gmsh becomes a MeshError with gmsh's reason."""
-    import gmsh
+    try:
+        import gmsh
+    except OSError as error:
+        raise MeshError(
+            f"gmsh cannot be loaded: {error}; install the libraries that it needs, on Debian and Ubuntu by apt-get "
+            "install libgl1 libglu1-mesa libxcursor1 libxft2 libxinerama1 libxrender1"
+        ) from None
 
     local = not gmsh.isInitialized()
     if local:

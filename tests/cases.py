@@ -159,7 +159,7 @@ class _RunHere:
 
 def mpirun(ranks: int) -> list[str]:
     """Its own time limit ends the ranks as well, which killing mpirun from outside does not."""
-    return ["mpirun", "--oversubscribe", "--timeout", "50", "-n", str(ranks)]
+    return ["env", "MPIEXEC_TIMEOUT=50", "mpirun", "-n", str(ranks)]
 
 
 def command(*arguments: str | Path, ranks: int = 0) -> list[str]:

@@ -124,7 +124,7 @@ def run(name: str, out: Path) -> Path:
     for override in [*overrides, "output.picture=false"]:
         command += ["--set", override]
     if ranks > 1:
-        command = ["mpirun", "--oversubscribe", "--timeout", "500", "-n", str(ranks), *command]
+        command = ["env", "MPIEXEC_TIMEOUT=500", "mpirun", "-n", str(ranks), *command]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if not (folder / "history.csv").exists():
         sys.exit(f"{name}: {done.stderr}")

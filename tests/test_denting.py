@@ -306,7 +306,7 @@ def test_bodies_on_other_ranks_are_dented_as_on_one(ranks: int, dented: Path, tm
     """Two bars struck at once are analysed on two ranks."""
     path = tmp_path / "study.toml"
     path.write_text(study_text(study(**thrown())))
-    command = ["timeout", "120", "mpirun", "--oversubscribe", "-n", str(ranks), "fracsim", "run", str(path), "-o"]
+    command = ["timeout", "120", "mpirun", "-n", str(ranks), "fracsim", "run", str(path), "-o"]
     ended = subprocess.run([*command, str(tmp_path / "out")], capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
     for name in ("history.csv", "pieces.csv"):

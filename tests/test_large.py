@@ -28,7 +28,6 @@ def test_a_field_of_more_than_2_to_31_bytes_is_gathered() -> None:
         "timeout",
         "250",
         "mpirun",
-        "--oversubscribe",
         "-n",
         "2",
         sys.executable,

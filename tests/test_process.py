@@ -120,12 +120,12 @@ time.sleep(5)
 
 @pytest.fixture
 def newer(tmp_path: Path) -> dict[str, str]:
-    """The environment of a process that finds a DOLFINx 0.11 before any other."""
+    """The environment of a process that finds a DOLFINx 0.12 before any other."""
     (tmp_path / "dolfinx").mkdir()
-    (tmp_path / "dolfinx" / "__init__.py").write_text('__version__ = "0.11.0.post1"\n')
-    (tmp_path / "fenics_dolfinx-0.11.0.post1.dist-info").mkdir()
-    (tmp_path / "fenics_dolfinx-0.11.0.post1.dist-info" / "METADATA").write_text(
-        "Metadata-Version: 2.1\nName: fenics-dolfinx\nVersion: 0.11.0.post1\n"
+    (tmp_path / "dolfinx" / "__init__.py").write_text('__version__ = "0.12.0"\n')
+    (tmp_path / "fenics_dolfinx-0.12.0.dist-info").mkdir()
+    (tmp_path / "fenics_dolfinx-0.12.0.dist-info" / "METADATA").write_text(
+        "Metadata-Version: 2.1\nName: fenics-dolfinx\nVersion: 0.12.0\n"
     )
     kept = {key: value for key, value in os.environ.items() if not key.startswith(("FRACSIM_", "XDG_"))}
     return kept | {"PYTHONPATH": str(tmp_path), "FRACSIM_CACHE": str(tmp_path / "cache")}
@@ -135,17 +135,26 @@ def test_another_dolfinx_is_refused_by_the_program(newer: dict[str, str], tmp_pa
     """In one message; what needs no DOLFINx goes on."""
     done = fracsim("run", "bar-2d", "-o", tmp_path / "out", env=newer)
     assert done.returncode == Exit.BAD_INPUT and done.stderr.count("\n") == 1, done.stderr
-    assert done.stderr.startswith("fracsim: DOLFINx 0.11.0.post1 is installed, and fracsim runs with 0.9 (0.10 and")
+    assert done.stderr.startswith("fracsim: DOLFINx 0.12.0 is installed, and fracsim runs with 0.9 to 0.11")
     assert not (tmp_path / "out").exists()
     assert fracsim("check", "bar-2d", env=newer).returncode == 0
 
 
 def test_another_dolfinx_is_passed_over_by_env(newer: dict[str, str]) -> None:
-    """No other Python here has 0.9, since all of them look there first."""
+    """No other Python here has one that fits, since all of them look there first."""
     env = Path(__file__).parent.parent / "env"
     done = subprocess.run(
         [env, "true"], env=newer | {"FRACSIM_WAY": "native"}, capture_output=True, text=True, check=False
     )
     assert done.returncode == 1 and done.stderr.count("\n") == 1
-    assert "env: no Python here can import dolfinx 0.9 (" in done.stderr
-    assert "has 0.11.0.post1, which fracsim does not run with yet)" in done.stderr
+    assert "env: no Python here can import DOLFINx 0.9 to 0.11 (" in done.stderr
+    assert "has 0.12.0, which fracsim does not run with yet)" in done.stderr
+
+
+def test_the_wheel_asks_for_a_python_that_fits(tmp_path: Path) -> None:
+    env = Path(__file__).parent.parent / "env"
+    ways = {"FRACSIM_WAY": "wheel", "FRACSIM_PYTHON": str(tmp_path / "python"), "FRACSIM_CACHE": str(tmp_path)}
+    environment = {key: value for key, value in os.environ.items() if key != "FRACSIM_INSIDE"} | ways
+    done = subprocess.run([env, "true"], env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("env: the wheel of DOLFINx needs Python 3.12 or later, x86-64 and glibc 2.34 or later")

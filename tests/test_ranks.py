@@ -39,7 +39,7 @@ def test_a_rank_that_fails_alone_ends_all(tmp_path: Path, rank: int, kind: str, 
     """
     kind, _, solver = kind.partition(", ")
     study = write_study(tmp_path / "bar.toml", BAR, output={"picture": False}, solver={"plain": bool(solver)})
-    command = ["timeout", "--kill-after=5", "40", "mpirun", "--oversubscribe", "-n", "2", sys.executable]
+    command = ["timeout", "--kill-after=5", "40", "mpirun", "-n", "2", sys.executable]
     script = [str(TESTS / "support" / "fails_alone.py"), str(rank), kind, str(study), "-o", str(tmp_path / "out")]
     done = subprocess.run([*command, *script], capture_output=True, text=True, check=False)
     assert done.returncode == code, done.stderr

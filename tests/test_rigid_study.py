@@ -270,7 +270,7 @@ def test_ranks_share_analyses_and_give_the_same_run(ranks: int, tmp_path: Path) 
     assert expected["broken_edges"] and expected["pieces"] > 4
     path = tmp_path / "study.toml"
     path.write_text(study_text(several))
-    command = ["timeout", "120", "mpirun", "--oversubscribe", "-n", str(ranks), "fracsim", "run", str(path), "-o"]
+    command = ["timeout", "120", "mpirun", "-n", str(ranks), "fracsim", "run", str(path), "-o"]
     ended = subprocess.run([*command, str(tmp_path / "out")], capture_output=True, text=True)
     assert ended.returncode == 0, ended.stderr
     for name in ("history.csv", "pieces.csv"):

@@ -113,7 +113,7 @@ def _command(trial: Trial, folder: Path) -> list[str]:
         work = ["python3", "-m", *trial.script, "-o", "figures.json"]
     if trial.ranks == 1:
         return work
-    return ["mpirun", "--oversubscribe", "--timeout", str(int(trial.limit) + 5), "-n", str(trial.ranks), *work]
+    return ["env", f"MPIEXEC_TIMEOUT={int(trial.limit) + 5}", "mpirun", "-n", str(trial.ranks), *work]
 
 
 def _run_once(command: list[str], folder: Path, limit: float) -> dict[str, Any]:

@@ -175,7 +175,7 @@ def call(*arguments: str | Path) -> Ended:
 
 def words(*arguments: str | Path, ranks: int = 1) -> list[str]:
     """The command line for processes of their own."""
-    mpirun = ["mpirun", "--oversubscribe", "-n", str(ranks)] if ranks > 1 else []
+    mpirun = ["mpirun", "-n", str(ranks)] if ranks > 1 else []
     return [*mpirun, shutil.which("fracsim") or "fracsim", *map(str, arguments)]
 
 

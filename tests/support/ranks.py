@@ -29,7 +29,7 @@ def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 250) -> A
         import_module(module).main(str(target))
         return loaded(target)
     command = [
-        "timeout", "--kill-after=10", str(seconds), "mpirun", "--oversubscribe", "-n", str(ranks),
+        "timeout", "--kill-after=10", str(seconds), "mpirun", "-n", str(ranks),
         sys.executable, "-m", "mpi4py", "-m", module, str(target),
     ]  # fmt: skip
     # os.environ is what this process was started with: variables that MPI has set since then stay behind
