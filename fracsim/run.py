@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from mpi4py import MPI
 
-from .errors import CannotWrite, NotConverged, StepAborted, Stopped, one_line
+from .errors import CannotWrite, InputError, NotConverged, StepAborted, Stopped, one_line
 from .mesh.parallel import abort_unless_all_failed, from_root, on_root, sum_over_ranks
 from .monitors import CHECKPOINT_MONITORS, RunMonitors, wants_surface
 from .output.atomic_write import write_on_root
@@ -508,5 +508,5 @@ def _draw(folder: Path) -> None:
         from .report.pictures.picture import render
 
         render(folder)
-    except (ImportError, OSError, RuntimeError) as error:
+    except (ImportError, InputError, OSError, RuntimeError) as error:
         print(f"fracsim: no picture drawn: {one_line(str(error))}", file=sys.stderr)

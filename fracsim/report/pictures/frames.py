@@ -227,7 +227,9 @@ def _extract_triangles(grid: Any, mask: Flags) -> Any:
     if not mask.any():
         return None
     corners = np.asarray(grid.cell_connectivity)
-    offset = np.asarray(grid.offset)[:-1][mask]
+    # PyVista 0.45 and later; before that it is `offset`
+    offsets = grid.cell_offsets if hasattr(grid, "cell_offsets") else grid.offset
+    offset = np.asarray(offsets)[:-1][mask]
     used, renumbered = np.unique(corners[offset[:, None] + np.arange(3)], return_inverse=True)
     surface = pyvista.PolyData.from_regular_faces(np.asarray(grid.points)[used], renumbered.reshape(-1, 3))
     for name, data in grid.point_data.items():

@@ -8,6 +8,7 @@ import shutil
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from ctypes import CDLL, CFUNCTYPE, byref, c_char_p, c_int, c_uint, c_void_p
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -33,9 +34,22 @@ SHEET_GAP = 8
 
 @contextmanager
 def virtual_display() -> Iterator[None]:
-    """Display for VTK: the present one, or an Xvfb server that ends with the context."""
+    """Display for VTK: the present one, an Xvfb server that ends with the context, or EGL, which needs none.
+
+    Raises:
+        InputError: there is none of them, for VTK would end the process.
+    """
+    if os.environ.get("DISPLAY"):
+        yield
+        return
     xvfb = shutil.which("Xvfb")
-    if os.environ.get("DISPLAY") or xvfb is None:
+    if xvfb is None:
+        if not has_egl():
+            raise InputError(
+                "pictures need a display, Xvfb, or EGL: install one of them, on Debian and Ubuntu by apt-get install "
+                "libegl1, or set output.picture = false"
+            )
+        os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
         yield
         return
     read, write = os.pipe()
@@ -52,6 +66,20 @@ def virtual_display() -> Iterator[None]:
         os.environ.pop("DISPLAY", None)
         server.terminate()
         server.wait()
+
+
+def has_egl() -> bool:
+    """Return whether EGL has a device that draws without a display, as VTK asks for."""
+    try:
+        egl = CDLL("libEGL.so.1")
+    except OSError:
+        return False
+    egl.eglGetProcAddress.restype, egl.eglGetProcAddress.argtypes = c_void_p, [c_char_p]
+    address = egl.eglGetProcAddress(b"eglQueryDevicesEXT")
+    count = c_int()
+    return bool(
+        address and CFUNCTYPE(c_uint, c_int, c_void_p, c_void_p)(address)(0, None, byref(count)) and count.value
+    )
 
 
 def render(
