@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
+from . import __version__
 from .errors import Exit, FracsimError, InputError, NotConverged, Stopped, one_line
 from .process import (
     INTERRUPTED,
@@ -33,14 +34,35 @@ if TYPE_CHECKING:
 
     from .study import Study
 
-app = typer.Typer(add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 StudyPath = Annotated[str, typer.Argument(metavar="STUDY.toml", help="a study file, or the name of a packaged one")]
 Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="override a value: time.step=1e-3")]
+# ClickException, of click or of the click that newer releases of typer bring along: BadParameter is a UsageError of it.
+_USAGE_ERROR: Any = typer.BadParameter.__mro__[2]
+# Name in the first line of new studies, by which editors find the schema.
+_SCHEMA_FILE = "fracsim.schema.json"
 _NONE: list[str] = []
 _NO_PATHS: list[Path] = []
 _BAD_PATH = (errno.ENAMETOOLONG, errno.ELOOP, errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EACCES, errno.EPERM)
 _CANNOT_WRITE = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG, errno.EIO, errno.ESTALE)
+
+
+def _print_version(asked: bool) -> None:
+    """Print the version and end the command, if it is asked for."""
+    if asked:
+        if is_first_rank():
+            print(f"fracsim {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
+    ] = False,
+) -> None:
+    """Fracture on the edges of a finite element mesh."""
 
 
 @app.command()
@@ -232,6 +254,56 @@ def sweep(
     run_sweep(study, path, set_, folder, ranks=ranks, only_list=list_, overwrite=overwrite)
 
 
+@app.command()
+def show(study: Annotated[str, typer.Argument(metavar="NAME", help="a packaged study (`fracsim list`)")]) -> None:
+    """Print a packaged study, with its comments."""
+    if not is_first_rank():
+        return
+    from .study.reader import packaged_study_text
+
+    print(packaged_study_text(study), end="")
+
+
+@app.command()
+def new(
+    path: Annotated[Path, typer.Argument(metavar="STUDY.toml", help="file to write")],
+    study: Annotated[str, typer.Option("--from", metavar="NAME", help="a packaged study (`fracsim list`)")],
+) -> None:
+    """Write a study file of your own: a copy of a packaged study, with its comments."""
+    if not is_first_rank():
+        return
+    from .study.reader import packaged_study_text
+
+    target = path if path.suffix else path.with_suffix(".toml")
+    if target.exists() or target.is_symlink():
+        raise InputError(f"{target} exists: give another name, or delete it")
+    target.write_text(f"#:schema {_SCHEMA_FILE}\n{packaged_study_text(study)}", encoding="utf-8")
+    print(f"wrote {target}; next: fracsim check {target}; for editors: fracsim schema > {_SCHEMA_FILE}")
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of study files, for editors that complete and check keys."""
+    if not is_first_rank():
+        return
+    import json
+
+    from .study.json_schema import study_schema
+
+    print(json.dumps(study_schema(), indent=1))
+
+
+@app.command()
+def doctor() -> None:
+    """Say which DOLFINx, PETSc, MPI, compiler and optional packages there are, and what to type for what lacks."""
+    if not is_first_rank():
+        return
+    from .doctor import print_parts
+
+    if not print_parts():
+        raise typer.Exit(Exit.BAD_INPUT)
+
+
 @app.command(name="list")
 def list_(
     what: Annotated[str | None, typer.Argument(help="materials: those that [material] like may name")] = None,
@@ -246,8 +318,10 @@ def list_(
             raise InputError(f'list {what}: there is "fracsim list" and "fracsim list materials"')
         print("\n".join(material_table()))
         return
+    from .studies import folder as packaged_studies
+
     for heading, entries in catalogue().items():
-        print(heading)
+        print(heading + (f" in {packaged_studies()}" if heading == "studies" else ""))
         for name, words in entries.items():
             print(f"  {name:18} {words}")
 
@@ -318,7 +392,7 @@ def main(begin: Callable[[], None] | None = None) -> NoReturn:
     def work() -> object:
         if begin is not None:
             begin()
-        code = app(standalone_mode=False)
+        code = app(["--help"] if bare else None, prog_name="fracsim", standalone_mode=False)
         sys.stdout.flush()  # here what cannot be written is told
         return code
 
@@ -346,13 +420,11 @@ def _exit_code(work: Callable[[], object]) -> int:
 
 def _error_code_and_message(error: BaseException) -> tuple[int, str]:
     """Return exit code and message: one sentence for an error of the user, a traceback for one of the program."""
-    import click
-
     if isinstance(error, FracsimError):
         return int(error.exit_code), f"fracsim: {error}"
-    if isinstance(error, click.ClickException):
+    if isinstance(error, _USAGE_ERROR):
         return int(Exit.BAD_INPUT), f"fracsim: {error.format_message().rstrip('.')}; see fracsim --help"
-    if isinstance(error, click.exceptions.Exit):
+    if isinstance(error, typer.Exit):
         return error.exit_code, ""
     if isinstance(error, SystemExit):
         return (error.code or 0, "") if isinstance(error.code, int | None) else (1, str(error.code))

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 
+import dolfinx
 import meshio
 import pytest
 
@@ -213,7 +215,7 @@ def test_render_needs_a_run(tmp_path: Path) -> None:
         (["run", "loaf", "--frob"], "No such option: --frob"),
         (["run", "loaf", "--wall-limit", "soon"], "Invalid value for '--wall-limit'"),
         (["run", "loaf", "--wall-limit", "-5"], "--wall-limit -5: must be a number of seconds, 0 or more"),
-        (["check", "loaf", "more"], "Got unexpected extra argument (more)"),
+        (["check", "loaf", "more"], "Got unexpected extra argument"),
         (["check", "loaf", "--set"], "Option '--set' requires an argument"),
         (["mesh", "loaf"], "Missing option '-o' / '--out'"),
         (["check", "nope.toml"], "there is no study file nope.toml"),
@@ -232,6 +234,22 @@ def test_help_and_no_command() -> None:
     assert bare.stdout == asked.stdout
     for command in ("run", "check", "mesh", "render", "list"):
         assert f"  {command} " in asked.stdout
+
+
+def test_version() -> None:
+    """Of both ways to start the program."""
+    module = subprocess.run([sys.executable, "-m", "fracsim", "--version"], capture_output=True, text=True, check=True)
+    assert fracsim("--version").stdout == module.stdout == f"fracsim {package.__version__}\n"
+
+
+def test_doctor_names_what_is_there_and_what_lacks(monkeypatch: pytest.MonkeyPatch) -> None:
+    done = fracsim("doctor")
+    assert done.returncode == Exit.DONE and " lacks" not in done.stdout
+    assert re.search(rf"^DOLFINx +{re.escape(dolfinx.__version__)}$", done.stdout, re.MULTILINE)
+    monkeypatch.setenv("CC", "/nowhere/cc")
+    done = fracsim("doctor")
+    assert done.returncode == Exit.BAD_INPUT
+    assert re.search(r"^C compiler +lacks: .*/nowhere/cc.*; apt-get install gcc", done.stdout, re.MULTILINE)
 
 
 def test_interrupted_before_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ table_checks           conditions between the tables of a study
 values                 types of values, and the documentation of a key
 material_library       named materials with their sources
 documentation          docs/study-file.md, written from the schema
+json_schema            JSON schema of study files, for editors
 reader                 read a study by path or name, override values, write all defaults
 error_messages         errors of validation as sentences
 conditions             boundary conditions, loads, obstacles and cracks for a dimension

@@ -7,6 +7,7 @@ import tomllib
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
 from dataclasses import asdict
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +34,18 @@ def find_study(name: str) -> Path:
     # os.path.isfile, unlike Path.is_file, accepts a name that is too long; `-o bar-2d` makes a folder bar-2d
     is_path = os.path.isfile(path) or path.parent != Path() or not os.path.isfile(packaged)
     return path if is_path else packaged
+
+
+def packaged_study_text(name: str) -> str:
+    """Text of a packaged study. InputError if there is none of this name."""
+    path = packaged_studies() / f"{name.removesuffix('.toml')}.toml"
+    if path.parent != packaged_studies() or not path.is_file():
+        names = [path.stem for path in packaged_studies().glob("*.toml")]
+        near = get_close_matches(name, names, n=1)
+        raise InputError(
+            f"no packaged study is called {name}" + (f"; did you mean {near[0]}?" if near else "; see fracsim list")
+        )
+    return path.read_text(encoding="utf-8")
 
 
 def load_study(study: str | Path, overrides: Sequence[str] = ()) -> Study:

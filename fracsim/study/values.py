@@ -46,12 +46,15 @@ def _not_too_small(value: float) -> float:
 
 
 Finite = Annotated[float, Strict(), AllowInfNan(False), AfterValidator(_not_too_large)]
-Positive = Annotated[Finite, Gt(0), AfterValidator(_not_too_small)]
-NonNegative = Annotated[Finite, Ge(0)]
+# bounds stand before validators: otherwise the JSON schema is without them
+Positive = Annotated[
+    float, Strict(), AllowInfNan(False), Gt(0), AfterValidator(_not_too_large), AfterValidator(_not_too_small)
+]
+NonNegative = Annotated[float, Strict(), AllowInfNan(False), Ge(0), AfterValidator(_not_too_large)]
 # may be inf: never breaks, never yields, yields at once
 Unbounded = Annotated[float, Strict(), Gt(0), AfterValidator(_not_too_small), AfterValidator(_not_too_large)]
 Strength = Unbounded  # Pa
-Poisson = Annotated[Finite, Gt(-1), Lt(0.5)]
+Poisson = Annotated[float, Strict(), AllowInfNan(False), Gt(-1), Lt(0.5)]
 Seed = Annotated[int, Strict(), Ge(0)]
 Flag = Annotated[bool, Strict()]
 Vector = Annotated[list[Finite], Len(2, 3)]
@@ -123,7 +126,13 @@ class _DeferredSchema:
     """
 
     def __get_pydantic_core_schema__(self, source: type[BaseModel], handler: Any) -> Any:
-        return no_info_plain_validator_function(source.model_validate)
+        def json_schema(_: Any, describe: Any) -> Any:
+            """JSON schema of the table, whose validator is built for it."""
+            source.model_rebuild()
+            return describe(source.__pydantic_core_schema__)
+
+        metadata = {"pydantic_js_functions": [json_schema]}
+        return no_info_plain_validator_function(source.model_validate, metadata=metadata)
 
 
 if TYPE_CHECKING:

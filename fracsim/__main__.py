@@ -1,0 +1,5 @@
+"""`python -m fracsim`: the command line."""
+
+from .cli import program
+
+program()
