@@ -33,7 +33,7 @@ from .vtk_grid import (
     vtk_text,
     without_ghosts,
 )
-from .vtk_sizes import check_xml_sizes, declared_in_legacy, declared_in_xml
+from .vtk_sizes import check_legacy_arrays, check_xml_sizes, declared_in_legacy, declared_in_xml
 
 MAX_MESSAGE = 300  # characters of VTK's messages
 
@@ -123,8 +123,11 @@ def _vtk_grid(path: Path) -> Grid:
             reader = getattr(vtkIOXML, f"vtkXML{kind[1].decode()}Reader")()
         else:
             refuse_vtk(path, f"it begins with {data[:16]!a}, not as a file of VTK does")
-    reader.SetFileName(str(path))
-    reader.Update()
+        reader.SetFileName(str(path))
+        reader.Update()
+        if data[:5] == b"# vtk" and (output := reader.GetOutput()) is not None:
+            arrays = {"POINT_DATA": output.GetPointData(), "CELL_DATA": output.GetCellData()}
+            check_legacy_arrays(path, data, {kind: items.GetNumberOfArrays() for kind, items in arrays.items()})
     return grid_arrays(path, reader.GetOutput(), pieces, cells)
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import base64
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal
 
@@ -34,6 +35,33 @@ def declared_in_legacy(data: Any) -> tuple[list[int], int | None]:
     offsets = version is not None and int(version[1]) >= 5  # it declares offsets, one more than cells
     cells = sum(max(count - offsets, 0) for count in counts.values()) if counts else None
     return ([int(points[1])] if points else []), cells
+
+
+_ATTRIBUTE = rb"SCALARS|VECTORS|NORMALS|TENSORS6?|TEXTURE_COORDINATES|COLOR_SCALARS|GLOBAL_IDS|PEDIGREE_IDS|EDGE_FLAGS"
+
+
+def check_legacy_arrays(path: Path, data: Any, counts: dict[str, int]) -> None:
+    """Raise MeshError if a legacy file declares more arrays than `counts` of them, by "POINT_DATA" and "CELL_DATA".
+
+    VTK 9.7 ends without an error where the text of an array is cut off. The last array of a text has to be whole.
+    """
+    flags = re.MULTILINE | re.IGNORECASE
+    heads = list(re.compile(rb"^(POINT_DATA|CELL_DATA)[ \t]+\d+[ \t]*\r?$", flags).finditer(data))
+    for head, after in pairwise([*heads, None]):
+        assert head is not None
+        begin, end = head.end(), after.start() if after else len(data)
+        attributes = re.compile(rb"^(?:" + _ATTRIBUTE + rb")[ \t]+(\S+)", flags).finditer(data, begin, end)
+        fields = re.compile(rb"^FIELD[ \t]+\S+[ \t]+(\d+)[ \t]*\r?$", flags).finditer(data, begin, end)
+        declared = len({match[1] for match in attributes}) + sum(int(match[1]) for match in fields)
+        kind = head[1].decode().upper()
+        if counts[kind] < declared:
+            refuse_vtk(path, f"{kind} declares {declared} arrays, of which {counts[kind]} can be read; it is damaged")
+    is_text = re.match(rb"(?:[^\n]*\n){2}ASCII\b", data)
+    arrays = (
+        list(re.compile(rb"^\S+[ \t]+(\d+)[ \t]+(\d+)[ \t]+[a-z_]+[ \t]*\r?$", flags).finditer(data)) if is_text else []
+    )
+    if arrays and len(data[arrays[-1].end() :].split()) < int(arrays[-1][1]) * int(arrays[-1][2]):
+        refuse_vtk(path, f"its last array, {arrays[-1][0].decode(errors='replace').split()[0]}, is cut off")
 
 
 def declared_in_xml(data: Any) -> tuple[list[int], int | None]:
