@@ -95,10 +95,10 @@ def _module(name: str) -> Callable[[], str]:
 def _pictures() -> str:
     from .report.pictures.picture import has_egl
 
-    ways = {"a display": bool(os.environ.get("DISPLAY")), "Xvfb": shutil.which("Xvfb") is not None, "EGL": has_egl()}
-    if not any(ways.values()):
+    windows = {"a display": bool(os.environ.get("DISPLAY")), "Xvfb": shutil.which("Xvfb") is not None, "EGL": has_egl()}
+    if not any(windows.values()):
         raise OSError("no display, Xvfb or EGL")
-    return "by " + next(name for name, there in ways.items() if there)
+    return "by " + next(name for name, exists in windows.items() if exists)
 
 
 DOLFINX_REMEDY = "pip install fracsim[dolfinx], or start commands by ./env"

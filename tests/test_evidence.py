@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -266,7 +267,7 @@ def test_trials_run_once_and_failed_ones_stay(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(program.importlib, "import_module", lambda *_: Group)
 
     def title(*options: str) -> str:
-        monkeypatch.setattr("sys.argv", ["evidence", str(tmp_path), "--only", "ladder", *options])
+        monkeypatch.setattr(sys, "argv", ["evidence", str(tmp_path), "--only", "ladder", *options])
         program.main()
         data = json.loads((tmp_path / "evidence.json").read_text())
         assert data["about"]["cores"]

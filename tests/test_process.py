@@ -157,4 +157,6 @@ def test_the_wheel_asks_for_a_python_that_fits(tmp_path: Path) -> None:
     environment = {key: value for key, value in os.environ.items() if key != "FRACSIM_INSIDE"} | ways
     done = subprocess.run([env, "true"], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 1 and done.stderr.count("\n") == 1
-    assert done.stderr.startswith("env: the wheel of DOLFINx needs Python 3.12 or later, x86-64 and glibc 2.34 or later")
+    assert done.stderr.startswith(
+        "env: the wheel of DOLFINx needs Python 3.12 or later, x86-64 and glibc 2.34 or later"
+    )

@@ -120,6 +120,7 @@ def test_the_study_is_for_the_way_in_alone() -> None:
 # --- the drawing of docs/architecture.md ---
 
 RUN = ("run.py", "rigid_run.py", "monitors.py")  # the files of the room "run"
+CLI = ("cli.py", "doctor.py", "__main__.py")  # those of the command line
 EVERYWHERE = {"errors", "studies"}  # below all rooms, and the folder of packaged studies
 
 
@@ -143,15 +144,16 @@ def imported_rooms() -> dict[str, set[str]]:
     """Room -> rooms that it imports, from the source."""
     folders = [path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()]
     result = {room: rooms_of(set().union(*own(room).values())) for room in folders}
-    result["run"] = set().union(*(of_fracsim(ROOT / name, "fracsim") for name in RUN))
-    result |= {name: of_fracsim(ROOT / f"{name}.py", "fracsim") for name in ("cli", "process")}
+    files_of = {"run": RUN, "cli": CLI, "process": ("process.py",)}
+    for room, names in files_of.items():
+        result[room] = set().union(*(of_fracsim(ROOT / name, "fracsim") for name in names))
     for room, folder in (("forms", FORMS), ("meshes", MESHES)):
         files = [
             (path, ".".join(["fracsim", room, *path.relative_to(folder).parent.parts])) for path in folder.rglob("*.py")
         ]
         result[room] = set().union(*(of_fracsim(path, package) for path, package in files))
-    of_run = {name.removesuffix(".py") for name in RUN}
-    return {room: {"run" if name in of_run else name for name in names} - {room} for room, names in result.items()}
+    room_of = {name.removesuffix(".py"): room for room, names in files_of.items() for name in names}
+    return {room: {room_of.get(name, name) for name in names} - {room} for room, names in result.items()}
 
 
 def of_fracsim(path: Path, package: str) -> set[str]:

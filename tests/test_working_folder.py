@@ -82,7 +82,7 @@ from mpi4py import MPI
 scene = build_scene(MPI.COMM_WORLD, load_study("strip.toml"))
 state, _ = scene.stepper.advance(scene.start())
 import dolfinx
-print(state.step, os.getcwd() == before, callable(dolfinx.utils.ctypes_utils.MatSetValuesLocal))
+print(state.step, os.getcwd() == before, callable(dolfinx.plot.vtk_mesh))
 """
 
 

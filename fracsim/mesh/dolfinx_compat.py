@@ -178,8 +178,8 @@ def form_domains(form: fem.Form, compiled: Any, kind: Any) -> list[tuple[int, In
     if IS_0_9:
         return [(number, compiled.domains(kind, number).reshape(-1)) for number in compiled.integral_ids(kind)]
     first, last = _integral_places(form.ufcx_form, kind)
-    identifiers = [int(form.ufcx_form.form_integral_ids[place]) for place in range(first, last)]
-    return [(number, compiled.domains(kind, place).reshape(-1)) for place, number in enumerate(identifiers)]
+    numbers = [int(form.ufcx_form.form_integral_ids[position]) for position in range(first, last)]
+    return [(number, compiled.domains(kind, index).reshape(-1)) for index, number in enumerate(numbers)]
 
 
 def _integral_places(ufcx_form: Any, kind: Any) -> tuple[int, int]:
@@ -198,8 +198,8 @@ def _integral_count(compiled: Any, kind: Any) -> int:
 def _single_domain(compiled: Any) -> Ints:
     """Cells of a C++ form with one integral, over cells."""
     kind = fem.IntegralType.cell
-    place = compiled.integral_ids(kind)[0] if IS_0_9 else 0
-    return np.asarray(compiled.domains(kind, place))
+    number = compiled.integral_ids(kind)[0] if IS_0_9 else 0
+    return np.asarray(compiled.domains(kind, number))
 
 
 def evaluate(

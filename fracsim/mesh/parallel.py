@@ -5,7 +5,7 @@ from __future__ import annotations
 import pickle
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from typing import Any
 
@@ -94,9 +94,13 @@ def abort_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, lat
     comm.Abort(code or 1)
 
 
-def is_launcher(process: int) -> bool:
-    """Whether a process starts the ranks of a job; False if the system gives no information on it."""
-    return _name_and_parent(process)[0].startswith(LAUNCHERS)
+def launchers(process: int) -> Iterator[int]:
+    """A process and its ancestors as far as they start the ranks of a job; none if the system tells nothing of them."""
+    name, parent = _name_and_parent(process)
+    while name.startswith(LAUNCHERS):
+        yield process
+        process = parent
+        name, parent = _name_and_parent(process)
 
 
 def find_launcher(process: int) -> int | None:

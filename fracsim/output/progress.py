@@ -15,7 +15,7 @@ import time
 from dataclasses import dataclass
 
 from ..errors import STOP_SIGNALS
-from ..mesh.parallel import is_launcher
+from ..mesh.parallel import launchers
 
 PROGRESS_VARIABLE = "FRACSIM_PROGRESS"
 
@@ -198,10 +198,17 @@ def _terminal_columns() -> int:
     try:
         if sys.stderr.isatty():
             return os.get_terminal_size(sys.stderr.fileno()).columns or PROGRESS_TIMING.terminal_columns
-        if not is_launcher(parent := os.getppid()):
-            return 0
-        descriptor = os.open(f"/proc/{parent}/fd/2", os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
     except (OSError, ValueError):
+        return 0
+    # MPICH has a process between mpirun and the ranks
+    return next((columns for process in launchers(os.getppid()) if (columns := _columns_of_stderr(process))), 0)
+
+
+def _columns_of_stderr(process: int) -> int:
+    """Columns of the terminal that a process has as its stderr; 0 if it has none."""
+    try:
+        descriptor = os.open(f"/proc/{process}/fd/2", os.O_WRONLY | os.O_NOCTTY | os.O_NONBLOCK)
+    except OSError:
         return 0
     try:
         if not os.isatty(descriptor):
