@@ -4,7 +4,7 @@ ranks := 2
 export PYTHONDONTWRITEBYTECODE :=
 sources := fracsim forms meshes studies tests
 
-.PHONY: demo test test-plain test-all attack readers paraview bench table report report-full study-file gallery lint format clean
+.PHONY: demo test test-plain test-all attack readers paraview bench table report report-full study-file gallery figures lint format clean
 
 # Tear a loaf of bread in two.
 demo:
@@ -83,6 +83,10 @@ study-file:
 # Pictures of docs/gallery.md: what has been run is not run again.
 gallery:
 	./env python3 -m fracsim.studies.gallery
+
+# Figures of the papers, docs/paper-figures.md: two hours on two cores.
+figures:
+	./env python3 -m fracsim.studies.paper_figures
 
 # mypy sees the package as it is installed: forms/ is fracsim.forms, and so on.
 lint:

@@ -21,7 +21,8 @@ from fracsim.output.fields_file import read_frame_times
 from fracsim.report.pictures.frames import FrameSource, load_grid
 from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
-from fracsim.studies import gallery
+from fracsim.studies import gallery, paper_figures
+from fracsim.studies.picture_page import draw_commands
 from fracsim.study import Study, TimeTable
 from fracsim.study.body import SOURCE_KEYS
 from fracsim.study.check import check_study
@@ -204,6 +205,16 @@ def test_figures_of_the_gallery_are_those_of_its_page() -> None:
             seconds.setdefault(folder, float(of_it.group(1)) / len(entry.runs))
     assert found is not None and int(found.group(1)) == len(seconds)
     assert sum(seconds.values()) / 60 == pytest.approx(int(found.group(2)), rel=0.1)
+
+
+def test_the_page_of_figures_has_the_commands_of_its_pictures() -> None:
+    page = (DOCS / "paper-figures.md").read_text()
+    for entry in paper_figures.ENTRIES:
+        part = page[page.index(f"## {entry.name}\n") :].split("\n## ")[0]
+        assert f"![{entry.text}](gallery/{entry.name}." in part and entry.remark in part
+        for folder, arguments in entry.runs:
+            assert f"./env fracsim run {arguments} -o out/gallery/{folder}\n" in part
+        assert all(f"./env {command}\n" in part for command in draw_commands(entry, f"{entry.name}.png"))
 
 
 def test_captions_of_the_gallery_are_what_the_pictures_show() -> None:

@@ -154,8 +154,13 @@ def lattice_bar(approach: str) -> DamagedBar:
     return DamagedBar(points * [1.0, 0.25], cells, approach)
 
 
-def simulate(approach: str) -> dict[str, Any]:
-    """Figures of the experiment with one approach."""
+def simulate(approach: str, frames: list[tuple[float, Values]] | None = None) -> dict[str, Any]:
+    """Figures of the experiment with one approach.
+
+    Args:
+        approach: of APPROACHES.
+        frames: list to which (time since the first break, s; displacement (n, 2), m) of each solved step is appended.
+    """
     bar = lattice_bar(approach)
     motion = _BackwardEuler(bar)
     load = np.zeros_like(bar.points)
@@ -175,6 +180,8 @@ def simulate(approach: str) -> dict[str, Any]:
             figures["newton_failed_at"] = (number + 1) * STEP
             break
         figures["peak"] = max(figures["peak"], motion.kinetic() / stored)
+        if frames is not None:
+            frames.append(((number + 1) * STEP, motion.u))
     figures |= {"reach": float(np.abs(motion.u).max()), "loop": cycle_work(approach), "finite": True}
     figures["lowest"] = lowest_eigenvalue(approach)
     return figures
