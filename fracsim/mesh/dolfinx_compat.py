@@ -9,7 +9,6 @@ fracsim runs with DOLFINx 0.9 and 0.11; 0.10 has the interface of 0.11 as far as
             exterior_facet_domain   fem.compute_integration_domains takes no dimension.
             bind_to_cells           The class of a form takes a list of kernels.
             form_domains            Integrals of a form are numbered by place, and no longer known by their identifier.
-            kernel_address          Integrals of a compiled form lie one type after another (`form_integral_offsets`).
             evaluate                Values have the shape (cells, points, components ...).
             make_index_map          takes a tag of its messages.
 after 0.11  create_mesh             takes `ghost_mode`; create_cell_partitioner is gone (4403).
@@ -104,7 +103,7 @@ def make_index_map(comm: MPI.Comm, size: int, ghosts: npt.NDArray[np.int64], own
     """Numbers of `size` owned entities and of ghosts, given by global number and owner (collective)."""
     if IS_0_9:
         return IndexMap(comm, size, ghosts, owners)
-    return IndexMap(comm, size, ghosts, owners, 1220)
+    return IndexMap(comm, size, ghosts, owners, 1220)  # any tag: the messages end within the call
 
 
 def find_facets(
@@ -198,7 +197,7 @@ def _integral_count(compiled: Any, kind: Any) -> int:
 def _single_domain(compiled: Any) -> Ints:
     """Cells of a C++ form with one integral, over cells."""
     kind = fem.IntegralType.cell
-    number = compiled.integral_ids(kind)[0] if IS_0_9 else 0
+    (number,) = compiled.integral_ids(kind) if IS_0_9 else range(compiled.num_integrals(kind, 0))
     return np.asarray(compiled.domains(kind, number))
 
 
@@ -210,7 +209,7 @@ def evaluate(
         expression.eval(mesh, cells, values)
     else:
         shape = len(cells), expression.X().shape[0], *expression.ufl_expression.ufl_shape
-        expression.eval(mesh, cells, values.reshape(shape))
+        expression.eval(mesh, cells, values.reshape(shape, copy=False))  # a copy would leave `values` as it was
     return values
 
 
