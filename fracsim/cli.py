@@ -91,7 +91,7 @@ def run(
     folder = out or Path("out") / path.stem
     loaded = _load(comm, path, set_, folder)
     import_dolfinx()
-    from .run import run_study
+    from .deformable_run import run_study
 
     start_run()
     how = {"restart": restart, "overwrite": overwrite}

@@ -55,7 +55,7 @@ def run_case(n: int, bare: bool) -> dict[str, Any]:
     from mpi4py import MPI
     from petsc4py import PETSc
 
-    from ..run import Run
+    from ..deformable_run import Run
     from ..scene import build_scene
     from ..study.reader import validate
 

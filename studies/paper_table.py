@@ -180,9 +180,9 @@ def record_row(name: str, out: Path, *, small: bool, limit: float) -> None:
     """
     from mpi4py import MPI
 
+    from ..deformable_run import Run
     from ..errors import NotConverged, StepAborted
     from ..mesh.parallel import sum_over_ranks
-    from ..run import Run
     from ..scene import build_scene
 
     comm, folder, study = MPI.COMM_WORLD, out / name, row_study(name, small=small)

@@ -16,8 +16,8 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, changed
+from fracsim.deformable_run import run_study
 from fracsim.errors import FracsimError, InputError
-from fracsim.run import run_study
 from fracsim.study import Study, TimeTable
 from fracsim.study.check import check_study
 from fracsim.study.reader import validate

@@ -10,7 +10,7 @@ from mpi4py import MPI
 
 from fracsim.contact.obstacle_term import ObstacleTerm
 from fracsim.contact.self_contact import SelfContact
-from fracsim.run import Run
+from fracsim.deformable_run import Run
 from fracsim.scene import build_scene
 from support.scenes import make_study
 from support.vtu import Drawn, frames

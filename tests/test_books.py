@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from fracsim.deformable_run import Run
 from fracsim.output.frame_files import FieldEvaluator
 from fracsim.report.runs import flatten_tables
-from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study.check import check_study
 from support.scenes import make_scene, make_study

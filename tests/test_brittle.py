@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from scipy.spatial.distance import cdist
 
 from cases import fracsim, write_study
+from fracsim.deformable_run import Run
 from fracsim.errors import Stopped
 from fracsim.fracture.brittle.crack_level_set import DirectionField
 from fracsim.fracture.brittle.surface_cut import (
@@ -30,7 +31,6 @@ from fracsim.fracture.principal_stress import (
     principal_stress_bound,
 )
 from fracsim.meshes.data import MeshData
-from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.study import MeshSettings
 from fracsim.study.mesh_source import build_mesh

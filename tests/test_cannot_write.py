@@ -18,8 +18,8 @@ import pyvista
 from mpi4py import MPI
 
 from cases import STRIP, changed, fracsim_here, mpirun, study, write_study
+from fracsim.deformable_run import Run
 from fracsim.errors import CannotWrite, Exit
-from fracsim.run import Run
 from fracsim.scene import build_scene
 
 TEARING = changed(STRIP, output={"fields": ["damage", "stress"]})
@@ -164,8 +164,8 @@ def test_a_full_disk_in_a_rigid_run(
 ) -> None:
     """The message names a checkpoint of now, or the last good one, or says that there is none; runs go on from it."""
     pytest.importorskip("mujoco", reason="an environment made without a network")
+    from fracsim.deformable_run import run_study
     from fracsim.output import atomic_write, rigid_frames
-    from fracsim.run import run_study
     from test_rigid_study import study as falling
 
     table, out = falling(output={"every": 10, "picture": False, "checkpoint": every}), tmp_path / "out"

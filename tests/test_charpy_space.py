@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 
-from fracsim.run import Run
+from fracsim.deformable_run import Run
 from fracsim.scene import build_scene
 from fracsim.studies import folder
 from fracsim.study.reader import load_study

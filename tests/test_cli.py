@@ -22,7 +22,7 @@ from fracsim.study.reader import validate
 HEAVY = ("dolfinx", "gmsh", "petsc4py", "mpi4py", "pyvista", "meshio", "ufl", "basix", "h5py", "matplotlib")
 # what some of them would bring along, and the rooms of the program that solve, write and draw
 NOT_CHECKED = ("vtkmodules", "pandas", "sympy", "numba", "ffcx", "cffi", "jinja2", "setuptools", "scipy.spatial")
-NOT_CHECKED += tuple(f"fracsim.{room}" for room in ("scene", "run", "fracture", "stepping", "output", "report"))
+NOT_CHECKED += tuple(f"fracsim.{room}" for room in ["scene", "deformable_run", "fracture", "output", "report"])
 
 
 # --- check ----------------------------------------------------------------------------------------------------------
@@ -138,7 +138,7 @@ import sys
 from pathlib import Path
 from mpi4py import MPI
 from fracsim.study.reader import load_study
-from fracsim.run import Run
+from fracsim.deformable_run import Run
 from fracsim.scene import build_scene
 folder = Path({str(tmp_path)!r})
 for scheme in {schemes}:
@@ -273,14 +273,14 @@ def test_a_fault_on_one_rank_ends_all(tmp_path: Path) -> None:
 import sys
 from mpi4py import MPI
 from fracsim.mesh import parallel
-from fracsim.solvers.nonlinear_solver import Solver
-ranks.FAILURE_WAIT = 1.0
-solve = Solver.solve
+from fracsim.solvers.nonlinear_solver import NonlinearSolver
+parallel.FAILURE_WAIT = 1.0
+solve = NonlinearSolver.solve
 def faulty(self, guess):
     if MPI.COMM_WORLD.rank == 1:
         raise ZeroDivisionError("a fault of rank 1")
     return solve(self, guess)
-Solver.solve = faulty
+NonlinearSolver.solve = faulty
 sys.argv = ["fracsim", "run", {str(bar)!r}, "-o", {str(tmp_path / "out")!r}]
 from fracsim.cli import main
 main()

@@ -13,9 +13,9 @@ import pytest
 import pyvista
 from mpi4py import MPI
 
+from fracsim.deformable_run import Run
 from fracsim.errors import Stopped
 from fracsim.mesh.interpenetration import find_interpenetration
-from fracsim.run import Run
 from fracsim.scene import build_scene
 from support.scenes import make_study
 from support.solids import lattice

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from fracsim.deformable_run import Run
 from fracsim.errors import StepAborted
 from fracsim.output.interrupt import InterruptHandler
-from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study import Study
 from fracsim.study.reader import study_text

@@ -10,10 +10,10 @@ import pytest
 from mpi4py import MPI
 from scipy.spatial import ConvexHull
 
+from fracsim.deformable_run import Run
 from fracsim.errors import InputError
 from fracsim.mesh.crack_planes import plane_crack, polygon_crack, segment_crack
 from fracsim.mesh.fragments import find_fragments
-from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.study.check import check_study
 from support.scenes import make_study

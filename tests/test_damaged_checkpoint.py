@@ -13,8 +13,8 @@ import pytest
 from mpi4py import MPI
 
 from cases import STRIP, changed, fracsim, fracsim_here, write_study
+from fracsim.deformable_run import Run, run_study
 from fracsim.errors import Exit
-from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.study.reader import validate
 from support import damaged_checkpoint as damaged

@@ -10,10 +10,10 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, study
+from fracsim.deformable_run import Run
 from fracsim.mechanics.jit import CellForm
 from fracsim.mechanics.plasticity import ExtrapolatedPlasticFlow
 from fracsim.mechanics.tangent import Tangent
-from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.timestepping.state import State
 from support.reference import dense_tangent

@@ -14,6 +14,7 @@ from mpi4py import MPI
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
+from fracsim.deformable_run import run_study
 from fracsim.errors import NotConverged
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.small_matrices import barycentric_gradients
@@ -23,7 +24,6 @@ from fracsim.rigid.bodies import Bodies
 from fracsim.rigid.breakage import BreakableBody, FragmentAverage
 from fracsim.rigid.denting import DentedShape, PlasticDenting, finite_gradient, fit_positions
 from fracsim.rigid.surface_loads import PointLoads
-from fracsim.run import run_study
 from fracsim.scene.rigid_scene import build_rigid_scene
 from fracsim.study.reader import study_text
 from support.rigid import DENSITY, TIGHT, moments_of, stiffness_of

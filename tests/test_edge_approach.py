@@ -11,10 +11,10 @@ from mpi4py import MPI
 from pydantic import ValidationError
 
 from cases import STRIP, changed, study
+from fracsim.deformable_run import Run
 from fracsim.errors import Stopped
 from fracsim.forms.energies import lame
 from fracsim.mesh.simplices import is_split, local_edges
-from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from support.reference import dense_tangent, gradients
 from support.scenes import make_scene, make_study, march

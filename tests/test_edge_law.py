@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from fracsim.deformable_run import Run
 from fracsim.fracture.fracture_pass import BrittleEdgeLaw, FracturePass
-from fracsim.run import Run
 from fracsim.scene import build_scene
 from support.ranks import OnRanks
 from support.scenes import Values, make_scene, make_study, march

@@ -231,7 +231,7 @@ def test_flat_on_flat_is_held_against_edge_on_edge() -> None:
 
 def test_modules_of_other_features_are_noticed() -> None:
     edges, average = "fracsim.mesh.edge_graph", "fracsim.fracture.nonlocal_average"
-    modules = ["fracsim.run", "fracsim.output.surface", "fracsim.fracture.edge_history", edges, average]
+    modules = ["fracsim.deformable_run", "fracsim.output.surface", "fracsim.fracture.edge_history", edges, average]
     assert feature_cost.unused_feature_modules("elastic", 10, modules) == sorted(modules[1:])
     assert feature_cost.unused_feature_modules("damage", 10, [edges, average]) == [average]
     assert feature_cost.unused_feature_modules("average", 10, [edges, average]) == []

@@ -14,7 +14,7 @@ from mpi4py import MPI
 from scipy.integrate import quad
 from scipy.linalg import eigh
 
-from fracsim.run import run_study
+from fracsim.deformable_run import run_study
 from fracsim.studies.evidence import closed_forms, precision
 from fracsim.studies.evidence.precision import (
     accuracy_summary,

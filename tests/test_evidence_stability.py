@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from fracsim.deformable_run import run_study
 from fracsim.errors import InputError
-from fracsim.run import run_study
 from fracsim.studies.evidence import (
     block_stretch,
     contact_studies,

@@ -13,11 +13,11 @@ import pytest
 import pyvista
 from mpi4py import MPI
 
+from fracsim.deformable_run import run_study
 from fracsim.errors import InputError
 from fracsim.output.surface.body_surface import BodySurface
 from fracsim.output.surface.vtk_files import SurfaceFiles, rotation_quaternions
 from fracsim.report.export import export_surfaces
-from fracsim.run import run_study
 from fracsim.study import Study
 from support.solids import lattice, patterns, separated
 

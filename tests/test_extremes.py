@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from fracsim.run import run_study
+from fracsim.deformable_run import run_study
 from fracsim.scene import build_scene
 from fracsim.studies.evidence import stability_studies
 from fracsim.study.reader import validate

@@ -9,8 +9,8 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, fracsim, fracsim_here, study, swept_here, write_study
+from fracsim.deformable_run import Run, run_study
 from fracsim.errors import InputError
-from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 
 TEARING = changed(STRIP, output={"fields": ["damage"]})

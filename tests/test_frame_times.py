@@ -15,13 +15,13 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, changed, fracsim, study, write_study
+from fracsim.deformable_run import Run, run_study
 from fracsim.output.surface.body_surface import BodySurface
 from fracsim.output.surface.vtk_files import SurfaceFiles
 from fracsim.report.export import export_surfaces
 from fracsim.report.pictures.frames import film_repetitions
 from fracsim.report.pictures.picture import render
 from fracsim.report.pictures.picture_options import PictureOptions
-from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.solvers.newton import SolveResult
 from fracsim.study import Study

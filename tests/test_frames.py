@@ -10,7 +10,7 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, changed, study
-from fracsim.run import Run
+from fracsim.deformable_run import Run
 from fracsim.scene import build_scene
 
 

@@ -22,7 +22,7 @@ CODE = set(re.findall(r"`([\w-]+)`", TEXT))
 def keys_of_summaries() -> set[str]:
     """Literal keys of the dictionaries in functions that give summary.json its figures."""
     package, keys = Path(fracsim.__file__).parent, set()
-    for name in ("run.py", "rigid_run.py", "monitors.py"):
+    for name in ("deformable_run.py", "rigid_run.py", "monitors.py"):
         for function in ast.walk(ast.parse((package / name).read_text())):
             if isinstance(function, ast.FunctionDef) and function.name in ("_summary", "summary"):
                 dicts = [node for node in ast.walk(function) if isinstance(node, ast.Dict)]

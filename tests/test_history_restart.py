@@ -12,8 +12,8 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, changed, fracsim_here, write_study
+from fracsim.deformable_run import Run
 from fracsim.errors import Exit
-from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study.reader import validate
 
@@ -136,7 +136,7 @@ def test_files_of_frames_that_are_not_text_are_refused(stopped: Path, tmp_path: 
 
 def test_a_rigid_run_names_them_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     pytest.importorskip("mujoco", reason="an environment made without a network")
-    from fracsim.run import run_study
+    from fracsim.deformable_run import run_study
 
     def study(end: float) -> Any:
         return validate({

@@ -10,10 +10,10 @@ import pytest
 from mpi4py import MPI
 
 from fracsim.cli import _single_node_text
+from fracsim.deformable_run import Run
 from fracsim.fracture.criterion import OverloadedEdges
 from fracsim.fracture.node_retention import RETENTION, CellRetention
 from fracsim.mesh.edge_graph import EdgeGraph
-from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.study.check import check_study
 from support.failing import Failing

@@ -18,10 +18,10 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, DUCTILE_TABLES, STRIP, changed, mpirun, study, write_study
+from fracsim.deformable_run import Run, run_study
 from fracsim.errors import Exit, Stopped
 from fracsim.output import interrupt
 from fracsim.output.interrupt import InterruptHandler
-from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.study import Study
 from support.quadratic import RUNS as QUADRATIC
@@ -216,10 +216,10 @@ def test_signals_that_end_a_run(tmp_path: Path, number: signal.Signals) -> None:
 LONG: Data = changed(BAR, time={"step": 1e-4, "end": 10.0}, output={"every": 1000})
 START = """
 import ctypes, os, sys, time
-import fracsim.cli, fracsim.run
+import fracsim.cli, fracsim.deformable_run
 def ready():
     open({folder!r} + f"/ready-{{os.getpid()}}", "w").close()
-step = fracsim.run.Run.step
+step = fracsim.deformable_run.Run.step
 def hang(run):
     if run.state.step == 2:  # in C, holding the interpreter, waiting for a lock for ever
         ready()
@@ -237,7 +237,7 @@ def slow_import(begin=fracsim.cli.import_dolfinx):
 if {what!r} == "slow_import":
     fracsim.cli.import_dolfinx = slow_import
 else:
-    fracsim.run.Run.step = {what}
+    fracsim.deformable_run.Run.step = {what}
 sys.argv = ["fracsim", "run", {study!r}, "-o", {folder!r} + "/out"]
 fracsim.cli.program()
 """

@@ -16,9 +16,9 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, command, fracsim_here, study, swept_here, write_study
+from fracsim.deformable_run import Run
 from fracsim.errors import InputError
 from fracsim.output.file_ownership import NEW, OUTPUT_FILES
-from fracsim.run import Run
 from fracsim.scene import build_scene
 
 TEARING = changed(STRIP, time={"end": 0.01, "step": 0.001}, output={"fields": ["damage"], "checkpoint": 1e-9})

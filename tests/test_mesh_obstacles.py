@@ -23,8 +23,8 @@ from fracsim.contact.triangle_mesh_shape import (
     refine_triangles,
     surface_distances,
 )
+from fracsim.deformable_run import Run
 from fracsim.errors import InputError
-from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from fracsim.study.check import check_study
 from support.resumed import assert_alike, going_stopped_resumed

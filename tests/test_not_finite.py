@@ -14,8 +14,8 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, study
+from fracsim.deformable_run import Run, run_study
 from fracsim.errors import NotConverged
-from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.study import Study, values
 

@@ -14,11 +14,11 @@ from mpi4py import MPI
 from fracsim.contact.obstacle_tessellation import ObstacleTessellation
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.shapes import HalfSpace, Sphere
+from fracsim.deformable_run import Run
 from fracsim.output.surface.vtk_files import read_pvd
 from fracsim.report.pictures.picture import render
 from fracsim.report.pictures.picture_options import PictureOptions
 from fracsim.report.pictures.surroundings import OBSTACLE_COLOUR
-from fracsim.run import Run
 from fracsim.scene import build_scene
 from support.scenes import make_study
 

@@ -12,10 +12,10 @@ import pytest
 from mpi4py import MPI
 
 from fracsim.contact.obstacle_term import ObstacleTerm
+from fracsim.deformable_run import Run
 from fracsim.errors import InputError
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.split_surface.local_surface import LocalSurface, ParentMatrix
-from fracsim.run import Run
 from fracsim.scene import Scene, build_scene
 from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import Walk, each_step, make_scene, make_study, march, positions

@@ -15,10 +15,10 @@ from scipy.linalg import eigh
 from scipy.sparse import csr_matrix
 
 import xdmf_reader
+from fracsim.deformable_run import run_study
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.split_surface.local_surface import LocalSurface
 from fracsim.output.fracture_log import FractureLog
-from fracsim.run import run_study
 from fracsim.studies.evidence.precision.manufactured_solution import relative_errors, solve
 from fracsim.study.check import check_study
 from fracsim.timestepping.stable_time_step import cell_frequencies

@@ -21,10 +21,10 @@ from mpi4py import MPI
 
 import xdmf_reader
 from cases import BAR, STRIP, command, study, write_study
+from fracsim.deformable_run import Run
 from fracsim.output.surface.vtk_files import write_vtu
 from fracsim.report.pictures.colour_maps import select_array
 from fracsim.report.pictures.frames import FrameSource, find_frames, load_grid
-from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study import Study
 from fracsim.study.reader import load_study

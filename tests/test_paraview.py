@@ -11,7 +11,7 @@ from mpi4py import MPI
 
 import paraview_reader
 from cases import BAR, study
-from fracsim.run import Run
+from fracsim.deformable_run import Run
 from fracsim.scene import build_scene
 from support.demo import run_demo, threshold_damage
 from support.strained import strained, stress

@@ -17,9 +17,9 @@ from mpi4py import MPI
 from pydantic import BaseModel, TypeAdapter
 
 from cases import fracsim
+from fracsim.deformable_run import Run, run_study
 from fracsim.output.fields_file import read_frame_times
 from fracsim.report.pictures.frames import FrameSource, load_grid
-from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.studies import gallery, paper_figures
 from fracsim.studies.picture_page import draw_commands

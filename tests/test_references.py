@@ -67,7 +67,7 @@ def test_a_wrong_mention_is_found(text: str, found: int) -> None:
     ("text", "found"),
     [
         ("[a](theory.md#nothing)", 1), ("[a](nothing.md)", 1), ("[a](../fracsim/nothing.py)", 1), ("[a](#nothing)", 1),
-        ("[a](#contact) [b](../fracsim/run.py) [c](https://example.org/x#y) [d](fracture.md)", 0),
+        ("[a](#contact) [b](../fracsim/deformable_run.py) [c](https://example.org/x#y) [d](fracture.md)", 0),
     ],
 )  # fmt: skip
 def test_a_wrong_link_is_found(text: str, found: int) -> None:
@@ -75,7 +75,7 @@ def test_a_wrong_link_is_found(text: str, found: int) -> None:
 
 
 def test_a_wrong_file_is_found() -> None:
-    assert list(broken_files("`fracsim/run.py`, `fracsim/nothing.py`, `fracsim/mesh`, `forms/nothing/`")) == [
+    assert list(broken_files("`fracsim/errors.py`, `fracsim/nothing.py`, `fracsim/mesh`, `forms/nothing/`")) == [
         "fracsim/nothing.py", "forms/nothing/",
     ]  # fmt: skip
 

@@ -24,10 +24,10 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, DUCTILE_TABLES, STRIP, changed, command, fracsim, mpirun, study, write_study
+from fracsim.deformable_run import Run, run_study
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
 from fracsim.output.frame_files import FieldEvaluator
 from fracsim.output.run_folder import study_differences
-from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.study.mesh_source import build_mesh, save_mesh
 from fracsim.study.reader import add_missing_defaults, study_text
@@ -428,7 +428,7 @@ def test_a_signal_during_the_set_up_is_neither_lost_nor_destroys(
         os.kill(os.getpid(), signal.SIGUSR1)
         return build_scene(*arguments)
 
-    monkeypatch.setattr("fracsim.run.build_scene", build)
+    monkeypatch.setattr("fracsim.deformable_run.build_scene", build)
     with pytest.raises(Stopped, match=r"^stopped by signal SIGUSR1 while the run was set up; nothing was written$"):
         run_study(MPI.COMM_SELF, study(TEARING), out, restart=restart)
     assert before == {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
@@ -461,13 +461,13 @@ def test_a_signal_right_after_the_start(tmp_path: Path, ranks: int) -> None:
     bar = write_study(tmp_path / "bar.toml", BAR)
     slow = f"""
 import os, sys, time
-import fracsim.run
-build = fracsim.run.build_scene
+import fracsim.deformable_run
+build = fracsim.deformable_run.build_scene
 def slowly(*arguments):
     open({str(tmp_path)!r} + f"/ready-{{os.getpid()}}", "w").close()
     time.sleep({1.5 if ranks else 0.5})
     return build(*arguments)
-fracsim.run.build_scene = slowly
+fracsim.deformable_run.build_scene = slowly
 sys.argv = ["fracsim", "run", {str(bar)!r}, "-o", {str(tmp_path / "out")!r}]
 from fracsim.cli import main
 main()

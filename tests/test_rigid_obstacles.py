@@ -12,7 +12,7 @@ from mpi4py import MPI
 
 pytest.importorskip("mujoco", reason="an environment made without a network")
 
-from fracsim.run import run_study
+from fracsim.deformable_run import run_study
 from fracsim.scene.rigid_scene import RigidScene, build_rigid_scene
 from test_rigid_study import FLOOR, assert_same, rows, study, tables
 

@@ -16,13 +16,13 @@ import pytest
 from mpi4py import MPI
 
 from cases import fracsim_here
+from fracsim.deformable_run import run_study
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
 from fracsim.fracture.brittle.grains import SurfaceParameters
 from fracsim.mesh.input_topology import MeshTopology
 from fracsim.rigid.instance_placement import InstancePlacement, InstancePoses
 from fracsim.rigid.instances import Instances
 from fracsim.rigid.parallel_analyses import ImpactLoads, ParallelAnalyses, analyse_impact
-from fracsim.run import run_study
 from fracsim.studies import folder
 from fracsim.study import Study
 from fracsim.study.check import check_study

@@ -113,13 +113,13 @@ def test_the_study_is_for_the_way_in_alone() -> None:
     ways_in = {file for file, names in of_root.items() if "study" in rooms_of(names)}
     rooms = [path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()]
     readers = {room for room in rooms if "study" in rooms_of(set().union(*own(room).values()))}
-    assert ways_in == {"cli.py", "run.py", "monitors.py"}
+    assert ways_in == {"cli.py", "deformable_run.py", "monitors.py"}
     assert readers == {"study", "scene", "report"}
 
 
 # --- the drawing of docs/architecture.md ---
 
-RUN = ("run.py", "rigid_run.py", "monitors.py")  # the files of the room "run"
+RUN = ("deformable_run.py", "rigid_run.py", "monitors.py")  # the files of the room "run"
 CLI = ("cli.py", "doctor.py", "__main__.py")  # those of the command line
 EVERYWHERE = {"errors", "studies"}  # below all rooms, and the folder of packaged studies
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from fracsim.deformable_run import Run
 from fracsim.errors import InputError
 from fracsim.mechanics.time_functions import TabulatedFunction
-from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study.check import check_study
 from fracsim.study.reader import validate

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
+from fracsim.deformable_run import Run, run_study
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.topology import boundary_facets
-from fracsim.run import Run, run_study
 from fracsim.scene import build_scene
 from fracsim.studies import folder
 from fracsim.study.check import check_study

@@ -13,12 +13,12 @@ import pyvista
 from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, study
+from fracsim.deformable_run import Run
 from fracsim.errors import InputError, Stopped
 from fracsim.report.pictures.colour_maps import colour_range, select_array
 from fracsim.report.pictures.frames import FrameSource, explode_fragments, find_frames, load_grid
 from fracsim.report.pictures.picture import render
 from fracsim.report.pictures.picture_options import PictureOptions
-from fracsim.run import Run
 from fracsim.scene import build_scene
 
 Data = dict[str, Any]

@@ -13,9 +13,9 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, command, fracsim_here, study, write_study
+from fracsim.deformable_run import Run
 from fracsim.errors import InputError
 from fracsim.meshes import BUILDERS
-from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study.reader import validate
 

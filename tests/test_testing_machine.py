@@ -13,8 +13,8 @@ import pytest
 from mpi4py import MPI
 
 from cases import BAR, STRIP, changed, study
+from fracsim.deformable_run import Run
 from fracsim.errors import InputError
-from fracsim.run import Run
 from fracsim.scene import build_scene
 from fracsim.study.check import check_study
 from fracsim.study.reader import validate

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from mpi4py import MPI
 
-from fracsim.run import Run
+from fracsim.deformable_run import Run
 from fracsim.scene import build_scene
 from fracsim.studies.evidence.run_results import columns
 from support.ranks import OnRanks, Results, starting

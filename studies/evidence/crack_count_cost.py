@@ -125,8 +125,8 @@ def measure(case: str, cuts: list[int], *, baseline: bool) -> dict[str, Any]:
     """Figures of one case on the ranks of this process (collective); the baseline needs one rank."""
     from mpi4py import MPI
 
+    from ...deformable_run import Run
     from ...mesh.parallel import sum_over_ranks
-    from ...run import Run
     from ...scene import build_scene
     from ...study.reader import validate
 

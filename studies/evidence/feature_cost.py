@@ -182,7 +182,7 @@ def start_run(name: str, n: int, folder: Path) -> Any:
     """Run of a scene before its first timed step."""
     from mpi4py import MPI
 
-    from ...run import Run
+    from ...deformable_run import Run
     from ...scene import build_scene
     from ...study.reader import validate
 
@@ -199,7 +199,7 @@ def start_run(name: str, n: int, folder: Path) -> Any:
 
 def measure_alone(name: str, n: int, began: float) -> dict[str, Any]:
     """Start-up time, modules, fields and memory of a scene in this process."""
-    from ... import run, scene  # noqa: F401  imports of every run: memory is counted from here
+    from ... import deformable_run, scene  # noqa: F401  imports of every run: memory is counted from here
 
     before = _process_memory("VmRSS")
     with tempfile.TemporaryDirectory() as folder:

@@ -142,7 +142,7 @@ def _start_run(study: Data, name: str, folder: Path) -> Any:
     """Run of a study before its first step."""
     from mpi4py import MPI
 
-    from ...run import Run
+    from ...deformable_run import Run
     from ...scene import build_scene
     from ...study.reader import validate
 

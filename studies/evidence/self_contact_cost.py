@@ -72,8 +72,8 @@ def measure(kind: str, n: int) -> dict[str, Any]:
     """Mean processor time of a step in contact, and median times of the pair operations at the end, s."""
     from mpi4py import MPI
 
+    from ...deformable_run import Run
     from ...meshes.write import write_mesh
-    from ...run import Run
     from ...scene import build_scene
     from ...study.reader import validate
 

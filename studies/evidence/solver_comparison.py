@@ -104,7 +104,7 @@ def _time_run(name: str, solver: str) -> dict[str, Any]:
     """Run a study with one solver: processor seconds, iterations and displacement."""
     from mpi4py import MPI
 
-    from ...run import Run
+    from ...deformable_run import Run
     from ...scene import build_scene
     from ...study.reader import validate
     from .run_results import history

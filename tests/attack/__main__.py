@@ -77,8 +77,8 @@ def _import_all() -> None:
     import h5py  # noqa: F401
     import meshio  # noqa: F401
 
+    import fracsim.deformable_run
     import fracsim.rigid_run
-    import fracsim.run
     import fracsim.scene.rigid_scene
     import fracsim.study.check  # noqa: F401
 

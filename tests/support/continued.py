@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from fracsim.run import Run
+from fracsim.deformable_run import Run
 from fracsim.scene import build_scene
 
 from . import quadratic, shattered, tearing, torn

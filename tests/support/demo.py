@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mpi4py import MPI
 
-from fracsim.run import run_study
+from fracsim.deformable_run import run_study
 from fracsim.study.reader import load_study
 
 OUTPUT_PAGE = Path(__file__).parents[2] / "docs" / "output.md"

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from cases import BAR, study
-from fracsim.run import Run
+from fracsim.deformable_run import Run
 from fracsim.scene import build_scene
 
 # u = A X, with six unlike strains

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from fracsim.run import Run
+from fracsim.deformable_run import Run
 from fracsim.scene import build_scene
 from fracsim.studies.evidence.run_results import columns
 

@@ -95,7 +95,7 @@ def _start_run(n: int, scheme: str, folder: Path) -> Any:
     """Run of a study before its first step."""
     from mpi4py import MPI
 
-    from ....run import Run
+    from ....deformable_run import Run
     from ....scene import build_scene
     from ....study.reader import validate
 

@@ -101,7 +101,7 @@ def run_in(study: Study, folder: Path) -> tuple[Path, float]:
     """Run a study in a folder; returns that of its output, and the processor time of its steps, s."""
     from mpi4py import MPI
 
-    from ....run import run_study
+    from ....deformable_run import run_study
     from ....study.reader import validate
 
     out = folder / "run"
