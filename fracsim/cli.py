@@ -16,6 +16,7 @@ from . import __version__
 from .errors import Exit, FracsimError, InputError, NotConverged, Stopped, one_line
 from .process import (
     INTERRUPTED,
+    check_launcher,
     end_process,
     import_blocked,
     import_dolfinx,
@@ -87,6 +88,7 @@ def run(
     from .study.reader import find_study
 
     comm = MPI.COMM_WORLD
+    check_launcher(comm.size)
     path = find_study(study)
     folder = out or Path("out") / path.stem
     loaded = _load(comm, path, set_, folder)

@@ -61,6 +61,8 @@ def _handle_signals() -> None:
 _PARENT_PID = os.getppid()
 # Environment variables with the rank of a process.
 _RANK_VARIABLES = ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK")
+# Those with the number of processes that a launcher started.
+_SIZE_VARIABLES = ("OMPI_COMM_WORLD_SIZE", "PMI_SIZE")
 # Whether this process was started as a command, and whether its run handles signals.
 _is_own_process = False
 _run_begun = False
@@ -168,6 +170,20 @@ def is_first_rank() -> bool:
 def _is_rank() -> bool:
     """Return whether a launcher started this process as a rank of a job."""
     return any(name in os.environ for name in _RANK_VARIABLES)
+
+
+def check_launcher(ranks: int) -> None:
+    """Raise InputError if a launcher started several processes and MPI made each of them a job of its own.
+
+    `ranks`: size of MPI.COMM_WORLD. Happens where the launcher and the MPI library have no protocol in common.
+    """
+    started = max(int(os.environ.get(name, "1")) for name in _SIZE_VARIABLES)
+    if ranks == 1 and started > 1:
+        raise InputError(
+            f"{started} processes were started, but MPI joined none of them: each would be a run on one rank. Start "
+            "them with the mpirun of Python's MPI library (`fracsim doctor` names it), or with Slurm by "
+            "`srun --mpi=pmix` for Open MPI and by `srun --mpi=pmi2` for MPICH"
+        )
 
 
 def start_run() -> None:
