@@ -96,8 +96,8 @@ def run(
     from .deformable_run import run_study
 
     start_run()
-    how = {"restart": restart, "overwrite": overwrite}
-    summary = run_study(comm, loaded, folder, **how, wall_limit=wall_limit, source=path)
+    how: dict[str, Any] = {"restart": restart, "overwrite": overwrite, "wall_limit": wall_limit}
+    summary = run_study(comm, loaded, folder, **how, source=path)
     if comm.rank == 0:
         ranks, pieces = summary["ranks"], summary["pieces"]
         print(

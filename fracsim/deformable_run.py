@@ -170,6 +170,7 @@ class Run:
             )
         self._clock = FrameSchedule(study.output.every, study.frame_interval)
         self._clock.record_frame(self.state.t)
+        self._has_summary = False
         self._frame_of: int | None = None  # the step of the last frame of this part of the run
         # it tells how the run ended, which is open again
         write_on_root(self.comm, folder / "summary.json", lambda: (folder / "summary.json").unlink(missing_ok=True))
@@ -239,6 +240,11 @@ class Run:
         self._frame_of = self.state.step
         self._meter.output_seconds += time.perf_counter() - began
 
+    def write_due_frame(self) -> None:
+        """Write a frame if one is due after the step, or the run has ended (collective). Raises CannotWrite."""
+        if self.ended or self._clock.is_due(self.state.t, self.state.step):
+            self.write_frame()
+
     def checkpoint(self) -> Path:
         """Write a checkpoint of the present state and return its path (collective).
 
@@ -265,6 +271,13 @@ class Run:
         """
         with self._lock, self._progress:
             return self._run_and_draw()
+
+    def close(self) -> None:
+        """Close the files of a run that was taken step by step; at its end write summary.json (collective)."""
+        if self.ended and not self._has_summary:
+            self._finish("done")
+        self.history.close()
+        self._lock.release()
 
     def _run_and_draw(self) -> dict[str, Any]:
         self._meter.start_stepping()
@@ -308,8 +321,7 @@ class Run:
             except StepAborted:
                 raise self._stop_error("; the step that was under way begins anew") from None
             done = self.ended
-            if done or self._clock.is_due(self.state.t, self.state.step):
-                self.write_frame()
+            self.write_due_frame()
             self._report_progress(report)
             if interval is not None and self.comm.bcast(time.monotonic() - last > interval):
                 self.checkpoint()
@@ -333,6 +345,7 @@ class Run:
         """Write summary.json and return its contents (collective)."""
         summary = self._summary(outcome)
         write_summary(self.comm, self.folder, summary)
+        self._has_summary = True
         print_notes(self.comm, self.monitors.notes(done=outcome == "done"))
         return summary
 
@@ -394,6 +407,7 @@ def run_study(
     overwrite: bool = False,
     wall_limit: float | None = None,
     source: Path | None = None,
+    build: Callable[[MPI.Comm, Study, Callable[[str], None]], Scene] | None = None,
 ) -> dict[str, Any]:
     """Build the scene, run it, draw the last frame, and return the contents of summary.json (collective).
 
@@ -405,6 +419,7 @@ def run_study(
         overwrite: replace a run in the folder that could be continued.
         wall_limit: s from now; None: no limit.
         source: study file, which must not be overwritten.
+        build: builds the scene of a deformable body; None: `build_scene`.
     """
     began = time.perf_counter()
     print_notes(comm, study.frame_notes)
@@ -420,7 +435,7 @@ def run_study(
     with InterruptHandler(comm, wall_limit) as interrupt, FolderLock(folder) as lock, progress:
         check = partial(_check, folder, study, study_text(study), source, restart=restart, overwrite=overwrite)
         on_root(comm, lambda: lock_checked_folder(lock, check))  # at once, not after a mesh of minutes
-        scene = build_scene(comm, study, stage)
+        scene = (build or build_scene)(comm, study, stage)
         if scene.domain.input_mesh is not None and scene.domain.input_mesh.notes:
             progress.end_line()
             print_notes(comm, list(scene.domain.input_mesh.notes))

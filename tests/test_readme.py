@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import itertools
 import json
 import re
 import tomllib
@@ -16,7 +14,6 @@ import pytest
 from mpi4py import MPI
 from pydantic import BaseModel, TypeAdapter
 
-from cases import fracsim
 from fracsim.deformable_run import Run, run_study
 from fracsim.output.fields_file import read_frame_times
 from fracsim.report.pictures.frames import FrameSource, load_grid
@@ -96,28 +93,6 @@ def test_the_threshold_of_the_page_on_output_opens_the_crack(case: str, tmp_path
         run_study(MPI.COMM_SELF, load_study("bar-2d", over), folder)
     count, pieces = regions(folder, threshold_damage())
     assert count >= 2 and pieces == 1
-
-
-def test_the_lines_of_python_step_as_the_command_does(tmp_path: Path) -> None:
-    """Exactly as printed; every row has the numbers of the history.csv that the command printed below them writes."""
-    printed = re.search(
-        r"```python\n(.*?)```\n\nThese are the numbers of `fracsim (.*?)`", (DOCS / "running.md").read_text(), re.DOTALL
-    )
-    assert printed is not None
-    names: dict[str, Any] = {}
-    exec(printed.group(1), names)
-    assert len(printed.group(1).splitlines()) <= 10
-    result = fracsim(*printed.group(2).split(), "--set", "output.picture=false", "-o", tmp_path / "out")
-    assert result.returncode == 0, result.stderr
-    with (tmp_path / "out" / "history.csv").open(newline="") as file:
-        written = list(csv.DictReader(file))
-    columns = ["time", "elastic", "kinetic", "dissipated", "broken_edges", *names["scene"].probes.columns]
-    broken = list(itertools.accumulate(row[4] for row in names["rows"]))
-    assert broken[-1] == np.count_nonzero(names["broken"]) > 0
-    assert (names["chi"] < 1).any() and len(names["u"]) == len(names["scene"].balance.reactions) / 2
-    for row, count, line in zip(names["rows"], broken, written, strict=True):
-        found = [float(line[name]) for name in columns]  # which in another process may part in their last digit
-        np.testing.assert_allclose([*row[:4], count, *row[5:]], found, rtol=1e-10, atol=1e-14)
 
 
 def keys_of(model: type[BaseModel], path: str = "") -> Iterator[tuple[str, Any]]:

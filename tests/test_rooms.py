@@ -108,12 +108,12 @@ def test_reports_read_files() -> None:
 
 
 def test_the_study_is_for_the_way_in_alone() -> None:
-    """cli, run with what it watches, and scene; and those reports that are named above."""
+    """cli, Python's interface, run with what it watches, and scene; and those reports that are named above."""
     of_root = {path.name: {name[8:] for name in imports(path, "fracsim")} for path in ROOT.glob("*.py")}
     ways_in = {file for file, names in of_root.items() if "study" in rooms_of(names)}
     rooms = [path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()]
     readers = {room for room in rooms if "study" in rooms_of(set().union(*own(room).values()))}
-    assert ways_in == {"cli.py", "deformable_run.py", "monitors.py"}
+    assert ways_in == {"cli.py", "deformable_run.py", "monitors.py", "simulation.py"}
     assert readers == {"study", "scene", "report"}
 
 
@@ -144,7 +144,7 @@ def imported_rooms() -> dict[str, set[str]]:
     """Room -> rooms that it imports, from the source."""
     folders = [path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()]
     result = {room: rooms_of(set().union(*own(room).values())) for room in folders}
-    files_of = {"run": RUN, "cli": CLI, "process": ("process.py",)}
+    files_of = {"run": RUN, "cli": CLI, "python": ("simulation.py",), "process": ("process.py",)}
     for room, names in files_of.items():
         result[room] = set().union(*(of_fracsim(ROOT / name, "fracsim") for name in names))
     for room, folder in (("forms", FORMS), ("meshes", MESHES)):

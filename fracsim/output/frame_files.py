@@ -190,7 +190,7 @@ class FrameFiles:
         )
         self.surface = None
         if surface:
-            self.surface = _surface_output(folder, balance, breaks, passing, resume_at, thickness, smooth=smooth)
+            self.surface = surface_output(folder, balance, breaks, passing, resume_at, thickness, smooth=smooth)
 
     @property
     def frame_counts(self) -> dict[str, int]:
@@ -198,7 +198,8 @@ class FrameFiles:
         if self.fields is None:
             return {}
         opened = None if self.surface is None else self.surface.surface_and_files
-        return {"fields.h5": len(self.fields.times), **({} if opened is None else opened[1].frame_counts)}
+        of_surface = {} if opened is None or opened[1] is None else opened[1].frame_counts
+        return {"fields.h5": len(self.fields.times), **of_surface}
 
     def write_frame(self, state: State) -> None:
         """Write a frame at the time of the state, if there is none yet. Raises CannotWrite (collective)."""
@@ -212,8 +213,8 @@ class FrameFiles:
             self.fields.append_frame(t, fields)
 
 
-def _surface_output(
-    folder: Path,
+def surface_output(
+    folder: Path | None,
     balance: Balance,
     breaks: FractureLog,
     passing: InterpenetrationMonitor | None,
@@ -222,7 +223,7 @@ def _surface_output(
     *,
     smooth: bool,
 ) -> SurfaceOutput:
-    """Split surface of a run; arguments of `FrameFiles`."""
+    """Split surface of a run; arguments of `FrameFiles`. Without a folder nothing is written."""
     # imported here: runs without surface output do not need VTK
     from .surface.surface_output import SurfaceOutput
 

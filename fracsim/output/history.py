@@ -168,17 +168,23 @@ class History:
         reaction_peaks: largest absolute value of each reaction so far, also before edges broke in a step, N.
         obstacle_work: sum of the work of each obstacle so far, J.
         last_step: step of the last row.
+        last_row: values of the last row by column.
         notes: sentences about rows that a restart did not find (rank 0).
     """
 
     def __init__(
-        self, comm: MPI.Comm, path: Path, probe_columns: list[str], resume_at: int | None = None, thickness: float = 1.0
+        self,
+        comm: MPI.Comm,
+        path: Path | None,
+        probe_columns: list[str],
+        resume_at: int | None = None,
+        thickness: float = 1.0,
     ) -> None:
         """Open the file (collective).
 
         Args:
             comm: the ranks of the run.
-            path: the file.
+            path: the file; None: rows are kept as `last_row` alone.
             probe_columns: names of the columns after `HISTORY_COLUMNS`.
             resume_at: keep the rows up to this step, in a new file; None: a new run.
             thickness: thickness of a 2D body, m; 1 in 3D.
@@ -192,16 +198,19 @@ class History:
         self.reaction_peaks = dict.fromkeys((name for name in probe_columns if name.startswith("reaction_")), 0.0)
         self.obstacle_work = dict.fromkeys((name for name in probe_columns if name.startswith(WORK_PREFIX)), 0.0)
         self.notes: list[str] = []
-        self._file: RawIOBase | None = write_on_root(comm, path, lambda: self._open(resume_at))
+        self.last_row: dict[str, int | float] = {}
+        self._file: RawIOBase | None = None
+        if path is not None:
+            self._file = write_on_root(comm, path, lambda: self._open(path, resume_at))
 
-    def _open(self, resume_at: int | None) -> RawIOBase:
+    def _open(self, path: Path, resume_at: int | None) -> RawIOBase:
         """Write header and earlier rows, and open the file for appending (rank 0)."""
-        earlier = EarlierRows([], []) if resume_at is None else read_earlier_rows(self._path, self.columns, resume_at)
+        earlier = EarlierRows([], []) if resume_at is None else read_earlier_rows(path, self.columns, resume_at)
         self.notes = earlier.notes
         if not earlier.is_readable:
-            self.notes.append(f"it is {rename_unreadable(self._path)} from here on, and {self._path.name} begins anew")
-        replace_text(self._path, "".join(map(_csv_line, [self.columns, *earlier.rows])))
-        return open_to_append(self._path)
+            self.notes.append(f"it is {rename_unreadable(path)} from here on, and {path.name} begins anew")
+        replace_text(path, "".join(map(_csv_line, [self.columns, *earlier.rows])))
+        return open_to_append(path)
 
     def append(
         self, state: State, report: StepReport, damage: tuple[int, int, int], probes: npt.NDArray[np.float64]
@@ -233,8 +242,10 @@ class History:
             self.reaction_peaks[name] = max(peak, abs(float(row[name])), abs(float(onset)))
         self.obstacle_work = {name: done + float(row[name]) for name, done in self.obstacle_work.items()}
         row |= self.obstacle_work
-        line = _csv_line([str(value) if isinstance(value, int) else f"{value:.12g}" for value in row.values()])
-        write_on_root(self.comm, self._path, lambda: self._write_line(line.encode()))
+        self.last_row = row
+        if self._path is not None:
+            line = _csv_line([str(value) if isinstance(value, int) else f"{value:.12g}" for value in row.values()])
+            write_on_root(self.comm, self._path, lambda: self._write_line(line.encode()))
         self.last_step = int(values[0])
 
     def _write_line(self, line: bytes) -> None:

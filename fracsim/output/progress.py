@@ -194,7 +194,9 @@ def _chosen_form() -> tuple[bool, float, int]:
 
 
 def _terminal_columns() -> int:
-    """Columns of the terminal that shows stderr; 0 if there is none."""
+    """Columns of the terminal, or of the output of a notebook, that shows stderr; 0 if there is none."""
+    if type(sys.stderr).__module__.startswith("ipykernel."):
+        return PROGRESS_TIMING.terminal_columns
     try:
         if sys.stderr.isatty():
             return os.get_terminal_size(sys.stderr.fileno()).columns or PROGRESS_TIMING.terminal_columns

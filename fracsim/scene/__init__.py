@@ -30,6 +30,7 @@ from ..mechanics.prescribed_motion import check_supports  # noqa: E402
 from ..mesh.domain import Domain, distribute  # noqa: E402
 from ..mesh.parallel import on_root  # noqa: E402
 from ..mesh.selection import nearest_node, select_nodes  # noqa: E402
+from ..meshes.data import MeshData  # noqa: E402
 from ..output.history import ProbeGroup, ProbeReader  # noqa: E402
 from ..solvers.nonlinear_solver import NonlinearSolver  # noqa: E402
 from ..solvers.weak_callbacks import collect_dropped_scenes  # noqa: E402
@@ -97,19 +98,26 @@ class Scene:
         self.balance.destroy()
 
 
-def build_scene(comm: MPI.Comm, study: Study, stage: Callable[[str], None] = lambda name: None) -> Scene:
+def build_scene(
+    comm: MPI.Comm,
+    study: Study,
+    stage: Callable[[str], None] = lambda name: None,
+    *,
+    given: MeshData | None = None,
+) -> Scene:
     """Return the scene of a study (collective).
 
     Args:
         comm: ranks that share the mesh.
         study: of one deformable body.
         stage: called with the name of each stage as it begins.
+        given: mesh in place of that of [mesh], on rank 0.
 
     Raises:
         InputError: mesh and study do not fit.
     """
     stage("building the mesh" if study.mesh.builder else "reading the mesh")
-    mesh = on_root(comm, lambda: build_checked_mesh(study))
+    mesh = on_root(comm, lambda: build_checked_mesh(study, given))
     stage("sharing the mesh among ranks" if comm.size > 1 else "building the edges of the mesh")
     return build_scene_on(distribute(comm, mesh, study.mesh.order), study, stage=stage)
 

@@ -29,7 +29,7 @@ from .conditions import (
     volume_loads,
 )
 from .load_resultants import facet_loads
-from .mesh_source import build_mesh, find_builder, open_surface
+from .mesh_source import build_mesh, check_given_mesh, find_builder, open_surface
 from .mesh_summary import MeshSummary, summarise_mesh, summarise_source
 from .quadratic_checks import with_curved_boundary
 
@@ -52,20 +52,24 @@ def check_study(study: Study) -> list[str]:
     return list(report_lines(study, summary, near))
 
 
-def build_checked_mesh(study: Study) -> MeshData:
+def build_checked_mesh(study: Study, given: MeshData | None = None) -> MeshData:
     """Returns the mesh of a study.
 
     What the source tells is checked before anything is built.
 
+    Args:
+        study: of one deformable body.
+        given: mesh in place of that of [mesh].
+
     Raises:
         InputError: if the mesh and the study do not fit together.
     """
-    surface = open_surface(study.mesh)
-    summary = summarise_source(study, surface)
+    surface = open_surface(study.mesh) if given is None else None
+    summary = summarise_source(study, surface) if given is None else None
     if summary is not None:
         _check(study, summary)
         _find_near_obstacles(study, summary)
-    mesh = build_mesh(study.mesh, surface)
+    mesh = build_mesh(study.mesh, surface) if given is None else check_given_mesh(given)
     if summary is None:
         _check(study, summarise_mesh(mesh))
     if study.obstacle:

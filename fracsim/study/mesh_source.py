@@ -27,6 +27,26 @@ if TYPE_CHECKING:
     from ..meshes.surfaces.closed import ClosedSurface
 
 
+# builder of a study whose mesh is handed over in Python; study.toml of its run has the name
+GIVEN_MESH = "given"
+
+
+@dataclasses.dataclass(frozen=True)
+class _GivenMesh:
+    """Stands for a mesh that is handed over in Python; nothing is known of the mesh without it."""
+
+    name = GIVEN_MESH
+
+    def bounds(self) -> Any:
+        """Raise MeshError: there is no mesh."""
+        raise MeshError(
+            f'builder = "{GIVEN_MESH}" stands for a mesh that is handed over in Python: run the study by '
+            "fracsim.Simulation(study, mesh=...), or give builder, file, surface or outline"
+        )
+
+    cells_estimate = build = bounds
+
+
 def find_builder(mesh: MeshSettings) -> Any:
     """Returns the builder of a [mesh] table with its parameters; None for a file or surface. No mesh is built.
 
@@ -36,6 +56,8 @@ def find_builder(mesh: MeshSettings) -> Any:
     if mesh.builder is None:
         _check_source(mesh)
         return None
+    if mesh.builder == GIVEN_MESH:
+        return _with_parameters(_GivenMesh, mesh.parameters)
     if mesh.builder not in BUILDERS:
         near = difflib.get_close_matches(mesh.builder, BUILDERS, n=1)
         hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(BUILDERS)}"
@@ -194,6 +216,14 @@ def build_mesh(mesh: MeshSettings, surface: ClosedSurface | None = None) -> Mesh
             data = read_mesh(mesh.file)
         join = mesh.file is not None and bool(mesh.parameters.get("join"))
         return _scaled(check_mesh(data, join=join), mesh)
+
+
+def check_given_mesh(mesh: MeshData) -> MeshData:
+    """Returns a mesh that was handed over, checked. Raises InputError if it is invalid."""
+    from ..meshes.check import check_mesh
+
+    with _mesh_errors():
+        return check_mesh(mesh)
 
 
 def _scaled(data: MeshData, mesh: MeshSettings) -> MeshData:

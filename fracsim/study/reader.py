@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict
 from difflib import get_close_matches
@@ -48,25 +48,31 @@ def packaged_study_text(name: str) -> str:
     return path.read_text(encoding="utf-8")
 
 
-def load_study(study: str | Path, overrides: Sequence[str] = ()) -> Study:
+def load_study(study: str | Path | Mapping[str, Any], overrides: Sequence[str] | Mapping[str, Any] = ()) -> Study:
     """Returns a validated study.
 
     Args:
-        study: path of a study file, or name of a packaged study.
-        overrides: `key.path=value` with values in TOML.
+        study: path of a study file, name of a packaged study, or the tables of a study with paths relative to the
+            working folder.
+        overrides: `key.path=value` with values in TOML, or values by `key.path`.
 
     Raises:
         InputError: with one message on the first error.
     """
-    path = find_study(study) if isinstance(study, str) else study
-    data = _parse(path)
-    # paths of the file are relative to it, those of --set to the working folder
-    _resolve_paths(data, path.parent)
-    for override in overrides:
+    if isinstance(study, Mapping):
+        data, name = deepcopy(dict(study)), "study"
+    else:
+        path = find_study(study) if isinstance(study, str) else study
+        data, name = _parse(path), str(path)
+        # paths of the file are relative to it, those of --set to the working folder
+        _resolve_paths(data, path.parent)
+    for override in overrides if not isinstance(overrides, Mapping) else ():
         _apply_override(data, override)
+    for key, value in overrides.items() if isinstance(overrides, Mapping) else ():
+        _set_value(data, key, value, key)
     _resolve_paths(data, Path())
     _check_whole_numbers(data)
-    return validate(data, str(path))
+    return validate(data, name)
 
 
 def validate(data: dict[str, Any], name: str) -> Study:
@@ -167,6 +173,11 @@ def _apply_override(data: dict[str, Any], override: str) -> None:
         value = text
     except RecursionError:
         raise InputError(f"--set {key.strip()}: {_TOO_DEEP}") from None
+    _set_value(data, key, value, override)
+
+
+def _set_value(data: dict[str, Any], key: str, value: Any, override: str) -> None:
+    """Set the value of a key `table.key`; `override`: for the message."""
     *path, last = key.strip().split(".")
     container: Any = data
     for part in path:

@@ -18,7 +18,7 @@ from ...timestepping.state import State
 from ..atomic_write import write_on_root
 from ..fields_file import Field
 from ..result_checks import InterpenetrationMonitor
-from .body_surface import BodySurface, PointCorrection
+from .body_surface import BodySurface, PointCorrection, SurfaceFrame
 from .vtk_files import SurfaceFiles
 
 Values = npt.NDArray[np.float64]
@@ -29,12 +29,12 @@ class SurfaceOutput:
 
     Attributes:
         record: time and position of each break; None without fracture.
-        surface_and_files: surface and its files on rank 0, None on the other ranks.
+        surface_and_files: surface and its files on rank 0, None on the other ranks; no files without a folder.
     """
 
     def __init__(
         self,
-        folder: Path,
+        folder: Path | None,
         domain: Domain,
         density: PerCell,
         record: EdgeHistory | None,
@@ -48,7 +48,7 @@ class SurfaceOutput:
         """Open the files (collective).
 
         Args:
-            folder: output folder.
+            folder: output folder; None: surfaces are made, and none is written.
             domain: distributed mesh.
             density: mass density, kg/m^3 (2D: kg/m^2).
             record: history of broken edges, in a study with fracture. On a restart it is that of the checkpoint.
@@ -68,17 +68,46 @@ class SurfaceOutput:
         )
         broken = self.record.gather_broken() if self.record is not None else None
 
-        def open_files() -> tuple[BodySurface, SurfaceFiles]:
+        def open_files() -> tuple[BodySurface, SurfaceFiles | None]:
             assert domain.input_mesh is not None and cell_density is not None
-            files = SurfaceFiles(folder, domain.dim, resume_at)
+            files = None if folder is None else SurfaceFiles(folder, domain.dim, resume_at)
             surface = BodySurface(domain.input_mesh, cell_density, smooth=smooth)
-            if broken is not None and resume_at is not None:
+            if broken is not None and files is not None and resume_at is not None:
                 edges, history = broken
                 surface.replay_fragment_names(surface.skeleton.edge_values(edges, history[:, 0]), files.times)
             return surface, files
 
-        self._path = folder / "surface.pvd"
+        self._corner_displacement: Any = None  # (N, d) of the last surface, m (rank 0)
+        self._path = (folder or Path()) / "surface.pvd"
         self.surface_and_files = write_on_root(domain.comm, self._path, open_files)
+
+    def make_frame(self, state: State, fields: list[Field]) -> SurfaceFrame | None:
+        """Split surface of a state on rank 0, None on the other ranks (collective).
+
+        Args:
+            state: present state.
+            fields: fields of fields.xdmf, which the surface has as well.
+        """
+        domain, d = self._domain, self._domain.dim
+        gathered: list[Any] = [
+            domain.input_numbering.gather_nodes(values.reshape(-1, d)) for values in (state.u, state.v)
+        ]
+        pattern = domain.input_numbering.gather_cells(self.record.graph.pattern) if self.record is not None else None
+        broken = self.record.gather_broken() if self.record is not None else None
+
+        def make() -> SurfaceFrame:
+            assert self.surface_and_files is not None
+            surface, _ = self.surface_and_files
+            (u, v), nodal = self._corner_values(gathered, fields)
+            self._corner_displacement = u
+            broken_at = cut = None
+            if broken is not None and pattern is not None:
+                edges, history = broken
+                broken_at, cut = (surface.skeleton.edge_values(edges, column) for column in history.T)
+                surface.update(pattern, cut)
+            return surface.make_frame(state.t, u, v, broken_at=broken_at, fields=nodal, corrections=self._corrections)
+
+        return write_on_root(domain.comm, self._path, make)
 
     def write_frame(self, state: State, fields: list[Field]) -> None:
         """Write a frame at the time of the state, if there is none yet (collective).
@@ -90,33 +119,22 @@ class SurfaceOutput:
         Raises:
             CannotWrite: a file cannot be written.
         """
-        domain, d = self._domain, self._domain.dim
-        gathered: list[Any] = [
-            domain.input_numbering.gather_nodes(values.reshape(-1, d)) for values in (state.u, state.v)
-        ]
-        pattern = domain.input_numbering.gather_cells(self.record.graph.pattern) if self.record is not None else None
-        broken = self.record.gather_broken() if self.record is not None else None
+        opened = self.surface_and_files
+        has_frame = opened is not None and opened[1] is not None and state.t in opened[1].times
+        if self._domain.comm.bcast(has_frame):
+            return
+        frame = self.make_frame(state, fields)
 
         def write() -> None:
-            assert self.surface_and_files is not None
-            surface, files = self.surface_and_files
-            if state.t in files.times:
-                return
-            (u, v), nodal = self._corner_values(gathered, fields)
-            broken_at = cut = None
-            if broken is not None and pattern is not None:
-                edges, history = broken
-                broken_at, cut = (surface.skeleton.edge_values(edges, column) for column in history.T)
-                surface.update(pattern, cut)
+            assert frame is not None and opened is not None and opened[1] is not None
             drawn = {
                 name: data for term in self._obstacle_terms for name, data in term.output_surfaces(state.t).items()
             }
-            frame = surface.make_frame(state.t, u, v, broken_at=broken_at, fields=nodal, corrections=self._corrections)
-            files.write_frame(frame, drawn)
+            opened[1].write_frame(frame, drawn)
             if self._interpenetration is not None:
-                self._interpenetration.record_frame(state.t, surface, u)
+                self._interpenetration.record_frame(state.t, opened[0], self._corner_displacement)
 
-        write_on_root(domain.comm, self._path, write)
+        write_on_root(self._domain.comm, self._path, write)
 
     def _corner_values(self, gathered: list[Any], fields: list[Field]) -> tuple[list[Any], list[Field]]:
         """Nodal values at the corners of quadratic cells only: the surface has straight cells (rank 0)."""

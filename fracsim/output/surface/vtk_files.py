@@ -161,17 +161,23 @@ def fragment_columns(dim: int, *, turning: bool = False) -> list[str]:
     return ["time", "piece", "nodes", "mass", "volume", *vectors, *spin, *turn, "dust"]
 
 
+def fragment_values(fragments: FragmentTable) -> dict[str, Values]:
+    """Columns of pieces.csv but the time, by name, in the order of the names of the fragments."""
+    rotation = [] if fragments.rotation is None else [fragments.rotation, rotation_quaternions(fragments.rotation)]
+    values = np.column_stack([
+        fragments.name, fragments.nodes, fragments.mass, fragments.volume, fragments.centre, fragments.velocity,
+        fragments.spin, *rotation, fragments.nodes == 1,
+    ])[np.argsort(fragments.name)]  # fmt: skip
+    columns = fragment_columns(fragments.centre.shape[1], turning=bool(rotation))
+    return dict(zip(columns[1:], values.T, strict=True))
+
+
 def _csv_rows(t: float, fragments: FragmentTable) -> list[list[str]]:
     """Rows of pieces.csv at time t in s, in the order of the names of the fragments."""
-    rotation = [] if fragments.rotation is None else [fragments.rotation, rotation_quaternions(fragments.rotation)]
-    is_single_node = fragments.nodes == 1
-    values = np.column_stack([
-        fragments.mass, fragments.volume, fragments.centre, fragments.velocity, fragments.spin, *rotation,
-        is_single_node,
-    ])  # fmt: skip
+    # numbers below 1e12 are whole in 12 digits
     return [
-        [f"{t:.12g}", str(fragments.name[row]), str(fragments.nodes[row]), *(f"{value:.12g}" for value in values[row])]
-        for row in np.argsort(fragments.name)
+        [f"{t:.12g}", *(f"{value:.12g}" for value in row)]
+        for row in zip(*fragment_values(fragments).values(), strict=True)
     ]
 
 

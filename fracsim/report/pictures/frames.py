@@ -74,13 +74,30 @@ class FrameSource:
 
 def find_frames(folder: Path) -> list[FrameSource]:
     """Frames of surface.pvd, or else of fields.h5, in an output folder. Raises InputError if there are none."""
-    pvd, h5 = folder / "surface.pvd", folder / "fields.h5"
+    return surface_frames(folder) or field_frames(folder)
+
+
+def surface_frames(folder: Path) -> list[FrameSource]:
+    """Frames of the body in surface.pvd, each with the obstacles at its time; none without the file."""
+    pvd = folder / "surface.pvd"
     check_readable(pvd)
+    entries = read_pvd(pvd) if pvd.exists() else []
+    obstacles: dict[float, list[PvdEntry]] = {}
+    for entry in entries:
+        if entry.part:
+            obstacles.setdefault(entry.t, []).append(entry)
+    frames = []
+    for body in (entry for entry in entries if not entry.part):
+        parts = obstacles.get(body.t, [])
+        files, names = tuple(folder / part.file for part in parts), tuple(part.name for part in parts)
+        frames.append(FrameSource(body.t, folder / body.file, -1, files, names))
+    return frames
+
+
+def field_frames(folder: Path) -> list[FrameSource]:
+    """Frames of fields.h5. Raises InputError if there are none."""
+    h5 = folder / "fields.h5"
     check_readable(h5)
-    if pvd.exists():
-        frames = _surface_frames(folder, read_pvd(pvd))
-        if frames:
-            return frames
     if not h5.exists():
         raise InputError(f"{folder} has no surface.pvd and no fields.h5: it is not the output folder of a run")
     with h5py.File(h5) as file:
@@ -121,20 +138,6 @@ def film_repetitions(times: Sequence[float]) -> npt.NDArray[np.int64]:
     pictures = frame_times[0] + interval * np.arange(count)
     nearest = np.searchsorted((frame_times[1:] + frame_times[:-1]) / 2, pictures - tolerance * interval)
     return np.bincount(nearest, minlength=len(frame_times))
-
-
-def _surface_frames(folder: Path, entries: list[PvdEntry]) -> list[FrameSource]:
-    """Frames of the body in surface.pvd, each with the obstacles at its time."""
-    obstacles: dict[float, list[PvdEntry]] = {}
-    for entry in entries:
-        if entry.part:
-            obstacles.setdefault(entry.t, []).append(entry)
-    frames = []
-    for body in (entry for entry in entries if not entry.part):
-        parts = obstacles.get(body.t, [])
-        files, names = tuple(folder / part.file for part in parts), tuple(part.name for part in parts)
-        frames.append(FrameSource(body.t, folder / body.file, -1, files, names))
-    return frames
 
 
 def load_grid(frame: FrameSource) -> Any:

@@ -1,0 +1,402 @@
+"""Python interface: load a study, run it, or take its steps one by one (docs/python.md).
+
+    import fracsim
+
+    output = fracsim.run("bar-2d", out="out/bar-2d")
+    with fracsim.Simulation("bar-2d") as simulation:
+        while not simulation.ended:
+            simulation.step()
+
+Every call is collective: all ranks of the communicator make it.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from .process import import_dolfinx, import_outside
+
+# A script that imports this module takes no settings of PETSc or DOLFINx from the working folder, as the command does.
+import_outside("mpi4py.MPI")
+import_dolfinx()
+
+from dolfinx import fem  # noqa: E402
+from dolfinx.mesh import Mesh  # noqa: E402
+from mpi4py import MPI  # noqa: E402
+
+from .deformable_run import Run, run_study, wants_smooth  # noqa: E402
+from .errors import InputError  # noqa: E402
+from .mesh.ghost_exchange import with_ghosts  # noqa: E402
+from .mesh.given_mesh import GivenMesh, NamedTags, gather_mesh  # noqa: E402
+from .output.fracture_log import FractureLog  # noqa: E402
+from .output.frame_files import FieldEvaluator, surface_output  # noqa: E402
+from .output.history import History  # noqa: E402
+from .report.run_output import RunOutput  # noqa: E402
+from .scene import Scene, build_scene  # noqa: E402
+from .study import Study  # noqa: E402
+from .study.mesh_source import GIVEN_MESH  # noqa: E402
+from .study.reader import find_study, load_study, study_text  # noqa: E402
+from .timestepping.state import State  # noqa: E402
+
+if TYPE_CHECKING:
+    from .output.surface.body_surface import SurfaceFrame
+    from .output.surface.surface_output import SurfaceOutput
+
+Values = npt.NDArray[np.float64]
+StudySource = str | Path | Mapping[str, Any] | Study
+Overrides = Sequence[str] | Mapping[str, Any]
+
+
+def load(study: StudySource, overrides: Overrides = ()) -> Study:
+    """Return a validated study, which is immutable.
+
+    Args:
+        study: path of a study file, name of a packaged study (`fracsim list`), or the tables of a study as a dict.
+        overrides: values by key, as in `{"mesh.h": 0.02}`, or texts as `--set` takes them, as in `["mesh.h=0.02"]`.
+
+    Raises:
+        InputError: with one message on the first error.
+    """
+    if isinstance(study, Study):
+        return load_study(tomllib.loads(study_text(study)), overrides) if overrides else study
+    return load_study(study, overrides)
+
+
+def run(
+    study: StudySource,
+    out: str | Path,
+    *,
+    overrides: Overrides = (),
+    restart: bool = False,
+    overwrite: bool = False,
+    wall_limit: float | None = None,
+    comm: MPI.Intracomm | None = None,
+    mesh: Mesh | None = None,
+    facets: NamedTags | None = None,
+    regions: NamedTags | None = None,
+) -> RunOutput:
+    """Run a study to its end, as `fracsim run` does, and return the output folder (collective).
+
+    Args:
+        study: as for `load`.
+        out: output folder.
+        overrides: as for `load`.
+        restart: continue from the checkpoint in the folder.
+        overwrite: replace a run in the folder that could be continued.
+        wall_limit: wall time after which the run stops with a checkpoint, s.
+        comm: communicator of the run; None: that of `mesh`, or MPI.COMM_WORLD.
+        mesh: mesh in place of [mesh], as for `Simulation`.
+        facets: tags of facets, and the tag of each named group.
+        regions: tags of cells, and the tag of each named region.
+
+    Raises:
+        InputError: study, mesh or folder cannot be used.
+        NotConverged, Stopped, CannotWrite: the run ended early; the message says how to continue.
+    """
+    comm, loaded, handed_over = _prepare(study, overrides, comm, mesh, facets, regions)
+    source = find_study(study) if isinstance(study, str) else study if isinstance(study, Path) else None
+    folder = Path(out)
+    run_study(
+        comm, loaded, folder, restart=restart, overwrite=overwrite, wall_limit=wall_limit, source=source,
+        build=partial(build_scene, given=None if handed_over is None else handed_over.mesh),
+    )  # fmt: skip
+    comm.Barrier()
+    return RunOutput(folder)
+
+
+def _prepare(
+    study: StudySource,
+    overrides: Overrides,
+    comm: MPI.Intracomm | None,
+    mesh: Mesh | None,
+    facets: NamedTags | None,
+    regions: NamedTags | None,
+) -> tuple[MPI.Intracomm, Study, GivenMesh | None]:
+    """Return communicator, study, and the given mesh on rank 0 (collective). The arguments are those of `run`."""
+    if mesh is None:
+        if facets is not None or regions is not None:
+            raise InputError("facets and regions are tags of a mesh that is handed over: give mesh=... as well")
+        return comm or MPI.COMM_WORLD, load(study, overrides), None
+    table = {"builder": GIVEN_MESH}
+    if isinstance(study, Mapping):
+        order = {key: value for key, value in study.get("mesh", {}).items() if key == "order"}
+        study = {**study, "mesh": order | table}
+    loaded = load(study, overrides)
+    if loaded.time.scheme == "rigid":
+        raise InputError('time.scheme = "rigid" takes no mesh of DOLFINx: give [mesh] in the study')
+    settings = type(loaded.mesh).model_validate(table | {"order": loaded.mesh.order})
+    return mesh.comm, loaded.model_copy(update={"mesh": settings}), gather_mesh(mesh, facets, regions)
+
+
+class Simulation:
+    """A deformable body that breaks, step by step; with an output folder if one is given.
+
+    A mesh that is handed over is gathered on rank 0, renumbered (nodes by their coordinates) and distributed anew
+    without ghost cells. `mesh` is the mesh of the program. `node_numbers` and `cell_numbers` are the map from its nodes
+    and cells to those of the mesh that was handed over.
+
+    Attributes:
+        study: that is simulated.
+        comm: communicator.
+        scene: objects of the program, without a promise to stay as they are.
+        state: present state: arrays `u`, `v`, `a` of the owned dofs, time `t`, number of steps `step`.
+    """
+
+    def __init__(
+        self,
+        study: StudySource,
+        out: str | Path | None = None,
+        *,
+        overrides: Overrides = (),
+        restart: bool = False,
+        overwrite: bool = False,
+        comm: MPI.Intracomm | None = None,
+        mesh: Mesh | None = None,
+        facets: NamedTags | None = None,
+        regions: NamedTags | None = None,
+    ) -> None:
+        """Build the body at t = 0, or at the checkpoint of a restart (collective).
+
+        Args:
+            study: as for `load`. With `mesh` its tables need no [mesh].
+            out: output folder, written as `run` does; None: nothing is written.
+            overrides: as for `load`.
+            restart: continue from the checkpoint in the folder.
+            overwrite: replace a run in the folder that could be continued.
+            comm: communicator; None: that of `mesh`, or MPI.COMM_WORLD.
+            mesh: straight triangles or tetrahedra on any number of ranks, in m.
+            facets: tags of facets, and the tag of each group: `(tags, {"left": 1, "right": 2})`.
+            regions: tags of cells, and the tag of each region: `(tags, {"crust": 7})`.
+
+        Raises:
+            InputError: study, mesh or folder cannot be used.
+        """
+        self.comm, self.study, self._given = _prepare(study, overrides, comm, mesh, facets, regions)
+        if self.study.time.scheme == "rigid":
+            raise InputError('time.scheme = "rigid" moves many bodies, which Simulation does not: use fracsim.run')
+        if restart and out is None:
+            raise InputError("restart continues from the checkpoint in a folder: give out=...")
+        self._closed = False
+        self._functions: dict[str, fem.Function] = {}
+        self._surface: SurfaceOutput | None = None
+        self._columns: dict[str, list[float]] = {}
+        arrays = None if self._given is None else self._given.mesh
+        self.scene: Scene = build_scene(self.comm, self.study, given=arrays)
+        self._run: Run | None = None
+        try:
+            if out is not None:
+                self._run = Run(self.scene, Path(out), restart=restart, overwrite=overwrite)
+                self._breaks, self._history = self._run.breaks, self._run.history
+                if self.state.step == 0:
+                    self._run.write_frame()
+            else:
+                self._state = self.scene.start()
+                self._breaks = FractureLog(self.scene.balance.stress, self.scene.fracture)
+                self._history = History(self.comm, None, self.scene.probes.columns, thickness=self.study.thickness)
+        except BaseException:
+            if self.comm.size == 1:  # a rank that failed alone would wait for the others here
+                self.scene.destroy()
+            raise
+
+    # --- steps ---
+
+    @property
+    def state(self) -> State:
+        """Present state. It is never written to."""
+        return self._state if self._run is None else self._run.state
+
+    @property
+    def t(self) -> float:
+        """Present time, s."""
+        return self.state.t
+
+    @property
+    def ended(self) -> bool:
+        """Whether the study is at its end."""
+        return self.scene.ended(self.state) if self._run is None else self._run.ended
+
+    def step(self) -> dict[str, float]:
+        """Take a step and return its row of history.csv by column (collective).
+
+        With an output folder the row, and a frame if one is due, are written.
+
+        Raises:
+            NotConverged: the step failed; `state` is that before it.
+        """
+        self._check_open()
+        if self._run is not None:
+            self._run.step()
+            self._run.write_due_frame()
+        else:
+            self._state, report = self.scene.stepper.advance(self._state)
+            if report.broken:
+                self._breaks.record_breaks(self._state.t)
+            self._history.append(self._state, report, self._breaks.counts, self.scene.probes())
+        for name in self._functions:
+            self._update_function(name)
+        row = {name: float(value) for name, value in self._history.last_row.items()}
+        for name, value in row.items():
+            self._columns.setdefault(name, []).append(value)
+        return row
+
+    def run(self) -> None:
+        """Take all steps to the end of the study (collective). With an output folder progress is shown on stderr.
+
+        Raises:
+            NotConverged, Stopped, CannotWrite: the message says how to continue.
+        """
+        self._check_open()
+        if self._run is not None:
+            self._run()
+            for name in self._functions:
+                self._update_function(name)
+        while not self.ended:
+            self.step()
+
+    @property
+    def history(self) -> dict[str, Values]:
+        """Columns of history.csv by name, (steps,) each, of the steps that `step` has taken."""
+        return {name: np.array(values) for name, values in self._columns.items()}
+
+    # --- fields ---
+
+    @property
+    def mesh(self) -> Mesh:
+        """Mesh of DOLFINx, without ghost cells; coordinates are those at rest, m."""
+        return self.scene.domain.mesh
+
+    @property
+    def displacement(self) -> fem.Function:
+        """Displacement, m: one function of DOLFINx, whose values follow the steps."""
+        return self._function("displacement")
+
+    @property
+    def velocity(self) -> fem.Function:
+        """Velocity, m/s: one function of DOLFINx, whose values follow the steps."""
+        return self._function("velocity")
+
+    @property
+    def damage(self) -> fem.Function:
+        """Share of broken edges of each cell, 0 to 1 (DG0): one function of DOLFINx, whose values follow the steps."""
+        return self._function("damage")
+
+    def _function(self, name: str) -> fem.Function:
+        if name not in self._functions:
+            domain = self.scene.domain
+            space = domain.scalar_cell_space if name == "damage" else domain.space
+            self._functions[name] = fem.Function(space, name=name)
+            self._update_function(name)
+        return self._functions[name]
+
+    def _update_function(self, name: str) -> None:
+        """Set the values of a function to those of the state (collective)."""
+        values, fracture = self._functions[name].x.array, self.scene.fracture
+        if name == "damage":
+            if fracture is not None:
+                graph = fracture.graph
+                values[: self.scene.domain.cell_count] = graph.broken[graph.cell_edges].mean(axis=1)
+        else:
+            owned = self.state.u if name == "displacement" else self.state.v
+            values[:] = with_ghosts(self.scene.domain, owned)
+
+    @property
+    def node_numbers(self) -> npt.NDArray[np.int64]:
+        """(owned nodes,) number of each node in `geometry.input_global_indices` of the mesh that was handed over.
+
+        Node i has the dofs d i to d i + d - 1 of `displacement`. A midside node has -1. InputError without such a mesh;
+        collective.
+        """
+        numbering, original = self.scene.domain.input_numbering, self._need_given()
+        return numbering.gather_corners.scatter(None if original is None else original.nodes + 1) - 1
+
+    @property
+    def cell_numbers(self) -> npt.NDArray[np.int64]:
+        """(owned cells,) number of each cell in `topology.original_cell_index` of the mesh that was handed over.
+
+        InputError without such a mesh; collective.
+        """
+        original = self._need_given()
+        return self.scene.domain.input_numbering.gather_cells.scatter(None if original is None else original.cells)
+
+    def _need_given(self) -> GivenMesh | None:
+        if self.study.mesh.builder != GIVEN_MESH:
+            raise InputError("the mesh is that of the study: only a mesh that was handed over has numbers of its own")
+        return self._given
+
+    # --- fragments and surface ---
+
+    def fragments(self) -> dict[str, Values]:
+        """Return columns of pieces.csv by name, a row per fragment (collective).
+
+        They are piece, nodes, mass (kg), volume (m^3), centre_x (m), velocity_x (m/s), spin_z (rad/s) and so on. The
+        number `piece` stays with a fragment as long as its surface is looked at at each break.
+        """
+        from .output.surface.vtk_files import fragment_values
+
+        frame = self._surface_frame()
+        return self.comm.bcast(None if frame is None else fragment_values(frame.fragments))
+
+    def surface(self) -> Any:
+        """Return the split surface now (pyvista.PolyData) on rank 0, None on the other ranks (collective).
+
+        It is closed around every fragment. Cells have `piece`, `origin`, `age` and the cell fields of output.fields.
+        """
+        frame = self._surface_frame()
+        if frame is None:
+            return None
+        import pyvista
+
+        from .output.surface.vtk_files import make_surface_grid
+
+        return pyvista.wrap(make_surface_grid(frame)).extract_surface(pass_pointid=False, pass_cellid=False)
+
+    def _surface_frame(self) -> SurfaceFrame | None:
+        """Return the split surface of the state on rank 0 (collective)."""
+        self._check_open()
+        balance, study = self.scene.balance, self.study
+        if self._surface is None:
+            self._surface = surface_output(
+                None, balance, self._breaks, None, None, study.thickness, smooth=wants_smooth(study)
+            )
+            self._evaluate = FieldEvaluator(balance.stress, study.output.fields or [], self.scene.fracture)
+        return self._surface.make_frame(self.state, self._evaluate(self.state, self._breaks.fragments))
+
+    # --- checkpoint and end ---
+
+    def checkpoint(self) -> Path:
+        """Write a checkpoint to the output folder and return its path (collective).
+
+        `Simulation(study, out, restart=True)` and `fracsim run --restart` continue from it, on any number of ranks.
+        """
+        self._check_open()
+        if self._run is None:
+            raise InputError("a checkpoint needs an output folder: Simulation(study, out=...)")
+        return self._run.checkpoint()
+
+    def close(self) -> None:
+        """Close the files and free the memory of PETSc's objects (collective). It may be called again."""
+        if self._closed:
+            return
+        self._closed = True
+        if self._run is not None:
+            self._run.close()
+        self.scene.destroy()
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise InputError("the simulation is closed; make a new one to go on")
+
+    def __enter__(self) -> Simulation:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        # after an error on one rank a collective call would wait for the others
+        if kind is None or self.comm.size == 1:
+            self.close()
