@@ -105,3 +105,19 @@ def test_the_conda_recipe_needs_what_pyproject_needs() -> None:
     optional = [line for extra, lines in extras().items() if extra != "dolfinx" for line in lines]
     assert sorted(needed["run_constraints"]) == sorted(map(conda, optional))
     assert needed["host"] == [python, "pip", *map(conda, PYPROJECT["build-system"]["requires"])]
+
+
+# --- citation ---
+
+
+def test_the_citation_has_the_version_and_both_papers() -> None:
+    """Keys that the Citation File Format 1.2 requires; titles and identifiers as in the theory."""
+    yaml = pytest.importorskip("yaml")
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    project, theory = PYPROJECT["project"], " ".join((ROOT / "docs" / "theory.md").read_text().split())
+    assert (citation["version"], citation["license"]) == (project["version"], project["license"])
+    assert len(citation["references"]) == 2
+    for paper in citation["references"]:
+        assert paper["title"] in theory and f"[doi:{paper['doi']}]" in theory and f"({paper['year']})" in theory
+        assert all(author["family-names"] in theory for author in paper["authors"])

@@ -12,7 +12,10 @@ import pytest
 ROOT = Path(__file__).parent.parent
 SOURCES = ("fracsim", "forms", "meshes", "studies", "tests")
 THEORY = ROOT / "docs" / "theory.md"
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    *(ROOT / f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING")),
+    *sorted((ROOT / "docs").glob("*.md")),
+]
 CODE = [path for room in SOURCES for kind in ("*.py", "*.c", "*.toml") for path in sorted((ROOT / room).rglob(kind))]
 # a page of docs/ in a comment or docstring, with the heading that is meant
 MENTION = re.compile(r"\bdocs/([\w-]+\.md)(?:#([\w-]+))?")
