@@ -2,9 +2,9 @@
 ranks := 2
 # Modules are compiled once, not by each process of the tests, whatever the machine says.
 export PYTHONDONTWRITEBYTECODE :=
-sources := fracsim forms meshes studies tests
+sources := fracsim forms meshes studies tests docs
 
-.PHONY: demo test test-plain test-all attack readers paraview bench table report report-full study-file gallery figures lint format clean
+.PHONY: demo test test-plain test-all attack readers paraview bench table report report-full study-file site gallery figures lint format clean
 
 # Tear a loaf of bread in two.
 demo:
@@ -79,6 +79,18 @@ report-full:
 # docs/study-file.md, from the descriptions of keys in fracsim/study.
 study-file:
 	./env python3 -m fracsim.study.documentation docs/study-file.md
+
+# out/site: README, docs/ and docstrings as a site that needs no network and no server. Warnings are errors: a broken link, a
+# missing heading, a page that the contents lack. What it needs is kept beside the venvs, as site.txt names it.
+site:
+	@./env sh -c 'cd "$${VIRTUAL_ENV%/*}" && exec 8>site.lock && flock 8 && wanted=$$(cat "$(CURDIR)/site.txt"; python3 -VV) && \
+	    [ "$$wanted" = "$$(cat site/ready 2>/dev/null)" ] || { echo "fetching Sphinx (once)" && rm -rf site && \
+	    pip install --quiet --no-warn-conflicts --target site --requirement "$(CURDIR)/site.txt" && \
+	    echo "$$wanted" >site/ready; }'
+	./env sh -c 'PYTHONPATH="$${VIRTUAL_ENV%/*}/site" python3 -m sphinx -W --keep-going -q -j auto -c docs/site -d build/site . out/site'
+	@! grep -rlE "<(script|link|img)[^>]+(src|href)=.(https?:)?//" --include="*.html" out/site || { \
+	    echo "make site: these pages load files from the network" >&2; exit 1; }
+	@echo "The site begins at out/site/index.html"
 
 # Pictures of docs/gallery.md: what has been run is not run again.
 gallery:
