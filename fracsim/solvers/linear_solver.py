@@ -22,8 +22,9 @@ from .forcing_terms import ContractionForcing, EisenstatWalkerForcing
 from .petsc_options import PetscOptions, PetscOptionSet, call_petsc
 from .plain_solver import PlainPreconditioner, plain_method
 from .policy import SolverPolicy
-from .preconditioner import GAMG_OPTIONS, Preconditioner, Update
+from .preconditioner import GAMG_OPTIONS, Preconditioner, Update, renew_smoothers
 from .tangent_operators import TangentOperators
+from .weak_callbacks import weak_callback
 
 Values = npt.NDArray[np.float64]
 
@@ -58,6 +59,7 @@ class LinearStepCG:
     """
 
     def __init__(self, comm: object, max_iterations: int, policy: SolverPolicy) -> None:
+        self._residual: PETSc.Vec | None = None
         self._ksp = ksp = PETSc.KSP().create(comm)
         self._options = PetscOptionSet(FISCHER_OPTIONS)
         ksp.setOptionsPrefix(self._options.prefix)
@@ -72,15 +74,20 @@ class LinearStepCG:
         """Solve K x = b down to |r| = `tolerance`, N; A is K for products (collective).
 
         Returns:
-            Whether it is solved.
+            Whether CG says that it is solved. `residual_norm` is |b - A x|, which CG's recursion may fall below.
         """
         ksp = self._ksp
         pc.setReusePreconditioner(True)
+        renew_smoothers(pc)
         ksp.setPC(pc)
         ksp.setOperators(A, K)
         ksp.setTolerances(rtol=0.0, atol=tolerance, max_it=self._max_iterations)
         ksp.solve(b, x)
-        self.iterations, self.residual_norm = ksp.its, ksp.norm
+        # KSP.buildResidual gives that of the recursion, too
+        self._residual = self._residual or b.duplicate()
+        A.mult(x, self._residual)
+        self._residual.axpy(-1.0, b)
+        self.iterations, self.residual_norm = ksp.its, float(self._residual.norm())
         return bool(ksp.reason > 0)
 
     def equivalent_iterations(self, rtol: float) -> int:
@@ -96,6 +103,8 @@ class LinearStepCG:
     def destroy(self) -> None:
         """Free PETSc's objects, and remove the options from its database."""
         self._options.remove()
+        if self._residual is not None:
+            self._residual.destroy()
         self._ksp.destroy()
 
 
@@ -156,6 +165,8 @@ class LinearSolver:
         self.steps_are_linear = steps_are_linear(balance, given, ksp.getType())
         is_single_cg = self.steps_are_linear and self.is_iterative
         self._step_cg = LinearStepCG(ksp.comm, int(ksp.max_it), policy) if is_single_cg else None
+        # SNES asks the KSP to keep the set-up of its preconditioner after each tangent
+        ksp.setPreSolve(weak_callback(self._renew_smoothers))
         self.forcing = None if self._asked_rtol else _forcing(balance, chosen, policy)
         # of attempts of a body that may touch something, until it does
         self._free_forcing: ContractionForcing | None = None
@@ -173,6 +184,9 @@ class LinearSolver:
         self.operators.update_entries()
         self.ksp.setOperators(self.tangent.matrix)
         self.ksp.setUp()
+
+    def _renew_smoothers(self, *_: object) -> None:
+        renew_smoothers(self.preconditioner.pc)
 
     # --- facts ---
 
@@ -362,6 +376,7 @@ class LinearSolver:
             solved_norm = min(solved_norm, self._asked_rtol * self.balance.work_vector.norm())
         self._prepare(eigenvalue_floor)
         K, pc, cg = self.operators.matrix, self.preconditioner.serving, self._step_cg
+        self._renew_smoothers()
         solved = cg.solve(self.operators.products or K, K, pc, self.balance.work_vector, self.correction, solved_norm)
         self._equivalent = cg.equivalent_iterations(float(self.ksp.rtol))
         return (cg.residual_norm, cg.iterations) if solved else None

@@ -46,6 +46,7 @@ FRAGMENT_OPTIONS: PetscOptions = {
     "mg_levels_ksp_max_it": 1,
     "mg_levels_pc_type": "sor",
 }
+MULTIGRID_TYPES = ("gamg", "mg", "ml")
 SSOR_OPTIONS: PetscOptions = {"pc_type": "sor"}
 MULTIGRID_OPTIONS: PetscOptions = {"pc_type": "gamg"}
 STRONG_LINKS: PetscOptions = {"pc_gamg_threshold": 0.05, "pc_gamg_aggressive_square_graph": False}
@@ -61,6 +62,17 @@ def rigid_body_nullspace(comm: MPI.Comm, positions: Values) -> PETSc.NullSpace:
     """
     coordinates = PETSc.Vec().createWithArray(positions.reshape(-1), bsize=positions.shape[1], comm=comm)
     return PETSc.NullSpace().createRigidBody(coordinates)
+
+
+def renew_smoothers(pc: PETSc.PC) -> None:
+    """Make the smoothers of multigrid follow the tangent, though coarse spaces and coarse operators are kept.
+
+    PETSc 3.25 makes smoothers keep their set-up where that of multigrid is kept, 3.22 does not. Diagonals of an older
+    tangent are too small where contact has become stiff, and the preconditioner is then indefinite.
+    """
+    if pc.getType() in MULTIGRID_TYPES:
+        for level in range(pc.getMGLevels()):
+            pc.getMGSmoother(level).getPC().setReusePreconditioner(False)
 
 
 def mass_stiffness_ratio(balance: Balance) -> float:

@@ -346,7 +346,7 @@ RUNS: dict[str, dict[str, Any]] = {
                       "spin": [1.0], "mass": 0.02, "friction": 0.3},
                       {"name": "second", "shape": "box", "size": [0.2, 0.1], "at": [0.85, 1.0], "velocity": [0.0, -2.0],
                        "mass": 0.01}],
-        "time": {"scheme": "generalized-alpha", "step": 0.05, "end": 0.1},
+        "time": {"scheme": "generalized-alpha", "step": 0.025, "end": 0.1},
     },
     # torn, then pushed together until its pieces touch one another
     "shut": {
