@@ -146,7 +146,8 @@ def mesh(
         print(f"note: {one_line(note)}")
     for name, value in (mesh_quality(data) | preferred_directions(data)).items():
         print(f"{name:24} {value:.6g}" if isinstance(value, float) else f"{name:24} {one_line(str(value))}")
-    save_mesh(data, out)
+    for note in save_mesh(data, out):
+        print(f"note: {one_line(note)}")
     print(f"saved in {out}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
 from fracsim.meshes.random_points.outline_file import fill_outline, read_outline
 from fracsim.meshes.read import read_mesh
-from fracsim.meshes.write import write_mesh
+from fracsim.meshes.write import NAMES_ARE_KEPT, write_mesh
 
 
 def sample(dim: int) -> MeshData:
@@ -57,6 +58,21 @@ def test_round_trip_with_tags(tmp_path: Path, dim: int, ending: str, key: str) -
     read = check_mesh(read_mesh(path))
     assert read.notes == ()
     assert_same(read, sample(dim), "tag-1", "tag-2", ("tag-5", "tag-6"))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("ending", NAMES_ARE_KEPT)
+def test_what_is_written_is_read_again(tmp_path: Path, dim: int, ending: str) -> None:
+    """All cells, facets and groups, by their names or by the numbers of the note."""
+    mesh = sample(dim)
+    mesh = replace(mesh, regions={f"half-{half}": np.flatnonzero(halves(mesh) == half) for half in (0, 1)})
+    notes = write_mesh(mesh, tmp_path / f"part{ending}")
+    names = [*mesh.facet_groups, *mesh.regions]
+    kept = {name: name if NAMES_ARE_KEPT[ending] else f"tag-{number}" for number, name in enumerate(names, start=1)}
+    assert bool(notes) != NAMES_ARE_KEPT[ending]
+    assert all(f"{number} is {name}" in note for note in notes for number, name in enumerate(names, start=1))
+    read = check_mesh(read_mesh(tmp_path / f"part{ending}"))
+    assert_same(read, mesh, kept["left"], kept["right"], (kept["half-0"], kept["half-1"]))
 
 
 @pytest.mark.parametrize("dim", [2, 3])
@@ -320,8 +336,8 @@ def test_an_outline_in_letters_of_windows(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("name", "why"),
     [
-        ("part.odd", r"its ending is of no known format \(.*\.xdmf.*\); save it as .msh, .vtu or .xdmf$"),
-        ("part.svg", "this mesh does not fit that format; save it as .msh, .vtu or .xdmf$"),
+        ("part.odd", r"its ending is of no known format; save it as .msh, or as .*\.xdmf"),
+        ("part.stl", r"such files would lose cells, facets or groups; save it as .msh, or as .*\.xdmf"),
         ("link/part.vtu", "Not a directory$|File exists$"),
     ],
 )

@@ -251,8 +251,8 @@ def _mesh_errors() -> Iterator[None]:
         raise InputError(f"mesh: {error}") from None
 
 
-def save_mesh(data: MeshData, path: Path) -> None:
-    """Save a mesh with its groups, in the format of the ending of the path.
+def save_mesh(data: MeshData, path: Path) -> tuple[str, ...]:
+    """Save a mesh with its groups, in the format of the ending of the path; returns notes on what it does not keep.
 
     Raises:
         InputError: if the format is unknown or the file cannot be written.
@@ -260,6 +260,6 @@ def save_mesh(data: MeshData, path: Path) -> None:
     from ..meshes.write import write_mesh
 
     try:
-        write_mesh(data, path)
+        return write_mesh(data, path)
     except MeshError as error:
         raise InputError(f"--out: {error}") from None

@@ -77,7 +77,8 @@ def prepare(folder: Path) -> None:
                 warnings.catch_warnings(),
             ):  # what this meshio cannot write, or lacks a library for
                 warnings.simplefilter("ignore")
-                meshio.write(_folder(top, name) / name, mesh, file_format=kind, **how)
+                with np.printoptions(legacy="1.25"):  # UGRID is written by repr
+                    meshio.write(_folder(top, name) / name, mesh, file_format=kind, **how)
     _write_with_vtk(top, box, surface)
     _write_with_gmsh(top)
     _write_vtkhdf(_folder(top, "a.vtkhdf") / "a.vtkhdf", box)
