@@ -229,6 +229,21 @@ class NeoHookean(_PlaneStrain):
         return distortion + volumetric / 2 * (ufl.det(F) - alpha) ** 2 - at_rest
 
 
+@dataclass(frozen=True)
+class UserEnergy(_PlaneStrain):
+    """Energy of the user, given for the 3 x 3 deformation gradient; 2D is plane strain.
+
+    Attributes:
+        law: object with a method `psi(F)`, J/m^3.
+    """
+
+    law: Any = None
+
+    def psi(self, F: Expr, rotation: Expr | None = None) -> Expr:
+        """Return the energy density, J/m^3."""
+        return self.law.psi(embed(F, 1.0))
+
+
 ENERGIES: dict[str, type] = {
     "linear": LinearElastic,
     "corotated": Corotated,

@@ -10,15 +10,17 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .mechanics.term import Term
     from .report.run_output import RunOutput, open_run
     from .simulation import Simulation, load, run
 
 __version__ = "0.1.0"
-__all__ = ["RunOutput", "Simulation", "load", "open_run", "run"]
+__all__ = ["RunOutput", "Simulation", "Term", "load", "open_run", "run"]
 
 _MODULES = {
     "RunOutput": "report.run_output",
     "Simulation": "simulation",
+    "Term": "mechanics.term",
     "load": "simulation",
     "open_run": "report.run_output",
     "run": "simulation",

@@ -44,6 +44,7 @@ from .process import import_outside
 from .scene import Scene, build_scene
 from .study import Study
 from .study.conditions import initial_cracks
+from .study.plugins import physics_lines
 from .study.reader import add_missing_defaults, study_text
 from .timestepping.stepper import StepReport
 
@@ -102,7 +103,8 @@ class Run:
         self.scene, self.folder, self.comm = scene, folder, scene.domain.comm
         self.interrupt = interrupt or InterruptHandler(self.comm, wall_limit)
         self._progress = progress or ProgressReporter(first=self.comm.rank == 0, end=scene.study.time.end)
-        self._text = study_text(scene.study, [f"{key}: {value}" for key, value in software_versions(self.comm).items()])
+        versions = [f"{key}: {value}" for key, value in software_versions(self.comm).items()]
+        self._text = study_text(scene.study, [*versions, *scene.physics.lines])
         self._meter = ResourceMeter(self.comm, scene.stepper, began)
         self._forgets = False  # a checkpoint was written: the next step depends on what is in it alone
         stress, by_forces = scene.balance.stress, scene.study.output.cut == "forces"
@@ -123,6 +125,12 @@ class Run:
     def _resume(self) -> CheckpointNotes:
         """Restore the state of the checkpoint; return its notes (collective). Raises InputError."""
         scene, breaks, notes = self.scene, self.breaks, from_root(self.comm, lambda: read_notes(self.folder))
+        earlier, lines = physics_lines(notes.study), self.scene.physics.lines
+        if earlier != lines:
+            raise InputError(
+                f"--restart: the run was with {'; '.join(earlier) or 'built-in physics'}, and is to go on with "
+                f"{'; '.join(lines) or 'built-in physics'}: give it the same, or run without --restart"
+            )
         if missing := sorted(CHECKPOINT_MONITORS - notes.monitors.keys()):
             raise restart_error(checkpoint_path(self.folder), f"notes/monitors has no {missing[0]}")
         state = read_checkpoint(self.folder, scene.domain, self.state, scene.balance, breaks.record, breaks.surfaces)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,13 +36,15 @@ from .deformable_run import Run, run_study, wants_smooth  # noqa: E402
 from .errors import InputError  # noqa: E402
 from .mesh.ghost_exchange import with_ghosts  # noqa: E402
 from .mesh.given_mesh import GivenMesh, NamedTags, gather_mesh  # noqa: E402
+from .meshes.data import MeshData  # noqa: E402
 from .output.fracture_log import FractureLog  # noqa: E402
 from .output.frame_files import FieldEvaluator, surface_output  # noqa: E402
 from .output.history import History  # noqa: E402
 from .report.run_output import RunOutput  # noqa: E402
 from .scene import Scene, build_scene  # noqa: E402
 from .study import Study  # noqa: E402
-from .study.mesh_source import GIVEN_MESH  # noqa: E402
+from .study.body import GIVEN_MESH  # noqa: E402
+from .study.plugins import Physics, collect_physics  # noqa: E402
 from .study.reader import find_study, load_study, study_text  # noqa: E402
 from .timestepping.state import State  # noqa: E402
 
@@ -78,9 +81,7 @@ def run(
     overwrite: bool = False,
     wall_limit: float | None = None,
     comm: MPI.Intracomm | None = None,
-    mesh: Mesh | None = None,
-    facets: NamedTags | None = None,
-    regions: NamedTags | None = None,
+    **parts: Any,
 ) -> RunOutput:
     """Run a study to its end, as `fracsim run` does, and return the output folder (collective).
 
@@ -92,38 +93,60 @@ def run(
         overwrite: replace a run in the folder that could be continued.
         wall_limit: wall time after which the run stops with a checkpoint, s.
         comm: communicator of the run; None: that of `mesh`, or MPI.COMM_WORLD.
-        mesh: mesh in place of [mesh], as for `Simulation`.
-        facets: tags of facets, and the tag of each named group.
-        regions: tags of cells, and the tag of each named region.
+        parts: mesh, facets, regions, energy, criterion, edge_law, terms and boundary, as for `Simulation`.
 
     Raises:
-        InputError: study, mesh or folder cannot be used.
+        InputError: study, mesh, physics or folder cannot be used.
         NotConverged, Stopped, CannotWrite: the run ended early; the message says how to continue.
     """
-    comm, loaded, handed_over = _prepare(study, overrides, comm, mesh, facets, regions)
+    body = _prepare(study, overrides, comm, **parts)
     source = find_study(study) if isinstance(study, str) else study if isinstance(study, Path) else None
     folder = Path(out)
     run_study(
-        comm, loaded, folder, restart=restart, overwrite=overwrite, wall_limit=wall_limit, source=source,
-        build=partial(build_scene, given=None if handed_over is None else handed_over.mesh),
+        body.comm, body.study, folder, restart=restart, overwrite=overwrite, wall_limit=wall_limit, source=source,
+        build=partial(build_scene, given=body.arrays, physics=body.physics),
     )  # fmt: skip
-    comm.Barrier()
+    body.comm.Barrier()
     return RunOutput(folder)
+
+
+@dataclass(frozen=True)
+class _Body:
+    """What a simulation is made of.
+
+    Attributes:
+        comm: communicator.
+        study: validated study.
+        physics: of the user, and plug-ins of the study.
+        mesh: mesh that was handed over, on rank 0.
+    """
+
+    comm: MPI.Intracomm
+    study: Study
+    physics: Physics
+    mesh: GivenMesh | None = None
+
+    @property
+    def arrays(self) -> MeshData | None:
+        """Arrays of the mesh that was handed over, on rank 0."""
+        return None if self.mesh is None else self.mesh.mesh
 
 
 def _prepare(
     study: StudySource,
     overrides: Overrides,
     comm: MPI.Intracomm | None,
-    mesh: Mesh | None,
-    facets: NamedTags | None,
-    regions: NamedTags | None,
-) -> tuple[MPI.Intracomm, Study, GivenMesh | None]:
-    """Return communicator, study, and the given mesh on rank 0 (collective). The arguments are those of `run`."""
+    mesh: Mesh | None = None,
+    facets: NamedTags | None = None,
+    regions: NamedTags | None = None,
+    **physics: Any,
+) -> _Body:
+    """Return what a simulation is made of (collective). The arguments are those of `Simulation`."""
     if mesh is None:
         if facets is not None or regions is not None:
             raise InputError("facets and regions are tags of a mesh that is handed over: give mesh=... as well")
-        return comm or MPI.COMM_WORLD, load(study, overrides), None
+        loaded = load(study, overrides)
+        return _Body(comm or MPI.COMM_WORLD, loaded, _collect(loaded, physics))
     table = {"builder": GIVEN_MESH}
     if isinstance(study, Mapping):
         order = {key: value for key, value in study.get("mesh", {}).items() if key == "order"}
@@ -132,7 +155,15 @@ def _prepare(
     if loaded.time.scheme == "rigid":
         raise InputError('time.scheme = "rigid" takes no mesh of DOLFINx: give [mesh] in the study')
     settings = type(loaded.mesh).model_validate(table | {"order": loaded.mesh.order})
-    return mesh.comm, loaded.model_copy(update={"mesh": settings}), gather_mesh(mesh, facets, regions)
+    loaded = loaded.model_copy(update={"mesh": settings})
+    return _Body(mesh.comm, loaded, _collect(loaded, physics), gather_mesh(mesh, facets, regions))
+
+
+def _collect(study: Study, physics: dict[str, Any]) -> Physics:
+    """Return the physics given in Python and the plug-ins of a study; rigid bodies have none."""
+    if study.time.scheme == "rigid" and any(value is not None and value != () for value in physics.values()):
+        raise InputError(f'time.scheme = "rigid" has no physics of the user: remove {", ".join(physics)}')
+    return collect_physics(study, **physics)
 
 
 class Simulation:
@@ -161,6 +192,11 @@ class Simulation:
         mesh: Mesh | None = None,
         facets: NamedTags | None = None,
         regions: NamedTags | None = None,
+        energy: Any = None,
+        criterion: Any = None,
+        edge_law: Any = None,
+        terms: Sequence[Any] = (),
+        boundary: Sequence[Mapping[str, Any]] = (),
     ) -> None:
         """Build the body at t = 0, or at the checkpoint of a restart (collective).
 
@@ -174,11 +210,23 @@ class Simulation:
             mesh: straight triangles or tetrahedra on any number of ranks, in m.
             facets: tags of facets, and the tag of each group: `(tags, {"left": 1, "right": 2})`.
             regions: tags of cells, and the tag of each region: `(tags, {"crust": 7})`.
+            energy: object with `psi(F)`, J/m^3, F (3, 3); or a class or function that makes one of its arguments
+                `mu`, `lmbda` (Pa) and `mesh`, or some of them.
+            criterion: function `load(stress, edges, strength)` with arrays (n, d, d), (n, k, d) and (n, k), which
+                returns loads (n, k); an edge breaks at 1.
+            edge_law: function of loads (n,) from 1 on that returns integrities (n,), 1 whole to 0 broken.
+            terms: classes or functions that make a `fracsim.Term` of a `TermInputs` (`u`, `domain`, `stress`, `mass`).
+            boundary: entries as in [[boundary]], whose displacement, traction, force or pressure is a function of t
+                (s), or of t and x (n, d); for a displacement with `components`, such as "x".
 
         Raises:
-            InputError: study, mesh or folder cannot be used.
+            InputError: study, mesh, physics or folder cannot be used; the message names what and why.
         """
-        self.comm, self.study, self._given = _prepare(study, overrides, comm, mesh, facets, regions)
+        body = _prepare(
+            study, overrides, comm, mesh, facets, regions, energy=energy, criterion=criterion, edge_law=edge_law,
+            terms=terms, boundary=boundary,
+        )  # fmt: skip
+        self.comm, self.study, self._given = body.comm, body.study, body.mesh
         if self.study.time.scheme == "rigid":
             raise InputError('time.scheme = "rigid" moves many bodies, which Simulation does not: use fracsim.run')
         if restart and out is None:
@@ -187,8 +235,7 @@ class Simulation:
         self._functions: dict[str, fem.Function] = {}
         self._surface: SurfaceOutput | None = None
         self._columns: dict[str, list[float]] = {}
-        arrays = None if self._given is None else self._given.mesh
-        self.scene: Scene = build_scene(self.comm, self.study, given=arrays)
+        self.scene: Scene = build_scene(self.comm, self.study, given=body.arrays, physics=body.physics)
         self._run: Run | None = None
         try:
             if out is not None:

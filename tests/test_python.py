@@ -28,7 +28,7 @@ from support import given
 from support.ranks import Arrays, run_on_ranks
 
 DOCS = Path(__file__).parent.parent / "docs"
-NAMES = {"RunOutput", "Simulation", "load", "open_run", "run"}
+NAMES = {"RunOutput", "Simulation", "Term", "load", "open_run", "run"}
 
 
 def python(code: str, folder: Path) -> str:
@@ -47,7 +47,7 @@ print([name for name in {heavy} if name in sys.modules], hasattr(fracsim, "simul
 import fracsim.deformable_run, fracsim.scene, fracsim.study.reader
 print([callable(getattr(fracsim, name)) for name in sorted(fracsim.__all__)])
 """
-    assert python(code, tmp_path) == "[] False\n[True, True, True, True, True]\n"
+    assert python(code, tmp_path) == "[] False\n[True, True, True, True, True, True]\n"
     assert set(package.__all__) == NAMES
 
 

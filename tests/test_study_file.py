@@ -142,7 +142,7 @@ def test_every_default_is_written() -> None:
     }  # fmt: skip
     assert data["fracture"] == {
         "strength": 2e4, "approach": "chi", "radius": 0.0, "kernel": "linear", "tie_break": 1e-6, "crumbs": True,
-        "unilateral": False, "branching": False, "law": "griffith",
+        "unilateral": False, "branching": False, "law": "griffith", "criterion": "normal-stress", "edge_law": "brittle",
     }  # fmt: skip
     assert "plasticity" not in data
     data = tomllib.loads(study_text(study(STRIP, plasticity={"yield_stress": 1e4})))

@@ -6,6 +6,7 @@ Equations: docs/theory.md#edge-criterion.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Protocol
 
 import numpy as np
@@ -14,7 +15,7 @@ import numpy.typing as npt
 from ..mechanics.stress import Stress
 from ..mesh.edge_graph import EdgeGraph
 from ..mesh.parallel import allgather, sum_over_ranks
-from .edge_stress import EdgeStressOperator, normal_stress_bound
+from .edge_stress import EdgeStressOperator, edge_vectors, normal_stress_bound
 from .strength import EdgeStrength
 
 Values = npt.NDArray[np.float64]
@@ -184,3 +185,50 @@ class OverloadedEdges:
 
     def restore_cuts(self, cut_positions: Values, tip_states: Values | None) -> None:
         """Do nothing: the criterion does not determine cuts."""
+
+
+EdgeLoad = Callable[[Values, Values, Values], Values]
+
+
+class UserCriterion(OverloadedEdges):
+    """Criterion of the user: an edge fails if the load that a function gives in one of its cells reaches 1.
+
+    The function has arguments stress (n, d, d) in Pa, averaged as the study asks, unit edge vectors (n, k, d) and
+    strengths (n, k) in Pa. It returns loads (n, k). Stress and edges are those of the present configuration.
+    """
+
+    def __init__(
+        self,
+        load: EdgeLoad,
+        stress: Stress,
+        graph: EdgeGraph,
+        strength: EdgeStrength,
+        average: CellAverage | None,
+        cap: float | None = None,
+    ) -> None:
+        """Build the criterion; the arguments are those of `OverloadedEdges`, after the function."""
+        super().__init__(stress, graph, strength, average, cap)
+        self._load, self._stress = load, stress
+        self._carried = IntactEdgeStress(stress, graph, average, whole_tensor=True)
+
+    def __call__(self, stress: Values, psi: Values) -> tuple[Edges, Values]:
+        """Find the local edges (n,) that fail, and their loads (n,) (collective)."""
+        averaged = self._carried.average_all(*self._carried(stress))
+        cells, edges = np.arange(len(averaged)), self._graph.cell_edges
+        vectors = edge_vectors(self._stress.cell_corners(cells))
+        length = np.linalg.norm(vectors, axis=2, keepdims=True)
+        directions = np.divide(vectors, length, out=np.zeros_like(vectors), where=length > 0)
+        load = np.asarray(self._load(full_tensors(averaged), directions, self.strength(cells, edges)), float)
+        fails = (load >= 1) & ~self._graph.broken[edges] & ~self._graph.split[:, None]
+        overloaded = edges[fails], load[fails]
+        return overloaded if self._max_edges is None else self._select_most_loaded(*overloaded, self._max_edges)
+
+
+def full_tensors(components: Values) -> Values:
+    """Return symmetric tensors (n, d, d) of components (n, 3 or 6): the normal ones, then xy, or xy, xz and yz."""
+    dim = 2 if components.shape[1] == 3 else 3
+    tensors = np.empty((len(components), dim, dim))
+    pairs = [(i, i) for i in range(dim)] + [(i, j) for i in range(dim) for j in range(i + 1, dim)]
+    for column, (i, j) in enumerate(pairs):
+        tensors[:, i, j] = tensors[:, j, i] = components[:, column]
+    return tensors

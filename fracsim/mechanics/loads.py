@@ -18,10 +18,10 @@ from ..mesh.parallel import sum_over_ranks
 from .jit import compile_form
 from .matrix_assembly import VectorAssembler
 from .term import Term, TimeLevel
-from .time_functions import TimeFunction
+from .time_functions import PlaceFunction, TimeFunction
 
 Values = npt.NDArray[np.float64]
-OnFacets = tuple[Ints, TimeFunction]  # local boundary facets, and the load on them
+OnFacets = tuple[Ints, TimeFunction | PlaceFunction]  # local boundary facets, and the load on them
 
 
 class _TimeDependentConstants:
@@ -30,9 +30,14 @@ class _TimeDependentConstants:
     def __init__(self, domain: Domain) -> None:
         self._domain = domain
         self._constants: list[tuple[fem.Constant, TimeFunction]] = []
+        self._fields: list[tuple[fem.Function, int, TimeFunction]] = []
 
-    def constant(self, function: TimeFunction, size: int) -> fem.Constant:
-        """Constant of `size` components with the values of a function."""
+    def constant(self, function: TimeFunction | PlaceFunction, size: int) -> Expr:
+        """Constant of `size` components with the values of a function; a field if they depend on the place."""
+        if isinstance(function, PlaceFunction):
+            field = fem.Function(self._domain.space)
+            self._fields.append((field, size, function.at(self._domain.nodes)))
+            return field if size > 1 else field[0]
         value = fem.Constant(self._domain.mesh, np.full(size, np.nan) if size > 1 else np.float64(np.nan))
         self._constants.append((value, function))
         return value
@@ -44,6 +49,11 @@ class _TimeDependentConstants:
             value = function(t).reshape(constant.value.shape)
             changed |= not np.array_equal(value, constant.value)
             constant.value[...] = value
+        for field, size, function in self._fields:
+            values = field.x.array.reshape(-1, self._domain.dim)[:, :size]
+            at_nodes = function(t).reshape(values.shape)
+            changed |= not np.array_equal(at_nodes, values)
+            values[...] = at_nodes
         return changed
 
 

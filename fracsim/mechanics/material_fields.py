@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -37,13 +37,19 @@ class MaterialFields:
 
 
 def material_fields(
-    domain: Domain, energy: str, *, young: PerCell, poisson: PerCell, density: PerCell, plane_stress: bool = False
+    domain: Domain,
+    energy: str | Callable[[Any, Any], Energy],
+    *,
+    young: PerCell,
+    poisson: PerCell,
+    density: PerCell,
+    plane_stress: bool = False,
 ) -> MaterialFields:
     """Elastic material on a mesh.
 
     Args:
         domain: the mesh.
-        energy: name of the stored energy (forms.energies.ENERGIES).
+        energy: name of the stored energy (forms.energies.ENERGIES), or a function of mu and lambda that returns one.
         young: Young's modulus, Pa.
         poisson: Poisson's ratio.
         density: kg/m^3.
@@ -54,7 +60,8 @@ def material_fields(
     if domain.dim == 2 and plane_stress:
         lmbda = plane_stress_lambda(mu, lmbda)
         options = {"plane_stress": True}
-    psi = ENERGIES[energy](coefficient(domain, mu), coefficient(domain, lmbda), **options)
+    make = ENERGIES[energy] if isinstance(energy, str) else energy
+    psi = make(coefficient(domain, mu), coefficient(domain, lmbda), **options)
     return MaterialFields(psi, density, young, mu, lmbda)
 
 

@@ -17,7 +17,7 @@ from ..mesh.connected_bodies import describe_free_motion, label_bodies, unsuppor
 from ..mesh.domain import Domain, Ints
 from ..mesh.parallel import on_root
 from ..meshes.data import MeshData, format_midpoint
-from .time_functions import TimeFunction
+from .time_functions import PlacedFunction, TimeFunction
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -36,14 +36,20 @@ class PrescribedMotion:
     """
 
     def __init__(self, domain: Domain, entries: Sequence[Entry]) -> None:
-        """`entries`: local nodes, (d,) flags of their prescribed components, and displacement (d,) in m."""
+        """`entries`: local nodes, (d,) flags of their prescribed components, and displacement (d,) in m.
+
+        A `PlacedFunction` has displacements (n d,) of the n nodes.
+        """
         size = domain.dim
         self._domain, self._functions = domain, [function for _, _, function in entries]
         # row of the table of all functions' values, for each component of each node
-        row = np.full((len(domain.nodes), size), -1, np.int64)
-        for index, (nodes, components, _) in enumerate(entries):
+        row, first = np.full((len(domain.nodes), size), -1, np.int64), 0
+        for nodes, components, function in entries:
+            # a function of time and place has values for each of its nodes
+            of_node = size * np.arange(len(nodes)) if isinstance(function, PlacedFunction) else 0
             for component in np.flatnonzero(components):
-                row[nodes, component] = index * size + component
+                row[nodes, component] = first + of_node + component
+            first += size * (len(nodes) if isinstance(function, PlacedFunction) else 1)
         flat = row.reshape(-1)
         self.dofs: Ints = np.flatnonzero(flat >= 0).astype(np.int32)
         self._row = flat[self.dofs]

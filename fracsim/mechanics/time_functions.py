@@ -38,6 +38,38 @@ class TabulatedFunction:
         return np.asarray(np.diff(knots) @ (rates[1:] + rates[:-1]) / 2)
 
 
+@dataclass(frozen=True)
+class PlaceFunction:
+    """Function of time and place of the user.
+
+    Attributes:
+        function: returns values (n, k) at time t (s) and reference positions x (n, d), m.
+    """
+
+    function: Callable[[float, Values], Values]
+
+    def at(self, x: Values) -> PlacedFunction:
+        """Function of time alone at positions x (n, d), m."""
+        return PlacedFunction(self.function, x)
+
+
+@dataclass(frozen=True)
+class PlacedFunction:
+    """Function of time with values (n k,) at n positions, k for each of them.
+
+    Attributes:
+        function: of t (s) and x (n, d).
+        x: (n, d) positions, m.
+    """
+
+    function: Callable[[float, Values], Values]
+    x: Values
+
+    def __call__(self, t: float) -> Values:
+        """(n k,) values at time t (s)."""
+        return np.asarray(self.function(t, self.x), float).reshape(-1)
+
+
 def constant_function(values: Sequence[float] | Values) -> TabulatedFunction:
     """Function with the same k values at all times."""
     return TabulatedFunction(np.zeros(1), np.array([values], float))

@@ -37,6 +37,7 @@ from ..solvers.weak_callbacks import collect_dropped_scenes  # noqa: E402
 from ..study import Study, TimeSettings, solver_options  # noqa: E402
 from ..study.check import build_checked_mesh  # noqa: E402
 from ..study.conditions import check_size, find_selector, initial_motion, obstacle_placements, step_size_function  # noqa: E402
+from ..study.plugins import NO_PHYSICS, Physics, collect_physics  # noqa: E402
 from ..timestepping.inelastic_update import FractureProtocol, NoFracture, PlasticFlowProtocol  # noqa: E402
 from ..timestepping.state import State, initial_velocity  # noqa: E402
 from ..timestepping.step_sizes import StepSizes  # noqa: E402
@@ -72,6 +73,7 @@ class Scene:
         stepper: takes a state to the next one.
         fracture: what breaks edges; None without [fracture].
         probes: what history.csv records beside energies.
+        physics: of the user, and plug-ins.
     """
 
     study: Study
@@ -81,6 +83,7 @@ class Scene:
     stepper: Stepper
     fracture: EdgeBreaking | None
     probes: ProbeReader
+    physics: Physics = NO_PHYSICS
 
     def start(self) -> State:
         """Return the state at t = 0 (collective)."""
@@ -104,6 +107,7 @@ def build_scene(
     stage: Callable[[str], None] = lambda name: None,
     *,
     given: MeshData | None = None,
+    physics: Physics = NO_PHYSICS,
 ) -> Scene:
     """Return the scene of a study (collective).
 
@@ -112,14 +116,17 @@ def build_scene(
         study: of one deformable body.
         stage: called with the name of each stage as it begins.
         given: mesh in place of that of [mesh], on rank 0.
+        physics: of the user; plug-ins that the study names are added.
 
     Raises:
         InputError: mesh and study do not fit.
     """
+    if physics is NO_PHYSICS and study.plugin_names:
+        physics = collect_physics(study)
     stage("building the mesh" if study.mesh.builder else "reading the mesh")
-    mesh = on_root(comm, lambda: build_checked_mesh(study, given))
+    mesh = on_root(comm, lambda: build_checked_mesh(study, given, physics.boundary))
     stage("sharing the mesh among ranks" if comm.size > 1 else "building the edges of the mesh")
-    return build_scene_on(distribute(comm, mesh, study.mesh.order), study, stage=stage)
+    return build_scene_on(distribute(comm, mesh, study.mesh.order), study, stage=stage, physics=physics)
 
 
 def build_scene_on(
@@ -128,6 +135,7 @@ def build_scene_on(
     material: MaterialFields | None = None,
     *,
     stage: Callable[[str], None] = lambda name: None,
+    physics: Physics = NO_PHYSICS,
 ) -> Scene:
     """Return the scene of a study on an existing mesh (collective).
 
@@ -136,16 +144,17 @@ def build_scene_on(
         study: of one deformable body.
         material: in place of that of the study.
         stage: called with the name of each stage as it begins.
+        physics: of the user.
     """
     stage("setting up the balance of forces (kernels are compiled the first time)")
     collect_dropped_scenes(domain.comm)
     scheme = make_scheme(study.time)
-    balance = build_balance(study, domain, scheme, material or build_material(study, domain))
+    balance = build_balance(study, domain, scheme, material or build_material(study, domain, physics.energy), physics)
     if not scheme.inertia:
         check_supports(domain, balance.motion)
     stage("setting up what breaks and what solves")
     flow = build_flow(study, balance)
-    breaking = build_fracture_pass(study, balance, flow)
+    breaking = build_fracture_pass(study, balance, flow, physics)
     solver = None
     if scheme.implicit:
         options, plain = solver_options.without_plain(study.solver), solver_options.uses_plain_solver(study.solver)
@@ -159,7 +168,7 @@ def build_scene_on(
         balance, _probes(study, domain), motions=motions, contours=_contours(study, balance), thickness=study.thickness,
         onset_reactions=(lambda: stepper.onset_reactions) if solves_again else None,
     )  # fmt: skip
-    return Scene(study, domain, balance, solver, stepper, breaking, probes)
+    return Scene(study, domain, balance, solver, stepper, breaking, probes, physics)
 
 
 def make_scheme(timing: TimeSettings) -> Scheme:

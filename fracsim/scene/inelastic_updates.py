@@ -13,6 +13,7 @@ from ..mesh.domain import Domain
 from ..study import BrittleSettings, Study
 from ..study.conditions import fibre_direction, initial_cracks
 from ..study.length_checks import check_branching_dimension
+from ..study.plugins import NO_PHYSICS, Physics, PhysicsPart
 from ..timestepping.inelastic_update import NoPlasticFlow, PlasticFlowProtocol
 from .terms import per_cell
 
@@ -38,7 +39,9 @@ def build_flow(study: Study, balance: Balance) -> PlasticFlowProtocol:
     return ReturnMapping(balance.stress)
 
 
-def build_fracture_pass(study: Study, balance: Balance, flow: PlasticFlowProtocol) -> FracturePass | None:
+def build_fracture_pass(
+    study: Study, balance: Balance, flow: PlasticFlowProtocol, physics: Physics = NO_PHYSICS
+) -> FracturePass | None:
     """Return the fracture pass of a study with this plastic flow (collective); None without [fracture]."""
     if study.fracture is None:
         return None
@@ -54,10 +57,15 @@ def build_fracture_pass(study: Study, balance: Balance, flow: PlasticFlowProtoco
     if study.fracture.energy is not None:
         fracture = _build_energy_pass(study, balance, flow, graph, passes, cuts)
     else:
-        criterion = _build_criterion(study, balance.stress, graph)
+        criterion = _build_criterion(study, balance.stress, graph, physics.criterion)
         attachment = _build_node_attachment(study, balance, graph, criterion.strength)
+        law = None
+        if physics.edge_law is not None:
+            from .user_physics import user_edge_law
+
+            law = user_edge_law(physics.edge_law)
         fracture = FracturePass(
-            balance.stress, graph, criterion, max_passes=passes, initial_cuts=cuts, node_attachment=attachment
+            balance.stress, graph, criterion, law, max_passes=passes, initial_cuts=cuts, node_attachment=attachment
         )
     if (cut := fracture.criterion.cut_positions) is not None:
         balance.contact.set_cuts(lambda: graph.gather_broken(cut[:, None]))
@@ -172,7 +180,7 @@ def _open_initial_cracks(study: Study, balance: Balance, graph: EdgeGraph) -> Va
 
 
 def _build_criterion(
-    study: Study, stress: Stress, graph: EdgeGraph
+    study: Study, stress: Stress, graph: EdgeGraph, criterion: PhysicsPart | None
 ) -> OverloadedEdges | CellRetention | BrittleSurfaces:
     """Return the criterion that selects edges (collective)."""
     from ..fracture.criterion import OverloadedEdges
@@ -180,7 +188,14 @@ def _build_criterion(
     assert study.fracture is not None
     strength, average = build_strength(study, stress.domain, graph), build_average(study, stress.domain)
     if study.brittle is None:
-        failing = OverloadedEdges(stress, graph, strength, average, study.fracture.cap)
+        if criterion is None:
+            failing = OverloadedEdges(stress, graph, strength, average, study.fracture.cap)
+        else:
+            from ..fracture.criterion import UserCriterion
+            from .user_physics import user_criterion
+
+            load = user_criterion(criterion, stress.domain.dim)
+            failing = UserCriterion(load, stress, graph, strength, average, study.fracture.cap)
         if study.fracture.crumbs:
             return failing
         from ..fracture.node_retention import CellRetention

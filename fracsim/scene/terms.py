@@ -7,39 +7,51 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import ufl
 from dolfinx import fem
 from mpi4py import MPI
 from ufl.core.expr import Expr
 
+from ..errors import InputError
 from ..forms.schemes import Scheme
 from ..mechanics.balance import Balance
 from ..mechanics.inertia import ConsistentMass, Inertia, LumpedMass, MassMatrix
 from ..mechanics.kernel_selection import KernelSelection
-from ..mechanics.loads import DeadLoads, OnFacets, Pressure, surface_area
+from ..mechanics.loads import DeadLoads, OnFacets, Pressure, surface_area, surface_measures
 from ..mechanics.material_fields import MaterialFields, PerCell, coefficient, material_fields, parameter_by_region
 from ..mechanics.matrix_assembly import VectorAssembler
-from ..mechanics.prescribed_motion import PrescribedMotion
+from ..mechanics.prescribed_motion import Entry, PrescribedMotion
 from ..mechanics.stress import RESIDUAL_STIFFNESS, DegradationModel, Stress
 from ..mechanics.term import Term
-from ..mechanics.time_functions import TimeFunction
+from ..mechanics.time_functions import PlacedFunction, PlaceFunction, TimeFunction
 from ..mesh.domain import Domain
 from ..mesh.selection import select_facets, select_nodes
-from ..mesh.selectors import check_regions
+from ..mesh.selectors import Group, check_regions
 from ..study import Study, solver_options
 from ..study.conditions import BoundaryCondition, boundary_conditions, volume_loads
+from ..study.plugins import NO_PHYSICS, Physics, PhysicsPart
 
 # --- material ---
 
 
-def build_material(study: Study, domain: Domain) -> MaterialFields:
-    """Return the material of a study (collective). Raises InputError if the mesh lacks a region of it."""
+def build_material(study: Study, domain: Domain, energy: PhysicsPart | None = None) -> MaterialFields:
+    """Return the material of a study (collective). Raises InputError if the mesh lacks a region of it.
+
+    `energy`: of the user, in place of that of the study.
+    """
     table = study.material
     check_regions(table.regions, domain.region_names)
     young, poisson, density = (per_cell(study, domain, table, key) for key in ("young", "poisson", "density"))
-    plane_stress = table.plane == "stress"
+    named: Any = table.energy
+    if energy is not None:
+        from .user_physics import check_energy, user_energy
+
+        named = user_energy(energy, domain)
     material = material_fields(
-        domain, table.energy, young=young, poisson=poisson, density=density, plane_stress=plane_stress
+        domain, named, young=young, poisson=poisson, density=density, plane_stress=table.plane == "stress"
     )
+    if energy is not None:
+        check_energy(energy, material, domain)
     return material if study.plasticity is None else _add_yield_law(study, domain, material)
 
 
@@ -103,10 +115,19 @@ class TermInputs:
         """Distributed mesh."""
         return self.assembler.domain
 
+    def facet_measure(self, group: str) -> ufl.Measure:
+        """Return the surface measure of a facet group (collective). Raises InputError if the mesh lacks it."""
+        (measure,) = surface_measures(self.domain, [select_facets(self.domain, Group(group), "facet_measure")])
+        return measure
+
     def on_facets(self, kind: str) -> list[OnFacets]:
         """Return facets and function of time of every boundary condition of a kind (collective)."""
         conditions = [condition for condition in self.conditions if condition.kind == kind]
         facets = [select_facets(self.domain, condition.selector, f"{condition.key}.on") for condition in conditions]
+        for condition in conditions:
+            if isinstance(condition.function, PlaceFunction):
+                placed, size = condition.function.at(self.domain.nodes), 1 if kind == "pressure" else self.domain.dim
+                _check_placed(self.domain, placed, size, self.study.time.end, condition)
         return [(numbers, condition.function) for numbers, condition in zip(facets, conditions, strict=True)]
 
 
@@ -145,7 +166,8 @@ def _force_tractions(inputs: TermInputs) -> list[OnFacets]:
     ]
 
 
-def _force_per_area(force: TimeFunction, area: float) -> TimeFunction:
+def _force_per_area(force: TimeFunction | PlaceFunction, area: float) -> TimeFunction:
+    assert not isinstance(force, PlaceFunction)
     return lambda t: np.asarray(force(t) / area)
 
 
@@ -205,16 +227,39 @@ TERMS: dict[str, Callable[[TermInputs], list[Term]]] = {
 }
 
 
-def build_balance(study: Study, domain: Domain, scheme: Scheme, material: MaterialFields) -> Balance:
+def _prescribed(domain: Domain, entry: BoundaryCondition, end: float) -> Entry:
+    """Return nodes, components and displacement of a boundary condition (collective)."""
+    nodes, function = select_nodes(domain, entry.selector, f"{entry.key}.on"), entry.function
+    if isinstance(function, PlaceFunction):
+        placed = function.at(domain.nodes[nodes])
+        _check_placed(domain, placed, domain.dim, end, entry)
+        return nodes, entry.components, placed
+    return nodes, entry.components, function
+
+
+def _check_placed(domain: Domain, function: PlacedFunction, size: int, end: float, entry: BoundaryCondition) -> None:
+    """Raise InputError on all ranks unless a function of the user has finite values at its places (collective)."""
+    wrong = ""
+    for t in (0.0, end):
+        try:
+            values = function(t)
+        except (TypeError, ValueError) as error:
+            wrong = f"is no array of numbers: {error}"
+            break
+        if values.size != size * len(function.x) or not np.isfinite(values).all():
+            wrong = f"is not finite with the shape (n, {size}), n = {len(function.x)}"
+    if messages := [message for message in domain.comm.allgather(wrong) if message]:
+        raise InputError(f"{entry.key}: {entry.kind} as a function of t and x {messages[0]}")
+
+
+def build_balance(
+    study: Study, domain: Domain, scheme: Scheme, material: MaterialFields, physics: Physics = NO_PHYSICS
+) -> Balance:
     """Return the balance of a body (collective). Raises InputError if a selector selects nothing."""
     kernels = KernelSelection(plain=solver_options.uses_plain_solver(study.solver))
     assembler, u = VectorAssembler(domain, kernels), fem.Function(domain.space, name="displacement")
-    entries = boundary_conditions(study, domain.dim)
-    prescribed = [
-        (select_nodes(domain, entry.selector, f"{entry.key}.on"), entry.components, entry.function)
-        for entry in entries
-        if entry.prescribes_motion
-    ]
+    entries = boundary_conditions(study, domain.dim, physics.boundary)
+    prescribed = [_prescribed(domain, entry, study.time.end) for entry in entries if entry.prescribes_motion]
     motion = PrescribedMotion(domain, prescribed)
     density = coefficient(domain, material.density)
     mass: MassMatrix = LumpedMass(assembler, density)
@@ -225,4 +270,14 @@ def build_balance(study: Study, domain: Domain, scheme: Scheme, material: Materi
     stress = Stress(assembler, u, material, degradation, floor=floor)
     inputs = TermInputs(study, scheme, assembler, u, density, stress, mass, motion, entries)
     terms = [term for make in TERMS.values() for term in make(inputs)]
-    return Balance(assembler, u, [stress, *terms], motion, mass, scheme, study.time.max_step)
+    if not physics.terms:
+        return Balance(assembler, u, [stress, *terms], motion, mass, scheme, study.time.max_step)
+    from .user_physics import TermCheck, user_terms
+
+    of_user = user_terms(physics.terms, inputs)
+    terms += [term for _, term in of_user]
+    balance = Balance(assembler, u, [stress, *terms], motion, mass, scheme, study.time.max_step)
+    check = TermCheck(balance)
+    for part, term in of_user:
+        check(part, term)
+    return balance

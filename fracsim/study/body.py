@@ -4,12 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, field_validator, model_validator
 
+from .plugins import or_plugin
 from .values import NonNegative, Poisson, Positive, Strength, StudyTable, key
 
+EnergyName = Literal["linear", "corotated", "stvk", "neo-hookean"]
+# builder of a study whose mesh is handed over in Python; study.toml of its run has the name
+GIVEN_MESH = "given"
 SOURCES = ("builder", "file", "surface", "outline", "shell")
 
 
@@ -166,9 +170,10 @@ class MaterialSettings(ElasticSettings):
         " the study does not give them.",
         default=None, example="soda-lime glass",
     )  # fmt: skip
-    energy: Literal["linear", "corotated", "stvk", "neo-hookean"] = key(
+    energy: Annotated[EnergyName, or_plugin("energies")] = key(
         "Elastic energy: Hooke's law for small strains and rotations, Hooke's law with the rotation of each cell, "
-        "Saint Venant-Kirchhoff, or stable neo-Hookean. Rigid bodies have `linear` only, which is their default.",
+        "Saint Venant-Kirchhoff, or stable neo-Hookean; or the name of a [plug-in](python.md#plug-ins). Rigid bodies "
+        "have `linear` only, which is their default.",
         default="neo-hookean", example="corotated",
     )  # fmt: skip
     plane: Literal["strain", "stress"] = key(

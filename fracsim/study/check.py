@@ -6,7 +6,9 @@ answer takes a second.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from math import prod
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +21,7 @@ from . import Study
 from .check_limits import LIMITS
 from .check_report import report_lines
 from .conditions import (
+    BoundaryCondition,
     boundary_conditions,
     check_size,
     fibre_direction,
@@ -52,7 +55,9 @@ def check_study(study: Study) -> list[str]:
     return list(report_lines(study, summary, near))
 
 
-def build_checked_mesh(study: Study, given: MeshData | None = None) -> MeshData:
+def build_checked_mesh(
+    study: Study, given: MeshData | None = None, functions: Sequence[Mapping[str, Any]] = ()
+) -> MeshData:
     """Returns the mesh of a study.
 
     What the source tells is checked before anything is built.
@@ -60,6 +65,7 @@ def build_checked_mesh(study: Study, given: MeshData | None = None) -> MeshData:
     Args:
         study: of one deformable body.
         given: mesh in place of that of [mesh].
+        functions: boundary conditions with functions of the user.
 
     Raises:
         InputError: if the mesh and the study do not fit together.
@@ -67,11 +73,11 @@ def build_checked_mesh(study: Study, given: MeshData | None = None) -> MeshData:
     surface = open_surface(study.mesh) if given is None else None
     summary = summarise_source(study, surface) if given is None else None
     if summary is not None:
-        _check(study, summary)
+        _check(study, summary, functions)
         _find_near_obstacles(study, summary)
     mesh = build_mesh(study.mesh, surface) if given is None else check_given_mesh(given)
     if summary is None:
-        _check(study, summarise_mesh(mesh))
+        _check(study, summarise_mesh(mesh), functions)
     if study.obstacle:
         _check_initial_overlap(study, mesh)
     return with_curved_boundary(study, mesh, find_builder(study.mesh))
@@ -92,20 +98,23 @@ def _check_initial_overlap(study: Study, mesh: MeshData) -> None:
     check_initial_overlap(study, mesh)
 
 
-def _check(study: Study, summary: MeshSummary) -> None:
+def _check(study: Study, summary: MeshSummary, functions: Sequence[Mapping[str, Any]] = ()) -> None:
     _check_groups(study, summary)
     _check_dimensions(study, summary)
+    conditions = boundary_conditions(study, summary.dim, functions)
+    for condition in conditions[len(study.boundary) :]:
+        _check_selector(f"{condition.key}.on", condition.selector, summary)
     if not study.time.scheme_class.inertia:
-        _check_translations(study, summary.dim)
+        _check_translations(conditions, summary.dim)
 
 
-def _check_translations(study: Study, dim: int) -> None:
+def _check_translations(conditions: Sequence[BoundaryCondition], dim: int) -> None:
     """Raises InputError if no entry prescribes the motion along an axis.
 
     Rotations and the motion of separate bodies need the mesh: the run finds them.
     """
     prescribed = np.zeros(dim, bool)
-    for condition in boundary_conditions(study, dim):
+    for condition in conditions:
         prescribed |= condition.components
     if not prescribed.all():
         raise InputError(unsupported_message("the body", f"moving along {AXES[int(np.argmin(prescribed))]}"))
@@ -135,7 +144,6 @@ def _check_dimensions(study: Study, summary: MeshSummary) -> None:
         raise InputError(f'time.scheme = "rigid" is for bodies in space; this mesh has {dim} dimensions')
     _check_copies(study, summary.cell_count)
     # each of these refuses vectors of another dimension
-    boundary_conditions(study, dim)
     volume_loads(study, dim)
     initial_motion(study, dim)
     obstacle_placements(study, dim)

@@ -6,16 +6,18 @@ DOLFINx here.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ValidationError
 
 from ..errors import InputError
-from ..mechanics.time_functions import TabulatedFunction, TimeFunction, Values, constant_function
+from ..mechanics.time_functions import PlaceFunction, TabulatedFunction, TimeFunction, Values, constant_function
 from ..mesh.crack_planes import CrackPlane, plane_crack, polygon_crack, segment_crack
 from ..mesh.selectors import Group, PointsInBox, PointsOnPlane, Selector
 from ..meshes.data import AXES
@@ -52,7 +54,7 @@ class BoundaryCondition:
     key: str
     kind: str
     selector: Selector
-    function: TimeFunction
+    function: TimeFunction | PlaceFunction
     components: Flags
 
     @property
@@ -106,13 +108,19 @@ class FreeObstacleMotion:
     gravity: Values
 
 
-def boundary_conditions(study: Study, dim: int) -> list[BoundaryCondition]:
-    """Returns all entries of [[boundary]].
+def boundary_conditions(study: Study, dim: int, functions: Sequence[Mapping[str, Any]] = ()) -> list[BoundaryCondition]:
+    """Returns all entries of [[boundary]], then those with functions of the user.
+
+    Args:
+        study: the study.
+        dim: dimension of the mesh.
+        functions: entries `on`, one of displacement, traction, force and pressure, and for a displacement `components`.
 
     Raises:
         InputError: if an entry does not fit the dimension, or two contradict each other.
     """
     entries = [_condition(entry, dim, f"boundary.{i}", study.thickness) for i, entry in enumerate(study.boundary)]
+    entries += [_user_condition(entry, dim, number, study) for number, entry in enumerate(functions)]
     check_conflicts(entries, dim)
     return entries
 
@@ -144,10 +152,9 @@ def check_conflicts(entries: Sequence[BoundaryCondition], dim: int) -> None:
 
 
 def _loaded(load: BoundaryCondition, dim: int) -> Flags:
-    """Components (d,) along which a traction or force acts at any time; none for a pressure."""
-    if load.kind == "pressure":
+    """Components (d,) along which a traction or force acts at any time; none for a pressure or a user's function."""
+    if not isinstance(load.function, TabulatedFunction) or load.kind == "pressure":
         return np.zeros(dim, bool)
-    assert isinstance(load.function, TabulatedFunction)
     return np.any(load.function.rows != 0, axis=0)
 
 
@@ -169,6 +176,48 @@ def _condition(entry: BoundarySettings, dim: int, key: str, thickness: float) ->
         if entry.kind == "force":
             function = TabulatedFunction(table.times, np.asarray(table.rows / thickness))
     return BoundaryCondition(key, entry.kind, selector, function, components)
+
+
+USER_CONDITIONS = ("displacement", "traction", "force", "pressure")
+
+
+def _user_condition(entry: Mapping[str, Any], dim: int, number: int, study: Study) -> BoundaryCondition:
+    """Returns a boundary condition whose value is a function of t (s), or of t and x (n, d), m."""
+    key = f"boundary[{number}] (given in Python)"
+    kinds = sorted(entry.keys() - {"on", "components"})
+    if len(kinds) != 1 or kinds[0] not in USER_CONDITIONS or "on" not in entry or not callable(entry[kinds[0]]):
+        raise InputError(
+            f"{key} has {', '.join(entry)}: give on, and one of {', '.join(USER_CONDITIONS)} with a function of t, or "
+            'of t and x, as in {"on": "right", "displacement": lambda t: [0.1 * t, 0.0]}'
+        )
+    kind, function = kinds[0], entry[kinds[0]]
+    if "components" in entry and kind != "displacement":
+        raise InputError(f"{key}: components are those of a displacement; {kind} has all of them: remove components")
+    try:
+        on = BoundarySettings.model_validate({"on": entry["on"], "fix": "x"}).on
+    except ValidationError:
+        raise InputError(f"{key}: on = {entry['on']!r} is no group, box or plane: {{'on': 'right'}}") from None
+    components = _named(entry.get("components", AXES[:dim]), dim, key, "components")
+    has_place, size = len(inspect.signature(function).parameters) > 1, 1 if kind == "pressure" else dim
+    if has_place and kind == "force":
+        raise InputError(f"{key}: a force is a resultant, which has no place: give a traction as a function of t and x")
+    if not has_place:
+        _check_values(function, study.time.end, size, f"{key}: {kind}")
+    share = 1 / study.thickness if kind == "force" else 1.0
+    value = PlaceFunction(function) if has_place else (lambda t: share * np.asarray(function(t), float).reshape(-1))
+    prescribed = components if kind == "displacement" else np.zeros(dim, bool)
+    return BoundaryCondition(key, kind, find_selector(on, dim, f"{key}.on"), value, prescribed)
+
+
+def _check_values(function: Callable[[float], Any], end: float, size: int, what: str) -> None:
+    """Raises InputError unless a function of the user returns `size` numbers at the start and the end."""
+    for t in (0.0, end):
+        try:
+            values = np.asarray(function(t), float).reshape(-1)
+        except (TypeError, ValueError) as error:
+            raise InputError(f"{what} at t = {t:g} s is no vector of numbers: {error}") from None
+        if values.shape != (size,) or not np.isfinite(values).all():
+            raise InputError(f"{what} at t = {t:g} s is {values.tolist()}; {size} finite numbers needed")
 
 
 def _named(axes: str, dim: int, key: str, word: str = "fix") -> Flags:

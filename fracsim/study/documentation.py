@@ -126,7 +126,8 @@ class _Table:
 
 def _tables() -> Iterator[_Table]:
     """All tables of a study, in the order of the schema."""
-    yield _Table("Top level", "", [_key("title", Study.model_fields["title"])])
+    plain = ("title", "terms")
+    yield _Table("Top level", "", [_key(name, Study.model_fields[name]) for name in plain])
     for name, field in Study.model_fields.items():
         models = models_in(field.annotation)
         heading = f"[[{name}]]" if "list" in str(field.annotation) else f"[{name}]"
@@ -135,8 +136,8 @@ def _tables() -> Iterator[_Table]:
             if name == "mesh":
                 keys += _source_keys()
             yield _Table(heading, _description(models[0]), keys)
-        elif name != "title":
-            yield _Table(heading, SOLVER, [_key(name, field)])
+        elif name not in plain:
+            yield _Table(heading, SOLVER if name == "solver" else "", [_key(name, field)])
 
 
 def _sections() -> Iterator[str]:

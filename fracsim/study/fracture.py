@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, field_validator, model_validator
 
+from .plugins import or_plugin
 from .values import Finite, Flag, NonNegative, Positive, Seed, Strength, StudyTable, Unbounded, Vector, key
 
 
@@ -44,6 +45,16 @@ class FractureSettings(StudyTable):
         "Fracture energy G_c. true takes that of `material.like` "
         "([cracks](fracture.md#cracks-with-a-fracture-energy)).",
         "J/m^2", default=None, example=20.0, otherwise="edges break one by one",
+    )  # fmt: skip
+    criterion: Annotated[Literal["normal-stress"], or_plugin("criteria")] = key(
+        "Load of an edge without `energy`: its normal stress over its strength, or the name of a "
+        "[plug-in](python.md#plug-ins).",
+        default="normal-stress", example="normal-stress",
+    )  # fmt: skip
+    edge_law: Annotated[Literal["brittle"], or_plugin("edge_laws")] = key(
+        "Integrity of an edge without `energy` as a function of its load: brittle, or the name of a "
+        "[plug-in](python.md#plug-ins).",
+        default="brittle", example="brittle",
     )  # fmt: skip
     law: Literal["griffith", "cohesive"] = key(
         "Law of a crack with `energy`: sharp, or cohesive with exponential softening.",

@@ -19,16 +19,13 @@ from ..meshes.data import MeshData, MeshError
 from ..meshes.parameters import SHORTEST, check_extent, is_length
 from ..meshes.plain_files import MISSING, unreadable_reason
 from . import MeshSettings
-from .body import SOURCE_KEYS
+from .body import GIVEN_MESH, SOURCE_KEYS
 from .error_messages import unknown_key_message, validation_message
+from .plugins import PhysicsPart, find_plugin
 
 if TYPE_CHECKING:
     from ..meshes.random_points.outline_file import PolygonOutline
     from ..meshes.surfaces.closed import ClosedSurface
-
-
-# builder of a study whose mesh is handed over in Python; study.toml of its run has the name
-GIVEN_MESH = "given"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,6 +56,8 @@ def find_builder(mesh: MeshSettings) -> Any:
     if mesh.builder == GIVEN_MESH:
         return _with_parameters(_GivenMesh, mesh.parameters)
     if mesh.builder not in BUILDERS:
+        if (plugin := find_plugin("builders", mesh.builder)) is not None:
+            return _with_parameters(_plugin_builder(plugin), mesh.parameters)
         near = difflib.get_close_matches(mesh.builder, BUILDERS, n=1)
         hint = f"did you mean {near[0]}?" if near else f"there are: {', '.join(BUILDERS)}"
         raise InputError(f'mesh.builder = "{mesh.builder}" is not a builder; {hint}')
@@ -82,6 +81,18 @@ def _with_parameters(kind: Any, parameters: dict[str, Any]) -> Any:
         raise InputError(
             f"mesh: {kind.name} with {listed}: numbers do not reach that far; take a larger h (lengths are in metres)"
         ) from None
+
+
+def _plugin_builder(plugin: PhysicsPart) -> Any:
+    """Class of the builder of a plug-in. InputError if it lacks what a builder has."""
+    kind = plugin.value
+    if not dataclasses.is_dataclass(kind) or not isinstance(kind, type):
+        raise InputError(f"{plugin.label} is no dataclass: its fields are the keys of [mesh]")
+    if missing := [
+        name for name in ("name", "groups", "regions", "bounds", "cells_estimate", "build") if not hasattr(kind, name)
+    ]:
+        raise InputError(f"{plugin.label} has no {missing[0]}; a builder has what fracsim.meshes.Builder says")
+    return kind
 
 
 @cache

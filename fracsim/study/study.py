@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import ValidationInfo, field_validator, model_validator
 
-from .body import DampingSettings, MaterialSettings, MeshSettings
+from ..meshes import BUILDERS
+from .body import GIVEN_MESH, DampingSettings, EnergyName, MaterialSettings, MeshSettings
 from .boundary_conditions import BoundarySettings, InitialSettings, LoadSettings
 from .contact import ContactSettings, ObstacleSettings
 from .fracture import BrittleSettings, CrackSettings, FractureSettings, PlasticitySettings
@@ -31,6 +32,14 @@ class Study(StudyTable):
     crack: list[Deferred[CrackSettings]] = key("Initial cracks.", factory=list)
     damping: Deferred[DampingSettings] | None = key("Damping.", default=None)
     boundary: list[BoundarySettings] = key("Boundary conditions.", factory=list)
+    terms: list[str] = key(
+        "Terms of the balance of forces beside those of the tables: names of [plug-ins](python.md#plug-ins).",
+        factory=list, example=["foundation"],
+    )  # fmt: skip
+    plugin: dict[str, dict[str, Any]] = key(
+        "Parameters of [plug-ins](python.md#plug-ins), a table `[plugin.NAME]` each.", factory=dict,
+        example={"yeoh": {"c20": -1e4}},
+    )  # fmt: skip
     load: Deferred[LoadSettings] | None = key("Forces on the volume.", default=None)
     initial: Deferred[InitialSettings] | None = key("Velocity at the start.", default=None)
     solver: dict[str, OptionValue] = key(
@@ -67,6 +76,20 @@ class Study(StudyTable):
     def _tables_fit_together(self) -> Study:
         check_tables(self)
         return self
+
+    @property
+    def plugin_names(self) -> list[tuple[str, str]]:
+        """Group and name of the plug-ins that the study names."""
+        names: list[tuple[str, str]] = []
+        if self.material.energy not in get_args(EnergyName):
+            names.append(("energies", self.material.energy))
+        if self.fracture is not None:
+            pairs = (("criteria", self.fracture.criterion), ("edge_laws", self.fracture.edge_law))
+            names += [(group, name) for group, name in pairs if name not in ("normal-stress", "brittle")]
+        names += [("terms", name) for name in self.terms]
+        if self.mesh.builder is not None and self.mesh.builder not in (*BUILDERS, GIVEN_MESH):
+            names.append(("builders", self.mesh.builder))
+        return names
 
     @property
     def monitored_load(self) -> str:

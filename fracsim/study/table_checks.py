@@ -245,6 +245,32 @@ def _check_initial_velocity(study: Study) -> None:
         raise ValueError("[initial] sets a velocity, which a quasi-static study does not have; remove it")
 
 
+def _check_plugins(study: Study) -> None:
+    names = study.plugin_names
+    if unused := sorted(study.plugin.keys() - {name for _, name in names}):
+        listed = ", ".join(name for _, name in names) or "none"
+        raise ValueError(
+            f"plugin.{unused[0]} has parameters of a plug-in that the study does not name; it names {listed}"
+        )
+    groups = {group for group, _ in names}
+    if "energies" in groups and study.plasticity is not None:
+        raise ValueError(
+            f'[plasticity] is for built-in energies, not for material.energy = "{study.material.energy}": choose '
+            'energy = "neo-hookean"'
+        )
+    criterion = sorted(
+        {"criteria": "criterion", "edge_laws": "edge_law"}[group]
+        for group in groups
+        if group in ("criteria", "edge_laws")
+    )
+    if criterion and study.fracture is not None and study.fracture.energy is not None:
+        raise ValueError(f"fracture.{criterion[0]} is for edges that break one by one: remove it, or fracture.energy")
+    if criterion and study.brittle is not None:
+        raise ValueError(f"fracture.{criterion[0]} is for edges that break one by one: remove it, or [brittle]")
+    if study.time.scheme == "rigid" and groups - {"builders"}:
+        raise ValueError(f'time.scheme = "rigid" takes no plug-ins but mesh builders: remove {names[0][1]}')
+
+
 CHECKS: tuple[Callable[[Study], None], ...] = (
     _check_fields,
     _check_region_strengths,
@@ -263,4 +289,5 @@ CHECKS: tuple[Callable[[Study], None], ...] = (
     check_rigid,
     _check_stop_criterion,
     _check_initial_velocity,
+    _check_plugins,
 )
