@@ -9,11 +9,11 @@ import numpy as np
 from .data import MeshData, MeshError
 from .plain_files import NotAPlainFileError, atomic_replacement_of_all
 
-
 # Endings of formats that keep cells, facets and groups, and whether groups keep their names. meshio has others, which
 # lose some of these.
 NAMES_ARE_KEPT = {
-    ".msh": True, ".vol": True, ".vtu": False, ".vtk": False, ".xdmf": False, ".xmf": False, ".mesh": False, ".meshb": False,
+    ".msh": True, ".vol": True, ".vtu": False, ".vtk": False, ".xdmf": False, ".xmf": False, ".mesh": False,
+    ".meshb": False,
 }  # fmt: skip
 
 
@@ -30,7 +30,7 @@ def write_mesh(mesh: MeshData, path: Path) -> tuple[str, ...]:
 
     ending = path.suffix.lower()
     if ending not in NAMES_ARE_KEPT:
-        is_known = any(path.name.lower().endswith(known) for known in meshio.extension_to_filetypes)
+        is_known = any(path.name.lower().endswith(suffix) for suffix in meshio.extension_to_filetypes)
         why = "such files would lose cells, facets or groups" if is_known else "its ending is of no known format"
         raise MeshError(f"cannot save the mesh as {path}: {why}; save it as .msh, or as {', '.join(NAMES_ARE_KEPT)}")
     cell, facet = ("triangle", "line") if mesh.dim == 2 else ("tetra", "triangle")
