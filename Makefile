@@ -2,7 +2,7 @@
 ranks := 2
 # Modules are compiled once, not by each process of the tests, whatever the machine says.
 export PYTHONDONTWRITEBYTECODE :=
-sources := fracsim forms meshes studies tests docs/site
+sources := fracsim forms meshes studies tests docs/site docs/notebooks
 
 .PHONY: demo test test-plain test-all attack readers paraview bench table report report-full study-file site gallery figures lint format clean
 

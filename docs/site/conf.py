@@ -33,6 +33,7 @@ source_suffix = {".md": "markdown", ".py": "percent"}
 # The contents, at the side of all pages. A page that is missing here is an error.
 CONTENTS = {
     "Start": "docs/install docs/running docs/faq docs/python docs/batch docs/studies docs/gallery",
+    "Notebooks": "docs/notebooks/own_energy docs/notebooks/own_criterion docs/notebooks/temperature",
     "Reference": "docs/study-file docs/meshes docs/output docs/site/reference docs/glossary",
     "Methods": "docs/fracture docs/contact docs/rigid docs/theory docs/accuracy docs/paper-figures",
     "Development": "docs/architecture docs/development CONTRIBUTING CHANGELOG",
@@ -84,7 +85,7 @@ class Percent(MystParser):
 def as_markdown(script: str) -> str:
     """Return the Markdown of a script in percent format."""
     parts = []
-    for kind, cell in re.findall(r"^# %%(.*)\n(.*?)(?=^# %%|\Z)", script, re.MULTILINE | re.DOTALL):
+    for kind, cell in re.findall(r"^# %%([^\n]*)\n(.*?)(?=^# %%|\Z)", script, re.MULTILINE | re.DOTALL):
         if "[markdown]" in kind:
             parts.append(re.sub(r"^# ?", "", cell, flags=re.MULTILINE))
         elif cell.strip():
@@ -122,6 +123,7 @@ def add_start(app: Any, error: Exception | None) -> None:
 
 def setup(app: Any) -> None:
     """Connect what is defined here with Sphinx."""
+    app.add_config_value("CONTENTS", {}, "env", dict)  # other contents: the start page is read again
     app.add_directive("mermaid", Mermaid)
     app.add_source_parser(Percent)
     app.connect("source-read", add_contents)
