@@ -36,7 +36,9 @@ from .deformable_run import Run, run_study, wants_smooth  # noqa: E402
 from .errors import InputError  # noqa: E402
 from .mesh.ghost_exchange import with_ghosts  # noqa: E402
 from .mesh.given_mesh import GivenMesh, NamedTags, gather_mesh  # noqa: E402
-from .meshes.data import MeshData  # noqa: E402
+from .mesh.parallel import on_root  # noqa: E402
+from .meshes.data import MeshData, MeshError  # noqa: E402
+from .meshes.parameters import Builder  # noqa: E402
 from .output.fracture_log import FractureLog  # noqa: E402
 from .output.frame_files import FieldEvaluator, surface_output  # noqa: E402
 from .output.history import History  # noqa: E402
@@ -44,7 +46,7 @@ from .report.run_output import RunOutput  # noqa: E402
 from .scene import Scene, build_scene  # noqa: E402
 from .study import Study  # noqa: E402
 from .study.body import GIVEN_MESH  # noqa: E402
-from .study.plugins import Physics, collect_physics  # noqa: E402
+from .study.plugins import Physics, collect_physics, given_part  # noqa: E402
 from .study.reader import find_study, load_study, study_text  # noqa: E402
 from .timestepping.state import State  # noqa: E402
 
@@ -93,7 +95,7 @@ def run(
         overwrite: replace a run in the folder that could be continued.
         wall_limit: wall time after which the run stops with a checkpoint, s.
         comm: communicator of the run; None: that of `mesh`, or MPI.COMM_WORLD.
-        parts: mesh, facets, regions, energy, criterion, edge_law, terms and boundary, as for `Simulation`.
+        parts: mesh, facets, regions, energy, criterion, edge_law, scheme, terms and boundary, as for `Simulation`.
 
     Raises:
         InputError: study, mesh, physics or folder cannot be used.
@@ -118,34 +120,31 @@ class _Body:
         comm: communicator.
         study: validated study.
         physics: of the user, and plug-ins of the study.
-        mesh: mesh that was handed over, on rank 0.
+        arrays: mesh that was handed over, on rank 0.
+        numbers: mesh of DOLFINx that was handed over, with its numbers, on rank 0.
     """
 
     comm: MPI.Intracomm
     study: Study
     physics: Physics
-    mesh: GivenMesh | None = None
-
-    @property
-    def arrays(self) -> MeshData | None:
-        """Arrays of the mesh that was handed over, on rank 0."""
-        return None if self.mesh is None else self.mesh.mesh
+    arrays: MeshData | None = None
+    numbers: GivenMesh | None = None
 
 
 def _prepare(
     study: StudySource,
     overrides: Overrides,
     comm: MPI.Intracomm | None,
-    mesh: Mesh | None = None,
+    mesh: Mesh | MeshData | Builder | None = None,
     facets: NamedTags | None = None,
     regions: NamedTags | None = None,
     **physics: Any,
 ) -> _Body:
     """Return what a simulation is made of (collective). The arguments are those of `Simulation`."""
+    if not isinstance(mesh, Mesh) and (facets is not None or regions is not None):
+        raise InputError("facets and regions are tags of a mesh of DOLFINx: give mesh=... as well")
     if mesh is None:
-        if facets is not None or regions is not None:
-            raise InputError("facets and regions are tags of a mesh that is handed over: give mesh=... as well")
-        loaded = load(study, overrides)
+        loaded = _with_scheme(load(study, overrides), physics.get("scheme"))
         return _Body(comm or MPI.COMM_WORLD, loaded, _collect(loaded, physics))
     table = {"builder": GIVEN_MESH}
     if isinstance(study, Mapping):
@@ -155,8 +154,27 @@ def _prepare(
     if loaded.time.scheme == "rigid":
         raise InputError('time.scheme = "rigid" takes no mesh of DOLFINx: give [mesh] in the study')
     settings = type(loaded.mesh).model_validate(table | {"order": loaded.mesh.order})
-    loaded = loaded.model_copy(update={"mesh": settings})
-    return _Body(mesh.comm, loaded, _collect(loaded, physics), gather_mesh(mesh, facets, regions))
+    loaded = _with_scheme(loaded.model_copy(update={"mesh": settings}), physics.get("scheme"))
+    if isinstance(mesh, Mesh):
+        handed_over = gather_mesh(mesh, facets, regions)
+        arrays = None if handed_over is None else handed_over.mesh
+        return _Body(mesh.comm, loaded, _collect(loaded, physics), arrays, handed_over)
+    ranks = comm or MPI.COMM_WORLD
+    arrays = on_root(ranks, lambda: mesh if isinstance(mesh, MeshData) else _built(mesh))
+    return _Body(ranks, loaded, _collect(loaded, physics), arrays)
+
+
+def _built(builder: Builder) -> MeshData:
+    """Return the mesh of a builder. Raises InputError."""
+    if not callable(getattr(builder, "build", None)):
+        raise InputError(
+            f"mesh is a {type(builder).__name__}; a dolfinx.mesh.Mesh, a fracsim.meshes.MeshData, or an object whose "
+            "build() returns one is needed"
+        )
+    try:
+        return builder.build()
+    except MeshError as error:
+        raise InputError(f"mesh: {error}") from None
 
 
 def _collect(study: Study, physics: dict[str, Any]) -> Physics:
@@ -164,6 +182,16 @@ def _collect(study: Study, physics: dict[str, Any]) -> Physics:
     if study.time.scheme == "rigid" and any(value is not None and value != () for value in physics.values()):
         raise InputError(f'time.scheme = "rigid" has no physics of the user: remove {", ".join(physics)}')
     return collect_physics(study, **physics)
+
+
+def _with_scheme(study: Study, scheme: Any) -> Study:
+    """Return a study with a time scheme given in Python. Raises InputError."""
+    if scheme is None:
+        return study
+    try:
+        return study.with_scheme(given_part("schemes", scheme))
+    except ValueError as error:
+        raise InputError(f"the study does not go with the time scheme: {error}") from None
 
 
 class Simulation:
@@ -189,12 +217,13 @@ class Simulation:
         restart: bool = False,
         overwrite: bool = False,
         comm: MPI.Intracomm | None = None,
-        mesh: Mesh | None = None,
+        mesh: Mesh | MeshData | Builder | None = None,
         facets: NamedTags | None = None,
         regions: NamedTags | None = None,
         energy: Any = None,
         criterion: Any = None,
         edge_law: Any = None,
+        scheme: Any = None,
         terms: Sequence[Any] = (),
         boundary: Sequence[Mapping[str, Any]] = (),
     ) -> None:
@@ -207,7 +236,8 @@ class Simulation:
             restart: continue from the checkpoint in the folder.
             overwrite: replace a run in the folder that could be continued.
             comm: communicator; None: that of `mesh`, or MPI.COMM_WORLD.
-            mesh: straight triangles or tetrahedra on any number of ranks, in m.
+            mesh: straight triangles or tetrahedra in m: a mesh of DOLFINx on any number of ranks; or a `MeshData` of
+                fracsim.meshes, or an object whose `build()` returns one on rank 0.
             facets: tags of facets, and the tag of each group: `(tags, {"left": 1, "right": 2})`.
             regions: tags of cells, and the tag of each region: `(tags, {"crust": 7})`.
             energy: object with `psi(F)`, J/m^3, F (3, 3); or a class or function that makes one of its arguments
@@ -215,6 +245,7 @@ class Simulation:
             criterion: function `load(stress, edges, strength)` with arrays (n, d, d), (n, k, d) and (n, k), which
                 returns loads (n, k); an edge breaks at 1.
             edge_law: function of loads (n,) from 1 on that returns integrities (n,), 1 whole to 0 broken.
+            scheme: implicit time scheme (forms.schemes.Scheme), or its class; in place of `time.scheme`.
             terms: classes or functions that make a `fracsim.Term` of a `TermInputs` (`u`, `domain`, `stress`, `mass`).
             boundary: entries as in [[boundary]], whose displacement, traction, force or pressure is a function of t
                 (s), or of t and x (n, d); for a displacement with `components`, such as "x".
@@ -224,9 +255,10 @@ class Simulation:
         """
         body = _prepare(
             study, overrides, comm, mesh, facets, regions, energy=energy, criterion=criterion, edge_law=edge_law,
-            terms=terms, boundary=boundary,
+            scheme=scheme, terms=terms, boundary=boundary,
         )  # fmt: skip
-        self.comm, self.study, self._given = body.comm, body.study, body.mesh
+        self.comm, self.study, self._given = body.comm, body.study, body.numbers
+        self._has_numbers = isinstance(mesh, Mesh)
         if self.study.time.scheme == "rigid":
             raise InputError('time.scheme = "rigid" moves many bodies, which Simulation does not: use fracsim.run')
         if restart and out is None:
@@ -373,8 +405,8 @@ class Simulation:
         return self.scene.domain.input_numbering.gather_cells.scatter(None if original is None else original.cells)
 
     def _need_given(self) -> GivenMesh | None:
-        if self.study.mesh.builder != GIVEN_MESH:
-            raise InputError("the mesh is that of the study: only a mesh that was handed over has numbers of its own")
+        if not self._has_numbers:
+            raise InputError("only a mesh of DOLFINx that was handed over has numbers of its own; give mesh=...")
         return self._given
 
     # --- fragments and surface ---

@@ -5,8 +5,9 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -16,8 +17,11 @@ from scipy.optimize import brentq
 import fracsim as package
 from cases import STRIP, changed, fracsim_here
 from fracsim.errors import InputError
+from fracsim.forms.schemes import SCHEMES, QuasiStatic
+from fracsim.forms.schemes.scheme import EndOfStepScheme
 from fracsim.simulation import Simulation, load
 from fracsim.study import plugins
+from fracsim.study.scheme_check import check_scheme
 from support.scenes import DIRECT
 from support.spring import Spring
 
@@ -379,9 +383,84 @@ def test_a_term_that_is_wrong_is_refused(foundation: Any) -> None:
         translated(lambda body: spring(body.u, body.assembler.owned_dof_count, 2.0))
 
 
+# --- time schemes ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Theta(EndOfStepScheme):
+    """u = u_n + dt ((1 - theta) v_n + theta v), v = v_n + dt ((1 - theta) a_n + theta a)."""
+
+    theta: float = 0.5
+    inertia: ClassVar[bool] = True
+    carries_acceleration: ClassVar[bool] = True
+
+    def rate_coefficients(self, dt: float) -> tuple[float, float]:
+        return 1 / (self.theta * dt) ** 2, 1 / (self.theta * dt)
+
+    def reference_displacements(self, dt: float, u: Any, v: Any, a: Any) -> tuple[Any, Any]:
+        with_rates = u + dt * (1 - self.theta) * v
+        return with_rates + self.theta * dt * (v + (1 - self.theta) * dt * a), with_rates
+
+
+def test_a_time_scheme_of_the_user_steps() -> None:
+    """Free fall: after N steps u = g dt^2 (N^2 / 2 + (theta - 1/2) N), as of no built-in scheme."""
+    falling = changed(STRIP, fracture=None, boundary=[], load={"gravity": [0.0, -9.81]}, output={"fields": []})
+    falling |= {"time": {"step": 0.01, "end": 0.1, "adapt": False}, "probe": [{"name": "tip", "point": [1.0, 0.25]}]}
+    for scheme, theta in ((Theta, 0.5), (Theta(0.75), 0.75)):
+        row = steps(falling, scheme=scheme)[-1]
+        assert row["probe_tip_y"] == pytest.approx(-9.81 * 0.01**2 * (50 + (theta - 0.5) * 10), rel=1e-8)
+
+
+def test_built_in_schemes_pass_the_check() -> None:
+    for name, scheme in SCHEMES.items():
+        if scheme.implicit and name != "rigid":
+            check_scheme(scheme(), name)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "message"),
+    [
+        (Theta(0.3), "is not stable"),
+        (Theta(0.0), "division by zero"),
+        (faulty(Theta, implicit=False), "is explicit"),
+        (faulty(Theta, complete_step=lambda self, dt, x, u, v, a: (x, v, a)), "does not converge"),
+        (faulty(Theta, reference_displacements=lambda self, dt, u, v, a: (u, u)), "does not keep a uniform motion"),
+        (faulty(Theta, rate_coefficients=lambda self, dt: (1 / dt, 1 / dt)), "in proportion"),
+        (object(), "has no inertia"),
+    ],
+)
+def test_a_time_scheme_that_is_wrong_is_refused(scheme: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Simulation(changed(STRIP, fracture=None, output={"fields": []}), scheme=scheme)
+
+
+def test_a_study_that_does_not_go_with_the_scheme_is_refused() -> None:
+    with pytest.raises(InputError, match=r"does not go with the time scheme: \[initial\] sets a velocity"):
+        Simulation(changed(STRIP, initial={"velocity": [1.0, 0.0]}), scheme=QuasiStatic)
+
+
 # --- plug-ins -------------------------------------------------------------------------------------------------------
 
-BUILDER = '''
+MORE = '''
+from typing import ClassVar
+
+from fracsim.forms.schemes import BackwardEuler
+
+
+@dataclass(frozen=True)
+class Damped(BackwardEuler):
+    """Backward Euler under another name, with a parameter."""
+
+    size: float = 1.0
+
+
+def shaker(on, amplitude):
+    return {"on": on, "displacement": lambda t: [amplitude * t, 0.0]}
+
+
+def nothing(body):
+    return []
+
 
 @dataclass(frozen=True)
 class Wedge:
@@ -412,10 +491,12 @@ def rubber(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     code = next(text for text in texts if "class Yeoh" in text).split("strip = {")[0]
     site = tmp_path / "site"
     (site / "rubber-1.2.dist-info").mkdir(parents=True)
-    (site / "rubber.py").write_text("import numpy as np\n" + code + BUILDER)
+    (site / "rubber.py").write_text("import numpy as np\n" + code + MORE)
     (site / "rubber-1.2.dist-info" / "METADATA").write_text("Metadata-Version: 2.1\nName: rubber\nVersion: 1.2\n")
     groups = tomllib.loads(next(text for text in texts if "entry-points" in text))["project"]["entry-points"]
     groups |= {"fracsim.builders": {"wedge": "rubber:Wedge"}, "fracsim.edge_laws": {"soft": "rubber:softening"}}
+    groups |= {"fracsim.schemes": {"damped": "rubber:Damped"}, "fracsim.loads": {"shaker": "rubber:shaker"}}
+    groups |= {"fracsim.terms": {"nothing": "rubber:nothing"}}
     groups["fracsim.energies"] |= {"lost": "rubber:Lost", "mooney-rivlin": "rubber:MooneyRivlin"}
     lines = [f"[{group}]\n" + "".join(f"{name} = {value}\n" for name, value in names.items())
              for group, names in groups.items()]  # fmt: skip
@@ -481,6 +562,31 @@ def test_the_command_line_knows_plugins(rubber: Path) -> None:
         assert not (rubber / "bad" / "history.csv").exists()
     unknown = fracsim_here("check", path, "--set", "mesh={builder='wedgy', h=0.5}")
     assert unknown.returncode == 2 and 'mesh.builder = "wedgy" is not a builder' in unknown.stderr
+
+
+def test_a_study_names_schemes_loads_and_terms(rubber: Path) -> None:
+    """With their parameters: the steps are those of the same study without plug-ins."""
+    fixed, driven = STRIP["boundary"]
+    table = {"time": [0.0, 1.0], "value": [[0.0, 0.0], [1.0, 0.0]]}
+    plain = changed(STRIP, boundary=[fixed, {"on": driven["on"], "displacement": table}])
+    plain["time"] = plain["time"] | {"scheme": "backward-euler"}
+    named = changed(plain, boundary=[fixed], time={"scheme": "damped"})
+    named |= {"loads": ["shaker"], "terms": ["nothing"]}
+    named["plugin"] = {"shaker": {"on": "right", "amplitude": 1.0}, "damped": {"size": 2.0}}
+    for row, other in zip(steps(named), steps(plain), strict=True):
+        assert {**row, "wall_step": 0} == {**other, "wall_step": 0}
+    with Simulation(named, rubber / "out") as simulation:
+        assert simulation.study.time.scheme_object.size == 2.0  # type: ignore[attr-defined]
+    text = (rubber / "out" / "study.toml").read_text()
+    assert all(
+        f"of rubber 1.2\n# physics: the {kind}" in text for kind in ("term of the balance nothing", "load shaker")
+    )
+    with Simulation(load(rubber / "out" / "study.toml")) as simulation:  # what a run writes can be run
+        assert simulation.step()["step"] == 1
+    listed = fracsim_here("list").stdout
+    assert re.search(r"plug-ins.*\n(.*\n)*? +yeoh +energy", listed), listed
+    with pytest.raises(InputError, match=r"the load shaker of rubber 1\.2: missing a required argument: 'amplitude'"):
+        Simulation(named | {"plugin": {"shaker": {"on": "right"}}})
 
 
 def test_two_packages_with_one_name_are_refused(rubber: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import threading
 import time
 from ctypes import CDLL
 from functools import cache
@@ -53,6 +54,8 @@ class InterruptHandler:
         self._depth += 1
         if self._depth > 1:
             return self
+        if threading.current_thread() is not threading.main_thread():
+            return self  # Python takes signals in the main thread alone
         code = _signal_library()
         for number in STOP_SIGNALS:
             if signal.getsignal(number) is signal.SIG_IGN:

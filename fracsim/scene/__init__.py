@@ -173,7 +173,7 @@ def build_scene_on(
 
 def make_scheme(timing: TimeSettings) -> Scheme:
     """Return the time scheme of a study."""
-    return timing.scheme_class(**timing.scheme_parameters)
+    return timing.scheme_object
 
 
 def make_stepper(

@@ -9,6 +9,7 @@ from ..meshes import BUILDERS
 from ..studies import folder
 from . import TimeSettings
 from .material_library import MATERIALS
+from .plugins import GROUPS, plugin_names
 
 ENERGIES = {
     "linear": "Hooke's law; small strains and rotations; plane stress in 2D",
@@ -48,4 +49,6 @@ def catalogue() -> dict[str, dict[str, str]]:
     builders = {name: (kind.__doc__ or "").strip().splitlines()[0] for name, kind in BUILDERS.items()}
     default = TimeSettings.model_fields["scheme"].default
     schemes = {name: kind.summary + " (default)" * (name == default) for name, kind in SCHEMES.items()}
-    return {"studies": studies, "builders": builders, "energies": ENERGIES, "schemes": schemes, "obstacles": OBSTACLES}
+    lists = {"studies": studies, "builders": builders, "energies": ENERGIES, "schemes": schemes, "obstacles": OBSTACLES}
+    plugins = {name: GROUPS[group] for group in GROUPS for name in plugin_names(group)}
+    return lists | ({"plug-ins": plugins} if plugins else {})

@@ -126,7 +126,7 @@ class _Table:
 
 def _tables() -> Iterator[_Table]:
     """All tables of a study, in the order of the schema."""
-    plain = ("title", "terms")
+    plain = ("title", "terms", "loads")
     yield _Table("Top level", "", [_key(name, Study.model_fields[name]) for name in plain])
     for name, field in Study.model_fields.items():
         models = models_in(field.annotation)

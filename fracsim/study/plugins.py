@@ -27,6 +27,8 @@ GROUPS = {
     "criteria": "criterion",
     "edge_laws": "law of an edge",
     "terms": "term of the balance",
+    "loads": "load",
+    "schemes": "time scheme",
     "builders": "mesh builder",
 }
 
@@ -132,22 +134,26 @@ class Physics:
         energy: object with `psi(F)`, or a class or function that makes one of `mu`, `lmbda` and `mesh` or some of them.
         criterion: function `load(stress, edges, strength)`.
         edge_law: function of loads that returns integrities.
+        scheme: time scheme, or its class; the study has it as well (`Study.with_scheme`).
         terms: classes or functions that make a term of `TermInputs` (scene.terms).
         boundary: entries as in [[boundary]], whose value is a function of t, or of t and x.
+        loads: what made these entries.
     """
 
     energy: PhysicsPart | None = None
     criterion: PhysicsPart | None = None
     edge_law: PhysicsPart | None = None
+    scheme: PhysicsPart | None = None
     terms: tuple[PhysicsPart, ...] = ()
     boundary: tuple[Mapping[str, Any], ...] = ()
+    loads: tuple[PhysicsPart, ...] = ()
 
     @property
     def lines(self) -> list[str]:
         """Lines of study.toml that record the physics."""
-        parts = [part for part in (self.energy, self.criterion, self.edge_law, *self.terms) if part is not None]
-        entries = [f"a boundary condition on {entry.get('on')} given in Python" for entry in self.boundary]
-        return [f"physics: {text}" for text in (*(part.label for part in parts), *entries)]
+        single = (self.energy, self.criterion, self.edge_law, self.scheme)
+        parts = [part for part in (*single, *self.terms, *self.loads) if part is not None]
+        return [f"physics: {part.label}" for part in parts]
 
 
 NO_PHYSICS = Physics()
@@ -164,6 +170,7 @@ def collect_physics(
     energy: Any = None,
     criterion: Any = None,
     edge_law: Any = None,
+    scheme: Any = None,
     terms: Sequence[Any] = (),
     boundary: Sequence[Mapping[str, Any]] = (),
 ) -> Physics:
@@ -179,15 +186,23 @@ def collect_physics(
 
     def first(group: str, value: Any) -> PhysicsPart | None:
         if value is not None:
-            return _given(group, value)
+            return given_part(group, value)
         return named[group][0] if group in named else None
 
-    all_terms = (*named.get("terms", []), *(_given("terms", term) for term in terms))
+    loads, entries = list(named.get("loads", [])), list[Mapping[str, Any]]()
+    for part in loads:
+        result = part.make(is_factory=True)
+        entries += [result] if isinstance(result, Mapping) else list(result)
+    for entry in boundary:
+        function = next((value for value in entry.values() if callable(value)), entry)
+        loads.append(given_part("loads", function))
+        entries.append(entry)
+    all_terms = (*named.get("terms", []), *(given_part("terms", term) for term in terms))
     parts = (first("energies", energy), first("criteria", criterion), first("edge_laws", edge_law))
-    return Physics(*parts, terms=all_terms, boundary=tuple(boundary))
+    return Physics(*parts, first("schemes", scheme), terms=all_terms, boundary=tuple(entries), loads=tuple(loads))
 
 
-def _given(group: str, value: Any) -> PhysicsPart:
+def given_part(group: str, value: Any) -> PhysicsPart:
     """Return a part that is given in Python."""
     name = getattr(value, "__qualname__", type(value).__qualname__)
     module = getattr(value, "__module__", None) or type(value).__module__

@@ -6,13 +6,16 @@ from typing import Any, get_args
 
 from pydantic import ValidationInfo, field_validator, model_validator
 
+from ..forms.schemes import SCHEMES
 from ..meshes import BUILDERS
 from .body import GIVEN_MESH, DampingSettings, EnergyName, MaterialSettings, MeshSettings
 from .boundary_conditions import BoundarySettings, InitialSettings, LoadSettings
 from .contact import ContactSettings, ObstacleSettings
 from .fracture import BrittleSettings, CrackSettings, FractureSettings, PlasticitySettings
 from .material_library import fill_from_library
+from .plugins import PhysicsPart, find_plugin
 from .rigid_bodies import BodySettings, with_rigid_defaults
+from .scheme_check import check_scheme
 from .solver_options import Options, OptionValue, expand_print_options
 from .table_checks import check_tables
 from .time_and_output import OutputSettings, ProbeSettings, TimeSettings, frame_interval, frame_notes
@@ -35,6 +38,10 @@ class Study(StudyTable):
     terms: list[str] = key(
         "Terms of the balance of forces beside those of the tables: names of [plug-ins](python.md#plug-ins).",
         factory=list, example=["foundation"],
+    )  # fmt: skip
+    loads: list[str] = key(
+        "Boundary conditions with functions of time and place: names of [plug-ins](python.md#plug-ins).",
+        factory=list, example=["shaker"],
     )  # fmt: skip
     plugin: dict[str, dict[str, Any]] = key(
         "Parameters of [plug-ins](python.md#plug-ins), a table `[plugin.NAME]` each.", factory=dict,
@@ -74,8 +81,29 @@ class Study(StudyTable):
 
     @model_validator(mode="after")
     def _tables_fit_together(self) -> Study:
-        check_tables(self)
-        return self
+        if (part := self._scheme_plugin) is None:
+            check_tables(self)
+            return self
+        return self.with_scheme(part)
+
+    @property
+    def _scheme_plugin(self) -> PhysicsPart | None:
+        """Plug-in of the time scheme; None for a built-in one, or one that is made already."""
+        name = self.time.scheme
+        return None if name in SCHEMES else find_plugin("schemes", name, self.plugin.get(name))
+
+    def with_scheme(self, part: PhysicsPart) -> Study:
+        """Returns the study with a time scheme of the user.
+
+        Raises:
+            InputError: the scheme is wrong.
+            ValueError: a key of the study does not go with it.
+        """
+        scheme = part.make()
+        check_scheme(scheme, part.label)
+        study = self.model_copy(update={"time": self.time.with_scheme(scheme)})
+        check_tables(study)
+        return study
 
     @property
     def plugin_names(self) -> list[tuple[str, str]]:
@@ -86,7 +114,9 @@ class Study(StudyTable):
         if self.fracture is not None:
             pairs = (("criteria", self.fracture.criterion), ("edge_laws", self.fracture.edge_law))
             names += [(group, name) for group, name in pairs if name not in ("normal-stress", "brittle")]
-        names += [("terms", name) for name in self.terms]
+        names += [("terms", name) for name in self.terms] + [("loads", name) for name in self.loads]
+        if self.time.scheme not in SCHEMES:
+            names.append(("schemes", self.time.scheme))
         if self.mesh.builder is not None and self.mesh.builder not in (*BUILDERS, GIVEN_MESH):
             names.append(("builders", self.mesh.builder))
         return names

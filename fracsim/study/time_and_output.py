@@ -6,10 +6,11 @@ import math
 from dataclasses import MISSING, fields
 from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
-from pydantic import Discriminator, Field, Tag, create_model, field_validator, model_validator
+from pydantic import Discriminator, Field, PrivateAttr, Tag, create_model, field_validator, model_validator
 
-from ..forms.schemes import SCHEMES, Scheme
+from ..forms.schemes import SCHEMES, BackwardEuler, Scheme
 from .boundary_conditions import Selector
+from .plugins import or_plugin
 from .values import Finite, Flag, Name, NonNegative, OverTime, Positive, Seconds, StudyTable, TimeTable, Vector, key
 
 
@@ -27,7 +28,11 @@ class StopCriterion(StudyTable):
 class BaseTimeSettings(StudyTable):
     """Time scheme and steps."""
 
-    scheme: str = key("Time scheme (`fracsim list`).", default="generalized-alpha", example="generalized-alpha")
+    scheme: str = key(
+        "Time scheme (`fracsim list`), or the name of a [plug-in](python.md#plug-ins).",
+        default="generalized-alpha",
+        example="generalized-alpha",
+    )
     step: OverTime[Seconds] = key(
         "Time step; a table gives it for a step that begins at that time. An upper bound for explicit steps.", "s",
         example=5e-3,
@@ -43,10 +48,26 @@ class BaseTimeSettings(StudyTable):
     until: StopCriterion | None = key("Ends the run before `end`.", default=None)
     mass: Literal["lumped", "consistent"] = key("Mass matrix.", default="lumped", example="consistent")
 
+    # time scheme of the user; None: that of `scheme`
+    _user_scheme: Scheme | None = PrivateAttr(default=None)
+
+    @property
+    def scheme_object(self) -> Scheme:
+        """The time scheme with its parameters."""
+        return self._user_scheme or self.scheme_class(**self.scheme_parameters)
+
+    def with_scheme(self, scheme: Scheme) -> BaseTimeSettings:
+        """Returns the settings with a time scheme of the user."""
+        settings = self.model_copy()
+        settings._user_scheme = scheme
+        return settings
+
     @property
     def scheme_class(self) -> type[Scheme]:
         """Class of the scheme."""
-        return SCHEMES[self.scheme]
+        if self._user_scheme is not None:
+            return type(self._user_scheme)
+        return SCHEMES.get(self.scheme, BackwardEuler)  # of a plug-in until it is made
 
     @property
     def max_step(self) -> float:
@@ -78,7 +99,7 @@ class BaseTimeSettings(StudyTable):
             raise ValueError('step of scheme = "rigid" is one number: bodies move by one step from start to end')
         if self.breaking_step is not None:
             self._check_breaking_step(self.breaking_step)
-        self.scheme_class(**self.scheme_parameters).check_parameters()
+        self.scheme_object.check_parameters()
         if not self.scheme_class.implicit and self.mass == "consistent":
             raise ValueError('mass = "consistent" is for implicit schemes; explicit steps need mass = "lumped"')
         return self
@@ -118,7 +139,8 @@ if TYPE_CHECKING:
 else:
     TimeSettings = create_model(
         "TimeSettings", __base__=BaseTimeSettings, __module__=__name__, __doc__=BaseTimeSettings.__doc__,
-        scheme=(Literal[tuple(SCHEMES)], BaseTimeSettings.model_fields["scheme"]), **_keys_of_schemes(),
+        scheme=(Annotated[Literal[tuple(SCHEMES)], or_plugin("schemes")], BaseTimeSettings.model_fields["scheme"]),
+        **_keys_of_schemes(),
     )  # fmt: skip
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import ufl
 from dolfinx import mesh as dolfinx_mesh
 from mpi4py import MPI
 
@@ -39,13 +40,57 @@ def plate(ghost_mode: dolfinx_mesh.GhostMode) -> dict[str, Any]:
     }
 
 
+def shear(stress: Any, edges: Any, strength: Any) -> Any:
+    """Load of an edge: its normal stress, and some of the greatest shear."""
+    principal = np.linalg.eigvalsh(stress)
+    normal = np.einsum("nki,nij,nkj->nk", edges, stress, edges)
+    return np.maximum(normal, 0.9 * (principal[:, -1:] - principal[:, :1])) / strength
+
+
+class Foundation(fracsim.Term):
+    """Springs on the tagged left end, k u . w dA."""
+
+    name, linear = "foundation", True
+
+    def __init__(self, body: Any) -> None:
+        self._u, self._ds = body.u, body.facet_measure("left")
+
+    def virtual_work(self, w: Any, dx: Any) -> Any:
+        return 1e6 * ufl.inner(self._u, w) * self._ds
+
+    def tangent_form(self, v: Any, w: Any, dx: Any) -> Any:
+        return 1e6 * ufl.inner(v, w) * self._ds
+
+
+def soft(mu: Any, lmbda: Any) -> Any:
+    """Saint Venant-Kirchhoff."""
+
+    class Law:
+        def psi(self, F: Any) -> Any:
+            E = (F.T * F - ufl.Identity(3)) / 2
+            return mu * ufl.inner(E, E) + lmbda / 2 * ufl.tr(E) ** 2
+
+    return Law()
+
+
+def pull(t: float, x: npt.NDArray[np.float64]) -> Any:
+    return np.stack([0.5 * t + 0.2 * t * x[:, 1], np.zeros(len(x))], axis=1)
+
+
+PHYSICS: dict[str, Any] = {
+    "energy": soft, "criterion": shear, "edge_law": lambda load: np.clip(3 - 2 * load, 0, 1), "terms": [Foundation],
+    "boundary": [{"on": "right", "displacement": pull}],
+}  # fmt: skip
+
+
 def compared() -> dict[str, npt.NDArray[np.generic]]:
     """Broken edges by input nodes, energies, pieces, and distances between nodes and cells and those mapped to."""
     comm, result = MPI.COMM_WORLD, dict[str, npt.NDArray[np.generic]]()
-    for mode in ("none", "shared_facet"):
-        handed = plate(getattr(dolfinx_mesh.GhostMode, mode))
-        mesh = handed["mesh"]
-        with fracsim.Simulation(STUDY, **handed) as simulation:
+    for mode in ("none", "shared_facet", "physics"):
+        handed = plate(dolfinx_mesh.GhostMode.shared_facet if mode == "shared_facet" else dolfinx_mesh.GhostMode.none)
+        mesh, own = handed["mesh"], PHYSICS if mode == "physics" else {}
+        study = STUDY | {"boundary": []} if own else STUDY
+        with fracsim.Simulation(study, **handed, **own) as simulation:
             simulation.run()
             domain, graph = simulation.scene.domain, simulation.scene.fracture.graph
             keys = comm.gather(graph.keys.of_edges(np.flatnonzero(graph.broken)))
