@@ -52,7 +52,7 @@ def test_coupling_with_another_form(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_notebooks_have_the_percent_format(path: Path) -> None:
     """A head for jupytext, then cells; a cell of text has comments alone."""
     head, *cells = re.split(r"^(?=# %%)", path.read_text(), flags=re.MULTILINE)
-    assert "formats: py:percent" in head and cells[0].startswith("# %% [markdown]\n# # Notebook: ")
+    assert "formats: py:percent" in head and cells[0].startswith("# %% [markdown]\n# # ")
     for cell in cells:
         lines = cell.splitlines()
         assert lines[0] in ("# %%", "# %% [markdown]")

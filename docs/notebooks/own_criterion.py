@@ -5,7 +5,7 @@
 # ---
 
 # %% [markdown]
-# # Notebook: a criterion of one's own
+# # A criterion of one's own
 #
 # A bar is pulled until it breaks, by the built-in criterion and by one that is given in Python: the greatest shear
 # stress (Tresca). The results are arrays.

@@ -5,7 +5,7 @@
 # ---
 
 # %% [markdown]
-# # Notebook: an energy of one's own
+# # An energy of one's own
 #
 # A plate of rubber is pulled. Its energy is that of Yeoh, given in Python, and its curve is compared with a closed
 # form.

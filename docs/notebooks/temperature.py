@@ -5,7 +5,7 @@
 # ---
 
 # %% [markdown]
-# # Notebook: coupling with another form of DOLFINx
+# # Coupling with another form of DOLFINx
 #
 # A plate is heated at one end. DOLFINx solves the heat equation on a mesh of its own. The temperature becomes an
 # eigenstrain in fracsim, on the same mesh handed over, and the plate bends as a closed form says.
