@@ -105,11 +105,11 @@ def test_a_run_that_ended_may_be_run_again_and_what_lies_beside_it_stays(tmp_pat
 @pytest.mark.parametrize(
     "where",
     [
-        "run.make_output_folder",
+        "deformable_run.make_output_folder",
         "monitors.InvertedCellMonitor",
         "output.frame_files.FieldEvaluator",
         "output.frame_files.FieldsFile",
-        "run.FrameSchedule",
+        "deformable_run.FrameSchedule",
     ],
 )
 def test_a_run_that_was_killed_is_recognised(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str) -> None:

@@ -373,8 +373,9 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 FRAMES, SURFACE = "output.frame_files", "output.surface.surface_output"
 OPENING = (
-    "run.make_output_folder", "run.History", f"{FRAMES}.FieldEvaluator", f"{FRAMES}.FieldsFile",
-    f"{SURFACE}.SurfaceFiles", f"{SURFACE}.BodySurface", "run.FrameSchedule", "output.atomic_write.os.replace",
+    "deformable_run.make_output_folder", "deformable_run.History", f"{FRAMES}.FieldEvaluator", f"{FRAMES}.FieldsFile",
+    f"{SURFACE}.SurfaceFiles", f"{SURFACE}.BodySurface", "deformable_run.FrameSchedule",
+    "output.atomic_write.os.replace",
 )  # fmt: skip
 
 
