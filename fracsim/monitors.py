@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from .output.result_checks import EnergyGainMonitor, InvertedCellMonitor, negligible_energy
+from .output.result_checks import EnergyGainMonitor, InvertedCellMonitor, negligible_energy, unbroken_note
 from .output.run_folder import software_versions
 from .output.summary import ResourceMeter, irregular_event_text
 
@@ -59,7 +59,7 @@ class RunMonitors:
     def __init__(self, scene: Scene, history: History, meter: ResourceMeter) -> None:
         """Make the monitors that the study needs (collective)."""
         study, stress = scene.study, scene.balance.stress
-        self._study, self.history, self.meter = study, history, meter
+        self._study, self._fracture, self.history, self.meter = study, scene.fracture, history, meter
         self.inverted = InvertedCellMonitor(stress, scene.fracture)
         floor = negligible_energy(stress)
         self.energy_gain = EnergyGainMonitor(at_rest=study.starts_at_rest, floor=floor, thickness=study.thickness)
@@ -120,6 +120,8 @@ class RunMonitors:
         energy, time = self._study.material.energy, self._study.time
         trouble = irregular_event_text(self.meter.read_totals()["trouble"])
         notes = [note for note in (trouble, self.inverted.note(energy), self.energy_gain.note(time.scheme)) if note]
+        if done and self._fracture is not None and (unbroken := unbroken_note(self._fracture)):
+            notes.append(unbroken)
         if self.contact_monitor is not None:
             notes += self.contact_monitor.notes(done=done)
         if self.obstacle_overlap is not None:

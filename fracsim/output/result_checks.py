@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
+from ..fracture.principal_stress import first_principal_stress, symmetric_tensors
 from ..mechanics.stress import Stress
 from ..mesh.parallel import sum_over_ranks
 from ..meshes.data import format_point
@@ -36,12 +37,14 @@ class CheckTolerances:
             with elastic waves gain a little.
         single_step_share: a single step is named if it gained at least this share of the total gain.
         min_jacobian: a cell with det F below this counts as inverted.
+        min_tension: share of the strength below which a principal stress is round-off.
     """
 
     negligible_strain: float = 3e-8
     relative_energy_gain: float = 0.05
     single_step_share: float = 0.5
     min_jacobian: float = 1e-6
+    min_tension: float = 1e-9
 
 
 CHECK_TOLERANCES = CheckTolerances()
@@ -184,6 +187,34 @@ class InvertedCellMonitor:
             f"t = {self.first_time:g} s, smallest J = {self.min_jacobian:.2g}): the result is not to be trusted from "
             f"there on; {remedy}"
         )
+
+
+def unbroken_note(fracture: FracturePass) -> str:
+    """Sentence on how far a body in which no edge has broken is from its strength, empty otherwise (collective).
+
+    It names the cell with the largest ratio of the first principal stress to the least strength of an edge.
+    """
+    graph, domain = fracture.graph, fracture.stress.domain
+    strength = getattr(fracture.criterion, "strength", None)  # a criterion of a user may have none
+    if strength is None:
+        return ""
+    weakened, initial = graph.integrity < 1, fracture.initial_cuts
+    if initial is not None:
+        weakened &= np.isnan(initial)
+    if sum_over_ranks(domain.comm, np.count_nonzero(weakened))[0]:
+        return ""
+    stress = first_principal_stress(symmetric_tensors(fracture.evaluate_undamaged_stress()[0], domain.dim))
+    ratio = stress / strength.minimum_in(np.arange(domain.cell_count))
+    centres = domain.nodes[domain.cell_nodes].mean(axis=1)
+    # a rank without cells has no row
+    rows = [(float(ratio[cell]), float(stress[cell]), centres[cell].tolist()) for cell in np.argsort(ratio)[-1:]]
+    largest, pascal, point = max(row for rows_of_rank in domain.comm.allgather(rows) for row in rows_of_rank)
+    if largest < CHECK_TOLERANCES.min_tension:
+        return "nothing broke, and no cell is in tension at the end"
+    return (
+        f"nothing broke: at the end the largest principal stress of a cell is {pascal:.3g} Pa, {largest:.2g} of the "
+        f"strength, at {format_point(point)} (docs/faq.md#nothing-breaks)"
+    )
 
 
 def _edge_determinants(corners: Values) -> Values:
