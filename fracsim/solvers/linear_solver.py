@@ -22,9 +22,8 @@ from .forcing_terms import ContractionForcing, EisenstatWalkerForcing
 from .petsc_options import PetscOptions, PetscOptionSet, call_petsc
 from .plain_solver import PlainPreconditioner, plain_method
 from .policy import SolverPolicy
-from .preconditioner import GAMG_OPTIONS, Preconditioner, Update, renew_smoothers
+from .preconditioner import GAMG_OPTIONS, Preconditioner, Update, renew_smoothers, renew_smoothers_before_solve
 from .tangent_operators import TangentOperators
-from .weak_callbacks import weak_callback
 
 Values = npt.NDArray[np.float64]
 
@@ -67,6 +66,7 @@ class LinearStepCG:
         ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         ksp.setFromOptions()
         ksp.setConvergenceHistory(max_iterations + 1, reset=True)
+        ksp.setPreSolve(renew_smoothers_before_solve)
         self._max_iterations, self._policy = max_iterations, policy
         self.iterations, self.residual_norm = 0, 0.0
 
@@ -78,7 +78,6 @@ class LinearStepCG:
         """
         ksp = self._ksp
         pc.setReusePreconditioner(True)
-        renew_smoothers(pc)
         ksp.setPC(pc)
         ksp.setOperators(A, K)
         ksp.setTolerances(rtol=0.0, atol=tolerance, max_it=self._max_iterations)
@@ -166,7 +165,7 @@ class LinearSolver:
         is_single_cg = self.steps_are_linear and self.is_iterative
         self._step_cg = LinearStepCG(ksp.comm, int(ksp.max_it), policy) if is_single_cg else None
         # SNES asks the KSP to keep the set-up of its preconditioner after each tangent
-        ksp.setPreSolve(weak_callback(self._renew_smoothers))
+        ksp.setPreSolve(renew_smoothers_before_solve)
         self.forcing = None if self._asked_rtol else _forcing(balance, chosen, policy)
         # of attempts of a body that may touch something, until it does
         self._free_forcing: ContractionForcing | None = None
@@ -184,9 +183,6 @@ class LinearSolver:
         self.operators.update_entries()
         self.ksp.setOperators(self.tangent.matrix)
         self.ksp.setUp()
-
-    def _renew_smoothers(self, *_: object) -> None:
-        renew_smoothers(self.preconditioner.pc)
 
     # --- facts ---
 
@@ -285,6 +281,7 @@ class LinearSolver:
         from .low_rank import WoodburyPreconditioner
 
         base.setReusePreconditioner(True)
+        renew_smoothers(base)
         context = WoodburyPreconditioner(base, couplings, self.balance.work_vector)
         pc = PETSc.PC().createPython(context, comm=self.ksp.comm)
         self.ksp.setPC(pc)
@@ -376,7 +373,6 @@ class LinearSolver:
             solved_norm = min(solved_norm, self._asked_rtol * self.balance.work_vector.norm())
         self._prepare(eigenvalue_floor)
         K, pc, cg = self.operators.matrix, self.preconditioner.serving, self._step_cg
-        self._renew_smoothers()
         solved = cg.solve(self.operators.products or K, K, pc, self.balance.work_vector, self.correction, solved_norm)
         self._equivalent = cg.equivalent_iterations(float(self.ksp.rtol))
         return (cg.residual_norm, cg.iterations) if solved else None

@@ -18,7 +18,7 @@ from petsc4py import PETSc
 from ..mechanics.balance import Balance
 from .petsc_options import PetscOptions
 from .policy import SolverPolicy
-from .preconditioner import Update
+from .preconditioner import Update, renew_smoothers
 
 if TYPE_CHECKING:
     from .multigrid.levels import FineLevel
@@ -57,6 +57,7 @@ class PlainPreconditioner:
     def update(self, operators: TangentOperators) -> None:
         """Set up for the tangent of the next solve (collective)."""
         operators.update_entries()
+        renew_smoothers(self.pc)
         operators.attach_to(self._ksp, self.pc)
         if self.pc.getType() == "cholesky" and self.pc.getFactorSolverType() == "mumps":
             negative_pivots = self.pc.getFactorMatrix().getMumpsInfog(12)

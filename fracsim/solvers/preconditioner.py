@@ -75,6 +75,11 @@ def renew_smoothers(pc: PETSc.PC) -> None:
             pc.getMGSmoother(level).getPC().setReusePreconditioner(False)
 
 
+def renew_smoothers_before_solve(ksp: PETSc.KSP, *_: object) -> None:
+    """Renew the smoothers of the preconditioner of a KSP; a callback of `KSP.setPreSolve`."""
+    renew_smoothers(ksp.getPC())
+
+
 def mass_stiffness_ratio(balance: Balance) -> float:
     """Inertia of a cell over its stiffness in the present step, c_a rho h^2 / Y (collective).
 
@@ -131,6 +136,7 @@ class AppliedPreconditioner:
             # PETSc would call the next set-up failed as well after one that failed
             self.pc.setFailedReason(PETSc.PC.FailedReason.NOERROR)
         self.release_vcycle()
+        renew_smoothers(self.pc)
         operators.attach_to(self._ksp, self.pc)
         if self._is_default and operators.blocks is not None:
             from .multigrid.vcycle import create_vcycle
@@ -161,6 +167,7 @@ class AppliedPreconditioner:
             return
         if deflation.update_operator(operators.matrix):
             self.pc.setReusePreconditioner(True)
+            renew_smoothers(self.pc)
             self.serving = deflation.pc
 
     def release_vcycle(self) -> None:

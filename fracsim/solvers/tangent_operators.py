@@ -10,7 +10,7 @@ from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
 from .multigrid.block_operator import BlockOperator, blocks_pay_off
 from .policy import SolverPolicy
-from .preconditioner import mass_stiffness_ratio, renew_smoothers, rigid_body_nullspace
+from .preconditioner import mass_stiffness_ratio, rigid_body_nullspace
 
 if TYPE_CHECKING:
     from ..mechanics.block_matrix import BlockMatrix
@@ -145,7 +145,6 @@ class TangentOperators:
         """Give the tangent to a KSP with this preconditioner, and set both up (collective)."""
         ksp.setPC(pc)
         pc.setReusePreconditioner(False)
-        renew_smoothers(pc)
         pc.setUseAmat(self.products is not None)
         ksp.setOperators(self.products or self.matrix, self.matrix)
         ksp.setUp()
