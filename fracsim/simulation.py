@@ -39,6 +39,7 @@ from .mesh.given_mesh import GivenMesh, NamedTags, gather_mesh  # noqa: E402
 from .mesh.parallel import on_root  # noqa: E402
 from .meshes.data import MeshData, MeshError  # noqa: E402
 from .meshes.parameters import Builder  # noqa: E402
+from .output.fields_file import pad_to_3d  # noqa: E402
 from .output.fracture_log import FractureLog  # noqa: E402
 from .output.frame_files import FieldEvaluator, surface_output  # noqa: E402
 from .output.history import History  # noqa: E402
@@ -432,9 +433,16 @@ class Simulation:
             return None
         import pyvista
 
-        from .output.surface.vtk_files import make_surface_grid
-
-        return pyvista.wrap(make_surface_grid(frame)).extract_surface(pass_pointid=False, pass_cellid=False)
+        parts = [(frame.segments, "lines"), (frame.triangles, "faces")]
+        cells = {name: np.insert(part, 0, part.shape[1], axis=1).ravel() for part, name in parts if len(part)}
+        surface = pyvista.PolyData(pad_to_3d(frame.points), **cells)
+        for name, values in frame.point_fields.items():
+            surface.point_data[name] = pad_to_3d(values)
+        for name, values in frame.element_fields.items():
+            # of the triangles, then of the segments: VTK has lines first
+            surface.cell_data[name] = np.roll(pad_to_3d(values), len(frame.segments), axis=0)
+        surface.field_data["origins"] = frame.origins
+        return surface
 
     def _surface_frame(self) -> SurfaceFrame | None:
         """Return the split surface of the state on rank 0 (collective)."""

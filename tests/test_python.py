@@ -130,6 +130,10 @@ def test_steps_are_those_of_the_run(output: RunOutput) -> None:
         written = output.surfaces[-1]
         assert surface.n_points == written.n_points and surface.n_cells == written.n_cells
         np.testing.assert_allclose(np.sort(surface.points, axis=0), np.sort(written.points, axis=0), atol=1e-6)
+        for name in ("piece", "origin", "damage"):  # lines have fields of their own, and come first
+            lines = np.asarray(written.celltypes) == 3
+            expected = np.concatenate([written.cell_data[name][lines], written.cell_data[name][~lines]])
+            np.testing.assert_array_equal(surface.cell_data[name], expected, name)
         at_end = output.pieces["time"] == output.pieces["time"][-1]
         np.testing.assert_allclose(fragments["mass"], output.pieces["mass"][at_end], rtol=1e-9)
     with pytest.raises(InputError, match="is closed"):
