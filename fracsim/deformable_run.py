@@ -44,7 +44,7 @@ from .process import import_outside
 from .scene import Scene, build_scene
 from .study import Study
 from .study.conditions import initial_cracks
-from .study.plugins import physics_lines
+from .study.plugins import collect_physics, physics_lines
 from .study.reader import add_missing_defaults, study_text
 from .timestepping.stepper import StepReport
 
@@ -483,7 +483,8 @@ def _run_rigid(
         lock_checked_folder(lock, check, make=True)
         progress.end_line()
         print_mesh_notes(scene)
-        text = study_text(study, [f"{key}: {value}" for key, value in software_versions(comm).items()])
+        versions = [f"{key}: {value}" for key, value in software_versions(comm).items()]
+        text = study_text(study, [*versions, *collect_physics(study).lines])
         summary = RigidRun(scene, folder, text, interrupt, restart=restart, progress=progress)()
         if study.output.picture:
             progress.set_stage("drawing the last frame")

@@ -12,9 +12,7 @@ Every call is collective: all ranks of the communicator make it.
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -35,9 +33,8 @@ from mpi4py import MPI  # noqa: E402
 from .deformable_run import Run, run_study, wants_smooth  # noqa: E402
 from .errors import InputError  # noqa: E402
 from .mesh.ghost_exchange import with_ghosts  # noqa: E402
-from .mesh.given_mesh import GivenMesh, NamedTags, gather_mesh  # noqa: E402
-from .mesh.parallel import on_root  # noqa: E402
-from .meshes.data import MeshData, MeshError  # noqa: E402
+from .mesh.given_mesh import GivenMesh, NamedTags  # noqa: E402
+from .meshes.data import MeshData  # noqa: E402
 from .meshes.parameters import Builder  # noqa: E402
 from .output.fields_file import pad_to_3d  # noqa: E402
 from .output.fracture_log import FractureLog  # noqa: E402
@@ -45,34 +42,17 @@ from .output.frame_files import FieldEvaluator, surface_output  # noqa: E402
 from .output.history import History  # noqa: E402
 from .report.run_output import RunOutput  # noqa: E402
 from .scene import Scene, build_scene  # noqa: E402
-from .study import Study  # noqa: E402
-from .study.body import GIVEN_MESH  # noqa: E402
-from .study.plugins import Physics, collect_physics, given_part  # noqa: E402
-from .study.reader import find_study, load_study, study_text  # noqa: E402
+from .simulation_inputs import Overrides, StudySource, load, prepare_inputs  # noqa: E402
+from .study.reader import find_study  # noqa: E402
 from .timestepping.state import State  # noqa: E402
 
 if TYPE_CHECKING:
     from .output.surface.body_surface import SurfaceFrame
     from .output.surface.surface_output import SurfaceOutput
 
+__all__ = ["Simulation", "load", "run"]
+
 Values = npt.NDArray[np.float64]
-StudySource = str | Path | Mapping[str, Any] | Study
-Overrides = Sequence[str] | Mapping[str, Any]
-
-
-def load(study: StudySource, overrides: Overrides = ()) -> Study:
-    """Return a validated study, which is immutable.
-
-    Args:
-        study: path of a study file, name of a packaged study (`fracsim list`), or the tables of a study as a dict.
-        overrides: values by key, as in `{"mesh.h": 0.02}`, or texts as `--set` takes them, as in `["mesh.h=0.02"]`.
-
-    Raises:
-        InputError: with one message on the first error.
-    """
-    if isinstance(study, Study):
-        return load_study(tomllib.loads(study_text(study)), overrides) if overrides else study
-    return load_study(study, overrides)
 
 
 def run(
@@ -102,7 +82,7 @@ def run(
         InputError: study, mesh, physics or folder cannot be used.
         NotConverged, Stopped, CannotWrite: the run ended early; the message says how to continue.
     """
-    body = _prepare(study, overrides, comm, **parts)
+    body = prepare_inputs(study, overrides, comm, **parts)
     source = find_study(study) if isinstance(study, str) else study if isinstance(study, Path) else None
     folder = Path(out)
     run_study(
@@ -111,88 +91,6 @@ def run(
     )  # fmt: skip
     body.comm.Barrier()
     return RunOutput(folder)
-
-
-@dataclass(frozen=True)
-class _Body:
-    """What a simulation is made of.
-
-    Attributes:
-        comm: communicator.
-        study: validated study.
-        physics: of the user, and plug-ins of the study.
-        arrays: mesh that was handed over, on rank 0.
-        numbers: mesh of DOLFINx that was handed over, with its numbers, on rank 0.
-    """
-
-    comm: MPI.Intracomm
-    study: Study
-    physics: Physics
-    arrays: MeshData | None = None
-    numbers: GivenMesh | None = None
-
-
-def _prepare(
-    study: StudySource,
-    overrides: Overrides,
-    comm: MPI.Intracomm | None,
-    mesh: Mesh | MeshData | Builder | None = None,
-    facets: NamedTags | None = None,
-    regions: NamedTags | None = None,
-    **physics: Any,
-) -> _Body:
-    """Return what a simulation is made of (collective). The arguments are those of `Simulation`."""
-    if not isinstance(mesh, Mesh) and (facets is not None or regions is not None):
-        raise InputError("facets and regions are tags of a mesh of DOLFINx: give mesh=... as well")
-    if mesh is None:
-        loaded = _with_scheme(load(study, overrides), physics.get("scheme"))
-        return _Body(comm or MPI.COMM_WORLD, loaded, _collect(loaded, physics))
-    table = {"builder": GIVEN_MESH}
-    if isinstance(study, Mapping):
-        order = {key: value for key, value in study.get("mesh", {}).items() if key == "order"}
-        study = {**study, "mesh": order | table}
-    loaded = load(study, overrides)
-    if loaded.time.scheme == "rigid":
-        raise InputError('time.scheme = "rigid" takes no mesh of DOLFINx: give [mesh] in the study')
-    settings = type(loaded.mesh).model_validate(table | {"order": loaded.mesh.order})
-    loaded = _with_scheme(loaded.model_copy(update={"mesh": settings}), physics.get("scheme"))
-    if isinstance(mesh, Mesh):
-        handed_over = gather_mesh(mesh, facets, regions)
-        arrays = None if handed_over is None else handed_over.mesh
-        return _Body(mesh.comm, loaded, _collect(loaded, physics), arrays, handed_over)
-    ranks = comm or MPI.COMM_WORLD
-    arrays = on_root(ranks, lambda: mesh if isinstance(mesh, MeshData) else _built(mesh))
-    return _Body(ranks, loaded, _collect(loaded, physics), arrays)
-
-
-def _built(builder: Builder) -> MeshData:
-    """Return the mesh of a builder. Raises InputError."""
-    if not callable(getattr(builder, "build", None)):
-        raise InputError(
-            f"mesh is a {type(builder).__name__}; a dolfinx.mesh.Mesh, a fracsim.meshes.MeshData, or an object whose "
-            "build() returns one is needed"
-        )
-    try:
-        return builder.build()
-    except MeshError as error:
-        raise InputError(f"mesh: {error}") from None
-
-
-def _collect(study: Study, physics: dict[str, Any]) -> Physics:
-    """Return the physics given in Python and the plug-ins of a study; rigid bodies have none."""
-    if study.time.scheme == "rigid" and any(value is not None and value != () for value in physics.values()):
-        raise InputError(f'time.scheme = "rigid" has no physics of the user: remove {", ".join(physics)}')
-    return collect_physics(study, **physics)
-
-
-def _with_scheme(study: Study, scheme: Any) -> Study:
-    """Return a study with a time scheme given in Python. Raises InputError."""
-    if scheme is None:
-        return study
-    try:
-        return study.with_scheme(given_part("schemes", scheme))
-    except ValueError as error:
-        raise InputError(f"the study does not go with the time scheme: {error}") from None
 
 
 class Simulation:
@@ -254,7 +152,7 @@ class Simulation:
         Raises:
             InputError: study, mesh, physics or folder cannot be used; the message names what and why.
         """
-        body = _prepare(
+        body = prepare_inputs(
             study, overrides, comm, mesh, facets, regions, energy=energy, criterion=criterion, edge_law=edge_law,
             scheme=scheme, terms=terms, boundary=boundary,
         )  # fmt: skip

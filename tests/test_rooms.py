@@ -113,13 +113,14 @@ def test_the_study_is_for_the_way_in_alone() -> None:
     ways_in = {file for file, names in of_root.items() if "study" in rooms_of(names)}
     rooms = [path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()]
     readers = {room for room in rooms if "study" in rooms_of(set().union(*own(room).values()))}
-    assert ways_in == {"cli.py", "deformable_run.py", "monitors.py", "simulation.py"}
+    assert ways_in == {"cli.py", "deformable_run.py", "monitors.py", *PYTHON}
     assert readers == {"study", "scene", "report"}
 
 
 # --- the drawing of docs/architecture.md ---
 
 RUN = ("deformable_run.py", "rigid_run.py", "monitors.py")  # the files of the room "run"
+PYTHON = ("simulation.py", "simulation_inputs.py")  # those of the interface of Python
 CLI = ("cli.py", "doctor.py", "__main__.py")  # those of the command line
 EVERYWHERE = {"errors", "studies"}  # below all rooms, and the folder of packaged studies
 
@@ -144,7 +145,7 @@ def imported_rooms() -> dict[str, set[str]]:
     """Room -> rooms that it imports, from the source."""
     folders = [path.name for path in ROOT.iterdir() if (path / "__init__.py").exists()]
     result = {room: rooms_of(set().union(*own(room).values())) for room in folders}
-    files_of = {"run": RUN, "cli": CLI, "python": ("simulation.py",), "process": ("process.py",)}
+    files_of = {"run": RUN, "cli": CLI, "python": PYTHON, "process": ("process.py",)}
     for room, names in files_of.items():
         result[room] = set().union(*(of_fracsim(ROOT / name, "fracsim") for name in names))
     for room, folder in (("forms", FORMS), ("meshes", MESHES)):

@@ -547,12 +547,15 @@ def test_the_command_line_knows_plugins(rubber: Path) -> None:
     assert done.returncode == 0, done.stderr
     wedge = ("--set", "mesh={builder='wedge', h=0.5}", "--set", "boundary=[{on='base', fix='xy'}]")
     assert fracsim_here("check", path, *wedge).returncode == 0
+    done = fracsim_here("run", path, "-o", rubber / "wedge", "--set", "time.end=0.005", *wedge)
+    assert done.returncode == 0 and "builder wedge of rubber 1.2" in (rubber / "wedge" / "study.toml").read_text()
     faults = {
         "plugin.yeoh.c40=1.0": "the energy yeoh of rubber 1.2: got an unexpected keyword argument 'c40'; its",
         "material.energy=yeohh": 'material.energy = "yeohh": must be',
         "plugin.yoeh.c20=1.0": "plugin.yoeh has parameters of a plug-in that the study does not name; it names",
         "material.energy=lost": "the energy lost of rubber 1.2 cannot be imported: AttributeError",
         "fracture.energy=10.0": "fracture.criterion is for edges that break one by one",
+        'terms=["wind"]': "terms.0: no installed package has the term of the balance wind; installed: nothing",
         "plugin.tresca.c=1.0": "the criterion tresca of rubber 1.2 is no class and has no parameters; remove c",
     }
     for setting, message in faults.items():

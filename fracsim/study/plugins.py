@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from pydantic import ValidationError, WrapValidator
+from pydantic import AfterValidator, ValidationError, WrapValidator
 
 from ..errors import InputError
 
@@ -126,6 +126,18 @@ def or_plugin(group: str) -> WrapValidator:
     return WrapValidator(validate)
 
 
+def installed(group: str) -> AfterValidator:
+    """Return a validator of a name, which an installed package must have."""
+
+    def validate(name: str) -> str:
+        if not _entry_points(group, name):
+            offered = ", ".join(plugin_names(group)) or "none"
+            raise ValueError(f"no installed package has the {GROUPS[group]} {name}; installed: {offered}")
+        return name
+
+    return AfterValidator(validate)
+
+
 @dataclass(frozen=True)
 class Physics:
     """The user's own physics, in place of that which the study names or beside it.
@@ -135,6 +147,7 @@ class Physics:
         criterion: function `load(stress, edges, strength)`.
         edge_law: function of loads that returns integrities.
         scheme: time scheme, or its class; the study has it as well (`Study.with_scheme`).
+        builder: of the mesh, which the study has as well.
         terms: classes or functions that make a term of `TermInputs` (scene.terms).
         boundary: entries as in [[boundary]], whose value is a function of t, or of t and x.
         loads: what made these entries.
@@ -144,6 +157,7 @@ class Physics:
     criterion: PhysicsPart | None = None
     edge_law: PhysicsPart | None = None
     scheme: PhysicsPart | None = None
+    builder: PhysicsPart | None = None
     terms: tuple[PhysicsPart, ...] = ()
     boundary: tuple[Mapping[str, Any], ...] = ()
     loads: tuple[PhysicsPart, ...] = ()
@@ -151,7 +165,7 @@ class Physics:
     @property
     def lines(self) -> list[str]:
         """Lines of study.toml that record the physics."""
-        single = (self.energy, self.criterion, self.edge_law, self.scheme)
+        single = (self.energy, self.criterion, self.edge_law, self.scheme, self.builder)
         parts = [part for part in (*single, *self.terms, *self.loads) if part is not None]
         return [f"physics: {part.label}" for part in parts]
 
@@ -181,6 +195,7 @@ def collect_physics(
     """
     named: dict[str, list[PhysicsPart]] = {}
     for group, name in study.plugin_names:
+        # a builder has its parameters in [mesh]
         if (part := find_plugin(group, name, study.plugin.get(name))) is not None:
             named.setdefault(group, []).append(part)
 
@@ -199,7 +214,14 @@ def collect_physics(
         entries.append(entry)
     all_terms = (*named.get("terms", []), *(given_part("terms", term) for term in terms))
     parts = (first("energies", energy), first("criteria", criterion), first("edge_laws", edge_law))
-    return Physics(*parts, first("schemes", scheme), terms=all_terms, boundary=tuple(entries), loads=tuple(loads))
+    return Physics(
+        *parts,
+        first("schemes", scheme),
+        first("builders", None),
+        terms=all_terms,
+        boundary=tuple(entries),
+        loads=tuple(loads),
+    )
 
 
 def given_part(group: str, value: Any) -> PhysicsPart:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
 
 from pydantic import ValidationInfo, field_validator, model_validator
 
@@ -13,7 +13,7 @@ from .boundary_conditions import BoundarySettings, InitialSettings, LoadSettings
 from .contact import ContactSettings, ObstacleSettings
 from .fracture import BrittleSettings, CrackSettings, FractureSettings, PlasticitySettings
 from .material_library import fill_from_library
-from .plugins import PhysicsPart, find_plugin
+from .plugins import PhysicsPart, find_plugin, installed
 from .rigid_bodies import BodySettings, with_rigid_defaults
 from .scheme_check import check_scheme
 from .solver_options import Options, OptionValue, expand_print_options
@@ -35,11 +35,11 @@ class Study(StudyTable):
     crack: list[Deferred[CrackSettings]] = key("Initial cracks.", factory=list)
     damping: Deferred[DampingSettings] | None = key("Damping.", default=None)
     boundary: list[BoundarySettings] = key("Boundary conditions.", factory=list)
-    terms: list[str] = key(
+    terms: list[Annotated[str, installed("terms")]] = key(
         "Terms of the balance of forces beside those of the tables: names of [plug-ins](python.md#plug-ins).",
         factory=list, example=["foundation"],
     )  # fmt: skip
-    loads: list[str] = key(
+    loads: list[Annotated[str, installed("loads")]] = key(
         "Boundary conditions with functions of time and place: names of [plug-ins](python.md#plug-ins).",
         factory=list, example=["shaker"],
     )  # fmt: skip
