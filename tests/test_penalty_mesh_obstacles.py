@@ -43,8 +43,8 @@ def deepest(term: PenaltyMeshContact) -> float:
     """How deep points of the body lie in the obstacle, or its points in the body: by trimesh, m."""
     x, surface = term._end_positions(), term.surface.current
     assert x is not None
-    mesh = surface.pairs.pairs[0].mesh
-    body = trimesh.Trimesh(x, surface.split.elements, process=False)
+    mesh = surface.parts[0].mesh
+    body = trimesh.Trimesh(x, surface.elements, process=False)
     obstacle = trimesh.Trimesh(mesh.positions, mesh.triangles, process=False)
     depths = [0.0]
     for points, within in ((x, obstacle), (mesh.positions, body)):
@@ -65,10 +65,10 @@ def test_a_point_over_a_facet_and_a_facet_over_a_point(tmp_path: Path) -> None:
     )
     term = term_of(scene)
     surface = term.surface.current
-    x, pairs = surface.split.points.copy(), surface.pairs.pairs[0]
+    x, pairs = surface.rest_positions.copy(), surface.parts[0]
     lowest = np.flatnonzero(x[:, 2] == x[:, 2].min())
     x[lowest, 2] -= 0.007  # 0.003 apart, of 0.005
-    contacts = pairs.contact.contacts(pairs.with_mesh(x))
+    contacts = pairs.contact.contacts(pairs.points(x))
     own = (contacts.points[:, 0] < len(x)) & (contacts.gap < 0.004)
     np.testing.assert_array_equal(np.sort(contacts.points[own, 0]), lowest)
     np.testing.assert_allclose(contacts.gap[own], 0.003)

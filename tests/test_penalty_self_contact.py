@@ -14,8 +14,9 @@ from scipy.sparse import eye
 from fracsim.contact.ipc_pairs import IpcPairs
 from fracsim.contact.penalty_contact import PenaltyContact, PenaltyState
 from fracsim.contact.penalty_contacts import ContactStiffness
-from fracsim.contact.penalty_pairs import PenaltyPairs, PenaltySurface
+from fracsim.contact.penalty_pairs import PenaltyPairs
 from fracsim.contact.penalty_point_facet import penalty_stiffness
+from fracsim.contact.penalty_surface import PenaltySurface
 from fracsim.meshes.builders.box import Box
 from fracsim.scene import Scene
 from support.resumed import assert_alike, going_stopped_resumed
@@ -85,7 +86,7 @@ def test_it_is_no_faster_than_said(dim: int) -> None:
         K += rate * np.outer(row.reshape(-1), row.reshape(-1))
     m = np.repeat(mass, dim)
     fastest = float(np.linalg.eigvalsh(K / np.sqrt(m[:, None] * m)).max())
-    bound = pairs.max_added_frequency(x, eye(n, format="csr"), mass)
+    bound = float((pairs.contacts_ahead(x).added_load(eye(n, format="csr")) / mass).max())
     assert 0.3 * bound < fastest <= bound
     own = penalty_stiffness(eye(n, format="csr"), np.ones(n), mass, np.inf, 4.0)
     np.testing.assert_allclose(own, mass, rtol=1e-12)
@@ -114,7 +115,7 @@ def test_two_bodies_collide(tmp_path: Path, dim: int) -> None:
         x = contact._end_positions()
         assert x is not None
         touched += contact.stored_energy() > 0
-        assert surface.pairs.contacts(x).gap.min(initial=1.0) > -0.01
+        assert surface.parts[0].contact.contacts(x).gap.min(initial=1.0) > -0.01
     right = X[:, 0] > 1.01
     assert touched > 5 and (m * state.v.reshape(-1, dim))[right, 0].sum() > 0.7 * before[0]
     assert min(steps) > 0.75 * max(steps)
@@ -158,17 +159,15 @@ def test_what_breaks_in_touch_gains_nothing(tmp_path: Path) -> None:
     state.settle()
     while contact.stored_energy() < 0.5:
         march(scene, state, 1)
-    before, graph, nodes = (
-        contact.stored_energy(),
-        scene.fracture.graph,
-        np.flatnonzero(surface.pairs.history.points.facets[:, 0] >= 0),
-    )
+    before, graph = contact.stored_energy(), scene.fracture.graph
+    pushed_keys = surface.element_set.points.keys[surface.parts[0].contact.history.points.facets[:, 0] >= 0]
     graph.break_edges(np.random.default_rng(2).random(len(graph.broken)) < 0.5)
     scene.fracture.mark_changed()
     scene.balance.edges_broke(graph.pattern)
     _, again = contact_of(scene)
-    assert again is not surface and len(again.split.points) > len(surface.split.points)
-    assert (again.pairs.history.points.facets[np.intersect1d(nodes, np.arange(len(X)))] >= 0).any()
+    assert again is not surface and len(again.rest_positions) > len(surface.rest_positions)
+    is_pushed = again.parts[0].contact.history.points.facets[:, 0] >= 0
+    assert np.isin(again.element_set.points.keys[is_pushed], pushed_keys).any()
     assert 0.1 * before < contact.stored_energy() <= before * (1 + 1e-6)
 
 
@@ -273,9 +272,10 @@ def test_rubbing_is_in_the_books(tmp_path: Path) -> None:
         assert report.kinetic + report.elastic + state.dissipated == pytest.approx(began, rel=0.02)
         x = contact._end_positions()
         assert x is not None
-        met = surface.pairs.contacts(x)
-        pull = met.spring_stiffness * np.linalg.norm(surface.pairs.history.points.slip[met.points[:, 0]], axis=1)
-        assert (pull <= 0.3 * met.spring_stiffness * (surface.pairs.width - met.gap) * (1 + 1e-12)).all()
+        pairs = surface.parts[0].contact
+        met = pairs.contacts(x)
+        pull = met.spring_stiffness * np.linalg.norm(pairs.history.points.slip[met.points[:, 0]], axis=1)
+        assert (pull <= 0.3 * met.spring_stiffness * (pairs.width - met.gap) * (1 + 1e-12)).all()
         slid = max(slid, float(pull.sum()))
     right = X[:, 0] > 1.01
     assert slid > 0 and state.dissipated > 0.005 * began
@@ -292,7 +292,8 @@ def test_a_surface_without_elements_touches_nothing(dim: int) -> None:
     assert barrier.free_fraction(x, x + 1.0) == 1.0 and not barrier.hessian(x).nnz
     for pairs in (barrier, PenaltyPairs(x, none, stiffness, distance=0.1)):
         assert pairs.energy(x) == 0.0 and not pairs.gradient(x).any() and pairs.min_gap(x) == np.inf
-        assert not pairs.pressure(x).any() and not len(pairs.intersections(x))
+        assert not len(pairs.intersections(x))
+    assert not barrier.pressure(x).any()
 
 
 @pytest.mark.parametrize("dim", (2, 3))

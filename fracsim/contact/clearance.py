@@ -90,21 +90,6 @@ class ShapeDistance:
     lower_bounds = distance
 
 
-@dataclass
-class NoDistance:
-    """Obstacle on a rank without points (ObstacleDistance)."""
-
-    radius: float
-    rotates: bool
-    max_error: float = 0.0
-
-    def distance(self, posed: PosedShape, x: Values) -> Values:
-        """Raise NotImplementedError: no point is there."""
-        raise NotImplementedError("obstacles are on rank 0")
-
-    lower_bounds = distance
-
-
 @dataclass(frozen=True)
 class FollowingPoints:
     """Points of a surface on this rank, which follow nodes: x = X + sum_a w_a u_a.

@@ -230,6 +230,39 @@ def intersecting_elements(mesh: ipctk.CollisionMesh, x: Values) -> Ints:
     return _intersecting_triangles(phase, mesh, x) if x.shape[1] == 3 else _intersecting_segments(phase, mesh, x)
 
 
+class SurfaceIntersections:
+    """Test whether elements of a surface intersect; ipctk's mesh is built when it is first used."""
+
+    _mesh: ipctk.CollisionMesh | None = None
+
+    def __init__(self, rest_positions: Values, elements: Ints, patch: npt.NDArray[np.int32] | None = None) -> None:
+        """As for IpcPairs; `patch`: (n,) numbers of parts of the surface that touch others alone; None: all touch."""
+        self._rest_positions, self._elements, self._patch = rest_positions, elements, patch
+
+    def __call__(self, x: Values) -> Ints:
+        """(k, 2) elements that intersect with points at x (n, d), m."""
+        if not len(self._elements):
+            return NO_PAIRS
+        if self._mesh is None:
+            self._mesh = collision_mesh(self._rest_positions, self._elements)
+            if self._patch is not None:
+                used = np.unique(self._elements)
+                self._mesh.can_collide = ipctk.make_vertex_patches_filter(np.ascontiguousarray(self._patch[used]))
+        vertices = self._mesh.vertices(x)
+        if not ipctk.has_intersections(self._mesh, vertices, ipctk.LBVH()):
+            return NO_PAIRS
+        return intersecting_elements(self._mesh, vertices)
+
+
+def collision_mesh(rest_positions: Values, elements: Ints) -> ipctk.CollisionMesh:
+    """Surface of ipctk: the points of elements (m, d) alone, at `rest_positions` (n, d), m."""
+    # one thread a rank, and sums in the same order each time
+    ipctk.set_num_threads(1)
+    corners, is_3d = elements.astype(np.int32), rest_positions.shape[1] == 3
+    edges = ipctk.edges(corners) if is_3d and len(corners) else corners.reshape(-1, 2)
+    return ipctk.CollisionMesh.build_from_full_mesh(rest_positions, edges, *((corners,) if is_3d else ()))
+
+
 def _intersecting_segments(phase: ipctk.LBVH, mesh: ipctk.CollisionMesh, x: Values) -> Ints:
     near = _as_pairs([(pair.edge0_id, pair.edge1_id) for pair in phase.detect_edge_edge_candidates()])
     (a, b), (c, d) = (x[mesh.edges[near[:, k]]].transpose(1, 0, 2) for k in range(2))
@@ -307,13 +340,8 @@ class IpcPairs:
             friction: coefficient of friction.
             share: of this rank in the pairs; None: all of them.
         """
-        # one thread a rank, and sums in the same order each time
-        ipctk.set_num_threads(1)
-        self._elements, corners = elements, elements.astype(np.int32)
-        is_3d = rest_positions.shape[1] == 3
-        faces = (corners,) if is_3d else ()
-        edges = ipctk.edges(corners) if is_3d and len(corners) else corners.reshape(-1, 2)
-        self._mesh = ipctk.CollisionMesh.build_from_full_mesh(rest_positions, edges, *faces)
+        self._elements, is_3d = elements, rest_positions.shape[1] == 3
+        self._mesh = collision_mesh(rest_positions, elements)
         mesh, at_vertices, centroids = self._mesh, Vertices(self._mesh), Centroids(self._mesh)
         points, surface_edges = np.arange(mesh.num_vertices)[:, None], np.ascontiguousarray(mesh.edges, np.int32)
         surface = np.ascontiguousarray(mesh.faces, np.int32) if is_3d else surface_edges

@@ -13,9 +13,10 @@ Equations: docs/theory.md#new-crack-faces.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import chain, repeat
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -38,7 +39,7 @@ Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 # pairs of a body with itself, or with several obstacles
-type SurfacePairs = IpcPairs | AllMeshPairs[Any]
+type SurfacePairs = IpcPairs | AllMeshPairs
 # factors of arms, excluded elements, steps between two releases of faces and steps to the next
 SurfaceSnapshot = tuple[Values, Ints, tuple[int, int]]
 
@@ -109,22 +110,174 @@ class SelfContactLaw:
         return max(self.sticking_speed, self.sticking_speed_ratio * speed)
 
 
-class SelfContactSurface:
-    """Split surface and its pairs for a state of damage.
+class RetractableSurface:
+    """Elements in contact, of which crack faces are retracted where there is no room for them.
+
+    A surface that ranks share overrides what needs them: `_pressures`, `_intersecting_faces` and the agreements.
 
     Attributes:
-        split: the surface.
-        point_map: map from nodes to its points, with new faces retracted.
+        elements: (m, d) points of the elements.
+        point_map: map from nodes to points, with new faces retracted.
         pairs: pairs that may be in contact.
-        face_gap: gap between the sides of a new crack, in distances of the barrier.
         closed_pressure: pressure, in stiffnesses, of faces without room.
         search_all_faces: whether candidates are searched for the retraction of all faces once some are retracted:
             fewer searches, and more candidates after them.
     """
 
-    face_gap: float = SURFACE.face_gap
     closed_pressure: ClassVar[float] = SURFACE.closed_pressure
     search_all_faces: ClassVar[bool] = False
+    pairs: SurfacePairs
+
+    def __init__(self, elements: Ints, point_map: SurfaceMap, stiffness: float) -> None:
+        """`stiffness`: of the law, Pa."""
+        self.elements, self.point_map, self._stiffness = elements, point_map, stiffness
+        is_copy = np.zeros(len(point_map.share), bool)
+        is_copy[point_map.copies] = True
+        self._crack_faces = np.flatnonzero(is_copy[elements].any(axis=1))
+        self._excluded: Ints = np.empty(0, np.int64)
+        self._release_interval = (1, 1)  # steps between two attempts to release faces, and to the next one
+
+    def _build_pairs(self, elements: Ints) -> SurfacePairs:
+        """Pairs of elements (k, d)."""
+        raise NotImplementedError("a subclass builds pairs")
+
+    def _exclude(self, elements: Ints) -> None:
+        """Build pairs without these elements (k,)."""
+        if len(elements):
+            self.pairs = self._build_pairs(np.delete(self.elements, elements, axis=0))
+        self._excluded = elements
+
+    def _include_all(self) -> None:
+        """Build pairs of all elements."""
+        self.pairs = self._build_pairs(self.elements)
+
+    def _search_along(self, x: Values, end: Values) -> None:
+        """Search candidates for the motion of the points from x to `end` (n, d), m."""
+        self.pairs.search_along(x, end)
+
+    def snapshot(self) -> SurfaceSnapshot:
+        """Factors of arms, excluded elements, and steps to the next release of faces."""
+        return self.point_map.share, self._excluded, self._release_interval
+
+    # --- what ranks agree on, if they share the surface ---
+
+    def _pressures(self, u: Values) -> Values:
+        """(n,) pressure on each point at displacements u (nodes, d), m; Pa (collective)."""
+        return self.pairs.pressure(self.point_map(u))
+
+    def _intersecting_faces(self, u: Values) -> Ints:
+        """Crack faces that intersect at displacements u (nodes, d), m (collective)."""
+        return np.intersect1d(self._crack_faces, self.pairs.intersections(self.point_map(u)))
+
+    def _common_share(self, share: Values) -> Values:
+        """(n,) least factor of the arm of each point on all ranks (collective)."""
+        return share
+
+    def _common_flags(self, flags: Flags) -> Flags:
+        """(n,) flags of points that are set on all ranks that have the point (collective)."""
+        return flags
+
+    def _on_any_rank(self, flag: bool) -> bool:
+        """Whether a flag is set on any rank (collective)."""
+        return flag
+
+    # --- retraction and release of crack faces ---
+
+    def _crowded_faces(self, u: Values, max_pressure: Values) -> Ints:
+        """Crack faces with a pressure above `max_pressure` (n,), Pa, at a corner, or else those that intersect."""
+        pressed = self._pressed_faces(u, max_pressure)
+        return pressed if self._on_any_rank(len(pressed) > 0) else self._intersecting_faces(u)
+
+    def _pressed_faces(self, u: Values, max_pressure: Values) -> Ints:
+        above = self._pressures(u) > max_pressure * (1 + SURFACE.round_off)
+        return self._crack_faces[above[self.elements[self._crack_faces]].any(axis=1)]
+
+    def _shorten(self, u: Values, faces: Ints, factor: float) -> bool:
+        """Shorten the arms of crack faces by a factor; whether any arm has changed."""
+        share, points = self.point_map.share.copy(), np.unique(self.elements[faces])
+        share[points] = np.maximum(factor * share[points], np.minimum(SURFACE.min_arm, share[points]))
+        share = self._common_share(share)
+        changed = self._on_any_rank(not np.array_equal(share, self.point_map.share))
+        if changed:
+            movable = np.unique(self.elements[self._crack_faces]) if self.search_all_faces else points
+            end = (x := self.point_map(u)).copy()
+            end[movable] = self.point_map.evaluate_points(
+                u, movable, np.minimum(SURFACE.min_arm, self.point_map.share[movable])
+            )
+            # one search for all the factors that follow
+            self._search_along(x, end)
+            self.point_map = self.point_map.with_arm_share(share)
+        return changed
+
+    def _retract_faces(self, u: Values, load: Values) -> None:
+        """Retract faces with a pressure above `load` (n,), Pa, and exclude those without room even so.
+
+        The pairs are those of all elements.
+        """
+        start = self.point_map.share
+        for factor in chain(repeat(SURFACE.factor, SURFACE.gentle_rounds), repeat(SURFACE.min_arm)):
+            if not (
+                self._shorten(u, self._pressed_faces(u, load), factor)
+                or self._shorten(u, cut := self._intersecting_faces(u), factor)
+            ):
+                break
+        max_pressure = np.maximum(load, self.closed_pressure * self._stiffness)
+        without_room = np.union1d(self._pressed_faces(u, max_pressure), cut)
+        self._exclude(without_room)
+        if self._on_any_rank(len(without_room) > 0):
+            # points of excluded faces alone keep their arms, so as not to come back smaller each time
+            unused: Flags = np.ones(len(start), bool)
+            unused[np.delete(self.elements, without_room, axis=0)] = False
+            unused = self._common_flags(unused)
+            self.point_map = self.point_map.with_arm_share(np.where(unused, start, self.point_map.share))
+
+    def extend_faces(self, u: Values) -> None:
+        """Extend retracted faces and include excluded ones where there is room, at displacements u (nodes, d), m.
+
+        Not in the step after edges broke, and less often where there is no room: each attempt costs as much as two
+        iterations of Newton's method (collective).
+        """
+        share, excluded, (pause, remaining) = self.snapshot()
+        is_retracted, is_excluded = (self._on_any_rank(flag) for flag in (bool(np.any(share < 1)), len(excluded) > 0))
+        if not is_retracted and not is_excluded:
+            return
+        if remaining:
+            self._release_interval = pause, remaining - 1
+            return
+        load = self._pressures(u)
+        if is_retracted:
+            self._extend_retracted(u, load)
+        if is_excluded:
+            self._include_all()
+            self._retract_faces(u, load)
+        same = np.array_equal(share, self.point_map.share) and np.array_equal(excluded, self._excluded)
+        pause = 1 if self._on_any_rank(not same) else min(2 * pause, SURFACE.max_pause)
+        self._release_interval = pause, pause - 1
+
+    def _extend_retracted(self, u: Values, load: Values) -> None:
+        previous = self.point_map.share
+        self.point_map = self.point_map.with_arm_share(np.minimum(previous / SURFACE.factor, 1.0))
+        # twice, as a face that stays may be in the way of its neighbours
+        for _ in range(2):
+            crowded = self._crowded_faces(u, load)
+            if not self._on_any_rank(len(crowded) > 0):
+                return
+            share, points = self.point_map.share.copy(), np.unique(self.elements[crowded])
+            share[points] = previous[points]
+            self.point_map = self.point_map.with_arm_share(self._common_share(share))
+        if self._on_any_rank(len(self._crowded_faces(u, load)) > 0):
+            self.point_map = self.point_map.with_arm_share(previous)
+
+
+class SelfContactSurface(RetractableSurface):
+    """Split surface and its pairs for a state of damage; every rank holds all of it.
+
+    Attributes:
+        split: the surface.
+        face_gap: gap between the sides of a new crack, in distances of the barrier.
+    """
+
+    face_gap: ClassVar[float] = SURFACE.face_gap
 
     def __init__(
         self,
@@ -149,21 +302,13 @@ class SelfContactSurface:
             comm: ranks that share the pairs.
         """
         self._skeleton, self._pattern, self._fragments_only = skeleton, pattern, law.fragments_only
-        if law.fragments_only:
-            self.split = build_fragment_surface(skeleton, pattern, cut)
-        else:
-            self.split = build_split_surface(skeleton, pattern)
-        self._rest_positions = offset_crack_faces(self.split, self.face_gap * law.distance)
-        self.point_map = make_surface_map(self.split, skeleton, pattern, self._rest_positions)
+        gap = self.face_gap * law.distance
+        self.split, self._rest_positions, point_map = build_contact_surface(skeleton, pattern, law, gap, cut)
+        super().__init__(self.split.elements, point_map, law.stiffness)
         self._share = PairShare.by_slabs(comm, self._rest_positions, self.point_map.copies)
         self._parameters = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
-        is_copy = np.zeros(len(self._rest_positions), bool)
-        is_copy[self.point_map.copies] = True
-        self._crack_faces = np.flatnonzero(is_copy[self.split.elements].any(axis=1))
         self._nodes, self._size = len(skeleton.points), float(np.linalg.norm(np.ptp(skeleton.points, axis=0)))
-        self.pairs: SurfacePairs = self._build_pairs(self.split.elements)
-        self._excluded: Ints = np.empty(0, np.int64)
-        self._release_interval = (1, 1)  # steps between two attempts to release faces, and to the next one
+        self.pairs = self._build_pairs(self.split.elements)
         if previous is None:
             self._check_apart()
         else:
@@ -183,30 +328,16 @@ class SelfContactSurface:
 
     def _check_apart(self) -> None:
         """Raise InputError where a body at rest intersects or touches itself."""
-        if len(cut_pairs := self.pairs.intersections(self.split.points)):
-            position = format_point(self.split.points[self.split.elements[cut_pairs[0]]].mean(axis=(0, 1)))
-            raise InputError(
-                f"[contact]: {len(cut_pairs)} pairs of surface elements cut or touch each other at the start, the "
-                f"first near {position}; move the bodies apart"
-            )
+        cut_pairs = self.pairs.intersections(self.split.points)
+        refuse_intersections(self.split.points[self.split.elements[cut_pairs]].mean(axis=(1, 2)))
 
     def _build_pairs(self, elements: Ints) -> SurfacePairs:
         return IpcPairs(self._rest_positions, elements, **self._parameters, share=self._share)
 
-    def _exclude(self, elements: Ints) -> None:
-        """Build pairs without these elements (k,)."""
-        if len(elements):
-            self.pairs = self._build_pairs(np.delete(self.split.elements, elements, axis=0))
-        self._excluded = elements
-
     def set_stiffness(self, stiffness: float) -> None:
         """Set the stiffness of the barrier, Pa."""
-        self._parameters["stiffness"] = stiffness
+        self._parameters["stiffness"] = self._stiffness = stiffness
         self.pairs.set_stiffness(stiffness)
-
-    def snapshot(self) -> SurfaceSnapshot:
-        """Factors of arms, excluded elements, and steps to the next release of faces."""
-        return self.point_map.share, self._excluded, self._release_interval
 
     def restore(self, memory: SurfaceSnapshot) -> None:
         """Restore a snapshot of this surface.
@@ -220,14 +351,11 @@ class SelfContactSurface:
         if share is not self.point_map.share:
             self.point_map = self.point_map.with_arm_share(share)
         if excluded is not self._excluded:
-            self.pairs = self._build_pairs(self.split.elements)
+            self._include_all()
             self._exclude(excluded)
 
-    # --- retraction and release of crack faces ---
-
-    def _identity(self, points: Ints | None = None) -> Values:
-        selected = self.point_map.copies if points is None else points
-        return point_identity(self.split, selected, np.arange(self._nodes), self._size)
+    def _identity(self) -> Values:
+        return point_identity(self.split, self.point_map.copies, np.arange(self._nodes), self._size)
 
     def _previous_state(self, previous: SelfContactSurface, u: Values) -> tuple[Values, Values]:
         """(n,) factors of arms and pressures, Pa, of points on the previous surface; of new points 1 and 0."""
@@ -244,118 +372,50 @@ class SelfContactSurface:
         load[:nodes] = pressure[:nodes]
         return share, load
 
-    def new_numbers(self, previous: SelfContactSurface, count: int) -> Ints:
-        """(n,) numbers on this surface of n = `count` points of the points of the previous surface; -1: none."""
-        old, new, total = previous.point_map.copies, self.point_map.copies, len(previous.split.points)
-        # nodes have kept their numbers, and come before copies
-        nodes = min(old.min(initial=total), new.min(initial=count))
-        number = np.full(total, -1)
-        number[:nodes] = np.arange(nodes)
-        rows = match_points(previous._identity(), self._identity())
-        number[old[rows >= 0]] = new[rows[rows >= 0]]
-        return number
 
-    def _crowded_faces(self, u: Values, max_pressure: Values) -> Ints:
-        """Crack faces with a pressure above `max_pressure` (n,), Pa, at a corner, or else those that intersect."""
-        pressed = self._pressed_faces(u, max_pressure)
-        return pressed if len(pressed) else self._intersecting_faces(u)
+def build_contact_surface(
+    skeleton: EntityNumbering, pattern: npt.NDArray[np.uint8], law: SelfContactLaw, gap: float, cut: Values | None
+) -> tuple[SplitSurface, Values, SurfaceMap]:
+    """Split surface of a whole mesh, reference positions (n, d) of its points with a gap of new cracks, m, and its map.
 
-    def _pressed_faces(self, u: Values, max_pressure: Values) -> Ints:
-        above = self.pairs.pressure(self.point_map(u)) > max_pressure * (1 + SURFACE.round_off)
-        return self._crack_faces[above[self.split.elements[self._crack_faces]].any(axis=1)]
+    Arguments as for SelfContactSurface.
+    """
+    split = (
+        build_fragment_surface(skeleton, pattern, cut) if law.fragments_only else build_split_surface(skeleton, pattern)
+    )
+    positions = offset_crack_faces(split, gap)
+    return split, positions, make_surface_map(split, skeleton, pattern, positions)
 
-    def _intersecting_faces(self, u: Values) -> Ints:
-        return np.intersect1d(self._crack_faces, self.pairs.intersections(self.point_map(u)))
 
-    def _shorten(self, u: Values, faces: Ints, factor: float) -> bool:
-        """Shorten the arms of crack faces by a factor; whether any arm has changed."""
-        share, points = self.point_map.share.copy(), np.unique(self.split.elements[faces])
-        share[points] = np.maximum(factor * share[points], np.minimum(SURFACE.min_arm, share[points]))
-        changed = not np.array_equal(share, self.point_map.share)
-        if changed:
-            movable = np.unique(self.split.elements[self._crack_faces]) if self.search_all_faces else points
-            end = (x := self.point_map(u)).copy()
-            end[movable] = self.point_map.evaluate_points(
-                u, movable, np.minimum(SURFACE.min_arm, self.point_map.share[movable])
-            )
-            # one search for all the factors that follow
-            self.pairs.search_along(x, end)
-            self.point_map = self.point_map.with_arm_share(share)
-        return changed
-
-    def _retract_faces(self, u: Values, load: Values) -> None:
-        """Retract faces with a pressure above `load` (n,), Pa, and exclude those without room even so.
-
-        The pairs are those of all elements.
-        """
-        start = self.point_map.share
-        for factor in chain(repeat(SURFACE.factor, SURFACE.gentle_rounds), repeat(SURFACE.min_arm)):
-            if not (
-                self._shorten(u, self._pressed_faces(u, load), factor)
-                or self._shorten(u, cut := self._intersecting_faces(u), factor)
-            ):
-                break
-        max_pressure = np.maximum(load, self.closed_pressure * self._parameters["stiffness"])
-        without_room = np.union1d(self._pressed_faces(u, max_pressure), cut)
-        self._exclude(without_room)
-        if len(without_room):
-            # points of excluded faces alone keep their arms, so as not to come back smaller each time
-            unused = np.ones(len(start), bool)
-            unused[np.delete(self.split.elements, without_room, axis=0)] = False
-            self.point_map = self.point_map.with_arm_share(np.where(unused, start, self.point_map.share))
-
-    def extend_faces(self, u: Values) -> None:
-        """Extend retracted faces and include excluded ones where there is room, at displacements u (nodes, d), m.
-
-        Not in the step after edges broke, and less often where there is no room: each attempt costs as much as two
-        iterations of Newton's method.
-        """
-        share, excluded, (pause, remaining) = self.snapshot()
-        if np.all(share == 1) and not len(excluded):
-            return
-        if remaining:
-            self._release_interval = pause, remaining - 1
-            return
-        load = self.pairs.pressure(self.point_map(u))
-        if np.any(share < 1):
-            self._extend_retracted(u, load)
-        if len(excluded):
-            self.pairs = self._build_pairs(self.split.elements)
-            self._retract_faces(u, load)
-        unchanged = np.array_equal(share, self.point_map.share) and np.array_equal(excluded, self._excluded)
-        pause = min(2 * pause, SURFACE.max_pause) if unchanged else 1
-        self._release_interval = pause, pause - 1
-
-    def _extend_retracted(self, u: Values, load: Values) -> None:
-        previous = self.point_map.share
-        self.point_map = self.point_map.with_arm_share(np.minimum(previous / SURFACE.factor, 1.0))
-        # twice, as a face that stays may be in the way of its neighbours
-        for _ in range(2):
-            crowded = self._crowded_faces(u, load)
-            if not len(crowded):
-                return
-            share, points = self.point_map.share.copy(), np.unique(self.split.elements[crowded])
-            share[points] = previous[points]
-            self.point_map = self.point_map.with_arm_share(share)
-        if len(self._crowded_faces(u, load)):
-            self.point_map = self.point_map.with_arm_share(previous)
+def refuse_intersections(positions: Values) -> None:
+    """Raise InputError if there are pairs of elements that intersect; `positions`: (k, d) of these, m."""
+    if len(positions):
+        first = format_point(positions[np.lexsort(positions.T[::-1])[0]])
+        raise InputError(
+            f"[contact]: {len(positions)} pairs of surface elements cut or touch each other at the start, the "
+            f"first near {first}; move the bodies apart"
+        )
 
 
 # --- offset of new crack faces ---
 
 
-def offset_crack_faces(surface: SplitSurface, gap: float) -> Values:
+def offset_crack_faces(
+    surface: SplitSurface, gap: float, least_cosine: Callable[[Values], Values] = lambda cosine: cosine
+) -> Values:
     """(n, d) reference positions, m, with opposite crack faces `gap`, m, apart where the shape of cells allows it.
 
     Every copy moves towards the mean of the nodes that it follows, so far that all crack faces at it recede by half
     the gap along their normals. (A fixed part of the edge would leave faces aslant to their edge nearer to each
     other.) Points on the boundary of the body stay, and so do tips, points with one copy.
+
+    `least_cosine`: least values (n,) of points of all ranks that share the surface.
     """
     start = surface.parents.start
     arm = np.add.reduceat(surface.parents.arm, start[:-1], axis=0) / np.diff(start)[:, None]
     length = np.linalg.norm(arm, axis=1)
     outward = arm / np.where(length > 0, length, 1.0)[:, None]
-    cosine = _min_cosine(surface, outward)
+    cosine = least_cosine(_min_cosine(surface, outward))
     distance = np.where(cosine > 0, 0.5 * gap / np.where(cosine > 0, cosine, 1.0), np.inf)
     distance = np.where(_is_tip(surface.points), 0.0, np.minimum(distance, SURFACE.max_offset * length))
     result: Values = surface.points - distance[:, None] * outward

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -22,14 +22,12 @@ from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
 from ..mesh.parallel import sum_over_ranks
 from .clearance import Clearance
-from .ipc_pairs import IpcPairs
 from .ipc_surface import SelfContactLaw
 from .mesh_obstacles import (
     AllMeshPairs,
     MeshContactSurface,
     MeshFriction,
     MeshObstacle,
-    MeshObstaclePairs,
 )
 from .obstacle import RigidObstacle
 from .pose import Pose
@@ -90,9 +88,9 @@ class MeshObstacleTerm(SelfContact):
     # --- surface and obstacles ---
 
     @property
-    def pairs(self) -> AllMeshPairs[IpcPairs]:
+    def pairs(self) -> AllMeshPairs:
         """Pairs of the surface and the obstacles."""
-        return cast("AllMeshPairs[IpcPairs]", self.surface.current.pairs)
+        return cast("AllMeshPairs", self.surface.current.pairs)
 
     def _place_meshes(self, poses: Sequence[Pose]) -> None:
         """Move the meshes to poses."""
@@ -257,7 +255,8 @@ class MeshObstacleTerm(SelfContact):
         x, v = self.end_positions(), self.surface.nodal_values(self._start_velocity)
         motion, result = self.group.bodies.dt * (self.surface.current.point_map.weights @ v), []
         for pairs, start_pose in zip(self.pairs.pairs, self.group.start_poses, strict=True):
-            result.append(approach(pairs, start_pose, x, motion))
+            force = -sum_over_ranks(self.comm, pairs.body_gradient(x))
+            result.append(approach(pairs.mesh, start_pose, x, force, motion))
         return result
 
 
@@ -356,19 +355,19 @@ class MeshPoseContact:
         return self.allows_exact_tangent
 
 
-def approach(pairs: MeshObstaclePairs[Any], start_pose: Pose, x: Values, motion: Values) -> float:
-    """Largest approach in a step of an obstacle and the points that it pushes, m (collective).
+def approach(mesh: MeshObstacle, start_pose: Pose, x: Values, force: Values, motion: Values) -> float:
+    """Largest approach in a step of an obstacle and the points that it pushes, m.
 
     Args:
-        pairs: with the obstacle, at the end of the step.
+        mesh: the obstacle, at the end of the step.
         start_pose: of the obstacle.
         x: (n, 3) points of the body, m.
+        force: (n, 3) on these, N.
         motion: (n, 3) of these without contact, m.
     """
-    force = -sum_over_ranks(pairs.contact.comm, pairs.body_gradient(x))
     size = np.linalg.norm(force, axis=1)
     pushed = size > 0
-    obstacle_motion = x[pushed] - start_pose.points_to_space(pairs.mesh.pose.to_body(x[pushed]))
+    obstacle_motion = x[pushed] - start_pose.points_to_space(mesh.pose.to_body(x[pushed]))
     normal = force[pushed] / size[pushed, None]
     distance = np.einsum("ni,ni->n", obstacle_motion - motion[pushed], normal)
     return float(distance.max(initial=0.0))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import ipctk
 import numpy as np
@@ -18,7 +17,6 @@ from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
 from ..errors import InputError
-from ..mesh.split_surface.closed_surface import SplitSurface
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from .ipc_pairs import NO_PAIRS, IpcPairs, PairShare
 from .ipc_surface import SelfContactLaw, SelfContactSurface
@@ -26,7 +24,7 @@ from .laws import BARRIER
 from .pose import Pose, PosedShape
 from .proximity import bounding_box
 from .sample_points import IpcFriction
-from .triangle_mesh_shape import penetration_depth
+from .triangle_mesh_shape import ClosedSurface, penetration_depth
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -147,7 +145,7 @@ class MeshObstacle:
         return distance
 
 
-class MeshObstaclePairs[Contact: IpcPairs]:
+class MeshObstaclePairs:
     """Pairs of a body's surface and one obstacle.
 
     Points are (n + m, 3): those of the body, then those of the obstacle.
@@ -163,7 +161,7 @@ class MeshObstaclePairs[Contact: IpcPairs]:
         elements: Ints,
         mesh: MeshObstacle,
         distance: float,
-        make_contact: Callable[[Values, Ints, Patches], Contact],
+        make_contact: Callable[[Values, Ints, Patches], IpcPairs],
     ) -> None:
         """Pairs of both surfaces.
 
@@ -188,7 +186,7 @@ class MeshObstaclePairs[Contact: IpcPairs]:
         self._contact, self._body_points = make_contact(points, triangles, patches), np.unique(elements)
 
     @property
-    def contact(self) -> Contact:
+    def contact(self) -> IpcPairs:
         """Barrier or penalty between the elements of both."""
         return self._contact
 
@@ -260,22 +258,22 @@ class MeshObstaclePairs[Contact: IpcPairs]:
         return np.where(unlimited, np.inf, distances)
 
 
-class AllMeshPairs[Contact: IpcPairs]:
+class AllMeshPairs:
     """Pairs of a body's surface and several obstacles; x (n, 3) of the body, m."""
 
-    def __init__(self, pairs: Sequence[MeshObstaclePairs[Contact]]) -> None:
+    def __init__(self, pairs: Sequence[MeshObstaclePairs]) -> None:
         self._pairs = pairs
 
     @property
-    def pairs(self) -> Sequence[MeshObstaclePairs[Contact]]:
+    def pairs(self) -> Sequence[MeshObstaclePairs]:
         """Pairs of each obstacle."""
         return self._pairs
 
-    def select(self, numbers: Sequence[int]) -> AllMeshPairs[Contact]:
+    def select(self, numbers: Sequence[int]) -> AllMeshPairs:
         """Pairs of some of the obstacles."""
         return AllMeshPairs([self.pairs[number] for number in numbers])
 
-    def _near(self, x: Values) -> Sequence[MeshObstaclePairs[Contact]]:
+    def _near(self, x: Values) -> Sequence[MeshObstaclePairs]:
         return [pairs for pairs in self.pairs if not pairs.is_far(x)]
 
     def energy(self, x: Values) -> float:
@@ -347,7 +345,7 @@ class MeshFriction:
         friction: of each.
     """
 
-    pairs: Sequence[MeshObstaclePairs[IpcPairs]]
+    pairs: Sequence[MeshObstaclePairs]
     friction: list[IpcFriction]
 
     def energy(self, x: Values) -> float:
@@ -356,12 +354,12 @@ class MeshFriction:
             friction.energy(pairs.with_mesh(x)) for pairs, friction in zip(self.pairs, self.friction, strict=True)
         )
 
-    def full_gradient(self, pairs: MeshObstaclePairs[IpcPairs], x: Values) -> Values:
+    def full_gradient(self, pairs: MeshObstaclePairs, x: Values) -> Values:
         """(n + m, 3) derivatives of the friction with one obstacle by the points of both, N."""
         points, friction = pairs.with_mesh(x), self.friction_with(pairs)
         return np.zeros_like(points) if friction is None else friction.gradient(points)
 
-    def friction_with(self, pairs: MeshObstaclePairs[IpcPairs]) -> IpcFriction | None:
+    def friction_with(self, pairs: MeshObstaclePairs) -> IpcFriction | None:
         """Friction with one obstacle; None: without friction."""
         items = zip(self.pairs, self.friction, strict=True)
         return next((friction for item_pairs, friction in items if item_pairs is pairs), None)
@@ -386,7 +384,7 @@ class MeshContactSurface(SelfContactSurface):
     """
 
     face_gap = 0.0
-    pairs: AllMeshPairs[IpcPairs]
+    pairs: AllMeshPairs
 
     def __init__(
         self,
@@ -405,23 +403,23 @@ class MeshContactSurface(SelfContactSurface):
         super().__init__(skeleton, pattern, law, u, previous, cut, comm)
 
     def _check_apart(self) -> None:
-        refuse_overlaps(self.split, self.pairs)
+        for pairs in self.pairs.pairs:
+            is_cut = len(pairs.cut_elements(self.split.points)) > 0
+            refuse_overlap((self.split.points, self.split.elements), pairs.mesh, cut=is_cut)
 
-    def _build_pairs(self, elements: Ints) -> AllMeshPairs[IpcPairs]:
+    def _build_pairs(self, elements: Ints) -> AllMeshPairs:
         # the coefficient of friction is that of each obstacle
         parameters = {name: self._parameters[name] for name in ("distance", "stiffness")}
         return all_mesh_pairs(self._rest_positions, elements, self._obstacles, **parameters, share=self._share)
 
 
-def refuse_overlaps(split: SplitSurface, pairs: AllMeshPairs[Any]) -> None:
+def refuse_overlap(body: ClosedSurface, mesh: MeshObstacle, *, cut: bool) -> None:
     """Raise InputError where an obstacle cuts the body at rest, or one is inside the other."""
-    for of_mesh in pairs.pairs:
-        mesh, cut = of_mesh.mesh, len(of_mesh.cut_elements(split.points)) > 0
-        depth = penetration_depth((split.points, split.elements), (mesh.positions, mesh.triangles), cut=cut)
-        if cut or depth is not None:
-            verb = "cuts" if depth is None else "overlaps"
-            by = "" if depth is None else f", by {depth:.4g} m"
-            raise InputError(f"{mesh.name} {verb} the body at the start{by}; move it away or make it smaller")
+    depth = penetration_depth(body, (mesh.positions, mesh.triangles), cut=cut)
+    if cut or depth is not None:
+        verb = "cuts" if depth is None else "overlaps"
+        by = "" if depth is None else f", by {depth:.4g} m"
+        raise InputError(f"{mesh.name} {verb} the body at the start{by}; move it away or make it smaller")
 
 
 def all_mesh_pairs(
@@ -432,10 +430,10 @@ def all_mesh_pairs(
     distance: float,
     stiffness: float,
     share: PairShare | None = None,
-) -> AllMeshPairs[IpcPairs]:
+) -> AllMeshPairs:
     """Pairs of a body, `rest_positions` (n, 3), m, and `elements` (k, 3), and obstacles; the others as for IpcPairs."""
 
-    def build(mesh: MeshObstacle) -> MeshObstaclePairs[IpcPairs]:
+    def build(mesh: MeshObstacle) -> MeshObstaclePairs:
         def make_contact(points: Values, triangles: Ints, patches: Patches) -> IpcPairs:
             of_both = None if share is None else share.with_others(len(mesh.points))
             parameters = {"distance": distance, "stiffness": stiffness, "friction": mesh.friction}

@@ -240,6 +240,9 @@ class ObstacleTerm(ContactState, Term):
 
     # --- fracture, and surfaces for output ---
 
+    def gather_separation(self) -> None:
+        """Do nothing: obstacles are on all ranks."""
+
     def separate_surface(self, position: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
         """Retract points of a surface for output that would lie in an obstacle, as those of contact are."""
         all_posed = self.group.bodies.posed_at(t)

@@ -1,7 +1,8 @@
 """Terms of the balance for contact of surfaces in explicit steps: a body with itself, or with triangle-mesh obstacles.
 
-Rank 0 has the split surface of the body, finds pairs in contact (penalty_pairs), and maps forces to the nodes:
-x = W u, f = -W^T dE/dx. Nothing is gathered while nothing is near.
+Each rank has its own elements of the body's split surface and those of others near them (partitioned_surface), finds
+its contacts (penalty_pairs), and maps forces to the nodes: x = W u, f = -W^T dE/dx. Nothing is exchanged while nothing
+is near.
 
     k_p = kappa A_p / (2 D)    as both sides act, but at most what leaves the stable step as it is (penalty_stiffness)
 
@@ -14,31 +15,33 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from mpi4py import MPI
 
 from ..mechanics.term import Term, TimeLevel
 from ..mesh.domain import Domain
-from ..mesh.parallel import from_root, on_root
-from .clearance import Clearance, NoDistance, ObstacleDistance
+from ..mesh.parallel import allgather, gather, max_over_ranks, sum_over_ranks
+from .clearance import Clearance
 from .ipc_surface import SelfContactLaw
 from .mesh_obstacle_term import approach, build_mesh_obstacle
 from .mesh_obstacles import MeshObstacle
 from .obstacle import VerletObstacle
-from .penalty_pairs import BodyMass, PairSprings, PenaltyHistory, PenaltyPart, PenaltySurface
+from .partitioned_surface import BodyMass, PartitionedSurface, motion_diagonal
+from .penalty_pairs import HistoryRows, PairSprings, PenaltyHistory
 from .penalty_point_facet import POINT_FACET
-from .pose import PosedShape
+from .penalty_surface import PenaltyPart
+from .pose import Pose, PosedShape
 from .pose_derivatives import resultant
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
-from .self_contact import BreakingSurface, Pattern, node_gather
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+
+# keys of points, and contacts
+type KeyedHistory = tuple[Ints, PenaltyHistory]
 
 
 @dataclass(frozen=True)
@@ -61,27 +64,25 @@ class IdleState:
 class PenaltyState:
     """Contacts at the end of the last step, and the test whether steps are idle (HistoryTerm).
 
-    A step is idle where nothing can be in contact, nor was at the end of the last one: nothing is gathered.
+    A step is idle where nothing can be in contact, nor was at the end of the last one: nothing is exchanged.
     """
 
     def __init__(
-        self,
-        domain: Domain,
-        u: fem.Function,
-        surface: BreakingSurface[PenaltySurface],
-        is_far: Callable[[], bool] | None,
+        self, domain: Domain, u: fem.Function, surface: PartitionedSurface, is_far: Callable[[], bool] | None
     ) -> None:
         """Begin with nothing in contact.
 
         Args:
             domain: mesh.
             u: displacement.
-            surface: surface of the body, on rank 0.
+            surface: surface of the body.
             is_far: function that tells whether the body is far from all obstacles at the current u (collective); None:
                 the body touches itself.
         """
         self._comm, self._dim, self._u, self._owned = domain.comm, domain.dim, u, domain.node_count * domain.dim
         self._surface, self._is_far, self._idle_state = surface, is_far, IdleState()
+        # contacts of a snapshot of a surface with other numbers, to be set when all ranks come together
+        self._restored: list[KeyedHistory] | None = None
         self.discard()
 
     def discard(self) -> None:
@@ -95,34 +96,25 @@ class PenaltyState:
         return self._idle
 
     def _nothing_is_near(self) -> bool:
-        """Whether nothing can be in contact at the current u (collective).
-
-        The approach of any two nodes is at most the diagonal of the bounding box of all motions.
-        """
+        """Whether nothing can be in contact at the current u (collective)."""
         if self._is_far is not None:
             return self._is_far()
         if (reference := self._idle_state.displacement) is None:
             return False
-        motion, d = self._u.x.array[: self._owned] - reference, self._dim
-        # by columns: minima along the first axis take twenty times as long
-        lowest = [motion[axis::d].min(initial=np.inf) for axis in range(d)]
-        bounds = np.array([*lowest, *(-motion[axis::d].max(initial=-np.inf) for axis in range(d))])
-        self._comm.Allreduce(MPI.IN_PLACE, bounds, MPI.MIN)
-        return float(np.linalg.norm(bounds.reshape(2, -1).sum(axis=0))) <= self._idle_state.clearance
+        motion = (self._u.x.array[: self._owned] - reference).reshape(-1, self._dim)
+        return motion_diagonal(self._comm, [motion]) <= self._idle_state.clearance
 
-    def measure_clearance(self, x: Values | None) -> None:
-        """Store how far nodes may approach from x (n, d), m, on rank 0, before anything is near (collective)."""
+    def measure_clearance(self, x: Values) -> None:
+        """Store how far nodes may approach from points x (n, d), m, before anything is near (collective)."""
         if self._is_far is not None:
             return  # bounding boxes are compared in each step
-
-        def clearance() -> float:
-            surface = self._surface.current
-            reach = surface.reach_of_points()
-            return 0.0 if x is None or np.isinf(reach) else surface.parts[0].contact.clearance(x) / reach
-
-        clear = from_root(self._comm, clearance)
-        displacement = self._u.x.array[: self._owned].copy() if clear else None
-        self._idle_state = replace(self._idle_state, displacement=displacement, clearance=clear)
+        contact, clearance = self._surface.current.parts[0].contact, 0.0
+        # a search of wide gaps is worth it on all ranks or on none
+        if not max_over_ranks(self._comm, int(self._surface.has_retracted or contact.anything_is_near(x))):
+            reach = max_over_ranks(self._comm, self._surface.reach_of_points())
+            clearance = -max_over_ranks(self._comm, -contact.clearance(x)) / reach
+        displacement = self._u.x.array[: self._owned].copy() if clearance else None
+        self._idle_state = replace(self._idle_state, displacement=displacement, clearance=clearance)
 
     def surface_changed(self) -> None:
         """Discard the clearance, as it is another surface."""
@@ -134,46 +126,56 @@ class PenaltyState:
         self._idle_state = replace(self._idle_state)
 
     def end_step(self, *, is_near: bool) -> None:
-        """Note whether anything is near contact at the end of a step."""
-        self._idle_state = replace(self._idle_state, is_near=is_near)
+        """Note whether anything is near contact at the end of a step, on any rank (collective)."""
+        any_near = bool(max_over_ranks(self._comm, int(is_near)))
+        self._idle_state = replace(self._idle_state, is_near=any_near)
+
+    def settle(self) -> None:
+        """Set contacts of a snapshot whose surface had other numbers (collective)."""
+        if self._restored is not None:
+            histories, self._restored = self._restored, None
+            self._surface.set_history([history.to_rows(keys) for keys, history in histories])
 
     def snapshot(self) -> object:
-        """Contacts, and idle state."""
-        surface = self._surface
-        histories = [part.contact.history for part in surface.current.parts] if surface.is_held else []
-        return histories, self._idle_state
+        """Contacts, numbering of the surface, and idle state."""
+        histories = self._restored or [(part.keys, part.contact.history) for part in self._surface.current.parts]
+        return histories, -1 if self._restored else self._surface.exchange_count, self._idle_state
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective)."""
-        histories, idle = cast("tuple[list[PenaltyHistory], IdleState]", memory)
+        histories, exchange_count, idle = cast("tuple[list[KeyedHistory], int, IdleState]", memory)
         if idle is self._idle_state:
             return
-        self._set_contacts(histories)
+        if exchange_count == self._surface.exchange_count:
+            self._restored = None
+            for part, (_, history) in zip(self._surface.current.parts, histories, strict=True):
+                part.contact.set_history(history)
+        else:
+            self._restored = histories
         # edges may have broken since: it is another surface
         count = self._idle_state.surface_count
         self._idle_state = idle if idle.surface_count == count else IdleState(idle.is_near, surface_count=count)
-
-    def _set_contacts(self, histories: Sequence[PenaltyHistory]) -> None:
-        """Set contacts of each part, on rank 0."""
-        if self._surface.is_held:
-            for part, history in zip(self._surface.current.parts, histories, strict=True):
-                part.contact.set_history(history)
         self.discard()
 
     def to_checkpoint(self) -> dict[str, Values]:
-        """Contacts of each part, on rank 0."""
-        if not self._surface.is_held:
-            return {}
-        histories = [part.contact.history.to_checkpoint() for part in self._surface.current.parts]
-        return {f"{name}_{index}": values for index, arrays in enumerate(histories) for name, values in arrays.items()}
+        """Contacts of each part by keys of points, on rank 0 (collective)."""
+        self.settle()
+        arrays: dict[str, Values] = {}
+        for index, part in enumerate(self._surface.current.parts):
+            if (rows := gather(self._comm, part.contact.history.to_rows(part.keys))) is not None:
+                arrays |= HistoryRows.join(rows).to_checkpoint(f"_{index}")
+        return arrays
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set the state from the arrays of a checkpoint."""
-        count = sum(name.startswith("by_") for name in saved)
-        histories = [PenaltyHistory.from_checkpoint(saved, f"_{index}") for index in range(count)]
-        is_near = not all(history.is_empty for history in histories)
+        """Set the state from the arrays of a checkpoint (collective)."""
+        count = len(self._surface.current.parts)
+        histories = [HistoryRows.from_checkpoint(saved, f"_{index}") for index in range(count)]
+        is_near = any(len(rows.points) or len(rows.edges) for rows in histories)
         self._idle_state = IdleState(is_near, surface_count=self._idle_state.surface_count)
-        self._set_contacts(histories)
+        if self._comm.rank:
+            histories = [HistoryRows(*(rows[:0] for rows in vars(part).values())) for part in histories]
+        self._surface.set_history(histories)
+        self.discard()
 
 
 class PenaltyContact(Term):
@@ -181,7 +183,7 @@ class PenaltyContact(Term):
 
     Attributes:
         law: contact law.
-        surface: surface of the body, on rank 0.
+        surface: surface of the body.
         state: contacts at the end of the last step, and whether steps are idle.
     """
 
@@ -205,7 +207,7 @@ class PenaltyContact(Term):
             law: contact law.
             mass: (owned dofs,) lumped, kg.
             max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
-            meshes: obstacles, on rank 0; none: the body touches itself.
+            meshes: obstacles; none: the body touches itself.
             is_far: as for PenaltyState.
 
         Raises:
@@ -213,63 +215,74 @@ class PenaltyContact(Term):
         """
         self.law, self._domain, self._u, self.comm = law, domain, u, domain.comm
         self._owned = domain.node_count * domain.dim
-        nodal_mass = node_gather(domain, law)(mass.reshape(-1, domain.dim))
-        # on other ranks than 0 no surface is built
-        body = BodyMass(np.empty(0) if nodal_mass is None else nodal_mass[:, 0].copy(), max_added)
         self._friction_loss = 0.0
-        build = partial(PenaltySurface, body=body, meshes=meshes)
-        self.surface = BreakingSurface(domain, u, law, build, everywhere=False)
+        self.surface = PartitionedSurface(domain, u, law, BodyMass(mass, max_added), meshes)
         self.state = PenaltyState(domain, u, self.surface, is_far)
         self.parts: tuple[object, ...] = (self.surface, self.state)
-        self._starts: list[Values] | None = None  # (n + m, d) points of each part at the start of the step, m
+        self._set_start(None)
         self.update_displacement()
 
-    # --- surface, on rank 0 ---
+    # --- surface ---
 
     @property
     def _parts(self) -> list[PenaltyPart]:
         return self.surface.current.parts
 
-    def edges_broke(self, pattern: Pattern) -> None:
+    def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Add new crack faces, retracted where there is no room (collective)."""
         self.surface.edges_broke(pattern)
         self.state.surface_changed()
-        self._starts = None
+        self._set_start(None)
         self.update_displacement()
 
     def update_displacement(self) -> None:
         """Discard positions and forces, as u has changed."""
         self.state.discard()
         self._positions: Values | None = None
-        self._has_positions = False  # the same on all ranks
         self._nodal_forces: Values | None = None
         self._gradients: list[Values] | None = None
 
     def clear_search(self) -> None:
         """Discard the candidates of collision detection (not collective)."""
         self.update_displacement()
-        if self.surface.is_held:
-            self.surface.current.pairs.clear_caches()
+        for part in self._parts:
+            part.contact.clear_caches()
 
     # --- forces and energy ---
 
-    def _end_positions(self) -> Any:
-        """(n, d) positions at the current u, m, on rank 0 (collective)."""
-        if not self._has_positions:
-            self._has_positions, self._positions = True, self.surface.positions(self._u.x.array[: self._owned])
+    def _end_positions(self) -> Values:
+        """(n, d) positions at the current u, m (collective)."""
+        if self._positions is None:
+            self._positions = self.surface.positions(self._u.x.array[: self._owned])
+            self.state.settle()
+            if self._start_u is not None and self._start_count != self.surface.exchange_count:
+                self._set_start(self._start_u)
         return self._positions
+
+    def _set_start(self, u: Values | None) -> None:
+        """Set the points at the start of the step at displacements u (owned dofs,), m; None: accepted (collective)."""
+        self._start_u, self._start_count, self._starts = u, self.surface.exchange_count, None
+        if u is not None:
+            x = self.surface.current.point_map(self.surface.nodal_values(u))
+            poses = self._start_poses()
+            self._starts = [part.points(x, pose) for part, pose in zip(self._parts, poses, strict=True)]
+
+    def _start_poses(self) -> Sequence[Pose | None]:
+        """Pose of the obstacle of each part at the start of the step."""
+        return [None]
 
     def min_gap(self) -> float:
         """Least gap within the penalty at the current u, m; infinite where none is (collective)."""
         x = self._end_positions()
-        return from_root(self.comm, lambda: self.surface.current.pairs.min_gap(x))
+        gaps = [part.contact.min_gap(part.points(x)) for part in self._parts if not part.is_far(x)]
+        return -max_over_ranks(self.comm, -min(gaps, default=np.inf))
 
     def _springs(self, index: int, part: PenaltyPart) -> PairSprings:
-        """Springs of friction of a part, on rank 0."""
+        """Springs of friction of a part."""
         return PairSprings(part.contact, part.friction, None if self._starts is None else self._starts[index])
 
     def _part_gradients(self, x: Values) -> list[Values]:
-        """(n + m, d) minus the forces of each part, friction included, with the body at x (n, d), m; on rank 0."""
+        """(n + m, d) minus the forces of each part, friction included, with the body at x (n, d), m."""
         if self._gradients is None:
             self._gradients = []
             for index, part in enumerate(self._parts):
@@ -288,28 +301,25 @@ class PenaltyContact(Term):
             return None
         x = self._end_positions()
         if self._nodal_forces is None:
-
-            def forces() -> Values:
-                total = np.sum([gradient[: len(x)] for gradient in self._part_gradients(x)], axis=0)
-                return self.surface.current.point_map.nodal_forces(-total)
-
-            self._nodal_forces = np.asarray(self.surface.gather.scatter(on_root(self.comm, forces))).reshape(-1)
+            total = np.sum([gradient[: len(x)] for gradient in self._part_gradients(x)], axis=0)
+            self._nodal_forces = self.surface.sum_at_nodes(self.surface.current.point_map.nodal_forces(-total))
             self.state.measure_clearance(x)
         return self._nodal_forces
 
     def stored_energy(self) -> float:
-        """Energy of the penalty and of the springs of friction at the current u, on rank 0, J (collective)."""
-        x, energy = None if self.state.is_idle() else self._end_positions(), 0.0
-        if x is not None:
-            for index, part in enumerate(self._parts):
-                if not part.is_far(x):
-                    points = part.points(x)
-                    springs = self._springs(index, part).energy(points) if part.friction else 0.0
-                    energy += part.contact.energy(points) + springs
+        """Energy of the penalty and of the springs of friction at the current u, of this rank, J (collective)."""
+        if self.state.is_idle():
+            return 0.0
+        x, energy = self._end_positions(), 0.0
+        for index, part in enumerate(self._parts):
+            if not part.is_far(x):
+                points = part.points(x)
+                springs = self._springs(index, part).energy(points) if part.friction else 0.0
+                energy += part.contact.energy(points) + springs
         return energy
 
     def step_work(self) -> tuple[float, float]:
-        """Work from outside, 0, and dissipation by friction, on rank 0, J."""
+        """Work from outside, 0, and dissipation by friction, of this rank, J."""
         return 0.0, self._friction_loss
 
     def frequency_bound(self) -> float:
@@ -317,10 +327,10 @@ class PenaltyContact(Term):
         if self.state.is_idle():
             return 0.0
         x = self._end_positions()
-        return from_root(self.comm, lambda: self.surface.current.max_added_frequency(x) + self._obstacle_frequency(x))
+        return self.surface.max_added_frequency(x) + self._obstacle_frequency(x)
 
     def _obstacle_frequency(self, x: Values) -> float:
-        """Square of the highest frequency of obstacles on their contacts, the body at x (n, d), m; 1/s^2; rank 0."""
+        """Square of the highest frequency of obstacles on contacts, the body at x (n, d), m; 1/s^2 (collective)."""
         return 0.0
 
     # --- steps ---
@@ -330,29 +340,27 @@ class PenaltyContact(Term):
         # of the end of the last step, before it is discarded
         is_idle = self.state.is_idle()
         self.update_displacement()
-        self._starts = None
+        self._set_start(None)
         if not level.dt:
             return
         self._friction_loss = 0.0
         if is_idle:
             return
         self.state.begin_step()
-        nodal = self.surface.nodal_values(level.u_n)
-        if self.surface.is_held:
-            self.surface.current.extend_faces(nodal)
-            x = self.surface.current.point_map(nodal)
-            self._starts = [part.points(x) for part in self._parts]
+        self.surface.refresh(level.u_n)
+        self.state.settle()
+        self.surface.extend_faces(level.u_n)
+        self._set_start(level.u_n)
 
     def accept_step(self) -> None:
         """Store contacts and dissipation of the step (collective)."""
         if self.state.is_idle():
             return
-        x = self._end_positions()
-        self.state.end_step(is_near=from_root(self.comm, lambda: self._end_on_root(x)))
-        self._starts = None
+        self.state.end_step(is_near=self._store_contacts(self._end_positions()))
+        self._set_start(None)
 
-    def _end_on_root(self, x: Values) -> bool:
-        """Store contacts at the end of a step with the body at x (n, d), m, on rank 0; whether any are near."""
+    def _store_contacts(self, x: Values) -> bool:
+        """Store contacts at the end of a step with the body at x (n, d), m; whether any are near on this rank."""
         is_near = False
         for index, part in enumerate(self._parts):
             if part.is_far(x) and part.contact.history.is_empty:
@@ -405,30 +413,32 @@ class PenaltyMeshContact(PenaltyContact):
         self.numbers, self.obstacles = self.group.numbers, self.group.obstacles
         self.barrier_width = law.distance
         items = zip(self.numbers, self.obstacles, strict=True)
-        self._all_meshes = on_root(domain.comm, lambda: [build_mesh_obstacle(*item, edge) for item in items]) or []
+        self._all_meshes = [build_mesh_obstacle(*item, edge) for item in items]
         self._dt = 0.0  # s, of the current or last step
-        # of the last step, on rank 0: force and moment on each, N and N m
+        # of the last step and of this rank's contacts: force and moment on each, N and N m
         self._wrenches: list[Values] = [np.zeros(6) for _ in numbers]
         self._posed = [bodies.posed[number] for number in numbers]
-        for mesh, posed in zip(self._all_meshes, self._posed, strict=False):
+        for mesh, posed in zip(self._all_meshes, self._posed, strict=True):
             mesh.move_to(posed.pose)
         super().__init__(domain, u, law, mass, max_added, self._all_meshes, self._is_far)
-        sizes = from_root(domain.comm, lambda: [(mesh.radius, mesh.rotates) for mesh in self._all_meshes])
-        distances: list[ObstacleDistance] = [*self._all_meshes] or [NoDistance(*size) for size in sizes]
         reach = POINT_FACET.max_gap * law.distance
-        self._clearance = Clearance(domain, distances, reach, self.surface.following_points)
+        self._clearance = Clearance(domain, self._all_meshes, reach, self.surface.following_points)
         self.parts, self.pose_contact = (*self.parts, self.group, self._clearance), self
 
     # --- motion ---
 
     def _move_to(self, posed: Sequence[PosedShape]) -> None:
-        """Move the meshes, on rank 0, to the poses of all obstacles; discard forces where they have moved."""
+        """Move the meshes to the poses of all obstacles; discard forces where they have moved."""
         last, self._posed = self._posed, [posed[number] for number in self.numbers]
         if all(new is old or new.pose.equals(old.pose) for new, old in zip(self._posed, last, strict=True)):
             return
-        for mesh, shape in zip(self._all_meshes, self._posed, strict=False):
+        for mesh, shape in zip(self._all_meshes, self._posed, strict=True):
             mesh.move_to(shape.pose)
         self.update_displacement()
+
+    def _start_poses(self) -> Sequence[Pose | None]:
+        """Pose of each obstacle at the start of the step."""
+        return self.group.start_poses
 
     def poses_moved(self) -> None:
         """Move the meshes to the poses of the obstacles."""
@@ -449,7 +459,7 @@ class PenaltyMeshContact(PenaltyContact):
         self._end_u = None
         super().update_displacement()
 
-    def edges_broke(self, pattern: Pattern) -> None:
+    def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Add new crack faces, retracted where there is no room (collective)."""
         super().edges_broke(pattern)
         self._clearance.discard()
@@ -475,24 +485,25 @@ class PenaltyMeshContact(PenaltyContact):
             for start, end, number in zip(last, self._wrenches, self.numbers, strict=True)
         ]
 
-    def _end_on_root(self, x: Values) -> bool:
-        self._wrenches = self._wrenches_on_root(x)
-        return super()._end_on_root(x)
+    def _store_contacts(self, x: Values) -> bool:
+        self._wrenches = self._own_wrenches(x)
+        return super()._store_contacts(x)
 
     def _obstacle_frequency(self, x: Values) -> float:
         # the squares of a body and an obstacle on one spring add up
         squares = [0.0]
         for number, part in zip(self.numbers, self._parts, strict=True):
-            if number in self.group.bodies.free and not part.is_far(x):
-                obstacle, posed = (
-                    cast("VerletObstacle", self.group.bodies.free[number]),
-                    self.group.bodies.posed[number],
-                )
+            if number not in self.group.bodies.free:
+                continue
+            obstacle, posed = cast("VerletObstacle", self.group.bodies.free[number]), self.group.bodies.posed[number]
+            rows: tuple[Values, Values] = np.empty((0, 3)), np.empty(0)
+            if not part.is_far(x):
                 points = part.points(x)
                 near = part.contact.contacts_ahead(points)
-                positions = near.positions(points, np.arange(len(points)) >= len(x))
-                stiffness = obstacle.spring_stiffness(positions, near.stiffness, posed)
-                squares.append(obstacle.max_frequency(stiffness, posed))
+                rows = near.positions(points, np.arange(len(points)) >= len(x)), near.stiffness
+            positions, stiffness = (np.concatenate(arrays) for arrays in zip(*allgather(self.comm, rows), strict=True))
+            if len(stiffness):
+                squares.append(obstacle.max_frequency(obstacle.spring_stiffness(positions, stiffness, posed), posed))
         return max(squares)
 
     # --- contact of the body, as the obstacles see it (rigid_obstacles.PoseContact) ---
@@ -502,12 +513,15 @@ class PenaltyMeshContact(PenaltyContact):
         numbers = self.group.free
         if not numbers or self.state.is_idle():
             return {number: np.zeros(6) for number in numbers}
-        x = self._end_positions()
-        all_wrenches = from_root(self.comm, lambda: self._wrenches_on_root(x))
+        wrenches = self._own_wrenches(self._end_positions())
+        all_wrenches = sum_over_ranks(self.comm, np.array(wrenches))
         return {number: all_wrenches[self.numbers.index(number)] for number in numbers}
 
-    def _wrenches_on_root(self, x: Values) -> list[Values]:
-        """(6,) force and moment of the body at x (n, 3), m, on each obstacle about its reference point, N and N m."""
+    def _own_wrenches(self, x: Values) -> list[Values]:
+        """(6,) force and moment of this rank's contacts on each obstacle about its reference point, N and N m.
+
+        `x`: (n, 3) points of the body, m.
+        """
         result = []
         for mesh, gradient in zip(self._all_meshes, self._part_gradients(x), strict=True):
             force = -gradient[len(x) :]
@@ -518,31 +532,29 @@ class PenaltyMeshContact(PenaltyContact):
     # --- readings ---
 
     def _wrench(self, index: int) -> Values:
-        """(6,) force and moment of the body on an obstacle at the end of the last step, on rank 0, N and N m."""
+        """(6,) force and moment on an obstacle at the end of the last step, of this rank's contacts, N and N m."""
         return self._wrenches[index]
 
     def _gap(self, index: int) -> float:
-        """Least distance between an obstacle and the body, m; on rank 0, infinite elsewhere (collective)."""
+        """Least distance between an obstacle and the body, m, of this rank's points (collective)."""
         if self.state.is_idle():
             return self._clearance.least_gap(index, self._end_displacement(), self._posed)
-        x = self._end_positions()
-        pairs = None if x is None else self._parts[index].obstacle
-        return np.inf if pairs is None else pairs.gap(x)
+        return self._parts[index].gap(self._end_positions())
 
     def closing_distances(self) -> list[float]:
         """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
 
-        It is that of the velocities at the start, without any contact; on rank 0.
+        It is that of the velocities at the start, without any contact; of the points of this rank.
         """
-        none = [0.0] * len(self.obstacles)
         if self.state.is_idle():
-            return none
-        x, v = self._end_positions(), self.surface.nodal_values(self._start_velocity)
-        if x is None:
-            return none
-        motion = self._dt * (self.surface.current.point_map.weights @ v)
-        pairs = [part.obstacle for part in self._parts if part.obstacle is not None]
-        return [approach(*item, x, motion) for item in zip(pairs, self.group.start_poses, strict=True)]
+            return [0.0] * len(self.obstacles)
+        x, surface = self._end_positions(), self.surface.current
+        motion = self._dt * (surface.point_map.weights @ self.surface.nodal_values(self._start_velocity))
+        result = []
+        for mesh, part, start_pose in zip(self._all_meshes, self._parts, self.group.start_poses, strict=True):
+            gradient = np.zeros_like(x) if part.is_far(x) else part.contact.gradient(part.points(x))[: len(x)]
+            result.append(approach(mesh, start_pose, x, -surface.sum_at_points(gradient), motion))
+        return result
 
     # --- state: wrenches at the end of the last step (HistoryTerm) ---
 
@@ -555,9 +567,9 @@ class PenaltyMeshContact(PenaltyContact):
         self._wrenches = cast("list[Values]", memory)
 
     def to_checkpoint(self) -> dict[str, Values]:
-        """Wrenches at the end of the last step."""
-        return {"wrenches": np.array(self._wrenches)}
+        """Wrenches at the end of the last step, of all ranks (collective)."""
+        return {"wrenches": sum_over_ranks(self.comm, np.array(self._wrenches))}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set the state from the arrays of a checkpoint."""
-        self._wrenches = list(saved["wrenches"])
+        """Set the state from the arrays of a checkpoint: rank 0 has all of it."""
+        self._wrenches = [wrench * (self.comm.rank == 0) for wrench in saved["wrenches"]]

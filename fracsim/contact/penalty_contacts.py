@@ -56,6 +56,32 @@ class ContactStiffness:
 
 
 @dataclass(frozen=True)
+class ElementRanks:
+    """Ranks of the elements that a rank has; a point or an edge belongs to the lowest rank of its elements.
+
+    Attributes:
+        rank: (m,).
+        this: this rank.
+        own_points: (n,) flags of the points of this rank.
+    """
+
+    rank: Ints
+    this: int
+    own_points: Flags
+
+    def own(self, elements: Ints) -> Flags:
+        """(k,) whether this rank is the lowest one of elements (k, c)."""
+        return np.asarray(self.rank[elements].min(axis=1, initial=np.iinfo(np.int64).max) == self.this)
+
+
+def own_points(rank: Ints, elements: Ints, count: int, this: int) -> Flags:
+    """(n,) whether a rank is the lowest one of the elements (m, d), of ranks (m,), at points n = `count`."""
+    lowest = np.full(count, np.iinfo(np.int64).max)
+    np.minimum.at(lowest, elements, rank[:, None])
+    return np.asarray(lowest == this)
+
+
+@dataclass(frozen=True)
 class PenaltyContacts:
     """Contacts within some gap.
 
@@ -123,20 +149,20 @@ class PenaltyContacts:
         weights = weights / np.maximum(weights.sum(axis=1), np.finfo(float).tiny)[:, None]
         return np.asarray(np.einsum("km,kmd->kd", weights, x[self.points]))
 
-    def max_added_frequency(self, nodes: csr_matrix, mass: Values) -> float:
-        """Bound of the increase of the square of a frequency if all contacts are closed, 1/s^2.
+    def added_load(self, nodes: csr_matrix) -> Values:
+        """(nodes,) bound of what these contacts add to M omega^2 of each node if all are closed, N/m.
+
+        By the rows of the stiffness matrix (Gershgorin).
 
         Args:
-            nodes: (n, nodes) weights with which points follow nodes; zero for points of what does not move.
-            mass: (nodes,) kg.
+            nodes: (n, nodes) weights with which the first points follow nodes; others do not move.
         """
         k, m = self.points.shape
-        if not k:
-            return 0.0
-        entries = self.weights.reshape(-1), (np.repeat(np.arange(k), m), self.points.reshape(-1))
+        rows, columns = np.repeat(np.arange(k), m), self.points.reshape(-1)
+        moves = columns < nodes.shape[0]
+        entries = self.weights.reshape(-1)[moves], (rows[moves], columns[moves])
         size = abs(csr_matrix(entries, shape=(k, nodes.shape[0])) @ nodes)
-        load = size.T @ (self.stiffness * np.asarray(size.sum(axis=1)).ravel())
-        return float((load / mass).max(initial=0.0))
+        return np.asarray(size.T @ (self.stiffness * np.asarray(size.sum(axis=1)).ravel()))
 
 
 def point_masses(size: csr_matrix, area: Values, rate: Values) -> Values:

@@ -1,4 +1,4 @@
-"""Penalty between edges of surfaces in 3D, which cross between their points; on one rank.
+"""Penalty between edges of surfaces in 3D, which cross between their points.
 
 Edges a and b with the closest points a_0 + s a and b_0 + t b of their lines have the gap g = n . o, o the vector
 between these points and n = +-(a x b) / |a x b|. The sign is such that g > 0 as edges come near, and stays while they
@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from .ipc_surface import unit_normals
 from .pair_search import PairFilter, PairSearch, SimplexPairs, near_pairs
-from .penalty_contacts import PenaltyContacts
+from .penalty_contacts import ElementRanks, PenaltyContacts
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -84,20 +84,14 @@ class EdgePairHistory:
             self.points[rows], self.side[rows], self.stiffness[rows], self.share[rows], self.slip[rows]
         )
 
-    def renumbered(self, number: Ints) -> EdgePairHistory:
-        """Pairs with new numbers (n,) of points; those with points that are no more, -1, are left out."""
-        points = number[self.points]
-        rows = np.flatnonzero((points >= 0).all(axis=1))
-        return replace(self.select(rows), points=points[rows])
-
-    def to_array(self) -> Values:
-        """(k, 10) rows for a checkpoint."""
-        return np.column_stack([self.points, self.side, self.stiffness, self.share, self.slip])
+    def to_rows(self, keys: Ints) -> tuple[Ints, Values]:
+        """(k, 4) keys of both ends, and (k, 6) side, stiffness, share and slip; `keys`: (n,) of all points."""
+        return keys[self.points], np.column_stack([self.side, self.stiffness, self.share, self.slip])
 
     @classmethod
-    def from_array(cls, rows: Values) -> EdgePairHistory:
-        """Pairs of the rows of a checkpoint."""
-        return cls(rows[:, :4].astype(np.int64), rows[:, 4], rows[:, 5], rows[:, 6], rows[:, 7:])
+    def from_rows(cls, points: Ints, values: Values) -> EdgePairHistory:
+        """Pairs with ends (k, 4), of the values of `to_rows`."""
+        return cls(points, values[:, 0], values[:, 1], values[:, 2], values[:, 3:])
 
 
 @dataclass(frozen=True)
@@ -107,11 +101,13 @@ class SharpEdges:
     Attributes:
         ends: (e, 2) points, the lower number first; ascending.
         corners: (e, 2, 3) corners of both facets.
+        triangles: (e, 2) numbers of both.
         weight: (e,) in (0, 1], by the angle between the facets at rest.
     """
 
     ends: Ints
     corners: Ints
+    triangles: Ints
     weight: Values
 
     def outward(self, x: Values, edges: Ints) -> Values:
@@ -133,7 +129,7 @@ def find_sharp_edges(x: Values, elements: Ints) -> SharpEdges:
     excess: Values = np.asarray((angle - EDGES.min_angle) / (EDGES.full_angle - EDGES.min_angle))
     weight, _ = _smooth_step(excess)
     sharp = np.flatnonzero(weight > 0)
-    return SharpEdges(ends[sharp], elements[triangles[sharp]], weight[sharp])
+    return SharpEdges(ends[sharp], elements[triangles[sharp]], triangles[sharp], weight[sharp])
 
 
 class EdgeContacts:
@@ -151,6 +147,7 @@ class EdgeContacts:
         *,
         distance: float,
         patch: npt.NDArray[np.int32] | None = None,
+        ranks: ElementRanks | None = None,
     ) -> None:
         """Edges of a surface.
 
@@ -160,12 +157,10 @@ class EdgeContacts:
             limit: (n,) stiffness that each point may have, N/m.
             distance: D, m.
             patch: (n,) numbers of parts of the surface that touch others alone; None: all touch.
+            ranks: of the elements; a pair belongs to the lowest rank at its lower edge. None: all are of this rank.
         """
-        self._sharp, self._width, self._count = (
-            find_sharp_edges(rest_positions, elements),
-            distance,
-            len(rest_positions),
-        )
+        self._sharp, self._width = find_sharp_edges(rest_positions, elements), distance
+        self._count = len(rest_positions)
         self._key = self._sharp.ends @ np.array([self._count, 1])  # ascending
         ends = self._sharp.ends
         self._stiffness = limit[ends].min(axis=1, initial=np.inf)
@@ -173,21 +168,39 @@ class EdgeContacts:
         edges = local.reshape(-1, 2)
         self._sets = SimplexPairs.of(edges, edges, EDGES.max_gap * distance)
         self._search = PairSearch(len(self._used), [self._sets], EDGES.search_margin * distance)
+        self._is_owned = None if ranks is None else ranks.own(self._sharp.triangles)
         if patch is not None:
             self._search.filter = PairFilter(np.ascontiguousarray(patch[self._used]), self._search.filter.is_owned)
+        if self._is_owned is not None:
+            is_searched = np.zeros(len(self._used), bool)
+            is_searched[edges[self._is_owned]] = True
+            self._search.filter = PairFilter(self._search.filter.patches, is_searched)
+        self._owned_pairs: tuple[Ints, Ints] | None = None  # pairs of the last search, and those of this rank
         self.set_history(EdgePairHistory.none())
 
     def set_history(self, history: EdgePairHistory) -> None:
         """Set the pairs near each other; those of edges that are not sharp are left out."""
         history = _ordered_ends(history)
         edges = [self._edge_numbers(history.points[:, columns]) for columns in (slice(0, 2), slice(2, 4))]
-        is_stored = (edges[0] >= 0) & (edges[1] >= 0)
+        is_stored = self._belong(*edges)
         if not is_stored.all():
             history, edges = history.select(is_stored), [numbers[is_stored] for numbers in edges]
         self.history = _swapped(history, edges[0] > edges[1])
         key = np.minimum(*edges) * len(self._key) + np.maximum(*edges)
         self._history_order = np.argsort(key)
         self._history_key = key[self._history_order]
+
+    def store(self, ends: Ints) -> Flags:
+        """(k,) whether pairs of edges with ends (k, 4) can be of this rank."""
+        pairs = np.sort(ends.reshape(-1, 2, 2), axis=2)
+        return self._belong(self._edge_numbers(pairs[:, 0]), self._edge_numbers(pairs[:, 1]))
+
+    def _belong(self, first: Ints, second: Ints) -> Flags:
+        """(k,) whether pairs of edges (k,), -1: not sharp, are of this rank."""
+        are_sharp = (first >= 0) & (second >= 0)
+        if self._is_owned is None or not are_sharp.any():
+            return np.asarray(are_sharp)
+        return np.asarray(are_sharp & self._is_owned[np.minimum(first, second)])
 
     def _edge_numbers(self, ends: Ints) -> Ints:
         """(k,) numbers of sharp edges with ends (k, 2); -1: not sharp."""
@@ -260,12 +273,21 @@ class EdgeContacts:
 
     def _near_pairs(self, x: Values) -> Ints:
         """(k, 2) sharp edges that may be near each other with points at x (n, 3), m, the lower number first."""
-        return self._search.pairs(x[self._used])[0]
+        (pairs,) = self._search.pairs(x[self._used])
+        return self._owned(pairs)
+
+    def _owned(self, pairs: Ints) -> Ints:
+        """(k, 2) pairs of this rank among pairs of sharp edges; those of the last pairs are kept."""
+        if self._is_owned is None:
+            return pairs
+        if self._owned_pairs is None or self._owned_pairs[0] is not pairs:
+            self._owned_pairs = pairs, pairs[self._is_owned[pairs[:, 0]]]
+        return self._owned_pairs[1]
 
     def clearance(self, x: Values, reach: float) -> float:
         """Least distance between sharp edges, m, at most `reach`; that of their lines, or 0 where they are parallel."""
         vertices = x[self._used]
-        pairs = near_pairs(self._sets, self._search.filter, vertices, vertices, reach)
+        pairs = self._owned(near_pairs(self._sets, self._search.filter, vertices, vertices, reach))
         ends = np.concatenate([self._sharp.ends[pairs[:, 0]], self._sharp.ends[pairs[:, 1]]], axis=1)
         return min(reach, float(_segment_distances(x[ends]).min(initial=reach)))
 

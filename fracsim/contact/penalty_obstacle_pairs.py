@@ -305,11 +305,14 @@ class MeshContacts:
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Arrays of contacts."""
-        return self._pairs.history.to_checkpoint()
+        return self._pairs.history.to_rows(np.arange(len(self._reference))).to_checkpoint("")
 
     def from_checkpoint(self, saved: dict[str, Values], suffix: str) -> None:
         """Set contacts from the arrays of a checkpoint."""
-        self._pairs.set_history(type(self._pairs.history).from_checkpoint(saved, suffix))
+        from .penalty_pairs import HistoryRows, PenaltyHistory
+
+        rows, unlimited = HistoryRows.from_checkpoint(saved, suffix), np.full(len(self._reference), np.inf)
+        self._pairs.set_history(PenaltyHistory.from_rows(rows, np.asarray, unlimited))
 
 
 class PenaltyPair:

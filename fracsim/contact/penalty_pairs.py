@@ -1,4 +1,4 @@
-"""Penalty between points and facets, and between edges, of surfaces in explicit steps, with friction; on one rank.
+"""Penalty between points and facets, and between edges, of surfaces in explicit steps, with friction.
 
 Of a body with itself, of bodies and triangle meshes, and of triangle meshes with one another.
 
@@ -15,28 +15,59 @@ Equations: docs/theory.md#explicit-contact.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix, vstack
+from scipy.sparse import csr_matrix
 
-from ..mesh.split_surface.entity_numbering import EntityNumbering
-from .ipc_pairs import IpcPairs, vertex_areas
-from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface, SurfacePairs
+from .ipc_pairs import SurfaceIntersections
 from .laws import slipped, tangential
-from .mesh_obstacles import AllMeshPairs, MeshObstacle, MeshObstaclePairs, Patches, refuse_overlaps
-from .penalty_contacts import ContactStiffness, PenaltyContacts, concatenate_contacts
+from .penalty_contacts import ContactStiffness, ElementRanks, PenaltyContacts, concatenate_contacts
 from .penalty_edges import EdgeContacts, EdgePairHistory
-from .penalty_point_facet import NO_FACET, POINT_FACET, PointFacetContacts, PointHistory, penalty_stiffness
-from .pose import Pose
+from .penalty_point_facet import NO_FACET, POINT_FACET, PointFacetContacts, PointHistory
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 
 NO_ROWS: Ints = np.empty(0, np.int64)
+
+
+@dataclass(frozen=True)
+class HistoryRows:
+    """Contacts at the end of a step by keys of points, which do not depend on the ranks.
+
+    Attributes:
+        points, point_values: of points before facets (PointHistory.to_rows).
+        edges, edge_values: of edges against edges (EdgePairHistory.to_rows).
+    """
+
+    points: Ints
+    point_values: Values
+    edges: Ints
+    edge_values: Values
+
+    def select(self, points: Flags, edges: Flags) -> HistoryRows:
+        """Some of the rows."""
+        return HistoryRows(self.points[points], self.point_values[points], self.edges[edges], self.edge_values[edges])
+
+    def to_checkpoint(self, suffix: str) -> dict[str, Values]:
+        """Arrays of names with a suffix."""
+        return {f"{entry.name}{suffix}": getattr(self, entry.name) for entry in fields(self)}
+
+    @classmethod
+    def from_checkpoint(cls, saved: dict[str, Values], suffix: str) -> HistoryRows:
+        """Contacts from the arrays of a checkpoint."""
+        arrays: list[Any] = [saved[f"{entry.name}{suffix}"] for entry in fields(cls)]
+        return cls(*arrays)
+
+    @classmethod
+    def join(cls, parts: Sequence[HistoryRows]) -> HistoryRows:
+        """Rows of several ranks."""
+        return cls(*(np.concatenate([getattr(part, entry.name) for part in parts]) for entry in fields(cls)))
 
 
 @dataclass(frozen=True)
@@ -45,43 +76,43 @@ class PenaltyHistory:
 
     Attributes:
         points: of points before facets.
-        edges: of edges against edges; None in 2D.
+        edges: of edges against edges; none in 2D.
     """
 
     points: PointHistory
-    edges: EdgePairHistory | None
+    edges: EdgePairHistory
 
     @property
     def is_empty(self) -> bool:
         """Whether nothing was near contact."""
-        return not (self.points.facets != NO_FACET).any() and (self.edges is None or not len(self.edges.side))
+        return not (self.points.facets != NO_FACET).any() and not len(self.edges.side)
 
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Arrays for a checkpoint."""
-        arrays = {"by": self.points.facets.astype(float), "held": self.points.stiffness, "slip": self.points.slip}
-        return arrays if self.edges is None else arrays | {"edges": self.edges.to_array()}
+    def to_rows(self, keys: Ints) -> HistoryRows:
+        """Contacts by the keys (n,) of all points."""
+        return HistoryRows(*self.points.to_rows(keys), *self.edges.to_rows(keys))
 
     @classmethod
-    def from_checkpoint(cls, saved: dict[str, Values], suffix: str = "") -> PenaltyHistory:
-        """Contacts from the arrays of a checkpoint, of names with a suffix."""
-        facets, stiffness = saved[f"by{suffix}"].astype(np.int64), saved[f"held{suffix}"]
-        points = PointHistory(facets, stiffness, saved.get(f"slip{suffix}", np.zeros(facets.shape)))
-        if facets.shape[1] == 2:
-            return cls(points, None)
-        edges = saved.get(f"edges{suffix}")
-        return cls(points, EdgePairHistory.none() if edges is None else EdgePairHistory.from_array(edges))
+    def from_rows(cls, rows: HistoryRows, lookup: Callable[[Ints], Ints], max_stiffness: Values) -> PenaltyHistory:
+        """Contacts of the points of a surface, no stiffer than `max_stiffness` (n,), N/m.
 
-    def renumbered(self, number: Ints, max_stiffness: Values) -> PenaltyHistory:
-        """Contacts with new numbers (n,) of points, -1: none, no stiffer than `max_stiffness` (new n,), N/m."""
-        edges = None if self.edges is None else self.edges.renumbered(number)
-        return PenaltyHistory(self.points.renumbered(number, max_stiffness), edges)
+        `lookup`: function that returns the point of each key; -1: none. Contacts without their point, or with edges
+        that are no more, are left out.
+        """
+        points, edges = lookup(rows.points), lookup(rows.edges)
+        have_point, have_edges = points[:, 0] >= 0, (edges >= 0).all(axis=1)
+        points = points[have_point]
+        return cls(
+            PointHistory.from_rows(points[:, 0], points[:, 1:], rows.point_values[have_point], max_stiffness),
+            EdgePairHistory.from_rows(edges[have_edges], rows.edge_values[have_edges]),
+        )
 
 
-class PenaltyPairs(IpcPairs):
+class PenaltyPairs:
     """Penalty between the elements of a surface; x is always (n, d), m.
 
     Attributes:
         width: D, m.
+        intersections: test which elements intersect.
     """
 
     def __init__(
@@ -92,6 +123,8 @@ class PenaltyPairs(IpcPairs):
         *,
         distance: float,
         patch: npt.NDArray[np.int32] | None = None,
+        ranks: ElementRanks | None = None,
+        edge: float | None = None,
     ) -> None:
         """Pairs of a surface.
 
@@ -101,15 +134,22 @@ class PenaltyPairs(IpcPairs):
             stiffness: of points.
             distance: D, m.
             patch: (n,) numbers of parts of the surface that touch others alone; None: all touch.
+            ranks: of the elements; None: all are of this rank.
+            edge: mean length of edges, m; None: of these elements.
         """
-        super().__init__(rest_positions, elements, distance=distance, stiffness=1.0)
         self.width, is_3d = distance, rest_positions.shape[1] == 3
-        if patch is not None:
-            self.restrict_to_patches(patch)
-        edge = self.mean_edge_length
-        self._points = PointFacetContacts(elements, stiffness, distance=distance, edge=edge, patch=patch)
+        if edge is None:
+            sides = rest_positions[elements] - rest_positions[np.roll(elements, 1, axis=1)]
+            edge = float(np.linalg.norm(sides, axis=2).mean()) if len(elements) else distance
+        self.intersections = SurfaceIntersections(rest_positions, elements, patch)
+        is_owned = None if ranks is None else ranks.own_points
+        self._points = PointFacetContacts(
+            elements, stiffness, distance=distance, edge=edge, patch=patch, is_owned=is_owned
+        )
         self._edges = (
-            EdgeContacts(rest_positions, elements, stiffness.limit, distance=distance, patch=patch) if is_3d else None
+            EdgeContacts(rest_positions, elements, stiffness.limit, distance=distance, patch=patch, ranks=ranks)
+            if is_3d
+            else None
         )
         self._near: tuple[Values, PenaltyContacts, PenaltyContacts] | None = None  # of the last x
         self._touching: PenaltyContacts | None = None  # those of them in contact
@@ -120,17 +160,28 @@ class PenaltyPairs(IpcPairs):
     def history(self) -> PenaltyHistory:
         """Contacts at the end of the last step; the same object as long as they are the same."""
         if self._history is None:
-            self._history = PenaltyHistory(self._points.history, None if self._edges is None else self._edges.history)
+            edges = EdgePairHistory.none() if self._edges is None else self._edges.history
+            self._history = PenaltyHistory(self._points.history, edges)
         return self._history
 
     def set_history(self, history: PenaltyHistory) -> None:
-        """Set the contacts at the end of the last step."""
+        """Set the contacts at the end of the last step; those of other ranks are left out."""
         if history is self._history:
             return
-        self._points.history, self._history = history.points, None
-        if self._edges is not None and history.edges is not None:
+        self._points.set_history(history.points)
+        if self._edges is not None:
             self._edges.set_history(history.edges)
+        self._history = None
         self._near = self._ahead = None
+
+    def store(self, points: Ints, edges: Ints) -> tuple[Flags, Flags]:
+        """(k,) whether contacts of points (k,), -1: none, and (m,) of edges with ends (m, 4) can be of this rank."""
+        of_points = points >= 0
+        of_points[of_points] = self._points.is_owned[points[of_points]]
+        of_edges: Flags = np.asarray((edges >= 0).all(axis=1))
+        if self._edges is not None:
+            of_edges[of_edges] = self._edges.store(edges[of_edges])
+        return of_points, of_edges
 
     def energy(self, x: Values) -> float:
         """Energy E(x), J."""
@@ -184,14 +235,12 @@ class PenaltyPairs(IpcPairs):
             self._edges.end_step(x, near, slip)
         self._near = self._touching = None
 
-    def max_added_frequency(self, x: Values, nodes: csr_matrix, mass: Values) -> float:
-        """Bound of the increase of the square of a frequency (PenaltyContacts.max_added_frequency), 1/s^2."""
-        return self.contacts_ahead(x).max_added_frequency(nodes, mass)
+    def anything_is_near(self, x: Values) -> bool:
+        """Whether any point has contact, or may be near a facet, at x."""
+        return self._points.anything_is_near(x)
 
     def clearance(self, x: Values) -> float:
-        """Distance by which any two points at x may approach before anything is near, m; 0 if anything is."""
-        if self._points.anything_is_near(x):
-            return 0.0
+        """Distance by which any two points at x may approach before anything is near, m; nothing is near at x."""
         reach = POINT_FACET.clearance_gap * self.width
         distance = self._points.clearance(x, reach)
         if self._edges is not None:
@@ -253,9 +302,9 @@ class PairSprings:
             contacts.spring_stiffness[:, None] * self.slips(x),
         )
         work = -0.5 * float(np.vdot(start + end, self._relative_motion(x)))
-        start_energy = 0.5 * float(history.points.stiffness @ np.sum(history.points.slip**2, axis=1))
-        if (edges := history.edges) is not None:
-            start_energy += 0.5 * float((edges.stiffness * edges.share) @ np.sum(edges.slip**2, axis=1))
+        points, edges = history.points, history.edges
+        start_energy = 0.5 * float(points.stiffness @ np.sum(points.slip**2, axis=1))
+        start_energy += 0.5 * float((edges.stiffness * edges.share) @ np.sum(edges.slip**2, axis=1))
         return start_energy - self.energy(x) - work
 
     def _relative_motion(self, x: Values) -> Values:
@@ -264,161 +313,3 @@ class PairSprings:
         if self.start is None:
             return np.zeros_like(contacts.normal)
         return np.where((contacts.start_stiffness > 0)[:, None], contacts.relative(x - self.start), 0.0)
-
-
-# --- surface of a body, and its pairs with itself or with obstacles ---
-
-
-@dataclass(frozen=True)
-class BodyMass:
-    """Mass of a body, and what contact may add to its frequencies.
-
-    Attributes:
-        mass: (nodes,) kg.
-        max_added: 1/s^2 (penalty_stiffness).
-    """
-
-    mass: Values
-    max_added: float
-
-
-@dataclass(frozen=True)
-class PenaltyPart:
-    """Contact of the surface of a body with itself, or with one obstacle.
-
-    Its points are (n + m, d): those of the body, then those of the obstacle.
-
-    Attributes:
-        contact: penalty.
-        friction: coefficient.
-        obstacle: pairs with the obstacle; None: the body with itself.
-    """
-
-    contact: PenaltyPairs
-    friction: float
-    obstacle: MeshObstaclePairs[PenaltyPairs] | None = None
-
-    def is_far(self, x: Values) -> bool:
-        """Whether the obstacle is out of contact with the body at x (n, d), m."""
-        return self.obstacle is not None and self.obstacle.is_far(x)
-
-    def points(self, x: Values, pose: Pose | None = None) -> Values:
-        """(n + m, d) points with the body at x (n, d), m, and the obstacle at a pose; None: the current one."""
-        if self.obstacle is None:
-            return x
-        mesh = self.obstacle.mesh
-        return np.concatenate([x, mesh.positions if pose is None else mesh.positions_at(pose)])
-
-
-class PenaltySurface(SelfContactSurface):
-    """Surface of a body with penalty contact, on rank 0.
-
-    Before obstacles alone crack faces are not offset from one another.
-    """
-
-    pairs: PenaltyPairs | AllMeshPairs[PenaltyPairs]
-    closed_pressure: ClassVar[float] = 0.0  # a face that is pressed at all has no room
-    search_all_faces: ClassVar[bool] = True  # to read candidates takes longer than to have more of them
-
-    def __init__(
-        self,
-        skeleton: EntityNumbering,
-        pattern: npt.NDArray[np.uint8],
-        law: SelfContactLaw,
-        u: Values,
-        previous: PenaltySurface | None,
-        cut: Values | None,
-        *,
-        body: BodyMass,
-        meshes: Sequence[MeshObstacle],
-    ) -> None:
-        """Build the surface; `body`: its mass; `meshes`: obstacles, none: it touches itself; others as of the base."""
-        self._law, self._body, self._meshes, self._previous = law, body, meshes, previous
-        self._stiffness: ContactStiffness | None = None
-        self.face_gap = 0.0 if meshes else SURFACE.face_gap
-        super().__init__(skeleton, pattern, law, u, previous, cut)
-        self._previous = None
-
-    @property
-    def parts(self) -> list[PenaltyPart]:
-        """Contact with itself, or with each obstacle."""
-        if isinstance(self.pairs, PenaltyPairs):
-            return [PenaltyPart(self.pairs, self._law.friction)]
-        return [PenaltyPart(pairs.contact, pairs.mesh.friction, pairs) for pairs in self.pairs.pairs]
-
-    def _check_apart(self) -> None:
-        if isinstance(self.pairs, PenaltyPairs):
-            super()._check_apart()
-        else:
-            refuse_overlaps(self.split, self.pairs)
-
-    def _build_pairs(self, elements: Ints) -> SurfacePairs:
-        stiffness, distance = self._own_stiffness(), self._law.distance
-        pairs: PenaltyPairs | AllMeshPairs[PenaltyPairs]
-        if not self._meshes:
-            pairs = PenaltyPairs(self._rest_positions, elements, stiffness, distance=distance)
-            self._transfer_contacts([pairs])
-            return pairs
-        pairs = AllMeshPairs([self._pairs_with(mesh, elements, stiffness) for mesh in self._meshes])
-        self._transfer_contacts([of_mesh.contact for of_mesh in pairs.pairs])
-        return pairs
-
-    def _own_stiffness(self) -> ContactStiffness:
-        """Stiffness of the body's points, by all elements and full arms: constant while a surface lasts."""
-        if self._stiffness is None:
-            pressure, area = self._pressure, vertex_areas(self._rest_positions, self.split.elements)
-            # before obstacles twice that of self-contact, where both sides yield
-            limit = (2 if self._meshes else 1) * self._body.max_added
-            k = penalty_stiffness(self.point_map.weights, area, self._body.mass, pressure, limit)
-            reduction: Values = np.ones(len(k))
-            if self._meshes:
-                reduction = np.divide(k, 0.5 * pressure * area, out=reduction, where=area > 0)
-            self._stiffness = ContactStiffness(k, k, reduction)
-        return self._stiffness
-
-    @property
-    def _pressure(self) -> float:
-        return self._law.stiffness / self._law.distance
-
-    def _pairs_with(self, mesh: MeshObstacle, elements: Ints, own: ContactStiffness) -> MeshObstaclePairs[PenaltyPairs]:
-        area = vertex_areas(mesh.points, mesh.triangles)
-        of_mesh = ContactStiffness(0.5 * self._pressure * area, np.full(len(area), np.inf), np.ones(len(area)))
-        stiffness = own.followed_by(of_mesh)
-
-        def make_contact(points: Values, triangles: Ints, patches: Patches) -> PenaltyPairs:
-            return PenaltyPairs(points, triangles, stiffness, distance=self._law.distance, patch=patches)
-
-        return MeshObstaclePairs(self._rest_positions, elements, mesh, self._law.distance, make_contact)
-
-    def _transfer_contacts(self, contacts: Sequence[PenaltyPairs]) -> None:
-        """Give pairs the contacts of this surface until now, or of the previous one."""
-        k = self._own_stiffness().point
-        number: Ints = np.arange(len(k))
-        if hasattr(self, "pairs"):
-            last = self.parts
-        elif self._previous is not None:
-            last, number = self._previous.parts, self.new_numbers(self._previous, len(k))
-        else:
-            return
-        for old, new in zip(last, contacts, strict=True):
-            m = 0 if old.obstacle is None else len(old.obstacle.mesh.points)
-            numbers, limit = np.r_[number, len(k) + np.arange(m)], np.r_[k, np.full(m, np.inf)]
-            new.set_history(old.contact.history.renumbered(numbers, limit))
-
-    def max_added_frequency(self, x: Values) -> float:
-        """Bound of what contact adds to the square of a frequency of the body at x (n, d), m; 1/s^2."""
-        weights, total = self.point_map.weights, 0.0
-        for part in self.parts:
-            if not part.is_far(x):
-                points = part.points(x)
-                no_nodes = csr_matrix((len(points) - len(x), weights.shape[1]))
-                nodes = vstack([weights, no_nodes], format="csr")
-                total += part.contact.max_added_frequency(points, nodes, self._body.mass)
-        return total
-
-    def reach_of_points(self) -> float:
-        """Largest motion of a point where no node moves by more than 1; infinite with retracted faces."""
-        share, excluded, _ = self.snapshot()
-        if len(excluded) or np.any(share < 1):
-            return np.inf
-        return float(abs(self.point_map.weights).sum(axis=1).max())

@@ -1,4 +1,4 @@
-"""Points before facets of a surface, for a penalty in explicit steps; on one rank.
+"""Points before facets of a surface, for a penalty in explicit steps.
 
 g_p is the distance, m, of a point p to the nearest facet of those that p is in front of. A point that was near a facet
 at the end of the last step may lie behind it, or one beside it: g_p < 0. All other points behind a facet are on the far
@@ -12,6 +12,7 @@ Equations: docs/theory.md#explicit-contact.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,7 +42,8 @@ class PointFacetPolicy:
         same_distance: difference of distances, in mean edges, of facets that share a closest point.
         min_barycentric: coordinate of a corner below which the corner does not carry a point.
         clearance_gap: gaps that are searched where nothing is within reach.
-        ahead_gap: gap of points that may be in contact a step later.
+        ahead_gap: gap of points that may be in contact a step later; below that of the faces of a new crack
+            (SURFACE.face_gap), which round-off would decide about.
         max_added: part of the allowed increase of the square of a frequency that the points at a node may cause.
     """
 
@@ -50,7 +52,7 @@ class PointFacetPolicy:
     same_distance: float = 1e-9
     min_barycentric: float = 1e-3
     clearance_gap: float = 10.0
-    ahead_gap: float = 2.0
+    ahead_gap: float = 1.99
     max_added: float = 0.25
 
 
@@ -188,14 +190,25 @@ class PointHistory:
         """No contact of n = `count` points."""
         return cls(np.full((count, dim), NO_FACET, np.int64), np.zeros(count), np.zeros((count, dim)))
 
-    def renumbered(self, number: Ints, max_stiffness: Values) -> PointHistory:
-        """The same with new numbers (n,) of points, -1: none, no stiffer than `max_stiffness` (new n,), N/m."""
-        result = PointHistory.none(len(max_stiffness), self.facets.shape[1])
-        points = np.flatnonzero((number >= 0) & (self.facets != NO_FACET).any(axis=1))
-        rows, corners = number[points], self.facets[points]
-        result.facets[rows] = np.where(corners >= 0, number[corners], NO_FACET)
-        result.stiffness[rows] = np.minimum(self.stiffness[points], max_stiffness[rows])
-        result.slip[rows] = self.slip[points]
+    def to_rows(self, keys: Ints) -> tuple[Ints, Values]:
+        """(k, 1 + d) keys of points with contacts and of corners, and (k, 1 + d) stiffness and slips.
+
+        `keys`: (n,) of all points.
+        """
+        points = np.flatnonzero((self.facets != NO_FACET).any(axis=1))
+        facets = np.where(self.facets[points] >= 0, keys[self.facets[points]], NO_FACET)
+        return (
+            np.column_stack([keys[points], facets]),
+            np.column_stack([self.stiffness[points], self.slip[points]]),
+        )
+
+    @classmethod
+    def from_rows(cls, points: Ints, corners: Ints, values: Values, max_stiffness: Values) -> PointHistory:
+        """Contacts of points (k,), with numbers (k, d) of corners, -1: none, no stiffer than (n,), N/m."""
+        result = cls.none(len(max_stiffness), corners.shape[1])
+        result.facets[points] = np.where(corners >= 0, corners, NO_FACET)
+        result.stiffness[points] = np.minimum(values[:, 0], max_stiffness[points])
+        result.slip[points] = values[:, 1:]
         return result
 
 
@@ -214,6 +227,7 @@ class PointFacetContacts:
         distance: float,
         edge: float,
         patch: npt.NDArray[np.int32] | None = None,
+        is_owned: Flags | None = None,
     ) -> None:
         """Points and facets of a surface.
 
@@ -223,13 +237,17 @@ class PointFacetContacts:
             distance: D, m.
             edge: mean length of edges, m.
             patch: (n,) numbers of parts of the surface that touch others alone; None: all touch.
+            is_owned: (n,) points whose contacts belong to this rank; None: all.
         """
         count, dim = len(stiffness.point), elements.shape[1]
+        self.is_owned = np.ones(count, bool) if is_owned is None else is_owned
         self.history = PointHistory.none(count, dim)
         self._stiffness, self._width, self._elements, self._edge = stiffness, distance, elements, edge
-        self._used, local = np.unique(elements, return_inverse=True)  # points that are searched
+        self._used, local = np.unique(elements, return_inverse=True)
         facets, reach = local.reshape(elements.shape), POINT_FACET.max_gap * distance
-        self._sets = SimplexPairs.of(np.arange(len(self._used))[:, None], facets, reach)
+        owned = np.flatnonzero(self.is_owned[self._used])
+        self._owned_points = self._used[owned]
+        self._sets = SimplexPairs.of(owned[:, None], facets, reach)
         self._search = PairSearch(len(self._used), [self._sets], POINT_FACET.search_margin * distance)
         if patch is not None:
             self._search.filter = PairFilter(np.ascontiguousarray(patch[self._used]), self._search.filter.is_owned)
@@ -238,6 +256,16 @@ class PointFacetContacts:
         self._is_close: Flags  # (k,) cached pairs that were close at the positions of their last check
         self._check_positions: Values
         self._last: tuple[Values, PointFacetPairs] | None = None
+
+    def set_history(self, history: PointHistory) -> None:
+        """Set the contacts at the end of the last step; those of points of other ranks are left out."""
+        if not self.is_owned.all() and (history.facets[~self.is_owned] != NO_FACET).any():
+            none = PointHistory.none(*history.facets.shape)
+            owned = self.is_owned
+            none.facets[owned], none.stiffness[owned] = history.facets[owned], history.stiffness[owned]
+            none.slip[owned] = history.slip[owned]
+            history = none
+        self.history = history
 
     def contacts_within(self, x: Values, reach: float) -> PenaltyContacts:
         """Nearest facet of each point that has one within `reach`, m, with points at x (n, d), m."""
@@ -283,7 +311,7 @@ class PointFacetContacts:
         """Least distance between points and facets at x (n, d), m, at most `reach`."""
         vertices = x[self._used]
         points, facets = near_pairs(self._sets, self._search.filter, vertices, vertices, reach).T
-        return closest_distance(x, self._used[points], self._elements[facets], reach)
+        return closest_distance(x, self._owned_points[points], self._elements[facets], reach)
 
     def search_along(self, x: Values, end: Values) -> None:
         """Search candidates for the motion from x to `end` (n, d), m."""
@@ -326,7 +354,8 @@ class PointFacetContacts:
         if candidates is not self._candidates:
             # in an order that does not depend on the search: of equally near facets the first one counts
             points, facets = candidates[0][np.lexsort(candidates[0].T[::-1])].T
-            self._candidates, self._cache = candidates, ClosestPointCache(self._used[points], self._elements[facets])
+            self._candidates = candidates
+            self._cache = ClosestPointCache(self._owned_points[points], self._elements[facets])
             self._check_positions = positions
             self._is_close = self._cache.are_within(x.copy(), np.arange(len(points)), reach)
         elif (far := np.sum((positions - self._check_positions) ** 2, axis=1) > (margin * self._width) ** 2).any():
@@ -338,7 +367,16 @@ class PointFacetContacts:
         return np.flatnonzero(self._is_close)
 
 
-def penalty_stiffness(weights: csr_matrix, area: Values, mass: Values, pressure: float, max_added: float) -> Values:
+def penalty_stiffness(
+    weights: csr_matrix,
+    area: Values,
+    mass: Values,
+    pressure: float,
+    max_added: float,
+    *,
+    sum_at_nodes: Callable[[Values], Values] = lambda values: values,
+    local_area: Values | None = None,
+) -> Values:
     """(n,) stiffness k_p of points, N/m.
 
     `pressure` on half the area of each point, as the other side acts too. At most what adds `max_added` to the square
@@ -350,10 +388,13 @@ def penalty_stiffness(weights: csr_matrix, area: Values, mass: Values, pressure:
         mass: (nodes,) kg.
         pressure: penalty's stiffness, Pa/m.
         max_added: 1/s^2; infinite: no limit.
+        sum_at_nodes: sums over the ranks of values (nodes,).
+        local_area: (n,) share of this rank in `area`, m^2; None: all of it.
     """
     if np.isinf(max_added):
         return 0.5 * pressure * area
     size = abs(weights)
-    rate = (size.T @ (area * np.asarray(size.sum(axis=1)).ravel())) / mass
+    row_sum = np.asarray(size.sum(axis=1)).ravel()
+    rate = sum_at_nodes(size.T @ ((area if local_area is None else local_area) * row_sum)) / mass
     max_stiffness = POINT_FACET.max_added * max_added * point_masses(size, area, rate)
     return np.minimum(0.5 * pressure * area, max_stiffness)

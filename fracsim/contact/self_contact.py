@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -24,7 +24,7 @@ from ..mechanics.extra_couplings import CouplingBuilder, StiffCoupling, stiff_di
 from ..mechanics.term import Term, TimeLevel
 from ..mechanics.term_protocols import CutPositions
 from ..mesh.domain import Domain
-from ..mesh.parallel import Gather, bcast, on_root, sum_over_ranks
+from ..mesh.parallel import Gather, allgather, bcast, sum_over_ranks
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.quadratic_surface import subdivided_input_mesh
 from ..mesh.split_surface.surface_map import SurfaceMap
@@ -54,85 +54,63 @@ class BreakingSurface[S: SelfContactSurface]:
     _cuts: CutPositions | None = None
     _surface: S | None = None
 
-    def __init__(
-        self, domain: Domain, u: fem.Function, law: SelfContactLaw, build: SurfaceBuilder[S], *, everywhere: bool
-    ) -> None:
-        """Build the surface of the whole body (collective).
+    def __init__(self, domain: Domain, u: fem.Function, law: SelfContactLaw, build: SurfaceBuilder[S]) -> None:
+        """Build the surface of the whole body on every rank (collective).
 
         Args:
             domain: mesh.
             u: displacement.
             law: contact law.
             build: function that builds a surface. It refuses bodies that intersect at rest.
-            everywhere: whether all ranks hold the surface; otherwise rank 0 alone.
         """
-        self.law, self._domain, self._u, self._build, self._everywhere = law, domain, u, build, everywhere
+        self.law, self._domain, self._u, self._build = law, domain, u, build
         self.gather, is_refined = node_gather(domain, law), domain.order == 2 and not law.corners_only
         # subdivided quadratic cells do not break
         self._parts = 2**domain.dim if is_refined else 1
         mesh = subdivided_input_mesh(domain) if is_refined else domain.input_mesh
-        if everywhere:
-            mesh = bcast(domain.comm, mesh)
-        self._skeleton = None if mesh is None else EntityNumbering(mesh)
+        self._skeleton = EntityNumbering(bcast(domain.comm, mesh))
         self._pattern: Pattern = np.zeros(domain.cell_count, np.uint8)
         first = domain.space.dofmap.index_map.local_range[0]
         # (nodes,) global numbers of nodes in input order
-        self.node_numbers = self._gathered(self.gather, first + np.arange(domain.node_count))
+        self.node_numbers = self.gather.to_all_ranks(first + np.arange(domain.node_count))
         self._rebuild()
 
     def _rebuild(self) -> None:
         """Build the surface of the current damage (collective)."""
-        pattern = self._gathered(self._domain.input_numbering.gather_cells, self._pattern)
+        pattern = self._domain.input_numbering.gather_cells.to_all_ranks(self._pattern)
         u = self.nodal_values(self._u.x.array[: self._domain.node_count * self._domain.dim])
-        cuts = None if self._cuts is None else self._cuts()
-        if self._cuts is not None and self._everywhere:
-            cuts = bcast(self._domain.comm, cuts)
-
-        def build() -> S:
-            assert self._skeleton is not None
-            cells = np.repeat(pattern, self._parts)
-            # most edges break within fragments
-            if self._surface is not None and self._surface.represents(cells):
-                return self._surface
-            cut = None if cuts is None else self._skeleton.edge_values(cuts[0], cuts[1][:, 0])
-            return self._build(self._skeleton, cells, self.law, u, self._surface, cut)
-
-        self._surface = build() if self._everywhere else on_root(self._domain.comm, build)
-
-    @property
-    def is_held(self) -> bool:
-        """Whether this rank holds the surface."""
-        return self._surface is not None
+        cut = None
+        if self._cuts is not None:
+            rows = allgather(self._domain.comm, self._cuts())
+            edges, positions = (np.concatenate(parts) for parts in zip(*rows, strict=True))
+            cut = self._skeleton.edge_values(edges, positions[:, 0])
+        cells = np.repeat(pattern, self._parts)
+        # most edges break within fragments
+        if self._surface is None or not self._surface.represents(cells):
+            self._surface = self._build(self._skeleton, cells, self.law, u, self._surface, cut)
 
     @property
     def current(self) -> S:
-        """Surface of the current damage, on ranks that hold it."""
+        """Surface of the current damage."""
         assert self._surface is not None
         return self._surface
 
-    def _gathered(self, gather: Gather, values: npt.NDArray[Any]) -> Any:
-        return gather.to_all_ranks(values) if self._everywhere else gather(values)
+    def nodal_values(self, u: Values) -> Values:
+        """(nodes, d) owned displacements u in the order of the input mesh (collective)."""
+        return self.gather.to_all_ranks(np.asarray(u).reshape(-1, self._domain.dim))
 
-    def nodal_values(self, u: Values) -> Any:
-        """(nodes, d) owned displacements u in the order of the input mesh; None where not held (collective)."""
-        return self._gathered(self.gather, np.asarray(u).reshape(-1, self._domain.dim))
-
-    def positions(self, u: Values) -> Any:
-        """(n, d) positions of its points for owned displacements u, m; None where not held (collective)."""
-        nodal = self.nodal_values(u)
-        return self._surface.point_map(nodal) if self._surface is not None else None
+    def positions(self, u: Values) -> Values:
+        """(n, d) positions of its points for owned displacements u, m (collective)."""
+        return self.current.point_map(self.nodal_values(u))
 
     def following_points(self) -> FollowingPoints:
-        """Points of the surface; none where it is not held."""
-        if self._surface is None:
-            none, d = np.empty(0, np.int64), self._domain.dim
-            return FollowingPoints(np.empty((0, d)), csr_matrix((0, 0)), none, np.empty((0, d), np.int64))
-        share, excluded, _ = self._surface.snapshot()
-        point_map, elements = self._surface.point_map, self._surface.split.elements
-        nodes = np.unique(point_map.weights.indices)
+        """Points of the surface."""
+        surface = self.current
+        share, excluded, _ = surface.snapshot()
+        nodes = np.unique(surface.point_map.weights.indices)
         may_stay = not len(excluded) and bool(np.all(share == 1))
-        weights = point_map.weights[:, nodes]
-        return FollowingPoints(point_map.rest, weights, self.node_numbers[nodes], elements, may_stay=may_stay)
+        weights, numbers = surface.point_map.weights[:, nodes], self.node_numbers[nodes]
+        return FollowingPoints(surface.point_map.rest, weights, numbers, surface.elements, may_stay=may_stay)
 
     def set_cuts(self, cuts: CutPositions) -> None:
         """Set where edges are cut; used for faces between fragments."""
@@ -158,32 +136,30 @@ class BreakingSurface[S: SelfContactSurface]:
         # faces without an offset stay where other terms have moved them
         return (point_map if self.current.face_gap else at).with_arm_share(np.minimum(point_map.share, at.share))
 
-    def snapshot(self) -> SurfaceSnapshot | None:
+    def gather_separation(self) -> None:
+        """Do nothing: every rank has the surface."""
+
+    def snapshot(self) -> SurfaceSnapshot:
         """Retracted and excluded parts of the surface."""
-        return None if self._surface is None else self._surface.snapshot()
+        return self.current.snapshot()
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective)."""
-        if self._surface is not None:
-            self._surface.restore(cast("SurfaceSnapshot", memory))
+        self.current.restore(cast("SurfaceSnapshot", memory))
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Factors of arms, numbers of excluded elements, steps to the next release of faces, and stiffness."""
-        if self._surface is None:
-            return {}
-        share, excluded, pause = self._surface.snapshot()
+        share, excluded, pause = self.current.snapshot()
         return {"share": share, "left_out": np.asarray(excluded, float), "pause": np.array(pause, float),
                 "stiffness": np.array([self.law.stiffness])}  # fmt: skip
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint."""
-        if self._surface is None:
-            return
         self.set_stiffness(float(saved["stiffness"][0]))
-        if len(saved["share"]) != len(self._surface.point_map.share):
+        if len(saved["share"]) != len(self.current.point_map.share):
             raise ValueError(f"{len(saved['share'])} points of the contact surface instead of those of its damage")
         pause, remaining = (int(number) for number in saved["pause"])
-        self._surface.restore((saved["share"], saved["left_out"].astype(np.int64), (pause, remaining)))
+        self.current.restore((saved["share"], saved["left_out"].astype(np.int64), (pause, remaining)))
 
 
 class SelfContact(Term):
@@ -220,7 +196,7 @@ class SelfContact(Term):
         # m^(d-2), times a stiffness in Pa
         self._stiff_threshold = SURFACE.stiff_ratio * domain.mean_edge_length ** (domain.dim - 2)
         build = build or partial(SelfContactSurface, comm=domain.comm)
-        self.surface = BreakingSurface(domain, u, law, build, everywhere=True)
+        self.surface = BreakingSurface(domain, u, law, build)
         self.parts = self.surface, CollisionLimit(self)
         self._discard_surface()
 

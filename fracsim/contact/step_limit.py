@@ -30,7 +30,6 @@ from .shape_base import lengths
 
 if TYPE_CHECKING:
     from ..mesh.split_surface.surface_map import SurfaceMap
-    from .ipc_pairs import IpcPairs
     from .mesh_obstacles import AllMeshPairs, MeshObstaclePairs
 
 Values = npt.NDArray[np.float64]
@@ -333,7 +332,7 @@ def _corrections(area: Values, motions: Sequence[ObstacleMotion], x: Values, mot
 
 
 def stop_before_meshes(
-    point_map: SurfaceMap, pairs: AllMeshPairs[IpcPairs], start: Values, end: Values, start_poses: Sequence[Pose]
+    point_map: SurfaceMap, pairs: AllMeshPairs, start: Values, end: Values, start_poses: Sequence[Pose]
 ) -> Values:
     """First guess with points stopped where they would cross a triangle mesh; the same array where none would.
 
@@ -360,7 +359,7 @@ def stop_before_meshes(
     return end
 
 
-def _mesh_corrections(pairs: MeshObstaclePairs[IpcPairs], start_pose: Pose, x: Values, end: Values) -> Values:
+def _mesh_corrections(pairs: MeshObstaclePairs, start_pose: Pose, x: Values, end: Values) -> Values:
     """(n, 3) differences of safe motions of points and their motions from x to `end`, m.
 
     In the frame of the obstacle a point stops where it comes as near to it as a tenth of its distance; piece by piece,

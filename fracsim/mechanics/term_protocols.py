@@ -22,9 +22,9 @@ if TYPE_CHECKING:
     from ..mesh.split_surface.surface_map import SurfaceMap
     from .block_matrix import TieMatrix
 
-# nodes (n, 2) of all broken edges, and positions (n, 1) of the cuts from the lower node, nan: in the middle; on rank 0.
-# None elsewhere (collective)
-type CutPositions = Callable[[], tuple[npt.NDArray[np.int64], Values] | None]
+# nodes (n, 2) of the broken edges of this rank, by their numbers in the input mesh, and positions (n, 1) of the cuts
+# from the lower node, nan: in the middle
+type CutPositions = Callable[[], tuple[npt.NDArray[np.int64], Values]]
 
 
 @dataclass(frozen=True)
@@ -217,6 +217,9 @@ class HistoryColumns(Protocol):
 @runtime_checkable
 class SurfaceSeparator(Protocol):
     """Term that keeps surfaces apart, in output as well."""
+
+    def gather_separation(self) -> None:
+        """Gather on rank 0 what `separate_surface` needs (collective)."""
 
     def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
         """Split surface without overlaps (on rank 0, not collective).

@@ -260,6 +260,11 @@ class EdgeGraph:
         """
         return self.keys.gather(self.broken, np.empty((len(self.broken), 0)) if values is None else values)
 
+    def broken_rows(self, values: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+        """(n, 2) keys of the broken edges of this rank, and the (n, m) rows of their `values` (edges, m)."""
+        broken = np.flatnonzero(self.broken)
+        return self.keys.of_edges(broken), values[broken]
+
     def gather_weakened(
         self, values: npt.NDArray[np.float64] | None = None
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:

@@ -31,9 +31,13 @@ class Fragments:
 
 def find_fragments(graph: EdgeGraph) -> Fragments:
     """The fragments of a graph (collective)."""
-    domain = graph.domain
+    return find_components(graph.domain, graph.edge_nodes[~graph.broken])
+
+
+def find_components(domain: Domain, edges: npt.NDArray[np.integer]) -> Fragments:
+    """The fragments that edges (n, 2) between local nodes connect; midside nodes follow an end (collective)."""
     # components within this rank
-    local_count, local = components(_links(graph), len(domain.nodes))
+    local_count, local = components(_with_midside_nodes(domain, edges), len(domain.nodes))
     # links between components of different ranks: a shared node has the labels of its owner and of this rank
     first = rank_offset(domain.comm, local_count)
     label = local + first
@@ -62,9 +66,6 @@ def midside_parents(domain: Domain) -> tuple[npt.NDArray[np.int32], npt.NDArray[
     return midside.nodes, ends[np.arange(len(ends)), np.argmin(domain.input_numbering.nodes[ends], axis=1)]
 
 
-def _links(graph: EdgeGraph) -> npt.NDArray[np.int32]:
-    """(n, 2) nodes of intact edges, and midside nodes with the ends that they belong to."""
-    edges = graph.edge_nodes[~graph.broken]
-    return (
-        edges if graph.domain.order == 1 else np.concatenate([edges, np.stack(midside_parents(graph.domain), axis=1)])
-    )
+def _with_midside_nodes(domain: Domain, edges: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
+    """(n, 2) nodes of edges, and midside nodes with the ends that they belong to."""
+    return edges if domain.order == 1 else np.concatenate([edges, np.stack(midside_parents(domain), axis=1)])

@@ -1,4 +1,4 @@
-"""Values of nodes, edges and facets that ranks share: owners send values to ghosts, or receive them (collective)."""
+"""Values of what ranks share: owners of nodes, edges and facets send values to ghosts, and keys name other entities."""
 
 from __future__ import annotations
 
@@ -8,8 +8,9 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import la
 from dolfinx.common import IndexMap
+from mpi4py import MPI
 
-from .parallel import allgather
+from .parallel import allgather, exchange_rows
 
 if TYPE_CHECKING:
     from .domain import Domain
@@ -58,3 +59,53 @@ def with_straight_edges(domain: Domain, owned: npt.NDArray[np.float64]) -> npt.N
     nodal = with_ghosts(domain, owned).reshape(-1, domain.dim).copy()
     domain.cell_midside_nodes.straighten_edges(nodal)
     return nodal.reshape(-1)[: len(owned)]
+
+
+class KeyLookup:
+    """Positions of keys among n distinct ones."""
+
+    def __init__(self, keys: npt.NDArray[np.int64]) -> None:
+        """`keys`: (n,)."""
+        self._order = np.argsort(keys)
+        self._sorted = keys[self._order]
+
+    def __call__(self, keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+        """(...) position of each key; -1: it is not among them."""
+        if not len(self._sorted):
+            return np.full(keys.shape, -1)
+        position = np.minimum(np.searchsorted(self._sorted, keys), len(self._sorted) - 1)
+        return np.where(self._sorted[position] == keys, self._order[position], -1)
+
+
+class KeyedReduction:
+    """Sums, minima and the like over the ranks of values with equal keys.
+
+    The values of a key meet on the rank whose number is the remainder of the key.
+    """
+
+    def __init__(self, comm: MPI.Comm, keys: npt.NDArray[np.int64]) -> None:
+        """`keys`: (n,) of this rank (collective)."""
+        self._comm = comm
+        if comm.size == 1:
+            return
+        rank = keys % comm.size
+        self._order = np.argsort(rank, kind="stable")
+        self._sent, self._received = np.bincount(rank, minlength=comm.size), np.empty(comm.size, np.int64)
+        comm.Alltoall(self._sent, self._received)
+        arrived = exchange_rows(comm, keys[self._order], self._sent, self._received)
+        self._by_key = np.argsort(arrived, kind="stable")
+        is_first = np.diff(arrived[self._by_key], prepend=-1) != 0
+        self._first = np.flatnonzero(is_first)
+        self._group = np.empty(len(arrived), np.int64)
+        self._group[self._by_key] = np.cumsum(is_first) - 1
+
+    def __call__(self, values: npt.NDArray[Any], operation: np.ufunc) -> npt.NDArray[Any]:
+        """(n, ...) results of an operation on the values (n, ...) of each key on all ranks (collective)."""
+        if self._comm.size == 1:
+            return values
+        arrived = exchange_rows(self._comm, np.ascontiguousarray(values[self._order]), self._sent, self._received)
+        if len(arrived):
+            arrived = operation.reduceat(arrived[self._by_key], self._first, axis=0)[self._group]
+        result = np.empty_like(values)
+        result[self._order] = exchange_rows(self._comm, np.ascontiguousarray(arrived), self._received, self._sent)
+        return result

@@ -230,6 +230,6 @@ def surface_output(
     density, terms = balance.stress.material.density * thickness, balance.terms
     return SurfaceOutput(
         folder, balance.domain, density, breaks.record, passing=passing, resume_at=resume_at, smooth=smooth,
-        apart=[part.separate_surface for part in fulfilling(terms, SurfaceSeparator)],
+        apart=fulfilling(terms, SurfaceSeparator),
         beside=fulfilling(terms, OutputSurfaces),
     )  # fmt: skip

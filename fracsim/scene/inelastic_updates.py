@@ -68,7 +68,7 @@ def build_fracture_pass(
             balance.stress, graph, criterion, law, max_passes=passes, initial_cuts=cuts, node_attachment=attachment
         )
     if (cut := fracture.criterion.cut_positions) is not None:
-        balance.contact.set_cuts(lambda: graph.gather_broken(cut[:, None]))
+        balance.contact.set_cuts(lambda: graph.broken_rows(cut[:, None]))
     if cuts is not None:
         balance.edges_broke(graph.pattern)
         balance.damage_changed()

@@ -403,7 +403,7 @@ class DrawnSurfaces:
         assert scene.domain.input_mesh is not None
         self._body = BodySurface(scene.domain.input_mesh, 1.0)
         terms = fulfilling(scene.balance.terms, SurfaceSeparator)
-        self._corrections = [term.separate_surface for term in terms]
+        self._terms, self._corrections = terms, [term.separate_surface for term in terms]
 
     def at(self, state: Walk) -> tuple[Values, Ints]:
         """Points (n, d), m, and elements (m, d) of all surfaces at the present time."""
@@ -413,6 +413,8 @@ class DrawnSurfaces:
             edges, history = EdgeHistory(scene.fracture.graph).gather_broken()
             self._body.update(pattern, self._body.skeleton.edge_values(edges, history[:, 1]))
         u, v = (domain.input_numbering.gather_nodes(values.reshape(-1, d)) for values in (state.u, state.v))
+        for term in self._terms:
+            term.gather_separation()
         frame = self._body.make_frame(state.t, u, v, corrections=self._corrections)
         surfaces = [(frame.points, self._body.split.elements), *obstacle_surfaces(scene, state)]
         first = np.cumsum([0, *(len(points) for points, _ in surfaces)])

@@ -67,6 +67,29 @@ class SurfacePoints:
         node = self._topology.cells[cell[:, None], np.maximum(-1 - corners, 0)]
         return np.where(corners >= 0, self._of_copy[copy], self._of_node[node])
 
+    def entity_nodes(self) -> npt.NDArray[np.bool_]:
+        """(copies, d + 1) flags of the nodes of the edge, facet or cell that each copy is the centre of."""
+        result = np.ones(self.group.shape, bool)
+        selected = np.flatnonzero(self.kind == CutEntity.FACET)
+        result[selected, self.entity[selected]] = False
+        selected = np.flatnonzero(self.kind == CutEntity.EDGE)
+        result[selected] = False
+        result[selected[:, None], local_edges(self._topology.dim)[self.entity[selected]]] = True
+        return result
+
+    def keys(self, number: Ints) -> Ints:
+        """(n,) keys of the points, equal on all ranks and as edges break; `number` (nodes,): of the input mesh.
+
+        A key stands for the nodes of the entity of a point and those that the point follows: a copy whose group has
+        lost nodes is another point.
+        """
+        nodes, corners = number[self.parents.parents[: self.first]], number[self._topology.cells[self.cell]]
+        rows = np.full((self.first + len(corners), 2, corners.shape[1]), -1)
+        rows[: self.first, :, -1] = nodes[:, None]
+        rows[self.first :, 0] = np.sort(np.where(self.entity_nodes(), corners, -1), axis=1)
+        rows[self.first :, 1] = np.sort(np.where(self.group, corners, -1), axis=1)
+        return row_keys(rows.reshape(len(rows), -1))
+
     def _keys(self, row: Ints, cell: Ints, owner: Ints) -> Ints:
         """(copies,) keys that are equal in all cells of a copy: (edge, end), (facet, group) or (cell, group)."""
         topology, copies, d = self._topology, self._copies, self._topology.dim
@@ -139,6 +162,22 @@ def _number_keys(keys: Ints) -> tuple[Ints, Ints]:
     return number, first_position
 
 
+def row_keys(rows: Ints) -> Ints:
+    """(k,) hashes of rows (k, w) of whole numbers, from 0 to 2^63 - 1.
+
+    Two different rows of n have one hash with a probability of n^2 / 2^64.
+
+    Source: G. L. Steele, D. Lea, C. H. Flood (2014), Fast splittable pseudorandom number generators (its mixing).
+    """
+    keys: npt.NDArray[np.uint64] = np.full(len(rows), 0x9E3779B97F4A7C15, np.uint64)
+    for column in rows.T:
+        keys ^= column.astype(np.int64).view(np.uint64)
+        keys = (keys ^ (keys >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        keys = (keys ^ (keys >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        keys ^= keys >> np.uint64(31)
+    return (keys >> np.uint64(1)).astype(np.int64)
+
+
 @dataclass(frozen=True)
 class SplitSurface:
     """The split surface in the reference configuration.
@@ -155,6 +194,7 @@ class SplitSurface:
         broken: (E,) flags of broken edges.
         fragment_count: number of fragments.
         node_fragment: (N,) fragment of each node; fragments are numbered by their lowest node.
+        numbering: the points by their entities; None: of several bodies.
     """
 
     points: Values
@@ -168,6 +208,7 @@ class SplitSurface:
     broken: npt.NDArray[np.bool_]
     fragment_count: int
     node_fragment: Ints
+    numbering: SurfacePoints | None = None
 
     @property
     def point_fragment(self) -> Ints:
@@ -229,6 +270,7 @@ class _SurfaceBuilder:
             self.broken,
             count,
             node_fragment,
+            points,
         )
 
     def _undamaged_cell_facets(self) -> tuple[Ints, ...]:

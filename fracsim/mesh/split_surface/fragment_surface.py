@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix, eye_array
 
-from ..simplices import is_split, local_edges
+from ..simplices import is_split
 from .closed_surface import SplitSurface, SurfacePoints, build_split_surface, build_surface_points
-from .cut_patterns import CutEntity, face_centre_weights, planar_cut_table
+from .cut_patterns import face_centre_weights, planar_cut_table
 from .entity_numbering import EntityNumbering
 from .smooth_cuts import CUTS
 from .surface_map import SurfaceMap, make_surface_map
@@ -34,6 +34,13 @@ def build_fragment_surface(topology: EntityNumbering, pattern: Patterns, cut: Va
     build_split_surface, at least `CUTS.min_distance` from the ends.
     """
     apart, loose, _ = find_open_edges(topology, pattern)
+    return build_surface_of_open_edges(topology, apart, loose, cut)
+
+
+def build_surface_of_open_edges(
+    topology: EntityNumbering, apart: Flags, loose: Flags, cut: Values | None = None
+) -> SplitSurface:
+    """The split surface of open edges (E,) without loose nodes (N,); `cut` as in build_fragment_surface."""
     cut = None if cut is None else np.clip(cut, CUTS.min_distance, 1 - CUTS.min_distance)
     surface = build_split_surface(topology, patterns_with_broken(topology, apart), cut, planar_cut_table)
     # all corners of an element follow nodes of the same side
@@ -43,19 +50,26 @@ def build_fragment_surface(topology: EntityNumbering, pattern: Patterns, cut: Va
 
 
 def has_same_fragments(topology: EntityNumbering, pattern: Patterns, before: Patterns) -> bool:
-    """Whether the surface of fragments is the same for two damage patterns (C,), and moves alike with the nodes.
+    """Whether the surface of fragments is the same for two damage patterns (C,), and moves alike with the nodes."""
+    edges, before_edges = (find_open_edges(topology, of_time)[:2] for of_time in (pattern, before))
+    return moves_alike(topology, (pattern, *edges), (before, *before_edges))
 
-    Cracks within a fragment change neither.
+
+def moves_alike(
+    topology: EntityNumbering, state: tuple[Patterns, Flags, Flags], before: tuple[Patterns, Flags, Flags]
+) -> bool:
+    """Whether the surface of fragments is the same for two patterns (C,), with flags of open edges and loose nodes.
+
+    Cracks within a fragment change neither it nor its motion.
     """
-    apart, loose, _ = find_open_edges(topology, pattern)
-    apart_before, loose_before, _ = find_open_edges(topology, before)
+    (pattern, apart, loose), (pattern_before, apart_before, loose_before) = state, before
     if not (np.array_equal(apart, apart_before) and np.array_equal(loose, loose_before)):
         return False
     ends = np.zeros(len(topology.points), bool)
     ends[topology.edges[apart]] = True
     affected = ends[topology.cells].any(axis=1)
     split_patterns = is_split(topology.dim)
-    return np.array_equal(split_patterns[pattern[affected]], split_patterns[before[affected]])
+    return np.array_equal(split_patterns[pattern[affected]], split_patterns[pattern_before[affected]])
 
 
 def find_open_edges(topology: EntityNumbering, pattern: Patterns) -> tuple[Flags, Flags, Ints]:
@@ -110,7 +124,7 @@ def _planar_means(
     node = topology.cells[drawn.cell]
     lead = node[np.arange(len(node)), drawn.group.argmax(axis=1)]
     same_fragment = np.where(loose[node], -1, node_fragment[node]) == node_fragment[lead][:, None]
-    within = _entity_nodes(drawn, topology.dim)
+    within = drawn.entity_nodes()
     same_side, opposite = within & same_fragment, within & ~same_fragment
     between = np.flatnonzero(opposite.any(axis=1) & ~loose[lead])
     bits = 1 << np.arange(topology.dim + 1)
@@ -121,17 +135,6 @@ def _planar_means(
     shape = len(between), len(flat.positions)
     cracked = (drawn.group != same_side)[between].any(axis=1)
     return drawn.first + between, csr_matrix((share[row, i, j], (row, column)), shape=shape), cracked
-
-
-def _entity_nodes(points: SurfacePoints, dim: int) -> Flags:
-    """(copies, d + 1) flags of the nodes of the edge, facet or cell that each point is the centre of."""
-    result = np.ones(points.group.shape, bool)
-    selected = np.flatnonzero(points.kind == CutEntity.FACET)
-    result[selected, points.entity[selected]] = False
-    selected = np.flatnonzero(points.kind == CutEntity.EDGE)
-    result[selected] = False
-    result[selected[:, None], local_edges(dim)[points.entity[selected]]] = True
-    return result
 
 
 def _planar_point_keys(topology: EntityNumbering, flat: SurfacePoints) -> Ints:

@@ -45,7 +45,7 @@ class LocalSurface:
 
     def __init__(self, domain: Domain) -> None:
         self._domain = domain
-        mesh = _local_mesh(domain)
+        mesh = local_mesh(domain)
         self._topology = EntityNumbering(mesh)
         self.update_damage(np.zeros(len(mesh.cells), np.uint8))
 
@@ -65,15 +65,11 @@ class LocalSurface:
         area = _areas(surface, self._topology)
         self._contact_points = np.flatnonzero(area > 0)
         self.area, self._split_surface = area[self._contact_points], surface
-        means = self._mean_matrix(surface)
-        turning = self._domain.comm.allreduce(len(surface.parents.rotating_nodes)) > 0
         intact = ~is_split(self._domain.dim)[pattern]
         if shown is not None:
             intact &= shown  # so that damage elsewhere changes no arm
-        arms = self._arm_matrix(surface, intact) if turning else csr_matrix(means.shape)
-        self.columns, (means, arms) = _restrict_to_used_columns([means, arms])
-        middle = mean_parent_positions(surface.points, surface.parents)[self._contact_points]
-        out = surface.points[self._contact_points] - middle
+        means, middle, arms, out = local_map_parts(self._domain, surface, self._contact_points, intact)
+        self.columns, (means, arms) = restrict_to_used_columns([means, arms])
         self.point_map = SurfaceMap(means, middle, arms, out)
 
     def identify_points(self, points: Ints | None = None) -> Values:
@@ -88,70 +84,82 @@ class LocalSurface:
 
     def facets(self) -> tuple[Ints, Values]:
         """(m, d) points of the elements that `area` is the sum of, and (m,) their areas, m^2 (2D: lengths, m)."""
-        elements, measure = _contact_elements(self._split_surface, self._topology)
+        elements, measure = contact_elements(self._split_surface, self._topology)
         real = measure > 0
         return np.searchsorted(self._contact_points, elements[real]), measure[real]
 
-    def _mean_matrix(self, surface: SplitSurface) -> csr_matrix:
-        """(points, global nodes) matrix of the means over the parents of each point."""
-        start, entries = _parents_of(surface, self._contact_points)
-        return self._global_matrix(start, self._global_numbers(surface.parents.parents[entries]), _shares(start))
 
-    def _arm_matrix(self, surface: SplitSurface, intact: npt.NDArray[np.bool_]) -> csr_matrix:
-        """(points, global nodes) matrix of the means over parents of arm times averaged gradient (collective).
+def local_map_parts(
+    domain: Domain, surface: SplitSurface, points: Ints, intact: npt.NDArray[np.bool_]
+) -> tuple[csr_matrix, Values, csr_matrix, Values]:
+    """Arguments of a SurfaceMap for points (k,) of a surface of this rank, with global nodes as columns (collective).
 
-        `intact`: (cells,) flags of the cells of which gradients are averaged.
-        """
-        comm, d = self._domain.comm, self._domain.dim
-        start, entries = _parents_of(surface, self._contact_points)
-        parents, arm = surface.parents.parents[entries], surface.parents.arm[entries]
-        arms = self._global_matrix(
-            d * start, _by_axis(self._global_numbers(parents), d), (_shares(start)[:, None] * arm).reshape(-1), d
-        )
-        count = arms.shape[0]
-        left = _assemble_petsc(
-            comm, (count, d * self._domain.node_count), arms, rank_offset(comm, count) + np.arange(count)
-        )
-        right = self._gradient_matrix(intact, parents[np.any(arm != 0, axis=1)])
-        product = left.matMult(right)
-        rows, nodes, values = product.getValuesCSR()
-        for matrix in (left, right, product):
-            matrix.destroy()
-        return self._global_matrix(rows, nodes, values)
+    `intact`: (cells,) flags of the cells of which gradients are averaged.
+    """
+    start, entries = _parents_of(surface, points)
+    parents, arm = surface.parents.parents[entries], surface.parents.arm[entries]
+    means = _global_matrix(domain, start, _global_numbers(domain, parents), _shares(start))
+    turning = domain.comm.allreduce(bool(np.any(arm)), op=MPI.LOR)
+    arms = _arm_matrix(domain, start, parents, arm, intact) if turning else csr_matrix(means.shape)
+    middle = mean_parent_positions(surface.points, surface.parents)[points]
+    return means, middle, arms, surface.points[points] - middle
 
-    def _gradient_matrix(self, intact: npt.NDArray[np.bool_], parents: Ints) -> PETSc.Mat:
-        """(d nodes, nodes) matrix of d/dX_j of a nodal field, averaged over intact cells (collective).
 
-        Rows are right for nodes that are among the `parents` of any rank.
-        """
-        domain, d = self._domain, self._domain.dim
-        wanted = self._sum_over_ranks(parents, 1.0) > 0
-        cells = np.flatnonzero(intact & wanted[domain.cell_nodes].any(axis=1))
-        corners, volume = domain.cell_nodes[cells].astype(np.int64), domain.volumes[cells][:, None]
-        # sums at other nodes lack cells: their rows are not used
-        around = np.maximum(self._sum_over_ranks(corners, volume), np.finfo(float).tiny)
-        rows, columns, values = gradient_entries(domain.nodes[corners], volume / around[corners], corners)
-        nodes = self._global_numbers(np.arange(len(domain.nodes)))
-        shape = d * len(nodes), self._domain.space.dofmap.index_map.size_global
-        entries = csr_matrix((values, (rows, nodes[columns])), shape=shape)
-        return _assemble_petsc(domain.comm, (d * domain.node_count, domain.node_count), entries, _by_axis(nodes, d))
+def _arm_matrix(domain: Domain, start: Ints, parents: Ints, arm: Values, intact: npt.NDArray[np.bool_]) -> csr_matrix:
+    """(points, global nodes) matrix of the means over parents of arm times averaged gradient (collective)."""
+    comm, d = domain.comm, domain.dim
+    numbers = _by_axis(_global_numbers(domain, parents), d)
+    arms = _global_matrix(domain, d * start, numbers, (_shares(start)[:, None] * arm).reshape(-1), d)
+    gradients, rows = _gradient_entries(domain, intact, parents[np.any(arm != 0, axis=1)])
+    if comm.size == 1:
+        return (arms @ gradients).tocsr()
+    count = arms.shape[0]
+    number = rank_offset(comm, count) + np.arange(count)
+    left = _assemble_petsc(comm, (count, d * domain.node_count), arms, number)
+    right = _assemble_petsc(comm, (d * domain.node_count, domain.node_count), gradients, rows)
+    product = left.matMult(right)
+    first, nodes, values = product.getValuesCSR()
+    for matrix in (left, right, product):
+        matrix.destroy()
+    return _global_matrix(domain, first, nodes, values)
 
-    def _sum_over_ranks(self, nodes: Ints, values: Values | float) -> Values:
-        """(nodes,) sums over all ranks of `values` at `nodes` (collective)."""
-        result = la.vector(self._domain.space.dofmap.index_map, 1, np.float64)
-        weights = np.broadcast_to(values, nodes.shape).reshape(-1)
-        result.array[:] = np.bincount(nodes.reshape(-1), weights, len(result.array))
-        result.scatter_reverse(la.InsertMode.add)
-        result.scatter_forward()
-        return np.asarray(result.array)
 
-    def _global_numbers(self, nodes: Ints) -> Ints:
-        return self._domain.space.dofmap.index_map.local_to_global(nodes.astype(np.int32)).astype(np.int64)
+def _gradient_entries(domain: Domain, intact: npt.NDArray[np.bool_], parents: Ints) -> tuple[csr_matrix, Ints]:
+    """(d local nodes, global nodes) shares of this rank in d/dX_j of a nodal field, averaged over intact cells.
 
-    def _global_matrix(self, start: Ints, columns: Ints, values: Values, width: int = 1) -> csr_matrix:
-        """Sparse matrix with `width` columns for each global node."""
-        shape = len(start) - 1, width * self._domain.space.dofmap.index_map.size_global
-        return csr_matrix((values, columns, start), shape=shape)
+    Also returns (d local nodes,) the global number of each row. Sums of rows over the ranks are right for nodes that
+    are among the `parents` of any rank (collective).
+    """
+    d = domain.dim
+    is_parent = sum_at_shared_nodes(domain, parents, 1.0) > 0
+    cells = np.flatnonzero(intact & is_parent[domain.cell_nodes].any(axis=1))
+    corners, volume = domain.cell_nodes[cells].astype(np.int64), domain.volumes[cells][:, None]
+    # sums at other nodes lack cells: their rows are not used
+    around = np.maximum(sum_at_shared_nodes(domain, corners, volume), np.finfo(float).tiny)
+    rows, columns, values = gradient_entries(domain.nodes[corners], volume / around[corners], corners)
+    nodes = _global_numbers(domain, np.arange(len(domain.nodes)))
+    shape = d * len(nodes), domain.space.dofmap.index_map.size_global
+    return csr_matrix((values, (rows, nodes[columns])), shape=shape), _by_axis(nodes, d)
+
+
+def sum_at_shared_nodes(domain: Domain, nodes: Ints, values: Values | float) -> Values:
+    """(nodes,) sums over all ranks of `values` at `nodes` (collective)."""
+    result = la.vector(domain.space.dofmap.index_map, 1, np.float64)
+    weights = np.broadcast_to(values, nodes.shape).reshape(-1)
+    result.array[:] = np.bincount(nodes.reshape(-1), weights, len(result.array))
+    result.scatter_reverse(la.InsertMode.add)
+    result.scatter_forward()
+    return np.asarray(result.array)
+
+
+def _global_numbers(domain: Domain, nodes: Ints) -> Ints:
+    return domain.space.dofmap.index_map.local_to_global(nodes.astype(np.int32)).astype(np.int64)
+
+
+def _global_matrix(domain: Domain, start: Ints, columns: Ints, values: Values, width: int = 1) -> csr_matrix:
+    """Sparse matrix with `width` columns for each global node."""
+    shape = len(start) - 1, width * domain.space.dofmap.index_map.size_global
+    return csr_matrix((values, columns, start), shape=shape)
 
 
 def _assemble_petsc(comm: MPI.Comm, owned: tuple[int, int], rows: csr_matrix, number: Ints) -> PETSc.Mat:
@@ -172,7 +180,7 @@ def _assemble_petsc(comm: MPI.Comm, owned: tuple[int, int], rows: csr_matrix, nu
     return matrix
 
 
-def _local_mesh(domain: Domain) -> MeshData:
+def local_mesh(domain: Domain) -> MeshData:
     """The cells of this rank as a mesh, with the boundary facets of the body as group OUTSIDE."""
     exterior = domain.facets.boundary
     geometry = dolfinx.mesh.entities_to_geometry(domain.mesh, domain.dim - 1, exterior)
@@ -182,7 +190,7 @@ def _local_mesh(domain: Domain) -> MeshData:
     return MeshData(domain.nodes, domain.cell_nodes.astype(np.int64), {OUTSIDE: facets})
 
 
-def _contact_elements(surface: SplitSurface, topology: EntityNumbering) -> tuple[Ints, Values]:
+def contact_elements(surface: SplitSurface, topology: EntityNumbering) -> tuple[Ints, Values]:
     """(m, d) elements of crack faces and of the boundary of the body, and (m,) their areas (2D: lengths)."""
     outside = np.flatnonzero([OUTSIDE in name for name in topology.origins])
     elements = surface.elements[np.isin(surface.origin, [CRACK, *outside])]
@@ -195,7 +203,7 @@ def _contact_elements(surface: SplitSurface, topology: EntityNumbering) -> tuple
 
 def _areas(surface: SplitSurface, topology: EntityNumbering) -> Values:
     """(points,) 1 / d of the area of the elements around each point."""
-    elements, measure = _contact_elements(surface, topology)
+    elements, measure = contact_elements(surface, topology)
     shares = np.repeat(measure / topology.dim, topology.dim)
     return np.asarray(np.bincount(elements.reshape(-1), shares, len(surface.points)), np.float64)
 
@@ -218,15 +226,15 @@ def _by_axis(numbers: Ints, d: int) -> Ints:
     return (d * numbers[:, None] + np.arange(d)).reshape(-1)
 
 
-def _restrict_to_used_columns(matrices: list[csr_matrix]) -> tuple[Ints, list[csr_matrix]]:
+def restrict_to_used_columns(matrices: list[csr_matrix]) -> tuple[Ints, list[csr_matrix]]:
     """The columns that have entries, and the matrices restricted to them."""
-    used = np.zeros(matrices[0].shape[1], bool)
     for matrix in matrices:
-        used[matrix.indices] = True
-    columns, number = np.flatnonzero(used), np.cumsum(used) - 1
+        matrix.sum_duplicates()  # now, as the restricted matrices share the values
+    columns = np.unique(np.concatenate([matrix.indices for matrix in matrices])).astype(np.int64)
     shape = matrices[0].shape[0], len(columns)
     return columns, [
-        csr_matrix((matrix.data, number[matrix.indices], matrix.indptr), shape=shape) for matrix in matrices
+        csr_matrix((matrix.data, np.searchsorted(columns, matrix.indices), matrix.indptr), shape=shape)
+        for matrix in matrices
     ]
 
 

@@ -16,8 +16,9 @@ from ...meshes.topology import orient_cells
 from ..domain import Domain
 from ..midside_nodes import with_midside_nodes
 from ..simplices import local_edges
-from .closed_surface import SplitSurface
-from .entity_numbering import CRACK
+from .closed_surface import SplitSurface, boundary_corners
+from .entity_numbering import CRACK, EntityNumbering
+from .local_surface import OUTSIDE, local_mesh
 from .surface_motion import PointParents
 
 Ints = npt.NDArray[np.int64]
@@ -85,6 +86,23 @@ def subdivided_input_mesh(domain: Domain) -> MeshData | None:
     whole = with_midside_nodes(domain.input_mesh, domain.midside_nodes, written=False)
     cells = _subdivide(_node_table(*np.split(whole.cells, [domain.dim + 1], axis=1)))
     return MeshData(whole.points, orient_cells(whole.points, cells)[0])
+
+
+def subdivided_local_mesh(domain: Domain) -> MeshData:
+    """The cells of this rank, divided where displacement is quadratic, with the boundary of the body as a group.
+
+    Its points are the nodes of this rank.
+    """
+    mesh = local_mesh(domain)
+    if domain.order == 1:
+        return mesh
+    topology = EntityNumbering(mesh)
+    outside = np.flatnonzero([OUTSIDE in topology.origins[origin] for origin in topology.origin])
+    facets, (i, j) = boundary_corners(topology, outside), local_edges(domain.dim - 1).T
+    between = _midside_nodes(domain, topology.boundary[outside, 0], facets[:, i], facets[:, j])
+    cells = _subdivide(_node_table(mesh.cells, domain.cell_midside_nodes.of_edges))
+    groups = {OUTSIDE: _subdivide(_node_table(facets, between))}
+    return MeshData(mesh.points, orient_cells(mesh.points, cells)[0], groups)
 
 
 def _node_table(corners: npt.NDArray[np.integer], middles: npt.NDArray[np.integer]) -> Ints:

@@ -12,13 +12,13 @@ import numpy.typing as npt
 
 from ...fracture.edge_history import EdgeHistory
 from ...mechanics.material_fields import PerCell
-from ...mechanics.term_protocols import OutputSurfaces
+from ...mechanics.term_protocols import OutputSurfaces, SurfaceSeparator
 from ...mesh.domain import Domain
 from ...timestepping.state import State
 from ..atomic_write import write_on_root
 from ..fields_file import Field
 from ..result_checks import InterpenetrationMonitor
-from .body_surface import BodySurface, PointCorrection, SurfaceFrame
+from .body_surface import BodySurface, SurfaceFrame
 from .vtk_files import SurfaceFiles
 
 Values = npt.NDArray[np.float64]
@@ -39,7 +39,7 @@ class SurfaceOutput:
         density: PerCell,
         record: EdgeHistory | None,
         *,
-        apart: Sequence[PointCorrection] = (),
+        apart: Sequence[SurfaceSeparator] = (),
         beside: Sequence[OutputSurfaces] = (),
         passing: InterpenetrationMonitor | None = None,
         smooth: bool = False,
@@ -52,7 +52,7 @@ class SurfaceOutput:
             domain: distributed mesh.
             density: mass density, kg/m^3 (2D: kg/m^2).
             record: history of broken edges, in a study with fracture. On a restart it is that of the checkpoint.
-            apart: corrections of the drawn points.
+            apart: terms that keep the drawn surface apart.
             beside: terms with obstacles to draw.
             passing: monitor of interpenetration, in a study without contact between fragments.
             smooth: draw cracks smooth.
@@ -61,7 +61,7 @@ class SurfaceOutput:
         Raises:
             CannotWrite: a file cannot be written.
         """
-        self._domain, self.record, self._corrections = domain, record, apart
+        self._domain, self.record, self._separators = domain, record, apart
         self._obstacle_terms, self._interpenetration = beside, passing
         cell_density = domain.input_numbering.gather_cells(
             np.broadcast_to(np.asarray(density, float), domain.cell_count)
@@ -94,6 +94,8 @@ class SurfaceOutput:
         ]
         pattern = domain.input_numbering.gather_cells(self.record.graph.pattern) if self.record is not None else None
         broken = self.record.gather_broken() if self.record is not None else None
+        for term in self._separators:
+            term.gather_separation()
 
         def make() -> SurfaceFrame:
             assert self.surface_and_files is not None
@@ -105,7 +107,8 @@ class SurfaceOutput:
                 edges, history = broken
                 broken_at, cut = (surface.skeleton.edge_values(edges, column) for column in history.T)
                 surface.update(pattern, cut)
-            return surface.make_frame(state.t, u, v, broken_at=broken_at, fields=nodal, corrections=self._corrections)
+            corrections = [term.separate_surface for term in self._separators]
+            return surface.make_frame(state.t, u, v, broken_at=broken_at, fields=nodal, corrections=corrections)
 
         return write_on_root(domain.comm, self._path, make)
 
