@@ -37,11 +37,11 @@ class Study(StudyTable):
     boundary: list[BoundarySettings] = key("Boundary conditions.", factory=list)
     terms: list[Annotated[str, installed("terms")]] = key(
         "Terms of the balance of forces beside those of the tables: names of [plug-ins](python.md#plug-ins).",
-        factory=list, example=["foundation"],
+        factory=list,
     )  # fmt: skip
     loads: list[Annotated[str, installed("loads")]] = key(
         "Boundary conditions with functions of time and place: names of [plug-ins](python.md#plug-ins).",
-        factory=list, example=["shaker"],
+        factory=list,
     )  # fmt: skip
     plugin: dict[str, dict[str, Any]] = key(
         "Parameters of [plug-ins](python.md#plug-ins), a table `[plugin.NAME]` each.", factory=dict,
