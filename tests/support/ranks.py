@@ -18,7 +18,7 @@ OnRanks = Callable[[int], tuple[Arrays, Path]]
 Results = Callable[[int], Arrays]
 
 
-def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 250) -> Arrays:
+def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 600) -> Arrays:
     """Run `main(path)` of a module on ranks, one in this process; returns the arrays that its rank 0 saved.
     AssertionError with its output where it fails.
 
