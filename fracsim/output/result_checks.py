@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..fracture.principal_stress import first_principal_stress, symmetric_tensors
 from ..mechanics.stress import Stress
 from ..mesh.parallel import sum_over_ranks
 from ..meshes.data import format_point
@@ -198,6 +197,8 @@ def unbroken_note(fracture: FracturePass) -> str:
     strength = getattr(fracture.criterion, "strength", None)  # a criterion of a user may have none
     if strength is None:
         return ""
+    from ..fracture.principal_stress import first_principal_stress, symmetric_tensors
+
     weakened, initial = graph.integrity < 1, fracture.initial_cuts
     if initial is not None:
         weakened &= np.isnan(initial)
