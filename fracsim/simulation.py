@@ -34,6 +34,7 @@ from .deformable_run import Run, run_study, wants_smooth  # noqa: E402
 from .errors import InputError  # noqa: E402
 from .mesh.ghost_exchange import with_ghosts  # noqa: E402
 from .mesh.given_mesh import GivenMesh, NamedTags  # noqa: E402
+from .mesh.parallel import failing_together  # noqa: E402
 from .meshes.data import MeshData  # noqa: E402
 from .meshes.parameters import Builder  # noqa: E402
 from .output.fields_file import pad_to_3d  # noqa: E402
@@ -85,10 +86,11 @@ def run(
     body = prepare_inputs(study, overrides, comm, **parts)
     source = find_study(study) if isinstance(study, str) else study if isinstance(study, Path) else None
     folder = Path(out)
-    run_study(
-        body.comm, body.study, folder, restart=restart, overwrite=overwrite, wall_limit=wall_limit, source=source,
-        build=partial(build_scene, given=body.arrays, physics=body.physics),
-    )  # fmt: skip
+    with failing_together(body.comm):
+        run_study(
+            body.comm, body.study, folder, restart=restart, overwrite=overwrite, wall_limit=wall_limit, source=source,
+            build=partial(build_scene, given=body.arrays, physics=body.physics),
+        )  # fmt: skip
     body.comm.Barrier()
     return RunOutput(folder)
 
@@ -166,7 +168,8 @@ class Simulation:
         self._functions: dict[str, fem.Function] = {}
         self._surface: SurfaceOutput | None = None
         self._columns: dict[str, list[float]] = {}
-        self.scene: Scene = build_scene(self.comm, self.study, given=body.arrays, physics=body.physics)
+        with failing_together(self.comm):
+            self.scene: Scene = build_scene(self.comm, self.study, given=body.arrays, physics=body.physics)
         self._run: Run | None = None
         try:
             if out is not None:
@@ -209,20 +212,24 @@ class Simulation:
             NotConverged: the step failed; `state` is that before it.
         """
         self._check_open()
-        if self._run is not None:
-            self._run.step()
-            self._run.write_due_frame()
-        else:
-            self._state, report = self.scene.stepper.advance(self._state)
-            if report.broken:
-                self._breaks.record_breaks(self._state.t)
-            self._history.append(self._state, report, self._breaks.counts, self.scene.probes())
+        with failing_together(self.comm):
+            self._advance()
         for name in self._functions:
             self._update_function(name)
         row = {name: float(value) for name, value in self._history.last_row.items()}
         for name, value in row.items():
             self._columns.setdefault(name, []).append(value)
         return row
+
+    def _advance(self) -> None:
+        if self._run is not None:
+            self._run.step()
+            self._run.write_due_frame()
+            return
+        self._state, report = self.scene.stepper.advance(self._state)
+        if report.broken:
+            self._breaks.record_breaks(self._state.t)
+        self._history.append(self._state, report, self._breaks.counts, self.scene.probes())
 
     def run(self) -> None:
         """Take all steps to the end of the study (collective). With an output folder progress is shown on stderr.
@@ -232,7 +239,8 @@ class Simulation:
         """
         self._check_open()
         if self._run is not None:
-            self._run()
+            with failing_together(self.comm):
+                self._run()
             for name in self._functions:
                 self._update_function(name)
         while not self.ended:

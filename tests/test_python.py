@@ -205,6 +205,32 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Arrays:
     return run_on_ranks("support.given", 1, tmp_path_factory.mktemp("given"))
 
 
+ALONE = """
+import fracsim
+import numpy as np
+from mpi4py import MPI
+
+def criterion(stress, edges, strength):
+    if MPI.COMM_WORLD.rank == 1 and simulation is not None:
+        raise ArithmeticError("a fault on one rank")
+    return np.zeros_like(strength)
+
+simulation = None
+simulation = fracsim.Simulation("bar-2d", overrides={"mesh.h": 0.05}, criterion=criterion)
+simulation.run()
+"""
+
+
+@pytest.mark.ranks
+def test_a_function_that_fails_on_one_rank_ends_all(tmp_path: Path) -> None:
+    """Rank 0 would wait for rank 1: both end within seconds, with the traceback of the user's function."""
+    (tmp_path / "script.py").write_text(ALONE)
+    command = ["timeout", "100", "mpirun", "-n", "2", sys.executable, "script.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode not in (0, 124)
+    assert "ArithmeticError: a fault on one rank" in done.stderr
+
+
 @pytest.mark.ranks
 @pytest.mark.parametrize("ranks", (2, 3))
 def test_a_mesh_handed_over_breaks_alike_on_any_ranks(alone: Arrays, tmp_path: Path, ranks: int) -> None:

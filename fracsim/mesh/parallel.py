@@ -5,7 +5,9 @@ from __future__ import annotations
 import pickle
 import sys
 import time
+import traceback
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 from typing import Any
 
@@ -92,6 +94,20 @@ def abort_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, lat
         time.sleep(FAILURE_WAIT)
     print(message or f"fracsim: rank {comm.rank} ended alone", file=sys.stderr, flush=True)
     comm.Abort(code or 1)
+
+
+@contextmanager
+def failing_together(comm: MPI.Intracomm) -> Iterator[None]:
+    """Context in which an exception that only some ranks raise ends all ranks, with its traceback (collective).
+
+    The other ranks would wait for these for ever.
+    """
+    try:
+        yield
+    except Exception as error:
+        if comm.size > 1:
+            abort_unless_all_failed(comm, traceback.format_exc(), int(getattr(error, "exit_code", 1)))
+        raise
 
 
 def launchers(process: int) -> Iterator[int]:
