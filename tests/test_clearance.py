@@ -131,8 +131,8 @@ def test_nothing_far_is_near(name: str, scheme: str, torn: bool) -> None:
 @pytest.mark.parametrize("scheme", TIMES)
 @pytest.mark.parametrize("name", OBSTACLES)
 def test_the_bound_changes_no_result(name: str, scheme: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A body that flies and an obstacle that comes near, hits or passes: the same numbers, bit by bit, as where nothing
-    ever counts as far."""
+    """A body that flies and an obstacle that comes near, hits or passes: the same numbers as where nothing ever counts
+    as far, but for the last digit, which depends on the processor."""
     results, end = [], 0.08 if scheme == "explicit" else 0.05
     for bounded in (True, False):
         if not bounded:
@@ -148,7 +148,7 @@ def test_the_bound_changes_no_result(name: str, scheme: str, monkeypatch: pytest
             march(scene, state, 1)
             rows.append([state.t, *scene.probes(), *state.u, *state.v])
         results.append(np.array(rows))
-    np.testing.assert_array_equal(*results)
+    np.testing.assert_allclose(*results, rtol=1e-14, atol=1e-14 * np.abs(results[0]).max())
 
 
 @pytest.mark.ranks

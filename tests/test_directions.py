@@ -118,7 +118,8 @@ def test_points_do_not_depend_on_the_processor(tmp_path: Path) -> None:
     code = "import sys, numpy; from support.squares import square\n"
     code += "numpy.save(sys.argv[1], square('unstructured', 30).points)"
     drawn = []
-    for processor in ("Prescott", "Haswell", "SkylakeX"):
+    has_avx512 = "avx512f" in Path("/proc/cpuinfo").read_text()  # kernels for SkylakeX end a process without it
+    for processor in ("Prescott", "Haswell", *(["SkylakeX"] if has_avx512 else [])):
         target = tmp_path / f"{processor}.npy"
         environment = os.environ | {"OPENBLAS_CORETYPE": processor, "PYTHONPATH": str(Path(__file__).parent)}
         subprocess.run([sys.executable, "-c", code, str(target)], env=environment, check=True)

@@ -74,6 +74,7 @@ class FrameSource:
 
 def find_frames(folder: Path) -> list[FrameSource]:
     """Frames of surface.pvd, or else of fields.h5, in an output folder. Raises InputError if there are none."""
+    check_readable(folder / "fields.h5")  # refused even where the surface is drawn
     return surface_frames(folder) or field_frames(folder)
 
 
