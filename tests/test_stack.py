@@ -77,6 +77,6 @@ def test_four_plates_of_gmsh_lie_still() -> None:
 @pytest.mark.ranks
 def test_it_lands_on_three_ranks(tmp_path: Path) -> None:
     """Before, PETSc coarsened a graph of strong links without end in the second step."""
-    energies = run_on_ranks("support.stacked", 3, tmp_path, 60)["energies"]
+    energies = run_on_ranks("support.stacked", 3, tmp_path, 240)["energies"]
     assert energies.shape == (2, 2)
     assert np.isfinite(energies).all()
