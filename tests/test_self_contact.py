@@ -7,10 +7,14 @@ from pathlib import Path
 import meshio
 import numpy as np
 import pytest
+from scipy.sparse import csr_matrix
 
+from fracsim.contact.ipc_pairs import IpcPairs
+from fracsim.contact.ipc_surface import RetractableSurface
 from fracsim.contact.laws import BARRIER
 from fracsim.contact.self_contact import SelfContact
 from fracsim.errors import InputError
+from fracsim.mesh.split_surface.surface_map import SurfaceMap
 from fracsim.meshes.builders.box import Box
 from support.scenes import break_across, each_step, make_scene, march, positions
 from support.torn import RUNS
@@ -205,3 +209,23 @@ def test_a_hammer_goes_on_through_crumbs() -> None:
         assert np.linalg.norm(positions(scene) + state.u.reshape(-1, 2) - hammer, axis=1).min() > 0.15
     assert len(contact.surface.current.pairs.intersections(contact.end_positions())) == 0
     assert scene.fracture.graph.broken_count > 10
+
+class _Crossing(RetractableSurface):
+    """Three segments, of which the last two cross; the first is excluded."""
+
+    def _build_pairs(self, elements: np.ndarray) -> IpcPairs:
+        return IpcPairs(self.point_map.rest, elements, distance=0.01, stiffness=1.0, friction=0.0)
+
+
+def test_intersecting_faces_keep_their_numbers_where_others_are_excluded() -> None:
+    x = np.array([[5.0, 0.0], [6.0, 0.0], [0.0, 0.0], [1.0, 1.0], [0.0, 1.0], [1.0, 0.0]])
+    none, arms = csr_matrix((6, 1)), csr_matrix(np.ones((6, 1)))
+    elements = np.array([[0, 1], [2, 3], [4, 5]])
+    surface = _Crossing(elements, SurfaceMap(none, x, arms, np.zeros_like(x)), 1.0)
+    surface._include_all()
+    u = np.zeros((1, 2))
+    assert surface._intersecting_faces(u).tolist() == [1, 2]
+    surface._exclude(np.array([0]))
+    assert surface._intersecting_faces(u).tolist() == [1, 2]
+    surface._include_all()
+    assert surface._intersecting_faces(u).tolist() == [1, 2]

@@ -149,7 +149,7 @@ class RetractableSurface:
 
     def _include_all(self) -> None:
         """Build pairs of all elements."""
-        self.pairs = self._build_pairs(self.elements)
+        self.pairs, self._excluded = self._build_pairs(self.elements), np.empty(0, np.int64)
 
     def _search_along(self, x: Values, end: Values) -> None:
         """Search candidates for the motion of the points from x to `end` (n, d), m."""
@@ -167,7 +167,8 @@ class RetractableSurface:
 
     def _intersecting_faces(self, u: Values) -> Ints:
         """Crack faces that intersect at displacements u (nodes, d), m (collective)."""
-        return np.intersect1d(self._crack_faces, self.pairs.intersections(self.point_map(u)))
+        numbers = np.delete(np.arange(len(self.elements)), self._excluded)
+        return np.intersect1d(self._crack_faces, numbers[self.pairs.intersections(self.point_map(u))])
 
     def _common_share(self, share: Values) -> Values:
         """(n,) least factor of the arm of each point on all ranks (collective)."""
