@@ -236,6 +236,28 @@ def report(
 
 
 @app.command()
+def plot(
+    outs: Annotated[list[Path], typer.Argument(metavar="OUT...", help="output folders of runs or sweeps")],
+    y: Annotated[str, typer.Option(help="column of history.csv: reaction_grip_x")],
+    x: Annotated[str, typer.Option(help="column of history.csv: motion_grip_x")] = "time",
+    target: Annotated[Path | None, typer.Option("-o", "--out", help=".svg, .png or .pdf (OUT/curve.svg)")] = None,
+    reference: Annotated[list[Path], typer.Option(help="CSV of a curve with a line of names; x first")] = _NO_PATHS,
+    scale: Annotated[
+        str, typer.Option(metavar="X,Y", help="factors from the units of references to SI; mm and kN: 1e-3,1e3")
+    ] = "1,1",
+) -> None:
+    """Draw a column of history.csv over another one, for several runs, beside curves of experiments."""
+    if not is_first_rank():
+        return
+    import_outside("matplotlib")
+    from .report.curve_plot import draw_curves, parse_scale
+
+    _note_active_runs(outs)
+    path = draw_curves(outs, target, x=x, y=y, references=reference, scale=parse_scale(scale))
+    print(f"saved {path}")
+
+
+@app.command()
 def sweep(
     study: StudyPath,
     set_: Annotated[list[str], typer.Option("--set", metavar="KEY=A,B,C", help="mesh.h=0.02,0.01")] = _NONE,

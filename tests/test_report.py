@@ -10,13 +10,16 @@ import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
 
+import imageio.v3
 import numpy as np
 import pytest
 
 from cases import BAR, DUCTILE_TABLES, STRIP, fracsim, swept_here, write_study
 from fracsim.errors import FalseClaim, InputError
 from fracsim.report.content import Claim, Picture, Plot, PlotGrid, ReportTable, Section, Series, from_data, to_data
+from fracsim.report.curve_plot import curve_plot
 from fracsim.report.html_report import make_report
 from fracsim.report.page import write_page
 from fracsim.report.plots import SERIES_COLOURS, draw_plot
@@ -242,6 +245,7 @@ def test_evidence_is_shown_without_importing_a_study(tmp_path: Path) -> None:
 import sys
 from pathlib import Path
 from fracsim.errors import FalseClaim
+from fracsim.report.curve_plot import curve_plot
 from fracsim.report.html_report import make_report
 try:
     make_report([Path({str(tmp_path)!r})], references=[])
@@ -327,3 +331,55 @@ def test_a_false_claim_ends_the_command_with_1(tmp_path: Path, holds: bool | Non
 def test_tables_inside_tables_are_named_by_their_path() -> None:
     data = {"a": {"b": 1, "c": [{"d": 2}, {"d": 3}]}, "e": [1, 2]}
     assert flatten_tables(data) == {"a.b": 1, "a.c.0.d": 2, "a.c.1.d": 3, "e": [1, 2]}
+
+
+# --- fracsim plot ---
+
+
+def test_a_curve_beside_an_experiment_in_its_own_units(runs: Path, tmp_path: Path) -> None:
+    """A test's CSV in mm and kN, written from the run itself, lies on the curve of the run."""
+    folder = runs / "strip"
+    (run,) = find_runs([folder])
+    x, y = (next(name for name in run.history if name.startswith(kind)) for kind in ("motion_", "reaction_"))
+    measured = tmp_path / "measured.csv"
+    rows = zip(run.history[x] / 1e-3, run.history[y] / 1e3, strict=True)
+    measured.write_text("u (mm),F (kN)\n" + "".join(f"{u:.17g},{f:.17g}\n" for u, f in rows))
+    plot = curve_plot([folder], x, y, [measured], (1e-3, 1e3))
+    ours, theirs = plot.series
+    assert np.allclose(ours.x, theirs.x) and np.allclose(ours.y, theirs.y)
+    size = {"": 1.0, "m": 1e-3, "µ": 1e-6, "k": 1e3, "M": 1e6}[plot.y.partition(", ")[2].removesuffix("N")]
+    assert np.allclose(np.array(ours.y) * size, run.history[y])
+    assert 1 <= max(map(abs, ours.y)) < 1000
+
+
+@pytest.mark.parametrize("suffix", [".svg", ".png", ".pdf"])
+def test_a_curve_is_drawn_as_what_other_programs_open(runs: Path, tmp_path: Path, suffix: str) -> None:
+    target = tmp_path / f"curve{suffix}"
+    result = fracsim("plot", runs / "sweep", runs / "strip", "--y", "elastic", "-o", target)
+    assert result.returncode == 0, result.stderr
+    if suffix == ".svg":
+        text = " ".join(ElementTree.parse(target).getroot().itertext())
+        assert "strip" in text and "time, " in text and "elastic, " in text
+    elif suffix == ".png":
+        pixels = imageio.v3.imread(target)
+        assert pixels.shape[:2] == (608, 1024) and pixels[0, 0].min() == 255 and pixels.min() < 50
+    else:
+        assert target.read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--y", "strength"), "no column strength; it has: step, time"),
+        (("--y", "elastic", "-o", "curve.jpeg"), "a curve is drawn as .svg, .png, .pdf"),
+        (("--y", "elastic", "--scale", "1e-3"), "must be two factors other than 0"),
+        (("--y", "elastic", "--reference", "three.csv"), "it has the columns a, b, c, but not time and elastic"),
+        (("--y", "elastic", "--reference", "bare.csv"), "where the names of the columns belong"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(runs: Path, tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
+    (tmp_path / "three.csv").write_text("a,b,c\n1,2,3\n2,3,4\n")
+    (tmp_path / "bare.csv").write_text("1,2\n2,3\n")
+    given = [tmp_path / each if each.endswith(".csv") else each for each in arguments]
+    result = fracsim("plot", runs / "strip", *given)
+    assert result.returncode == 2 and message in result.stderr and "Traceback" not in result.stderr

@@ -210,6 +210,7 @@ def test_a_hammer_goes_on_through_crumbs() -> None:
     assert len(contact.surface.current.pairs.intersections(contact.end_positions())) == 0
     assert scene.fracture.graph.broken_count > 10
 
+
 class _Crossing(RetractableSurface):
     """Three segments, of which the last two cross; the first is excluded."""
 

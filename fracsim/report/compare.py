@@ -21,6 +21,11 @@ from .runs import PHASES, RunData, Values, differing_settings
 ENERGY_LABELS = {
     "external_work": "external work", "elastic": "elastic", "kinetic": "kinetic", "dissipated": "dissipated",
 }  # fmt: skip
+# columns of history.csv, or the first words of their names -> units
+_UNITS = {
+    "time": "s", "dt": "s", "wall": "s", "reaction": "N", "onset": "N", "contact": "N", "probe": "m", "motion": "m",
+    "work": "J", "kinetic": "J", "crack_length": "m", "crack_area": "m²", "tip": "m",
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -30,7 +35,7 @@ class ReferenceCurve:
     Attributes:
         name: name of the file without suffix.
         x: column of history.csv on the x axis.
-        columns: values of all columns, sorted by x.
+        columns: values of all columns, in the order of the file.
     """
 
     name: str
@@ -142,11 +147,16 @@ def _motion_columns(column: str, runs: list[RunData]) -> Iterator[str]:
         yield motion
 
 
+def column_unit(column: str) -> str:
+    """Unit of a column of history.csv; "" for numbers and for columns without a known unit."""
+    kind = column.partition("_")[0]
+    return "J" if column in ENERGY_LABELS else _UNITS.get(column, _UNITS.get(kind, ""))
+
+
 def _axis_label(column: str) -> str:
     """Name of a column with its unit."""
-    units = {"time": "s", "reaction": "N", "contact": "N", "probe": "m", "motion": "m"}
-    kind = column.partition("_")[0]
-    return f"{column}, {units[kind]}" if kind in units else column
+    unit = column_unit(column)
+    return f"{column}, {unit}" if unit else column
 
 
 def energy_section(runs: list[RunData]) -> Section:
@@ -193,6 +203,8 @@ def read_reference(path: Path) -> ReferenceCurve:
         check_readable(path)
         with path.open(newline="", encoding="utf-8") as file:
             header, *rows = [row for row in csv.reader(file) if row]
+        if all(map(_reads_as_number, header)):
+            raise ValueError("the first line has numbers, where the names of the columns belong")
         table = np.array(rows, float)
         if len(header) < 2 or table.ndim != 2 or table.shape[1] != len(header) or not np.isfinite(table).all():
             raise ValueError("every row must have a number for each of two or more columns")
@@ -202,9 +214,16 @@ def read_reference(path: Path) -> ReferenceCurve:
             f"--reference {path}: {why}. Give a CSV whose first line names columns of history.csv, x first: "
             "motion_grip_x,reaction_grip_x"
         ) from None
-    order = np.argsort(table[:, 0], kind="stable")
-    columns = dict(zip(header, table[order].T, strict=True))
+    columns = dict(zip(header, table.T, strict=True))
     return ReferenceCurve(path.stem, header[0].strip(), {name.strip(): values for name, values in columns.items()})
+
+
+def _reads_as_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
 
 
 def reference_section(runs: list[RunData], references: list[ReferenceCurve]) -> Section:
@@ -236,7 +255,8 @@ def _deviation(run: RunData, reference: ReferenceCurve, y: str) -> tuple[TableCe
     run_x, run_y = run.history[reference.x], run.history[y]
     x, expected = reference.columns[reference.x], reference.columns[y]
     peak, reference_peak = float(np.max(np.abs(run_y), initial=0.0)), float(np.max(np.abs(expected)))
-    order = np.argsort(run_x, kind="stable")
+    order, by_x = (np.argsort(values, kind="stable") for values in (run_x, x))
+    x, expected = x[by_x], expected[by_x]
     common = (x >= run_x.min(initial=math.inf)) & (x <= run_x.max(initial=-math.inf))
     rms = None
     if common.any() and reference_peak > 0:

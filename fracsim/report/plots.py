@@ -12,6 +12,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,10 @@ _STYLE: dict[str, Any] = {
 }  # fmt: skip
 # series whose legend is inside the axes; a longer legend stands beside them
 _MAX_INSIDE_LEGEND = 6
+# of pictures in pixels
+_PIXELS_PER_INCH = 160
+# metadata by format: the same curves give the same file
+_WITHOUT_DATE = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 
 
 @dataclass(frozen=True)
@@ -87,15 +92,27 @@ def draw_plot(plot: Plot | PlotGrid, name: str) -> str:
     if isinstance(plot, PlotGrid):
         return _draw_grid(plot, name)
     with _figure(name) as figure:
-        axes = figure.add_subplot()
-        _fill_axes(axes, plot, range(len(plot.series)))
-        axes.set(xlabel=plot.x, ylabel=plot.y)
-        if axes.get_legend_handles_labels()[1]:
-            is_long = len(plot.series) > _MAX_INSIDE_LEGEND
-            axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0)) if is_long else axes.legend()
-        if labelled := _labelled_points(plot):
-            label_points(axes, labelled, _points(plot))
+        _draw_axes(figure, plot)
         return _to_svg(figure)
+
+
+def save_plot(plot: Plot, path: Path) -> None:
+    """Write a plot to a file, on a white ground; its suffix is the format of matplotlib."""
+    with _figure(path.stem) as figure:
+        _draw_axes(figure, plot)
+        figure.savefig(path, dpi=_PIXELS_PER_INCH, facecolor="white", metadata=_WITHOUT_DATE.get(path.suffix))
+
+
+def _draw_axes(figure: Any, plot: Plot) -> None:
+    """Draw a plot on the whole figure, with labels and legend."""
+    axes = figure.add_subplot()
+    _fill_axes(axes, plot, range(len(plot.series)))
+    axes.set(xlabel=plot.x, ylabel=plot.y)
+    if axes.get_legend_handles_labels()[1]:
+        is_long = len(plot.series) > _MAX_INSIDE_LEGEND
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0)) if is_long else axes.legend()
+    if labelled := _labelled_points(plot):
+        label_points(axes, labelled, _points(plot))
 
 
 def _draw_grid(grid: PlotGrid, name: str) -> str:
