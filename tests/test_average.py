@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from fracsim.fracture import nonlocal_average as average_module
 from fracsim.fracture.edge_stress import frobenius_norm
 from fracsim.fracture.nonlocal_average import NonlocalAverage
 from support.scenes import Values, cell_corners, make_scene
@@ -113,69 +110,33 @@ def test_a_large_constant_kernel_is_the_mean_over_the_body(body: Body) -> None:
     np.testing.assert_allclose(body.average(10.0, "constant")(values), mean, atol=len(values) * EPS)
 
 
-def limit_weights(monkeypatch: pytest.MonkeyPatch, count: float) -> None:
-    """Let a rank compute no more than `count` weights before stress needs them."""
-    monkeypatch.setattr(average_module, "LIMITS", replace(average_module.LIMITS, max_initial_weights=count))
+@pytest.mark.parametrize("kernel", KERNELS)
+@pytest.mark.parametrize("shift", (0.0, 1e4), ids=("", "far from the origin"))
+def test_cells_that_reach_a_bound_are_found_with_their_averages(body: Body, kernel: str, shift: float) -> None:
+    """None is missed by the first look in single precision: exactly the cells whose average of the norms reaches the
+    bound are found, whichever cells have come apart since the last time, or are whole again."""
+    count, rng = len(body.volumes), np.random.default_rng(4)
+    body.domain.nodes[:] += shift
+    average = body.average(2.7 * H, kernel)
+    body.domain.nodes[:] -= shift
+    some = rng.uniform(size=count) < 0.7
+    for active in (None, some, some & (np.arange(count) % 50 > 0), some):
+        enters = np.ones(count) if active is None else active.astype(float)
+        values = rng.normal(size=(count, 3)) * enters[:, None]
+        norms = frobenius_norm(values, 2)
+        expected = brute_force(body, 2.7 * H, kernel, np.column_stack([norms, values]), enters)
+        bound = float(np.quantile(expected[:, 0], 0.8)) * (1 + 1e-9)
+        cells, found = average.find_averages_above(values, norms, bound, active)
+        np.testing.assert_array_equal(cells, np.flatnonzero(expected[:, 0] >= bound))
+        np.testing.assert_allclose(found, expected[cells, 1:], atol=count * EPS * max(shift, 1.0))
+        assert len(average.find_averages_above(values, norms, 1.01 * norms.max(), active)[0]) == 0
 
 
-@pytest.mark.parametrize("at_once", (0, 5e7), ids=("rows made as needed", "all rows"))
-def test_cells_that_may_reach_a_bound_are_found_with_their_averages(
-    monkeypatch: pytest.MonkeyPatch, at_once: float
-) -> None:
-    """None is missed: every cell whose average is as large as the bound is among them, with the same average, whichever
-    cells have come apart since the last time, or are whole again."""
-    limit_weights(monkeypatch, at_once)
-    scene, _ = make_scene(
-        mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.1, "pattern": "unstructured"},
-        fracture={"strength": 1.0, "radius": 0.25},
-    )
-    average, n = NonlocalAverage(scene.domain, 0.25, "linear"), scene.domain.cell_count
-    other = NonlocalAverage(scene.domain, 0.25, "linear")
-    rng = np.random.default_rng(4)
-    some = rng.uniform(size=n) < 0.7
-    for active in (None, some, some & (np.arange(n) % 50 > 0), some):
-        values = rng.normal(size=(n, 3)) * (1.0 if active is None else active[:, None])
-        size = frobenius_norm(values, 2)
-        whole = other(values, active)
-        bound = float(np.quantile(frobenius_norm(whole, 2), 0.8))
-        cells, found = average.find_averages_above(values, size, bound, active)
-        np.testing.assert_allclose(found, whole[cells], rtol=1e-12, atol=1e-14)
-        assert set(np.flatnonzero(frobenius_norm(whole, 2) >= bound)) <= set(cells)
-        assert len(average.find_averages_above(values, size, 1.01 * size.max(), active)[0]) == 0
-
-
-def test_weights_are_those_of_now_where_few_rows_are_made(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A cell that has no row itself, beyond R of the hot one, comes apart: averages between the two leave it out."""
-    body = Body(MESHES["2d-unstructured"])
-    count, radius = len(body.volumes), 2.7 * H
-    limit_weights(monkeypatch, 0)
-    few = body.average(radius, "linear")
-    size = np.random.default_rng(3).uniform(0.1, 0.3, count)
-    size[17] = 5.0
-    far = np.linalg.norm(body.centroids - body.centroids[17], axis=1)
-    for active in (np.ones(count, bool), ~((far > radius) & (far < 1.5 * radius))):
-        values = np.where(active, size, 0.0)[:, None]
-        cells, found = few.find_averages_above(values, values[:, 0], 0.3, active)
-        np.testing.assert_allclose(found, brute_force(body, radius, "linear", values, active)[cells], rtol=1e-12)
-    assert len(cells) > 5 and not np.isin(np.flatnonzero(~active), few._weights.blocks[0].cells).any()
-
-
-def test_rows_are_made_where_stress_is_high(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One hot cell: rows of the cells within R of it and no others, kept from pass to pass, the same to a bit."""
-    body = Body(MESHES["2d-unstructured"])
-    size = np.zeros(len(body.volumes))
-    whole = body.average(2.7 * H, "linear")
-    limit_weights(monkeypatch, 0)
-    few = body.average(2.7 * H, "linear")
-    made = []
-    for hot in (17, 17, 90):
-        size[:] = np.random.default_rng(hot).uniform(0.1, 0.3, len(size))
-        size[hot] = 5.0
-        cells, found = few.find_averages_above(size[:, None], size, 0.35)
-        expected, averages = whole.find_averages_above(size[:, None], size, 0.35)
-        assert len(cells) and np.array_equal(cells, expected) and np.array_equal(found, averages)
-        made.append(sum(len(rows.cells) for rows in few._weights.blocks))
-    near = np.linalg.norm(body.centroids - body.centroids[[17, 90], None], axis=2) <= 2.7 * H
-    assert made == [near[0].sum(), near[0].sum(), near.any(axis=0).sum()] and made[0] < len(size) / 3
-    assert np.array_equal(few(size[:, None]), whole(size[:, None])), "all rows, in the order of the cells"
-    assert np.array_equal(few.find_averages_above(size[:, None], size, 0.35)[1], averages)
+def test_one_loaded_cell_raises_the_averages_around_it(body: Body) -> None:
+    """A load as large as can be is found wherever its weight is not 0, and nowhere else."""
+    norms = np.zeros(len(body.volumes))
+    norms[17] = 1e250
+    radius = 2.7 * H
+    cells, _ = body.average(radius, "linear").find_averages_above(norms[:, None], norms, 1.0)
+    distance = np.linalg.norm(body.centroids - body.centroids[17], axis=1)
+    np.testing.assert_array_equal(cells, np.flatnonzero(distance < radius))

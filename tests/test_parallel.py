@@ -195,14 +195,6 @@ def test_same_walls_are_drawn_in(results: Results, ranks: int) -> None:
     np.testing.assert_allclose(found["squeezed-u"], serial["squeezed-u"], atol=1e-7 * scale(serial["squeezed-u"]))
 
 
-@pytest.mark.parametrize("ranks", RANKS)
-def test_same_crack_where_weights_are_made_as_needed(results: Results, ranks: int) -> None:
-    """An average of few rows breaks the edges that one of all rows breaks."""
-    found = results(ranks)
-    assert np.array_equal(found["broken-by-rows"], found["block-broken"])
-    np.testing.assert_allclose(found["u-by-rows"], found["block-u"], atol=1e-9 * scale(found["block-u"]))
-
-
 @pytest.mark.parametrize("run", ("block", "joined"))
 @pytest.mark.parametrize("ranks", RANKS)
 def test_same_crack_where_products_are_made_in_blocks(results: Results, ranks: int, run: str) -> None:

@@ -1,6 +1,6 @@
 """Averages of cell values over neighbouring cells: within a radius, or over the cells that share a node.
 
-`NonlocalAverage` (M22, eq. 13) is a sparse matrix with one row per owned cell,
+`NonlocalAverage` (M22, eq. 13) is, at each owned cell,
 
     <s>_c = sum_k w_ck s_k / sum_k w_ck,   w_ck = V_k g(|X_k - X_c| / R),   |X_k - X_c| <= R,
 
@@ -15,7 +15,7 @@ Both are the same on any number of ranks. Equations: docs/theory.md#edge-criteri
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
 from ctypes import CDLL, Structure, byref, c_double, c_int64
 from dataclasses import dataclass
 from functools import cache
@@ -24,46 +24,43 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from dolfinx import la
-from scipy.sparse import csr_matrix
+from mpi4py import MPI
+from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
-from ..mesh.c_library import Float64, Int32, load_library, struct_pointer
+from ..mesh.c_library import Float32, Float64, Int64, load_library, struct_pointer
 from ..mesh.domain import Domain
 from ..mesh.parallel import RankHalo, max_over_ranks
 
 Values = npt.NDArray[np.float64]
+Singles = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 SOURCE = Path(__file__).with_suffix(".c")
-
-KERNELS: dict[str, Callable[[Values], Values]] = {
-    "linear": lambda q: 1 - q,
-    "constant": np.ones_like,
-    # The radius is three standard deviations; the 1 % of the weight outside is cut off.
-    "gaussian": lambda q: np.exp(-4.5 * q**2),
-}
+KERNELS = ("linear", "constant", "gaussian")  # in the order of nonlocal_average.c
 
 
 @dataclass(frozen=True)
 class AverageLimits:
-    """Memory limits and tolerances of the averages.
+    """Sizes and tolerances of the averages.
 
     Attributes:
-        max_initial_weights: weights that a rank computes before the first step (0.6 GB). Beyond it a row is computed
-            when the stress near it first reaches the strength, since the number of weights grows as h^-6.
-        rows_per_block: rows computed at once. A distance takes three times the memory of a weight meanwhile.
-        sampled_rows: rows that are counted to estimate the number of weights.
+        bins_per_radius: bins along the radius. With 4 a group of centres sees twice the points that it needs.
+        bins_per_spacing: bins along the mean distance of cells, at most, which bounds the memory of the bins.
+        max_columns: values of a cell that are averaged at once.
+        coarse_share: 1 less the relative rounding error of sums in single precision, for 10,000 points.
+        max_coarse: largest norm over the bound in single precision; beyond it an average reaches the bound anyhow.
+        least_extent: extent of a body over its largest one, below which it counts as flat.
         bound_round_off: relative rounding error of an average that is compared with a bound.
-        near_bound_round_off: the same of cell values that decide which rows are needed.
-        radius_round_off: relative rounding error of distances that are compared with the radius.
     """
 
-    max_initial_weights: float = 5e7
-    rows_per_block: int = 20_000
-    sampled_rows: int = 1_000
+    bins_per_radius: float = 4.0
+    bins_per_spacing: float = 2.0
+    max_columns: int = 7
+    coarse_share: float = 0.999
+    max_coarse: float = 1e20
+    least_extent: float = 1e-9
     bound_round_off: float = 1e-12
-    near_bound_round_off: float = 1e-9
-    radius_round_off: float = 1e-9
 
 
 LIMITS = AverageLimits()
@@ -72,33 +69,30 @@ LIMITS = AverageLimits()
 class NonlocalAverage:
     """Average over the cells within a radius (m), weighted by volume and kernel.
 
-    A rank has copies of the cells of other ranks within the radius of its own.
+    A rank has copies of the cells of other ranks within the radius of its own. Weights are computed when they are used:
+    their number grows as h^-6, and reading one from memory would take as long.
     """
 
     def __init__(self, domain: Domain, radius: float, kernel: str) -> None:
-        """Exchange the neighbouring cells of other ranks, and compute weights up to the memory limit (collective)."""
+        """Exchange the neighbouring cells of other ranks, and sort all near cells into bins (collective)."""
         self._comm = domain.comm
         centroids = domain.nodes[domain.cell_nodes].mean(axis=1)
         self._exchange = RankHalo(domain.comm, centroids, radius)
-        near = self._exchange(centroids)
-        volumes = self._exchange(domain.volumes[:, None])[:, 0]
-        # Sums in the order of the input mesh are the same to the last bit on any number of ranks.
-        order = np.argsort(self._exchange(domain.input_numbering.cells[:, None].astype(float))[:, 0], kind="stable")
-        self._weights = _WeightMatrix(centroids, near[order], volumes[order], order, radius, kernel)
+        volumes, numbers = domain.volumes[:, None], domain.input_numbering.cells[:, None].astype(float)
+        near = self._exchange(np.hstack([centroids, volumes, numbers]))
+        self._centres = _in_space(centroids)
+        self._bins = _Bins(domain.comm, self._centres, _in_space(near[:, : domain.dim]), near[:, -1], radius, kernel)
+        self._volumes = near[self._bins.order, -2]
+        # Centres that follow one another in a tree lie close together.
+        self._tree_order = cKDTree(centroids).indices.astype(np.int64)
 
     def __call__(self, values: Values, active: Flags | None = None) -> Values:
         """Average cell values (cells, n); inactive cells do not enter; 0 where no active cell is near (collective)."""
-        self._weights.compute_all()
-        n = values.shape[1]
-        # The flag is averaged as well: its sum is the weight of the active cells.
-        if active is not None:
-            values = np.column_stack([np.where(active[:, None], values, 0.0), active])
-        near = self._exchange(values)
-        averages = np.zeros((len(values), n))
-        for block in self._weights.blocks:
-            sums = block.multiply(near)
-            weight = block.row_sums[:, None] if active is None else sums[:, -1:]
-            averages[block.cells] = np.divide(sums[:, :n], weight, out=np.zeros((len(sums), n)), where=weight > 0)
+        near, volumes = self._sorted(values), self._active_volumes(active)
+        averages = np.empty(values.shape)
+        for first in range(0, values.shape[1], LIMITS.max_columns):
+            columns = slice(first, first + LIMITS.max_columns)
+            averages[self._tree_order, columns] = self._average(self._tree_order, near[:, columns], volumes)
         return averages
 
     def find_averages_above(
@@ -112,31 +106,47 @@ class NonlocalAverage:
             bound: value that the norm of an average is compared with.
             active: (cells,) cells that enter averages; None: all.
         """
-        n = values.shape[1]
         # The norm of an average is at most the average of the norms, one column instead of six, and no average exceeds
         # the largest norm of all ranks.
+        bound *= 1 - LIMITS.bound_round_off
         if max_over_ranks(self._comm, float(np.max(norms, initial=0.0))) < bound:
-            return np.empty(0, np.int64), np.empty((0, n))
-        near, near_norms = self._exchange(values), self._exchange(norms[:, None])[:, 0]
-        # The sums are rounded, so that cells slightly below the bound count as well.
-        over_bound = near_norms >= bound * (1 - LIMITS.near_bound_round_off)
-        self._weights.compute_near(over_bound)
-        candidates = self._weights.flag_centres_near(over_bound)
-        near_active = None if active is None else self._exchange(active[:, None].astype(float))
-        parts = [
-            block.find_averages_above(candidates, near_norms, sums, bound * (1 - LIMITS.bound_round_off), near)
-            for block, sums in zip(self._weights.blocks, self._weights.active_sums(near_active), strict=True)
-        ]
-        cells = np.concatenate([np.empty(0, np.int64), *(cells for cells, _ in parts)])
-        averages = np.concatenate([np.empty((0, n)), *(averages for _, averages in parts)])
-        order = np.argsort(cells)
-        return cells[order], averages[order]
+            return np.empty(0, np.int64), np.empty((0, values.shape[1]))
+        near_norms, volumes = self._sorted(norms[:, None]), self._active_volumes(active)
+        near = self._exchange(values)
+        cells = self._may_reach(near_norms[:, 0], volumes, bound)
+        if not len(cells):
+            return cells, np.empty((0, values.shape[1]))
+        averages = self._average(cells, np.hstack([near_norms, near[self._bins.order]]), volumes)
+        reaches = np.flatnonzero(averages[:, 0] >= bound)
+        order = reaches[np.argsort(cells[reaches])]
+        return cells[order], averages[order, 1:]
 
+    def _sorted(self, values: Values) -> Values:
+        """Return the values (near, n) of near cells in the order of bins, of those of this rank (cells, n)."""
+        return np.ascontiguousarray(self._exchange(values)[self._bins.order], float)
 
-class _WeightArrays(Structure):
-    """Arrays of a sparse matrix, in the layout of nonlocal_average.c."""
+    def _active_volumes(self, active: Flags | None) -> Values:
+        """Return the volumes (near,) of near cells in the order of bins, 0 where inactive."""
+        return self._volumes if active is None else self._volumes * self._sorted(active[:, None].astype(float))[:, 0]
 
-    _fields_ = (("start", Int32), ("place", Int32), ("weight", Float64))
+    def _may_reach(self, norms: Values, volumes: Values, bound: float) -> Ints:
+        """Find the cells (m,) whose average of `norms` (near,) may reach `bound`, in single precision."""
+        load = norms / bound
+        # An average is at most the largest load within the radius.
+        candidates = self._tree_order[self._bins.near_any((load >= 1) & (volumes > 0))[self._tree_order]]
+        relative = volumes / np.mean(volumes) if volumes.any() else volumes
+        coarse = (relative * np.minimum(load, LIMITS.max_coarse)).astype(np.float32)
+        selected = np.empty(len(candidates), np.int64)
+        centres = c_int64(len(candidates)), candidates, self._centres
+        sums = relative.astype(np.float32), coarse, c_double(LIMITS.coarse_share)
+        return selected[: _code().find_centres(self._bins.pointer, *centres, *sums, selected)]
+
+    def _average(self, cells: Ints, near: Values, volumes: Values) -> Values:
+        """Return the averages (m, n) of near values (near, n) around some cells (m,)."""
+        near, result = np.ascontiguousarray(near), np.empty((len(cells), near.shape[1]))
+        centres, width = (c_int64(len(cells)), cells, self._centres), c_int64(near.shape[1])
+        _code().averages_around(self._bins.pointer, *centres, volumes, width, near, result)
+        return result
 
 
 @cache
@@ -145,156 +155,65 @@ def _code() -> CDLL:
     return load_library(SOURCE, separate_rounding=True)
 
 
-class _WeightBlock:
-    """Rows of the weight matrix of some centres.
+def _in_space(points: Values) -> Values:
+    """Return points (n, 3) of points (n, d), with coordinates of 0 beyond d."""
+    return np.ascontiguousarray(np.pad(points, ((0, 0), (0, 3 - points.shape[1]))))
+
+
+class _Points(Structure):
+    """Points in bins, in the layout of nonlocal_average.c."""
+
+    _fields_ = (
+        ("origin", Float64), ("bins", Int64), ("start", Int64), ("x", Float64), ("y", Float64), ("z", Float64),
+        ("coarse", Float32), ("size", c_double), ("radius", c_double), ("margin", c_double), ("points", c_int64),
+        ("kernel", c_int64),
+    )  # fmt: skip
+
+
+class _Bins:
+    """Points sorted into cubic bins that are the same on all ranks, so that sums over them are.
 
     Attributes:
-        cells: (n,) centres of the rows.
-        row_sums: (n,) sums of their weights, m^d.
-    """
-
-    def __init__(self, cells: Ints, weights: csr_matrix) -> None:
-        """Store the rows `weights` (n, near) of the centres `cells` (n,)."""
-        self.cells, self.row_sums = cells, np.asarray(weights.sum(axis=1))[:, 0]
-        # The C structure has addresses only: these references keep the arrays alive.
-        self._arrays = np.asarray(weights.indptr, np.int32), np.asarray(weights.indices, np.int32), weights.data
-        self._matrix = _WeightArrays(*map(struct_pointer, self._arrays))
-        self._all_rows = np.arange(len(cells))
-
-    def find_averages_above(
-        self, candidates: Flags, norms: Values, sums: Values, bound: float, values: Values
-    ) -> tuple[Ints, Values]:
-        """Find the candidate cells (m,) whose average of `norms` reaches `bound`, and their averages (m, k).
-
-        Args:
-            candidates: (own cells,) cells that may reach the bound.
-            norms: (near,) norms of values.
-            sums: (n,) sums of the weights of active cells.
-            bound: value to reach.
-            values: (near, k) values to average.
-        """
-        width, count = values.shape[1], len(self.cells)
-        cells, averages = np.empty(count, np.int64), np.empty((count, width))
-        inputs = self.cells, candidates, np.ascontiguousarray(norms), sums, c_double(bound)
-        outputs = c_int64(width), np.ascontiguousarray(values), cells, averages
-        count = _code().averages_above(byref(self._matrix), c_int64(count), *inputs, *outputs)
-        return cells[:count], averages[:count]
-
-    def mark_neighbours(self, near_flags: Flags, marks: Flags) -> None:
-        """Set `marks` (near,) of the cells that are near the flagged own cells (near,) of this block."""
-        sizes = c_int64(len(self.cells)), self.cells
-        _code().mark_columns(byref(self._matrix), *sizes, near_flags, marks)
-
-    def multiply(self, values: Values, rows: Ints | None = None) -> Values:
-        """Return the weighted sums (n, k) of near values (near, k), of all rows or of `rows`."""
-        rows = self._all_rows if rows is None else rows
-        result, values = np.empty((len(rows), values.shape[1])), np.ascontiguousarray(values)
-        sizes = c_int64(len(rows)), rows, c_int64(values.shape[1])
-        _code().multiply_rows(byref(self._matrix), *sizes, values, result)
-        return result
-
-
-class _WeightMatrix:
-    """Weights of near cells around centres, computed at once or row by row if they are too many.
-
-    Attributes:
-        blocks: blocks of rows. They are never joined, which would need their memory once more.
+        order: (points,) the points by bin, and in a bin by number.
+        pointer: argument of the functions of nonlocal_average.c.
     """
 
     def __init__(
-        self, centres: Values, near: Values, volumes: Values, positions: Ints, radius: float, kernel: str
+        self, comm: MPI.Intracomm, centres: Values, points: Values, numbers: Values, radius: float, kernel: str
     ) -> None:
-        """Build the matrix.
+        """Sort points (points, 3) with distinct numbers (points,): first the `centres` of this rank (collective)."""
+        # Bins, and so sums, do not depend on the partition.
+        low, high = np.empty(3), np.empty(3)
+        comm.Allreduce(centres.min(axis=0, initial=np.inf), low, MPI.MIN)
+        comm.Allreduce(centres.max(axis=0, initial=-np.inf), high, MPI.MAX)
+        extent = (high - low)[high - low > LIMITS.least_extent * np.max(high - low)]
+        spacing = (np.prod(extent) / comm.allreduce(len(centres))) ** (1 / max(len(extent), 1))
+        size = max(radius / LIMITS.bins_per_radius, float(spacing) / LIMITS.bins_per_spacing)
+        bin_indices = np.floor((points - low) / size).astype(np.int64)
+        first = bin_indices.min(axis=0) if len(points) else np.zeros(3, np.int64)
+        bins = np.max(bin_indices - first, axis=0, initial=0) + 1
+        x, y, z = (bin_indices - first).T
+        bin_of = (z * bins[1] + y) * bins[0] + x
+        self.order = np.lexsort([numbers, bin_of])
+        self._shape, self._bin_of, self._centre_count = tuple(bins[::-1]), bin_of, len(centres)
+        self._reach = math.ceil(radius / size)
+        start = np.concatenate([[0], np.cumsum(np.bincount(bin_of, minlength=int(bins.prod())))])
+        origin, sorted_points = low + first * size, points[self.order].T.copy()
+        coarse = ((sorted_points - origin[:, None]) / radius).astype(np.float32)
+        # Each coordinate is rounded to half a unit in the 24th binary digit, before and after the difference.
+        margin = 2.0**-20 + float(np.max(coarse, initial=0.0)) * 2.0**-21
+        # The C structure has addresses only: these references keep the arrays alive.
+        self._arrays = origin, bins, start, *sorted_points, coarse
+        sizes = size, radius, margin, len(points), KERNELS.index(kernel)
+        self._points = _Points(*map(struct_pointer, self._arrays), *sizes)
+        self.pointer = byref(self._points)
 
-        Args:
-            centres: (centres, d) centroids of the cells of this rank, m.
-            near: (near, d) centroids of these and of near cells, in the order of the input mesh, m.
-            volumes: (near,) their volumes, m^d.
-            positions: (near,) their positions in exchanged values, where the cells of this rank come first.
-            radius: radius of the average, m.
-            kernel: name of the kernel.
-        """
-        self._positions, self._centres, self._near, self._volumes = positions, centres, near, volumes
-        self._radius, self._kernel = radius, kernel
-        self._tree = cKDTree(near)
-        self._missing = np.ones(len(centres), bool)
-        # Centres with cells of other ranks within the radius.
-        self._near_other_rank = np.zeros(len(centres), bool)
-        self.blocks: list[_WeightBlock] = []
-        self._active: Values = np.ones((len(near), 1))
-        self._active_sums: list[Values] = []
-        if self._estimate_weights() <= LIMITS.max_initial_weights:
-            self.compute_all()
-
-    def _estimate_weights(self) -> float:
-        """Estimate the number of weights from a sample of rows."""
-        stride = max(len(self._centres) // LIMITS.sampled_rows, 1)
-        counts = self._tree.query_ball_point(self._centres[::stride], self._radius, return_length=True)
-        return float(np.sum(counts)) * stride
-
-    def flag_centres_near(self, near_flags: Flags) -> Flags:
-        """Flag the centres (centres,) with rows that may have a flagged near cell (near,) within the radius.
-
-        Own cells among the flagged ones must have rows.
-        """
-        count, marks = len(self._centres), np.zeros(len(near_flags), bool)
-        # Of two cells exactly R apart only one may count as near, which matters if the kernel is not 0 at R.
-        if KERNELS[self._kernel](np.ones(1))[0]:
-            return ~marks[:count]
-        # Nearness is symmetric: the rows of flagged cells have their centres.
-        for block in self.blocks:
-            block.mark_neighbours(near_flags, marks)
-        return marks[:count] | self._near_other_rank if near_flags[count:].any() else marks[:count]
-
-    def compute_near(self, near_flags: Flags) -> None:
-        """Compute the rows of all centres with a flagged near cell (near,) within the radius."""
-        if not self._missing.any() or not near_flags.any():
-            return
-        centres, points = self._centres, self._near[near_flags[self._positions]]
-        reach = self._radius * (1 + LIMITS.radius_round_off)
-        # A bounding box excludes most centres from the search.
-        in_box = np.all((centres >= points.min(axis=0) - reach) & (centres <= points.max(axis=0) + reach), axis=1)
-        cells = np.flatnonzero(self._missing & in_box)
-        distance, _ = cKDTree(points).query(centres[cells], distance_upper_bound=reach)
-        self._add_rows(cells[np.isfinite(distance)])
-
-    def compute_all(self) -> None:
-        """Compute the rows of all centres."""
-        self._add_rows(np.flatnonzero(self._missing))
-
-    def active_sums(self, active: Values | None) -> list[Values]:
-        """Return, for each block, the sums of the weights of near cells with 1 in `active` (near, 1); None: of all."""
-        if active is None:
-            return [block.row_sums for block in self.blocks]
-        changed, self._active = (active != self._active)[:, 0], active
-        if changed.any() and self._missing.any():
-            # A changed cell without a row of its own may be near rows that exist: sum all again.
-            self._active_sums = []
-        elif changed.any():
-            # Only rows near cells that became active or inactive are summed again.
-            near = self.flag_centres_near(changed)
-            for block, sums in zip(self.blocks, self._active_sums, strict=False):
-                rows = np.flatnonzero(near[block.cells])
-                sums[rows] = block.multiply(active, rows)[:, 0]
-        self._active_sums += [block.multiply(active)[:, 0] for block in self.blocks[len(self._active_sums) :]]
-        return self._active_sums
-
-    def _add_rows(self, cells: Ints) -> None:
-        """Compute the rows of centres (n,), in blocks."""
-        for start in range(0, len(cells), LIMITS.rows_per_block):
-            part = cells[start : start + LIMITS.rows_per_block]
-            pairs = cKDTree(self._centres[part]).sparse_distance_matrix(
-                self._tree, self._radius, output_type="coo_matrix"
-            )
-            weights = self._volumes[pairs.col] * KERNELS[self._kernel](pairs.data / self._radius)
-            self._near_other_rank[part[pairs.row[self._positions[pairs.col] >= len(self._centres)]]] = True
-            rows = csr_matrix((weights, (pairs.row, pairs.col)), shape=(len(part), len(self._near)))
-            rows.sort_indices()
-            # Columns become positions in exchanged values, and keep the order of the input mesh.
-            rows.indices = self._positions[rows.indices].astype(rows.indices.dtype)
-            rows.has_sorted_indices = False
-            self.blocks.append(_WeightBlock(part, rows))
-        self._missing[cells] = False
+    def near_any(self, flags: Flags) -> Flags:
+        """Flag the centres (centres,) near flagged points (points,) in the order of bins: all within the radius."""
+        marks = np.zeros(self._shape, bool)
+        marks.ravel()[self._bin_of[self.order[flags]]] = True
+        marks = maximum_filter(marks, size=2 * self._reach + 1, mode="constant")
+        return np.asarray(marks.ravel()[self._bin_of[: self._centre_count]])
 
 
 class NeighbourAverage:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from dolfinx.fem import IntegralType
 from mpi4py import MPI
 from petsc4py import PETSc
 
-from fracsim.fracture import nonlocal_average as average_module
 from fracsim.fracture.node_retention import CellRetention
 from fracsim.fracture.nonlocal_average import NonlocalAverage
 from fracsim.fracture.strength import hash_points
@@ -430,14 +428,6 @@ def squeezed() -> Found:
     return walls | {"squeezed-u": u}
 
 
-def by_rows() -> Found:
-    """Edges that the block breaks where its average makes no row before stress asks for it."""
-    limits, average_module.LIMITS = average_module.LIMITS, replace(average_module.LIMITS, max_initial_weights=0)
-    found = run("block")
-    average_module.LIMITS = limits
-    return {"broken-by-rows": found["block-broken"], "u-by-rows": found["block-u"]}
-
-
 def in_blocks() -> Found:
     """Edges that the block breaks where its tangent is multiplied with in blocks."""
     with other_policy(min_block_dofs=0):
@@ -460,4 +450,4 @@ def compared(folder: Path) -> Found:
     integrity, count = weakened(MPI.COMM_WORLD)
     found |= {"weakened-integrity": integrity, "weakened-count": np.array(count)}
     found |= dead_cells("lumped", "fitted", "blocks", "brought") | dead_cells("consistent", "blocks", "brought")
-    return found | hanging() | squeezed() | by_rows() | in_blocks()
+    return found | hanging() | squeezed() | in_blocks()
