@@ -174,7 +174,14 @@ def render(
     limits: Annotated[str, typer.Option("--range", help="LOW,HIGH of the colours; default: of what is shown")] = "",
     magnify: Annotated[float, typer.Option(min=0, help="displacements so many times as large")] = 1.0,
     sheet: Annotated[str, typer.Option(help="so many frames on one picture, or which: 0,18,-1")] = "",
-    fps: Annotated[int, typer.Option(min=1, max=120, help="frames a second of a film")] = 12,
+    fps: Annotated[int, typer.Option(min=1, max=120, help="pictures a second of a film")] = 12,
+    speed: Annotated[
+        float, typer.Option(min=0, help="simulated seconds a second of a film, in place of --fps: 0.05")
+    ] = 0.0,
+    frames: Annotated[str, typer.Option(metavar="FIRST:END", help="of a film or folder of pictures: 0:30")] = "",
+    follow: Annotated[bool, typer.Option("--follow", help="the camera moves with the body")] = False,
+    target: Annotated[str, typer.Option(metavar="X,Y,Z", help="point at the centre of the picture, m")] = "",
+    axes: Annotated[bool, typer.Option("--axes", help="show the directions of x, y and z")] = False,
     title: Annotated[str | None, typer.Option(help="in place of the study's")] = None,
     dust: Annotated[bool, typer.Option("--dust/--no-dust", help="draw pieces of a single node")] = True,
     bare: Annotated[bool, typer.Option("--bare", help="no title, time, scale bar or legend")] = False,
@@ -183,16 +190,17 @@ def render(
     if not is_first_rank():
         return
     import_outside("pyvista")
-    from .report.pictures.picture import render
-    from .report.pictures.picture_options import PictureOptions, parse_limits, parse_size
+    from .report.pictures.picture import FilmOptions, render
+    from .report.pictures.picture_options import PictureOptions, parse_limits, parse_size, parse_target
 
     _note_active_runs(outs)
     how = PictureOptions(
         colour, explode, view, zoom, material=look, size=parse_size(size),
         limits=parse_limits(limits) if limits else None, magnify=magnify, floor=floor, title=title, bare=bare,
-        dust=dust,
+        dust=dust, axes=axes, follow=follow, target=parse_target(target) if target else None,
     )  # fmt: skip
-    print(f"saved {render(outs, png, how, frame=frame, sheet=sheet, fps=fps)}")
+    film = FilmOptions(fps, frames, speed)
+    print(f"saved {render(outs, png, how, frame=frame, sheet=sheet, film=film)}")
 
 
 @app.command()

@@ -12,15 +12,17 @@ from xml.etree import ElementTree
 import numpy as np
 import numpy.typing as npt
 import pytest
+from imageio.v3 import imread
 from mpi4py import MPI
 
 from cases import BAR, changed, fracsim, study, write_study
 from fracsim.deformable_run import Run, run_study
+from fracsim.errors import InputError
 from fracsim.output.surface.body_surface import BodySurface
 from fracsim.output.surface.vtk_files import SurfaceFiles
 from fracsim.report.export import export_surfaces
 from fracsim.report.pictures.frames import film_repetitions
-from fracsim.report.pictures.picture import render
+from fracsim.report.pictures.picture import FilmOptions, render
 from fracsim.report.pictures.picture_options import PictureOptions
 from fracsim.scene import build_scene
 from fracsim.solvers.newton import SolveResult
@@ -176,7 +178,8 @@ def test_a_film_lasts_as_long_as_the_motion(uneven: Path, tmp_path: Path) -> Non
     """Five pictures of 10 ms at 10 a second, the third of them held; a folder has the four frames."""
     from PIL import Image
 
-    film = Image.open(render(uneven, tmp_path / "film.gif", PictureOptions(size=(160, 120), bare=True), fps=10))
+    options, film_options = PictureOptions(size=(160, 120), bare=True), FilmOptions(10)
+    film = Image.open(render(uneven, tmp_path / "film.gif", options, film=film_options))
     lengths = []
     for frame in range(film.n_frames):
         film.seek(frame)
@@ -184,6 +187,35 @@ def test_a_film_lasts_as_long_as_the_motion(uneven: Path, tmp_path: Path) -> Non
     assert sum(lengths) == 500 and Counter(lengths) in (Counter({100: 3, 200: 1}), Counter({100: 5}))
     render(uneven, tmp_path / "pictures", PictureOptions(size=(160, 120), bare=True))
     assert len(list((tmp_path / "pictures").iterdir())) == 4
+
+
+def test_a_film_of_some_frames_at_a_speed(uneven: Path, tmp_path: Path) -> None:
+    """Frames 10 ms apart at a tenth of the true speed: a picture each 100 ms."""
+    from PIL import Image
+
+    options = PictureOptions(size=(160, 120), bare=True)
+    film = Image.open(render(uneven, tmp_path / "f.gif", options, film=FilmOptions(frames=":3", speed=0.1)))
+    assert film.n_frames == 3 and film.info["duration"] == 100
+    for wrong, message in ((FilmOptions(frames="4:"), "has 4 frames"), (FilmOptions(frames="2"), "must be the first")):
+        with pytest.raises(InputError, match=message):
+            render(uneven, tmp_path / "g.gif", options, film=wrong)
+    with pytest.raises(InputError, match=r"--speed 20: must be 0.01 to 1.2 here"):
+        render(uneven, tmp_path / "g.gif", options, film=FilmOptions(speed=20))
+    with pytest.raises(InputError, match="--frames :3: of a film or a folder"):
+        render(uneven, tmp_path / "g.png", options, film=FilmOptions(frames=":3"))
+
+
+def test_the_camera_moves_with_the_body_on_request(uneven: Path, tmp_path: Path) -> None:
+    """A block that moves along (1, 1, 1) m: beside the ways of the camera its picture stays the same."""
+    pictures = {}
+    for follow in (True, False):
+        options = PictureOptions(size=(160, 120), bare=True, follow=follow, magnify=20)
+        folder = render(uneven, tmp_path / str(follow), options)
+        pictures[follow] = [imread(path).astype(int) for path in sorted(folder.iterdir())]
+    assert len(pictures[True]) == 4
+    for picture in pictures[True][1:]:
+        assert np.abs(picture - pictures[True][0]).max(axis=2).mean() < 0.5
+    assert np.abs(pictures[False][3] - pictures[False][0]).max(axis=2).mean() > 5
 
 
 def test_usd_has_simulated_time(uneven: Path, tmp_path: Path) -> None:

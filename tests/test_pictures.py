@@ -19,17 +19,19 @@ from fracsim.output.surface.body_surface import BodySurface
 from fracsim.output.surface.vtk_files import SurfaceFiles
 from fracsim.report.pictures import renderer
 from fracsim.report.pictures.annotations import annotate, format_length, format_time, round_length
-from fracsim.report.pictures.picture import SHEET_GAP, render, tile_pictures, virtual_display
+from fracsim.report.pictures.picture import SHEET_GAP, FilmOptions, render, tile_pictures, virtual_display
 from fracsim.report.pictures.picture_options import (
     DEFAULT_SIZE,
     MATERIAL_LOOKS,
     PictureOptions,
     parse_limits,
     parse_size,
+    parse_target,
 )
 from fracsim.report.pictures.renderer import crack_opening
 from fracsim.report.pictures.shadows import SHADOW_STYLE, DepthWindow, lamp_camera, lamp_directions, shadow_shares
 from fracsim.report.pictures.surroundings import PLANE_COLOUR
+from fracsim.report.units import readable_unit
 from fracsim.study.time_and_output import LOOKS
 from support.solids import lattice, patterns, separated
 
@@ -206,6 +208,38 @@ def test_numbers_in_words() -> None:
     assert [round_length(x) for x in (0.0123, 0.7, 49.0)] == pytest.approx([0.01, 0.5, 20.0])
     assert [format_length(x) for x in (0.01, 0.005, 2e-5, 5.0, 0.5)] == ["1 cm", "5 mm", "20 µm", "5 m", "50 cm"]
     assert [format_time(t) for t in (0.0, 1.2e-4, 0.45, 2.0)] == ["t = 0 s", "t = 120 µs", "t = 450 ms", "t = 2 s"]
+
+
+def test_units_have_the_prefix_of_the_largest_value() -> None:
+    assert readable_unit("Pa", 1.34e7) == ("MPa", 1e6) and readable_unit("N", 999.0) == ("N", 1.0)
+    assert readable_unit("N", 1000.0) == ("kN", 1e3) and readable_unit("m", 2e-5) == ("µm", pytest.approx(1e-6))
+    assert readable_unit("", 1e9) == ("", 1.0) and readable_unit("m", 0.0) == ("m", 1.0)
+    assert readable_unit("Pa", 1e15) == ("GPa", 1e9)
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_point_in_the_middle_of_the_picture(dim: int, tmp_path: Path) -> None:
+    """The right end of a bar of 6 m: half of the picture is beyond it, and zoom shows it larger."""
+    folder, last = written(tmp_path, 0.0, cut=False, dim=dim), (6.0, 0.5, 0.5 if dim == 3 else 0.0)
+    look = replace(FRONT, size=DEFAULT_SIZE, target=last)
+    for zoom in (1.0, 4.0):
+        pixels = shown(render(folder, options=replace(look, zoom=zoom)))
+        middle = pixels[DEFAULT_SIZE[1] // 2]
+        body = np.flatnonzero(np.abs(middle - pixels[0, -1]).max(axis=1) > 20)
+        # in perspective the near side of the end is up to half a metre closer to the camera
+        assert body.max() == pytest.approx(DEFAULT_SIZE[0] / 2, abs=3 if dim == 2 else 12 * zoom)
+
+
+def test_axes_have_their_directions_on_the_picture(tmp_path: Path) -> None:
+    """From the front x is to the right, red, and z upwards, blue; y is along the line of sight."""
+    look = replace(FRONT, bare=False, title="", axes=True, size=DEFAULT_SIZE)
+    pixels = shown(render(written(tmp_path, 0.0, cut=False), options=look))
+    pixels = pixels[: DEFAULT_SIZE[1] // 4, DEFAULT_SIZE[0] // 2 :]
+    rows, columns = np.nonzero(np.abs(pixels - [0xC0, 0x39, 0x2B]).max(axis=2) == 0)
+    assert np.ptp(columns) == pytest.approx(60, abs=2) and np.ptp(rows) < 4
+    upward_rows, upward_columns = np.nonzero(np.abs(pixels - [0x2C, 0x5F, 0xA8]).max(axis=2) == 0)
+    assert np.ptp(upward_rows) == pytest.approx(60, abs=4) and np.ptp(upward_columns) < 4
+    assert upward_rows.max() == pytest.approx(rows.mean(), abs=4) and columns.min() <= upward_columns.mean() + 4
 
 
 @pytest.mark.parametrize("ground", (40, 90, 140, 190, 250))
@@ -406,7 +440,8 @@ def test_a_film_in_mp4_has_every_frame(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     import imageio.v2
 
-    made = render(written(tmp_path, 0.0, 0.5, 1.0), tmp_path / "film.mp4", PictureOptions(size=(161, 121)), fps=5)
+    folder, film_options = written(tmp_path, 0.0, 0.5, 1.0), FilmOptions(5)
+    made = render(folder, tmp_path / "film.mp4", PictureOptions(size=(161, 121)), film=film_options)
     with imageio.v2.get_reader(made) as film:
         assert film.count_frames() == 3 and film.get_meta_data()["fps"] == pytest.approx(5)
 
@@ -422,6 +457,7 @@ def test_a_film_in_mp4_has_every_frame(tmp_path: Path) -> None:
         (lambda folder: parse_size("4x90000"), "--size 4x90000"),
         (lambda folder: parse_limits("2,1"), "--range 2,1: must be two numbers, the lower first"),
         (lambda folder: parse_limits("0,nan"), "--range 0,nan"),
+        (lambda folder: parse_target("0,1"), "--target 0,1: must be a point in m"),
     ),
 )
 def test_what_cannot_be_drawn_is_said(call: Callable[[Path], Any], message: str, tmp_path: Path) -> None:

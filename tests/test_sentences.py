@@ -25,7 +25,7 @@ def words(sentence: str) -> int:
 
 
 def test_sentences_are_found_and_counted() -> None:
-    page = "# Title here\n\nOne two `a b` three. Four\nfive $x + y$.\n\n    code line\n\n- an item of\n  five words\n- two words\n"
+    page = "# Title\n\nOne two `a b` three. Four\nfive $x$.\n\n    code\n\n- an item of\n  five words\n- two words\n"
     assert [words(each) for each in sentences(page)] == [4, 3, 5, 2]
 
 

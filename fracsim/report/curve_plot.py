@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from math import floor, log10
 from pathlib import Path
 
 from ..errors import InputError
@@ -12,10 +11,9 @@ from .compare import ReferenceCurve, column_unit, history_series, read_reference
 from .content import Plot, Series
 from .plots import gapped_array, save_plot
 from .runs import find_runs
+from .units import readable_unit
 
 _FORMATS = (".svg", ".png", ".pdf")
-# prefixes of units by their power of 1,000
-_PREFIXES = {-4: "p", -3: "n", -2: "µ", -1: "m", 0: "", 1: "k", 2: "M", 3: "G"}
 
 
 def draw_curves(
@@ -54,10 +52,16 @@ def curve_plot(folders: list[Path], x: str, y: str, references: list[Path], scal
         run.history_column(x, "--x"), run.history_column(y, "--y")
     curves = [history_series(run, x, y, run.name) for run in runs]
     curves += [reference_series(read_reference(path), x, y, scale) for path in references]
-    x_unit, x_size = _readable_unit(column_unit(x), [value for curve in curves for value in curve.x])
-    y_unit, y_size = _readable_unit(column_unit(y), [value for curve in curves for value in curve.y])
+    x_label, x_size = _readable_axis(x, [value for curve in curves for value in curve.x])
+    y_label, y_size = _readable_axis(y, [value for curve in curves for value in curve.y])
     scaled = (replace(curve, x=_divided(curve.x, x_size), y=_divided(curve.y, y_size)) for curve in curves)
-    return Plot("", x + x_unit, y + y_unit, tuple(scaled))
+    return Plot("", x_label, y_label, tuple(scaled))
+
+
+def _readable_axis(column: str, values: list[float | None]) -> tuple[str, float]:
+    """Return the label of an axis with a readable unit, and the SI value of one such unit."""
+    unit, size = readable_unit(column_unit(column), max(map(abs, filter(None, values)), default=0.0))
+    return f"{column}, {unit}" if unit else column, size
 
 
 def reference_series(reference: ReferenceCurve, x: str, y: str, scale: tuple[float, float]) -> Series:
@@ -90,12 +94,3 @@ def parse_scale(text: str) -> tuple[float, float]:
 
 def _divided(values: Iterable[float | None], size: float) -> tuple[float, ...]:
     return tuple(map(float, gapped_array(values) / size))
-
-
-def _readable_unit(unit: str, values: list[float | None]) -> tuple[str, float]:
-    """Return the end of a label with the unit, and the SI value of one such unit."""
-    largest = max((abs(value) for value in values if value is not None and abs(value) < float("inf")), default=0.0)
-    if not unit:
-        return "", 1.0
-    power = 0 if largest == 0 else min(max(floor(log10(largest) / 3 + 1e-9), min(_PREFIXES)), max(_PREFIXES))
-    return f", {_PREFIXES[power]}{unit}", 1000.0**power

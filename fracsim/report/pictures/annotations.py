@@ -15,6 +15,7 @@ import numpy.typing as npt
 from .colour_maps import map_colours
 
 Pixels = npt.NDArray[np.uint8]
+Directions = npt.NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 
@@ -30,6 +31,9 @@ class TextStyle:
         light_ground: a ground nowhere darker than this, of 255, carries dark text without an outline.
         font_height: height of the font, as a share of the height of the picture.
         ticks: number of ticks of the colour legend.
+        axis_length: length of an axis across the line of sight, in heights of the font.
+        shortest_axis: sine of the angle to the line of sight below which an axis is not drawn.
+        axis_colours: colours of the axes x, y, z.
     """
 
     ink: Colour = (34, 38, 44)
@@ -39,6 +43,9 @@ class TextStyle:
     light_ground: int = 150
     font_height: float = 1.0 / 45.0
     ticks: int = 5
+    axis_length: float = 3.0
+    shortest_axis: float = 0.1
+    axis_colours: tuple[str, ...] = ("#c0392b", "#2e8b57", "#2c5fa8")
 
 
 STYLE = TextStyle()
@@ -51,7 +58,7 @@ class ColourLegend:
 
     Attributes:
         title: name of the field, with its unit.
-        limits: range of the colours.
+        limits: range of the colours, in that unit.
     """
 
     title: str
@@ -66,6 +73,7 @@ def annotate(
     pixel: float = 0.0,
     legend: ColourLegend | None = None,
     keys: Sequence[tuple[str, str]] = (),
+    axes: Directions | None = None,
 ) -> Pixels:
     """Picture (height, width, 3) with annotations.
 
@@ -76,6 +84,7 @@ def annotate(
         pixel: width of a pixel, m; 0 for no scale bar.
         legend: legend of a field.
         keys: pairs (colour, text), shown if there is no legend.
+        axes: directions (3, 2) of x, y and z on the picture, to the right and upwards; None: not shown.
     """
     from PIL import Image, ImageDraw
 
@@ -95,6 +104,8 @@ def annotate(
         x, y = edge, bottom
         pen.bar((x, y - max(2, unit // 6), x + round(length / pixel), y))
         pen.write((x, y - 1.7 * unit), format_length(length))
+    if axes is not None:
+        _draw_axes(pen, axes)
     return np.asarray(image)
 
 
@@ -187,6 +198,18 @@ def _draw_legend(pen: _Pen, legend: ColourLegend) -> None:
         tick = x + share * (width - 1)
         draw.line((tick, y + height, tick, y + height + unit / 4), STYLE.ink)
         pen.write((tick, y + height + 0.4 * unit), format_number(low + share * (high - low)), anchor="mt")
+
+
+def _draw_axes(pen: _Pen, axes: Directions) -> None:
+    """Draw the directions (k, 2) of the axes with their names in the upper right corner."""
+    length = STYLE.axis_length * pen.unit
+    x, y = pen.image.width - 1.6 * length, 1.6 * length
+    for name, colour, right, up in zip("xyz", STYLE.axis_colours, axes[:, 0], axes[:, 1], strict=False):
+        if math.hypot(right, up) < STYLE.shortest_axis:
+            continue
+        pen.draw.line((x, y, x + length * right, y - length * up), colour, max(2, pen.unit // 8))
+        beyond = length + 0.7 * pen.unit
+        pen.write((x + beyond * right, y - beyond * up), name, anchor="mm")
 
 
 def _draw_keys(pen: _Pen, keys: Sequence[tuple[str, str]], right: float, bottom: float) -> None:

@@ -89,6 +89,24 @@ def corners_near(points: Values, files: Iterable[Path]) -> dict[Path, Values]:
     }
 
 
+def body_centre(frame: FrameSource, options: PictureOptions) -> Values:
+    """Median (3,) of the points of the large fragments of a frame, m: pieces that fly off do not shift it."""
+    return np.asarray(np.median(large_fragment_points(prepare_grid(frame, options)), axis=0))
+
+
+def moved(view: ViewBounds, shift: Values, options: PictureOptions) -> ViewBounds:
+    """Bounds moved by `shift` (3,), m."""
+    return ViewBounds(view.bounds + np.repeat(shift, 2), view.extents + _extents(shift[None], options, view.is_flat))
+
+
+def centred(view: ViewBounds, target: Values, options: PictureOptions) -> ViewBounds:
+    """Bounds enlarged so that the point `target` (3,), m, is at the centre of the picture."""
+    of_target = _extents(target[None], options, view.is_flat)
+    # to the right and left alike, and so to the top and bottom
+    reach = (view.extents - of_target).reshape(2, 2).max(axis=1).repeat(2)
+    return ViewBounds(view.bounds, of_target + reach)
+
+
 def merge_bounds(views: Sequence[ViewBounds]) -> ViewBounds:
     """Bounds that contain those of several frames."""
     bounds = np.stack([view.bounds for view in views])

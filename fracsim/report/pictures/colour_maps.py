@@ -76,9 +76,13 @@ def colour_range(values: Values, *, signed: bool = False) -> tuple[float, float]
     return (float(low), float(high)) if high > low else (float(values.min()), float(values.max()))
 
 
-def field_title(field: str) -> str:
-    """Name of a field or component in words, with its unit."""
-    unit = UNITS.get(field.partition(":")[0], "")
+def field_unit(field: str) -> str:
+    """SI unit of a field or component; "" for numbers."""
+    return UNITS.get(field.partition(":")[0], "")
+
+
+def field_title(field: str, unit: str) -> str:
+    """Name of a field or component in words, with the unit of its numbers."""
     return field.replace("_", " ").replace(":", " ").replace("von mises", "von Mises") + (f" ({unit})" if unit else "")
 
 

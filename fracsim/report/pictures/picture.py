@@ -9,7 +9,7 @@ import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from ctypes import CDLL, CFUNCTYPE, byref, c_char_p, c_int, c_uint, c_void_p
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +18,9 @@ import numpy.typing as npt
 
 from ...errors import InputError
 from ...meshes.plain_files import atomic_replacement_of_all, check_replaceable
-from .camera import merge_bounds, view_bounds
+from .camera import ViewBounds, body_centre, centred, merge_bounds, moved, view_bounds
 from .colour_maps import merge_ranges
-from .frames import FrameSource, film_repetitions, find_frames, read_study
+from .frames import FrameSource, film_interval, film_repetitions, find_frames, read_study
 from .picture_options import PictureOptions
 from .renderer import Renderer, field_range
 
@@ -30,6 +30,48 @@ FILM_SUFFIXES = (".gif", ".mp4")
 _SHEET_SCALE = 0.5
 # pixels between the pictures of a sheet
 SHEET_GAP = 8
+# least and largest number of pictures per second of a film
+_RATE_LIMITS = 1, 120
+
+
+@dataclass(frozen=True)
+class FilmOptions:
+    """Frames and timing of a film.
+
+    Attributes:
+        fps: pictures per second.
+        frames: "" for all frames, or "FIRST:END" as a slice of Python, such as "0:30".
+        speed: simulated seconds per second of the film, in place of `fps`; 0: not given.
+    """
+
+    fps: int = 12
+    frames: str = ""
+    speed: float = 0.0
+
+    def select(self, frames: list[FrameSource]) -> list[FrameSource]:
+        """Frames of the film. Raises InputError if there are none."""
+        try:
+            first, end = (int(part) if part else None for part in (self.frames or ":").split(":"))
+        except ValueError:
+            raise InputError(
+                f"--frames {self.frames}: must be the first frame and the one after the last: 0:30"
+            ) from None
+        if not (selected := frames[first:end]):
+            raise InputError(f"--frames {self.frames}: the run has {len(frames)} frames, counted from 0, none of these")
+        return selected
+
+    def rate(self, times: Sequence[float]) -> float:
+        """Pictures per second of a film of frames at these times, s. Raises InputError if a film has no such rate."""
+        if not self.speed:
+            return self.fps
+        interval = film_interval(times)
+        low, high = (fps * interval for fps in _RATE_LIMITS)
+        if not low <= self.speed <= high:
+            raise InputError(
+                f"--speed {self.speed:g}: must be {low:.3g} to {high:.3g} here, as frames are {interval:.3g} s "
+                f"apart and a film has {_RATE_LIMITS[0]} to {_RATE_LIMITS[1]} pictures a second"
+            )
+        return self.speed / interval
 
 
 @contextmanager
@@ -89,7 +131,7 @@ def render(
     *,
     frame: int = -1,
     sheet: str = "",
-    fps: int = 12,
+    film: FilmOptions | None = None,
 ) -> Path:
     """Draw frames of a run and return the path of what was written.
 
@@ -102,7 +144,7 @@ def render(
         options: options of the pictures.
         frame: number of the frame, -1 for the last.
         sheet: number of frames on a sheet, or which, as in "0,18,-1".
-        fps: pictures per second of a film.
+        film: frames and timing of a film.
 
     Raises:
         InputError: there is no such frame, or the options do not fit.
@@ -116,15 +158,19 @@ def render(
         # before anything is drawn
         check_replaceable(target)
     run_frames = [find_frames(run) for run in folders]
-    is_picture = target.suffix == ".png"
+    is_picture, film = target.suffix == ".png", film or FilmOptions()
+    if is_picture and film.frames:
+        raise InputError(f"--frames {film.frames}: of a film or a folder of pictures; a picture has --frame or --sheet")
     if is_picture:
         frames = select_frames(run_frames, folders, frame, sheet)
     elif sheet or len(folders) > 1:
         raise InputError(f"-o {target}: a sheet, or pictures of several runs, is a .png")
     else:
-        frames = run_frames[0]
+        frames = film.select(run_frames[0])
     is_film = target.suffix in FILM_SUFFIXES
-    repetitions = film_repetitions([source.t for source in frames]) if is_film else np.ones(len(frames), int)
+    times = [source.t for source in frames]
+    repetitions = film_repetitions(times) if is_film else np.ones(len(frames), int)
+    rate = film.rate(times)
     frames = [source for source, count in zip(frames, repetitions, strict=True) if count]
     repetitions = repetitions[repetitions > 0]
     if len(frames) > 1:
@@ -139,7 +185,7 @@ def render(
             _save_png(target, tile_pictures(list(pictures)))
         else:
             repeated = zip(pictures, repetitions, strict=True)
-            _save_film(target, (picture for picture, count in repeated for _ in range(count)), fps)
+            _save_film(target, (picture for picture, count in repeated for _ in range(count)), rate)
     return target
 
 
@@ -188,13 +234,25 @@ def _render_frames(frames: Sequence[FrameSource], options: PictureOptions, *, ti
         options: options of the pictures.
         titled: the title is the name of the run.
     """
-    view = merge_bounds([view_bounds(frame, options) for frame in frames])
+    views = _frame_views(frames, options)
     limits = options.limits or merge_ranges([field_range(frame, options.colour) for frame in frames])
-    if options.floor and view.is_flat:
+    if options.floor and views[0].is_flat:
         raise InputError("--floor: a body in 2D has none")
-    with Renderer(options, view, limits, read_study(frames[0].folder)) as renderer:
-        for frame in frames:
-            yield renderer.render_frame(frame, frame.folder.name if titled else None)
+    with Renderer(options, views[0], limits, read_study(frames[0].folder)) as renderer:
+        for frame, view in zip(frames, views, strict=True):
+            yield renderer.render_frame(frame, view, frame.folder.name if titled else None)
+
+
+def _frame_views(frames: Sequence[FrameSource], options: PictureOptions) -> list[ViewBounds]:
+    """Bounds that the camera shows of each frame: those of all frames, or of the first one moved with the body."""
+    if options.follow:
+        first = view_bounds(frames[0], options)
+        centres = [body_centre(frame, options) for frame in frames]
+        return [moved(first, centre - centres[0], options) for centre in centres]
+    view = merge_bounds([view_bounds(frame, options) for frame in frames])
+    if options.target is not None:
+        view = centred(view, np.array(options.target), options)
+    return [view] * len(frames)
 
 
 def tile_pictures(pictures: Sequence[Pixels]) -> Pixels:
@@ -219,7 +277,7 @@ def _save_png(target: Path, pixels: Pixels) -> None:
         Image.fromarray(pixels).save(temporary, "PNG", optimize=True)
 
 
-def _save_film(target: Path, pictures: Iterator[Pixels], fps: int) -> None:
+def _save_film(target: Path, pictures: Iterator[Pixels], fps: float) -> None:
     """Write pictures as a film, or as PNGs to a folder if `target` has no suffix."""
     if target.suffix:
         with atomic_replacement_of_all(target) as temporary, _FilmWriter(temporary, fps) as append:
@@ -234,7 +292,7 @@ def _save_film(target: Path, pictures: Iterator[Pixels], fps: int) -> None:
 class _FilmWriter:
     """Writer of a film. The sides of an MP4 are made even, as its codec requires."""
 
-    def __init__(self, target: Path, fps: int) -> None:
+    def __init__(self, target: Path, fps: float) -> None:
         import imageio.v2
 
         settings: dict[str, Any] = {"duration": 1000 / fps, "loop": 0}

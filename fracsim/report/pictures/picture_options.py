@@ -44,6 +44,9 @@ class PictureOptions:
         bare: draw no title, time, scale bar or legend.
         dust: draw single-node fragments.
         fine: supersampling, which takes three times as long.
+        axes: draw the directions of x, y and z.
+        follow: the camera moves with the body and is as near as at the first frame; otherwise it sees all frames whole.
+        target: point (3,) at the centre of the picture, m; None: the centre of what is shown.
     """
 
     colour: str = "crack"
@@ -59,6 +62,9 @@ class PictureOptions:
     bare: bool = False
     dust: bool = True
     fine: bool = True
+    axes: bool = False
+    follow: bool = False
+    target: tuple[float, ...] | None = None
 
     def view_direction(self) -> tuple[float, ...]:
         """Direction from the body to the camera. Raises InputError if `view` is neither a name nor a direction."""
@@ -81,6 +87,17 @@ def parse_size(text: str) -> tuple[int, int]:
     if not (width.isdecimal() and height.isdecimal() and all(low <= int(side) <= high for side in (width, height))):
         raise InputError(f"--size {text}: must be WIDTHxHEIGHT in pixels, {low} to {high} each, such as 1400x900")
     return int(width), int(height)
+
+
+def parse_target(text: str) -> tuple[float, ...]:
+    """Point of a text such as "0,0,0.1", m. Raises InputError."""
+    try:
+        x, y, z = (float(part) for part in text.split(","))
+    except ValueError:
+        x = y = z = math.nan
+    if not math.isfinite(x + y + z):
+        raise InputError(f"--target {text}: must be a point in m: --target 0,0,0.1")
+    return x, y, z
 
 
 def parse_limits(text: str) -> tuple[float, float]:

@@ -11,9 +11,10 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
+from ..units import readable_unit
 from .annotations import ColourLegend, annotate, format_time
 from .camera import ViewBounds, aim_camera, camera_axes, pixel_width, prepare_grid
-from .colour_maps import colour_range, field_title, map_colours, select_array
+from .colour_maps import colour_range, field_title, field_unit, map_colours, select_array
 from .frames import (
     FrameParts,
     FrameSource,
@@ -145,7 +146,7 @@ class Renderer:
 
         Args:
             options: options of the picture.
-            view: bounds to show.
+            view: bounds of the first frame to show.
             limits: range of the colours, see `field_range`.
             study: tables of the study, for its title, look and planes.
         """
@@ -153,7 +154,7 @@ class Renderer:
 
         self.options, self.limits, self._study, self._flat = options, limits, study, view.is_flat
         self.material = material_look(options.material or study.get("output", {}).get("look", "plain"))
-        self._view, self._bounds = view, view.bounds
+        self._bounds = view.bounds
         self._size = float(np.linalg.norm(np.diff(view.bounds.reshape(3, 2))))
         # window pixels per pixel of the picture
         self._line_scale = SCENE_STYLE.supersampling if options.fine else 1
@@ -167,14 +168,15 @@ class Renderer:
     def __exit__(self, *_: object) -> None:
         self._plotter.close()
 
-    def render_frame(self, frame: FrameSource, title: str | None = None) -> Pixels:
-        """Picture (height, width, 3) of a frame; `title` replaces that of the options."""
+    def render_frame(self, frame: FrameSource, view: ViewBounds, title: str | None = None) -> Pixels:
+        """Picture (height, width, 3) of a frame that shows the bounds; `title` replaces that of the options."""
         plotter, options = self._plotter, self.options
+        self._bounds = view.bounds
         # otherwise everything is drawn again with each addition
         plotter.suppress_rendering = True
         plotter.clear_actors()
         # first: the width of narrow cracks is in pixels
-        aim_camera(plotter, self._view, options)
+        aim_camera(plotter, view, options)
         grid = prepare_grid(frame, options)
         parts = frame_parts(grid)
         self._add_body(parts)
@@ -323,12 +325,16 @@ class Renderer:
         if options.colour == "crack" and self.material == MATERIAL_LOOKS["plain"] and not self._flat:
             keys = [(self.material.boundary_colour, "boundary"), (self.material.crack_colour, "crack")]
         elif options.colour != "crack" and self.limits is not None:
-            legend = ColourLegend(field_title(options.colour), self.limits)
+            unit, size = readable_unit(field_unit(options.colour), max(map(abs, self.limits)))
+            low, high = self.limits
+            legend = ColourLegend(field_title(options.colour, unit), (low / size, high / size))
         width = pixel_width(self._plotter, options.size[1])
         time = format_time(frame.t)
         if options.magnify != 1:
             time += f", displacements x {options.magnify:g}"
-        return annotate(pixels, title=title, time=time, pixel=width, legend=legend, keys=keys)
+        # components of the unit vectors x, y, z to the right and upwards
+        axes = camera_axes(options, self._flat)[:2].T[: 2 if self._flat else 3] if options.axes else None
+        return annotate(pixels, title=title, time=time, pixel=width, legend=legend, keys=keys, axes=axes)
 
 
 def field_range(frame: FrameSource, colour: str) -> tuple[float, float] | None:
