@@ -206,13 +206,13 @@ def render(
 @app.command()
 def export(
     out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a run")],
-    kind: Annotated[str, typer.Option("--format", help="ply, obj, glb (a file a frame), usd (one with all of them)")],
+    kind: Annotated[str, typer.Option("--format", help="usd (all frames in a file), glb (so too if rigid), obj, ply")],
     target: Annotated[Path | None, typer.Option("-o", "--out", help="folder for the files (OUT/export)")] = None,
     frame: Annotated[int | None, typer.Option(help="this one alone, from 0; -1 is the last")] = None,
     dust: Annotated[bool, typer.Option("--dust/--no-dust", help="with pieces of a single node")] = True,
     look: Annotated[str, typer.Option(help="colours, as of render")] = "",
 ) -> None:
-    """Write the split surface of a run for Blender, Houdini and others: closed, in m."""
+    """Write the surfaces of a run, with obstacles and materials, for Blender, Houdini and others."""
     if not is_first_rank():
         return
     import_outside("pyvista")

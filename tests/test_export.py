@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,34 +13,20 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 import pyvista
-from mpi4py import MPI
 
-from fracsim.deformable_run import run_study
 from fracsim.errors import InputError
 from fracsim.output.surface.body_surface import BodySurface
 from fracsim.output.surface.vtk_files import SurfaceFiles, rotation_quaternions
 from fracsim.report.export import export_surfaces
-from fracsim.study import Study
-from support.solids import lattice, patterns, separated
+from support.exported import PIECES, broken_bar, dropped_bar
+from support.solids import lattice
 
 Values = npt.NDArray[np.float64]
-PIECES = (0, 1, 2)
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bar of 6 x 1 x 1 m, whole at first, then in three pieces that lie far away from the origin."""
-    folder = tmp_path_factory.mktemp("bar")
-    mesh = lattice(6, 1, 1)
-    surface, files = BodySurface(mesh, 1.0), SurfaceFiles(folder, 3)
-    x, none = mesh.points, np.zeros_like(mesh.points)
-    files.write_frame(surface.make_frame(0.0, none, none))
-    part = np.searchsorted([2.5, 3.5], x[:, 0])
-    surface.update(patterns(surface.skeleton, separated(surface.skeleton, part)))
-    apart = np.array([[0.0, 0, 0], [0.5, 0.25, 0], [40.0, 0, 8.0]])[part]
-    files.write_frame(surface.make_frame(1.0, apart, none))
-    (folder / "study.toml").write_text('[output]\nlook = "bread"\n')
-    return folder
+    return broken_bar(tmp_path_factory.mktemp("bar"))
 
 
 def volume(mesh: Any) -> float:
@@ -48,6 +36,12 @@ def volume(mesh: Any) -> float:
     x = np.asarray(mesh.points, float)
     x = (x - x.mean(axis=0))[mesh.regular_faces]
     return float(np.linalg.det(x).sum() / 6)
+
+
+def of_obj(path: Path) -> list[Any]:
+    """By VTK's reader, which gives each normal a point of its own; the floor lies lower than all pieces."""
+    bodies = pyvista.read(path).clean(tolerance=0.0).split_bodies()
+    return [each.extract_surface() for each in bodies if each.bounds[4] > -1e-3]
 
 
 def of_ply(path: Path) -> list[Any]:
@@ -66,21 +60,31 @@ def of_glb(path: Path) -> list[Any]:
             walk(each) if isinstance(each, pyvista.MultiBlock) else found.append(each)
 
     walk(blocks)
-    return [each.extract_surface().clean(tolerance=1e-7) for each in found if each is not None and each.n_cells]
+    joined = pyvista.merge([each for each in found if each is not None and each.n_cells])
+    return list(joined.extract_surface().clean(tolerance=1e-7).split_bodies())
 
 
 def of_usd(path: Path) -> list[Any]:
-    """The last frame, by the arrays that USD hands over."""
+    """Fragments at the last time, by the arrays that USD hands over; skin and inside have their own points."""
     from pxr import Usd, UsdGeom
 
     stage = Usd.Stage.Open(str(path))  # which goes with its name
-    mesh = UsdGeom.Mesh(stage.GetDefaultPrim())
-    points = np.array(mesh.GetPointsAttr().Get(1.0), float)
-    faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(1.0)).reshape(-1, 3)
-    return list(pyvista.PolyData.from_regular_faces(points, faces).split_bodies())
+    end, found = stage.GetEndTimeCode(), []
+    placed = UsdGeom.XformCache(end)
+    for prim in stage.Traverse():
+        shown = prim.IsA(UsdGeom.Mesh) and UsdGeom.Imageable(prim).ComputeVisibility(end) == "inherited"
+        if not shown or not str(prim.GetPath()).startswith(("/run/body", "/run/piece")):
+            continue
+        mesh, turn = UsdGeom.Mesh(prim), np.array(placed.GetLocalToWorldTransform(prim))
+        points = np.array(mesh.GetPointsAttr().Get(end), float).reshape(-1, 3)
+        faces = np.array(mesh.GetFaceVertexIndicesAttr().Get(end)).reshape(-1, 3)
+        found.append(pyvista.PolyData.from_regular_faces(points @ turn[:3, :3] + turn[3, :3], faces))
+    if len(found) > 2:
+        return found
+    return list(pyvista.merge(found).extract_surface().clean(tolerance=1e-7).split_bodies())
 
 
-READERS: dict[str, Callable[[Path], list[Any]]] = {"ply": of_ply, "obj": of_ply, "glb": of_glb, "usd": of_usd}
+READERS: dict[str, Callable[[Path], list[Any]]] = {"ply": of_ply, "obj": of_obj, "glb": of_glb, "usd": of_usd}
 
 
 @pytest.mark.parametrize("kind", READERS)
@@ -102,62 +106,202 @@ def _cut_volumes(run: Path) -> list[float]:
 
 
 def by_trimesh(path: Path) -> list[Any]:
+    """Pieces of a GLB, whose skin and inside are two meshes of trimesh; the floor is none."""
     trimesh = pytest.importorskip("trimesh")
-    return list(trimesh.load(path).geometry.values())
+    scene, parts = trimesh.load(path), dict[str, list[Any]]()
+    for node in scene.graph.nodes_geometry:
+        if node.startswith("piece_"):
+            parts.setdefault(node[: len("piece_000000")], []).append(scene.geometry[scene.graph[node][1]])
+    return [trimesh.util.concatenate(part) for part in parts.values()]
 
 
 def volume_in_single(mesh: Any) -> float:
     """Of a surface in single precision, in which corners of slivers fall together: each side is one of an even number
     of triangles that are left."""
-    points, number = np.unique(np.asarray(mesh.vertices), axis=0, return_inverse=True)
-    corners = number.reshape(-1)[mesh.faces]
+    is_vtk = isinstance(mesh, pyvista.PolyData)
+    given, faces = (mesh.points, mesh.regular_faces) if is_vtk else (mesh.vertices, mesh.faces)
+    points, number = np.unique(np.asarray(given, float), axis=0, return_inverse=True)
+    corners = number.reshape(-1)[faces]
     flat = (corners == np.roll(corners, 1, axis=1)).any(axis=1)
     sides = np.sort(np.concatenate([np.roll(corners[~flat], n, axis=1)[:, :2] for n in range(3)]), axis=1)
     assert not np.any(np.unique(sides, axis=0, return_counts=True)[1] % 2) and np.count_nonzero(flat) < 0.1 * len(flat)
-    return float(np.linalg.det(points[corners]).sum() / 6)
+    x = points - points.mean(axis=0)
+    return float(np.linalg.det(x[corners]).sum() / 6)
 
 
 @pytest.fixture(scope="module")
 def rigid(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bar that falls askew on a floor, breaks there and goes on as rigid pieces."""
     pytest.importorskip("mujoco", reason="an environment made without a network")
-    folder = tmp_path_factory.mktemp("rigid") / "out"
-    tables = {
-        "title": "dropped", "mesh": {"builder": "box", "size": [0.6, 0.2, 0.2], "h": 0.1},
-        "material": {"energy": "linear", "young": 1e10, "poisson": 0.2, "density": 2000.0},
-        "fracture": {"strength": 3e5, "kernel": "neighbours"}, "brittle": {"surfaces": 4}, "contact": {"friction": 0.4},
-        "load": {"gravity": [0.0, 0.0, -9.81]},
-        "body": [{"position": [0.0, 0.0, 0.05], "rotation": [0.0, -0.1, 0.0], "velocity": [0.0, 0.0, -4.0]}],
-        "obstacle": [{"name": "floor", "shape": "plane", "at": [0.0] * 3, "normal": [0.0, 0.0, 1.0], "friction": 0.5}],
-        "time": {"scheme": "rigid", "step": 2e-3, "end": 0.06}, "output": {"every": 30, "picture": False},
-    }  # fmt: skip
-    run_study(MPI.COMM_SELF, Study.model_validate(tables), folder)
-    return folder
+    return dropped_bar(tmp_path_factory.mktemp("rigid") / "out")
 
 
 @pytest.mark.parametrize("kind", READERS)
 def test_rigid_pieces_are_closed_with_their_volumes(kind: str, rigid: Path, tmp_path: Path) -> None:
     """As many as pieces.csv has, each as large, to 1e-6; all together 0.024 m^3. The floor is none of them."""
     pytest.importorskip("pxr" if kind == "usd" else "trimesh")
-    made, volume_of = export_surfaces(rigid, kind, tmp_path)[-1], volume_in_single if kind == "glb" else volume
-    found = sorted(volume_of(each) for each in (by_trimesh if kind == "glb" else READERS[kind])(made))
-    with (rigid / "pieces.csv").open() as file:
-        rows = [*csv.DictReader(file)]
-    expected = sorted(float(row["volume"]) for row in rows if row["time"] == rows[-1]["time"])
+    frame = None if kind == "usd" else -1
+    made, volume_of = export_surfaces(rigid, kind, tmp_path, frame=frame)[-1], volume_in_single
+    if kind == "ply":
+        volume_of = volume
+    reader = by_trimesh if kind == "glb" else READERS[kind]
+    found = sorted(volume_of(each) for each in reader(made))
+    rows = last_rows(rigid)
+    expected = sorted(float(row["volume"]) for row in rows)
     assert len(expected) > 2
     assert found == pytest.approx(expected, rel=1e-6) and sum(found) == pytest.approx(0.024, rel=1e-6)
 
 
-def test_usd_has_every_frame_and_metres(run: Path, tmp_path: Path) -> None:
+def rows_of(folder: Path) -> list[dict[str, str]]:
+    with (folder / "pieces.csv").open() as file:
+        return [*csv.DictReader(file)]
+
+
+def last_rows(folder: Path) -> list[dict[str, str]]:
+    rows = rows_of(folder)
+    return [row for row in rows if row["time"] == rows[-1]["time"]]
+
+
+def test_glb_of_rigid_pieces_moves_as_pieces_csv_says(rigid: Path, tmp_path: Path) -> None:
+    """A node for each shape of a piece; origins are centres of mass, rotations those since the first frame of a shape.
+
+    glTF has y upwards: (x, y, z) of the run is (x, z, -y) there.
+    """
+    from scipy.spatial.transform import Rotation
+
+    (path,) = export_surfaces(rigid, "glb", tmp_path)
+    document, values = read_glb(path)
+    names = [node["name"] for node in document["nodes"]]
+    pieces = {row["piece"] for row in rows_of(rigid)}
+    assert {name[6:12] for name in names if name != "floor"} == {f"{int(piece):06d}" for piece in pieces}
+    (animation,) = document["animations"]
+    channels = {(c["target"]["node"], c["target"]["path"]): c["sampler"] for c in animation["channels"]}
+    times = sorted({float(row["time"]) for row in rows_of(rigid)})
+    steps = np.median(np.diff(times)) * 24
+    compared = 0
+    for (number, what), sampler in channels.items():
+        if what == "scale":
+            continue
+        keys = values(animation["samplers"][sampler]["input"])[:, 0] * steps
+        output = values(animation["samplers"][sampler]["output"])
+        piece = int(names[number][6:12])
+        by_time = {float(row["time"]): row for row in rows_of(rigid) if int(row["piece"]) == piece}
+        own = [by_time[min(by_time, key=lambda t: abs(t - key))] for key in keys]
+        if what == "translation":
+            centre = np.array([[float(row[f"centre_{axis}"]) for axis in "xyz"] for row in own])
+            np.testing.assert_allclose(output, centre[:, [0, 2, 1]] * [1, 1, -1], atol=2e-7)
+        else:
+            turn = Rotation.from_quat([[float(row[f"quaternion_{part}"]) for part in "xyzw"] for row in own])
+            wanted = (turn * turn[0].inv()).as_rotvec()[:, [0, 2, 1]] * [1, 1, -1]
+            np.testing.assert_allclose(Rotation.from_quat(output).as_rotvec(), wanted, atol=2e-6)
+        compared += len(keys)
+    assert compared > 2 * len(pieces)
+
+
+def test_glb_shows_each_shape_in_its_frames(rigid: Path, tmp_path: Path) -> None:
+    """Shapes that are shown at a key enclose together the volume of the bar, whole and broken."""
+    (path,) = export_surfaces(rigid, "glb", tmp_path)
+    document, values = read_glb(path)
+    (animation,) = document["animations"]
+    scales = {c["target"]["node"]: animation["samplers"][c["sampler"]] for c in animation["channels"]
+              if c["target"]["path"] == "scale"}  # fmt: skip
+    last = max(values(sampler["input"]).max() for sampler in scales.values())
+    for t in (0.0, last):
+        total = 0.0
+        for number, node in enumerate(document["nodes"]):
+            if node["name"] == "floor":
+                continue
+            if number in scales:
+                keys, shown = (values(scales[number][name])[:, 0] for name in ("input", "output"))
+                assert scales[number]["interpolation"] == "STEP"
+                if not shown[max(np.searchsorted(keys, t, side="right") - 1, 0)]:
+                    continue
+            for part in document["meshes"][node["mesh"]]["primitives"]:
+                corners = values(part["attributes"]["POSITION"])[values(part["indices"]).reshape(-1, 3)]
+                total += np.linalg.det(corners.astype(float)).sum() / 6
+        assert total == pytest.approx(0.024, rel=1e-5)
+
+
+def read_glb(path: Path) -> tuple[dict[str, Any], Callable[[int], Any]]:
+    """Document of a file, and a function that returns the array of an accessor."""
+    data = path.read_bytes()
+    length = struct.unpack("<I", data[12:16])[0]
+    document = json.loads(data[20 : 20 + length])
+
+    def values(number: int) -> Any:
+        accessor = document["accessors"][number]
+        view, kind = document["bufferViews"][accessor["bufferView"]], {5126: "<f4", 5125: "<u4"}
+        columns = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        start, count = 28 + length + view["byteOffset"], accessor["count"] * columns
+        return np.frombuffer(data, kind[accessor["componentType"]], count, start).reshape(-1, columns)
+
+    return document, values
+
+
+@pytest.mark.parametrize("kind", ["glb", "obj", "usd"])
+def test_normals_of_the_skin_are_sharp_at_edges_and_rims(kind: str, run: Path, tmp_path: Path) -> None:
+    """All faces of the bar are along axes, and so are all normals of its skin, at edges and at cracks as well."""
+    made = export_surfaces(run, kind, tmp_path)[-1]
+    if kind == "glb":
+        document, values = read_glb(made)
+        parts = [part for mesh in document["meshes"] for part in mesh["primitives"]]
+        assert [document["materials"][number]["name"] for number in (0, 1)] == ["skin", "inside"]
+        assert {part["material"] for part in parts} == {0, 1}
+        normals = np.concatenate([values(part["attributes"]["NORMAL"]) for part in parts if part["material"] == 0])
+    elif kind == "obj":
+        normals = skin_normals_of_obj(made)
+    else:
+        pytest.importorskip("pxr")
+        from pxr import Usd, UsdGeom
+
+        stage = Usd.Stage.Open(str(made))
+        skin = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/run/body/skin"))
+        normals = np.array(skin.GetPrimvar("normals").ComputeFlattened(1.0))
+    assert len(normals) > 100 and np.abs(normals).max(axis=1) == pytest.approx(1.0, abs=1e-4)
+
+
+def skin_normals_of_obj(path: Path) -> Any:
+    lines = [line.split() for line in path.read_text().splitlines()]
+    assert lines[2][0] == "mtllib" and (path.parent / lines[2][1]).is_file()
+    normals = np.array([line[1:] for line in lines if line[0] == "vn"], float)
+    material, used = "", []
+    for word, *rest in lines:
+        material = rest[0] if word == "usemtl" else material
+        used += [int(corner.split("/")[2]) - 1 for corner in rest] if word == "f" and material == "skin" else []
+    return normals[used]
+
+
+def test_usd_has_every_frame_metres_and_velocities(run: Path, tmp_path: Path) -> None:
     pxr = pytest.importorskip("pxr.Usd")
-    from pxr import UsdGeom
+    from pxr import UsdGeom, UsdShade
 
     stage = pxr.Stage.Open(str(export_surfaces(run, "usd", tmp_path)[0]))
-    mesh = UsdGeom.Mesh(stage.GetDefaultPrim())
-    assert mesh.GetPointsAttr().GetTimeSamples() == [0.0, 1.0] and stage.GetEndTimeCode() == 1.0
+    assert stage.GetDefaultPrim().GetPath() == "/run" and stage.GetEndTimeCode() == 1.0
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0 and UsdGeom.GetStageUpAxis(stage) == "Z"
-    piece = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("piece").Get(1.0))
-    assert set(piece.tolist()) == set(PIECES)
+    assert stage.GetDefaultPrim().GetAttribute("userProperties:time").Get(1.0) == 1.0
+    for name, count in (("skin", 3), ("inside", 3)):
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath(f"/run/body/{name}"))
+        assert mesh.GetPointsAttr().GetTimeSamples() == [0.0, 1.0]
+        assert len(mesh.GetVelocitiesAttr().Get(1.0)) == len(mesh.GetPointsAttr().Get(1.0))
+        piece = np.array(UsdGeom.PrimvarsAPI(mesh).GetPrimvar("piece").Get(1.0))
+        assert len(set(piece.tolist())) == count == len(PIECES)
+        bound, _ = UsdShade.MaterialBindingAPI(mesh.GetPrim()).ComputeBoundMaterial()
+        assert bound.GetPath() == f"/run/materials/{name}"
+
+
+def test_colours_are_in_linear_light_where_the_format_says_so(run: Path, tmp_path: Path) -> None:
+    """#b9712c by colour-science tables: sRGB 185, 113, 44 are 0.48515, 0.16513, 0.02519 in linear light."""
+    wanted = pytest.approx([0.48515, 0.16513, 0.02519], abs=2e-5)
+    document, _ = read_glb(export_surfaces(run, "glb", tmp_path, frame=0)[0])
+    assert document["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"][:3] == wanted
+    export_surfaces(run, "obj", tmp_path, frame=0)
+    (line,) = [line for line in next(tmp_path.glob("*.mtl")).read_text().splitlines() if line.startswith("Kd")][:1]
+    assert [float(part) for part in line.split()[1:]] == wanted
+    pytest.importorskip("pxr")
+    from pxr import Usd
+
+    stage = Usd.Stage.Open(str(export_surfaces(run, "usd", tmp_path)[0]))
+    colour = stage.GetPrimAtPath("/run/materials/skin/surface").GetAttribute("inputs:diffuseColor").Get()
+    assert list(colour) == wanted
 
 
 def test_colours_are_those_of_the_look(run: Path, tmp_path: Path) -> None:

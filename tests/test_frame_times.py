@@ -225,7 +225,7 @@ def test_usd_has_simulated_time(uneven: Path, tmp_path: Path) -> None:
 
     (path,) = export_surfaces(uneven, "usd", tmp_path)
     stage = Usd.Stage.Open(str(path))
-    points = UsdGeom.Mesh(stage.GetDefaultPrim()).GetPointsAttr()
+    points = UsdGeom.Mesh(stage.GetPrimAtPath("/run/body/skin")).GetPointsAttr()
     codes = points.GetTimeSamples()
     assert codes == [0.0, 1.0, 2.0, 4.0] and (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (0.0, 4.0)
     seconds = np.array(codes) / stage.GetTimeCodesPerSecond()
