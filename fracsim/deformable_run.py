@@ -168,6 +168,7 @@ class Run:
             folder, self.scene.balance, self.scene.fracture, self.breaks,
             fields=wanted_fields(study), surface=wants_surface(study), smooth=wants_smooth(study),
             passing=self.monitors.interpenetration, resume_at=t, thickness=study.thickness,
+            precision=study.output.precision,
         )  # fmt: skip
         if notes is not None:
             had = notes.monitors["frames"]

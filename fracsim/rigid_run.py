@@ -116,7 +116,15 @@ class RigidRun:
         density = float(scene.study.material.density)
         self.frames = self._write(
             folder / "surface.pvd",
-            lambda: RigidFrames(folder, scene.instance_mesh, scene.poses, density, scene.obstacles, t),
+            lambda: RigidFrames(
+                folder,
+                scene.instance_mesh,
+                scene.poses,
+                density,
+                scene.obstacles,
+                t,
+                precision=scene.study.output.precision,
+            ),
         )
         if arrays is not None:
             self.frames.resume(arrays["broken_at"])

@@ -81,7 +81,7 @@ def test_cuts_by_forces_move_the_crack_only(torn: Run, tmp_path: Path) -> None:
     for made in (other, torn):
         grid = last(made.folder)
         grid.points = grid.points - grid.point_data["displacement"]
-        assert area(grid) == pytest.approx(0.25, rel=1e-12)
+        assert area(grid) == pytest.approx(0.25, rel=1e-6)  # written in single precision
 
 
 def area(grid: Any) -> float:

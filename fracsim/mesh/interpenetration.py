@@ -12,6 +12,9 @@ from scipy.spatial import cKDTree
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+# cells at most that give the usual size of a cell
+SAMPLED_CELLS = 10_000
 
 
 def find_interpenetration(x: Values, cells: Ints, fragment: Ints) -> tuple[int, int] | None:
@@ -32,7 +35,11 @@ def find_interpenetration(x: Values, cells: Ints, fragment: Ints) -> tuple[int, 
     holds = np.zeros(fragment.max() + 1, bool)
     holds[names[large]] = True
     searched = np.flatnonzero(holds[cell_fragment])
-    node, cell = _candidates(x, nodes[near], cells[searched])
+    if not len(searched):
+        return None
+    usual_radius = float(np.median(_balls(x, cells[searched[:: len(searched) // SAMPLED_CELLS + 1]])[1]))
+    searched = searched[_cells_at_points(x, nodes[near], cells[searched])]
+    node, cell = _candidates(x, nodes[near], cells[searched], 4 * usual_radius)
     foreign = fragment[node] != cell_fragment[searched[cell]]
     node, cell = node[foreign], searched[cell[foreign]]
     depth = _min_barycentric(x, node, cells[cell])
@@ -67,16 +74,30 @@ def _points_in_boxes(x: Values, start: Ints, count: Ints, small: Ints, lower: Va
     return np.unique(point[((position > lower[pair]) & (position < upper[pair])).all(axis=1)])
 
 
-def _candidates(x: Values, nodes: Ints, cells: Ints) -> tuple[Ints, Ints]:
-    """Pairs (node, index in `cells`) in which the node lies in the smallest ball about the cell's centre."""
-    if not len(cells):
-        return np.empty(0, np.int64), np.empty(0, np.int64)
+def _cells_at_points(x: Values, nodes: Ints, cells: Ints) -> Flags:
+    """Flags (C,) of the cells that overlap the box about some nodes."""
+    if not len(nodes):
+        return np.zeros(len(cells), bool)
+    lower, upper = x[nodes].min(axis=0), x[nodes].max(axis=0)
+    bits = 1 << np.arange(x.shape[1], dtype=np.uint8)
+    # A cell all of whose nodes are on one outer side of the box does not overlap it.
+    sides = ((x < lower) @ bits, (x > upper) @ bits)
+    return np.asarray(sum(np.bitwise_and.reduce(side[cells], axis=1) for side in sides) == 0)
+
+
+def _balls(x: Values, cells: Ints) -> tuple[Values, Values]:
+    """Centres (C, d) of cells, and radii (C,) of balls about them that have all corners, m."""
     corners = x[cells]
     centre = corners.mean(axis=1)
-    radius = np.sqrt(((corners - centre[:, None]) ** 2).sum(axis=2).max(axis=1))
+    return centre, np.sqrt(((corners - centre[:, None]) ** 2).sum(axis=2).max(axis=1))
+
+
+def _candidates(x: Values, nodes: Ints, cells: Ints, max_radius: float) -> tuple[Ints, Ints]:
+    """Pairs (node, index in `cells`) in which the node lies in the smallest ball about the cell's centre."""
+    centre, radius = _balls(x, cells)
     # larger cells are torn or crushed, and are left out
-    usual = np.flatnonzero(radius < 4 * np.median(radius))
-    if not len(nodes) or not len(usual):
+    usual = np.flatnonzero(radius < max_radius)
+    if not len(usual):
         return np.empty(0, np.int64), np.empty(0, np.int64)
     centres = cKDTree(centre[usual])
     pairs = cKDTree(x[nodes]).sparse_distance_matrix(centres, radius[usual].max(), output_type="ndarray")

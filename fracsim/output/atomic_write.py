@@ -16,8 +16,8 @@ from ..errors import CannotWrite
 from ..mesh.parallel import on_root
 from ..meshes.plain_files import MISSING, NotAPlainFileError, atomic_replacement, unreadable_reason
 
-# Bytes that HDF5 may need beside the values of one array. A text attribute takes most of them.
-HDF5_OVERHEAD_BYTES = 6 << 10
+# Bytes that HDF5 may need beside the values of one array. A text attribute and the index of chunks take most.
+HDF5_OVERHEAD_BYTES = 12 << 10
 
 
 def replace_text(path: Path, text: str) -> None:

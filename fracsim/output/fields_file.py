@@ -30,6 +30,7 @@ COMPONENTS_ATTRIBUTE = "components"
 _ATTRIBUTE_TYPES = {1: "Scalar", 3: "Vector", len(TENSOR_COMPONENTS): "Matrix"}
 # by nodes per cell
 _TOPOLOGY_TYPES = {3: "Triangle", 4: "Tetrahedron", 6: "Triangle_6", 10: "Tetrahedron_10"}
+_ROWS_PER_CHUNK = 1 << 18
 _COMPONENT_NAMES = np.bytes_(" ".join(TENSOR_COMPONENTS))
 _TAIL = "    </Grid>\n  </Domain>\n</Xdmf>\n"
 _HEAD = (
@@ -61,20 +62,23 @@ class FieldsFile:
         times: times of the frames, s.
     """
 
-    def __init__(self, folder: Path, mesh: MeshData, resume_at: float | None = None) -> None:
+    def __init__(
+        self, folder: Path, mesh: MeshData, resume_at: float | None = None, *, precision: str = "single"
+    ) -> None:
         """Open the files.
 
         Args:
             folder: output folder.
             mesh: input mesh.
             resume_at: keep the frames up to this time, s; None: a new run.
+            precision: of the fields, "single" or "double".
 
         Raises:
             InputError: the frames of the earlier run cannot be read.
             OSError: the files cannot be written.
         """
         self.xdmf, self.h5 = folder / "fields.xdmf", folder / "fields.h5"
-        self._mesh = mesh
+        self._mesh, self._precision = mesh, precision
         self.times: list[float] = []
         grids = ""
         if resume_at is not None and self.h5.exists():
@@ -87,8 +91,8 @@ class FieldsFile:
         """Create fields.h5 with the mesh and without frames."""
         size = 2 * self._mesh.points.nbytes + self._mesh.cells.nbytes + 3 * HDF5_OVERHEAD_BYTES
         with atomic_replacement(self.h5) as temporary, writable_hdf5(temporary, size, new=True) as file:
-            file["points"] = pad_to_3d(self._mesh.points)
-            file["cells"] = self._mesh.cells.astype(np.int32)
+            _create_compressed(file, "points", pad_to_3d(self._mesh.points))
+            _create_compressed(file, "cells", self._mesh.cells.astype(np.int32))
             file.create_group("frames")
 
     def _resume(self, until: float) -> str:
@@ -136,14 +140,16 @@ class FieldsFile:
         Raises:
             OSError: the disk is full; the earlier frames are unchanged.
         """
-        fields = [Field(field.name, field.centre, pad_to_3d(field.values)) for field in fields]
+        fields = [
+            Field(field.name, field.centre, rounded(pad_to_3d(field.values), self._precision)) for field in fields
+        ]
         name = f"{len(self.times):06d}"
         size = HDF5_OVERHEAD_BYTES + sum(field.values.nbytes + HDF5_OVERHEAD_BYTES for field in fields)
         with writable_hdf5(self.h5, size) as file:
             frame = file["frames"].create_group(name)
             frame.attrs["time"] = t
             for field in fields:
-                data = frame.create_dataset(field.name, data=field.values)
+                data = _create_compressed(frame, field.name, field.values)
                 data.attrs["centre"] = field.centre
                 if is_tensor(field.values):
                     data.attrs[COMPONENTS_ATTRIBUTE] = _COMPONENT_NAMES
@@ -227,6 +233,21 @@ def read_field(data: Any) -> npt.NDArray[np.generic]:
 def reorder_earlier_tensor(values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
     """Symmetric tensors (n, 6) in the order of `EARLIER_TENSOR_COMPONENTS`, put in that of `TENSOR_COMPONENTS`."""
     return values[:, [EARLIER_TENSOR_COMPONENTS.index(name) for name in TENSOR_COMPONENTS]]
+
+
+def rounded(values: npt.NDArray[np.generic], precision: str) -> npt.NDArray[np.generic]:
+    """Values as they are written: real numbers in single precision, unless `precision` is "double"."""
+    if precision == "double" or values.dtype != np.float64:
+        return values
+    # beyond 3e38, which no viewer draws, they are infinite
+    with np.errstate(over="ignore"):
+        return values.astype(np.float32)
+
+
+def _create_compressed(group: Any, name: str, values: npt.NDArray[np.generic]) -> Any:
+    """New data set of an HDF5 group, compressed. Other levels of gzip take longer and save 3 %."""
+    chunks = (min(len(values), _ROWS_PER_CHUNK), *values.shape[1:])
+    return group.create_dataset(name, data=values, chunks=chunks, shuffle=True, compression="gzip", compression_opts=1)
 
 
 def pad_to_3d(values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:

@@ -88,7 +88,7 @@ class FieldEvaluator:
         """Share (cells,) of the edges of each cell that are broken, 0 to 1."""
         assert self._fracture is not None
         graph = self._fracture.graph
-        return np.asarray(graph.broken[graph.cell_edges].mean(axis=1))
+        return np.bitwise_count(graph.pattern) / graph.cell_edges.shape[1]
 
     def _expression_values(self, name: str) -> Values:
         """Values (cells, components) of an expression of the deformation; stress and energy are multiplied by chi."""
@@ -164,6 +164,7 @@ class FrameFiles:
         passing: InterpenetrationMonitor | None = None,
         resume_at: float | None = None,
         thickness: float = 1.0,
+        precision: str,
     ) -> None:
         """Open the files (collective).
 
@@ -178,6 +179,7 @@ class FrameFiles:
             passing: monitor of interpenetration, in a study without contact between fragments.
             resume_at: keep the frames up to this time, s; None: a new run.
             thickness: thickness of a 2D body, m; 1 in 3D.
+            precision: of points and fields, "single" or "double".
 
         Raises:
             CannotWrite: a file cannot be written.
@@ -186,11 +188,15 @@ class FrameFiles:
         self._comm, self._path, self._breaks = stress.domain.comm, folder / "fields.xdmf", breaks
         self._evaluate, mesh = FieldEvaluator(stress, fields, breaking), mesh_of_nodes(stress.domain)
         self.fields = write_on_root(
-            self._comm, self._path, lambda: FieldsFile(folder, mesh, resume_at) if mesh else None
+            self._comm,
+            self._path,
+            lambda: FieldsFile(folder, mesh, resume_at, precision=precision) if mesh else None,
         )
         self.surface = None
         if surface:
-            self.surface = surface_output(folder, balance, breaks, passing, resume_at, thickness, smooth=smooth)
+            self.surface = surface_output(
+                folder, balance, breaks, passing, resume_at, thickness, smooth=smooth, precision=precision
+            )
 
     @property
     def frame_counts(self) -> dict[str, int]:
@@ -222,6 +228,7 @@ def surface_output(
     thickness: float,
     *,
     smooth: bool,
+    precision: str = "single",
 ) -> SurfaceOutput:
     """Split surface of a run; arguments of `FrameFiles`. Without a folder nothing is written."""
     # imported here: runs without surface output do not need VTK
@@ -230,6 +237,7 @@ def surface_output(
     density, terms = balance.stress.material.density * thickness, balance.terms
     return SurfaceOutput(
         folder, balance.domain, density, breaks.record, passing=passing, resume_at=resume_at, smooth=smooth,
+        precision=precision,
         apart=fulfilling(terms, SurfaceSeparator),
         beside=fulfilling(terms, OutputSurfaces),
     )  # fmt: skip

@@ -6,7 +6,9 @@ gives a sentence if the result is doubtful.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
     from ..fracture.fracture_pass import FracturePass
     from .surface.body_surface import BodySurface
 
+Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
 
@@ -37,6 +40,7 @@ class CheckTolerances:
         single_step_share: a single step is named if it gained at least this share of the total gain.
         min_jacobian: a cell with det F below this counts as inverted.
         min_tension: share of the strength below which a principal stress is round-off.
+        cells_per_part: cells whose Jacobians are computed at a time.
     """
 
     negligible_strain: float = 3e-8
@@ -44,6 +48,7 @@ class CheckTolerances:
     single_step_share: float = 0.5
     min_jacobian: float = 1e-6
     min_tension: float = 1e-9
+    cells_per_part: int = 16_000
 
 
 CHECK_TOLERANCES = CheckTolerances()
@@ -150,14 +155,19 @@ class InvertedCellMonitor:
         self._graph = fracture.graph if fracture is not None else None
         self.min_jacobian, self.inverted_count, self.first_time = 1.0, 0, 0.0
 
+    @cached_property
+    def _reference(self) -> Values:
+        """Determinants (cells,) of the edge vectors at rest, m^d."""
+        nodes, cell_nodes = self._domain.nodes, self._domain.cell_nodes
+        return _edge_determinants(lambda cells: nodes[cell_nodes[cells]], np.arange(len(cell_nodes)))
+
     def record_frame(self, t: float) -> None:
         """Record the present deformation at time t in s (collective)."""
         if self._stress.material.energy.linear:
             return
         domain = self._domain
         cells = np.arange(domain.cell_count) if self._graph is None else np.flatnonzero(~self._graph.damaged)
-        reference = domain.nodes[domain.cell_nodes[cells]]
-        J = _edge_determinants(self._stress.cell_corners(cells)) / _edge_determinants(reference)
+        J = _edge_determinants(self._stress.cell_corners, cells) / self._reference[cells]
         self.min_jacobian = min(self.min_jacobian, domain.comm.allreduce(float(J.min(initial=np.inf)), op=MPI.MIN))
         inverted = int(sum_over_ranks(domain.comm, np.count_nonzero(CHECK_TOLERANCES.min_jacobian >= J))[0])
         if inverted and not self.inverted_count:
@@ -218,9 +228,20 @@ def unbroken_note(fracture: FracturePass) -> str:
     )
 
 
-def _edge_determinants(corners: Values) -> Values:
-    """Determinants (n,) of the edge vectors from the first of the corners (n, d + 1, d), m^d."""
-    return np.asarray(np.linalg.det(corners[:, 1:] - corners[:, :1]))
+def _edge_determinants(corners_of: Callable[[Ints], Values], cells: Ints) -> Values:
+    """Determinants (n,) of the edge vectors from the first of the corners (k, d + 1, d) of cells (n,), m^d."""
+    # Parts stay in the cache: the corners of a million cells take 100 MB.
+    parts = np.array_split(cells, len(cells) // CHECK_TOLERANCES.cells_per_part + 1)
+    return np.concatenate([_determinants(corners[:, 1:] - corners[:, :1]) for corners in map(corners_of, parts)])
+
+
+def _determinants(rows: Values) -> Values:
+    """Determinants (n,) of matrices (n, d, d)."""
+    if rows.shape[1] == 2:
+        return np.asarray(np.linalg.det(rows))
+    a, b, c = rows.transpose(1, 2, 0)
+    # in 3D a quarter of the time of np.linalg.det
+    return np.asarray(sum(a[i] * (b[i - 2] * c[i - 1] - b[i - 1] * c[i - 2]) for i in range(3)))
 
 
 class InterpenetrationMonitor:

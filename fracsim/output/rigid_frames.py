@@ -51,6 +51,8 @@ class RigidFrames:
         density: float,
         obstacles: Sequence[RigidObstacle],
         resume_at: float | None = None,
+        *,
+        precision: str,
     ) -> None:
         """Open the files.
 
@@ -61,11 +63,12 @@ class RigidFrames:
             density: mass density, kg/m^3.
             obstacles: obstacles to draw.
             resume_at: keep the frames up to this time, s; None: a new run.
+            precision: of points and fields, "single" or "double".
 
         Raises:
             OSError: the files cannot be written.
         """
-        self.files = SurfaceFiles(folder, 3, resume_at, turning=True)
+        self.files = SurfaceFiles(folder, 3, resume_at, turning=True, precision=precision)
         self.surface = InstanceSurface(mesh, poses, density)
         self.broken_at: Values = np.full(self.surface.edge_count, NEVER_BROKEN)
         points = self.surface.split.points

@@ -296,6 +296,11 @@ class OutputSettings(StudyTable):
         "forces, or such that cracks are smooth.",
         default=None, example="smooth", otherwise="smooth with a `look` and without contact, else middle",
     )  # fmt: skip
+    precision: Literal["single", "double"] = key(
+        "Precision of points and fields in fields.h5 and surface.pvd: 7 or 16 digits.",
+        default="single",
+        example="double",
+    )
     picture: Flag = key("Write last.png, a picture of the last frame.", default=True, example=False)
     look: Annotated[  # type: ignore[valid-type]
         Annotated[Literal[LOOKS], Tag("<name>")] | Annotated[ColourSettings, Tag("<colours>")],

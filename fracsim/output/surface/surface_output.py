@@ -44,6 +44,7 @@ class SurfaceOutput:
         passing: InterpenetrationMonitor | None = None,
         smooth: bool = False,
         resume_at: float | None = None,
+        precision: str = "single",
     ) -> None:
         """Open the files (collective).
 
@@ -57,6 +58,7 @@ class SurfaceOutput:
             passing: monitor of interpenetration, in a study without contact between fragments.
             smooth: draw cracks smooth.
             resume_at: keep the frames up to this time, s; None: a new run.
+            precision: of points and fields, "single" or "double".
 
         Raises:
             CannotWrite: a file cannot be written.
@@ -70,7 +72,7 @@ class SurfaceOutput:
 
         def open_files() -> tuple[BodySurface, SurfaceFiles | None]:
             assert domain.input_mesh is not None and cell_density is not None
-            files = None if folder is None else SurfaceFiles(folder, domain.dim, resume_at)
+            files = None if folder is None else SurfaceFiles(folder, domain.dim, resume_at, precision=precision)
             surface = BodySurface(domain.input_mesh, cell_density, smooth=smooth)
             if broken is not None and files is not None and resume_at is not None:
                 edges, history = broken
