@@ -224,6 +224,26 @@ def export(
 
 
 @app.command()
+def view(
+    out: Annotated[Path, typer.Argument(metavar="OUT", help="output folder of a run, which may go on")],
+    html: Annotated[Path | None, typer.Option("-o", "--out", help="write the page as one .html file instead")] = None,
+) -> None:
+    """Show a run in the browser: the body in time, in 3D, with its fields, fragments and curves."""
+    if not is_first_rank():
+        return
+    import_outside("pyvista")
+    from .output.lock import describe_lock_holder
+    from .report.view_page import serve_view, write_view
+
+    if html is None:
+        serve_view(out, lambda: bool(describe_lock_holder(out)))
+        return
+    _note_active_runs([out])
+    size = write_view(out, html).stat().st_size
+    print(f"saved {html} ({size / 1e6:.1f} MB)")
+
+
+@app.command()
 def report(
     outs: Annotated[list[Path], typer.Argument(metavar="OUT...", help="folders of runs, sweeps, or of evidence")],
     html: Annotated[Path | None, typer.Option("-o", "--out", help="the page (OUT/report.html)")] = None,

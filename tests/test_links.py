@@ -260,10 +260,11 @@ def written(target: Path) -> list[tuple[tuple[str | Path, ...], list[str]]]:
             (("export", "torn", "--format", kind, "-o", target), [f"out_000000.{kind}"])
             for kind in ("ply", "obj", "glb")
         ),
+        (("view", "torn", "-o", target / "v.html"), ["v.html"]),
     ]
 
 
-@pytest.mark.parametrize("number", [0, 1, 2, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 4)), 5, 6, 7, 8])
+@pytest.mark.parametrize("number", [0, 1, 2, *(pytest.param(n, marks=pytest.mark.slow) for n in (3, 4)), 5, 6, 7, 8, 9])
 def test_commands_replace_links(tmp_path: Path, torn: Path, number: int) -> None:
     """Of files named with -o, and of others beside them; what they write is what they write elsewhere."""
     out = tmp_path / "target"
