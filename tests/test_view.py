@@ -24,10 +24,13 @@ from typing import Any
 import numpy as np
 import pytest
 import pyvista
+from mpi4py import MPI
 
+from fracsim.deformable_run import run_study
 from fracsim.errors import InputError
 from fracsim.report.view_data import PackedRun
 from fracsim.report.view_page import ViewServer, write_view
+from fracsim.study.reader import load_study
 from programs import Chromium
 from support.exported import dropped_bar
 
@@ -260,12 +263,22 @@ def test_a_served_page_follows_a_run(run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("surface", ["true", "false"])
+def test_a_body_in_2d_is_seen_from_the_front(surface: str, tmp_path: Path) -> None:
+    """Its split surface, or its mesh."""
+    over = ["mesh.h=0.02", f"output.surface={surface}", "output.picture=false", "output.interval=0.1"]
+    run_study(MPI.COMM_SELF, load_study("bar-2d", over), tmp_path / "bar")
+    with Chromium(tmp_path / "profile", 1280, 800) as browser:
+        browser.open(write_view(tmp_path / "bar", tmp_path / "bar.html").as_uri())
+        browser.wait_for(SHOWN)
+        view = browser.evaluate("camera.getWorldDirection(new THREE.Vector3()).toArray()")
+        assert view == pytest.approx([0.0, 0.0, -1.0], abs=1e-6)
+        assert browser.evaluate("[...parts.keys()]") == (["skin", "outline"] if surface == "true" else ["skin"])
+        assert browser.errors == []
+
+
+@pytest.mark.slow
 def test_the_page_of_the_demo_has_at_most_ten_megabytes(tmp_path: Path) -> None:
-    from mpi4py import MPI
-
-    from fracsim.deformable_run import run_study
-    from fracsim.study.reader import load_study
-
     run_study(MPI.COMM_SELF, load_study("loaf", ["output.picture=false"]), tmp_path / "loaf")
     page = write_view(tmp_path / "loaf", tmp_path / "loaf.html")
     assert page.stat().st_size < 10e6

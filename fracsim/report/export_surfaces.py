@@ -20,8 +20,8 @@ Values = npt.NDArray[np.float64]
 # materials by their number: original boundary, crack faces, obstacles, and obstacles that are planes
 MATERIALS = ("skin", "inside", "obstacle", "plane")
 SKIN, INSIDE, OBSTACLE, PLANE = range(len(MATERIALS))
-# largest deviation of a rigid motion, as a share of the distances: round-off of the twelve digits of a frame
-_RIGID_TOLERANCE = 1e-7
+# largest deviation of a rigid motion, as a share of the distances: round-off of frames in single precision
+_RIGID_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
