@@ -9,7 +9,7 @@ import numpy as np
 
 from .data import Indices, MeshData, MeshError, Points, format_midpoint, format_point, list_some
 from .parameters import LONGEST, SHORTEST
-from .topology import Floats, Mask, components, distinct_rows, edges_of, facets_of, orient_cells, signed_measures
+from .topology import Floats, Mask, components, distinct_rows, facets_of, links_in, orient_cells, signed_measures
 
 SAME_PLACE = 1e-6  # distance over the size of the mesh within which nodes coincide
 
@@ -33,7 +33,6 @@ def check_mesh(mesh: MeshData, *, join: bool = False) -> MeshData:
     mesh = join_bodies(mesh) if join else mesh
     mesh = _without_repeated_facets(_oriented(mesh))
     _check_flat(mesh)
-    _check_cells_once(mesh)
     table = _FacetTable(mesh.cells)
     _check_facets(mesh, table)
     count, body = label_bodies(mesh)
@@ -134,9 +133,9 @@ def flat_cells(points: Points, cells: Indices, share: float = 0.0) -> Mask:
     # Coordinates x are stored to eps |x|, which changes the measure by up to about
     # (d + 1) / (d - 1)! * eps |x| * L^(d - 1) with the longest edge L; the bound is twice that.
     dim = points.shape[1]
-    corners = points[cells]
+    largest = np.abs(points).max(axis=1)[cells].max(axis=1)
     longest = _longest_edges(points, cells)
-    minimum = 2 * (dim + 1) * _precision(points) * np.abs(corners).max(axis=(1, 2)) * longest ** (dim - 1)
+    minimum = 2 * (dim + 1) * _precision(points) * largest * longest ** (dim - 1)
     return np.abs(signed_measures(points, cells)) <= np.maximum(minimum, share * longest**dim)
 
 
@@ -159,18 +158,22 @@ def _check_cells_once(mesh: MeshData) -> None:
 
 def _check_facets(mesh: MeshData, table: _FacetTable) -> None:
     """Raise MeshError unless each facet belongs to one cell, or to two on opposite sides."""
+    # outward normals of the two cells are opposite, and so is the order of their nodes
+    balance = np.bincount(table.index, np.where(_is_rising(table.facets), 1, -1))
+    same_side = (table.counts == 2) & (balance != 0)
+    if (table.counts > 2).any() or same_side.any():
+        _check_cells_once(mesh)
     _refuse_facets(mesh, table.facets[table.counts[table.index] > 2], "belong to more than two cells")
-    # outward normals of the two cells are opposite: a facet with the same normal twice has both cells on one side
-    _, same, inverse = distinct_rows(_rotated_to_least(table.facets))
-    _refuse_facets(mesh, table.facets[same[inverse] > 1], "have two cells on the same side, so that the cells overlap")
+    overlaps = table.facets[same_side[table.index]]
+    _refuse_facets(mesh, overlaps, "have two cells on the same side, so that the cells overlap")
 
 
-def _rotated_to_least(facets: Indices) -> Indices:
-    """Triangles (k, 3) with their nodes rotated so that the least comes first; edges (k, 2) as they are."""
+def _is_rising(facets: Indices) -> Mask:
+    """(k,) whether an even permutation of the nodes of a facet (k, d) is in rising order."""
     if facets.shape[1] == 2:
-        return facets
-    columns = (facets.argmin(axis=1)[:, None] + np.arange(3)) % 3
-    return np.take_along_axis(facets, columns, axis=1)
+        return facets[:, 0] < facets[:, 1]
+    a, b, c = facets.T
+    return ((a < b).astype(np.int8) + (b < c) + (c < a)) == 2
 
 
 def _refuse_facets(mesh: MeshData, facets: Indices, what: str) -> None:
@@ -245,7 +248,7 @@ def _without_repeated_facets(mesh: MeshData) -> MeshData:
 
 def label_bodies(mesh: MeshData) -> tuple[int, Indices]:
     """Number of bodies, which share no node, and the body of each node (n,)."""
-    return components(edges_of(mesh.cells), len(mesh.points))
+    return components(links_in(mesh.cells), len(mesh.points))
 
 
 def coincident_nodes(mesh: MeshData, body: Indices) -> Indices:
@@ -348,5 +351,8 @@ def _region_notes(mesh: MeshData) -> Iterator[str]:
 
 def _longest_edges(points: Points, cells: Indices) -> Floats:
     """(m,) longest edge of each cell [m]."""
-    first, second = np.triu_indices(cells.shape[1], k=1)
-    return np.linalg.norm(points[cells[:, first]] - points[cells[:, second]], axis=2).max(axis=1)
+    longest = np.zeros(len(cells))
+    for first, second in zip(*np.triu_indices(cells.shape[1], k=1), strict=True):
+        edges = points.take(cells[:, first], axis=0) - points.take(cells[:, second], axis=0)
+        np.maximum(longest, np.einsum("ij,ij->i", edges, edges), out=longest)
+    return np.asarray(np.sqrt(longest))

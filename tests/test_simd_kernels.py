@@ -35,6 +35,7 @@ def summed(form: fem.Form, bcs: list[fem.DirichletBC], *, lanes: bool, by_blocks
     assembly = TangentAssembler(form)
     if by_blocks:
         assembly.switch_to_blocks()
+    assert assembly.matrix.getSize()  # made at its first use
     assembly._sum.data[:] = 0.0
     if lanes:
         several = SimdBilinearForm.for_form(form, assembly._sum)

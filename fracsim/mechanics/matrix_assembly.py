@@ -49,13 +49,10 @@ class TangentAssembler:
 
     Attributes:
         form: compiled form.
-        matrix: PETSc's matrix of single entries, until `shrink` replaces it.
         blocks: matrix in blocks, if the form is assembled into blocks; until `shrink` replaces it.
         diagonal_blocks: (owned nodes,) indices of the blocks on the diagonal, if there are blocks.
         entries_outdated: whether the blocks are newer than `matrix`.
     """
-
-    matrix: PETSc.Mat
 
     def __init__(self, form: CellForm, kernels: KernelSelection | None = None) -> None:
         """`kernels`: selection of kernels; None: the default one."""
@@ -64,7 +61,16 @@ class TangentAssembler:
         self.blocks: BlockMatrix | None = None
         self.entries_outdated = False
         self._dead: Flags | None = None
-        self._create()
+        self._matrix: PETSc.Mat | None = None
+
+    @property
+    def matrix(self) -> PETSc.Mat:
+        """PETSc's matrix of single entries, until `shrink` replaces it (collective the first time)."""
+        # made at its first use, since `switch_to_blocks` would replace it
+        if self._matrix is None:
+            self._create()
+        assert self._matrix is not None
+        return self._matrix
 
     def switch_to_blocks(self, *, with_dead_cells: bool = False) -> BlockMatrix | None:
         """Assemble into blocks from now on; returns the matrix in blocks, None if there is no kernel (collective).
@@ -73,10 +79,10 @@ class TangentAssembler:
             with_dead_cells: whether cells that the form excludes have blocks.
         """
         if self.blocks is None:
-            code = self.kernels.block_product(self.form.mesh.comm, self.matrix.getBlockSize())
+            code = self.kernels.block_product(self.form.mesh.comm, self.form.function_spaces[0].dofmap.index_map_bs)
             if code is None:
                 return None
-            self.matrix.destroy()
+            self.destroy()
             self._create(code, with_dead_cells)
         return self.blocks
 
@@ -91,7 +97,7 @@ class TangentAssembler:
         owned = self.form.function_spaces[0].dofmap.index_map.size_local
         pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
         pattern.finalize()
-        self.matrix = create_matrix(self.form.mesh.comm, pattern)
+        self._matrix = create_matrix(self.form.mesh.comm, pattern)
         self._sum = make_scalar_csr(pattern) if block_code is None else make_block_csr(pattern)
         self._kernel_of = KernelCache(lambda form: self.kernels.bilinear_form(form, self._sum))
         rows, columns = (self._sum.index_map(axis) for axis in (0, 1))
@@ -139,6 +145,8 @@ class TangentAssembler:
             extra_form: form of the same pattern to be added.
             mass: blocks to be added, if there are blocks.
         """
+        if self._matrix is None:
+            self._create()
         self._sum.data[:] = 0.0
         for form in (self.form, extra_form) if extra_form is not None else (self.form,):
             self._add(form, bcs)
@@ -191,7 +199,9 @@ class TangentAssembler:
 
     def destroy(self) -> None:
         """Free PETSc's matrices."""
-        self.matrix.destroy()
+        if self._matrix is not None:
+            self._matrix.destroy()
+            self._matrix = None
         if self.blocks is not None:
             self.blocks.destroy()
             self.blocks, self.entries_outdated = None, False

@@ -74,7 +74,7 @@ class TangentOperators:
         self._release_operators()
         tangent = self._tangent
         self.products: PETSc.Mat | None = None
-        pay_off = self._may_use_blocks and blocks_pay_off(tangent.matrix, self._policy.min_block_dofs)
+        pay_off = self._may_use_blocks and blocks_pay_off(tangent.domain.space.dofmap, self._policy.min_block_dofs)
         if pay_off and (blocks := tangent.switch_to_blocks()) is not None:
             self._block_operator = BlockOperator(tangent.matrix, blocks)
             self.products = self._block_operator.to_petsc()

@@ -80,7 +80,11 @@ class Box:
             points = self._placed(points)
         else:
             points, cells = mesh_with_gmsh(self._draw, len(self.size), SizeField(self.h), seed=self.seed)
-        return MeshData(points, cells, facet_groups_on_planes(points, boundary_facets(cells), self._planes()))
+        # The body is convex: only cells with a facet on a plane have boundary facets.
+        low, high = self.bounds()
+        beside = ((points == low) | (points == high)).any(axis=1)[cells].sum(axis=1) >= cells.shape[1] - 1
+        facets = boundary_facets(cells[beside])
+        return MeshData(points, cells, facet_groups_on_planes(points, facets, self._planes()))
 
     def _steps(self) -> tuple[int, ...]:
         return tuple(max(1, round(length / self.h)) for length in self.size)

@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING, Any
 from petsc4py import PETSc
 
 if TYPE_CHECKING:
+    from dolfinx.fem import DofMap
+
     from ...mechanics.block_matrix import BlockMatrix
     from .levels import FineLevel
 
@@ -47,6 +49,6 @@ class BlockOperator:
         return result
 
 
-def blocks_pay_off(tangent: PETSc.Mat, min_dofs: int) -> bool:
+def blocks_pay_off(dofs: DofMap, min_dofs: int) -> bool:
     """Return True if products in blocks are faster; small matrices stay in the cache in any form."""
-    return tangent.getBlockSize() > 1 and tangent.getSize()[0] >= min_dofs
+    return dofs.index_map_bs > 1 and dofs.index_map.size_global * dofs.index_map_bs >= min_dofs
