@@ -288,6 +288,17 @@ def test_usd_has_every_frame_metres_and_velocities(run: Path, tmp_path: Path) ->
         assert bound.GetPath() == f"/run/materials/{name}"
 
 
+@pytest.mark.parametrize("name", ["run", "rigid"])
+def test_usd_passes_its_own_validators(name: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    pytest.importorskip("pxr")
+    from pxr import Usd, UsdValidation
+
+    (path,) = export_surfaces(request.getfixturevalue(name), "usd", tmp_path)
+    validators = UsdValidation.ValidationRegistry().GetOrLoadAllValidators()
+    found = UsdValidation.ValidationContext(validators).Validate(Usd.Stage.Open(str(path)))
+    assert len(validators) > 10 and [error.GetMessage() for error in found] == []
+
+
 def test_colours_are_in_linear_light_where_the_format_says_so(run: Path, tmp_path: Path) -> None:
     """#b9712c by colour-science tables: sRGB 185, 113, 44 are 0.48515, 0.16513, 0.02519 in linear light."""
     wanted = pytest.approx([0.48515, 0.16513, 0.02519], abs=2e-5)

@@ -91,9 +91,11 @@ class UsdFile:
 
         codes, first, stop = self._codes, track.first, track.frames.stop
         name = track.surface.name.replace("-", "_")
-        xform = UsdGeom.Xform.Define(self._stage, f"/run/{name}")
+        # an obstacle may be named body or materials
+        path = f"/run/{name}" if track.surface.material[0] in (SKIN, INSIDE) else f"/run/obstacles/{name}"
+        xform = UsdGeom.Xform.Define(self._stage, path)
         # the same name again: Blender takes that of the mesh
-        mesh = _Mesh(self._stage, f"/run/{name}/{name}")
+        mesh = _Mesh(self._stage, f"{path}/{name}")
         mesh.set_surface(track.surface)
         mesh.bind_by_face(track.surface.material, self._materials, self._colours)
         translate, orient = xform.AddTranslateOp(UsdGeom.XformOp.PrecisionDouble), xform.AddOrientOp()
