@@ -12,6 +12,7 @@ demo:
 	@echo
 	@echo "The torn loaf is in out/loaf:"
 	@ls -1 out/loaf
+	@echo "In the browser: ./env fracsim view out/loaf"
 	@echo "In ParaView open out/loaf/surface.pvd: the torn loaf in time, to be coloured by piece, origin or age."
 
 # One worker a core, two at least; tests of a file stay together (tests/conftest.py). More than eight wait for the longest.

@@ -18,6 +18,7 @@ from fracsim.errors import InputError
 from fracsim.output.surface.body_surface import BodySurface
 from fracsim.output.surface.vtk_files import SurfaceFiles, rotation_quaternions
 from fracsim.report.export import export_surfaces
+from fracsim.report.export_surfaces import corner_normals
 from support.exported import PIECES, broken_bar, dropped_bar
 from support.solids import lattice
 
@@ -257,6 +258,23 @@ def test_normals_of_the_skin_are_sharp_at_edges_and_rims(kind: str, run: Path, t
         skin = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath("/run/body/skin"))
         normals = np.array(skin.GetPrimvar("normals").ComputeFlattened(1.0))
     assert len(normals) > 100 and np.abs(normals).max(axis=1) == pytest.approx(1.0, abs=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("angle", "materials", "smooth"), [(20, (0, 0), True), (20, (0, 1), False), (50, (0, 0), False)]
+)
+def test_normals_are_smooth_within_a_material(angle: float, materials: tuple[int, int], smooth: bool) -> None:
+    """Two triangles that meet at an angle: the mean of their normals at the common edge, or the normal of each."""
+    a = np.deg2rad(angle)
+    points = np.array([[0, 0, 0], [0, 1, 0], [1, 0.5, 0], [-np.cos(a), 0.5, -np.sin(a)]], float)
+    triangles = np.array([[1, 0, 2], [0, 1, 3]])
+    faces = np.array([[0.0, 0, 1], [-np.sin(a), 0, np.cos(a)]])
+    found = corner_normals(points, triangles, np.array(materials))
+    middle = np.array([-np.sin(a / 2), 0, np.cos(a / 2)])
+    wanted = np.repeat(faces[:, None], 3, axis=1)
+    if smooth:
+        wanted[:, :2] = middle
+    np.testing.assert_allclose(found, wanted, atol=1e-6)
 
 
 def skin_normals_of_obj(path: Path) -> Any:

@@ -232,6 +232,8 @@ def test_usd_has_simulated_time(uneven: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(seconds, [0.0, 0.01, 0.02, 0.04], rtol=1e-12)
     moved = [np.asarray(points.Get(code)).min() for code in codes]  # as far as the time says
     np.testing.assert_allclose(moved, seconds, atol=1e-7)
+    velocities = UsdGeom.Mesh(points.GetPrim()).GetVelocitiesAttr()  # m/s: as they are in the run
+    assert np.all(np.asarray(velocities.Get(2.0)) == 1.0)
 
 
 def test_files_of_a_frame_have_its_time(uneven: Path, tmp_path: Path) -> None:

@@ -98,7 +98,7 @@ def read_fragments(frame: FrameSource, dust: bool = True) -> list[Surface]:
     triangles = np.asarray(grid.cell_connectivity).reshape(-1, 3)
     material = np.where(is_crack(grid), INSIDE, SKIN)
     points, fragment = np.asarray(grid.points, float), np.asarray(grid.cell_data["piece"])
-    body = Surface("body", points, triangles, material, _corner_normals(points, triangles, material), _velocity(grid))
+    body = Surface("body", points, triangles, material, corner_normals(points, triangles, material), _velocity(grid))
     order = np.argsort(fragment, kind="stable")
     names, first = np.unique(fragment[order], return_index=True)
     parts = zip(names, np.split(order, first[1:]), strict=True)
@@ -112,7 +112,7 @@ def read_obstacles(frame: FrameSource, planes: Collection[str]) -> list[Surface]
         grid = obstacle_surface(file)
         points, triangles = np.asarray(grid.points, float), np.asarray(grid.regular_faces)
         material = np.full(len(triangles), PLANE if name in planes else OBSTACLE)
-        normals = _corner_normals(points, triangles, material)
+        normals = corner_normals(points, triangles, material)
         surfaces.append(Surface(name, points, triangles, material, normals, np.zeros_like(points)))
     return surfaces
 
@@ -132,7 +132,7 @@ def _velocity(grid: Any) -> Values:
     return np.asarray(grid.point_data["velocity"], float)
 
 
-def _corner_normals(points: Values, triangles: Ints, material: Ints) -> Values:
+def corner_normals(points: Values, triangles: Ints, material: Ints) -> Values:
     """Unit normals (k, 3, 3) at corners: smooth over edges that are not sharp, among triangles of one material."""
     import pyvista
 
