@@ -290,6 +290,17 @@ def test_a_look_colours_skin_and_inside(tmp_path: Path) -> None:
             assert np.mean(apart < 0.03) > least
 
 
+def test_runs_side_by_side_have_the_look_of_their_own_study(tmp_path: Path) -> None:
+    folders = []
+    for skin in ("#ff0000", "#00ff00"):
+        folders.append(written(tmp_path / skin[1:], 0.0, cut=False))
+        (folders[-1] / "study.toml").write_text(f'[output]\nlook = {{ skin = "{skin}", inside = "#0000ff" }}\n')
+    both = shown(render(folders, tmp_path / "both.png", replace(FRONT, material="")))
+    left, right = both[:, : SMALL[0] // 2], both[:, -(SMALL[0] // 2) :]
+    assert of_hue(left, 0).mean() > 0.1 and not of_hue(left, 1).any()
+    assert of_hue(right, 1).mean() > 0.1 and not of_hue(right, 0).any()
+
+
 def rgb_of(colour: str) -> Values:
     return np.array([int(colour[k : k + 2], 16) for k in (1, 3, 5)], float)
 

@@ -32,7 +32,7 @@ source_suffix = {".md": "markdown", ".py": "percent"}
 
 # The contents, at the side of all pages. A page that is missing here is an error.
 CONTENTS = {
-    "Start": "docs/install docs/running docs/faq docs/python docs/batch docs/studies docs/gallery",
+    "Start": "docs/install docs/tutorials docs/running docs/faq docs/python docs/batch docs/studies docs/gallery",
     "Notebooks": "docs/notebooks/own_energy docs/notebooks/own_criterion docs/notebooks/temperature",
     "Reference": "docs/study-file docs/meshes docs/output docs/view docs/blender docs/site/reference docs/glossary",
     "Methods": "docs/fracture docs/contact docs/rigid docs/theory docs/accuracy docs/paper-figures",

@@ -20,7 +20,7 @@ from ...errors import InputError
 from ...meshes.plain_files import atomic_replacement_of_all, check_replaceable
 from .camera import ViewBounds, body_centre, centred, merge_bounds, moved, view_bounds
 from .colour_maps import merge_ranges
-from .frames import FrameSource, film_interval, film_repetitions, find_frames, read_study
+from .frames import FrameSource, film_interval, film_repetitions, find_frames
 from .picture_options import PictureOptions
 from .renderer import Renderer, field_range
 
@@ -238,7 +238,7 @@ def _render_frames(frames: Sequence[FrameSource], options: PictureOptions, *, ti
     limits = options.limits or merge_ranges([field_range(frame, options.colour) for frame in frames])
     if options.floor and views[0].is_flat:
         raise InputError("--floor: a body in 2D has none")
-    with Renderer(options, views[0], limits, read_study(frames[0].folder)) as renderer:
+    with Renderer(options, views[0], limits, frames[0].folder) as renderer:
         for frame, view in zip(frames, views, strict=True):
             yield renderer.render_frame(frame, view, frame.folder.name if titled else None)
 

@@ -6,6 +6,7 @@ A crack that opens by less than a pixel is drawn as a line where it meets the bo
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -22,6 +23,7 @@ from .frames import (
     is_crack,
     load_grid,
     plane_normals,
+    read_study,
     with_normals,
 )
 from .picture_options import MATERIAL_LOOKS, PictureOptions, material_look
@@ -140,7 +142,7 @@ class Renderer:
     """
 
     def __init__(
-        self, options: PictureOptions, view: ViewBounds, limits: tuple[float, float] | None, study: dict[str, Any]
+        self, options: PictureOptions, view: ViewBounds, limits: tuple[float, float] | None, folder: Path
     ) -> None:
         """Open a window off-screen.
 
@@ -148,18 +150,16 @@ class Renderer:
             options: options of the picture.
             view: bounds of the first frame to show.
             limits: range of the colours, see `field_range`.
-            study: tables of the study, for its title, look and planes.
+            folder: output folder of the first frame, whose study has a title, a look and planes.
         """
         import pyvista
 
-        self.options, self.limits, self._study, self._flat = options, limits, study, view.is_flat
-        self.material = material_look(options.material or study.get("output", {}).get("look", "plain"))
-        self._bounds = view.bounds
+        self.options, self.limits, self._flat, self._bounds = options, limits, view.is_flat, view.bounds
         self._size = float(np.linalg.norm(np.diff(view.bounds.reshape(3, 2))))
         # window pixels per pixel of the picture
         self._line_scale = SCENE_STYLE.supersampling if options.fine else 1
         self._plotter = pyvista.Plotter(off_screen=True, window_size=options.size, lighting="none")
-        self._plotter.set_background(MATERIAL_LOOKS["plain"].backdrop if self._flat else self.material.backdrop)
+        self._use_study(folder)
         self._main_light = self._add_lights()
 
     def __enter__(self) -> Self:
@@ -172,6 +172,8 @@ class Renderer:
         """Picture (height, width, 3) of a frame that shows the bounds; `title` replaces that of the options."""
         plotter, options = self._plotter, self.options
         self._bounds = view.bounds
+        if frame.folder != self._folder:
+            self._use_study(frame.folder)
         # otherwise everything is drawn again with each addition
         plotter.suppress_rendering = True
         plotter.clear_actors()
@@ -188,6 +190,12 @@ class Renderer:
             self._add_narrow_cracks(grid)
             pixels = self._draw_with_surroundings(frame, parts.surfaces)
         return self._annotate(pixels, frame, title)
+
+    def _use_study(self, folder: Path) -> None:
+        """Take title, look and planes of the study in an output folder."""
+        self._folder, self._study = folder, read_study(folder)
+        self.material = material_look(self.options.material or self._study.get("output", {}).get("look", "plain"))
+        self._plotter.set_background(MATERIAL_LOOKS["plain"].backdrop if self._flat else self.material.backdrop)
 
     def _draw_pixels(self) -> Pixels:
         """Picture (height, width, 3) of what has been added, without text."""
