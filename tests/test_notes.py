@@ -168,6 +168,15 @@ def test_no_packaged_study_is_asked_about() -> None:
         assert list(unit_questions(load_study(path), 1.0)) == [], path.name
 
 
+def test_a_mesh_of_tens_of_millions_of_cells_is_asked_about() -> None:
+    """A step of h that has slipped by a digit: the check says what it costs and which h is a million cells."""
+    loaf = load_study("loaf", ["mesh.h=0.0008"])
+    (line,) = [line for line in check_study(loaf) if "are so many" in line]
+    cells, gigabytes = (float(number.replace(",", "")) for number in re.findall(r"([\d,]+) (?:cells|GB)", line))
+    assert cells > 4e7 and gigabytes == pytest.approx(4e-6 * cells, abs=1)
+    assert not any("are so many" in line for line in check_study(load_study("loaf", ["mesh.h=0.0028"])))
+
+
 def test_large_strains_of_glass_are_not_worth_their_price() -> None:
     """In quasi-static steps; bread stretches, and with inertia pieces turn."""
     slow = {"scheme": "quasi-static", "step": 0.5, "end": 1.0}

@@ -14,6 +14,8 @@ class CheckLimits:
     Attributes:
         max_built_cells: a builder's mesh is built for resultants and overlaps up to this size; a few seconds.
         max_sampled_cells: cells of a large mesh whose edges are measured.
+        max_expected_cells: cells without a question.
+        bytes_per_cell: memory on all ranks, with fracture and without contact.
         max_bodies: rigid bodies that fit into memory.
         max_edge_direction_ratio: edges near the commonest directions over those of a mesh without preferred
             directions; random points have 1.1 to 3.7.
@@ -56,6 +58,8 @@ class CheckLimits:
 
     max_built_cells: int = 60_000
     max_sampled_cells: int = 50_000
+    max_expected_cells: int = 5_000_000
+    bytes_per_cell: float = 4e3
     max_bodies: int = 100_000
     max_edge_direction_ratio: float = 4.0
     min_direction_nodes: ByDimension = field(default_factory=lambda: {2: 100, 3: 1000})
