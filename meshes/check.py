@@ -9,7 +9,7 @@ import numpy as np
 
 from .data import Indices, MeshData, MeshError, Points, format_midpoint, format_point, list_some
 from .parameters import LONGEST, SHORTEST
-from .topology import Floats, Mask, components, distinct_rows, facets_of, links_in, orient_cells, signed_measures
+from .topology import Floats, Mask, components, distinct_rows, links_in, orient_cells, signed_measures
 
 SAME_PLACE = 1e-6  # distance over the size of the mesh within which nodes coincide
 
@@ -49,19 +49,27 @@ class _FacetTable:
     """The facets of all cells.
 
     Attributes:
-        facets: (m (d + 1), d), cell by cell, normals outwards.
-        counts: (k,) number of cells at each distinct facet.
-        index: (m (d + 1),) distinct facet of each of `facets`.
+        distinct: (k, d) facets, each once, its nodes in rising order.
+        counts: (k,) number of cells at each facet.
+        index: (m (d + 1),) distinct facet of each facet of each cell, cell by cell.
+        balance: (k,) cells on one side of each facet less cells on the other.
     """
 
     def __init__(self, cells: Indices) -> None:
-        self.facets = facets_of(cells).reshape(-1, cells.shape[1] - 1)
-        self._distinct, self.counts, self.index = distinct_rows(np.sort(self.facets, axis=1))
+        """`cells`: (m, d + 1) positive cells."""
+        nodes = cells.shape[1]
+        # Without a node of a cell in rising order the others are a facet in rising order.
+        ordered = np.sort(cells, axis=1)
+        rows = np.stack([np.delete(ordered, node, axis=1) for node in range(nodes)], axis=1)
+        self.distinct, self.counts, self.index = distinct_rows(rows.reshape(-1, nodes - 1))
+        exchanges = sum((cells[:, i] > cells[:, j]).astype(np.int8) for i in range(nodes) for j in range(i + 1, nodes))
+        sides = 1 - 2 * ((np.asarray(exchanges)[:, None] + np.arange(nodes)) % 2)
+        self.balance = np.bincount(self.index, sides.ravel())
 
     def cells_at(self, groups: list[Indices]) -> list[Indices]:
         """For each group the number of cells at each facet; 0 of a facet that is not of the mesh."""
-        sizes = np.cumsum([len(self._distinct), *map(len, groups)])
-        _, _, inverse = distinct_rows(np.sort(np.concatenate([self._distinct, *groups]), axis=1))
+        sizes = np.cumsum([len(self.distinct), *map(len, groups)])
+        _, _, inverse = distinct_rows(np.sort(np.concatenate([self.distinct, *groups]), axis=1))
         counts = np.zeros(inverse.max() + 1, np.int64)
         counts[inverse[: sizes[0]]] = self.counts
         return np.split(counts[inverse[sizes[0] :]], sizes[1:-1] - sizes[0]) if groups else []
@@ -158,31 +166,19 @@ def _check_cells_once(mesh: MeshData) -> None:
 
 def _check_facets(mesh: MeshData, table: _FacetTable) -> None:
     """Raise MeshError unless each facet belongs to one cell, or to two on opposite sides."""
-    # outward normals of the two cells are opposite, and so is the order of their nodes
-    balance = np.bincount(table.index, np.where(_is_rising(table.facets), 1, -1))
-    same_side = (table.counts == 2) & (balance != 0)
-    if (table.counts > 2).any() or same_side.any():
+    crowded, overlap = table.counts > 2, (table.counts == 2) & (table.balance != 0)
+    if crowded.any() or overlap.any():
         _check_cells_once(mesh)
-    _refuse_facets(mesh, table.facets[table.counts[table.index] > 2], "belong to more than two cells")
-    overlaps = table.facets[same_side[table.index]]
-    _refuse_facets(mesh, overlaps, "have two cells on the same side, so that the cells overlap")
-
-
-def _is_rising(facets: Indices) -> Mask:
-    """(k,) whether an even permutation of the nodes of a facet (k, d) is in rising order."""
-    if facets.shape[1] == 2:
-        return facets[:, 0] < facets[:, 1]
-    a, b, c = facets.T
-    return ((a < b).astype(np.int8) + (b < c) + (c < a)) == 2
+    _refuse_facets(mesh, table.distinct[crowded], "belong to more than two cells")
+    _refuse_facets(mesh, table.distinct[overlap], "have two cells on the same side, so that the cells overlap")
 
 
 def _refuse_facets(mesh: MeshData, facets: Indices, what: str) -> None:
-    """Raise MeshError if there are such facets; `what`: their fault."""
+    """Raise MeshError if there are such facets (k, d); `what`: their fault."""
     if len(facets):
-        distinct = distinct_rows(np.sort(facets, axis=1))[0]
         raise MeshError(
-            f"{len(distinct)} facets {what}, the first with nodes {distinct[0].tolist()} near "
-            f"{format_midpoint(mesh.points, distinct[0])}; mend the mesh there."
+            f"{len(facets)} facets {what}, the first with nodes {facets[0].tolist()} near "
+            f"{format_midpoint(mesh.points, facets[0])}; mend the mesh there."
         )
 
 
