@@ -60,6 +60,20 @@ def _flag_unsplit_after(graph: EdgeGraph, fails: Flags) -> Flags:
     return ~is_split(graph.domain.dim)[graph.pattern | (fails[graph.cell_edges] @ bits).astype(np.uint8)]
 
 
+def _flag_losing_last_cell(graph: EdgeGraph, cells_around: NodeCellCount, fails: Flags) -> Flags:
+    """Flag the nodes (nodes,) all of whose unsplit cells are split once `fails` (edges,) break (collective)."""
+    # Few edges fail in a pass: the cells around all nodes are not counted.
+    cells = graph.edge_cells(np.flatnonzero(fails))
+    cells = cells[~graph.split[cells]]
+    bits = 1 << np.arange(graph.cell_edges.shape[1])
+    pattern = graph.pattern[cells] | (fails[graph.cell_edges[cells]] @ bits).astype(np.uint8)
+    lost = np.zeros(len(graph.split), bool)
+    lost[cells[is_split(graph.domain.dim)[pattern]]] = True
+    lost_count = cells_around(lost)
+    loses = lost_count > 0
+    return loses & (cells_around(~graph.split & loses[graph.cell_nodes].any(axis=1)) == lost_count)
+
+
 class CellRetention:
     """A criterion without the failing edges of cells that nodes need to keep an unsplit cell.
 
@@ -119,16 +133,14 @@ class CellRetention:
     def _spared_edges(self, fails: Flags, stress: Values) -> Flags:
         """Flag the edges (edges,) of the cells that retain a node, given the failing edges (collective)."""
         graph = self._graph
-        cell_fails = fails[graph.cell_edges]
-        before = ~graph.split
-        after = before & _flag_unsplit_after(graph, fails)
-        endangered = (self._cells_around(before) > 0) & (self._cells_around(after) == 0)
-        cells = np.flatnonzero(before & endangered[graph.cell_nodes].any(axis=1))
-        load = self._cell_load(cells, stress, cell_fails[cells])
+        endangered = _flag_losing_last_cell(graph, self._cells_around, fails)
+        cells = np.flatnonzero(~graph.split & endangered[graph.cell_nodes].any(axis=1))
+        load = self._cell_load(cells, stress, fails[graph.cell_edges[cells]])
         # A cell under too large a load cannot retain a node.
         cells, load = cells[load < self._max_cell_load], load[load < self._max_cell_load]
         spared = np.zeros(len(fails), bool)
-        spared[graph.cell_edges[self._choose_cells(cells, load, cell_fails[cells], endangered)]] = True
+        chosen = self._choose_cells(cells, load, fails[graph.cell_edges[cells]], endangered)
+        spared[graph.cell_edges[chosen]] = True
         return graph.any_over_ranks(spared)
 
     def _cell_load(self, cells: Ints, stress: Values, fails: Flags) -> Values:
@@ -194,8 +206,10 @@ class NodeAttachment:
         fails[edges] = True
         fails = graph.any_over_ranks(fails) & ~graph.broken
         if sum_over_ranks(graph.domain.comm, np.count_nonzero(fails))[0]:
-            in_unsplit_cell = np.zeros(len(fails), bool)
-            in_unsplit_cell[graph.cell_edges[~graph.split]] = True
+            in_unsplit_cell = np.ones(len(fails), bool)
+            in_unsplit_cell[graph.cell_edges[graph.split]] = False
+            beside = graph.edge_cells(np.flatnonzero(~in_unsplit_cell))
+            in_unsplit_cell[graph.cell_edges[beside[~graph.split[beside]]]] = True
             # Intact edges without an unsplit cell attach nodes already.
             attaching = ~graph.broken & ~graph.any_over_ranks(in_unsplit_cell)
             spared = self._attaching_edges(fails, attaching, stress)
@@ -207,10 +221,10 @@ class NodeAttachment:
     def _attaching_edges(self, fails: Flags, attaching: Flags, stress: Values) -> Flags:
         """Flag the edges (edges,) that attach nodes once `fails` (edges,) break; `attaching` do so already."""
         graph = self._graph
-        without_cell = self._cells_around(_flag_unsplit_after(graph, fails)) == 0
-        has_cell = self._cells_around(~graph.split) > 0
-        if not sum_over_ranks(graph.domain.comm, np.count_nonzero(without_cell & has_cell))[0]:
+        loses = _flag_losing_last_cell(graph, self._cells_around, fails)
+        if not sum_over_ranks(graph.domain.comm, np.count_nonzero(loses))[0]:
             return np.zeros(len(fails), bool)
+        without_cell = self._cells_around(_flag_unsplit_after(graph, fails)) == 0
         candidates = np.flatnonzero(~graph.broken & without_cell[graph.edge_nodes].any(axis=1))
         load = self._edge_loads(candidates, without_cell, stress)
         # An edge that a crack cuts attaches a node only if no other edge can.
