@@ -10,6 +10,7 @@ import subprocess
 import sys
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import imageio.v3
@@ -58,6 +59,8 @@ class Page(HTMLParser):
         if tag not in self.VOID:
             self.open.append(tag)
         for key, value in attributes:
+            if tag == "a" and (value or "").endswith(".csv"):
+                continue  # a link, which nothing follows by itself
             if key in ("src", "href", "xlink:href", "data", "poster") and not (value or "").startswith(("#", "data:")):
                 self.fetched.append(f"{tag} {key}={value}")
             if key == "id" and value:
@@ -383,3 +386,12 @@ def test_what_cannot_be_drawn_is_refused(runs: Path, tmp_path: Path, arguments: 
     given = [tmp_path / each if each.endswith(".csv") else each for each in arguments]
     result = fracsim("plot", runs / "strip", *given)
     assert result.returncode == 2 and message in result.stderr and "Traceback" not in result.stderr
+
+
+def test_tables_are_links_to_their_files_and_the_end_is_in_the_contents(runs: Path, tmp_path: Path) -> None:
+    page = make_report([runs / "sweep"], tmp_path / "two words.html", references=[])
+    text = page.read_text(encoding="utf-8")
+    links = re.findall(r'<p class="caption"[^>]*>.*?<a href="([^"]+)">', text)
+    assert links and all((tmp_path / unquote(link)).is_file() for link in links)
+    targets = set(re.findall(r'id="([^"]+)"', text))
+    assert {"about"} <= set(re.findall(r'<a href="#([^"]+)"', text)) <= targets

@@ -76,6 +76,7 @@ def write_table_csv(path: Path, table: ReportTable) -> None:
 def _section_data(section: Section, number: int, pictures: Path, csv_folder: str) -> dict[str, Any]:
     """Data of a section for the template."""
     return {
+        "number": number,
         "title": section.title,
         "open": [claim for claim in section.claims if claim.holds is False],
         "unknown": [claim for claim in section.claims if claim.holds is None],

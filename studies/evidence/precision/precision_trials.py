@@ -12,7 +12,8 @@ MINIMAL_OUTPUT: dict[str, Any] = {
     "every": 1_000_000,
     "fields": [],
     "picture": False,
-}  # only the first and the last frame
+    "precision": "double",
+}  # only the first and the last frame, with all digits
 SCRIPTS = "fracsim.studies.evidence.precision"
 TIGHT_TOLERANCES: dict[str, Any] = {"snes_rtol": 1e-10, "ksp_rtol": 1e-8}  # leaves the error of h and dt alone
 
