@@ -201,6 +201,8 @@ def test_a_film_of_some_frames_at_a_speed(uneven: Path, tmp_path: Path) -> None:
             render(uneven, tmp_path / "g.gif", options, film=wrong)
     with pytest.raises(InputError, match=r"--speed 20: must be 0.01 to 1.2 here"):
         render(uneven, tmp_path / "g.gif", options, film=FilmOptions(speed=20))
+    with pytest.raises(InputError, match=r"--speed 0\.1: of a film"):
+        render(uneven, tmp_path / "pictures", options, film=FilmOptions(speed=0.1))
     with pytest.raises(InputError, match="--frames :3: of a film or a folder"):
         render(uneven, tmp_path / "g.png", options, film=FilmOptions(frames=":3"))
 

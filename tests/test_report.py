@@ -378,10 +378,12 @@ def test_a_curve_is_drawn_as_what_other_programs_open(runs: Path, tmp_path: Path
         (("--y", "elastic", "--scale", "1e-3"), "must be two factors other than 0"),
         (("--y", "elastic", "--reference", "three.csv"), "it has the columns a, b, c, but not time and elastic"),
         (("--y", "elastic", "--reference", "bare.csv"), "where the names of the columns belong"),
+        (("--y", "elastic", "--reference", "ragged.csv"), "the first line has 2 columns, the line '1,2,3' 3"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused(runs: Path, tmp_path: Path, arguments: tuple[str, ...], message: str) -> None:
     (tmp_path / "three.csv").write_text("a,b,c\n1,2,3\n2,3,4\n")
+    (tmp_path / "ragged.csv").write_text("a,b\n1,2,3\n")
     (tmp_path / "bare.csv").write_text("1,2\n2,3\n")
     given = [tmp_path / each if each.endswith(".csv") else each for each in arguments]
     result = fracsim("plot", runs / "strip", *given)

@@ -203,6 +203,8 @@ def read_reference(path: Path) -> ReferenceCurve:
         check_readable(path)
         with path.open(newline="", encoding="utf-8") as file:
             header, *rows = [row for row in csv.reader(file) if row]
+        if wrong := next((row for row in rows if len(row) != len(header)), None):
+            raise ValueError(f"the first line has {len(header)} columns, the line '{','.join(wrong)}' {len(wrong)}")
         if all(map(_reads_as_number, header)):
             raise ValueError("the first line has numbers, where the names of the columns belong")
         table = np.array(rows, float)

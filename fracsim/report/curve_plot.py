@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import InputError
+from ..meshes.plain_files import atomic_replacement_of_all
 from .compare import ReferenceCurve, column_unit, history_series, read_reference
 from .content import Plot, Series
 from .plots import gapped_array, save_plot
@@ -41,7 +42,10 @@ def draw_curves(
     target = target or folders[0] / "curve.svg"
     if target.suffix not in _FORMATS:
         raise InputError(f"-o {target}: a curve is drawn as {', '.join(_FORMATS)}: -o curve.svg")
-    save_plot(curve_plot(folders, x, y, references, scale), target)
+    plot = curve_plot(folders, x, y, references, scale)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_replacement_of_all(target) as temporary:
+        save_plot(plot, temporary)
     return target
 
 

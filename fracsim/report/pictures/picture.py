@@ -161,6 +161,8 @@ def render(
     is_picture, film = target.suffix == ".png", film or FilmOptions()
     if is_picture and film.frames:
         raise InputError(f"--frames {film.frames}: of a film or a folder of pictures; a picture has --frame or --sheet")
+    if film.speed and target.suffix not in FILM_SUFFIXES:
+        raise InputError(f"--speed {film.speed:g}: of a film; give its file, .mp4 or .gif, with -o")
     if is_picture:
         frames = select_frames(run_frames, folders, frame, sheet)
     elif sheet or len(folders) > 1:
