@@ -6,7 +6,15 @@
 #include <math.h>
 #include <stdint.h>
 
-enum { LANES = 8, COARSE_LANES = 16, MAX_WIDTH = 7 };
+/* numbers in a vector register: GCC takes fifteen times as long for longer vectors */
+#if defined(__AVX512F__)
+#define LANES 8
+#elif defined(__AVX__)
+#define LANES 4
+#else
+#define LANES 2
+#endif
+enum { COARSE_LANES = 2 * LANES, MAX_WIDTH = 7 };
 enum { LINEAR, CONSTANT, GAUSSIAN };
 
 typedef struct {
@@ -89,16 +97,20 @@ INLINE wide where(mask m, wide x) { return (wide)(m & (mask)x); }
 INLINE coarse coarse_where(coarse_mask m, coarse x) { return (coarse)(m & (coarse_mask)x); }
 
 /* exp(-4.5 x), 0 <= x <= 1, to 1e-14: Taylor polynomial of the 16th root. */
-#define DEFINE_EXPONENTIAL(vector, name)                                      \
-    INLINE vector name(vector x)                                              \
-    {                                                                         \
-        vector e = x * 0 + 1;                                                 \
-        for (int n = 11; n > 0; n--) e = 1 - e * x * (4.5f / 16) / (float)n;  \
-        e *= e, e *= e, e *= e;                                               \
-        return e * e;                                                         \
-    }
-DEFINE_EXPONENTIAL(wide, exponential)
-DEFINE_EXPONENTIAL(coarse, coarse_exponential)
+INLINE wide exponential(wide x)
+{
+    wide e = x * 0 + 1;
+    for (int n = 11; n > 0; n--) e = 1 - e * x * (4.5 / 16 / n);
+    e *= e, e *= e, e *= e;
+    return e * e;
+}
+INLINE coarse coarse_exponential(coarse x)
+{
+    coarse e = x * 0 + 1;
+    for (int n = 5; n > 0; n--) e = 1 - e * x * (4.5f / 16 / n);
+    e *= e, e *= e, e *= e;
+    return e * e;
+}
 
 /* Sums over the points around the centres: of weights, and of weights times values (points, width). Points without
    volume are left out. */
@@ -138,7 +150,7 @@ void averages_around(
 {
     const Points *p = arrays;
     for (int64_t first = 0; first < count; first += LANES) {
-        wide c[3], weights, sums[MAX_WIDTH];
+        wide c[3] = {{0}}, weights, sums[MAX_WIDTH];
         for (int l = 0; l < LANES; l++)
             for (int i = 0; i < 3; i++) c[i][l] = centres[3 * chosen[first + l < count ? first + l : first] + i];
 #define SUM(columns, kernel) sum_around(p, c, volume, columns, values, kernel, &weights, sums)
@@ -187,7 +199,7 @@ int64_t find_centres(
     for (int64_t first = 0; first < count; first += COARSE_LANES) {
         const int64_t *group = order + first;
         const int size = count - first < COARSE_LANES ? (int)(count - first) : COARSE_LANES;
-        coarse c[3], volumes, loads;
+        coarse c[3] = {{0}}, volumes, loads;
         Search s;
         for (int i = 0; i < 3; i++) {
             s.low[i] = s.high[i] = centres[3 * group[0] + i];
