@@ -299,6 +299,16 @@ def test_a_second_signal_ends_a_process_that_hangs(tmp_path: Path) -> None:
     process.communicate()
 
 
+def test_a_handler_that_python_does_not_know_gives_way_to_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A profiler that is loaded before Python may have installed it: Python tells None."""
+    install, installed = signal.signal, signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(signal, "signal", lambda number, handler: install(number, handler) and None)
+    with InterruptHandler(MPI.COMM_SELF, None):
+        assert signal.getsignal(signal.SIGTERM) not in (installed, signal.SIG_DFL)
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    install(signal.SIGTERM, installed)
+
+
 def test_a_signal_that_is_ignored_ends_nothing(tmp_path: Path) -> None:
     """As under nohup: PETSc takes SIGHUP for itself as it is imported."""
     process = begun(tmp_path, "late", prefix=("nohup",))

@@ -35,7 +35,7 @@ CONTENTS = {
     "Start": "docs/install docs/tutorials docs/running docs/faq docs/python docs/batch docs/studies docs/gallery",
     "Notebooks": "docs/notebooks/own_energy docs/notebooks/own_criterion docs/notebooks/temperature",
     "Reference": "docs/study-file docs/meshes docs/output docs/view docs/blender docs/site/reference docs/glossary",
-    "Methods": "docs/fracture docs/contact docs/rigid docs/theory docs/accuracy docs/paper-figures",
+    "Methods": "docs/fracture docs/contact docs/rigid docs/theory docs/accuracy docs/scaling docs/paper-figures",
     "Development": "docs/architecture docs/development CONTRIBUTING CHANGELOG",
 }
 

@@ -71,7 +71,8 @@ class InterruptHandler:
         self._depth -= 1
         if not self._depth:
             for number, handler in self._previous_handlers.items():
-                signal.signal(number, handler)  # type: ignore[arg-type]
+                # None: one that a library had installed before Python began, which Python cannot install again
+                signal.signal(number, signal.SIG_DFL if handler is None else handler)  # type: ignore[arg-type]
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
         if number == signal.SIGINT and not self.has_output:
