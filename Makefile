@@ -42,9 +42,10 @@ attack:
 
 # Debian's VTK is built without the XDMF reader that ParaView has; the tests read fields.xdmf with that of the wheel.
 readers:
-	@./env sh -c 'cd "$${VIRTUAL_ENV%/*}" && exec 8>vtk-reader.lock && flock 8 && test -e vtk-reader/ready || { \
-	    echo "fetching a VTK that reads XDMF (once)" && rm -rf vtk-reader && \
-	    pip install --quiet --no-deps --target vtk-reader vtk==9.7.2 && touch vtk-reader/ready; }'
+	@./env sh -c 'cd "$${VIRTUAL_ENV%/*}" && reader=$$(python3 -c "import sys; print(f\"vtk-reader-{sys.implementation.cache_tag}\")") && \
+	    exec 8>vtk-reader.lock && flock 8 && test -e $$reader/ready || { \
+	    echo "fetching a VTK that reads XDMF (once)" && rm -rf $$reader && \
+	    pip install --quiet --no-deps --target $$reader vtk==9.7.2 && touch $$reader/ready; }'
 
 # unpack FOLDER PACKAGES: Debian packages with all that they need and the system lacks, unpacked beside the venvs, once.
 define unpack

@@ -29,7 +29,8 @@ def used(kind: str, count: int, steps: int, every: int, often: int) -> list[Any]
 def test_a_dropped_scene_leaves_nothing(kind: str) -> None:
     """Where all before it are freed as the next one is built there are no more after 24 than after twelve."""
     first, second = used(kind, 24, 1, 1, 1)
-    assert all(there <= here for here, there in zip(first[:3], second[:3], strict=True))
+    # scenes are freed in no fixed order, which may take one communicator more; a leak of each scene would take twelve
+    assert all(there <= here + 1 for here, there in zip(first[:3], second[:3], strict=True))
 
 
 @pytest.mark.slow

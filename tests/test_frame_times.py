@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -248,3 +250,25 @@ def test_files_of_a_frame_have_its_time(uneven: Path, tmp_path: Path) -> None:
     assert obj.read_text().splitlines()[1] == "# t = 0.02 s"
     (ply,) = export_surfaces(uneven, "ply", tmp_path, frame=2)
     assert b"\ncomment t = 0.02 s\n" in ply.read_bytes()[:300]
+
+
+def test_a_frame_is_read_without_a_lock(tmp_path: Path) -> None:
+    """A run goes on writing to fields.h5 while a picture of it is drawn."""
+    import h5py
+
+    from fracsim.report.pictures.frames import field_frames, load_grid
+
+    assert fracsim("run", write_study(tmp_path / "bar.toml", BAR), "-o", tmp_path / "out").returncode == 0
+    script = f"import h5py; h5py.File({str(tmp_path / 'out/fields.h5')!r}, 'r+').close()"
+    read = h5py.File
+    opened: list[Any] = []
+
+    def open_and_write(*arguments: Any, **options: Any) -> Any:
+        file = read(*arguments, **options)
+        opened.append(subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False))
+        return file
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fracsim.report.pictures.frames.h5py.File", open_and_write)
+        load_grid(field_frames(tmp_path / "out")[0])
+    assert len(opened) == 2 and all(done.returncode == 0 for done in opened), opened[0].stderr

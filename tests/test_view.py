@@ -29,7 +29,7 @@ from mpi4py import MPI
 from fracsim.deformable_run import run_study
 from fracsim.errors import InputError
 from fracsim.report.view_data import PackedRun
-from fracsim.report.view_page import ViewServer, write_view
+from fracsim.report.view_page import ViewServer, page_text, write_view
 from fracsim.study.reader import load_study
 from programs import Chromium
 from support.exported import dropped_bar
@@ -287,3 +287,23 @@ def test_the_page_of_the_demo_has_at_most_ten_megabytes(tmp_path: Path) -> None:
         browser.wait_for(SHOWN)
         browser.evaluate("show(frames.length - 1)")
         assert browser.errors == []
+
+
+def test_text_of_a_run_stays_text(run: Path) -> None:
+    """No element and no comment begins within the data of the page."""
+    title = "</script><!--<script>"
+    page, plain = (page_text(json.dumps({"title": each})) for each in (title, "plain"))
+    assert page.count("<") == plain.count("<") and json.loads(
+        page[page.index('{"title') :].split("\n")[0].split("<")[0]
+    )
+
+
+def test_a_run_that_is_repeated_is_packed_anew(run: Path, tmp_path: Path) -> None:
+    """Its frames have the same times and names, but were written later."""
+    folder = beginning(run, tmp_path / "again", 3)
+    packed = PackedRun(folder)
+    packed.to_json()
+    assert packed.to_json()["generation"] == 0
+    first = min((folder / "surface").glob("surface_*.vtu"))
+    os.utime(first, ns=(0, first.stat().st_mtime_ns + 10**9))
+    assert packed.to_json()["generation"] == 1 and len(packed.frames) == 3

@@ -12,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-# where `make readers` puts it: beside the venvs, made once for all of them
-READERS = Path(os.environ.get("FRACSIM_READERS", Path(sys.prefix).parent / "vtk-reader"))
+# where `make readers` puts it: beside the venvs, made once for all of one Python
+_FOLDER = Path(sys.prefix).parent / f"vtk-reader-{sys.implementation.cache_tag}"
+READERS = Path(os.environ.get("FRACSIM_READERS", _FOLDER))
 NO_READER = 77
 
 

@@ -196,7 +196,8 @@ class _Bins:
         bin_of = (z * bins[1] + y) * bins[0] + x
         self.order = np.lexsort([numbers, bin_of])
         self._shape, self._bin_of, self._centre_count = tuple(bins[::-1]), bin_of, len(centres)
-        self._reach = math.ceil(radius / size)
+        # with the round-off that the search in C admits
+        self._reach = math.ceil(radius / size * (1 + 1e-6))
         start = np.concatenate([[0], np.cumsum(np.bincount(bin_of, minlength=int(bins.prod())))])
         origin, sorted_points = low + first * size, points[self.order].T.copy()
         coarse = ((sorted_points - origin[:, None]) / radius).astype(np.float32)

@@ -88,7 +88,8 @@ class FieldEvaluator:
         """Share (cells,) of the edges of each cell that are broken, 0 to 1."""
         assert self._fracture is not None
         graph = self._fracture.graph
-        return np.bitwise_count(graph.pattern) / graph.cell_edges.shape[1]
+        broken = np.unpackbits(graph.pattern[:, None], axis=1).sum(axis=1)
+        return np.asarray(broken / graph.cell_edges.shape[1])
 
     def _expression_values(self, name: str) -> Values:
         """Values (cells, components) of an expression of the deformation; stress and energy are multiplied by chi."""

@@ -42,6 +42,10 @@ class _Part:
     positions: Ints
 
 
+# source of a frame, and the time at which its file was written
+type _Mark = tuple[FrameSource, int]
+
+
 class PackedRun:
     """Frames of a run, which are packed once each.
 
@@ -58,7 +62,7 @@ class PackedRun:
 
     def _clear(self) -> None:
         self.frames: list[dict[str, Any]] = []
-        self._sources: list[FrameSource] = []
+        self._marks: list[_Mark] = []
         self._parts: dict[str, _Part] = {}
         # file of each obstacle as of the last frame
         self._obstacles: dict[str, Path] = {}
@@ -86,19 +90,25 @@ class PackedRun:
         try:
             sources = find_frames(self._folder)
         except InputError:
-            if self._sources:
+            if self._marks:
                 raise
             return  # none is written yet
-        if sources[: len(self._sources)] != self._sources:
+        marks = [_mark(source) for source in sources]
+        if marks[: len(self._marks)] != self._marks:
             self._clear()
             self.generation += 1
-        for source in sources[len(self._sources) :]:
-            self.frames.append(self._pack_frame(source))
-            self._sources.append(source)
+        for source, mark in zip(sources[len(self._marks) :], marks[len(self._marks) :], strict=True):
+            parts, obstacles = self._parts.copy(), self._obstacles.copy()
+            try:
+                self.frames.append(self._pack_frame(source))
+            except BaseException:
+                self._parts, self._obstacles = parts, obstacles
+                raise
+            self._marks.append(mark)
 
     def _pack_frame(self, source: FrameSource) -> dict[str, Any]:
         grid = load_grid(source)
-        if not self._sources:
+        if not self._marks:
             box = np.asarray(grid.bounds).reshape(3, 2)
             self._origin, self._step = box.mean(axis=1), float(np.linalg.norm(np.diff(box))) / _STEPS or 1.0
         parts = frame_parts(grid)
@@ -140,6 +150,12 @@ class PackedRun:
         times = np.array([float(f"{frame['t']:.12g}") for frame in self.frames])
         rows = [np.flatnonzero(table["time"] == t) for t in times]
         return [{name: [_short(value) for value in column[row]] for name, column in columns.items()} for row in rows]
+
+
+def _mark(source: FrameSource) -> _Mark:
+    """Mark of a frame, which differs if another run has written it. All frames of fields.h5 are in one file."""
+    written = source.file.stat().st_mtime_ns if source.index < 0 else 0
+    return source, written
 
 
 def _pack_topology(name: str, part: Any, elements: Ints) -> dict[str, Any]:

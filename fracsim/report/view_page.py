@@ -39,8 +39,8 @@ def write_view(folder: Path, target: Path) -> Path:
 def page_text(data: str) -> str:
     """Page with the data of a run as JSON; "null" if it is to ask the server for them."""
     page = files(__package__).joinpath("view.html").read_text(encoding="utf-8")
-    # "</" would end the element that holds the data
-    return page.replace("THREE_JS", _three_js()).replace("DATA_OF_THE_RUN", data.replace("</", "<\\/"))
+    # "<" could end the element that holds the data, or begin a comment in it
+    return page.replace("THREE_JS", _three_js()).replace("DATA_OF_THE_RUN", data.replace("<", "\\u003c"))
 
 
 def _three_js() -> str:
@@ -111,7 +111,7 @@ class _Handler(BaseHTTPRequestHandler):
                 return
             try:
                 self._answer("application/json", self.server.data(*map(int, numbers)))
-            except InputError as error:
+            except (InputError, OSError, KeyError) as error:  # a frame may be half written
                 self.send_error(503, explain=str(error))
         else:
             self.send_error(404)

@@ -83,7 +83,7 @@ def _mesh_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
     yield f"size        {_size(summary)}"
     for note in summary.notes:
         yield f"{_INDENT}note: {note}"
-    for line in (*_cell_count_question(summary), *unit_questions(study, summary.max_side)):
+    for line in (*_cell_count_question(study, summary), *unit_questions(study, summary.max_side)):
         yield f"{_INDENT}{line}"
     plane = f", plane {study.material.plane}{_thickness(study)}" if summary.dim == 2 else ""
     regions = f"; regions {', '.join(study.material.regions)}" if study.material.regions else ""
@@ -91,14 +91,14 @@ def _mesh_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
     yield f"material    {study.material.energy}{plane}{regions}{like}"
 
 
-def _cell_count_question(summary: MeshSummary) -> Iterator[str]:
+def _cell_count_question(study: Study, summary: MeshSummary) -> Iterator[str]:
     """Yield a question on a mesh of more cells than most computers hold."""
     cells = summary.cell_count
     if cells > LIMITS.max_expected_cells:
         coarser = summary.h * (cells / 1e6) ** (1 / summary.dim)
-        memory = cells * LIMITS.bytes_per_cell / 1e9
-        yield f"question: {cells:,} cells take about {memory:.0f} GB of memory: are so many"
-        yield f"meant? Cells of {coarser:.2g} m are a million, which take {LIMITS.bytes_per_cell / 1e3:g} GB"
+        gigabytes = cells * LIMITS.bytes_per_cell / 1e9
+        memory = "" if study.time.scheme == "rigid" else f" take about {gigabytes:.0f} GB of memory"
+        yield f"question: {cells:,} cells{memory}: are so many meant? Cells of {coarser:.2g} m are a million"
 
 
 def _fracture_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
@@ -165,7 +165,7 @@ def _rigid_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
     source = study.mesh.source
     yield f"mesh        {source}: {summary.dim}D, {summary.size_text}"
     yield f"size        {_size(summary)}"
-    for line in (*_cell_count_question(summary), *unit_questions(study, summary.max_side)):
+    for line in (*_cell_count_question(study, summary), *unit_questions(study, summary.max_side)):
         yield f"{_INDENT}{line}"
     copies = sum(int(np.prod(body.copies)) for body in study.body) or 1
     yield f"bodies      {copies} times the mesh; they move on one rank, no fields.xdmf"

@@ -101,13 +101,21 @@ def field_frames(folder: Path) -> list[FrameSource]:
     check_readable(h5)
     if not h5.exists():
         raise InputError(f"{folder} has no surface.pvd and no fields.h5: it is not the output folder of a run")
-    with h5py.File(h5) as file:
+    with _read_hdf5(h5) as file:
         if name := find_external_data(file):
             raise InputError(f"{h5} has the data of '{name}' in another file, which no run of fracsim does")
         times = [float(file["frames"][name].attrs["time"]) for name in sorted(file["frames"])]
     if not times:
         raise InputError(f"{h5} has no frame yet")
     return [FrameSource(t, h5, index) for index, t in enumerate(times)]
+
+
+def _read_hdf5(path: Path) -> Any:
+    """Open a file for reading without a lock, which would end a run that writes to it. Raises InputError."""
+    try:
+        return h5py.File(path, locking=False)
+    except OSError as error:
+        raise InputError(f"{path} cannot be read, or is being written: {error}; try again") from None
 
 
 def film_interval(times: Sequence[float]) -> float:
@@ -154,7 +162,7 @@ def load_grid(frame: FrameSource) -> Any:
             # NaN gives the original boundary a colour of its own
             grid.cell_data["age"] = np.where(is_crack(grid), grid.cell_data["age"], np.nan)
         return grid
-    with h5py.File(frame.file) as file:
+    with _read_hdf5(frame.file) as file:
         stored = file["frames"][sorted(file["frames"])[frame.index]]
         cells = file["cells"][()]
         cell_type = pyvista.CellType[CELL_TYPES[cells.shape[1]]]
