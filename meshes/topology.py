@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from math import factorial
+
 import numpy as np
 import numpy.typing as npt
 
@@ -17,12 +20,19 @@ def signed_measures(points: Points, cells: npt.NDArray[np.integer]) -> Floats:
     det(x_1 - x_0, ..., x_d - x_0) / d!
     """
     axes = points.T.copy()
-    # rows of the matrix, each as arrays of its components: a quarter of the time of np.linalg.det
     rows = [[x[cells[:, node]] - x[cells[:, 0]] for x in axes] for node in range(1, cells.shape[1])]
+    return determinants(rows) / factorial(len(rows))
+
+
+def determinants(rows: Sequence[Sequence[Floats]] | Floats) -> Floats:
+    """(m,) determinants of 2 x 2 or 3 x 3 matrices; row i has the components rows[i][j] (m,).
+
+    In 3D in a quarter of the time of np.linalg.det.
+    """
     if len(rows) == 2:
-        return np.asarray(rows[0][0] * rows[1][1] - rows[0][1] * rows[1][0]) / 2
+        return np.asarray(rows[0][0] * rows[1][1] - rows[0][1] * rows[1][0])
     a, b, c = rows
-    return np.asarray(sum(a[i] * (b[i - 2] * c[i - 1] - b[i - 1] * c[i - 2]) for i in range(3))) / 6
+    return np.asarray(sum(a[i] * (b[i - 2] * c[i - 1] - b[i - 1] * c[i - 2]) for i in range(3)))
 
 
 def orient_cells(points: Points, cells: Indices) -> tuple[Indices, int]:

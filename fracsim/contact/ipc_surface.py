@@ -151,6 +151,10 @@ class RetractableSurface:
         """Build pairs of all elements."""
         self.pairs, self._excluded = self._build_pairs(self.elements), np.empty(0, np.int64)
 
+    def _remaining(self) -> Ints:
+        """Numbers (m,) of the elements that the pairs have."""
+        return np.delete(np.arange(len(self.elements)), self._excluded)
+
     def _search_along(self, x: Values, end: Values) -> None:
         """Search candidates for the motion of the points from x to `end` (n, d), m."""
         self.pairs.search_along(x, end)
@@ -167,8 +171,7 @@ class RetractableSurface:
 
     def _intersecting_faces(self, u: Values) -> Ints:
         """Crack faces that intersect at displacements u (nodes, d), m (collective)."""
-        numbers = np.delete(np.arange(len(self.elements)), self._excluded)
-        return np.intersect1d(self._crack_faces, numbers[self.pairs.intersections(self.point_map(u))])
+        return np.intersect1d(self._crack_faces, self._remaining()[self.pairs.intersections(self.point_map(u))])
 
     def _common_share(self, share: Values) -> Values:
         """(n,) least factor of the arm of each point on all ranks (collective)."""

@@ -224,9 +224,9 @@ class PenaltySurface(RetractableSurface):
 
     def _pressures(self, u: Values) -> Values:
         x, result = self.point_map(u), np.zeros(len(self.rest_positions))
-        remaining = np.delete(self.elements, self._excluded, axis=0)
-        is_own = np.delete(self.element_set.elements.rank, self._excluded) == self.comm.rank
-        area = self._over_points(vertex_areas(self.rest_positions, remaining[is_own]), np.add)
+        remaining = self._remaining()
+        own = remaining[self.element_set.elements.rank[remaining] == self.comm.rank]
+        area = self._over_points(vertex_areas(self.rest_positions, self.elements[own]), np.add)
         for part in self.parts:
             near = not part.is_far(x)
             gradient = part.contact.gradient(part.points(x))[: len(x)] if near else np.zeros_like(x)
@@ -236,9 +236,9 @@ class PenaltySurface(RetractableSurface):
 
     def _intersecting_faces(self, u: Values) -> Ints:
         x, is_cut = self.point_map(u), np.zeros(len(self.elements), bool)
-        numbers = np.delete(np.arange(len(self.elements)), self._excluded)
+        remaining = self._remaining()
         for part in self.parts:
-            is_cut[numbers[part.cut_elements(x, len(numbers))]] = True
+            is_cut[remaining[part.cut_elements(x, len(remaining))]] = True
         return np.intersect1d(self._crack_faces, np.flatnonzero(self._over_elements(is_cut, np.logical_or)))
 
     def _common_share(self, share: Values) -> Values:

@@ -54,10 +54,11 @@ RETENTION = RetentionParameters()
 ATTACHED = -np.inf
 
 
-def _flag_unsplit_after(graph: EdgeGraph, fails: Flags) -> Flags:
-    """Flag the cells (cells,) that are not split once the edges in `fails` (edges,) break as well."""
+def _flag_unsplit_after(graph: EdgeGraph, fails: Flags, cells: Ints | slice) -> Flags:
+    """Flag those of `cells` (m,) that are not split once the edges in `fails` (edges,) break as well."""
     bits = 1 << np.arange(graph.cell_edges.shape[1])
-    return ~is_split(graph.domain.dim)[graph.pattern | (fails[graph.cell_edges] @ bits).astype(np.uint8)]
+    pattern = graph.pattern[cells] | (fails[graph.cell_edges[cells]] @ bits).astype(np.uint8)
+    return ~is_split(graph.domain.dim)[pattern]
 
 
 def _flag_losing_last_cell(graph: EdgeGraph, cells_around: NodeCellCount, fails: Flags) -> Flags:
@@ -65,10 +66,8 @@ def _flag_losing_last_cell(graph: EdgeGraph, cells_around: NodeCellCount, fails:
     # Few edges fail in a pass: the cells around all nodes are not counted.
     cells = graph.edge_cells(np.flatnonzero(fails))
     cells = cells[~graph.split[cells]]
-    bits = 1 << np.arange(graph.cell_edges.shape[1])
-    pattern = graph.pattern[cells] | (fails[graph.cell_edges[cells]] @ bits).astype(np.uint8)
     lost = np.zeros(len(graph.split), bool)
-    lost[cells[is_split(graph.domain.dim)[pattern]]] = True
+    lost[cells[~_flag_unsplit_after(graph, fails, cells)]] = True
     lost_count = cells_around(lost)
     loses = lost_count > 0
     return loses & (cells_around(~graph.split & loses[graph.cell_nodes].any(axis=1)) == lost_count)
@@ -224,7 +223,7 @@ class NodeAttachment:
         loses = _flag_losing_last_cell(graph, self._cells_around, fails)
         if not sum_over_ranks(graph.domain.comm, np.count_nonzero(loses))[0]:
             return np.zeros(len(fails), bool)
-        without_cell = self._cells_around(_flag_unsplit_after(graph, fails)) == 0
+        without_cell = self._cells_around(_flag_unsplit_after(graph, fails, slice(None))) == 0
         candidates = np.flatnonzero(~graph.broken & without_cell[graph.edge_nodes].any(axis=1))
         load = self._edge_loads(candidates, without_cell, stress)
         # An edge that a crack cuts attaches a node only if no other edge can.
