@@ -225,8 +225,8 @@ class PenaltySurface(RetractableSurface):
     def _pressures(self, u: Values) -> Values:
         x, result = self.point_map(u), np.zeros(len(self.rest_positions))
         remaining = self._remaining()
-        own = remaining[self.element_set.elements.rank[remaining] == self.comm.rank]
-        area = self._over_points(vertex_areas(self.rest_positions, self.elements[own]), np.add)
+        of_rank = remaining[self.element_set.elements.rank[remaining] == self.comm.rank]
+        area = self._over_points(vertex_areas(self.rest_positions, self.elements[of_rank]), np.add)
         for part in self.parts:
             near = not part.is_far(x)
             gradient = part.contact.gradient(part.points(x))[: len(x)] if near else np.zeros_like(x)
