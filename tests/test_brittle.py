@@ -260,7 +260,7 @@ def test_principal_stress_by_its_definition() -> None:
     random = np.random.default_rng(1)
     s = random.normal(size=(50, 3, 3))
     s = s + np.swapaxes(s, 1, 2)
-    n = first_principal_directions(s, random.random((50, 3)), 0)
+    n = first_principal_directions(s, random.random((50, 3)), 1.0)
     top = np.einsum("ni,nij,nj->n", n, s, n)
     tries = random.normal(size=(2000, 3))
     tries /= np.linalg.norm(tries, axis=1)[:, None]
@@ -273,9 +273,9 @@ def test_equal_principal_stresses_give_a_drawn_direction() -> None:
     """Biaxial tension with noise: a direction in its plane that the noise does not change, but the seed does."""
     place, noise = np.array([[0.1, 0.2, 0.3]]), np.random.default_rng(0).normal(size=(3, 3)) * 1e-9
     s = np.diag([1.0, 1.0, 0.2])
-    plain = first_principal_directions(s[None], place, 0)[0]
-    noisy = first_principal_directions((s + noise + noise.T)[None], place, 0)[0]
-    other = first_principal_directions(s[None], place, 1)[0]
+    plain = first_principal_directions(s[None], place, 1.0)[0]
+    noisy = first_principal_directions((s + noise + noise.T)[None], place, 1.0)[0]
+    other = first_principal_directions(s[None], place, 1.0, 1)[0]
     assert (
         abs(plain[2]) < 1e-12 and 1 - abs(plain @ noisy) < 1e-8 / EQUAL_STRESS_TOLERANCE and abs(plain @ other) < 0.999
     )

@@ -21,7 +21,7 @@ from fracsim.fracture.criterion import OverloadedEdges
 from fracsim.fracture.edge_stress import EdgeStressOperator
 from fracsim.fracture.fracture_pass import FracturePass
 from fracsim.fracture.nonlocal_average import NonlocalAverage
-from fracsim.fracture.strength import EdgeStrength, hash_points
+from fracsim.fracture.strength import EdgeStrength, hash_points, round_points
 from fracsim.mechanics.jit import CellExpression
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.simplices import is_split, local_edges
@@ -535,6 +535,6 @@ def test_strength_scatters_by_the_edge_not_by_the_cell() -> None:
     for edge, value in zip(edges.ravel().tolist(), noise.ravel().tolist(), strict=True):
         values.setdefault(edge, set()).add(value)
     assert Counter(len(found) for found in values.values()) == {1: len(values)}
-    middles = scene.domain.nodes[scene.fracture.graph.edge_nodes].sum(axis=1)
+    middles = round_points(scene.domain.nodes[scene.fracture.graph.edge_nodes].sum(axis=1), np.sqrt(3.0))
     assert {edge: next(iter(found)) for edge, found in values.items()} == dict(enumerate(hash_points(middles).tolist()))
     assert edges.shape[1] == len(local_edges(3))

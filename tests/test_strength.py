@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from fracsim.fracture.strength import EdgeStrength, FibreAnisotropy, WeibullScatter, fibre_factors, weibull_factors
+from fracsim.fracture.strength import (
+    EdgeStrength,
+    FibreAnisotropy,
+    WeibullScatter,
+    fibre_factors,
+    hash_points,
+    round_points,
+    weibull_factors,
+)
 from support.scenes import make_scene, march
 
 
@@ -30,6 +38,21 @@ def test_the_seed_decides() -> None:
     assert np.array_equal(first, again)
     assert np.array_equal(weibull_factors(points[order], WeibullScatter(modulus=5.0, seed=7)), first[order])
     assert abs(np.corrcoef(first, other)[0, 1]) < 4 / np.sqrt(len(points))
+
+
+@pytest.mark.parametrize("size", (1e-3, 1.0, np.sqrt(2.0), 250.0))
+def test_round_off_of_the_mesh_does_not_change_the_strength(size: float) -> None:
+    """A mesh of another library, 1e-15 of the body away, has the same numbers; one 2e-9 away has others.
+
+    The body lies three times its size from the origin, and its size differs by round-off, too.
+    """
+    random = np.random.default_rng(4)
+    lattice = size * (3 + np.stack(np.meshgrid(*[np.linspace(0, 1, 18)] * 3), axis=-1).reshape(-1, 3))
+    first = hash_points(round_points(lattice, size))
+    same = round_points(lattice + 1e-15 * size * random.uniform(-1, 1, lattice.shape), size * (1 + 4e-16))
+    other = round_points(lattice + 2e-9 * size, size)
+    assert np.array_equal(first, hash_points(same))
+    assert np.all(first != hash_points(other))
 
 
 def test_direction() -> None:

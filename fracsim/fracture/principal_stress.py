@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..forms.kinematics import SYMMETRIC_COMPONENTS
-from .strength import hash_points
+from .strength import hash_points, round_points
 
 Values = npt.NDArray[np.float64]
 
@@ -42,25 +42,27 @@ def tensile_part(components: Values, dim: int) -> Values:
     return np.stack([np.einsum("nk,nk->n", scaled[:, i], vectors[:, j]) for i, j in SYMMETRIC_COMPONENTS[dim]], axis=1)
 
 
-def first_principal_directions(stress: Values, points: Values, seed: int) -> Values:
+def first_principal_directions(stress: Values, points: Values, size: float, seed: int = 0) -> Values:
     """Return unit directions (n, d) of the largest principal stress; their sign is arbitrary.
 
     If several principal stresses are equal to the largest one, a direction of their eigenspace is drawn.
 
     Args:
         stress: (n, d, d), Pa.
-        points: (n, d) from whose bits directions are drawn, m.
+        points: (n, d) from which directions are drawn, m.
+        size: length of the body, m: points that differ by its round-off have the same directions.
         seed: seed of the draws.
     """
     values, vectors = np.linalg.eigh(stress)
-    size = np.abs(values).max(axis=1, keepdims=True)
-    is_largest = values >= values[:, -1:] - EQUAL_STRESS_TOLERANCE * size
+    largest = np.abs(values).max(axis=1, keepdims=True)
+    is_largest = values >= values[:, -1:] - EQUAL_STRESS_TOLERANCE * largest
     result = vectors[:, :, -1].copy()
     multiple = np.flatnonzero(is_largest.sum(axis=1) > 1)
     if len(multiple):
         # Hashed from the points, so that the directions are the same on any number of ranks.
         d = stress.shape[1]
-        draw = np.column_stack([hash_points(points[multiple], d * seed + axis) for axis in range(d)])
+        rounded = round_points(points[multiple], size)
+        draw = np.column_stack([hash_points(rounded, d * seed + axis) for axis in range(d)])
         shares = np.einsum("nij,ni->nj", vectors[multiple], draw) * is_largest[multiple]
         result[multiple] = np.einsum("nij,nj->ni", vectors[multiple], shares)
     return unit_or_first_axis(result)

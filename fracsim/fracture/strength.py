@@ -2,7 +2,7 @@
 
     s_e = strength(cell) (1 + tie_break h_e) w_e f_e
 
-- h_e in [-1, 1) is hashed from the reference mid-point of the edge.
+- h_e in [-1, 1) is hashed from the reference mid-point of the edge, rounded to about 1e-9 of the body's size.
 - w_e = (-ln(1 - U))^(1/m) / Gamma(1 + 1/m) is a Weibull number of mean 1, drawn from the mid-point and a seed.
 - f_e = 1 + (ratio - 1) (n . a)^2, with the reference direction n of the edge and the fibre a.
 
@@ -117,9 +117,10 @@ class EdgeStrength:
         return np.full(len(self._graph.broken), np.nan)
 
     def _twice_midpoints(self, edges: npt.NDArray[np.integer]) -> Values:
-        """Return the sum (n, d) of the ends of edges, which has the same bits whichever end is first."""
-        ends = self._graph.domain.nodes[self._graph.edge_nodes[edges]]
-        return ends[:, 0] + ends[:, 1]
+        """Return the rounded sum (n, d) of the ends of edges."""
+        domain = self._graph.domain
+        ends = domain.nodes[self._graph.edge_nodes[edges]]
+        return round_points(ends[:, 0] + ends[:, 1], domain.bounds.diagonal)
 
     def _edge_factors(self, scatter: WeibullScatter | None, fibre: FibreAnisotropy | None) -> Values | None:
         """Return w_e f_e (edges,) of local edges; None if all are 1."""
@@ -150,6 +151,16 @@ def fibre_factors(vectors: Values, fibre: FibreAnisotropy) -> Values:
     a = np.asarray(fibre.direction, float)
     cosine2 = (vectors @ a) ** 2 / (np.einsum("ni,ni->n", vectors, vectors) * (a @ a))
     return np.asarray(1 + (fibre.ratio - 1) * cosine2)
+
+
+def round_points(points: Values, size: float) -> Values:
+    """Return points (n, k) in whole multiples of a power of two between 0.6e-9 and 1.2e-9 of the body's size, m.
+
+    Meshes whose coordinates differ by round-off, as of two versions of a library, have the same multiples: of 10^7
+    coordinates about one lies so near to the middle between two multiples that round-off decides.
+    """
+    # The power changes at sizes of 2^(n + 0.3) m, not at powers of two, which are the sizes of many bodies.
+    return np.rint(np.ldexp(points, 30 - math.floor(math.log2(size) + 0.7)))
 
 
 def hash_points(points: Values, seed: int = 0) -> Values:

@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mesh.c_library import Float64, Int32, load_library, struct_pointer
-from ..mesh.dolfinx_compat import cell_geometry, compiled_constants, form_cell_nodes, form_fields, kernel_address
+from ..mesh.dolfinx_compat import cell_geometry, form_cell_nodes, form_fields, kernel_address, kernel_constants
 from .jit import CellForm
 
 Values = npt.NDArray[np.float64]
@@ -47,7 +47,7 @@ class CellSubsetAssembler:
         self._form, self._fields = form, form_fields(form)
         nodes, size = form_cell_nodes(form), form.function_spaces[0].dofmap.index_map_bs
         points, corners = form.mesh.geometry.x, cell_geometry(form.mesh.geometry)
-        self._constants = compiled_constants(form.all_cells_form)
+        self._constants = kernel_constants(form.whole)
         self._pointers = [struct_pointer(array) for array in (nodes, corners, points, self._constants)]
         width = sum(field.dofs.shape[1] * field.size for field in self._fields)
         sizes = nodes.shape[1], size, corners.shape[1], len(self._fields), width
@@ -64,7 +64,7 @@ class CellSubsetAssembler:
             values: (dofs,) of this rank, ghosts included; added to.
             instead: values of fields in place of those whose array begins at an address.
         """
-        self._constants[:] = compiled_constants(self._form.all_cells_form)
+        self._constants[:] = kernel_constants(self._form.whole)
         fields = self._field_table(instead) if instead else self._current_fields
         _code().add(byref(self._arguments), byref(fields), len(cells), cells, values)
 

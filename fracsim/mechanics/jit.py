@@ -23,7 +23,7 @@ from ufl.variable import Label
 
 from ..errors import CannotWrite, InputError
 from ..mesh.c_library import machine_flags
-from ..mesh.dolfinx_compat import bind_to_cells, cache_kernels, evaluate, kernel_source, single_integral_cells
+from ..mesh.dolfinx_compat import bind_to_cells, cache_kernels, evaluate, integrated_cells_of, kernel_source
 from ..mesh.domain import Domain
 from ..mesh.library_cache import is_disk_full, library_folder, private_umask
 from ..mesh.parallel import raise_on_all_ranks
@@ -57,6 +57,9 @@ class CellForm(fem.Form):
 
     Kernels are bound to the remaining cells when DOLFINx asks for the form next. Vectors are assembled over
     `remaining_cells` without that.
+
+    Attributes:
+        whole: the form over all cells of the measure, as it was compiled.
     """
 
     # fem.create_form would bind kernels to other cells as well, but in DOLFINx 0.9 it mixes up the coefficients of a
@@ -64,7 +67,7 @@ class CellForm(fem.Form):
 
     def __init__(self, form: ufl.Form) -> None:
         compiled = compile_form(form)
-        self._all_cells: Any = compiled._cpp_object
+        self.whole = compiled
         self._excluded: npt.NDArray[np.bool_] | None = None
         self._remaining: npt.NDArray[np.int64] | None = None
         super().__init__(compiled._cpp_object, compiled.ufcx_form, compiled.code, compiled.module)
@@ -77,11 +80,6 @@ class CellForm(fem.Form):
         return self._over(~self._excluded)
 
     @property
-    def all_cells_form(self) -> Any:
-        """C++ form over all cells of the measure, as it was compiled; to use it binds no kernel again."""
-        return self._all_cells
-
-    @property
     def remaining_cells(self) -> npt.NDArray[np.int64] | None:
         """Cells of the integral once any have been excluded; None before, and for forms with other integrals."""
         if self._remaining is None and self._excluded is not None and (cells := self._cells) is not None:
@@ -91,7 +89,8 @@ class CellForm(fem.Form):
     @cached_property
     def _cells(self) -> npt.NDArray[np.int64] | None:
         """Cells of the measure; None for a form with other integrals."""
-        return single_integral_cells(self._all_cells)
+        cells = integrated_cells_of(self.whole)
+        return None if cells is None else np.array(cells, np.int64)
 
     def exclude_cells(self, dead: npt.NDArray[np.bool_]) -> None:
         """Integrate from now on over the cells of the measure that are not flagged (cells,) (not collective)."""
@@ -99,7 +98,7 @@ class CellForm(fem.Form):
         self.__dict__.pop("_cpp_object", None)  # kernels are bound to the remaining cells when it is asked for
 
     def _over(self, chosen: npt.NDArray[np.bool_]) -> Any:
-        return bind_to_cells(self, self._all_cells, self._constants, lambda cells: cells[chosen[cells]])
+        return bind_to_cells(self.whole, self._constants, lambda cells: cells[chosen[cells]])
 
 
 def cell_measure(domain: Domain, cells: npt.NDArray[np.int32] | None = None) -> ufl.Measure:

@@ -16,6 +16,8 @@ from dolfinx import fem, la
 from dolfinx.mesh import Mesh
 from mpi4py import MPI
 
+from ..mesh.dolfinx_compat import coefficient_spaces
+
 if TYPE_CHECKING:
     from ctypes import CDLL
 
@@ -42,9 +44,11 @@ class KernelSelection:
     min_cells: int = 5_000
 
     def _pays_for(self, form: fem.Form) -> bool:
-        spaces = form.function_spaces or [field.function_space for field in form._cpp_object.coefficients]
+        if self.plain:
+            return False
+        spaces = form.function_spaces or coefficient_spaces(form)
         dofs = (space.dofmap.index_map.size_global * space.dofmap.index_map_bs for space in spaces)
-        return not self.plain and any(count >= self.min_dofs for count in dofs)
+        return any(count >= self.min_dofs for count in dofs)
 
     def functional(self, form: fem.Form) -> SimdFunctional | None:
         """Kernel of an integral over cells (collective)."""

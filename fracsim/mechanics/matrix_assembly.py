@@ -26,7 +26,6 @@ from ..mesh.dolfinx_compat import (
     create_vector,
     make_block_csr,
     make_scalar_csr,
-    make_sparsity_pattern,
 )
 from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
@@ -93,7 +92,7 @@ class TangentAssembler:
             block_code: library of products with blocks; None: single entries.
             with_dead_cells: whether cells that the form excludes are in the pattern.
         """
-        pattern = make_sparsity_pattern(self.form.all_cells_form if with_dead_cells else self.form._cpp_object)
+        pattern = fem.create_sparsity_pattern(self.form.whole if with_dead_cells else self.form)
         owned = self.form.function_spaces[0].dofmap.index_map.size_local
         pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
         pattern.finalize()

@@ -28,7 +28,6 @@ from ..mesh.dolfinx_compat import (
     expression_fields,
     form_cell_nodes,
     form_fields,
-    form_integral_types,
     integrated_cells_of,
     kernel_constants,
     set_identity_rows,
@@ -94,9 +93,16 @@ class SimdKernel:
         self._nodes = form_cell_nodes(form) if form.rank else cell_geometry(form.mesh.geometry)
         self._fields = _KernelFields(form_fields(form))
 
+    @property
+    def _cells(self) -> npt.NDArray[np.int32]:
+        """Cells over which the form integrates at present."""
+        cells = integrated_cells_of(self._form)
+        assert cells is not None  # `compile_simd_form` takes no other form
+        return cells
+
     def _call(self, function: Any, *arguments: npt.NDArray[Any]) -> int:
         """Result of a C function of the form and further arrays."""
-        cells, geometry, c = integrated_cells_of(self._form), self._form.mesh.geometry, kernel_constants(self._form)
+        cells, geometry, c = self._cells, self._form.mesh.geometry, kernel_constants(self._form)
         arrays = cells, self._nodes, cell_geometry(geometry), geometry.x, c
         form = _SimdForm(len(cells), self._fields.width, len(c), *map(struct_pointer, arrays), self._fields.pointer)
         return int(function(byref(form), *arguments) or 0)
@@ -107,7 +113,7 @@ class SimdFunctional(SimdKernel):
 
     def integrate(self) -> float:
         """Sum over this rank's cells."""
-        values = np.empty(len(integrated_cells_of(self._form)))
+        values = np.empty(len(self._cells))
         self._call(self._code.fill, values)
         return float(values.sum())
 
@@ -187,7 +193,7 @@ class SimdExpression:
 
 def compile_simd_form(form: fem.Form) -> CDLL | None:
     """Library of the vectorised kernel of a form; None if it cannot be vectorised (collective)."""
-    if form_integral_types(form) != [fem.IntegralType.cell]:
+    if integrated_cells_of(form) is None:
         return None
     fields, corners = form_fields(form), cell_node_count(form.mesh.geometry)
     bs, nodes = 1, 1

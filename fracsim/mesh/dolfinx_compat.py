@@ -168,25 +168,29 @@ def cache_kernels() -> None:
     jit.get_cached_module, jit._load_objects = looked_up_once, load_compiled
 
 
-def bind_to_cells(form: fem.Form, whole: Any, constants: Sequence[Any], keep: Callable[[Ints], Ints]) -> Any:
-    """C++ form with the kernels of `form`, over those cells of each integral of `whole` that `keep` returns.
+def bind_to_cells(form: fem.Form, constants: Sequence[Any], keep: Callable[[Ints], Ints]) -> Any:
+    """C++ form with the kernels of a compiled `form`, over those cells of each integral that `keep` returns.
 
-    `whole`: C++ form as it was compiled; its integrals over facets stay. `constants`: C++ constants of the form.
+    Integrals over facets stay. `constants`: C++ constants of the form.
     """
+    compiled: Any = form._cpp_object
     module: Any = form.module
     cell = fem.IntegralType.cell
-    domains = {kind: form_domains(form, whole, kind) for kind in whole.integral_types}
+    domains = {kind: form_domains(form, kind) for kind in compiled.integral_types}
     domains[cell] = [(number, keep(cells)) for number, cells in domains.get(cell, [])]
     kernels: Any = module.ffi.cast("uintptr_t", module.ffi.addressof(form.ufcx_form))
     entity_maps: Any = {}
     if not IS_0_9:
         kernels, entity_maps = [kernels], []
-    bind = fem.form_cpp_class(whole.dtype)
-    return bind(kernels, whole.function_spaces, whole.coefficients, constants, domains, entity_maps, whole.mesh)
+    bind = fem.form_cpp_class(form.dtype)
+    return bind(
+        kernels, compiled.function_spaces, compiled.coefficients, constants, domains, entity_maps, compiled.mesh
+    )
 
 
-def form_domains(form: fem.Form, compiled: Any, kind: Any) -> list[tuple[int, Ints]]:
-    """Identifier and flat array of entities of each integral of a type; `compiled`: C++ form of `form`."""
+def form_domains(form: fem.Form, kind: Any) -> list[tuple[int, Ints]]:
+    """Identifier and flat array of entities of each integral of a type."""
+    compiled: Any = form._cpp_object
     if IS_0_9:
         return [(number, compiled.domains(kind, number).reshape(-1)) for number in compiled.integral_ids(kind)]
     first, last = _integral_places(form.ufcx_form, kind)
@@ -200,18 +204,6 @@ def _integral_places(ufcx_form: Any, kind: Any) -> tuple[int, int]:
     position = [fem.IntegralType.cell, fem.IntegralType.exterior_facet, fem.IntegralType.interior_facet].index(kind)
     offsets = ufcx_form.form_integral_offsets
     return int(offsets[position]), int(offsets[position + 1])
-
-
-def _integral_count(compiled: Any, kind: Any) -> int:
-    """Number of integrals of a type of a C++ form."""
-    return len(compiled.integral_ids(kind)) if IS_0_9 else int(compiled.num_integrals(kind, 0))
-
-
-def _single_domain(compiled: Any) -> Ints:
-    """Cells of a C++ form with one integral, over cells."""
-    kind = fem.IntegralType.cell
-    (number,) = compiled.integral_ids(kind) if IS_0_9 else range(compiled.num_integrals(kind, 0))
-    return np.asarray(compiled.domains(kind, number))
 
 
 def evaluate(
@@ -237,12 +229,7 @@ def kernel_source(expression: fem.Expression, mesh: dolfinx.mesh.Mesh, options: 
 
 def kernel_constants(kind: fem.Form | fem.Expression) -> npt.NDArray[np.float64]:
     """Constants that are passed to the kernel of a form or expression."""
-    return compiled_constants(kind._cpp_object)
-
-
-def compiled_constants(compiled: Any) -> npt.NDArray[np.float64]:
-    """Constants that are passed to the kernels of a C++ form."""
-    constants: npt.NDArray[np.float64] = dolfinx.cpp.fem.pack_constants(compiled)
+    constants: npt.NDArray[np.float64] = dolfinx.cpp.fem.pack_constants(kind._cpp_object)
     return constants
 
 
@@ -282,26 +269,19 @@ def kernel_address(form: fem.Form) -> int:
     return int(module.ffi.cast("uintptr_t", form.ufcx_form.form_integrals[0].tabulate_tensor_float64))
 
 
-def integrated_cells_of(form: fem.Form) -> Ints:
-    """Present cells of a form with one integral, over cells."""
-    return _single_domain(form._cpp_object)
-
-
-def single_integral_cells(compiled: Any) -> npt.NDArray[np.int64] | None:
-    """Cells of a C++ form with one integral, over cells; None for any other form."""
-    if compiled_integral_types(compiled) != [fem.IntegralType.cell]:
+def integrated_cells_of(form: fem.Form) -> Ints | None:
+    """Present cells of a form with one integral, over cells; None for any other form."""
+    compiled: Any = form._cpp_object
+    cell = fem.IntegralType.cell
+    if list(compiled.integral_types) != [cell]:
         return None
-    return np.array(_single_domain(compiled), np.int64)
+    numbers = compiled.integral_ids(cell) if IS_0_9 else range(compiled.num_integrals(cell, 0))
+    return np.asarray(compiled.domains(cell, numbers[0])) if len(numbers) == 1 else None
 
 
-def form_integral_types(form: fem.Form) -> list[Any]:
-    """Type of each integral of a form."""
-    return compiled_integral_types(form._cpp_object)
-
-
-def compiled_integral_types(compiled: Any) -> list[Any]:
-    """Type of each integral of a C++ form."""
-    return [kind for kind in compiled.integral_types for _ in range(_integral_count(compiled, kind))]
+def coefficient_spaces(form: fem.Form) -> list[Any]:
+    """C++ function spaces of the functions that are passed to the kernel of a form."""
+    return [function.function_space for function in form._cpp_object.coefficients]
 
 
 def form_cell_nodes(form: fem.Form) -> Ints:
@@ -341,11 +321,6 @@ def assemble_matrix(form: fem.Form, bcs: list[fem.DirichletBC] | None = None, di
     matrix = fem_petsc.assemble_matrix(form, bcs or [], diagonal)
     matrix.assemble()
     return _reference_counted(matrix)
-
-
-def make_sparsity_pattern(form: Any) -> SparsityPattern:
-    """A new sparsity pattern of a C++ bilinear form, to which entries can be added."""
-    return dolfinx.cpp.fem.create_sparsity_pattern(form)
 
 
 def make_scalar_csr(pattern: SparsityPattern) -> la.MatrixCSR:

@@ -178,7 +178,7 @@ def weaken(scene: Scene) -> None:
 def integrated_cells(scene: Scene) -> npt.NDArray[np.int32]:
     """Owned cells that the residual is assembled over."""
     work = scene.balance._work
-    return dict(form_domains(work, work._cpp_object, IntegralType.cell))[1]
+    return dict(form_domains(work, IntegralType.cell))[1]
 
 
 def dead_cells(mass: str, *ways: str) -> Found:

@@ -64,7 +64,7 @@ class DirectionField:
             strength: (cells,) Pa.
         """
         share = np.clip(first_principal_stress(stress) / strength, 0.0, 1.0) * mesh.volumes
-        normal = material_normals(first_principal_directions(stress, mesh.centroids, 0), gradient)
+        normal = material_normals(first_principal_directions(stress, mesh.centroids, mesh.size), gradient)
         dyads = (share[:, None, None] * normal[:, :, None] * normal[:, None, :]).reshape(len(stress), -1)
         sums = (mesh.node_cells @ dyads) / (mesh.node_cells @ mesh.volumes)[:, None]
         values, vectors = np.linalg.eigh(sums.reshape(-1, mesh.dim, mesh.dim))

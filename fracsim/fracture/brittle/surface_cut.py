@@ -86,6 +86,7 @@ class SurfaceCutMesh(MeshTopology, CellNodes):
         centroids: (cells, d) m.
         layer: triangles of a shell, whose nodes are there twice; None for a solid.
         tolerance: distance up to which a node lies on a surface, m.
+        size: diagonal of the bounding box, m.
     """
 
     def __init__(self, mesh: MeshData) -> None:
@@ -97,6 +98,7 @@ class SurfaceCutMesh(MeshTopology, CellNodes):
             self.points = mesh.shell.middle
         self.centroids: Values = self.points[mesh.cells].mean(axis=1)
         self.tolerance = CUT.on_surface * float(np.mean(self.volumes)) ** (1 / mesh.dim)
+        self.size = float(np.linalg.norm(np.ptp(self.points, axis=0)))
 
     @cached_property
     def node_cells(self) -> csr_matrix:

@@ -125,7 +125,7 @@ class SurfacePass:
             field: principal directions for curved surfaces; None for planes.
         """
         mesh, points = self.mesh, self.mesh.centroids[load.cell]
-        directions = first_principal_directions(load.stress, points, self.parameters.seed)
+        directions = first_principal_directions(load.stress, points, mesh.size, self.parameters.seed)
         normals = material_normals(directions, load.gradient)
         damage = _PassDamage(mesh, broken_keys)
         candidates = StartCandidates(points, load.load, self._spacing, earlier_starts)

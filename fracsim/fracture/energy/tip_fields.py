@@ -211,7 +211,7 @@ class TipFieldEvaluator:
 
         The first ones are unit vectors in space, the second ones those in the reference configuration.
         """
-        normals = first_principal_directions(stress, self.centres[cells], 0)
+        normals = first_principal_directions(stress, self.centres[cells], self._domain.bounds.diagonal)
         if self._stress.energy.linear:
             return normals, normals
         H = self.mean_gradients(cells, self._stress.u.x.array)
