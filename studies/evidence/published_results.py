@@ -6,6 +6,7 @@ measured: Winkler (2001), fig. 7.12, series A, as github.com/PSAAPGroupLinder/lS
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,18 +22,15 @@ PUBLISHED_ROWS: tuple[tuple[TableCell, ...], ...] = (
     ("phase field (Miehe et al. 2010)", None, 701.0, 5.55e-6, "1.37e8 to 1.42e8"),
     ("Griffith, sharp crack", None, 645.0, 4.56e-6, None),
 )
-# displacement, mm, and load, N
-PANEL_CURVE = (
-    (0.0, 6.4), (0.0498, 2014.9), (0.0956, 4016.3), (0.1207, 5000.9), (0.1359, 5584.3), (0.1483, 5998.9),
-    (0.1609, 6400.6), (0.1713, 6707.5), (0.1839, 6991.8), (0.1925, 7132.9), (0.2008, 7209.8), (0.2078, 7219.1),
-    (0.2162, 7123.7), (0.2241, 6983.3), (0.2384, 6713.8), (0.2543, 6342.8), (0.2693, 5996.0), (0.2839, 5644.4),
-    (0.3002, 5265.4), (0.3238, 4800.6), (0.3463, 4408.4), (0.3684, 4014.6), (0.3996, 3528.6), (0.4486, 3003.0),
-    (0.4992, 2477.4), (0.5476, 2162.7), (0.5986, 1910.6), (0.6982, 1545.1), (0.7988, 1282.5), (0.8990, 1100.4),
-    (1.0003, 1040.5),
-)  # fmt: skip
-MEASURED = {
-    "l-panel": (tuple(displacement * 1e-3 for displacement, _ in PANEL_CURVE), tuple(load for _, load in PANEL_CURVE))
-}
+
+
+def _measured_panel() -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Return displacement, m, and load, N, of the measured panel."""
+    rows = np.loadtxt(Path(__file__).with_name("winkler-2001.csv"), delimiter=",", skiprows=1)
+    return tuple((1e-3 * rows[:, 0]).tolist()), tuple(rows[:, 1].tolist())
+
+
+MEASURED = {"l-panel": _measured_panel()}
 
 
 def table(records: list[Record]) -> tuple[ReportTable, ...]:
