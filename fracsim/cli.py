@@ -233,14 +233,15 @@ def view(
         return
     import_outside("pyvista")
     from .output.lock import describe_lock_holder
-    from .report.view_page import serve_view, write_view
+    from .report.view_page import LARGE_PAGE, serve_view, write_view
 
     if html is None:
         serve_view(out, lambda: bool(describe_lock_holder(out)))
         return
     _note_active_runs([out])
     size = write_view(out, html).stat().st_size
-    print(f"saved {html} ({size / 1e6:.1f} MB)")
+    advice = "; a longer output.interval or fewer output.fields make it smaller" if size > LARGE_PAGE else ""
+    print(f"saved {html} ({size / 1e6:.1f} MB{advice})")
 
 
 @app.command()

@@ -100,6 +100,19 @@ def test_fragments_and_history_are_those_of_the_tables(run: Path) -> None:
     assert len(data["history"]["time"]) == 30 and data["outcome"] == "done"
 
 
+def test_fields_are_components_of_tensors_and_magnitudes_of_vectors(tmp_path: Path) -> None:
+    """In the frame of a clamped bar that is pulled: sigma_xx is the largest component."""
+    over = ["mesh.h=0.05", "time.end=0.02", "output.surface=false", "output.picture=false",
+            'output.fields=["velocity", "stress", "von_mises"]']  # fmt: skip
+    run_study(MPI.COMM_SELF, load_study("bar-2d", over), tmp_path / "bar")
+    data = PackedRun(tmp_path / "bar").to_json()
+    ranges = {name: field["range"] for name, field in data["frames"][-1]["parts"]["skin"]["fields"].items()}
+    components = {f"stress:{component}" for component in ("xx", "yy", "zz", "xy", "yz", "xz")}
+    assert components | {"velocity", "von_mises"} <= set(ranges) and "stress" not in ranges
+    assert ranges["stress:xx"][1] == max(ranges[name][1] for name in components) > 0
+    assert data["units"]["stress"] == "Pa" and ranges["velocity"][0] >= 0
+
+
 def test_the_page_needs_nothing_else(run: Path, tmp_path: Path) -> None:
     page = write_view(run, tmp_path / "run.html").read_text()
     markup = re.sub(r"<script>.*?</script>", "", page, count=1, flags=re.DOTALL)  # three.js names addresses in comments

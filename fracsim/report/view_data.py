@@ -16,8 +16,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
+from ..output.fields_file import TENSOR_COMPONENTS
 from .compare import column_unit
-from .pictures.colour_maps import HIDDEN, UNITS
+from .pictures.colour_maps import COMPONENT_NAMES, HIDDEN, UNITS
 from .pictures.frames import FrameSource, find_frames, frame_parts, load_grid, plane_normals, with_normals
 from .pictures.picture_options import material_look
 from .pictures.surroundings import OBSTACLE_COLOUR, PLANE_COLOUR, obstacle_surface
@@ -174,21 +175,31 @@ def _pack_topology(name: str, part: Any, elements: Ints) -> dict[str, Any]:
 
 
 def _fields(part: Any, triangles: Ints) -> dict[str, Values]:
-    """Scalars (n,) at the points, by field: magnitudes of vectors, and means of the values of triangles."""
+    """Scalars (n,) at the points, by field: magnitudes of vectors, components of tensors, means of triangles' values."""
     fields = {}
     for data in (part.point_data, part.cell_data):
         for name, array in data.items():
-            values = np.asarray(array, float)
-            if name in (*HIDDEN, "piece", "region") or name.startswith("vtk") or values.shape[1:] not in ((), (3,)):
+            if name in (*HIDDEN, "piece", "region") or name.startswith("vtk"):
                 continue
-            values = np.linalg.norm(values, axis=1) if values.ndim == 2 else values
-            if len(values) != part.n_points or data is part.cell_data:
-                corners = triangles.reshape(-1)
-                count = np.bincount(corners, minlength=part.n_points)
-                values = np.bincount(corners, np.repeat(values, 3), part.n_points) / np.maximum(count, 1)
-            if np.isfinite(values).any():
-                fields[name] = values
+            for title, scalars in _scalars(name, np.asarray(array, float)):
+                at_points = scalars
+                if len(scalars) != part.n_points or data is part.cell_data:
+                    corners = triangles.reshape(-1)
+                    count = np.bincount(corners, minlength=part.n_points)
+                    at_points = np.bincount(corners, np.repeat(scalars, 3), part.n_points) / np.maximum(count, 1)
+                if np.isfinite(at_points).any():
+                    fields[title] = at_points
     return fields
+
+
+def _scalars(name: str, values: Values) -> list[tuple[str, Values]]:
+    """Names and scalars (n,) that show an array (n,) or (n, components); none of an array of another shape."""
+    if values.ndim == 1:
+        return [(name, values)]
+    components = COMPONENT_NAMES.get(values.shape[-1], ()) if values.ndim == 2 else ()
+    if components == TENSOR_COMPONENTS:
+        return [(f"{name}:{component}", values[:, column]) for column, component in enumerate(components)]
+    return [(name, np.linalg.norm(values, axis=1))] if components else []
 
 
 def _pack_field(values: Values) -> dict[str, Any]:

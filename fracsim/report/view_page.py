@@ -18,6 +18,8 @@ from ..meshes.plain_files import atomic_replacement
 from .view_data import PackedRun
 
 HOST, PORT = "127.0.0.1", 8750
+# bytes of a page that a browser takes seconds to open
+LARGE_PAGE = 50_000_000
 # trimesh brings three.js (MIT licence) in the template of its own viewer, in front of that viewer's code
 _TEMPLATE, _BEGIN, _END = "resources/templates/viewer.zip", "<script>", "var camera,controls"
 
@@ -131,9 +133,9 @@ class _Handler(BaseHTTPRequestHandler):
 def serve_view(folder: Path, is_running: Callable[[], bool]) -> None:
     """Serve the page until the user interrupts it, and open it in the browser; see `ViewServer`."""
     with ViewServer(folder, is_running) as server:
-        print(f"{folder} is shown at {server.address} until you press Ctrl-C", flush=True)
-        webbrowser.open(server.address)
         try:
+            print(f"{folder} is shown at {server.address} until you press Ctrl-C", flush=True)
+            webbrowser.open(server.address)
             server.serve_forever()
         except KeyboardInterrupt:
             print(file=sys.stderr)
