@@ -175,7 +175,7 @@ def _pack_topology(name: str, part: Any, elements: Ints) -> dict[str, Any]:
 
 
 def _fields(part: Any, triangles: Ints) -> dict[str, Values]:
-    """Scalars (n,) at the points, by field: magnitudes of vectors, components of tensors, means of triangles' values."""
+    """Scalars (n,) at the points, by field: magnitudes of vectors, components of tensors, means of cells."""
     fields = {}
     for data in (part.point_data, part.cell_data):
         for name, array in data.items():

@@ -27,7 +27,7 @@ PUBLISHED_ROWS: tuple[tuple[TableCell, ...], ...] = (
 def _measured_panel() -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return displacement, m, and load, N, of the measured panel."""
     rows = np.loadtxt(Path(__file__).with_name("winkler-2001.csv"), delimiter=",", skiprows=1)
-    return tuple((1e-3 * rows[:, 0]).tolist()), tuple(rows[:, 1].tolist())
+    return tuple(float(mm) * 1e-3 for mm in rows[:, 0]), tuple(float(load) for load in rows[:, 1])
 
 
 MEASURED = {"l-panel": _measured_panel()}
