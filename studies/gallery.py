@@ -81,7 +81,8 @@ ENTRIES = (
         "punched-slab", "A metal slab perforated by a ball, seen from below.",
         (("punched-slab", "punched-slab --set mesh.h=0.008"),), "--view=0.5,-1.1,-0.45",
     ),
-    packaged_entry("table-loaf", "A loaf torn over a table; pieces of it fall on the table.", "--view 0.35,-1.3,0.45 --floor"),
+    packaged_entry("table-loaf", "A loaf torn over a table; pieces of it fall on the table.",
+                   "--view 0.35,-1.3,0.45 --floor"),
     packaged_entry("bowl", "Fifty stones in a bowl.", "--view 0.3,-1.0,0.9"),
     packaged_entry(
         "rigid-wall", "An adobe wall of rigid bodies, seen from behind, 40, 120 and 240 ms after the ball starts.",

@@ -69,6 +69,26 @@ def test_cuts_are_where_energies_are_equal(dim: int, spread: float) -> None:
 
 
 @pytest.mark.parametrize("dim", (2, 3))
+def test_stretched_grains_are_round_in_shrunk_coordinates(dim: int) -> None:
+    """Nodes and cuts are those of the shrunk body with the same seeds; a grain is as much longer as it is stretched."""
+    stretch = np.array([6.0, 1.0, 1.0])[:dim]
+    body = SurfaceCutMesh(box(dim))
+    grains = GrainBoundaries(body, GrainParameters(300, 4, stretch=stretch), False)
+    label, _ = assign_to_seeds(body.points / stretch, grains.seeds / stretch, grains.weights)
+    assert np.array_equal(grains.node_grain, label)
+    ends = grains.node_grain[body.edges[grains.edges]]
+    cut = cut_points(body.points, body.edges[grains.edges], grains.cut_positions)
+    first, second = (grains.weights[ends[:, a]] * np.linalg.norm((cut - grains.seeds[ends[:, a]]) / stretch, axis=1)
+                     for a in (0, 1))  # fmt: skip
+    assert np.all(np.abs(first - second) < 1e-8)
+    points = np.random.default_rng(0).random((40_000, dim)) * [1.0, 0.8, 0.5][:dim]
+    label, _ = assign_to_seeds(points / stretch, grains.seeds / stretch, grains.weights)
+    inside = [each for each in (points[label == k] for k in range(300)) if len(each) > 20]
+    spread = np.median([each.std(axis=0) for each in inside], axis=0)
+    assert spread[0] / spread[1] > 2.5  # the body ends before six times the width
+
+
+@pytest.mark.parametrize("dim", (2, 3))
 def test_settled_nodes_have_a_cell_of_their_grain(dim: int) -> None:
     """No node is without a cell within its grain, and hardly more have changed their grain than were."""
     table = {"count": {2: 60, 3: 12}[dim], "spread": 0.2}

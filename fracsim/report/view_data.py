@@ -16,7 +16,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..output.fields_file import TENSOR_COMPONENTS
 from .compare import column_unit
 from .pictures.colour_maps import COMPONENT_NAMES, HIDDEN, UNITS
 from .pictures.frames import FrameSource, find_frames, frame_parts, load_grid, plane_normals, with_normals
@@ -197,7 +196,7 @@ def _scalars(name: str, values: Values) -> list[tuple[str, Values]]:
     if values.ndim == 1:
         return [(name, values)]
     components = COMPONENT_NAMES.get(values.shape[-1], ()) if values.ndim == 2 else ()
-    if components == TENSOR_COMPONENTS:
+    if len(components) > 3:  # a tensor
         return [(f"{name}:{component}", values[:, column]) for column, component in enumerate(components)]
     return [(name, np.linalg.norm(values, axis=1))] if components else []
 

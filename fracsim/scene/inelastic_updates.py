@@ -11,7 +11,7 @@ from ..mechanics.balance import Balance
 from ..mechanics.stress import Stress
 from ..mesh.domain import Domain
 from ..study import BrittleSettings, Study
-from ..study.conditions import fibre_direction, initial_cracks
+from ..study.conditions import fibre_direction, grain_stretch, initial_cracks
 from ..study.length_checks import check_branching_dimension
 from ..study.plugins import NO_PHYSICS, Physics, PhysicsPart
 from ..timestepping.inelastic_update import NoPlasticFlow, PlasticFlowProtocol
@@ -203,7 +203,7 @@ def _build_criterion(
         return CellRetention(failing, stress, graph)
     from ..fracture.brittle.surface_criterion import BrittleSurfaces
 
-    return BrittleSurfaces(stress, graph, strength, average, build_surface_parameters(study.brittle))
+    return BrittleSurfaces(stress, graph, strength, average, build_surface_parameters(study.brittle, graph.domain.dim))
 
 
 def _build_node_attachment(
@@ -255,12 +255,13 @@ def build_strength(study: Study, domain: Domain, graph: EdgeGraph, instance: int
     return EdgeStrength(graph, of_cell, tie_break=table.tie_break, scatter=scatter, fibre=fibre)
 
 
-def build_surface_parameters(table: BrittleSettings, instance: int = 0) -> SurfaceParameters:
+def build_surface_parameters(table: BrittleSettings, dim: int, instance: int = 0) -> SurfaceParameters:
     """Return the parameters of [brittle]; `instance`: number of an instance of the mesh, which has seeds of its own."""
     from ..fracture.brittle.grains import GrainParameters, SurfaceParameters
 
     grains = None
     if (entry := table.grains) is not None:
-        grains = GrainParameters(entry.count, entry.seed + instance, entry.spread, entry.mode)
+        stretch = grain_stretch(table, dim)
+        grains = GrainParameters(entry.count, entry.seed + instance, entry.spread, entry.mode, stretch)
     curved = table.shape == "curved"
     return SurfaceParameters(table.surfaces, table.spacing, curved, table.seed + instance, table.per_pass, grains)

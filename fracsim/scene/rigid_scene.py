@@ -201,7 +201,10 @@ def _build_breakable(
     if study.brittle is not None:
         from ..fracture.brittle.surface_criterion import BrittleSurfaces
 
-        strength, rules = build_strength(study, domain, graph, number), build_surface_parameters(study.brittle, number)
+        strength, rules = (
+            build_strength(study, domain, graph, number),
+            build_surface_parameters(study.brittle, 3, number),
+        )
         criterion = BrittleSurfaces(stiffness.stress, graph, strength, fragment_average, rules)
     return BreakableBody(stiffness, graph, criterion, fragment_average, study.solver, check_abort=check_abort)
 

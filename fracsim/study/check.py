@@ -26,6 +26,7 @@ from .conditions import (
     check_size,
     fibre_direction,
     find_selector,
+    grain_stretch,
     initial_cracks,
     initial_motion,
     obstacle_placements,
@@ -148,6 +149,8 @@ def _check_dimensions(study: Study, summary: MeshSummary) -> None:
     initial_motion(study, dim)
     obstacle_placements(study, dim)
     fibre_direction(study, dim)
+    if study.brittle is not None:
+        grain_stretch(study.brittle, dim)
     for crack in initial_cracks(study, dim):
         if not crack.intersects_box(np.array(summary.lower), np.array(summary.upper)):
             raise InputError(f"{crack.name} lies outside the body, which spans {summary.extent}")

@@ -32,7 +32,7 @@ from . import (
     TimeSettings,
     TimeTable,
 )
-from .fracture import CrackSettings
+from .fracture import BrittleSettings, CrackSettings
 from .mesh_source import check_file
 
 Flags = npt.NDArray[np.bool_]
@@ -370,6 +370,13 @@ def _crack(entry: CrackSettings, key: str, dim: int) -> CrackPlane:
     if dim == 2:
         raise InputError(f"{key}.polygon is for 3D meshes; this one has 2 dimensions: give a segment or a plane")
     return polygon_crack(key, np.array([check_size(corner, dim, f"{key}.polygon") for corner in entry.polygon]))
+
+
+def grain_stretch(table: BrittleSettings, dim: int) -> Values | None:
+    """Returns `stretch` of [brittle.grains], (d,); None without it."""
+    if table.grains is None or table.grains.stretch is None:
+        return None
+    return check_size(table.grains.stretch, dim, "brittle.grains.stretch")
 
 
 def fibre_direction(study: Study, dim: int) -> Values | None:

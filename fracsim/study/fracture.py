@@ -185,6 +185,10 @@ class GrainSettings(StudyTable):
         "boundaries.",
         default="replace", example="bias",
     )  # fmt: skip
+    stretch: Annotated[list[Positive], Field(min_length=2, max_length=3)] | None = key(
+        "Lengths of a grain along x, y, z, relative to one another: long grains for wood.",
+        default=None, example=[8, 1, 1], otherwise="equal lengths",
+    )  # fmt: skip
 
 
 class BrittleSettings(StudyTable):

@@ -274,7 +274,7 @@ surfaces = 4
 spacing = 0.2
 seed = 1
 per_pass = 2
-grains = { count = 4, seed = 1, spread = 0.1 }
+grains = { count = 4, seed = 1, spread = 0.1, stretch = [2.0, 1.0, 1.0] }
 [[boundary]]
 on = "left"
 fix = "xyz"

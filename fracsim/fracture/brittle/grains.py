@@ -1,4 +1,6 @@
-"""Grain boundaries (B07, section 7.1): nodes belong to the seed p_i with the least energy k_i |x - p_i|.
+"""Grain boundaries (B07, section 7.1): nodes belong to the seed p_i with the least energy k_i |S^-1 (x - p_i)|.
+
+S is diagonal: long grains, as of wood, are round in shrunk coordinates. B07 has S = I.
 
 B07 cuts edges at the zero of (E_i - E_j) / 2, linear between nodes. The difference of the squares has the same zero and
 is linear along an edge if the weights are equal, so that the boundaries are exact planes then.
@@ -8,6 +10,7 @@ Equations: docs/theory.md#brittle-surfaces.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -31,12 +34,14 @@ class GrainParameters:
         seed: seed of the random points.
         spread: the weights k_i are drawn from 1 - spread to 1 + spread; 0 for equal weights.
         mode: "replace": a surface cuts out a grain; "bias": it follows the nearest grain boundaries.
+        stretch: (d,) lengths of a grain along the axes, relative to one another; None: equal lengths.
     """
 
     count: int
     seed: int = 0
     spread: float = 0.0
     mode: Literal["replace", "bias"] = "replace"
+    stretch: Sequence[float] | Values | None = None
 
 
 @dataclass(frozen=True)
@@ -77,8 +82,12 @@ class GrainBoundaries:
         """Draw seeds and assign nodes; `retain_nodes`: every node gets a cell within its own grain where possible."""
         self.mode = parameters.mode
         self.seeds, self.weights = draw_seeds(mesh, parameters)
-        self.node_grain, _ = assign_to_seeds(mesh.points, self.seeds, self.weights)
-        self.cell_grain, _ = assign_to_seeds(mesh.centroids, self.seeds, self.weights)
+        stretch = np.ones(mesh.dim) if parameters.stretch is None else np.asarray(parameters.stretch, float)
+        self._shrunk = 1 / stretch
+        self.node_grain, self.cell_grain = (
+            assign_to_seeds(points * self._shrunk, self.seeds * self._shrunk, self.weights)[0]
+            for points in (mesh.points, mesh.centroids)
+        )
         if retain_nodes and mesh.layer is None:
             self.node_grain = _reassign_isolated_nodes(mesh.cells, self.node_grain)
         elif retain_nodes and mesh.layer is not None:
@@ -117,8 +126,9 @@ class GrainBoundaries:
         return np.clip(position, CUT.min_share, 1 - CUT.min_share)
 
     def _squared_energy(self, points: Values, grain: Ints) -> Values:
-        """Return k_i^2 |x - p_i|^2 (n,) of points (n, d) and grains i (n,)."""
-        return np.asarray(self.weights[grain] ** 2 * np.sum((points - self.seeds[grain]) ** 2, axis=1))
+        """Return k_i^2 |S^-1 (x - p_i)|^2 (n,) of points (n, d) and grains i (n,)."""
+        distance = (points - self.seeds[grain]) * self._shrunk
+        return np.asarray(self.weights[grain] ** 2 * np.sum(distance**2, axis=1))
 
 
 def draw_seeds(mesh: SurfaceCutMesh, parameters: GrainParameters) -> tuple[Values, Values]:
