@@ -253,6 +253,7 @@ def report(
         str | None, typer.Option(help="error against run time of peak_COLUMN, final_COLUMN, ...")
     ] = None,
     exact: Annotated[float | None, typer.Option(help="what the quantity should be (that of the finest run)")] = None,
+    view: Annotated[bool, typer.Option("--view", help="a page of each run in 3D, as of `fracsim view`, too")] = False,
 ) -> None:
     """Tables and plots of runs in one HTML file that needs nothing else, and CSVs beside it."""
     if not is_first_rank():
@@ -261,7 +262,7 @@ def report(
     from .report.html_report import make_report
 
     _note_active_runs(outs)
-    print(f"saved {make_report(outs, html, references=reference, quantity=quantity, exact=exact)}")
+    print(f"saved {make_report(outs, html, references=reference, quantity=quantity, exact=exact, view=view)}")
 
 
 @app.command()

@@ -397,3 +397,15 @@ def test_tables_are_links_to_their_files_and_the_end_is_in_the_contents(runs: Pa
     assert links and all((tmp_path / unquote(link)).is_file() for link in links)
     targets = set(re.findall(r'id="([^"]+)"', text))
     assert {"about"} <= set(re.findall(r'<a href="#([^"]+)"', text)) <= targets
+
+
+def test_a_report_links_to_its_runs_in_3d(runs: Path, tmp_path: Path) -> None:
+    """A page of each run, with its frames; the address has the name of the folder as it is."""
+    page = make_report([runs / "sweep", runs / "strip"], tmp_path / "two words.html", references=[], view=True)
+    line = re.findall(r"<p>In 3D: (.*)</p>", page.read_text(encoding="utf-8"))
+    links = re.findall(r'<a href="([^"]+)">([^<]+)</a>', line[0])
+    assert len(links) == len({address for address, _ in links}) == 1 + len(list((runs / "sweep").glob("*/study.toml")))
+    for address, _ in links:
+        text = (tmp_path / unquote(address)).read_text(encoding="utf-8")
+        data = json.loads(re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)[0])
+        assert data["frames"] and data["outcome"] == "done"

@@ -8,6 +8,7 @@ import platform
 from datetime import date
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from urllib.parse import quote
 
 from ..errors import FalseClaim, InputError
 from .compare import read_reference, run_sections
@@ -26,6 +27,7 @@ def make_report(
     references: list[Path],
     quantity: str | None = None,
     exact: float | None = None,
+    view: bool = False,
 ) -> Path:
     """Write a report and return its path.
 
@@ -35,6 +37,7 @@ def make_report(
         references: CSV files of curves to compare with.
         quantity: quantity whose error is compared, see `RunData.quantity`.
         exact: exact value of the quantity.
+        view: write the page of `fracsim view` of each run beside the tables, with links to them.
 
     Raises:
         InputError: the folders or options do not fit.
@@ -44,15 +47,30 @@ def make_report(
     if target.suffix != ".html":
         raise InputError(f"-o {target}: the report is an .html file")
     if any((folder / "evidence.json").is_file() for folder in folders):
-        if len(folders) > 1 or references or quantity:
-            raise InputError("the report on evidence takes its folder alone, without --reference or --quantity")
+        if len(folders) > 1 or references or quantity or view:
+            raise InputError("the report on evidence takes its folder alone, without --reference, --quantity or --view")
         return _evidence_report(folders[0], target)
     if exact is not None and quantity is None:
         raise InputError("--exact is the value of a quantity: name it with --quantity")
     runs = find_runs(folders)
     sections = run_sections(runs, [read_reference(path) for path in references], quantity=quantity, exact=exact)
     title = "fracsim: " + (str(runs[0].settings.get("title", runs[0].name)) if len(runs) == 1 else f"{len(runs)} runs")
-    return write_page(target, sections, Path(), title=title, subtitle=_date_line(), about=_about_runs(runs))
+    links = _write_views(runs, target) if view else {}
+    about = _about_runs(runs)
+    return write_page(target, sections, Path(), title=title, subtitle=_date_line(), about=about, links=links)
+
+
+def _write_views(runs: list[RunData], target: Path) -> dict[str, str]:
+    """Write the page of `fracsim view` of each run; returns their addresses by name, relative to the report."""
+    from .view_page import write_view
+
+    links = {}
+    for run in runs:
+        page = target.with_suffix("") / f"view-{run.name.replace('/', '-')}.html"
+        page.parent.mkdir(parents=True, exist_ok=True)
+        write_view(run.folder, page)
+        links[run.name] = quote(f"{page.parent.name}/{page.name}")
+    return links
 
 
 def _evidence_report(folder: Path, target: Path) -> Path:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import base64
 import csv
 import re
+from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from ..errors import InputError
@@ -24,6 +26,7 @@ def write_page(
     subtitle: str,
     about: dict[str, str],
     shown: int | None = None,
+    links: Mapping[str, str] = MappingProxyType({}),
 ) -> Path:
     """Write a page and the CSV files, in the folder of the same name without suffix. Returns the path of the page.
 
@@ -35,6 +38,7 @@ def write_page(
         subtitle: line below the title.
         about: names and values at the end of the page.
         shown: number of sections that are open; the others show their titles only. None: all are open.
+        links: address, relative to the page, of other pages by name.
 
     Raises:
         InputError: the files cannot be written.
@@ -47,8 +51,9 @@ def write_page(
         files(__package__).joinpath("template.html").read_text(encoding="utf-8")
     )
     text = template.render(
-        title=title, subtitle=subtitle, sections=parts, about=about, shown=len(parts) if shown is None else shown
-    )
+        title=title, subtitle=subtitle, sections=parts, about=about, links=links,
+        shown=len(parts) if shown is None else shown,
+    )  # fmt: skip
     try:
         check_replaceable(target)
         if csv_folder.is_symlink():
