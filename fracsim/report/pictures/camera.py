@@ -89,9 +89,15 @@ def corners_near(points: Values, files: Iterable[Path]) -> dict[Path, Values]:
     }
 
 
-def body_centre(frame: FrameSource, options: PictureOptions) -> Values:
-    """Median (3,) of the points of the large fragments of a frame, m: pieces that fly off do not shift it."""
-    return np.asarray(np.median(large_fragment_points(prepare_grid(frame, options)), axis=0))
+def body_motion(frame: FrameSource, options: PictureOptions) -> Values:
+    """Median displacement (3,) of the points of the large fragments of a frame, m.
+
+    Pieces that fly off do not shift it, nor do the points that new cracks add, unlike the median of the points.
+    """
+    grid = prepare_grid(frame, options)
+    is_large = flag_large_fragments(grid)
+    motion = np.asarray(grid.points, float) - np.asarray(grid.point_data["rest"] if "rest" in grid.point_data else 0.0)
+    return np.asarray(np.median(motion[is_large], axis=0))
 
 
 def moved(view: ViewBounds, shift: Values, options: PictureOptions) -> ViewBounds:
@@ -116,12 +122,15 @@ def merge_bounds(views: Sequence[ViewBounds]) -> ViewBounds:
 
 def large_fragment_points(grid: Any) -> Values:
     """Points (n, 3) of the fragments that are large enough to be shown, m."""
-    points = np.asarray(grid.points, float)
-    if "piece" in grid.point_data:
-        _, of_point, count = np.unique(grid.point_data["piece"], return_inverse=True, return_counts=True)
-        threshold = min(CAMERA.min_fragment_share * len(points), count.max())
-        points = points[count[of_point] >= threshold]
-    return points
+    return np.asarray(grid.points, float)[flag_large_fragments(grid)]
+
+
+def flag_large_fragments(grid: Any) -> npt.NDArray[np.bool_]:
+    """Flag the points (points,) of the fragments that are large enough to be shown."""
+    if "piece" not in grid.point_data:
+        return np.ones(grid.n_points, bool)
+    _, of_point, count = np.unique(grid.point_data["piece"], return_inverse=True, return_counts=True)
+    return np.asarray(count[of_point] >= min(CAMERA.min_fragment_share * grid.n_points, count.max()))
 
 
 def prepare_grid(frame: FrameSource, options: PictureOptions) -> Any:

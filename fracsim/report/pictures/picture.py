@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from ...errors import InputError
 from ...meshes.plain_files import atomic_replacement_of_all, check_replaceable
-from .camera import ViewBounds, body_centre, centred, merge_bounds, moved, view_bounds
+from .camera import ViewBounds, body_motion, centred, merge_bounds, moved, view_bounds
 from .colour_maps import merge_ranges
 from .frames import FrameSource, film_interval, film_repetitions, find_frames
 from .picture_options import PictureOptions
@@ -249,8 +249,8 @@ def _frame_views(frames: Sequence[FrameSource], options: PictureOptions) -> list
     """Bounds that the camera shows of each frame: those of all frames, or of the first one moved with the body."""
     if options.follow:
         first = view_bounds(frames[0], options)
-        centres = [body_centre(frame, options) for frame in frames]
-        return [moved(first, centre - centres[0], options) for centre in centres]
+        motions = [body_motion(frame, options) for frame in frames]
+        return [moved(first, motion - motions[0], options) for motion in motions]
     view = merge_bounds([view_bounds(frame, options) for frame in frames])
     if options.target is not None:
         view = centred(view, np.array(options.target), options)
