@@ -17,6 +17,7 @@ from pathlib import Path
 
 import pytest
 
+from fracsim.errors import Exit
 from fracsim.study.catalogue import catalogue
 from test_page_commands import PAGES
 
@@ -69,6 +70,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], None]:
         if "mine.stl" in command and not (folder / "mine.stl").exists():
             execute("fracsim mesh struck-figure -o body.vtu")
             subprocess.run([sys.executable, "-c", SURFACE], cwd=folder, check=True, timeout=100)
+        if "--restart" in command:  # of a run that was stopped
+            stopped = command.replace("--restart", "--wall-limit 8").split()
+            assert subprocess.run(stopped, cwd=folder, capture_output=True, timeout=100).returncode == Exit.STOPPED
         process = subprocess.Popen(
             ["bash", "-c", f"exec {command}"], cwd=folder, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
             start_new_session=True, env=os.environ | {"BROWSER": "true"},
@@ -91,6 +95,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], None]:
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize("page", [page for page in PAGES if is_run_here(page)], ids=lambda page: page.stem)
 def test_the_commands_of_a_page_run(page: Path, run: Callable[[str], None]) -> None:
     for command in page_commands(page):

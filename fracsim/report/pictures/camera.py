@@ -96,7 +96,7 @@ def body_motion(frame: FrameSource, options: PictureOptions) -> Values:
     """
     grid = prepare_grid(frame, options)
     is_large = flag_large_fragments(grid)
-    motion = np.asarray(grid.points, float) - np.asarray(grid.point_data["rest"] if "rest" in grid.point_data else 0.0)
+    motion = np.asarray(grid.points, float) - np.asarray(grid.point_data.get("rest", 0.0))
     return np.asarray(np.median(motion[is_large], axis=0))
 
 

@@ -267,10 +267,9 @@ class Renderer:
         floor = find_floor(obstacles, planes, self._bounds) if self.options.floor else None
         if floor is None and not obstacles:
             return self._draw_pixels()
-        floor_actor = None
         if floor is not None:
             obstacles.pop(floor.plane, None)
-            floor_actor = add_floor(plotter, floor, self.material.backdrop)
+            add_floor(plotter, floor, self.material.backdrop)
         actors = {name: add_obstacle(plotter, obstacles[name], is_plane=name in planes) for name in obstacles}
         lit = self._draw_pixels()
         with DepthWindow(*self.options.size) as window:
@@ -279,12 +278,16 @@ class Renderer:
                 del obstacles[name]
             lit = self._draw_pixels() if len(obstacles) < len(actors) else lit
             self._main_light.intensity *= SCENE_STYLE.shadow_light
-            if floor_actor is not None:
-                darken_floor(floor_actor, self.material.backdrop)
+            if floor is not None:
+                darken_floor(floor, self.material.backdrop)
             shaded = self._draw_pixels()
             self._main_light.intensity /= SCENE_STYLE.shadow_light
             window.set_surfaces(body if floor is None else [*body, floor.surface], [*obstacles.values()])
             view_depth = window.depth_from(plotter.camera)
+            is_floor = np.zeros(view_depth.depth.shape, bool)
+            if floor is not None:
+                window.set_surfaces([floor.surface])
+                is_floor = window.depth_from(plotter.camera).depth <= view_depth.depth
         # a plane has no edge, but its slab has: it casts no shadow
         casters = [surface for name, surface in obstacles.items() if name not in planes]
         centre, radius = self._bounds.reshape(3, 2).mean(axis=1), self._size / 2
@@ -292,7 +295,14 @@ class Renderer:
             maps.set_surfaces(body, casters)
             cameras = [lamp_camera(ray, centre, radius) for ray in lamp_directions(self._light_direction(floor))]
             # rows of depth images begin at the lower edge
-            share = shadow_shares(view_depth, maps, cameras, np.any(lit != shaded, axis=2)[::-1])[::-1, :, None]
+            share = shadow_shares(view_depth, maps, cameras, np.any(lit != shaded, axis=2)[::-1])
+            if floor is not None:
+                sky = [
+                    lamp_camera(ray, centre, radius) for ray in lamp_directions(floor.normal, SHADOW_STYLE.sky_radius)
+                ]
+                hidden = shadow_shares(view_depth, maps, sky, is_floor)
+                share = 1.0 - (1.0 - share) * (1.0 - SHADOW_STYLE.sky_share * hidden)
+        share = share[::-1, :, None]
         return np.asarray(np.rint((1.0 - share) * lit + share * shaded), np.uint8)
 
     def _light_direction(self, floor: Floor | None) -> Values:

@@ -22,13 +22,17 @@ class ShadowStyle:
 
     Attributes:
         lamp_samples: points of the lamp, each with a depth map.
-        lamp_radius: angular radius of the lamp, rad: shadows are sharp near what casts them and soft far from it.
+        lamp_radius: radius of the lamp at unit distance: shadows are sharp near what casts them and soft far from it.
+        sky_radius: radius at unit distance of the part of the sky that a floor sees.
+        sky_share: share of the shadow that a floor has where all of that sky is hidden.
         map_side: side of a depth map, pixels.
         offset: points nearer than this behind a surface are lit, as a share of the radius of the sphere of casters.
     """
 
     lamp_samples: int = 24
     lamp_radius: float = 0.035
+    sky_radius: float = 1.2
+    sky_share: float = 0.6
     map_side: int = 768
     offset: float = 0.012
 
@@ -110,17 +114,18 @@ def projection_matrix(camera: Any, aspect: float) -> Values:
     return np.array([[matrix.GetElement(row, column) for column in range(4)] for row in range(4)])
 
 
-def lamp_directions(direction: Values) -> Values:
-    """Unit vectors (n, 3) towards points of the lamp, spread evenly over its disc.
+def lamp_directions(direction: Values, lamp_radius: float = SHADOW_STYLE.lamp_radius) -> Values:
+    """Unit vectors (n, 3) towards points of a lamp, spread evenly over its disc.
 
     Args:
         direction: unit vector (3,) towards the centre of the lamp.
+        lamp_radius: radius of the disc at unit distance.
     """
     count = SHADOW_STYLE.lamp_samples
     across = np.linalg.svd(direction[None])[2][1:]
     number = np.arange(count)
     angle = number * np.pi * (3.0 - np.sqrt(5.0))
-    radius = SHADOW_STYLE.lamp_radius * np.sqrt((number + 0.5) / count)
+    radius = lamp_radius * np.sqrt((number + 0.5) / count)
     spread = radius[:, None] * (np.cos(angle)[:, None] * across[0] + np.sin(angle)[:, None] * across[1])
     directions = direction + spread
     return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))

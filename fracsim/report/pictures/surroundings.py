@@ -31,6 +31,8 @@ class SurroundingsStyle:
         min_floor_level: least vertical component of the unit normal of a plane that serves as floor.
         floor_radius: radius of the floor.
         shadow_brightness: brightness of a shadow, as a share of that of the floor.
+        near_brightness: brightness of the floor below the body, as a share of that of the backdrop.
+        near_radius: distance over which the floor becomes as bright as the backdrop.
     """
 
     max_hidden_share: float = 0.5
@@ -40,6 +42,8 @@ class SurroundingsStyle:
     min_floor_level: float = 0.5
     floor_radius: float = 40.0
     shadow_brightness: float = 0.8
+    near_brightness: float = 0.9
+    near_radius: float = 1.2
 
 
 SURROUNDINGS_STYLE = SurroundingsStyle()
@@ -80,8 +84,14 @@ def find_floor(obstacles: Mapping[str, Any], normals: Mapping[str, Values], boun
         point = centre + (level - centre @ normal) * normal
     else:
         plane, normal, point = "", np.array([0.0, 0.0, 1.0]), np.array([*centre[:2], box[2, 0]])
-    radius = SURROUNDINGS_STYLE.floor_radius * size
-    return Floor(pyvista.Disc(center=point, inner=0.0, outer=radius, normal=normal, c_res=48), normal, plane)
+    surface = pyvista.Disc(center=point, inner=0.0, outer=1.0, normal=normal, r_res=48, c_res=48)
+    offset = np.asarray(surface.points, float) - point
+    distance = np.linalg.norm(offset, axis=1)
+    # rings are close to one another near the body, where the brightness changes
+    surface.points = point + offset * (SURROUNDINGS_STYLE.floor_radius * size * distance**3)[:, None]
+    share = distance**4 * SURROUNDINGS_STYLE.floor_radius / SURROUNDINGS_STYLE.near_radius
+    surface.point_data["brightness"] = 1 - (1 - SURROUNDINGS_STYLE.near_brightness) * np.exp(-(share**2))
+    return Floor(surface, normal, plane)
 
 
 def obstacle_surface(file: Path) -> Any:
@@ -138,13 +148,24 @@ def make_translucent(actor: Any) -> None:
 
 
 def add_floor(plotter: Any, floor: Floor, colour: str) -> Any:
-    """Add a floor of exactly this colour "#rrggbb", whatever the light; returns its actor."""
-    return plotter.add_mesh(floor.surface, color=colour, lighting=False, ambient=0.0, diffuse=1.0)
+    """Add a floor, a little darker than the backdrop below the body and of its colour "#rrggbb" far away.
+
+    The light does not change its colour. Returns its actor.
+    """
+    floor.surface.point_data["rgb"] = _floor_colours(floor, colour, 1.0)
+    return plotter.add_mesh(floor.surface, scalars="rgb", rgb=True, lighting=False, ambient=0.0, diffuse=1.0)
 
 
-def darken_floor(actor: Any, colour: str) -> None:
-    """Give a floor of this colour "#rrggbb" that of its shadows."""
-    actor.prop.color = [SURROUNDINGS_STYLE.shadow_brightness * part / 255 for part in rgb(colour)]
+def darken_floor(floor: Floor, colour: str) -> None:
+    """Give a floor that has been added, of this colour "#rrggbb", the brightness of its shadows."""
+    floor.surface.point_data["rgb"][:] = _floor_colours(floor, colour, SURROUNDINGS_STYLE.shadow_brightness)
+    floor.surface.Modified()
+
+
+def _floor_colours(floor: Floor, colour: str, brightness: float) -> npt.NDArray[np.uint8]:
+    """Colours (points, 3) of a floor at a brightness of 0 to 1."""
+    shares = brightness * np.asarray(floor.surface.point_data["brightness"])[:, None]
+    return np.asarray(np.rint(shares * rgb(colour)), np.uint8)
 
 
 def add_flat_obstacle(plotter: Any, file: Path) -> None:
