@@ -1,7 +1,8 @@
 """Files fields.xdmf and fields.h5: the computational mesh in time, with one XDMF grid per time and all fields on it.
 
-Rank 0 writes them in the order of the input mesh, so that the files do not depend on the partition. With one grid per
-time (DOLFINx's writer makes one per field) ParaView can warp by displacement and colour by damage at once.
+All ranks compress them in the order of the input mesh (compressed_rows) and rank 0 writes them, so that the files do
+not depend on the partition. With one grid per time (DOLFINx's writer makes one per field) ParaView can warp by
+displacement and colour by damage at once.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ from ..errors import InputError
 from ..meshes.data import MeshData
 from ..meshes.plain_files import atomic_replacement, find_external_data
 from .atomic_write import HDF5_OVERHEAD_BYTES, append_bytes, open_hdf5, replace_text, writable_hdf5
+from .compressed_rows import ROWS_PER_CHUNK, CompressedField
 
 Values = npt.NDArray[np.float64]
 # symmetric tensor, in the order of VTK and ParaView
@@ -30,7 +32,8 @@ COMPONENTS_ATTRIBUTE = "components"
 _ATTRIBUTE_TYPES = {1: "Scalar", 3: "Vector", len(TENSOR_COMPONENTS): "Matrix"}
 # by nodes per cell
 _TOPOLOGY_TYPES = {3: "Triangle", 4: "Tetrahedron", 6: "Triangle_6", 10: "Tetrahedron_10"}
-_ROWS_PER_CHUNK = 1 << 18
+# bytes that HDF5 needs to find a chunk
+CHUNK_INDEX_BYTES = 128
 _COMPONENT_NAMES = np.bytes_(" ".join(TENSOR_COMPONENTS))
 _TAIL = "    </Grid>\n  </Domain>\n</Xdmf>\n"
 _HEAD = (
@@ -46,7 +49,7 @@ class Field:
     Attributes:
         name: name of the field.
         centre: "Node" or "Cell".
-        values: array with a row per node or cell, in the order of the input mesh; None on ranks other than 0.
+        values: array with a row per owned node or cell; for BodySurface, of all in the order of the input mesh.
     """
 
     name: str
@@ -62,23 +65,20 @@ class FieldsFile:
         times: times of the frames, s.
     """
 
-    def __init__(
-        self, folder: Path, mesh: MeshData, resume_at: float | None = None, *, precision: str = "single"
-    ) -> None:
+    def __init__(self, folder: Path, mesh: MeshData, resume_at: float | None = None) -> None:
         """Open the files.
 
         Args:
             folder: output folder.
             mesh: input mesh.
             resume_at: keep the frames up to this time, s; None: a new run.
-            precision: of the fields, "single" or "double".
 
         Raises:
             InputError: the frames of the earlier run cannot be read.
             OSError: the files cannot be written.
         """
         self.xdmf, self.h5 = folder / "fields.xdmf", folder / "fields.h5"
-        self._mesh, self._precision = mesh, precision
+        self._mesh = mesh
         self.times: list[float] = []
         grids = ""
         if resume_at is not None and self.h5.exists():
@@ -127,35 +127,34 @@ class FieldsFile:
 
     def _stored_grid(self, name: str, frame: Any) -> str:
         """XML of a frame that is in fields.h5."""
-        fields = [Field(key, data.attrs["centre"], data[()]) for key, data in frame.items()]
+        fields = [CompressedField(key, data.attrs["centre"], data.shape, data.dtype) for key, data in frame.items()]
         return self._grid(name, float(frame.attrs["time"]), fields)
 
-    def append_frame(self, t: float, fields: list[Field]) -> None:
+    def append_frame(self, t: float, fields: list[CompressedField]) -> None:
         """Append a frame.
 
         Args:
             t: time, s.
-            fields: fields of the frame. Vectors of 2D bodies may have two components.
+            fields: fields of the frame.
 
         Raises:
             OSError: the disk is full; the earlier frames are unchanged.
         """
-        fields = [
-            Field(field.name, field.centre, rounded(pad_to_3d(field.values), self._precision)) for field in fields
-        ]
         name = f"{len(self.times):06d}"
-        size = HDF5_OVERHEAD_BYTES + sum(field.values.nbytes + HDF5_OVERHEAD_BYTES for field in fields)
+        size = HDF5_OVERHEAD_BYTES + sum(map(_stored_bytes, fields))
         with writable_hdf5(self.h5, size) as file:
             frame = file["frames"].create_group(name)
             frame.attrs["time"] = t
             for field in fields:
-                data = _create_compressed(frame, field.name, field.values)
+                data = frame.create_dataset(field.name, field.shape, field.dtype, **_filters(field.shape))
+                for number, chunk in enumerate(field.chunks):
+                    data.id.write_direct_chunk((number * data.chunks[0], *(0 for _ in field.shape[1:])), chunk)
                 data.attrs["centre"] = field.centre
-                if is_tensor(field.values):
+                if is_tensor(field):
                     data.attrs[COMPONENTS_ATTRIBUTE] = _COMPONENT_NAMES
         append_bytes(self.xdmf, (self._grid(name, t, fields) + _TAIL).encode(), over=len(_TAIL))
 
-    def _grid(self, name: str, t: float, fields: list[Field]) -> str:
+    def _grid(self, name: str, t: float, fields: list[CompressedField]) -> str:
         """XML of one frame; its time is added to `times`."""
         self.times.append(t)
         attributes = "".join(self._attribute(name, field) for field in fields)
@@ -169,14 +168,14 @@ class FieldsFile:
             f"{attributes}      </Grid>\n"
         )
 
-    def _attribute(self, frame: str, field: Field) -> str:
+    def _attribute(self, frame: str, field: CompressedField) -> str:
         """XML of one field."""
-        shape = field.values.shape
+        shape = field.shape
         kind = _ATTRIBUTE_TYPES[shape[1] if len(shape) > 1 else 1]
-        number = "Int" if field.values.dtype.kind == "i" else "Float"
-        if is_tensor(field.values):
+        number = "Int" if field.dtype.kind == "i" else "Float"
+        if is_tensor(field):
             shape = (shape[0], 1, shape[1])
-        item = self._data_item(f"frames/{frame}/{field.name}", shape, number, field.values.itemsize)
+        item = self._data_item(f"frames/{frame}/{field.name}", shape, number, field.dtype.itemsize)
         head = f'<Attribute Name="{field.name}" AttributeType="{kind}" Center="{field.centre}">'
         return f"        {head}{item}</Attribute>\n"
 
@@ -215,7 +214,7 @@ def read_frame_times(h5: Path) -> dict[str, float]:
 
 
 def is_tensor(values: Any) -> bool:
-    """True if an array has the shape (n, 6) of symmetric tensors."""
+    """True if an array or field has the shape (n, 6) of symmetric tensors."""
     return len(values.shape) == 2 and values.shape[1] == len(TENSOR_COMPONENTS)
 
 
@@ -246,8 +245,18 @@ def rounded(values: npt.NDArray[np.generic], precision: str) -> npt.NDArray[np.g
 
 def _create_compressed(group: Any, name: str, values: npt.NDArray[np.generic]) -> Any:
     """New data set of an HDF5 group, compressed. Other levels of gzip take longer and save 3 %."""
-    chunks = (min(len(values), _ROWS_PER_CHUNK), *values.shape[1:])
-    return group.create_dataset(name, data=values, chunks=chunks, shuffle=True, compression="gzip", compression_opts=1)
+    return group.create_dataset(name, data=values, **_filters(values.shape))
+
+
+def _filters(shape: tuple[int, ...]) -> dict[str, Any]:
+    """Chunks and filters of a data set; those of `RowCompressor`."""
+    chunks = (max(min(shape[0], ROWS_PER_CHUNK), 1), *shape[1:])
+    return {"chunks": chunks, "shuffle": True, "compression": "gzip", "compression_opts": 1}
+
+
+def _stored_bytes(field: CompressedField) -> int:
+    """Bytes that a field takes in the file."""
+    return HDF5_OVERHEAD_BYTES + sum(len(chunk) + CHUNK_INDEX_BYTES for chunk in field.chunks)
 
 
 def pad_to_3d(values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:

@@ -20,7 +20,8 @@ from ..mechanics.term_protocols import OutputSurfaces, SurfaceSeparator, fulfill
 from ..mesh.midside_nodes import mesh_of_nodes
 from ..timestepping.state import State
 from .atomic_write import write_on_root
-from .fields_file import TENSOR_COMPONENTS, Field, FieldsFile
+from .compressed_rows import CompressedField, RowCompressor
+from .fields_file import TENSOR_COMPONENTS, Field, FieldsFile, pad_to_3d, rounded
 from .fracture_log import FractureLog
 
 if TYPE_CHECKING:
@@ -34,7 +35,7 @@ _TENSOR_INDICES = [("xyz".index(name[0]), "xyz".index(name[1])) for name in TENS
 
 
 class FieldEvaluator:
-    """Values of the fields of a frame, gathered on rank 0. Expressions are compiled at the first frame."""
+    """Values of the fields of a frame. Expressions are compiled at the first frame."""
 
     def __init__(self, stress: Stress, names: list[str], fracture: FracturePass | None = None) -> None:
         """Choose the fields.
@@ -49,24 +50,18 @@ class FieldEvaluator:
         self._compiled: dict[str, CellExpression] = {}
 
     def __call__(self, state: State, fragments: Fragments | None) -> list[Field]:
-        """Displacement and the chosen fields, in the order of the input mesh (complete on rank 0; collective)."""
-        d = self._domain.dim
-        fields = [self._nodal_field("displacement", state.u.reshape(-1, d))]
+        """Displacement and the chosen fields of the nodes and cells that this rank owns (collective)."""
+        d, nodes = self._domain.dim, self._domain.node_count
+        fields = [Field("displacement", "Node", state.u.reshape(-1, d)[:nodes])]
         for name in self._names:
             if name == "velocity":
-                fields.append(self._nodal_field(name, state.v.reshape(-1, d)))
+                fields.append(Field(name, "Node", state.v.reshape(-1, d)[:nodes]))
             elif name == "piece":
                 assert fragments is not None
-                fields.append(
-                    self._nodal_field(name, fragments.node_fragment[: self._domain.node_count].astype(np.int32))
-                )
+                fields.append(Field(name, "Node", fragments.node_fragment[:nodes].astype(np.int32)))
             else:
-                fields.append(Field(name, "Cell", self._domain.input_numbering.gather_cells(self._cell_values(name))))
+                fields.append(Field(name, "Cell", self._cell_values(name)))
         return fields
-
-    def _nodal_field(self, name: str, owned: Values) -> Field:
-        """Nodal field from the values at the nodes that this rank owns (collective)."""
-        return Field(name, "Node", self._domain.input_numbering.gather_nodes(owned))
 
     def _cell_values(self, name: str) -> Values:
         """Values of a cell field on the cells of this rank, (cells,) or (cells, components)."""
@@ -191,8 +186,13 @@ class FrameFiles:
         self.fields = write_on_root(
             self._comm,
             self._path,
-            lambda: FieldsFile(folder, mesh, resume_at, precision=precision) if mesh else None,
+            lambda: FieldsFile(folder, mesh, resume_at) if mesh else None,
         )
+        self._precision, numbering = precision, stress.domain.input_numbering
+        self._compressors = {
+            "Node": RowCompressor(self._comm, numbering.nodes[: numbering.owned_nodes]),
+            "Cell": RowCompressor(self._comm, numbering.cells),
+        }
         self.surface = None
         if surface:
             self.surface = surface_output(
@@ -211,11 +211,19 @@ class FrameFiles:
     def write_frame(self, state: State) -> None:
         """Write a frame at the time of the state, if there is none yet. Raises CannotWrite (collective)."""
         fields = self._evaluate(state, self._breaks.fragments)
-        write_on_root(self._comm, self._path, lambda: self._write_fields(state.t, fields))
+        compressed = [self._compress(field) for field in fields]
+        write_on_root(self._comm, self._path, lambda: self._write_fields(state.t, compressed))
         if self.surface is not None:
             self.surface.write_frame(state, fields)
 
-    def _write_fields(self, t: float, fields: list[Field]) -> None:
+    def _compress(self, field: Field) -> CompressedField:
+        """The field as it is written, complete on rank 0 (collective). Vectors have three components."""
+        compressor = self._compressors[field.centre]
+        values = rounded(pad_to_3d(field.values), self._precision)
+        shape = (compressor.rows, *values.shape[1:])
+        return CompressedField(field.name, field.centre, shape, values.dtype, compressor(values) or [])
+
+    def _write_fields(self, t: float, fields: list[CompressedField]) -> None:
         if self.fields is not None and t not in self.fields.times:
             self.fields.append_frame(t, fields)
 

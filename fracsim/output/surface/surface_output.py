@@ -14,6 +14,7 @@ from ...fracture.edge_history import EdgeHistory
 from ...mechanics.material_fields import PerCell
 from ...mechanics.term_protocols import OutputSurfaces, SurfaceSeparator
 from ...mesh.domain import Domain
+from ...mesh.parallel import gather
 from ...timestepping.state import State
 from ..atomic_write import write_on_root
 from ..fields_file import Field
@@ -88,7 +89,7 @@ class SurfaceOutput:
 
         Args:
             state: present state.
-            fields: fields of fields.xdmf, which the surface has as well.
+            fields: fields of fields.xdmf; the surface has those of the cells.
         """
         domain, d = self._domain, self._domain.dim
         gathered: list[Any] = [
@@ -96,13 +97,14 @@ class SurfaceOutput:
         ]
         pattern = domain.input_numbering.gather_cells(self.record.graph.pattern) if self.record is not None else None
         broken = self.record.gather_broken() if self.record is not None else None
+        cell_fields = self._gather_cell_fields(fields)
         for term in self._separators:
             term.gather_separation()
 
         def make() -> SurfaceFrame:
             assert self.surface_and_files is not None
             surface, _ = self.surface_and_files
-            (u, v), nodal = self._corner_values(gathered, fields)
+            u, v = self._corner_values(gathered)
             self._corner_displacement = u
             broken_at = cut = None
             if broken is not None and pattern is not None:
@@ -110,7 +112,7 @@ class SurfaceOutput:
                 broken_at, cut = (surface.skeleton.edge_values(edges, column) for column in history.T)
                 surface.update(pattern, cut)
             corrections = [term.separate_surface for term in self._separators]
-            return surface.make_frame(state.t, u, v, broken_at=broken_at, fields=nodal, corrections=corrections)
+            return surface.make_frame(state.t, u, v, broken_at=broken_at, fields=cell_fields, corrections=corrections)
 
         return write_on_root(domain.comm, self._path, make)
 
@@ -119,7 +121,7 @@ class SurfaceOutput:
 
         Args:
             state: present state.
-            fields: fields of fields.xdmf, which the surface has as well.
+            fields: fields of fields.xdmf; the surface has those of the cells.
 
         Raises:
             CannotWrite: a file cannot be written.
@@ -141,11 +143,28 @@ class SurfaceOutput:
 
         write_on_root(self._domain.comm, self._path, write)
 
-    def _corner_values(self, gathered: list[Any], fields: list[Field]) -> tuple[list[Any], list[Field]]:
+    def _gather_cell_fields(self, fields: list[Field]) -> list[Field]:
+        """Cell fields in the order of the input mesh on rank 0, 0 in cells that have no element (collective)."""
+        domain = self._domain
+        # in 2D triangles cover the body
+        has_element = domain.facets.boundary_sides.any(axis=1) | (domain.dim == 2)
+        if self.record is not None:
+            has_element |= self.record.graph.pattern != 0
+        cells, owned = np.flatnonzero(has_element), [field for field in fields if field.centre == "Cell"]
+        parts = gather(domain.comm, (domain.input_numbering.cells[cells], [field.values[cells] for field in owned]))
+        if parts is None or domain.input_mesh is None:
+            return []
+        result = []
+        for number, field in enumerate(owned):
+            values = np.zeros((len(domain.input_mesh.cells), *field.values.shape[1:]), field.values.dtype)
+            for index, rows in parts:
+                values[index] = rows[number]
+            result.append(replace(field, values=values))
+        return result
+
+    def _corner_values(self, gathered: list[Any]) -> list[Any]:
         """Nodal values at the corners of quadratic cells only: the surface has straight cells (rank 0)."""
         source = self._domain.input_mesh
         if self._domain.order == 1 or source is None:
-            return gathered, fields
-        count = len(source.points)
-        nodal = [replace(field, values=field.values[:count]) if field.centre == "Node" else field for field in fields]
-        return [values[:count] for values in gathered], nodal
+            return gathered
+        return [values[: len(source.points)] for values in gathered]

@@ -265,8 +265,6 @@ def write_vtu(path: Path, grid: Any) -> None:
     writer.SetCompressorTypeToZLib()
     writer.SetCompressionLevel(1)
     writer.SetBlockSize(1 << 20)
-    if grid.GetNumberOfPoints() < np.iinfo(np.int32).max // 8:
-        writer.SetIdTypeToInt32()
     if not writer.Write():
         raise OSError("VTK cannot write it")
     # bytes if the output is not valid text
@@ -289,7 +287,7 @@ def _vtk_array(values: npt.NDArray[np.generic], name: str = "") -> Any:
 
 def make_grid(points: npt.NDArray[np.generic], triangles: Ints, segments: Ints) -> Any:
     """VTK grid of triangles (k, 3), then segments (m, 2), with points (n, d) in m."""
-    from vtkmodules.util.numpy_support import numpy_to_vtkIdTypeArray
+    from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
 
@@ -297,9 +295,11 @@ def make_grid(points: npt.NDArray[np.generic], triangles: Ints, segments: Ints) 
     vtk_points.SetData(_vtk_array(points))
     grid.SetPoints(vtk_points)
     sizes = np.repeat([3, 2], [len(triangles), len(segments)])
-    offsets = np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64)
-    corners = np.concatenate([triangles.ravel(), segments.ravel()]).astype(np.int64)
-    cells.SetData(numpy_to_vtkIdTypeArray(offsets, deep=True), numpy_to_vtkIdTypeArray(corners, deep=True))
+    offsets = np.concatenate([[0], np.cumsum(sizes)])
+    # VTK writes them as they are: half the bytes of 64-bit numbers before compression
+    number = np.int32 if max(offsets[-1], len(points)) <= np.iinfo(np.int32).max else np.int64
+    corners = np.concatenate([triangles.ravel(), segments.ravel()]).astype(number)
+    cells.SetData(numpy_to_vtk(offsets.astype(number), deep=True), numpy_to_vtk(corners, deep=True))
     grid.SetCells(_vtk_array(np.where(sizes == 3, _VTK_TRIANGLE, _VTK_LINE).astype(np.uint8)), cells)
     return grid
 
