@@ -23,7 +23,7 @@ STORED, RUNS, REPEATS = (0, zlib.Z_DEFAULT_STRATEGY), (1, zlib.Z_RLE), (1, zlib.
 # the method of a byte plane is chosen by this part of it; bytes
 SAMPLED_SHARE, MIN_SAMPLE = 8, 1024
 # size of the sample by a faster method over the least
-MAX_LOSS = 1.05
+MAX_LOSS = 1.1
 
 
 @dataclass(frozen=True)
