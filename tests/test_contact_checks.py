@@ -168,8 +168,10 @@ def test_pieces_pass_through_each_other(tmp_path: Path, capsys: pytest.CaptureFi
     (note,) = notes(two_bodies(tmp_path), tmp_path / "out", capsys)
     assert "pieces 0 and 1 pass through each other, first seen at t = 0.75 s near (" in note
     assert note.endswith("; a [contact] table keeps them apart")
-    seen = json.loads((tmp_path / "out" / "summary.json").read_text())["passed_through"]
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    seen = summary["passed_through"]
     assert seen["time"] == pytest.approx(0.75) and seen["pieces"] == [0, 1] and 0.85 < seen["place"][0] < 1
+    assert summary["pieces"] == 2
 
 
 def test_pieces_are_told_of_after_a_restart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.stress import Stress
-from ..mesh.connected_bodies import label_bodies
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_ghosts
 from ..mesh.parallel import sum_over_ranks
+from ..meshes.topology import links_in
 
 if TYPE_CHECKING:
     from ..fracture.brittle.surface_criterion import BrittleSurfaces
@@ -45,7 +45,7 @@ class FractureLog:
         self.fragments: Fragments | None = None
         # (edges,) state of the broken edges that `fragments` belongs to
         self._broken: npt.NDArray[np.bool_] | None = None
-        self.counts = (0, 0, _count_bodies(self._domain))
+        self.counts = (0, 0, 0)
         self._criterion: FractureCriterion | None = None
         if breaking is not None:
             from ..fracture.edge_history import EdgeHistory
@@ -60,6 +60,8 @@ class FractureLog:
             if breaking.initial_cuts is not None:
                 self.record.record_breaks(0.0, breaking.initial_cuts)
             self.update_counts()
+        else:
+            self.counts = (0, 0, _count_bodies(self._domain))
 
     def record_breaks(self, t: float) -> None:
         """Record the edges that broke since the last call, at time t in s, and find the fragments (collective)."""
@@ -129,4 +131,6 @@ class FractureLog:
 
 def _count_bodies(domain: Domain) -> int:
     """Number of bodies of the mesh that share no node (collective)."""
-    return int(domain.comm.bcast(label_bodies(domain.input_mesh)[0] if domain.input_mesh is not None else None))
+    from ..mesh.fragments import find_components
+
+    return find_components(domain, links_in(domain.cell_nodes)).count
