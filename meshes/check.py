@@ -9,7 +9,7 @@ import numpy as np
 
 from .data import Indices, MeshData, MeshError, Points, format_midpoint, format_point, list_some
 from .parameters import LONGEST, SHORTEST
-from .topology import Floats, Mask, components, distinct_rows, links_in, orient_cells, signed_measures
+from .topology import Floats, Mask, components, distinct_rows, links_in, orient_cells, signed_measures, sorted_rows
 
 SAME_PLACE = 1e-6  # distance over the size of the mesh within which nodes coincide
 
@@ -59,7 +59,7 @@ class _FacetTable:
         """`cells`: (m, d + 1) positive cells."""
         nodes = cells.shape[1]
         # Without a node of a cell in rising order the others are a facet in rising order.
-        ordered = np.sort(cells, axis=1)
+        ordered = sorted_rows(cells)
         rows = np.stack([np.delete(ordered, node, axis=1) for node in range(nodes)], axis=1)
         self.distinct, self.counts, self.index = distinct_rows(rows.reshape(-1, nodes - 1))
         exchanges = sum((cells[:, i] > cells[:, j]).astype(np.int8) for i in range(nodes) for j in range(i + 1, nodes))
@@ -69,7 +69,7 @@ class _FacetTable:
     def cells_at(self, groups: list[Indices]) -> list[Indices]:
         """For each group the number of cells at each facet; 0 of a facet that is not of the mesh."""
         sizes = np.cumsum([len(self.distinct), *map(len, groups)])
-        _, _, inverse = distinct_rows(np.sort(np.concatenate([self.distinct, *groups]), axis=1))
+        _, _, inverse = distinct_rows(sorted_rows(np.concatenate([self.distinct, *groups])))
         counts = np.zeros(inverse.max() + 1, np.int64)
         counts[inverse[: sizes[0]]] = self.counts
         return np.split(counts[inverse[sizes[0] :]], sizes[1:-1] - sizes[0]) if groups else []
@@ -155,7 +155,7 @@ def _precision(points: Points) -> float:
 
 def _check_cells_once(mesh: MeshData) -> None:
     """Raise MeshError if two cells have the same nodes."""
-    _, counts, inverse = distinct_rows(np.sort(mesh.cells, axis=1))
+    _, counts, inverse = distinct_rows(sorted_rows(mesh.cells))
     twice = np.flatnonzero(counts[inverse] > 1)
     if len(twice):
         raise MeshError(
@@ -234,7 +234,7 @@ def _without_repeated_facets(mesh: MeshData) -> MeshData:
     """The mesh with each facet once in its group."""
     groups = {}
     for name, facets in mesh.facet_groups.items():
-        _, _, inverse = distinct_rows(np.sort(facets, axis=1))
+        _, _, inverse = distinct_rows(sorted_rows(facets))
         groups[name] = facets[np.sort(np.unique(inverse, return_index=True)[1])]
     return replace(mesh, facet_groups=groups)
 

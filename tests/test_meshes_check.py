@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from fracsim.meshes import BUILDERS, MeshData, MeshError
 from fracsim.meshes.check import check_mesh
 from fracsim.meshes.quality import mesh_quality
-from fracsim.meshes.topology import boundary_facets, edges_of, facets_of, signed_measures
+from fracsim.meshes.topology import boundary_facets, edges_of, facets_of, signed_measures, sorted_rows
 
 SQUARE = MeshData(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), np.array([[0, 1, 2], [0, 2, 3]]))
 
@@ -267,3 +267,10 @@ def test_euler_characteristic(mesh: MeshData) -> None:
     else:
         assert counts[0] - counts[1] + len(facets) - counts[2] == 1
         assert rim - len(edges_of(boundary)) + len(boundary) == 2
+
+
+@pytest.mark.parametrize("width", (1, 2, 3, 4, 10))
+def test_rows_are_sorted_as_by_numpy(width: int) -> None:
+    rows = np.random.default_rng(width).integers(-9, 9, size=(200, width))
+    np.testing.assert_array_equal(sorted_rows(rows), np.sort(rows, axis=1))
+    assert sorted_rows(rows[:0]).shape == (0, width)

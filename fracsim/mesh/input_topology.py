@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..meshes.data import Indices, MeshData
-from ..meshes.topology import distinct_rows
+from ..meshes.topology import distinct_rows, sorted_rows
 from .simplices import local_edges
 
 _EDGE_NUMBERS: WeakKeyDictionary[MeshData, tuple[Indices, Indices]] = WeakKeyDictionary()
@@ -45,6 +45,5 @@ class MeshTopology:
 
 def _number_edges(mesh: MeshData) -> tuple[Indices, Indices]:
     """(E, 2) distinct edges, and (C, k) the edges of each cell."""
-    pairs = np.sort(mesh.cells[:, local_edges(mesh.dim)], axis=2).reshape(-1, 2)
-    edges, _, inverse = distinct_rows(pairs)
+    edges, _, inverse = distinct_rows(sorted_rows(mesh.cells[:, local_edges(mesh.dim)].reshape(-1, 2)))
     return edges, inverse.reshape(len(mesh.cells), -1)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...meshes.data import MeshData
-from ...meshes.topology import components, distinct_rows, facets_of
+from ...meshes.topology import components, distinct_rows, facets_of, sorted_rows
 from ..input_topology import MeshTopology
 
 Ints = npt.NDArray[np.int64]
@@ -32,7 +32,7 @@ class EntityNumbering(MeshTopology):
 
     def __init__(self, mesh: MeshData) -> None:
         super().__init__(mesh)
-        sorted_facets = np.sort(facets_of(mesh.cells).reshape(-1, mesh.dim), axis=1)
+        sorted_facets = sorted_rows(facets_of(mesh.cells).reshape(-1, mesh.dim))
         self.facets, counts, inverse = distinct_rows(sorted_facets)
         self.cell_facets: Ints = inverse.reshape(len(mesh.cells), -1)
         self.boundary = np.argwhere(counts[self.cell_facets] == 1)
