@@ -133,4 +133,4 @@ def _count_bodies(domain: Domain) -> int:
     """Number of bodies of the mesh that share no node (collective)."""
     from ..mesh.fragments import find_components
 
-    return find_components(domain, links_in(domain.cell_nodes)).count
+    return find_components(domain, links_in(domain.cell_nodes.astype(np.int64))).count
