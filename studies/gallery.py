@@ -74,7 +74,8 @@ ENTRIES = (
     packaged_entry("hammered-vase", "The vase on a table, hit by a ball.", "--view 0.55,-1.2,0.35 --floor"),
     packaged_entry("dropped-vase", "A vase dropped on an inclined table.", "--view 0.4,-1.5,0.3 --floor"),
     packaged_entry("platens", "Brazilian test with the approach `edge`, coloured by piece.", "--field piece"),
-    packaged_entry("bent-bar", "A glass bar on two supports, hit in the middle by a cylinder.", "--view 0.3,-1.6,0.25"),
+    packaged_entry("bent-bar", "A glass bar on two supports, hit in the middle by a cylinder.",
+                   "--view 0.3,-1.6,0.25"),
     packaged_entry("hammered-figure", "A jade figure on a table, hit on its belly by a hammer.",
                    "--view 0.75,-1.2,0.35 --floor"),
     PictureEntry(

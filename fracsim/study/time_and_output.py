@@ -257,7 +257,7 @@ FIELDS = (
 FRACTURE_FIELDS = ("damage", "chi", "piece")
 
 
-LOOKS = ("plain", "bread", "porcelain", "jade", "granite", "steel", "wood")
+LOOKS = ("plain", "bread", "porcelain", "glass", "jade", "granite", "steel", "wood")
 Colour = Annotated[str, Field(pattern="^#[0-9a-fA-F]{6}$")]
 
 

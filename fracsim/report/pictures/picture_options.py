@@ -132,6 +132,7 @@ MATERIAL_LOOKS = {
     "plain": MaterialLook(BOUNDARY_COLOUR, CRACK_COLOUR, 0.0, "#ffffff"),
     "bread": MaterialLook("#b9712c", "#f0deb6", 0.12, "#f3efe6"),
     "porcelain": MaterialLook("#f4f2ee", "#d8bf9c", 0.6, "#c9d2dc"),
+    "glass": MaterialLook("#bcd6d0", "#eef7f4", 0.8, "#dfe6ec"),
     "jade": MaterialLook("#5c9c77", "#b5d9b4", 0.5, "#eef0ec"),
     "granite": MaterialLook("#86837f", "#c4b5a6", 0.1),
     "steel": MaterialLook("#76808c", "#d3d8de", 0.55),
