@@ -10,7 +10,7 @@ from dolfinx import la
 from dolfinx.common import IndexMap
 from mpi4py import MPI
 
-from .parallel import allgather, exchange_rows
+from .parallel import exchange_rows
 
 if TYPE_CHECKING:
     from .domain import Domain
@@ -29,12 +29,15 @@ def min_over_ranks(index_map: IndexMap, values: npt.NDArray[Any]) -> npt.NDArray
     comm = index_map.comm
     if comm.size == 1:
         return values
-    first, owned_count = index_map.local_range[0], index_map.size_local
-    # every rank has the ghosts of all ranks, and takes those that it owns
-    ghosts, ghost_values = (np.concatenate(allgather(comm, rows)) for rows in (index_map.ghosts, values[owned_count:]))
-    owned = (ghosts >= first) & (ghosts < first + owned_count)
+    # each ghost goes to its owner alone
+    order = np.argsort(index_map.owners, kind="stable")
+    sent, received = np.bincount(index_map.owners, minlength=comm.size), np.empty(comm.size, np.int64)
+    comm.Alltoall(sent, received)
+    ghosts, ghost_values = (
+        exchange_rows(comm, rows[order], sent, received) for rows in (index_map.ghosts, values[index_map.size_local :])
+    )
     result = values.copy()
-    np.minimum.at(result, ghosts[owned] - first, ghost_values[owned])
+    np.minimum.at(result, ghosts - index_map.local_range[0], ghost_values)
     return owner_values(index_map, result)
 
 

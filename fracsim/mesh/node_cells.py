@@ -75,7 +75,8 @@ def _join_over_ranks(
     label[domain.facets.cell_facets[cells]] = (first + component)[:, None]
     ghosts = slice(index_map.size_local, None)
     links = np.stack([label[ghosts], owner_values(index_map, label)[ghosts]], axis=1)
-    links = np.concatenate(allgather(comm, links[(links >= 0).all(axis=1)]))
+    links = np.unique(links[(links >= 0).all(axis=1)], axis=0)
+    links = np.concatenate(allgather(comm, links))
     sizes, lowest_cells = (np.concatenate(allgather(comm, values)) for values in (size, lowest))
     total, joined = components(links, len(sizes))
     joined_lowest = np.full(total, np.iinfo(np.int64).max)
