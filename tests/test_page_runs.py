@@ -77,8 +77,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], None]:
         # a long run is stopped, which is no error; its later frames are not drawn on the pages
         limit = LONG if command.startswith("fracsim run") and "--wall-limit" not in command else ""
         process = subprocess.Popen(
-            ["bash", "-c", f"exec {command}{limit}"], cwd=folder, text=True, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            start_new_session=True, env=os.environ | {"BROWSER": "true"},
+            ["bash", "-c", f"exec {command}{limit}"], cwd=folder, text=True, stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT, start_new_session=True, env=os.environ | {"BROWSER": "true"},
         )  # fmt: skip
         served = command.startswith("fracsim view") and "-o" not in command
         printed = ""
