@@ -167,7 +167,9 @@ def render(
     frame: Annotated[int, typer.Option(help="which frame, from 0; -1 is the last")] = -1,
     look: Annotated[
         str,
-        typer.Option(help="bread, porcelain, glass, jade, granite, steel, wood, plain; or two colours: #b9712c,#f0deb6"),
+        typer.Option(
+            help="bread, porcelain, glass, jade, granite, steel, wood, plain; or two colours: #b9712c,#f0deb6"
+        ),
     ] = "",
     floor: Annotated[bool, typer.Option("--floor", help="where an obstacle plane is, else below the body")] = False,
     size: Annotated[str, typer.Option(help="of a picture in pixels; half of it each on a sheet")] = "1400x900",
