@@ -8,10 +8,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.stress import Stress
+from ..mesh.connected_bodies import label_bodies
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_ghosts
 from ..mesh.parallel import sum_over_ranks
-from ..meshes.topology import links_in
 
 if TYPE_CHECKING:
     from ..fracture.brittle.surface_criterion import BrittleSurfaces
@@ -131,6 +131,4 @@ class FractureLog:
 
 def _count_bodies(domain: Domain) -> int:
     """Number of bodies of the mesh that share no node (collective)."""
-    from ..mesh.fragments import find_components
-
-    return find_components(domain, links_in(domain.cell_nodes.astype(np.int64))).count
+    return int(domain.comm.bcast(label_bodies(domain.input_mesh)[0] if domain.input_mesh is not None else None))
