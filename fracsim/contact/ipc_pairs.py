@@ -28,9 +28,17 @@ import numpy.typing as npt
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
-from ..mesh.parallel import sum_over_ranks
+from ..mesh.parallel import allgather, sum_over_ranks
 from .laws import BARRIER
-from .pair_search import PairFilter, PairSearch, SimplexPairs, free_fractions, max_length, pair_distances
+from .pair_search import (
+    PairFilter,
+    PairSearch,
+    SimplexPairs,
+    free_fractions,
+    intersecting_pairs,
+    max_length,
+    pair_distances,
+)
 from .sample_points import Centroids, IpcFriction, Vertices, measures, projection
 
 Values = npt.NDArray[np.float64]
@@ -218,40 +226,7 @@ class ActivePairs:
         return float(self.pairs.compute_minimum_distance(self.kind.samples.mesh, self.positions))
 
 
-# --- intersections ---
-
-
-def intersecting_elements(mesh: ipctk.CollisionMesh, x: Values) -> Ints:
-    """(k, 2) elements that intersect and are not neighbours, with vertices at x (n, d), m."""
-    phase = ipctk.LBVH()
-    if not len(x):
-        return NO_PAIRS
-    phase.build(x, mesh.edges, mesh.faces, 0.0)
-    return _intersecting_triangles(phase, mesh, x) if x.shape[1] == 3 else _intersecting_segments(phase, mesh, x)
-
-
-class SurfaceIntersections:
-    """Test whether elements of a surface intersect; ipctk's mesh is built when it is first used."""
-
-    _mesh: ipctk.CollisionMesh | None = None
-
-    def __init__(self, rest_positions: Values, elements: Ints, patch: npt.NDArray[np.int32] | None = None) -> None:
-        """As for IpcPairs; `patch`: (n,) numbers of parts of the surface that touch others alone; None: all touch."""
-        self._rest_positions, self._elements, self._patch = rest_positions, elements, patch
-
-    def __call__(self, x: Values) -> Ints:
-        """(k, 2) elements that intersect with points at x (n, d), m."""
-        if not len(self._elements):
-            return NO_PAIRS
-        if self._mesh is None:
-            self._mesh = collision_mesh(self._rest_positions, self._elements)
-            if self._patch is not None:
-                used = np.unique(self._elements)
-                self._mesh.can_collide = ipctk.make_vertex_patches_filter(np.ascontiguousarray(self._patch[used]))
-        vertices = self._mesh.vertices(x)
-        if not ipctk.has_intersections(self._mesh, vertices, ipctk.LBVH()):
-            return NO_PAIRS
-        return intersecting_elements(self._mesh, vertices)
+# --- collision mesh ---
 
 
 def collision_mesh(rest_positions: Values, elements: Ints) -> ipctk.CollisionMesh:
@@ -261,56 +236,6 @@ def collision_mesh(rest_positions: Values, elements: Ints) -> ipctk.CollisionMes
     corners, is_3d = elements.astype(np.int32), rest_positions.shape[1] == 3
     edges = ipctk.edges(corners) if is_3d and len(corners) else corners.reshape(-1, 2)
     return ipctk.CollisionMesh.build_from_full_mesh(rest_positions, edges, *((corners,) if is_3d else ()))
-
-
-def _intersecting_segments(phase: ipctk.LBVH, mesh: ipctk.CollisionMesh, x: Values) -> Ints:
-    near = _as_pairs([(pair.edge0_id, pair.edge1_id) for pair in phase.detect_edge_edge_candidates()])
-    (a, b), (c, d) = (x[mesh.edges[near[:, k]]].transpose(1, 0, 2) for k in range(2))
-    return near[_separates(a, b, c, d) & _separates(c, d, a, b)]
-
-
-def _separates(a: Values, b: Values, c: Values, d: Values) -> Flags:
-    """(k,) whether the line through a and b separates c from d, (k, 2) each."""
-    (x, y), arms = (b - a).T, [(point - a).T for point in (c, d)]
-    side = [x * arm_y - y * arm_x for arm_x, arm_y in arms]
-    return np.asarray(side[0] * side[1] <= 0)
-
-
-def _intersecting_triangles(phase: ipctk.LBVH, mesh: ipctk.CollisionMesh, x: Values) -> Ints:
-    near = _as_pairs([(pair.edge_id, pair.face_id) for pair in phase.detect_edge_face_candidates()])
-    near = near[_pierces(x[mesh.edges[near[:, 0]]], x[mesh.faces[near[:, 1]]])]
-    row, triangle = _triangles_at_edges(mesh.faces_to_edges, near[:, 0])
-    return np.unique(np.sort(np.column_stack([triangle, near[row, 1]]), axis=1), axis=0)
-
-
-def _triangles_at_edges(triangle_edges: Ints, edges: Ints) -> tuple[Ints, Ints]:
-    """All triangles at edges (k,): rows (m,) of these, and triangles (m,); `triangle_edges`: (triangles, 3)."""
-    order = np.argsort(triangle_edges, axis=None, kind="stable")
-    sorted_edges = triangle_edges.reshape(-1)[order]
-    first, end = np.searchsorted(sorted_edges, edges, "left"), np.searchsorted(sorted_edges, edges, "right")
-    row = np.repeat(np.arange(len(edges)), count := end - first)
-    position = np.arange(len(row)) + np.repeat(first - np.cumsum(count) + count, count)
-    return row, order[position] // triangle_edges.shape[1]
-
-
-def _pierces(ends: Values, corners: Values) -> Flags:
-    """(k,) whether edges (k, 2, 3) pass through triangles (k, 3, 3).
-
-    The ends are on both sides of the plane, and the edge turns in the same sense about all three sides.
-    """
-    start, direction = ends[:, 0], ends[:, 1] - ends[:, 0]
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    height = [np.einsum("ij,ij->i", ends[:, k] - corners[:, 0], normal) for k in range(2)]
-    sense = [
-        np.einsum("ij,ij->i", direction, np.cross(corners[:, k] - start, corners[:, (k + 1) % 3] - start))
-        for k in range(3)
-    ]
-    same = np.all(np.array(sense) >= 0, axis=0) | np.all(np.array(sense) <= 0, axis=0)
-    return np.asarray((height[0] * height[1] <= 0) & (height[0] != height[1]) & same)
-
-
-def _as_pairs(numbers: list[tuple[int, int]]) -> Ints:
-    return np.array(numbers, np.int64).reshape(-1, 2)
 
 
 class IpcPairs:
@@ -444,10 +369,6 @@ class IpcPairs:
     def _gap_at(self, vertices: Values) -> float:
         return float(np.sqrt(min(pairs.least_squared_distance() for pairs in self._active_pairs(vertices))))
 
-    def search_along(self, x: Values, end: Values) -> None:
-        """Search candidates for the whole motion from x to `end` (n, d), m."""
-        self._search.pairs_along(self._mesh.vertices(x), self._mesh.vertices(end))
-
     # --- friction ---
 
     def lag_friction(self, x: Values, start: Values, slip: float) -> IpcFriction:
@@ -524,10 +445,9 @@ class IpcPairs:
 
     def intersections(self, x: Values) -> Ints:
         """(k, 2) elements that intersect, of all ranks (collective)."""
-        vertices = self._mesh.vertices(x)
-        if not self.comm.allreduce(ipctk.has_intersections(self._mesh, vertices, ipctk.LBVH()), op=MPI.LOR):
-            return NO_PAIRS
-        return intersecting_elements(self._mesh, vertices)
+        surface = self._kinds[0].simplices.second
+        rank_pairs = intersecting_pairs(surface, self._search.filter, self._mesh.vertices(x))
+        return np.unique(np.concatenate(allgather(self.comm, rank_pairs)), axis=0)
 
     def pressure(self, x: Values) -> Values:
         """(n,) force of the barrier on each point by its share of the reference area, Pa; 0 where it has none.

@@ -120,12 +120,9 @@ class RetractableSurface:
         point_map: map from nodes to points, with new faces retracted.
         pairs: pairs that may be in contact.
         closed_pressure: pressure, in stiffnesses, of faces without room.
-        search_all_faces: whether candidates are searched for the retraction of all faces once some are retracted:
-            fewer searches, and more candidates after them.
     """
 
     closed_pressure: ClassVar[float] = SURFACE.closed_pressure
-    search_all_faces: ClassVar[bool] = False
     pairs: SurfacePairs
 
     def __init__(self, elements: Ints, point_map: SurfaceMap, stiffness: float) -> None:
@@ -154,10 +151,6 @@ class RetractableSurface:
     def _remaining(self) -> Ints:
         """Numbers (m,) of the elements that the pairs have."""
         return np.delete(np.arange(len(self.elements)), self._excluded)
-
-    def _search_along(self, x: Values, end: Values) -> None:
-        """Search candidates for the motion of the points from x to `end` (n, d), m."""
-        self.pairs.search_along(x, end)
 
     def snapshot(self) -> SurfaceSnapshot:
         """Factors of arms, excluded elements, and steps to the next release of faces."""
@@ -203,13 +196,6 @@ class RetractableSurface:
         share = self._common_share(share)
         changed = self._on_any_rank(not np.array_equal(share, self.point_map.share))
         if changed:
-            movable = np.unique(self.elements[self._crack_faces]) if self.search_all_faces else points
-            end = (x := self.point_map(u)).copy()
-            end[movable] = self.point_map.evaluate_points(
-                u, movable, np.minimum(SURFACE.min_arm, self.point_map.share[movable])
-            )
-            # one search for all the factors that follow
-            self._search_along(x, end)
             self.point_map = self.point_map.with_arm_share(share)
         return changed
 

@@ -314,11 +314,6 @@ class AllMeshPairs:
         items = zip(self.pairs, start_poses, strict=True)
         return min((pairs.moving_free_fraction(x, end, pose) for pairs, pose in items), default=1.0)
 
-    def search_along(self, x: Values, end: Values) -> None:
-        """Search candidates for the whole motion of the body from x to `end`."""
-        for pairs in self._near(x):
-            pairs.contact.search_along(pairs.with_mesh(x), pairs.with_mesh(end))
-
     def pressure(self, x: Values) -> Values:
         """(n,) sum of the pressures of all barriers on each point, Pa."""
         pressures = [pairs.contact.pressure(pairs.with_mesh(x))[: len(x)] for pairs in self._near(x)]

@@ -6,10 +6,16 @@
 #include <string.h>
 
 #define MAX_CELLS_PER_SIMPLEX 4
+#define ROUND_OFF 1e-10 /* of the height of a point above a plane, in the sizes of triangle and edge */
 
 typedef struct {
     double low[3], high[3];
 } Box;
+
+/* the smaller and the larger of two numbers, `a` if `b` is no number: fmin and fmax would be calls */
+static double lower(double a, double b) { return b < a ? b : a; }
+
+static double higher(double a, double b) { return b > a ? b : a; }
 
 static void subtract(double *r, const double *a, const double *b)
 {
@@ -107,19 +113,25 @@ static int gather(const double *x, const int32_t *vertices, int corners, int cen
     return 1;
 }
 
-/* Box around the motion of n points (n, 3), grown by `reach`. */
+/* Box around the motion of n points (n, 3), grown by `reach`; positions that are no numbers do not count. */
 static Box box_of(int n, const double *start, const double *end, double reach)
 {
     Box box;
     for (int k = 0; k < 3; k++) {
         double low = INFINITY, high = -INFINITY;
         for (int c = 0; c < n; c++) {
-            low = fmin(low, fmin(start[3 * c + k], end[3 * c + k]));
-            high = fmax(high, fmax(start[3 * c + k], end[3 * c + k]));
+            double a = start[3 * c + k], b = end[3 * c + k];
+            low = lower(lower(low, a), b), high = higher(higher(high, a), b);
         }
         box.low[k] = low - reach, box.high[k] = high + reach;
     }
     return box;
+}
+
+static int boxes_meet(const Box *a, const Box *b)
+{
+    return !(a->low[0] > b->high[0] || a->high[0] < b->low[0] || a->low[1] > b->high[1] || a->high[1] < b->low[1]
+             || a->low[2] > b->high[2] || a->high[2] < b->low[2]);
 }
 
 /* Largest length of the relative motion of two vertices of simplices that move straight from `start` to `end`. */
@@ -130,7 +142,7 @@ static double relative_motion(int a, const double *xs, const double *xe, int b, 
         for (int j = 0; j < 3 * b; j += 3) {
             double m[3];
             for (int k = 0; k < 3; k++) m[k] = (xe[i + k] - xs[i + k]) - (ye[j + k] - ys[j + k]);
-            square = fmax(square, dot(m, m));
+            square = higher(square, dot(m, m));
         }
     return sqrt(square);
 }
@@ -177,8 +189,8 @@ static Grid grid_of(int64_t n, const Box *boxes)
     for (int64_t i = 0; i < n; i++) {
         double largest = 0;
         for (int k = 0; k < 3; k++) {
-            grid.low[k] = fmin(grid.low[k], boxes[i].low[k]), high[k] = fmax(high[k], boxes[i].high[k]);
-            largest = fmax(largest, boxes[i].high[k] - boxes[i].low[k]);
+            grid.low[k] = lower(grid.low[k], boxes[i].low[k]), high[k] = higher(high[k], boxes[i].high[k]);
+            largest = higher(largest, boxes[i].high[k] - boxes[i].low[k]);
         }
         size += largest / n;
     }
@@ -193,88 +205,174 @@ static Grid grid_of(int64_t n, const Box *boxes)
     return grid;
 }
 
-/* Pairs of a simplex of `first` (m, a) and one of `second` (n, b), without common vertices, that may come as near as
-   `reach` while the vertices (count, 3) move from `start` to `end`. Of `first`, the centroids count if `centroids`.
-   With `same` both are one set, and each pair is found once. Pairs have different patches, unless those are negative,
-   and one of them is marked as `own`. Up to `capacity` pairs (k, 2) are written; returns k, or -1 without memory. */
-int64_t find_near_pairs(const double *start, const double *end, int64_t m, int a, const int32_t *first, int64_t n, int b,
-                        const int32_t *second, int centroids, int same, const int32_t *patches, const uint8_t *own,
-                        double reach, int64_t capacity, int32_t *pairs)
+/* Whether an edge passes through a triangle (3, 3): its ends are on both sides of the plane, and it turns in the same
+   sense about all three sides. An edge in the plane, but for round-off, does not. */
+static int pierces(const double *start, const double *end, const double *corners)
 {
-    if (m == 0 || n == 0) return 0;
-    double xs[9], xe[9], ys[9], ye[9];
-    Box *boxes = malloc(n * sizeof(Box));
-    if (!boxes) return -1;
-    for (int64_t j = 0; j < n; j++) {
-        gather(start, second + b * j, b, 0, ys);
-        gather(end, second + b * j, b, 0, ye);
-        boxes[j] = box_of(b, ys, ye, reach);
+    double a[3], b[3], normal[3], arm[3], direction[3], heights[2];
+    subtract(a, corners + 3, corners), subtract(b, corners + 6, corners), subtract(direction, end, start);
+    for (int k = 0; k < 3; k++) normal[k] = a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3];
+    subtract(arm, start, corners), heights[0] = dot(arm, normal);
+    subtract(arm, end, corners), heights[1] = dot(arm, normal);
+    double size = ROUND_OFF * sqrt(dot(normal, normal) * (dot(a, a) + dot(b, b) + dot(direction, direction)));
+    for (int k = 0; k < 2; k++) heights[k] = fabs(heights[k]) > size ? heights[k] : 0;
+    if (heights[0] * heights[1] > 0 || heights[0] == heights[1]) return 0;
+    int positive = 1, negative = 1;
+    for (int c = 0; c < 3; c++) {
+        subtract(a, corners + 3 * c, start), subtract(b, corners + 3 * ((c + 1) % 3), start);
+        double sense = 0;
+        for (int k = 0; k < 3; k++)
+            sense += direction[k] * (a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3]);
+        positive &= sense >= 0, negative &= sense <= 0;
     }
-    const Grid grid = grid_of(n, boxes);
-    const int *count = grid.count;
-    const int64_t cells = (int64_t)count[0] * count[1] * count[2];
-    int64_t *begin = calloc(cells + 2, sizeof(int64_t)), found = 0;
-    int32_t *inside = NULL;
+    return positive || negative;
+}
+
+/* Whether an edge of a triangle at x passes through one at y, with none of its vertices. */
+static int edge_pierces(const int32_t *first, const double *x, const int32_t *second, const double *y)
+{
+    for (int c = 0; c < 3; c++) {
+        int32_t edge[2] = {first[c], first[(c + 1) % 3]};
+        if (!share_vertex(2, edge, 3, second) && pierces(x + 3 * c, x + 3 * ((c + 1) % 3), y)) return 1;
+    }
+    return 0;
+}
+
+/* Whether the line through a segment (2, 3) in the plane separates the ends of another. */
+static int separates(const double *x, const double *y)
+{
+    double side[2], dx = x[3] - x[0], dy = x[4] - x[1];
+    for (int c = 0; c < 2; c++) side[c] = dx * (y[3 * c + 1] - x[1]) - dy * (y[3 * c] - x[0]);
+    return side[0] * side[1] <= 0;
+}
+
+/* Whether two segments in the plane, or two triangles, intersect elsewhere than at a common vertex. */
+static int intersect(int corners, const int32_t *first, const double *x, const int32_t *second, const double *y)
+{
+    if (corners == 3) return edge_pierces(first, x, second, y) || edge_pierces(second, y, first, x);
+    return !share_vertex(2, first, 2, second) && separates(x, y) && separates(y, x);
+}
+
+enum { OWN = 1, MOVED = 2 };
+
+/* Which flags vertices of a simplex have. */
+static int marks_of(int n, const int32_t *vertices, const uint8_t *own, const uint8_t *moved)
+{
+    int marks = 0;
+    for (int c = 0; c < n; c++) marks |= (own[vertices[c]] ? OWN : 0) | (moved[vertices[c]] ? MOVED : 0);
+    return marks;
+}
+
+/* Simplices in the cells of a grid, in each cell those with a vertex that has moved first: cell c has the numbers
+   inside[begin[2 c]] and on, the others from inside[begin[2 c + 1]] on. */
+typedef struct {
+    Box *boxes, of_moved;
+    uint8_t *marks;
+    Grid grid;
+    int64_t *begin;
+    int32_t *inside;
+} Bins;
+
+static void free_bins(Bins *bins) { free(bins->boxes), free(bins->marks), free(bins->begin), free(bins->inside); }
+
+/* Fill the bins with n simplices of b vertices that move from `start` to `end`; 0 without memory. */
+static int fill_bins(Bins *bins, int64_t n, int b, const int32_t *simplices, const double *start, const double *end,
+                     const uint8_t *own, const uint8_t *moved, double reach)
+{
+    double ys[9], ye[9];
+    Box *boxes = bins->boxes = malloc(n * sizeof(Box)), *all = &bins->of_moved;
+    bins->marks = malloc(n), bins->begin = NULL, bins->inside = NULL;
+    if (!boxes || !bins->marks) return 0;
+    for (int k = 0; k < 3; k++) all->low[k] = INFINITY, all->high[k] = -INFINITY;
+    for (int64_t j = 0; j < n; j++) {
+        gather(start, simplices + b * j, b, 0, ys);
+        gather(end, simplices + b * j, b, 0, ye);
+        boxes[j] = box_of(b, ys, ye, reach);
+        bins->marks[j] = (uint8_t)marks_of(b, simplices + b * j, own, moved);
+        for (int k = 0; bins->marks[j] & MOVED && k < 3; k++)
+            all->low[k] = lower(all->low[k], boxes[j].low[k]), all->high[k] = higher(all->high[k], boxes[j].high[k]);
+    }
+    bins->grid = grid_of(n, boxes);
+    const int *count = bins->grid.count;
+    const int64_t slots = 2 * (int64_t)count[0] * count[1] * count[2];
+    int64_t *begin = bins->begin = calloc(slots + 2, sizeof(int64_t));
+    if (!begin) return 0;
     /* counts, then sums, then numbers, as in a counting sort */
-    for (int round = 0; begin && round < 2; round++) {
+    for (int round = 0; round < 2; round++) {
         for (int64_t j = 0; j < n; j++) {
             int low[3], high[3];
-            cells_of(&grid, &boxes[j], low, high);
+            cells_of(&bins->grid, &boxes[j], low, high);
             for (int u = low[0]; u <= high[0]; u++)
                 for (int v = low[1]; v <= high[1]; v++)
                     for (int w = low[2]; w <= high[2]; w++) {
-                        int64_t cell = ((int64_t)u * count[1] + v) * count[2] + w;
-                        if (round) inside[begin[cell + 1]++] = (int32_t)j;
-                        else begin[cell + 2]++;
+                        int64_t slot = 2 * (((int64_t)u * count[1] + v) * count[2] + w) + !(bins->marks[j] & MOVED);
+                        if (round) bins->inside[begin[slot + 1]++] = (int32_t)j;
+                        else begin[slot + 2]++;
                     }
         }
         if (round) break;
-        for (int64_t cell = 0; cell < cells; cell++) begin[cell + 2] += begin[cell + 1];
-        inside = malloc((begin[cells + 1] + 1) * sizeof(int32_t));
-        if (!inside) break;
+        for (int64_t slot = 0; slot < slots; slot++) begin[slot + 2] += begin[slot + 1];
+        bins->inside = malloc((begin[slots + 1] + 1) * sizeof(int32_t));
+        if (!bins->inside) return 0;
     }
-    if (!begin || !inside) {
-        free(boxes), free(begin), free(inside);
+    return 1;
+}
+
+/* Pairs of a simplex of `first` (m, a) and one of `second` (n, b) that may come as near as `reach` while the vertices
+   (count, 3) move from `start` to `end`, without common vertices; or, if `crossing`, that intersect at the start. Of
+   `first`, the centroids count if `centroids`. With `same` both are one set, and each pair is found once. Pairs have
+   different patches, unless those are negative, a vertex that is marked as `own`, and one that is marked as `moved`. Up
+   to `capacity` pairs (k, 2) are written; returns k, or -1 without memory. */
+int64_t find_pairs(const double *start, const double *end, int64_t m, int a, const int32_t *first, int64_t n, int b,
+                   const int32_t *second, int centroids, int same, int crossing, const int32_t *patches,
+                   const uint8_t *own, const uint8_t *moved, double reach, int64_t capacity, int32_t *pairs)
+{
+    if (m == 0 || n == 0) return 0;
+    double xs[9], xe[9], ys[9], ye[9];
+    int64_t found = 0;
+    Bins bins;
+    if (!fill_bins(&bins, n, b, second, start, end, own, moved, reach)) {
+        free_bins(&bins);
         return -1;
     }
+    const Grid grid = bins.grid;
     for (int64_t i = 0; i < m; i++) {
         const int32_t *x = first + a * i;
-        int points = gather(start, x, a, centroids, xs), low[3], high[3];
+        int points = gather(start, x, a, centroids, xs), low[3], high[3], marks = marks_of(a, x, own, moved);
         gather(end, x, a, centroids, xe);
         Box box = box_of(points, xs, xe, 0);
+        if (!(marks & MOVED) && !boxes_meet(&box, &bins.of_moved)) continue;
         cells_of(&grid, &box, low, high);
         for (int u = low[0]; u <= high[0]; u++)
             for (int v = low[1]; v <= high[1]; v++)
                 for (int w = low[2]; w <= high[2]; w++) {
-                    int64_t cell = ((int64_t)u * count[1] + v) * count[2] + w;
-                    for (int64_t k = begin[cell]; k < begin[cell + 1]; k++) {
-                        int64_t j = inside[k];
+                    int64_t slot = 2 * (((int64_t)u * grid.count[1] + v) * grid.count[2] + w);
+                    int64_t stop = bins.begin[slot + (marks & MOVED ? 2 : 1)];
+                    for (int64_t k = bins.begin[slot]; k < stop; k++) {
+                        int64_t j = bins.inside[k];
                         const int32_t *y = second + b * j;
-                        const Box *other = &boxes[j];
+                        const Box *other = &bins.boxes[j];
                         if (same && j <= i) continue;
-                        if (box.low[0] > other->high[0] || box.high[0] < other->low[0] || box.low[1] > other->high[1]
-                            || box.high[1] < other->low[1] || box.low[2] > other->high[2] || box.high[2] < other->low[2])
-                            continue;
+                        if (!boxes_meet(&box, other) || (marks | bins.marks[j]) != (OWN | MOVED)) continue;
                         if (patches[x[0]] == patches[y[0]] && patches[x[0]] >= 0) continue;
-                        if (share_vertex(a, x, b, y)) continue;
-                        int is_own = 0, from[3], to[3];
-                        for (int c = 0; c < a; c++) is_own |= own[x[c]];
-                        for (int c = 0; c < b; c++) is_own |= own[y[c]];
-                        if (!is_own) continue;
+                        if (!crossing && share_vertex(a, x, b, y)) continue;
                         /* each pair in the first of the cells that its boxes share */
+                        int from[3], to[3];
                         cells_of(&grid, other, from, to);
                         if (u != (low[0] > from[0] ? low[0] : from[0]) || v != (low[1] > from[1] ? low[1] : from[1])
                             || w != (low[2] > from[2] ? low[2] : from[2]))
                             continue;
                         gather(start, y, b, 0, ys);
                         gather(end, y, b, 0, ye);
-                        if (least_distance(points, xs, xe, b, ys, ye, reach) > reach) continue;
+                        if (crossing ? !intersect(b, x, xs, y, ys)
+                                     : least_distance(points, xs, xe, b, ys, ye, reach) > reach)
+                            continue;
                         if (found < capacity) pairs[2 * found] = (int32_t)i, pairs[2 * found + 1] = (int32_t)j;
                         found++;
                     }
                 }
     }
-    free(boxes), free(begin), free(inside);
+    free_bins(&bins);
     return found;
 }
 

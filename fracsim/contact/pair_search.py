@@ -2,7 +2,7 @@
 
 A grid of cubes gives pairs whose bounding boxes meet. Of these the pairs remain that can come within a distance r: with
 the distances d_0 and d_1 at both ends of a straight motion, and the largest relative motion s of their vertices, they
-stay at least (d_0 + d_1 - s) / 2 apart.
+stay at least (d_0 + d_1 - s) / 2 apart. Pairs that intersect are found in the same grid.
 
 Source: C. Ericson (2005), Real-time collision detection, chapters 5 and 7.
 """
@@ -73,15 +73,37 @@ class PairFilter:
         return cls(np.full(count, -1, np.int32), np.ones(count, bool))
 
 
-def near_pairs(pairs: SimplexPairs, where: PairFilter, start: Values, end: Values, reach: float) -> Ints:
-    """(k, 2) numbers of simplices that may come within `reach`, m, as vertices move from `start` to `end` (n, d), m."""
+def near_pairs(
+    pairs: SimplexPairs, where: PairFilter, start: Values, end: Values, reach: float, moved: Flags | None = None
+) -> Ints:
+    """(k, 2) numbers of simplices that may come within `reach`, m, as vertices move from `start` to `end` (n, d), m.
+
+    `moved`: (n,) flags, of which one vertex of a pair at least has one; None: all pairs count.
+    """
+    return _find_pairs(pairs, where, start, end, reach, moved, crossing=False)
+
+
+def intersecting_pairs(elements: Numbers, where: PairFilter, x: Values) -> Ints:
+    """(k, 2) elements (m, d) that intersect elsewhere than at common vertices, with vertices at x (n, d), m.
+
+    Elements that touch intersect, unless they lie in one plane (2D: on one line).
+    """
+    pairs = SimplexPairs.of(elements, elements, 0.0)
+    return _find_pairs(pairs, where, x, x, 0.0, None, crossing=True)
+
+
+def _find_pairs(
+    pairs: SimplexPairs, where: PairFilter, start: Values, end: Values, reach: float, moved: Flags | None, *,
+    crossing: bool,
+) -> Ints:  # fmt: skip
     x, y = (_in_space(positions) for positions in (start, end))
     sets = [number for simplices in (pairs.first, pairs.second) for number in (*simplices.shape, simplices)]
-    options = int(pairs.centroids), int(pairs.is_one_set), where.patches, where.is_owned
-    search, capacity = load_library(SOURCE).find_near_pairs, 4 * len(pairs.first) + 1000
+    options = int(pairs.centroids), int(pairs.is_one_set), int(crossing)
+    flags = where.patches, where.is_owned, np.ones(len(x), bool) if moved is None else moved
+    search, capacity = load_library(SOURCE).find_pairs, 4 * len(pairs.first) + 1000
     while True:
         result = np.empty((capacity, 2), np.int32)
-        count = search(x, y, *sets, *options, reach, capacity, result)
+        count = search(x, y, *sets, *options, *flags, reach, capacity, result)
         if count < 0:
             raise MemoryError(f"no memory for the search among {len(pairs.second)} elements in contact")
         if count <= capacity:
@@ -122,11 +144,70 @@ def _in_space(x: Values) -> Values:
     return result
 
 
+@dataclass(frozen=True)
+class PairSearchPolicy:
+    """Tuned numbers of searches.
+
+    Attributes:
+        max_moved: share of the vertices up to which pairs of those that have moved are searched again alone. With a
+            fifth of the vertices that takes 0.8 of the time of a search among all.
+        fits: fits of a motion to the vertices that are near it.
+        fitted: share of the vertices, those nearest to the motion, to which it is fitted.
+    """
+
+    max_moved: float = 0.3
+    fits: int = 3
+    fitted: float = 0.7
+
+
+SEARCH = PairSearchPolicy()
+
+
+@dataclass(frozen=True)
+class SearchedMotion:
+    """Straight motion of vertices along which pairs have been searched.
+
+    Attributes:
+        start: (n, d) m.
+        change: (n, d) m.
+        margin: m.
+    """
+
+    start: Values
+    change: Values
+    margin: float
+
+    def far_vertices(self, x: Values) -> Flags:
+        """(n,) flags of vertices at x (n, d), m, that are farther than the margin from one time of the motion.
+
+        All may have moved alike besides. The time and the common motion are fitted to most vertices.
+        """
+        offset, weight = x - self.start, np.ones(len(x))
+        far = weight > 0
+        for _ in range(SEARCH.fits if len(x) else 0):
+            away, change = (vectors - weight @ vectors / weight.sum() for vectors in (offset, self.change))
+            weighted = weight[:, None] * change
+            square, along = float(np.vdot(weighted, change)), 0.0
+            if square:
+                along = min(max(float(np.vdot(weighted, away)) / square, 0.0), 1.0)
+            away -= along * change
+            distance = np.einsum("nd,nd->n", away, away)
+            # positions that are no numbers are far
+            far = ~(distance <= self.margin**2)
+            if not far.any() or np.isnan(distance).any():
+                break
+            fitted = int(SEARCH.fitted * (len(x) - 1))
+            weight = 1.0 * (distance <= np.partition(distance, fitted)[fitted])
+        return np.asarray(far)
+
+
 class PairSearch:
     """Pairs within a distance of each other; x (n, d) of the vertices, m.
 
     Pairs are searched along a whole step of Newton's method, within the distance and twice a margin. They serve all
-    positions within the margin of it: the trials of the line search, the steps after it, and mostly the next one.
+    positions within the margin of it: the trials of the line search, the steps after it, and mostly the next one. Where
+    few vertices have left it, the pairs of these alone are searched again. Pairs are in the order of their numbers,
+    whatever has been searched: sums over them do not depend on it.
 
     Attributes:
         filter: vertices of which pairs are searched.
@@ -139,31 +220,65 @@ class PairSearch:
 
     def clear_caches(self) -> None:
         """Discard all pairs."""
-        self._pairs: list[Ints] | None = None
+        # the search among all vertices, and the later one of pairs with a moved vertex
+        self._all: tuple[SearchedMotion, list[Ints]] | None = None
+        self._later: tuple[SearchedMotion, Flags] | None = None
+        self._pairs: list[Ints] = []  # of both
 
     def pairs(self, x: Values) -> list[Ints]:
         """(k, 2) pairs of each set; the same list while it is valid."""
-        if self._pairs is None or not self._is_valid(x):
-            self._pairs = self._search(x, x)
-        return self._pairs
+        return self.pairs_along(x, x)
 
     def pairs_along(self, x: Values, end: Values) -> list[Ints]:
         """(k, 2) pairs of each set for the whole motion from x to `end`; the same list while it is valid."""
-        if self._pairs is None or not (self._is_valid(x) and self._is_valid(end)):
-            self._pairs = self._search(x, end)
+        if self._all is None:
+            self._search(x, end)
+            return self._pairs
+        ends = (x,) if end is x else (x, end)
+        moved = np.any([self._all[0].far_vertices(positions) for positions in ends], axis=0)
+        if not moved.any():
+            self._pairs, self._later = self._all[1], None
+        elif np.count_nonzero(moved) > SEARCH.max_moved * len(x):
+            self._search(x, end)
+        elif not self._is_later_valid(moved, ends):
+            self._search_moved(x, end, moved)
         return self._pairs
 
-    def _search(self, x: Values, end: Values) -> list[Ints]:
-        """Search along a motion; the mean motion brings nothing together."""
-        start, centred_end = centred(x), centred(end)
-        self._start, self._motion, margin = start, centred_end - start, 2 * self._margin
-        return [near_pairs(pairs, self.filter, start, centred_end, pairs.distance + margin) for pairs in self._sets]
+    def _is_later_valid(self, moved: Flags, ends: Sequence[Values]) -> bool:
+        """Whether the later search has all pairs of moved vertices at positions (n, d)."""
+        if self._later is None:
+            return False
+        motion, searched = self._later
+        return not (moved & ~searched).any() and not any(motion.far_vertices(x).any() for x in ends)
 
-    def _is_valid(self, x: Values) -> bool:
-        """Whether no pair can be missing: all points are near one point of time of the motion in the last search."""
-        offset, square = centred(x) - self._start, float(np.vdot(self._motion, self._motion))
-        along = min(max(float(np.vdot(offset, self._motion)) / square, 0.0), 1.0) if square else 0.0
-        return max_length(offset - along * self._motion) <= self._margin
+    def _search(self, x: Values, end: Values) -> None:
+        """Search all pairs along a motion."""
+        motion = self._motion(x, end)
+        self._pairs = [_sorted(pairs, self._along(motion, pairs)) for pairs in self._sets]
+        self._all, self._later = (motion, self._pairs), None
+
+    def _search_moved(self, x: Values, end: Values, moved: Flags) -> None:
+        """Search the pairs of moved vertices along a motion; other pairs are those of the last search among all."""
+        assert self._all is not None
+        motion, result = self._motion(x, end), []
+        for pairs, numbers in zip(self._sets, self._all[1], strict=True):
+            is_moved = moved[pairs.first[numbers[:, 0]]].any(axis=1) | moved[pairs.second[numbers[:, 1]]].any(axis=1)
+            result.append(_sorted(pairs, np.concatenate([numbers[~is_moved], self._along(motion, pairs, moved)])))
+        self._pairs, self._later = result, (motion, moved)
+
+    def _motion(self, x: Values, end: Values) -> SearchedMotion:
+        """Motion without that of most vertices, which brings nothing together."""
+        change = end - x
+        return SearchedMotion(x, change - np.median(change, axis=0) if len(x) else change, self._margin)
+
+    def _along(self, motion: SearchedMotion, pairs: SimplexPairs, moved: Flags | None = None) -> Ints:
+        reach = pairs.distance + 2 * self._margin
+        return near_pairs(pairs, self.filter, motion.start, motion.start + motion.change, reach, moved)
+
+
+def _sorted(pairs: SimplexPairs, numbers: Ints) -> Ints:
+    """Pairs (k, 2) in the order of their numbers."""
+    return numbers[np.argsort(numbers[:, 0] * len(pairs.second) + numbers[:, 1])]
 
 
 def centred(x: Values) -> Values:

@@ -263,10 +263,6 @@ class EdgeContacts:
         stiffness = np.where(touches, near.stiffness, 0.0)
         self.set_history(EdgePairHistory(near.points, side, stiffness, near.share, slips))
 
-    def search_along(self, x: Values, end: Values) -> None:
-        """Search candidates for the motion from x to `end` (n, 3), m."""
-        self._search.pairs_along(x[self._used], end[self._used])
-
     def clear_caches(self) -> None:
         """Discard the candidates."""
         self._search.clear_caches()

@@ -23,8 +23,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
-from .ipc_pairs import SurfaceIntersections
 from .laws import slipped, tangential
+from .pair_search import PairFilter, intersecting_pairs
 from .penalty_contacts import ContactStiffness, ElementRanks, PenaltyContacts, concatenate_contacts
 from .penalty_edges import EdgeContacts, EdgePairHistory
 from .penalty_point_facet import NO_FACET, POINT_FACET, PointFacetContacts, PointHistory
@@ -112,7 +112,6 @@ class PenaltyPairs:
 
     Attributes:
         width: D, m.
-        intersections: test which elements intersect.
     """
 
     def __init__(
@@ -141,7 +140,8 @@ class PenaltyPairs:
         if edge is None:
             sides = rest_positions[elements] - rest_positions[np.roll(elements, 1, axis=1)]
             edge = float(np.linalg.norm(sides, axis=2).mean()) if len(elements) else distance
-        self.intersections = SurfaceIntersections(rest_positions, elements, patch)
+        self._elements, everywhere = elements, PairFilter.none(len(rest_positions))
+        self._filter = everywhere if patch is None else PairFilter(patch, everywhere.is_owned)
         is_owned = None if ranks is None else ranks.own_points
         self._points = PointFacetContacts(
             elements, stiffness, distance=distance, edge=edge, patch=patch, is_owned=is_owned
@@ -235,6 +235,10 @@ class PenaltyPairs:
             self._edges.end_step(x, near, slip)
         self._near = self._touching = None
 
+    def intersections(self, x: Values) -> Ints:
+        """(k, 2) elements that intersect with points at x."""
+        return intersecting_pairs(self._elements, self._filter, x)
+
     def anything_is_near(self, x: Values) -> bool:
         """Whether any point has contact, or may be near a facet, at x."""
         return self._points.anything_is_near(x)
@@ -246,12 +250,6 @@ class PenaltyPairs:
         if self._edges is not None:
             distance = self._edges.clearance(x, distance)
         return max(0.0, distance - POINT_FACET.ahead_gap * self.width)
-
-    def search_along(self, x: Values, end: Values) -> None:
-        """Search candidates for the whole motion from x to `end`."""
-        self._points.search_along(x, end)
-        if self._edges is not None:
-            self._edges.search_along(x, end)
 
     def clear_caches(self) -> None:
         """Discard the candidates of collision detection."""

@@ -313,10 +313,6 @@ class PointFacetContacts:
         points, facets = near_pairs(self._sets, self._search.filter, vertices, vertices, reach).T
         return closest_distance(x, self._owned_points[points], self._elements[facets], reach)
 
-    def search_along(self, x: Values, end: Values) -> None:
-        """Search candidates for the motion from x to `end` (n, d), m."""
-        self._search.pairs_along(x[self._used], end[self._used])
-
     def clear_caches(self) -> None:
         """Discard the candidates."""
         self._search.clear_caches()

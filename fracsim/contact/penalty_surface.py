@@ -102,7 +102,6 @@ class PenaltySurface(RetractableSurface):
     """
 
     closed_pressure: ClassVar[float] = 0.0  # a face that is pressed at all has no room
-    search_all_faces: ClassVar[bool] = True  # to read candidates takes longer than to have more of them
 
     def __init__(
         self,
@@ -249,11 +248,6 @@ class PenaltySurface(RetractableSurface):
 
     def _on_any_rank(self, flag: bool) -> bool:
         return bool(flag) if self.comm.size == 1 else bool(self.comm.allreduce(bool(flag), op=MPI.LOR))
-
-    def _search_along(self, x: Values, end: Values) -> None:
-        for part in self.parts:
-            if not part.is_far(x):
-                part.contact.search_along(part.points(x), part.points(end))
 
 
 def triangle_ranks(mesh: MeshObstacle, ranks: int) -> Ints:
