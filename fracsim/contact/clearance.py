@@ -48,7 +48,7 @@ class ClearancePolicy:
     """
 
     min_clearance: float = 0.1
-    surplus: float = 1.0
+    surplus: float = 4.0
 
 
 CLEARANCE = ClearancePolicy()
