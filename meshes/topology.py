@@ -158,7 +158,8 @@ def components(links: npt.NDArray[np.integer], count: int) -> tuple[int, Indices
     """
     # Each round hooks the roots of trees that a link joins onto the lower root, and flattens the trees: at most
     # log2(count) rounds. SciPy's function is no faster on large graphs, and slow to import.
-    root: Indices = np.arange(count)
+    # In the type of the links, which 32 bits hold in half the memory.
+    root = np.arange(count, dtype=links.dtype)
     first, second = links[:, 0], links[:, 1]
     while True:
         ends = root[first], root[second]
@@ -173,7 +174,7 @@ def components(links: npt.NDArray[np.integer], count: int) -> tuple[int, Indices
     return int(is_root.sum()), (np.cumsum(is_root) - 1)[root]
 
 
-def _flattened(parent: Indices) -> Indices:
+def _flattened(parent: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
     """(n,) root of each node of trees given by parents; a root is its own parent."""
     while not np.array_equal(above := parent[parent], parent):
         parent = above

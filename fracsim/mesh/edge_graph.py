@@ -28,7 +28,7 @@ class Incidence:
     def __init__(self, table: npt.NDArray[np.integer], count: int) -> None:
         numbers = table.ravel()
         # rows sorted by the number in them; _end[i]: one past the last row of number i
-        self._rows = np.argsort(numbers, kind="stable") // table.shape[1]
+        self._rows = (np.argsort(numbers, kind="stable") // table.shape[1]).astype(np.int32)
         # the last entry is the start of number 0, which _end[i - 1] reads for i = 0
         self._end = np.append(np.cumsum(np.bincount(numbers, minlength=count)), 0)
 
@@ -40,7 +40,7 @@ class Incidence:
         # positions in `_rows`: consecutive ones for each number
         positions = np.repeat(end - last, counts)
         positions += np.arange(len(positions))
-        return np.unique(self._rows[positions])
+        return np.unique(self._rows[positions]).astype(np.int64)
 
 
 class EdgeKeys:

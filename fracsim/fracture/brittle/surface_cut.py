@@ -240,7 +240,7 @@ class CrossedCells:
         if usable is not None:
             cells = cells[usable[cells]]
         i, j = local_edges(mesh.dim).T
-        side, edges = sides[mesh.cells[cells]], mesh.cell_edges[cells]
+        side, edges = sides[mesh.cells[cells]], mesh.cell_edges[cells].astype(np.int64)
         return cls(cells, edges, (side[:, i] != side[:, j]) & ~broken[edges])
 
     def all_open_edges(self) -> Ints:
@@ -269,7 +269,7 @@ class CrossedCells:
         return self.cells[flags[self.edges].any(axis=1)]
 
 
-def level_set_cut_positions(phi: Values, sides: Flags, ends: Ints) -> Values:
+def level_set_cut_positions(phi: Values, sides: Flags, ends: npt.NDArray[np.integer]) -> Values:
     """Return the cut positions (n,) of edges whose ends (n, 2) are on different sides, from the first end.
 
     It is the zero of phi on the edge, or the node itself if that was moved to the other side.

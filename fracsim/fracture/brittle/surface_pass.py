@@ -143,7 +143,9 @@ class SurfacePass:
                 # All edges around this grain are broken.
                 candidates.discard(self.grains.cell_grain[load.cell] == self.grains.cell_grain[cell])
         new = np.flatnonzero(~np.isnan(damage.cut_positions))
-        return OpenedSurfaces(np.array(starts).reshape(-1, mesh.dim), mesh.edges[new], damage.cut_positions[new])
+        return OpenedSurfaces(
+            np.array(starts).reshape(-1, mesh.dim), mesh.edges[new].astype(np.int64), damage.cut_positions[new]
+        )
 
     def _open_surface(self, damage: _PassDamage, cell: int, normal: Values, field: DirectionField | None) -> bool:
         """Open the surface through a cell; return whether it cuts anything."""

@@ -294,7 +294,7 @@ class _SurfaceBuilder:
         """(corners, cell, edge, origin) of crack faces, both sides."""
         corners, owner, edge = self._expand(self.table.crack_faces, self.pattern, np.arange(len(self.damaged)))
         cell = self.damaged[owner]
-        return corners, cell, self.topology.cell_edges[cell, edge], np.full(len(cell), CRACK)
+        return corners, cell, self.topology.cell_edges[cell, edge].astype(np.int64), np.full(len(cell), CRACK)
 
     def _fill(self) -> tuple[Ints, Ints]:
         """Triangles that cover the body in 2D, and the cell of each; none in 3D."""

@@ -33,8 +33,8 @@ class EntityNumbering(MeshTopology):
     def __init__(self, mesh: MeshData) -> None:
         super().__init__(mesh)
         sorted_facets = sorted_rows(facets_of(mesh.cells).reshape(-1, mesh.dim))
-        self.facets, counts, inverse = distinct_rows(sorted_facets)
-        self.cell_facets: Ints = inverse.reshape(len(mesh.cells), -1)
+        facets, counts, inverse = distinct_rows(sorted_facets)
+        self.facets, self.cell_facets = facets.astype(np.int32), inverse.reshape(len(mesh.cells), -1).astype(np.int32)
         self.boundary = np.argwhere(counts[self.cell_facets] == 1)
         self.origins, self.origin = _origins(mesh, self.facets[self.cell_facets[tuple(self.boundary.T)]])
 
@@ -72,7 +72,7 @@ class EntityNumbering(MeshTopology):
         return components(self.edges[~broken], len(self.points))
 
 
-def _origins(mesh: MeshData, facets: Ints) -> tuple[list[str], Ints]:
+def _origins(mesh: MeshData, facets: npt.NDArray[np.int32]) -> tuple[list[str], Ints]:
     """The names of origins, and (B,) the index of the name of each boundary facet (B, d)."""
     groups = mesh.facet_groups
     _, _, number = distinct_rows(np.sort(np.concatenate([facets, *groups.values()]), axis=1))
