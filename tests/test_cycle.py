@@ -14,7 +14,7 @@ from petsc4py import PETSc
 from cases import BAR, study
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers.linear_solver import LinearSolver
-from fracsim.solvers.multigrid import bcsr, vcycle
+from fracsim.solvers.multigrid import bcsr, hierarchy, vcycle
 from fracsim.solvers.multigrid.levels import SmoothedLevel
 from fracsim.solvers.policy import DEFAULT_POLICY
 from fracsim.solvers.preconditioner import Update, mass_stiffness_ratio
@@ -108,6 +108,7 @@ def test_it_is_multigrid_written_out(dim: int, slowly: float, monkeypatch: pytes
     largest eigenvalue Lanczos' method finds nine tenths at least. `slowly`: 0 where more is done with coarser
     levels."""
     set_policy(monkeypatch, min_block_dofs=0, slow_cycle_ratio=slowly)
+    monkeypatch.setattr(hierarchy, "ROWS_AT_A_TIME", 16)  # several parts of each prolongation
     small = {2: {"size": [0.6, 0.14], "h": 0.02}, 3: {"size": [0.6, 0.15, 0.15], "h": 0.05}}  # matrices are dense
     scene = bar(dim, {}, mesh=small[dim])
     Walk(scene).advance()

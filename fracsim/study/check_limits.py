@@ -59,7 +59,7 @@ class CheckLimits:
     max_built_cells: int = 60_000
     max_sampled_cells: int = 50_000
     max_expected_cells: int = 5_000_000
-    bytes_per_cell: float = 4e3
+    bytes_per_cell: float = 2.5e3
     max_bodies: int = 100_000
     max_edge_direction_ratio: float = 4.0
     min_direction_nodes: ByDimension = field(default_factory=lambda: {2: 100, 3: 1000})

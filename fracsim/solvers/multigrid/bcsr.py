@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from ctypes import CDLL, c_float, c_int64
 from pathlib import Path
 from typing import Any
@@ -149,12 +150,23 @@ def compile_block_csr(comm: MPI.Comm, size: int) -> CDLL | None:
 class Prolongation:
     """Prolongation diag(left) P diag(right), P with the rows of this rank."""
 
-    def __init__(self, code: CDLL, P: BlockCSRData, left: Values, right: Values) -> None:
-        """Assign the scaled blocks of P; `code`: compiled for their size."""
-        numbers = np.empty(P.values.size, np.float32)
-        pattern = c_int64(len(P.starts) - 1), array_pointer(P.starts), array_pointer(P.columns)
-        code.scale(*pattern, array_pointer(P.values), array_pointer(left), array_pointer(right), array_pointer(numbers))
-        self._all = *pattern, array_pointer(numbers)
+    def __init__(self, code: CDLL, parts: Iterable[BlockCSRData], left: Values, right: Values) -> None:
+        """Assign the scaled blocks of P, whose rows come in parts; `code`: compiled for their size."""
+        starts = [np.zeros(1, np.int64)]
+        columns, numbers, row = [], [], 0
+        for part in parts:
+            rows, scaled = len(part.starts) - 1, np.empty(part.values.size, np.float32)
+            of_rows = left[part.values.shape[1] * row :]
+            pattern = c_int64(rows), array_pointer(part.starts), array_pointer(part.columns)
+            code.scale(
+                *pattern, *(array_pointer(array) for array in (part.values, of_rows, right)), array_pointer(scaled)
+            )
+            starts.append(starts[-1][-1] + part.starts[1:])
+            columns.append(part.columns)
+            numbers.append(scaled)
+            row += rows
+        pointers = [array_pointer(np.concatenate(pieces)) for pieces in (starts, columns, numbers)]
+        self._all = c_int64(row), *pointers
         self._add, self._add_transposed = (
             unchecked_function(code, name, *self._all) for name in ("add", "add_transposed")
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,11 +16,13 @@ from ...mesh.dolfinx_compat import make_index_map
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
+# Rows of a matrix that are brought into blocks at a time: in double precision all of them would take twice the memory.
+ROWS_AT_A_TIME = 1 << 15
 
 
 @dataclass(frozen=True)
 class BlockCSRData:
-    """Pattern and values of a block CSR matrix, with the rows of this rank.
+    """Pattern and values of a block CSR matrix, with rows of this rank.
 
     Attributes:
         starts: (rows + 1,) first block of each row.
@@ -41,18 +44,26 @@ class LevelData:
         size: dofs of a node.
         diagonal: diagonal of its matrix, with ghosts.
         matrix: its matrix; None on the finest and the coarsest level.
-        prolongation: prolongation from the next coarser level; None on the coarsest level.
+        prolongation: rows of the prolongation from the next coarser level, in parts; none on the coarsest level.
     """
 
     nodes: IndexMap
     size: int
     diagonal: Values
     matrix: BlockCSRData | None
-    prolongation: BlockCSRData | None
+    prolongation: Iterator[BlockCSRData]
+
+    @property
+    def scale(self) -> Values:
+        """(dofs with ghosts,) diag(A)^(-1/2)."""
+        diagonal = np.abs(self.diagonal)
+        return np.asarray(1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0)))
 
 
-def copy_levels(gamg: PETSc.PC, finest: IndexMap) -> list[LevelData]:
-    """Return the levels of a multigrid that is set up, from the coarsest on (collective).
+def copy_levels(gamg: PETSc.PC, finest: IndexMap) -> Iterator[LevelData]:
+    """Yield the levels of a multigrid that is set up, from the coarsest on (collective).
+
+    One is copied at a time: together they have more bytes than the tangent.
 
     Args:
         gamg: PETSc's multigrid.
@@ -62,20 +73,18 @@ def copy_levels(gamg: PETSc.PC, finest: IndexMap) -> list[LevelData]:
     solvers = [gamg.getMGCoarseSolve(), *(gamg.getMGSmoother(level) for level in range(1, count))]
     matrices = [solver.getOperators()[1] for solver in solvers]
     sizes = [matrix.getBlockSize() for matrix in matrices]
-    prolongations = [None, *(MatrixEntries(gamg.getMGInterpolation(level)) for level in range(1, count))]
-    result: list[LevelData] = []
+    prolongation: Iterator[BlockCSRData] = iter(())
     for level, (matrix, size) in enumerate(zip(matrices, sizes, strict=True)):
-        owned = MatrixEntries(matrix) if 0 < level < count - 1 else None
-        read = [item.columns // size for item in (owned, prolongations[level + 1]) if item] if level < count - 1 else []
-        nodes = _level_nodes(matrix, size, read) if read else finest
-        diagonal, prolongation = la.vector(nodes, size), prolongations[level]
+        copied = [matrix] if 0 < level < count - 1 else []
+        to_finer = [gamg.getMGInterpolation(level + 1)] if level < count - 1 else []
+        nodes = _level_nodes(matrix, size, [*copied, *to_finer]) if to_finer else finest
+        diagonal = la.vector(nodes, size)
         diagonal.array[: nodes.size_local * size] = matrix.getDiagonal().array_r
         diagonal.scatter_forward()
-        result.append(LevelData(
-            nodes, size, diagonal.array.copy(), owned.in_blocks((size, size), nodes) if owned else None,
-            prolongation.in_blocks((size, sizes[level - 1]), result[-1].nodes) if prolongation else None,
-        ))  # fmt: skip
-    return result
+        blocks = MatrixEntries(matrix).in_blocks((size, size), nodes) if copied else None
+        yield LevelData(nodes, size, diagonal.array.copy(), blocks, prolongation)
+        if to_finer:
+            prolongation = MatrixEntries(*to_finer).parts((sizes[level + 1], size), nodes)
 
 
 class MatrixEntries:
@@ -90,24 +99,40 @@ class MatrixEntries:
 
     def in_blocks(self, size: tuple[int, int], nodes: IndexMap) -> BlockCSRData:
         """Return the matrix in blocks with 0 for missing entries; `nodes`: of its columns."""
-        columns = size[1] * _to_local(self.columns // size[1], nodes) + self.columns % size[1]
-        shape = len(self._starts) - 1, size[1] * (nodes.size_local + nodes.num_ghosts)
-        blocks = csr_matrix((self._values, columns, self._starts), shape=shape).tobsr(size)
+        return self._rows_in_blocks(0, len(self._starts) - 1, size, nodes)
+
+    def parts(self, size: tuple[int, int], nodes: IndexMap) -> Iterator[BlockCSRData]:
+        """Yield its rows in blocks, some at a time (see `in_blocks`)."""
+        rows, step = len(self._starts) - 1, ROWS_AT_A_TIME * size[0]
+        for first in range(0, max(rows, 1), step):
+            yield self._rows_in_blocks(first, min(first + step, rows), size, nodes)
+
+    def _rows_in_blocks(self, first: int, last: int, size: tuple[int, int], nodes: IndexMap) -> BlockCSRData:
+        starts = self._starts[first : last + 1]
+        entries = slice(starts[0], starts[-1])
+        columns = self.columns[entries]
+        columns = size[1] * _to_local(columns // size[1], nodes) + columns % size[1]
+        shape = last - first, size[1] * (nodes.size_local + nodes.num_ghosts)
+        blocks = csr_matrix((self._values[entries], columns, starts - starts[0]), shape=shape).tobsr(size)
         return BlockCSRData(blocks.indptr.astype(np.int64), blocks.indices.astype(np.int32), blocks.data)
 
 
-def _level_nodes(matrix: PETSc.Mat, size: int, read: list[Ints]) -> IndexMap:
+def _level_nodes(matrix: PETSc.Mat, size: int, products: list[PETSc.Mat]) -> IndexMap:
     """Return the nodes of the rows of a matrix (collective).
 
     Args:
         matrix: block matrix.
         size: dofs of a node.
-        read: global numbers of nodes whose values are read; those of other ranks are ghosts.
+        products: matrices that multiply vectors of these nodes. The values that they read on other ranks are ghosts.
     """
     first, last = (end // size for end in matrix.getOwnershipRange())
-    ghosts = np.unique(np.concatenate([item[(item < first) | (item >= last)] for item in read])).astype(np.int64)
+    comm, read = matrix.comm.tompi4py(), [np.empty(0, np.int64)]
+    for product in products if comm.size > 1 else []:
+        columns = MatrixEntries(product).columns // size
+        read.append(columns[(columns < first) | (columns >= last)])
+    ghosts = np.unique(np.concatenate(read)).astype(np.int64)
     owners = np.searchsorted(matrix.getOwnershipRanges() // size, ghosts, side="right") - 1
-    return make_index_map(matrix.comm.tompi4py(), last - first, ghosts, owners.astype(np.int32))
+    return make_index_map(comm, last - first, ghosts, owners.astype(np.int32))
 
 
 def _to_local(numbers: Ints, nodes: IndexMap) -> Ints:

@@ -76,8 +76,7 @@ class SmoothedLevel:
             policy: tuned numbers.
         """
         nodes, size = data.nodes, data.size
-        diagonal = np.abs(data.diagonal)
-        self.scale: Values = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
+        self.scale = data.scale
         self._comm, self._owned, self._size, self._policy = nodes.comm, nodes.size_local * size, size, policy
         self.couplings: Sequence[NodeCoupling] = ()
         self._matrix = BlockCSR(code, size, pattern.starts, pattern.columns)
@@ -85,8 +84,10 @@ class SmoothedLevel:
         self.b, self.x, self.residual, self._direction, self._next_x = (GhostedVector(nodes, size) for _ in range(5))
         self._previous_x = GhostedVector(nodes, size) if data.matrix else None
         self.smoothing = DEFAULT_SMOOTHING
-        self._row = np.repeat(np.arange(nodes.size_local), np.diff(pattern.starts))
-        self._on_diagonal = np.flatnonzero(pattern.columns == self._row)
+        row = np.repeat(np.arange(nodes.size_local, dtype=np.int32), np.diff(pattern.starts))
+        # Blocks on the diagonal, and their rows.
+        self._on_diagonal = np.flatnonzero(pattern.columns == row)
+        self._diagonal_row = row[self._on_diagonal]
 
     def assign_values(self, values: Values, couplings: Sequence[NodeCoupling] = ()) -> None:
         """Assign the blocks (blocks, size^2) of A and its couplings, and set up the smoother (collective)."""
@@ -105,7 +106,7 @@ class SmoothedLevel:
     def _diagonal_blocks(self) -> Single:
         """Return the diagonal blocks of A' with the couplings, (owned nodes, size, size)."""
         D = np.zeros_like(self._inverse.blocks)
-        D[self._row[self._on_diagonal]] = self._matrix.blocks[self._on_diagonal].reshape(-1, *D.shape[1:])
+        D[self._diagonal_row] = self._matrix.blocks[self._on_diagonal].reshape(-1, *D.shape[1:])
         for coupling in self.couplings:
             scale = self._scale_at(coupling.nodes)
             D[coupling.nodes] += coupling.diagonal_blocks * (scale[:, :, None] * scale[:, None, :])

@@ -72,14 +72,18 @@ class SinglePrecisionVCycle:
             policy: tuned numbers.
         """
         self.gamg, self._blocks, self._tangent, self._policy = gamg, blocks, blocks.matrix, policy
-        coarsest, *finer = copy_levels(gamg, self._tangent.index_map(1))
+        levels = copy_levels(gamg, self._tangent.index_map(1))
+        coarsest = next(levels)
         starts = self._tangent.indptr[: self._tangent.index_map(0).size_local + 1]
         pattern = BlockCSRData(starts, self._tangent.indices[: starts[-1]], self._values)
         self._levels: list[SmoothedLevel] = []
         self._prolongations: list[Prolongation] = []
-        coarser = coarsest
+        coarser_size = coarsest.size
         scale: Values = np.ones(len(coarsest.diagonal))
-        for data in finer:
+        for data in levels:
+            # First, so that the double precision of its blocks is gone as the level is allocated.
+            product_code = codes[data.size, coarser_size]
+            self._prolongations.append(Prolongation(product_code, data.prolongation, 1 / data.scale, scale))
             block_code = codes[data.size,]
             if data.matrix:
                 level = SmoothedLevel(data, data.matrix, block_code, policy)
@@ -89,10 +93,7 @@ class SinglePrecisionVCycle:
                 # stiffer.
                 level = self.fine_level = FineLevel(data, pattern, block_code, policy)
             self._levels.append(level)
-            assert data.prolongation is not None
-            code = codes[data.size, coarser.size]
-            self._prolongations.append(Prolongation(code, data.prolongation, 1 / level.scale, scale))
-            coarser, scale = data, level.scale
+            coarser_size, scale = data.size, level.scale
         owned = (len(starts) - 1) * self._tangent.block_size[0]
         self._scale = scale[:owned].astype(np.float32)
         self._coarsest_b, self._coarsest_x = (GhostedVector(coarsest.nodes, coarsest.size) for _ in range(2))
