@@ -122,9 +122,7 @@ def shares_of(points: Values, elements: Ints, ranks: int, obstacle: int | None) 
     for rank in range(ranks):
         share = PairShare.by_slabs(OneOfSeveral(rank, ranks), points[patch == 0], np.arange(0))
         share = share if obstacle is None else share.with_others(obstacle)
-        shares.append(IpcPairs(points, elements, **law, share=share))
-        if obstacle is not None:
-            shares[-1].restrict_to_patches(patch)
+        shares.append(IpcPairs(points, elements, **law, share=share, patch=None if obstacle is None else patch))
     return shares
 
 

@@ -12,7 +12,7 @@ import pytest
 from mpi4py import MPI
 
 from fracsim.contact.mesh_obstacle_term import MeshObstacleTerm
-from fracsim.contact.mesh_obstacles import MeshObstacle, all_mesh_pairs
+from fracsim.contact.mesh_obstacles import AllMeshPairs, MeshObstacle, MeshObstaclePairs
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.rigid_pose import FreePose
 from fracsim.contact.shapes import RoundedBox
@@ -95,7 +95,7 @@ def test_what_acts_on_a_solid_is_the_derivative_by_its_place() -> None:
     against those of the gradient."""
     points, triangles = refine_triangles(CORNERS, SIDES, 0.4)
     solid = MeshObstacle("block", *refine_triangles(CORNERS * [0.5, 0.4, 0.3] + [0.1, 0.05, 0.68], SIDES, 0.3), 0.0)
-    facings = all_mesh_pairs(points, triangles, [solid], distance=0.1, stiffness=50.0)
+    facings = AllMeshPairs([MeshObstaclePairs(points, triangles, solid, distance=0.1, stiffness=50.0)])
     x, step = points + 0.01 * np.sin(30 * points), 1e-6
     moved = []
     for axis in range(3):

@@ -44,7 +44,6 @@ from .sample_points import Centroids, IpcFriction, Vertices, measures, projectio
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
-NO_PAIRS: Ints = np.empty((0, 2), np.int64)
 
 
 @dataclass(frozen=True)
@@ -254,6 +253,7 @@ class IpcPairs:
         stiffness: float,
         friction: float = 0.0,
         share: PairShare | None = None,
+        patch: npt.NDArray[np.int32] | None = None,
     ) -> None:
         """Pairs of a surface; points of no element are ignored.
 
@@ -264,6 +264,7 @@ class IpcPairs:
             stiffness: k, Pa.
             friction: coefficient of friction.
             share: of this rank in the pairs; None: all of them.
+            patch: (n,) numbers of parts of the surface that touch others alone; None: all touch.
         """
         self._elements, is_3d = elements, rest_positions.shape[1] == 3
         self._mesh = collision_mesh(rest_positions, elements)
@@ -279,14 +280,21 @@ class IpcPairs:
         # in 3D ipctk weights points as half of all pairs of a triangle, and edges as the other half
         self._weights = [2.0, 2.0, 1.0] if is_3d else [1.0, 1.0]
         self.comm = MPI.COMM_SELF if share is None else share.comm
-        vertices = None if share is None or share.comm.size == 1 else share.points[np.unique(elements)]
+        used = np.unique(elements)
+        vertices = None if share is None or share.comm.size == 1 else share.points[used]
         self._search = PairSearch(mesh.num_vertices, sets, PAIRS.search_margin * distance)
-        self._own_filter = None
+        everywhere = self._search.filter
         if vertices is not None:
             # two points of other ranks have the same number and do not touch
             number = np.where(vertices, 1 + np.arange(len(vertices)), 0).astype(np.int32)
-            mesh.can_collide = self._own_filter = ipctk.make_vertex_patches_filter(number)
-            self._search.filter = PairFilter(self._search.filter.patches, vertices)
+            mesh.can_collide = ipctk.make_vertex_patches_filter(number)
+        if patch is not None:
+            patch = np.ascontiguousarray(patch[used])
+            of_patches = ipctk.make_vertex_patches_filter(patch)
+            mesh.can_collide = of_patches if vertices is None else of_patches & mesh.can_collide
+        self._search.filter = PairFilter(
+            everywhere.patches if patch is None else patch, everywhere.is_owned if vertices is None else vertices
+        )
         self._kinds = [
             PairKind(pairs, weight * stiffness, centroids if pairs.centroids else at_vertices, vertices)
             for pairs, weight in zip(sets, self._weights, strict=True)
@@ -305,13 +313,6 @@ class IpcPairs:
     def mean_edge_length(self) -> float:
         """Mean length of edges at rest, m."""
         return float(self._edge)
-
-    def restrict_to_patches(self, patch: npt.NDArray[np.int32]) -> None:
-        """Let elements touch those of other patches alone; `patch`: (n,) number of the patch of each point."""
-        patch = np.ascontiguousarray(patch[np.unique(self._elements)])
-        self._search.filter = PairFilter(patch, self._search.filter.is_owned)
-        of_patches = ipctk.make_vertex_patches_filter(patch)
-        self._mesh.can_collide = of_patches if self._own_filter is None else of_patches & self._own_filter
 
     # --- candidates and active pairs ---
 

@@ -322,7 +322,7 @@ class SelfContactSurface(RetractableSurface):
         refuse_intersections(self.split.points[self.split.elements[cut_pairs]].mean(axis=(1, 2)))
 
     def _build_pairs(self, elements: Ints) -> SurfacePairs:
-        return IpcPairs(self._rest_positions, elements, **self._parameters, share=self._share)
+        return IpcPairs(self._rest_positions, elements, **self._parameters, share=self._share, patch=None)
 
     def set_stiffness(self, stiffness: float) -> None:
         """Set the stiffness of the barrier, Pa."""

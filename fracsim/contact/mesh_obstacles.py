@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 
 from ..errors import InputError
 from ..mesh.split_surface.entity_numbering import EntityNumbering
-from .ipc_pairs import NO_PAIRS, IpcPairs, PairShare
+from .ipc_pairs import IpcPairs, PairShare
 from .ipc_surface import SelfContactLaw, SelfContactSurface
 from .laws import BARRIER
 from .pose import Pose, PosedShape
@@ -28,7 +28,6 @@ from .triangle_mesh_shape import ClosedSurface, penetration_depth
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-Patches = npt.NDArray[np.int32]
 
 
 @dataclass(frozen=True)
@@ -153,6 +152,7 @@ class MeshObstaclePairs:
     Attributes:
         mesh: the obstacle.
         body_count: n.
+        contact: barrier between the elements of both.
     """
 
     def __init__(
@@ -160,35 +160,31 @@ class MeshObstaclePairs:
         rest_positions: Values,
         elements: Ints,
         mesh: MeshObstacle,
+        *,
         distance: float,
-        make_contact: Callable[[Values, Ints, Patches], IpcPairs],
+        stiffness: float,
+        share: PairShare | None = None,
     ) -> None:
         """Pairs of both surfaces.
 
         Args:
             rest_positions: (n, 3) of the body, m.
             elements: (k, 3) of the body.
-            mesh: the obstacle.
+            mesh: the obstacle, whose coefficient of friction counts.
             distance: at which contact begins, m.
-            make_contact: returns the contact of points (n + m, 3), triangles (k, 3) of both, and patches (n + m,), of
-                which different ones may touch.
+            stiffness: of the barrier, Pa.
+            share: of this rank in the pairs; None: all of them.
         """
-        self.mesh, self.body_count, self._element_count, self._reach = (
-            mesh,
-            len(rest_positions),
-            len(elements),
-            distance,
-        )
+        self.mesh, self._reach = mesh, distance
+        self.body_count, self._element_count = len(rest_positions), len(elements)
+        self._body_points = np.unique(elements)
         # the obstacle in its own frame, so that the measures of its elements are constant
         points = np.concatenate([rest_positions, mesh.points])
         triangles = np.concatenate([elements, mesh.triangles + len(rest_positions)])
         patches = np.repeat(np.array([0, 1], np.int32), [len(rest_positions), len(mesh.points)])
-        self._contact, self._body_points = make_contact(points, triangles, patches), np.unique(elements)
-
-    @property
-    def contact(self) -> IpcPairs:
-        """Barrier or penalty between the elements of both."""
-        return self._contact
+        parameters = {"distance": distance, "stiffness": stiffness, "friction": mesh.friction}
+        share = None if share is None else share.with_others(len(mesh.points))
+        self.contact = IpcPairs(points, triangles, **parameters, share=share, patch=patches)
 
     def with_mesh(self, x: Values) -> Values:
         """(n + m, 3) points of the body at x (n, 3), and of the obstacle at its current pose, m."""
@@ -259,15 +255,14 @@ class MeshObstaclePairs:
 
 
 class AllMeshPairs:
-    """Pairs of a body's surface and several obstacles; x (n, 3) of the body, m."""
+    """Pairs of a body's surface and several obstacles; x (n, 3) of the body, m.
+
+    Attributes:
+        pairs: of each obstacle.
+    """
 
     def __init__(self, pairs: Sequence[MeshObstaclePairs]) -> None:
-        self._pairs = pairs
-
-    @property
-    def pairs(self) -> Sequence[MeshObstaclePairs]:
-        """Pairs of each obstacle."""
-        return self._pairs
+        self.pairs = pairs
 
     def select(self, numbers: Sequence[int]) -> AllMeshPairs:
         """Pairs of some of the obstacles."""
@@ -322,7 +317,7 @@ class AllMeshPairs:
     def intersections(self, x: Values) -> Ints:
         """(k, 2) elements of the body that obstacles intersect, twice each."""
         cut = np.concatenate([pairs.cut_elements(x) for pairs in self.pairs])
-        return np.column_stack([cut, cut]) if len(cut) else NO_PAIRS
+        return np.column_stack([cut, cut])
 
     def lag_friction(self, x: Values, start: Values, slip: float) -> MeshFriction:
         """Friction with pressures and tangents at x and obstacles at their current poses; as of IpcPairs."""
@@ -403,9 +398,10 @@ class MeshContactSurface(SelfContactSurface):
             refuse_overlap((self.split.points, self.split.elements), pairs.mesh, cut=is_cut)
 
     def _build_pairs(self, elements: Ints) -> AllMeshPairs:
-        # the coefficient of friction is that of each obstacle
-        parameters = {name: self._parameters[name] for name in ("distance", "stiffness")}
-        return all_mesh_pairs(self._rest_positions, elements, self._obstacles, **parameters, share=self._share)
+        X, parameters = self._rest_positions, {name: self._parameters[name] for name in ("distance", "stiffness")}
+        return AllMeshPairs(
+            [MeshObstaclePairs(X, elements, mesh, **parameters, share=self._share) for mesh in self._obstacles]
+        )
 
 
 def refuse_overlap(body: ClosedSurface, mesh: MeshObstacle, *, cut: bool) -> None:
@@ -415,27 +411,3 @@ def refuse_overlap(body: ClosedSurface, mesh: MeshObstacle, *, cut: bool) -> Non
         verb = "cuts" if depth is None else "overlaps"
         by = "" if depth is None else f", by {depth:.4g} m"
         raise InputError(f"{mesh.name} {verb} the body at the start{by}; move it away or make it smaller")
-
-
-def all_mesh_pairs(
-    rest_positions: Values,
-    elements: Ints,
-    obstacles: Sequence[MeshObstacle],
-    *,
-    distance: float,
-    stiffness: float,
-    share: PairShare | None = None,
-) -> AllMeshPairs:
-    """Pairs of a body, `rest_positions` (n, 3), m, and `elements` (k, 3), and obstacles; the others as for IpcPairs."""
-
-    def build(mesh: MeshObstacle) -> MeshObstaclePairs:
-        def make_contact(points: Values, triangles: Ints, patches: Patches) -> IpcPairs:
-            of_both = None if share is None else share.with_others(len(mesh.points))
-            parameters = {"distance": distance, "stiffness": stiffness, "friction": mesh.friction}
-            contact = IpcPairs(points, triangles, **parameters, share=of_both)
-            contact.restrict_to_patches(patches)
-            return contact
-
-        return MeshObstaclePairs(rest_positions, elements, mesh, distance, make_contact)
-
-    return AllMeshPairs([build(mesh) for mesh in obstacles])

@@ -42,10 +42,8 @@ class MeshPair:
         patches = np.repeat(np.array([0, 1], np.int32), [first, len(reference) - first])
 
         def build(distance: float) -> IpcPairs:
-            coefficient = self._friction_coefficient
-            pairs = IpcPairs(reference, elements, distance=distance, stiffness=stiffness, friction=coefficient)
-            pairs.restrict_to_patches(patches)
-            return pairs
+            law = {"distance": distance, "stiffness": stiffness, "friction": self._friction_coefficient}
+            return IpcPairs(reference, elements, **law, share=None, patch=patches)
 
         self._distance, self._pairs = law.barrier.width, build(law.barrier.width)
         start = self._positions([obstacle.posed_at(0.0).pose for obstacle in obstacles.values()])

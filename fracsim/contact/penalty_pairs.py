@@ -21,7 +21,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
 
 from .laws import slipped, tangential
 from .pair_search import PairFilter, intersecting_pairs
@@ -281,10 +280,6 @@ class PairSprings:
     def energy(self, x: Values) -> float:
         """Energy of the springs, J."""
         return 0.5 * float(self.pairs.contacts(x).spring_stiffness @ np.sum(self.slips(x) ** 2, axis=1))
-
-    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
-        """Raise NotImplementedError: explicit steps need no tangent."""
-        raise NotImplementedError("explicit steps ask for no tangent")
 
     def slips(self, x: Values) -> Values:
         """(k, d) stretch of the springs of the contacts at x, m; zero for new contacts."""
