@@ -23,13 +23,18 @@ STUDIES = sorted((ROOT / "studies").glob("*.toml"))
 LAUNCHERS = r"^(?:\S*=\S+ )*(?:\./env )?(?:mpirun -n \d+ |srun --mpi=pmix )?(fracsim .*)"
 
 
-def command_lines(text: str) -> Iterator[str]:
-    """Commands of fracsim in the code of a page, with continued lines joined."""
+def code_lines(text: str) -> Iterator[str]:
+    """Lines of the code of a page, with continued lines joined."""
     code = "\n".join(re.findall(r"^(?: {4}|\t)(.*)$", text, re.MULTILINE))
     for block in (code, *re.findall(r"```(?:bash|sh)?\n(.*?)```", text, re.DOTALL)):
-        for line in block.replace("\\\n", " ").splitlines():
-            if found := re.match(LAUNCHERS, line.strip()):
-                yield found.group(1)
+        yield from block.replace("\\\n", " ").splitlines()
+
+
+def command_lines(text: str) -> Iterator[str]:
+    """Commands of fracsim in the code of a page."""
+    for line in code_lines(text):
+        if found := re.match(LAUNCHERS, line.strip()):
+            yield found.group(1)
 
 
 def comment_lines(study: Path) -> Iterator[str]:

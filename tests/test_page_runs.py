@@ -19,10 +19,10 @@ import pytest
 
 from fracsim.errors import Exit
 from fracsim.study.catalogue import catalogue
-from test_page_commands import PAGES
+from test_page_commands import PAGES, code_lines
 
 ELSEWHERE = ("gallery", "paper-figures", "tutorials", "batch", "install")
-COMMAND = r"^ {4}(?:\./env )?((?:mpirun -n \d+ )?fracsim .*|python3 -m fracsim\..*)"
+COMMAND = r"(?:\./env )?((?:mpirun -n \d+ )?fracsim .*|python3 -m fracsim\..*)"
 # What the pages take as the user's own, and how it is made.
 FILES = {
     "mine.toml": "fracsim new mine.toml --from bar-2d",
@@ -39,8 +39,8 @@ pyvista.read("body.vtu").extract_surface().triangulate().clean().save("mine.stl"
 
 
 def page_commands(page: Path) -> list[str]:
-    """Commands in the indented code of a page, without comments; continued lines are joined."""
-    lines = page.read_text(encoding="utf-8").replace("\\\n", " ").splitlines()
+    """Commands in the code of a page, without comments."""
+    lines = code_lines(page.read_text(encoding="utf-8"))
     return [re.split(r"\s{2,}# ", match.group(1))[0].strip() for line in lines if (match := re.match(COMMAND, line))]
 
 

@@ -18,12 +18,8 @@ from ..mesh.parallel import alltoall, exchange_rows, gather
 
 Ints = npt.NDArray[np.int64]
 ROWS_PER_CHUNK = 1 << 15
-# level and strategy of zlib
-STORED, RUNS, REPEATS = (0, zlib.Z_DEFAULT_STRATEGY), (1, zlib.Z_RLE), (1, zlib.Z_DEFAULT_STRATEGY)
-# the method of a byte plane is chosen by this part of it; bytes
-SAMPLED_SHARE, MIN_SAMPLE = 8, 1024
-# size of the sample by a faster method over the least
-MAX_LOSS = 1.1
+# of zlib; higher levels take longer and save 3 %
+COMPRESSION_LEVEL = 1
 
 
 @dataclass(frozen=True)
@@ -82,30 +78,6 @@ class RowCompressor:
 
 
 def compress_chunk(values: npt.NDArray[Any]) -> bytes:
-    """Bytes of a chunk after the filters shuffle and deflate: a zlib stream of its byte planes.
-
-    Each plane is compressed in the way that suits a sample of it: the low bytes of real numbers are noise and are
-    stored; others are runs of equal bytes, found in half the time of repeated strings.
-    """
-    planes = np.ascontiguousarray(values.reshape(-1).view(np.uint8).reshape(-1, values.itemsize).T)
-    # the zlib header of level 1; raw deflate streams that end at a byte form one stream
-    parts = [b"\x78\x01"]
-    for plane in planes:
-        parts.append(_deflate(plane, *_choose_method(plane), zlib.Z_SYNC_FLUSH))
-    parts += _deflate(planes[:0], *STORED, zlib.Z_FINISH), zlib.adler32(planes).to_bytes(4, "big")
-    return b"".join(parts)
-
-
-def _choose_method(plane: npt.NDArray[np.uint8]) -> tuple[int, int]:
-    """Level and strategy of zlib for a byte plane, the fastest whose sample is nearly as small as any."""
-    middle = len(plane) // 2
-    sample = plane[middle : middle + max(len(plane) // SAMPLED_SHARE, MIN_SAMPLE)]
-    repeats, runs = (len(_deflate(sample, *method, zlib.Z_FINISH)) for method in (REPEATS, RUNS))
-    allowed = MAX_LOSS * repeats
-    return STORED if len(sample) <= allowed else RUNS if runs <= allowed else REPEATS
-
-
-def _deflate(data: npt.NDArray[np.uint8], level: int, strategy: int, end: int) -> bytes:
-    """Raw deflate stream of contiguous bytes."""
-    stream = zlib.compressobj(level, zlib.DEFLATED, -zlib.MAX_WBITS, zlib.DEF_MEM_LEVEL, strategy)
-    return stream.compress(data) + stream.flush(end)
+    """Bytes of a chunk after the filters shuffle and deflate: a zlib stream of its byte planes."""
+    planes = values.reshape(-1).view(np.uint8).reshape(-1, values.itemsize).T
+    return zlib.compress(np.ascontiguousarray(planes), COMPRESSION_LEVEL)

@@ -18,7 +18,7 @@ from ..errors import InputError
 from ..meshes.data import MeshData
 from ..meshes.plain_files import atomic_replacement, find_external_data
 from .atomic_write import HDF5_OVERHEAD_BYTES, append_bytes, open_hdf5, replace_text, writable_hdf5
-from .compressed_rows import ROWS_PER_CHUNK, CompressedField
+from .compressed_rows import COMPRESSION_LEVEL, ROWS_PER_CHUNK, CompressedField
 
 Values = npt.NDArray[np.float64]
 # symmetric tensor, in the order of VTK and ParaView
@@ -251,7 +251,7 @@ def _create_compressed(group: Any, name: str, values: npt.NDArray[np.generic]) -
 def _filters(shape: tuple[int, ...]) -> dict[str, Any]:
     """Chunks and filters of a data set; those of `RowCompressor`."""
     chunks = (max(min(shape[0], ROWS_PER_CHUNK), 1), *shape[1:])
-    return {"chunks": chunks, "shuffle": True, "compression": "gzip", "compression_opts": 1}
+    return {"chunks": chunks, "shuffle": True, "compression": "gzip", "compression_opts": COMPRESSION_LEVEL}
 
 
 def _stored_bytes(field: CompressedField) -> int:

@@ -55,7 +55,7 @@ def make_report(
     runs = find_runs(folders)
     sections = run_sections(runs, [read_reference(path) for path in references], quantity=quantity, exact=exact)
     title = "fracsim: " + (str(runs[0].settings.get("title", runs[0].name)) if len(runs) == 1 else f"{len(runs)} runs")
-    links = _write_views(runs, target) if view else {}
+    links = _write_views(runs, target) if view else None
     about = _about_runs(runs)
     return write_page(target, sections, Path(), title=title, subtitle=_date_line(), about=about, links=links)
 

@@ -5,10 +5,8 @@ from __future__ import annotations
 import base64
 import csv
 import re
-from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from ..errors import InputError
@@ -26,7 +24,7 @@ def write_page(
     subtitle: str,
     about: dict[str, str],
     shown: int | None = None,
-    links: Mapping[str, str] = MappingProxyType({}),
+    links: dict[str, str] | None = None,
 ) -> Path:
     """Write a page and the CSV files, in the folder of the same name without suffix. Returns the path of the page.
 

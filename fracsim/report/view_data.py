@@ -176,16 +176,16 @@ def _pack_topology(name: str, part: Any, elements: Ints) -> dict[str, Any]:
 def _fields(part: Any, triangles: Ints) -> dict[str, Values]:
     """Scalars (n,) at the points, by field: magnitudes of vectors, components of tensors, means of cells."""
     fields = {}
+    corners = triangles.reshape(-1)
+    count = np.maximum(np.bincount(corners, minlength=part.n_points), 1)
     for data in (part.point_data, part.cell_data):
         for name, array in data.items():
             if name in (*HIDDEN, "piece", "region") or name.startswith("vtk"):
                 continue
             for title, scalars in _scalars(name, np.asarray(array, float)):
                 at_points = scalars
-                if len(scalars) != part.n_points or data is part.cell_data:
-                    corners = triangles.reshape(-1)
-                    count = np.bincount(corners, minlength=part.n_points)
-                    at_points = np.bincount(corners, np.repeat(scalars, 3), part.n_points) / np.maximum(count, 1)
+                if data is part.cell_data:
+                    at_points = np.bincount(corners, np.repeat(scalars, 3), part.n_points) / count
                 if np.isfinite(at_points).any():
                     fields[title] = at_points
     return fields

@@ -183,10 +183,8 @@ def _build_yielding(
         yield_stress = np.broadcast_to(per_cell(study, domain, table, "yield_stress"), domain.cell_count)
     else:
         yield_stress = shape.yield_stress[domain.input_numbering.cells]
-    denting, average = (
-        PlasticDenting(stiffness, yield_stress, table.hardening),
-        FragmentAverage(None, domain.cell_count),
-    )
+    denting = PlasticDenting(stiffness, yield_stress, table.hardening)
+    average = FragmentAverage(None, domain.cell_count)
     return BreakableBody(stiffness, EdgeGraph(domain), None, average, study.solver, denting, check_abort)
 
 
@@ -201,10 +199,8 @@ def _build_breakable(
     if study.brittle is not None:
         from ..fracture.brittle.surface_criterion import BrittleSurfaces
 
-        strength, rules = (
-            build_strength(study, domain, graph, number),
-            build_surface_parameters(study.brittle, 3, number),
-        )
+        strength = build_strength(study, domain, graph, number)
+        rules = build_surface_parameters(study.brittle, domain.dim, number)
         criterion = BrittleSurfaces(stiffness.stress, graph, strength, fragment_average, rules)
     return BreakableBody(stiffness, graph, criterion, fragment_average, study.solver, check_abort=check_abort)
 

@@ -147,13 +147,13 @@ def make_translucent(actor: Any) -> None:
     actor.prop.opacity = SURROUNDINGS_STYLE.opacity
 
 
-def add_floor(plotter: Any, floor: Floor, colour: str) -> Any:
+def add_floor(plotter: Any, floor: Floor, colour: str) -> None:
     """Add a floor, a little darker than the backdrop below the body and of its colour "#rrggbb" far away.
 
-    The light does not change its colour. Returns its actor.
+    The light does not change its colour.
     """
     floor.surface.point_data["rgb"] = _floor_colours(floor, colour, 1.0)
-    return plotter.add_mesh(floor.surface, scalars="rgb", rgb=True, lighting=False, ambient=0.0, diffuse=1.0)
+    plotter.add_mesh(floor.surface, scalars="rgb", rgb=True, lighting=False, ambient=0.0, diffuse=1.0)
 
 
 def darken_floor(floor: Floor, colour: str) -> None:
