@@ -352,6 +352,39 @@ def test_a_crack_turns_as_the_field_around_it_asks(kind: str) -> None:
         assert released[0] * STIFF == pytest.approx(expected, rel=0.12)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("h", "seed"), [(0.03, 1), (0.025, 2), (0.02, 3), (0.0175, 4), (0.015, 5)])
+def test_a_crack_at_45_degrees_kinks_towards_its_normal_load(h: float, seed: int) -> None:
+    """A plate in tension with a crack at 45 degrees: over 3 h both ends turn by 53.1 degrees, within 4; the hoop stress of
+    K_I = K_II is largest there."""
+    along, middle = np.sqrt([0.5, 0.5]), np.array([0.5, 0.5])
+    study = make_study(
+        **plate_tables(), mesh={"builder": "box", "size": [1, 1], "h": h, "pattern": "unstructured", "seed": seed},
+        crack=[{"segment": [list(middle - 0.15 * along), list(middle + 0.15 * along)]}],
+        boundary=[{"on": "bottom", "fix": "y"}, {"on": {"box": [[0, 0], [0, 0]]}, "fix": "x"},
+                  {"on": "top", "displacement": {"time": [0, 100], "value": [["free", 0], ["free", 6e-4]]}}],
+        time={"scheme": "quasi-static", "step": 0.5, "end": 100},
+    )  # fmt: skip
+    scene = build_scene(MPI.COMM_SELF, study)
+    criterion, state, start = criterion_of(scene), scene.start(), tips(scene)
+    size = np.sqrt(2 * np.mean(scene.domain.volumes))
+    distance = np.zeros((2, 1))
+    while distance.max(axis=1).min() < 3.5 * size:
+        state, _ = scene.stepper.advance(state)
+        cuts = criterion.field_evaluator.cut_points(
+            np.flatnonzero(~np.isnan(criterion.cut_positions)), criterion.cut_positions
+        )
+        # cuts ahead of each end of the crack as it was given
+        outward = np.sign((start - middle) @ along)[:, None] * along
+        arms = cuts - start[:, None]
+        distance = np.where(np.einsum("tni,ti->tn", arms, outward) > 0, np.linalg.norm(arms, axis=2), 0.0)
+    for arm, away, ahead in zip(arms, distance, outward, strict=True):
+        order = np.argsort(away)
+        across = arm @ np.array([-ahead[1], ahead[0]])
+        sideways, forward = (np.interp(3 * size, away[order], x[order]) for x in (across, arm @ ahead))
+        assert np.degrees(np.arctan2(abs(sideways), forward)) == pytest.approx(53.1, abs=4)
+
+
 # --- a notched plate -------------------------------------------------------------------------------------------------
 
 
