@@ -355,8 +355,8 @@ def test_a_crack_turns_as_the_field_around_it_asks(kind: str) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize(("h", "seed"), [(0.03, 1), (0.025, 2), (0.02, 3), (0.0175, 4), (0.015, 5)])
 def test_a_crack_at_45_degrees_kinks_towards_its_normal_load(h: float, seed: int) -> None:
-    """A plate in tension with a crack at 45 degrees: over 3 h both ends turn by 53.1 degrees, within 4; the hoop stress of
-    K_I = K_II is largest there."""
+    """A plate in tension: over 3 h both ends of the crack turn by 53.1 degrees, within 4. The hoop stress of K_I = K_II
+    is largest there."""
     along, middle = np.sqrt([0.5, 0.5]), np.array([0.5, 0.5])
     study = make_study(
         **plate_tables(), mesh={"builder": "box", "size": [1, 1], "h": h, "pattern": "unstructured", "seed": seed},
