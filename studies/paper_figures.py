@@ -118,8 +118,8 @@ ENTRIES = (
         "resolutions", "A loaf of 1,500, 37,000 and 616,000 tetrahedra (M22 fig. 14).",
         (("loaf-coarse", f"{SHORT_LOAF} --set mesh.h=0.0245"), ("loaf-medium", f"{SHORT_LOAF} --set mesh.h=0.0084"),
          ("loaf-fine", f"{SHORT_LOAF} --set mesh.h=0.0033")), "--floor",
-        remark="As in the paper, smaller cells show finer details. The place of the crack depends on the mesh: there is no"
-        " fracture energy.",
+        remark="As in the paper, smaller cells show finer details. The place of the crack depends on the mesh:"
+        " there is no fracture energy.",
     ),
     PictureEntry(
         "debris", "Bread with yield stress 2.5 MPa and strength 3 MPa, and with 1 MPa and 4 MPa (M22 fig. 15).",
