@@ -119,7 +119,7 @@ figures:
 
 # mypy sees the package as it is installed: forms/ is fracsim.forms, and so on.
 lint:
-	@./env sh -c 'command -v ruff >/dev/null || pip install --quiet --no-deps --requirement tools.txt'
+	@./env sh -c '{ command -v ruff && python3 -c "import mypy"; } >/dev/null 2>&1 || pip install --quiet --no-deps --requirement tools.txt'
 	./env ruff check $(sources)
 	./env ruff format --check $(sources)
 	@rm -rf build/types && mkdir -p build/types/fracsim

@@ -311,7 +311,7 @@ class Clearance:
         surplus = CLEARANCE.surplus * self._edge
         nearest = [NearestPoints.select(points, g, m + surplus) for g, m in zip(gaps, min_gaps, strict=True)]
         hidden_u = u.copy() if np.isfinite(of_hidden).any() else None
-        poses, limits = [shape.pose for shape in posed], clearance.tolist()
+        poses, limits = [shape.pose for shape in posed], [float(limit) for limit in clearance]
         self._search = GapSearch(nodal, hidden_u, poses, min_gaps, limits, amplification, growth, nearest, nodal_values)
         return self._search
 

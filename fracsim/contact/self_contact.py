@@ -250,7 +250,7 @@ class SelfContact(Term):
         if self._is_stale or self._positions is None:
             self._positions, self._is_stale = self.surface.positions(self.end_displacement), False
             self._contact_force = self._stored = None
-        return cast("Values", self._positions)
+        return self._positions
 
     def is_far(self) -> bool:
         """Whether nothing can be in contact at the current u (collective); of a body with itself it is not asked."""

@@ -151,7 +151,7 @@ def compile_on_all_ranks(comm: MPI.Comm, name: str, text: str, more: list[str]) 
     return None
 
 
-@mpi_jit_decorator  # type: ignore[misc]
+@mpi_jit_decorator  # type: ignore[untyped-decorator]
 def _try_to_compile(name: str, text: str, more: list[str]) -> ctypes.CDLL | Exception:
     # rank 0 compiles first, then all others load; so an error is returned and not raised, which would stop rank 0 alone
     try:

@@ -302,8 +302,9 @@ class OutputSettings(StudyTable):
         example="double",
     )
     picture: Flag = key("Write last.png, a picture of the last frame.", default=True, example=False)
-    look: Annotated[  # type: ignore[valid-type]
-        Annotated[Literal[LOOKS], Tag("<name>")] | Annotated[ColourSettings, Tag("<colours>")],
+    look: Annotated[
+        Annotated[Literal[LOOKS], Tag("<name>")]  # type: ignore[valid-type]
+        | Annotated[ColourSettings, Tag("<colours>")],
         Discriminator(_look),
     ] = key("Colours of pictures, by material or given.", default="plain", example="porcelain")
     checkpoint: Positive | None = key(
