@@ -173,7 +173,7 @@ def test_a_mesh_of_tens_of_millions_of_cells_is_asked_about() -> None:
     loaf = load_study("loaf", ["mesh.h=0.0008"])
     (line,) = [line for line in check_study(loaf) if "are so many" in line]
     cells, gigabytes = (float(number.replace(",", "")) for number in re.findall(r"([\d,]+) (?:cells|GB)", line))
-    assert cells > 4e7 and gigabytes == pytest.approx(4e-6 * cells, abs=1)
+    assert cells > 4e7 and gigabytes == pytest.approx(2.5e-6 * cells, abs=1)
     assert not any("are so many" in line for line in check_study(load_study("loaf", ["mesh.h=0.0028"])))
 
 
