@@ -68,7 +68,7 @@ def flags(found, shape):
 def test_pairs_at_rest_are_those_within_the_distance(name):
     x, pairs, counts = case(name)
     distance = all_distances(x, pairs)
-    found = flags(near_pairs(pairs, PairFilter.none(len(x)), x, x, pairs.distance), distance.shape)
+    found = flags(near_pairs(pairs, PairFilter.of(len(x)), x, x, pairs.distance), distance.shape)
     assert (distance[counts & found] < pairs.distance + 2 * SIZE / STEPS).all()
     assert found[counts & (distance <= pairs.distance)].all() and not found[~counts].any() and found.any()
 
@@ -77,7 +77,7 @@ def test_pairs_at_rest_are_those_within_the_distance(name):
 def test_no_pair_that_comes_near_on_the_way_is_missed(name):
     x, pairs, counts = case(name)
     motion = 0.3 * np.random.default_rng(2).normal(size=x.shape)
-    found = near_pairs(pairs, PairFilter.none(len(x)), x, x + motion, pairs.distance)
+    found = near_pairs(pairs, PairFilter.of(len(x)), x, x + motion, pairs.distance)
     found = flags(found, counts.shape)
     near = [all_distances(x + t * motion, pairs) <= pairs.distance for t in np.linspace(0, 1, 9)]
     assert found[counts & np.any(near, axis=0)].all() and found.sum() < counts.sum()
@@ -88,7 +88,7 @@ def test_pairs_of_a_search_serve_all_positions_within_its_margin(name):
     """Near the way, at any time of it; farther away, and beside it, pairs are searched again."""
     x, pairs, counts = case(name)
     rng, margin = np.random.default_rng(3), 0.03
-    search, way = PairSearch(len(x), [pairs], margin), 0.1 * rng.normal(size=x.shape)
+    search, way = PairSearch(PairFilter.of(len(x)), [pairs], margin), 0.1 * rng.normal(size=x.shape)
     along = search.pairs_along(x, x + way)
     for t in (0.0, 0.4, 1.0):
         noise = rng.normal(size=x.shape)
@@ -104,7 +104,7 @@ def test_pairs_of_vertices_that_leave_the_motion_are_searched_again(name, share)
     """Few or many vertices leave it, others after them, and all return: no near pair is missing or doubled."""
     x, pairs, counts = case(name)
     rng, margin = np.random.default_rng(4), 0.02
-    search, way = PairSearch(len(x), [pairs], margin), 0.1 * rng.normal(size=x.shape)
+    search, way = PairSearch(PairFilter.of(len(x)), [pairs], margin), 0.1 * rng.normal(size=x.shape)
     along, y = search.pairs_along(x, x + way), x + 0.5 * way
     for _ in range(4):
         moved = rng.random(len(x)) < share
@@ -123,7 +123,7 @@ def test_pairs_of_vertices_that_leave_the_motion_are_searched_again(name, share)
 @pytest.mark.parametrize("name", CASES)
 def test_pairs_of_moved_vertices_are_those_of_all_that_have_one(name):
     x, pairs, _ = case(name)
-    where, moved = PairFilter.none(len(x)), np.random.default_rng(6).random(len(x)) < 0.1
+    where, moved = PairFilter.of(len(x)), np.random.default_rng(6).random(len(x)) < 0.1
     all_pairs = near_pairs(pairs, where, x, x, 0.1)
     found = near_pairs(pairs, where, x, x, 0.1, moved)
     wanted = moved[pairs.first[all_pairs[:, 0]]].any(axis=1) | moved[pairs.second[all_pairs[:, 1]]].any(axis=1)
@@ -137,7 +137,7 @@ def test_intersecting_elements_are_those_of_another_test(dim):
     rng = np.random.default_rng(7)
     x = (0.6 * rng.random((COUNT, 1, dim)) + 0.4 * rng.random((COUNT, dim, dim))).reshape(-1, dim)
     elements = np.arange(COUNT * dim).reshape(COUNT, dim)
-    found = intersecting_pairs(elements, PairFilter.none(len(x)), x)
+    found = intersecting_pairs(elements, PairFilter.of(len(x)), x)
     wanted = intersecting_elements(x, elements)
     assert len(found) > 10 and {tuple(sorted(pair)) for pair in found} == {tuple(sorted(pair)) for pair in wanted}
     patches = np.repeat(np.arange(COUNT) % 2, dim).astype(np.int32)
@@ -149,7 +149,7 @@ def test_an_edge_opposite_to_a_common_vertex_may_pass_through():
     """Two triangles with a common vertex, one folded through the other; unfolded they do not intersect."""
     x = np.array([[0, 0, 0], [2.0, -1, 0], [2, 1, 0], [1.5, 0.0, 1], [1.5, 0.1, -1]])
     elements = np.array([[0, 1, 2], [0, 3, 4]])
-    where = PairFilter.none(len(x))
+    where = PairFilter.of(len(x))
     assert len(intersecting_pairs(elements, where, x)) == 1
     x[4, 2] = 0.5
     assert not len(intersecting_pairs(elements, where, x))
@@ -158,7 +158,7 @@ def test_an_edge_opposite_to_a_common_vertex_may_pass_through():
 @pytest.mark.parametrize("name", CASES)
 def test_patches_and_marks_leave_out_pairs(name):
     x, pairs, _ = case(name)
-    all_pairs, reach = near_pairs(pairs, PairFilter.none(len(x)), x, x, 0.1), 0.1
+    all_pairs, reach = near_pairs(pairs, PairFilter.of(len(x)), x, x, 0.1), 0.1
     patches, own = np.zeros(len(x), np.int32), np.zeros(len(x), bool)
     patches[np.unique(pairs.second[: COUNT // 2])] = 1
     patches[pairs.second[COUNT // 2 :]] = 2
@@ -166,7 +166,7 @@ def test_patches_and_marks_leave_out_pairs(name):
     first, second = pairs.first[all_pairs[:, 0]], pairs.second[all_pairs[:, 1]]
     differ, marked = patches[first[:, 0]] != patches[second[:, 0]], own[first].any(axis=1) | own[second].any(axis=1)
     for where, wanted in ((PairFilter(patches, np.ones(len(x), bool)), differ),
-                          (PairFilter(PairFilter.none(len(x)).patches, own), marked)):  # fmt: skip
+                          (PairFilter(PairFilter.of(len(x)).patches, own), marked)):  # fmt: skip
         assert 0 < wanted.sum() < len(wanted)
         assert np.array_equal(near_pairs(pairs, where, x, x, reach), all_pairs[wanted])
 
@@ -176,7 +176,7 @@ def test_positions_that_are_no_numbers_end_the_search():
     for value in (np.nan, np.inf):
         y = x.copy()
         y[5] = value
-        near_pairs(pairs, PairFilter.none(len(x)), x, y, 0.05)
+        near_pairs(pairs, PairFilter.of(len(x)), x, y, 0.05)
 
 
 @pytest.mark.parametrize("name", CASES)

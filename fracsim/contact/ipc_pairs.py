@@ -282,8 +282,6 @@ class IpcPairs:
         self.comm = MPI.COMM_SELF if share is None else share.comm
         used = np.unique(elements)
         vertices = None if share is None or share.comm.size == 1 else share.points[used]
-        self._search = PairSearch(mesh.num_vertices, sets, PAIRS.search_margin * distance)
-        everywhere = self._search.filter
         if vertices is not None:
             # two points of other ranks have the same number and do not touch
             number = np.where(vertices, 1 + np.arange(len(vertices)), 0).astype(np.int32)
@@ -292,9 +290,8 @@ class IpcPairs:
             patch = np.ascontiguousarray(patch[used])
             of_patches = ipctk.make_vertex_patches_filter(patch)
             mesh.can_collide = of_patches if vertices is None else of_patches & mesh.can_collide
-        self._search.filter = PairFilter(
-            everywhere.patches if patch is None else patch, everywhere.is_owned if vertices is None else vertices
-        )
+        where = PairFilter.of(mesh.num_vertices, patch, vertices)
+        self._search = PairSearch(where, sets, PAIRS.search_margin * distance)
         self._kinds = [
             PairKind(pairs, weight * stiffness, centroids if pairs.centroids else at_vertices, vertices)
             for pairs, weight in zip(sets, self._weights, strict=True)

@@ -68,9 +68,12 @@ class PairFilter:
     is_owned: Flags
 
     @classmethod
-    def none(cls, count: int) -> PairFilter:
-        """Pairs of all vertices."""
-        return cls(np.full(count, -1, np.int32), np.ones(count, bool))
+    def of(cls, count: int, patches: npt.NDArray[np.int32] | None = None, is_owned: Flags | None = None) -> PairFilter:
+        """Pairs of `count` vertices; without patches or marks (None) all of them count."""
+        return cls(
+            np.full(count, -1, np.int32) if patches is None else np.ascontiguousarray(patches),
+            np.ones(count, bool) if is_owned is None else is_owned,
+        )
 
 
 def near_pairs(
@@ -213,9 +216,9 @@ class PairSearch:
         filter: vertices of which pairs are searched.
     """
 
-    def __init__(self, count: int, sets: Sequence[SimplexPairs], margin: float) -> None:
-        """`count`: n; `sets`: pairs that are searched; `margin`: motion, m, after which they are searched again."""
-        self.filter, self._sets, self._margin = PairFilter.none(count), sets, margin
+    def __init__(self, where: PairFilter, sets: Sequence[SimplexPairs], margin: float) -> None:
+        """`where`: the filter; `sets`: searched pairs; `margin`: motion, m, after which they are searched again."""
+        self.filter, self._sets, self._margin = where, sets, margin
         self.clear_caches()
 
     def clear_caches(self) -> None:

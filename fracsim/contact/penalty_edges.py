@@ -167,14 +167,13 @@ class EdgeContacts:
         self._used, local = np.unique(ends, return_inverse=True)
         edges = local.reshape(-1, 2)
         self._sets = SimplexPairs.of(edges, edges, EDGES.max_gap * distance)
-        self._search = PairSearch(len(self._used), [self._sets], EDGES.search_margin * distance)
         self._is_owned = None if ranks is None else ranks.own(self._sharp.triangles)
-        if patch is not None:
-            self._search.filter = PairFilter(np.ascontiguousarray(patch[self._used]), self._search.filter.is_owned)
+        is_searched = None
         if self._is_owned is not None:
             is_searched = np.zeros(len(self._used), bool)
             is_searched[edges[self._is_owned]] = True
-            self._search.filter = PairFilter(self._search.filter.patches, is_searched)
+        where = PairFilter.of(len(self._used), None if patch is None else patch[self._used], is_searched)
+        self._search = PairSearch(where, [self._sets], EDGES.search_margin * distance)
         self._owned_pairs: tuple[Ints, Ints] | None = None  # pairs of the last search, and those of this rank
         self.set_history(EdgePairHistory.none())
 

@@ -139,8 +139,7 @@ class PenaltyPairs:
         if edge is None:
             sides = rest_positions[elements] - rest_positions[np.roll(elements, 1, axis=1)]
             edge = float(np.linalg.norm(sides, axis=2).mean()) if len(elements) else distance
-        self._elements, everywhere = elements, PairFilter.none(len(rest_positions))
-        self._filter = everywhere if patch is None else PairFilter(patch, everywhere.is_owned)
+        self._elements, self._filter = elements, PairFilter.of(len(rest_positions), patch)
         is_owned = None if ranks is None else ranks.own_points
         self._points = PointFacetContacts(
             elements, stiffness, distance=distance, edge=edge, patch=patch, is_owned=is_owned

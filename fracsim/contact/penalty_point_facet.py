@@ -248,9 +248,8 @@ class PointFacetContacts:
         owned = np.flatnonzero(self.is_owned[self._used])
         self._owned_points = self._used[owned]
         self._sets = SimplexPairs.of(owned[:, None], facets, reach)
-        self._search = PairSearch(len(self._used), [self._sets], POINT_FACET.search_margin * distance)
-        if patch is not None:
-            self._search.filter = PairFilter(np.ascontiguousarray(patch[self._used]), self._search.filter.is_owned)
+        where = PairFilter.of(len(self._used), None if patch is None else patch[self._used])
+        self._search = PairSearch(where, [self._sets], POINT_FACET.search_margin * distance)
         self._candidates: list[Ints] | None = None  # those of which closest points are cached
         self._cache: ClosestPointCache
         self._is_close: Flags  # (k,) cached pairs that were close at the positions of their last check
