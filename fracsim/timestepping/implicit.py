@@ -65,9 +65,10 @@ class ImplicitStepper(BalanceStepper):
         return np.asarray(state.u + (1 - self.balance.scheme.alpha_f) * dt * state.v)
 
     def _repeat_with_fracture(self, state: State, dt: float, solve: SolveResult) -> tuple[SolveResult, int, float]:
-        """Break edges and solve the step again from its start, until no edge breaks or no passes are left.
+        """Break edges and solve the step again, until no edge breaks or no passes are left.
 
-        If the weakened body has no solution, the last solution stays, and the next step starts out of balance.
+        Each solve begins at the last solution. If the weakened body has no solution, the last solution stays, and the
+        next step starts out of balance.
         """
         inelastic, broken, released = self.inelastic, 0, 0.0
         for _ in range(inelastic.max_passes - 1):
@@ -83,7 +84,7 @@ class ImplicitStepper(BalanceStepper):
                 break
             broken, released = broken + result.broken_edges, released + result.released_energy
             inelastic.damage_changed(result)
-            again = self._attempt(state, dt)
+            again = self._solve(state, dt, solved)
             solve = solve.with_iterations_of(again)
             if not again.converged:
                 self.failures.unbalanced_steps += 1
