@@ -11,7 +11,7 @@ import pytest
 from scipy.integrate import quad
 
 from fracsim.forms.kinematics import SYMMETRIC_COMPONENTS
-from fracsim.fracture.energy.critical_distance import critical_distance, start_points
+from fracsim.fracture.energy.critical_distance import average_at_nodes, critical_distance, find_start_places
 from fracsim.fracture.energy.neighbour_search import NearbyCells
 from fracsim.fracture.energy.tip_parameters import TIP
 from fracsim.scene import Scene
@@ -115,7 +115,7 @@ def test_the_mean_ahead_of_a_tip_is_that_of_its_field(dim: int) -> None:
     point, normal = np.full((1, dim), 0.2), np.eye(dim)[[-1]]
     evaluator._nearby = NearbyCells(scene.domain, radius)
     evaluator.neighbourhoods._split = np.zeros(len(evaluator._nearby.number), bool)
-    (mean,) = evaluator.mean_stress_ahead(point, (normal, normal), np.array([radius]), components)
+    (mean,) = evaluator.mean_stress_ahead(point, (normal, normal), np.array([radius]), np.zeros(1), components)
     assert mean[-1, -1] == pytest.approx(TIP.near_field_mean[dim] / np.sqrt(2 * np.pi * radius), rel=0.05)
 
 
@@ -160,15 +160,121 @@ def test_a_plate_with_a_hole(ratio: float) -> None:
     assert found == pytest.approx(by_line, rel=0.1)
 
 
-def test_points_of_the_surface() -> None:
+@pytest.mark.parametrize("h, lateral", ((0.0125, 0.12), (0.008, 0.08)))
+@pytest.mark.parametrize("length", (0.4, 1.0))
+def test_a_disk_between_platens_starts_to_split_inside(h: float, lateral: float, length: float) -> None:
+    """At 2 P / (pi D) = f_t on the loaded diameter, L = `length` h, not by a few cells in tension beside a platen."""
+    radius, half = 0.1, 0.012
+
+    def platen(side: float) -> dict[str, Any]:
+        ends = sorted((0.985 * side * radius, 1.1 * side * radius))
+        return {"box": [[-half, ends[0]], [half, ends[1]]]}
+
+    scene = bodies(
+        mesh={"builder": "disk", "radius": radius, "h": h},
+        fracture={"energy": np.pi * STRENGTH**2 * length * h / MODULUS},
+        boundary=[{"on": platen(side), "displacement": [0.0, -side * 1e-7]} for side in (-1.0, 1.0)],
+        probe=[{"name": "upper", "on": platen(1.0)}],
+        time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
+    )
+    told = dict(zip(scene.probes.columns, scene.probes(), strict=True))
+    factor = start_factor(scene)
+    assert factor * abs(told["reaction_upper_y"]) / (np.pi * radius) / STRENGTH == pytest.approx(1.0, abs=lateral)
+    assert scene.fracture is not None
+    stress = 1.001 * factor * scene.fracture.evaluate_undamaged_stress()[0]
+    rule = scene.fracture.criterion._initiation
+    places = rule.propose_cuts(rule.find_cells(stress, np.zeros(len(stress), bool)), stress).point
+    assert len(places)
+    assert np.abs(places[:, 0]).max() < 2 * h
+    assert np.abs(places[:, 1]).max() < radius / 2
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_a_crack_at_rest_keeps_no_other_from_starting(dim: int) -> None:
+    """The stress is largest around the crack, but reaches the strength far from it, too."""
+    size, h = [1.0, *[0.4] * (dim - 1)], {2: 0.02, 3: 0.05}[dim]
+    edge = {"polygon": [[0.1, -0.1, -0.1], [0.1, 0.5, -0.1], [0.1, 0.5, 0.15], [0.1, -0.1, 0.15]]}
+    crack = {"segment": [[0.1, -0.1], [0.1, 0.1]]} if dim == 2 else edge
+    scene, _ = make_scene(
+        mesh={"builder": "box", "size": size, "h": h, "pattern": "unstructured"}, material=MATERIAL,
+        fracture={"strength": STRENGTH, "energy": TOUGHNESS}, crack=[crack],
+    )  # fmt: skip
+    assert scene.fracture is not None
+    criterion = scene.fracture.criterion
+    assert len(criterion.find_tips())
+    distance = criterion.field_evaluator.cut_cells.tree.query(criterion.field_evaluator.centres)[0]
+    rule, stress = criterion._initiation, np.zeros((len(distance), len(SYMMETRIC_COMPONENTS[dim])))
+    stress[:, 0] = STRENGTH * (3.0 - distance)
+    found = rule.propose_cuts(rule.find_cells(stress, np.zeros(len(stress), bool)), stress)
+    assert len(found.cells)
+    assert criterion.field_evaluator.cut_cells.tree.query(found.point)[0].min() > criterion.disc_radius.min()
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_cracks_start_at_the_most_loaded_of_all_cells_near(dim: int) -> None:
+    """Of those within 2 h, and of those at its corners, by comparison of all pairs of cells."""
+    size = [1.0, *[0.5] * (dim - 1)]
+    scene = drawn(size, {2: 0.05, 3: 0.12}[dim], fracture={"energy": TOUGHNESS})
+    assert scene.fracture is not None
+    rule, nodes = scene.fracture.criterion._initiation, scene.domain.cell_nodes
+    load = 0.8 + np.random.default_rng(1).random(len(nodes))
+    centres, h = scene.fracture.criterion.field_evaluator.centres, scene.fracture.criterion._h
+    near = np.linalg.norm(centres[:, None] - centres, axis=2) < TIP.start_distance * h[:, None]
+    near |= (nodes[:, None, :, None] == nodes[None, :, None, :]).any(axis=(2, 3))
+    expected = (load >= 1) & np.array([load[i] >= load[near[i]].max() for i in range(len(load))])
+    cells = np.arange(len(load))
+    np.testing.assert_array_equal(rule._is_largest(cells, load), expected)
+
+
+@pytest.mark.parametrize("dim", (2, 3))
+def test_averages_at_nodes(dim: int) -> None:
+    """By loops over cells; a field that is the same in all cells stays."""
+    scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 0.5, 0.5][:dim], "h": 0.25, "pattern": "unstructured"})
+    domain, rng = scene.domain, np.random.default_rng(1)
+    values, some = rng.random((len(domain.cell_nodes), 2)), np.arange(0, len(domain.cell_nodes), 3)
+    values[:, 1] = 7.0
+    at_node = {}
+    for node in np.unique(domain.cell_nodes):
+        around = (domain.cell_nodes == node).any(axis=1)
+        at_node[node] = domain.volumes[around] @ values[around] / domain.volumes[around].sum()
+    weights = rng.integers(1, 3, (len(some), dim + 1)).astype(float)
+    expected = [
+        np.average([at_node[node] for node in domain.cell_nodes[cell]], axis=0, weights=weight)
+        for cell, weight in zip(some, weights, strict=True)
+    ]
+    np.testing.assert_allclose(average_at_nodes(domain, values, some, weights), expected)
+
+
+def test_places_of_the_surface() -> None:
     """Cracks start at the surface where a cell reaches it, in the middle of cells elsewhere."""
     scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.2})
-    points, corners = start_points(scene.domain), scene.domain.nodes[scene.domain.cell_nodes]
+    places, corners = find_start_places(scene.domain), scene.domain.nodes[scene.domain.cell_nodes]
     outside = ((corners < 1e-9) | (corners > 1 - 1e-9)).any(axis=2)
     inner = ~outside.any(axis=1)
-    np.testing.assert_allclose(points[inner], corners[inner].mean(axis=1))
-    for point, corner, flags in zip(points[~inner], corners[~inner], outside[~inner], strict=True):
+    np.testing.assert_array_equal(places.weights, outside | inner[:, None])
+    np.testing.assert_allclose(places.points[inner], corners[inner].mean(axis=1))
+    for point, corner, flags in zip(places.points[~inner], corners[~inner], outside[~inner], strict=True):
         np.testing.assert_allclose(point, corner[flags].mean(axis=0))
+    assert not places.notched.any()
+
+
+@pytest.mark.parametrize("builder", ({"builder": "disk", "radius": 1.0, "h": 0.2},
+                                     {"builder": "cylinder", "radius": 1.0, "length": 1.0, "h": 0.3}))  # fmt: skip
+def test_a_convex_surface_has_no_notch(builder: dict[str, Any]) -> None:
+    """Neither where it is curved, nor at its edges."""
+    assert not find_start_places(make_scene(mesh=builder)[0].domain).notched.any()
+
+
+def test_a_notch_is_where_the_surface_is_concave(tmp_path: Path) -> None:
+    """The root of a V notch, and the hole of a plate where its facets are long."""
+    beam = make_scene(**notched_beam(tmp_path, 5e-5, 1, STRENGTH), solver={})[0].domain
+    places = find_start_places(beam)
+    root = places.points[places.notched]
+    assert len(root)
+    assert np.linalg.norm(root - root.mean(axis=0), axis=1).max() < 1e-4
+    for ratio, is_notch in ((3, True), (30, False)):
+        plate = {"builder": "plate-hole", "length": 1.0, "height": 1.0, "radius": 0.1, "h": 0.1, "h_hole": 0.1 / ratio}
+        assert find_start_places(make_scene(mesh=plate)[0].domain).notched.any() == is_notch
 
 
 @pytest.mark.parametrize("strength", (150e6, 200e6, 400e6))

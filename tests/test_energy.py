@@ -497,11 +497,10 @@ def test_a_crack_with_an_energy_closes(order: int) -> None:
     assert pulled == pytest.approx(open_, rel=0.01)
 
 
-@pytest.mark.parametrize("h", [0.1, 0.09])
+@pytest.mark.parametrize("h", [0.1, 0.09, 0.085, 0.08, 0.075, 0.07])
 def test_a_smooth_bar_breaks_at_its_strength(h: float) -> None:
     """Uniform stress: it breaks in the first step in which the stress reaches f_t, and loses G_c times its section at
-    least: where stress decides it may lose more. The row of that step has the load before the break, too. On two of
-    six meshes, 0.1 among them, the crack leaves one cell of the section whole, which carries 6 and 9 % of the load."""
+    least: where stress decides it may lose more. The row of that step has the load before the break, too."""
     steps = {"time": [0, 100], "value": [[0.0, "free"], [1.5e-3, "free"]]}
     study = make_study(
         material={"energy": "linear", "young": 1e3, "poisson": 0.0, "density": 1.0},
@@ -517,7 +516,7 @@ def test_a_smooth_bar_breaks_at_its_strength(h: float) -> None:
         peak = max(peak, scene.probes()[0])
         state, _ = scene.stepper.advance(state)
     assert peak / 0.5 == pytest.approx(0.5, rel=0.02)
-    assert scene.probes()[0] < (0.1 if h == 0.1 else 1e-6) * peak and state.dissipated > 1e-5 * 0.5
+    assert scene.probes()[0] < 1e-6 * peak and state.dissipated > 1e-5 * 0.5
     row = dict(zip(scene.probes.columns, scene.probes(), strict=True))
     # The plate is loaded by E / (2 m) * 1.5e-5 m in a step, so that the last load is one such step above the peak.
     assert row["onset_grip_x"] == pytest.approx(peak + 0.5 * 1e3 / 2.0 * 1.5e-5, rel=1e-6)

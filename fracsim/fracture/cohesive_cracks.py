@@ -332,7 +332,7 @@ class CohesiveTipCriterion(TipCriterion):
     def _critical_distance(self) -> CriticalDistance:
         """Return no length: the strength alone starts cohesive cracks."""
         none = np.zeros(self._domain.cell_count)
-        return CriticalDistance(none, none, none)
+        return CriticalDistance(none, none, none, none)
 
     def allow_initiation(self, allowed: bool) -> None:
         """Allow or forbid new cracks in the following calls."""

@@ -15,11 +15,12 @@ import numpy.typing as npt
 from ...mechanics.stress import Stress
 from ...mesh.domain import Domain
 from ...mesh.edge_graph import EdgeGraph
+from ...mesh.ghost_exchange import min_over_ranks
 from ...mesh.parallel import allgather, sum_over_ranks
 from ..edge_stress import frobenius_norm
 from ..principal_stress import first_principal_stress, principal_stress_bound, symmetric_tensors
 from ..strength import EdgeStrength, hash_points
-from .critical_distance import CriticalDistance, start_points
+from .critical_distance import CriticalDistance, StartPlaces, average_at_nodes, find_start_places
 from .tip_fields import TipFieldEvaluator
 from .tip_parameters import TIP
 
@@ -88,8 +89,15 @@ def rank_rows(kind: int, sigma: Values, key: Values, points: Values, exclusion: 
     return np.column_stack([np.full(len(sigma), float(kind)), -sigma, hash_points(key), points, exclusion])
 
 
-def select_proposals(domain: Domain, *proposals: CutProposal) -> tuple[list[CutProposal], bool]:
+def select_proposals(
+    domain: Domain, *proposals: CutProposal, one_start: bool = False
+) -> tuple[list[CutProposal], bool]:
     """Select the cells that are cut, in order of rank, none within the distance of an earlier one (collective).
+
+    Args:
+        domain: gives the ranks.
+        proposals: of this rank.
+        one_start: whether one new crack at most is selected, and only where no tip advances.
 
     Returns:
         The selected parts of the proposals of this rank, and whether any rank has any.
@@ -101,6 +109,9 @@ def select_proposals(domain: Domain, *proposals: CutProposal) -> tuple[list[CutP
     rows = np.concatenate(parts)
     # By kind, then by stress, then by hash.
     remaining = list(np.lexsort(rows[:, 2::-1].T))
+    if one_start:
+        tips = [row for row in remaining if rows[row, 0] == TIP_ADVANCE]
+        remaining = tips or remaining[:1]
     selected = np.zeros(len(rows), bool)
     while remaining:
         first = remaining[0]
@@ -131,10 +142,10 @@ class Initiation(Protocol):
 
 
 class CrackInitiation:
-    """A crack starts where strength and energy are reached, farther than R from any crack.
+    """A crack starts where strength and energy are reached, far from any crack.
 
-    The first principal stress over the strength of a cell is at least 1, and the largest within the critical distance.
-    The mean stress ahead of the cell is at least the threshold of `CriticalDistance`.
+    The first principal stress over the strength of a cell is at least 1, and the largest of such cells within 2 h. The
+    mean stress ahead of the cell is at least the threshold of `CriticalDistance`.
     """
 
     def __init__(
@@ -149,45 +160,66 @@ class CrackInitiation:
         """Build the rule (collective); `disc`: (cells,) R, m; `start`: the critical distance."""
         self._graph, self._strength, self._evaluator, self._disc = graph, strength, evaluator, disc
         self._domain, self._dim, self._start = stress.domain, stress.domain.dim, start
-        # The most loaded cell as far as a crack of the critical distance, or its tip, may reach.
-        self._distance = np.maximum(TIP.start_distance / TIP.disc_radius[self._dim] * disc, start.radius)
+        self._resolution = TIP.start_distance / TIP.disc_radius[self._dim] * disc
+        # The disc of a tip, or the mean ahead of a place, must not belong to two cracks.
+        self._distance = np.maximum(disc, start.radius)
 
     @cached_property
-    def _points(self) -> Values:
-        """(cells, d) points from which cracks start, m (collective where they are first asked for)."""
-        return start_points(self._domain)
+    def _places(self) -> StartPlaces:
+        """Places at which cracks start (collective at the first use)."""
+        return find_start_places(self._domain)
 
     def find_cells(self, stress: Values, excluded: Flags) -> Ints:
-        """Find intact cells, farther than R from any crack, whose local stress (cells, 3 or 6) may be large enough."""
+        """Find intact cells, far from any crack, whose local stress (cells, 3 or 6) may be large enough."""
         graph, d, minimum = self._graph, self._dim, self._strength.minimum
         # Shear counts twice in the norm: a plain sum of squares excludes most cells in a third of the time.
         cells = np.flatnonzero(2 * np.einsum("ni,ni->n", stress, stress) >= minimum**2).astype(np.int64)
         cells = cells[~(graph.damaged[cells] | excluded[cells]) & (frobenius_norm(stress[cells], d) >= minimum)]
         cells = cells[principal_stress_bound(symmetric_tensors(stress[cells], d)) >= minimum]
-        cut_cells = self._evaluator.cut_cells
         # Near a crack the tip decides, not the stress of single cells.
-        if len(cells) and len(cut_cells.number):
-            distance = cut_cells.tree.query(self._evaluator.centres[cells])[0]
-            cells = cells[distance > self._disc[cells]]
-        return cells
+        return cells[self._far_from_cracks(cells, self._disc)]
+
+    def _far_from_cracks(self, cells: Ints, distance: Values) -> Flags:
+        """Return whether cells (n,) are farther from any crack than the distances (cells,), m, of each (collective)."""
+        cut_cells = self._evaluator.cut_cells
+        if not len(cells) or not len(cut_cells.number):
+            return np.ones(len(cells), bool)
+        return np.asarray(cut_cells.tree.query(self._evaluator.centres[cells])[0] > distance[cells])
 
     def propose_cuts(self, cells: Ints, stress: Values) -> CutProposal:
         """Propose the cells (m,) of (n,) in which cracks start (collective)."""
-        load = self._load(stress)
-        cells = cells[load[cells] >= 1]
-        cells = cells[self._evaluator.find_largest(cells, load, self._distance[cells])]
-        normals = self._evaluator.crack_normals(symmetric_tensors(stress[cells], self._dim), cells)
-        mean = self._evaluator.mean_stress_ahead(self._points[cells], normals, self._start.radius[cells], stress)
+        evaluator, load = self._evaluator, np.zeros(len(stress))
+        # Where no crack may start the load is left out: it may be largest around a tip at rest.
+        cells = cells[self._far_from_cracks(cells, self._distance)]
+        places = self._places
+        sigma = first_principal_stress(symmetric_tensors(stress[cells], self._dim))
+        # Where no notch concentrates it, the stress of one cell differs from that of its neighbours by error alone.
+        smooth = average_at_nodes(self._domain, stress, cells, places.weights[cells])
+        smooth_sigma = first_principal_stress(symmetric_tensors(smooth, self._dim))
+        sigma = np.where(places.notched[cells], sigma, np.minimum(sigma, smooth_sigma))
+        load[cells] = sigma / cell_strength(self._strength, self._graph, cells)
+        cells = cells[self._is_largest(cells, load)]
+        normals = evaluator.crack_normals(symmetric_tensors(stress[cells], self._dim), cells)
+        radii = self._start.radius[cells], self._start.least_radius[cells]
+        mean = evaluator.mean_stress_ahead(places.points[cells], normals, *radii, stress)
         overloaded = first_principal_stress(mean) >= self._start.threshold[cells]
         cells = cells[overloaded]
-        centres, exclusion = self._evaluator.centres[cells], np.maximum(self._disc, self._start.radius)[cells]
-        rank = rank_rows(NEW_CRACK, load[cells], centres, centres, exclusion)
+        centres = evaluator.centres[cells]
+        rank = rank_rows(NEW_CRACK, load[cells], centres, centres, self._distance[cells])
         return CutProposal(rank, cells, mean[overloaded])
 
-    def _load(self, stress: Values) -> Values:
-        """Return the first principal stress over the strength (cells,) of unsplit cells, 0 far below the strength."""
-        load = np.zeros(len(stress))
-        cells = np.flatnonzero(~self._graph.split & (frobenius_norm(stress, self._dim) >= self._strength.minimum))
-        sigma = first_principal_stress(symmetric_tensors(stress[cells], self._dim))
-        load[cells] = sigma / cell_strength(self._strength, self._graph, cells)
-        return load
+    def _is_largest(self, cells: Ints, load: Values) -> Flags:
+        """Return which cells (n,) have a load of 1 at least, the largest within 2 h (collective).
+
+        `load`: (cells,) of all. Neighbours at a node are compared first: there are a hundred times as many cells as
+        places, and each has some hundred cells within 2 h.
+        """
+        corners, nodes = self._domain.cell_nodes[cells], self._domain.space.dofmap.index_map
+        at_node = np.zeros(nodes.size_local + nodes.num_ghosts)
+        np.maximum.at(at_node, corners, load[cells, None])
+        at_node = -min_over_ranks(nodes, -at_node)
+        around = at_node[corners].max(axis=1, initial=0.0)
+        is_largest = np.asarray((load[cells] >= 1) & (around * (1 - TIP.force_round_off) <= load[cells]))
+        rows = np.flatnonzero(is_largest)
+        is_largest[rows] = self._evaluator.find_largest(cells[rows], load, self._resolution[cells[rows]])
+        return is_largest

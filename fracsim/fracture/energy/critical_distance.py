@@ -11,6 +11,8 @@ from dolfinx import la
 from ...mesh.domain import Domain
 from .tip_parameters import TIP
 
+Flags = npt.NDArray[np.bool_]
+Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
 
@@ -25,11 +27,13 @@ class CriticalDistance:
     Attributes:
         length: (cells,) L, m.
         radius: (cells,) R, m.
+        least_radius: (cells,) 3 h, m.
         threshold: (cells,) mean stress at which a crack starts, Pa.
     """
 
     length: Values
     radius: Values
+    least_radius: Values
     threshold: Values
 
 
@@ -45,22 +49,88 @@ def critical_distance(dim: int, modulus: Values, toughness: Values, strength: Va
     """
     c, energy = TIP.near_field_mean[dim], modulus * toughness
     length = energy / (np.pi * strength**2)
-    radius = np.clip(c**2 / 2 * length, TIP.min_start_radius * h, TIP.max_start_radius[dim] * h)
-    return CriticalDistance(length, radius, np.minimum(strength, c * np.sqrt(energy / (2 * np.pi * radius))))
+    least_radius = TIP.min_start_radius * h
+    radius = np.clip(c**2 / 2 * length, least_radius, TIP.max_start_radius[dim] * h)
+    return CriticalDistance(
+        length, radius, least_radius, np.minimum(strength, c * np.sqrt(energy / (2 * np.pi * radius)))
+    )
 
 
-def start_points(domain: Domain) -> Values:
-    """Return the points (cells, d), m, from which a crack in a cell starts (collective).
+@dataclass(frozen=True)
+class StartPlaces:
+    """Places of cells at which cracks start: the corners in the body's surface, or all of a cell without such corners.
 
-    They are the mean of the corners in the body's surface, or the centroid of a cell without such corners.
+    Attributes:
+        points: (cells, d) mean of these corners, m.
+        weights: (cells, d + 1) 1 for these corners, else 0.
+        notched: (cells,) whether the surface is concave at one of them, so that it concentrates the stress.
     """
-    on_surface = la.vector(domain.space.dofmap.index_map, 1, np.float64)
-    nodes, outside = domain.cell_nodes, domain.facets.boundary_sides
-    for opposite, flags in enumerate(outside.T):
-        on_surface.array[np.delete(nodes, opposite, axis=1)[flags]] = 1.0
+
+    points: Values
+    weights: Values
+    notched: Flags
+
+
+def find_start_places(domain: Domain) -> StartPlaces:
+    """Return the places of all cells at which cracks may start (collective).
+
+    With the areas A, normals n and centroids c of the facets around a node x, and N along sum A n, the surface is
+    concave at x where sum A (c - x) . N exceeds `TIP.notch_sine` times sum A |c - x|.
+    """
+    d, nodes, X = domain.dim, domain.cell_nodes, domain.nodes
+    sums = la.vector(domain.space.dofmap.index_map, 2 * d + 1, np.float64)
+    at_node = sums.array.reshape(-1, 2 * d + 1)
+    for opposite, flags in enumerate(domain.facets.boundary_sides.T):
+        facet = np.delete(nodes[flags], opposite, axis=1)
+        corners = X[facet]
+        normal = _area_normals(corners)
+        # outwards, away from the opposite corner
+        outwards = np.sign(np.einsum("ni,ni->n", corners[:, 0] - X[nodes[flags, opposite]], normal))
+        normal *= outwards[:, None]
+        area = np.linalg.norm(normal, axis=1)[:, None]
+        for corner in range(d):
+            apart = corners.mean(axis=1) - corners[:, corner]
+            rows = np.column_stack([normal, area * apart, area * np.linalg.norm(apart, axis=1)[:, None]])
+            np.add.at(at_node, facet[:, corner], rows)
     # A node of this rank may be in the surface by a facet of another rank.
-    on_surface.scatter_reverse(la.InsertMode.add)
-    on_surface.scatter_forward()
-    weight = (on_surface.array[nodes] > 0).astype(float)
-    weight[~weight.any(axis=1)] = 1.0
-    return np.asarray(np.einsum("nk,nki->ni", weight, domain.nodes[nodes]) / weight.sum(axis=1)[:, None])
+    sums.scatter_reverse(la.InsertMode.add)
+    sums.scatter_forward()
+    normal, apart, size = at_node[:, :d], at_node[:, d : 2 * d], at_node[:, -1]
+    notched = np.einsum("ni,ni->n", apart, normal) > TIP.notch_sine * size * np.linalg.norm(normal, axis=1)
+    weights = (size > 0)[nodes].astype(float)
+    weights[~weights.any(axis=1)] = 1.0
+    points = np.einsum("nk,nki->ni", weights, X[nodes]) / weights.sum(axis=1)[:, None]
+    return StartPlaces(points, weights, notched[nodes].any(axis=1))
+
+
+def _area_normals(corners: Values) -> Values:
+    """Return vectors (n, d) across facets with corners (n, d, d), as long as their area, m^(d - 1)."""
+    sides = corners[:, 1:] - corners[:, :1]
+    if corners.shape[1] == 2:
+        return np.column_stack([sides[:, 0, 1], -sides[:, 0, 0]])
+    return np.asarray(np.cross(sides[:, 0], sides[:, 1]) / 2)
+
+
+def average_at_nodes(domain: Domain, values: Values, cells: Ints, weights: Values) -> Values:
+    """Return the weighted mean (n, k) over the corners of cells (n,) of the mean of all cells at each corner.
+
+    Collective.
+
+    Args:
+        domain: gives nodes and volumes.
+        values: (cells, k) of all cells; those at a corner are weighted by their volumes.
+        cells: (n,) cells.
+        weights: (n, d + 1) of their corners.
+    """
+    nodes, volumes = domain.cell_nodes, domain.volumes
+    columns = np.column_stack([values * volumes[:, None], volumes])
+    sums = la.vector(domain.space.dofmap.index_map, columns.shape[1], np.float64)
+    at_node = sums.array.reshape(-1, columns.shape[1])
+    for column, total in zip(columns.T, at_node.T, strict=True):
+        total[:] = np.bincount(nodes.ravel(), np.repeat(column, nodes.shape[1]), len(at_node))
+    # Sums of ghost nodes are added to their owners, then copied back.
+    sums.scatter_reverse(la.InsertMode.add)
+    sums.scatter_forward()
+    at_corners = at_node[nodes[cells]]
+    mean = at_corners[..., :-1] / at_corners[..., -1:]
+    return np.asarray(np.einsum("nc,nck->nk", weights, mean) / weights.sum(axis=1)[:, None])

@@ -152,7 +152,9 @@ class TipCriterion:
         edges: Edges = np.empty(0, np.int64)
         self.cells = np.empty(0, np.int64)
         if tip_count + candidate_count:
-            (advances, starts), any_selected = select_proposals(self._domain, advances, starts)
+            # Without inertia the first crack unloads other places before a crack starts there.
+            one_start = not self.field_evaluator.has_motion
+            (advances, starts), any_selected = select_proposals(self._domain, advances, starts, one_start=one_start)
             self.cells = np.concatenate([advances.cells, starts.cells])
             if any_selected:
                 edges = self._cut_cells(advances, starts)
@@ -262,9 +264,9 @@ class TipCriterion:
     def _is_overloaded(self, fields: TipFields, rows: Ints, mean: Values) -> Flags:
         """Return whether the stress ahead of tips `rows` (m,) with averaged stress (m, d, d) is enough (collective)."""
         cells, evaluator = fields.tips.cell[rows], self.field_evaluator
-        ahead = evaluator.mean_stress_ahead(
-            fields.tips.point[rows], evaluator.crack_normals(mean, cells), self._start.radius[cells], fields.cell_stress
-        )
+        normals, start = evaluator.crack_normals(mean, cells), self._start
+        radii = start.radius[cells], start.least_radius[cells]
+        ahead = evaluator.mean_stress_ahead(fields.tips.point[rows], normals, *radii, fields.cell_stress)
         return np.asarray(first_principal_stress(ahead) >= self._start.threshold[cells])
 
     def _find_critical_tips(self, size: Values, toughness: Values, tips: CrackTips) -> tuple[Flags, Flags]:

@@ -218,17 +218,19 @@ class TipFieldEvaluator:
         return normals, material_normals(normals, np.eye(stress.shape[1]) + H)
 
     def mean_stress_ahead(
-        self, points: Values, normals: tuple[Values, Values], radius: Values, stress: Values
+        self, points: Values, normals: tuple[Values, Values], radius: Values, least_radius: Values, stress: Values
     ) -> Values:
         """Return the mean stress (n, d, d), Pa, over half discs, in 3D half balls, ahead of points (collective).
 
         Ahead is the direction of the tension across the coming crack: sum V <n . s n>+ (X - X_0), less its part along
         the normal. Split cells do not count, nor do cells that are compressed along n, before which the crack ends.
+        Within the least radius these count as without stress: a few cells in tension beside a load start no crack.
 
         Args:
             points: (n, d) reference points X_0, m.
             normals: (n, d) normals of the coming cracks, n in space and those in the reference configuration.
             radius: (n,) m.
+            least_radius: (n,) at most `radius`, m.
             stress: (cells, 3 or 6) Cauchy stress, Pa.
         """
         d, (spatial, material) = self._domain.dim, normals
@@ -236,12 +238,13 @@ class TipFieldEvaluator:
         near = self._near_values(pairs, stress)
         n = spatial[pairs.first]
         tension = np.einsum("ni,nij,nj->n", n, symmetric_tensors(near, d), n)
-        counts = ~self.neighbourhoods.split_cells[pairs.second] & (tension > 0)
-        volume = self._nearby.volumes[pairs.second] * counts
-        ahead = pairs.sum((volume * tension)[:, None] * pairs.apart)
+        volume = self._nearby.volumes[pairs.second] * ~self.neighbourhoods.split_cells[pairs.second]
+        ahead = pairs.sum((volume * np.maximum(tension, 0.0))[:, None] * pairs.apart)
         ahead -= np.einsum("ni,ni->n", ahead, material)[:, None] * material
         volume = volume * (np.einsum("ni,ni->n", ahead[pairs.first], pairs.apart) >= 0)
-        return symmetric_tensors(weighted_mean(pairs.sum(volume[:, None] * near), pairs.sum(volume)[:, None]), d)
+        tensile = volume * (tension > 0)
+        counted = np.where(pairs.distance < least_radius[pairs.first], volume, tensile)
+        return symmetric_tensors(weighted_mean(pairs.sum(tensile[:, None] * near), pairs.sum(counted)[:, None]), d)
 
     def find_largest(self, cells: Ints, values: Values, radius: Values) -> npt.NDArray[np.bool_]:
         """Return whether the value of cells (n,) is the largest within radius (n,), m, of their centroids (collective).

@@ -35,6 +35,8 @@ class TipParameters:
         min_start_radius: least radius of the half disc ahead of a place at which a crack starts.
         max_start_radius: largest radius of that half disc, which bounds the number of cells in it.
         start_distance: distance within which a crack starts at the most loaded cell alone.
+        notch_sine: mean sine of the angle between the surface around a node and its tangent plane, from which on a
+            concave surface is a notch.
         branching_ratio: mean of G over G_c from which on a crack branches: there is energy for two.
         branching_angle: angle between a branch and the crack it comes from, rad. At 27 degrees short branches open
             without sliding.
@@ -62,6 +64,7 @@ class TipParameters:
     min_start_radius: float = 3.0
     max_start_radius: Mapping[int, float] = _by_dimension(60.0, 8.0)
     start_distance: float = 2.0
+    notch_sine: float = 0.1
     branching_ratio: float = 2.0
     branching_angle: float = radians(27.0)
     side_by_side: float = 0.5
