@@ -76,6 +76,7 @@ class PicturePage:
         if unknown := set(asked.names) - set(names):
             sys.exit(f"no picture is called {', '.join(sorted(unknown))}")
         wanted = [entry for entry in self.entries if not asked.names or entry.name in asked.names]
+        wanted.sort(key=self._seconds, reverse=True)  # no core waits for a long run that another began last
         runs = dict(run for entry in wanted for run in entry.runs)
         with ThreadPoolExecutor(asked.jobs) as pool:
             list(pool.map(lambda run: run_study(*run, again=asked.again), runs.items()))
@@ -96,14 +97,22 @@ class PicturePage:
         said = f"{entry.text} {self._figures(entry)}".rstrip() + (f"\n\n{entry.remark}" if entry.remark else "")
         return f"## {entry.name}\n\n![{entry.text}](gallery/{file})\n\n{said}\n\n" + "\n".join(lines) + "\n\n"
 
+    def _old_figures(self, entry: PictureEntry) -> str:
+        """Processor time and fragments of the entry's runs as the page says; empty if it does not."""
+        page = self.path.read_text(encoding="utf-8") if self.path.exists() else ""
+        of_it = next((part for part in page.split("\n## ") if part.startswith(f"{entry.name}\n")), "")
+        results = re.search(r" (\d+ s[.;].*)$", of_it, re.MULTILINE)
+        return results[1] if results else ""
+
+    def _seconds(self, entry: PictureEntry) -> int:
+        """Processor time of the entry's runs as the page says, s; 0 if it does not."""
+        return int(self._old_figures(entry).partition(" ")[0] or 0)
+
     def _figures(self, entry: PictureEntry) -> str:
         """Processor time and fragments of the entry's runs; the page's old text if a run is missing."""
         folders = [RUNS / folder for folder, _ in entry.runs]
         if not all(map(has_ended, folders)):
-            page = self.path.read_text(encoding="utf-8") if self.path.exists() else ""
-            of_it = next((part for part in page.split("\n## ") if part.startswith(f"{entry.name}\n")), "")
-            results = re.search(r" (\d+ s[.;].*)$", of_it, re.MULTILINE)
-            return results[1] if results else ""
+            return self._old_figures(entry)
         seconds = sum(json.loads((folder / "summary.json").read_text(encoding="utf-8"))["cpu"] for folder in folders)
         counts = [count_fragments(folder) for folder in folders]
         parts = ", ".join(
