@@ -191,17 +191,17 @@ class CrackInitiation:
         evaluator, load = self._evaluator, np.zeros(len(stress))
         # Where no crack may start the load is left out: it may be largest around a tip at rest.
         cells = cells[self._far_from_cracks(cells, self._distance)]
-        places = self._places
+        start_places = self._places
         sigma = first_principal_stress(symmetric_tensors(stress[cells], self._dim))
         # Where no notch concentrates it, the stress of one cell differs from that of its neighbours by error alone.
-        smooth = average_at_nodes(self._domain, stress, cells, places.weights[cells])
+        smooth = average_at_nodes(self._domain, stress, cells, start_places.weights[cells])
         smooth_sigma = first_principal_stress(symmetric_tensors(smooth, self._dim))
-        sigma = np.where(places.notched[cells], sigma, np.minimum(sigma, smooth_sigma))
+        sigma = np.where(start_places.notched[cells], sigma, np.minimum(sigma, smooth_sigma))
         load[cells] = sigma / cell_strength(self._strength, self._graph, cells)
         cells = cells[self._is_largest(cells, load)]
         normals = evaluator.crack_normals(symmetric_tensors(stress[cells], self._dim), cells)
         radii = self._start.radius[cells], self._start.least_radius[cells]
-        mean = evaluator.mean_stress_ahead(places.points[cells], normals, *radii, stress)
+        mean = evaluator.mean_stress_ahead(start_places.points[cells], normals, *radii, stress)
         overloaded = first_principal_stress(mean) >= self._start.threshold[cells]
         cells = cells[overloaded]
         centres = evaluator.centres[cells]

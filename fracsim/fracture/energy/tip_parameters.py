@@ -64,7 +64,7 @@ class TipParameters:
     min_start_radius: float = 3.0
     max_start_radius: Mapping[int, float] = _by_dimension(60.0, 8.0)
     start_distance: float = 2.0
-    notch_sine: float = 0.1
+    notch_sine: float = 0.01
     branching_ratio: float = 2.0
     branching_angle: float = radians(27.0)
     side_by_side: float = 0.5
