@@ -25,7 +25,7 @@ NVE36 = (
     "--set 'material.like=steel NVE 36 at 23 C' --set material.energy=corotated --set plasticity.update=implicit"
     " --set fracture.energy=false --set fracture.radius=8e-4 --set time.step=1e-5 --set time.breaking_step=1e-5"
 )
-THIRD = "--set mesh.h=0.0023 --set mesh.h_notch=0.0007"  # of the cells of Charpy bars in space
+THIRD = "--set mesh.h=0.0023 --set mesh.h_notch=0.0007"  # of the cells of a Charpy bar in space
 AVERAGED = "doormat --set fracture.radius=0.05 --set fracture.strength=2e5 --set time.step=4e-4"
 ENTRIES = (
     packaged_entry("loaf", "A loaf of bread, fixed at one end and pulled at the other until it tears.",
@@ -132,7 +132,7 @@ ENTRIES = (
     PictureEntry(
         "charpy-3d",
         "Charpy bars in space: A516 at -40 C breaks, NVE 36 at 23 C bends and cracks over a third of its ligament.",
-        (("charpy-3d", f"charpy-3d {THIRD}"), ("charpy-3d-ductile", f"charpy-3d-ductile {THIRD}")),
+        (("charpy-3d", f"charpy-3d {THIRD}"), ("charpy-3d-ductile", "charpy-3d-ductile")),
         "--view 0.5,-1.1,-0.45 --field crack --size 1400x560",
     ),
     packaged_entry("kalthoff", "A notched steel plate under impact on the side below its notch: vertical stress.",
