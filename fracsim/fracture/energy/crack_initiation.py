@@ -158,7 +158,7 @@ class CrackInitiation:
         start: CriticalDistance,
     ) -> None:
         """Build the rule (collective); `disc`: (cells,) R, m; `start`: the critical distance."""
-        self._graph, self._strength, self._evaluator, self._disc = graph, strength, evaluator, disc
+        self._graph, self._strength, self._evaluator = graph, strength, evaluator
         self._domain, self._dim, self._start = stress.domain, stress.domain.dim, start
         self._resolution = TIP.start_distance / TIP.disc_radius[self._dim] * disc
         # The disc of a tip, or the mean ahead of a place, must not belong to two cracks.
@@ -176,27 +176,23 @@ class CrackInitiation:
         cells = np.flatnonzero(2 * np.einsum("ni,ni->n", stress, stress) >= minimum**2).astype(np.int64)
         cells = cells[~(graph.damaged[cells] | excluded[cells]) & (frobenius_norm(stress[cells], d) >= minimum)]
         cells = cells[principal_stress_bound(symmetric_tensors(stress[cells], d)) >= minimum]
-        # Near a crack the tip decides, not the stress of single cells.
-        return cells[self._far_from_cracks(cells, self._disc)]
-
-    def _far_from_cracks(self, cells: Ints, distance: Values) -> Flags:
-        """Return whether cells (n,) are farther from any crack than the distances (cells,), m, of each (collective)."""
         cut_cells = self._evaluator.cut_cells
-        if not len(cells) or not len(cut_cells.number):
-            return np.ones(len(cells), bool)
-        return np.asarray(cut_cells.tree.query(self._evaluator.centres[cells])[0] > distance[cells])
+        # Near a crack the tip decides, not the stress of single cells.
+        if len(cells) and len(cut_cells.number):
+            distance = cut_cells.tree.query(self._evaluator.centres[cells])[0]
+            cells = cells[distance > self._distance[cells]]
+        return cells
 
     def propose_cuts(self, cells: Ints, stress: Values) -> CutProposal:
         """Propose the cells (m,) of (n,) in which cracks start (collective)."""
         evaluator, load = self._evaluator, np.zeros(len(stress))
-        # Where no crack may start the load is left out: it may be largest around a tip at rest.
-        cells = cells[self._far_from_cracks(cells, self._distance)]
         start_places = self._places
         sigma = first_principal_stress(symmetric_tensors(stress[cells], self._dim))
         # Where no notch concentrates it, the stress of one cell differs from that of its neighbours by error alone.
         smooth = average_at_nodes(self._domain, stress, cells, start_places.weights[cells])
         smooth_sigma = first_principal_stress(symmetric_tensors(smooth, self._dim))
         sigma = np.where(start_places.notched[cells], sigma, np.minimum(sigma, smooth_sigma))
+        # Where no crack may start the load is left out: it may be largest around a tip at rest.
         load[cells] = sigma / cell_strength(self._strength, self._graph, cells)
         cells = cells[self._is_largest(cells, load)]
         normals = evaluator.crack_normals(symmetric_tensors(stress[cells], self._dim), cells)
