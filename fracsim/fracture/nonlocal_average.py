@@ -23,13 +23,13 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import la
 from mpi4py import MPI
 from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from ..mesh.c_library import Float32, Float64, Int64, load_library, struct_pointer
 from ..mesh.domain import Domain
+from ..mesh.ghost_exchange import sum_at_nodes
 from ..mesh.parallel import RankHalo, max_over_ranks
 
 Values = npt.NDArray[np.float64]
@@ -264,12 +264,5 @@ class NeighbourAverage:
 
     def _sum_over_neighbours(self, values: Values) -> Values:
         """Return the sums (cells, n) over the nodes of each cell of the sums over the cells around the node."""
-        nodes, n = self._domain.cell_nodes, values.shape[1]
-        nodal = la.vector(self._domain.space.dofmap.index_map, n, np.float64)
-        table = nodal.array.reshape(-1, n)
-        for total, column in zip(table.T, values.T, strict=True):
-            total += np.bincount(nodes.ravel(), np.repeat(column, nodes.shape[1]), minlength=len(table))
-        # Sums of ghost nodes are added to their owners, then copied back.
-        nodal.scatter_reverse(la.InsertMode.add)
-        nodal.scatter_forward()
-        return np.asarray(table[nodes].sum(axis=1))
+        nodes = self._domain.cell_nodes
+        return np.asarray(sum_at_nodes(self._domain, nodes, values)[nodes].sum(axis=1))

@@ -41,6 +41,20 @@ def min_over_ranks(index_map: IndexMap, values: npt.NDArray[Any]) -> npt.NDArray
     return owner_values(index_map, result)
 
 
+def sum_at_nodes(
+    domain: Domain, nodes: npt.NDArray[np.integer[Any]], values: npt.NDArray[np.float64]
+) -> npt.NDArray[np.float64]:
+    """(owned and ghost nodes, k) sums over all ranks of values (n, k), each for its nodes (n, ...) (collective)."""
+    sums = la.vector(domain.space.dofmap.index_map, values.shape[1], np.float64)
+    result, repeats = sums.array.reshape(-1, values.shape[1]), int(np.prod(nodes.shape[1:]))
+    for total, column in zip(result.T, values.T, strict=True):
+        total[:] = np.bincount(nodes.reshape(-1), np.repeat(column, repeats), len(result))
+    # Sums of ghost nodes are added to their owners, then copied back.
+    sums.scatter_reverse(la.InsertMode.add)
+    sums.scatter_forward()
+    return np.asarray(result)
+
+
 def with_ghosts(domain: Domain, owned: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
     """(owned and ghost dofs,) values of the displacement space from its owned dofs.
 

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import la
 
 from ...mesh.domain import Domain
+from ...mesh.ghost_exchange import sum_at_nodes
+from ...mesh.small_matrices import barycentric_gradients
 from .tip_parameters import TIP
 
 Flags = npt.NDArray[np.bool_]
@@ -78,37 +79,25 @@ def find_start_places(domain: Domain) -> StartPlaces:
     concave at x where sum A (c - x) . N exceeds `TIP.notch_sine` times sum A |c - x|.
     """
     d, nodes, X = domain.dim, domain.cell_nodes, domain.nodes
-    sums = la.vector(domain.space.dofmap.index_map, 2 * d + 1, np.float64)
-    at_node = sums.array.reshape(-1, 2 * d + 1)
-    for opposite, flags in enumerate(domain.facets.boundary_sides.T):
-        facet = np.delete(nodes[flags], opposite, axis=1)
-        corners = X[facet]
-        normal = _area_normals(corners)
-        # outwards, away from the opposite corner
-        outwards = np.sign(np.einsum("ni,ni->n", corners[:, 0] - X[nodes[flags, opposite]], normal))
-        normal *= outwards[:, None]
-        area = np.linalg.norm(normal, axis=1)[:, None]
-        for corner in range(d):
-            apart = corners.mean(axis=1) - corners[:, corner]
-            rows = np.column_stack([normal, area * apart, area * np.linalg.norm(apart, axis=1)[:, None]])
-            np.add.at(at_node, facet[:, corner], rows)
-    # A node of this rank may be in the surface by a facet of another rank.
-    sums.scatter_reverse(la.InsertMode.add)
-    sums.scatter_forward()
+    cell, opposite = np.nonzero(domain.facets.boundary_sides)
+    # The outward area of the side opposite to a corner is - d V grad N.
+    gradients = barycentric_gradients(X[nodes[cell]])[np.arange(len(cell)), opposite]
+    normal = -d * domain.volumes[cell, None] * gradients
+    facet = nodes[cell][np.arange(d + 1) != opposite[:, None]].reshape(-1, d)
+    apart = X[facet].mean(axis=1)[:, None] - X[facet]
+    area = np.linalg.norm(normal, axis=1)[:, None, None]
+    rows = [
+        np.broadcast_to(normal[:, None], apart.shape),
+        area * apart,
+        area * np.linalg.norm(apart, axis=2)[..., None],
+    ]
+    at_node = sum_at_nodes(domain, facet.reshape(-1), np.concatenate(rows, axis=2).reshape(-1, 2 * d + 1))
     normal, apart, size = at_node[:, :d], at_node[:, d : 2 * d], at_node[:, -1]
     notched = np.einsum("ni,ni->n", apart, normal) > TIP.notch_sine * size * np.linalg.norm(normal, axis=1)
     weights = (size > 0)[nodes].astype(float)
     weights[~weights.any(axis=1)] = 1.0
     points = np.einsum("nk,nki->ni", weights, X[nodes]) / weights.sum(axis=1)[:, None]
     return StartPlaces(points, weights, notched[nodes].any(axis=1))
-
-
-def _area_normals(corners: Values) -> Values:
-    """Return vectors (n, d) across facets with corners (n, d, d), as long as their area, m^(d - 1)."""
-    sides = corners[:, 1:] - corners[:, :1]
-    if corners.shape[1] == 2:
-        return np.column_stack([sides[:, 0, 1], -sides[:, 0, 0]])
-    return np.asarray(np.cross(sides[:, 0], sides[:, 1]) / 2)
 
 
 def average_at_nodes(domain: Domain, values: Values, cells: Ints, weights: Values) -> Values:
@@ -122,15 +111,8 @@ def average_at_nodes(domain: Domain, values: Values, cells: Ints, weights: Value
         cells: (n,) cells.
         weights: (n, d + 1) of their corners.
     """
-    nodes, volumes = domain.cell_nodes, domain.volumes
-    columns = np.column_stack([values * volumes[:, None], volumes])
-    sums = la.vector(domain.space.dofmap.index_map, columns.shape[1], np.float64)
-    at_node = sums.array.reshape(-1, columns.shape[1])
-    for column, total in zip(columns.T, at_node.T, strict=True):
-        total[:] = np.bincount(nodes.ravel(), np.repeat(column, nodes.shape[1]), len(at_node))
-    # Sums of ghost nodes are added to their owners, then copied back.
-    sums.scatter_reverse(la.InsertMode.add)
-    sums.scatter_forward()
+    nodes, volumes = domain.cell_nodes, domain.volumes[:, None]
+    at_node = sum_at_nodes(domain, nodes, np.concatenate([values * volumes, volumes], axis=1))
     at_corners = at_node[nodes[cells]]
     mean = at_corners[..., :-1] / at_corners[..., -1:]
     return np.asarray(np.einsum("nc,nck->nk", weights, mean) / weights.sum(axis=1)[:, None])

@@ -7,11 +7,11 @@ from math import factorial, prod
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import la
 from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from ...mesh.domain import Domain
+from ...mesh.ghost_exchange import sum_at_nodes
 from ...mesh.parallel import RankHalo, alltoall
 
 Ints = npt.NDArray[np.int64]
@@ -59,12 +59,7 @@ class RemoteCellValues:
 def local_mesh_size(domain: Domain) -> Values:
     """Return h = (d! V)^(1/d) (cells,), m, V the mean volume of the cells around the corners (collective)."""
     volumes, nodes = domain.volumes, domain.cell_nodes
-    sums = la.vector(domain.space.dofmap.index_map, 2, np.float64)
-    rows = sums.array.reshape(-1, 2)
-    np.add.at(rows, nodes.ravel(), np.repeat(np.column_stack([volumes, np.ones(len(volumes))]), nodes.shape[1], axis=0))
-    # Sums of ghost nodes are added to their owners, then copied back.
-    sums.scatter_reverse(la.InsertMode.add)
-    sums.scatter_forward()
+    rows = sum_at_nodes(domain, nodes, np.column_stack([volumes, np.ones(len(volumes))]))
     at_corners = rows[nodes]
     mean = (at_corners[..., 0] / at_corners[..., 1]).mean(axis=1)
     return np.asarray((factorial(domain.dim) * mean) ** (1 / domain.dim))
