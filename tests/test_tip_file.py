@@ -10,6 +10,7 @@ import pytest
 from mpi4py import MPI
 
 from fracsim.deformable_run import Run
+from fracsim.output.tip_file import pair_nearest_first
 from fracsim.scene import build_scene
 from fracsim.studies.evidence.run_results import columns
 from support.ranks import OnRanks, Results, starting
@@ -68,6 +69,22 @@ def test_a_file_with_other_columns_is_kept_beside(tmp_path: Path) -> None:
     run.step()
     assert (tmp_path / "out" / "tips.csv.unreadable").exists()
     assert columns(tmp_path / "out" / "tips.csv")["step"].tolist() == [2, 2]
+
+
+@pytest.mark.parametrize("count", [0, 1, 40, 300])
+def test_tips_are_paired_nearest_first(count: int) -> None:
+    """As by sorting all pairs of points of the same crack, where some have no partner left."""
+    rng = np.random.default_rng(count)
+    last, points = rng.random((count, 3)), rng.random((count + count // 3, 3))
+    last_crack, crack = rng.integers(4, size=len(last)), rng.integers(5, size=len(points))
+    distance = np.linalg.norm(points[:, None] - last, axis=2)
+    expected, taken = np.full(len(points), -1), set[int]()
+    for k, row in sorted(np.ndindex(distance.shape), key=lambda pair: float(distance[pair])):
+        if crack[k] == last_crack[row] and expected[k] < 0 and row not in taken:
+            expected[k] = row
+            taken.add(row)
+    np.testing.assert_array_equal(pair_nearest_first(last, last_crack, points, crack), expected)
+    assert len(taken) < len(points) or not count
 
 
 @pytest.fixture(scope="module")

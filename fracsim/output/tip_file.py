@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from ..fracture.energy.tip_record import TipRecord
 from ..mesh.parallel import allgather
@@ -156,24 +157,41 @@ class TipFile:
             lines.append(",".join([*numbers, *(f"{value:.12g}" for value in measured)]) + "\r\n")
         return "".join(lines)
 
-    def _follow(self, cells: Ints, points: Values, crack: Ints) -> list[int]:
+    def _follow(self, cells: Ints, points: Values, crack: Ints) -> Ints:
         """Return the numbers (n,) of tips: that of the nearest tip of the last rows in the same crack, or a new one."""
         assert self._cracks is not None
-        numbers = list(self._tips)
-        last_crack = self._cracks.find(np.array([self._tips[number].cell for number in numbers], np.int64))[0]
-        pairs = sorted(
-            (float(np.linalg.norm(points[k] - self._tips[number].course[-1][1])), number, k)
-            for number, in_crack in zip(numbers, last_crack, strict=True)
-            for k in np.flatnonzero(crack == in_crack)
-        )
-        tips: dict[int, int] = {}
-        for _, number, k in pairs:
-            if k not in tips and number not in tips.values():
-                tips[int(k)] = number
+        last = list(self._tips.values())
+        last_crack = self._cracks.find(np.array([tip.cell for tip in last], np.int64))[0]
+        last_points = np.array([tip.course[-1][1] for tip in last]).reshape(-1, points.shape[1])
+        row = pair_nearest_first(last_points, last_crack, points, crack)
+        tips: Ints = np.array([*self._tips, 0])[row]
+        new = row < 0
+        tips[new] = self._newest + 1 + np.arange(new.sum())
+        self._newest += int(new.sum())
         # A tip that ended is not taken up again by another one.
-        self._tips = {number: tip for number, tip in self._tips.items() if number in tips.values()}
-        for k in range(len(cells)):
-            if k not in tips:
-                tips[k] = self._newest = self._newest + 1
-                self._tips[tips[k]] = TrackedTip()
-        return [tips[k] for k in range(len(cells))]
+        self._tips = {tip: self._tips.get(tip) or TrackedTip() for tip in map(int, np.sort(tips))}
+        return tips
+
+
+def pair_nearest_first(last: Values, last_crack: Ints, points: Values, crack: Ints) -> Ints:
+    """Return for each point (n, d), m, the row of its partner among `last` (m, d), m, or -1.
+
+    Partners are in the same crack, `crack` (n,) and `last_crack` (m,). The nearest two of all pairs become partners
+    first, then the nearest two that are left: mutual nearest neighbours are such pairs.
+    """
+    partner: Ints = np.full(len(points), -1)
+    # One more axis keeps cracks further apart than any two points.
+    apart = 1 + 2 * float(np.linalg.norm(np.concatenate([last, points]), axis=1).max(initial=0.0))
+    old, new = (np.column_stack([x, apart * c]) for x, c in ((last, last_crack), (points, crack)))
+    free_old, free = np.arange(len(old)), np.arange(len(new))
+    while len(free_old) and len(free):
+        distance, row = cKDTree(old[free_old]).query(new[free])
+        is_near = distance < apart
+        if not is_near.any():
+            break
+        mutual = is_near & (cKDTree(new[free]).query(old[free_old])[1][row] == np.arange(len(free)))
+        # Equal distances may leave no mutual pair: the first one of the nearest is made.
+        mutual[np.argmin(distance)] |= not mutual.any()
+        partner[free[mutual]] = free_old[row[mutual]]
+        free_old, free = np.delete(free_old, row[mutual]), free[~mutual]
+    return partner
