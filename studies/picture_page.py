@@ -12,8 +12,9 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
+from multiprocessing import get_context
 from pathlib import Path
 
 MAX_PICTURE_BYTES = 300_000  # bytes of a picture
@@ -80,7 +81,9 @@ class PicturePage:
         runs = dict(run for entry in wanted for run in entry.runs)
         with ThreadPoolExecutor(asked.jobs) as pool:
             list(pool.map(lambda run: run_study(*run, again=asked.again), runs.items()))
-            list(pool.map(draw_picture, wanted))
+        # Processes load the library of pictures once, not once a picture.
+        with ProcessPoolExecutor(asked.jobs, mp_context=get_context("spawn")) as processes:
+            list(processes.map(draw_picture, wanted))
         drawn = [entry for entry in self.entries if picture_path(entry).exists()]
         self.path.write_text(self.head + "".join(self._section(entry) for entry in drawn), encoding="utf-8")
         for folder in runs:
@@ -142,6 +145,8 @@ def draw_commands(entry: PictureEntry, file: str) -> list[str]:
 
 def draw_picture(entry: PictureEntry) -> None:
     """Draw the picture of an entry."""
+    from ..cli import app
+
     target = picture_path(entry)
     if not entry.runs:
         subprocess.run([sys.executable, "-m", entry.render, str(target)], check=True)
@@ -149,7 +154,7 @@ def draw_picture(entry: PictureEntry) -> None:
     folders = [str(RUNS / folder) for folder, _ in entry.runs]
     rows = [RUNS / f"{entry.name}-{row}{target.suffix}" for row in range(len(entry.below) + 1)]
     for render, row in zip((entry.render, *entry.below), rows, strict=True):
-        subprocess.run(["fracsim", "render", *folders, "-o", str(row), *shlex.split(render)], check=True)
+        app(["render", *folders, "-o", str(row), *shlex.split(render)], standalone_mode=False)
     if len(rows) == 1:
         shutil.move(rows[0], target)
     else:
