@@ -63,7 +63,7 @@ def edges_of(cells: Indices) -> Indices:
     return distinct_rows(pairs)[0]
 
 
-def links_in(cells: Indices) -> Indices:
+def links_in(cells: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
     """(m d, 2) pairs of nodes that connect the nodes of each cell."""
     return np.stack([np.repeat(cells[:, 0], cells.shape[1] - 1), cells[:, 1:].ravel()], axis=1)
 

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -21,6 +22,7 @@ from fracsim.mesh.split_surface.local_surface import LocalSurface
 from fracsim.output.fracture_log import FractureLog
 from fracsim.studies.evidence.precision.manufactured_solution import relative_errors, solve
 from fracsim.study.check import check_study
+from fracsim.study.mesh_source import build_mesh
 from fracsim.timestepping.stable_time_step import cell_frequencies
 from support.scenes import make_scene, make_study, march
 
@@ -102,6 +104,23 @@ def test_vtk_reads_curved_cells(tmp_path: Path) -> None:
     rim = np.count_nonzero(np.abs(np.linalg.norm(points, axis=1) - 1) < 1e-12)
     assert rim % 2 == 0 and rim >= 24
     np.testing.assert_allclose(moved - points, np.broadcast_to([1e-3, 0.0, 0.0], points.shape), atol=1e-12)
+
+
+@pytest.mark.parametrize("size", [[1.0, 0.5], [1.0, 0.5, 0.5]])
+def test_middles_in_fields_h5_are_in_the_order_of_vtk(tmp_path: Path, size: list[float]) -> None:
+    """Each half-way along the edge that vtkQuadraticTriangle and vtkQuadraticTetra have at its place."""
+    study = make_study(
+        mesh={"builder": "box", "size": size, "h": 0.25, "order": 2}, output={"picture": False},
+        time={"scheme": "explicit", "step": 1e-3, "end": 1e-3},
+    )  # fmt: skip
+    run_study(MPI.COMM_SELF, study, tmp_path / "out")
+    with h5py.File(tmp_path / "out" / "fields.h5") as file:
+        points, cells = file["points"][:], file["cells"][:]
+    d, mesh = len(size), build_mesh(study.mesh)
+    ends = [(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)][: 3 * (d - 1)]
+    np.testing.assert_array_equal(cells[:, : d + 1], mesh.cells)
+    np.testing.assert_array_equal(points[: len(mesh.points), :d], mesh.points)
+    np.testing.assert_allclose(points[cells[:, d + 1 :]], points[cells[:, ends]].mean(axis=2), atol=1e-15)
 
 
 # --- what it does not go with ---

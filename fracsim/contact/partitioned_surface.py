@@ -269,8 +269,9 @@ class PartitionedSurface:
             return
         is_cut = [max_over_ranks(comm, len(part.cut_elements(positions, count))) for part in surface.parts]
 
+        mesh = self._domain.input_mesh
+
         def check() -> None:
-            mesh = self._domain.input_mesh
             assert mesh is not None
             for obstacle, cut in zip(self._meshes, is_cut, strict=True):
                 refuse_overlap((mesh.points, boundary_facets(mesh.cells)), obstacle, cut=cut > 0)

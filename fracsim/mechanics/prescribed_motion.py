@@ -13,10 +13,11 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..errors import InputError
-from ..mesh.connected_bodies import describe_free_motion, label_bodies, unsupported_message
+from ..mesh.connected_bodies import describe_free_motion, unsupported_message
 from ..mesh.domain import Domain, Ints
+from ..mesh.fragments import find_bodies
 from ..mesh.parallel import on_root
-from ..meshes.data import MeshData, format_midpoint
+from ..meshes.data import format_midpoint
 from .time_functions import PlacedFunction, TimeFunction
 
 Values = npt.NDArray[np.float64]
@@ -100,17 +101,26 @@ def check_supports(domain: Domain, motion: PrescribedMotion) -> None:
     """
     prescribed = np.zeros(domain.node_count * domain.dim, bool)
     prescribed[motion.owned_dofs] = True
-    flags = domain.input_numbering.gather_nodes(prescribed.reshape(-1, domain.dim))
-    on_root(domain.comm, lambda: _check(domain.input_mesh, flags))
+    bodies, gather_corners = find_bodies(domain), domain.input_numbering.gather_corners
+    rows = domain.nodes, prescribed.reshape(-1, domain.dim), bodies.node_fragment
+    points, flags, body = (gather_corners(values[: domain.node_count]) for values in rows)
+    on_root(domain.comm, lambda: _check(bodies.count, points, flags, body))
 
 
-def _check(mesh: MeshData | None, prescribed: npt.NDArray[np.bool_] | None) -> None:
-    assert mesh is not None and prescribed is not None
-    bodies, body = label_bodies(mesh)
+def _check(bodies: int, points: Values | None, prescribed: Flags | None, body: Ints | None) -> None:
+    """Raise InputError if one of the bodies may move (rank 0).
+
+    Args:
+        bodies: their number.
+        points: (N, d) of the input mesh, m.
+        prescribed: (N, d) flags of prescribed components.
+        body: (N,) that each point belongs to.
+    """
+    assert points is not None and prescribed is not None and body is not None
     for number in range(bodies):
         nodes = body == number
-        free = describe_free_motion(mesh.points[nodes], prescribed[: len(body)][nodes])
+        free = describe_free_motion(points[nodes], prescribed[nodes])
         if free:
-            where = f"the body around {format_midpoint(mesh.points, nodes)}"
+            where = f"the body around {format_midpoint(points, nodes)}"
             which = f"{where} (one of {bodies})" if bodies > 1 else "the body"
             raise InputError(unsupported_message(which, free))

@@ -243,7 +243,7 @@ def _geometry(
     element, nodes = coordinate_element(dim), dim + 1
     if midside_nodes is not None and midside_nodes.curved:
         element, nodes = coordinate_element(dim, 2), (dim + 1) * (dim + 2) // 2
-        data = data and with_midside_nodes(data, midside_nodes, written=False)
+        data = data and with_midside_nodes(data, midside_nodes)
     if data is None:
         return np.empty((0, nodes), np.int64), np.empty((0, dim)), element
     return data.cells, data.points, element

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
-from ..meshes.topology import components
+from ..meshes.topology import components, links_in
 from .domain import Domain
-from .edge_graph import EdgeGraph
 from .ghost_exchange import owner_values
 from .parallel import allgather, rank_offset
+
+if TYPE_CHECKING:
+    from .edge_graph import EdgeGraph
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,11 @@ class Fragments:
 def find_fragments(graph: EdgeGraph) -> Fragments:
     """The fragments of a graph (collective)."""
     return find_components(graph.domain, graph.edge_nodes[~graph.broken])
+
+
+def find_bodies(domain: Domain) -> Fragments:
+    """The bodies of a mesh, which share no node (collective)."""
+    return find_components(domain, links_in(domain.cell_nodes))
 
 
 def find_components(domain: Domain, edges: npt.NDArray[np.integer]) -> Fragments:

@@ -73,24 +73,22 @@ class CellMidsideNodes:
         values[self.nodes] = values[self.ends].mean(axis=1)
 
 
-def with_midside_nodes(data: MeshData, middles: MidsideNodes, *, written: bool) -> MeshData:
-    """The mesh with midside nodes as points, and cells of 6 (2D) or 10 (3D) nodes.
-
-    `written`: nodes of a cell are in the order of VTK and XDMF, otherwise in the order of local edges.
-    """
+def with_midside_nodes(data: MeshData, middles: MidsideNodes) -> MeshData:
+    """The mesh with midside nodes as points, and cells of 6 (2D) or 10 (3D) nodes: corners, then local edges."""
     between = data.points[middles.ends].mean(axis=1) if data.middles is None else data.middles
-    # edges of VTK and XDMF: (0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)
-    file_order = {2: [2, 0, 1], 3: [5, 2, 4, 3, 1, 0]}[data.dim]
-    ends = data.cells[:, local_edges(data.dim)[file_order if written else slice(None)]]
-    cells = np.hstack([data.cells, middles.index_between(ends)])
+    cells = np.hstack([data.cells, middles.index_between(data.cells[:, local_edges(data.dim)])])
     return replace(data, points=np.concatenate([data.points, between]), cells=cells)
 
 
-def mesh_of_nodes(domain: Domain) -> MeshData | None:
-    """The input mesh on rank 0, with midside nodes for quadratic displacement; None elsewhere."""
-    if domain.midside_nodes is None or domain.input_mesh is None:
-        return domain.input_mesh
-    return with_midside_nodes(domain.input_mesh, domain.midside_nodes, written=True)
+def file_cell_nodes(domain: Domain) -> Ints:
+    """(cells, n) numbers in the input mesh of the nodes of the owned cells, in the order of VTK and XDMF."""
+    nodes = domain.input_numbering.nodes[domain.all_cell_nodes]
+    if domain.order == 1:
+        return nodes
+    # edges of VTK and XDMF: (0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)
+    file_order = {2: [2, 0, 1], 3: [5, 2, 4, 3, 1, 0]}[domain.dim]
+    corners, midside = np.split(nodes, [domain.dim + 1], axis=1)
+    return np.hstack([corners, midside[:, file_order]])
 
 
 def find_midside_nodes(comm: MPI.Comm, data: MeshData | None) -> MidsideNodes:

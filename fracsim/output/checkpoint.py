@@ -21,6 +21,7 @@ from ..errors import InputError, NotConverged
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
 from ..mesh.parallel import Gather, bcast, on_root, sum_over_ranks
+from ..meshes.data import MeshData
 from ..timestepping.state import State
 from .atomic_write import write_on_root
 from .checkpoint_file import (
@@ -104,8 +105,8 @@ def write_checkpoint(
         arrays["broken"], arrays["breaks"] = record.to_checkpoint() or (None, None)
     if surfaces is not None:
         arrays["starts"] = surfaces.starts
-    path = checkpoint_path(folder)
-    write_on_root(comm, path, lambda: write_checkpoint_file(path, arrays, clock, domain.input_mesh, notes))
+    path, mesh = checkpoint_path(folder), domain.input_mesh
+    write_on_root(comm, path, lambda: write_checkpoint_file(path, arrays, clock, mesh, notes))
     return path
 
 
@@ -171,7 +172,8 @@ def read_checkpoint(
     if surfaces is not None:
         shapes["starts"] = ()
     checks = _ContentChecks(shapes, nodes, cell_count, fracture=record is not None, plasticity=plastic is not None)
-    stored = on_root(comm, lambda: _read_checked(folder, domain, checks))
+    mesh = domain.input_mesh
+    stored = on_root(comm, lambda: _read_checked(folder, mesh, checks))
     message, arrays = None, {} if stored is None else stored.arrays
     if stored is not None:
         replicated: dict[str, Any] = {name: arrays.get(name) for name in _REPLICATED}
@@ -316,10 +318,10 @@ def _clock_problem(clock: dict[str, Any], arrays: dict[str, npt.NDArray[Any]]) -
     return ""
 
 
-def _read_checked(folder: Path, domain: Domain, checks: _ContentChecks) -> StoredCheckpoint:
+def _read_checked(folder: Path, mesh: MeshData | None, checks: _ContentChecks) -> StoredCheckpoint:
     """Checkpoint that passed all checks (rank 0). Raises InputError."""
     stored = read_checkpoint_file(folder)
-    check_mesh(stored, domain.input_mesh)
+    check_mesh(stored, mesh)
     checks(stored)
     return stored
 

@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..meshes.data import MeshData
 from ..meshes.plain_files import atomic_replacement, find_external_data
 from .atomic_write import HDF5_OVERHEAD_BYTES, append_bytes, open_hdf5, replace_text, writable_hdf5
 from .compressed_rows import COMPRESSION_LEVEL, ROWS_PER_CHUNK, CompressedField
@@ -65,12 +64,15 @@ class FieldsFile:
         times: times of the frames, s.
     """
 
-    def __init__(self, folder: Path, mesh: MeshData, resume_at: float | None = None) -> None:
+    def __init__(
+        self, folder: Path, points: CompressedField, cells: CompressedField, resume_at: float | None = None
+    ) -> None:
         """Open the files.
 
         Args:
             folder: output folder.
-            mesh: input mesh.
+            points: (n, 3) nodes of the input mesh, m.
+            cells: (m, k) nodes of its cells.
             resume_at: keep the frames up to this time, s; None: a new run.
 
         Raises:
@@ -78,21 +80,21 @@ class FieldsFile:
             OSError: the files cannot be written.
         """
         self.xdmf, self.h5 = folder / "fields.xdmf", folder / "fields.h5"
-        self._mesh = mesh
+        self._points_shape, self._cells_shape = points.shape, cells.shape
         self.times: list[float] = []
         grids = ""
         if resume_at is not None and self.h5.exists():
             grids = self._resume(resume_at)
         else:
-            self._create()
+            self._create(points, cells)
         replace_text(self.xdmf, _HEAD + grids + _TAIL)
 
-    def _create(self) -> None:
+    def _create(self, *mesh: CompressedField) -> None:
         """Create fields.h5 with the mesh and without frames."""
-        size = 2 * self._mesh.points.nbytes + self._mesh.cells.nbytes + 3 * HDF5_OVERHEAD_BYTES
+        size = HDF5_OVERHEAD_BYTES + sum(map(_stored_bytes, mesh))
         with atomic_replacement(self.h5) as temporary, writable_hdf5(temporary, size, new=True) as file:
-            _create_compressed(file, "points", pad_to_3d(self._mesh.points))
-            _create_compressed(file, "cells", self._mesh.cells.astype(np.int32))
+            for field in mesh:
+                _create_compressed(file, field)
             file.create_group("frames")
 
     def _resume(self, until: float) -> str:
@@ -146,9 +148,7 @@ class FieldsFile:
             frame = file["frames"].create_group(name)
             frame.attrs["time"] = t
             for field in fields:
-                data = frame.create_dataset(field.name, field.shape, field.dtype, **_filters(field.shape))
-                for number, chunk in enumerate(field.chunks):
-                    data.id.write_direct_chunk((number * data.chunks[0], *(0 for _ in field.shape[1:])), chunk)
+                data = _create_compressed(frame, field)
                 data.attrs["centre"] = field.centre
                 if is_tensor(field):
                     data.attrs[COMPONENTS_ATTRIBUTE] = _COMPONENT_NAMES
@@ -158,12 +158,12 @@ class FieldsFile:
         """XML of one frame; its time is added to `times`."""
         self.times.append(t)
         attributes = "".join(self._attribute(name, field) for field in fields)
-        nodes = self._data_item("points", (len(self._mesh.points), 3))
-        topology = _TOPOLOGY_TYPES[self._mesh.cells.shape[1]]
+        nodes = self._data_item("points", self._points_shape)
+        topology = _TOPOLOGY_TYPES[self._cells_shape[1]]
         return (
             f'      <Grid Name="body" GridType="Uniform">\n        <Time Value="{t:.12g}"/>\n'
-            f'        <Topology TopologyType="{topology}" NumberOfElements="{len(self._mesh.cells)}">'
-            f"{self._data_item('cells', self._mesh.cells.shape, 'Int')}</Topology>\n"
+            f'        <Topology TopologyType="{topology}" NumberOfElements="{self._cells_shape[0]}">'
+            f"{self._data_item('cells', self._cells_shape, 'Int')}</Topology>\n"
             f'        <Geometry GeometryType="XYZ">{nodes}</Geometry>\n'
             f"{attributes}      </Grid>\n"
         )
@@ -243,9 +243,12 @@ def rounded(values: npt.NDArray[np.generic], precision: str) -> npt.NDArray[np.g
         return values.astype(np.float32)
 
 
-def _create_compressed(group: Any, name: str, values: npt.NDArray[np.generic]) -> Any:
-    """New data set of an HDF5 group, compressed. Other levels of gzip take longer and save 3 %."""
-    return group.create_dataset(name, data=values, **_filters(values.shape))
+def _create_compressed(group: Any, field: CompressedField) -> Any:
+    """New data set of an HDF5 group."""
+    data = group.create_dataset(field.name, field.shape, field.dtype, **_filters(field.shape))
+    for number, chunk in enumerate(field.chunks):
+        data.id.write_direct_chunk((number * data.chunks[0], *(0 for _ in field.shape[1:])), chunk)
+    return data
 
 
 def _filters(shape: tuple[int, ...]) -> dict[str, Any]:

@@ -8,8 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mechanics.stress import Stress
-from ..mesh.connected_bodies import label_bodies
-from ..mesh.domain import Domain
+from ..mesh.fragments import Fragments, find_bodies, find_fragments
 from ..mesh.ghost_exchange import with_ghosts
 from ..mesh.parallel import sum_over_ranks
 
@@ -18,7 +17,6 @@ if TYPE_CHECKING:
     from ..fracture.criterion import FractureCriterion
     from ..fracture.edge_history import EdgeHistory
     from ..fracture.fracture_pass import FracturePass
-    from ..mesh.fragments import Fragments
 
 
 class FractureLog:
@@ -61,7 +59,7 @@ class FractureLog:
                 self.record.record_breaks(0.0, breaking.initial_cuts)
             self.update_counts()
         else:
-            self.counts = (0, 0, _count_bodies(self._domain))
+            self.counts = (0, 0, find_bodies(self._domain).count)
 
     def record_breaks(self, t: float) -> None:
         """Record the edges that broke since the last call, at time t in s, and find the fragments (collective)."""
@@ -95,8 +93,6 @@ class FractureLog:
         counts = np.array([graph.broken_count, np.count_nonzero(graph.split), changed])
         broken, split, changed_ranks = sum_over_ranks(self._domain.comm, counts)
         if self.fragments is None or changed_ranks:
-            from ..mesh.fragments import find_fragments
-
             self.fragments, self._broken = find_fragments(graph), graph.broken.copy()
         self.counts = int(broken), int(split), self.fragments.count
 
@@ -127,8 +123,3 @@ class FractureLog:
         # ends in the order of the input mesh, so that a cut does not depend on the partition
         swap = domain.input_numbering.nodes[ends[:, 0]] > domain.input_numbering.nodes[ends[:, 1]]
         return cut_positions_from_forces(force, np.where(swap[:, None], ends[:, ::-1], ends))
-
-
-def _count_bodies(domain: Domain) -> int:
-    """Number of bodies of the mesh that share no node (collective)."""
-    return int(domain.comm.bcast(label_bodies(domain.input_mesh)[0] if domain.input_mesh is not None else None))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from ..mechanics.balance import Balance
 from ..mechanics.jit import CellExpression
 from ..mechanics.stress import Stress
 from ..mechanics.term_protocols import OutputSurfaces, SurfaceSeparator, fulfilling
-from ..mesh.midside_nodes import mesh_of_nodes
+from ..mesh.midside_nodes import file_cell_nodes
 from ..timestepping.state import State
 from .atomic_write import write_on_root
 from .compressed_rows import CompressedField, RowCompressor
@@ -182,17 +183,16 @@ class FrameFiles:
         """
         stress = balance.stress
         self._comm, self._path, self._breaks = stress.domain.comm, folder / "fields.xdmf", breaks
-        self._evaluate, mesh = FieldEvaluator(stress, fields, breaking), mesh_of_nodes(stress.domain)
-        self.fields = write_on_root(
-            self._comm,
-            self._path,
-            lambda: FieldsFile(folder, mesh, resume_at) if mesh else None,
-        )
-        self._precision, numbering = precision, stress.domain.input_numbering
+        self._evaluate = FieldEvaluator(stress, fields, breaking)
+        domain, numbering = stress.domain, stress.domain.input_numbering
         self._compressors = {
             "Node": RowCompressor(self._comm, numbering.nodes[: numbering.owned_nodes]),
             "Cell": RowCompressor(self._comm, numbering.cells),
         }
+        points = self._compressed(Field("points", "Node", pad_to_3d(domain.nodes)))
+        cells = self._compressed(Field("cells", "Cell", file_cell_nodes(domain).astype(np.int32)))
+        self.fields = write_on_root(self._comm, self._path, lambda: FieldsFile(folder, points, cells, resume_at))
+        self._precision = precision
         self.surface = None
         if surface:
             self.surface = surface_output(
@@ -218,8 +218,11 @@ class FrameFiles:
 
     def _compress(self, field: Field) -> CompressedField:
         """The field as it is written, complete on rank 0 (collective). Vectors have three components."""
-        compressor = self._compressors[field.centre]
-        values = rounded(pad_to_3d(field.values), self._precision)
+        return self._compressed(replace(field, values=rounded(pad_to_3d(field.values), self._precision)))
+
+    def _compressed(self, field: Field) -> CompressedField:
+        """The field with the values that it has, complete on rank 0 (collective)."""
+        compressor, values = self._compressors[field.centre], field.values
         shape = (compressor.rows, *values.shape[1:])
         return CompressedField(field.name, field.centre, shape, values.dtype, compressor(values) or [])
 

@@ -15,6 +15,7 @@ from ...mechanics.stress import Stress
 from ...mesh.edge_graph import EdgeGraph
 from ...mesh.parallel import from_root, gather, sum_over_ranks
 from ...mesh.simplices import local_edges
+from ...meshes.data import MeshData
 from ..criterion import CellAverage, Edges, IntactEdgeStress
 from ..principal_stress import first_principal_stress, principal_stress_bound, symmetric_tensors
 from ..strength import EdgeStrength
@@ -90,8 +91,8 @@ class BrittleSurfaces:
             return none
         parts = gather(self._domain.comm, load)
         field = self._cell_fields(self._carried.average_all(carried, active)) if self._parameters.curved else None
-        broken = self._graph.broken_keys()
-        opened: OpenedSurfaces = from_root(self._domain.comm, lambda: self._open_on_root(parts, broken, field))
+        broken, mesh = self._graph.broken_keys(), self._domain.input_mesh
+        opened: OpenedSurfaces = from_root(self._domain.comm, lambda: self._open_on_root(mesh, parts, broken, field))
         self.starts = np.concatenate([self.starts, opened.starts])
         edges = self._store_cuts(opened)
         return edges, np.ones(len(edges))
@@ -165,13 +166,15 @@ class BrittleSurfaces:
         fields = stress, self._gradients(cells), self._cell_strength(cells)
         return tuple(self._domain.input_numbering.gather_cells(values) for values in fields)
 
-    def _open_on_root(self, parts: Any, broken: Any, field: tuple[Any, ...] | None) -> OpenedSurfaces:
+    def _open_on_root(
+        self, mesh: MeshData | None, parts: Any, broken: Any, field: tuple[Any, ...] | None
+    ) -> OpenedSurfaces:
         """Open the surfaces of the pass, on rank 0, from the overloaded cells of all ranks."""
         # The topology of the input mesh is built when the first surface starts.
         if self._surface_pass is None:
-            assert self._domain.input_mesh is not None
+            assert mesh is not None
             retain_nodes = self._stress.chi is not None
-            self._surface_pass = SurfacePass(self._domain.input_mesh, self._parameters, self.spacing, retain_nodes)
+            self._surface_pass = SurfacePass(mesh, self._parameters, self.spacing, retain_nodes)
         names = OverloadedCells.__annotations__
         load = OverloadedCells(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
         # In the order of the input mesh, whatever the ranks.

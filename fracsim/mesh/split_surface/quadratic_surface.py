@@ -79,11 +79,11 @@ def _midside_nodes(domain: Domain, cell: Ints, low: Ints, high: Ints) -> Ints:
 def subdivided_input_mesh(domain: Domain) -> MeshData | None:
     """The input mesh on rank 0, None elsewhere; for quadratic displacement its cells are divided, without groups.
 
-    Its points are numbered by `Domain.input_numbering.nodes`.
+    Collective. Its points are numbered by `Domain.input_numbering.nodes`.
     """
     if domain.midside_nodes is None or domain.input_mesh is None:
         return domain.input_mesh
-    whole = with_midside_nodes(domain.input_mesh, domain.midside_nodes, written=False)
+    whole = with_midside_nodes(domain.input_mesh, domain.midside_nodes)
     cells = _subdivide(_node_table(*np.split(whole.cells, [domain.dim + 1], axis=1)))
     return MeshData(whole.points, orient_cells(whole.points, cells)[0])
 

@@ -71,10 +71,12 @@ class SurfaceOutput:
         )
         broken = self.record.gather_broken() if self.record is not None else None
 
+        mesh = domain.input_mesh
+
         def open_files() -> tuple[BodySurface, SurfaceFiles | None]:
-            assert domain.input_mesh is not None and cell_density is not None
+            assert mesh is not None and cell_density is not None
             files = None if folder is None else SurfaceFiles(folder, domain.dim, resume_at, precision=precision)
-            surface = BodySurface(domain.input_mesh, cell_density, smooth=smooth)
+            surface = BodySurface(mesh, cell_density, smooth=smooth)
             if broken is not None and files is not None and resume_at is not None:
                 edges, history = broken
                 surface.replay_fragment_names(surface.skeleton.edge_values(edges, history[:, 0]), files.times)
@@ -152,11 +154,11 @@ class SurfaceOutput:
             has_element |= self.record.graph.pattern != 0
         cells, owned = np.flatnonzero(has_element), [field for field in fields if field.centre == "Cell"]
         parts = gather(domain.comm, (domain.input_numbering.cells[cells], [field.values[cells] for field in owned]))
-        if parts is None or domain.input_mesh is None:
+        if parts is None:
             return []
-        result = []
+        result, cell_count = [], domain.mesh.topology.index_map(domain.dim).size_global
         for number, field in enumerate(owned):
-            values = np.zeros((len(domain.input_mesh.cells), *field.values.shape[1:]), field.values.dtype)
+            values = np.zeros((cell_count, *field.values.shape[1:]), field.values.dtype)
             for index, rows in parts:
                 values[index] = rows[number]
             result.append(replace(field, values=values))
@@ -164,7 +166,5 @@ class SurfaceOutput:
 
     def _corner_values(self, gathered: list[Any]) -> list[Any]:
         """Nodal values at the corners of quadratic cells only: the surface has straight cells (rank 0)."""
-        source = self._domain.input_mesh
-        if self._domain.order == 1 or source is None:
-            return gathered
-        return [values[: len(source.points)] for values in gathered]
+        midside_nodes = self._domain.midside_nodes
+        return gathered if midside_nodes is None else [values[: midside_nodes.points] for values in gathered]
