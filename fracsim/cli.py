@@ -130,7 +130,7 @@ def check(study: StudyPath, set_: Set = _NONE) -> None:
 @app.command()
 def mesh(
     study: StudyPath,
-    out: Annotated[Path, typer.Option("-o", "--out", help="mesh file: .vtu, .xdmf, .msh, ...")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="mesh file: .vtkhdf, .msh, .vtu, ...")],
     set_: Set = _NONE,
 ) -> None:
     """Build and save the mesh of a study, print its quality."""

@@ -6,6 +6,7 @@
     surfaces.fill.fill_surface("part.stl", h=0.01)          tetrahedra inside a closed surface
     check.check_mesh(mesh)                                  faults mended or refused
     quality.mesh_quality(mesh)                              quality measures
+    vtkhdf.find_file_mesh("part.vtkhdf")                    arrays of a file, of which ranks read their shares
 
 The package needs NumPy only; gmsh, meshio and SciPy are imported by the functions that use them.
 """

@@ -9,7 +9,17 @@ import numpy as np
 
 from .data import Indices, MeshData, MeshError, Points, format_midpoint, format_point, list_some
 from .parameters import LONGEST, SHORTEST
-from .topology import Floats, Mask, components, distinct_rows, links_in, orient_cells, signed_measures, sorted_rows
+from .topology import (
+    Floats,
+    Mask,
+    components,
+    distinct_rows,
+    facet_sides,
+    links_in,
+    orient_cells,
+    signed_measures,
+    sorted_rows,
+)
 
 SAME_PLACE = 1e-6  # distance over the size of the mesh within which nodes coincide
 
@@ -35,11 +45,11 @@ def check_mesh(mesh: MeshData, *, join: bool = False) -> MeshData:
     _check_flat(mesh)
     table = _FacetTable(mesh.cells)
     _check_facets(mesh, table)
-    count, body = label_bodies(mesh)
+    bodies, body = label_bodies(mesh)
+    parts = components(table.pairs(mesh.dim + 1), len(mesh.cells))[0]
     notes = [
         *_check_groups(mesh, table),
-        *_unmerged_nodes(mesh, body),
-        *_body_notes(mesh, table, count, body),
+        *connection_notes(mesh.points, body, bodies, parts),
         *_region_notes(mesh),
     ]
     return replace(mesh, notes=mesh.notes + tuple(notes))
@@ -57,13 +67,8 @@ class _FacetTable:
 
     def __init__(self, cells: Indices) -> None:
         """`cells`: (m, d + 1) positive cells."""
-        nodes = cells.shape[1]
-        # Without a node of a cell in rising order the others are a facet in rising order.
-        ordered = sorted_rows(cells)
-        rows = np.stack([np.delete(ordered, node, axis=1) for node in range(nodes)], axis=1)
-        self.distinct, self.counts, self.index = distinct_rows(rows.reshape(-1, nodes - 1))
-        exchanges = sum((cells[:, i] > cells[:, j]).astype(np.int8) for i in range(nodes) for j in range(i + 1, nodes))
-        sides = 1 - 2 * ((np.asarray(exchanges)[:, None] + np.arange(nodes)) % 2)
+        rows, sides = (np.stack(parts, axis=1) for parts in zip(*facet_sides(cells), strict=True))
+        self.distinct, self.counts, self.index = distinct_rows(rows.reshape(-1, cells.shape[1] - 1))
         self.balance = np.bincount(self.index, sides.ravel())
 
     def cells_at(self, groups: list[Indices]) -> list[Indices]:
@@ -138,19 +143,26 @@ def _check_flat(mesh: MeshData) -> None:
 
 def flat_cells(points: Points, cells: Indices, share: float = 0.0) -> Mask:
     """(m,) whether each cell's measure is zero to round-off, or below a share of its longest edge^d."""
+    bound = measure_bounds(points, cells, single=is_single_precision(points), share=share)
+    return np.abs(signed_measures(points, cells)) <= bound
+
+
+def measure_bounds(points: Points, cells: Indices, *, single: bool, share: float = 0.0) -> Floats:
+    """(m,) measures of cells that are zero to round-off, or a share of the longest edge^d.
+
+    `single`: whether all coordinates of the mesh are numbers of single precision.
+    """
     # Coordinates x are stored to eps |x|, which changes the measure by up to about
     # (d + 1) / (d - 1)! * eps |x| * L^(d - 1) with the longest edge L; the bound is twice that.
-    dim = points.shape[1]
+    dim, eps = points.shape[1], float(np.finfo(np.float32 if single else np.float64).eps)
     largest = np.abs(points).max(axis=1)[cells].max(axis=1)
     longest = _longest_edges(points, cells)
-    minimum = 2 * (dim + 1) * _precision(points) * largest * longest ** (dim - 1)
-    return np.abs(signed_measures(points, cells)) <= np.maximum(minimum, share * longest**dim)
+    return np.maximum(2 * (dim + 1) * eps * largest * longest ** (dim - 1), share * longest**dim)
 
 
-def _precision(points: Points) -> float:
-    """Relative round-off of the coordinates, that of single precision if all of them fit into it."""
-    single = bool(np.array_equal(points, points.astype(np.float32)))
-    return float(np.finfo(np.float32 if single else np.float64).eps)
+def is_single_precision(points: Points) -> bool:
+    """Whether all coordinates are numbers of single precision."""
+    return bool(np.array_equal(points, points.astype(np.float32)))
 
 
 def _check_cells_once(mesh: MeshData) -> None:
@@ -187,9 +199,13 @@ def _check_groups(mesh: MeshData, table: _FacetTable) -> Iterator[str]:
     cells_there = table.cells_at(list(mesh.facet_groups.values()))
     for (name, facets), count in zip(mesh.facet_groups.items(), cells_there, strict=True):
         _refuse_lost(mesh, name, facets, np.flatnonzero(count == 0))
-        inside = int((count > 1).sum())
-        if inside:
-            yield f"{inside} of the {len(facets)} facets of group '{name}' lie inside the body, between two cells."
+        yield from inner_facets_note(name, len(facets), int((count > 1).sum()))
+
+
+def inner_facets_note(name: str, facets: int, inside: int) -> Iterator[str]:
+    """A note of those facets of a group that lie inside the body."""
+    if inside:
+        yield f"{inside} of the {facets} facets of group '{name}' lie inside the body, between two cells."
 
 
 def _refuse_lost(mesh: MeshData, name: str, facets: Indices, lost: Indices) -> None:
@@ -247,12 +263,12 @@ def label_bodies(mesh: MeshData) -> tuple[int, Indices]:
     return components(links_in(mesh.cells), len(mesh.points))
 
 
-def coincident_nodes(mesh: MeshData, body: Indices) -> Indices:
+def coincident_nodes(points: Points, body: Indices) -> Indices:
     """(k, 2) pairs of nodes of different bodies that coincide; `body`: (n,) as of `label_bodies`."""
     from scipy.spatial import cKDTree  # slow to import; most meshes have one body
 
-    reach = SAME_PLACE * float(np.ptp(mesh.points, axis=0).max())
-    pairs: Indices = cKDTree(mesh.points).query_pairs(reach, output_type="ndarray").astype(np.int64)
+    reach = SAME_PLACE * float(np.ptp(points, axis=0).max())
+    pairs: Indices = cKDTree(points).query_pairs(reach, output_type="ndarray").astype(np.int64)
     return pairs[body[pairs[:, 0]] != body[pairs[:, 1]]]
 
 
@@ -267,7 +283,7 @@ def join_bodies(mesh: MeshData) -> MeshData:
     count, body = label_bodies(mesh)
     if count == 1:
         return replace(mesh, notes=(*mesh.notes, "[mesh] join = true: the mesh is one body already."))
-    pairs = coincident_nodes(mesh, body)
+    pairs = coincident_nodes(mesh.points, body)
     if len(pairs) == 0:
         raise MeshError(
             f"[mesh] join = true, and no nodes of the {count} bodies are at the same place (within {SAME_PLACE:g} of "
@@ -302,36 +318,45 @@ def _refuse_cracks(mesh: MeshData, body: Indices, cluster: Indices) -> None:
 # --- noted ----------------------------------------------------------------------------------------------------------
 
 
-def _unmerged_nodes(mesh: MeshData, body: Indices) -> Iterator[str]:
+def connection_notes(points: Points, body: Indices, bodies: int, parts: int) -> Iterator[str]:
+    """Notes of nodes at the same place, of separate bodies, and of parts that an edge or a node only connects.
+
+    Args:
+        points: (n, d) [m].
+        body: (n,) that each point belongs to.
+        bodies: number of bodies, which share no node.
+        parts: number of parts of the mesh that share no facet.
+    """
+    yield from _unmerged_nodes(points, body)
+    yield from _body_notes(points, body, bodies, parts)
+
+
+def _unmerged_nodes(points: Points, body: Indices) -> Iterator[str]:
     """A note of nodes of one body at the same place."""
-    order = np.lexsort((body, *mesh.points.T))
-    same = (np.diff(mesh.points[order], axis=0) == 0).all(axis=1) & (np.diff(body[order]) == 0)
+    order = np.lexsort((body, *points.T))
+    same = (np.diff(points[order], axis=0) == 0).all(axis=1) & (np.diff(body[order]) == 0)
     if same.any():
-        where = mesh.points[order[np.flatnonzero(same)[0]]].tolist()
+        where = points[order[np.flatnonzero(same)[0]]].tolist()
         yield (
             f"{int(same.sum())} nodes lie exactly on another node (the first at {where}) and are not joined: the body "
             "is open there, as along a crack."
         )
 
 
-def _body_notes(mesh: MeshData, table: _FacetTable, by_nodes: int, body: Indices) -> Iterator[str]:
-    """Notes of separate bodies, and of parts that are connected by an edge or node only.
-
-    `by_nodes`: number of bodies that share no node.
-    """
-    by_facets = components(table.pairs(mesh.dim + 1), len(mesh.cells))[0]
-    if by_nodes > 1:
-        yield f"The mesh has {by_nodes} bodies that share no node; each needs its own supports."
-        if len(pairs := coincident_nodes(mesh, body)):
+def _body_notes(points: Points, body: Indices, bodies: int, parts: int) -> Iterator[str]:
+    """Notes of separate bodies, and of parts that are connected by an edge or node only; as `connection_notes`."""
+    if bodies > 1:
+        yield f"The mesh has {bodies} bodies that share no node; each needs its own supports."
+        if len(pairs := coincident_nodes(points, body)):
             yield (
                 f"{len(np.unique(pairs))} nodes coincide with nodes of another body, the first at "
-                f"{format_point(mesh.points[pairs[0, 0]])} m: these bodies touch and are not joined. Where parts of a "
+                f"{format_point(points[pairs[0, 0]])} m: these bodies touch and are not joined. Where parts of a "
                 "file are meant to be one body, give [mesh] join = true."
             )
-    if by_facets > by_nodes:
-        how = "an edge or a node" if mesh.dim == 3 else "a node"
+    if parts > bodies:
+        how = "an edge or a node" if points.shape[1] == 3 else "a node"
         yield (
-            f"{by_facets - by_nodes} parts of the mesh touch the rest in {how} only, not through a facet, and turn "
+            f"{parts - bodies} parts of the mesh touch the rest in {how} only, not through a facet, and turn "
             "there as on a hinge."
         )
 

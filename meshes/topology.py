@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from math import factorial
 
 import numpy as np
@@ -77,6 +77,35 @@ def sorted_rows(rows: Indices) -> Indices:
             pair = columns[lower], columns[column]
             columns[lower], columns[column] = np.minimum(*pair), np.maximum(*pair)
     return np.stack(columns, axis=1)
+
+
+def facet_sides(cells: Indices) -> Iterator[tuple[Indices, Indices]]:
+    """For each node i of the cells (m, d + 1) the facets opposite to it, (m, d) nodes in rising order, and their sides.
+
+    Two positive cells at one facet are on opposite sides of it, (m,) 1 and -1, unless they overlap.
+    """
+    nodes = cells.shape[1]
+    # without a node of a cell in rising order the others are a facet in rising order
+    ordered = sorted_rows(cells)
+    exchanges = sum((cells[:, i] > cells[:, j]).astype(np.int8) for i in range(nodes) for j in range(i + 1, nodes))
+    for node in range(nodes):
+        yield np.delete(ordered, node, axis=1), np.asarray(1 - 2 * ((exchanges + node) % 2), np.int64)
+
+
+def row_keys(rows: Indices) -> Indices:
+    """(k,) hashes of rows (k, w) of whole numbers, from 0 to 2^63 - 1.
+
+    Two different rows of n have one hash with a probability of n^2 / 2^64.
+
+    Source: G. L. Steele, D. Lea, C. H. Flood (2014), Fast splittable pseudorandom number generators (its mixing).
+    """
+    keys: npt.NDArray[np.uint64] = np.full(len(rows), 0x9E3779B97F4A7C15, np.uint64)
+    for column in rows.T:
+        keys ^= column.astype(np.int64).view(np.uint64)
+        keys = (keys ^ (keys >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        keys = (keys ^ (keys >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        keys ^= keys >> np.uint64(31)
+    return (keys >> np.uint64(1)).astype(np.int64)
 
 
 def distinct_rows(rows: Indices) -> tuple[Indices, Indices, Indices]:

@@ -34,6 +34,7 @@ from .vtk_grid import (
     without_ghosts,
 )
 from .vtk_sizes import check_legacy_arrays, check_xml_sizes, declared_in_legacy, declared_in_xml
+from .vtkhdf import read_group_names
 
 MAX_MESSAGE = 300  # characters of VTK's messages
 
@@ -65,7 +66,8 @@ def _read(path: Path) -> MeshFileContents:
         if kind == EXODUS:
             contents = read_exodus(path, head)
         elif kind == HDF or head == HDF5_SIGNATURE:
-            contents = _contents(path, [_hdf_grid(path)])
+            grid, names = _hdf_grid(path)
+            contents = _contents(path, [grid], names)
         elif path.suffix.lower() == ".pvtu":
             contents = _contents(path, _parallel_grids(path))
         else:
@@ -131,8 +133,8 @@ def _vtk_grid(path: Path) -> Grid:
     return grid_arrays(path, reader.GetOutput(), pieces, cells)
 
 
-def _hdf_grid(path: Path) -> Grid:
-    """The grid of a VTKHDF file."""
+def _hdf_grid(path: Path) -> tuple[Grid, dict[int, str]]:
+    """The grid of a VTKHDF file, and the names of its groups by their numbers."""
     import h5py
 
     try:
@@ -148,6 +150,7 @@ def _hdf_grid(path: Path) -> Grid:
             pieces = [int(count) for count in file["VTKHDF/NumberOfPoints"][()].ravel()]
             cells = int(file["VTKHDF/NumberOfCells"][()].sum())
             steps = int(file["VTKHDF/Steps"].attrs["NSteps"]) if "VTKHDF/Steps" in file else 1
+            names = read_group_names(file)
     except MeshError:
         raise
     except (OSError, KeyError, RuntimeError, ValueError, TypeError, AttributeError):
@@ -161,7 +164,7 @@ def _hdf_grid(path: Path) -> Grid:
     reader = vtkHDFReader()
     reader.SetFileName(str(path))
     reader.Update()
-    return grid_arrays(path, reader.GetOutputDataObject(0), pieces, cells)
+    return grid_arrays(path, reader.GetOutputDataObject(0), pieces, cells), names
 
 
 def _parallel_grids(path: Path) -> list[Grid]:
@@ -186,9 +189,10 @@ def _parallel_grids(path: Path) -> list[Grid]:
     return grids
 
 
-def _contents(path: Path, grids: list[Grid]) -> MeshFileContents:
-    """Grids as one, with sets of cells and of points from their arrays."""
+def _contents(path: Path, grids: list[Grid], names: dict[int, str] | None = None) -> MeshFileContents:
+    """Grids as one, with sets of cells and of points from their arrays; `names`: of the numbers of sets."""
     notes: list[str] = []
+    names = names or {}
     grid = grids[0] if len(grids) == 1 else appended_grids(grids)
     if "vtkGhostType" in grid.cell_data:
         grid = without_ghosts(grid, notes)
@@ -196,15 +200,15 @@ def _contents(path: Path, grids: list[Grid]) -> MeshFileContents:
         join_pieces(path, grid, notes)
     blocks, members = blocks_of_cells(path, grid.types, grid.offsets, grid.connectivity)
     cell_data = {name: [values[part] for part in members] for name, values in grid.cell_data.items()}
-    sets, used, tag_notes = tag_sets(cell_data, blocks, lambda tag, _: [f"tag-{tag}"])
+    sets, used, tag_notes = tag_sets(cell_data, blocks, lambda tag, _: [names.get(tag, f"tag-{tag}")])
     point_sets = {name: np.flatnonzero(values) for name, values in grid.point_data.items() if _is_mask(values)}
     hidden = ("vtkGhostType", "GlobalPointIds", "GlobalCellIds", "GlobalNodeId", "GlobalElementId")
-    for kind, names in (
+    for kind, unused in (
         ("cell", [name for name in grid.cell_data if name not in (*used, *hidden)]),
         ("point", [name for name in grid.point_data if name not in (*point_sets, *hidden)]),
     ):
-        if names:
-            notes.append(f"Not used: the {kind} arrays {', '.join(names)}.")
+        if unused:
+            notes.append(f"Not used: the {kind} arrays {', '.join(unused)}.")
     return MeshFileContents(grid.points, blocks, sets, point_sets, notes=(*tag_notes, *notes))
 
 

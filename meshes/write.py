@@ -1,4 +1,4 @@
-"""Mesh files with cells, facets and their groups, written by meshio."""
+"""Mesh files with cells, facets and their groups, VTKHDF written by h5py and the others by meshio."""
 
 from __future__ import annotations
 
@@ -8,12 +8,13 @@ import numpy as np
 
 from .data import MeshData, MeshError
 from .plain_files import NotAPlainFileError, atomic_replacement_of_all
+from .vtkhdf import write_vtkhdf
 
 # Endings of formats that keep cells, facets and groups, and whether groups keep their names. meshio has others, which
 # lose some of these.
 NAMES_ARE_KEPT = {
     ".msh": True, ".vol": True, ".vtu": False, ".vtk": False, ".xdmf": False, ".xmf": False, ".mesh": False,
-    ".meshb": False,
+    ".meshb": False, ".vtkhdf": True,
 }  # fmt: skip
 
 
@@ -54,6 +55,9 @@ def write_mesh(mesh: MeshData, path: Path) -> tuple[str, ...]:
         path.parent.mkdir(parents=True, exist_ok=True)
         options = {"file_format": "gmsh22"} if path.suffix == ".msh" else {}
         with atomic_replacement_of_all(path) as new:  # XDMF has two files
+            if ending == ".vtkhdf":
+                write_vtkhdf(new, points, [mesh.cells, *facets], values, names)
+                return ()
             meshio.Mesh(points, blocks, cell_data=data, field_data=field_data).write(new, **options)
     except NotAPlainFileError as error:
         raise MeshError(f"{path} {error.strerror}; give another name") from None

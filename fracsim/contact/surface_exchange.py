@@ -4,7 +4,7 @@ Each rank marks the cubes of a grid that its elements overlap, grown by a distan
 bounding boxes they overlap. These send the elements that overlap a marked cube, with their points. So two elements
 within the distance are on a common rank, and a rank has all elements at the points of its own elements.
 
-Points and elements are named by keys (closed_surface.row_keys), and lie in an order of the input mesh.
+Points and elements are named by keys (topology.row_keys), and lie in an order of the input mesh.
 
 Source: S. Plimpton and others (1998), Parallel transient dynamics simulations: algorithms for contact detection and
 smoothed particle hydrodynamics, Journal of Parallel and Distributed Computing 50, 104-122.
@@ -22,9 +22,9 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix, vstack
 
 from ..mesh.parallel import allgather, alltoall
-from ..mesh.split_surface.closed_surface import row_keys
 from ..mesh.split_surface.local_surface import restrict_to_used_columns
 from ..mesh.split_surface.surface_map import SurfaceMap
+from ..meshes.topology import row_keys
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -2,6 +2,7 @@
 
 parallel                    collective operations; errors that reach every rank; halos of cells
 domain                      the partitioned mesh: nodes, cells, function spaces, and numbers in the input mesh
+mesh_shares                 meshes in files that all ranks read, each its share
 facets                      named groups of facets, the boundary, neighbouring cells
 midside_nodes               nodes of quadratic displacement
 ghost_exchange              values of nodes, edges and facets that ranks share

@@ -16,7 +16,7 @@ from ..meshes.topology import signed_measures
 from .dolfinx_compat import CachedCellElement, cell_geometry, coordinate_element, create_mesh
 from .facets import Facets, find_group_facets
 from .midside_nodes import CellMidsideNodes, MidsideNodes, find_midside_nodes, with_midside_nodes
-from .parallel import Gather, GatherSubset, bcast, sum_over_ranks
+from .parallel import Gather, GatherSubset, bcast, gather, sum_over_ranks
 
 Ints = npt.NDArray[np.int32]
 Values = npt.NDArray[np.float64]
@@ -98,7 +98,9 @@ class Domain:
         region_names: names of the regions, in the order of `cell_region`.
         cell_region: (cells,) index into region_names of each owned cell, -1 outside all regions.
         bounds: bounding box of the body, over all ranks.
-        input_mesh: the input mesh on rank 0, None elsewhere; output and checkpoints keep its order.
+        notes: messages to the user on the input mesh, on rank 0.
+        whole_mesh: the input mesh on rank 0 that built or read it; None elsewhere, and where ranks read their shares.
+        group_nodes: (k, d) input nodes of the facets of each group in the share of this rank; None without shares.
         midside_nodes: of the input mesh for quadratic displacement; None: displacement is linear.
     """
 
@@ -107,7 +109,9 @@ class Domain:
     region_names: list[str]
     cell_region: npt.NDArray[np.int32]
     bounds: BoundingBox
-    input_mesh: MeshData | None = None
+    notes: tuple[str, ...] = ()
+    whole_mesh: MeshData | None = None
+    group_nodes: dict[str, npt.NDArray[np.int64]] | None = None
     midside_nodes: MidsideNodes | None = None
 
     @property
@@ -203,6 +207,26 @@ class Domain:
         return InputNumbering(self.comm, nodes, cells, self.node_count, point_count)
 
     @cached_property
+    def input_mesh(self) -> MeshData | None:
+        """The input mesh on rank 0, None elsewhere (collective); output and checkpoints keep its order.
+
+        Where ranks read their shares, the mesh is gathered at first use, and stays.
+        """
+        return self.whole_mesh if self.group_nodes is None else self._gather_mesh(self.group_nodes)
+
+    def _gather_mesh(self, group_nodes: dict[str, npt.NDArray[np.int64]]) -> MeshData | None:
+        """The input mesh on rank 0, None elsewhere (collective); displacement is linear."""
+        numbering = self.input_numbering
+        points = numbering.gather_nodes(self.nodes)
+        cells, region = (numbering.gather_cells(rows) for rows in (numbering.nodes[self.cell_nodes], self.cell_region))
+        groups = gather(self.comm, group_nodes)
+        if points is None or cells is None or region is None or groups is None:
+            return None
+        facets = {name: np.concatenate([part[name] for part in groups]) for name in group_nodes}
+        regions = {name: np.flatnonzero(region == number) for number, name in enumerate(self.region_names)}
+        return MeshData(points, cells, facets, regions, self.notes)
+
+    @cached_property
     def volumes(self) -> npt.NDArray[np.float64]:
         """(cells,) volume (2D: area) of each owned cell in the reference configuration, m^d."""
         return np.abs(signed_measures(self.nodes, self.cell_nodes))
@@ -226,14 +250,31 @@ def distribute(comm: MPI.Comm, data: MeshData | None, order: int = 1) -> Domain:
         head = (data.dim, list(data.facet_groups), _region_index(data), list(data.regions), bounds)
     dim, groups, region, region_names, bounds = bcast(comm, head)
     midside_nodes = find_midside_nodes(comm, data) if order == 2 else None
-    mesh = create_mesh(comm, *_geometry(data, midside_nodes, dim))
+    group_nodes = {name: np.empty((0, dim), np.int64) for name in groups} if data is None else data.facet_groups
+    mesh, facets = create_mesh_with_groups(comm, _geometry(data, midside_nodes, dim), group_nodes)
+    owned = owned_input_cells(mesh)
+    local = region[owned] if region_names else np.full(len(owned), -1, np.int32)
+    notes = () if data is None else data.notes
+    return Domain(mesh, facets, region_names, local, bounds, notes, data, midside_nodes=midside_nodes)
+
+
+def create_mesh_with_groups(
+    comm: MPI.Comm,
+    geometry: tuple[npt.NDArray[np.int64], Values, CachedCellElement],
+    group_nodes: dict[str, npt.NDArray[np.int64]],
+) -> tuple[dolfinx.mesh.Mesh, Facets]:
+    """The mesh of DOLFINx and its groups of facets, of which each rank gives some; no facet is given twice."""
+    mesh = create_mesh(comm, *geometry)
+    dim = mesh.topology.dim
     mesh.topology.create_entities(dim - 1)
     mesh.topology.create_connectivity(dim - 1, dim)
-    group_nodes = None if data is None else [np.asarray(data.facet_groups[name]) for name in groups]
-    facets = Facets(mesh, find_group_facets(mesh, groups, group_nodes))
-    owned = mesh.topology.index_map(dim).size_local
-    local = region[mesh.topology.original_cell_index[:owned]] if region_names else np.full(owned, -1, np.int32)
-    return Domain(mesh, facets, region_names, local, bounds, data, midside_nodes)
+    return mesh, Facets(mesh, find_group_facets(mesh, group_nodes))
+
+
+def owned_input_cells(mesh: dolfinx.mesh.Mesh) -> npt.NDArray[np.int64]:
+    """(cells,) number in the input mesh of each owned cell."""
+    count = mesh.topology.index_map(mesh.topology.dim).size_local
+    return np.asarray(mesh.topology.original_cell_index[:count], np.int64)
 
 
 def _geometry(

@@ -35,11 +35,9 @@ class Facets:
     @cached_property
     def neighbours(self) -> Ints:
         """(n, 2) pairs of owned cells that share a facet."""
-        facets = self.cell_facets
-        order = np.argsort(facets, axis=None, kind="stable")
-        twice = np.flatnonzero(np.diff(facets.reshape(-1)[order]) == 0)
-        pairs = np.stack([order[twice], order[twice + 1]], axis=1) // facets.shape[1]
-        return pairs.astype(np.int32)
+        cells = self._topology.connectivity(self._topology.dim - 1, self._topology.dim)
+        first = cells.offsets[:-1][np.diff(cells.offsets) == 2]
+        return np.stack([cells.array[first], cells.array[first + 1]], axis=1)
 
     @cached_property
     def boundary(self) -> Ints:
@@ -55,28 +53,26 @@ class Facets:
         return flags[self.cell_facets]
 
 
-def find_group_facets(
-    mesh: dolfinx.mesh.Mesh, names: list[str], nodes: list[npt.NDArray[np.int64]] | None
-) -> dict[str, Ints]:
-    """Local facets of each group, given on rank 0 by the input nodes of their facets (collective).
+def find_group_facets(mesh: dolfinx.mesh.Mesh, groups: dict[str, npt.NDArray[np.int64]]) -> dict[str, Ints]:
+    """Local facets of each group (collective).
 
-    `names`: of the groups; `nodes`: (facets, d) input nodes of each group, None on other ranks.
+    `groups`: (facets, d) input nodes of some facets of each group; equal facets are on one rank.
     """
     result: dict[str, Ints] = {}
+    names = list(groups)
     # DOLFINx needs as long to find the facets of one group as those of all: each facet is sent once, with a bit for
     # each group. A signed 32-bit integer has 31 bits without the sign.
     groups_per_call = 31
     for first in range(0, len(names), groups_per_call):
-        batch = slice(first, first + groups_per_call)
-        rows, bits = _group_bits(mesh.topology.dim, None if nodes is None else nodes[batch])
-        facets, groups = find_facets(mesh, rows, bits)
-        result |= {name: facets[groups >> bit & 1 == 1] for bit, name in enumerate(names[batch])}
+        batch = names[first : first + groups_per_call]
+        rows, bits = _group_bits(mesh.topology.dim, [groups[name] for name in batch])
+        facets, flags = find_facets(mesh, rows, bits)
+        result |= {name: facets[flags >> bit & 1 == 1] for bit, name in enumerate(batch)}
     return result
 
 
-def _group_bits(dim: int, nodes: list[npt.NDArray[np.int64]] | None) -> tuple[npt.NDArray[np.int64], Ints]:
+def _group_bits(dim: int, groups: list[npt.NDArray[np.int64]]) -> tuple[npt.NDArray[np.int64], Ints]:
     """(n, d) sorted nodes of the distinct facets of all groups, and (n,) a number whose bit k is set in group k."""
-    groups = nodes or []
     rows, _, inverse = distinct_rows(np.sort(np.concatenate([np.empty((0, dim), np.int64), *groups]), axis=1))
     bits = np.zeros(len(rows), np.int32)
     group_bit = np.repeat(1 << np.arange(len(groups), dtype=np.int32), [len(facets) for facets in groups])

@@ -10,7 +10,7 @@ from dolfinx import la
 from dolfinx.common import IndexMap
 from mpi4py import MPI
 
-from .parallel import exchange_rows
+from .parallel import RowRouting, exchange_rows
 
 if TYPE_CHECKING:
     from .domain import Domain
@@ -105,11 +105,8 @@ class KeyedReduction:
         self._comm = comm
         if comm.size == 1:
             return
-        rank = keys % comm.size
-        self._order = np.argsort(rank, kind="stable")
-        self._sent, self._received = np.bincount(rank, minlength=comm.size), np.empty(comm.size, np.int64)
-        comm.Alltoall(self._sent, self._received)
-        arrived = exchange_rows(comm, keys[self._order], self._sent, self._received)
+        self._routing = RowRouting(comm, keys % comm.size)
+        arrived = self._routing.send(keys)
         self._by_key = np.argsort(arrived, kind="stable")
         is_first = np.diff(arrived[self._by_key], prepend=-1) != 0
         self._first = np.flatnonzero(is_first)
@@ -120,9 +117,7 @@ class KeyedReduction:
         """(n, ...) results of an operation on the values (n, ...) of each key on all ranks (collective)."""
         if self._comm.size == 1:
             return values
-        arrived = exchange_rows(self._comm, np.ascontiguousarray(values[self._order]), self._sent, self._received)
+        arrived = self._routing.send(values)
         if len(arrived):
             arrived = operation.reduceat(arrived[self._by_key], self._first, axis=0)[self._group]
-        result = np.empty_like(values)
-        result[self._order] = exchange_rows(self._comm, np.ascontiguousarray(arrived), self._received, self._sent)
-        return result
+        return self._routing.send_back(arrived)

@@ -28,15 +28,17 @@ from ..mechanics.balance import Balance  # noqa: E402
 from ..mechanics.material_fields import MaterialFields  # noqa: E402
 from ..mechanics.prescribed_motion import check_supports  # noqa: E402
 from ..mesh.domain import Domain, distribute  # noqa: E402
-from ..mesh.parallel import on_root  # noqa: E402
+from ..mesh.parallel import from_root, on_root  # noqa: E402
 from ..mesh.selection import nearest_node, select_nodes  # noqa: E402
 from ..meshes.data import MeshData  # noqa: E402
 from ..output.history import ProbeGroup, ProbeReader  # noqa: E402
 from ..solvers.nonlinear_solver import NonlinearSolver  # noqa: E402
 from ..solvers.weak_callbacks import collect_dropped_scenes  # noqa: E402
 from ..study import Study, TimeSettings, solver_options  # noqa: E402
-from ..study.check import build_checked_mesh  # noqa: E402
+from ..study.check import build_checked_mesh, check_initial_overlap, check_summary  # noqa: E402
 from ..study.conditions import check_size, find_selector, initial_motion, obstacle_placements, step_size_function  # noqa: E402
+from ..study.mesh_source import file_scale, find_shared_mesh  # noqa: E402
+from ..study.mesh_summary import summarise_shared_mesh  # noqa: E402
 from ..study.plugins import NO_PHYSICS, Physics, collect_physics  # noqa: E402
 from ..timestepping.inelastic_update import FractureProtocol, NoFracture, PlasticFlowProtocol  # noqa: E402
 from ..timestepping.state import State, initial_velocity  # noqa: E402
@@ -48,6 +50,7 @@ from .terms import TERMS, TermInputs, build_balance, build_material  # noqa: E40
 if TYPE_CHECKING:
     from ..fracture.fracture_pass import FracturePass as EdgeBreaking
     from ..mechanics.contour_integral import ContourIntegral
+    from ..meshes.vtkhdf import FileMesh
 
 __all__ = [
     "TERMS",
@@ -124,9 +127,43 @@ def build_scene(
     if physics is NO_PHYSICS and study.plugin_names:
         physics = collect_physics(study)
     stage("building the mesh" if study.mesh.builder else "reading the mesh")
-    mesh = on_root(comm, lambda: build_checked_mesh(study, given, physics.boundary))
-    stage("sharing the mesh among ranks" if comm.size > 1 else "building the edges of the mesh")
-    return build_scene_on(distribute(comm, mesh, study.mesh.order), study, stage=stage, physics=physics)
+    # rank 0 alone knows whether a mesh is given
+    file = from_root(comm, lambda: find_shared_mesh(study.mesh) if given is None else None)
+    domain = None if file is None else _domain_of_shares(comm, study, file, stage, physics)
+    if domain is None:
+        mesh = on_root(comm, lambda: build_checked_mesh(study, given, physics.boundary))
+        stage(_distribution_stage(comm))
+        domain = distribute(comm, mesh, study.mesh.order)
+    return build_scene_on(domain, study, stage=stage, physics=physics)
+
+
+def _distribution_stage(comm: MPI.Comm) -> str:
+    return "sharing the mesh among ranks" if comm.size > 1 else "building the edges of the mesh"
+
+
+def _domain_of_shares(
+    comm: MPI.Comm, study: Study, file: FileMesh, stage: Callable[[str], None], physics: Physics
+) -> Domain | None:
+    """Return the domain of a mesh of which each rank reads its share; None: rank 0 builds or reads it (collective).
+
+    Raises:
+        InputError: mesh and study do not fit.
+    """
+    # imported here: other studies do not need it
+    from ..mesh.mesh_shares import distribute_shares, read_share
+
+    share = read_share(comm, file, file_scale(study.mesh))
+    if share is None:
+        return None
+    bounds = share.bounds
+    summary = summarise_shared_mesh(share.facet_groups, share.regions, bounds.lower, bounds.upper, share.cell_count)
+    check_summary(study, summary, physics.boundary)
+    stage(_distribution_stage(comm))
+    domain = distribute_shares(comm, share)
+    if study.obstacle:
+        mesh = domain.input_mesh
+        on_root(comm, lambda: None if mesh is None else check_initial_overlap(study, mesh))
+    return domain
 
 
 def build_scene_on(

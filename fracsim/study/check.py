@@ -45,14 +45,14 @@ def check_study(study: Study) -> list[str]:
         InputError: if the study cannot run.
     """
     summary = summarise_source(study, open_surface(study.mesh)) or summarise_mesh(build_mesh(study.mesh))
-    _check(study, summary)
+    check_summary(study, summary)
     near = _find_near_obstacles(study, summary)
     # small meshes are built for the area of loads and for obstacles that may overlap the body
     needs_mesh = near or facet_loads(study, summary.dim)
     if summary.mesh is None and needs_mesh and summary.cell_count <= LIMITS.max_built_cells:
         summary = summary.with_mesh(build_mesh(study.mesh))
     if near and summary.mesh is not None:
-        _check_initial_overlap(study, summary.mesh)
+        check_initial_overlap(study, summary.mesh)
     return list(report_lines(study, summary, near))
 
 
@@ -74,14 +74,36 @@ def build_checked_mesh(
     surface = open_surface(study.mesh) if given is None else None
     summary = summarise_source(study, surface) if given is None else None
     if summary is not None:
-        _check(study, summary, functions)
+        check_summary(study, summary, functions)
         _find_near_obstacles(study, summary)
     mesh = build_mesh(study.mesh, surface) if given is None else check_given_mesh(given)
     if summary is None:
-        _check(study, summarise_mesh(mesh), functions)
-    if study.obstacle:
-        _check_initial_overlap(study, mesh)
+        check_summary(study, summarise_mesh(mesh), functions)
+    check_initial_overlap(study, mesh)
     return with_curved_boundary(study, mesh, find_builder(study.mesh))
+
+
+def check_summary(study: Study, summary: MeshSummary, functions: Sequence[Mapping[str, Any]] = ()) -> None:
+    """Checks a study against what is known of its mesh; `functions` as in `build_checked_mesh`.
+
+    Raises:
+        InputError: if the mesh and the study do not fit together.
+    """
+    _check_groups(study, summary)
+    _check_dimensions(study, summary)
+    conditions = boundary_conditions(study, summary.dim, functions)
+    for condition in conditions[len(study.boundary) :]:
+        _check_selector(f"{condition.key}.on", condition.selector, summary)
+    if not study.time.scheme_class.inertia:
+        _check_translations(conditions, summary.dim)
+
+
+def check_initial_overlap(study: Study, mesh: MeshData) -> None:
+    """Raises InputError if a body overlaps an obstacle at the start."""
+    if study.obstacle:
+        from . import overlap_checks
+
+        overlap_checks.check_initial_overlap(study, mesh)
 
 
 def _find_near_obstacles(study: Study, summary: MeshSummary) -> list[str]:
@@ -91,22 +113,6 @@ def _find_near_obstacles(study: Study, summary: MeshSummary) -> list[str]:
     from .overlap_checks import find_near_obstacles
 
     return find_near_obstacles(study, np.array(summary.lower), np.array(summary.upper))
-
-
-def _check_initial_overlap(study: Study, mesh: MeshData) -> None:
-    from .overlap_checks import check_initial_overlap
-
-    check_initial_overlap(study, mesh)
-
-
-def _check(study: Study, summary: MeshSummary, functions: Sequence[Mapping[str, Any]] = ()) -> None:
-    _check_groups(study, summary)
-    _check_dimensions(study, summary)
-    conditions = boundary_conditions(study, summary.dim, functions)
-    for condition in conditions[len(study.boundary) :]:
-        _check_selector(f"{condition.key}.on", condition.selector, summary)
-    if not study.time.scheme_class.inertia:
-        _check_translations(conditions, summary.dim)
 
 
 def _check_translations(conditions: Sequence[BoundaryCondition], dim: int) -> None:

@@ -26,6 +26,7 @@ from .plugins import PhysicsPart, find_plugin
 if TYPE_CHECKING:
     from ..meshes.random_points.outline_file import PolygonOutline
     from ..meshes.surfaces.closed import ClosedSurface
+    from ..meshes.vtkhdf import FileMesh
 
 
 @dataclasses.dataclass(frozen=True)
@@ -229,6 +230,28 @@ def build_mesh(mesh: MeshSettings, surface: ClosedSurface | None = None) -> Mesh
         return _scaled(check_mesh(data, join=join), mesh)
 
 
+def find_shared_mesh(mesh: MeshSettings) -> FileMesh | None:
+    """Returns where the mesh of a [mesh] table lies in its file, if all ranks can read it. Called on rank 0.
+
+    None if rank 0 has to build or read the mesh.
+
+    Raises:
+        InputError: if the table is invalid.
+    """
+    # bodies that are joined, and midside nodes, are found in the whole mesh
+    if mesh.file is None or mesh.order == 2 or mesh.parameters.get("join"):
+        return None
+    from ..meshes.vtkhdf import find_file_mesh
+
+    _check_source(mesh)
+    return find_file_mesh(mesh.file)
+
+
+def file_scale(mesh: MeshSettings) -> float:
+    """Returns the scale of a mesh from a file, m per unit of length; 1 of any other mesh."""
+    return float(mesh.parameters.get("scale", 1)) if mesh.file is not None else 1.0
+
+
 def check_given_mesh(mesh: MeshData) -> MeshData:
     """Returns a mesh that was handed over, checked. Raises InputError if it is invalid."""
     from ..meshes.check import check_mesh
@@ -239,7 +262,7 @@ def check_given_mesh(mesh: MeshData) -> MeshData:
 
 def _scaled(data: MeshData, mesh: MeshSettings) -> MeshData:
     """A mesh from a file in metres. It is scaled after its check, which recognises single precision by its bits."""
-    scale = float(mesh.parameters.get("scale", 1)) if mesh.file is not None else 1.0
+    scale = file_scale(mesh)
     if scale == 1:
         return data
     check_extent(data.points * scale, f"the mesh, with mesh.scale = {scale:g},")

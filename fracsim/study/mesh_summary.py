@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ..errors import InputError
 from ..mesh.connected_bodies import label_bodies
@@ -19,6 +20,8 @@ from .mesh_source import estimate_filled_cells, find_builder
 
 if TYPE_CHECKING:
     from ..meshes.surfaces.closed import ClosedSurface
+
+Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -110,6 +113,23 @@ def summarise_mesh(mesh: MeshData) -> MeshSummary:
     groups, regions, facets = tuple(mesh.facet_groups), tuple(mesh.regions), partial(_count_facets, mesh)
     h, cells = mean_edge_length(mesh), len(mesh.cells)
     return MeshSummary(mesh.dim, groups, regions, lower, upper, cells, size, h, facets, volume, mesh.notes, mesh)
+
+
+def summarise_shared_mesh(
+    groups: Iterable[str], regions: Iterable[str], lower: Values, upper: Values, cell_count: int
+) -> MeshSummary:
+    """Returns the summary of a mesh that is shared among ranks, without its sizes.
+
+    Args:
+        groups: names of groups of facets.
+        regions: names of regions.
+        lower: (d,) corner of the bounding box, m.
+        upper: (d,) opposite corner, m.
+        cell_count: number of cells of all ranks.
+    """
+    low, high = (tuple(float(x) for x in corner) for corner in (lower, upper))
+    size = f"{cell_count:,} cells"
+    return MeshSummary(len(lower), tuple(groups), tuple(regions), low, high, cell_count, size, np.inf, lambda: "facets")
 
 
 def mean_edge_length(mesh: MeshData) -> float:

@@ -12,7 +12,7 @@ from functools import cache
 import numpy as np
 import numpy.typing as npt
 
-from ...meshes.topology import facets_of
+from ...meshes.topology import facets_of, row_keys
 from ..simplices import local_edges
 from .cut_patterns import CutEntity, CutTable, PatternElements, cut_table, intact_cell_table
 from .entity_numbering import CRACK, EntityNumbering
@@ -160,22 +160,6 @@ def _number_keys(keys: Ints) -> tuple[Ints, Ints]:
     first_position = np.empty(np.count_nonzero(used), np.int64)
     first_position[number[::-1]] = np.arange(len(keys))[::-1]
     return number, first_position
-
-
-def row_keys(rows: Ints) -> Ints:
-    """(k,) hashes of rows (k, w) of whole numbers, from 0 to 2^63 - 1.
-
-    Two different rows of n have one hash with a probability of n^2 / 2^64.
-
-    Source: G. L. Steele, D. Lea, C. H. Flood (2014), Fast splittable pseudorandom number generators (its mixing).
-    """
-    keys: npt.NDArray[np.uint64] = np.full(len(rows), 0x9E3779B97F4A7C15, np.uint64)
-    for column in rows.T:
-        keys ^= column.astype(np.int64).view(np.uint64)
-        keys = (keys ^ (keys >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-        keys = (keys ^ (keys >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-        keys ^= keys >> np.uint64(31)
-    return (keys >> np.uint64(1)).astype(np.int64)
 
 
 @dataclass(frozen=True)
