@@ -25,7 +25,7 @@ LAYERS = tuple(room for floor in FLOORS for room in sorted(floor))
 BELOW = {"errors", "forms", "meshes"}  # what any of them may use
 # modules that the study room uses: those without DOLFINx
 WITHOUT_DOLFINX = {
-    "mesh.connected_bodies",
+    "mesh.free_motion",
     "mesh.selectors",
     "mesh.crack_planes",
     "mechanics.time_functions",

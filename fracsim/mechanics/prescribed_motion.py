@@ -13,9 +13,9 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..errors import InputError
-from ..mesh.connected_bodies import describe_free_motion, unsupported_message
 from ..mesh.domain import Domain, Ints
 from ..mesh.fragments import find_bodies
+from ..mesh.free_motion import describe_free_motion, unsupported_message
 from ..mesh.parallel import on_root
 from ..meshes.data import format_midpoint
 from .time_functions import PlacedFunction, TimeFunction

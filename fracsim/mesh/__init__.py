@@ -12,7 +12,7 @@ simplices                   edges of a triangle or tetrahedron; tables of patter
 small_matrices              arrays of 2 x 2 and 3 x 3 matrices
 edge_graph                  the edges of the mesh, their integrity, and the cells at an edge
 fragments                   connected components of nodes under intact edges
-connected_bodies            bodies of the input mesh; rigid motions that supports leave free
+free_motion                 rigid motions that supports leave free
 node_cells                  cells around nodes, and facet-connected components
 interpenetration            nodes of one fragment in cells of another
 c_library, library_cache    functions in C and the types of their arguments; the folder of compiled libraries

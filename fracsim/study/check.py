@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import InputError
-from ..mesh.connected_bodies import unsupported_message
+from ..mesh.free_motion import unsupported_message
 from ..mesh.selectors import Group, Selector, check_group, check_regions
 from ..meshes.data import AXES, MeshData
 from ..meshes.parameters import MAX_CELLS

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..mesh.connected_bodies import label_bodies
+from ..meshes.check import label_bodies
 from ..meshes.data import MeshData, MeshError, format_point
 from ..meshes.topology import boundary_facets, edges_of, signed_measures
 from . import Study

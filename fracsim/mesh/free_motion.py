@@ -1,20 +1,13 @@
-"""Connected bodies of a mesh, and the rigid motions that supports leave free. DOLFINx is not imported here."""
+"""Rigid motions that the supports of a body leave free. DOLFINx is not imported here."""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
 
-from ..meshes.data import AXES, MeshData
-from ..meshes.topology import components
+from ..meshes.data import AXES
 
 Values = npt.NDArray[np.float64]
-
-
-def label_bodies(mesh: MeshData) -> tuple[int, npt.NDArray[np.int64]]:
-    """The number of bodies that share no node, and (N,) the body of each node."""
-    first = np.repeat(mesh.cells[:, 0], mesh.cells.shape[1] - 1)
-    return components(np.stack([first, mesh.cells[:, 1:].reshape(-1)], axis=1), len(mesh.points))
 
 
 def describe_free_motion(points: Values, held: npt.NDArray[np.bool_]) -> str:
