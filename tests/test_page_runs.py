@@ -26,6 +26,7 @@ COMMAND = r"(?:\./env )?((?:mpirun -n \d+ )?fracsim .*|python3 -m fracsim\..*)"
 # What the pages take as the user's own, and how it is made.
 FILES = {
     "mine.toml": "fracsim new mine.toml --from bar-2d",
+    "part.toml": "fracsim new part.toml --from bar-2d",
     "out/mine": "fracsim run mine.toml -o out/mine",
     "out/a": "fracsim run bar-2d -o out/a",
     "out/b": "fracsim run bar-2d --set mesh.h=0.02 -o out/b",
