@@ -221,6 +221,7 @@ class Run:
             self._forgets = False
         self.interrupt.begin_step()
         self.state, report = self.scene.stepper.advance(self.state)
+        began = time.perf_counter()
         if self.tips is not None:
             self.tips.append(self.state.step, self.state.t)
         if report.broken:
@@ -230,6 +231,7 @@ class Run:
         self.history.append(self.state, report, self.breaks.counts, np.array([*probes, *front]))
         figures = {name: float(value) for name, value in zip(self.scene.probes.columns, probes, strict=True)}
         self.monitors.record_step(self.state, report, figures, self.breaks.counts[0])
+        self._meter.output_seconds += time.perf_counter() - began
         return report
 
     def record_breaks(self) -> None:

@@ -71,6 +71,18 @@ def test_a_file_with_other_columns_is_kept_beside(tmp_path: Path) -> None:
     assert columns(tmp_path / "out" / "tips.csv")["step"].tolist() == [2, 2]
 
 
+def test_phases_account_for_the_time_of_a_run(tmp_path: Path) -> None:
+    """Of a crack that runs with inertia, which takes several passes in a step; rows of files are output."""
+    study = strip(
+        fracture={"strength": 1e3, "energy": 1e-4},
+        time={"scheme": "backward-euler", "step": 2e-3, "end": 0.06},
+    )
+    summary = Run(build_scene(MPI.COMM_SELF, study), tmp_path / "out")()
+    seconds = summary["seconds"]
+    assert summary["broken_edges"] > 30 and seconds["fracture"] > 0.2 * seconds["solve"]
+    assert sum(seconds.values()) == pytest.approx(summary["wall"], rel=0.1)
+
+
 @pytest.mark.parametrize("count", [0, 1, 40, 300])
 def test_tips_are_paired_nearest_first(count: int) -> None:
     """As by sorting all pairs of points of the same crack, where some have no partner left."""

@@ -75,15 +75,17 @@ class ImplicitStepper(BalanceStepper):
             solved = self._solution()
             _, v, a = self._complete_step(state, dt)
             self._flow()
-            inelastic.fracture.set_rates(v, a)
-            if inelastic.fracture.softens_gradually:
-                self.balance.set_displacement(solved)
-            result = inelastic.fracture_pass(dt)
+            with self._timer.measure(inelastic.fracture.phase):
+                inelastic.fracture.set_rates(v, a)
+                if inelastic.fracture.softens_gradually:
+                    self.balance.set_displacement(solved)
+                result = inelastic.fracture_pass(dt)
+                if result.previous_damage:
+                    inelastic.damage_changed(result)
             if not result.previous_damage:
                 self._return_to(solved, state, dt)
                 break
             broken, released = broken + result.broken_edges, released + result.released_energy
-            inelastic.damage_changed(result)
             again = self._solve(state, dt, solved)
             solve = solve.with_iterations_of(again)
             if not again.converged:

@@ -86,8 +86,10 @@ class StepTimer:
     def measure(self, phase: str) -> Iterator[None]:
         """Add the time of the block to a phase."""
         began = time.perf_counter()
-        yield
-        self.seconds[phase] = self.seconds.get(phase, 0.0) + time.perf_counter() - began
+        try:
+            yield
+        finally:  # a pass that calls for a shorter step counts, too
+            self.seconds[phase] = self.seconds.get(phase, 0.0) + time.perf_counter() - began
 
 
 class Stepper(Protocol):
