@@ -529,11 +529,12 @@ def _check(
 
 
 def _draw(folder: Path) -> None:
-    """Draw the last frame; a failure is only reported."""
+    """Draw the last frame without supersampling; a failure is only reported."""
     try:
         import_outside("pyvista")
         from .report.pictures.picture import render
+        from .report.pictures.picture_options import PictureOptions
 
-        render(folder)
+        render(folder, options=PictureOptions(fine=False))
     except (ImportError, InputError, OSError, RuntimeError) as error:
         print(f"fracsim: no picture drawn: {one_line(str(error))}", file=sys.stderr)
