@@ -205,7 +205,6 @@ def build_mesh(mesh: MeshSettings, surface: ClosedSurface | None = None) -> Mesh
         InputError: if the mesh is invalid.
     """
     from ..meshes.check import check_mesh
-    from ..meshes.read import read_mesh
 
     builder = find_builder(mesh)
     surface = surface or open_surface(mesh)
@@ -224,6 +223,8 @@ def build_mesh(mesh: MeshSettings, surface: ClosedSurface | None = None) -> Mesh
             parameters = mesh.parameters
             data = read_shell(mesh.shell, float(parameters["thickness"]), float(parameters.get("scale", 1.0)))
         else:
+            from ..meshes.read import read_mesh  # only files need the readers of all formats
+
             assert mesh.file is not None
             data = read_mesh(mesh.file)
         join = mesh.file is not None and bool(mesh.parameters.get("join"))
