@@ -16,8 +16,10 @@ from fracsim.scene import Scene, build_scene
 from fracsim.solvers.linear_solver import LinearSolver
 from fracsim.solvers.multigrid import bcsr, hierarchy, vcycle
 from fracsim.solvers.multigrid.levels import SmoothedLevel
+from fracsim.solvers.newton import SolveResult
 from fracsim.solvers.policy import DEFAULT_POLICY
 from fracsim.solvers.preconditioner import Update, mass_stiffness_ratio
+from fracsim.solvers.strategies import Attempt
 from support.scenes import Walk
 from support.solver_policy import set_policy
 
@@ -266,3 +268,38 @@ def test_without_a_compiler_petscs_own_stays(monkeypatch: pytest.MonkeyPatch) ->
     assert Walk(scene).advance().solve.converged
     preconditioner = linear_of(scene).preconditioner
     assert preconditioner.applied.vcycle is None and preconditioner.serving.getType() == "gamg"
+
+
+def test_levels_of_an_indefinite_tangent_are_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """CG fails for a positive tangent of a bar pressed to half its length with levels of the exact one, which is
+    indefinite. Strategies have these made again; levels of an earlier tangent are kept."""
+    set_policy(monkeypatch, min_block_dofs=0)
+    scene = bar(3, {})
+    Walk(scene).advance()
+    linear, balance, free = linear_of(scene), scene.balance, scene.balance.motion.free_dofs
+    preconditioner, solvers = linear.preconditioner, scene.solver._solvers  # type: ignore[union-attr]
+    pressed = np.zeros((len(free) // 3, 3))
+    pressed[:, 0] = -0.5 * balance.domain.nodes[: len(pressed), 0]
+    balance.set_displacement(np.where(free, pressed.ravel(), balance.u.x.array[: len(free)]))
+    failed = Attempt("exact tangents", SolveResult(False, 0, 0, ""), linear_solves_failed=True)
+
+    def solve(eigenvalue_floor: float | None) -> tuple[bool, object]:
+        balance.work_vector.array_w[:] = np.where(free, 1.0, 0.0)
+        return linear.solve(eigenvalue_floor), preconditioner.applied.vcycle
+
+    def fail() -> object:
+        solved, cycle = solve(None)
+        assert not solved and linear.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT
+        return cycle
+
+    preconditioner._due = Update.REBUILD
+    cycle = fail()
+    assert solve(0.0) == (False, cycle)
+    preconditioner._due = Update.REBUILD
+    cycle = fail()
+    solvers.start_after_failure(failed)
+    solved, made = solve(0.0)
+    assert solved and made is not cycle
+    assert fail() is made  # which was set up for a positive tangent
+    solvers.start_after_failure(failed)
+    assert solve(0.0) == (True, made)

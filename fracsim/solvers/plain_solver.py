@@ -87,6 +87,9 @@ class PlainPreconditioner:
     def solve_failed(self) -> None:
         """Ignored."""
 
+    def tangent_was_indefinite(self) -> None:
+        """Ignored."""
+
     def bypassed(self) -> None:
         """Ignored."""
 

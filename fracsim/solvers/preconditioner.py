@@ -225,6 +225,7 @@ class Preconditioner:
         self._looks_for_fragments = False  # before the next solve
         # --- decisions ---
         self._due, self._keeps = Update.REBUILD, keeps
+        self._last_update = Update.NONE  # before the last solve
         self._solves = 0  # since it was rebuilt
         self._fresh_iterations = 0  # of a solve when it was fresh; 0: unknown
         self._whole_iterations = 0  # of a fresh set-up while the body was whole
@@ -261,6 +262,10 @@ class Preconditioner:
     def solve_failed(self) -> None:
         """Record that a solve failed: smoothers of an older tangent need not be positive for this one."""
         self._due = Update.REBUILD
+
+    def tangent_was_indefinite(self) -> None:
+        """Record that the last tangent was indefinite: what was set up for it is set up again for the next one."""
+        self._due = max(self._due, self._last_update)
 
     def bypassed(self) -> None:
         """Record that another solver was used, and that the tangent has changed since."""
@@ -385,9 +390,11 @@ class Preconditioner:
     def update(self, operators: TangentOperators) -> None:
         """Update the preconditioner to the tangent of the next solve (collective)."""
         # SNES only knows a fixed number of tangents between two set-ups
-        if self._decide(counts_solve=True) != Update.NONE:
+        self._last_update = self._decide(counts_solve=True)
+        if self._last_update != Update.NONE:
             operators.update_entries()  # which may change the pattern
-            self._set_up(operators, self._decide(counts_solve=False))
+            self._last_update = self._decide(counts_solve=False)
+            self._set_up(operators, self._last_update)
         new_fragments = self._looks_for_fragments and self.applied.may_deflate
         self._looks_for_fragments = self._looks_for_fragments and not new_fragments
         self.applied.serve(operators, new_fragments=new_fragments)

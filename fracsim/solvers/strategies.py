@@ -206,7 +206,9 @@ class Solvers:
     def start_after_failure(self, last: Attempt) -> Values | None:
         """(owned dofs,) start after exact tangents have failed, m; also tells the preconditioner of the failure."""
         # an indefinite tangent is not caused by the preconditioner
-        if self.ksp.reason != PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT:
+        if self.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT:
+            self.linear.preconditioner.tangent_was_indefinite()
+        else:
             self.linear.preconditioner.solve_failed()
         return self.balance.level.u_n if self.restart_at_step_start else last.start
 
