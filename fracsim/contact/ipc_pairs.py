@@ -39,7 +39,15 @@ from .pair_search import (
     max_length,
     pair_distances,
 )
-from .sample_points import Centroids, IpcFriction, Vertices, measures, projection
+from .sample_points import (
+    Centroids,
+    IpcFriction,
+    Vertices,
+    gradient_at_points,
+    hessian_at_points,
+    measures,
+    projection,
+)
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -280,7 +288,8 @@ class IpcPairs:
         # in 3D ipctk weights points as half of all pairs of a triangle, and edges as the other half
         self._weights = [2.0, 2.0, 1.0] if is_3d else [1.0, 1.0]
         self.comm = MPI.COMM_SELF if share is None else share.comm
-        used = np.unique(elements)
+        # numbers of the vertices of ipctk's surface among the points, ascending
+        self._points = used = np.unique(elements)
         vertices = None if share is None or share.comm.size == 1 else share.points[used]
         if vertices is not None:
             # two points of other ranks have the same number and do not touch
@@ -330,24 +339,20 @@ class IpcPairs:
 
     def energy(self, x: Values) -> float:
         """Energy E(x) of this rank's pairs, J."""
-        vertices = self._mesh.vertices(x)
+        vertices = x[self._points]
         return sum(pairs.energy() for pairs in self._active_pairs(vertices))
 
     def gradient(self, x: Values) -> Values:
         """(n, d) dE/dx of this rank's pairs, N: minus the forces on the points."""
-        vertices = self._mesh.vertices(x)
+        vertices = x[self._points]
         total = sum(pairs.gradient() for pairs in self._active_pairs(vertices))
-        if not len(self._mesh.rest_positions):
-            return np.zeros_like(x)
-        return np.asarray(self._mesh.to_full_dof(total)).reshape(x.shape)
+        return gradient_at_points(total, self._points, x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2 of this rank's pairs, N/m; unless `exact`, each without its negative eigenvalues."""
-        vertices, method = self._mesh.vertices(x), projection(exact=exact)
+        vertices, method = x[self._points], projection(exact=exact)
         total = sum(pairs.hessian(method) for pairs in self._active_pairs(vertices))
-        if not len(self._mesh.rest_positions):
-            return csr_matrix((x.size, x.size))
-        return csr_matrix(self._mesh.to_full_dof(total))
+        return hessian_at_points(total, self._points, x.shape)
 
     def set_stiffness(self, stiffness: float) -> None:
         """Set the stiffness k, Pa."""
@@ -362,7 +367,7 @@ class IpcPairs:
 
     def min_gap(self, x: Values) -> float:
         """Least distance of this rank's pairs on which the barrier acts, m; infinite where there is none."""
-        return self._gap_at(self._mesh.vertices(x))
+        return self._gap_at(x[self._points])
 
     def _gap_at(self, vertices: Values) -> float:
         return float(np.sqrt(min(pairs.least_squared_distance() for pairs in self._active_pairs(vertices))))
@@ -377,13 +382,13 @@ class IpcPairs:
             start: (n, d) positions from which slip is measured, m.
             slip: from which on friction has its full size, m: a speed times the time step.
         """
-        vertices = self._mesh.vertices(x)
+        vertices = x[self._points]
         parts = []
         for pairs in self._active_pairs(vertices):
             part = ipctk.TangentialCollisions()
             part.build(pairs.kind.samples.mesh, pairs.positions, pairs.pairs, pairs.kind.barrier, self._friction)
             parts.append((pairs.kind.samples, part))
-        return IpcFriction(self._mesh, parts, self._mesh.vertices(start), ipctk.FrictionPotential(slip))
+        return IpcFriction(self._points, parts, start[self._points], ipctk.FrictionPotential(slip))
 
     # --- collisions ---
 
@@ -397,7 +402,7 @@ class IpcPairs:
 
     def _own_free_fraction(self, x: Values, end: Values) -> float:
         """Fraction of the motion from x to `end` (n, d) without a collision of this rank's pairs."""
-        vertices, motion = self._mesh.vertices(x), self._mesh.vertices(end) - self._mesh.vertices(x)
+        vertices, motion = x[self._points], end[self._points] - x[self._points]
         if len(motion):
             motion -= motion.mean(axis=0)  # the mean motion brings nothing together
         if self._is_short(vertices, motion):
@@ -444,7 +449,7 @@ class IpcPairs:
     def intersections(self, x: Values) -> Ints:
         """(k, 2) elements that intersect, of all ranks (collective)."""
         surface = self._kinds[0].simplices.second
-        rank_pairs = intersecting_pairs(surface, self._search.filter, self._mesh.vertices(x))
+        rank_pairs = intersecting_pairs(surface, self._search.filter, x[self._points])
         return np.unique(np.concatenate(allgather(self.comm, rank_pairs)), axis=0)
 
     def pressure(self, x: Values) -> Values:

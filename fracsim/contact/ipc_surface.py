@@ -63,8 +63,7 @@ class SurfacePolicy:
             converged in the second one with positive ones.
         later_exact_tangent: the same in later attempts. With positive tangents to the end |r| fell by a third to a
             half in each iteration: a torn loaf took 26 iterations of the second attempt in place of 10.
-        stiff_ratio: stiffness, in that of a face of an edge's size, from which on directions are kept apart from
-            the matrix.
+        max_coupled_nodes: nodes in contact up to which their stiffness is kept apart from the matrix.
     """
 
     face_gap: float = 2.0
@@ -77,7 +76,7 @@ class SurfacePolicy:
     round_off: float = 1e-6
     exact_tangent: float = 1.0
     later_exact_tangent: float = 0.01
-    stiff_ratio: float = 100.0
+    max_coupled_nodes: int = 3000
 
 
 SURFACE = SurfacePolicy()

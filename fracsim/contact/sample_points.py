@@ -154,13 +154,13 @@ class IpcFriction:
     friction of a backward Euler step: against the slip, and at most mu N_k.
 
     Attributes:
-        mesh: surface.
+        points: (k,) numbers of the vertices of the surface among the points.
         parts: sample points and pairs of each kind.
         start: (n, d) x_0, m.
         potential: of ipctk.
     """
 
-    mesh: ipctk.CollisionMesh
+    points: Ints
     parts: list[tuple[Vertices | Centroids, ipctk.TangentialCollisions]]
     start: Values
     potential: ipctk.FrictionPotential
@@ -179,7 +179,7 @@ class IpcFriction:
             samples.gradient(self.potential.gradient(pairs, samples.mesh, samples.positions(motion)))
             for samples, pairs in self.parts
         )
-        return np.asarray(self.mesh.to_full_dof(total)).reshape(x.shape)
+        return gradient_at_points(total, self.points, x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2, N/m; unless `exact`, each pair without its negative eigenvalues."""
@@ -188,11 +188,29 @@ class IpcFriction:
             samples.hessian(self.potential.hessian(pairs, samples.mesh, samples.positions(motion), method))
             for samples, pairs in self.parts
         )
-        return csr_matrix(self.mesh.to_full_dof(total))
+        return hessian_at_points(total, self.points, x.shape)
 
     def _motion(self, x: Values) -> Values:
-        motion: Values = self.mesh.vertices(x) - self.start
+        motion: Values = x[self.points] - self.start
         return motion
+
+
+def gradient_at_points(gradient: npt.ArrayLike, points: Ints, shape: tuple[int, ...]) -> Values:
+    """(n, d) derivatives by all points of those (k d,) by `points` (k,); `shape`: (n, d)."""
+    result = np.zeros(shape)
+    result[points] = np.reshape(gradient, (len(points), shape[1]))
+    return result
+
+
+def hessian_at_points(H: csr_matrix, points: Ints, shape: tuple[int, ...]) -> csr_matrix:
+    """(n d, n d) second derivatives by all points of those (k d, k d) by `points` (k,), ascending; `shape`: (n, d)."""
+    n, d = shape
+    if not len(points):
+        return csr_matrix((n * d, n * d))
+    dofs = (d * points[:, None] + np.arange(d)).reshape(-1)
+    entries = np.zeros(n * d + 1, np.int64)
+    entries[1 + dofs] = np.diff(H.indptr)
+    return csr_matrix((H.data, dofs[H.indices], np.cumsum(entries)), shape=(n * d, n * d))
 
 
 def projection(*, exact: bool) -> ipctk.PSDProjectionMethod:

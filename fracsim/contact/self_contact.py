@@ -20,7 +20,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
-from ..mechanics.extra_couplings import CouplingBuilder, StiffCoupling, stiff_directions
+from ..mechanics.extra_couplings import CouplingBuilder, FewNodesCoupling, sum_few_nodes
 from ..mechanics.term import Term, TimeLevel
 from ..mechanics.term_protocols import CutPositions
 from ..mesh.domain import Domain
@@ -193,8 +193,6 @@ class SelfContact(Term):
         self._domain, self._u = domain, u
         self._owned, self.comm = domain.node_count * domain.dim, domain.comm
         self._coupling = CouplingBuilder(domain)
-        # m^(d-2), times a stiffness in Pa
-        self._stiff_threshold = SURFACE.stiff_ratio * domain.mean_edge_length ** (domain.dim - 2)
         build = build or partial(SelfContactSurface, comm=domain.comm)
         self.surface = BreakingSurface(domain, u, law, build)
         self.parts = self.surface, CollisionLimit(self)
@@ -280,10 +278,10 @@ class SelfContact(Term):
             self._contact_force = self._nodal_forces(x)
         return self._contact_force
 
-    def coupling_matrix(self) -> PETSc.Mat | StiffCoupling | None:
+    def coupling_matrix(self) -> PETSc.Mat | FewNodesCoupling | None:
         """Minus the derivative of the forces; None where nothing is in contact (collective).
 
-        Where few directions are much stiffer than the body, they come apart from the matrix (StiffCoupling).
+        With inertia, and between few nodes, it stays apart from the matrix (FewNodesCoupling).
         """
         if self.is_far():
             return None
@@ -298,12 +296,9 @@ class SelfContact(Term):
         H = csr_matrix(self.level.contact_weights.factor * H)
         if not self.comm.allreduce(H.nnz):
             return None
-        matrix = self._coupling(surface.point_map.nodal_stiffness(H), self.surface.node_numbers)
-        stiff = stiff_directions(H, self._stiff_threshold * self.surface.law.stiffness, self.comm)
-        if stiff is None:
-            return matrix
-        directions, stiffness = self.surface.gather.owned(surface.point_map.nodal_directions(stiff[0])), stiff[1]
-        return StiffCoupling(matrix, directions.reshape(self._owned, len(stiffness)), stiffness)
+        part, nodes = surface.point_map.nodal_stiffness(H), self.surface.node_numbers
+        coupling = sum_few_nodes(self._domain, part, nodes, SURFACE.max_coupled_nodes) if self.level.dt else None
+        return self._coupling(part, nodes) if coupling is None else coupling
 
     def min_gap(self) -> float:
         """Least distance within the barrier at the current u, m; infinite where none is active (collective)."""

@@ -1,22 +1,20 @@
-"""Stiffness between nodes that share no cell: matrices over the dofs of all ranks, and their stiff directions.
+"""Stiffness between nodes that share no cell, in a matrix over all dofs or between the few nodes that have it.
 
 Two points in contact move as one along their normal. Smoothers and aggregates of multigrid do not represent such a
-motion: with 15 pairs in contact CG takes 75 iterations where the body alone takes 12. The few stiff directions are
-found here and eliminated exactly (solvers.low_rank), with the preconditioner of the body.
+motion: with 15 pairs in contact CG takes 75 iterations where the body alone takes 12. A coupling of few nodes stays
+beside the tangent, and its preconditioner solves for these nodes exactly (solvers.coupled_nodes).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..mesh.domain import Domain
-from ..mesh.parallel import allgather
+from ..mesh.parallel import allgather, sum_over_ranks
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -59,77 +57,79 @@ class CouplingBuilder:
             self._last = None
 
 
-@dataclass(frozen=True)
-class StiffCoupling:
-    """Coupling C + U diag(k) U^T, of which the second part is stiff and stays beside the tangent.
+class FewNodesCoupling:
+    """Stiffness C between few nodes anywhere, which stays beside the tangent.
 
     Attributes:
-        matrix: C over the dofs of all ranks, N/m.
-        directions: (owned dofs, m) U.
-        stiffness: (m,) k > 0, N/m.
+        numbers: (m,) global numbers of the nodes, ascending, the same on all ranks.
+        K: (m d, m d) their stiffness, N/m, the same on all ranks.
+        nodes: (k,) local numbers of those that this rank owns.
+        rows: the rows of K of these.
+        dofs: (k d,) their dofs.
     """
 
-    matrix: PETSc.Mat
-    directions: Values
-    stiffness: Values
+    def __init__(self, domain: Domain, numbers: Ints, K: csr_matrix) -> None:
+        self._comm, self.numbers, self.K, d = domain.comm, numbers, K, domain.dim
+        first, end = domain.space.dofmap.index_map.local_range
+        start, stop = np.searchsorted(numbers, [first, end])
+        self.nodes: Ints = numbers[start:stop] - first
+        self.rows, self.dofs = slice(d * start, d * stop), dofs_of_nodes(self.nodes, d)
+        self._owned_K = K[self.rows]
+
+    def at_all_nodes(self, values: Values) -> Values:
+        """(m d,) values at all nodes, of those (k d,) of this rank (collective)."""
+        result = np.zeros(self.K.shape[0])
+        result[self.rows] = values
+        return sum_over_ranks(self._comm, result)
+
+    def without_dofs(self, domain: Domain, dofs: npt.NDArray[np.signedinteger]) -> FewNodesCoupling:
+        """The coupling without those of owned dofs (j,), which are prescribed (collective)."""
+        from scipy.sparse import csr_matrix, diags
+
+        is_free = np.ones(domain.node_count * domain.dim)
+        is_free[dofs] = 0.0
+        free = diags(self.at_all_nodes(is_free[self.dofs]))
+        return FewNodesCoupling(domain, self.numbers, csr_matrix(free @ self.K @ free))
+
+    def owned_rows(self) -> csr_matrix:
+        """(m d, m d) stiffness with the rows of this rank's nodes alone, N/m."""
+        from scipy.sparse import csr_matrix
+
+        first = np.zeros(self.K.shape[0] + 1, self.K.indptr.dtype)
+        first[1:][self.rows] = np.diff(self._owned_K.indptr)
+        return csr_matrix((self._owned_K.data, self._owned_K.indices, np.cumsum(first)), shape=self.K.shape)
+
+    def add_product(self, x: Values, y: Values) -> None:
+        """Add C x to y, both (owned dofs,) (collective)."""
+        y[self.dofs] += self._owned_K @ self.at_all_nodes(x[self.dofs])
 
 
-@dataclass(frozen=True)
-class StiffDirectionLimits:
-    """Bounds above which stiff directions are not eliminated: it would cost more than the iterations that it saves.
+def sum_few_nodes(domain: Domain, part: csr_matrix, nodes: Ints, limit: int) -> FewNodesCoupling | None:
+    """Sum over the ranks of their parts; None if more nodes than `limit` have entries (collective).
 
-    With groups of 450 dofs four plates at rest on one another (688 nodes) took 43 s instead of 9 s.
-
-    Attributes:
-        group_dofs: most dofs of a group of coupled points.
-        directions: most stiff directions of all groups.
+    Args:
+        domain: the mesh.
+        part: (n d, n d) stiffness, N/m.
+        nodes: (n,) global numbers of its nodes.
+        limit: largest number of nodes.
     """
+    from scipy.sparse import csr_matrix
 
-    group_dofs: int = 240
-    directions: int = 64
-
-
-LIMITS = StiffDirectionLimits()
-
-
-def stiff_directions(H: csr_matrix, least: float, comm: MPI.Comm = MPI.COMM_SELF) -> tuple[csr_matrix, Values] | None:
-    """Eigenvectors (n, m) and eigenvalues (m,), N/m, above `least`, of a symmetric matrix; None beyond LIMITS.
-
-    The matrix is the sum of H (n, n) over the ranks (collective).
-    """
-    from scipy.sparse import csr_matrix, hstack  # a run without contact does without SciPy
-
-    rows, group, sizes = _coupled_groups(H)
-    # groups of the sum are no smaller
-    if comm.allreduce(int(sizes.max(initial=0)), op=MPI.MAX) > LIMITS.group_dofs:
+    d, entries = domain.dim, part.tocoo()
+    used = np.unique(entries.row // d)
+    parts = allgather(domain.comm, nodes[used])
+    numbers = np.unique(np.concatenate(parts))
+    if len(numbers) > limit:
         return None
-    if comm.size > 1:
-        H = csr_matrix(sum(allgather(comm, H)))
-        rows, group, sizes = _coupled_groups(H)
-        if sizes.max(initial=0) > LIMITS.group_dofs:
-            return None
-    coupled = H[rows][:, rows]
-    # no eigenvalue is above the largest sum of absolute values of a row (Gershgorin)
-    bound = np.zeros(len(sizes))
-    np.maximum.at(bound, group, np.asarray(abs(coupled).sum(axis=1)).reshape(-1))
-    columns, values = [csr_matrix((H.shape[0], 0))], list[Values]()
-    for part in np.split(np.argsort(group, kind="stable"), np.cumsum(sizes)[:-1]) if len(rows) else []:
-        if bound[group[part[0]]] <= least:
-            continue
-        eigenvalues, vectors = np.linalg.eigh(coupled[part][:, part].toarray())
-        stiff = eigenvalues > least
-        count = int(stiff.sum())
-        entries = np.repeat(rows[part], count), np.tile(np.arange(count), len(part))
-        columns.append(csr_matrix((vectors[:, stiff].reshape(-1), entries), shape=(H.shape[0], count)))
-        values.append(eigenvalues[stiff])
-    stiffness: Values = np.concatenate(values) if values else np.empty(0)
-    return None if len(stiffness) > LIMITS.directions else (csr_matrix(hstack(columns)), stiffness)
+    position = np.zeros(len(nodes), np.int64)
+    position[used] = np.searchsorted(numbers, nodes[used])
+    row, column = (d * position[index // d] + index % d for index in (entries.row, entries.col))
+    all_parts = zip(*allgather(domain.comm, (row, column, entries.data)), strict=True)
+    rows, columns, values = (np.concatenate(items) for items in all_parts)
+    size = d * len(numbers)
+    return FewNodesCoupling(domain, numbers, csr_matrix((values, (rows, columns)), shape=(size, size)))
 
 
-def _coupled_groups(H: csr_matrix) -> tuple[Ints, Ints, Ints]:
-    """(k,) rows with entries of a symmetric matrix, (k,) their groups that the entries couple, and sizes of these."""
-    from scipy.sparse.csgraph import connected_components
-
-    rows = np.flatnonzero(np.diff(H.indptr))
-    _, group = connected_components(H[rows][:, rows], directed=False)
-    return rows, group, np.bincount(group)
+def dofs_of_nodes(nodes: Ints, d: int) -> Ints:
+    """(d n,) dofs of nodes (n,)."""
+    return np.asarray(d * nodes[:, None] + np.arange(d)).reshape(-1)

@@ -2,7 +2,7 @@
 
 Forms of the terms are assembled cell by cell (mechanics.matrix_assembly). Couplings between nodes of different cells
 are added to a matrix of single entries, and stay beside a matrix in blocks. Those that would fill the matrix stay
-beside it in both cases: as low-rank updates, or as StiffCoupling.
+beside it in both cases: as low-rank updates, or as FewNodesCoupling.
 
 Equations: docs/theory.md#linear-systems.
 """
@@ -23,7 +23,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..mesh.parallel import sum_over_ranks
-from .extra_couplings import StiffCoupling
+from .extra_couplings import CouplingBuilder, FewNodesCoupling
 from .inertia import MassMatrix
 from .jit import CellForm, cell_measure
 from .matrix_assembly import TangentAssembler
@@ -63,7 +63,7 @@ class Couplings:
     """Couplings between nodes of different cells, which the terms of a balance add to its tangent.
 
     Attributes:
-        stiff: couplings of the last tangent that the assembled matrix lacks.
+        beside: coupling of the last tangent that the assembled matrix lacks; None: it has all.
         has_contact: whether terms coupled nodes in the last tangent, except by constants.
         in_entries: whether the matrix of single entries has ever had one.
         varying: whether a coupling that is no constant has ever been added to K.
@@ -73,9 +73,14 @@ class Couplings:
         self._motion, self._domain = motion, domain
         self._tied = [term for term in terms if isinstance(term, TieTerm)]
         self._coupled = overriding(terms, "add_stiffness", "coupling_matrix")
-        self.stiff: list[StiffCoupling] = []
+        self.beside: FewNodesCoupling | None = None
         self._beside_blocks: list[PETSc.Mat] = []  # of the last tangent, but for ties
+        self._builder, self._keeps_beside = CouplingBuilder(domain), True
         self.has_contact = self.in_entries = self.varying = False
+
+    def keep_beside(self, keep: bool) -> None:
+        """Keep a FewNodesCoupling beside the matrix from now on, or add it to the matrix, as factors need it."""
+        self._keeps_beside = keep
 
     def add_to_entries(self, K: PETSc.Mat, *, with_contact: bool, only_varying: bool) -> bool:
         """Add stiffness and couplings of the terms to the entries (collective).
@@ -88,7 +93,7 @@ class Couplings:
         Returns:
             Whether the nonzero pattern has changed.
         """
-        self.stiff, self.has_contact, changed = [], False, False
+        self.beside, self.has_contact, changed = None, False, False
         for term in self._coupled:
             term.add_stiffness(K)
             if not with_contact or (coupling := self._coupling_of(term)) is None:
@@ -101,7 +106,7 @@ class Couplings:
         """Put ties and couplings of the terms beside the blocks (collective)."""
         from .block_matrix import CouplingMatrix
 
-        self.stiff, self.has_contact, blocks.couplings, self._beside_blocks = [], False, [], []
+        self.beside, self.has_contact, blocks.couplings, self._beside_blocks = None, False, [], []
         if not with_contact:
             return
         ties = [term.tie_matrix(self._motion.free_dofs) for term in self._tied]
@@ -119,16 +124,16 @@ class Couplings:
         return any([self._add(K, coupling) for coupling in (*ties, *self._beside_blocks)])
 
     def _coupling_of(self, term: Term) -> PETSc.Mat | None:
-        """Coupling of a term that is to be added to K, if any; a StiffCoupling is kept beside it (collective)."""
+        """Coupling of a term that is to be added to K, if any; a FewNodesCoupling may stay beside it (collective)."""
         coupling = term.coupling_matrix()
         if coupling is None:
             return None
         self.has_contact |= not term.linear
-        if isinstance(coupling, StiffCoupling):
-            coupling.matrix.zeroRowsColumns(self._prescribed_rows, diag=0.0)
-            coupling.directions[self._motion.owned_dofs] = 0.0
-            self.stiff.append(coupling)
-            return None
+        if isinstance(coupling, FewNodesCoupling):
+            if self._keeps_beside:
+                self.beside = coupling.without_dofs(self._domain, self._motion.owned_dofs)
+                return None
+            coupling = self._builder(coupling.owned_rows(), coupling.numbers)
         self.varying |= not term.linear
         return coupling
 
@@ -160,7 +165,7 @@ class Tangent:
             the owner of anything made for an earlier pattern has to make it again.
         low_rank_updates: U (owned dofs, k) and C (k, k): the assembled matrix lacks - U C U^T.
         couplings: couplings between nodes of different cells.
-        may_be_incomplete: whether the assembled matrix may lack low-rank updates or stiff couplings.
+        may_be_incomplete: whether the assembled matrix may lack low-rank updates or a coupling.
     """
 
     def __init__(

@@ -24,7 +24,7 @@ from ufl.core.expr import Expr
 from .contact_time_weights import UNWEIGHTED, ContactTimeWeights
 
 if TYPE_CHECKING:
-    from .extra_couplings import StiffCoupling
+    from .extra_couplings import FewNodesCoupling
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -82,7 +82,7 @@ class Term:
         parts: objects that fulfil protocols of `term_protocols` for the term.
         symmetric: whether its part of the tangent is symmetric.
         linear: whether its part of the tangent depends on damage and on the rates of the scheme alone, not on u and t.
-        leaves_tangent_incomplete: whether part of its tangent stays beside the matrix (low-rank update, StiffCoupling).
+        leaves_tangent_incomplete: whether part of its tangent stays beside the matrix (FewNodesCoupling, ...).
     """
 
     name: ClassVar[str] = ""
@@ -125,11 +125,11 @@ class Term:
     def add_stiffness(self, K: PETSc.Mat) -> None:
         """Add the derivative of `add_nodal_forces` to the assembled tangent, within the pattern of its cells."""
 
-    def coupling_matrix(self) -> PETSc.Mat | StiffCoupling | None:
+    def coupling_matrix(self) -> PETSc.Mat | FewNodesCoupling | None:
         """Remaining part of that derivative: a matrix of any pattern over the dofs, None if there is none (collective).
 
         It is added to the entries of the tangent, whose nonzero pattern may change, and stays beside a tangent in
-        blocks. A StiffCoupling stays beside both.
+        blocks. A FewNodesCoupling stays beside both; of one term alone.
         """
         return None
 

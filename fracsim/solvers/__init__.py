@@ -11,7 +11,8 @@ direct_solver          factors of the tangent (MUMPS), and their cost
 preconditioner         multigrid or SSOR: when it is rebuilt, and from what
 plain_solver           linear solver of `plain = true`: PETSc alone
 deflation              two-level preconditioner for fragments that are hardly attached
-low_rank               updates of low rank of the tangent and of its inverse
+coupled_nodes          preconditioner of a tangent with stiffness between few nodes beside it, as of contact
+low_rank               products with low-rank updates of the tangent
 tangent_operators      tangent as the matrices that a KSP takes
 multigrid              V cycle in single precision
 policy                 tuned numbers

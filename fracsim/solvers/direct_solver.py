@@ -89,7 +89,7 @@ class DirectSolver:
 
     def measure_cost(self, ksp: PETSc.KSP) -> None:
         """Measure the cost of the last factorisation, and whether the tangent is positive definite (collective)."""
-        # The preconditioner of the KSP may be another one, which corrects these factors for stiff springs (low_rank).
+        # The preconditioner of the KSP may be another one, which corrects for a coupling beside K (coupled_nodes).
         factors, entries = self.pc.getFactorMatrix(), ksp.getOperators()[1].getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)
         operations = factors.getMumpsRinfog(3)
         self.equivalent_iterations = operations / (self._policy.flops_per_iteration * entries["nz_used"])

@@ -260,29 +260,31 @@ class LinearSolver:
 
     def _prepare(self, eigenvalue_floor: float | None) -> None:
         """Assemble the tangent, and update preconditioner or factors to it (collective)."""
+        tangent = self.tangent
+        # factors of a body without its contact would leave many iterations
+        tangent.couplings.keep_beside(self.ksp.getType() != "preonly" and not self.direct.serves)
         self.operators.assemble(eigenvalue_floor)
         self._tell_of_last_solve()
-        tangent = self.tangent
-        if (tangent.low_rank_updates or tangent.couplings.stiff) and self.ksp.getType() == "preonly":
+        if tangent.low_rank_updates and self.ksp.getType() == "preonly":
             # Factors leave out the low-rank updates.
             self.ksp.setType("gmres")
         if self.direct.serves:
             self.direct.update(self.ksp, self.operators)
         else:
             self.preconditioner.update(self.operators)
-        self._add_stiff_couplings(self.direct.pc if self.direct.serves else self.preconditioner.serving)
+        self._add_coupling(self.direct.pc if self.direct.serves else self.preconditioner.serving)
 
-    def _add_stiff_couplings(self, base: PETSc.PC) -> None:
-        """Add the stiff couplings of the balance to the preconditioner (collective)."""
-        couplings = [coupling for coupling in self.tangent.couplings.stiff if len(coupling.stiffness)]
-        if not couplings:
+    def _add_coupling(self, base: PETSc.PC) -> None:
+        """Add the coupling of few nodes to the preconditioner (collective)."""
+        coupling = self.tangent.couplings.beside
+        if coupling is None:
             self.ksp.setPC(base)
             return
-        from .low_rank import WoodburyPreconditioner
+        from .coupled_nodes import CoupledNodesPreconditioner
 
         base.setReusePreconditioner(True)
         renew_smoothers(base)
-        context = WoodburyPreconditioner(base, couplings, self.balance.work_vector)
+        context = CoupledNodesPreconditioner(base, coupling, self.tangent, self.balance.work_vector)
         pc = PETSc.PC().createPython(context, comm=self.ksp.comm)
         self.ksp.setPC(pc)
         pc.destroy()

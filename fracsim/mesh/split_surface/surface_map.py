@@ -88,11 +88,6 @@ class SurfaceMap:
         W, used = self._used_weights(H)
         return (W.T @ H[used][:, used] @ W).tocsr()
 
-    def nodal_directions(self, directions: csr_matrix) -> Values:
-        """(nodes, d m) directions of the nodes of directions (n d, m) of the points."""
-        W, used = self._used_weights(directions)
-        return np.asarray((W.T @ directions[used]).toarray().reshape(self.weights.shape[1], -1))
-
     def _used_weights(self, rows: csr_matrix) -> tuple[csr_matrix, Ints]:
         """(k d, nodes d) weights of the points with entries in `rows` (n d, m), and (k d,) their rows: mostly few."""
         d = self.rest.shape[1]

@@ -1,0 +1,64 @@
+"""Preconditioner of a tangent with a coupling of few nodes beside it, as contact of a body with itself has.
+
+    P = Q + (1 - Q A) M (1 - A Q),   Q = Z E^-1 Z^T,   E = Z^T A Z,   A = K + C
+
+M is the preconditioner of the body, made for K. Z has the dofs of the nodes that C couples: Q solves for these nodes
+exactly, however stiff C is, and M for what is left. A Z has few rows (Mandel 1993; Tang et al. 2009).
+
+Equations: docs/theory.md#linear-systems.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from petsc4py import PETSc
+from scipy.sparse import csr_matrix, vstack
+from scipy.sparse.linalg import splu
+
+from ..mechanics.extra_couplings import FewNodesCoupling, dofs_of_nodes
+from ..mechanics.tangent import Tangent
+from ..mesh.parallel import allgather, sum_over_ranks
+
+
+class CoupledNodesPreconditioner:
+    """Context of the PETSc preconditioner P."""
+
+    def __init__(self, base_pc: PETSc.PC, coupling: FewNodesCoupling, tangent: Tangent, like: PETSc.Vec) -> None:
+        """Compute A Z and the factors of E (collective).
+
+        Args:
+            base_pc: M, set up.
+            coupling: C.
+            tangent: K.
+            like: a vector of the size of P.
+        """
+        self._base_pc, self._coupling, self._comm = base_pc, coupling, like.comm.tompi4py()
+        self._residual = like.duplicate()
+        first, end = like.getOwnershipRange()
+        # rows of K of all coupled nodes, in the order of the ranks, which is that of their numbers
+        rows = csr_matrix(vstack(allgather(self._comm, tangent.owned_rows(coupling.nodes))))
+        coupled = dofs_of_nodes(coupling.numbers, tangent.domain.dim)
+        E = rows[:, coupled] + coupling.K
+        options = {"SymmetricMode": True}
+        self._solve = splu(E.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).solve
+        columns = csr_matrix(rows[:, first:end].T)
+        self._changed = np.flatnonzero(np.diff(columns.indptr))  # owned dofs in which K Z has entries
+        self._KZ = columns[self._changed]
+        self._KZt = csr_matrix(self._KZ.T)
+
+    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Evaluate y = P x (collective)."""
+        coupling, residual, changed = self._coupling, self._residual, self._changed
+        x.copy(residual)
+        motion = self._solve(coupling.at_all_nodes(x.array_r[coupling.dofs]))
+        with_motion = self._KZ @ motion
+        residual.array_w[changed] -= with_motion
+        residual.array_w[coupling.dofs] = 0.0  # as E is solved exactly
+        self._base_pc.apply(residual, y)
+        force = sum_over_ranks(self._comm, self._KZt @ y.array_r[changed])
+        force += coupling.K @ coupling.at_all_nodes(y.array_r[coupling.dofs])
+        y.array_w[coupling.dofs] += (motion - self._solve(force))[coupling.rows]
+
+    def destroy(self, _: PETSc.PC) -> None:
+        """Free PETSc's objects."""
+        self._residual.destroy()
