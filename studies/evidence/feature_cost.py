@@ -39,10 +39,10 @@ EXACT: dict[str, Any] = {"solver": {"snes_type": "newtonls", "ksp_rtol": 1e-5}}
 YIELDING_EVERYWHERE: dict[str, Any] = {"solver": None, "plasticity": {"yield_stress": 2e3, "hardening": 1e5}}
 FRACTURE_MODULES = (
     "fracture.fracture_pass", "fracture.degradation", "fracture.strength", "fracture.edge_stress",
-    "fracture.edge_history", "mesh.edge_graph", "mesh.fragments",
+    "fracture.edge_history", "mesh.edge_graph",
 )  # fmt: skip
 PLASTIC_MODULES = (
-    "mechanics.plasticity", "mechanics.plasticity", "mechanics.return_mapping", "mechanics.tensor_functions",
+    "mechanics.plasticity", "mechanics.return_mapping", "mechanics.tensor_functions",
     "forms.plasticity",
 )  # fmt: skip
 AVERAGE, SURFACE, BRITTLE = "fracture.nonlocal_average", ("mesh.split_surface", "output.surface"), "fracture.brittle"
