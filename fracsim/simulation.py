@@ -334,7 +334,8 @@ class Simulation:
 
         It is closed around every fragment. Cells have `piece`, `origin`, `age` and the cell fields of output.fields.
         """
-        frame = self._surface_frame()
+        part = self._surface_frame()
+        frame = None if part is None else part.gather()
         if frame is None:
             return None
         import pyvista
@@ -351,7 +352,7 @@ class Simulation:
         return surface
 
     def _surface_frame(self) -> SurfaceFrame | None:
-        """Return the split surface of the state on rank 0 (collective)."""
+        """Return the part of the split surface that this rank has, None without a part (collective)."""
         self._check_open()
         balance, study = self.scene.balance, self.study
         if self._surface is None:

@@ -130,7 +130,7 @@ def test_overlap_is_what_vtk_finds(dim: int) -> None:
         if found is None:
             assert inner.sum() <= 2  # all in the rim of their cells
         else:
-            assert inner[found[0]] and piece[cells[found[1], 0]] == 0
+            assert inner[found.node] and found.fragments == (1, 0)
             found_at += 1
     assert 10 < found_at < 50
 

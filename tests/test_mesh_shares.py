@@ -242,13 +242,14 @@ def test_the_same_crack_from_a_file_that_ranks_share(results: Results, ranks: in
 @pytest.mark.ranks
 @pytest.mark.parametrize("ranks", RANKS)
 def test_no_rank_has_more_than_its_share(results: Results, ranks: int) -> None:
-    """Of points and cells; the whole mesh is gathered where the split surface is written, and otherwise never."""
+    """Of points and cells; the whole mesh is gathered where cracks are drawn smooth, and for no other surface."""
     for name in ("plate", "block"):
         shares = results(ranks)[f"shares-{name}"]
         assert len(shares) == ranks and np.all(shares.max(axis=0) - shares.min(axis=0) <= 1)
-    without, with_surface = (results(ranks)[f"gathered-{surface}"].tolist() for surface in (False, True))
-    assert without[0] == 0 and with_surface[0] == 1
-    assert without[1] == with_surface[1] > 5
+    kinds = ("none", "surface", "smooth")
+    gathered, broken = np.array([results(ranks)[f"gathered-{kind}"].tolist() for kind in kinds]).T
+    assert gathered.tolist() == [0, 0, 1]
+    assert broken[0] > 5 and set(broken) == {broken[0]}
 
 
 @pytest.mark.ranks

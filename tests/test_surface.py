@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from fracsim.mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from fracsim.mesh.split_surface.entity_numbering import CRACK, EntityNumbering
+from fracsim.mesh.split_surface.mesh_part import WholeMesh
 from fracsim.mesh.split_surface.smooth_cuts import CUTS, smooth_cuts
 from fracsim.mesh.split_surface.surface_motion import NodalRotations
 from fracsim.meshes.data import MeshData
@@ -225,7 +226,7 @@ def test_a_turning_half_does_not_shear(dim: int, angle: float) -> None:
     pattern = patterns(skeleton, separated(skeleton, half))
     Q, shift = turn(dim, angle), np.arange(1.0, dim + 1)
     u = np.where(half[:, None] == 1, mesh.points @ (Q - np.eye(dim)).T + shift, 0.0)
-    moved = made.parents.displacement(u, NodalRotations(skeleton, pattern, made.parents.rotating_nodes)(u))
+    moved = made.parents.displacement(u, NodalRotations(WholeMesh(skeleton), pattern, made.parents.rotating_nodes)(u))
     turned = half[made.parents.first_parent] == 1
     expected = np.where(turned[:, None], made.points @ (Q - np.eye(dim)).T + shift, 0.0)
     assert np.abs(moved - expected).max() <= 1000 * EPS * 6  # 6 m long
@@ -259,7 +260,7 @@ def test_a_node_without_a_whole_cell_does_not_turn() -> None:
     mesh = one_cell(3)
     skeleton = EntityNumbering(mesh)
     pattern = np.array([63], np.uint8)
-    R = NodalRotations(skeleton, pattern, np.arange(4))(mesh.points @ (turn(3, 1.0) - np.eye(3)).T)
+    R = NodalRotations(WholeMesh(skeleton), pattern, np.arange(4))(mesh.points @ (turn(3, 1.0) - np.eye(3)).T)
     assert np.array_equal(R, np.tile(np.eye(3), (4, 1, 1)))
 
 
@@ -286,7 +287,7 @@ def rebuilt(n: int) -> tuple[int, int]:
     u = np.random.default_rng(1).normal(size=mesh.points.shape) * 1e-3
     with Profile() as calls:
         made = build_split_surface(skeleton, pattern)
-        made.parents.displacement(u, NodalRotations(skeleton, pattern, made.parents.rotating_nodes)(u))
+        made.parents.displacement(u, NodalRotations(WholeMesh(skeleton), pattern, made.parents.rotating_nodes)(u))
     assert n < 10 or np.mean(pattern != 0) > 0.05
     assert_closed(made)
     assert_volume(mesh, made)

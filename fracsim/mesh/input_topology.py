@@ -47,5 +47,6 @@ class MeshTopology:
 
 def _number_edges(mesh: MeshData) -> tuple[Numbers, Numbers]:
     """(E, 2) distinct edges, and (C, k) the edges of each cell."""
-    edges, _, inverse = distinct_rows(sorted_rows(mesh.cells[:, local_edges(mesh.dim)].reshape(-1, 2)))
-    return edges.astype(np.int32), inverse.reshape(len(mesh.cells), -1).astype(np.int32)
+    ends = mesh.cells[:, local_edges(mesh.dim)]
+    edges, _, inverse = distinct_rows(sorted_rows(ends.reshape(-1, 2)))
+    return edges.astype(np.int32), inverse.reshape(ends.shape[:2]).astype(np.int32)

@@ -6,9 +6,14 @@ reported: a reported node lies about one edge length inside the other fragment.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 from scipy.spatial import cKDTree
+
+from .parallel import allgather, alltoall, concatenate_over_ranks, max_over_ranks, sum_over_ranks
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -17,37 +22,116 @@ Flags = npt.NDArray[np.bool_]
 SAMPLED_CELLS = 10_000
 
 
-def find_interpenetration(x: Values, cells: Ints, fragment: Ints) -> tuple[int, int] | None:
-    """The node that lies deepest inside a cell of another fragment, and that cell; None if there is none.
+@dataclass(frozen=True, order=True)
+class Overlap:
+    """A node of one fragment inside an intact cell of another.
 
-    `x`: (N, d) current positions, m.    `cells`: (C, d + 1) intact cells.    `fragment`: (N,) fragment of each node.
+    Attributes:
+        depth: least barycentric coordinate of the node in the cell.
+        node: number of the node in the input mesh.
+        position: current position of the node, m.
+        fragments: of the node, and of the cell.
     """
-    cell_fragment = fragment[cells[:, 0]]
-    nodes = np.argsort(fragment, kind="stable")
-    names, start, count = np.unique(fragment[nodes], return_index=True, return_counts=True)
-    if len(names) < 2:
-        return None
-    lower, upper = np.minimum.reduceat(x[nodes], start), np.maximum.reduceat(x[nodes], start)
-    small, large = _overlapping_boxes(lower, upper, count)
+
+    depth: float
+    node: int
+    position: tuple[float, ...]
+    fragments: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class RankNodes:
+    """Nodes of which ranks have parts.
+
+    Attributes:
+        comm: the ranks.
+        numbers: (N,) numbers of the nodes of this rank in the input mesh.
+        is_owned: (N,) flags; each node is owned by one rank.
+    """
+
+    comm: MPI.Intracomm
+    numbers: Ints
+    is_owned: Flags
+
+
+def find_interpenetration(x: Values, cells: Ints, fragment: Ints, nodes: RankNodes | None = None) -> Overlap | None:
+    """The node that lies deepest inside a cell of another fragment; None if there is none (collective).
+
+    Args:
+        x: (N, d) current positions, m.
+        cells: (C, d + 1) intact cells of this rank.
+        fragment: (N,) fragment of each node.
+        nodes: the nodes of this rank; None: one rank has all.
+    """
+    shared = nodes or RankNodes(MPI.COMM_SELF, np.arange(len(x)), np.ones(len(x), bool))
+    comm, cell_fragment = shared.comm, fragment[cells[:, 0]]
+    owned = np.flatnonzero(shared.is_owned)
+    by_fragment = owned[np.argsort(fragment[owned], kind="stable")]
+    fragment_count = max_over_ranks(comm, int(fragment.max(initial=-1)) + 1)
+    count = np.bincount(fragment[owned], minlength=fragment_count)
+    lower, upper = _bounding_boxes(comm, x[by_fragment], count)
+    small, large = _overlapping_boxes(lower, upper, sum_over_ranks(comm, count))
     if not len(small):
         return None
-    near = _points_in_boxes(x[nodes], start, count, small, lower[large], upper[large])
-    holds = np.zeros(fragment.max() + 1, bool)
-    holds[names[large]] = True
+    near = by_fragment[
+        _points_in_boxes(x[by_fragment], np.cumsum(count) - count, count, small, lower[large], upper[large])
+    ]
+    holds = np.zeros(fragment_count, bool)
+    holds[large] = True
     searched = np.flatnonzero(holds[cell_fragment])
-    if not len(searched):
+    box_of_near = _bounding_boxes(comm, x[near], np.array([len(near)]))
+    searched = searched[_cells_at_box(x, box_of_near[0][0], box_of_near[1][0], cells[searched])]
+    sampled = cells[searched[:: len(searched) // SAMPLED_CELLS + 1]]
+    radii = concatenate_over_ranks(comm, _balls(x, sampled)[1])
+    if not len(radii):
         return None
-    usual_radius = float(np.median(_balls(x, cells[searched[:: len(searched) // SAMPLED_CELLS + 1]])[1]))
-    searched = searched[_cells_at_points(x, nodes[near], cells[searched])]
-    node, cell = _candidates(x, nodes[near], cells[searched], 4 * usual_radius)
-    foreign = fragment[node] != cell_fragment[searched[cell]]
-    node, cell = node[foreign], searched[cell[foreign]]
-    depth = _min_barycentric(x, node, cells[cell])
+    near_x, near_fragment, near_number = _nodes_at_cells(comm, x, cells[searched], near, fragment, shared.numbers)
+    node, cell = _candidates(near_x, x, cells[searched], 4 * float(np.median(radii)))
+    cell = searched[cell]
+    foreign = near_fragment[node] != cell_fragment[cell]
+    node, cell = node[foreign], cell[foreign]
+    depth = _min_barycentric(near_x[node], x[cells[cell]])
+    overlaps = []
     # least barycentric coordinate of a node that counts as inside: bodies that only touch do not interpenetrate
-    if not len(depth) or depth.max() <= 0.05:
-        return None
-    deepest = np.argmax(depth)
-    return int(node[deepest]), int(cell[deepest])
+    if len(depth) and depth.max() > 0.05:
+        deepest = np.argmax(depth)
+        inner, outer = node[deepest], cell[deepest]
+        pair = int(near_fragment[inner]), int(cell_fragment[outer])
+        overlaps = [Overlap(float(depth[deepest]), int(near_number[inner]), tuple(near_x[inner].tolist()), pair)]
+    return max((overlap for of_rank in allgather(comm, overlaps) for overlap in of_rank), default=None)
+
+
+def _bounding_boxes(comm: MPI.Intracomm, x: Values, count: Ints) -> tuple[Values, Values]:
+    """(k, d) lower and (k, d) upper corners of the boxes about k groups of points of all ranks (collective).
+
+    `x`: (n, d) points, group by group.    `count`: (k,) points of this rank in each group.
+    """
+    lower, upper = np.full((len(count), x.shape[1]), np.inf), np.full((len(count), x.shape[1]), -np.inf)
+    used = np.flatnonzero(count)
+    start = (np.cumsum(count) - count)[used]
+    if len(used):
+        lower[used], upper[used] = np.minimum.reduceat(x, start), np.maximum.reduceat(x, start)
+    if comm.size > 1:
+        comm.Allreduce(MPI.IN_PLACE, lower, MPI.MIN)
+        comm.Allreduce(MPI.IN_PLACE, upper, MPI.MAX)
+    return lower, upper
+
+
+def _nodes_at_cells(
+    comm: MPI.Intracomm, x: Values, cells: Ints, nodes: Ints, fragment: Ints, numbers: Ints
+) -> tuple[Values, Ints, Ints]:
+    """(n, d) positions, (n,) fragments and (n,) numbers of nodes of all ranks in the box about cells of this rank.
+
+    Collective. `nodes`: (k,) that this rank has to offer.
+    """
+    if comm.size == 1:
+        return x[nodes], fragment[nodes], numbers[nodes]
+    corners = x[cells.reshape(-1)]
+    boxes = allgather(comm, (corners.min(axis=0, initial=np.inf), corners.max(axis=0, initial=-np.inf)))
+    inside = [nodes[((x[nodes] >= lower) & (x[nodes] <= upper)).all(axis=1)] for lower, upper in boxes]
+    arrived = alltoall(comm, [(x[rows], fragment[rows], numbers[rows]) for rows in inside])
+    near_x, near_fragment, near_number = (np.concatenate(parts) for parts in zip(*arrived, strict=True))
+    return near_x, near_fragment, near_number
 
 
 def _overlapping_boxes(lower: Values, upper: Values, count: Ints) -> tuple[Ints, Ints]:
@@ -74,11 +158,8 @@ def _points_in_boxes(x: Values, start: Ints, count: Ints, small: Ints, lower: Va
     return np.unique(point[((position > lower[pair]) & (position < upper[pair])).all(axis=1)])
 
 
-def _cells_at_points(x: Values, nodes: Ints, cells: Ints) -> Flags:
-    """Flags (C,) of the cells that overlap the box about some nodes."""
-    if not len(nodes):
-        return np.zeros(len(cells), bool)
-    lower, upper = x[nodes].min(axis=0), x[nodes].max(axis=0)
+def _cells_at_box(x: Values, lower: Values, upper: Values, cells: Ints) -> Flags:
+    """Flags (C,) of the cells that overlap a box."""
     bits = 1 << np.arange(x.shape[1], dtype=np.uint8)
     # A cell all of whose nodes are on one outer side of the box does not overlap it.
     sides = ((x < lower) @ bits, (x > upper) @ bits)
@@ -92,26 +173,25 @@ def _balls(x: Values, cells: Ints) -> tuple[Values, Values]:
     return centre, np.sqrt(((corners - centre[:, None]) ** 2).sum(axis=2).max(axis=1))
 
 
-def _candidates(x: Values, nodes: Ints, cells: Ints, max_radius: float) -> tuple[Ints, Ints]:
-    """Pairs (node, index in `cells`) in which the node lies in the smallest ball about the cell's centre."""
+def _candidates(points: Values, x: Values, cells: Ints, max_radius: float) -> tuple[Ints, Ints]:
+    """Pairs (index in `points` (n, d), index in `cells`) of points in the smallest ball about the cell's centre."""
     centre, radius = _balls(x, cells)
     # larger cells are torn or crushed, and are left out
     usual = np.flatnonzero(radius < max_radius)
-    if not len(usual):
+    if not len(usual) or not len(points):
         return np.empty(0, np.int64), np.empty(0, np.int64)
     centres = cKDTree(centre[usual])
-    pairs = cKDTree(x[nodes]).sparse_distance_matrix(centres, radius[usual].max(), output_type="ndarray")
+    pairs = cKDTree(points).sparse_distance_matrix(centres, radius[usual].max(), output_type="ndarray")
     cell = usual[pairs["j"]]
     close = pairs["v"] < radius[cell]
-    return nodes[pairs["i"][close]], cell[close]
+    return pairs["i"][close], cell[close]
 
 
-def _min_barycentric(x: Values, node: Ints, cells: Ints) -> Values:
-    """(n,) minimum barycentric coordinate of each node in its cell; -1 in a cell without volume."""
-    corners = x[cells]
+def _min_barycentric(points: Values, corners: Values) -> Values:
+    """(n,) minimum barycentric coordinate of points (n, d) in cells with corners (n, d + 1, d); -1 without volume."""
     edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
     real = np.flatnonzero(np.linalg.det(edges) != 0)
-    depth = np.full(len(node), -1.0)
-    inner = np.linalg.solve(edges[real], (x[node[real]] - corners[real, 0])[:, :, None])[:, :, 0]
+    depth = np.full(len(points), -1.0)
+    inner = np.linalg.solve(edges[real], (points[real] - corners[real, 0])[:, :, None])[:, :, 0]
     depth[real] = np.minimum(inner.min(axis=1), 1 - inner.sum(axis=1))
     return depth

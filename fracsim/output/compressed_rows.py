@@ -1,12 +1,13 @@
-"""Compression of the rows of fields.h5 on all ranks: the filters shuffle and deflate of HDF5, a chunk at a time.
+"""Compression of rows on all ranks, a chunk at a time: those of fields.h5, and those of the split surface.
 
-Chunk k holds rows k n to (k + 1) n of the input mesh and is compressed on rank k mod (number of ranks). Rank 0 receives
+Chunk k holds rows k n to (k + 1) n of the whole mesh and is compressed on rank k mod (number of ranks). Rank 0 receives
 compressed bytes only, and writes them. Chunks do not depend on the number of ranks.
 """
 
 from __future__ import annotations
 
 import zlib
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -41,18 +42,40 @@ class CompressedField:
     chunks: list[bytes] = field(default_factory=list)
 
 
+def compress_chunk(values: npt.NDArray[Any]) -> bytes:
+    """Bytes of a chunk after the filters shuffle and deflate of HDF5: a zlib stream of its byte planes."""
+    planes = values.reshape(-1).view(np.uint8).reshape(-1, values.itemsize).T
+    return zlib.compress(np.ascontiguousarray(planes), COMPRESSION_LEVEL)
+
+
 class RowCompressor:
-    """Compresses rows of owned entities in the order of the input mesh.
+    """Compresses rows of owned entities in the order of the whole mesh.
 
     Attributes:
         rows: rows of all ranks.
         chunk_rows: rows of a chunk.
     """
 
-    def __init__(self, comm: MPI.Intracomm, input_index: Ints, chunk_rows: int = ROWS_PER_CHUNK) -> None:
-        """`input_index`: (n,) index in the input mesh of each entity that this rank owns (collective)."""
+    def __init__(
+        self,
+        comm: MPI.Intracomm,
+        input_index: Ints,
+        chunk_rows: int = ROWS_PER_CHUNK,
+        *,
+        compress: Callable[[npt.NDArray[Any]], bytes] = compress_chunk,
+        fill_last: bool = True,
+    ) -> None:
+        """Find out which rank compresses which rows (collective).
+
+        Args:
+            comm: the ranks that own rows.
+            input_index: (n,) index in the whole mesh of each entity that this rank owns.
+            chunk_rows: rows of a chunk.
+            compress: bytes of a chunk.
+            fill_last: zeros follow in the last chunk, so that it is as long as the others.
+        """
         self._comm, self.rows = comm, int(comm.allreduce(len(input_index)))
-        self.chunk_rows = max(min(self.rows, chunk_rows), 1)
+        self.chunk_rows, self._compress, self._fills_last = max(min(self.rows, chunk_rows), 1), compress, fill_last
         chunk = input_index // self.chunk_rows
         rank = chunk % comm.size
         self._order = np.argsort(rank, kind="stable")
@@ -71,13 +94,12 @@ class RowCompressor:
             rows = exchange_rows(self._comm, rows, self._sent, self._received)
         chunks = np.zeros((self._chunks, self.chunk_rows, *rows.shape[1:]), rows.dtype)
         chunks.reshape(-1, *rows.shape[1:])[self._position] = rows
-        parts = gather(self._comm, [compress_chunk(chunk) for chunk in chunks])
+        parts = gather(self._comm, [self._compress(self._trimmed(chunk, k)) for k, chunk in enumerate(chunks)])
         if parts is None:
             return None
         return [part[k] for k in range(max(map(len, parts))) for part in parts if k < len(part)]
 
-
-def compress_chunk(values: npt.NDArray[Any]) -> bytes:
-    """Bytes of a chunk after the filters shuffle and deflate: a zlib stream of its byte planes."""
-    planes = values.reshape(-1).view(np.uint8).reshape(-1, values.itemsize).T
-    return zlib.compress(np.ascontiguousarray(planes), COMPRESSION_LEVEL)
+    def _trimmed(self, chunk: npt.NDArray[Any], k: int) -> npt.NDArray[Any]:
+        """Chunk k of this rank, without the rows beyond the last one unless these are compressed too."""
+        first = (self._comm.rank + k * self._comm.size) * self.chunk_rows
+        return chunk if self._fills_last else chunk[: self.rows - first]

@@ -204,8 +204,8 @@ class FrameFiles:
         """Number of frames in each file (rank 0; empty on the other ranks)."""
         if self.fields is None:
             return {}
-        opened = None if self.surface is None else self.surface.surface_and_files
-        of_surface = {} if opened is None or opened[1] is None else opened[1].frame_counts
+        surface_files = None if self.surface is None else self.surface.files
+        of_surface = {} if surface_files is None else surface_files.frame_counts
         return {"fields.h5": len(self.fields.times), **of_surface}
 
     def write_frame(self, state: State) -> None:

@@ -238,7 +238,7 @@ def _edge_determinants(corners_of: Callable[[Ints], Values], cells: Ints) -> Val
 
 
 class InterpenetrationMonitor:
-    """First frame in which fragments interpenetrate, in a study without contact between them (rank 0).
+    """First frame in which fragments interpenetrate, in a study without contact between them.
 
     Later frames are not checked, nor is a body of one fragment.
 
@@ -250,26 +250,24 @@ class InterpenetrationMonitor:
         self.first_overlap: dict[str, Any] = {}
 
     def record_frame(self, t: float, surface: BodySurface, u: Values) -> None:
-        """Record a frame at time t in s (rank 0).
+        """Record a frame at time t in s (collective over the ranks with parts of the surface).
 
         Args:
             t: time, s.
             surface: surface of the body, with its fragments.
             u: nodal displacement (N, d), m.
         """
-        fragment_of_node = surface.split.node_fragment
         if self.first_overlap or surface.split.fragment_count == 1:
             return
-        from ..mesh.interpenetration import find_interpenetration
+        from ..mesh.interpenetration import RankNodes, find_interpenetration
 
-        x = surface.skeleton.points + u
+        part = surface.part
+        nodes = RankNodes(part.comm, part.node_numbers, part.owner == part.comm.rank)
         cells = surface.skeleton.cells[surface.undamaged_cells]
-        first = find_interpenetration(x, cells, fragment_of_node)
-        if first is not None:
-            node, cell = first
-            pair = (node, cells[cell, 0])
-            names = sorted(int(surface.fragment_names[fragment_of_node[corner]]) for corner in pair)
-            self.first_overlap = {"time": t, "place": x[node].tolist(), "pieces": names}
+        overlap = find_interpenetration(surface.skeleton.points + u, cells, surface.split.node_fragment, nodes)
+        if overlap is not None:
+            names = sorted(int(surface.fragment_names[fragment]) for fragment in overlap.fragments)
+            self.first_overlap = {"time": t, "place": list(overlap.position), "pieces": names}
 
     def to_checkpoint(self) -> dict[str, Any]:
         """Values for `from_checkpoint`."""

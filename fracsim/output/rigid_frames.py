@@ -18,13 +18,15 @@ from ..contact.obstacle_tessellation import ObstacleTessellations
 from ..contact.pose import PosedShape
 from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from ..mesh.split_surface.entity_numbering import EntityNumbering
+from ..mesh.split_surface.mesh_part import WholeMesh
 from ..mesh.split_surface.surface_motion import PointParents
+from ..mesh.split_surface.surface_numbering import number_whole_surface
 from ..meshes.data import MeshData
 from ..meshes.topology import signed_measures
 from ..rigid.bodies import Bodies
 from ..rigid.instance_placement import InstancePoses
 from .surface.body_surface import BodySurface
-from .surface.fragment_table import FragmentNames, FragmentTable, enclosed_volumes, group_sums
+from .surface.fragment_table import FragmentNames, FragmentTable, group_sums
 from .surface.vtk_files import SurfaceFiles
 
 Ints = npt.NDArray[np.int64]
@@ -143,7 +145,8 @@ class InstanceSurface(BodySurface):
             poses: reference poses of the instances.
             density: mass density, kg/m^3.
         """
-        self.skeleton, self._poses, self._names, self.build_count = EntityNumbering(mesh), poses, FragmentNames(), 0
+        self.part = WholeMesh(EntityNumbering(mesh))
+        self.skeleton, self._poses, self._names, self.build_count = self.part.skeleton, poses, FragmentNames(), 0
         count = len(poses)
         share = np.repeat(density * signed_measures(mesh.points, mesh.cells) / (mesh.dim + 1), mesh.dim + 1)
         self.mass = np.tile(group_sums(mesh.cells.ravel(), share, len(mesh.points)), count)
@@ -200,13 +203,12 @@ class InstanceSurface(BodySurface):
     def _join(self) -> None:
         """Join the surfaces of the instances."""
         self.split = built = join_surfaces(self._instances, self.skeleton, self._poses)
-        self.fragment_names = self._names.update(built.fragment_count, built.node_fragment, self.mass)
-        fragment = built.point_fragment
-        self.volume = enclosed_volumes(
-            built.points, built.elements, fragment[built.elements[:, 0]], built.fragment_count
-        )
-        self._name_of_point = self.fragment_names[fragment]
-        self.build_count += 1
+        numbering = number_whole_surface(len(built.points), len(built.elements), 0)
+        self._use_surface(numbering, np.ones(len(built.node_fragment), bool))
+
+    def _input_cells(self, cells: Ints) -> Ints:
+        """Cells are numbered over all instances."""
+        return cells
 
 
 def join_surfaces(instances: Sequence[SplitSurface], skeleton: EntityNumbering, poses: InstancePoses) -> SplitSurface:

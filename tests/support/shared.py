@@ -232,11 +232,11 @@ def run_from_file(name: str, path: Path) -> dict[str, Any]:
         return torn.run(name)
 
 
-def gathered_by_a_run(path: Path, folder: Path, *, surface: bool) -> tuple[bool, int]:
+def gathered_by_a_run(path: Path, folder: Path, surface: dict[str, Any]) -> tuple[bool, int]:
     """Whether rank 0 has the whole mesh after a run with frames and breaks, and broken edges (collective)."""
     comm = MPI.COMM_WORLD
     study = make_study(**torn.RUNS["block"] | {"mesh": {"file": str(path)}, "solver": torn.TIGHT}
-                       | {"output": {"every": 2, "picture": False, "surface": surface}})  # fmt: skip
+                       | {"output": {"every": 2, "picture": False, **surface}})  # fmt: skip
     scene = build_scene(comm, study)
     summary = Run(scene, folder)()
     assert scene.domain.whole_mesh is None
@@ -275,11 +275,11 @@ def main(path: str) -> None:
         share = share_of(file, comm)
         assert share is not None
         found[f"shares-{name}"] = np.array(comm.allgather((len(share.points), len(share.cells))))
-    for surface in (False, True):
-        gathered = gathered_by_a_run(files["block"], folder / f"out-{surface}", surface=surface)
-        found[f"gathered-{surface}"] = np.array(gathered)
+    surfaces = {"none": {"surface": False}, "surface": {"surface": True}, "smooth": {"surface": True, "cut": "smooth"}}
+    for kind, surface in surfaces.items():
+        found[f"gathered-{kind}"] = np.array(gathered_by_a_run(files["block"], folder / f"out-{kind}", surface))
     if comm.rank == 0:
-        with h5py.File(folder / "out-False" / "fields.h5") as file:
+        with h5py.File(folder / "out-none" / "fields.h5") as file:
             found |= {f"fields-{name}": file[name][:] for name in ("points", "cells")}
         np.savez(path, **found)
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from fracsim.fracture.edge_history import EdgeHistory
 from fracsim.mesh.fragments import find_fragments
 from fracsim.output.surface.surface_output import SurfaceOutput
 from fracsim.scene import Scene
 from fracsim.timestepping.state import State
+
+from .surface_parts import Arrays, gathered_surface
 
 
 class WrittenSurface:
@@ -32,22 +32,16 @@ class WrittenSurface:
         if self._steps % 4 == 0:
             self._output.write_frame(state, [])
 
-    def result(self, name: str) -> dict[str, npt.NDArray[Any]]:
+    def result(self, name: str) -> Arrays:
         """The last frame, on rank 0 (collective)."""
-        domain = self._scene.domain
+        domain, surface = self._scene.domain, self._output.surface
         of_node = domain.input_numbering.gather_nodes(
             find_fragments(self._scene.fracture.graph).node_fragment[: domain.node_count]
         )
         ours = domain.input_numbering.gather_cells(domain.input_numbering.nodes[domain.cell_nodes])
-        if self._output.surface_and_files is None:
+        assert surface is not None
+        arrays = gathered_surface(surface)
+        if domain.input_mesh is None or of_node is None:
             return {}
-        surface, _ = self._output.surface_and_files
-        made, follow = surface.split, surface.split.parents
-        assert domain.input_mesh is not None
         assert np.array_equal(ours, domain.input_mesh.cells)  # patterns are in the local order of the input cells
-        arrays = {
-            "elements": made.elements, "cell": made.cell, "edge": made.edge, "origin": made.origin,
-            "points": made.points, "start": follow.start, "parents": follow.parents, "fill": made.fill,
-            "names": surface.fragment_names, "piece": made.node_fragment, "graph-piece": of_node,
-        }  # fmt: skip
-        return {f"surface-{name}-{key}": values for key, values in arrays.items()}
+        return {f"surface-{name}-{key}": values for key, values in {**arrays, "graph-piece": of_node}.items()}

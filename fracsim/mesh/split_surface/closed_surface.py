@@ -90,6 +90,34 @@ class SurfacePoints:
         rows[self.first :, 1] = np.sort(np.where(self.group, corners, -1), axis=1)
         return row_keys(rows.reshape(len(rows), -1))
 
+    def order_keys(self, node_numbers: Ints, cell_numbers: Ints) -> tuple[Ints, Ints]:
+        """(n, 3) keys that order the points of several parts of a mesh as those of the whole mesh.
+
+        Also returns (n,) the lowest cell of each copy, 0 for nodes. `node_numbers` and `cell_numbers`: of the input
+        mesh.
+        """
+        topology, nodes, copies = self._topology, self.parents.parents[: self.first], slice(self.first, None)
+        kind = np.concatenate([np.zeros(self.first, np.int64), 1 + self.kind])
+        entity = np.zeros((len(kind), topology.dim + 1), np.int64)
+        entity[: self.first, 0] = node_numbers[nodes]
+        entity[copies, 0], entity[copies, -1] = cell_numbers[self.cell], self.group.argmax(axis=1)
+        selected = np.flatnonzero(self.kind == CutEntity.EDGE)
+        edge = topology.cell_edges[self.cell[selected], self.entity[selected]]
+        end = topology.cells[self.cell[selected], self.group[selected].argmax(axis=1)]
+        entity[self.first + selected, :2] = node_numbers[topology.edges[edge]]
+        entity[self.first + selected, 2:] = 0
+        entity[self.first + selected, -1] = end == topology.edges[edge, 1]
+        selected = np.flatnonzero(self.kind == CutEntity.FACET)
+        facet = topology.facets[topology.cell_facets[self.cell[selected], self.entity[selected]]]
+        group = np.where(self.group[selected], topology.cells[self.cell[selected]], len(topology.points))
+        entity[self.first + selected, :-1] = node_numbers[facet]
+        entity[self.first + selected, -1] = np.count_nonzero(facet < group.min(axis=1)[:, None], axis=1)
+        # numbers of entities have 31 bits
+        lead = (kind << 40) + entity[:, 0]
+        middle = entity[:, 1] if topology.dim == 2 else (entity[:, 1] << 32) + entity[:, 2]
+        lowest_cell = np.concatenate([np.zeros(self.first, np.int64), cell_numbers[self.cell]])
+        return np.stack([lead, middle, entity[:, -1]], axis=1), lowest_cell
+
     def _keys(self, row: Ints, cell: Ints, owner: Ints) -> Ints:
         """(copies,) keys that are equal in all cells of a copy: (edge, end), (facet, group) or (cell, group)."""
         topology, copies, d = self._topology, self._copies, self._topology.dim
@@ -205,14 +233,15 @@ def build_split_surface(
     pattern: npt.NDArray[np.integer],
     cut: Values | None = None,
     table: Callable[[int], CutTable] = cut_table,
+    fragments: Callable[[npt.NDArray[np.bool_]], tuple[int, Ints]] | None = None,
 ) -> SplitSurface:
     """The split surface of damage patterns (C,), see EdgeGraph.pattern.
 
     `cut`: (E,) position of the cut of each edge, from the lower node (0) to the higher (1); NaN: 1/2.
-    `table`: the table of patterns for a dimension.
+    `table`: the table of patterns for a dimension.    `fragments`: find_fragments of a MeshPart; None: of the topology.
     """
     rows = table if pattern.any() else intact_cell_table
-    return _SurfaceBuilder(topology, pattern, cut, rows(topology.dim))()
+    return _SurfaceBuilder(topology, pattern, cut, rows(topology.dim))(fragments or topology.find_fragments)
 
 
 def build_surface_points(
@@ -238,10 +267,10 @@ class _SurfaceBuilder:
         self.broken = topology.broken_edges(pattern)
         self.points = SurfacePoints(topology, self.damaged, self.pattern, cut, table)
 
-    def __call__(self) -> SplitSurface:
+    def __call__(self, fragments: Callable[[npt.NDArray[np.bool_]], tuple[int, Ints]]) -> SplitSurface:
         parts = self._undamaged_cell_facets(), self._damaged_cell_facets(), self._crack_faces()
         elements, cell, edge, origin = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
-        count, node_fragment = self.topology.find_fragments(self.broken)
+        count, node_fragment = fragments(self.broken)
         points = self.points
         return SplitSurface(
             points.positions,

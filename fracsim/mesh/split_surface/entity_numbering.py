@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -18,6 +19,21 @@ Values = npt.NDArray[np.float64]
 CRACK, BODY = 0, 1
 
 
+@dataclass(frozen=True)
+class BoundaryFacets:
+    """Boundary facets of a mesh, or of a part of it.
+
+    Attributes:
+        sides: (B, 2) cell and local facet of each, in the order of the cells.
+        origins: names of the possible origins of an element.
+        origin: (B,) index into `origins` of each.
+    """
+
+    sides: Ints
+    origins: list[str]
+    origin: Ints
+
+
 class EntityNumbering(MeshTopology):
     """A mesh with numbered edges, facets and boundary facets.
 
@@ -30,13 +46,16 @@ class EntityNumbering(MeshTopology):
         origin: (B,) index into `origins` of each boundary facet.
     """
 
-    def __init__(self, mesh: MeshData) -> None:
+    def __init__(self, mesh: MeshData, boundary: BoundaryFacets | None = None) -> None:
+        """`boundary`: of the body, where the mesh is a part of it; None: the facets of one cell."""
         super().__init__(mesh)
         sorted_facets = sorted_rows(facets_of(mesh.cells).reshape(-1, mesh.dim))
         facets, counts, inverse = distinct_rows(sorted_facets)
-        self.facets, self.cell_facets = facets.astype(np.int32), inverse.reshape(len(mesh.cells), -1).astype(np.int32)
-        self.boundary = np.argwhere(counts[self.cell_facets] == 1)
-        self.origins, self.origin = _origins(mesh, self.facets[self.cell_facets[tuple(self.boundary.T)]])
+        self.facets, self.cell_facets = facets.astype(np.int32), inverse.reshape(mesh.cells.shape).astype(np.int32)
+        if boundary is None:
+            sides = np.argwhere(counts[self.cell_facets] == 1)
+            boundary = BoundaryFacets(sides, *_origins(mesh, self.facets[self.cell_facets[tuple(sides.T)]]))
+        self.boundary, self.origins, self.origin = boundary.sides, boundary.origins, boundary.origin
 
     def with_points(self, points: Values) -> EntityNumbering:
         """This topology with nodes at `points` (N, d), m."""
@@ -81,6 +100,19 @@ def _origins(mesh: MeshData, facets: npt.NDArray[np.int32]) -> tuple[list[str], 
     member: npt.NDArray[np.bool_] = np.zeros((len(boundary), 0), bool)
     if groups:
         member = np.stack([np.isin(boundary, numbers) for numbers in members], axis=1)
-    kinds, kind_number = np.unique(member, axis=0, return_inverse=True)
-    named = [" + ".join(np.array(list(groups))[kind]) if kind.any() else "boundary" for kind in kinds]
-    return ["crack", "body", *named], kind_number.reshape(-1) + 2
+    return name_origins(list(groups), member, member)
+
+
+def name_origins(
+    groups: list[str], member: npt.NDArray[np.bool_], kinds: npt.NDArray[np.bool_]
+) -> tuple[list[str], Ints]:
+    """Names of origins, and (B,) the index of the name of each boundary facet.
+
+    Args:
+        groups: names of the groups.
+        member: (B, groups) flags of the groups that each facet is in.
+        kinds: (n, groups) rows among which are all rows that occur on any rank.
+    """
+    distinct, number = np.unique(np.concatenate([kinds, member]), axis=0, return_inverse=True)
+    named = [" + ".join(np.array(groups)[kind]) if kind.any() else "boundary" for kind in distinct]
+    return ["crack", "body", *named], number.reshape(-1)[len(kinds) :] + 2

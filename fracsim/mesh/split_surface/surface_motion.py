@@ -15,13 +15,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
+from ..parallel import RowRouting
 from ..simplices import is_split, local_edges
 from ..small_matrices import polar_rotation
-from .entity_numbering import EntityNumbering
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
+
+    from .mesh_part import MeshPart
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -102,11 +105,29 @@ class NodalRotations:
     R is the identity: the fragment is smaller than a cell, and its rotation is unknown.
     """
 
-    def __init__(self, topology: EntityNumbering, pattern: npt.NDArray[np.integer], nodes: Ints) -> None:
-        d = topology.dim
-        nodes, self._of = np.unique(_rotation_source(topology, pattern)[nodes], return_inverse=True)
+    def __init__(self, part: MeshPart, pattern: npt.NDArray[np.integer], nodes: Ints) -> None:
+        """`nodes`: (k,) of this rank (collective)."""
+        topology = part.skeleton
+        d, comm = topology.dim, part.comm
+        self._part, self._identity = part, np.eye(d)
+        # of all nodes, since ranks find the nearest ones together
+        sources = _rotation_source(part, pattern)[nodes]
+        self._is_used = comm.allreduce(len(nodes) > 0, op=MPI.LOR)
+        if not self._is_used:
+            return
+        from scipy.sparse import csr_matrix
+
+        keys, self._of = np.unique(sources, return_inverse=True)
+        # the owner of a node has its rotation
+        self._routing = RowRouting(comm, keys % comm.size)
+        asked = np.searchsorted(part.node_numbers, self._routing.send(keys) // comm.size)
+        is_asked = np.zeros(len(topology.points), bool)
+        is_asked[asked] = True
+        everywhere = np.arange(len(topology.points))
+        self._nodes = np.flatnonzero(part.sum_at(everywhere, is_asked[:, None].astype(float))[:, 0])
         row = np.full(len(topology.points), -1)
-        row[nodes] = np.arange(len(nodes))
+        row[self._nodes] = np.arange(len(self._nodes))
+        self._asked = row[asked]
         around = np.any(row[topology.cells] >= 0, axis=1) & ~is_split(d)[pattern]
         self._cells = topology.cells[around]
         span = topology.points[self._cells]
@@ -117,49 +138,49 @@ class NodalRotations:
         target = row[self._cells]
         cell, corner = np.nonzero(target >= 0)
         ones = np.ones(len(cell))
-        self._identity = np.eye(d)
-        self._sum: csr_matrix | None = None
-        if len(nodes):
-            from scipy.sparse import csr_matrix
-
-            self._sum = csr_matrix((ones, (target[cell, corner], cell)), shape=(len(nodes), len(self._cells)))
-            volume = self._sum @ np.abs(np.linalg.det(span))
-            # without cells the mean is 0 and F the identity
-            self._per_volume = 1.0 / np.where(volume > 0, volume, 1.0)
+        self._sum = csr_matrix((ones, (target[cell, corner], cell)), shape=(len(self._nodes), len(self._cells)))
+        volume = part.sum_at(self._nodes, (self._sum @ np.abs(np.linalg.det(span)))[:, None])
+        # without cells the mean is 0 and F the identity
+        self._per_volume = 1.0 / np.where(volume > 0, volume, 1.0)
 
     def __call__(self, u: Values) -> Values:
-        """(nodes, d, d) rotations R for displacements u (N, d), m, with F = 1 + mean of grad u."""
+        """(nodes, d, d) rotations R for displacements u (N, d), m, with F = 1 + mean of grad u (collective)."""
         d = len(self._identity)
-        if self._sum is None:
+        if not self._is_used:
             return np.empty((0, d, d))
         moved = u[self._cells]
         moved = moved[:, 1:] - moved[:, :1]
         gradient = np.einsum("nkj,nki->nij", np.swapaxes(self._inverse, 1, 2), moved)
-        mean = (self._sum @ gradient.reshape(-1, d * d)) * self._per_volume[:, None]
+        mean = self._part.sum_at(self._nodes, self._sum @ gradient.reshape(-1, d * d)) * self._per_volume
         F = mean.reshape(-1, d, d) + self._identity
-        return polar_rotation(F)[self._of]
+        return self._routing.send_back(polar_rotation(F)[self._asked])[self._of]
 
 
-def _rotation_source(topology: EntityNumbering, pattern: npt.NDArray[np.integer]) -> Ints:
-    """(N,) the node whose rotation each node has.
+def _rotation_source(part: MeshPart, pattern: npt.NDArray[np.integer]) -> Ints:
+    """(N,) the node whose rotation each node has, as its number in the input mesh times the ranks plus its owner.
 
     That is the node itself if it has an unsplit cell or if no connected node has one. Otherwise it is the nearest such
-    node along intact edges, the lowest one of several.
+    node along intact edges, the lowest one of several (collective).
     """
-    result = np.arange(len(topology.points))
-    has_unsplit_cell = np.zeros(len(result), bool)
-    has_unsplit_cell[topology.cells[~is_split(topology.dim)[pattern]]] = True
-    if has_unsplit_cell.all():
+    topology, comm = part.skeleton, part.comm
+    result = part.node_numbers * comm.size + part.owner
+    lacks_unsplit_cell = np.ones(len(result), np.int64)
+    lacks_unsplit_cell[topology.cells[~is_split(topology.dim)[pattern]]] = 0
+    has_rotation = part.least(lacks_unsplit_cell) == 0
+    if comm.allreduce(bool(has_rotation.all()), op=MPI.LAND):
         return result
     pairs = local_edges(topology.dim)
-    cells = np.flatnonzero(~has_unsplit_cell[topology.cells].all(axis=1))
+    cells = np.flatnonzero(~has_rotation[topology.cells].all(axis=1))
     intact = (np.asarray(pattern)[cells, None] >> np.arange(len(pairs))) & 1 == 0
     ends = topology.cells[cells][:, pairs][intact]
     ends = np.concatenate([ends, ends[:, ::-1]])
-    has_rotation = has_unsplit_cell.copy()
-    while len(new := np.flatnonzero(~has_rotation[ends[:, 0]] & has_rotation[ends[:, 1]])):
-        nearest = np.full(len(result), len(result))
+    far = np.iinfo(np.int64).max
+    while True:
+        new = np.flatnonzero(~has_rotation[ends[:, 0]] & has_rotation[ends[:, 1]])
+        nearest: Ints = np.full(len(result), far)
         np.minimum.at(nearest, ends[new, 0], result[ends[new, 1]])
-        reached = np.unique(ends[new, 0])
+        nearest = part.least(nearest)
+        reached = np.flatnonzero(nearest < far)
+        if not comm.allreduce(len(reached) > 0, op=MPI.LOR):
+            return result
         result[reached], has_rotation[reached] = nearest[reached], True
-    return result

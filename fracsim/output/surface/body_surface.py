@@ -1,22 +1,31 @@
-"""Split surface of a body at a time: built again if edges broke, otherwise only moved."""
+"""Split surface of a body at a time: built again if edges broke, otherwise only moved.
+
+Each rank has the surface of its part of the mesh (mesh_part), which is a whole mesh on one rank, or its own cells.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
 from ...errors import NotConverged
+from ...mesh.parallel import Gather, allgather
 from ...mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from ...mesh.split_surface.entity_numbering import BODY, EntityNumbering
+from ...mesh.split_surface.mesh_part import MeshPart, WholeMesh, total
 from ...mesh.split_surface.surface_motion import NodalRotations
+from ...mesh.split_surface.surface_numbering import SurfaceNumbering, number_surface, number_whole_surface
 from ...meshes.data import MeshData
 from ...meshes.topology import signed_measures
-from ..fields_file import Field
+from ..fields_file import Field, rounded
 from .fragment_table import FragmentNames, FragmentTable, enclosed_volumes, group_sums, tabulate_fragments
+from .vtu_file import CompressedGrid, GridCompressor
 
 if TYPE_CHECKING:
     from ...mesh.split_surface.surface_map import SurfaceMap
@@ -33,7 +42,7 @@ MAX_COORDINATE = float(np.finfo(np.float32).max)
 
 @dataclass(frozen=True)
 class SurfaceFrame:
-    """Split surface at a time, ready to be written.
+    """Split surface at a time, ready to be written, or the part of it that a rank has.
 
     Attributes:
         t: time, s.
@@ -43,7 +52,9 @@ class SurfaceFrame:
         point_fields: fields at the points, by name.
         element_fields: fields of the elements, by name. Elements are the triangles, then the segments.
         origins: names of the numbers in element_fields["origin"].
-        fragments: mass, volume and motion of the fragments.
+        fragments: mass, volume and motion of the fragments of the body.
+        numbering: numbers of points and elements on the whole surface.
+        compressor: compresses surfaces with these elements.
     """
 
     t: float
@@ -54,48 +65,91 @@ class SurfaceFrame:
     element_fields: Arrays
     origins: list[str]
     fragments: FragmentTable
+    numbering: SurfaceNumbering
+    compressor: GridCompressor
+
+    def compress(self, precision: str) -> CompressedGrid | None:
+        """The frame for its file on rank 0, None elsewhere (collective).
+
+        `precision`: of points and fields, "single" or "double".
+        """
+        point_fields, element_fields = (
+            {name: rounded(values, precision) for name, values in fields.items()}
+            for fields in (self.point_fields, self.element_fields)
+        )
+        return self.compressor(rounded(self.points, precision), point_fields, element_fields, self.origins)
+
+    def gather(self) -> SurfaceFrame | None:
+        """The frame of the whole surface on rank 0, None elsewhere (collective)."""
+        numbering = self.numbering
+        if numbering.comm.size == 1:
+            return self
+        is_own = numbering.is_own
+        gather_points, gather_elements = (
+            Gather(numbering.comm, numbers) for numbers in (numbering.points[is_own], numbering.elements)
+        )
+        # a segment has no third point
+        segments = np.pad(numbering.points[self.segments], ((0, 0), (0, 1)))
+        points = gather_points(self.points[is_own])
+        elements = gather_elements(np.concatenate([numbering.points[self.triangles], segments]))
+        point_fields: Any = {name: gather_points(values[is_own]) for name, values in self.point_fields.items()}
+        element_fields: Any = {name: gather_elements(values) for name, values in self.element_fields.items()}
+        if points is None or elements is None:
+            return None
+        triangles, segments = elements[: numbering.triangle_count], elements[numbering.triangle_count :, :2]
+        whole = number_whole_surface(len(points), len(triangles), len(segments))
+        return replace(
+            self, points=points, triangles=triangles, segments=segments, point_fields=point_fields,
+            element_fields=element_fields, numbering=whole, compressor=GridCompressor(whole, triangles, segments),
+        )  # fmt: skip
 
 
 class BodySurface:
-    """Split surface of a mesh, on the rank that has the mesh.
+    """Split surface of a mesh, or of the part of it that a rank has.
 
     Attributes:
-        skeleton: edges, facets and boundary of the mesh.
-        split: surface in the reference configuration.
-        mass: lumped masses (N,) of the nodes, kg.
+        part: the part of the mesh.
+        skeleton: edges, facets and boundary of the part.
+        split: surface in the reference configuration; its fragments are those of the body.
+        numbering: numbers of its points and elements on the surface of all ranks.
+        mass: lumped masses (N,) of the nodes, kg; 0 at nodes that another rank owns.
         fragment_names: names (fragments,), numbers that stay with a fragment.
+        fragment_nodes: numbers (fragments,) of nodes.
         volume: volumes (fragments,), m^3 (2D: m^2).
         build_count: how often the surface was built.
     """
 
     split: SplitSurface
 
-    def __init__(self, mesh: MeshData, density: Values | float, *, smooth: bool = False) -> None:
-        """Build the surface of the intact mesh.
+    def __init__(self, mesh: MeshData | MeshPart, density: Values | float, *, smooth: bool = False) -> None:
+        """Build the surface of the intact mesh (collective).
 
         Args:
-            mesh: input mesh.
+            mesh: input mesh on one rank, or the part of it that this rank has.
             density: mass density, kg/m^3; one number or (C,).
-            smooth: broken edges without a given cut are cut so that cracks are smooth.
+            smooth: broken edges without a given cut are cut so that cracks are smooth; of a whole mesh.
         """
         self._smooth = smooth
-        self.skeleton = EntityNumbering(mesh)
-        volume = signed_measures(mesh.points, mesh.cells)
-        share = np.broadcast_to((density * volume / (mesh.dim + 1))[:, None], mesh.cells.shape)
-        self.mass = group_sums(mesh.cells.ravel(), share.ravel(), len(mesh.points))
-        self._names = FragmentNames()
-        self._pattern: npt.NDArray[np.integer] = np.zeros(len(mesh.cells), np.uint8)
+        part: MeshPart = WholeMesh(EntityNumbering(mesh)) if isinstance(mesh, MeshData) else mesh
+        self.part, self.skeleton, topology = part, part.skeleton, part.skeleton
+        volume, nodes = signed_measures(topology.points, topology.cells), np.arange(len(topology.points))
+        share = np.broadcast_to((density * volume / (topology.dim + 1))[:, None], topology.cells.shape)
+        mass = group_sums(topology.cells.ravel(), share.ravel(), len(nodes))
+        self._is_owned = part.owner == part.comm.rank
+        self.mass = np.where(self._is_owned, part.sum_at(nodes, mass[:, None])[:, 0], 0.0)
+        self._names = FragmentNames(part.comm)
+        self._pattern: npt.NDArray[np.integer] = np.zeros(len(topology.cells), np.uint8)
         self.build_count = 0
         self._build(None)
 
     def update(self, pattern: npt.NDArray[np.integer], cut: Values | None = None) -> bool:
-        """Build the surface again if edges broke; returns True if it was built.
+        """Build the surface again if edges broke; returns True if it was built (collective).
 
         Args:
             pattern: edge patterns (C,) of the cells.
             cut: positions (E,) of the cuts of broken edges, see `build_split_surface`.
         """
-        if np.array_equal(pattern, self._pattern):
+        if self.part.comm.allreduce(np.array_equal(pattern, self._pattern), op=MPI.LAND):
             return False
         self._pattern = pattern.copy()
         self._build(cut)
@@ -107,31 +161,39 @@ class BodySurface:
         return self._pattern == 0
 
     def replay_fragment_names(self, broken_at: Values, times: Iterable[float]) -> None:
-        """Restore the names of the fragments after a restart.
+        """Restore the names of the fragments after a restart (collective).
 
         Args:
             broken_at: times (E,) at which edges broke, s.
             times: times of the earlier frames, s.
         """
         for t in times:
-            count, fragment_of_node = self.skeleton.find_fragments(broken_at <= t * (1 + 1e-12))
+            count, fragment_of_node = self.part.find_fragments(broken_at <= t * (1 + 1e-12))
             self._names.update(count, fragment_of_node, self.mass)
 
     def _build(self, cut: Values | None) -> None:
+        part, topology = self.part, self.skeleton
         if self._smooth:
             from ...mesh.split_surface.smooth_cuts import smooth_cuts
 
-            cut = smooth_cuts(self.skeleton, self.skeleton.broken_edges(self._pattern), cut)
-        self.split = built = build_split_surface(self.skeleton, self._pattern, cut)
-        self.fragment_names = self._names.update(built.fragment_count, built.node_fragment, self.mass)
-        fragment = built.point_fragment
-        self.volume = enclosed_volumes(
-            built.points, built.elements, fragment[built.elements[:, 0]], built.fragment_count
-        )
-        self._rotations = NodalRotations(self.skeleton, self._pattern, built.parents.rotating_nodes)
-        self._name_of_point = self.fragment_names[fragment]
+            cut = smooth_cuts(topology, topology.broken_edges(self._pattern), cut)
+        self.split = built = build_split_surface(topology, self._pattern, cut, fragments=part.find_fragments)
+        self._rotations = NodalRotations(part, self._pattern, built.parents.rotating_nodes)
+        self._use_surface(number_surface(part, built, self._pattern), self._is_owned)
         # map from nodal displacement to points, before corrections
         self._uncorrected: SurfaceMap | None = None
+
+    def _use_surface(self, numbering: SurfaceNumbering, is_owned: npt.NDArray[np.bool_]) -> None:
+        """Names, sizes and volumes of the fragments of `split`; `is_owned` (N,): nodes of this rank (collective)."""
+        built, self.numbering, add = self.split, numbering, partial(total, self.part)
+        count, fragment = built.fragment_count, built.point_fragment
+        self.fragment_names = self._names.update(count, built.node_fragment, self.mass)
+        self.fragment_nodes = add(np.bincount(built.node_fragment[is_owned], minlength=count))
+        centre = add(built.points.sum(axis=0)) / add(np.array([len(built.points)]))
+        of_element = fragment[built.elements[:, 0]]
+        self.volume = add(enclosed_volumes(built.points - centre, built.elements, of_element, count))
+        self._name_of_point = self.fragment_names[fragment]
+        self._compressor: GridCompressor | None = None
         self.build_count += 1
 
     def make_frame(
@@ -144,7 +206,9 @@ class BodySurface:
         fields: Iterable[Field] = (),
         corrections: Sequence[PointCorrection] = (),
     ) -> SurfaceFrame:
-        """Surface at a time. The velocity of a point is the mean over its parent nodes, without their rotation.
+        """Surface at a time (collective).
+
+        The velocity of a point is the mean over its parent nodes, without their rotation.
 
         Args:
             t: time, s.
@@ -153,7 +217,7 @@ class BodySurface:
             broken_at: times (E,) at which edges broke, s, for the age of the crack.
             fields: further fields. Nodal ones are averaged over the parent nodes; an element has the value of the cell
                 behind it.
-            corrections: corrections of the drawn points.
+            corrections: corrections of the drawn points, of a whole mesh.
 
         Raises:
             NotConverged: a displacement or velocity is not finite in single precision; with fragment and cell.
@@ -162,17 +226,15 @@ class BodySurface:
         follow = self.split.parents
         displacement = self._point_displacement(t, u, corrections)
         fields = [field for field in fields if field.name not in ("displacement", "velocity", "piece")]
-        point_fields: Arrays = {"displacement": displacement, "velocity": follow.mean(v)}
-        point_fields["piece"] = self._name_of_point.astype(np.int32)
+        point_fields: Arrays = {"velocity": follow.mean(v)}
         point_fields |= {field.name: follow.mean(field.values) for field in fields if field.centre == "Node"}
-        triangles, segments, cell, element_fields = self._elements()
-        element_fields["age"] = self._crack_age(t, broken_at)
-        element_fields |= {field.name: field.values[cell] for field in fields if field.centre == "Cell"}
+        cell_fields: dict[str, Any] = {field.name: field.values for field in fields if field.centre == "Cell"}
+        owned, add = self._is_owned, partial(total, self.part)
         table = tabulate_fragments(
-            self.fragment_names, self.split.node_fragment, self.mass, self.volume, self.skeleton.points + u, v
-        )
-        points, origins = self.split.points + displacement, self.skeleton.origins
-        return SurfaceFrame(t, points, triangles, segments, point_fields, element_fields, origins, table)
+            self.fragment_names, self.split.node_fragment[owned], self.mass[owned], self.volume,
+            (self.skeleton.points + u)[owned], v[owned], add,
+        )  # fmt: skip
+        return self._frame(t, displacement, point_fields, cell_fields, table, broken_at)
 
     def make_rigid_frame(
         self, t: float, points: Values, velocity: Values, fragments: FragmentTable, broken_at: Values | None = None
@@ -186,13 +248,30 @@ class BodySurface:
             fragments: motion of the fragments, in the order of `split`.
             broken_at: times (E,) at which edges broke, s, for the age of the crack.
         """
-        triangles, segments, _, element_fields = self._elements()
-        element_fields["age"] = self._crack_age(t, broken_at)
-        point_fields: Arrays = {"displacement": points - self.split.points, "velocity": velocity}
-        point_fields["piece"] = self._name_of_point.astype(np.int32)
         table = replace(fragments, name=self.fragment_names)
-        origins = self.skeleton.origins
-        return SurfaceFrame(t, points, triangles, segments, point_fields, element_fields, origins, table)
+        return self._frame(t, points - self.split.points, {"velocity": velocity}, {}, table, broken_at)
+
+    def _frame(
+        self,
+        t: float,
+        displacement: Values,
+        point_fields: Arrays,
+        cell_fields: Arrays,
+        table: FragmentTable,
+        broken_at: Values | None,
+    ) -> SurfaceFrame:
+        """Frame with the fields that all bodies have, further ones of the points and of the cells (C, ...)."""
+        built = self.split
+        triangles, segments, cell, element_fields = self._elements()
+        element_fields["age"] = self._crack_age(t, broken_at)
+        element_fields |= {name: values[cell] for name, values in cell_fields.items()}
+        point_fields = {"displacement": displacement, **point_fields, "piece": self._name_of_point.astype(np.int32)}
+        if self._compressor is None:
+            self._compressor = GridCompressor(self.numbering, triangles, segments)
+        return SurfaceFrame(
+            t, built.points + displacement, triangles, segments, point_fields, element_fields, self.skeleton.origins,
+            table, self.numbering, self._compressor,
+        )  # fmt: skip
 
     def _point_displacement(self, t: float, u: Values, corrections: Sequence[PointCorrection]) -> Values:
         """Displacements (n, d) of the points, m."""
@@ -215,12 +294,16 @@ class BodySurface:
         cell = np.concatenate([built.fill_cell, built.cell])
         origin = np.concatenate([np.full(len(built.fill), BODY), built.origin])
         first_point = np.concatenate([built.fill[:, 0], built.elements[:, 0]])
-        is_single_node = np.bincount(built.node_fragment)[built.point_fragment] == 1
+        is_single_node = self.fragment_nodes[built.point_fragment] == 1
         fixed = {
-            "piece": self._name_of_point[first_point], "origin": origin, "cell": cell,
+            "piece": self._name_of_point[first_point], "origin": origin, "cell": self._input_cells(cell),
             "dust": is_single_node[first_point],
         }  # fmt: skip
         return triangles, segments, cell, {name: values.astype(np.int32) for name, values in fixed.items()}
+
+    def _input_cells(self, cells: Ints) -> Ints:
+        """Numbers (n,) in the input mesh of cells (n,)."""
+        return self.part.cell_numbers[cells]
 
     def _crack_age(self, t: float, broken_at: Values | None) -> Values:
         """Time (elements,) since the edge behind each element broke, s; 0 on the boundary and if unknown.
@@ -234,15 +317,22 @@ class BodySurface:
         return age
 
     def _check_finite(self, t: float, u: Values, v: Values) -> None:
-        """Raise NotConverged if a nodal displacement or velocity (N, d) exceeds `MAX_COORDINATE`."""
-        for values, quantity in ((u, "displacement"), (v, "velocity")):
-            lost = np.flatnonzero(~np.all(np.abs(values) <= MAX_COORDINATE, axis=1))
-            if len(lost):
-                node = lost[0]
-                cell = int(np.argmax(np.any(self.skeleton.cells == node, axis=1)))
+        """Raise NotConverged if a nodal displacement or velocity (N, d) exceeds `MAX_COORDINATE` (collective)."""
+        part = self.part
+        exceeding = [~np.all(np.abs(values) <= MAX_COORDINATE, axis=1) for values in (u, v)]
+        counts = total(part, np.array([np.count_nonzero(lost & self._is_owned) for lost in exceeding]))
+        for values, quantity, lost, count in zip((u, v), ("displacement", "velocity"), exceeding, counts, strict=True):
+            if not count:
+                continue
+            # ranks that have the lowest node may have other cells at it
+            rows = []
+            for node in np.flatnonzero(lost)[:1]:
+                cell = part.cell_numbers[np.argmax(np.any(self.skeleton.cells == node, axis=1))]
                 name = self.fragment_names[self.split.node_fragment[node]]
-                raise NotConverged(
-                    f"the surface at t = {t:g} s was not written: node {node} of piece {name} (cell {cell}) has the "
-                    f"{quantity} {values[node]}; {len(lost)} nodes are not numbers below {MAX_COORDINATE:.0e}; "
-                    "choose a smaller time.step"
-                )
+                rows.append((int(part.node_numbers[node]), int(cell), int(name), str(values[node])))
+            node, cell, name, value = min(row for rows_of_rank in allgather(part.comm, rows) for row in rows_of_rank)
+            raise NotConverged(
+                f"the surface at t = {t:g} s was not written: node {node} of piece {name} (cell {cell}) has the "
+                f"{quantity} {value}; {count} nodes are not numbers below {MAX_COORDINATE:.0e}; "
+                "choose a smaller time.step"
+            )

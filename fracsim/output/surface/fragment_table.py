@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 
+from ...mesh.parallel import sum_over_ranks
 from ...mesh.split_surface.polyhedron_moments import cone_volumes
 
 Ints = npt.NDArray[np.int64]
@@ -41,9 +44,15 @@ class FragmentTable:
 
 
 def tabulate_fragments(
-    name: Ints, fragment_of_node: Ints, mass: Values, volume: Values, x: Values, v: Values
+    name: Ints,
+    fragment_of_node: Ints,
+    mass: Values,
+    volume: Values,
+    x: Values,
+    v: Values,
+    total: Callable[[npt.NDArray[Any]], npt.NDArray[Any]] = np.asarray,
 ) -> FragmentTable:
-    """Figures of deformable fragments.
+    """Figures of deformable fragments, from the nodes that this rank owns (collective).
 
     Args:
         name: names (p,) of the fragments.
@@ -52,15 +61,16 @@ def tabulate_fragments(
         volume: volumes (p,), m^3 (2D: m^2).
         x: present positions (N, d) of the nodes, m.
         v: velocities (N, d) of the nodes, m/s.
+        total: sum of an array over the ranks; by default there is one rank.
     """
 
     def sum_nodes(values: Values) -> Values:
-        return group_sums(fragment_of_node, values, len(name))
+        return total(group_sums(fragment_of_node, values, len(name)))
 
     weight = sum_nodes(mass)
     centre, velocity = (sum_nodes(mass[:, None] * values) / weight[:, None] for values in (x, v))
     spin = _spin(sum_nodes, mass, x - centre[fragment_of_node], v - velocity[fragment_of_node])
-    nodes = np.bincount(fragment_of_node, minlength=len(name))
+    nodes = total(np.bincount(fragment_of_node, minlength=len(name)))
     return FragmentTable(name, nodes, weight, volume, centre, velocity, spin)
 
 
@@ -93,14 +103,12 @@ def enclosed_volumes(points: Values, elements: Ints, fragment: Ints, count: int)
     V = 1/6 sum x_0 . (x_1 x x_2) over triangles; 2D: A = 1/2 sum x_0 x x_1 over segments.
 
     Args:
-        points: positions (n, d), m.
+        points: positions (n, d), m; near the origin there is less cancellation.
         elements: triangles (k, 3) or segments (k, 2), oriented outwards.
         fragment: fragment (k,) of each element.
         count: number of fragments.
     """
-    # near the origin there is less cancellation
-    x = (points - points.mean(axis=0))[elements]
-    return group_sums(fragment, cone_volumes(x), count)
+    return group_sums(fragment, cone_volumes(points[elements]), count)
 
 
 def group_sums(group: Ints, values: Values, count: int) -> Values:
@@ -112,7 +120,8 @@ def group_sums(group: Ints, values: Values, count: int) -> Values:
         count: number of groups.
     """
     # bincount and no sparse matrix: to import scipy.sparse takes 0.13 s
-    columns = [np.bincount(group, column, minlength=count) for column in values.reshape(len(group), -1).T]
+    table = values.reshape(len(group), int(np.prod(values.shape[1:])))
+    columns = [np.bincount(group, column, minlength=count) for column in table.T]
     return np.asarray(columns, float).T.reshape(count, *values.shape[1:])
 
 
@@ -124,23 +133,30 @@ class FragmentNames:
     node.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, comm: MPI.Intracomm = MPI.COMM_SELF) -> None:
+        """`comm`: ranks that have nodes of the fragments."""
+        self._comm = comm
         self._of_node: Ints | None = None
         self._next = 0
 
     def update(self, count: int, fragment_of_node: Ints, mass: Values) -> Ints:
-        """Names (count,) of the present fragments.
+        """Names (count,) of the present fragments (collective).
 
         Args:
             count: number of fragments; they are numbered by their lowest node.
             fragment_of_node: fragment (N,) of each node.
-            mass: masses (N,) of the nodes, kg.
+            mass: masses (N,) of the nodes, kg; the sums over the ranks count.
         """
         names: Ints = np.zeros(count, np.int64)
         unnamed: Ints = np.arange(count)
         if self._of_node is not None:
-            names[:] = self._of_node[np.unique(fragment_of_node, return_index=True)[1]]
-            unnamed = _lighter_parts(names, group_sums(fragment_of_node, mass, count))
+            # all nodes of a fragment have been in one
+            names[fragment_of_node] = self._of_node
+            weight = group_sums(fragment_of_node, mass, count)
+            if self._comm.size > 1:
+                self._comm.Allreduce(MPI.IN_PLACE, names, MPI.MAX)
+                weight = sum_over_ranks(self._comm, weight)
+            unnamed = _lighter_parts(names, weight)
         names[unnamed] = self._next + np.arange(len(unnamed))
         self._next += len(unnamed)
         self._of_node = names[fragment_of_node]

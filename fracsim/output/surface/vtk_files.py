@@ -1,7 +1,6 @@
 """Files of the split surface: surface.pvd, one VTU file per frame in surface/, and pieces.csv.
 
-ParaView can open them after every frame. VTU files are written by VTK. In surface.pvd part 0 of a time is the body, and
-the others are obstacles.
+ParaView can open them after every frame. In surface.pvd part 0 of a time is the body, and the others are obstacles.
 """
 
 from __future__ import annotations
@@ -18,10 +17,12 @@ import numpy as np
 import numpy.typing as npt
 
 from ...errors import InputError
+from ...mesh.split_surface.surface_numbering import number_whole_surface
 from ...meshes.plain_files import atomic_replacement, check_readable, create
 from ..atomic_write import append_bytes, replace_text
-from ..fields_file import EARLIER_TENSOR_COMPONENTS, TENSOR_COMPONENTS, pad_to_3d, reorder_earlier_tensor, rounded
+from ..fields_file import EARLIER_TENSOR_COMPONENTS, TENSOR_COMPONENTS, reorder_earlier_tensor, rounded
 from ..file_ownership import FRAME_FILE_PATTERN
+from .vtu_file import CompressedGrid, GridCompressor
 
 if TYPE_CHECKING:
     from ...mechanics.term_protocols import SurfaceData
@@ -37,8 +38,6 @@ SURFACE_FOLDER = "surface/"
 _PVD_HEAD = '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
 _PVD_TAIL = "  </Collection>\n</VTKFile>\n"
 _PVD_ENTRY = re.compile(r'timestep="([^"]+)"(?: part="(\d+)" name="([^"]+)")? file="([^"]+)"')
-# VTK's numbers of cell types
-_VTK_TRIANGLE, _VTK_LINE = 5, 3
 # more than the XML before the data takes
 _VTU_HEAD_BYTES = 1 << 16
 
@@ -99,12 +98,18 @@ class SurfaceFiles:
         """Number of frames in each file."""
         return {self._pvd.name: len(self.times), self._csv.name: self._csv_frames}
 
-    def write_frame(self, frame: SurfaceFrame, obstacles: dict[str, SurfaceData] | None = None) -> Path:
+    def write_frame(
+        self,
+        frame: SurfaceFrame,
+        obstacles: dict[str, SurfaceData] | None = None,
+        grid: CompressedGrid | None = None,
+    ) -> Path:
         """Write a frame and return the path of its VTU file.
 
         Args:
             frame: surface of the body.
             obstacles: data of the obstacles by name.
+            grid: the frame, compressed by all ranks that have parts of it; None: this rank has the whole surface.
 
         Raises:
             OSError: the files cannot be written.
@@ -112,7 +117,9 @@ class SurfaceFiles:
         # VTU files come before the files that refer to them
         number = len(self.times)
         body = PvdEntry(frame.t, f"surface/surface_{number:06d}.vtu")
-        write_vtu(self._folder / body.file, make_surface_grid(frame, self._precision))
+        grid = frame.compress(self._precision) if grid is None else grid
+        assert grid is not None
+        grid.write(self._folder / body.file)
         drawn = [(name, self._write_obstacle(name, data, number)) for name, data in (obstacles or {}).items()]
         append_bytes(self._csv, _csv_text(_csv_rows(frame.t, frame.fragments)).encode())
         self._csv_frames += 1
@@ -125,9 +132,11 @@ class SurfaceFiles:
         previous, file = self._last_obstacles.get(name, (None, ""))
         if previous is None or not np.array_equal(previous.points, data.points):
             file = f"surface/obstacle_{name}_{number:06d}.vtu"
-            write_vtu(
-                self._folder / file, make_grid(rounded(data.points, self._precision), data.triangles, data.segments)
-            )
+            counts = len(data.points), len(data.triangles), len(data.segments)
+            compressor = GridCompressor(number_whole_surface(*counts), data.triangles, data.segments)
+            grid = compressor(rounded(data.points, self._precision), {}, {})
+            assert grid is not None
+            grid.write(self._folder / file)
             self._last_obstacles[name] = data, file
         return file
 
@@ -248,11 +257,11 @@ def read_body_frames(pvd: Path) -> list[tuple[float, str]]:
     return [(entry.t, entry.file) for entry in read_pvd(pvd) if not entry.part]
 
 
-# --- VTU files --------------------------------------------------------------------------------------------------------
+# --- VTU files of earlier versions ------------------------------------------------------------------------------------
 
 
 def write_vtu(path: Path, grid: Any) -> None:
-    """Write an unstructured grid as a VTU file with appended and compressed data. Raises OSError."""
+    """Write an unstructured grid of VTK as a VTU file. Raises OSError."""
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
     writer = vtkXMLUnstructuredGridWriter()
@@ -260,11 +269,8 @@ def write_vtu(path: Path, grid: Any) -> None:
     writer.WriteToOutputStringOn()
     writer.SetInputData(grid)
     writer.SetDataModeToAppended()
-    # raw data take a third of the time of base64; zlib takes 30 ms for 65,000 triangles and leaves two thirds of LZ4's
+    # raw data take a third of the time of base64
     writer.EncodeAppendedDataOff()
-    writer.SetCompressorTypeToZLib()
-    writer.SetCompressionLevel(1)
-    writer.SetBlockSize(1 << 20)
     if not writer.Write():
         raise OSError("VTK cannot write it")
     # bytes if the output is not valid text
@@ -273,60 +279,12 @@ def write_vtu(path: Path, grid: Any) -> None:
         file.write(data if isinstance(data, bytes) else data.encode())
 
 
-def _vtk_array(values: npt.NDArray[np.generic], name: str = "") -> Any:
-    """VTK array of scalars (n,), vectors (n, d) or symmetric tensors (n, 6)."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-
-    array = numpy_to_vtk(np.ascontiguousarray(pad_to_3d(values)), deep=True)
-    array.SetName(name)
-    # ParaView names six columns so by itself; other programs need the names
-    for column, axes in enumerate(TENSOR_COMPONENTS if array.GetNumberOfComponents() == len(TENSOR_COMPONENTS) else ()):
-        array.SetComponentName(column, axes.upper())
-    return array
-
-
-def make_grid(points: npt.NDArray[np.generic], triangles: Ints, segments: Ints) -> Any:
-    """VTK grid of triangles (k, 3), then segments (m, 2), with points (n, d) in m."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
-
-    grid, vtk_points, cells = vtkUnstructuredGrid(), vtkPoints(), vtkCellArray()
-    vtk_points.SetData(_vtk_array(points))
-    grid.SetPoints(vtk_points)
-    sizes = np.repeat([3, 2], [len(triangles), len(segments)])
-    offsets = np.concatenate([[0], np.cumsum(sizes)])
-    # VTK writes them as they are: half the bytes of 64-bit numbers before compression
-    number = np.int32 if max(offsets[-1], len(points)) <= np.iinfo(np.int32).max else np.int64
-    corners = np.concatenate([triangles.ravel(), segments.ravel()]).astype(number)
-    cells.SetData(numpy_to_vtk(offsets.astype(number), deep=True), numpy_to_vtk(corners, deep=True))
-    grid.SetCells(_vtk_array(np.where(sizes == 3, _VTK_TRIANGLE, _VTK_LINE).astype(np.uint8)), cells)
-    return grid
-
-
-def make_surface_grid(frame: SurfaceFrame, precision: str) -> Any:
-    """VTK grid of a surface with its fields; real numbers have the `precision` "single" or "double"."""
-    from vtkmodules.vtkCommonCore import vtkStringArray
-
-    grid = make_grid(rounded(frame.points, precision), frame.triangles, frame.segments)
-    for name, values in frame.point_fields.items():
-        grid.GetPointData().AddArray(_vtk_array(rounded(values, precision), name))
-    for name, values in frame.element_fields.items():
-        grid.GetCellData().AddArray(_vtk_array(rounded(values, precision), name))
-    names = vtkStringArray()
-    names.SetName("origins")
-    for origin in frame.origins:
-        names.InsertNextValue(origin)
-    grid.GetFieldData().AddArray(names)
-    return grid
-
-
 def reorder_tensors(grid: Any) -> bool:
     """Reorder tensors of an earlier version to `TENSOR_COMPONENTS`; returns True if there were any.
 
     Their component names give the order in which an earlier version wrote them.
     """
-    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.util.numpy_support import numpy_to_vtk, vtk_to_numpy
 
     changed = False
     for data in (grid.GetPointData(), grid.GetCellData()):
@@ -334,9 +292,12 @@ def reorder_tensors(grid: Any) -> bool:
         for array in arrays:
             names = tuple(array.GetComponentName(number) for number in range(array.GetNumberOfComponents()))
             if names == EARLIER_TENSOR_COMPONENTS:
-                reordered = reorder_earlier_tensor(vtk_to_numpy(array))
+                reordered = numpy_to_vtk(reorder_earlier_tensor(vtk_to_numpy(array)), deep=True)
+                reordered.SetName(array.GetName())
+                for column, axes in enumerate(TENSOR_COMPONENTS):
+                    reordered.SetComponentName(column, axes.upper())
                 # replaces the array of that name
-                data.AddArray(_vtk_array(reordered, array.GetName()))
+                data.AddArray(reordered)
                 changed = True
     return changed
 
