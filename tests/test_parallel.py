@@ -104,6 +104,15 @@ def test_what_holds_a_node_is_the_same_at_any_number_of_ranks(ranks: int, result
     assert np.array_equal(found, serial) and len(found)
 
 
+@pytest.mark.parametrize("ranks", RANKS)
+def test_requested_rows_are_those_of_their_cells(results: Results, ranks: int) -> None:
+    """Rows arrive in the order of the request, and a rank evaluates each row once, whichever ranks request it."""
+    mesh, rows = mesh_named("3d"), results(ranks)["requested-rows"]
+    assert np.array_equal(rows[:, 0], rows[:, 1]) and len(rows) >= len(mesh.cells) // 2
+    assert np.array_equal(np.sort(rows[:, 2:], axis=1), np.sort(mesh.cells[rows[:, 0]], axis=1))
+    assert results(ranks)["requested-once"].all()
+
+
 # --- pieces ---
 
 

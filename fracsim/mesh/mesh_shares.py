@@ -7,7 +7,6 @@ which has the messages.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,7 +22,7 @@ from .dolfinx_compat import coordinate_element
 from .domain import BoundingBox, Domain, create_mesh_with_groups, owned_input_cells
 from .fragments import find_bodies
 from .ghost_exchange import owner_values
-from .parallel import RowRouting, allgather, rank_offset, sum_over_ranks
+from .parallel import RemoteRows, RowRouting, allgather, rank_offset, sum_over_ranks
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
@@ -69,24 +68,11 @@ def block_start(count: int, ranks: int, rank: int) -> int:
     return count * rank // ranks
 
 
-class BlockLookup:
-    """Finds rows of arrays of which each rank has a block (block_start)."""
-
-    def __init__(self, comm: MPI.Comm, count: int, rows: Ints) -> None:
-        """`rows`: (n,) numbers of the rows that this rank needs, of `count` (collective)."""
-        starts = np.array([block_start(count, comm.size, rank) for rank in range(comm.size)])
-        self._routing = RowRouting(comm, np.searchsorted(starts, rows, side="right") - 1)
-        self._needed = self._routing.send(rows) - starts[comm.rank]
-
-    def __call__(self, block: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """(n, ...) rows that this rank needs; `block`: those that it has (collective)."""
-        return self._routing.send_back(block[self._needed])
-
-    def needs_all(self, count: int) -> bool:
-        """Whether ranks need all of the `count` rows of the block of this rank."""
-        needed = np.zeros(count, bool)
-        needed[self._needed] = True
-        return bool(needed.all())
+def request_block_rows(comm: MPI.Comm, count: int, rows: Ints) -> RemoteRows:
+    """An exchange of rows (n,) of arrays of `count` rows, of which each rank has a block (collective)."""
+    starts = np.array([block_start(count, comm.size, rank) for rank in range(comm.size)])
+    rank = np.searchsorted(starts, rows, side="right") - 1
+    return RemoteRows(comm, rank, rows - starts[rank])
 
 
 # --- reading --------------------------------------------------------------------------------------------------------
@@ -197,9 +183,9 @@ class _ShareChecks:
         self._comm, self._points, self._cells = comm, points, blocks.cells
         self.bounds = self._bounding_box()
         nodes, self._corners = _local_numbers(blocks.cells)
-        lookup = BlockLookup(comm, point_count, nodes)
-        self._corner_points: Values = lookup(points)
-        self._all_used = lookup.needs_all(len(points))
+        exchange = request_block_rows(comm, point_count, nodes)
+        self._corner_points: Values = exchange(points[exchange.requested])[0]
+        self._all_used = len(exchange.requested) == len(points)
         # a facet and one of its sides belong to one cell at most
         self._sides = self._facets_of_cells()
         self._facets = np.column_stack([sorted_rows(blocks.facets), blocks.facet_tags])
@@ -279,7 +265,8 @@ def distribute_shares(comm: MPI.Comm, share: MeshShare) -> Domain:
     groups = {name: _facets_once(comm, facets) for name, facets in share.facet_groups.items()}
     geometry = share.cells, share.points, coordinate_element(share.dim)
     mesh, facets = create_mesh_with_groups(comm, geometry, groups)
-    region = BlockLookup(comm, share.cell_count, owned_input_cells(mesh))(share.cell_region)
+    exchange = request_block_rows(comm, share.cell_count, owned_input_cells(mesh))
+    (region,) = exchange(share.cell_region[exchange.requested])
     domain = Domain(mesh, facets, share.regions, region.astype(np.int32), share.bounds, group_nodes=share.facet_groups)
     return replace(domain, notes=(*share.notes, *_find_connections(domain, coincide=share.points_coincide)))
 

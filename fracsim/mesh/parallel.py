@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import cache
+from math import prod
 from typing import Any
 
 import numpy as np
@@ -233,6 +234,35 @@ class RowRouting:
         rows = np.empty_like(arrived)
         rows[self._order] = arrived
         return rows
+
+
+class RemoteRows:
+    """Exchange of the rows of arrays that ranks request from those which have them.
+
+    Attributes:
+        requested: (m,) rows of this rank that any rank requests, ascending; on one rank in the order of the request.
+    """
+
+    def __init__(self, comm: MPI.Comm, rank: npt.NDArray[np.int64], index: npt.NDArray[np.int64]) -> None:
+        """Request rows (collective); `rank`, `index`: (n,) the rank that has each row, and its number there."""
+        self.requested: npt.NDArray[np.int64] = index
+        self._routing: RowRouting | None = None
+        if comm.size > 1:
+            self._routing = RowRouting(comm, rank)
+            self.requested, self._position = np.unique(self._routing.send(index), return_inverse=True)
+
+    def __call__(self, *fields: npt.NDArray[Any]) -> list[npt.NDArray[Any]]:
+        """Return the rows (n, ...) that this rank requests, from rows (m, ...) of `requested` (collective).
+
+        All fields are one message. Rows of other ranks have each component contiguous in memory.
+        """
+        if self._routing is None:
+            return list(fields)
+        flat = [field.reshape(len(field), prod(field.shape[1:])) for field in fields]
+        columns = self._routing.send_back(np.concatenate(flat, axis=1)[self._position]).T.copy()
+        parts = np.split(columns, np.cumsum([part.shape[1] for part in flat])[:-1])
+        shaped = [part.reshape(*field.shape[1:], columns.shape[1]) for part, field in zip(parts, fields, strict=True)]
+        return [np.moveaxis(part, -1, 0) for part in shaped]
 
 
 def _packed(value: object) -> npt.NDArray[np.uint8]:

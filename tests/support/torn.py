@@ -20,7 +20,7 @@ from fracsim.mesh.domain import Domain
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.fragments import find_fragments
 from fracsim.mesh.node_cells import node_components
-from fracsim.mesh.parallel import sum_over_ranks
+from fracsim.mesh.parallel import RemoteRows, sum_over_ranks
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers.deflation import create_deflation
 from fracsim.timestepping.state import State
@@ -95,6 +95,22 @@ def averages(domain: Domain, name: str) -> Found:
         found[f"average-{name}-{kernel}"] = domain.input_numbering.gather_cells(average(values))
         found[f"active-{name}-{kernel}"] = domain.input_numbering.gather_cells(average(values, active))
     return found
+
+
+def requested_rows(domain: Domain) -> Found:
+    """Numbers and nodes in the input mesh of cells that each rank requests: from the last on, another share each."""
+    comm, number = domain.comm, domain.input_numbering.cells
+    parts = comm.allgather(number)
+    owner, index = np.zeros((2, sum(map(len, parts))), np.int64)
+    for rank, cells in enumerate(parts):
+        owner[cells], index[cells] = rank, np.arange(len(cells))
+    wanted = np.arange(len(owner))[:: -2 - comm.rank]
+    exchange = RemoteRows(comm, owner[wanted], index[wanted])
+    nodes = domain.input_numbering.nodes[domain.cell_nodes]
+    arrived = exchange(number[exchange.requested], nodes[exchange.requested])
+    rows = np.concatenate(comm.allgather(np.column_stack([wanted, *arrived])))
+    is_once = len(exchange.requested) == len(set(exchange.requested.tolist()))
+    return {"requested-rows": rows, "requested-once": np.array(comm.allgather(is_once))}
 
 
 def pieces(label: str) -> Found:
@@ -442,7 +458,7 @@ def compared(folder: Path) -> Found:
         scene, _ = make_scene(mesh=MESHES[name])
         found |= averages(scene.domain, name)
         if name == "3d":
-            found |= edges(scene.domain) | held(scene)
+            found |= edges(scene.domain) | held(scene) | requested_rows(scene.domain)
     for label in LABELS:
         found |= pieces(label)
     for name in RUNS:

@@ -1,59 +1,20 @@
-"""Cells and points near points, and values of cells of other ranks; the same results on any number of ranks."""
+"""Cells and points near points, of this rank and of others; the same results on any number of ranks."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import factorial, prod
+from math import factorial
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 from scipy.spatial import cKDTree
 
 from ...mesh.domain import Domain
 from ...mesh.ghost_exchange import sum_at_nodes
-from ...mesh.parallel import RankHalo, alltoall
+from ...mesh.parallel import RankHalo, RemoteRows
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
-
-
-class RemoteCellValues:
-    """Exchange of the values of some cells, evaluated by the ranks that own them.
-
-    Attributes:
-        owned_cells: (m,) cells of this rank that any rank requests; on one rank in the order of the request.
-    """
-
-    def __init__(self, comm: MPI.Comm, rank: Ints, index: Ints) -> None:
-        """Request cells (collective); `rank`, `index`: (n,) owner of each cell, and its local number there."""
-        self._comm = comm
-        if comm.size == 1:
-            self.owned_cells: Ints = index
-            return
-        self._order = np.argsort(rank, kind="stable")
-        # Each rank learns which of its cells the others need.
-        requested = alltoall(comm, [index[rank == owner] for owner in range(comm.size)])
-        self.owned_cells = np.unique(np.concatenate(requested))
-        self._send = [np.searchsorted(self.owned_cells, cells) for cells in requested]
-
-    def __call__(self, *fields: Values) -> list[Values]:
-        """Return the values (n, ...) of the requested cells, from those (m, ...) of `owned_cells` (collective).
-
-        Values from other ranks have each component contiguous in memory.
-        """
-        if self._comm.size == 1:
-            return list(fields)
-        tails = [field.shape[1:] for field in fields]
-        rows = np.concatenate(
-            [field.reshape(len(field), prod(tail)).T for field, tail in zip(fields, tails, strict=True)]
-        )
-        received = np.concatenate(alltoall(self._comm, [rows[:, columns] for columns in self._send]), axis=1)
-        result = np.empty_like(received)
-        result[:, self._order] = received
-        parts = np.split(result, np.cumsum([prod(tail) for tail in tails])[:-1])
-        shaped = [part.reshape(*tail, result.shape[1]) for part, tail in zip(parts, tails, strict=True)]
-        return [np.moveaxis(part, -1, 0) for part in shaped]
 
 
 def local_mesh_size(domain: Domain) -> Values:
@@ -147,9 +108,9 @@ class NearbyCells:
         """Return the pairs of points (n, d) and near cells whose centroids are nearer than radius (n,), m."""
         return find_pairs(self._tree, points, radius)
 
-    def request_values(self, cells: Ints) -> RemoteCellValues:
+    def request_values(self, cells: Ints) -> RemoteRows:
         """Return an exchange of the values of near cells (n,) (collective)."""
-        return RemoteCellValues(self._comm, self._rank[cells], self._index[cells])
+        return RemoteRows(self._comm, self._rank[cells], self._index[cells])
 
     def corners(self, cells: Ints) -> tuple[Values, npt.NDArray[np.bool_]]:
         """Return the corners (n, d + 1, d), m, of near cells (n,), and the sides in the body's surface (collective).
@@ -157,7 +118,7 @@ class NearbyCells:
         Flags (n, d + 1) of sides have the number of the corner opposite to it.
         """
         exchange = self.request_values(cells)
-        owned = exchange.owned_cells
+        owned = exchange.requested
         corners = self._domain.nodes[self._domain.cell_nodes[owned]]
         corners, outside = exchange(corners, self._domain.facets.boundary_sides[owned].astype(float))
         return corners, outside > 0

@@ -12,6 +12,7 @@ from ...forms.crack_closure import spring_modulus
 from ...mechanics.stress import Stress
 from ...mesh.edge_graph import EdgeGraph
 from ...mesh.ghost_exchange import with_ghosts
+from ...mesh.parallel import RemoteRows
 from ...mesh.simplices import local_edges
 from ...mesh.small_matrices import barycentric_gradients
 from ..effective_stress import UndamagedStress
@@ -19,7 +20,7 @@ from ..principal_stress import first_principal_directions, material_normals, sym
 from .configurational_force import closure_spring_stress, eshelby_stress, first_piola_stress, transposed_product
 from .cut_cells import CutCells, CutGeometry
 from .gradient_operators import GradientOperators
-from .neighbour_search import NearbyCells, NeighbourPairs, RemoteCellValues, weighted_mean
+from .neighbour_search import NearbyCells, NeighbourPairs, weighted_mean
 from .tip_neighbourhoods import CrackTips, TipNeighbourhoods, TipRadii
 from .tip_parameters import TIP
 
@@ -117,7 +118,7 @@ class TipFieldEvaluator:
         )
         # Gradients of barycentric coordinates, NaN until they are needed.
         self._barycentric_gradients = np.full((domain.cell_count, domain.dim + 1, domain.dim), np.nan)
-        self._operators: tuple[RemoteCellValues, GradientOperators] | None = None
+        self._operators: tuple[RemoteRows, GradientOperators] | None = None
         # Quadratic cells need the stress at points, not means.
         self._undamaged = UndamagedStress(stress) if domain.order == 2 else None
         material, count = stress.material, (domain.cell_count,)
@@ -149,7 +150,7 @@ class TipFieldEvaluator:
             psi: (cells,) energy density of the undamaged material, J/m^3.
         """
         exchange, tips, (mu, kappa) = self.neighbourhoods.remote_values, self.neighbourhoods.tips, self._elastic
-        cells, operators = exchange.owned_cells, self.operators
+        cells, operators = exchange.requested, self.operators
         H = operators.evaluate_gradients(operators.gather_nodal_values(self._stress.u.x.array))
         # Column by column, which takes half the time of rows.
         cell_stress = np.array([column[cells] for column in stress.T]).T
@@ -186,7 +187,7 @@ class TipFieldEvaluator:
         """Operators of the cells of this rank that any rank requests, kept as long as these are the same."""
         exchange = self.neighbourhoods.remote_values
         if self._operators is None or self._operators[0] is not exchange:
-            cells = exchange.owned_cells
+            cells = exchange.requested
             built = GradientOperators.of_cells(self._domain, cells, self._gradients_of_coordinates(cells))
             self._operators = exchange, built
         return self._operators[1]
@@ -259,7 +260,7 @@ class TipFieldEvaluator:
         """Return the values (pairs, ...) of the second cells of pairs, from those (cells, ...) of all (collective)."""
         needed, index = np.unique(pairs.second, return_inverse=True)
         exchange = self._nearby.request_values(needed)
-        (near,) = exchange(values[exchange.owned_cells])
+        (near,) = exchange(values[exchange.requested])
         return np.ascontiguousarray(near)[index]
 
     def mean_gradients(self, cells: Ints, field: Values) -> Values:
