@@ -46,6 +46,17 @@ def test_parts_smaller_than_the_disc_of_a_tip_stay(cut: float) -> None:
     assert not rule(np.zeros((len(graph.split), 6))).any()
 
 
+def test_a_node_between_halves_is_attached_to_one_of_them() -> None:
+    """It has no unsplit cell, and an edge to each: one edge breaks, and the node does not become a piece."""
+    scene, rule = hinged.bridged_block()
+    graph = scene.fracture.graph
+    assert find_fragments(graph).count == 1
+    flags = rule(np.zeros((len(graph.split), 6)))
+    assert flags.sum() == 1 and graph.retained is not None and graph.retained.sum() == 1
+    graph.break_edges(flags)
+    assert find_fragments(graph).count == 2 and graph.break_unloaded_edges() == 0
+
+
 def test_a_ligament_holds() -> None:
     """Halves that share a facet are one part."""
     scene = hinged.block()
@@ -67,7 +78,7 @@ def test_chains_of_small_parts_are_cut_in_one_place() -> None:
 
 @pytest.mark.ranks
 @pytest.mark.parametrize("ranks", (2, 3))
-@pytest.mark.parametrize("name", hinged.CASES)
+@pytest.mark.parametrize("name", (*hinged.CASES, "bridge"))
 def test_the_same_edges_on_ranks(on_ranks: OnRanks, ranks: int, name: str) -> None:
     """The very same edges break on any number of ranks."""
     serial, parallel = on_ranks(1)[0], on_ranks(ranks)[0]

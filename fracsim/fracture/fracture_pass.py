@@ -180,12 +180,11 @@ class FracturePass:
         """Carry out one pass at the present displacement (collective)."""
         stress, psi = self.evaluate_undamaged_stress()
         broken, weakened = self._weaken_failing_edges(stress, psi) if self._is_due else (0, 0)
+        broken += self._break_idle_edges(broken)
         if self._hinges is not None and self._is_due:
             released = self.graph.break_edges(self._hinges(stress))
             broken, weakened = broken + released, weakened + released
-        # Edges between split cells alone carry nothing any more.
-        if broken and self.degradation.breaks_idle_edges:
-            broken += self.graph.break_unloaded_edges()
+            broken += self._break_idle_edges(released)
         before = [damage.x.array.copy() for damage in self.stress.damage_fields] if broken else []
         release = self.degradation(weakened > 0, stress, psi)
         if weakened or release.chi_drop or self._has_tip_states:
@@ -193,6 +192,10 @@ class FracturePass:
         return FracturePassResult(
             broken, release.chi_drop, release.released, release.elastic, release.exhausted, before
         )
+
+    def _break_idle_edges(self, broken: int) -> int:
+        """Break edges between split cells alone, which carry nothing, if edges `broken` just now; return their number."""
+        return self.graph.break_unloaded_edges() if broken and self.degradation.breaks_idle_edges else 0
 
     def _weaken_failing_edges(self, stress: Values, psi: Values) -> tuple[int, int]:
         """Weaken the edges that fail; return the numbers of broken and of weakened edges (collective)."""

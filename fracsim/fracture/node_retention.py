@@ -195,10 +195,13 @@ class NodeAttachment:
         self._is_prescribed_edge: Flags = np.asarray(prescribed[graph.edge_nodes].all(axis=1))
         self._cells_around = NodeCellCount(graph.domain)
 
-    def __call__(self, edges: npt.NDArray[np.integer], stress: Values) -> Flags:
+    def __call__(self, edges: npt.NDArray[np.integer], stress: Values, *, detaches: bool = False) -> Flags:
         """Flag, of the edges (n,) that fail, those that break; store the spared ones in the graph (collective).
 
-        `stress` is the local stress (cells, 3 or 6), Pa.
+        Args:
+            edges: (n,) failing edges.
+            stress: local stress (cells, 3 or 6), Pa.
+            detaches: edges that attach nodes already may break, too: other edges attach these nodes to their parts.
         """
         graph = self._graph
         fails = np.zeros(len(graph.broken), bool)
@@ -211,6 +214,8 @@ class NodeAttachment:
             in_unsplit_cell[graph.cell_edges[beside[~graph.split[beside]]]] = True
             # Intact edges without an unsplit cell attach nodes already.
             attaching = ~graph.broken & ~graph.any_over_ranks(in_unsplit_cell)
+            if detaches:
+                attaching &= ~fails
             spared = self._attaching_edges(fails, attaching, stress)
             retained = (self._is_prescribed_edge & ~fails) | attaching | spared
             graph.retain_edges(retained)

@@ -9,6 +9,7 @@ from fracsim.fracture.energy.hinges import HingeRelease
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.fragments import find_fragments
 from fracsim.meshes.data import MeshData
+from fracsim.meshes.topology import edges_of
 from fracsim.scene import Scene
 
 from .scenes import make_scene
@@ -19,11 +20,11 @@ Ints = npt.NDArray[np.int64]
 CASES = {"short": 0.5, "long": 1.0}
 
 
-def block() -> Scene:
-    """An unbroken block of random tetrahedra."""
+def block(**fracture: bool) -> Scene:
+    """An unbroken block of random tetrahedra; keys of its fracture."""
     return make_scene(
         mesh={"builder": "box", "size": [1.5, 0.6, 0.6], "h": 0.15, "pattern": "unstructured"},
-        fracture={"strength": 1.0, "energy": 1.0},
+        fracture={"strength": 1.0, "energy": 1.0, **fracture},
     )[0]
 
 
@@ -55,9 +56,44 @@ def cut_but_for(graph: EdgeGraph, left: npt.NDArray[np.bool_], hinge: Ints) -> N
     graph.break_edges((left[ends[:, 0]] != left[ends[:, 1]]) & ~is_hinge)
 
 
+def bridged_block() -> tuple[Scene, HingeRelease]:
+    """Two halves and a node between them without an unsplit cell, which one edge attaches to each; and the rule."""
+    scene = block(crumbs=False)
+    graph, comm, mesh = scene.fracture.graph, scene.domain.comm, scene.domain.input_mesh
+    rule = HingeRelease(graph, np.full(len(graph.split), 0.2), scene.fracture.criterion._node_attachment)
+    left, kept, cut = comm.bcast(_bridge(mesh) if mesh is not None and comm.rank == 0 else None)
+    ends = graph.domain.input_numbering.nodes[graph.edge_nodes]
+    is_kept, is_cut = (
+        (np.sort(ends, axis=1)[:, None] == np.sort(pairs, axis=1)).all(axis=2).any(axis=1) for pairs in (kept, cut)
+    )
+    graph.break_edges((left[ends[:, 0]] != left[ends[:, 1]]) & ~is_kept | is_cut)
+    graph.retain_edges(is_kept)
+    return scene, rule
+
+
+def _bridge(mesh: MeshData) -> tuple[npt.NDArray[np.bool_], Ints, Ints]:
+    """(points,) whether a point is of the left half, (2, 2) a node amid the cut with a node of each half, and (n, 2)
+    edges which split all cells of the first node."""
+    left, edges = mesh.points[:, 0] < 0.7, edges_of(mesh.cells)
+    node = int(np.argmin(np.linalg.norm(mesh.points - [0.7, 0.3, 0.3], axis=1)))
+    around = np.setdiff1d(edges[(edges == node).any(axis=1)], node)
+    ends = np.array([around[left[around]][0], around[~left[around]][0]])
+    cut = [[node, other] for other in np.setdiff1d(around, ends)]
+    for end in ends:
+        ring = mesh.cells[(mesh.cells == node).any(axis=1) & (mesh.cells == end).any(axis=1)]
+        cut += [[end, other] for other in np.setdiff1d(ring, [node, end])]
+    return left, np.array([[node, end] for end in ends]), np.array(cut)
+
+
 def compared() -> Found:
     """For each case pieces before and after the release, and the keys of all broken edges then, on rank 0."""
-    found: Found = {}
+    scene, rule = bridged_block()
+    graph = scene.fracture.graph
+    before = find_fragments(graph).count
+    graph.break_edges(rule(np.zeros((len(graph.split), 6))))
+    found: Found = {"hinged-bridge-pieces": np.array([before, find_fragments(graph).count])}
+    if (keys := graph.broken_keys()) is not None:
+        found["hinged-bridge-broken"] = keys
     for name, cut in CASES.items():
         scene = block()
         graph = scene.fracture.graph

@@ -65,7 +65,7 @@ class HingeRelease:
         flags[~graph.broken] = _are_apart(labels[~graph.broken], numbers, body)
         if self._attachment is not None:
             edges = np.flatnonzero(flags)
-            flags[edges] = self._attachment(edges, stress)
+            flags[edges] = self._attachment(edges, stress, detaches=True)
         return flags
 
     def _volumes(self, part: Ints, count: int) -> Values:
