@@ -95,3 +95,13 @@ def test_the_ductile_bar_bends_and_cracks_in_part(tmp_path: Path) -> None:
     share = (np.histogram2d(*cracked[:, 1:].T, bins=bins)[0] > 0).mean()
     assert 0.2 < share < 0.5
     assert rows[:, 0].argmax() < len(rows) - 5  # the load falls as it cracks
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1200)
+def test_the_brittle_izod_bar_ends_as_two_pieces(tmp_path: Path) -> None:
+    """Its halves come apart, though loose nodes are attached to both of them."""
+    _, rows, masses = broken("izod-3d", ["time.end=4.5e-4"], tmp_path / "out")
+    shares = np.array(masses) / sum(masses)
+    assert shares[:2].min() > 0.45 and shares[2:].sum() < 0.01
+    assert rows[-1, 0] < 0.01 * rows[:, 0].max()

@@ -39,6 +39,8 @@ COARSE = {
     "hammered-figure": ["mesh.h=0.015"],
     "hammered-vase": ["mesh.h=0.015"],
     "izod": ["mesh.h=0.002", "mesh.h_notch=0.0006"],
+    "izod-3d": ["mesh.h=0.005", "mesh.h_notch=0.0015"],
+    "izod-3d-ductile": ["mesh.h=0.005", "mesh.h_notch=0.0015"],
     "jelly-figure": ["mesh.h=0.015"],
     "kalthoff": ["mesh.h=0.005"],
     "l-panel": ["mesh.h=0.1", "mesh.h_corner=0.05"],

@@ -194,7 +194,7 @@ class FracturePass:
         )
 
     def _break_idle_edges(self, broken: int) -> int:
-        """Break edges between split cells alone, which carry nothing, if edges `broken` just now; return their number."""
+        """Break edges between split cells alone, which carry nothing, if `broken` edges broke; return their number."""
         return self.graph.break_unloaded_edges() if broken and self.degradation.breaks_idle_edges else 0
 
     def _weaken_failing_edges(self, stress: Values, psi: Values) -> tuple[int, int]:
