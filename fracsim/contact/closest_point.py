@@ -32,7 +32,8 @@ class ClosestPointPolicy:
         slope_reduction: part of the initial slope at which a line search ends.
         flat_distance: distance, in facet sizes, from which on an obstacle counts as flat for the initial guess.
         min_change: change of barycentric coordinates that counts as none.
-        tolerance: remaining derivative by barycentric coordinates, in facet sizes.
+        tolerance: remaining derivative by barycentric coordinates, in smoothings mu.
+        round_off: that of a derivative, in largest coordinates, below which the search ends.
     """
 
     max_iterations: int = 40
@@ -40,7 +41,8 @@ class ClosestPointPolicy:
     slope_reduction: float = 0.1
     flat_distance: float = 1e3
     min_change: float = 1e-13
-    tolerance: float = 1e-11
+    tolerance: float = 1e-10
+    round_off: float = 4 * float(np.finfo(float).eps)
 
 
 SEARCH = ClosestPointPolicy()
@@ -173,13 +175,13 @@ def find_closest_points(
         x: (k, c, d) corners, m.
         smoothing: mu, m.
         start: (k, c) barycentric coordinates to start from; nan, or None for all: from `initial_barycentric`.
-        tolerance: remaining derivative by barycentric coordinates, in facet sizes.
+        tolerance: remaining derivative by barycentric coordinates, in smoothings mu.
     """
     lam = np.full(x.shape[:2], np.nan) if start is None else start.copy()
     if (kernels := posed.shape.kernels) is not None:
         kernels.find_closest_points(posed.packed, x, smoothing, tolerance, lam)
         return FacetClosestPoints(posed, x, smoothing, lam)
-    max_residual = tolerance * np.linalg.norm(x[:, 1] - x[:, 0], axis=1)
+    max_residual = np.maximum(tolerance * smoothing, SEARCH.round_off * abs(x).max(axis=(1, 2), initial=0.0))
     if (new := np.isnan(lam[:, 0])).any():
         lam[new] = initial_barycentric(posed, x[new], smoothing)
     slope, active = _SlopeFunction(posed, x, smoothing)(lam), np.arange(len(x))

@@ -403,7 +403,7 @@ class ContactState:
         self._start_forces = [contact.force @ contact.normal for contact in lagged]
         sum_at_points = None if self.comm.size == 1 else self.surface.sum_at_points
         for number in self.facets.numbers:
-            of_facets, _ = evaluate_facets(self.facets.active, posed[number], x, barrier)
+            of_facets, *_ = evaluate_facets(self.facets.active, posed[number], x, barrier)
             self._start_forces[number] = self._start_forces[number] + of_facets.forces.sum(axis=(0, 1))
             if self.obstacles[number].friction:
                 lagged[number] = add_facet_friction(lagged[number], of_facets, x, sum_at_points)
@@ -465,8 +465,8 @@ class ContactState:
         if number not in self.facets.numbers:
             return of_points
         facet_start = None if start is None else (start_posed, self._start_positions)
-        inner, stored = evaluate_facets(self.facets.active, posed, self.positions, self.law.barrier, facet_start)
-        return merge_forces(of_points, inner, stored)
+        of_facets = evaluate_facets(self.facets.active, posed, self.positions, self.law.barrier, facet_start)
+        return merge_forces(of_points, *of_facets)
 
     def _is_out_of_range(self, number: int, posed: PosedShape) -> bool:
         """Whether an obstacle is too far from all points and facets to act, now and at the start of the step."""

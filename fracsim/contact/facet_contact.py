@@ -13,7 +13,7 @@ Equations: docs/theory.md#facets.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -38,10 +38,13 @@ class FacetPolicy:
         smoothing: mu of closest points, in barrier widths.
         max_bow: facets whose middle comes nearer to an obstacle than their nodes by less, in barrier widths, are
             left to their nodes.
+        flatness: differences of a facet's gaps, in smoothings, and of its closest points from those before a plane,
+            up to which an obstacle is flat over it.
     """
 
     smoothing: float = 0.1
     max_bow: float = 0.1
+    flatness: float = 1e-9
 
 
 FACETS = FacetPolicy()
@@ -355,8 +358,11 @@ def evaluate_facets(
     x: Values,
     law: GapPotential,
     start: tuple[PosedShape, Values] | None = None,
-) -> tuple[FacetForces, float]:
-    """Forces on facets near an obstacle, and the energy that they store, J.
+) -> tuple[FacetForces, float, float]:
+    """Forces on facets near an obstacle, the energy that they store, J, and the least gap of a facet, m.
+
+    Facets over which the obstacle is flat have no forces: F is a difference of equal parts. Where the parts are large,
+    their round-off would exceed the forces on a body that is touched softly.
 
     Args:
         facets: all facets.
@@ -371,20 +377,31 @@ def evaluate_facets(
         near = np.union1d(near, step_start.near)
     closest = facets.closest_points(posed, x, near)
     if not len(near):
-        return FacetForces.from_closest(facets.corners[near], facets.area[near], closest, law), 0.0
+        return FacetForces.from_closest(facets.corners[near], facets.area[near], closest, law), 0.0, float("inf")
+    least_gap = float(closest.gap.min())
     start_gap, acting = None, closest.gap < law.width  # elsewhere gap' >= gap, and F = 0 with its derivatives
     if step_start is not None:
         start_gap = step_start.gaps(near, closest.barycentric)
         acting |= start_gap < law.width
     rows = np.flatnonzero(acting)
-    corners, area, closest = facets.corners[near[rows]], facets.area[near[rows]], closest.select(rows)
+    plane, closest = _soft_min_gap(posed, x, facets.corners[near[rows]], facets.smoothing), closest.select(rows)
+    is_flat = abs(closest.gap - plane.gap) <= FACETS.flatness * facets.smoothing
+    is_flat &= abs(closest.barycentric - plane.barycentric).max(axis=1, initial=0.0) <= FACETS.flatness
+    gaps = None
+    if start is not None and start_gap is not None:
+        plane = _soft_min_gap(*start, facets.corners[near[rows]], facets.smoothing)
+        gaps = np.column_stack([start_gap[rows], plane.gap, plane.gaps])
+        is_flat &= abs(gaps[:, 0] - gaps[:, 1]) <= FACETS.flatness * facets.smoothing
+    curved = np.flatnonzero(~is_flat)
+    corners, area, closest = facets.corners[near[rows[curved]]], facets.area[near[rows[curved]]], closest.select(curved)
     stored = FacetForces.from_closest(corners, area, closest, law)
-    if start is None or start_gap is None:
-        return stored, float(stored.energy.sum())
-    corner_gaps = start[0].distance(start[1][corners].reshape(-1, x.shape[1])).reshape(corners.shape)
-    plane_gap = SoftMinGap(corner_gaps, facets.smoothing).gap
-    gaps = np.column_stack([start_gap[rows], plane_gap, corner_gaps])
-    return FacetForces.from_closest(corners, area, closest, law, gaps), float(stored.energy.sum())
+    inner = stored if gaps is None else FacetForces.from_closest(corners, area, closest, law, gaps[curved])
+    return inner, float(stored.energy.sum()), least_gap
+
+
+def _soft_min_gap(posed: PosedShape, x: Values, corners: Ints, smoothing: float) -> SoftMinGap:
+    """Smoothed minima of the nodal gaps of facets (k, c) to an obstacle, with points at x (n, d), m."""
+    return SoftMinGap(posed.distance(x[corners].reshape(-1, x.shape[1])).reshape(corners.shape), smoothing)
 
 
 def _block_diagonal(blocks: Values) -> Values:
@@ -437,11 +454,11 @@ def add_facet_friction(
     return LaggedContact(points, share[loaded] * size, normal, position, obstacle_point)
 
 
-def merge_forces(of_points: ContactForces, inner: FacetForces, stored: float) -> ContactForces:
-    """Forces on points and on facets together; `stored`: energy of the facets, J."""
+def merge_forces(of_points: ContactForces, inner: FacetForces, stored: float, least_gap: float) -> ContactForces:
+    """Forces on points and on facets together; `stored`, `least_gap`: energy, J, and least gap, m, of the facets."""
+    min_gap = min(of_points.min_gap, least_gap)
     if not len(inner.area):
-        return of_points
-    min_gap = min(of_points.min_gap, float(inner.closest.gap.min()))
+        return replace(of_points, min_gap=min_gap)
     points = np.union1d(of_points.points, inner.corners.reshape(-1))
     rows, d = np.searchsorted(points, of_points.points), of_points.normal.shape[1]
     normal, friction = np.zeros((2, len(points), d))

@@ -235,7 +235,7 @@ static void initial_barycentric(const Obstacle *o, const Facet *f, double flat_d
 
 // Tuned numbers, as packed from closest_point.SEARCH.
 typedef struct {
-  double max_iterations, max_trials, slope_reduction, flat_distance, min_change;
+  double max_iterations, max_trials, slope_reduction, flat_distance, min_change, round_off;
 } Search;
 
 // Fraction of a step after which the convex L is no longer steep along it; slope and rise are those there at the end.
@@ -261,9 +261,10 @@ static double line_search(const Obstacle *o, const Facet *f, const Search *searc
 }
 
 static void find_closest_point(const Obstacle *o, const Facet *f, const Search *search, double tolerance, double *l) {
-  double edge[3], slope[3], rise[3], y[3], n[3], H[9], Q[3][3], step[3];
-  for (int i = 0; i < 3; ++i) edge[i] = f->x[1][i] - f->x[0][i];
-  const double max_residual = tolerance * sqrt(dot(edge, edge));
+  double slope[3], rise[3], y[3], n[3], H[9], Q[3][3], step[3], largest = 0.0;
+  for (int a = 0; a < f->c; ++a)
+    for (int i = 0; i < 3; ++i) largest = fmax(largest, fabs(f->x[a][i]));
+  const double max_residual = fmax(tolerance * f->smoothing, search->round_off * largest);
   if (isnan(l[0])) initial_barycentric(o, f, search->flat_distance, l);
   slope_at(o, f, l, slope, rise);
   for (int k = 0; k < search->max_iterations; ++k) {

@@ -28,7 +28,8 @@ Values = npt.NDArray[np.float64]
 
 SOURCE = Path(__file__).with_suffix(".c")
 _SEARCH = np.array([
-    SEARCH.max_iterations, SEARCH.max_trials, SEARCH.slope_reduction, SEARCH.flat_distance, SEARCH.min_change
+    SEARCH.max_iterations, SEARCH.max_trials, SEARCH.slope_reduction, SEARCH.flat_distance, SEARCH.min_change,
+    SEARCH.round_off,
 ])  # fmt: skip
 
 

@@ -44,7 +44,7 @@ class StepLimitPolicy:
     Attributes:
         max_iterations: of conservative advancement. Each ends with safe fractions.
         min_progress: relative change of a fraction at which the advancement ends.
-        closest_point_tolerance: remaining derivative by barycentric coordinates, in facet sizes, on the way.
+        closest_point_tolerance: remaining derivative by barycentric coordinates, in smoothings mu, on the way.
         reach: points nearer to an obstacle than this times their motion are looked at.
         max_rounds: rounds in which points that depend on several nodes are stopped before obstacles.
         min_weight: sum of weights of stopped points from which on a node is moved back.
@@ -56,7 +56,7 @@ class StepLimitPolicy:
 
     max_iterations: int = 50
     min_progress: float = 1e-3
-    closest_point_tolerance: float = 1e-6
+    closest_point_tolerance: float = 1e-4
     reach: float = 1.2
     max_rounds: int = 20
     min_weight: float = 1e-3
