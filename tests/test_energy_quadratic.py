@@ -71,7 +71,7 @@ def test_what_a_tip_sees_of_a_cell_is_its_mean() -> None:
     scene.balance.set_displacement(u(domain.nodes).ravel())
     criterion_of(scene).set_motion(v(domain.nodes).ravel(), a(domain.nodes).ravel(), 0.0, 1.0)
     look = seen(scene)
-    cells = look.neighbourhoods.remote_values.owned_cells
+    cells = look.neighbourhoods.remote_values.requested
     x, w = quadrature(domain, cells)
     H, chi, rho = u.gradient(x), scene.balance.stress.chi.x.array[cells], 7800.0
     mu, lmbda = YOUNG / 2 / (1 + POISSON), YOUNG * POISSON / (1 + POISSON) / (1 - 2 * POISSON)

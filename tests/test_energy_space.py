@@ -191,7 +191,7 @@ def test_forces_are_sums_over_all_cells() -> None:
     """Forces of any Sigma and f are those of sums over the whole body, with q of the nodes, linear in each cell."""
     scene = plate(8, {"time": [0, 1], "value": [[0, 0, 0], [0, 0, 1e-6]]}, 1.0)
     look, domain, rng = seen(scene).neighbourhoods, scene.domain, np.random.default_rng(7)
-    own, volumes, count = look.remote_values.owned_cells, domain.volumes, len(look.tips)
+    own, volumes, count = look.remote_values.requested, domain.volumes, len(look.tips)
     sigma, push = np.zeros((domain.cell_count, 3, 3)), np.zeros((domain.cell_count, 3))
     sigma[own], push[own] = rng.standard_normal((len(own), 3, 3)), 3e4 * rng.standard_normal((len(own), 3))
     points, corners = domain.nodes, domain.cell_nodes
