@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ..mesh.parallel import alltoall, exchange_rows, gather
+from ..mesh.parallel import RowRouting, gather
 
 Ints = npt.NDArray[np.int64]
 ROWS_PER_CHUNK = 1 << 15
@@ -77,21 +77,16 @@ class RowCompressor:
         self._comm, self.rows = comm, int(comm.allreduce(len(input_index)))
         self.chunk_rows, self._compress, self._fills_last = max(min(self.rows, chunk_rows), 1), compress, fill_last
         chunk = input_index // self.chunk_rows
-        rank = chunk % comm.size
-        self._order = np.argsort(rank, kind="stable")
-        self._sent = np.bincount(rank, minlength=comm.size)
+        self._routing = RowRouting(comm, chunk % comm.size)
         # row in the chunks of the rank that compresses it
-        position = (chunk // comm.size * self.chunk_rows + input_index % self.chunk_rows)[self._order]
-        arrived = alltoall(comm, np.split(position, np.cumsum(self._sent)[:-1]))
-        self._received, self._position = np.array([len(rows) for rows in arrived]), np.concatenate(arrived)
+        position = chunk // comm.size * self.chunk_rows + input_index % self.chunk_rows
+        self._position = self._routing.send(position)
         count = -(-self.rows // self.chunk_rows)
         self._chunks = len(range(comm.rank, count, comm.size))
 
     def __call__(self, values: npt.NDArray[Any]) -> list[bytes] | None:
         """Compressed chunks on rank 0, None elsewhere; `values` (n, ...) of owned entities (collective)."""
-        rows = np.ascontiguousarray(values[self._order])
-        if self._comm.size > 1:
-            rows = exchange_rows(self._comm, rows, self._sent, self._received)
+        rows = self._routing.send(values)
         chunks = np.zeros((self._chunks, self.chunk_rows, *rows.shape[1:]), rows.dtype)
         chunks.reshape(-1, *rows.shape[1:])[self._position] = rows
         parts = gather(self._comm, [self._compress(self._trimmed(chunk, k)) for k, chunk in enumerate(chunks)])
