@@ -33,6 +33,7 @@ class PictureEntry:
         render: arguments of `fracsim render` without folders and output; without runs, a module that draws the file.
         film: all frames, as a GIF.
         below: `render` of further pictures of the same runs, drawn below one another.
+        plot: arguments of `fracsim plot` without folders and output, drawn below the pictures; empty for no plot.
         remark: paragraph below the caption.
     """
 
@@ -42,6 +43,7 @@ class PictureEntry:
     render: str
     film: bool = False
     below: tuple[str, ...] = ()
+    plot: str = ""
     remark: str = ""
 
 
@@ -136,11 +138,18 @@ def draw_commands(entry: PictureEntry, file: str) -> list[str]:
     if not entry.runs:
         return [f"python3 -m {entry.render} {file}"]
     folders = " ".join(str(RUNS / folder) for folder, _ in entry.runs)
-    renders = [entry.render, *entry.below]
-    if len(renders) == 1:
-        return [f"fracsim render {folders} {entry.render}" + (f" -o {file}" if entry.film else "")]
+    commands = drawings(entry)
     stem, suffix = file.rsplit(".", 1)
-    return [f"fracsim render {folders} {render} -o {stem}-{row}.{suffix}" for row, render in enumerate(renders, 1)]
+    rows = [f" -o {stem}-{row}.{suffix}" for row in range(1, len(commands) + 1)]
+    if len(commands) == 1:
+        rows = [f" -o {file}" if entry.film else ""]
+    return [f"fracsim {name} {folders} {options}{row}" for (name, options), row in zip(commands, rows, strict=True)]
+
+
+def drawings(entry: PictureEntry) -> list[tuple[str, str]]:
+    """Commands of fracsim that draw an entry's pictures, and their arguments without folders and output."""
+    commands = [("render", render) for render in (entry.render, *entry.below)]
+    return [*commands, ("plot", entry.plot)] if entry.plot else commands
 
 
 def draw_picture(entry: PictureEntry) -> None:
@@ -152,9 +161,10 @@ def draw_picture(entry: PictureEntry) -> None:
         subprocess.run([sys.executable, "-m", entry.render, str(target)], check=True)
         return
     folders = [str(RUNS / folder) for folder, _ in entry.runs]
-    rows = [RUNS / f"{entry.name}-{row}{target.suffix}" for row in range(len(entry.below) + 1)]
-    for render, row in zip((entry.render, *entry.below), rows, strict=True):
-        app(["render", *folders, "-o", str(row), *shlex.split(render)], standalone_mode=False)
+    commands = drawings(entry)
+    rows = [RUNS / f"{entry.name}-{row}{target.suffix}" for row in range(len(commands))]
+    for (name, options), row in zip(commands, rows, strict=True):
+        app([name, *folders, "-o", str(row), *shlex.split(options)], standalone_mode=False)
     if len(rows) == 1:
         shutil.move(rows[0], target)
     else:
