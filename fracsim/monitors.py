@@ -13,7 +13,13 @@ from .output.run_folder import software_versions
 from .output.summary import ResourceMeter, irregular_event_text
 
 if TYPE_CHECKING:
-    from .output.contact_checks import ObstacleContact, ObstacleContactMonitor, ObstacleOverlapMonitor
+    from .output.contact_checks import (
+        IntersectionMonitor,
+        ObstacleContact,
+        ObstacleContactMonitor,
+        ObstacleOverlapMonitor,
+        SelfContactTerm,
+    )
     from .output.history import History
     from .output.result_checks import InterpenetrationMonitor, LoadDropMonitor
     from .scene import Scene
@@ -52,7 +58,8 @@ class RunMonitors:
         energy_gain: energy that appears without work.
         contact_monitor: contact of obstacles with the body; None without obstacles.
         obstacle_overlap: overlap of obstacles with one another; None without several obstacles, one of them free.
-        interpenetration: of fragments; None with self-contact or without a surface.
+        interpenetration: of fragments; None without a surface.
+        intersections: of facets in contact of the body with itself; None without it, and in explicit steps.
         load_drop: ends the run when the load has dropped; None without `time.until`.
     """
 
@@ -65,7 +72,9 @@ class RunMonitors:
         self.energy_gain = EnergyGainMonitor(at_rest=study.starts_at_rest, floor=floor, thickness=study.thickness)
         self.contact_monitor, self.obstacle_overlap = _obstacle_monitors(scene)
         self.interpenetration, self.load_drop = _interpenetration_monitor(study), _load_drop_monitor(study)
-        optional = (self.contact_monitor, self.obstacle_overlap, self.interpenetration, self.load_drop)
+        self.intersections = _intersection_monitor(scene)
+        of_contact = (self.contact_monitor, self.obstacle_overlap, self.interpenetration, self.intersections)
+        optional = (*of_contact, self.load_drop)
         self._optional: list[Monitor] = [monitor for monitor in optional if monitor is not None]
 
     @property
@@ -86,6 +95,8 @@ class RunMonitors:
         self.inverted.record_frame(t)
         if self.obstacle_overlap is not None:
             self.obstacle_overlap.record_frame(t)
+        if self.intersections is not None:
+            self.intersections.record_frame(t)
 
     def to_checkpoint(self) -> dict[str, Any]:
         """Return what a checkpoint stores (collective)."""
@@ -128,6 +139,8 @@ class RunMonitors:
             notes += self.obstacle_overlap.notes()
         if self.interpenetration is not None:
             notes += self.interpenetration.notes(implicit=time.scheme_class.implicit)
+        if self.intersections is not None:
+            notes += self.intersections.notes()
         return notes
 
 
@@ -155,12 +168,23 @@ def _obstacle_monitors(scene: Scene) -> tuple[ObstacleContactMonitor | None, Obs
 
 
 def _interpenetration_monitor(study: Study) -> InterpenetrationMonitor | None:
-    """Return the monitor of interpenetration, if there is a surface and no self-contact."""
-    if not wants_surface(study) or (study.contact is not None and study.contact.itself):
+    """Return the monitor of interpenetration, if there is a surface."""
+    if not wants_surface(study):
         return None
     from .output.result_checks import InterpenetrationMonitor
 
-    return InterpenetrationMonitor()
+    return InterpenetrationMonitor(in_contact=study.contact.itself if study.contact is not None else False)
+
+
+def _intersection_monitor(scene: Scene) -> IntersectionMonitor | None:
+    """Return the monitor of facets that intersect, if the body is in contact with itself in implicit steps."""
+    study = scene.study
+    if study.contact is None or not study.contact.itself or not study.time.scheme_class.implicit:
+        return None
+    from .output.contact_checks import IntersectionMonitor
+
+    (term,) = [term for term in scene.balance.terms if term.name == "contact"]
+    return IntersectionMonitor(cast("SelfContactTerm", term))
 
 
 def _load_drop_monitor(study: Study) -> LoadDropMonitor | None:

@@ -196,6 +196,43 @@ def test_one_piece_is_not_looked_at(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     one()
 
 
-@pytest.mark.parametrize("more", [{"output": PAIR["output"] | {"surface": False}}, {"contact": {}}])
-def test_nothing_is_looked_for_where_it_is_not_wanted(more: Tables, tmp_path: Path) -> None:
-    assert begun(two_bodies(tmp_path) | more, tmp_path / "out").monitors.interpenetration is None
+def test_nothing_is_looked_for_where_it_is_not_wanted(tmp_path: Path) -> None:
+    monitors = begun(two_bodies(tmp_path) | {"output": PAIR["output"] | {"surface": False}}, tmp_path / "out").monitors
+    assert monitors.interpenetration is None and monitors.intersections is None
+
+
+def test_pieces_that_contact_fails_to_keep_apart(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without collision detection contact lets bodies into each other: both monitors tell, and summary.json."""
+    monkeypatch.setattr("fracsim.contact.ipc_pairs.IpcPairs.free_fraction", lambda *_: 1.0)
+    deep, facets = notes(two_bodies(tmp_path) | {"contact": {"distance": 1e-3}}, tmp_path / "out", capsys)
+    assert "pieces 0 and 1 pass through each other in spite of [contact], first seen at t = 0.75 s" in deep
+    assert deep.endswith("; a shorter time.step may help")
+    assert "of facets of the body cut each other, first seen at t = 0.75 s near (" in facets
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    (seen,) = summary["facets_intersect"].values()
+    assert seen["time"] == pytest.approx(0.75) and seen["pairs"] > 1 and summary["passed_through"]["pieces"] == [0, 1]
+
+
+def test_pieces_that_a_penalty_does_not_keep_apart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Explicit steps, in which nothing holds up a prescribed motion."""
+    tables = two_bodies(tmp_path) | {"contact": {}, "time": {"scheme": "explicit", "step": 0.05, "end": 1.0}}
+    tables["output"] = PAIR["output"] | {"every": 5}
+    (deep,) = (note for note in notes(tables, tmp_path / "out", capsys) if "pass through" in note)
+    assert "pieces 0 and 1 pass through each other in spite of [contact], first seen at t = 0." in deep
+
+
+@pytest.mark.parametrize("itself", [True, "pieces"])
+def test_pieces_that_contact_keeps_apart_need_no_word(
+    itself: bool | str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The second block is held at its far end alone, and gives way."""
+    tables = two_bodies(tmp_path) | {"contact": {"itself": itself}}
+    tables["boundary"] = [PAIR["boundary"][0], PAIR["boundary"][1] | {"on": {"box": [[2.55, -0.1], [2.7, 1.1]]}}]
+    run = begun(tables | {"time": PAIR["time"] | {"end": 0.75}}, tmp_path / "out")
+    run()
+    assert run.monitors.interpenetration is not None and run.monitors.intersections is not None
+    assert not run.monitors.interpenetration.first_overlap and not run.monitors.intersections.first_seen
+    told = capsys.readouterr().err
+    assert "pass through" not in told and "cut each other" not in told

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import meshio
 import numpy as np
@@ -13,9 +15,13 @@ from fracsim.contact.ipc_pairs import IpcPairs
 from fracsim.contact.ipc_surface import RetractableSurface
 from fracsim.contact.laws import BARRIER
 from fracsim.contact.self_contact import SelfContact
-from fracsim.errors import InputError
+from fracsim.errors import InputError, NotConverged
 from fracsim.mesh.split_surface.surface_map import SurfaceMap
 from fracsim.meshes.builders.box import Box
+from fracsim.output.contact_checks import IntersectionMonitor
+from fracsim.scene import Scene
+from support.intersections import intersecting_elements
+from support.ranks import run_on_ranks
 from support.scenes import break_across, each_step, make_scene, march, positions
 from support.torn import RUNS
 
@@ -112,6 +118,115 @@ def test_a_cracked_column_carries_its_upper_half(order: int, h: float) -> None:
     assert 0.5 * 1e4 * 0.5 * 0.05 < carried[0] < 1.2 * 1e4 * 0.5 * 0.05 / (1 - 0.3**2)
     assert abs(carried[1]) < 1e-3 * carried[0]
     assert carried[0] < carried[2] < 1.2 * carried[0]
+
+
+def self_contact(scene: Scene) -> SelfContact:
+    """The term of contact of the body with itself."""
+    (term,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
+    return term
+
+
+def driven_block(path: Path, dim: int, scheme: str = "backward-euler", **held: Any) -> dict[str, Any]:
+    """A study of two blocks, the whole of the left one driven to the right by twice the gap in a step.
+
+    `held`: where the right one is held; by default at its far end.
+    """
+    left = {"box": [[-1.0] * dim, [1.01, *[2.0] * (dim - 1)]]}
+    held = held or {"box": [[2.04, *[-1.0] * (dim - 1)], [2.2, *[2.0] * (dim - 1)]]}
+    return {
+        "mesh": {"file": two_blocks(path, dim, 0.05)}, "material": SOFT, "contact": {}, "solver": FINE,
+        "boundary": [{"on": left, "velocity": [1.0, *[0.0] * (dim - 1)]}, {"on": held, "fix": "xyz"[:dim]}],
+        "time": {"scheme": scheme, "step": 0.1, "end": 0.3},
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("dim", "scheme"),
+    [(2, "backward-euler"), (2, "generalized-alpha"), (2, "quasi-static"), (3, "backward-euler")],
+)
+def test_a_driven_block_pushes_another_ahead(tmp_path: Path, dim: int, scheme: str) -> None:
+    """Contact cuts the first guess of the step. What is driven comes to its place all the same, and passes nothing: the
+    other block is pressed by the way less the gap."""
+    scene, state = make_scene(**driven_block(tmp_path, dim, scheme))
+    contact, left = self_contact(scene), positions(scene)[:, 0] < 1.01
+    for _ in each_step(scene, state):
+        u = state.u.reshape(-1, dim)[:, 0]
+        np.testing.assert_allclose(u[left], state.t, rtol=1e-12)
+        assert not len(intersecting_elements(contact.surface.positions(state.u), contact.surface.current.elements))
+        assert state.t - 0.05 < u[~left].max() < state.t
+    assert state.t == pytest.approx(0.3)
+
+
+def test_a_prescribed_motion_that_contact_forbids_is_refused(tmp_path: Path) -> None:
+    """A block that is driven against one that is held as a whole: there is no such motion."""
+    scene, state = make_scene(**driven_block(tmp_path, 2, box=[[1.04, -1.0], [2.2, 2.0]]))
+    with pytest.raises(NotConverged, match=r"Contact is in the way of the prescribed motion"):
+        march(scene, state)
+    assert state.t < 0.05
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_facets_that_intersect_are_counted(tmp_path: Path, dim: int) -> None:
+    """As many as an independent test finds, those of an excluded facet apart; and none where none intersect."""
+    scene, _ = make_scene(**driven_block(tmp_path, dim))
+    contact, X = self_contact(scene), positions(scene)
+    surface, monitor = contact.surface.current, IntersectionMonitor(contact)
+
+    def shift(gap: float) -> None:
+        u = np.where(X[:, :1] > 1.01, [[gap - 0.05, 0.0137, 0.0071][:dim]], 0.0).reshape(-1)
+        scene.balance.evaluate_at(0.0, u, 0 * u, dt=1e-3)
+
+    for t, gap in enumerate((0.05, 0.01)):
+        shift(gap)
+        monitor.record_frame(t)
+    assert not monitor.first_seen and not monitor.notes() and not monitor.summary()
+    shift(-0.163)
+    pairs = intersecting_elements(contact.end_positions(), surface.elements)
+    surface._exclude(pairs[0, :1])
+    monitor.record_frame(0.5)
+    of_excluded = (pairs == pairs[0, 0]).any(axis=1)
+    counts = {kind: seen["pairs"] for kind, seen in monitor.first_seen.items()}
+    assert counts == {"in_contact": (~of_excluded).sum(), "without_room": of_excluded.sum()}
+    shift(-0.1)
+    monitor.record_frame(1.0)
+    assert all(seen["time"] == 0.5 and 0.8 < seen["place"][0] < 1.05 for seen in monitor.first_seen.values())
+    in_contact, without_room = monitor.notes()
+    assert "of facets of the body cut each other, first seen at t = 0.5 s near (" in in_contact
+    assert "contact has failed there" in in_contact and "crack faces that appeared without room" in without_room
+    other = IntersectionMonitor(contact)
+    other.from_checkpoint(json.loads(json.dumps(monitor.to_checkpoint())))
+    assert other.first_seen == monitor.summary()["facets_intersect"]
+
+
+@pytest.mark.parametrize(
+    "more",
+    [
+        {"fracture": RUNS["shut"]["fracture"] | {"passes": 5}},
+        RUNS["crushed"] | {"fracture": RUNS["crushed"]["fracture"] | {"passes": 5}, "time": {
+            "scheme": "backward-euler", "step": 0.05, "end": 0.2}},
+        {"time": {"scheme": "quasi-static", "step": 0.025, "end": 0.2}},
+    ],
+    ids=("pushed", "crushed", "quasi-static"),
+)  # fmt: skip
+def test_crack_faces_that_have_room_never_intersect(more: dict[str, Any]) -> None:
+    """A body that breaks in several passes a step, and is pushed together: its supports take crack faces along, and a
+    solve after a pass begins where new faces have room."""
+    scene, state = make_scene(**RUNS["shut"] | more | {"contact": {"friction": 0.2}, "solver": {}})
+    contact, broken = self_contact(scene), 0
+    for report in each_step(scene, state):
+        surface, broken = contact.surface.current, broken + report.broken
+        elements = np.delete(surface.elements, surface._excluded, axis=0)
+        assert not len(intersecting_elements(contact.surface.positions(state.u), elements)), state.t
+    assert broken > 30
+
+
+@pytest.mark.ranks
+@pytest.mark.parametrize("ranks", (2, 3))
+def test_ranks_push_alike(ranks: int, tmp_path: Path) -> None:
+    """The driven block, and what the monitor of intersections records."""
+    one, several = (run_on_ranks("support.pushed", count, tmp_path) for count in (1, ranks))
+    for name, values in one.items():
+        np.testing.assert_allclose(several[name], values, rtol=1e-9, atol=1e-7, err_msg=name)
 
 
 def test_contact_that_is_too_soft_is_made_stiffer(tmp_path: Path) -> None:

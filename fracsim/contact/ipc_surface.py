@@ -23,6 +23,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ..errors import InputError
+from ..mesh.parallel import allgather
 from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from ..mesh.split_surface.entity_numbering import CRACK, EntityNumbering
 from ..mesh.split_surface.fragment_surface import build_fragment_surface, has_same_fragments, project_onto_fragments
@@ -30,6 +31,7 @@ from ..mesh.split_surface.point_matching import match_points, point_identity
 from ..mesh.split_surface.surface_map import SurfaceMap, make_surface_map
 from ..meshes.data import format_point
 from .ipc_pairs import IpcPairs, PairShare
+from .pair_search import PairFilter, intersecting_pairs
 
 if TYPE_CHECKING:
     from .mesh_obstacles import AllMeshPairs
@@ -319,6 +321,16 @@ class SelfContactSurface(RetractableSurface):
         """Raise InputError where a body at rest intersects or touches itself."""
         cut_pairs = self.pairs.intersections(self.split.points)
         refuse_intersections(self.split.points[self.split.elements[cut_pairs]].mean(axis=(1, 2)))
+
+    def find_intersections(self, u: Values) -> tuple[Ints, Flags]:
+        """(k, 2) elements that intersect, excluded ones too, at displacements u (nodes, d), m (collective).
+
+        Also returns (k,) flags of pairs of which one is excluded.
+        """
+        x, share = self.point_map(u), self._share
+        rank_pairs = intersecting_pairs(self.elements, PairFilter.of(len(x), is_owned=share.points), x)
+        pairs = np.unique(np.concatenate(allgather(share.comm, rank_pairs)), axis=0)
+        return pairs, np.asarray(np.isin(pairs, self._excluded).any(axis=1))
 
     def _build_pairs(self, elements: Ints) -> SurfacePairs:
         return IpcPairs(self._rest_positions, elements, **self._parameters, share=self._share, patch=None)

@@ -36,6 +36,7 @@ from .sample_points import SlipFriction
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
 Pattern = npt.NDArray[np.uint8]
 
 # skeleton, pattern (cells,), law, u (nodes, d), surface until now, positions of cuts (edges,) -> surface
@@ -178,6 +179,8 @@ class SelfContact(Term):
     allows_exact_tangent: bool = True
     level: TimeLevel
     _attempts = 0  # of Newton's method in the step
+    _start_displacement: Values | None = None  # of the step
+    _fitted_displacement: Values | None = None  # at which crack faces have found their room within the step
 
     def __init__(
         self,
@@ -214,6 +217,7 @@ class SelfContact(Term):
         """Add new crack faces, retracted where there is no room (collective)."""
         self.surface.edges_broke(pattern)
         self._discard_surface()
+        self._fitted_displacement = self._u.x.array[: self._owned].copy()
 
     # --- steps ---
 
@@ -223,10 +227,18 @@ class SelfContact(Term):
         if not level.dt:
             return
         nodal, slip, surface = self.surface.nodal_values(level.u_n), self._sticking_slip(level), self.surface.current
-        surface.extend_faces(nodal)
+        if not self._is_repeated(level.u_n):
+            self._fitted_displacement = None
+        if self._fitted_displacement is None:
+            surface.extend_faces(nodal)
         self.start_positions = x = surface.point_map(nodal)
         if self.surface.law.friction:
             self.friction = surface.pairs.lag_friction(x, x, slip)
+
+    def _is_repeated(self, u_n: Values) -> bool:
+        """Whether a step begins where the last one did, at u_n (owned dofs,), m: it is repeated (collective)."""
+        before, self._start_displacement = self._start_displacement, u_n.copy()
+        return self.comm.allreduce(before is not None and np.array_equal(before, u_n), op=MPI.LAND)
 
     def _sticking_slip(self, level: TimeLevel) -> float:
         """Slip in the step that counts as sticking, m, with speeds relative to the body's mean (collective)."""
@@ -300,10 +312,26 @@ class SelfContact(Term):
         coupling = sum_few_nodes(self._domain, part, nodes, SURFACE.max_coupled_nodes) if self.level.dt else None
         return self._coupling(part, nodes) if coupling is None else coupling
 
+    def fits(self, u: Values) -> bool:
+        """Whether crack faces have found their room at u (owned dofs,), m, the end of the step (collective)."""
+        if self._fitted_displacement is None:
+            return False
+        change = np.max(np.abs(u - self._fitted_displacement), initial=0.0)
+        return bool(self.comm.allreduce(change <= SURFACE.round_off * self.surface.law.distance, op=MPI.LAND))
+
     def min_gap(self) -> float:
         """Least distance within the barrier at the current u, m; infinite where none is active (collective)."""
         x = self.surface.positions(self._u.x.array[: self._owned])
         return float(self.comm.allreduce(self.surface.current.pairs.min_gap(x), op=MPI.MIN))
+
+    def find_intersections(self) -> tuple[Values, Flags]:
+        """(k, d) midpoints of pairs of elements that intersect at the current u, m (collective).
+
+        Also returns (k,) flags of pairs of which one is excluded: a crack face without room.
+        """
+        surface, nodal = self.surface.current, self.surface.nodal_values(self._u.x.array[: self._owned])
+        pairs, without_room = surface.find_intersections(nodal)
+        return surface.point_map(nodal)[surface.elements[pairs]].mean(axis=(1, 2)), without_room
 
     def stored_energy(self) -> float:
         """Energy of the barrier at the current u, of this rank's pairs, J (collective)."""
@@ -373,9 +401,12 @@ class CollisionLimit:
         return surface.pairs.free_fraction(x, x + surface.point_map.weights @ nodal)
 
     def feasible_guess(self, u: Values) -> Values:
-        """(owned dofs,) first guess of u, m, as far on its way from the start as there is no collision (collective)."""
+        """(owned dofs,) first guess of u, m, as far on its way from the start as there is no collision (collective).
+
+        Where edges broke within the step, new crack faces have room at the last solution, but maybe not at the start.
+        """
         level, start = self._term.level, self._term.start_positions
-        if not level.dt or start is None:
+        if not level.dt or start is None or self._term.fits(level.displacement_at_end(u)):
             return u
         fraction = self._free_fraction(start, level.displacement_at_end(u) - level.u_n)
         return u if fraction == 1 else np.asarray(level.u_n + fraction * (u - level.u_n))

@@ -242,17 +242,39 @@ class Balance:
             b.array_w[:] -= condensed
         b.array_w[self.motion.owned_dofs] = 0.0
 
-    def assemble_extension_residual(self, x: PETSc.Vec, b: PETSc.Vec) -> None:
+    def assemble_extension_residual(self, x: PETSc.Vec, b: PETSc.Vec, free_fraction: float | None = None) -> None:
         """Sum r + K (u_prescribed - u) into b, at an x whose prescribed dofs have other values (collective).
 
         Its solution extends a jump of the prescribed displacement linearly into the body. Cells at the boundary would
         otherwise take all of it and might invert.
+
+        Args:
+            x: displacement, m.
+            b: the sum, N.
+            free_fraction: of the jump at the prescribed dofs alone that contact allows. K then has the stiffness of
+                contact, from a difference of forces. None: without.
         """
         self.set_iterate(x, prescribed=False)
         local = self._assembler.assemble_local_part(b, self._work)
         apply_lifting(local, self.tangent.form, self.motion.bcs, self.u)
         self._add_nodal_parts(self._assembler.sum_over_ranks(b))
+        if free_fraction is not None:
+            b.array_w[:] -= self._contact_force_change(x, 1e-4 * free_fraction)
         b.array_w[self.motion.owned_dofs] = 0.0
+
+    def _contact_force_change(self, x: PETSc.Vec, fraction: float) -> Values:
+        """(owned dofs,) change of the contact forces in r by a jump of prescribed dofs to their values, N (collective).
+
+        Linear, from the change in a small `fraction` of the jump. The current u is x, with other prescribed values.
+        """
+        u, change = x.array_r.copy(), []
+        for share in (fraction, 0.0):
+            moved = u.copy()
+            moved[self.motion.owned_dofs] += share * (self.motion.values - u[self.motion.owned_dofs])
+            self.set_displacement(moved)
+            forces = self.contact.forces()
+            change.append(np.zeros_like(u) if forces is None else self._weighted(forces))
+        return np.asarray((change[0] - change[1]) / fraction)
 
     def update_forces(self) -> Values:
         """(owned dofs,) residual at the current u, stored as `reactions` (collective)."""

@@ -1,4 +1,4 @@
-"""Monitors of obstacles: missed or too fast contact with the body, and obstacles that overlap."""
+"""Monitors of contact: facets that intersect, missed or too fast contact with obstacles, and obstacles that overlap."""
 
 from __future__ import annotations
 
@@ -6,12 +6,19 @@ import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Protocol
 
+import numpy as np
+import numpy.typing as npt
+
 from ..contact.obstacle import RigidObstacle, find_overlaps, free_pairs
 from ..mesh.domain import Domain
+from ..meshes.data import format_point
 from ..timestepping.state import State
 
 if TYPE_CHECKING:
     from ..contact.rigid_obstacles import RigidObstacles
+
+Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 
 class ObstacleContact(Protocol):
@@ -151,3 +158,64 @@ class ObstacleOverlapMonitor:
             f"{first} ran into {second}, by {self.deepest_overlap['depth']:.3g} m at "
             f"t = {self.deepest_overlap['time']:g} s: they met faster than explicit steps can follow"
         ]
+
+
+class SelfContactTerm(Protocol):
+    """Contact of a body with itself, as the monitor sees it."""
+
+    def find_intersections(self) -> tuple[Values, Flags]:
+        """(k, d) midpoints of pairs of facets that intersect, m, and (k,) flags of those without room (collective)."""
+
+
+class IntersectionMonitor:
+    """Facets of a body in contact with itself that intersect in a frame. The same on all ranks.
+
+    Attributes:
+        first_seen: of pairs "in_contact" and of crack faces "without_room", whose contact is off until there is room:
+            time in s and place in m of the first one, and the largest number of pairs in a frame.
+    """
+
+    def __init__(self, term: SelfContactTerm) -> None:
+        """Start without any frame; `term`: contact of the body with itself in implicit steps."""
+        self._term = term
+        self.first_seen: dict[str, dict[str, Any]] = {}
+
+    def record_frame(self, t: float) -> None:
+        """Record the current positions at time t in s (collective)."""
+        positions, without_room = self._term.find_intersections()
+        for kind, of_kind in (("in_contact", positions[~without_room]), ("without_room", positions[without_room])):
+            if not len(of_kind):
+                continue
+            first = of_kind[np.lexsort(of_kind.T[::-1])[0]].tolist()
+            entry = self.first_seen.setdefault(kind, {"time": t, "place": first, "pairs": 0})
+            entry["pairs"] = max(entry["pairs"], len(of_kind))
+
+    def to_checkpoint(self) -> dict[str, Any]:
+        """Values for `from_checkpoint`."""
+        return {"facets_intersect": self.first_seen}
+
+    def from_checkpoint(self, monitors: dict[str, Any]) -> None:
+        """Restore the values of `to_checkpoint`."""
+        self.first_seen = monitors.get("facets_intersect", {})
+
+    def summary(self) -> dict[str, Any]:
+        """Part of summary.json; empty if nothing intersected."""
+        return self.to_checkpoint() if self.first_seen else {}
+
+    def notes(self) -> list[str]:
+        """Sentences about facets that intersected."""
+        remedies = {
+            "in_contact": "contact has failed there, and the result is not to be trusted; a shorter time.step may help",
+            "without_room": "crack faces that appeared without room have no contact until there is some; a smaller "
+            "mesh.h leaves more",
+        }
+        return [_intersection_note(entry, remedies[kind]) for kind, entry in sorted(self.first_seen.items())]
+
+
+def _intersection_note(entry: dict[str, Any], remedy: str) -> str:
+    """Sentence about pairs of facets that were seen to intersect."""
+    pairs = "1 pair" if entry["pairs"] == 1 else f"{entry['pairs']} pairs"
+    return (
+        f"{pairs} of facets of the body cut each other, first seen at t = {entry['time']:g} s near "
+        f"{format_point(entry['place'])}: {remedy}"
+    )

@@ -173,7 +173,7 @@ class FrameFiles:
             fields: names of output.fields.
             surface: write the split surface.
             smooth: draw cracks smooth.
-            passing: monitor of interpenetration, in a study without contact between fragments.
+            passing: monitor of interpenetration.
             resume_at: keep the frames up to this time, s; None: a new run.
             thickness: thickness of a 2D body, m; 1 in 3D.
             precision: of points and fields, "single" or "double".

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -238,7 +238,7 @@ def _edge_determinants(corners_of: Callable[[Ints], Values], cells: Ints) -> Val
 
 
 class InterpenetrationMonitor:
-    """First frame in which fragments interpenetrate, in a study without contact between them.
+    """First frame in which fragments interpenetrate.
 
     Later frames are not checked, nor is a body of one fragment.
 
@@ -246,7 +246,9 @@ class InterpenetrationMonitor:
         first_overlap: time in s, place in m, and names of the two fragments; empty if there was no overlap.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, in_contact: bool | Literal["pieces"] = False) -> None:
+        """Start without any frame; `in_contact`: the key contact.itself."""
+        self._in_contact = in_contact
         self.first_overlap: dict[str, Any] = {}
 
     def record_frame(self, t: float, surface: BodySurface, u: Values) -> None:
@@ -262,8 +264,11 @@ class InterpenetrationMonitor:
         from ..mesh.interpenetration import RankNodes, find_interpenetration
 
         part = surface.part
-        nodes = RankNodes(part.comm, part.node_numbers, part.owner == part.comm.rank)
-        cells = surface.skeleton.cells[surface.undamaged_cells]
+        cells, is_owned = surface.skeleton.cells[surface.undamaged_cells], part.owner == part.comm.rank
+        if self._in_contact == "pieces":
+            # nodes without an undamaged cell have no contact; with contact one rank has the whole surface
+            is_owned &= np.isin(np.arange(len(is_owned)), cells)
+        nodes = RankNodes(part.comm, part.node_numbers, is_owned)
         overlap = find_interpenetration(surface.skeleton.points + u, cells, surface.split.node_fragment, nodes)
         if overlap is not None:
             names = sorted(int(surface.fragment_names[fragment]) for fragment in overlap.fragments)
@@ -286,10 +291,16 @@ class InterpenetrationMonitor:
         if not self.first_overlap:
             return []
         first, second = self.first_overlap["pieces"]
-        remedy = "a [contact] table" if implicit else "[contact] with an implicit scheme"
+        if self._in_contact:
+            spite, remedy = " in spite of [contact]", "a shorter time.step may help"
+        else:
+            spite, remedy = (
+                "",
+                f"{'a [contact] table' if implicit else '[contact] with an implicit scheme'} keeps them apart",
+            )
         return [
-            f"pieces {first} and {second} pass through each other, first seen at t = {self.first_overlap['time']:g} s "
-            f"near {format_point(self.first_overlap['place'])}; {remedy} keeps them apart"
+            f"pieces {first} and {second} pass through each other{spite}, first seen at "
+            f"t = {self.first_overlap['time']:g} s near {format_point(self.first_overlap['place'])}; {remedy}"
         ]
 
 

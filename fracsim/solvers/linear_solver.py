@@ -328,12 +328,15 @@ class LinearSolver:
         self.failures += 1
         return np.zeros_like(force)
 
-    def extend(self, x: PETSc.Vec, eigenvalue_floor: float | None) -> int:
+    def extend(self, x: PETSc.Vec, eigenvalue_floor: float | None, free_fraction: float | None = None) -> int:
         """Extend a jump of the prescribed displacement into the body; return the Krylov iterations (collective).
 
-        `x` is the displacement, changed in place.
+        Args:
+            x: displacement, changed in place.
+            eigenvalue_floor: see `TangentOperators`.
+            free_fraction: see `Balance.assemble_extension_residual`.
         """
-        self.balance.assemble_extension_residual(x, self.balance.work_vector)
+        self.balance.assemble_extension_residual(x, self.balance.work_vector, free_fraction)
         # Without a force on a free dof there is nothing to extend.
         if not self.balance.work_vector.norm():
             return 0

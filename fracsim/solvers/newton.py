@@ -342,7 +342,11 @@ class NewtonSolver:
     def _attempt(self, guess: Values | None) -> SolveResult:
         self.shrink_tangent()
         self.balance.begin_solve()
-        extended = 0 if guess is None else self._start_from(guess)
+        extended, is_feasible = self._start_from(guess)
+        if not is_feasible:
+            rounds = self._policy.max_extensions
+            reason = f"Contact is in the way of the prescribed motion: not there in {rounds} extensions into the body"
+            return SolveResult(False, 0, extended, reason, self._convergence.stopped_for_cost)
         if self.linear.steps_are_linear and (solved := self._solve_linear_step()) is not None:
             return replace(solved, krylov_iterations=solved.krylov_iterations + extended)
         newton, krylov, is_jammed = self._advance_obstacles()
@@ -357,15 +361,51 @@ class NewtonSolver:
         reason = "" if converged else self._failure()
         return SolveResult(converged, newton, krylov, reason, self._convergence.stopped_for_cost)
 
-    def _start_from(self, guess: Values) -> int:
-        """Set x to a feasible first guess; returns the number of Krylov iterations (collective)."""
-        self._x.array_w[:] = guess
-        jumps = self.balance.motion.max_deviation(guess) > self._policy.max_support_jump
-        extended = self.linear.extend(self._x, self._eigenvalue_floor()) if jumps else 0
+    def _start_from(self, guess: Values | None) -> tuple[int, bool]:
+        """Set x to a feasible first guess near `guess`; None: near the last iterate (collective).
+
+        Returns:
+            Number of Krylov iterations, and whether there is one with prescribed dofs at their values.
+        """
+        extended = 0
+        if guess is not None:
+            self._x.array_w[:] = guess
+            if self.balance.motion.max_deviation(guess) > self._policy.max_support_jump:
+                extended = self.linear.extend(self._x, self._eigenvalue_floor())
         if self.balance.contact.limits_newton_steps:
-            self._x.array_w[:] = self.balance.feasible_guess(self._x.array_r.copy())
-            self.balance.set_iterate(self._x)  # restricted obstacles are advanced from there
-        return extended
+            if guess is not None:
+                self._x.array_w[:] = self.balance.feasible_guess(self._x.array_r.copy())
+            krylov, is_feasible = self._complete_prescribed_motion()
+            self.balance.set_iterate(self._x, prescribed=is_feasible)  # restricted obstacles are advanced from there
+            return extended + krylov, is_feasible
+        return extended, True
+
+    def _complete_prescribed_motion(self) -> tuple[int, bool]:
+        """Move prescribed dofs of x to their values, along a motion that contact allows (collective).
+
+        A guess that contact has cut has a part of the prescribed motion alone. Where the rest cannot be added at the
+        supports, it is extended into the body by Newton's steps, as far as contact allows in each.
+
+        Returns:
+            Number of Krylov iterations, and whether the values were reached.
+        """
+        balance, x, dofs, krylov = self.balance, self._x, self.balance.motion.owned_dofs, 0
+        for extensions in range(self._policy.max_extensions + 1):
+            if not balance.motion.max_deviation(x.array_r):
+                return krylov, True
+            start, change = x.array_r.copy(), np.zeros(x.getLocalSize())
+            change[dofs] = balance.motion.values - start[dofs]
+            balance.set_iterate(x, prescribed=False)
+            if (fraction := balance.max_step_fraction(change)) < 1:
+                if not fraction or extensions == self._policy.max_extensions:
+                    break
+                krylov += self.linear.extend(x, self._eigenvalue_floor(), fraction)
+                change += x.array_r - start
+                fraction = balance.max_step_fraction(change)
+            x.array_w[:] = start + fraction * change
+            if fraction == 1:
+                x.array_w[dofs] = balance.motion.values
+        return krylov, False
 
     def _advance_obstacles(self) -> tuple[int, int, bool]:
         """Solve from x, and again each time that obstacles with a restricted motion have advanced (collective).

@@ -21,6 +21,8 @@ class SolverPolicy:
     # Mean edges. Longest jump of prescribed dofs without a linear extension into the body. A longer jump at a support
     # alone may invert its cells.
     max_support_jump: float = 0.01
+    # Extensions of a prescribed motion that contact is in the way of, before the step is halved.
+    max_extensions: int = 10
     # Share of |r| that an iteration leaves. Below it the method converges by itself and no nodes are relaxed
     # separately.
     fast_reduction_ratio: float = 0.1

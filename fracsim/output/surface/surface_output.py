@@ -58,7 +58,7 @@ class SurfaceOutput:
             record: history of broken edges, in a study with fracture. On a restart it is that of the checkpoint.
             apart: terms that keep the drawn surface apart.
             beside: terms with obstacles to draw.
-            passing: monitor of interpenetration, in a study without contact between fragments.
+            passing: monitor of interpenetration.
             smooth: draw cracks smooth.
             resume_at: keep the frames up to this time, s; None: a new run.
             precision: of points and fields, "single" or "double".
