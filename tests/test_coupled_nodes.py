@@ -32,13 +32,9 @@ def positive(n: int) -> np.ndarray:
     return root @ root.T + np.eye(n)
 
 
-@pytest.mark.parametrize("stiffness", [1e-3, 1e8])
-def test_the_preconditioner_is_that_of_dense_matrices(stiffness: float) -> None:
-    """Q + (1 - Q A) M (1 - A Q) with M = 1 / diag K, however stiff the coupling is."""
-    d, count, numbers = 3, 12, np.array([1, 4, 5, 9])
-    n, m = d * count, d * len(numbers)
-    K, C = positive(n), stiffness * positive(m)
-    body = body_of(count, d)
+def preconditioned(K: np.ndarray, C: np.ndarray, numbers: np.ndarray, d: int, values: np.ndarray) -> np.ndarray:
+    """P of `values`, with M = 1 / diag K."""
+    n, body = len(K), body_of(len(K) // d, d)
     rows = csr_matrix(K)
     tangent: Any = SimpleNamespace(
         domain=body, owned_rows=lambda nodes: rows[(d * nodes[:, None] + np.arange(d)).reshape(-1)]
@@ -50,15 +46,34 @@ def test_the_preconditioner_is_that_of_dense_matrices(stiffness: float) -> None:
     base.setType("jacobi")
     base.setUp()
     x, y = operator.createVecs()
-    x.array_w[:] = RANDOM.normal(size=n)
+    x.array_w[:] = values
     CoupledNodesPreconditioner(base, FewNodesCoupling(body, numbers, csr_matrix(C)), tangent, x).apply(base, x, y)
+    return np.asarray(y.array_r.copy())
+
+
+@pytest.mark.parametrize("stiffness", [1e-3, 1e8])
+def test_the_preconditioner_is_that_of_dense_matrices(stiffness: float) -> None:
+    """Q + (1 - Q A) M (1 - A Q) with M = 1 / diag K, however stiff the coupling is."""
+    d, count, numbers = 3, 12, np.array([1, 4, 5, 9])
+    n, m = d * count, d * len(numbers)
+    K, C, x = positive(n), stiffness * positive(m), RANDOM.normal(size=n)
+    y = preconditioned(K, C, numbers, d, x)
     Z = np.zeros((n, m))
     Z[(d * numbers[:, None] + np.arange(d)).reshape(-1), np.arange(m)] = 1.0
     A = K + Z @ C @ Z.T
     Q, one = Z @ np.linalg.inv(Z.T @ A @ Z) @ Z.T, np.eye(n)
     P = Q + (one - Q @ A) @ np.diag(1 / np.diag(K)) @ (one - A @ Q)
-    np.testing.assert_allclose(y.array_r, P @ x.array_r, rtol=0, atol=1e-6 * np.abs(P @ x.array_r).max())
+    np.testing.assert_allclose(y, P @ x, rtol=0, atol=1e-6 * np.abs(P @ x).max())
     np.testing.assert_allclose(P, P.T, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("kind", ["singular", "infinite"])
+def test_a_coupling_that_cannot_be_solved_for_is_left_to_the_body(kind: str) -> None:
+    """P = M where K + C of the coupled nodes is 0, or C is not finite as that of a gap of 0."""
+    d, numbers, K, x = 2, np.array([0, 2]), positive(6), RANDOM.normal(size=6)
+    dofs = (d * numbers[:, None] + np.arange(d)).reshape(-1)
+    C = -K[np.ix_(dofs, dofs)] if kind == "singular" else np.full((4, 4), np.inf)
+    np.testing.assert_allclose(preconditioned(K, C, numbers, d, x), x / np.diag(K), rtol=1e-12)
 
 
 def test_prescribed_dofs_are_not_coupled() -> None:

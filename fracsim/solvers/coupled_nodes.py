@@ -3,14 +3,18 @@
     P = Q + (1 - Q A) M (1 - A Q),   Q = Z E^-1 Z^T,   E = Z^T A Z,   A = K + C
 
 M is the preconditioner of the body, made for K. Z has the dofs of the nodes that C couples: Q solves for these nodes
-exactly, however stiff C is, and M for what is left. A Z has few rows (Mandel 1993; Tang et al. 2009).
+exactly, however stiff C is, and M for what is left. A Z has few rows (Mandel 1993; Tang et al. 2009). Where E is
+singular or not finite, P = M: the solve fails, and its step is halved.
 
 Equations: docs/theory.md#linear-systems.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
+import numpy.typing as npt
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix, vstack
 from scipy.sparse.linalg import splu
@@ -18,6 +22,8 @@ from scipy.sparse.linalg import splu
 from ..mechanics.extra_couplings import FewNodesCoupling, dofs_of_nodes
 from ..mechanics.tangent import Tangent
 from ..mesh.parallel import allgather, sum_over_ranks
+
+Values = npt.NDArray[np.float64]
 
 
 class CoupledNodesPreconditioner:
@@ -39,8 +45,7 @@ class CoupledNodesPreconditioner:
         rows = csr_matrix(vstack(allgather(self._comm, tangent.owned_rows(coupling.nodes))))
         coupled = dofs_of_nodes(coupling.numbers, tangent.domain.dim)
         E = rows[:, coupled] + coupling.K
-        options = {"SymmetricMode": True}
-        self._solve = splu(E.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).solve
+        self._solve = _solver_of(E)
         columns = csr_matrix(rows[:, first:end].T)
         self._changed = np.flatnonzero(np.diff(columns.indptr))  # owned dofs in which K Z has entries
         self._KZ = columns[self._changed]
@@ -49,6 +54,9 @@ class CoupledNodesPreconditioner:
     def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Evaluate y = P x (collective)."""
         coupling, residual, changed = self._coupling, self._residual, self._changed
+        if self._solve is None:
+            self._base_pc.apply(x, y)
+            return
         x.copy(residual)
         motion = self._solve(coupling.at_all_nodes(x.array_r[coupling.dofs]))
         with_motion = self._KZ @ motion
@@ -62,3 +70,14 @@ class CoupledNodesPreconditioner:
     def destroy(self, _: PETSc.PC) -> None:
         """Free PETSc's objects."""
         self._residual.destroy()
+
+
+def _solver_of(E: csr_matrix) -> Callable[[Values], Values] | None:
+    """Solution of E x = b by factors, for symmetric E; None where E is singular or not finite."""
+    if not np.isfinite(E.data).all():
+        return None
+    options = {"SymmetricMode": True}
+    try:
+        return splu(E.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).solve
+    except RuntimeError:  # a pivot is 0
+        return None
