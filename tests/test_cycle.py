@@ -16,10 +16,10 @@ from fracsim.scene import Scene, build_scene
 from fracsim.solvers.linear_solver import LinearSolver
 from fracsim.solvers.multigrid import bcsr, hierarchy, vcycle
 from fracsim.solvers.multigrid.levels import SmoothedLevel
-from fracsim.solvers.newton import SolveResult
+from fracsim.solvers.newton import UNLIMITED_COST, SolveResult
 from fracsim.solvers.policy import DEFAULT_POLICY
 from fracsim.solvers.preconditioner import Update, mass_stiffness_ratio
-from fracsim.solvers.strategies import Attempt
+from fracsim.solvers.strategies import Attempt, Task, _first_positive_tangents
 from support.scenes import Walk
 from support.solver_policy import set_policy
 
@@ -303,3 +303,64 @@ def test_levels_of_an_indefinite_tangent_are_made_again(monkeypatch: pytest.Monk
     assert fail() is made  # which was set up for a positive tangent
     solvers.start_after_failure(failed)
     assert solve(0.0) == (True, made)
+
+
+def test_a_failure_that_an_indefinite_tangent_explains_keeps_the_levels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where CG finds the tangent or the preconditioner indefinite, or a line search no descent, levels of an earlier
+    tangent are kept; where CG takes too many iterations they are made again."""
+    set_policy(monkeypatch, min_block_dofs=0)
+    scene = bar(3, {})
+    Walk(scene).advance()
+    linear, reason = linear_of(scene), PETSc.KSP.ConvergedReason
+    preconditioner, solvers = linear.preconditioner, scene.solver._solvers  # type: ignore[union-attr]
+    failed = Attempt("exact tangents", SolveResult(False, 0, 0, ""), linear_solves_failed=True)
+    linear.balance.work_vector.set(0.0)
+    linear.solve()
+    assert preconditioner._last_update == Update.NONE
+    for code, update in (
+        (reason.DIVERGED_INDEFINITE_MAT, Update.NONE), (reason.DIVERGED_INDEFINITE_PC, Update.NONE),
+        (reason.CONVERGED_RTOL, Update.NONE), (reason.DIVERGED_MAX_IT, Update.REBUILD),
+    ):  # fmt: skip
+        linear.ksp.setConvergedReason(code)
+        solvers.start_after_failure(failed)
+        assert preconditioner._due == update
+
+
+def test_levels_that_are_not_positive_for_positive_tangents_are_made_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An attempt with positive tangents that an indefinite preconditioner ends goes on from its last iterate with
+    levels made anew; one that ends otherwise does not."""
+    scene, reason = bar(3, {}), PETSc.KSP.ConvergedReason
+    Walk(scene).advance()
+    linear, solvers = linear_of(scene), scene.solver._solvers  # type: ignore[union-attr]
+    guess = np.zeros(3)
+    for code, expected in (
+        (reason.DIVERGED_INDEFINITE_PC, [(True, Update.NONE), (False, Update.REBUILD)]),
+        (reason.DIVERGED_INDEFINITE_MAT, [(True, Update.NONE)]),
+    ):
+        calls: list[tuple[bool, Update]] = []
+
+        def attempt(given: np.ndarray | None, *_: object, code: int = code, calls: list[Any] = calls) -> SolveResult:
+            calls.append((given is guess, linear.preconditioner._due))
+            linear.ksp.setConvergedReason(code if len(calls) == 1 else reason.CONVERGED_RTOL)
+            return SolveResult(len(calls) > 1, 1, 1, "")
+
+        linear.preconditioner._due = Update.NONE
+        monkeypatch.setattr(solvers.newton, "attempt", attempt)
+        result = _first_positive_tangents(solvers, Task(guess, UNLIMITED_COST, []), None)
+        assert calls == expected and result.start is guess
+        assert result.result.converged == (len(expected) == 2)
+
+
+def test_coarse_matrices_are_the_same_with_stored_products(monkeypatch: pytest.MonkeyPatch) -> None:
+    """P^T (A P) in place of PETSc's sums row by row, whose option is in the database during the set-up alone."""
+    levels = []
+    for limit in (0, DEFAULT_POLICY.max_stored_product_dofs):
+        set_policy(monkeypatch, max_stored_product_dofs=limit)
+        scene = bar(3, {})
+        Walk(scene).advance()
+        pc = linear_of(scene).preconditioner.pc
+        levels.append([dense(pc.getMGSmoother(level).getOperators()[1]) for level in range(pc.getMGLevels())])
+        assert not PETSc.Options().hasName("matptap_via")
+    assert len(levels[0]) == len(levels[1]) > 1
+    for one, other in zip(*levels, strict=True):
+        np.testing.assert_allclose(other, one, rtol=0, atol=1e-12 * abs(one).max())

@@ -101,6 +101,23 @@ def call_petsc(call: Callable[[], None]) -> None:
 
 
 @contextmanager
+def stored_products(matrix: PETSc.Mat, max_dofs: int) -> Iterator[None]:
+    """Let multigrid that is set up within the block form P^T (A P), with A P stored, for at most `max_dofs` dofs.
+
+    PETSc forms P^T A P row by row on one rank, without storing A P; on several ranks it stores A P by default.
+    """
+    database, key = PETSc.Options(), "matptap_via"
+    applies = matrix.getType() == "seqaij" and matrix.getSize()[0] <= max_dofs and not database.hasName(key)
+    if applies:
+        database[key] = "rap"
+    try:
+        yield
+    finally:
+        if applies:
+            database.delValue(key)
+
+
+@contextmanager
 def option_errors(given: PetscOptions) -> Iterator[None]:
     """Turn errors of PETSc within the block into input errors, if the study has given options.
 

@@ -119,6 +119,8 @@ class SolverPolicy:
     # c_a rho h^2 / Y. Above it SSOR alone serves a body in fragments. Measured on a porcelain figure that shatters
     # (46,000 tetrahedra, a sixth): 2.5 times the iterations, half the time.
     min_ssor_inertia: float = 1e-2
+    # Dofs up to which products of multigrid's set-up are stored on one rank: half of its time for 0.5 KB a tetrahedron.
+    max_stored_product_dofs: int = 250_000
     # Iterations of a whole body from which on aggregates of strong links are tried, and share of these that the new
     # aggregates may take. Measured: 38 iterations for 77 on a sheet of 234,000 tetrahedra, nu = 0.45.
     slow_iterations: int = 25
@@ -130,17 +132,18 @@ class SolverPolicy:
     # Iterations of a fresh set-up as a multiple of those of the whole body, plus 2, above which aggregates are not
     # smoothed any more. Measured: a step in 0.85 of the time (33,000 tetrahedra, 10 planes), 0.7 after 100 planes.
     fragmented_ratio: float = 1.5
-    # Edges that broke for each node of the body, after which operators are refreshed; beside the V cycle it is set up
-    # again if its iterations have grown as well.
+    # Edges that broke for each node of the body, after which operators are refreshed; the V cycle is judged by its
+    # iterations alone. Measured: a jelly that tears is set up in two steps of six in place of five.
     refresh_edges: float = 0.02
     # Edges that broke for each node of the body, after which the V cycle is refreshed as well: where all cells are
     # split its old levels take three times the time of a step.
     many_edges: float = 0.5
     # Iterations that a refresh costs.
     refresh_cost: int = 10
-    # Iterations that a set-up and, where no edge broke, a refresh cost beside the V cycle in single precision.
-    vcycle_setup_cost: int = 100
-    vcycle_refresh_cost: int = 40
+    # Iterations that a set-up and, where no edge broke, a refresh cost beside the V cycle in single precision. Measured
+    # with stored products on 157,000 tetrahedra: 60 and 30.
+    vcycle_setup_cost: int = 65
+    vcycle_refresh_cost: int = 30
     # Factor of both where coarse levels are smoothed thoroughly and an iteration costs more.
     thorough_cost_factor: float = 0.6
     # Solves whose slowest tells the iterations of a fresh set-up beside the V cycle. One step has tangents that differ

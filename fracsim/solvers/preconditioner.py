@@ -21,7 +21,7 @@ from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
 from ..mesh.parallel import sum_over_ranks
-from .petsc_options import PetscOptions, PetscOptionSet
+from .petsc_options import PetscOptions, PetscOptionSet, stored_products
 from .policy import SolverPolicy
 
 if TYPE_CHECKING:
@@ -137,7 +137,8 @@ class AppliedPreconditioner:
             self.pc.setFailedReason(PETSc.PC.FailedReason.NOERROR)
         self.release_vcycle()
         renew_smoothers(self.pc)
-        operators.attach_to(self._ksp, self.pc)
+        with stored_products(operators.matrix, self._policy.max_stored_product_dofs):
+            operators.attach_to(self._ksp, self.pc)
         if self._is_default and operators.blocks is not None:
             from .multigrid.vcycle import create_vcycle
 
@@ -305,8 +306,7 @@ class Preconditioner:
         # Too many iterations. Also where a refresh is due: coarse spaces from before a crack carry the motion of one
         # side to the other.
         fresh = self._fresh_iterations
-        may_be_old = is_old or self.applied.vcycle is None
-        if may_be_old and fresh and equivalent > self._rebuild_ratio * fresh + 2:
+        if self.applied.vcycle is None and fresh and equivalent > self._rebuild_ratio * fresh + 2:
             self._due = Update.REBUILD
         # Factors and coarse spaces of another pattern would be written past the end of their arrays.
         if self._pattern_is_new:

@@ -204,9 +204,13 @@ class Solvers:
         return balance.scheme.inertia and not balance.conservative and not balance.contact.limits_newton_steps
 
     def start_after_failure(self, last: Attempt) -> Values | None:
-        """(owned dofs,) start after exact tangents have failed, m; also tells the preconditioner of the failure."""
-        # an indefinite tangent is not caused by the preconditioner
-        if self.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT:
+        """(owned dofs,) start after exact tangents have failed, m; also tells the preconditioner of the failure.
+
+        The preconditioner is not the cause where the tangent is indefinite: as CG notices, as a line search without
+        descent shows, or by the coarse matrix of the deflation, which makes the preconditioner indefinite.
+        """
+        reason = PETSc.KSP.ConvergedReason
+        if self.ksp.reason > 0 or self.ksp.reason in (reason.DIVERGED_INDEFINITE_MAT, reason.DIVERGED_INDEFINITE_PC):
             self.linear.preconditioner.tangent_was_indefinite()
         else:
             self.linear.preconditioner.solve_failed()
@@ -318,7 +322,11 @@ def _first_positive_tangents(solvers: Solvers, task: Task, last: Attempt | None)
         start: Values | None = task.guess
     else:
         start = solvers.start_after_failure(last)
-    return _modified_tangents(solvers, POSITIVE_TANGENTS[0], start, task)
+    attempt = _modified_tangents(solvers, POSITIVE_TANGENTS[0], start, task)
+    if attempt.linear_solves_failed and solvers.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC:
+        solvers.linear.preconditioner.solve_failed()  # that of an earlier tangent is not positive
+        attempt = replace(_modified_tangents(solvers, POSITIVE_TANGENTS[0], None, task), start=start)
+    return attempt
 
 
 def _modified_tangents(
