@@ -109,11 +109,12 @@ def smoother(planes: int, given: dict[str, Any]) -> str:
 
 def test_what_hangs_is_solved_for_by_itself_in_long_steps(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ten planes through a bar and steps in which inertia holds nothing: at most six tenths of the iterations
-    that it takes by multigrid of another kind (0.4 with PETSc 3.22, 0.53 with 3.25)."""
+    that it takes by multigrid of another kind (0.44 with PETSc 3.22). Its tangent is positive: moduli made positive
+    would hold the fragments as well."""
     its = []
     for held in (DEFAULT_POLICY.max_deflated_inertia, 0.0):
         set_policy(monkeypatch, max_deflated_inertia=held)
-        its.append(sum(shattered(0.04, 10, {}, 6, step=0.1)[1][-3:]))
+        its.append(sum(shattered(0.04, 10, {}, 6, step=0.1, energy="linear")[1][-3:]))
     assert its[0] < 0.6 * its[1], f"{its[0]} iterations, {its[1]} without"
 
 
@@ -139,13 +140,13 @@ def test_multigrid_of_pieces_pays() -> None:
 
 
 def shattered(
-    h: float, planes: int, given: dict[str, Any], steps: int, step: float | None = None
+    h: float, planes: int, given: dict[str, Any], steps: int, step: float | None = None, energy: str = "neo-hookean"
 ) -> tuple[Scene, list[int]]:
     """A bar after a step as a whole and some in pieces, and the iterations of these."""
     data = study(
         BAR,
         mesh={"size": [0.6, 0.2, 0.2], "h": h},
-        material={"energy": "neo-hookean"},
+        material={"energy": energy},
         fracture={"strength": 1e12},
         time={"end": 1.0, "scheme": "backward-euler"} if step is None else {"end": 100 * step, "step": step},
         solver=SOLVER | given,

@@ -32,19 +32,19 @@ def stalls_after(norms: list[float], how: TangentModification | None) -> int | N
     return None
 
 
-ROUND = [100.0, 10.0, 0.1, *[0.11] * 30]  # exact below a hundredth: from the third on
+ROUND = [100.0, 10.0, 0.01, *[0.011] * 30]  # exact below a thousandth: from the third on
 
 
 @pytest.mark.parametrize(
     ("norms", "how", "at"),
     [
         (ROUND, POSITIVE_TANGENTS[0], 2 + DEFAULT_POLICY.max_stalled_iterations),
-        (ROUND, POSITIVE_TANGENTS[2], None),  # positive all the way: goes down, however slowly
+        (ROUND, POSITIVE_TANGENTS[3], None),  # positive all the way: goes down, however slowly
         (ROUND, None, None),
         ([1.0] * 30, EXACT_TANGENTS, DEFAULT_POLICY.max_stalled_iterations),
         ([100.0, 10.0, *[20.0] * 30], POSITIVE_TANGENTS[0], None),  # far away residuals may rise
         # but not several times, which leaves an unstable equilibrium
-        ([100.0, 10.0, *(11.0 * 1.1**k for k in range(30))], POSITIVE_TANGENTS[2], 1 + 10),
+        ([100.0, 10.0, *(11.0 * 1.1**k for k in range(30))], POSITIVE_TANGENTS[3], 1 + 10),
         ([100.0, *(0.5 * 0.99**k for k in range(30))], POSITIVE_TANGENTS[0], None),
     ],
 )

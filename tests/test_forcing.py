@@ -46,18 +46,18 @@ def test_iterations_are_those_of_an_exact_solve() -> None:
 
 
 def test_without_contact_a_solve_leaves_a_share_of_what_the_tangent_leaves() -> None:
-    """q^2 where it is new, 2 q where it is kept, and a share of little at least; the first q is that of the last
+    """q^2 where it is new and exact, else 2 q, and a share of little at least; the first q is that of the last
     attempt."""
     sparing = ContractionForcing(RTOL)
     assert not sparing.record_iterate(1.0, 1e-5, nothing)
-    assert sparing.tolerance_for(1e-5, kept=False) == RTOL  # nothing is known of the first
+    assert sparing.tolerance_for(1e-5, exact=True) == RTOL  # nothing is known of the first
     assert not sparing.record_iterate(0.05, 1e-5, nothing)
-    assert sparing.tolerance_for(1e-5, kept=False) == pytest.approx(DEFAULT_POLICY.cg_share * 0.05**2)
+    assert sparing.tolerance_for(1e-5, exact=True) == pytest.approx(DEFAULT_POLICY.cg_share * 0.05**2)
     assert sparing.record_iterate(1e-4, 1e-5, nothing)  # which leaves 4e-7 of r, less than LEFT of little
-    assert sparing.tolerance_for(1e-5, kept=True) == pytest.approx(DEFAULT_POLICY.cg_share_of_solution * 1e-5 / 1e-4)
+    assert sparing.tolerance_for(1e-5, exact=False) == pytest.approx(DEFAULT_POLICY.cg_share_of_solution * 1e-5 / 1e-4)
     sparing.begin_attempt()
     sparing.record_iterate(1.0, 1e-5, nothing)
-    assert sparing.tolerance_for(1e-5, kept=False) == pytest.approx(DEFAULT_POLICY.cg_share * 0.05)
+    assert sparing.tolerance_for(1e-5, exact=True) == pytest.approx(DEFAULT_POLICY.cg_share * 0.05)
 
 
 def test_what_cg_leaves_is_not_taken_for_what_the_tangent_leaves() -> None:
@@ -65,22 +65,23 @@ def test_what_cg_leaves_is_not_taken_for_what_the_tangent_leaves() -> None:
     at most DEFAULT_POLICY.cg_share_of_residual of q are CG's."""
     sparing = ContractionForcing(RTOL)
     sparing.record_iterate(10.0, 1e-5, nothing)
-    assert sparing.tolerance_for(1e-5, kept=False) == RTOL
+    assert sparing.tolerance_for(1e-5, exact=True) == RTOL
     sparing.record_iterate(0.5, 1e-5, lambda: 1e-3)  # ten times RTOL of r
     sparing.begin_attempt()
     sparing.record_iterate(10.0, 1e-5, nothing)
-    assert sparing.tolerance_for(1e-5, kept=False) == pytest.approx(DEFAULT_POLICY.cg_share_of_residual * 0.05 / 10)
+    assert sparing.tolerance_for(1e-5, exact=True) == pytest.approx(DEFAULT_POLICY.cg_share_of_residual * 0.05 / 10)
 
 
 def test_no_correction_is_rougher_than_may_be() -> None:
     sparing = ContractionForcing(RTOL)
     sparing.record_iterate(1.0, 1e-6, nothing)
     assert not sparing.record_iterate(0.9, 1e-6, nothing)  # a tangent that leaves nearly all of r
-    assert sparing.tolerance_for(1e-6, kept=False) == DEFAULT_POLICY.max_correction_rtol
+    assert sparing.tolerance_for(1e-6, exact=True) == DEFAULT_POLICY.max_correction_rtol
     sparing.record_iterate(1e-9, 1e-6, nothing)
-    assert sparing.tolerance_for(1e-6, kept=True) == DEFAULT_POLICY.max_last_correction_rtol  # far below what is little
+    # far below the residual of a solution
+    assert sparing.tolerance_for(1e-6, exact=False) == DEFAULT_POLICY.max_last_correction_rtol
     sparing.record_iterate(0.0, 0.0, nothing)
-    assert sparing.tolerance_for(0.0, kept=True) >= RTOL  # nothing divides by a residual of 0
+    assert sparing.tolerance_for(0.0, exact=False) >= RTOL  # nothing divides by a residual of 0
     assert sparing.equivalent_iterations(2) == 0  # too few to tell
 
 

@@ -18,10 +18,10 @@ RANDOM = np.random.default_rng(3)
 
 @pytest.mark.parametrize("correct", [psd_correction, plain_psd_correction])
 @pytest.mark.parametrize("size", [4, 9])
-@pytest.mark.parametrize("small", [0.0, 0.05])
-def test_matrices_are_made_positive(correct: Callable[..., None], size: int, small: float) -> None:
-    """By their negative eigenvalues (LAPACK's), where one of them is below - small of their mean; one of nothing and
-    one with equal eigenvalues are among them."""
+@pytest.mark.parametrize(("small", "factor"), [(0.0, 1.0), (0.05, 2.0)])
+def test_matrices_are_made_positive(correct: Callable[..., None], size: int, small: float, factor: float) -> None:
+    """By zeros in place of negative eigenvalues (LAPACK's), or their absolute values, where one is below - small of
+    their mean; one of nothing and one with equal eigenvalues are among them."""
     roots = RANDOM.normal(size=(203, size, size))
     A = roots @ roots.transpose(0, 2, 1) + RANDOM.uniform(-3.0, 1.0, 203)[:, None, None] * np.eye(size)
     A[5], A[6] = 0.0, -np.eye(size)
@@ -29,10 +29,11 @@ def test_matrices_are_made_positive(correct: Callable[..., None], size: int, sma
     lifted = values[:, 0] < -small * values.mean(axis=1)
     lifted[6] = True
     assert 0 < lifted.sum() < len(A)
-    expected = (vectors * -np.minimum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1) * lifted[:, None, None]
+    made = np.maximum(values, 0.0) if factor == 1 else abs(values)
+    expected = ((vectors * made[:, None, :]) @ vectors.transpose(0, 2, 1) - A) * lifted[:, None, None]
     found, filled = np.full((len(A) + 1, size, size), 7.0), np.ones(len(A), np.uint8)
     for order in (slice(None), slice(None, None, -1)):  # once more with what the first time has left
-        correct(np.ascontiguousarray(A[order]), small, found[:-1], filled)
+        correct(np.ascontiguousarray(A[order]), small, factor, found[:-1], filled)
         np.testing.assert_allclose(found[:-1], expected[order], atol=1e-10)
         np.testing.assert_array_equal(filled, lifted[order])
     assert (found[-1] == 7.0).all()

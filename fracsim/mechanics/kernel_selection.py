@@ -99,7 +99,7 @@ class KernelSelection:
 
         return compile_block_product(comm, size)
 
-    def psd_correction(self) -> Callable[[Values, float, Values, Flags], None] | None:
+    def psd_correction(self) -> Callable[[Values, float, float, Values, Flags], None] | None:
         """Function that corrects moduli with negative eigenvalues, see psd_projection."""
         if self.plain:
             return None

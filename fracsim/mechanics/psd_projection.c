@@ -82,7 +82,7 @@ static void diagonalise(real a[N][N], real v[N][N]) {
 }
 
 // corrections C of LANES matrices, of which those beyond `count` are copies of others
-static void correct(const double *A, const int64_t *cells, int count, double *C) {
+static void correct(const double *A, const int64_t *cells, int count, double factor, double *C) {
   real a[N][N], v[N][N];
   load(A, cells, a);
   diagonalise(a, v);
@@ -90,12 +90,13 @@ static void correct(const double *A, const int64_t *cells, int count, double *C)
     for (int i = 0; i < N; ++i)
       for (int j = 0; j < N; ++j)
         for (int lane = 0; lane < count; ++lane)
-          if (a[k][k][lane] < 0.0) C[(cells[lane] * N + i) * N + j] -= a[k][k][lane] * v[k][i][lane] * v[k][j][lane];
+          if (a[k][k][lane] < 0.0)
+            C[(cells[lane] * N + i) * N + j] -= factor * a[k][k][lane] * v[k][i][lane] * v[k][j][lane];
 }
 
-// C (count, N, N) = - sum of negative eigenvalues times their projectors, for matrices A with an eigenvalue below
+// C (count, N, N) = - factor sum of negative eigenvalues times their projectors, for matrices A with an eigenvalue below
 // - tolerance of their mean; 0 for all others, and for zero matrices. filled: (count,) flags of C that are not 0.
-void positive(int64_t count, double tolerance, const double *A, double *C, uint8_t *filled) {
+void positive(int64_t count, double tolerance, double factor, const double *A, double *C, uint8_t *filled) {
   int64_t queue[2 * LANES], cells[LANES];
   int queued = 0;
   for (int64_t first = 0; first < count; first += LANES) {
@@ -109,13 +110,13 @@ void positive(int64_t count, double tolerance, const double *A, double *C, uint8
       if ((filled[cell] = least[lane] < 0.0)) queue[queued++] = cell;
     }
     if (queued >= LANES) {
-      correct(A, queue, LANES, C);
+      correct(A, queue, LANES, factor, C);
       queued -= LANES;
       for (int k = 0; k < queued; ++k) queue[k] = queue[LANES + k];
     }
   }
   if (queued) {
     for (int k = queued; k < LANES; ++k) queue[k] = queue[0];
-    correct(A, queue, queued, C);
+    correct(A, queue, queued, factor, C);
   }
 }

@@ -301,8 +301,10 @@ class Tangent:
         """Assemble forms and inertia, without couplings; `reuse`: the forms are those of the last assembly."""
         if self.couplings.in_entries and self._assembler.blocks is None:
             self.matrix.zeroEntries()  # entries beyond the pattern of the cells
-        psd_form = None if reuse or psd_tolerance is None else self._psd_form(psd_tolerance)
         factor = sum(term.mass_factor for term in self._inertial)
+        psd_form = None
+        if not reuse and psd_tolerance is not None:
+            psd_form = self._psd_form(psd_tolerance, has_inertia=factor > 0)
         if self._assembler.blocks is not None:
             mass = self._mass.block_values(self._assembler, factor) if factor else None
             self._assembler(self._motion.bcs, psd_form, mass)
@@ -340,14 +342,15 @@ class Tangent:
         limited = bool(fulfilling(self._terms, StepLimiter))
         return limited and all([term.potential() is not None for term in self._terms]) and not adds_entries
 
-    def _psd_form(self, tolerance: float) -> fem.Form:
+    def _psd_form(self, tolerance: float, *, has_inertia: bool) -> fem.Form:
         """Form of the correction of the moduli at the current u."""
         if self._psd is None:
             from .psd_projection import PsdProjection
 
             self._psd = PsdProjection(self._stress)
             _exclude_dead_cells(self._stress, self._psd.form)
-        self._psd.update(tolerance)
+        # Absolute values of the eigenvalues would hold a body that buckles without inertia.
+        self._psd.update(tolerance, 2.0 if has_inertia else 1.0)
         return self._psd.form
 
     def _is_assembled(self, psd_tolerance: float | None) -> bool:

@@ -52,7 +52,8 @@ class ContractionForcing:
     """Tolerances of the linear solves of an attempt without contact.
 
     CG may leave a share of what the linearisation leaves, q_k^2 of r with q_k = |r_{k+1}| / |r_k|, or a small share of
-    the residual of a solution. The last tangent is used again where it suffices, and leaves 2 q_k of r.
+    the residual of a solution. The last tangent is used again where it suffices, and leaves 2 q_k of r, as one that is
+    made positive does.
 
     Attributes:
         rtol: tight tolerance.
@@ -89,14 +90,19 @@ class ContractionForcing:
             self._first_excess = max(1.0, ratio * left_by_cg() / allowed)
         return len(self._norms) > 1 and 2 * self._contraction * norm <= policy.reused_tangent_share * solved_norm
 
-    def tolerance_for(self, solved_norm: float, *, kept: bool) -> float:
-        """Return the tolerance of the solve from the last iterate; `kept`: with the tangent of the iterate before."""
+    def tolerance_for(self, solved_norm: float, *, exact: bool) -> float:
+        """Return the tolerance of the solve from the last iterate.
+
+        Args:
+            solved_norm: |r| of a solution, N.
+            exact: whether the tangent is that of the iterate; else it is an earlier or a modified one.
+        """
         policy, norm = self._policy, self._norms[-1]
         enough = policy.cg_share_of_solution * solved_norm / norm if norm else 1.0
         if len(self._norms) == 1:
             left = self._first_left / self._first_excess
         else:
-            left = 2 * self._contraction if kept else self._contraction**2
+            left = self._contraction**2 if exact else 2 * self._contraction
         share = min(policy.max_correction_rtol, policy.cg_share * left)
         self._used = max(self.rtol, share, min(enough, policy.max_last_correction_rtol))
         return self._used

@@ -167,9 +167,13 @@ class TangentModification(NamedTuple):
     from_last_iterate: bool = False
 
 
-# Tried in turn. The second and the third continue from the last iterate of the one before.
+# Tried in turn. The second, third and fourth continue from the last iterate of the one before: with positive moduli
+# again where the exact tangent was indefinite still, then without negative eigenvalues at all.
 POSITIVE_TANGENTS = (
     TangentModification("positive tangents", DEFAULT_POLICY.exact_below, DEFAULT_POLICY.eigenvalue_floor),
+    TangentModification(
+        "positive tangents again", DEFAULT_POLICY.exact_below, DEFAULT_POLICY.eigenvalue_floor, from_last_iterate=True
+    ),
     TangentModification("strictly positive tangents", DEFAULT_POLICY.exact_below, 0.0, from_last_iterate=True),
     TangentModification("strictly positive tangents to the end", 0.0, 0.0, from_last_iterate=True),
     TangentModification("strictly positive tangents, preconditioner for each", 0.0, 0.0, rebuild_preconditioner=True),

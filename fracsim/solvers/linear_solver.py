@@ -238,7 +238,7 @@ class LinearSolver:
                 self._prepare(eigenvalue_floor)
                 if self.ksp.getType() == "cg":
                     self.operators.multiply_by(self.preconditioner.fine_level)
-            rtol = forcing.tolerance_for(solved_norm, kept=keeps_tangent)
+            rtol = forcing.tolerance_for(solved_norm, exact=not keeps_tangent and eigenvalue_floor is None)
         self.ksp.setTolerances(rtol=rtol)
 
     def begin_attempt(self) -> None:
