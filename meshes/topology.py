@@ -190,15 +190,13 @@ def components(links: npt.NDArray[np.integer], count: int) -> tuple[int, Indices
     # In the type of the links, which 32 bits hold in half the memory.
     root = np.arange(count, dtype=links.dtype)
     first, second = links[:, 0], links[:, 1]
-    while True:
-        ends = root[first], root[second]
-        apart = ends[0] != ends[1]
-        if not apart.any():
-            break
-        first, second = first[apart], second[apart]
-        low, high = np.minimum(*ends)[apart], np.maximum(*ends)[apart]
+    while len(first):
+        low, high = np.minimum(first, second), np.maximum(first, second)
         np.minimum.at(root, high, low)
         root = _flattened(root)
+        first, second = root[low], root[high]
+        apart = np.flatnonzero(first != second)
+        first, second = first[apart], second[apart]
     is_root = root == np.arange(count)
     return int(is_root.sum()), (np.cumsum(is_root) - 1)[root]
 

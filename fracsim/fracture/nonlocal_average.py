@@ -24,7 +24,6 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
-from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from ..mesh.c_library import Float32, Float64, Int64, load_library, struct_pointer
@@ -111,19 +110,18 @@ class NonlocalAverage:
         bound *= 1 - LIMITS.bound_round_off
         if max_over_ranks(self._comm, float(np.max(norms, initial=0.0))) < bound:
             return np.empty(0, np.int64), np.empty((0, values.shape[1]))
-        near_norms, volumes = self._sorted(norms[:, None]), self._active_volumes(active)
-        near = self._exchange(values)
-        cells = self._may_reach(near_norms[:, 0], volumes, bound)
+        near, volumes = self._sorted(np.column_stack([norms, values])), self._active_volumes(active)
+        cells = self._may_reach(near[:, 0], volumes, bound)
         if not len(cells):
             return cells, np.empty((0, values.shape[1]))
-        averages = self._average(cells, np.hstack([near_norms, near[self._bins.order]]), volumes)
+        averages = self._average(cells, near, volumes)
         reaches = np.flatnonzero(averages[:, 0] >= bound)
         order = reaches[np.argsort(cells[reaches])]
         return cells[order], averages[order, 1:]
 
     def _sorted(self, values: Values) -> Values:
         """Return the values (near, n) of near cells in the order of bins, of those of this rank (cells, n)."""
-        return np.ascontiguousarray(self._exchange(values)[self._bins.order], float)
+        return np.ascontiguousarray(self._exchange(values).take(self._bins.order, axis=0), float)
 
     def _active_volumes(self, active: Flags | None) -> Values:
         """Return the volumes (near,) of near cells in the order of bins, 0 where inactive."""
@@ -195,7 +193,8 @@ class _Bins:
         x, y, z = (bin_indices - first).T
         bin_of = (z * bins[1] + y) * bins[0] + x
         self.order = np.lexsort([numbers, bin_of])
-        self._shape, self._bin_of, self._centre_count = tuple(bins[::-1]), bin_of, len(centres)
+        self._shape = tuple(bins[::-1])
+        self._bin_of_centre, self._bin_in_order = bin_of[: len(centres)], bin_of[self.order]
         # with the round-off that the search in C admits
         self._reach = math.ceil(radius / size * (1 + 1e-6))
         start = np.concatenate([[0], np.cumsum(np.bincount(bin_of, minlength=int(bins.prod())))])
@@ -212,9 +211,25 @@ class _Bins:
     def near_any(self, flags: Flags) -> Flags:
         """Flag the centres (centres,) near flagged points (points,) in the order of bins: all within the radius."""
         marks = np.zeros(self._shape, bool)
-        marks.ravel()[self._bin_of[self.order[flags]]] = True
-        marks = maximum_filter(marks, size=2 * self._reach + 1, mode="constant")
-        return np.asarray(marks.ravel()[self._bin_of[: self._centre_count]])
+        marks.ravel()[self._bin_in_order[flags]] = True
+        for axis in range(3):
+            marks = _any_within(marks, self._reach, axis)
+        return np.asarray(marks.ravel()[self._bin_of_centre])
+
+
+def _any_within(marks: Flags, reach: int, axis: int) -> Flags:
+    """Return whether any of the marks (...) up to `reach` entries away along an axis is set."""
+    count = marks.shape[axis]
+    reach = min(reach, count - 1)
+    lines = np.zeros((count + 2 * reach, *np.delete(marks.shape, axis)), bool)
+    lines[reach : reach + count] = np.moveaxis(marks, axis, 0)
+    # Entry i has those of i to i + width - 1.
+    width = 1
+    while width < 2 * reach + 1:
+        shift = min(width, 2 * reach + 1 - width)
+        lines[:-shift] |= lines[shift:]
+        width += shift
+    return np.moveaxis(lines[:count], 0, axis)
 
 
 class NeighbourAverage:

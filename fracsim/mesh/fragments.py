@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from ..meshes.topology import components, links_in
+from ..meshes.topology import components, distinct_rows, links_in
 from .domain import Domain
 from .ghost_exchange import owner_values
 from .parallel import allgather, rank_offset
@@ -34,7 +34,7 @@ class Fragments:
 
 def find_fragments(graph: EdgeGraph) -> Fragments:
     """The fragments of a graph (collective)."""
-    return find_components(graph.domain, graph.edge_nodes[~graph.broken])
+    return find_components(graph.domain, graph.edge_nodes.take(np.flatnonzero(~graph.broken), axis=0))
 
 
 def find_bodies(domain: Domain) -> Fragments:
@@ -52,7 +52,7 @@ def find_components(domain: Domain, edges: npt.NDArray[np.integer]) -> Fragments
     ghosts = slice(domain.node_count, None)
     owners_label = owner_values(domain.space.dofmap.index_map, label)
     links = np.stack([label[ghosts], owners_label[ghosts]], axis=1)
-    all_links = np.concatenate(allgather(domain.comm, np.unique(links, axis=0)))
+    all_links = np.concatenate(allgather(domain.comm, distinct_rows(links)[0]))
     # fragments in the order of their lowest nodes, so that their numbers do not depend on the partition
     lowest = np.full(local_count, np.iinfo(np.int64).max)
     np.minimum.at(lowest, local, domain.input_numbering.nodes)

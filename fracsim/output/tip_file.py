@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from pathlib import Path
 
@@ -32,9 +33,9 @@ class TrackedTip:
 
     def __init__(self) -> None:
         self.cell = -1
-        self.course: deque[tuple[float, Values]] = deque(maxlen=11)
+        self.course: deque[tuple[float, list[float]]] = deque(maxlen=11)
 
-    def move(self, t: float, cell: int, point: Values) -> None:
+    def move(self, t: float, cell: int, point: list[float]) -> None:
         """Add the position (d,), m, at time t, s."""
         self.cell = cell
         self.course.append((t, point))
@@ -43,7 +44,7 @@ class TrackedTip:
     def speed(self) -> float:
         """Mean speed over the last rows, m/s; NaN in the first one."""
         (began, first), (ended, last) = self.course[0], self.course[-1]
-        return float(np.linalg.norm(last - first) / (ended - began)) if ended > began else np.nan
+        return math.dist(first, last) / (ended - began) if ended > began else math.nan
 
 
 class TipFile:
@@ -81,6 +82,8 @@ class TipFile:
         self._has_speed, self.notes = inertia, list[str]()
         self._tips: dict[int, TrackedTip] = {}
         self._newest = 0  # the largest number of a tip
+        # cells (n,), points (n, d), m, and numbers (n,) of the tips in the last rows
+        self._last: tuple[Ints, Values, Ints] | None = None
         self._cracks: CrackTable | None = None
         write_on_root(self._comm, path, lambda: self._open(resume_at))
         self.update_cracks()
@@ -91,7 +94,7 @@ class TipFile:
         self._newest = max((int(row[2]) for row in rows), default=0)
         tips = {int(row[2]) for row in rows if row[0] == rows[-1][0]}
         for row in (row for row in rows if int(row[2]) in tips):
-            point = np.array(row[4 : 4 + self._extent.dim], float)
+            point = [float(coordinate) for coordinate in row[4 : 4 + self._extent.dim]]
             self._tips.setdefault(int(row[2]), TrackedTip()).move(float(row[1]), int(row[3]), point)
         replace_text(self._path, "".join(",".join(row) + "\r\n" for row in [self.columns, *rows]))
 
@@ -148,18 +151,22 @@ class TipFile:
         points = rows[:, 1 : 1 + d]
         crack, size = self._cracks.find(cells)
         tips = self._follow(cells, points, crack)
+        measured = np.column_stack([points, size, rows[:, 1 + d :]])
         lines = []
         for k in np.argsort(tips):
-            tip = self._tips[tips[k]]
-            tip.move(t, int(cells[k]), points[k])
-            measured = [*points[k], size[k], *rows[k, 1 + d :], *([tip.speed] if self._has_speed else [])]
-            numbers = [str(step), f"{t:.12g}", str(tips[k]), str(cells[k])]
-            lines.append(",".join([*numbers, *(f"{value:.12g}" for value in measured)]) + "\r\n")
+            number, cell, values = int(tips[k]), int(cells[k]), list(map(float, measured[k]))
+            tip = self._tips[number]
+            tip.move(t, cell, values[:d])
+            if self._has_speed:
+                values.append(tip.speed)
+            lines.append(f"{step},{t:.12g},{number},{cell}," + ",".join([f"{x:.12g}" for x in values]) + "\r\n")
         return "".join(lines)
 
     def _follow(self, cells: Ints, points: Values, crack: Ints) -> Ints:
         """Return the numbers (n,) of tips: that of the nearest tip of the last rows in the same crack, or a new one."""
         assert self._cracks is not None
+        if self._last is not None and np.array_equal(cells, self._last[0]) and np.array_equal(points, self._last[1]):
+            return self._last[2]
         last = list(self._tips.values())
         last_crack = self._cracks.find(np.array([tip.cell for tip in last], np.int64))[0]
         last_points = np.array([tip.course[-1][1] for tip in last]).reshape(-1, points.shape[1])
@@ -170,6 +177,7 @@ class TipFile:
         self._newest += int(new.sum())
         # A tip that ended is not taken up again by another one.
         self._tips = {tip: self._tips.get(tip) or TrackedTip() for tip in map(int, np.sort(tips))}
+        self._last = cells, points, tips
         return tips
 
 

@@ -247,6 +247,8 @@ class TipCriterion:
         # A branch is inactive behind the other unless there is enough energy for both.
         is_inactive = (tips.is_inactive & (size < TIP.branching_ratio * toughness)) | self._excluded_cells[tips.cell]
         candidates = np.flatnonzero((~mature | enough) & ~is_inactive)
+        if not sum_over_ranks(self._domain.comm, len(candidates))[0]:
+            return empty_proposal(d, self.course_width)
         mean = fields.mean_stress(candidates)
         sigma = first_principal_stress(mean)
         active = (sigma > 0) & mature[candidates]
