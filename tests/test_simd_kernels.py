@@ -162,7 +162,7 @@ def test_psd_form() -> None:
     """The same of the form that is added where moduli are made positive, of a body that is crushed at random."""
     balance = damaged("damped", 3, boundary=SIDE)[0].balance
     balance.set_displacement(np.random.default_rng(6).uniform(-0.2, 0.2, balance.owned_dof_count))
-    assert_as_one_by_one(balance.tangent._psd_form(0.1), balance.motion.bcs)
+    assert_as_one_by_one(balance.tangent._psd_form(0.1, has_inertia=True), balance.motion.bcs)
 
 
 def test_what_dolfinx_goes_on_with() -> None:
