@@ -10,17 +10,16 @@ from mpi4py import MPI
 
 from fracsim.output.contact_checks import IntersectionMonitor
 from support.scenes import Values, make_scene, march, positions
-from test_self_contact import driven_block, self_contact, two_blocks
+from test_self_contact import driven_block, self_contact
 
 
 def main(path: str) -> None:
     """Save the displacement after each step, and what the monitor of overlapping blocks has recorded (collective)."""
-    comm, folder, arrays = MPI.COMM_WORLD, Path(path).parent / f"pushed-{MPI.COMM_WORLD.size}", dict[str, Values]()
+    comm, arrays = MPI.COMM_WORLD, dict[str, Values]()
+    # each rank writes the mesh of the blocks
+    folder = Path(path).parent / f"pushed-{comm.size}-{comm.rank}"
+    folder.mkdir()
     for scheme in ("backward-euler", "quasi-static"):
-        if comm.rank == 0:
-            folder.mkdir(exist_ok=True)
-            two_blocks(folder, 2, 0.05)
-        comm.Barrier()
         scene, state = make_scene(**driven_block(folder, 2, scheme=scheme))
         gather = scene.domain.input_numbering.gather_nodes
         while state.t < 0.3 * (1 - 1e-12):
