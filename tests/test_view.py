@@ -197,7 +197,10 @@ def test_the_command_serves_until_it_is_interrupted(run: Path) -> None:
         with urllib.request.urlopen(found.group(1), timeout=30) as reply:
             assert b"<title>fracsim view</title>" in reply.read()
         process.send_signal(signal.SIGINT)
-        _, errors = process.communicate(timeout=30)
+        try:
+            _, errors = process.communicate(timeout=30)
+        finally:
+            process.kill()  # or the block would wait for it
     assert process.returncode == 0 and not errors.strip()
 
 
