@@ -294,10 +294,8 @@ class InterpenetrationMonitor:
         if self._in_contact:
             spite, remedy = " in spite of [contact]", "a shorter time.step may help"
         else:
-            spite, remedy = (
-                "",
-                f"{'a [contact] table' if implicit else '[contact] with an implicit scheme'} keeps them apart",
-            )
+            table = "a [contact] table" if implicit else "[contact] with an implicit scheme"
+            spite, remedy = "", f"{table} keeps them apart"
         return [
             f"pieces {first} and {second} pass through each other{spite}, first seen at "
             f"t = {self.first_overlap['time']:g} s near {format_point(self.first_overlap['place'])}; {remedy}"
