@@ -8,7 +8,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
-from .output.result_checks import EnergyGainMonitor, InvertedCellMonitor, negligible_energy, unbroken_note
+from .output.result_checks import (
+    EnergyGainMonitor,
+    InvertedCellMonitor,
+    negligible_energy,
+    unbroken_note,
+    untested_balance_note,
+)
 from .output.run_folder import software_versions
 from .output.summary import ResourceMeter, irregular_event_text
 
@@ -67,6 +73,7 @@ class RunMonitors:
         """Make the monitors that the study needs (collective)."""
         study, stress = scene.study, scene.balance.stress
         self._study, self._fracture, self.history, self.meter = study, scene.fracture, history, meter
+        self._is_linear = scene.balance.linear
         self.inverted = InvertedCellMonitor(stress, scene.fracture)
         floor = negligible_energy(stress)
         self.energy_gain = EnergyGainMonitor(at_rest=study.starts_at_rest, floor=floor, thickness=study.thickness)
@@ -130,7 +137,9 @@ class RunMonitors:
         """Return notes on doubtful results (collective); `done`: the run came to its end."""
         energy, time = self._study.material.energy, self._study.time
         trouble = irregular_event_text(self.meter.read_totals()["trouble"])
-        notes = [note for note in (trouble, self.inverted.note(energy), self.energy_gain.note(time.scheme)) if note]
+        untested = untested_balance_note(self._study.solver, is_linear=self._is_linear)
+        of_all = (trouble, untested, self.inverted.note(energy), self.energy_gain.note(time.scheme))
+        notes = [note for note in of_all if note]
         if done and self._fracture is not None and (unbroken := unbroken_note(self._fracture)):
             notes.append(unbroken)
         if self.contact_monitor is not None:

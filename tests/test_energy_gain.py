@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from mpi4py import MPI
 
+from fracsim.deformable_run import Run
 from fracsim.output.result_checks import EnergyGainMonitor, negligible_energy
 from fracsim.output.summary import irregular_event_text
-from support.scenes import deform, make_scene
+from fracsim.scene import build_scene
+from support.scenes import deform, make_scene, make_study
 
 
 def watched(rows: list[tuple[float, float, float, float]], *, at_rest: bool = True) -> EnergyGainMonitor:
@@ -76,6 +80,23 @@ def test_what_a_run_went_on_in_spite_of_is_one_sentence() -> None:
     )
     assert words.startswith("the run went on in spite of 2 steps that ended out of balance")
     assert "; 5 cells crushed flat" in words and "linear" not in words
+
+
+@pytest.mark.parametrize(
+    ("energy", "method", "is_told"),
+    [("neo-hookean", "ksponly", True), ("neo-hookean", "newtonls", False), ("linear", "ksponly", False)],
+)
+def test_a_balance_that_was_not_tested_is_told(energy: str, method: str, is_told: bool, tmp_path: Path) -> None:
+    """One linear solve a step is a solution of a linear balance alone."""
+    study = make_study(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.5},
+        material={"energy": energy, "young": 1.0, "poisson": 0.3, "density": 1.0},
+        time={"step": 0.1, "end": 0.1},
+        solver={"snes_type": method},
+    )
+    scene = build_scene(MPI.COMM_SELF, study)
+    monitors = Run(scene, tmp_path / "run").monitors
+    assert any("was not tested" in note for note in monitors.notes(done=True)) == is_told
 
 
 def test_a_resolve_that_fails_after_a_break_is_counted() -> None:

@@ -199,6 +199,21 @@ class InvertedCellMonitor:
         )
 
 
+def untested_balance_note(solver: dict[str, Any], *, is_linear: bool) -> str:
+    """Sentence on steps of one linear solve, after which r(u) = 0 is not tested; empty without such steps.
+
+    Args:
+        solver: PETSc options of the study.
+        is_linear: whether forces are linear in the displacement.
+    """
+    if is_linear or solver.get("snes_type") != "ksponly":
+        return ""
+    return (
+        'with solver.snes_type = "ksponly" a step is one linear solve, and its balance of forces was not tested: '
+        'compare a run with the default, "newtonls"'
+    )
+
+
 def unbroken_note(fracture: FracturePass) -> str:
     """Sentence on how far a body in which no edge has broken is from its strength, empty otherwise (collective).
 
