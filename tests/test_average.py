@@ -112,24 +112,44 @@ def test_a_large_constant_kernel_is_the_mean_over_the_body(body: Body) -> None:
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("shift", (0.0, 1e4), ids=("", "far from the origin"))
-def test_cells_that_reach_a_bound_are_found_with_their_averages(body: Body, kernel: str, shift: float) -> None:
+@pytest.mark.parametrize("radius", (2.7 * H, 0.8), ids=("near", "far"))
+def test_cells_that_reach_a_bound_are_found_with_their_averages(
+    body: Body, kernel: str, radius: float, shift: float
+) -> None:
     """None is missed by the first look in single precision: exactly the cells whose average of the norms reaches the
     bound are found, whichever cells have come apart since the last time, or are whole again."""
     count, rng = len(body.volumes), np.random.default_rng(4)
     body.domain.nodes[:] += shift
-    average = body.average(2.7 * H, kernel)
+    average = body.average(radius, kernel)
     body.domain.nodes[:] -= shift
     some = rng.uniform(size=count) < 0.7
     for active in (None, some, some & (np.arange(count) % 50 > 0), some):
         enters = np.ones(count) if active is None else active.astype(float)
         values = rng.normal(size=(count, 3)) * enters[:, None]
         norms = frobenius_norm(values, 2)
-        expected = brute_force(body, 2.7 * H, kernel, np.column_stack([norms, values]), enters)
+        expected = brute_force(body, radius, kernel, np.column_stack([norms, values]), enters)
         bound = float(np.quantile(expected[:, 0], 0.8)) * (1 + 1e-9)
         cells, found = average.find_averages_above(values, norms, bound, active)
         np.testing.assert_array_equal(cells, np.flatnonzero(expected[:, 0] >= bound))
         np.testing.assert_allclose(found, expected[cells, 1:], atol=count * EPS * max(shift, 1.0))
         assert len(average.find_averages_above(values, norms, 1.01 * norms.max(), active)[0]) == 0
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+def test_sums_over_bins_bound_averages(kernel: str) -> None:
+    """Of the cells near a loaded end they exclude most whose average is below 1, and none that reaches it."""
+    body = Body({"builder": "box", "size": [2.0, 0.5, 0.5], "h": 0.06})
+    average = body.average(0.35, kernel)
+    load = 1.2 - body.centroids[:, 0]
+    bins, order = average._bins, average._bins.order
+    assert bins.are_coarse
+    active = np.random.default_rng(0).uniform(size=len(load)) < 0.9
+    volumes = (body.volumes * active)[order]
+    near = bins.near_any((load[order] >= 1) & (volumes > 0))
+    may_reach = bins.may_reach_one(load[order], volumes)
+    reaches = average(load[:, None], active)[:, 0] >= 1
+    assert reaches.any() and np.all(may_reach[reaches]) and np.all(near[reaches])
+    assert 2 * np.sum(near & ~may_reach) > np.sum(near & ~reaches)
 
 
 def test_one_loaded_cell_raises_the_averages_around_it(body: Body) -> None:

@@ -18,12 +18,13 @@ from __future__ import annotations
 import math
 from ctypes import CDLL, Structure, byref, c_double, c_int64
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
+from scipy.fft import irfftn, next_fast_len, rfftn
 from scipy.spatial import cKDTree
 
 from ..mesh.c_library import Float32, Float64, Int64, load_library, struct_pointer
@@ -129,11 +130,14 @@ class NonlocalAverage:
 
     def _may_reach(self, norms: Values, volumes: Values, bound: float) -> Ints:
         """Find the cells (m,) whose average of `norms` (near,) may reach `bound`, in single precision."""
-        load = norms / bound
+        load = np.minimum(norms / bound, LIMITS.max_coarse)
         # An average is at most the largest load within the radius.
-        candidates = self._tree_order[self._bins.near_any((load >= 1) & (volumes > 0))[self._tree_order]]
+        is_near = self._bins.near_any((load >= 1) & (volumes > 0))
+        if self._bins.are_coarse and is_near.any():
+            is_near &= self._bins.may_reach_one(load, volumes)
+        candidates = self._tree_order[is_near[self._tree_order]]
         relative = volumes / np.mean(volumes) if volumes.any() else volumes
-        coarse = (relative * np.minimum(load, LIMITS.max_coarse)).astype(np.float32)
+        coarse = (relative * load).astype(np.float32)
         selected = np.empty(len(candidates), np.int64)
         centres = c_int64(len(candidates)), candidates, self._centres
         sums = relative.astype(np.float32), coarse, c_double(LIMITS.coarse_share)
@@ -174,6 +178,7 @@ class _Bins:
     Attributes:
         order: (points,) the points by bin, and in a bin by number.
         pointer: argument of the functions of nonlocal_average.c.
+        are_coarse: whether there are fewer bins than points.
     """
 
     def __init__(
@@ -193,7 +198,9 @@ class _Bins:
         x, y, z = (bin_indices - first).T
         bin_of = (z * bins[1] + y) * bins[0] + x
         self.order = np.lexsort([numbers, bin_of])
-        self._shape = tuple(bins[::-1])
+        self._shape: tuple[int, ...] = tuple(map(int, bins[::-1]))
+        self.are_coarse = math.prod(self._shape) < len(points)
+        self._bins_per_radius, self._kernel = radius / size, kernel
         self._bin_of_centre, self._bin_in_order = bin_of[: len(centres)], bin_of[self.order]
         # with the round-off that the search in C admits
         self._reach = math.ceil(radius / size * (1 + 1e-6))
@@ -215,6 +222,40 @@ class _Bins:
         for axis in range(3):
             marks = _any_within(marks, self._reach, axis)
         return np.asarray(marks.ravel()[self._bin_of_centre])
+
+    def may_reach_one(self, load: Values, volumes: Values) -> Flags:
+        """Flag the centres (centres,) around which the average of `load` (points,) may reach 1.
+
+        It does where sum_k w_k V_k (load_k - 1) >= 0. In sums over bins positive terms take the weight of the smallest
+        distance in two bins, negative ones that of the largest: an upper bound. A convolution gives it for all bins.
+        """
+        excess = volumes * (load - 1)
+        shape, transforms = self._convolution
+        parts = np.maximum(excess, 0.0), np.minimum(excess, 0.0)
+        sums = (np.bincount(self._bin_in_order, part, math.prod(self._shape)).reshape(self._shape) for part in parts)
+        total = sum(rfftn(part, shape) * weights for part, weights in zip(sums, transforms, strict=True))
+        bounds = irfftn(total, shape)[tuple(slice(self._reach, self._reach + count) for count in self._shape)]
+        round_off = LIMITS.bound_round_off * float(volumes @ (1 + load))
+        return np.asarray(bounds.ravel()[self._bin_of_centre] >= -round_off)
+
+    @cached_property
+    def _convolution(self) -> tuple[list[int], list[npt.NDArray[np.complex128]]]:
+        """Shape of a convolution with weights between bins, and transforms of the largest and the smallest weights."""
+        away = np.abs(np.arange(-self._reach, self._reach + 1))
+        shape = [next_fast_len(count + 2 * self._reach, real=True) for count in self._shape]
+        transforms = []
+        # 1e-6: by so much rounding may move a point into another bin
+        for steps in (np.maximum(away - 1 - 1e-6, 0.0), away + 1 + 1e-6):
+            squares = np.square(steps / self._bins_per_radius)
+            q = np.sqrt(squares[:, None, None] + squares[:, None] + squares)
+            transforms.append(rfftn(_weights(self._kernel, q), shape))
+        return shape, transforms
+
+
+def _weights(kernel: str, q: Values) -> Values:
+    """Weights at distances over the radius."""
+    shape = {"linear": 1 - q, "constant": np.ones_like(q), "gaussian": np.exp(-4.5 * q**2)}[kernel]
+    return np.where(q <= 1, shape, 0.0)
 
 
 def _any_within(marks: Flags, reach: int, axis: int) -> Flags:
