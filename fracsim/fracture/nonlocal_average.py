@@ -33,7 +33,6 @@ from ..mesh.ghost_exchange import sum_at_nodes
 from ..mesh.parallel import RankHalo, max_over_ranks
 
 Values = npt.NDArray[np.float64]
-Singles = npt.NDArray[np.float32]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 SOURCE = Path(__file__).with_suffix(".c")
