@@ -12,6 +12,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from .errors import CannotWrite, NotConverged, StepAborted, Stopped
+from .meshes.data import mesh_fingerprint
 from .output.atomic_write import write_on_root
 from .output.checkpoint_file import (
     CHECKPOINT_LIMITS,
@@ -149,7 +150,7 @@ class RigidRun:
     def _resume(self) -> dict[str, npt.NDArray[Any]]:
         """Restore the state of the checkpoint; return its arrays. Raises InputError."""
         stored, stepper = read_checkpoint_file(self.folder), self.scene.stepper
-        check_mesh(stored, self.scene.mesh)
+        check_mesh(stored, mesh_fingerprint(self.scene.mesh))
         arrays, clock, earlier = stored.arrays, stored.clock, stored.notes.monitors
         _check_stored(stored, stepper.to_checkpoint(self.state), len(self.scene.obstacles), stepper.instances)
         self._start = float(clock["start"])
@@ -207,7 +208,8 @@ class RigidRun:
         clock = {"t": state.t, "step": state.step, "work": state.work, "start": self._start}
         counts = {"blows": self.blows, "loads": self.loads, "frames": self.frames.files.frame_counts}
         notes = CheckpointNotes(self.text, counts)
-        write_on_root(ROOT_COMM, path, lambda: write_checkpoint_file(path, arrays, clock, self.scene.mesh, notes))
+        fingerprint = mesh_fingerprint(self.scene.mesh)
+        write_on_root(ROOT_COMM, path, lambda: write_checkpoint_file(path, arrays, clock, fingerprint, notes))
         self._saved_at = state.t
         return path
 

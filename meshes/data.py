@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -59,6 +61,23 @@ class MeshData:
     def dim(self) -> int:
         """Dimension of space, 2 or 3."""
         return int(self.points.shape[1])
+
+
+def mesh_fingerprint(mesh: MeshData) -> str:
+    """First digits of the SHA-256 of a mesh's nodes, cells, groups and regions."""
+    parts: list[npt.NDArray[Any]] = [mesh.points, mesh.cells, *([] if mesh.middles is None else [mesh.middles])]
+    groups = [*mesh.facet_groups.items(), *mesh.regions.items()]
+    for name, members in sorted(groups, key=lambda group: group[0]):
+        parts += [np.frombuffer(name.encode(), np.uint8), members]
+    return hash_arrays(parts)
+
+
+def hash_arrays(arrays: Iterable[npt.NDArray[Any]]) -> str:
+    """First digits of the SHA-256 of the bytes of arrays."""
+    digest = hashlib.sha256()
+    for values in arrays:
+        digest.update(np.ascontiguousarray(values).reshape(-1).view(np.uint8))
+    return digest.hexdigest()[:16]
 
 
 def format_point(point: Iterable[float]) -> str:

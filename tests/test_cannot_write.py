@@ -55,7 +55,7 @@ CASES: dict[str, tuple[str, tuple[str, str, str], int]] = {
     "surface": ("surface.pvd", ("fracsim.output.surface.vtk_files", "SurfaceFiles", "write_frame"), 1_000),
     "pieces": ("surface.pvd", ("fracsim.output.surface.vtk_files", "", "append_bytes"), 600),
     "history": ("history.csv", ("fracsim.output.history", "", "write_all"), 700),
-    "checkpoint": ("checkpoint/state.h5", ("fracsim.output.checkpoint", "", "write_checkpoint_file"), 9_000),
+    "checkpoint": ("checkpoint/state.h5", ("fracsim.deformable_run", "", "write_checkpoint"), 9_000),
 }
 EVERY_STEP = {"output": {"checkpoint": 1e-9}}
 

@@ -17,9 +17,9 @@ from fracsim.errors import Exit
 from fracsim.mesh.domain import distribute
 from fracsim.meshes import MeshData, MeshError
 from fracsim.meshes.check import check_mesh
+from fracsim.meshes.data import mesh_fingerprint
 from fracsim.meshes.read import read_mesh
 from fracsim.meshes.vtkhdf import FileMesh, find_file_mesh
-from fracsim.output.checkpoint_file import mesh_fingerprint
 from fracsim.scene import build_scene
 from fracsim.study.mesh_source import build_mesh
 from support import torn
@@ -217,7 +217,7 @@ def test_notes_and_mesh_on_ranks(results: Results, tmp_path: Path, ranks: int, n
     for dim in (2, 3):
         whole = checked(write_case(tmp_path, dim, name))
         assert tuple(results(ranks)[f"notes-{dim}-{name}"].tolist()) == whole.notes
-        assert str(results(ranks)[f"mesh-{dim}-{name}"]) == mesh_fingerprint(whole)
+        assert set(results(ranks)[f"mesh-{dim}-{name}"].tolist()) == {mesh_fingerprint(whole)}
 
 
 @pytest.mark.ranks

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import numpy as np
 import numpy.typing as npt
 
-from ..mesh.edge_graph import EdgeGraph
+from ..mesh.edge_graph import EdgeGraph, EdgeRows
 from ..mesh.ghost_exchange import min_over_ranks
 
 Ints = npt.NDArray[np.int64]
@@ -59,18 +61,20 @@ class EdgeHistory:
         """
         return self.graph.gather_broken(np.column_stack([self.break_times, self.cut_positions]))
 
-    def to_checkpoint(self) -> tuple[Ints, Values] | None:
-        """Gather all weakened edges on rank 0: keys (n, 2), and times, cuts and tip states (n, 2 or more)."""
+    def weakened_rows(self) -> Values:
+        """(edges, 2 or more) times, cuts and tip states, which a checkpoint has of weakened edges."""
         states = [] if self.tip_states is None else [self.tip_states]
-        return self.graph.gather_weakened(np.column_stack([self.break_times, self.cut_positions, *states]))
+        return np.column_stack([self.break_times, self.cut_positions, *states])
 
-    def from_checkpoint(self, keys: Ints, values: Values) -> None:
-        """Restore what `to_checkpoint` returned, on every rank: keys (n, 2) and values (n, 2 or more)."""
-        local, row = self.graph.keys.find_edges(keys)
-        self.break_times[local], self.cut_positions[local] = values[row, :2].T
-        if values.shape[1] > 2:
-            self.tip_states = np.full((len(self.break_times), values.shape[1] - 2), np.nan)
-            self.tip_states[local] = values[row, 2:]
+    def restore_rows(self, blocks: Iterable[EdgeRows]) -> None:
+        """Restore `weakened_rows` (n, 2 or more) of the edges with keys (n, 2), in blocks that every rank is given."""
+        for keys, values in blocks:
+            local, row = self.graph.keys.find_edges(keys)
+            self.break_times[local], self.cut_positions[local] = values[row, :2].T
+            if values.shape[1] > 2:
+                if self.tip_states is None:
+                    self.tip_states = np.full((len(self.break_times), values.shape[1] - 2), np.nan)
+                self.tip_states[local] = values[row, 2:]
 
 
 def cut_positions_from_forces(force: Values, ends: npt.NDArray[np.integer]) -> Values:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import dolfinx
 import numpy as np
@@ -11,12 +13,12 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
-from ..meshes.data import MeshData, format_point
+from ..meshes.data import MeshData, format_point, hash_arrays, mesh_fingerprint
 from ..meshes.topology import signed_measures
 from .dolfinx_compat import CachedCellElement, cell_geometry, coordinate_element, create_mesh
 from .facets import Facets, find_group_facets
 from .midside_nodes import CellMidsideNodes, MidsideNodes, find_midside_nodes, with_midside_nodes
-from .parallel import Gather, GatherSubset, bcast, gather, sum_over_ranks
+from .parallel import BlockGather, Gather, GatherSubset, bcast, gather, rank_offset, sum_over_ranks
 
 Ints = npt.NDArray[np.int32]
 Values = npt.NDArray[np.float64]
@@ -208,7 +210,7 @@ class Domain:
 
     @cached_property
     def input_mesh(self) -> MeshData | None:
-        """The input mesh on rank 0, None elsewhere (collective); output and checkpoints keep its order.
+        """The input mesh on rank 0, None elsewhere (collective); files keep its order.
 
         Where ranks read their shares, the mesh is gathered at first use, and stays.
         """
@@ -225,6 +227,37 @@ class Domain:
         facets = {name: np.concatenate([part[name] for part in groups]) for name in group_nodes}
         regions = {name: np.flatnonzero(region == number) for number, name in enumerate(self.region_names)}
         return MeshData(points, cells, facets, regions, self.notes)
+
+    @cached_property
+    def fingerprint(self) -> str | None:
+        """`mesh_fingerprint` of the input mesh on rank 0, None elsewhere (collective); no rank gathers the mesh."""
+        if self.group_nodes is None:
+            return None if self.whole_mesh is None else mesh_fingerprint(self.whole_mesh)
+        digits = hash_arrays(part for part in self._hashed_parts(self.group_nodes) if part is not None)
+        return digits if self.comm.rank == 0 else None
+
+    def _hashed_parts(self, group_nodes: dict[str, npt.NDArray[np.int64]]) -> Iterator[npt.NDArray[Any] | None]:
+        """What `mesh_fingerprint` hashes, in blocks on rank 0, None elsewhere (collective)."""
+        numbering, owned = self.input_numbering, slice(self.node_count)
+        for index, values in (
+            (numbering.nodes[owned], self.nodes[owned]),
+            (numbering.cells, numbering.nodes[self.cell_nodes]),
+        ):
+            yield from BlockGather(self.comm, index)(values)
+        for name in sorted({*group_nodes, *self.region_names}):
+            # a group and a region may have the same name
+            if name in group_nodes:
+                yield np.frombuffer(name.encode(), np.uint8)
+                facets = group_nodes[name]
+                index = rank_offset(self.comm, len(facets)) + np.arange(len(facets))
+                yield from BlockGather(self.comm, index)(facets)
+            if name in self.region_names:
+                yield np.frombuffer(name.encode(), np.uint8)
+                is_member, start = self.cell_region == self.region_names.index(name), 0
+                for block in BlockGather(self.comm, numbering.cells)(is_member):
+                    if block is not None:
+                        yield start + np.flatnonzero(block)
+                        start += len(block)
 
     @cached_property
     def volumes(self) -> npt.NDArray[np.float64]:

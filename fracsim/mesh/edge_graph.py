@@ -7,6 +7,7 @@ Equations: docs/theory.md#edge-damage.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from functools import cached_property
 
 import numpy as np
@@ -15,8 +16,13 @@ from dolfinx import la
 
 from .domain import Domain, Ints
 from .ghost_exchange import min_over_ranks
-from .parallel import gather, sum_over_ranks
+from .parallel import MAX_GATHERED_ROWS, gather, sum_over_ranks
 from .simplices import intact_edges, is_split, local_edges
+
+# Nodes in a row have some seven times as many edges with their lower end there, on all ranks.
+NODES_PER_RANGE = 1 << 12
+# keys (n, 2) of edges, and rows (n, m) of values
+type EdgeRows = tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]
 
 
 class Incidence:
@@ -52,6 +58,7 @@ class EdgeKeys:
     def __init__(self, domain: Domain, edge_nodes: Ints, owned_count: int) -> None:
         """`edge_nodes`: (edges, 2) local nodes of owned and ghost edges; `owned_count`: number of owned ones."""
         self._comm, self._node_numbers = domain.comm, domain.input_numbering.nodes
+        self._all_nodes = int(domain.space.dofmap.index_map.size_global)
         self._edge_nodes, self._owned_count = edge_nodes, owned_count
 
     def of_edges(self, edges: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
@@ -83,20 +90,34 @@ class EdgeKeys:
         flags[self.find_edges(keys[np.lexsort(keys.T[::-1])])[0]] = True
         return flags
 
-    def gather(
-        self, flags: npt.NDArray[np.bool_], values: npt.NDArray[np.float64]
-    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
+    def gather(self, flags: npt.NDArray[np.bool_], values: npt.NDArray[np.float64]) -> EdgeRows | None:
         """(n, 2) sorted keys of all flagged edges, and the (n, m) rows of their `values` (edges, m), on rank 0.
 
         None on the other ranks (collective).
         """
         owned = np.flatnonzero(flags[: self._owned_count])
-        parts = gather(self._comm, (self.of_edges(owned), values[owned]))
+        return self._gather(self.of_edges(owned), values[owned])
+
+    def _gather(self, keys: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> EdgeRows | None:
+        """Sorted keys (n, 2) of all ranks, and their rows (n, m), on rank 0, None elsewhere (collective)."""
+        parts = gather(self._comm, (keys, rows))
         if parts is None:
             return None
         keys, rows = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
         order = np.lexsort(keys.T[::-1])
         return keys[order], rows[order]
+
+    def gather_blocks(self, flags: npt.NDArray[np.bool_], values: npt.NDArray[np.float64]) -> Iterator[EdgeRows | None]:
+        """What `gather` returns in blocks that follow one another, so that rank 0 holds one at a time (collective)."""
+        owned = np.flatnonzero(flags[: self._owned_count])
+        keys = self.of_edges(owned)
+        # all edges whose lower nodes are in a range of numbers belong to one block
+        of_edge, ranges = keys[:, 0] // NODES_PER_RANGE, self._all_nodes // NODES_PER_RANGE + 1
+        counts = sum_over_ranks(self._comm, np.bincount(of_edge, minlength=ranges))
+        block = (np.cumsum(counts) - counts) // MAX_GATHERED_ROWS
+        for number in range(int(block[-1]) + 1):
+            in_block = block[of_edge] == number
+            yield self._gather(keys[in_block], values[owned[in_block]])
 
 
 def _encode(keys: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
@@ -251,38 +272,42 @@ class EdgeGraph:
         """(n, k) integrity of each local edge of the cells."""
         return self.integrity[self.cell_edges[cells]]
 
-    def gather_broken(
-        self, values: npt.NDArray[np.float64] | None = None
-    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
+    def gather_broken(self, values: npt.NDArray[np.float64] | None = None) -> EdgeRows | None:
         """(n, 2) sorted keys of all broken edges, and the (n, m) rows of their `values` (edges, m), on rank 0.
 
         None on the other ranks (collective).
         """
         return self.keys.gather(self.broken, np.empty((len(self.broken), 0)) if values is None else values)
 
-    def broken_rows(self, values: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]]:
+    def broken_rows(self, values: npt.NDArray[np.float64]) -> EdgeRows:
         """(n, 2) keys of the broken edges of this rank, and the (n, m) rows of their `values` (edges, m)."""
         broken = np.flatnonzero(self.broken)
         return self.keys.of_edges(broken), values[broken]
 
-    def gather_weakened(
-        self, values: npt.NDArray[np.float64] | None = None
-    ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.float64]] | None:
-        """(n, 2) sorted keys of all edges with integrity below 1, and the (n, m) rows of their `values`, on rank 0.
+    @property
+    def weakened_count(self) -> int:
+        """Number of edges with integrity below 1 that this rank owns."""
+        return int(np.count_nonzero(self.integrity[: self.edge_count] < 1))
 
-        `values`: (edges, m), by default the integrity (edges, 1). None on the other ranks (collective).
+    def weakened_blocks(self, values: npt.NDArray[np.float64] | None = None) -> Iterator[EdgeRows | None]:
+        """All edges with integrity below 1 in blocks of rising keys on rank 0, None elsewhere (collective).
+
+        Each with the rows of its `values` (edges, m), by default the integrity (edges, 1).
         """
-        return self.keys.gather(self.integrity < 1, self.integrity[:, None] if values is None else values)
+        return self.keys.gather_blocks(self.integrity < 1, self.integrity[:, None] if values is None else values)
 
-    def restore_integrity(self, keys: npt.NDArray[np.int64], integrity: npt.NDArray[np.float64]) -> None:
-        """Set the integrity (n, 1) of the edges with `keys` (n, 2), and 1 elsewhere: the inverse of `gather_weakened`.
+    def restore_integrity(self, blocks: Iterable[EdgeRows]) -> int:
+        """Set the integrity of the edges of blocks, given on every rank, and 1 elsewhere: what `weakened_blocks` gave.
 
-        Both arrays are given on every rank.
+        Returns the number of these edges that this rank owns.
         """
-        values = np.ones(len(self.integrity))
-        local, rows = self.keys.find_edges(keys)
-        values[local] = integrity[rows, 0]
+        values, count = np.ones(len(self.integrity)), 0
+        for keys, integrity in blocks:
+            local, rows = self.keys.find_edges(keys)
+            values[local] = integrity[rows, 0]
+            count += int(np.count_nonzero(local < self.edge_count))
         self.set_integrity(values)
+        return count
 
     def broken_keys(self) -> npt.NDArray[np.int64] | None:
         """(n, 2) sorted keys of all broken edges on rank 0, None elsewhere (collective)."""

@@ -345,11 +345,14 @@ def bcast(comm: MPI.Comm, value: Any) -> Any:
 # --- in the order of the input mesh ---------------------------------------------------------------------------------
 
 
+# Rows of an array of the whole mesh that rank 0 holds at a time: 3 MB of vectors
+MAX_GATHERED_ROWS = 1 << 17
+
+
 class Gather:
     """Gathers rows of owned entities on rank 0 in the order of the input mesh, at any partition.
 
-    Rank 0 alone writes output, so that files are the same at any rank count, and parallel HDF5 is not needed. One copy
-    of a field on rank 0 is small beside the tangent matrix.
+    Rank 0 then holds all of them; of arrays as long as the mesh `BlockGather` gathers a block at a time.
     """
 
     def __init__(self, comm: MPI.Comm, input_index: npt.NDArray[np.int64]) -> None:
@@ -439,6 +442,50 @@ class GatherSubset(Gather):
         """(entities, ...) rows of the subset among zeros."""
         result = np.zeros((len(self._which), *rows.shape[1:]), rows.dtype)
         result[self._which] = rows
+        return result
+
+
+class BlockGather:
+    """Gathers rows of owned entities on rank 0 in the order of the input mesh, a block at a time, and scatters them.
+
+    Rank 0 alone reads and writes files, so that they are the same at any rank count, and parallel HDF5 is not needed.
+
+    Attributes:
+        count: number of rows on all ranks.
+    """
+
+    def __init__(self, comm: MPI.Comm, input_index: npt.NDArray[np.int64]) -> None:
+        """`input_index`: (n,) index in the input mesh of each entity that this rank owns (collective)."""
+        self._comm, self._order = comm, np.argsort(input_index)
+        self._sorted = input_index[self._order]
+        self.count = int(sum_over_ranks(comm, len(input_index))[0])
+
+    def _blocks(self) -> Iterator[tuple[slice, npt.NDArray[np.int64], Gather]]:
+        """Rows of each block, the owned entities in it, and what gathers their rows (collective)."""
+        for start in range(0, self.count, MAX_GATHERED_ROWS):
+            end = min(start + MAX_GATHERED_ROWS, self.count)
+            own_rows = slice(*np.searchsorted(self._sorted, [start, end]))
+            yield slice(start, end), self._order[own_rows], Gather(self._comm, self._sorted[own_rows] - start)
+
+    def __call__(self, values: npt.NDArray[Any]) -> Iterator[npt.NDArray[Any] | None]:
+        """Blocks of the rows of all ranks in input order on rank 0, None elsewhere (collective).
+
+        `values`: (n, ...) rows of owned entities.
+        """
+        for _, owned, gather in self._blocks():
+            yield gather(values[owned])
+
+    def scatter(self, read: Callable[[slice], npt.NDArray[Any] | None]) -> npt.NDArray[Any]:
+        """(n, ...) rows that this rank owns (collective).
+
+        `read` (collective) returns the given rows, in input order, on rank 0, and None elsewhere.
+        """
+        result = np.empty(0)
+        for rows, owned, gather in self._blocks():
+            block = gather.scatter(read(rows))
+            if rows.start == 0:
+                result = np.empty((len(self._order), *block.shape[1:]), block.dtype)
+            result[owned] = block
         return result
 
 

@@ -1,8 +1,8 @@
 """Checkpoint file: named arrays and numbers in HDF5, followed by one line with the SHA-256 digest of all bytes before.
 
 The digest is verified before HDF5 opens the file, so a truncated or altered file is refused as a whole. Rank 0 reads
-and writes, in the order of the input mesh; the number of ranks of a run does not matter. Names, shapes and ranges are
-checked after the digest, since other programs can write such files too.
+and writes, in the order of the input mesh and a block of rows at a time; the number of ranks of a run does not matter.
+Names, shapes and ranges are checked after the digest, since other programs can write such files too.
 """
 
 from __future__ import annotations
@@ -12,8 +12,9 @@ import json
 import os
 import tomllib
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import InputError
-from ..meshes.data import MeshData
+from ..mesh.parallel import MAX_GATHERED_ROWS
 from ..meshes.plain_files import atomic_replacement
 from .atomic_write import HDF5_OVERHEAD_BYTES, open_hdf5, writable_hdf5
 from .file_ownership import CHECKPOINT_FILE
 
-Arrays = dict[str, npt.NDArray[Any]]
+# shape and type of the numbers of an array
+type Layout = tuple[tuple[int, ...], np.dtype[Any]]
 
 # the last line of the file before its digest
 DIGEST_MARK = b"\nfracsim checkpoint, SHA-256 "
@@ -77,16 +79,16 @@ class StoredCheckpoint:
 
     Attributes:
         path: the file.
-        arrays: arrays by name.
+        arrays: arrays by name; data sets of HDF5 while the file is open.
         clock: numbers by name: time in s, step, and others of the time scheme.
-        mesh_digest: see `mesh_fingerprint`.
+        fingerprint: `mesh_fingerprint` of its mesh.
         notes: study and monitors.
     """
 
     path: Path
-    arrays: Arrays
+    arrays: dict[str, Any]
     clock: dict[str, Any]
-    mesh_digest: str
+    fingerprint: str
     notes: CheckpointNotes
 
 
@@ -105,38 +107,70 @@ def describe_last_checkpoint(folder: Path, t: float | None) -> str:
 # --- writing ----------------------------------------------------------------------------------------------------------
 
 
-def write_checkpoint_file(
-    path: Path, arrays: dict[str, Any], clock: dict[str, Any], mesh: MeshData | None, notes: CheckpointNotes
-) -> None:
-    """Write a checkpoint in place of the previous one, which stays until the new one is complete (rank 0).
+class ArrayWriter:
+    """Writes arrays into an open checkpoint file, whole or a block of rows after the other."""
+
+    def __init__(self, file: Any, layouts: dict[str, Layout]) -> None:
+        self._file, self._layouts = file, layouts
+        self._written = dict.fromkeys(layouts, 0)
+
+    def append_rows(self, name: str, rows: npt.NDArray[Any]) -> None:
+        """Write the next rows of an array. Raises OSError."""
+        start = self._written[name]
+        if start == 0:
+            self._file.create_dataset(name, *self._layouts[name])
+        if rows.size:
+            self._file[name][start : start + len(rows)] = rows
+            self._written[name] += len(rows)
+
+
+@contextmanager
+def new_checkpoint_file(
+    path: Path, layouts: dict[str, Layout], clock: dict[str, Any], fingerprint: str | None, notes: CheckpointNotes
+) -> Iterator[ArrayWriter]:
+    """Writer of the arrays of a checkpoint; the file replaces the previous one when the context ends (rank 0).
 
     Args:
-        path: the file.
-        arrays: arrays by name.
+        path: the file. The previous one stays until the new one is complete.
+        layouts: of all arrays, by name.
         clock: numbers by name.
-        mesh: mesh of the study.
+        fingerprint: `mesh_fingerprint` of the mesh of the study, which rank 0 has.
         notes: study and monitors.
 
     Raises:
         OSError: the file cannot be written.
     """
+    assert fingerprint is not None
     # without parents: a deleted output folder is an error
     path.parent.mkdir(exist_ok=True)
     with atomic_replacement(path) as temporary:
-        with writable_hdf5(temporary, _file_size(arrays, notes), new=True) as file:
-            for name, values in arrays.items():
-                file[name] = values
+        with writable_hdf5(temporary, _file_size(layouts, notes), new=True) as file:
+            yield ArrayWriter(file, layouts)
             for name, value in clock.items():
                 file.attrs[name] = value
-            file.attrs["mesh"] = mesh_fingerprint(mesh)
+            file.attrs["mesh"] = fingerprint
             file["notes/study"], file["notes/monitors"] = notes.study, json.dumps(notes.monitors)
         append_digest(temporary)
 
 
-def _file_size(arrays: dict[str, Any], notes: CheckpointNotes) -> int:
+def layouts_of(arrays: dict[str, npt.NDArray[Any]]) -> dict[str, Layout]:
+    """Layouts of whole arrays."""
+    return {name: (values.shape, values.dtype) for name, values in arrays.items()}
+
+
+def write_checkpoint_file(
+    path: Path, arrays: dict[str, npt.NDArray[Any]], clock: dict[str, Any], fingerprint: str, notes: CheckpointNotes
+) -> None:
+    """Write a checkpoint of whole arrays; arguments and errors as for `new_checkpoint_file` (rank 0)."""
+    with new_checkpoint_file(path, layouts_of(arrays), clock, fingerprint, notes) as writer:
+        for name, values in arrays.items():
+            writer.append_rows(name, values)
+
+
+def _file_size(layouts: dict[str, Layout], notes: CheckpointNotes) -> int:
     """Upper bound of the size of a checkpoint file in bytes."""
-    data = sum(values.nbytes for values in arrays.values() if values is not None)
-    return data + len(notes.study) + 2 * HDF5_OVERHEAD_BYTES + (1 << 10) * (len(arrays) + len(_NOTES))
+    data = sum(prod(shape) * dtype.itemsize for shape, dtype in layouts.values())
+    return data + len(notes.study) + 2 * HDF5_OVERHEAD_BYTES + (1 << 10) * (len(layouts) + len(_NOTES))
 
 
 def append_digest(path: Path) -> None:
@@ -148,19 +182,6 @@ def append_digest(path: Path) -> None:
         file.flush()
         # on disk before the file replaces the previous checkpoint: a power failure must not destroy both
         os.fsync(file.fileno())
-
-
-def mesh_fingerprint(mesh: MeshData | None) -> str:
-    """First 16 digits of the SHA-256 of a mesh's nodes, cells, groups and regions (rank 0, which has the mesh)."""
-    assert mesh is not None
-    digest = hashlib.sha256()
-    for values in (mesh.points, mesh.cells, *([] if mesh.middles is None else [mesh.middles])):
-        digest.update(np.ascontiguousarray(values).tobytes())
-    groups = [*mesh.facet_groups.items(), *mesh.regions.items()]
-    for name, members in sorted(groups, key=lambda group: group[0]):
-        digest.update(name.encode())
-        digest.update(np.ascontiguousarray(members).tobytes())
-    return digest.hexdigest()[:16]
 
 
 # --- reading ----------------------------------------------------------------------------------------------------------
@@ -177,15 +198,36 @@ def read_notes(folder: Path) -> CheckpointNotes:
 
 def read_checkpoint_file(folder: Path) -> StoredCheckpoint:
     """Contents of the checkpoint in a folder (rank 0). Raises InputError if it is missing or damaged."""
+    with open_checkpoint(folder) as stored:
+        return replace(stored, arrays={name: read_rows(stored, name, slice(None)) for name in stored.arrays})
+
+
+@contextmanager
+def open_checkpoint(folder: Path) -> Iterator[StoredCheckpoint]:
+    """The checkpoint in a folder, with its file open (rank 0). Raises InputError if it is missing or damaged."""
     path = _existing_checkpoint(folder)
-    with _input_errors(path):
-        _check_digest(path)
-        with open_hdf5(path) as file:
-            arrays = {name: _read_array(file, name) for name in file if name != "notes"}
+    with ExitStack() as stack:
+        with _input_errors(path):
+            _check_digest(path)
+            file = stack.enter_context(open_hdf5(path))
+            arrays = {name: _find_array(file, name) for name in file if name != "notes"}
             clock = {name: _to_number(name, value) for name, value in file.attrs.items() if name != "mesh"}
-            digest, notes = str(file.attrs["mesh"]), _read_notes(file)
-        _check_clock(clock)
-    return StoredCheckpoint(path, arrays, clock, digest, notes)
+            fingerprint, notes = str(file.attrs["mesh"]), _read_notes(file)
+            _check_clock(clock)
+        yield StoredCheckpoint(path, arrays, clock, fingerprint, notes)
+
+
+def read_rows(stored: StoredCheckpoint, name: str, rows: slice) -> npt.NDArray[Any]:
+    """Rows of an array of an open checkpoint. Raises InputError if they cannot be read."""
+    data = stored.arrays[name]
+    with _input_errors(stored.path):
+        return np.asarray(data[rows] if data.shape else data[()])
+
+
+def row_blocks(count: int = 0) -> Iterator[slice]:
+    """Rows of an array, a block at a time; one block without rows if there are none."""
+    for start in range(0, max(count, 1), MAX_GATHERED_ROWS):
+        yield slice(start, min(start + MAX_GATHERED_ROWS, count))
 
 
 def _existing_checkpoint(folder: Path) -> Path:
@@ -206,9 +248,9 @@ def _read_notes(file: Any) -> CheckpointNotes:
     return notes
 
 
-def check_mesh(stored: StoredCheckpoint, mesh: MeshData | None) -> None:
-    """Raise InputError if a checkpoint belongs to another mesh (rank 0)."""
-    if stored.mesh_digest != mesh_fingerprint(mesh):
+def check_mesh(stored: StoredCheckpoint, fingerprint: str | None) -> None:
+    """Raise InputError if a checkpoint belongs to another mesh than that with a `mesh_fingerprint` (rank 0)."""
+    if stored.fingerprint != fingerprint:
         raise InputError(f"--restart: {stored.path} belongs to another mesh; run without --restart in another folder")
 
 
@@ -245,8 +287,8 @@ def _check_digest(path: Path) -> None:
         raise ValueError("it is damaged: its digest (SHA-256) is not that of its contents")
 
 
-def _read_array(file: Any, name: str) -> npt.NDArray[Any]:
-    """Array of an open HDF5 file. Raises ValueError unless its numbers are stored contiguously in this file."""
+def _find_array(file: Any, name: str) -> Any:
+    """Data set of an open HDF5 file. Raises ValueError unless its numbers are stored contiguously in this file."""
     import h5py
 
     if not isinstance(file.get(name, getlink=True), h5py.HardLink):
@@ -256,7 +298,7 @@ def _read_array(file: Any, name: str) -> npt.NDArray[Any]:
         raise ValueError(f"{name} is no array of numbers")
     if data.external or data.is_virtual or data.chunks or data.id.get_storage_size() != data.size * data.dtype.itemsize:
         raise ValueError(f"{name} does not lie in the file in one piece")
-    return np.asarray(data[()])
+    return data
 
 
 def _read_text(file: Any, name: str) -> str:

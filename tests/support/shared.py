@@ -18,9 +18,9 @@ from fracsim.deformable_run import Run
 from fracsim.mesh.domain import Domain
 from fracsim.mesh.mesh_shares import MeshShare, distribute_shares, read_share
 from fracsim.meshes import BUILDERS, MeshData
+from fracsim.meshes.data import mesh_fingerprint
 from fracsim.meshes.topology import facets_of
 from fracsim.meshes.vtkhdf import find_file_mesh, write_vtkhdf
-from fracsim.output.checkpoint_file import mesh_fingerprint
 from fracsim.scene import build_scene
 from fracsim.study.mesh_source import build_mesh
 
@@ -233,12 +233,14 @@ def run_from_file(name: str, path: Path) -> dict[str, Any]:
 
 
 def gathered_by_a_run(path: Path, folder: Path, surface: dict[str, Any]) -> tuple[bool, int]:
-    """Whether rank 0 has the whole mesh after a run with frames and breaks, and broken edges (collective)."""
+    """Whether rank 0 has the whole mesh after a run with frames, breaks and a checkpoint; broken edges (collective)."""
     comm = MPI.COMM_WORLD
     study = make_study(**torn.RUNS["block"] | {"mesh": {"file": str(path)}, "solver": torn.TIGHT}
                        | {"output": {"every": 2, "picture": False, **surface}})  # fmt: skip
     scene = build_scene(comm, study)
-    summary = Run(scene, folder)()
+    run = Run(scene, folder)
+    summary = run()
+    run.checkpoint()
     assert scene.domain.whole_mesh is None
     gathered = comm.allgather("input_mesh" in vars(scene.domain))
     assert len(set(gathered)) == 1
@@ -265,11 +267,14 @@ def main(path: str) -> None:
         found[f"refused-{dim}-{name}"] = np.array(refused[0])
         if share is not None:
             domain = distribute_shares(comm, share)
+            with mock.patch("fracsim.mesh.parallel.MAX_GATHERED_ROWS", 50):
+                fingerprint = domain.fingerprint
+            assert "input_mesh" not in vars(domain)
             mesh = domain.input_mesh
             assert (mesh is None) == (comm.rank > 0)
             if mesh is not None:
                 found[f"notes-{dim}-{name}"] = np.array(domain.notes, str)
-                found[f"mesh-{dim}-{name}"] = np.array(mesh_fingerprint(mesh))
+                found[f"mesh-{dim}-{name}"] = np.array([mesh_fingerprint(mesh), fingerprint])
     for name, file in files.items():
         found |= {f"run-{key}": values for key, values in run_from_file(name, file).items()}
         share = share_of(file, comm)
