@@ -43,7 +43,7 @@ def test_mixed_derivatives_by_both_poses(both: tuple[Shape, Shape], friction: fl
     apart = min(gap.min() for gap in stop.gaps(here, there))
     here = here.incremented(np.eye(d + turns)[d - 1] * (0.05 - apart))
     slid = here.incremented(0.03 * np.eye(d + turns)[0])
-    rub = stop.begin_step(here, there, barrier, lambda points, normals: 0.1).friction
+    rub = stop.lag_friction(here, there, barrier, lambda points, normals: 0.1) if friction else None
     assert (rub is not None and len(rub.force) > 0) == (friction > 0)
 
     def energy(q: Values, p: Values) -> float:
@@ -80,8 +80,8 @@ def gap(term: FreeRigidObstacles) -> float:
     at = [each.motion.pose for each in term.free.values()]
     return min(
         float(g.min(initial=9.0))
-        for (i, j), pair in term.pairs.kinds[0]._pairs.items()
-        for g in pair.gaps(at[i], at[j])
+        for pair in term.pairs.pairs
+        for g in pair.pair.gaps(*(at[number] for number in pair.numbers))
     )
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from fracsim.contact.laws import Barrier, ObstacleLaw
 from fracsim.contact.obstacle import FreeObstacle, RigidObstacle, overlap_depth
-from fracsim.contact.obstacle_pairs import ObstaclePairs
+from fracsim.contact.obstacle_pairs import BarrierPair, ObstaclePairs
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.rigid_pose import FreeRigidObstacles
 from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylinder, Shape, Sphere
@@ -64,10 +64,9 @@ def test_derivatives_by_the_pose(both: tuple[Shape, Shape], along: bool, frictio
     down = -there.normal(start.centre[None])[0] if d == 3 else np.array([0.0, -1.0])
     here = start.incremented(np.concatenate([(gap - 0.02) * down, np.zeros(turns)]))
     body = thing(shape)
-    stops = ObstaclePairs(
-        {0: body, 1: RigidObstacle("other", other, np.zeros(d), friction=friction)},
-        ObstacleLaw(Barrier(50.0, 0.2), sticking_speed=1.0),
-    )
+    obstacles = {0: body, 1: RigidObstacle("other", other, np.zeros(d), friction=friction)}
+    law = ObstacleLaw(Barrier(50.0, 0.2), sticking_speed=1.0)
+    stops = ObstaclePairs([BarrierPair((0, 1), obstacles, law)], free=[0])
 
     def placed(pose: Pose) -> list[PosedShape]:
         return [PosedShape(shape, pose), there]

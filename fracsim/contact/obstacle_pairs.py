@@ -10,7 +10,7 @@ exactly in 2D, and in 3D except for two edges that cross, of which points are sa
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
@@ -21,8 +21,8 @@ import numpy.typing as npt
 
 from .laws import BARRIER, CoulombFriction, GapPotential, ObstacleLaw, tangential
 from .node_contact import ContactForces, StepStart, evaluate_points, lag_contact
-from .obstacle import RigidObstacle, free_pairs
-from .pose import Pose, PosedShape, rotate_vectors, rotation_second_derivative
+from .obstacle import RigidObstacle
+from .pose import Pose, PosedShape, rotation_second_derivative
 from .pose_derivatives import (
     PoseCoupling,
     PoseDerivatives,
@@ -32,7 +32,7 @@ from .pose_derivatives import (
 )
 from .shape_base import ConvexBody, Shape, frame_about, unit_vector
 from .shapes import Capsule, OffsetShape, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
-from .step_limit import PoseMotion, safe_fractions
+from .step_limit import PointMotion, PoseMotion
 from .triangle_mesh_shape import TriangleMeshShape
 
 Values = npt.NDArray[np.float64]
@@ -167,10 +167,10 @@ class PairFriction:
         return -self.law.gradient(self.force, self.normal, self.slip(poses))
 
     def derivatives(self, poses: tuple[Pose, Pose], *, exact: bool) -> tuple[PoseDerivatives, PoseDerivatives, Values]:
-        """Derivatives by the pose of each, with the energy in the first; (p, p) second derivatives by both."""
+        """Derivatives by the pose of each, with the whole energy; (p, p) second derivatives by both."""
         gradient, slip, d = -self.on_first(poses), self.slip(poses), poses[0].dim
-        H, energies, result, J = self.law.hessian(self.force, self.normal, slip), (self.energy(poses), 0.0), [], []
-        for pose, x, energy, sign in zip(poses, self._carried(poses), energies, (1.0, -1.0), strict=True):
+        H, energy, result, J = self.law.hessian(self.force, self.normal, slip), self.energy(poses), [], []
+        for pose, x, sign in zip(poses, self._carried(poses), (1.0, -1.0), strict=True):
             arm = x - pose.centre
             J.append(sign * point_jacobian(arm))
             hessian = np.asarray(np.einsum("kip,kij,kjq->pq", J[-1], H, J[-1]))
@@ -178,19 +178,6 @@ class PairFriction:
                 hessian[d:, d:] += rotation_second_derivative(sign * gradient, arm).sum(axis=0)
             result.append(PoseDerivatives(energy, np.einsum("kdp,kd->p", J[-1], gradient), hessian))
         return result[0], result[1], np.asarray(np.einsum("kip,kij,kjq->pq", J[0], H, J[1]))
-
-
-@dataclass(frozen=True, eq=False)
-class PairStart:
-    """Pair of obstacles at the start of a step.
-
-    Attributes:
-        gaps: (n,) of the points of each, m.
-        friction: in the step; None: without contact, or friction.
-    """
-
-    gaps: list[Values]
-    friction: PairFriction | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -242,10 +229,10 @@ class ObstaclePair:
         """(n,) gaps of the points of each, m."""
         return [posed.distance(x) for x, posed in self.sides(body, obstacle)]
 
-    def begin_step(
+    def lag_friction(
         self, body: Pose, obstacle: Pose, barrier: GapPotential, slip: Callable[[Values, Values], float]
-    ) -> PairStart:
-        """State of the pair at the start of a step, at the poses of both there.
+    ) -> PairFriction | None:
+        """Friction of a step, at the poses of both at its start; None: nothing presses there.
 
         Args:
             body: pose of the first obstacle.
@@ -253,18 +240,16 @@ class ObstaclePair:
             barrier: b.
             slip: points and normals of contact (k, d) -> slip that counts as sticking, m.
         """
-        gaps = self.gaps(body, obstacle)
-        if not self.friction:
-            return PairStart(gaps, None)
-        sides = zip(self.sides(body, obstacle), gaps, self.areas, self.points, strict=True)
-        lagged = [(lag_contact(x, gap, area, posed, barrier), inset) for (x, posed), gap, area, inset in sides]
+        sides = zip(self.sides(body, obstacle), self.areas, self.points, strict=True)
+        lagged = [
+            (lag_contact(x, posed.distance(x), area, posed, barrier), inset.radius) for (x, posed), area, inset in sides
+        ]
         force = np.concatenate([contact.force for contact, _ in lagged])
         if not len(force):
-            return PairStart(gaps, None)
+            return None
         normal = np.concatenate([contact.normal for contact, _ in lagged])
-        point = np.concatenate([contact.position - inset.radius * contact.normal for contact, inset in lagged])
-        law = CoulombFriction(self.friction, slip(point, normal))
-        return PairStart(gaps, PairFriction(law, force, normal, point, (body, obstacle)))
+        point = np.concatenate([contact.position - radius * contact.normal for contact, radius in lagged])
+        return PairFriction(CoulombFriction(self.friction, slip(point, normal)), force, normal, point, (body, obstacle))
 
     def contact_forces(
         self, body: Pose, obstacle: Pose, barrier: GapPotential, start: list[Values] | None
@@ -294,73 +279,11 @@ class ObstaclePair:
         reach = straight + angle * self._radius + other_angle * (between + straight + self._radius)
         if self.gap_bound(body, obstacle) * (1 - BARRIER.min_gap_ratio) > reach:
             return 1.0
-        (x, target), (y, other_target) = self.sides(body, obstacle)
-        motions = [
-            _PairMotion(target, x - body.centre, body.centre, q, target.effective_increment(other_q)),
-            _PairMotion(
-                other_target, y - obstacle.centre, obstacle.centre, other_q, other_target.effective_increment(q)
-            ),
-        ]
-        return min(motion.safe_fraction() for motion in motions)
-
-
-@dataclass(frozen=True, eq=False)
-class _PairMotion:
-    """Motion of points with a rigid body, and of an obstacle before them.
-
-    Attributes:
-        obstacle: at the start.
-        arm: (n, d) points relative to the centre of the body, m.
-        centre: (d,) of the body, m.
-        increment: (p,) of the body's pose.
-        obstacle_increment: (p,) of the obstacle's pose.
-    """
-
-    obstacle: PosedShape
-    arm: Values
-    centre: Values
-    increment: Values
-    obstacle_increment: Values
-
-    def safe_fraction(self) -> float:
-        """Fraction of the motion that leaves a tenth of each gap; 0 where one is closed."""
-        if not len(self.arm):
-            return 1.0
-        if not (self.gap(np.zeros(len(self.arm))) > 0).all():
-            return 0.0
-        return float(safe_fractions(self.gap, self.speed, len(self.arm)).min())
-
-    def gap(self, fraction: Values) -> Values:
-        """(n,) gaps after fractions (n,) of the motion, m."""
-        return self.obstacle.shape.distance(self._obstacle_frame(fraction))
-
-    def speed(self, fraction: Values) -> Values:
-        """(n,) bounds of the closing speed, m per whole motion (step_limit.PointMotion).
-
-        A rotation of the obstacle adds at most its angle times the distance of the points from its centre.
-        """
-        d, radius = len(self.centre), np.linalg.norm(self.arm, axis=1)
-        straight = self.increment[:d] - self.obstacle_increment[:d]
-        angle, obstacle_angle = np.linalg.norm(self.increment[d:]), np.linalg.norm(self.obstacle_increment[d:])
-        closing: Values = np.full(len(self.arm), float(np.linalg.norm(straight)))
-        if self.obstacle.shape.convex:
-            v = self._rotated_back(np.tile(straight, (len(self.arm), 1)), fraction)
-            normal = self.obstacle.shape.normal(self._obstacle_frame(fraction))
-            closing = np.maximum(-np.einsum("ni,ni->n", normal, v), 0.0)
-        distance = np.linalg.norm(self.centre - self.obstacle.pose.centre) + np.linalg.norm(straight) + radius
-        return np.asarray(closing + angle * radius + obstacle_angle * distance)
-
-    def _obstacle_frame(self, fraction: Values) -> Values:
-        """(n, d) points in the frame of the obstacle, m."""
-        d = len(self.centre)
-        straight = fraction[:, None] * (self.increment[:d] - self.obstacle_increment[:d])
-        motion = straight + rotate_vectors(self.arm, fraction[:, None] * self.increment[d:])
-        return self._rotated_back(self.centre - self.obstacle.pose.centre + motion, fraction)
-
-    def _rotated_back(self, vectors: Values, fraction: Values) -> Values:
-        """(n, d) vectors in the frame that the obstacle has at each fraction."""
-        w = -fraction[:, None] * self.obstacle_increment[len(self.centre) :]
-        return np.asarray(rotate_vectors(vectors, w) @ self.obstacle.pose.rotation)
+        carriers, motions = ((body, q, other_q), (obstacle, other_q, q)), []
+        for (x, target), (carrier, motion, against) in zip(self.sides(body, obstacle), carriers, strict=True):
+            shift, rotation = np.tile(motion[:d], (len(x), 1)), (carrier.centre, motion[d:])
+            motions.append(PointMotion(target, x, shift, target.effective_increment(against), rotation))
+        return min(points.safe_fraction() for points in motions)
 
 
 type PosedObstacles = Mapping[int, PosedShape] | Sequence[PosedShape]  # by the numbers of obstacles
@@ -380,64 +303,152 @@ class StepMotion(Protocol):
         """(d,) velocity of an obstacle at the start of the step, or (n, d) of its points at x (n, d), m/s."""
 
 
-class ObstaclePairs:
-    """All pairs of free obstacles with others; `posed` are all obstacles at their poses, by their numbers.
+# derivatives by the poses of both obstacles, each with the whole energy, and (p, p) second derivatives by both
+type PairDerivatives = tuple[PoseDerivatives, PoseDerivatives, Values]
 
-    A pair of two triangle meshes has no distance function, and is left out.
+
+class PairContact(Protocol):
+    """Contact of a free obstacle and another one; `posed` are all obstacles at their poses, by their numbers.
+
+    Attributes:
+        numbers: of both.
     """
 
-    def __init__(self, obstacles: Mapping[int, RigidObstacle], law: ObstacleLaw) -> None:
-        """`obstacles` by their numbers, free ones and others."""
-        numbers = list(obstacles)
-        named = [(numbers[i], numbers[j]) for i, j in free_pairs([obstacles[number] for number in numbers])]
-        # a triangle mesh comes first, since it is in contact at its own points
-        named = [(j, i) if isinstance(obstacles[j].shape, TriangleMeshShape) else (i, j) for i, j in named]
-        self._pairs = {
-            (i, j): ObstaclePair.between(obstacles[i], obstacles[j])
-            for i, j in named
-            if not all(isinstance(obstacles[number].shape, TriangleMeshShape) for number in (i, j))
-        }
-        self._free = {number for number, obstacle in obstacles.items() if obstacle.free}
-        self._law, self._width, self._time_averaged = law, law.barrier.width, False
-        self._start: dict[Numbers, PairStart] = {}
-        self._started_near: set[Numbers] = set()  # pairs in contact at the start of the step
+    numbers: Numbers
 
     def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
         """Begin a step of dt, s; `time_averaged`: barriers are averaged over it."""
-        self._start, self._started_near, self._time_averaged = {}, set(), time_averaged
-        for (i, j), pair in self._pairs.items():
-            first, second = (motion.start_posed[number].pose for number in (i, j))
-            is_near = pair.gap_bound(first, second) < self._width
-            if time_averaged or (is_near and pair.friction):
-                slip = partial(self._sticking_slip, motion, dt, (i, j))
-                self._start[i, j] = pair.begin_step(first, second, self._law.barrier, slip)
-            if is_near:
-                self._started_near.add((i, j))
 
-    def _sticking_slip(self, motion: StepMotion, dt: float, numbers: Numbers, points: Values, normals: Values) -> float:
+    def is_open(self, posed: PosedObstacles) -> bool:
+        """Whether all gaps are open."""
+
+    def safe_fraction(self, first: PoseMotion, second: PoseMotion) -> float:
+        """Fraction of the motions of both that leaves a tenth of each gap."""
+
+    def derivatives(self, posed: PosedObstacles, *, exact: bool) -> PairDerivatives | None:
+        """Derivatives of the potential by both poses; None: out of contact."""
+
+    def energies(self, posed: PosedObstacles) -> tuple[float, float]:
+        """Energy of the barrier, and potential of all forces in the step, J."""
+
+    def dissipated(self, posed: PosedObstacles) -> float:
+        """Energy dissipated by friction in the step, J."""
+
+
+class BarrierPair:
+    """Barrier and friction of a free obstacle and another one, of which one at least is analytic (PairContact)."""
+
+    def __init__(self, numbers: Numbers, obstacles: Mapping[int, RigidObstacle], law: ObstacleLaw) -> None:
+        """`obstacles`: by their numbers."""
+        if isinstance(obstacles[numbers[1]].shape, TriangleMeshShape):
+            # a triangle mesh comes first, since it is in contact at its own points
+            numbers = numbers[1], numbers[0]
+        first, second = (obstacles[number] for number in numbers)
+        self.numbers, self.pair, self._law = numbers, ObstaclePair.between(first, second), law
+        # at the start of the step: whether they may be in contact, gaps (n,) of the points of each, m, and friction
+        self._started_near = False
+        self._start: list[Values] | None = None
+        self._friction: PairFriction | None = None
+
+    def _poses(self, posed: PosedObstacles) -> tuple[Pose, Pose]:
+        return posed[self.numbers[0]].pose, posed[self.numbers[1]].pose
+
+    def _is_near(self, poses: tuple[Pose, Pose]) -> bool:
+        return self.pair.gap_bound(*poses) < self._law.barrier.width
+
+    def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
+        """Begin a step of dt, s; `time_averaged`: the barrier is averaged over it."""
+        poses = self._poses(motion.start_posed)
+        self._started_near, self._friction = self._is_near(poses), None
+        self._start = self.pair.gaps(*poses) if time_averaged else None
+        if self._started_near and self.pair.friction:
+            slip = partial(self._sticking_slip, motion, dt)
+            self._friction = self.pair.lag_friction(*poses, self._law.barrier, slip)
+
+    def _sticking_slip(self, motion: StepMotion, dt: float, points: Values, normals: Values) -> float:
         """Slip in the step that counts as sticking, m."""
-        first, second = (np.broadcast_to(motion.velocity(n, points), points.shape) for n in numbers)
+        first, second = (np.broadcast_to(motion.velocity(n, points), points.shape) for n in self.numbers)
         speed = float(np.linalg.norm(tangential(normals, first - second), axis=1).max())
         return dt * max(self._law.sticking_speed, self._law.sticking_ratio * speed)
 
+    def is_open(self, posed: PosedObstacles) -> bool:
+        """Whether all gaps are open."""
+        return all(gap.min(initial=np.inf) > 0 for gap in self.pair.gaps(*self._poses(posed)))
+
+    def safe_fraction(self, first: PoseMotion, second: PoseMotion) -> float:
+        """Fraction of the motions of both that leaves a tenth of each gap."""
+        return self.pair.safe_fraction(first[0].pose, first[1], second[0].pose, second[1])
+
+    def derivatives(self, posed: PosedObstacles, *, exact: bool) -> PairDerivatives | None:
+        """Derivatives of the potential by both poses; None: out of contact."""
+        first, second = poses = self._poses(posed)
+        if (sides := self._contact_forces(poses)) is None:
+            return None
+        (of_first, x), (of_second, y) = sides
+        by_first = carried_point_derivatives(of_first, x, first, exact=exact)
+        by_first = by_first + PoseCoupling(of_second, y, first, None, first, exact=exact).derivatives()
+        by_second = PoseCoupling(of_first, x, second, None, second, exact=exact).derivatives()
+        by_second = by_second + carried_point_derivatives(of_second, y, second, exact=exact)
+        by_both = mixed_pose_hessian(of_first, x, first, second, exact=exact)
+        by_both = by_both + mixed_pose_hessian(of_second, y, second, first, exact=exact).T
+        if self._friction is None:
+            return by_first, by_second, by_both
+        of_friction = self._friction.derivatives(poses, exact=exact)
+        return by_first + of_friction[0], by_second + of_friction[1], by_both + of_friction[2]
+
+    def energies(self, posed: PosedObstacles) -> tuple[float, float]:
+        """Energy of the barrier, and potential of all forces in the step, J."""
+        poses = self._poses(posed)
+        sides = self._contact_forces(poses) or []
+        potential = 0.0 if self._friction is None else self._friction.energy(poses)
+        stored = sum(contact.energy for contact, _ in sides)
+        return stored, sum(contact.potential for contact, _ in sides) + potential
+
+    def dissipated(self, posed: PosedObstacles) -> float:
+        """Energy dissipated by friction in the step, J."""
+        if self._friction is None:
+            return 0.0
+        poses = self._poses(posed)
+        return -float(np.vdot(self._friction.on_first(poses), self._friction.slip(poses)))
+
+    def _contact_forces(self, poses: tuple[Pose, Pose]) -> list[tuple[ContactForces, Values]] | None:
+        """Normal forces on the points of both; None: out of contact, now and at the start of the step."""
+        if not self._started_near and not self._is_near(poses):
+            return None
+        sides = self.pair.contact_forces(*poses, self._law.barrier, self._start)
+        touches = self._friction is not None or any(len(contact.points) for contact, _ in sides)
+        return sides if touches else None
+
+
+class ObstaclePairs:
+    """Contact between obstacles; `posed` are all obstacles at their poses, by their numbers.
+
+    Attributes:
+        pairs: of a free obstacle and another one each.
+    """
+
+    def __init__(self, pairs: Sequence[PairContact], free: Iterable[int]) -> None:
+        """`free`: numbers of the free obstacles."""
+        self.pairs, self._free = tuple(pairs), frozenset(free)
+
+    def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
+        """Begin a step of dt, s; `time_averaged`: barriers are averaged over it."""
+        for pair in self.pairs:
+            pair.begin_step(motion, dt, time_averaged=time_averaged)
+
     def are_open(self, posed: PosedObstacles) -> bool:
         """Whether all gaps are open."""
-        gaps = [pair.gaps(posed[i].pose, posed[j].pose) for (i, j), pair in self._pairs.items()]
-        return all(gap.min(initial=np.inf) > 0 for sides in gaps for gap in sides)
+        return all(pair.is_open(posed) for pair in self.pairs)
 
     def safe_fraction(self, motions: Mapping[int, PoseMotion]) -> float:
         """Fraction of the motions of obstacles that leaves a tenth of each gap between them."""
-        fractions = [
-            pair.safe_fraction(motions[i][0].pose, motions[i][1], motions[j][0].pose, motions[j][1])
-            for (i, j), pair in self._pairs.items()
-            if i in motions and j in motions
-        ]
-        return min(fractions, default=1.0)
+        moving = [pair for pair in self.pairs if all(number in motions for number in pair.numbers)]
+        return min((pair.safe_fraction(*(motions[n] for n in pair.numbers)) for pair in moving), default=1.0)
 
     def derivatives(
         self, posed: PosedObstacles, *, exact: bool
     ) -> tuple[dict[int, PoseDerivatives], dict[Numbers, Values]]:
-        """Energies and derivatives of contact by the poses of free obstacles.
+        """Potentials and derivatives of contact by the poses of free obstacles.
 
         Returns:
             Derivatives by the pose of each free obstacle in contact, where the energy of a pair counts once. And mixed
@@ -445,34 +456,16 @@ class ObstaclePairs:
         """
         bodies: dict[int, PoseDerivatives] = {}
         mixed: dict[Numbers, Values] = {}
-        for (i, j), ((of_i, x), (of_j, y)) in self._contact_forces(posed).items():
-            first, second = posed[i].pose, posed[j].pose
-            by_pose = {
-                i: carried_point_derivatives(of_i, x, first, exact=exact)
-                + PoseCoupling(of_j, y, first, None, first, exact=exact).derivatives(),
-                j: PoseCoupling(of_i, x, second, None, second, exact=exact).derivatives()
-                + carried_point_derivatives(of_j, y, second, exact=exact),
-            }
-            block = mixed_pose_hessian(of_i, x, first, second, exact=exact)
-            block = block + mixed_pose_hessian(of_j, y, second, first, exact=exact).T
-            free = [number for number in (i, j) if number in self._free]
-            if len(free) == 2:  # the energy counts once
-                by_pose[j] = replace(by_pose[j], energy=0.0)
-            if (friction := self._friction((i, j))) is not None:
-                by_i, by_j, by_both = friction.derivatives((first, second), exact=exact)
-                if i not in self._free:
-                    by_j = replace(by_j, energy=by_i.energy)
-                by_pose = {i: by_pose[i] + by_i, j: by_pose[j] + by_j}
-                block = block + by_both
-            if len(free) == 2:
-                mixed[i, j] = block
-            for number in free:
-                bodies[number] = bodies[number] + by_pose[number] if number in bodies else by_pose[number]
+        for pair in self.pairs:
+            if (parts := pair.derivatives(posed, exact=exact)) is None:
+                continue
+            *by_pose, by_both = parts
+            if self._free.issuperset(pair.numbers):
+                by_pose[1], mixed[pair.numbers] = replace(by_pose[1], energy=0.0), by_both
+            for number, body in zip(pair.numbers, by_pose, strict=True):
+                if number in self._free:
+                    bodies[number] = bodies[number] + body if number in bodies else body
         return bodies, mixed
-
-    def _friction(self, numbers: Numbers) -> PairFriction | None:
-        start = self._start.get(numbers)
-        return None if start is None else start.friction
 
     def wrenches(self, posed: PosedObstacles) -> dict[int, Values]:
         """(p,) force and moment of the others on each free obstacle in contact, N and N m."""
@@ -480,109 +473,14 @@ class ObstaclePairs:
 
     def energies(self, posed: PosedObstacles) -> tuple[float, float]:
         """Energy of the barriers, and potential of all forces in the step, J."""
-        stored, potential = 0.0, 0.0
-        for (i, j), sides in self._contact_forces(posed).items():
-            stored += sum(contact.energy for contact, _ in sides)
-            potential += sum(contact.potential for contact, _ in sides)
-            if (friction := self._friction((i, j))) is not None:
-                potential += friction.energy((posed[i].pose, posed[j].pose))
-        return stored, potential
-
-    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> tuple[float, float]:
-        """Work of prescribed obstacles on free ones by their own increments (p,) in the step; dissipation, J."""
-        total, dissipated = 0.0, 0.0
-        for (i, j), ((of_i, _), (of_j, _)) in self._contact_forces(posed).items():
-            on_first, d = of_i.normal.sum(axis=0) - of_j.normal.sum(axis=0), posed[i].pose.dim
-            if (friction := self._friction((i, j))) is not None:
-                poses = posed[i].pose, posed[j].pose
-                by_friction = friction.on_first(poses)
-                on_first = on_first + by_friction.sum(axis=0)
-                dissipated -= float(np.vdot(by_friction, friction.slip(poses)))
-            for number, force in ((j, on_first), (i, -on_first)):
-                if number not in self._free:
-                    total += float(force @ increments[number][:d])
-        return total, dissipated
-
-    def _contact_forces(self, posed: PosedObstacles) -> dict[Numbers, list[tuple[ContactForces, Values]]]:
-        """Normal forces on the points of both obstacles of each pair in contact, now or at the start of the step."""
-        contacts = {}
-        for (i, j), pair in self._pairs.items():
-            if (i, j) in self._started_near or pair.gap_bound(posed[i].pose, posed[j].pose) < self._width:
-                start = self._start[i, j].gaps if self._time_averaged else None
-                contacts[i, j] = pair.contact_forces(posed[i].pose, posed[j].pose, self._law.barrier, start)
-        return {
-            numbers: sides
-            for numbers, sides in contacts.items()
-            if self._friction(numbers) is not None or any(len(contact.points) for contact, _ in sides)
-        }
-
-
-class PairContact(Protocol):
-    """Contact between obstacles of one kind."""
-
-    def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
-        """Begin a step of dt, s; `time_averaged`: barriers are averaged over it."""
-
-    def are_open(self, posed: PosedObstacles) -> bool:
-        """Whether all gaps are open."""
-
-    def safe_fraction(self, motions: Mapping[int, PoseMotion]) -> float:
-        """Fraction of the motions of obstacles that leaves a tenth of each gap between them."""
-
-    def derivatives(
-        self, posed: PosedObstacles, *, exact: bool
-    ) -> tuple[dict[int, PoseDerivatives], dict[Numbers, Values]]:
-        """Energies and derivatives by the poses of free obstacles in contact."""
-
-    def energies(self, posed: PosedObstacles) -> tuple[float, float]:
-        """Energy of the barriers, and potential of their forces in the step, J."""
-
-    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> tuple[float, float]:
-        """Work of prescribed obstacles on free ones by their own increments (p,) in the step; dissipation, J."""
-
-
-class AllPairs:
-    """Contact between obstacles of all kinds; `posed` are all obstacles at their poses, by their numbers."""
-
-    def __init__(self, kinds: Sequence[PairContact]) -> None:
-        self.kinds = tuple(kinds)
-
-    def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
-        """Begin a step of dt, s; `time_averaged`: barriers are averaged over it."""
-        for pairs in self.kinds:
-            pairs.begin_step(motion, dt, time_averaged=time_averaged)
-
-    def are_open(self, posed: PosedObstacles) -> bool:
-        """Whether all gaps are open."""
-        return all(pairs.are_open(posed) for pairs in self.kinds)
-
-    def safe_fraction(self, motions: Mapping[int, PoseMotion]) -> float:
-        """Fraction of the motions of obstacles that leaves a tenth of each gap between them."""
-        return min((pairs.safe_fraction(motions) for pairs in self.kinds), default=1.0)
-
-    def derivatives(
-        self, posed: PosedObstacles, *, exact: bool
-    ) -> tuple[dict[int, PoseDerivatives], dict[Numbers, Values]]:
-        """Energies and derivatives by the poses of free obstacles in contact."""
-        bodies: dict[int, PoseDerivatives] = {}
-        mixed: dict[Numbers, Values] = {}
-        for pairs in self.kinds:
-            of_bodies, of_pairs = pairs.derivatives(posed, exact=exact)
-            mixed |= of_pairs
-            for number, body in of_bodies.items():
-                bodies[number] = bodies[number] + body if number in bodies else body
-        return bodies, mixed
-
-    def wrenches(self, posed: PosedObstacles) -> dict[int, Values]:
-        """(p,) force and moment of the others on each free obstacle in contact, N and N m."""
-        return {number: -body.gradient for number, body in self.derivatives(posed, exact=False)[0].items()}
-
-    def energies(self, posed: PosedObstacles) -> tuple[float, float]:
-        """Energy of the barriers, and potential of their forces in the step, J."""
-        energies = [pairs.energies(posed) for pairs in self.kinds]
+        energies = [pair.energies(posed) for pair in self.pairs]
         return sum(stored for stored, _ in energies), sum(potential for _, potential in energies)
 
-    def work(self, posed: PosedObstacles, increments: Mapping[int, Values] | Sequence[Values]) -> tuple[float, float]:
+    def work(self, posed: PosedObstacles, increments: Sequence[Values]) -> tuple[float, float]:
         """Work of prescribed obstacles on free ones by their own increments (p,) in the step; dissipation, J."""
-        works = [pairs.work(posed, increments) for pairs in self.kinds]
-        return sum(work for work, _ in works), sum(dissipated for _, dissipated in works)
+        total = 0.0
+        for pair in self.pairs:
+            if not self._free.issuperset(pair.numbers) and (parts := pair.derivatives(posed, exact=False)) is not None:
+                by_pose = zip(pair.numbers, parts[:2], strict=True)
+                total += sum(float(body.gradient @ increments[n]) for n, body in by_pose if n not in self._free)
+        return total, sum(pair.dissipated(posed) for pair in self.pairs)

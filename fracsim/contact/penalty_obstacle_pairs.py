@@ -23,8 +23,7 @@ from .obstacle import FreeObstacle, RigidObstacle, free_pairs
 from .obstacle_pairs import SAMPLES, Numbers, ObstaclePair
 from .pose import Pose, PosedShape
 from .pose_derivatives import resultant
-from .proximity import bounding_box
-from .triangle_mesh_shape import TriangleMeshShape
+from .triangle_mesh_shape import StackedMeshes, TriangleMeshShape
 
 if TYPE_CHECKING:
     from .penalty_pairs import PenaltyHistory, PenaltyPairs  # with ipctk
@@ -231,16 +230,11 @@ class MeshContacts:
     def __init__(self, first: RigidObstacle, second: RigidObstacle) -> None:
         from .ipc_pairs import vertex_areas
 
-        meshes = [obstacle.shape.tessellate() for obstacle in (first, second)]
-        self._points, self._count = [points for points, _ in meshes], len(meshes[0][0])
-        self._reference = np.concatenate(self._points)
-        self._elements = np.concatenate([meshes[0][1], meshes[1][1] + self._count]).astype(np.int64)
-        self._area, self._friction = vertex_areas(self._reference, self._elements), max(first.friction, second.friction)
-        # sum of the radii of both about their reference points
-        self._radii = sum(float(np.linalg.norm(X, axis=1).max()) for X in self._points)
-        areas = self._area[: self._count].sum(), self._area[self._count :].sum()
+        meshes = self._meshes = StackedMeshes(first.shape, second.shape)
+        self._area, self._friction = vertex_areas(meshes.points, meshes.triangles), max(first.friction, second.friction)
+        areas = [self._area[rows].sum() for rows in meshes.rows]
         self.touching_area = SAMPLES.touching_share * float(min(areas))
-        self._start = self._positions((first.posed_at(0.0).pose, second.posed_at(0.0).pose))
+        self._start = meshes.positions((first.posed_at(0.0).pose, second.posed_at(0.0).pose))
 
     def set_penalty(self, penalty: Penalty) -> None:
         """Set the penalty, of which each side has one half; its width is smaller for obstacles that start nearer."""
@@ -253,22 +247,12 @@ class MeshContacts:
         from .penalty_contacts import ContactStiffness
         from .penalty_pairs import PenaltyPairs
 
-        patches = np.repeat(np.array([0, 1], np.int32), [self._count, len(self._reference) - self._count])
-        stiffness = ContactStiffness.of_one_body(0.5 * penalty.rate * self._area)
-        return PenaltyPairs(self._reference, self._elements, stiffness, distance=penalty.width, patch=patches)
-
-    def _positions(self, poses: Poses) -> Values:
-        """(n, 3) points of both obstacles at poses, m."""
-        return np.concatenate([pose.points_to_space(X) for pose, X in zip(poses, self._points, strict=True)])
+        meshes, stiffness = self._meshes, ContactStiffness.of_one_body(0.5 * penalty.rate * self._area)
+        return PenaltyPairs(meshes.points, meshes.triangles, stiffness, distance=penalty.width, patch=meshes.patches)
 
     def _near_positions(self, poses: Poses) -> Values | None:
-        """(n, 3) points of both obstacles, m; None: their bounding spheres or boxes are too far apart."""
-        max_gap = PAIR_PENALTY.near_gap * self._pairs.width
-        if float(np.linalg.norm(poses[0].centre - poses[1].centre)) - self._radii > max_gap:
-            return None
-        x = self._positions(poses)
-        (low, high), (second_low, second_high) = bounding_box(x[: self._count]), bounding_box(x[self._count :])
-        return x if np.maximum(low - second_high, second_low - high).max() < max_gap else None
+        """(n, 3) points of both obstacles, m; None: they are too far apart."""
+        return self._meshes.near_positions(poses, PAIR_PENALTY.near_gap * self._pairs.width)
 
     def end_step(self, starts: Poses, ends: Poses) -> PairForces | None:
         """Forces at the end of a step, of which the contacts are stored; None: out of contact."""
@@ -276,11 +260,11 @@ class MeshContacts:
 
         if (x := self._near_positions(ends)) is None:
             return None
-        springs = PairSprings(self._pairs, self._friction, self._positions(starts))
-        contacts, slips, is_first = self._pairs.contacts(x), springs.slips(x), np.arange(len(x)) < self._count
+        springs = PairSprings(self._pairs, self._friction, self._meshes.positions(starts))
+        contacts, slips, is_first = self._pairs.contacts(x), springs.slips(x), self._meshes.patches == 0
         press, energies = -self._pairs.gradient(x), (self._pairs.energy(x), springs.energy(x))
-        rows = slice(None, self._count), slice(self._count, None)
-        of_press = [resultant(press[part], x[part] - pose.centre) for part, pose in zip(rows, ends, strict=True)]
+        parts = zip(self._meshes.rows, ends, strict=True)
+        of_press = [resultant(press[rows], x[rows] - pose.centre) for rows, pose in parts]
         # at one point, in the middle of the gap, so that friction has no moment
         middle = 0.5 * (contacts.positions(x, is_first) + contacts.positions(x, ~is_first))
         sign = np.sum(contacts.weights * is_first[contacts.points], axis=1)
@@ -293,7 +277,7 @@ class MeshContacts:
         if (x := self._near_positions(poses)) is None:
             return None
         near = self._pairs.contacts_ahead(x)
-        return (near.positions(x, np.arange(len(x)) < self._count), near.stiffness) if len(near.gap) else None
+        return (near.positions(x, self._meshes.patches == 0), near.stiffness) if len(near.gap) else None
 
     def snapshot(self) -> PenaltyHistory:
         """Contacts at the end of the last step."""
@@ -305,13 +289,13 @@ class MeshContacts:
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Arrays of contacts."""
-        return self._pairs.history.to_rows(np.arange(len(self._reference))).to_checkpoint("")
+        return self._pairs.history.to_rows(np.arange(len(self._meshes.points))).to_checkpoint("")
 
     def from_checkpoint(self, saved: dict[str, Values], suffix: str) -> None:
         """Set contacts from the arrays of a checkpoint."""
         from .penalty_pairs import HistoryRows, PenaltyHistory
 
-        rows, unlimited = HistoryRows.from_checkpoint(saved, suffix), np.full(len(self._reference), np.inf)
+        rows, unlimited = HistoryRows.from_checkpoint(saved, suffix), np.full(len(self._meshes.points), np.inf)
         self._pairs.set_history(PenaltyHistory.from_rows(rows, np.asarray, unlimited))
 
 

@@ -24,7 +24,7 @@ from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
 from .obstacle import FreeObstacle, RigidMotion, RigidObstacle
-from .obstacle_pairs import AllPairs
+from .obstacle_pairs import ObstaclePairs
 from .pose import PosedShape, solve_matrix
 from .pose_derivatives import PoseDerivatives
 from .rigid_body import SOLVER, RigidStep, RigidSystem, SystemDerivatives, is_positive_definite
@@ -159,7 +159,7 @@ class PoseUnknowns:
     """
 
     def __init__(
-        self, comm: MPI.Intracomm, free: Mapping[int, FreePose], pairs: AllPairs, body: FreeRigidObstacles
+        self, comm: MPI.Intracomm, free: Mapping[int, FreePose], pairs: ObstaclePairs, body: FreeRigidObstacles
     ) -> None:
         """`body`: the term, which has contact of the body with them."""
         self.free, self.pairs, self._comm, self._body, self.has_step = free, pairs, comm, body, False
@@ -317,7 +317,7 @@ class FreeRigidObstacles(RigidObstacles):
         domain: Domain,
         obstacles: Sequence[RigidObstacle],
         scheme: Scheme,
-        pairs: AllPairs,
+        pairs: ObstaclePairs,
     ) -> None:
         """Build the term.
 

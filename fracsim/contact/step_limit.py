@@ -98,19 +98,31 @@ def safe_fractions(gap: Callable[[Values], Values], speed: Callable[[Values], Va
 
 @dataclass(frozen=True, eq=False)
 class PointMotion:
-    """Straight motion of points, and of an obstacle whose pose is incremented by s q at the fraction s.
+    """Motion of points, straight or carried by a body, and of an obstacle whose pose is incremented by s q.
+
+    s is the fraction of the motion.
 
     Attributes:
         obstacle: at the start.
         x: (n, d) points at the start, m.
         motion: (n, d) of the points, m.
         increment: (p,) q.
+        carrier: (d,) centre, m, and (r,) rotation, rad, of a body that turns the points about it; None: nothing does.
     """
 
     obstacle: PosedShape
     x: Values
     motion: Values
     increment: Values
+    carrier: tuple[Values, Values] | None = None
+
+    def safe_fraction(self) -> float:
+        """Fraction of the motion that leaves a tenth of each gap; 0 where one is closed."""
+        if not len(self.x):
+            return 1.0
+        if not (self.gap(np.zeros(len(self.x))) > 0).all():
+            return 0.0
+        return float(safe_fractions(self.gap, self.speed, len(self.x)).min())
 
     def gap(self, fraction: Values) -> Values:
         """(n,) distances after fractions (n,) of the motion, m."""
@@ -122,7 +134,7 @@ class PointMotion:
         Relative to the centre a point moves straight, by v. The distance to a convex body lies above its tangent
         plane: a gap loses at most -n . v, n its normal at `fraction`. So a point that slides along a plane may move
         on. The distance to a hollow body is Lipschitz alone: |v|. A rotation by w adds |w| times the distance from
-        the centre.
+        the centre, that of the points as well as that of the obstacle.
         """
         v = self._relative
         if self.obstacle.shape.convex:
@@ -142,9 +154,15 @@ class PointMotion:
 
     @cached_property
     def _rotation_speed(self) -> Values:
-        """(n,) |w| times the largest distance from the centre on the way, which is at one of its ends."""
-        ends = [np.linalg.norm(self._from_centre(np.full(len(self.x), end)), axis=1) for end in (0.0, 1.0)]
-        return np.asarray(np.linalg.norm(self._rotation) * np.maximum(*ends))
+        """(n,) |w| times the largest distance from the centre on the way; of points that move straight at an end."""
+        angle = np.linalg.norm(self._rotation)
+        if self.carrier is None:
+            ends = [np.linalg.norm(self._from_centre(np.full(len(self.x), end)), axis=1) for end in (0.0, 1.0)]
+            return np.asarray(angle * np.maximum(*ends))
+        centre, rotation = self.carrier
+        radius, between = np.linalg.norm(self.x - centre, axis=1), np.linalg.norm(centre - self.obstacle.pose.centre)
+        farthest = between + np.linalg.norm(self._relative, axis=1) + radius
+        return np.asarray(np.linalg.norm(rotation) * radius + angle * farthest)
 
     def _body_positions(self, fraction: Values) -> Values:
         """(n, d) points in the frame of the obstacle; cached, as gap and speed need the same ones."""
@@ -154,7 +172,11 @@ class PointMotion:
         return cached[1]
 
     def _from_centre(self, fraction: Values) -> Values:
-        return np.asarray(self.x - self.obstacle.pose.centre + fraction[:, None] * self._relative)
+        x = self.x
+        if self.carrier is not None:
+            centre, rotation = self.carrier
+            x = centre + rotate_vectors(x - centre, fraction[:, None] * rotation)
+        return np.asarray(x - self.obstacle.pose.centre + fraction[:, None] * self._relative)
 
     def _to_body(self, vectors: Values, fraction: Values) -> Values:
         """(n, d) vectors in the frame that the obstacle has at each fraction."""

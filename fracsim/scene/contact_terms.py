@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
-from itertools import combinations
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -139,8 +138,8 @@ def _build_motion(
     """
     if not any(obstacle.free for obstacle in obstacles):
         return RigidObstacles(domain, obstacles)
-    from ..contact.obstacle import check_free_obstacles
-    from ..contact.obstacle_pairs import AllPairs, ObstaclePairs, PairContact
+    from ..contact.obstacle import check_free_obstacles, free_pairs
+    from ..contact.obstacle_pairs import BarrierPair, ObstaclePairs, PairContact
     from ..contact.rigid_obstacles import VerletRigidObstacles
     from ..contact.rigid_pose import FreeRigidObstacles
     from ..contact.supporting_obstacles import pair_obstacles
@@ -155,14 +154,16 @@ def _build_motion(
 
         penalty = cast("Penalty", law.barrier)
         return VerletRigidObstacles(domain, obstacles, penalty_pairs_of(in_pairs, penalty, max_added))
-    kinds: list[PairContact] = [ObstaclePairs(in_pairs, law)]
-    for pair in combinations([number for number in numbered if is_mesh[number]], 2):
-        if not any(numbered[number].free for number in pair):
-            continue
-        from ..contact.mesh_pairs import MeshPair
+    pairs: list[PairContact] = []
+    for numbers in free_pairs(obstacles):
+        if all(is_mesh[number] for number in numbers):
+            from ..contact.mesh_pairs import MeshPair
 
-        kinds.append(MeshPair({number: in_pairs[number] for number in pair}, law, mesh_stiffness))
-    return FreeRigidObstacles(domain, obstacles, scheme, AllPairs(kinds))
+            pairs.append(MeshPair(numbers, in_pairs, law, mesh_stiffness))
+        else:
+            pairs.append(BarrierPair(numbers, in_pairs, law))
+    free = [number for number, obstacle in numbered.items() if obstacle.free]
+    return FreeRigidObstacles(domain, obstacles, scheme, ObstaclePairs(pairs, free))
 
 
 def _max_added_frequency(contact: ContactSettings, domain: Domain, stress: Stress) -> float:
