@@ -284,12 +284,6 @@ def _sorted(pairs: SimplexPairs, numbers: Ints) -> Ints:
     return numbers[np.argsort(numbers[:, 0] * len(pairs.second) + numbers[:, 1])]
 
 
-def centred(x: Values) -> Values:
-    """(n, d) positions relative to their mean, m."""
-    result: Values = x - x.mean(axis=0) if len(x) else x
-    return result
-
-
 def max_length(vectors: Values) -> float:
     """Largest length of the rows of an array (n, d)."""
     return float(np.sqrt(np.max(np.einsum("nd,nd->n", vectors, vectors), initial=0.0)))

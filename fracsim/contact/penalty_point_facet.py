@@ -21,7 +21,7 @@ from scipy.sparse import csr_matrix
 
 from .closest_point import minimise_on_simplex
 from .ipc_surface import unit_normals
-from .pair_search import PairFilter, PairSearch, SimplexPairs, centred, near_pairs
+from .pair_search import PairFilter, PairSearch, SimplexPairs, near_pairs
 from .penalty_contacts import ContactStiffness, PenaltyContacts, point_masses
 
 Values = npt.NDArray[np.float64]
@@ -38,7 +38,7 @@ class PointFacetPolicy:
 
     Attributes:
         max_gap: largest gap, or depth, of a pair; a deeper point has passed through.
-        search_margin: motion of points after which candidates are searched again.
+        search_margin: motion of points after which pairs are searched again.
         same_distance: difference of distances, in mean edges, of facets that share a closest point.
         min_barycentric: coordinate of a corner below which the corner does not carry a point.
         clearance_gap: gaps that are searched where nothing is within reach.
@@ -95,29 +95,18 @@ class ClosestPointCache:
     def __init__(self, points: Ints, corners: Ints) -> None:
         self.points, self.corners = points, corners
         self._barycentric, self._offset = np.zeros(corners.shape), np.zeros(corners.shape)
-        self._is_known = np.zeros(len(points), bool)
         self._x: Values | None = None
 
-    def __call__(self, x: Values, rows: Ints) -> tuple[Values, Values]:
-        """(r, d) barycentric coordinates, and vectors (r, d), m, from closest points to the points at x (n, d)."""
-        if self._x is None or x.shape != self._x.shape:
-            self._is_known[:] = False
-        elif x is not self._x:
-            self._is_known &= ~self.involves((x != self._x).any(axis=1))
+    def __call__(self, x: Values) -> tuple[Values, Values]:
+        """(k, d) barycentric coordinates, and vectors (k, d), m, from closest points to the points at x (n, d)."""
+        new: Ints = np.arange(len(self.points))
+        if self._x is not None and x.shape == self._x.shape:
+            moved = (x != self._x).any(axis=1)
+            new = np.flatnonzero(moved[self.points] | moved[self.corners].any(axis=1))
         self._x = x
-        if len(new := rows[~self._is_known[rows]]):
+        if len(new):
             self._barycentric[new], self._offset[new] = _closest_points(x, self.points[new], self.corners[new])
-            self._is_known[new] = True
-        return self._barycentric[rows], self._offset[rows]
-
-    def involves(self, moved: Flags) -> Flags:
-        """(k,) pairs of which the point or a corner is among `moved` (n,)."""
-        return np.asarray(moved[self.points] | moved[self.corners].any(axis=1))
-
-    def are_within(self, x: Values, rows: Ints, reach: float) -> Flags:
-        """(r,) whether pairs are nearer than `reach`, m."""
-        _, offset = self(x, rows)
-        return np.asarray(np.einsum("kd,kd->k", offset, offset) < reach**2)
+        return self._barycentric, self._offset
 
 
 def closest_distance(x: Values, points: Ints, corners: Ints, limit: float) -> float:
@@ -126,18 +115,16 @@ def closest_distance(x: Values, points: Ints, corners: Ints, limit: float) -> fl
     return min(limit, float(np.linalg.norm(offset, axis=1).min(initial=limit)))
 
 
-def point_facet_pairs(
-    x: Values, cache: ClosestPointCache, rows: Ints, reach: float, tolerance: float
-) -> PointFacetPairs:
+def point_facet_pairs(x: Values, cache: ClosestPointCache, reach: float, tolerance: float) -> PointFacetPairs:
     """Pairs nearer than `reach`, m, one facet for each closest point.
 
     Of facets that share a closest point, at equal distances within `tolerance`, m, the one is taken whose normal is
     most parallel to the offset: it tells the side of the point.
     """
-    barycentric, offset = cache(x, rows)
+    barycentric, offset = cache(x)
     distance = np.linalg.norm(offset, axis=1)
     near = np.flatnonzero(distance < reach)
-    points, corners = cache.points[rows[near]], cache.corners[rows[near]]
+    points, corners = cache.points[near], cache.corners[near]
     barycentric, offset, distance = barycentric[near], offset[near], distance[near]
     normal = unit_normals(x[corners])
     height = np.einsum("kd,kd->k", offset, normal)
@@ -250,10 +237,8 @@ class PointFacetContacts:
         self._sets = SimplexPairs.of(owned[:, None], facets, reach)
         where = PairFilter.of(len(self._used), None if patch is None else patch[self._used])
         self._search = PairSearch(where, [self._sets], POINT_FACET.search_margin * distance)
-        self._candidates: list[Ints] | None = None  # those of which closest points are cached
+        self._searched: Ints | None = None  # pairs of which closest points are cached
         self._cache: ClosestPointCache
-        self._is_close: Flags  # (k,) cached pairs that were close at the positions of their last check
-        self._check_positions: Values
         self._last: tuple[Values, PointFacetPairs] | None = None
 
     def set_history(self, history: PointHistory) -> None:
@@ -304,7 +289,7 @@ class PointFacetContacts:
 
     def anything_is_near(self, x: Values) -> bool:
         """Whether any point has contact, or may be near a facet, at x (n, d), m."""
-        return bool(self.history.stiffness.any()) or len(self._close_rows(x)) > 0
+        return bool(self.history.stiffness.any()) or len(self._candidates(x).points) > 0
 
     def clearance(self, x: Values, reach: float) -> float:
         """Least distance between points and facets at x (n, d), m, at most `reach`."""
@@ -319,9 +304,9 @@ class PointFacetContacts:
     def _all_pairs(self, x: Values) -> PointFacetPairs:
         """Pairs of points in front of facets or behind; those of the last x are kept."""
         if self._last is None or not np.array_equal(x, self._last[0]):
-            positions, rows = x.copy(), self._close_rows(x)
+            positions, cache = x.copy(), self._candidates(x)
             reach, tolerance = POINT_FACET.max_gap * self._width, POINT_FACET.same_distance * self._edge
-            self._last = positions, point_facet_pairs(positions, self._cache, rows, reach, tolerance)
+            self._last = positions, point_facet_pairs(positions, cache, reach, tolerance)
         return self._last[1]
 
     def _stiffness_of(self, pairs: PointFacetPairs) -> Values:
@@ -337,29 +322,14 @@ class PointFacetContacts:
         previous = self.history.stiffness[pairs.points]
         return np.where(previous > 0, previous, np.minimum(largest, limit))
 
-    def _close_rows(self, x: Values) -> Ints:
-        """(k,) cached pairs that may be as near, or as deep, as counts, with points at x (n, d), m.
-
-        A pair is checked again when one of its points has moved by the margin since its last check.
-        """
-        vertices = x[self._used]
-        candidates = self._search.pairs(vertices)
-        margin = POINT_FACET.search_margin
-        positions, reach = centred(vertices), (POINT_FACET.max_gap + 3 * margin) * self._width
-        if candidates is not self._candidates:
-            # in an order that does not depend on the search: of equally near facets the first one counts
-            points, facets = candidates[0][np.lexsort(candidates[0].T[::-1])].T
-            self._candidates = candidates
+    def _candidates(self, x: Values) -> ClosestPointCache:
+        """Pairs that may be as near, or as deep, as counts, with points at x (n, d), m."""
+        (pairs,) = self._search.pairs(x[self._used])
+        if pairs is not self._searched:
+            points, facets = pairs.T
+            self._searched = pairs
             self._cache = ClosestPointCache(self._owned_points[points], self._elements[facets])
-            self._check_positions = positions
-            self._is_close = self._cache.are_within(x.copy(), np.arange(len(points)), reach)
-        elif (far := np.sum((positions - self._check_positions) ** 2, axis=1) > (margin * self._width) ** 2).any():
-            moved = np.zeros(len(x), bool)
-            moved[self._used[far]] = True
-            rows = np.flatnonzero(self._cache.involves(moved))
-            self._is_close[rows] = self._cache.are_within(x.copy(), rows, reach)
-            self._check_positions = np.where(far[:, None], positions, self._check_positions)
-        return np.flatnonzero(self._is_close)
+        return self._cache
 
 
 def penalty_stiffness(
