@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from operator import le
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,9 @@ from ..mesh.split_surface.surface_map import row_entries
 from .obstacle import RigidObstacle
 from .pose import Pose, PosedShape
 from .proximity import outline_radius
+
+if TYPE_CHECKING:
+    from .mesh_obstacles import MeshObstacle  # with ipctk
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -54,28 +57,14 @@ class ClearancePolicy:
 CLEARANCE = ClearancePolicy()
 
 
-class ObstacleDistance(Protocol):
-    """Distance of points from an obstacle at a pose.
+class ShapeDistance:
+    """Distance of points from an analytic obstacle at a pose.
 
     Attributes:
         radius: r, m.
         rotates: whether its rotation may change.
         max_error: by how much distances may be too large, m.
     """
-
-    radius: float
-    rotates: bool
-    max_error: float
-
-    def lower_bounds(self, posed: PosedShape, x: Values) -> Values:
-        """(n,) lower bounds of the distances of points x (n, d), m; the least one is exact."""
-
-    def distance(self, posed: PosedShape, x: Values) -> Values:
-        """(n,) distances of points x (n, d), m."""
-
-
-class ShapeDistance:
-    """Distance of points from an analytic obstacle (ObstacleDistance)."""
 
     max_error = 0.0
 
@@ -87,6 +76,7 @@ class ShapeDistance:
         """(n,) distances of points x (n, d), m."""
         return posed.distance(x)
 
+    # (n,) lower bounds of the distances; the least one is exact
     lower_bounds = distance
 
 
@@ -192,7 +182,7 @@ class Clearance:
     def __init__(
         self,
         domain: Domain,
-        obstacles: Sequence[ObstacleDistance],
+        obstacles: Sequence[ShapeDistance | MeshObstacle],
         reach: float,
         points: Callable[[], FollowingPoints],
         hidden: Callable[[Values, Sequence[PosedShape]], Sequence[float]] | None = None,

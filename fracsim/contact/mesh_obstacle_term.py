@@ -28,13 +28,15 @@ from .mesh_obstacles import (
     MeshContactSurface,
     MeshFriction,
     MeshObstacle,
+    MeshObstaclePairs,
 )
 from .obstacle import RigidObstacle
 from .pose import Pose
-from .pose_derivatives import PoseDerivatives, point_jacobian, point_set_derivatives, sum_of_derivatives
+from .pose_derivatives import PoseContact, PoseDerivatives, point_jacobian, point_set_derivatives
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
+from .sample_points import IpcFriction
 from .self_contact import Pattern, SelfContact, mean_velocities
-from .step_limit import stop_before_meshes
+from .step_limit import PoseMotion, stop_before_meshes
 from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
 
 Values = npt.NDArray[np.float64]
@@ -83,7 +85,7 @@ class MeshObstacleTerm(SelfContact):
         self._place_meshes(self.group.poses)
         super().__init__(domain, u, law, partial(MeshContactSurface, obstacles=self._meshes, comm=domain.comm))
         self.clearance = Clearance(domain, self._meshes, law.distance, self.surface.following_points)
-        self.parts, self.pose_contact = (self.surface, self.group, self.clearance), MeshPoseContact(self)
+        self.parts, self.pose_contact = (self.surface, self.group, self.clearance), PoseContact(self)
 
     # --- surface and obstacles ---
 
@@ -187,24 +189,29 @@ class MeshObstacleTerm(SelfContact):
 
     def max_step_fraction(self, change: Values) -> float:
         """Fraction of a correction of u (owned dofs,), m, and free poses without a collision (collective)."""
-        motion = np.asarray(change / self.level.fraction, np.float64)
-        return self.fraction_along(self.end_displacement, self.group.bodies.correction_increments(), motion)
+        increments, moving = self.group.bodies.correction_increments(), {}
+        for index, (number, posed) in enumerate(zip(self.numbers, self.group.posed, strict=True)):
+            moving[index] = posed, increments.get(number, np.zeros(6))
+        return self.safe_fraction(self.end_displacement, np.divide(change, self.level.fraction), moving)
 
-    def fraction_along(self, u: Values, increments: Mapping[int, Values], change: Values | None) -> float:
-        """Fraction of increments (p,) from current poses and a motion of the body without a collision (collective).
+    def safe_fraction(self, u: Values, change: Values | None, moving: Mapping[int, PoseMotion]) -> float:
+        """Fraction of motions of the body and of obstacles without a collision (collective).
 
-        `u`, `change`: (owned dofs,) displacement at the start, and its change, m; None: the body is at rest.
+        Args:
+            u: (owned dofs,) displacement at the start, m.
+            change: (owned dofs,) of it, m; None: the body is at rest.
+            moving: motions of obstacles by their indices; others are not looked at.
         """
-        motions = self.group.motions(increments)
+        motions = self.group.motions(moving)
         if self.clearance.is_far([u] if change is None else [u, u + change], motions):
             return 1.0
-        x = self.surface.positions(u)
+        x, fraction = self.surface.positions(u), 1.0
         end = x if change is None else x + self.surface.current.point_map.weights @ self.surface.nodal_values(change)
-        starts, ends = ([posed.pose for posed in side] for side in zip(*motions, strict=True))
         # pairs take obstacles from the given poses to where they are
-        self._place_meshes(ends)
-        fraction = self.pairs.moving_free_fraction(x, end, starts)
-        self._place_meshes(starts)
+        self._place_meshes([posed.pose for _, posed in motions])
+        for index, (posed, _) in moving.items():
+            fraction = min(fraction, self.pairs.pairs[index].moving_free_fraction(x, end, posed.pose))
+        self._place_meshes(self.group.poses)
         return fraction
 
     def feasible_guess(self, u: Values) -> Values:
@@ -233,6 +240,51 @@ class MeshObstacleTerm(SelfContact):
         start, end = self.surface.positions(u_n), self.surface.positions(u_end)
         return self.pairs.moving_free_fraction(start, end, self.group.start_poses) == 1
 
+    # --- contact as the obstacles see it (pose_derivatives.PoseContact) ---
+
+    def rank_wrench(self, index: int) -> Values:
+        """(6,) force and moment on an obstacle, of this rank's pairs, N and N m (collective)."""
+        return -self.rank_derivatives(index, exact=False).gradient
+
+    def rank_derivatives(self, index: int, *, exact: bool) -> PoseDerivatives:
+        """Energy and derivatives by the pose of an obstacle, of this rank's pairs (collective)."""
+        x, pairs = self.end_positions(), self.pairs.pairs[index]
+        # far on this rank; others may be near
+        if pairs.is_far(x):
+            return PoseDerivatives.none(6)
+        points, mesh = pairs.with_mesh(x), slice(x.size, None)
+        energy, gradient = pairs.contact.energy(points), pairs.contact.gradient(points)
+        H = pairs.contact.hessian(points, exact=exact)
+        if (friction := self._friction_with(pairs)) is not None:
+            energy, gradient = energy + friction.energy(points), gradient + friction.gradient(points)
+            H = H + friction.hessian(points, exact=exact)
+        return point_set_derivatives(energy, gradient[len(x) :], H[mesh, mesh], pairs.mesh.arms, exact=exact)
+
+    def rank_mixed_hessian(self, index: int) -> Values:
+        """(nodes, 18) second derivatives by nodes and the pose of an obstacle, of this rank's pairs (collective)."""
+        x, pairs = self.end_positions(), self.pairs.pairs[index]
+        point_map, body = self.surface.current.point_map, slice(None, x.size)
+        if pairs.is_far(x):
+            return np.zeros((point_map.weights.shape[1], 18))
+        points = pairs.with_mesh(x)
+        H = pairs.contact.hessian(points)
+        if (friction := self._friction_with(pairs)) is not None:
+            H = H + friction.hessian(points)
+        mixed = H[body, x.size :] @ point_jacobian(pairs.mesh.arms).reshape(-1, 6)
+        return point_map.nodal_forces(mixed.reshape(len(x), -1))
+
+    def assemble_mixed_hessian(self, index: int, part: Values) -> Values:
+        """(owned dofs, 6) sums at the nodes of what `rank_mixed_hessian` returned (collective)."""
+        return self.surface.gather.sum_owned(part).reshape(-1, 6)
+
+    def _friction_with(self, pairs: MeshObstaclePairs) -> IpcFriction | None:
+        """Lagged friction with one obstacle; None: without friction."""
+        return None if self.friction is None else self.friction.friction_with(pairs)
+
+    def uses_exact_tangent(self) -> bool:
+        """Whether the tangent at the current u may have negative eigenvalues: not with free obstacles."""
+        return self.allows_exact_tangent
+
     # --- readings ---
 
     def _current_force(self, number: int) -> Values:
@@ -258,101 +310,6 @@ class MeshObstacleTerm(SelfContact):
             force = -sum_over_ranks(self.comm, pairs.body_gradient(x))
             result.append(approach(pairs.mesh, start_pose, x, force, motion))
         return result
-
-
-class MeshPoseContact:
-    """Contact of the body with triangle meshes, as the obstacles see it (rigid_obstacles.PoseContact)."""
-
-    def __init__(self, term: MeshObstacleTerm) -> None:
-        self._term, self.group, self.allows_exact_tangent = term, term.group, term.allows_exact_tangent
-
-    def poses_moved(self) -> None:
-        """Move the meshes to the poses of the obstacles, and discard forces."""
-        self._term.poses_moved()
-
-    def rest_fraction(self, increments: Mapping[int, Values], u: Values | None) -> float:
-        """Fraction of increments (p,) from current poses on which no gap to the body closes (collective).
-
-        `u`: (owned dofs,) displacement of the body at rest, m; None: the current one at the end of the step.
-        """
-        if not increments:
-            return 1.0
-        if u is None:
-            u = self._term.end_displacement
-        return self._term.fraction_along(u, increments, None)
-
-    def start_fraction(self, number: int, q: Values, u: Values) -> float:
-        """Fraction of an increment (p,) of an obstacle and the motion of the body that closes no gap (collective).
-
-        Both from the start of the step; `u`: (owned dofs,) displacement of the level after the motion, m.
-        """
-        level, index = self._term.level, self.group.numbers.index(number)
-        start, u_end = self.group.start_poses[index], level.displacement_at_end(u)
-        motions = self.group.motions({number: q}, from_start=True)
-        if self._term.clearance.is_far([level.u_n, u_end], motions):
-            return 1.0
-        x, end = self._term.surface.positions(level.u_n), self._term.surface.positions(u_end)
-        pairs = self._term.pairs.pairs[index]
-        pairs.mesh.move_to(motions[index][1].pose)
-        fraction = pairs.moving_free_fraction(x, end, start)
-        pairs.mesh.move_to(self.group.poses[index])
-        return fraction
-
-    def wrenches(self) -> dict[int, Values]:
-        """(p,) force and moment of the body on free obstacles, N and N m (collective)."""
-        return {number: -derivatives.gradient for number, derivatives in self.pose_derivatives(exact=False).items()}
-
-    def pose_derivatives(self, *, exact: bool) -> dict[int, PoseDerivatives]:
-        """Energy and derivatives by the poses of free obstacles (collective)."""
-        numbers, none = self.group.free, PoseDerivatives(0.0, np.zeros(6), np.zeros((6, 6)))
-        if not numbers or self._term.is_far():
-            return dict.fromkeys(numbers, none)
-        x = self._term.end_positions()
-        parts = [self._own_derivatives(number, x, exact=exact) or none for number in numbers]
-        return dict(zip(numbers, sum_of_derivatives(parts, self._term.comm), strict=True))
-
-    def _own_derivatives(self, number: int, x: Values, *, exact: bool) -> PoseDerivatives | None:
-        """Derivatives by the pose of an obstacle of this rank's pairs, the body at x (n, 3), m; None: it is far."""
-        pairs, n = self._term.pairs.pairs[self.group.numbers.index(number)], len(x)
-        # far on this rank; others may be near
-        if pairs.is_far(x):
-            return None
-        points, mesh = pairs.with_mesh(x), slice(3 * n, None)
-        energy, gradient = pairs.contact.energy(points), pairs.contact.gradient(points)
-        H = pairs.contact.hessian(points, exact=exact)
-        if self._term.friction is not None and (friction := self._term.friction.friction_with(pairs)) is not None:
-            energy, gradient = energy + friction.energy(points), gradient + friction.gradient(points)
-            H = H + friction.hessian(points, exact=exact)
-        arms = pairs.mesh.positions - pairs.mesh.pose.centre
-        return point_set_derivatives(energy, gradient[n:], H[mesh, mesh], arms, exact=exact)
-
-    def mixed_hessians(self) -> dict[int, Values]:
-        """(owned dofs, p) second derivatives by nodes and the poses of free obstacles in contact (collective)."""
-        numbers = self.group.free
-        if not numbers or self._term.is_far():
-            return {}
-        x = self._term.end_positions()
-        parts = {number: self._own_mixed(number, x) for number in numbers}
-        touching = sum_over_ranks(self._term.comm, [float(part.any()) for part in parts.values()])
-        near = [number for number, touches in zip(numbers, touching, strict=True) if touches]
-        return {number: self._term.surface.gather.sum_owned(parts[number]).reshape(-1, 6) for number in near}
-
-    def _own_mixed(self, number: int, x: Values) -> Values:
-        """(nodes, 18) second derivatives by nodes and pose of this rank's pairs, the body at x (n, 3), m."""
-        pairs, body = self._term.pairs.pairs[self.group.numbers.index(number)], slice(0, x.size)
-        if pairs.is_far(x):
-            return np.zeros((self._term.surface.current.point_map.weights.shape[1], 18))
-        points = pairs.with_mesh(x)
-        H = pairs.contact.hessian(points)
-        if self._term.friction is not None and (friction := self._term.friction.friction_with(pairs)) is not None:
-            H = H + friction.hessian(points)
-        J = point_jacobian(pairs.mesh.positions - pairs.mesh.pose.centre).reshape(-1, 6)
-        mixed = H[body, x.size :] @ J
-        return self._term.surface.current.point_map.nodal_forces(mixed.reshape(len(x), -1))
-
-    def uses_exact_tangent(self) -> bool:
-        """Whether the tangent at the current u may have negative eigenvalues: not with free obstacles."""
-        return self.allows_exact_tangent
 
 
 def approach(mesh: MeshObstacle, start_pose: Pose, x: Values, force: Values, motion: Values) -> float:

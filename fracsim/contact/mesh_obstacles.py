@@ -77,7 +77,7 @@ def free_fraction_on_arcs(
 
 
 class MeshObstacle:
-    """Triangle-mesh obstacle at a pose (clearance.ObstacleDistance, by its vertices).
+    """Triangle-mesh obstacle at a pose (as clearance.ShapeDistance, by its vertices).
 
     Attributes:
         name: in messages.
@@ -110,6 +110,11 @@ class MeshObstacle:
         if self._positions is None:
             self._positions = self.positions_at(self.pose)
         return self._positions
+
+    @property
+    def arms(self) -> Values:
+        """(m, 3) its points about the reference point, m."""
+        return self.positions - self.pose.centre
 
     def positions_at(self, pose: Pose) -> Values:
         """(m, 3) its points at a pose, m."""

@@ -17,8 +17,9 @@ from .ipc_pairs import IpcPairs
 from .laws import ObstacleLaw
 from .mesh_obstacles import MESH, free_fraction_on_arcs
 from .obstacle import RigidObstacle
-from .obstacle_pairs import Numbers, PairDerivatives, PosedObstacles, StepMotion
+from .obstacle_pairs import Numbers, PairDerivatives, PosedObstacles
 from .pose_derivatives import point_jacobian, point_set_derivatives
+from .rigid_obstacles import RigidObstacles
 from .sample_points import IpcFriction
 from .step_limit import PoseMotion
 from .triangle_mesh_shape import StackedMeshes
@@ -27,7 +28,7 @@ Values = npt.NDArray[np.float64]
 
 
 class MeshPair:
-    """A pair of triangle-mesh obstacles (obstacle_pairs.PairContact)."""
+    """A pair of triangle-mesh obstacles, as obstacle_pairs.BarrierPair."""
 
     def __init__(
         self, numbers: Numbers, obstacles: Mapping[int, RigidObstacle], law: ObstacleLaw, stiffness: float
@@ -56,7 +57,7 @@ class MeshPair:
         max_gap = self._distance if self._friction is None else np.inf
         return self._meshes.near_positions([posed[number].pose for number in self.numbers], max_gap)
 
-    def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
+    def begin_step(self, motion: RigidObstacles, dt: float, *, time_averaged: bool) -> None:
         """Begin a step of dt, s: friction is lagged; forces are those of the end of the step, whatever the scheme."""
         self._friction = None
         if self._coefficient and (x := self._near_positions(motion.start_posed)) is not None:

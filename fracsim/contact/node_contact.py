@@ -17,13 +17,16 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from .laws import CoulombFriction, FrictionDirection, GapPotential, TimeAveragedPotential
 from .pose import Pose, PosedShape
+
+if TYPE_CHECKING:
+    from .facet_contact import FacetForces
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -121,22 +124,6 @@ class LaggedContact:
     obstacle_point: Values
 
 
-class FacetCoupling(Protocol):
-    """Second derivatives of an energy that couples the corners of facets (facet_contact)."""
-
-    @property
-    def corners(self) -> Ints:
-        """(k, c) points."""
-
-    @property
-    def hessian(self) -> Values:
-        """(k, c d, c d) minus the derivative of the forces, N/m."""
-
-    @property
-    def stiffness(self) -> Values:
-        """(k, c d, c d) the same, positive semi-definite together with that of the points."""
-
-
 @dataclass(frozen=True)
 class ContactForces:
     """Forces of one obstacle on points, and their derivatives.
@@ -149,7 +136,7 @@ class ContactForces:
         potential: J; both forces are minus its derivatives.
         make_hessians: returns `normal_hessian` and `friction_hessian`; called once, when they are needed.
         min_gap: lower bound of the gaps of all points and facets, m.
-        facets: coupling of corners of facets, whose forces are in `normal`; None without any.
+        facets: forces on facets, which are in `normal`, and their derivatives; None without any.
     """
 
     points: Ints
@@ -159,7 +146,7 @@ class ContactForces:
     potential: float
     make_hessians: Callable[[], tuple[Values, Values]]
     min_gap: float = 0.0
-    facets: FacetCoupling | None = None
+    facets: FacetForces | None = None
 
     @cached_property
     def _hessians(self) -> tuple[Values, Values]:

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from itertools import product
-from typing import Protocol, cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -34,6 +34,10 @@ from .shape_base import ConvexBody, Shape, frame_about, unit_vector
 from .shapes import Capsule, OffsetShape, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
 from .step_limit import PointMotion, PoseMotion
 from .triangle_mesh_shape import TriangleMeshShape
+
+if TYPE_CHECKING:
+    from .mesh_pairs import MeshPair  # with ipctk
+    from .rigid_obstacles import RigidObstacles
 
 Values = npt.NDArray[np.float64]
 
@@ -290,53 +294,19 @@ type PosedObstacles = Mapping[int, PosedShape] | Sequence[PosedShape]  # by the 
 type Numbers = tuple[int, int]  # of a free obstacle and another one
 
 
-class StepMotion(Protocol):
-    """Motion of obstacles in a step, as pairs need it at its start.
-
-    Attributes:
-        start_posed: obstacles at the start of the step, by their numbers.
-    """
-
-    start_posed: list[PosedShape]
-
-    def velocity(self, number: int, x: Values) -> Values:
-        """(d,) velocity of an obstacle at the start of the step, or (n, d) of its points at x (n, d), m/s."""
-
-
 # derivatives by the poses of both obstacles, each with the whole energy, and (p, p) second derivatives by both
 type PairDerivatives = tuple[PoseDerivatives, PoseDerivatives, Values]
 
 
-class PairContact(Protocol):
-    """Contact of a free obstacle and another one; `posed` are all obstacles at their poses, by their numbers.
+class BarrierPair:
+    """Barrier and friction of a free obstacle and another one, of which one at least is analytic.
+
+    `posed` are all obstacles at their poses, by their numbers.
 
     Attributes:
         numbers: of both.
+        pair: their geometry.
     """
-
-    numbers: Numbers
-
-    def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
-        """Begin a step of dt, s; `time_averaged`: barriers are averaged over it."""
-
-    def is_open(self, posed: PosedObstacles) -> bool:
-        """Whether all gaps are open."""
-
-    def safe_fraction(self, first: PoseMotion, second: PoseMotion) -> float:
-        """Fraction of the motions of both that leaves a tenth of each gap."""
-
-    def derivatives(self, posed: PosedObstacles, *, exact: bool) -> PairDerivatives | None:
-        """Derivatives of the potential by both poses; None: out of contact."""
-
-    def energies(self, posed: PosedObstacles) -> tuple[float, float]:
-        """Energy of the barrier, and potential of all forces in the step, J."""
-
-    def dissipated(self, posed: PosedObstacles) -> float:
-        """Energy dissipated by friction in the step, J."""
-
-
-class BarrierPair:
-    """Barrier and friction of a free obstacle and another one, of which one at least is analytic (PairContact)."""
 
     def __init__(self, numbers: Numbers, obstacles: Mapping[int, RigidObstacle], law: ObstacleLaw) -> None:
         """`obstacles`: by their numbers."""
@@ -356,7 +326,7 @@ class BarrierPair:
     def _is_near(self, poses: tuple[Pose, Pose]) -> bool:
         return self.pair.gap_bound(*poses) < self._law.barrier.width
 
-    def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
+    def begin_step(self, motion: RigidObstacles, dt: float, *, time_averaged: bool) -> None:
         """Begin a step of dt, s; `time_averaged`: the barrier is averaged over it."""
         poses = self._poses(motion.start_posed)
         self._started_near, self._friction = self._is_near(poses), None
@@ -365,7 +335,7 @@ class BarrierPair:
             slip = partial(self._sticking_slip, motion, dt)
             self._friction = self.pair.lag_friction(*poses, self._law.barrier, slip)
 
-    def _sticking_slip(self, motion: StepMotion, dt: float, points: Values, normals: Values) -> float:
+    def _sticking_slip(self, motion: RigidObstacles, dt: float, points: Values, normals: Values) -> float:
         """Slip in the step that counts as sticking, m."""
         first, second = (np.broadcast_to(motion.velocity(n, points), points.shape) for n in self.numbers)
         speed = float(np.linalg.norm(tangential(normals, first - second), axis=1).max())
@@ -427,11 +397,11 @@ class ObstaclePairs:
         pairs: of a free obstacle and another one each.
     """
 
-    def __init__(self, pairs: Sequence[PairContact], free: Iterable[int]) -> None:
+    def __init__(self, pairs: Sequence[BarrierPair | MeshPair], free: Iterable[int]) -> None:
         """`free`: numbers of the free obstacles."""
         self.pairs, self._free = tuple(pairs), frozenset(free)
 
-    def begin_step(self, motion: StepMotion, dt: float, *, time_averaged: bool) -> None:
+    def begin_step(self, motion: RigidObstacles, dt: float, *, time_averaged: bool) -> None:
         """Begin a step of dt, s; `time_averaged`: barriers are averaged over it."""
         for pair in self.pairs:
             pair.begin_step(motion, dt, time_averaged=time_averaged)

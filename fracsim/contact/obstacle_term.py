@@ -23,22 +23,15 @@ from petsc4py import PETSc
 from ..mechanics.extra_couplings import CouplingBuilder
 from ..mechanics.term import Term
 from ..mesh.domain import Domain
-from ..mesh.parallel import sum_over_ranks
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .contact_state import ContactState
 from .contact_surface import retract_from_obstacles
 from .laws import ObstacleLaw
 from .node_contact import ContactForces
 from .pose import min_distance
-from .pose_derivatives import (
-    PoseCoupling,
-    PoseDerivatives,
-    contact_wrench,
-    resultant,
-    sum_of_derivatives,
-)
+from .pose_derivatives import PoseContact, PoseCoupling, PoseDerivatives, contact_wrench, resultant
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
-from .step_limit import safe_motion_fractions, stop_before_obstacles
+from .step_limit import PoseMotion, safe_motion_fractions, stop_before_obstacles
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -92,7 +85,9 @@ class ObstacleTerm(ContactState, Term):
         facets = (self.facets,) if self.facets.numbers else ()
         self.parts = (self.surface, *facets, self.group, self.clearance)
         self._has_tangent = False  # in this attempt of Newton's method
-        self.pose_contact, self._coupling = PointPoseContact(self), CouplingBuilder(domain)
+        self.pose_contact, self._coupling = PoseContact(self), CouplingBuilder(domain)
+        # index of an obstacle, whether exact -> forces that a coupling with its pose is of, and the coupling
+        self._couplings: dict[tuple[int, bool], tuple[ContactForces, PoseCoupling]] = {}
         self._is_exact: bool | None = None  # whether the tangent at the current u and poses is; None: not known yet
 
     def update_displacement(self) -> None:
@@ -195,24 +190,33 @@ class ObstacleTerm(ContactState, Term):
 
     def max_step_fraction(self, change: Values) -> float:
         """Fraction of a change of u (owned dofs,), m, that leaves a tenth of every gap (collective)."""
-        increments, u = self.group.bodies.correction_increments(), self.end_displacement
-        change_at_end = np.divide(change, self.level.fraction)
-        if self.clearance.is_far([u, u + change_at_end], self.group.motions(increments)):
-            return 1.0
-        self.evaluate_near()
-        motion = self.surface.interpolation(change_at_end)
-        by_obstacle = [self._fractions(number, motion, increments.get(n)) for number, n in enumerate(self.numbers)]
-        fractions = [values[self.surface.area > 0] for values in by_obstacle]
-        return float(min(values.min(initial=1.0) for values in fractions))
+        increments, moving = self.group.bodies.correction_increments(), {}
+        for index, (number, posed) in enumerate(zip(self.numbers, self.group.posed, strict=True)):
+            moving[index] = posed, increments.get(number, np.zeros_like(self.group.increments[index]))
+        return self.safe_fraction(self.end_displacement, np.divide(change, self.level.fraction), moving)
 
-    def _fractions(self, number: int, motion: Values, q: Values | None) -> Values:
-        """(n,) fractions of the motion (n, d) of points, m, and an increment (p,), None: none, that close no gap."""
-        if q is None:
-            q = np.zeros_like(self.group.increments[number])
-        facets, min_gap = self.facets_for(number), self.obstacle_forces()[number].min_gap
-        return safe_motion_fractions(
-            self.group.posed[number], self.positions, motion, q, facets, self.point_candidates, min_gap
-        )
+    def safe_fraction(self, u: Values, change: Values | None, moving: Mapping[int, PoseMotion]) -> float:
+        """Fraction of motions of the body and of obstacles that leaves a tenth of every gap (collective).
+
+        Args:
+            u: (owned dofs,) displacement at the start, m.
+            change: (owned dofs,) of it, m; None: the body is at rest.
+            moving: motions of obstacles by their indices; others are not looked at.
+        """
+        if self.clearance.is_far([u] if change is None else [u, u + change], self.group.motions(moving)):
+            return 1.0
+        is_current = u is self.end_displacement
+        if is_current:
+            self.evaluate_near()
+        x = self.positions if is_current else self.surface.positions(u)
+        motion = np.zeros_like(x) if change is None else self.surface.interpolation(change)
+        fractions: list[Values] = [np.ones(len(x))]
+        for index, (posed, q) in moving.items():
+            # gaps of the current forces are those at the current poses
+            min_gap = self.obstacle_forces()[index].min_gap if is_current else 0.0
+            limits = self.facets_for(index), self.point_candidates, min_gap
+            fractions.append(safe_motion_fractions(posed, x, motion, q, *limits))
+        return self.surface.min_fraction(np.min(fractions, axis=0))
 
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) first guess of u, m, that crosses no obstacle on its way from the start (collective)."""
@@ -237,6 +241,40 @@ class ObstacleTerm(ContactState, Term):
         return self.surface.gaps_are_open(min_distance(self.group.posed, x)) and self.facets.are_open(
             self.group.posed, x
         )
+
+    # --- contact as the obstacles see it (pose_derivatives.PoseContact) ---
+
+    allows_exact_tangent = True
+
+    def poses_moved(self) -> None:
+        """Discard forces, as obstacles have moved."""
+        self.discard_forces()
+
+    def rank_wrench(self, index: int) -> Values:
+        """(p,) force and moment on an obstacle, of this rank, N and N m (collective)."""
+        return contact_wrench(self.obstacle_forces()[index], self.positions, self.group.poses[index])
+
+    def rank_derivatives(self, index: int, *, exact: bool) -> PoseDerivatives:
+        """Energy and derivatives by the pose of an obstacle, of this rank (collective)."""
+        return self._pose_coupling(index, exact=exact).derivatives()
+
+    def rank_mixed_hessian(self, index: int) -> Values:
+        """(k, d, p) derivatives of minus the forces on points by the pose of an obstacle, of this rank (collective)."""
+        return self._pose_coupling(index, exact=self.uses_exact_tangent()).mixed_hessian()
+
+    def assemble_mixed_hessian(self, index: int, part: Values) -> Values:
+        """(owned dofs, p) sums at the nodes of what `rank_mixed_hessian` returned (collective)."""
+        return self.surface.interpolation.assemble_points_to_nodes(self.obstacle_forces()[index].points, part)
+
+    def _pose_coupling(self, index: int, *, exact: bool) -> PoseCoupling:
+        """Coupling of the points and the pose of an obstacle at the current u and poses (collective)."""
+        contact, cached = self.obstacle_forces()[index], self._couplings.get((index, exact))
+        # forces are evaluated anew where u or poses have changed
+        if cached is None or cached[0] is not contact:
+            poses = self.group.poses[index], self.lagged[index], self.group.start_poses[index]
+            cached = contact, PoseCoupling(contact, self.positions, *poses, exact=exact)
+            self._couplings[index, exact] = cached
+        return cached[1]
 
     # --- fracture, and surfaces for output ---
 
@@ -297,108 +335,3 @@ class ObstacleTerm(ContactState, Term):
             approach = np.einsum("ni,ni->n", relative, posed.normal(self.positions[pushed]))
             result.append(float(approach.max(initial=0.0)))
         return result
-
-
-class PointPoseContact:
-    """Contact of the body with analytic obstacles, as the obstacles see it (rigid_obstacles.PoseContact)."""
-
-    allows_exact_tangent = True
-
-    def __init__(self, term: ObstacleTerm) -> None:
-        self._term, self.group = term, term.group
-        # index of an obstacle, whether exact -> forces that the coupling is of, and the coupling
-        self._couplings: dict[tuple[int, bool], tuple[ContactForces, PoseCoupling]] = {}
-
-    def poses_moved(self) -> None:
-        """Discard forces, as obstacles have moved."""
-        self._term.discard_forces()
-
-    def rest_fraction(self, increments: Mapping[int, Values], u: Values | None) -> float:
-        """Fraction of increments (p,) from current poses on which no gap to the body closes (collective).
-
-        `u`: (owned dofs,) displacement of the body at rest, m; None: the current one at the end of the step.
-        """
-        end = self._term.end_displacement if u is None else u
-        if self._term.clearance.is_far([end], self.group.motions(increments)):
-            return 1.0
-        if u is None:
-            self._term.evaluate_near()
-        x = self._term.positions if u is None else self._term.surface.positions(u)
-        fractions: list[Values] = [np.ones(len(x))]
-        for number, n in enumerate(self.group.numbers):
-            if n in increments:
-                facets = self._term.facets_for(number)
-                motion = np.zeros_like(x), increments[n], facets, self._term.point_candidates
-                fractions.append(safe_motion_fractions(self.group.posed[number], x, *motion))
-        return self._term.surface.min_fraction(np.min(fractions, axis=0))
-
-    def start_fraction(self, number: int, q: Values, u: Values) -> float:
-        """Fraction of an increment (p,) of an obstacle and the motion of the body that closes no gap (collective).
-
-        Both from the start of the step; `u`: (owned dofs,) displacement of the level after the motion, m.
-        """
-        level, index = self._term.level, self.group.numbers.index(number)
-        motions = self.group.motions({number: q}, from_start=True)
-        if self._term.clearance.is_far([level.u_n, level.displacement_at_end(u)], motions):
-            return 1.0
-        x = self._term.surface.positions(level.u_n)
-        motion = self._term.surface.positions(level.displacement_at_end(u)) - x
-        facets = self._term.facets_for(index)
-        return self._term.surface.min_fraction(
-            safe_motion_fractions(self.group.start_posed[index], x, motion, q, facets, self._term.point_candidates)
-        )
-
-    def wrenches(self) -> dict[int, Values]:
-        """(p,) force and moment of the body on free obstacles, N and N m, of all ranks (collective)."""
-        if not (numbers := self.group.free):
-            return {}
-        if self._term.is_far():
-            return {number: np.zeros(len(self.group.bodies.increments[number])) for number in numbers}
-        contacts = self._term.obstacle_forces()
-        local = [
-            contact_wrench(contacts[index], self._term.positions, self.group.poses[index])
-            for index in map(self.group.numbers.index, numbers)
-        ]
-        return dict(zip(numbers, sum_over_ranks(self._term.comm, np.array(local)), strict=True))
-
-    def pose_derivatives(self, *, exact: bool) -> dict[int, PoseDerivatives]:
-        """Energy and derivatives by the poses of free obstacles, of all ranks (collective)."""
-        if not (numbers := self.group.free):
-            return {}
-        if self._term.is_far():
-            sizes = [len(self.group.bodies.increments[number]) for number in numbers]
-            none = [PoseDerivatives(0.0, np.zeros(size), np.zeros((size, size))) for size in sizes]
-            return dict(zip(numbers, none, strict=True))
-        local = [self._coupling(self.group.numbers.index(number), exact=exact).derivatives() for number in numbers]
-        return dict(zip(numbers, sum_of_derivatives(local, self._term.comm), strict=True))
-
-    def _coupling(self, index: int, *, exact: bool) -> PoseCoupling:
-        """Coupling of the points and the pose of an obstacle at the current u and poses (collective)."""
-        term, group = self._term, self.group
-        contact, cached = term.obstacle_forces()[index], self._couplings.get((index, exact))
-        # forces are evaluated anew where u or poses have changed
-        if cached is None or cached[0] is not contact:
-            poses = group.poses[index], term.lagged[index], group.start_poses[index]
-            cached = contact, PoseCoupling(contact, term.positions, *poses, exact=exact)
-            self._couplings[index, exact] = cached
-        return cached[1]
-
-    def mixed_hessians(self) -> dict[int, Values]:
-        """(owned dofs, p) derivatives of minus the nodal forces by poses, of free obstacles in contact (collective)."""
-        if not (numbers := self.group.free) or self._term.is_far():
-            return {}
-        contacts, exact = self._term.obstacle_forces(), self.uses_exact_tangent()
-        indices = [self.group.numbers.index(number) for number in numbers]
-        touching = sum_over_ranks(self._term.comm, np.array([len(contacts[index].points) for index in indices])) > 0
-        interpolation = self._term.surface.interpolation
-        return {
-            number: interpolation.assemble_points_to_nodes(
-                contacts[index].points, self._coupling(index, exact=exact).mixed_hessian()
-            )
-            for number, index, touches in zip(numbers, indices, touching, strict=True)
-            if touches
-        }
-
-    def uses_exact_tangent(self) -> bool:
-        """Whether the tangent at the current u has negative eigenvalues of contact (collective)."""
-        return self._term.uses_exact_tangent()

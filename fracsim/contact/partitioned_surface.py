@@ -54,19 +54,6 @@ Pattern = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class BodyMass:
-    """Mass of a body, and what contact may add to its frequencies.
-
-    Attributes:
-        mass: (owned dofs,) lumped, kg.
-        max_added: 1/s^2 (penalty_stiffness).
-    """
-
-    mass: Values
-    max_added: float
-
-
-@dataclass(frozen=True)
 class SurfaceState:
     """What changes of a surface between breaks.
 
@@ -109,7 +96,13 @@ class PartitionedSurface:
     _drawn: SurfaceMap | None = None
 
     def __init__(
-        self, domain: Domain, u: fem.Function, law: SelfContactLaw, body: BodyMass, meshes: Sequence[MeshObstacle] = ()
+        self,
+        domain: Domain,
+        u: fem.Function,
+        law: SelfContactLaw,
+        mass: Values,
+        max_added: float,
+        meshes: Sequence[MeshObstacle] = (),
     ) -> None:
         """Build the surface (collective).
 
@@ -117,13 +110,15 @@ class PartitionedSurface:
             domain: mesh.
             u: displacement.
             law: contact law.
-            body: its mass.
+            mass: (owned dofs,) lumped, kg.
+            max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
             meshes: obstacles; none: the body touches itself.
 
         Raises:
             InputError: if the surface at rest intersects itself, or an obstacle.
         """
-        self.law, self._domain, self._u, self._body, self._meshes = law, domain, u, body, meshes
+        self.law, self._domain, self._u, self._meshes = law, domain, u, meshes
+        self._mass, self._max_added = mass, max_added
         self._comm, self._owned = domain.comm, domain.node_count * domain.dim
         is_refined = domain.order == 2 and not law.corners_only
         # subdivided quadratic cells do not break
@@ -246,8 +241,8 @@ class PartitionedSurface:
             return nodes(total)[:, 0].copy()
 
         # before obstacles twice that of self-contact, where both sides yield
-        limit = (2 if self._meshes else 1) * self._body.max_added
-        mass = nodes(self._body.mass)[:, 0].copy()
+        limit = (2 if self._meshes else 1) * self._max_added
+        mass = nodes(self._mass)[:, 0].copy()
         pressure = self.law.stiffness / self.law.distance
         return penalty_stiffness(weights, area, mass, pressure, limit, sum_at_nodes=sum_at_nodes, local_area=local_area)
 
@@ -370,7 +365,7 @@ class PartitionedSurface:
         if self._comm.allreduce(bool(loads.any()), op=MPI.LOR):
             for part in range(loads.shape[1]):
                 total = self.sum_at_nodes(np.repeat(loads[:, part, None], d, axis=1))
-                largest[part] = (total / self._body.mass).max(initial=0.0)
+                largest[part] = (total / self._mass).max(initial=0.0)
             self._comm.Allreduce(MPI.IN_PLACE, largest, MPI.MAX)
         return float(largest.sum())
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -29,12 +29,12 @@ from .ipc_surface import SelfContactLaw
 from .mesh_obstacle_term import approach, build_mesh_obstacle
 from .mesh_obstacles import MeshObstacle
 from .obstacle import VerletObstacle
-from .partitioned_surface import BodyMass, PartitionedSurface, motion_diagonal
+from .partitioned_surface import PartitionedSurface, motion_diagonal
 from .penalty_pairs import HistoryRows, PairSprings, PenaltyHistory
 from .penalty_point_facet import POINT_FACET
 from .penalty_surface import PenaltyPart
 from .pose import Pose, PosedShape
-from .pose_derivatives import resultant
+from .pose_derivatives import PoseContact, resultant
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
 
 Values = npt.NDArray[np.float64]
@@ -216,7 +216,7 @@ class PenaltyContact(Term):
         self.law, self._domain, self._u, self.comm = law, domain, u, domain.comm
         self._owned = domain.node_count * domain.dim
         self._friction_loss = 0.0
-        self.surface = PartitionedSurface(domain, u, law, BodyMass(mass, max_added), meshes)
+        self.surface = PartitionedSurface(domain, u, law, mass, max_added, meshes)
         self.state = PenaltyState(domain, u, self.surface, is_far)
         self.parts: tuple[object, ...] = (self.surface, self.state)
         self._set_start(None)
@@ -385,7 +385,7 @@ class PenaltyContact(Term):
 
 
 class PenaltyMeshContact(PenaltyContact):
-    """Contact of a body with triangle-mesh obstacles in explicit steps (rigid_obstacles.PoseContact).
+    """Contact of a body with triangle-mesh obstacles in explicit steps.
 
     Attributes:
         group: the obstacles, and what they did to the body in the last step.
@@ -395,7 +395,6 @@ class PenaltyMeshContact(PenaltyContact):
     """
 
     name = "solids"
-    allows_exact_tangent = False
     _end_u: Values | None = None
 
     def __init__(
@@ -423,7 +422,7 @@ class PenaltyMeshContact(PenaltyContact):
         super().__init__(domain, u, law, mass, max_added, self._all_meshes, self._is_far)
         reach = POINT_FACET.max_gap * law.distance
         self._clearance = Clearance(domain, self._all_meshes, reach, self.surface.following_points)
-        self.parts, self.pose_contact = (*self.parts, self.group, self._clearance), self
+        self.parts, self.pose_contact = (*self.parts, self.group, self._clearance), PoseContact(cast("Any", self))
 
     # --- motion ---
 
@@ -506,16 +505,15 @@ class PenaltyMeshContact(PenaltyContact):
                 squares.append(obstacle.max_frequency(obstacle.spring_stiffness(positions, stiffness, posed), posed))
         return max(squares)
 
-    # --- contact of the body, as the obstacles see it (rigid_obstacles.PoseContact) ---
+    # --- contact as the obstacles see it (pose_derivatives.PoseContact) ---
 
-    def wrenches(self) -> dict[int, Values]:
-        """(6,) force and moment of the body on free obstacles, N and N m (collective)."""
-        numbers = self.group.free
-        if not numbers or self.state.is_idle():
-            return {number: np.zeros(6) for number in numbers}
-        wrenches = self._own_wrenches(self._end_positions())
-        all_wrenches = sum_over_ranks(self.comm, np.array(wrenches))
-        return {number: all_wrenches[self.numbers.index(number)] for number in numbers}
+    def is_far(self) -> bool:
+        """Whether nothing can be in contact at the current u, nor was in the last step (collective)."""
+        return self.state.is_idle()
+
+    def rank_wrench(self, index: int) -> Values:
+        """(6,) force and moment on an obstacle at the current u, of this rank's contacts, N and N m (collective)."""
+        return self._own_wrenches(self._end_positions())[index]
 
     def _own_wrenches(self, x: Values) -> list[Values]:
         """(6,) force and moment of this rank's contacts on each obstacle about its reference point, N and N m.

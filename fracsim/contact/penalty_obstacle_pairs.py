@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Protocol, cast
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -93,41 +93,13 @@ class PairForces:
         return cls(wrenches, friction, float(numbers[-2]), float(numbers[-1]))
 
 
-class PairContacts(Protocol):
-    """Contacts of two obstacles.
-
-    Attributes:
-        touching_area: area that may touch at once, m^2.
-    """
-
-    touching_area: float
-
-    def set_penalty(self, penalty: Penalty) -> None:
-        """Set the penalty; its width is smaller for obstacles that start nearer."""
-
-    def end_step(self, starts: Poses, ends: Poses) -> PairForces | None:
-        """Forces at the end of a step, of which the contacts are stored; None: out of contact."""
-
-    def near_springs(self, poses: Poses) -> tuple[Values, Values] | None:
-        """Positions (k, d), m, and stiffness (k,), N/m, of contacts that may act a step later; None: none."""
-
-    def snapshot(self) -> Any:
-        """Contacts at the end of the last step."""
-
-    def restore(self, memory: Any) -> None:
-        """Restore a snapshot."""
-
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Arrays of the snapshot for a checkpoint."""
-
-    def from_checkpoint(self, saved: dict[str, Values], suffix: str) -> None:
-        """Set contacts from the arrays of a checkpoint, of names with a suffix."""
-
-
 class InsetPointContacts:
     """Contacts at the inset points of two obstacles of which one at least is analytic.
 
     Friction acts on the surface of the point's obstacle, where this is nearest to the other one.
+
+    Attributes:
+        touching_area: area that may touch at once, m^2.
     """
 
     def __init__(self, first: RigidObstacle, second: RigidObstacle) -> None:
@@ -225,7 +197,7 @@ class _InsetContacts:
 
 
 class MeshContacts:
-    """Contacts between two triangle meshes."""
+    """Contacts between two triangle meshes, as InsetPointContacts."""
 
     def __init__(self, first: RigidObstacle, second: RigidObstacle) -> None:
         from .ipc_pairs import vertex_areas
@@ -317,7 +289,7 @@ class PenaltyPair:
         if meshes[1] and not meshes[0]:  # a triangle mesh comes first, since it is in contact at its own points
             numbers, first, second = (numbers[1], numbers[0]), second, first
         self.numbers = numbers
-        self.contacts: PairContacts = MeshContacts(first, second) if all(meshes) else InsetPointContacts(first, second)
+        self.contacts: Any = MeshContacts(first, second) if all(meshes) else InsetPointContacts(first, second)
         self.forces = self._none = PairForces.none(len(first.start_point))
         self.dissipated, self.work = 0.0, (0.0, 0.0)
 

@@ -9,17 +9,21 @@ Equations: docs/theory.md#rigid-obstacles.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
 from ..mesh.parallel import sum_over_ranks
 from .node_contact import ContactForces, LaggedContact
 from .pose import Pose, rotation_derivative, rotation_second_derivative
+
+if TYPE_CHECKING:
+    from .mesh_obstacle_term import MeshObstacleTerm
+    from .obstacle_term import ObstacleTerm
 
 Values = npt.NDArray[np.float64]
 
@@ -37,6 +41,17 @@ class PoseDerivatives:
     energy: float
     gradient: Values
     hessian: Values
+
+    @classmethod
+    def none(cls, size: int) -> PoseDerivatives:
+        """Without contact, by p = `size` components."""
+        return cls(0.0, np.zeros(size), np.zeros((size, size)))
+
+    @classmethod
+    def from_array(cls, numbers: Values) -> PoseDerivatives:
+        """From energy, gradient and second derivatives in one row."""
+        p = int(np.sqrt(len(numbers) - 0.75) - 0.5)  # 1 + p + p^2 numbers
+        return cls(float(numbers[0]), numbers[1 : 1 + p], numbers[1 + p :].reshape(p, p))
 
     def __add__(self, second: PoseDerivatives) -> PoseDerivatives:
         """Sum of both."""
@@ -106,16 +121,6 @@ class PoseCoupling:
             if self._exact:
                 hessian[d:, d:] += rotation_second_derivative(contact.friction, self._friction_arm).sum(axis=0)
         return PoseDerivatives(contact.potential, np.asarray(gradient), hessian)
-
-
-def sum_of_derivatives(local: Sequence[PoseDerivatives], comm: MPI.Intracomm) -> list[PoseDerivatives]:
-    """Sums over all ranks of derivatives of several obstacles (collective)."""
-    rows = [np.concatenate([[part.energy], part.gradient, part.hessian.reshape(-1)]) for part in local]
-    p, result = len(local[0].gradient), []
-    for row in sum_over_ranks(comm, np.array(rows)):
-        energy, gradient, hessian = np.split(row, [1, 1 + p])
-        result.append(PoseDerivatives(float(energy[0]), gradient, hessian.reshape(p, p)))
-    return result
 
 
 def carried_point_derivatives(contact: ContactForces, x: Values, pose: Pose, *, exact: bool) -> PoseDerivatives:
@@ -193,3 +198,84 @@ def _product(J: Values, values: Values) -> Values:
     """(p, q) sum of J^T V over n points, J (n, d, p), V (n, d, q)."""
     n, d, p = J.shape
     return np.asarray(J.reshape(n * d, p).T @ values.reshape(n * d, values.shape[2]))
+
+
+class PoseContact:
+    """Contact of the body with some obstacles, as the obstacles see it.
+
+    Attributes:
+        group: these obstacles.
+    """
+
+    def __init__(self, term: ObstacleTerm | MeshObstacleTerm) -> None:
+        """`term`: of the contact; one of explicit steps is asked for `wrenches` alone."""
+        self._term, self.group = term, term.group
+        self._free = [(number, self.group.numbers.index(number)) for number in self.group.free]
+
+    def poses_moved(self) -> None:
+        """Take over the poses of obstacles, and discard forces (not collective)."""
+        self._term.poses_moved()
+
+    def wrenches(self) -> dict[int, Values]:
+        """(p,) force and moment of the body on free ones at the current u, N and N m, of all ranks (collective)."""
+        if not self._free or self._term.is_far():
+            return {number: np.zeros_like(self.group.bodies.increments[number]) for number, _ in self._free}
+        return self._summed([self._term.rank_wrench(index) for _, index in self._free])
+
+    def _summed(self, local: Sequence[Values]) -> dict[int, Values]:
+        """Sums over the ranks of values of free obstacles, by their numbers (collective)."""
+        sums = sum_over_ranks(self._term.comm, np.array(local))
+        return {number: values for (number, _), values in zip(self._free, sums, strict=True)}
+
+    # --- in implicit steps ---
+
+    def rest_fraction(self, increments: Mapping[int, Values], u: Values | None) -> float:
+        """Fraction of increments (p,) from the current poses on which no gap to the body closes (collective).
+
+        `u`: (owned dofs,) displacement of the body at rest, m; None: the current one at the end of the step.
+        """
+        u, posed = self._term.end_displacement if u is None else u, self.group.posed
+        moving = {i: (posed[i], increments[n]) for i, n in enumerate(self.group.numbers) if n in increments}
+        return self._term.safe_fraction(u, None, moving) if moving else 1.0
+
+    def start_fraction(self, number: int, q: Values, u: Values) -> float:
+        """Fraction of an increment (p,) of an obstacle and the motion of the body that closes no gap (collective).
+
+        Both from the start of the step; `u`: (owned dofs,) displacement of the level after the motion, m.
+        """
+        level, index = self._term.level, self.group.numbers.index(number)
+        change = level.displacement_at_end(u) - level.u_n
+        return self._term.safe_fraction(level.u_n, change, {index: (self.group.start_posed[index], q)})
+
+    def pose_derivatives(self, *, exact: bool) -> dict[int, PoseDerivatives]:
+        """Energy and derivatives by the poses of free ones, of all ranks (collective)."""
+        if not self._free:
+            return {}
+        parts = [PoseDerivatives.none(len(self.group.bodies.increments[number])) for number, _ in self._free]
+        if not self._term.is_far():
+            parts = [self._term.rank_derivatives(index, exact=exact) for _, index in self._free]
+            rows = [np.concatenate([[part.energy], part.gradient, part.hessian.reshape(-1)]) for part in parts]
+            parts = [PoseDerivatives.from_array(row) for row in self._summed(rows).values()]
+        return {number: part for (number, _), part in zip(self._free, parts, strict=True)}
+
+    def mixed_hessians(self) -> dict[int, Values]:
+        """(owned dofs, p) d2E/dx dq by the increments q of poses, of free ones in contact (collective)."""
+        if not self._free or self._term.is_far():
+            return {}
+        parts = [self._term.rank_mixed_hessian(index) for _, index in self._free]
+        touching = self._summed([np.array(part.any(), float) for part in parts])
+        items = zip(self._free, parts, strict=True)
+        return {
+            number: self._term.assemble_mixed_hessian(index, part)
+            for (number, index), part in items
+            if touching[number]
+        }
+
+    def uses_exact_tangent(self) -> bool:
+        """Whether the tangent at the current u has negative eigenvalues of contact (collective)."""
+        return self._term.uses_exact_tangent()
+
+    @property
+    def allows_exact_tangent(self) -> bool:
+        """Whether tangents are exact near the solution."""
+        return self._term.allows_exact_tangent

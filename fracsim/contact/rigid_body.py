@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from typing import Protocol
 
 import numpy as np
@@ -381,13 +381,17 @@ class FreeMotions:
         position_NAME_x and velocity_NAME_x of the centre of mass, m and m/s; turn_NAME_z and spin_NAME_z, rad and
         rad/s; kinetic_NAME, J.
         """
-        columns = {
-            name: partial(reader, index)
-            for obstacle in self.free.values()
-            for reader in [_MotionReader(obstacle, self.is_root)]
-            for index, name in enumerate(column_names(obstacle.body))
-        }
+        columns: dict[str, Callable[[], Values]] = {}
+        for obstacle in self.free.values():
+            # read column by column, evaluated once for each state of motion
+            values = lru_cache(maxsize=1)(obstacle.body.history_values)
+            for index, name in enumerate(column_names(obstacle.body)):
+                columns[name] = partial(self._reading, obstacle, values, index)
         return TermColumns(columns)
+
+    def _reading(self, obstacle: MovingObstacle, values: Callable[[RigidMotion], Values], index: int) -> Values:
+        """(1,) value of a column; 0 on other ranks than 0."""
+        return values(obstacle.motion)[index : index + 1] if self.is_root else np.zeros(1)
 
 
 def motion_rows(motions: Iterable[RigidMotion]) -> Values:
@@ -395,21 +399,3 @@ def motion_rows(motions: Iterable[RigidMotion]) -> Values:
     rows = [motion.to_array() for motion in motions]
     length = max(map(len, rows), default=0)
     return np.array([np.pad(row, (0, length - len(row))) for row in rows])
-
-
-class _MotionReader:
-    """Numbers of an obstacle for history.csv: read column by column, evaluated once for each state of motion."""
-
-    def __init__(self, obstacle: MovingObstacle, is_root: bool) -> None:
-        self._obstacle, self._is_root = obstacle, is_root
-        self._motion: RigidMotion | None = None
-        self._values: Values = np.empty(0)
-
-    def __call__(self, index: int) -> Values:
-        """(1,) value of a column; 0 on other ranks than 0."""
-        if not self._is_root:
-            return np.zeros(1)
-        if self._motion is not self._obstacle.motion:
-            self._motion = self._obstacle.motion
-            self._values = self._obstacle.body.history_values(self._motion)
-        return self._values[index : index + 1]

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,7 @@ from ..meshes.data import AXES
 from .obstacle import FreeObstacle, RigidObstacle, VerletObstacle
 from .obstacle_tessellation import ObstacleTessellations
 from .pose import Pose, PosedShape
-from .pose_derivatives import PoseDerivatives
+from .pose_derivatives import PoseContact
 from .rigid_body import FreeMotions, MovingObstacle
 from .step_limit import PoseMotion
 
@@ -35,45 +35,6 @@ if TYPE_CHECKING:
 Values = npt.NDArray[np.float64]
 
 type Increments = Mapping[int, Values]  # (p,) of poses, by the numbers of obstacles
-
-
-class PoseContact(Protocol):
-    """Contact of the body with some obstacles, as the obstacles see it.
-
-    Attributes:
-        group: these obstacles.
-        allows_exact_tangent: whether tangents are exact near the solution.
-    """
-
-    group: ObstacleGroup
-    allows_exact_tangent: bool
-
-    def poses_moved(self) -> None:
-        """Take over the poses of obstacles, and discard forces (not collective)."""
-
-    def rest_fraction(self, increments: Increments, u: Values | None) -> float:
-        """Fraction of increments from the current poses on which no gap to the body closes (collective).
-
-        `u`: (owned dofs,) displacement of the body at rest, m; None: the current one at the end of the step.
-        """
-
-    def start_fraction(self, number: int, q: Values, u: Values) -> float:
-        """Fraction of an increment (p,) of an obstacle and the motion of the body that closes no gap (collective).
-
-        Both from the start of the step; `u`: (owned dofs,) displacement of the level after the motion, m.
-        """
-
-    def wrenches(self) -> Increments:
-        """(p,) force and moment of the body on free ones at the current u, N and N m, of all ranks (collective)."""
-
-    def pose_derivatives(self, *, exact: bool) -> Mapping[int, PoseDerivatives]:
-        """Energy and derivatives by the poses of free ones, of all ranks (collective)."""
-
-    def mixed_hessians(self) -> Increments:
-        """(owned dofs, p) d2E/dx dq by the increments q of poses, of free ones in contact (collective)."""
-
-    def uses_exact_tangent(self) -> bool:
-        """Whether the tangent at the current u has negative eigenvalues of contact (collective)."""
 
 
 class RigidObstacles(Term):
@@ -290,7 +251,8 @@ class VerletRigidObstacles(RigidObstacles):
         """
         sums = dict.fromkeys(self.free, 0.0)
         for pair in self._pairs:
-            if (springs := pair.contacts.near_springs(pair.poses(self.posed))) is None:
+            springs: tuple[Values, Values] | None = pair.contacts.near_springs(pair.poses(self.posed))
+            if springs is None:
                 continue
             squares = {
                 number: obstacle.max_frequency(obstacle.spring_stiffness(*springs, posed), posed)
@@ -381,15 +343,12 @@ class ObstacleGroup:
         """Poses at the start of the step."""
         return [posed.pose for posed in self.start_posed]
 
-    def motions(self, increments: Increments, *, from_start: bool = False) -> list[tuple[PosedShape, PosedShape]]:
-        """Each now, and after increments (p,) by their numbers in the study, of now or of the start of the step."""
+    def motions(self, moving: Mapping[int, PoseMotion]) -> list[tuple[PosedShape, PosedShape]]:
+        """Each at the start and the end of its motion, given by its index in the group; others at rest."""
         result = []
-        for number, posed in zip(self.numbers, self.posed, strict=True):
-            start = self.bodies.start_posed[number] if from_start and number in increments else posed
-            end = start
-            if number in increments:
-                end = PosedShape(start.shape, start.pose.incremented(increments[number]))
-            result.append((start, end))
+        for index, posed in enumerate(self.posed):
+            start, q = moving.get(index, (posed, np.zeros(0)))
+            result.append((start, PosedShape(start.shape, start.pose.incremented(q)) if q.any() else start))
         return result
 
     @property

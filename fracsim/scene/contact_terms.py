@@ -33,6 +33,7 @@ from ..study.overlap_checks import build_shape
 
 if TYPE_CHECKING:
     from ..contact.laws import Penalty
+    from ..contact.mesh_pairs import MeshPair
     from ..contact.shape_kernels import CompiledShapeKernels
     from ..contact.triangle_mesh_shape import TriangleMeshShape
 
@@ -139,7 +140,7 @@ def _build_motion(
     if not any(obstacle.free for obstacle in obstacles):
         return RigidObstacles(domain, obstacles)
     from ..contact.obstacle import check_free_obstacles, free_pairs
-    from ..contact.obstacle_pairs import BarrierPair, ObstaclePairs, PairContact
+    from ..contact.obstacle_pairs import BarrierPair, ObstaclePairs
     from ..contact.rigid_obstacles import VerletRigidObstacles
     from ..contact.rigid_pose import FreeRigidObstacles
     from ..contact.supporting_obstacles import pair_obstacles
@@ -154,10 +155,10 @@ def _build_motion(
 
         penalty = cast("Penalty", law.barrier)
         return VerletRigidObstacles(domain, obstacles, penalty_pairs_of(in_pairs, penalty, max_added))
-    pairs: list[PairContact] = []
+    pairs: list[BarrierPair | MeshPair] = []
     for numbers in free_pairs(obstacles):
         if all(is_mesh[number] for number in numbers):
-            from ..contact.mesh_pairs import MeshPair
+            from ..contact.mesh_pairs import MeshPair  # with ipctk
 
             pairs.append(MeshPair(numbers, in_pairs, law, mesh_stiffness))
         else:
