@@ -95,7 +95,7 @@ def test_a_point_in_an_obstacle_is_pushed_straight_out_of_it(along: bool) -> Non
     """Before a floor: a force in no other direction, and no stiffness that a tangent could hold (with infinities
     0 times infinity would be an invalid value)."""
     x, area = np.array([[0.3, -1e-4], [0.5, 0.5e-3]]), np.array([0.1, 0.2])
-    start = StepStart.from_gaps(np.array([0.5e-3, 0.5e-3]), 2) if along else None
+    start = StepStart(np.array([0.5e-3, 0.5e-3])) if along else None
     found = evaluate_points(
         x, area, PosedShape(HalfSpace((0.0, 1.0)), Pose.at_point(np.zeros(2))), BARRIER, None, None, np.zeros(2), start
     )

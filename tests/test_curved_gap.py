@@ -7,7 +7,7 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.contact.laws import Barrier
-from fracsim.contact.node_contact import ContactForces, StepStart, evaluate_points
+from fracsim.contact.node_contact import ContactForces, LaggedContact, StepStart, evaluate_points
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.shapes import RoundedBox, Shape, Sphere
 from support.scenes import each_step, make_scene
@@ -20,7 +20,7 @@ def test_around_a_ball_by_hand() -> None:
     force is p along the mean of both normals while e is small, which does nothing along the chord."""
     R, a, g = 0.4, 1e-3, 0.1
     x0, x1 = R * np.array([[1.0, 0.0]]), R * np.array([[np.cos(a), np.sin(a)]])
-    start = StepStart(np.array([g]), np.array([0]), x0 / R, x0)
+    start = StepStart(np.array([g]), LaggedContact(np.array([0]), np.ones(1), x0 / R, x0, x0))
     bent = start.curved_gap(np.array([0]), np.array([g]), x1 / R, x1)
     e = R * (1 - np.cos(a))
     assert bent.value == pytest.approx(g * (g + e / 2) / (g + e))
@@ -37,7 +37,8 @@ def test_forces_and_stiffness_are_derivatives(shape: Shape) -> None:
     apart = (placed.distance(x0) > 0.03) & (placed.distance(x) > 0.02)
     x0, x, gap = x0[apart], x[apart], placed.distance(x0[apart])
     known = np.flatnonzero(gap < 0.2)
-    start, area = StepStart(gap, known, placed.normal(x0[known]), x0[known]), np.full(len(x), 0.02)
+    acting = LaggedContact(known, np.ones(len(known)), placed.normal(x0[known]), x0[known], x0[known])
+    start, area = StepStart(gap, acting), np.full(len(x), 0.02)
     assert len(known) > 5
 
     def felt(x: Values) -> ContactForces:

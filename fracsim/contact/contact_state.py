@@ -395,10 +395,7 @@ class ContactState:
         if self.level.contact_weights.time_averaged:
             width, area = barrier.width, self.surface.area
             self._started_near = [np.flatnonzero((gap < width) & (area > 0)) for gap in gaps]
-            self._step_starts = [
-                StepStart(gap, contact.points, contact.normal, contact.position)
-                for gap, contact in zip(gaps, lagged, strict=True)
-            ]
+            self._step_starts = [StepStart(gap, contact) for gap, contact in zip(gaps, lagged, strict=True)]
         # for the work of normal forces by the trapezoidal rule
         self._start_forces = [contact.force @ contact.normal for contact in lagged]
         sum_at_points = None if self.comm.size == 1 else self.surface.sum_at_points
@@ -448,8 +445,6 @@ class ContactState:
 
     def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
         """Forces of an obstacle at a given pose on the points."""
-        if self._is_out_of_range(number, posed):
-            return no_contact(self._domain.dim, self.law.barrier.width)
         obstacle, lagged = self.obstacles[number], self.lagged[number]
         friction = None
         if lagged is not None and self._sticking_slips is not None:
@@ -467,18 +462,6 @@ class ContactState:
         facet_start = None if start is None else (start_posed, self._start_positions)
         of_facets = evaluate_facets(self.facets.active, posed, self.positions, self.law.barrier, facet_start)
         return merge_forces(of_points, *of_facets)
-
-    def _is_out_of_range(self, number: int, posed: PosedShape) -> bool:
-        """Whether an obstacle is too far from all points and facets to act, now and at the start of the step."""
-        lagged, width = self.lagged[number], self.law.barrier.width
-        if (lagged is not None and len(lagged.points)) or len(self._candidates(number, posed)):
-            return False
-        if number not in self.facets.numbers:
-            return True
-        ends = [(posed, self.positions)]
-        if self._step_starts[number] is not None:
-            ends.append((self.group.start_posed[number], self._start_positions))
-        return not any(len(self.facets.active.candidates(*end, width)) for end in ends)
 
     def _candidates(self, number: int, posed: PosedShape) -> Ints:
         """(k,) points on which an obstacle may act, or acted at the start of the step."""

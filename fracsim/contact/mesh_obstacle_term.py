@@ -32,7 +32,7 @@ from .mesh_obstacles import (
 )
 from .obstacle import RigidObstacle
 from .pose import Pose
-from .pose_derivatives import PoseContact, PoseDerivatives, point_jacobian, point_set_derivatives
+from .pose_derivatives import PoseContact, PoseDerivatives, closing_distance, point_jacobian, point_set_derivatives
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
 from .sample_points import IpcFriction
 from .self_contact import Pattern, SelfContact, mean_velocities
@@ -189,9 +189,7 @@ class MeshObstacleTerm(SelfContact):
 
     def max_step_fraction(self, change: Values) -> float:
         """Fraction of a correction of u (owned dofs,), m, and free poses without a collision (collective)."""
-        increments, moving = self.group.bodies.correction_increments(), {}
-        for index, (number, posed) in enumerate(zip(self.numbers, self.group.posed, strict=True)):
-            moving[index] = posed, increments.get(number, np.zeros(6))
+        moving = self.group.correction_motions()
         return self.safe_fraction(self.end_displacement, np.divide(change, self.level.fraction), moving)
 
     def safe_fraction(self, u: Values, change: Values | None, moving: Mapping[int, PoseMotion]) -> float:
@@ -308,26 +306,8 @@ class MeshObstacleTerm(SelfContact):
         motion, result = self.group.bodies.dt * (self.surface.current.point_map.weights @ v), []
         for pairs, start_pose in zip(self.pairs.pairs, self.group.start_poses, strict=True):
             force = -sum_over_ranks(self.comm, pairs.body_gradient(x))
-            result.append(approach(pairs.mesh, start_pose, x, force, motion))
+            result.append(closing_distance(start_pose, pairs.mesh.pose, x, force, motion))
         return result
-
-
-def approach(mesh: MeshObstacle, start_pose: Pose, x: Values, force: Values, motion: Values) -> float:
-    """Largest approach in a step of an obstacle and the points that it pushes, m.
-
-    Args:
-        mesh: the obstacle, at the end of the step.
-        start_pose: of the obstacle.
-        x: (n, 3) points of the body, m.
-        force: (n, 3) on these, N.
-        motion: (n, 3) of these without contact, m.
-    """
-    size = np.linalg.norm(force, axis=1)
-    pushed = size > 0
-    obstacle_motion = x[pushed] - start_pose.points_to_space(mesh.pose.to_body(x[pushed]))
-    normal = force[pushed] / size[pushed, None]
-    distance = np.einsum("ni,ni->n", obstacle_motion - motion[pushed], normal)
-    return float(distance.max(initial=0.0))
 
 
 def build_mesh_obstacle(number: int, obstacle: RigidObstacle, edge: float) -> MeshObstacle:

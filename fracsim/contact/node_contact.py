@@ -15,7 +15,7 @@ Equations: docs/theory.md#contact-in-a-time-step.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -35,39 +35,53 @@ Ints = npt.NDArray[np.int64]
 CLOSED_STIFFNESS = 1e150
 
 
+@dataclass(frozen=True)
+class LaggedContact:
+    """Contact at the start of a step, with which the friction of the step is lagged.
+
+    Attributes:
+        points: (k,) of the surface.
+        force: (k,) normal forces, N.
+        normal: (k, d) unit normals.
+        position: (k, d) positions of the points, m.
+        obstacle_point: (k, d) points of the obstacle that press on them, m.
+    """
+
+    points: Ints
+    force: Values
+    normal: Values
+    position: Values
+    obstacle_point: Values
+
+
 @dataclass(frozen=True, eq=False)
 class StepStart:
     """Points at the start of a step.
 
     Attributes:
         gap: (n,) gaps of all points, m.
-        active: (k,) points on which the barrier acted.
-        normal: (k, d) unit normals at these.
-        position: (k, d) positions of these, m.
+        contact: those on which the barrier acted; None: gaps alone are known, and f = g.
     """
 
     gap: Values
-    active: Ints
-    normal: Values
-    position: Values
-
-    @classmethod
-    def from_gaps(cls, gap: Values, dim: int) -> StepStart:
-        """Points of which the gaps (n,), m, alone are known: f = g."""
-        return cls(gap, np.empty(0, np.int64), np.empty((0, dim)), np.empty((0, dim)))
+    contact: LaggedContact | None = None
 
     def carried_with(self, start: Pose, end: Pose) -> StepStart:
         """The same start, moved with an obstacle from its pose at the start to that at the end."""
-        normal = end.vectors_to_space(self.normal @ start.rotation)
-        return StepStart(self.gap, self.active, normal, end.points_to_space(start.to_body(self.position)))
+        if (contact := self.contact) is None:
+            return self
+        normal = end.vectors_to_space(contact.normal @ start.rotation)
+        position = end.points_to_space(start.to_body(contact.position))
+        return StepStart(self.gap, replace(contact, normal=normal, position=position))
 
     def curved_gap(self, points: Ints, gap: Values, normal: Values, x: Values) -> CurvedGap:
         """Curved gap f of points (m,), which include the active ones, with gaps (m,) and normals (m, d) at x (m, d)."""
         e, e_gradient, has_excess = np.zeros(len(points)), np.zeros_like(x), np.zeros(len(points), bool)
-        rows = np.searchsorted(points, self.active)
-        motion = x[rows] - self.position
-        e[rows] = gap[rows] - self.gap[self.active] - np.einsum("ni,ni->n", self.normal, motion)
-        e_gradient[rows], has_excess[rows] = normal[rows] - self.normal, True
+        if (contact := self.contact) is not None:
+            rows = np.searchsorted(points, contact.points)
+            motion = x[rows] - contact.position
+            e[rows] = gap[rows] - self.gap[contact.points] - np.einsum("ni,ni->n", contact.normal, motion)
+            e_gradient[rows], has_excess[rows] = normal[rows] - contact.normal, True
         return CurvedGap.from_gaps(gap, e, normal, e_gradient, has_excess)
 
 
@@ -103,25 +117,6 @@ class CurvedGap:
         nn, nm, mm = (a[:, :, None] * b[:, None, :] for a, b in ((n, n), (n, m), (m, m)))
         remainder = gg * nn + ge * (nm + nm.transpose(0, 2, 1)) + ee * mm
         return cls(value, by_g[:, None] * n + by_e[:, None] * m, by_g + by_e, remainder)
-
-
-@dataclass(frozen=True)
-class LaggedContact:
-    """Contact at the start of a step, with which the friction of the step is lagged.
-
-    Attributes:
-        points: (k,) of the surface.
-        force: (k,) normal forces, N.
-        normal: (k, d) unit normals.
-        position: (k, d) positions of the points, m.
-        obstacle_point: (k, d) points of the obstacle that press on them, m.
-    """
-
-    points: Ints
-    force: Values
-    normal: Values
-    position: Values
-    obstacle_point: Values
 
 
 @dataclass(frozen=True)
@@ -216,6 +211,8 @@ def evaluate_points(
     if friction is not None and lagged is not None and len(lagged.points):
         points = np.union1d(points, lagged.points)
         gap = posed.distance(x[points])
+    if not len(points):
+        return no_contact(x.shape[1], barrier.width)
     point_area, positions = area[points], x[points]
     normal = posed.normal(positions)
     potential = barrier if start is None else TimeAveragedPotential(barrier, start.gap[points])

@@ -268,7 +268,7 @@ class ObstaclePair:
         """
         starts: list[StepStart | None] = [None, None]
         if start is not None:
-            starts = [StepStart.from_gaps(gap, body.dim) for gap in start]
+            starts = [StepStart(gap) for gap in start]
         no_motion = np.zeros(body.dim)
         return [
             (evaluate_points(x, area, posed, barrier, None, None, no_motion, step_start), x)

@@ -29,7 +29,14 @@ from .contact_surface import retract_from_obstacles
 from .laws import ObstacleLaw
 from .node_contact import ContactForces
 from .pose import min_distance
-from .pose_derivatives import PoseContact, PoseCoupling, PoseDerivatives, contact_wrench, resultant
+from .pose_derivatives import (
+    PoseContact,
+    PoseCoupling,
+    PoseDerivatives,
+    closing_distance,
+    contact_wrench,
+    resultant,
+)
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
 from .step_limit import PoseMotion, safe_motion_fractions, stop_before_obstacles
 
@@ -190,9 +197,7 @@ class ObstacleTerm(ContactState, Term):
 
     def max_step_fraction(self, change: Values) -> float:
         """Fraction of a change of u (owned dofs,), m, that leaves a tenth of every gap (collective)."""
-        increments, moving = self.group.bodies.correction_increments(), {}
-        for index, (number, posed) in enumerate(zip(self.numbers, self.group.posed, strict=True)):
-            moving[index] = posed, increments.get(number, np.zeros_like(self.group.increments[index]))
+        moving = self.group.correction_motions()
         return self.safe_fraction(self.end_displacement, np.divide(change, self.level.fraction), moving)
 
     def safe_fraction(self, u: Values, change: Values | None, moving: Mapping[int, PoseMotion]) -> float:
@@ -326,12 +331,9 @@ class ObstacleTerm(ContactState, Term):
         if self.is_far():
             return [0.0] * len(self.obstacles)
         motion, result = self.group.bodies.dt * self.surface.interpolation(self._start_velocity), list[float]()
-        for increment, posed, contact in zip(
-            self.group.increments, self.group.posed, self.obstacle_forces(), strict=True
+        for start_pose, pose, contact in zip(
+            self.group.start_poses, self.group.poses, self.obstacle_forces(), strict=True
         ):
-            # points with a normal force, not with friction alone
-            pushed = contact.points[contact.normal.any(axis=1)]
-            relative = increment[: self._domain.dim] - motion[pushed]
-            approach = np.einsum("ni,ni->n", relative, posed.normal(self.positions[pushed]))
-            result.append(float(approach.max(initial=0.0)))
+            x, points = self.positions[contact.points], contact.points
+            result.append(closing_distance(start_pose, pose, x, contact.normal, motion[points]))
         return result

@@ -26,7 +26,7 @@ from ..mesh.domain import Domain
 from ..mesh.parallel import allgather, gather, max_over_ranks, sum_over_ranks
 from .clearance import Clearance
 from .ipc_surface import SelfContactLaw
-from .mesh_obstacle_term import approach, build_mesh_obstacle
+from .mesh_obstacle_term import build_mesh_obstacle
 from .mesh_obstacles import MeshObstacle
 from .obstacle import VerletObstacle
 from .partitioned_surface import PartitionedSurface, motion_diagonal
@@ -34,7 +34,7 @@ from .penalty_pairs import HistoryRows, PairSprings, PenaltyHistory
 from .penalty_point_facet import POINT_FACET
 from .penalty_surface import PenaltyPart
 from .pose import Pose, PosedShape
-from .pose_derivatives import PoseContact, resultant
+from .pose_derivatives import PoseContact, closing_distance, resultant
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
 
 Values = npt.NDArray[np.float64]
@@ -551,7 +551,7 @@ class PenaltyMeshContact(PenaltyContact):
         result = []
         for mesh, part, start_pose in zip(self._all_meshes, self._parts, self.group.start_poses, strict=True):
             gradient = np.zeros_like(x) if part.is_far(x) else part.contact.gradient(part.points(x))[: len(x)]
-            result.append(approach(mesh, start_pose, x, -surface.sum_at_points(gradient), motion))
+            result.append(closing_distance(start_pose, mesh.pose, x, -surface.sum_at_points(gradient), motion))
         return result
 
     # --- state: wrenches at the end of the last step (HistoryTerm) ---

@@ -186,6 +186,24 @@ def resultant(force: Values, arm: Values) -> Values:
     return np.concatenate([force.sum(axis=0), moment])
 
 
+def closing_distance(start: Pose, end: Pose, x: Values, force: Values, motion: Values) -> float:
+    """Largest approach in a step of an obstacle and the points that it pushes, m.
+
+    Args:
+        start: pose of the obstacle.
+        end: its pose at the end of the step.
+        x: (n, d) points of the body then, m.
+        force: (n, d) normal forces on these, N.
+        motion: (n, d) of these without contact, m.
+    """
+    size = np.linalg.norm(force, axis=1)
+    pushed = size > 0
+    obstacle_motion = x[pushed] - start.points_to_space(end.to_body(x[pushed]))
+    normal = force[pushed] / size[pushed, None]
+    distance = np.einsum("ni,ni->n", obstacle_motion - motion[pushed], normal)
+    return float(distance.max(initial=0.0))
+
+
 def _jacobian(arm: Values) -> Values:
     """(n, d, p) J of arms (n, d), m."""
     d, by_rotation = arm.shape[1], rotation_derivative(arm)

@@ -351,6 +351,12 @@ class ObstacleGroup:
             result.append((start, PosedShape(start.shape, start.pose.incremented(q)) if q.any() else start))
         return result
 
+    def correction_motions(self) -> dict[int, PoseMotion]:
+        """Motions from current poses in a correction of Newton's method, by the indices in the group."""
+        increments = self.bodies.correction_increments()
+        items = enumerate(zip(self.numbers, self.posed, self.increments, strict=True))
+        return {index: (posed, increments.get(number, 0 * q)) for index, (number, posed, q) in items}
+
     @property
     def step_motions(self) -> list[tuple[PosedShape, PosedShape]]:
         """Each at the start of the step, and now."""
