@@ -13,7 +13,7 @@ from scipy.sparse import eye
 
 from fracsim.contact.ipc_pairs import IpcPairs
 from fracsim.contact.penalty_contact import PenaltyContact, PenaltyState
-from fracsim.contact.penalty_contacts import ContactStiffness
+from fracsim.contact.penalty_contacts import ContactStiffness, NodalMassShare
 from fracsim.contact.penalty_pairs import PenaltyPairs
 from fracsim.contact.penalty_point_facet import penalty_stiffness
 from fracsim.contact.penalty_surface import PenaltySurface
@@ -88,7 +88,7 @@ def test_it_is_no_faster_than_said(dim: int) -> None:
     fastest = float(np.linalg.eigvalsh(K / np.sqrt(m[:, None] * m)).max())
     bound = float((pairs.contacts_ahead(x).added_load(eye(n, format="csr")) / mass).max())
     assert 0.3 * bound < fastest <= bound
-    own = penalty_stiffness(eye(n, format="csr"), np.ones(n), mass, np.inf, 4.0)
+    own = penalty_stiffness(NodalMassShare(eye(n, format="csr"), mass), np.ones(n), np.inf, 4.0)
     np.testing.assert_allclose(own, mass, rtol=1e-12)
 
 

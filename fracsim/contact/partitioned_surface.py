@@ -42,6 +42,7 @@ from .clearance import FollowingPoints
 from .ipc_pairs import vertex_areas
 from .ipc_surface import SURFACE, SelfContactLaw, build_contact_surface, offset_crack_faces, refuse_intersections
 from .mesh_obstacles import MeshObstacle, refuse_overlap
+from .penalty_contacts import NodalMassShare
 from .penalty_pairs import HistoryRows, PenaltyHistory
 from .penalty_point_facet import POINT_FACET, penalty_stiffness
 from .penalty_surface import PenaltySurface, triangle_ranks
@@ -242,9 +243,8 @@ class PartitionedSurface:
 
         # before obstacles twice that of self-contact, where both sides yield
         limit = (2 if self._meshes else 1) * self._max_added
-        mass = nodes(self._mass)[:, 0].copy()
-        pressure = self.law.stiffness / self.law.distance
-        return penalty_stiffness(weights, area, mass, pressure, limit, sum_at_nodes=sum_at_nodes, local_area=local_area)
+        mass_share = NodalMassShare(weights, nodes(self._mass)[:, 0].copy(), sum_at_nodes)
+        return penalty_stiffness(mass_share, area, self.law.stiffness / self.law.distance, limit, local_area)
 
     def _over_border(self, values: Values, operation: np.ufunc) -> Values:
         """(n, ...) values of this rank's points, of those that ranks share an operation on all (collective)."""

@@ -13,6 +13,7 @@ Equations: docs/theory.md#explicit-contact.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -165,22 +166,44 @@ class PenaltyContacts:
         return np.asarray(size.T @ (self.stiffness * np.asarray(size.sum(axis=1)).ravel()))
 
 
-def point_masses(size: csr_matrix, area: Values, rate: Values) -> Values:
-    """(n,) parts M_p of points in the mass of their nodes, kg.
+class NodalMassShare:
+    """Share of points in the mass of their nodes, and bounds of frequencies of springs at points.
 
-    Springs k_p = M_p at all points have no frequency above 1: with k_p = A_p the rows of M^-1 K, which bound its
-    eigenvalues (Gershgorin), are the rates of the nodes, and M_p is A_p by the largest rate of its nodes.
+    Points follow nodes by weights w: springs k_p between points and what is at rest are K = sum_p k_p w_p w_p^T. The
+    rows of M^-1 K bound its eigenvalues (Gershgorin), whatever the directions of the springs:
 
-    Args:
-        size: (n, nodes) sizes |w| of the weights with which points follow nodes.
-        area: (n,) m^2.
-        rate: (nodes,) sum over points p of |w_p| A_p S_p by the mass of the node, S_p the sum of |w_p|, m^2/kg.
+        omega^2  <=  max over nodes a of  1/m_a  sum_p |w_pa| k_p S_p,    S_p = sum_b |w_pb|
     """
-    entries, row_sum = size.tocoo(), np.asarray(size.sum(axis=1)).ravel()
-    counts = entries.data > MIN_WEIGHT * row_sum[entries.row]
-    max_rate = np.zeros(len(area))
-    np.maximum.at(max_rate, entries.row, np.where(counts, rate[entries.col], 0.0))
-    return np.where(max_rate > 0, area / np.where(max_rate > 0, max_rate, 1.0), 0.0)
+
+    def __init__(
+        self, weights: csr_matrix, mass: Values, sum_at_nodes: Callable[[Values], Values] = lambda values: values
+    ) -> None:
+        """Share of points.
+
+        Args:
+            weights: (n, nodes) with which points follow nodes.
+            mass: (nodes,) kg.
+            sum_at_nodes: sums over the ranks of values (nodes,).
+        """
+        self._size, self._mass, self._sum_at_nodes = abs(weights), mass, sum_at_nodes
+        self._sum = np.asarray(self._size.sum(axis=1)).ravel()
+
+    def node_rates(self, stiffness: Values) -> Values:
+        """(nodes,) 1/m_a sum_p |w_pa| k_p S_p, 1/s^2, of k (n,), N/m (collective)."""
+        summed = self._sum_at_nodes(self._size.T @ (stiffness * self._sum))
+        return np.asarray(summed / np.maximum(self._mass, np.finfo(float).tiny))
+
+    def point_masses(self, area: Values, local_area: Values | None = None) -> Values:
+        """(n,) masses M_p of points with areas (n,), kg (collective).
+
+        Springs k_p = M_p at all points have no frequency above 1: M_p is A_p by the largest of the rates that springs
+        k_p = A_p cause at the nodes of the point. `local_area`: (n,) share of this rank in `area`; None: all of it.
+        """
+        rate, entries = self.node_rates(area if local_area is None else local_area), self._size.tocoo()
+        counts = entries.data > MIN_WEIGHT * self._sum[entries.row]
+        max_rate = np.zeros(len(area))
+        np.maximum.at(max_rate, entries.row, np.where(counts, rate[entries.col], 0.0))
+        return np.where(max_rate > 0, area / np.where(max_rate > 0, max_rate, 1.0), 0.0)
 
 
 def concatenate_contacts(parts: list[PenaltyContacts]) -> PenaltyContacts:

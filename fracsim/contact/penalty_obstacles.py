@@ -30,16 +30,14 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..mesh.domain import Domain
-from ..mesh.parallel import gather, sum_over_ranks
-from ..mesh.split_surface.local_surface import ParentMatrix
+from ..mesh.parallel import gather, max_over_ranks, sum_over_ranks
 from ..mesh.split_surface.point_matching import match_points
-from ..mesh.split_surface.surface_map import SurfaceMap
 from .facet_contact import ContactFacets, evaluate_facets, merge_forces
 from .laws import ObstacleLaw, Penalty, slipped, tangential
 from .node_contact import ContactForces
 from .obstacle import VerletObstacle
 from .obstacle_term import ObstacleTerm
-from .penalty_contacts import point_masses
+from .penalty_contacts import NodalMassShare
 from .pose import PosedShape, min_distance
 from .rigid_obstacles import RigidObstacles
 
@@ -63,39 +61,6 @@ class PenaltyPolicy:
 
 
 PENALTY = PenaltyPolicy()
-
-
-class NodalMassShare:
-    """Share of points in the mass of their nodes, and bounds of frequencies of springs at points.
-
-    Points follow nodes by weights w: springs k_p between points and what is at rest are K = sum_p k_p w_p w_p^T. The
-    rows of M^-1 K bound its eigenvalues (Gershgorin), whatever the directions of the springs:
-
-        omega^2  <=  max over nodes a of  1/m_a  sum_p |w_pa| k_p S_p,    S_p = sum_b |w_pb|
-    """
-
-    def __init__(self, point_map: SurfaceMap, interpolation: ParentMatrix, mass: Values) -> None:
-        """`mass`: (owned dofs,) lumped, kg (collective)."""
-        self._interpolation, self._weights = interpolation, abs(point_map.weights)
-        self._sum = np.asarray(self._weights.sum(axis=1)).ravel()
-        self._mass = interpolation.nodal_values(mass)[:, 0].copy()
-
-    def node_rates(self, stiffness: Values) -> Values:
-        """(columns,) 1/m_a sum_p |w_pa| k_p S_p at nodes, 1/s^2, of k (n,), N/m (collective)."""
-        load = self._weights.T @ (stiffness * self._sum)
-        vector = np.zeros((len(load), self._interpolation.dim))
-        vector[:, 0] = load
-        summed = self._interpolation.nodal_values(self._interpolation.sum_at_nodes(vector))[:, 0]
-        return np.asarray(summed / np.maximum(self._mass, np.finfo(float).tiny))
-
-    def max_rate(self, stiffness: Values) -> float:
-        """Bound of omega^2 over all ranks, 1/s^2, of k (n,), N/m (collective)."""
-        rate = float(self.node_rates(stiffness).max(initial=0.0))
-        return float(self._interpolation.comm.allreduce(rate, op=MPI.MAX))
-
-    def point_masses(self, area: Values) -> Values:
-        """(n,) masses M_p of points with areas `area` (n,), kg (collective)."""
-        return point_masses(self._weights, area, self.node_rates(area))
 
 
 @dataclass(frozen=True)
@@ -220,21 +185,32 @@ class PenaltyObstacleTerm(ObstacleTerm):
     def _update_stiffness(self) -> None:
         """Compute the stiffness of the points of the current surface (collective)."""
         point_map, area = self.surface.local.point_map, self.surface.area
-        mass_share = NodalMassShare(point_map, self.surface.interpolation, self._mass)
+        mass = self.surface.interpolation.nodal_values(self._mass)[:, 0].copy()
+        self._mass_share = mass_share = NodalMassShare(point_map.weights, mass, self._sum_at_nodes)
         self.stiffness: Values = self.law.barrier.curvature(np.zeros(len(area))) * area
         if np.isfinite(self._max_added):
             self.stiffness = np.minimum(self.stiffness, self._max_added * mass_share.point_masses(area))
-        self._added_frequency, self._stiffness_of = mass_share.max_rate(self.stiffness), (point_map, area)
+        self._added_frequency, self._stiffness_of = self._max_rate(self.stiffness), (point_map, area)
         if self.facets.numbers:
-            self._update_facets(mass_share)
+            self._update_facets()
 
-    def _update_facets(self, mass_share: NodalMassShare) -> None:
+    def _sum_at_nodes(self, values: Values) -> Values:
+        """(columns,) sums over the ranks of values (columns,) at the nodes of the points (collective)."""
+        vector, interpolation = np.zeros((len(values), self._domain.dim)), self.surface.interpolation
+        vector[:, 0] = values
+        return np.asarray(interpolation.nodal_values(interpolation.sum_at_nodes(vector))[:, 0])
+
+    def _max_rate(self, stiffness: Values) -> float:
+        """Bound of omega^2 of springs k (n,), N/m, at the points of all ranks, 1/s^2 (collective)."""
+        return max_over_ranks(self.comm, float(self._mass_share.node_rates(stiffness).max(initial=0.0)))
+
+    def _update_facets(self) -> None:
         """Compute the stiffness k_f of facets off crack faces, kept as areas of ContactFacets (collective)."""
         surface, is_copy = self.surface, np.zeros(len(self.surface.area), bool)
         is_copy[surface.local.point_map.copies] = True
         facets, k = self.facets.active, self.law.barrier.curvature(np.zeros(1)) * self.facets.active.area
         if np.isfinite(self._max_added):
-            masses = mass_share.point_masses(surface.area)
+            masses = self._mass_share.point_masses(surface.area)
             per_mass = np.divide(surface.area, masses, out=np.zeros(len(masses)), where=masses > 0)
             # in a row of Gershgorin's bound each facet at a node has a weight of at most 1
             rate = facets.corners.shape[1] * per_mass[facets.corners].max(axis=1, initial=0.0)
@@ -242,7 +218,6 @@ class PenaltyObstacleTerm(ObstacleTerm):
             k = np.minimum(k, limit * facets.area / np.where(rate > 0, rate, np.inf))
         acts = ~is_copy[facets.corners].any(axis=1)
         self._facets = ContactFacets(facets.corners[acts], k[acts], facets.smoothing, warm_start=False)
-        self._mass_share = mass_share
         corners = surface.rest_positions[self._facets.corners]
         side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0.0))
         self._facet_reach = self.law.barrier.width + PENALTY.max_stretch * self.comm.allreduce(side, op=MPI.MAX)
@@ -263,7 +238,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
                 near = self._facets.within_reach(self.group.posed[number], self.positions, reach)
                 np.add.at(load, self._facets.corners[near], self._facets.area[near][:, None])
             if self.comm.allreduce(bool(load.any()), op=MPI.LOR):
-                added += self._mass_share.max_rate(load)
+                added += self._max_rate(load)
         return added + max(map(self._obstacle_frequency, of_free, of_free.values()), default=0.0)
 
     def _obstacle_frequency(self, number: int, obstacle: VerletObstacle) -> float:

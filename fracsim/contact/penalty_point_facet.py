@@ -12,17 +12,15 @@ Equations: docs/theory.md#explicit-contact.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix
 
 from .closest_point import minimise_on_simplex
 from .ipc_surface import unit_normals
 from .pair_search import PairFilter, PairSearch, SimplexPairs, near_pairs
-from .penalty_contacts import ContactStiffness, PenaltyContacts, point_masses
+from .penalty_contacts import ContactStiffness, NodalMassShare, PenaltyContacts
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -333,33 +331,21 @@ class PointFacetContacts:
 
 
 def penalty_stiffness(
-    weights: csr_matrix,
-    area: Values,
-    mass: Values,
-    pressure: float,
-    max_added: float,
-    *,
-    sum_at_nodes: Callable[[Values], Values] = lambda values: values,
-    local_area: Values | None = None,
+    share: NodalMassShare, area: Values, pressure: float, max_added: float, local_area: Values | None = None
 ) -> Values:
-    """(n,) stiffness k_p of points, N/m.
+    """(n,) stiffness k_p of points, N/m (collective).
 
     `pressure` on half the area of each point, as the other side acts too. At most what adds `max_added` to the square
     of a frequency where each node is in contact with as many points as it carries.
 
     Args:
-        weights: (n, nodes) with which points follow nodes.
+        share: of the points in the mass of their nodes.
         area: (n,) m^2.
-        mass: (nodes,) kg.
         pressure: penalty's stiffness, Pa/m.
         max_added: 1/s^2; infinite: no limit.
-        sum_at_nodes: sums over the ranks of values (nodes,).
         local_area: (n,) share of this rank in `area`, m^2; None: all of it.
     """
+    stiffness = 0.5 * pressure * area
     if np.isinf(max_added):
-        return 0.5 * pressure * area
-    size = abs(weights)
-    row_sum = np.asarray(size.sum(axis=1)).ravel()
-    rate = sum_at_nodes(size.T @ ((area if local_area is None else local_area) * row_sum)) / mass
-    max_stiffness = POINT_FACET.max_added * max_added * point_masses(size, area, rate)
-    return np.minimum(0.5 * pressure * area, max_stiffness)
+        return stiffness
+    return np.minimum(stiffness, POINT_FACET.max_added * max_added * share.point_masses(area, local_area))
