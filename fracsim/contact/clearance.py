@@ -27,7 +27,6 @@ from scipy.sparse import csr_matrix
 
 from ..mesh.domain import Domain
 from ..mesh.split_surface.local_surface import NodeExchange
-from ..mesh.split_surface.surface_map import row_entries
 from .obstacle import RigidObstacle
 from .pose import Pose, PosedShape
 from .proximity import outline_radius
@@ -118,31 +117,23 @@ class NearestPoints:
     Attributes:
         gaps: (k,) lower bounds of g_0, ascending, m.
         reference: (k, d) X, m.
-        nodes: (k, m) rows of nodal values.
-        weights: (k, m) w; 0 where a point follows fewer than m nodes.
+        weights: (k, nodes) w.
     """
 
     gaps: Values
     reference: Values
-    nodes: Ints
-    weights: Values
+    weights: csr_matrix
 
     @classmethod
     def select(cls, points: FollowingPoints, gaps: Values, limit: float) -> NearestPoints:
         """Points with gaps (n,) up to a limit, m."""
         near = np.flatnonzero(gaps <= limit)
         near = near[np.argsort(gaps[near], kind="stable")]
-        entry, row = row_entries(points.weights, near)
-        count = np.bincount(row, minlength=len(near))
-        column = np.arange(len(row)) - np.repeat(np.cumsum(count) - count, count)
-        nodes, weights = np.zeros((len(near), m := int(count.max(initial=0))), np.int64), np.zeros((len(near), m))
-        nodes[row, column], weights[row, column] = points.weights.indices[entry], points.weights.data[entry]
-        return cls(gaps[near], points.reference[near], nodes, weights)
+        return cls(gaps[near], points.reference[near], points.weights[near])
 
     def positions(self, nodal: Values, count: int) -> Values:
         """(count, d) positions of the first points for nodal values (nodes, d), m."""
-        w = self.weights[:count]
-        return np.asarray(self.reference[:count] + np.einsum("km,kmd->kd", w, nodal[self.nodes[:count]]))
+        return np.asarray(self.reference[:count] + self.weights[:count] @ nodal)
 
 
 @dataclass(frozen=True)

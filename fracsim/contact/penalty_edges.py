@@ -174,7 +174,6 @@ class EdgeContacts:
             is_searched[edges[self._is_owned]] = True
         where = PairFilter.of(len(self._used), None if patch is None else patch[self._used], is_searched)
         self._search = PairSearch(where, [self._sets], EDGES.search_margin * distance)
-        self._owned_pairs: tuple[Ints, Ints] | None = None  # pairs of the last search, and those of this rank
         self.set_history(EdgePairHistory.none())
 
     def set_history(self, history: EdgePairHistory) -> None:
@@ -272,12 +271,8 @@ class EdgeContacts:
         return self._owned(pairs)
 
     def _owned(self, pairs: Ints) -> Ints:
-        """(k, 2) pairs of this rank among pairs of sharp edges; those of the last pairs are kept."""
-        if self._is_owned is None:
-            return pairs
-        if self._owned_pairs is None or self._owned_pairs[0] is not pairs:
-            self._owned_pairs = pairs, pairs[self._is_owned[pairs[:, 0]]]
-        return self._owned_pairs[1]
+        """(k, 2) pairs of this rank among pairs of sharp edges."""
+        return pairs if self._is_owned is None else pairs[self._is_owned[pairs[:, 0]]]
 
     def clearance(self, x: Values, reach: float) -> float:
         """Least distance between sharp edges, m, at most `reach`; that of their lines, or 0 where they are parallel."""

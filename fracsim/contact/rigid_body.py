@@ -17,7 +17,7 @@ Equations: docs/theory.md#rigid-obstacles.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from typing import Protocol
@@ -243,16 +243,7 @@ class RigidStep:
 
     def pose(self, z: Values) -> Pose:
         """Pose at z (k,)."""
-        key = z.tobytes()
-        if key not in self._last_pose:
-            self._last_pose.clear()
-            self._last_pose[key] = self.start.pose.incremented(self.increment(z))
-        return self._last_pose[key]
-
-    @cached_property
-    def _last_pose(self) -> dict[bytes, Pose]:
-        """The pose that was asked for last, by its z: energies, derivatives and contact ask for the same one."""
-        return {}
+        return self.start.pose.incremented(self.increment(z))
 
     @cached_property
     def _dim(self) -> int:
@@ -354,8 +345,10 @@ class FreeMotions:
             obstacle.motion = motions[number]
 
     def to_checkpoint(self) -> dict[str, Values]:
-        """Rows of numbers for a checkpoint."""
-        return {"flights": motion_rows(obstacle.motion for obstacle in self.free.values())}
+        """Rows of numbers for a checkpoint; shorter ones, as of a pendulum, end with zeros."""
+        rows = [obstacle.motion.to_array() for obstacle in self.free.values()]
+        length = max(map(len, rows), default=0)
+        return {"flights": np.array([np.pad(row, (0, length - len(row))) for row in rows])}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set states of motion from the rows of a checkpoint."""
@@ -392,10 +385,3 @@ class FreeMotions:
     def _reading(self, obstacle: MovingObstacle, values: Callable[[RigidMotion], Values], index: int) -> Values:
         """(1,) value of a column; 0 on other ranks than 0."""
         return values(obstacle.motion)[index : index + 1] if self.is_root else np.zeros(1)
-
-
-def motion_rows(motions: Iterable[RigidMotion]) -> Values:
-    """(n, m) numbers of states of motion, one row each; shorter rows, as of a pendulum, end with zeros."""
-    rows = [motion.to_array() for motion in motions]
-    length = max(map(len, rows), default=0)
-    return np.array([np.pad(row, (0, length - len(row))) for row in rows])

@@ -54,6 +54,10 @@ class HalfSpace:
     """
 
     kind: ClassVar[str] = "plane"
+    convex: ClassVar[bool] = True
+    rotation_invariant: ClassVar[bool] = False
+    min_radius: ClassVar[float] = float("inf")
+    volume: ClassVar[float] = float("inf")
     direction: tuple[float, ...]
     extent: float = 1.0
     kernels: ShapeKernels | None = field(default=None, compare=False, repr=False, kw_only=True)
@@ -67,26 +71,6 @@ class HalfSpace:
     def dim(self) -> int:
         """Dimension, 2 or 3."""
         return len(self.direction)
-
-    @property
-    def convex(self) -> bool:
-        """True."""
-        return True
-
-    @property
-    def rotation_invariant(self) -> bool:
-        """False."""
-        return False
-
-    @property
-    def min_radius(self) -> float:
-        """Infinite."""
-        return float("inf")
-
-    @property
-    def volume(self) -> float:
-        """Infinite."""
-        return float("inf")
 
     def distance(self, x: Values) -> Values:
         """(n,) n . x, m."""
@@ -411,17 +395,14 @@ class RoundedCylinder(ConvexBody):
 
 
 @dataclass(frozen=True, eq=False)
-class TranslatedShape:
-    """Shape centred at an offset from its reference point, as of a pendulum about its hinge.
+class _DerivedShape:
+    """Shape made of another one, whose dimension, convexity and compiled functions it has.
 
     Attributes:
         shape: original shape.
-        offset: (d,) its centre, m.
     """
 
-    kind: ClassVar[str] = "shape on a hinge"
     shape: Shape
-    offset: Values
 
     @property
     def kernels(self) -> ShapeKernels | None:
@@ -438,6 +419,19 @@ class TranslatedShape:
         """Whether the original shape is convex."""
         return self.shape.convex
 
+
+@dataclass(frozen=True, eq=False)
+class TranslatedShape(_DerivedShape):
+    """Shape centred at an offset from its reference point, as of a pendulum about its hinge.
+
+    Attributes:
+        offset: (d,) its centre, m.
+    """
+
+    kind: ClassVar[str] = "shape on a hinge"
+    rotation_invariant: ClassVar[bool] = False  # a rotation about the reference point moves it
+    offset: Values
+
     @property
     def min_radius(self) -> float:
         """Smallest radius of curvature of the original shape, m."""
@@ -447,11 +441,6 @@ class TranslatedShape:
     def volume(self) -> float:
         """Volume of the original shape, m^3 (2D: m^2)."""
         return self.shape.volume
-
-    @property
-    def rotation_invariant(self) -> bool:
-        """False: a rotation about the reference point moves it."""
-        return False
 
     def distance(self, x: Values) -> Values:
         """(n,) signed distances, m."""
@@ -480,26 +469,14 @@ class TranslatedShape:
 
 
 @dataclass(frozen=True, eq=False)
-class OffsetShape:
+class OffsetShape(_DerivedShape):
     """All points within an offset of a shape: its distance minus the offset.
 
     Attributes:
-        shape: original shape.
         offset: m.
     """
 
-    shape: Shape
     offset: float
-
-    @property
-    def kernels(self) -> ShapeKernels | None:
-        """Compiled functions of the original shape."""
-        return self.shape.kernels
-
-    @property
-    def convex(self) -> bool:
-        """Whether the shape is convex."""
-        return self.shape.convex
 
     @property
     def rotation_invariant(self) -> bool:
