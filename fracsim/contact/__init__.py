@@ -21,13 +21,13 @@ Laws and geometry:
     shape_base, shapes    signed distances, moments and tessellations of half space, sphere, capsule, box, cylinder
     shape_kernels         compiled distances, closest points of facets and their energy; the modules beside it are plain
     triangle_mesh_shape   closed surfaces of triangles
-    clearance             bound of the distance from obstacles over many steps, while all are far; smallest gaps
-    proximity             points and facets that may be near an obstacle
+    clearance             points and facets that may be near an obstacle; bound of the distance over many steps, while
+                          all are far; smallest gaps
     supporting_obstacles  obstacles that a body is set down on
 
 Points and facets before analytic obstacles:
 
-    contact_surface       points of the split surface; retraction of new crack faces
+    contact_surface       points of the split surface; retraction of new crack faces; cells that show theirs
     node_contact          forces on points, lagged friction
     closest_point, facet_contact  forces on facets between their nodes
     step_limit            conservative advancement, first guesses, motion of obstacles in a step
@@ -45,11 +45,11 @@ Surfaces with ipctk:
 Free obstacles:
 
     rigid_body            states of motion; incremental potential of poses
-    pose_derivatives      derivatives of contact by a pose
-    obstacle_pairs, mesh_pairs  contact between obstacles: analytic ones, triangle meshes
+    pose_derivatives      derivatives of contact by a pose; contact of the body as the obstacles see it
+    obstacle_pairs, mesh_pairs  contact between obstacles: pairs with an analytic one, pairs of triangle meshes
     penalty_obstacle_pairs  both in explicit steps
 
-Modules without DOLFINx and MPI: laws, closest_point, facet_contact, node_contact, obstacle, pose, shape_base, shapes,
+Modules without DOLFINx and MPI: laws, closest_point, node_contact, obstacle, pose, shape_base, shapes,
 triangle_mesh_shape. Every rank evaluates its own points.
 
 Source: M. Li and others (2020), Incremental Potential Contact, ACM Transactions on Graphics 39 (4), 49. Its barrier

@@ -16,13 +16,12 @@ from ..mesh.domain import Domain
 from ..mesh.parallel import gather
 from ..mesh.split_surface.point_matching import match_points
 from ..mesh.split_surface.surface_map import SurfaceMap
-from .clearance import Clearance, FollowingPoints, ShapeDistance
-from .contact_surface import RETRACTION, TINY, ContactSurface, SurfaceVersion, retract_cut_elements
+from .clearance import Clearance, FollowingPoints, ProximityCandidates, ShapeDistance, outline_radius
+from .contact_surface import RETRACTION, TINY, ContactSurface, ShownCells, SurfaceVersion, retract_cut_elements
 from .facet_contact import FACETS, ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
 from .laws import CoulombFriction, FrictionDirection, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
 from .pose import PosedShape, min_distance
-from .proximity import ProximityCandidates, ShownCells, outline_radius
 from .rigid_obstacles import ObstacleGroup
 from .step_limit import check_obstacles_apart, refuse_overlap
 

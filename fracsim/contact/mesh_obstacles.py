@@ -18,11 +18,11 @@ from scipy.spatial import cKDTree
 
 from ..errors import InputError
 from ..mesh.split_surface.entity_numbering import EntityNumbering
+from .clearance import bounding_box
 from .ipc_pairs import IpcPairs, PairShare
 from .ipc_surface import SelfContactLaw, SelfContactSurface
 from .laws import BARRIER
 from .pose import Pose, PosedShape
-from .proximity import bounding_box
 from .sample_points import IpcFriction
 from .triangle_mesh_shape import ClosedSurface, penetration_depth
 

@@ -19,13 +19,13 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ..errors import InputError
+from .clearance import ProximityCandidates
 from .closest_point import FacetClosestPoints, find_closest_points
 from .contact_surface import ContactSurface
 from .facet_contact import ContactFacets
 from .laws import BARRIER
 from .obstacle import RigidObstacle
 from .pose import Pose, PosedShape, rotate_vectors
-from .proximity import ProximityCandidates
 from .shape_base import lengths
 
 if TYPE_CHECKING:
