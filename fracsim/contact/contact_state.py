@@ -92,9 +92,13 @@ class SurfaceFacets:
         """Number of excluded facets of this rank."""
         return len(self._excluded)
 
-    def gaps(self, posed: Sequence[PosedShape], facets: ContactFacets, x: Values) -> Values:
-        """(m,) least gaps between facets, their points at x (n, d), m, and the curved ones of the obstacles."""
-        return np.asarray(np.min([facets.gaps(posed[n], x, self._width) for n in self.numbers], axis=0))
+    def gaps(self, posed: Sequence[PosedShape], facets: ContactFacets, x: Values, reach: float | None = None) -> Values:
+        """(m,) least gaps of facets to the curved ones of the obstacles, with points at x (n, d), m; infinite far away.
+
+        `reach`: gap from which on an obstacle is far, m; None: the width of the barrier.
+        """
+        reach = self._width if reach is None else reach
+        return np.asarray(np.min([facets.gaps(posed[n], x, reach) for n in self.numbers], axis=0))
 
     def are_open(self, posed: Sequence[PosedShape], x: Values) -> bool:
         """Whether no facet is cut with points at x (n, d), m (collective)."""
@@ -108,8 +112,7 @@ class SurfaceFacets:
         if not self.numbers:
             return at
         facets = ContactFacets(elements, np.ones(len(elements)), FACETS.smoothing * self._width)
-        curved = [posed[number] for number in self.numbers]
-        return retract_cut_elements(at, u, elements, lambda x: ~facets.are_open(curved, x))
+        return retract_cut_elements(at, u, elements, lambda x: self.gaps(posed, facets, x, 0.0) <= 0)
 
     # --- new crack faces ---
 

@@ -12,7 +12,7 @@ Equations: docs/theory.md#facets.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
@@ -84,10 +84,6 @@ class ContactFacets:
     def _candidates(self) -> ProximityCandidates:
         return ProximityCandidates(0.0, self.corners)
 
-    def candidates(self, posed: PosedShape, x: Values, reach: float) -> Ints:
-        """(k,) facets that may have a gap below `reach`, m, to an obstacle, with points at x (n, d), m; others too."""
-        return self._candidates(posed, x, reach + self.max_gap_error)
-
     @cached_property
     def max_gap_error(self) -> float:
         """Largest amount by which smoothing makes a gap smaller, m."""
@@ -150,7 +146,7 @@ class ContactFacets:
             centroids; (k, c) distances of corners on the tangent plane minus `max_gap_error`; (k, d) normals.
         """
         (_, c), d = self.corners.shape, x.shape[1]
-        near = self.candidates(posed, x, float(reach.max(initial=0.0)))
+        near = self._candidates(posed, x, float(reach.max(initial=0.0)) + self.max_gap_error)
         if not len(near):
             return near, np.empty(0), np.empty((0, c)), np.empty((0, d))
         facet_reach = np.broadcast_to(reach, len(x))[self.corners[near]].max(axis=1, initial=0.0) + self.max_gap_error
@@ -166,14 +162,6 @@ class ContactFacets:
     def distances(self, posed: PosedShape, x: Values, reach: float) -> Values:
         """(k,) distances of the closest points of facets within `reach`, m."""
         return posed.distance(self.closest_points(posed, x, self.within_reach(posed, x, reach)).position)
-
-    def are_open(self, obstacles: Sequence[PosedShape], x: Values) -> Flags:
-        """(m,) facets that none of several obstacles cuts."""
-        is_open = np.ones(len(self.area), bool)
-        for posed in obstacles:
-            near = self.within_reach(posed, x, 0.0)
-            is_open[near] &= self.closest_points(posed, x, near).gap > 0
-        return is_open
 
     def gaps(self, posed: PosedShape, x: Values, reach: float) -> Values:
         """(m,) gaps to an obstacle, m; infinite beyond `reach`."""

@@ -318,8 +318,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
         pressure, normal = self.stiffness[points] * closure, posed.normal(self.positions[points])
         energy, no_friction = 0.5 * float(pressure @ closure), np.zeros_like(normal)
         forces = ContactForces(points, energy, pressure[:, None] * normal, no_friction, 0.0, _no_tangent)
-        is_round = number in self.facets.numbers
-        if not is_round or not len(self._facets.candidates(posed, self.positions, law.width)):
+        if number not in self.facets.numbers:
             return forces
         of_unit_rate = Penalty(law.width, law.width)
         return merge_forces(forces, *evaluate_facets(self._facets, posed, self.positions, of_unit_rate))
