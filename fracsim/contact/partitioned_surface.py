@@ -42,8 +42,7 @@ from .clearance import FollowingPoints
 from .ipc_pairs import vertex_areas
 from .ipc_surface import SURFACE, SelfContactLaw, build_contact_surface, offset_crack_faces, refuse_intersections
 from .mesh_obstacles import MeshObstacle, refuse_overlap
-from .penalty_contacts import NodalMassShare
-from .penalty_pairs import HistoryRows, PenaltyHistory
+from .penalty_contacts import NodalMassShare, PenaltyHistory
 from .penalty_point_facet import POINT_FACET, penalty_stiffness
 from .penalty_surface import PenaltySurface, triangle_ranks
 from .surface_exchange import EXCHANGE, ElementRows, ElementSet, PointRows, exchange_elements
@@ -159,7 +158,7 @@ class PartitionedSurface:
         self.element_set = replace(self.element_set, points=replace(self.element_set.points, share=-states[:, 0]))
         self.surface_count += 1
         self._exchange(u)
-        self.set_history([part.contact.history.to_rows(part.keys) for part in previous.parts])
+        self.set_history([part.contact.history.by_keys(part.keys) for part in previous.parts])
         self.current.retract_faces(self.nodal_values(u), self.element_set.points.keys, states[:, 1])
         self._faces_changed()
 
@@ -279,7 +278,7 @@ class PartitionedSurface:
         """Exchange elements again if one may be missing at displacements u (owned dofs,), m (collective)."""
         if self._restored is None and not self._moved_far(u):
             return
-        histories = [part.contact.history.to_rows(part.keys) for part in self.current.parts]
+        histories = [part.contact.history.by_keys(part.keys) for part in self.current.parts]
         state, self._restored = self._restored or self.snapshot(), None
         rows, faces = self.element_set.points, self.element_set.elements
         self.element_set = ElementSet(replace(rows, share=state.share), replace(faces, is_excluded=state.is_excluded))
@@ -329,17 +328,17 @@ class PartitionedSurface:
         sides = [mesh.triangles[triangle_ranks(mesh, self._comm.size) == self._comm.rank] for mesh in self._meshes]
         return [_bounding_boxes(mesh.positions[rows]) for mesh, rows in zip(self._meshes, sides, strict=True)]
 
-    def set_history(self, histories: Sequence[HistoryRows]) -> None:
+    def set_history(self, histories: Sequence[PenaltyHistory]) -> None:
         """Set the contacts of each part at the end of the last step; each goes to the rank that it belongs to.
 
         Collective.
         """
-        for part, rows in zip(self.current.parts, histories, strict=True):
-            stored = part.contact.store(part.lookup(rows.points[:, 0]), part.lookup(rows.edges))
+        for part, history in zip(self.current.parts, histories, strict=True):
+            stored = part.contact.store(part.lookup(history.points.points[:, 0]), part.lookup(history.edges.points))
             if self._comm.size > 1:
-                elsewhere = rows.select(*(~flags for flags in stored))
-                rows = HistoryRows.join([rows.select(*stored), *allgather(self._comm, elsewhere)])
-            part.contact.set_history(PenaltyHistory.from_rows(rows, part.lookup, part.max_stiffness))
+                elsewhere = history.select(*(~flags for flags in stored))
+                history = PenaltyHistory.join([history.select(*stored), *allgather(self._comm, elsewhere)])
+            part.contact.set_history(history.by_numbers(part.lookup, part.max_stiffness))
 
     # --- positions and forces ---
 

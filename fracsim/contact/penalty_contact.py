@@ -30,7 +30,8 @@ from .mesh_obstacle_term import build_mesh_obstacle
 from .mesh_obstacles import MeshObstacle
 from .obstacle import VerletObstacle
 from .partitioned_surface import PartitionedSurface, motion_diagonal
-from .penalty_pairs import HistoryRows, PairSprings, PenaltyHistory
+from .penalty_contacts import PenaltyHistory
+from .penalty_pairs import NO_ROWS, PairSprings
 from .penalty_point_facet import POINT_FACET
 from .penalty_surface import PenaltyPart
 from .pose import Pose, PosedShape
@@ -134,7 +135,7 @@ class PenaltyState:
         """Set contacts of a snapshot whose surface had other numbers (collective)."""
         if self._restored is not None:
             histories, self._restored = self._restored, None
-            self._surface.set_history([history.to_rows(keys) for keys, history in histories])
+            self._surface.set_history([history.by_keys(keys) for keys, history in histories])
 
     def snapshot(self) -> object:
         """Contacts, numbering of the surface, and idle state."""
@@ -162,18 +163,18 @@ class PenaltyState:
         self.settle()
         arrays: dict[str, Values] = {}
         for index, part in enumerate(self._surface.current.parts):
-            if (rows := gather(self._comm, part.contact.history.to_rows(part.keys))) is not None:
-                arrays |= HistoryRows.join(rows).to_checkpoint(f"_{index}")
+            if (rows := gather(self._comm, part.contact.history.by_keys(part.keys))) is not None:
+                arrays |= PenaltyHistory.join(rows).to_checkpoint(f"_{index}")
         return arrays
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint (collective)."""
         count = len(self._surface.current.parts)
-        histories = [HistoryRows.from_checkpoint(saved, f"_{index}") for index in range(count)]
-        is_near = any(len(rows.points) or len(rows.edges) for rows in histories)
+        histories = [PenaltyHistory.from_checkpoint(saved, f"_{index}") for index in range(count)]
+        is_near = any(not history.is_empty for history in histories)
         self._idle_state = IdleState(is_near, surface_count=self._idle_state.surface_count)
         if self._comm.rank:
-            histories = [HistoryRows(*(rows[:0] for rows in vars(part).values())) for part in histories]
+            histories = [history.select(NO_ROWS, NO_ROWS) for history in histories]
         self._surface.set_history(histories)
         self.discard()
 

@@ -13,8 +13,9 @@ Equations: docs/theory.md#explicit-contact.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +27,8 @@ Flags = npt.NDArray[np.bool_]
 
 # weight of a node, in the sum of all of a point, below which it is round-off of arms that cancel
 MIN_WEIGHT = 1e-6
+# number of a corner that is no more
+NO_POINT = -1
 
 
 @dataclass(frozen=True)
@@ -164,6 +167,134 @@ class PenaltyContacts:
         entries = self.weights.reshape(-1)[moves], (rows[moves], columns[moves])
         size = abs(csr_matrix(entries, shape=(k, nodes.shape[0])) @ nodes)
         return np.asarray(size.T @ (self.stiffness * np.asarray(size.sum(axis=1)).ravel()))
+
+
+@dataclass(frozen=True)
+class ContactHistory:
+    """Contacts of one kind near each other at the end of the last step: points before facets, or edges against edges.
+
+    Attributes:
+        points: (k, m) numbers of points, or their keys; -1: a corner that is no more.
+        values: (k, 3 + d) side, stiffness, share and slip.
+    """
+
+    points: Ints
+    values: Values
+
+    @classmethod
+    def of(cls, near: PenaltyContacts, width: float, slip: Values | None, side: Values | None = None) -> ContactHistory:
+        """Contacts near each other; stiffness and slip are those of contacts with gaps below `width`, m.
+
+        `slip`: (k, d) stretch of springs, m; None: zero. `side`: (k,) sign of the normals, None: 1.
+        """
+        touches, ones = near.gap < width, np.ones(len(near.gap))
+        stiffness = np.where(touches, near.stiffness, 0.0)
+        slips = np.zeros_like(near.normal) if slip is None else np.where(touches[:, None], slip, 0.0)
+        return cls(near.points, np.column_stack([ones if side is None else side, stiffness, near.share, slips]))
+
+    @classmethod
+    def none(cls, count: int, dim: int) -> ContactHistory:
+        """No contacts of m = `count` points."""
+        return cls(np.empty((0, count), np.int64), np.empty((0, 3 + dim)))
+
+    def select(self, rows: Flags | Ints) -> ContactHistory:
+        """Some of the contacts."""
+        return ContactHistory(self.points[rows], self.values[rows])
+
+    @property
+    def side(self) -> Values:
+        """(k,) sign of the normal of edges, 1 or -1."""
+        return self.values[:, 0]
+
+    @property
+    def stiffness(self) -> Values:
+        """(k,) k of those in contact, N/m; 0: without contact."""
+        return self.values[:, 1]
+
+    @property
+    def share(self) -> Values:
+        """(k,) h."""
+        return self.values[:, 2]
+
+    @property
+    def slip(self) -> Values:
+        """(k, d) stretch of the springs of friction, m."""
+        return self.values[:, 3:]
+
+    @property
+    def spring_energy(self) -> float:
+        """Energy of the springs of friction, J."""
+        return 0.5 * float((self.stiffness * self.share) @ np.sum(self.slip**2, axis=1))
+
+
+@dataclass(frozen=True)
+class PenaltyHistory:
+    """Contacts at the end of the last step.
+
+    Attributes:
+        points: of points before facets.
+        edges: of edges against edges; none in 2D.
+    """
+
+    points: ContactHistory
+    edges: ContactHistory
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing was near contact."""
+        return not len(self.points.points) and not len(self.edges.points)
+
+    def select(self, points: Flags | Ints, edges: Flags | Ints) -> PenaltyHistory:
+        """Some of the contacts."""
+        return PenaltyHistory(self.points.select(points), self.edges.select(edges))
+
+    @classmethod
+    def join(cls, parts: Sequence[PenaltyHistory]) -> PenaltyHistory:
+        """Contacts of several ranks."""
+        return cls(_joined([part.points for part in parts]), _joined([part.edges for part in parts]))
+
+    def by_keys(self, keys: Ints) -> PenaltyHistory:
+        """Contacts by the keys (n,) of all points, which do not depend on the ranks."""
+        points, edges = self.points.points, self.edges.points
+        points = np.where(points >= 0, keys[points], NO_POINT)
+        return PenaltyHistory(
+            ContactHistory(points, self.points.values), ContactHistory(keys[edges], self.edges.values)
+        )
+
+    def by_numbers(self, lookup: Callable[[Ints], Ints], max_stiffness: Values) -> PenaltyHistory:
+        """Contacts by keys of the points of a surface, no stiffer than `max_stiffness` (n,), N/m.
+
+        `lookup`: function that returns the point of each key; -1: none. Contacts without their point, or with edges
+        that are no more, are left out.
+        """
+        points, edges = lookup(self.points.points), lookup(self.edges.points)
+        have_point, have_edges = points[:, 0] >= 0, (edges >= 0).all(axis=1)
+        values = self.points.values[have_point]
+        values[:, 1] = np.minimum(values[:, 1], max_stiffness[points[have_point, 0]])
+        edge_values = self.edges.values[have_edges]
+        return PenaltyHistory(
+            ContactHistory(points[have_point], values), ContactHistory(edges[have_edges], edge_values)
+        )
+
+    def to_checkpoint(self, suffix: str) -> dict[str, Values]:
+        """Arrays of names with a suffix; of points without side and share, which are 1."""
+        values = np.delete(self.points.values, [0, 2], axis=1)
+        arrays: dict[str, Any] = {"points": self.points.points, "point_values": values,
+                  "edges": self.edges.points, "edge_values": self.edges.values}  # fmt: skip
+        return {f"{name}{suffix}": array for name, array in arrays.items()}
+
+    @classmethod
+    def from_checkpoint(cls, saved: dict[str, Any], suffix: str) -> PenaltyHistory:
+        """Contacts from the arrays of a checkpoint."""
+        values = np.insert(saved[f"point_values{suffix}"], [0, 1], 1.0, axis=1)
+        points = ContactHistory(saved[f"points{suffix}"], values)
+        return cls(points, ContactHistory(saved[f"edges{suffix}"], saved[f"edge_values{suffix}"]))
+
+
+def _joined(parts: Sequence[ContactHistory]) -> ContactHistory:
+    """Contacts of one kind of several ranks."""
+    points = np.concatenate([part.points for part in parts])
+    return ContactHistory(points, np.concatenate([part.values for part in parts]))
 
 
 class NodalMassShare:

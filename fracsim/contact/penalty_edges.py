@@ -15,14 +15,14 @@ Equations: docs/theory.md#explicit-contact.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from .ipc_surface import unit_normals
 from .pair_search import PairFilter, PairSearch, SimplexPairs, near_pairs
-from .penalty_contacts import ElementRanks, PenaltyContacts
+from .penalty_contacts import ContactHistory, ElementRanks, PenaltyContacts
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -53,45 +53,6 @@ class EdgePolicy:
 
 
 EDGES = EdgePolicy()
-
-
-@dataclass(frozen=True)
-class EdgePairHistory:
-    """Pairs of edges near each other at the end of the last step.
-
-    Attributes:
-        points: (k, 4) ends of both.
-        side: (k,) sign of n: 1 or -1.
-        stiffness: (k,) k of those in contact, N/m; 0: without contact.
-        share: (k,) h.
-        slip: (k, 3) stretch of their springs of friction, m.
-    """
-
-    points: Ints
-    side: Values
-    stiffness: Values
-    share: Values
-    slip: Values
-
-    @classmethod
-    def none(cls) -> EdgePairHistory:
-        """No pairs."""
-        return cls(np.empty((0, 4), np.int64), np.empty(0), np.empty(0), np.empty(0), np.empty((0, 3)))
-
-    def select(self, rows: Flags | Ints) -> EdgePairHistory:
-        """Some of the pairs."""
-        return EdgePairHistory(
-            self.points[rows], self.side[rows], self.stiffness[rows], self.share[rows], self.slip[rows]
-        )
-
-    def to_rows(self, keys: Ints) -> tuple[Ints, Values]:
-        """(k, 4) keys of both ends, and (k, 6) side, stiffness, share and slip; `keys`: (n,) of all points."""
-        return keys[self.points], np.column_stack([self.side, self.stiffness, self.share, self.slip])
-
-    @classmethod
-    def from_rows(cls, points: Ints, values: Values) -> EdgePairHistory:
-        """Pairs with ends (k, 4), of the values of `to_rows`."""
-        return cls(points, values[:, 0], values[:, 1], values[:, 2], values[:, 3:])
 
 
 @dataclass(frozen=True)
@@ -174,9 +135,9 @@ class EdgeContacts:
             is_searched[edges[self._is_owned]] = True
         where = PairFilter.of(len(self._used), None if patch is None else patch[self._used], is_searched)
         self._search = PairSearch(where, [self._sets], EDGES.search_margin * distance)
-        self.set_history(EdgePairHistory.none())
+        self.set_history(ContactHistory.none(4, 3))
 
-    def set_history(self, history: EdgePairHistory) -> None:
+    def set_history(self, history: ContactHistory) -> None:
         """Set the pairs near each other; those of edges that are not sharp are left out."""
         history = _ordered_ends(history)
         edges = [self._edge_numbers(history.points[:, columns]) for columns in (slice(0, 2), slice(2, 4))]
@@ -252,14 +213,11 @@ class EdgeContacts:
 
     def end_step(self, x: Values, near: PenaltyContacts, slip: Values | None) -> None:
         """Store contacts `near` at the end of a step, and slips (k, 3) of their springs, m; x: (n, 3), m."""
-        if not len(near.gap) and not len(self.history.side):
+        if not len(near.gap) and not len(self.history.points):
             return
-        touches = near.gap < self._width
         crossing = _CrossingEdges.of(x[near.points])
         side = np.where(np.einsum("kd,kd->k", crossing.normal, near.normal) < 0, -1.0, 1.0)
-        slips = np.zeros_like(near.normal) if slip is None else np.where(touches[:, None], slip, 0.0)
-        stiffness = np.where(touches, near.stiffness, 0.0)
-        self.set_history(EdgePairHistory(near.points, side, stiffness, near.share, slips))
+        self.set_history(ContactHistory.of(near, self._width, slip, side))
 
     def clear_caches(self) -> None:
         """Discard the candidates."""
@@ -282,22 +240,23 @@ class EdgeContacts:
         return min(reach, float(_segment_distances(x[ends]).min(initial=reach)))
 
 
-def _ordered_ends(history: EdgePairHistory) -> EdgePairHistory:
+def _ordered_ends(history: ContactHistory) -> ContactHistory:
     """The same pairs with the lower end of each edge first; n stays."""
-    points, side = history.points.copy(), history.side.copy()
+    points, values = history.points.copy(), history.values.copy()
     for first in (0, 2):
         reverse = points[:, first] > points[:, first + 1]
         points[reverse, first : first + 2] = points[reverse, first : first + 2][:, ::-1]
-        side[reverse] *= -1
-    return replace(history, points=points, side=side)
+        values[reverse, 0] *= -1
+    return ContactHistory(points, values)
 
 
-def _swapped(history: EdgePairHistory, rows: Flags) -> EdgePairHistory:
+def _swapped(history: ContactHistory, rows: Flags) -> ContactHistory:
     """The same pairs with a and b exchanged in some rows: a x b and the slip change their signs, as o does."""
     if not rows.any():
         return history
-    points, sign = np.where(rows[:, None], history.points[:, [2, 3, 0, 1]], history.points), np.where(rows, -1.0, 1.0)
-    return replace(history, points=points, slip=sign[:, None] * history.slip)
+    points, values = np.where(rows[:, None], history.points[:, [2, 3, 0, 1]], history.points), history.values.copy()
+    values[rows, 3:] *= -1
+    return ContactHistory(points, values)
 
 
 @dataclass(frozen=True)

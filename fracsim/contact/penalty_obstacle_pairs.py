@@ -26,7 +26,8 @@ from .pose_derivatives import resultant
 from .triangle_mesh_shape import StackedMeshes, TriangleMeshShape
 
 if TYPE_CHECKING:
-    from .penalty_pairs import PenaltyHistory, PenaltyPairs  # with ipctk
+    from .penalty_contacts import PenaltyHistory
+    from .penalty_pairs import PenaltyPairs  # with ipctk
 
 Values = npt.NDArray[np.float64]
 
@@ -261,14 +262,14 @@ class MeshContacts:
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Arrays of contacts."""
-        return self._pairs.history.to_rows(np.arange(len(self._meshes.points))).to_checkpoint("")
+        return self._pairs.history.to_checkpoint("")
 
     def from_checkpoint(self, saved: dict[str, Values], suffix: str) -> None:
         """Set contacts from the arrays of a checkpoint."""
-        from .penalty_pairs import HistoryRows, PenaltyHistory
+        from .penalty_contacts import PenaltyHistory
 
-        rows, unlimited = HistoryRows.from_checkpoint(saved, suffix), np.full(len(self._meshes.points), np.inf)
-        self._pairs.set_history(PenaltyHistory.from_rows(rows, np.asarray, unlimited))
+        unlimited = np.full(len(self._meshes.points), np.inf)
+        self._pairs.set_history(PenaltyHistory.from_checkpoint(saved, suffix).by_numbers(np.asarray, unlimited))
 
 
 class PenaltyPair:

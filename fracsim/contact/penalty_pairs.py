@@ -15,95 +15,29 @@ Equations: docs/theory.md#explicit-contact.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from .laws import slipped, tangential
 from .pair_search import PairFilter, intersecting_pairs
-from .penalty_contacts import ContactStiffness, ElementRanks, PenaltyContacts, concatenate_contacts
-from .penalty_edges import EdgeContacts, EdgePairHistory
-from .penalty_point_facet import NO_FACET, POINT_FACET, PointFacetContacts, PointHistory
+from .penalty_contacts import (
+    ContactHistory,
+    ContactStiffness,
+    ElementRanks,
+    PenaltyContacts,
+    PenaltyHistory,
+    concatenate_contacts,
+)
+from .penalty_edges import EdgeContacts
+from .penalty_point_facet import POINT_FACET, PointFacetContacts
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
 NO_ROWS: Ints = np.empty(0, np.int64)
-
-
-@dataclass(frozen=True)
-class HistoryRows:
-    """Contacts at the end of a step by keys of points, which do not depend on the ranks.
-
-    Attributes:
-        points, point_values: of points before facets (PointHistory.to_rows).
-        edges, edge_values: of edges against edges (EdgePairHistory.to_rows).
-    """
-
-    points: Ints
-    point_values: Values
-    edges: Ints
-    edge_values: Values
-
-    def select(self, points: Flags, edges: Flags) -> HistoryRows:
-        """Some of the rows."""
-        return HistoryRows(self.points[points], self.point_values[points], self.edges[edges], self.edge_values[edges])
-
-    def to_checkpoint(self, suffix: str) -> dict[str, Values]:
-        """Arrays of names with a suffix."""
-        return {f"{entry.name}{suffix}": getattr(self, entry.name) for entry in fields(self)}
-
-    @classmethod
-    def from_checkpoint(cls, saved: dict[str, Values], suffix: str) -> HistoryRows:
-        """Contacts from the arrays of a checkpoint."""
-        arrays: list[Any] = [saved[f"{entry.name}{suffix}"] for entry in fields(cls)]
-        return cls(*arrays)
-
-    @classmethod
-    def join(cls, parts: Sequence[HistoryRows]) -> HistoryRows:
-        """Rows of several ranks."""
-        return cls(*(np.concatenate([getattr(part, entry.name) for part in parts]) for entry in fields(cls)))
-
-
-@dataclass(frozen=True)
-class PenaltyHistory:
-    """Contacts at the end of the last step.
-
-    Attributes:
-        points: of points before facets.
-        edges: of edges against edges; none in 2D.
-    """
-
-    points: PointHistory
-    edges: EdgePairHistory
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether nothing was near contact."""
-        return not (self.points.facets != NO_FACET).any() and not len(self.edges.side)
-
-    def to_rows(self, keys: Ints) -> HistoryRows:
-        """Contacts by the keys (n,) of all points."""
-        return HistoryRows(*self.points.to_rows(keys), *self.edges.to_rows(keys))
-
-    @classmethod
-    def from_rows(cls, rows: HistoryRows, lookup: Callable[[Ints], Ints], max_stiffness: Values) -> PenaltyHistory:
-        """Contacts of the points of a surface, no stiffer than `max_stiffness` (n,), N/m.
-
-        `lookup`: function that returns the point of each key; -1: none. Contacts without their point, or with edges
-        that are no more, are left out.
-        """
-        points, edges = lookup(rows.points), lookup(rows.edges)
-        have_point, have_edges = points[:, 0] >= 0, (edges >= 0).all(axis=1)
-        points = points[have_point]
-        return cls(
-            PointHistory.from_rows(points[:, 0], points[:, 1:], rows.point_values[have_point], max_stiffness),
-            EdgePairHistory.from_rows(edges[have_edges], rows.edge_values[have_edges]),
-        )
 
 
 class PenaltyPairs:
@@ -158,7 +92,7 @@ class PenaltyPairs:
     def history(self) -> PenaltyHistory:
         """Contacts at the end of the last step; the same object as long as they are the same."""
         if self._history is None:
-            edges = EdgePairHistory.none() if self._edges is None else self._edges.history
+            edges = ContactHistory.none(4, 2) if self._edges is None else self._edges.history
             self._history = PenaltyHistory(self._points.history, edges)
         return self._history
 
@@ -224,13 +158,11 @@ class PenaltyPairs:
         self._ahead, self._history = (x.copy(), self.near_contacts(x)), None
         points, *edges = self._near_parts(x)
         count = int((points.gap < self.width).sum())
-        self._points.end_step(points, None if slips is None else slips[:count])
+        all_slips = _of_near(points, self.width, None if slips is None else slips[:count])
+        self._points.end_step(points, all_slips)
         if self._edges is not None:
-            near, slip = edges[0] if edges else points.select(NO_ROWS), None
-            if slips is not None:
-                slip = np.zeros_like(near.normal)
-                slip[near.gap < self.width] = slips[count:]
-            self._edges.end_step(x, near, slip)
+            near = edges[0] if edges else points.select(NO_ROWS)
+            self._edges.end_step(x, near, _of_near(near, self.width, None if slips is None else slips[count:]))
         self._near = self._touching = None
 
     def intersections(self, x: Values) -> Ints:
@@ -255,6 +187,15 @@ class PenaltyPairs:
         if self._edges is not None:
             self._edges.clear_caches()
         self._near = self._touching = None
+
+
+def _of_near(near: PenaltyContacts, width: float, slips: Values | None) -> Values | None:
+    """(k, d) slips of near contacts, of which those with gaps below `width`, m, have some."""
+    if slips is None:
+        return None
+    result = np.zeros_like(near.normal)
+    result[near.gap < width] = slips
+    return result
 
 
 @dataclass(frozen=True)
@@ -294,10 +235,7 @@ class PairSprings:
             contacts.spring_stiffness[:, None] * self.slips(x),
         )
         work = -0.5 * float(np.vdot(start + end, self._relative_motion(x)))
-        points, edges = history.points, history.edges
-        start_energy = 0.5 * float(points.stiffness @ np.sum(points.slip**2, axis=1))
-        start_energy += 0.5 * float((edges.stiffness * edges.share) @ np.sum(edges.slip**2, axis=1))
-        return start_energy - self.energy(x) - work
+        return history.points.spring_energy + history.edges.spring_energy - self.energy(x) - work
 
     def _relative_motion(self, x: Values) -> Values:
         """(k, d) motion at contacts that stay in contact since the start of the step, m."""

@@ -20,14 +20,11 @@ import numpy.typing as npt
 from .closest_point import minimise_on_simplex
 from .ipc_surface import unit_normals
 from .pair_search import PairFilter, PairSearch, SimplexPairs, near_pairs
-from .penalty_contacts import ContactStiffness, NodalMassShare, PenaltyContacts
+from .penalty_contacts import NO_POINT, ContactHistory, ContactStiffness, NodalMassShare, PenaltyContacts
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
-
-# corners of the facet of a point without contact
-NO_FACET = -1
 
 
 @dataclass(frozen=True)
@@ -156,47 +153,6 @@ def _closest_points(x: Values, points: Ints, corners: Ints) -> tuple[Values, Val
     return barycentric, -np.einsum("kcd,kc->kd", arms, barycentric)
 
 
-@dataclass(frozen=True)
-class PointHistory:
-    """Points near facets at the end of the last step.
-
-    Attributes:
-        facets: (n, d) corners of the facets that points were before, or NO_FACET.
-        stiffness: (n,) k_p of points in contact, N/m; 0 of others.
-        slip: (n, d) stretch of their springs of friction, m.
-    """
-
-    facets: Ints
-    stiffness: Values
-    slip: Values
-
-    @classmethod
-    def none(cls, count: int, dim: int) -> PointHistory:
-        """No contact of n = `count` points."""
-        return cls(np.full((count, dim), NO_FACET, np.int64), np.zeros(count), np.zeros((count, dim)))
-
-    def to_rows(self, keys: Ints) -> tuple[Ints, Values]:
-        """(k, 1 + d) keys of points with contacts and of corners, and (k, 1 + d) stiffness and slips.
-
-        `keys`: (n,) of all points.
-        """
-        points = np.flatnonzero((self.facets != NO_FACET).any(axis=1))
-        facets = np.where(self.facets[points] >= 0, keys[self.facets[points]], NO_FACET)
-        return (
-            np.column_stack([keys[points], facets]),
-            np.column_stack([self.stiffness[points], self.slip[points]]),
-        )
-
-    @classmethod
-    def from_rows(cls, points: Ints, corners: Ints, values: Values, max_stiffness: Values) -> PointHistory:
-        """Contacts of points (k,), with numbers (k, d) of corners, -1: none, no stiffer than (n,), N/m."""
-        result = cls.none(len(max_stiffness), corners.shape[1])
-        result.facets[points] = np.where(corners >= 0, corners, NO_FACET)
-        result.stiffness[points] = np.minimum(values[:, 0], max_stiffness[points])
-        result.slip[points] = values[:, 1:]
-        return result
-
-
 class PointFacetContacts:
     """Points of a surface before its facets, and their history.
 
@@ -226,7 +182,6 @@ class PointFacetContacts:
         """
         count, dim = len(stiffness.point), elements.shape[1]
         self.is_owned = np.ones(count, bool) if is_owned is None else is_owned
-        self.history = PointHistory.none(count, dim)
         self._stiffness, self._width, self._elements, self._edge = stiffness, distance, elements, edge
         self._used, local = np.unique(elements, return_inverse=True)
         facets, reach = local.reshape(elements.shape), POINT_FACET.max_gap * distance
@@ -238,21 +193,22 @@ class PointFacetContacts:
         self._searched: Ints | None = None  # pairs of which closest points are cached
         self._cache: ClosestPointCache
         self._last: tuple[Values, PointFacetPairs] | None = None
+        self.set_history(ContactHistory.none(1 + dim, dim))
 
-    def set_history(self, history: PointHistory) -> None:
+    def set_history(self, history: ContactHistory) -> None:
         """Set the contacts at the end of the last step; those of points of other ranks are left out."""
-        if not self.is_owned.all() and (history.facets[~self.is_owned] != NO_FACET).any():
-            none = PointHistory.none(*history.facets.shape)
-            owned = self.is_owned
-            none.facets[owned], none.stiffness[owned] = history.facets[owned], history.stiffness[owned]
-            none.slip[owned] = history.slip[owned]
-            history = none
-        self.history = history
+        self.history = history = history.select(self.is_owned[history.points[:, 0]])
+        points, (count, dim) = history.points[:, 0], (len(self.is_owned), self._elements.shape[1])
+        # of all points: corners of the facets that they were before, k_p of those in contact, and slip
+        self._facets = np.full((count, dim), NO_POINT)
+        self._start_stiffness, self._slip = np.zeros(count), np.zeros((count, dim))
+        self._facets[points] = history.points[:, 1:]
+        self._start_stiffness[points], self._slip[points] = history.stiffness, history.slip
 
     def contacts_within(self, x: Values, reach: float) -> PenaltyContacts:
         """Nearest facet of each point that has one within `reach`, m, with points at x (n, d), m."""
         pairs = self._all_pairs(x)
-        previous = self.history.facets[pairs.points]
+        previous = self._facets[pairs.points]
         # facets of the last step, or beside them, may be in front of a point that lies behind
         stays = (previous[:, :, None] == pairs.corners[:, None]).any(axis=(1, 2))
         pairs = pairs.select((pairs.gap > 0) | stays)
@@ -270,20 +226,14 @@ class PointFacetContacts:
             stiffness=self._stiffness_of(pairs),
             share=np.ones(len(pairs.points)),
             share_gradient=None,
-            slip=self.history.slip[pairs.points],
-            start_stiffness=self.history.stiffness[pairs.points],
+            slip=self._slip[pairs.points],
+            start_stiffness=self._start_stiffness[pairs.points],
         )
 
     def end_step(self, near: PenaltyContacts, slip: Values | None) -> None:
-        """Store contacts `near` at the end of a step, and slips (k, d) of the springs of those that touch, m."""
-        if not len(near.gap) and not (self.history.facets != NO_FACET).any():
-            return
-        history, touches = PointHistory.none(*self.history.slip.shape), near.gap < self._width
-        history.facets[near.points[:, 0]], points = near.points[:, 1:], near.points[touches, 0]
-        history.stiffness[points] = near.stiffness[touches]
-        if slip is not None:
-            history.slip[points] = slip
-        self.history = history
+        """Store contacts `near` at the end of a step, and slips (k, d) of their springs, m."""
+        if len(near.gap) or len(self.history.points):
+            self.set_history(ContactHistory.of(near, self._width, slip))
 
     def anything_is_near(self, x: Values) -> bool:
         """Whether any point has contact, or may be near a facet, at x (n, d), m."""
@@ -317,7 +267,7 @@ class PointFacetContacts:
         limit = np.where(carries, allowed.limit[pairs.corners] / weight, np.inf).min(axis=1, initial=np.inf)
         reduction = np.where(carries, allowed.reduction[pairs.corners], 1.0).min(axis=1, initial=1.0)
         largest = allowed.point[pairs.points] * reduction
-        previous = self.history.stiffness[pairs.points]
+        previous = self._start_stiffness[pairs.points]
         return np.where(previous > 0, previous, np.minimum(largest, limit))
 
     def _candidates(self, x: Values) -> ClosestPointCache:

@@ -22,9 +22,8 @@ from ..mesh.ghost_exchange import KeyedReduction, KeyLookup
 from .ipc_pairs import vertex_areas
 from .ipc_surface import RetractableSurface, SelfContactLaw
 from .mesh_obstacles import MeshObstacle
-from .penalty_contacts import ContactStiffness, ElementRanks, own_points
+from .penalty_contacts import NO_POINT, ContactStiffness, ElementRanks, own_points
 from .penalty_pairs import PenaltyPairs
-from .penalty_point_facet import NO_FACET
 from .pose import Pose
 from .surface_exchange import ElementSet
 
@@ -161,7 +160,7 @@ class PenaltySurface(RetractableSurface):
                 distance=distance, patch=np.repeat(np.array([0, 1], np.int32), [count, size]), ranks=ranks, edge=edge,
             )  # fmt: skip
             # keys of the body are not negative
-            mesh_keys, limits = NO_FACET - 1 - np.arange(size), np.append(k, np.full(size, np.inf))
+            mesh_keys, limits = NO_POINT - 1 - np.arange(size), np.append(k, np.full(size, np.inf))
             parts.append(
                 PenaltyPart(pairs, mesh.friction, np.append(keys, mesh_keys), limits, body_points, self._reach, mesh)
             )
