@@ -11,6 +11,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
+from ..errors import InputError
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import gather
@@ -21,9 +22,9 @@ from .contact_surface import RETRACTION, TINY, ContactSurface, ShownCells, Surfa
 from .facet_contact import FACETS, ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
 from .laws import CoulombFriction, FrictionDirection, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
+from .obstacle import RigidObstacle
 from .pose import PosedShape, min_distance
 from .rigid_obstacles import ObstacleGroup
-from .step_limit import check_obstacles_apart, refuse_overlap
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -66,7 +67,7 @@ class SurfaceFacets:
         posed = [obstacle.posed_at(0.0) for obstacle in group.obstacles]
         for number in self.numbers:
             distances = self.active.distances(posed[number], x, 0.0)
-            refuse_overlap(self._surface.comm, distances, group.numbers[number], group.obstacles[number])
+            refuse_closed_gaps(self._surface.comm, distances, group.numbers[number], group.obstacles[number])
         if not self._may_be_cut:
             self._excluded = np.flatnonzero(self.gaps(posed, self._all_facets, x) <= 0)
 
@@ -237,6 +238,16 @@ class SurfaceFacets:
         self._active = None
 
 
+def refuse_closed_gaps(comm: MPI.Intracomm, gaps: Values, number: int, obstacle: RigidObstacle) -> None:
+    """Raise InputError where a gap (n,) to an obstacle at the start is not positive (collective)."""
+    min_gap = comm.allreduce(float(gaps.min(initial=np.inf)), op=MPI.MIN)
+    if min_gap <= 0:
+        raise InputError(
+            f"obstacle.{number}: {obstacle.name} overlaps the body at the start, by {-min_gap:.4g} m; "
+            "move it away or make it smaller"
+        )
+
+
 class ContactState:
     """Obstacles, and the points of a body that they act on at the end of a step.
 
@@ -286,8 +297,10 @@ class ContactState:
         self._directions: dict[int, FrictionDirection] = {}  # in this attempt, by the numbers of obstacles
         self._attempts = 0  # of Newton's method in the step
         self._tangent_positions: Values | None = None  # of the points at the last tangent of this attempt
-        items = dict(zip(self.numbers, self.obstacles, strict=True))
-        check_obstacles_apart(self.comm, self.surface.rest_positions, items)
+        for number, obstacle in zip(self.numbers, self.obstacles, strict=True):
+            refuse_closed_gaps(
+                self.comm, obstacle.posed_at(0.0).distance(self.surface.rest_positions), number, obstacle
+            )
         self.point_candidates = ProximityCandidates(domain.mean_edge_length)
         edge, may_be_cut = domain.mean_edge_length, self.facets_may_be_cut
         self.facets = SurfaceFacets(self.surface, group, law.barrier.width, edge, may_be_cut=may_be_cut)

@@ -205,11 +205,12 @@ class MeshObstacleTerm(SelfContact):
             return 1.0
         x, fraction = self.surface.positions(u), 1.0
         end = x if change is None else x + self.surface.current.point_map.weights @ self.surface.nodal_values(change)
-        # pairs take obstacles from the given poses to where they are
-        self._place_meshes([posed.pose for _, posed in motions])
         for index, (posed, _) in moving.items():
-            fraction = min(fraction, self.pairs.pairs[index].moving_free_fraction(x, end, posed.pose))
-        self._place_meshes(self.group.poses)
+            pairs, (_, end_posed) = self.pairs.pairs[index], motions[index]
+            # pairs take the obstacle from the given pose to where it is
+            pairs.mesh.move_to(end_posed.pose)
+            fraction = min(fraction, pairs.moving_free_fraction(x, end, posed.pose))
+            pairs.mesh.move_to(self.group.poses[index])
         return fraction
 
     def feasible_guess(self, u: Values) -> Values:

@@ -16,7 +16,6 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from ..errors import InputError
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from .clearance import bounding_box
 from .ipc_pairs import IpcPairs, PairShare
@@ -24,7 +23,7 @@ from .ipc_surface import SelfContactLaw, SelfContactSurface
 from .laws import BARRIER
 from .pose import Pose, PosedShape
 from .sample_points import IpcFriction
-from .triangle_mesh_shape import ClosedSurface, penetration_depth
+from .triangle_mesh_shape import ClosedSurface, refuse_overlap
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -110,6 +109,11 @@ class MeshObstacle:
         if self._positions is None:
             self._positions = self.positions_at(self.pose)
         return self._positions
+
+    @property
+    def surface(self) -> ClosedSurface:
+        """Points at the current pose, m, and triangles."""
+        return self.positions, self.triangles
 
     @property
     def arms(self) -> Values:
@@ -399,20 +403,11 @@ class MeshContactSurface(SelfContactSurface):
 
     def _check_apart(self) -> None:
         for pairs in self.pairs.pairs:
-            is_cut = len(pairs.cut_elements(self.split.points)) > 0
-            refuse_overlap((self.split.points, self.split.elements), pairs.mesh, cut=is_cut)
+            is_cut, body = len(pairs.cut_elements(self.split.points)) > 0, (self.split.points, self.split.elements)
+            refuse_overlap(pairs.mesh.name, body, pairs.mesh.surface, cut=is_cut)
 
     def _build_pairs(self, elements: Ints) -> AllMeshPairs:
         X, parameters = self._rest_positions, {name: self._parameters[name] for name in ("distance", "stiffness")}
         return AllMeshPairs(
             [MeshObstaclePairs(X, elements, mesh, **parameters, share=self._share) for mesh in self._obstacles]
         )
-
-
-def refuse_overlap(body: ClosedSurface, mesh: MeshObstacle, *, cut: bool) -> None:
-    """Raise InputError where an obstacle cuts the body at rest, or one is inside the other."""
-    depth = penetration_depth(body, (mesh.positions, mesh.triangles), cut=cut)
-    if cut or depth is not None:
-        verb = "cuts" if depth is None else "overlaps"
-        by = "" if depth is None else f", by {depth:.4g} m"
-        raise InputError(f"{mesh.name} {verb} the body at the start{by}; move it away or make it smaller")

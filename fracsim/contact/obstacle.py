@@ -26,11 +26,13 @@ class OverlapPolicy:
         iterations: of the search for the deepest point of an overlap.
         step_ratio: length of each step of that search, in the one before.
         min_overlap: overlap, in sizes of the free obstacle, below which obstacles merely touch.
+        tessellation_depth: part of its size by which the tessellation of a shape lies within it at most.
     """
 
     iterations: int = 60
     step_ratio: float = 0.8
     min_overlap: float = 1e-6
+    tessellation_depth: float = 0.02
 
 
 OVERLAP = OverlapPolicy()
@@ -255,11 +257,10 @@ class VerletObstacle:
 # --- overlaps ---
 
 
-def free_pairs(obstacles: Sequence[RigidObstacle]) -> list[tuple[int, int]]:
+def free_pairs(are_free: Sequence[bool]) -> list[tuple[int, int]]:
     """Numbers of a free obstacle and another one, each pair once."""
-    pairs = combinations(range(len(obstacles)), 2)
-    free_first = [(a, b) if obstacles[a].free else (b, a) for a, b in pairs]
-    return [(a, b) for a, b in free_first if obstacles[a].free]
+    free_first = [(a, b) if are_free[a] else (b, a) for a, b in combinations(range(len(are_free)), 2)]
+    return [(a, b) for a, b in free_first if are_free[a]]
 
 
 def find_overlaps(
@@ -300,13 +301,22 @@ def _mesh_overlap_depth(first: PosedShape, second: PosedShape) -> float:
     return -np.inf if depth is None else depth
 
 
-def check_free_obstacles(obstacles: Mapping[int, RigidObstacle]) -> None:
-    """Raise InputError where a free obstacle overlaps or touches another one at the start; analytic, by numbers."""
-    numbers, posed = list(obstacles), [obstacle.posed_at(0.0) for obstacle in obstacles.values()]
-    pairs = free_pairs(list(obstacles.values()))
-    for a, b, depth in find_overlaps(posed, pairs, -OVERLAP.min_overlap):
-        name, second = (obstacles[numbers[index]].name for index in (a, b))
+def check_free_obstacles(
+    obstacles: Mapping[int, tuple[str, bool, PosedShape]], min_overlap: float = OVERLAP.min_overlap
+) -> None:
+    """Raise InputError where a free obstacle overlaps another one at the start.
+
+    Args:
+        obstacles: names of analytic obstacles, whether they are free, and their shapes at the start, by their numbers.
+        min_overlap: in sizes of the free one, from which on it counts; a negative one: they may not touch either.
+    """
+    numbers, posed = list(obstacles), [shape for _, _, shape in obstacles.values()]
+    pairs = free_pairs([is_free for _, is_free, _ in obstacles.values()])
+    x = {a: posed[a].pose.points_to_space(posed[a].shape.tessellate()[0]) for a, _ in pairs}
+    margin = {a: OVERLAP.tessellation_depth * float(np.ptp(points, axis=0).max()) for a, points in x.items()}
+    near = [(a, b) for a, b in pairs if not posed[b].distance_bound(x[a]) > margin[a]]
+    for a, b, depth in find_overlaps(posed, near, min_overlap):
         raise InputError(
-            f"obstacle.{numbers[a]}: {name} moves freely and overlaps {second} at the start, by "
-            f"{max(0.0, depth):.4g} m; move it away or make it smaller"
+            f"obstacle.{numbers[a]}: {obstacles[numbers[a]][0]} moves freely and overlaps {obstacles[numbers[b]][0]} "
+            f"at the start, by {max(0.0, depth):.4g} m; move it away or make it smaller"
         )

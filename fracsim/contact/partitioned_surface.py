@@ -41,11 +41,12 @@ from ..meshes.topology import boundary_facets
 from .clearance import FollowingPoints
 from .ipc_pairs import vertex_areas
 from .ipc_surface import SURFACE, SelfContactLaw, build_contact_surface, offset_crack_faces, refuse_intersections
-from .mesh_obstacles import MeshObstacle, refuse_overlap
+from .mesh_obstacles import MeshObstacle
 from .penalty_contacts import NodalMassShare, PenaltyHistory
 from .penalty_point_facet import POINT_FACET, penalty_stiffness
 from .penalty_surface import PenaltySurface, triangle_ranks
 from .surface_exchange import EXCHANGE, ElementRows, ElementSet, PointRows, exchange_elements
+from .triangle_mesh_shape import refuse_overlap
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -268,7 +269,7 @@ class PartitionedSurface:
         def check() -> None:
             assert mesh is not None
             for obstacle, cut in zip(self._meshes, is_cut, strict=True):
-                refuse_overlap((mesh.points, boundary_facets(mesh.cells)), obstacle, cut=cut > 0)
+                refuse_overlap(obstacle.name, (mesh.points, boundary_facets(mesh.cells)), obstacle.surface, cut=cut > 0)
 
         on_root(comm, check)
 

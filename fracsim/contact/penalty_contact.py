@@ -486,7 +486,7 @@ class PenaltyMeshContact(PenaltyContact):
         ]
 
     def _store_contacts(self, x: Values) -> bool:
-        self._wrenches = self._own_wrenches(x)
+        self._wrenches = [self.rank_wrench(index) for index in range(len(self.numbers))]
         return super()._store_contacts(x)
 
     def _obstacle_frequency(self, x: Values) -> float:
@@ -514,19 +514,10 @@ class PenaltyMeshContact(PenaltyContact):
 
     def rank_wrench(self, index: int) -> Values:
         """(6,) force and moment on an obstacle at the current u, of this rank's contacts, N and N m (collective)."""
-        return self._own_wrenches(self._end_positions())[index]
-
-    def _own_wrenches(self, x: Values) -> list[Values]:
-        """(6,) force and moment of this rank's contacts on each obstacle about its reference point, N and N m.
-
-        `x`: (n, 3) points of the body, m.
-        """
-        result = []
-        for mesh, gradient in zip(self._all_meshes, self._part_gradients(x), strict=True):
-            force = -gradient[len(x) :]
-            pressed = force.any(axis=1)
-            result.append(resultant(force[pressed], mesh.positions[pressed] - mesh.pose.centre))
-        return result
+        x, mesh = self._end_positions(), self._all_meshes[index]
+        force = -self._part_gradients(x)[index][len(x) :]
+        pressed = force.any(axis=1)
+        return resultant(force[pressed], mesh.positions[pressed] - mesh.pose.centre)
 
     # --- readings ---
 

@@ -335,7 +335,7 @@ def penalty_pairs_of(obstacles: Mapping[int, RigidObstacle], penalty: Penalty, m
         penalty: of points in contact; less stiff where it would add more than a share of `max_added`.
         max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
     """
-    all_numbers = free_pairs([obstacles[n] for n in range(len(obstacles))])
+    all_numbers = free_pairs([obstacles[n].free for n in range(len(obstacles))])
     pairs = [PenaltyPair(numbers, obstacles, f"_{index}") for index, numbers in enumerate(all_numbers)]
     for pair in pairs:
         members = (obstacles[number] for number in pair.numbers)

@@ -9,22 +9,19 @@ Equations: docs/theory.md#step-limits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 
-from ..errors import InputError
 from .clearance import ProximityCandidates
 from .closest_point import FacetClosestPoints, find_closest_points
 from .contact_surface import ContactSurface
 from .facet_contact import ContactFacets
 from .laws import BARRIER
-from .obstacle import RigidObstacle
 from .pose import Pose, PosedShape, rotate_vectors
 from .shape_base import lengths
 
@@ -403,22 +400,6 @@ def _mesh_corrections(pairs: MeshObstaclePairs, start_pose: Pose, x: Values, end
         safe_x = safe_x + np.where(is_moving[:, None], step, 0.0)
         free_x = free_x + step
     return np.where(is_moving[:, None], 0.0, safe_x - end)
-
-
-def check_obstacles_apart(comm: MPI.Intracomm, x: Values, obstacles: Mapping[int, RigidObstacle]) -> None:
-    """Raise InputError where a point x (n, d) of the body lies in an obstacle before the first step (collective)."""
-    for number, obstacle in obstacles.items():
-        refuse_overlap(comm, obstacle.posed_at(0.0).distance(x), number, obstacle)
-
-
-def refuse_overlap(comm: MPI.Intracomm, gaps: Values, number: int, obstacle: RigidObstacle) -> None:
-    """Raise InputError where a gap (n,) to an obstacle at the start is not positive (collective)."""
-    min_gap = comm.allreduce(float(gaps.min(initial=np.inf)), op=MPI.MIN)
-    if min_gap <= 0:
-        raise InputError(
-            f"obstacle.{number}: {obstacle.name} overlaps the body at the start, by {-min_gap:.4g} m; "
-            "move it away or make it smaller"
-        )
 
 
 type PoseMotion = tuple[PosedShape, Values]  # an obstacle at its start, and the increment (p,) of its pose

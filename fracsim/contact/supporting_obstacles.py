@@ -183,7 +183,7 @@ def _gaps_to_nodes(domain: Domain, obstacles: Sequence[RigidObstacle]) -> Values
 
 def _lower_to_others(gaps: Values, obstacles: Sequence[RigidObstacle]) -> None:
     """Reduce gaps (obstacles,) of free obstacles, m, to those to the others that they are in contact with."""
-    for a, b in free_pairs(obstacles):
+    for a, b in free_pairs([obstacle.free for obstacle in obstacles]):
         body, second = obstacles[a], obstacles[b]
         sides = ObstaclePair.between(body, second).gaps(body.posed_at(0.0).pose, second.posed_at(0.0).pose)
         gap = min(float(side.min(initial=np.inf)) for side in sides)

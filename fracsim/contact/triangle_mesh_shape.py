@@ -11,6 +11,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from ..errors import InputError
 from ..meshes.surfaces.triangle_geometry import BATCH_SIZE, batches, enclosed_volumes, winding_numbers
 from ..meshes.topology import distinct_rows
 from .shape_base import Shape, Tessellation
@@ -200,6 +201,15 @@ def penetration_depth(first: ClosedSurface, second: ClosedSurface, *, cut: bool)
     depths = [_depth_inside(surface, target, cut=cut) for surface, target in ((first, second), (second, first))]
     inside = [depth for depth in depths if depth is not None]
     return max(inside) if inside else None
+
+
+def refuse_overlap(name: str, body: ClosedSurface, obstacle: ClosedSurface, *, cut: bool) -> None:
+    """Raise InputError where an obstacle cuts the body at rest (`cut`), or one is inside the other."""
+    depth = penetration_depth(body, obstacle, cut=cut)
+    if cut or depth is not None:
+        verb = "cuts" if depth is None else "overlaps"
+        by = "" if depth is None else f", by {depth:.4g} m"
+        raise InputError(f"{name} {verb} the body at the start{by}; move it away or make it smaller")
 
 
 def surfaces_intersect(first: ClosedSurface, second: ClosedSurface) -> bool:

@@ -125,7 +125,7 @@ class ObstacleOverlapMonitor:
 
     def __init__(self, motion: RigidObstacles) -> None:
         """Start without any frame; `motion` of the obstacles."""
-        self._motion, self._pairs = motion, free_pairs(motion.obstacles)
+        self._motion, self._pairs = motion, free_pairs([obstacle.free for obstacle in motion.obstacles])
         self.deepest_overlap: dict[str, Any] = {}
 
     def record_frame(self, t: float) -> None:

@@ -139,16 +139,17 @@ def _build_motion(
     """
     if not any(obstacle.free for obstacle in obstacles):
         return RigidObstacles(domain, obstacles)
-    from ..contact.obstacle import check_free_obstacles, free_pairs
+    from ..contact.obstacle import OVERLAP, check_free_obstacles, free_pairs
     from ..contact.obstacle_pairs import BarrierPair, ObstaclePairs
     from ..contact.rigid_obstacles import VerletRigidObstacles
     from ..contact.rigid_pose import FreeRigidObstacles
     from ..contact.supporting_obstacles import pair_obstacles
     from ..contact.triangle_mesh_shape import TriangleMeshShape
 
-    numbered = dict(enumerate(obstacles))
-    is_mesh = {number: isinstance(obstacle.shape, TriangleMeshShape) for number, obstacle in numbered.items()}
-    check_free_obstacles({number: obstacle for number, obstacle in numbered.items() if not is_mesh[number]})
+    numbered = list(enumerate(obstacles))
+    is_mesh = [isinstance(obstacle.shape, TriangleMeshShape) for obstacle in obstacles]
+    placed = {n: (obstacle.name, obstacle.free, obstacle.posed_at(0.0)) for n, obstacle in numbered if not is_mesh[n]}
+    check_free_obstacles(placed, -OVERLAP.min_overlap)
     in_pairs = pair_obstacles(obstacles, law.barrier.width, domain.mean_edge_length)
     if not scheme.implicit:
         from ..contact.penalty_obstacle_pairs import penalty_pairs_of
@@ -156,14 +157,14 @@ def _build_motion(
         penalty = cast("Penalty", law.barrier)
         return VerletRigidObstacles(domain, obstacles, penalty_pairs_of(in_pairs, penalty, max_added))
     pairs: list[BarrierPair | MeshPair] = []
-    for numbers in free_pairs(obstacles):
+    for numbers in free_pairs([obstacle.free for obstacle in obstacles]):
         if all(is_mesh[number] for number in numbers):
             from ..contact.mesh_pairs import MeshPair  # with ipctk
 
             pairs.append(MeshPair(numbers, in_pairs, law, mesh_stiffness))
         else:
             pairs.append(BarrierPair(numbers, in_pairs, law))
-    free = [number for number, obstacle in numbered.items() if obstacle.free]
+    free = [number for number, obstacle in numbered if obstacle.free]
     return FreeRigidObstacles(domain, obstacles, scheme, ObstaclePairs(pairs, free))
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from ..contact.obstacle import find_overlaps, free_pairs
+from ..contact.obstacle import check_free_obstacles
 from ..contact.pose import Pose, PosedShape
 from ..contact.shapes import SHAPES, Shape
 from ..errors import InputError
@@ -70,7 +70,10 @@ def find_near_obstacles(study: Study, lower: Values, upper: Values) -> list[str]
     if study.time.scheme == "rigid":
         bodies = _copies_in_space(study, corners)
     else:
-        _check_free_obstacles(entries, shapes)
+        # the run checks those from files
+        items = enumerate(zip(entries, shapes, strict=True))
+        named = {n: (entry.name, entry.free_motion is not None, shape) for n, (entry, shape) in items if shape}
+        check_free_obstacles(named)
         bodies = corners[None]
     return [
         entry.name
@@ -111,35 +114,6 @@ def _corners(lower: Values, upper: Values) -> Values:
     bounds = np.stack([lower, upper])
     choice = np.indices((2,) * len(lower)).reshape(len(lower), -1).T
     return np.asarray(np.take_along_axis(bounds, choice, axis=0), float)
-
-
-def _check_free_obstacles(entries: list[ObstaclePlacement], placed: list[PosedShape | None]) -> None:
-    """Raises InputError if a free obstacle overlaps another one. The run checks those from files."""
-    shapes = [
-        (number, entry, shape) for number, (entry, shape) in enumerate(zip(entries, placed, strict=True)) if shape
-    ]
-    named = [_NamedObstacle(entry.name, entry.free_motion is not None) for _, entry, _ in shapes]
-    candidates = free_pairs(named)  # type: ignore[arg-type]
-    boxes = {a: _corners(*_box(shapes[a][2])) for a, _ in candidates}
-    near = [(a, b) for a, b in candidates if not shapes[b][2].distance_bound(boxes[a]) > 0]
-    for a, b, depth in find_overlaps([shape for _, _, shape in shapes], near):
-        raise InputError(
-            f"obstacle.{shapes[a][0]}: {shapes[a][1].name} moves freely and overlaps {shapes[b][1].name} at the start, "
-            f"by {max(0.0, depth):.4g} m; move it away or make it smaller"
-        )
-
-
-def _box(placed: PosedShape) -> tuple[Values, Values]:
-    """Corners (d,) of a box around an obstacle, m."""
-    points = placed.pose.points_to_space(placed.shape.tessellate()[0])
-    return points.min(axis=0), points.max(axis=0)
-
-
-class _NamedObstacle:
-    """Name and freedom of an obstacle, for `free_pairs`."""
-
-    def __init__(self, name: str, free: bool) -> None:
-        self.name, self.free = name, free
 
 
 def _check_shape(entry: ObstaclePlacement, number: int, mesh: MeshData) -> None:
@@ -194,7 +168,7 @@ def containment_depth(x: Values, mesh: MeshData) -> Values:
 
 def _check_mesh_obstacle(entry: ObstaclePlacement, number: int, mesh: MeshData) -> None:
     """Raises InputError if an obstacle from a file overlaps the body."""
-    from ..contact.triangle_mesh_shape import penetration_depth, surfaces_intersect
+    from ..contact.triangle_mesh_shape import refuse_overlap, surfaces_intersect
 
     geometry: dict[str, Any] = entry.geometry
     surface = read_obstacle_surface(geometry["file"], geometry.get("scale", 1.0), f"obstacle.{number}")
@@ -203,14 +177,7 @@ def _check_mesh_obstacle(entry: ObstaclePlacement, number: int, mesh: MeshData) 
         return
     body = mesh.points, boundary_facets(mesh.cells)
     obstacle = points, np.asarray(surface.triangles, np.int64)
-    intersects = surfaces_intersect(body, obstacle)
-    overlap = penetration_depth(body, obstacle, cut=intersects)
-    if intersects or overlap is not None:
-        verb = "cuts" if overlap is None else "overlaps"
-        amount = "" if overlap is None else f", by {overlap:.4g} m"
-        raise InputError(
-            f"obstacle.{number}: {entry.name} {verb} the body at the start{amount}; move it away or make it smaller"
-        )
+    refuse_overlap(f"obstacle.{number}: {entry.name}", body, obstacle, cut=surfaces_intersect(body, obstacle))
 
 
 def _copies_in_space(study: Study, x: Values) -> Values:
