@@ -282,7 +282,7 @@ def test_a_free_ball_smaller_than_a_facet_is_felt_between_its_corners(dim: int, 
         assert np.linalg.norm(x - centre, axis=2).min() > 0.1  # no corner is near
         np.testing.assert_allclose(momenta(scene, state)[0], before, atol=1e-9 * 2)
         assert report.kinetic + report.elastic < energy * (1 + 1e-6)
-    assert 0 < least < next(term for term in scene.balance.terms if isinstance(term, ObstacleTerm)).barrier_width
+    assert 0 < least < next(term for term in scene.balance.terms if isinstance(term, ObstacleTerm)).group.barrier_width
     moved = contact_of(scene).free[0].motion.momentum[dim - 1] / 0.5
     assert 0.1 < moved < 4.0
 

@@ -252,11 +252,8 @@ class ContactState:
     """Obstacles, and the points of a body that they act on at the end of a step.
 
     Attributes:
-        group: the obstacles, and what they did to the body in the last step.
-        obstacles: these obstacles, which are analytic.
-        numbers: their numbers in the study.
+        group: the obstacles, which are analytic, and what they did to the body in the last step.
         law: contact law.
-        barrier_width: gap from which on contact acts, m.
         surface: points of the body that may touch.
         facets: facets between them.
         positions: (n, d) positions of these points at the end of the step that belongs to u, m.
@@ -277,8 +274,7 @@ class ContactState:
 
     def __init__(self, domain: Domain, u: fem.Function, group: ObstacleGroup, law: ObstacleLaw) -> None:
         """Raise InputError where the body at rest, or a free obstacle, overlaps an obstacle (collective)."""
-        self.group, self.numbers, self.obstacles, self.law = group, group.numbers, group.obstacles, law
-        self.barrier_width = law.barrier.width
+        self.group, self.law = group, law
         self.surface = ContactSurface(domain, law.barrier.width)
         self._shown = ShownCells(domain, law.barrier.width)
         self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
@@ -288,7 +284,7 @@ class ContactState:
         self._end_u: Values | None = None
         self._far: bool | None = None  # whether all obstacles are, at the current u and poses; None: not known yet
         self._start_is_known = True  # whether the contact at the start of the step is
-        distances = [ShapeDistance(obstacle) for obstacle in self.obstacles]
+        distances = [ShapeDistance(obstacle) for obstacle in self.group.obstacles]
         reach = self.near_widths * law.barrier.width
         self.clearance = Clearance(domain, distances, reach, self._following_points, self._hidden_distances)
         self._contact_forces: list[ContactForces] | None = None
@@ -297,7 +293,7 @@ class ContactState:
         self._directions: dict[int, FrictionDirection] = {}  # in this attempt, by the numbers of obstacles
         self._attempts = 0  # of Newton's method in the step
         self._tangent_positions: Values | None = None  # of the points at the last tangent of this attempt
-        for number, obstacle in zip(self.numbers, self.obstacles, strict=True):
+        for number, obstacle in zip(self.group.numbers, self.group.obstacles, strict=True):
             refuse_closed_gaps(
                 self.comm, obstacle.posed_at(0.0).distance(self.surface.rest_positions), number, obstacle
             )
@@ -417,16 +413,17 @@ class ContactState:
         for number in self.facets.numbers:
             of_facets, *_ = evaluate_facets(self.facets.active, posed[number], x, barrier)
             self._start_forces[number] = self._start_forces[number] + of_facets.forces.sum(axis=(0, 1))
-            if self.obstacles[number].friction:
+            if self.group.obstacles[number].friction:
                 lagged[number] = add_facet_friction(lagged[number], of_facets, x, sum_at_points)
         self.lagged = [
-            contact if obstacle.friction else None for contact, obstacle in zip(lagged, self.obstacles, strict=True)
+            contact if obstacle.friction else None
+            for contact, obstacle in zip(lagged, self.group.obstacles, strict=True)
         ]
         self._start_positions = x
 
     def _discard_start(self) -> None:
         """Discard the contact at the start of the step, as the points are no longer the same."""
-        none = [None] * len(self.obstacles)
+        none = [None] * len(self.group.obstacles)
         self.lagged, self._step_starts, self._tangent_positions = [*none], [*none], None
         self._sticking_slips, self._directions = None, {}
         self.discard_forces()
@@ -447,7 +444,7 @@ class ContactState:
         if self._contact_forces is None:
             if self.is_far():
                 none = no_contact(self._domain.dim, self.law.barrier.width)
-                self._contact_forces = [none for _ in self.obstacles]
+                self._contact_forces = [none for _ in self.group.obstacles]
                 return self._contact_forces
             self._find_start()
             if self._sticking_slips is None:
@@ -460,7 +457,7 @@ class ContactState:
 
     def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
         """Forces of an obstacle at a given pose on the points."""
-        obstacle, lagged = self.obstacles[number], self.lagged[number]
+        obstacle, lagged = self.group.obstacles[number], self.lagged[number]
         friction = None
         if lagged is not None and self._sticking_slips is not None:
             friction = CoulombFriction(obstacle.friction, self._sticking_slips[number])
@@ -485,12 +482,12 @@ class ContactState:
 
     def _compute_sticking_slips(self) -> list[float]:
         """Slip in the step that counts as sticking, m, at each obstacle (collective)."""
-        speeds = np.zeros(len(self.obstacles))
-        if self.law.sticking_ratio and any(obstacle.friction for obstacle in self.obstacles):
+        speeds = np.zeros(len(self.group.obstacles))
+        if self.law.sticking_ratio and any(obstacle.friction for obstacle in self.group.obstacles):
             velocity = self.surface.interpolation(self._start_velocity)
             for number, lagged in enumerate(self.lagged):
                 if lagged is not None and len(lagged.points):
-                    of_obstacle = self.group.bodies.velocity(self.numbers[number], lagged.position)
+                    of_obstacle = self.group.bodies.velocity(self.group.numbers[number], lagged.position)
                     relative = velocity[lagged.points] - of_obstacle
                     speeds[number] = np.linalg.norm(tangential(lagged.normal, relative), axis=1).max()
             self.comm.Allreduce(MPI.IN_PLACE, speeds, MPI.MAX)
@@ -502,7 +499,7 @@ class ContactState:
         """(d,) motion of an obstacle in the step, or (k, d) of its points in lagged contact, m."""
         if (lagged := self.lagged[number]) is None:
             return np.zeros(self._domain.dim)
-        return self.group.bodies.point_motion(self.numbers[number], lagged.obstacle_point)
+        return self.group.bodies.point_motion(self.group.numbers[number], lagged.obstacle_point)
 
     def contact_forces(self) -> Values | None:
         """(owned dofs,) forces of the obstacles on the nodes at the end of the step, N; None: far (collective)."""

@@ -30,7 +30,6 @@ from .mesh_obstacles import (
     MeshObstacle,
     MeshObstaclePairs,
 )
-from .obstacle import RigidObstacle
 from .pose import Pose
 from .pose_derivatives import PoseContact, PoseDerivatives, closing_distance, point_jacobian, point_set_derivatives
 from .rigid_obstacles import ObstacleGroup, RigidObstacles
@@ -48,9 +47,6 @@ class MeshObstacleTerm(SelfContact):
 
     Attributes:
         group: the obstacles, and what they did to the body in the last step.
-        obstacles: these.
-        numbers: their numbers in the study.
-        barrier_width: gap from which on contact acts, m.
         clearance: whether the body is far from the obstacles.
         pose_contact: contact as the obstacles see it.
     """
@@ -73,13 +69,10 @@ class MeshObstacleTerm(SelfContact):
         Raises:
             InputError: if an obstacle overlaps the body at rest.
         """
-        self.group, edge = ObstacleGroup(bodies, numbers, self._gap, self._current_force), domain.mean_edge_length
-        self.numbers, self.obstacles = self.group.numbers, self.group.obstacles
-        self.barrier_width = law.distance
+        self.group = ObstacleGroup(bodies, numbers, law.distance, self._gap, self._current_force)
         # the tangent by points and poses has a positive semi-definite form alone
-        self.allows_exact_tangent = not any(obstacle.free for obstacle in self.obstacles)
-        items = zip(self.numbers, self.obstacles, strict=True)
-        self._meshes = [build_mesh_obstacle(*item, edge) for item in items]
+        self.allows_exact_tangent = not any(obstacle.free for obstacle in self.group.obstacles)
+        self._meshes = build_mesh_obstacles(self.group, domain.mean_edge_length)
         self._started_near = True
         self._far: bool | None = None  # at the current u; None: not known yet
         self._place_meshes(self.group.poses)
@@ -135,7 +128,7 @@ class MeshObstacleTerm(SelfContact):
         self.start_positions = None
         # one row that stands for all points of an obstacle
         zero: Values = np.zeros((1, 3))
-        self._start_gradients = [zero for _ in self.obstacles]
+        self._start_gradients = [zero for _ in self.group.obstacles]
         if level.dt and self._started_near:
             nodal, slip, surface = (
                 self.surface.nodal_values(level.u_n),
@@ -154,14 +147,14 @@ class MeshObstacleTerm(SelfContact):
         """Slip in the step that counts as sticking, m, with the largest speed relative to an obstacle (collective)."""
         square, mean = mean_velocities(self.comm, level.v_n.reshape(-1, self._domain.dim))
         centres = [pose.centre[None] for pose in self.group.start_poses]
-        placed = zip(self.numbers, centres, strict=True)
+        placed = zip(self.group.numbers, centres, strict=True)
         velocities = [self.group.bodies.velocity(number, centre).reshape(-1) for number, centre in placed]
         speed = float(np.sqrt(max(0.0, *(float(square - 2 * mean @ V + V @ V) for V in velocities))))
         return level.dt * self.surface.law.sticking_speed_at(speed)
 
     def accept_step(self) -> None:
         """Record forces and work of contact in the step (collective)."""
-        forces: list[Values] = [np.zeros(3) for _ in self.obstacles]
+        forces: list[Values] = [np.zeros(3) for _ in self.group.obstacles]
         self.group.friction_loss, self.group.work, self.group.forces = 0.0, [0.0] * len(forces), forces
         if not self.is_far():
             self._record_work(self.end_positions(), forces)
@@ -221,7 +214,7 @@ class MeshObstacleTerm(SelfContact):
         if self.clearance.is_far([level.u_n, level.displacement_at_end(u)], self.group.step_motions):
             return u
         start, end = (self.surface.nodal_values(nodal) for nodal in (level.u_n, level.displacement_at_end(u)))
-        prescribed = [index for index, obstacle in enumerate(self.obstacles) if not obstacle.free]
+        prescribed = [index for index, obstacle in enumerate(self.group.obstacles) if not obstacle.free]
         start_poses = [self.group.start_poses[index] for index in prescribed]
         point_map, pairs = self.surface.current.point_map, self.pairs.select(prescribed)
         if (guess := stop_before_meshes(point_map, pairs, start, end, start_poses)) is end:
@@ -302,7 +295,7 @@ class MeshObstacleTerm(SelfContact):
         It is that of the velocities at the start, without any contact.
         """
         if self.is_far():
-            return [0.0] * len(self.obstacles)
+            return [0.0] * len(self.group.obstacles)
         x, v = self.end_positions(), self.surface.nodal_values(self._start_velocity)
         motion, result = self.group.bodies.dt * (self.surface.current.point_map.weights @ v), []
         for pairs, start_pose in zip(self.pairs.pairs, self.group.start_poses, strict=True):
@@ -311,10 +304,13 @@ class MeshObstacleTerm(SelfContact):
         return result
 
 
-def build_mesh_obstacle(number: int, obstacle: RigidObstacle, edge: float) -> MeshObstacle:
-    """Obstacle at the start, with triangles as small as those of the body."""
-    shape = obstacle.shape
-    assert isinstance(shape, TriangleMeshShape)
-    points, triangles = refine_triangles(shape.points, shape.triangles, edge)
-    name, rotates = f"obstacle.{number}: {obstacle.name}", obstacle.free or obstacle.spin is not None
-    return MeshObstacle(name, points, triangles, obstacle.friction, rotates=rotates)
+def build_mesh_obstacles(group: ObstacleGroup, edge: float) -> list[MeshObstacle]:
+    """Obstacles of a group at the start, with edges of their triangles of at most `edge`, m, as those of the body."""
+    result = []
+    for number, obstacle in zip(group.numbers, group.obstacles, strict=True):
+        shape = obstacle.shape
+        assert isinstance(shape, TriangleMeshShape)
+        points, triangles = refine_triangles(shape.points, shape.triangles, edge)
+        name, rotates = f"obstacle.{number}: {obstacle.name}", obstacle.free or obstacle.spin is not None
+        result.append(MeshObstacle(name, points, triangles, obstacle.friction, rotates=rotates))
+    return result

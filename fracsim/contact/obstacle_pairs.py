@@ -30,7 +30,7 @@ from .pose_derivatives import (
     mixed_pose_hessian,
     point_jacobian,
 )
-from .shape_base import ConvexBody, Shape, frame_about, unit_vector
+from .shape_base import Shape, frame_about, unit_vector
 from .shapes import Capsule, OffsetShape, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
 from .step_limit import PointMotion, PoseMotion
 from .triangle_mesh_shape import TriangleMeshShape
@@ -74,6 +74,11 @@ class InsetPoints:
     radius: float
     area: float = 0.0
 
+    @property
+    def areas(self) -> Values:
+        """(n,) shares of all points, m^2."""
+        return np.full(len(self.points), self.area)
+
 
 def inset_points(shape: Shape) -> InsetPoints:
     """Inset points of a shape; none of half spaces and hollow shapes."""
@@ -87,16 +92,15 @@ def inset_points(shape: Shape) -> InsetPoints:
 
 
 def _points_and_radius(shape: Shape) -> tuple[Values, float]:
-    if isinstance(shape, ConvexBody) and not shape.hollow:
-        if isinstance(shape, Sphere):
-            return np.zeros((1, shape.dim)), shape.radius
-        if isinstance(shape, Capsule):
-            along = np.linspace(-0.5, 0.5, SAMPLES.edge_points) * shape.length
-            return along[:, None] * unit_vector(shape.axis), shape.radius
-        if isinstance(shape, RoundedBox):
-            return _edge_points(np.array(shape.size) / 2 - shape.fillet), shape.fillet
-        if isinstance(shape, RoundedCylinder):
-            return _circle_points(shape), shape.fillet
+    if isinstance(shape, Sphere) and shape.convex:
+        return np.zeros((1, shape.dim)), shape.radius
+    if isinstance(shape, Capsule) and shape.convex:
+        along = np.linspace(-0.5, 0.5, SAMPLES.edge_points) * shape.length
+        return along[:, None] * unit_vector(shape.axis), shape.radius
+    if isinstance(shape, RoundedBox) and shape.convex:
+        return _edge_points(np.array(shape.size) / 2 - shape.fillet), shape.fillet
+    if isinstance(shape, RoundedCylinder) and shape.convex:
+        return _circle_points(shape), shape.fillet
     return np.empty((0, shape.dim)), 0.0
 
 
@@ -190,13 +194,11 @@ class ObstaclePair:
 
     Attributes:
         points: their inset points.
-        areas: (n,) shares of these, m^2.
         targets: shapes that the points of each are in contact with: the other one, grown by their radius.
         friction: coefficient of friction, the larger one of both.
     """
 
     points: tuple[InsetPoints, InsetPoints]
-    areas: tuple[Values, Values]
     targets: tuple[Shape, Shape]
     friction: float
 
@@ -204,16 +206,12 @@ class ObstaclePair:
     def between(cls, body: RigidObstacle, obstacle: RigidObstacle) -> ObstaclePair:
         """Pair of two obstacles."""
         first, second = inset_points(body.shape), inset_points(obstacle.shape)
-        friction = max(body.friction, obstacle.friction)
+        targets = OffsetShape(obstacle.shape, first.radius), OffsetShape(body.shape, second.radius)
         # a triangle mesh has no distance function: it is in contact with others at its own points alone
         if isinstance(body.shape, TriangleMeshShape):
-            none = InsetPoints(np.empty((0, 3)), 0.0)
-            areas = np.full(len(first.points), first.area), np.empty(0)
-            return cls((first, none), areas, (obstacle.shape,) * 2, friction)
-        areas = np.full(len(first.points), first.area), np.full(len(second.points), second.area)
-        targets = OffsetShape(obstacle.shape, first.radius), OffsetShape(body.shape, second.radius)
+            second, targets = InsetPoints(np.empty((0, 3)), 0.0), (targets[0], targets[0])
         # an OffsetShape has all of a Shape that `evaluate_points` needs
-        return cls((first, second), areas, cast("tuple[Shape, Shape]", targets), friction)
+        return cls((first, second), cast("tuple[Shape, Shape]", targets), max(body.friction, obstacle.friction))
 
     def sides(self, body: Pose, obstacle: Pose) -> Iterator[tuple[Values, PosedShape]]:
         """(n, d) points of each obstacle in space, m, and the shape that they are in contact with."""
@@ -244,9 +242,9 @@ class ObstaclePair:
             barrier: b.
             slip: points and normals of contact (k, d) -> slip that counts as sticking, m.
         """
-        sides = zip(self.sides(body, obstacle), self.areas, self.points, strict=True)
         lagged = [
-            (lag_contact(x, posed.distance(x), area, posed, barrier), inset.radius) for (x, posed), area, inset in sides
+            (lag_contact(x, posed.distance(x), inset.areas, posed, barrier), inset.radius)
+            for (x, posed), inset in zip(self.sides(body, obstacle), self.points, strict=True)
         ]
         force = np.concatenate([contact.force for contact, _ in lagged])
         if not len(force):
@@ -271,8 +269,8 @@ class ObstaclePair:
             starts = [StepStart(gap) for gap in start]
         no_motion = np.zeros(body.dim)
         return [
-            (evaluate_points(x, area, posed, barrier, None, None, no_motion, step_start), x)
-            for (x, posed), area, step_start in zip(self.sides(body, obstacle), self.areas, starts, strict=True)
+            (evaluate_points(x, inset.areas, posed, barrier, None, None, no_motion, step_start), x)
+            for (x, posed), inset, step_start in zip(self.sides(body, obstacle), self.points, starts, strict=True)
         ]
 
     def safe_fraction(self, body: Pose, q: Values, obstacle: Pose, other_q: Values) -> float:

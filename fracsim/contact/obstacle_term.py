@@ -87,7 +87,9 @@ class ObstacleTerm(ContactState, Term):
         Raises:
             InputError: if the body at rest overlaps an obstacle.
         """
-        super().__init__(domain, u, ObstacleGroup(bodies, numbers, self._gap, self._current_force), law)
+        super().__init__(
+            domain, u, ObstacleGroup(bodies, numbers, law.barrier.width, self._gap, self._current_force), law
+        )
         # facets after the points that they are made of
         facets = (self.facets,) if self.facets.numbers else ()
         self.parts = (self.surface, *facets, self.group, self.clearance)
@@ -165,9 +167,9 @@ class ObstacleTerm(ContactState, Term):
 
     def accept_step(self) -> None:
         """Record forces and work of contact in the step (collective)."""
-        group, indices = self.group, range(len(self.obstacles))
+        group, indices = self.group, range(len(self.group.obstacles))
         group.friction_loss, group.forces = 0.0, [self._current_force(number) for number in indices]
-        group.work = [0.0] * len(self.obstacles)
+        group.work = [0.0] * len(self.group.obstacles)
         for number in indices if not self.is_far() else ():
             on_body, by_obstacle = self._friction_work(number)
             group.work[number] = self._normal_work(number) + by_obstacle
@@ -231,7 +233,7 @@ class ObstacleTerm(ContactState, Term):
         self._find_start()
         # free obstacles have a first guess of their own (rigid_pose)
         prescribed = self.group.bodies.prescribed_motions()
-        motions = [(*prescribed[n], self.facets_for(i)) for i, n in enumerate(self.numbers) if n in prescribed]
+        motions = [(*prescribed[n], self.facets_for(i)) for i, n in enumerate(self.group.numbers) if n in prescribed]
         guess = level.displacement_at_end(u)
         if (end := stop_before_obstacles(self.surface, motions, level.u_n, guess)) is guess:
             return u
@@ -289,7 +291,7 @@ class ObstacleTerm(ContactState, Term):
     def separate_surface(self, position: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
         """Retract points of a surface for output that would lie in an obstacle, as those of contact are."""
         all_posed = self.group.bodies.posed_at(t)
-        posed = [all_posed[number] for number in self.numbers]
+        posed = [all_posed[number] for number in self.group.numbers]
         position = retract_from_obstacles(position, u, partial(min_distance, posed))
         return self.facets.separate(position, elements, u, posed)
 
@@ -329,7 +331,7 @@ class ObstacleTerm(ContactState, Term):
         It is that of the velocities at the start, without any contact; of this rank's points.
         """
         if self.is_far():
-            return [0.0] * len(self.obstacles)
+            return [0.0] * len(self.group.obstacles)
         motion, result = self.group.bodies.dt * self.surface.interpolation(self._start_velocity), list[float]()
         for start_pose, pose, contact in zip(
             self.group.start_poses, self.group.poses, self.obstacle_forces(), strict=True

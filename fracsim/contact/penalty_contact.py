@@ -26,7 +26,7 @@ from ..mesh.domain import Domain
 from ..mesh.parallel import allgather, gather, max_over_ranks, sum_over_ranks
 from .clearance import Clearance
 from .ipc_surface import SelfContactLaw
-from .mesh_obstacle_term import build_mesh_obstacle
+from .mesh_obstacle_term import build_mesh_obstacles
 from .mesh_obstacles import MeshObstacle
 from .obstacle import VerletObstacle
 from .partitioned_surface import PartitionedSurface, motion_diagonal
@@ -390,9 +390,6 @@ class PenaltyMeshContact(PenaltyContact):
 
     Attributes:
         group: the obstacles, and what they did to the body in the last step.
-        obstacles: these.
-        numbers: their numbers in the study.
-        barrier_width: gap from which on contact acts, m.
     """
 
     name = "solids"
@@ -409,11 +406,8 @@ class PenaltyMeshContact(PenaltyContact):
         max_added: float,
     ) -> None:
         """`bodies`: motion of all obstacles; `numbers`: of the triangle meshes; the others as for PenaltyContact."""
-        self.group, edge = ObstacleGroup(bodies, numbers, self._gap, self._wrench), domain.mean_edge_length
-        self.numbers, self.obstacles = self.group.numbers, self.group.obstacles
-        self.barrier_width = law.distance
-        items = zip(self.numbers, self.obstacles, strict=True)
-        self._all_meshes = [build_mesh_obstacle(*item, edge) for item in items]
+        self.group = ObstacleGroup(bodies, numbers, law.distance, self._gap, self._wrench)
+        self._all_meshes = build_mesh_obstacles(self.group, domain.mean_edge_length)
         self._dt = 0.0  # s, of the current or last step
         # of the last step and of this rank's contacts: force and moment on each, N and N m
         self._wrenches: list[Values] = [np.zeros(6) for _ in numbers]
@@ -429,7 +423,7 @@ class PenaltyMeshContact(PenaltyContact):
 
     def _move_to(self, posed: Sequence[PosedShape]) -> None:
         """Move the meshes to the poses of all obstacles; discard forces where they have moved."""
-        last, self._posed = self._posed, [posed[number] for number in self.numbers]
+        last, self._posed = self._posed, [posed[number] for number in self.group.numbers]
         if all(new is old or new.pose.equals(old.pose) for new, old in zip(self._posed, last, strict=True)):
             return
         for mesh, shape in zip(self._all_meshes, self._posed, strict=True):
@@ -478,21 +472,21 @@ class PenaltyMeshContact(PenaltyContact):
     def accept_step(self) -> None:
         """Store contacts, forces, work and dissipation of the step (collective)."""
         # work by the trapezoidal rule, as of velocity Verlet
-        last, self._wrenches = self._wrenches, [np.zeros(6) for _ in self.numbers]
+        last, self._wrenches = self._wrenches, [np.zeros(6) for _ in self.group.numbers]
         super().accept_step()
         self.group.work = [
             -0.5 * float((start + end) @ self.group.bodies.increments[number])
-            for start, end, number in zip(last, self._wrenches, self.numbers, strict=True)
+            for start, end, number in zip(last, self._wrenches, self.group.numbers, strict=True)
         ]
 
     def _store_contacts(self, x: Values) -> bool:
-        self._wrenches = [self.rank_wrench(index) for index in range(len(self.numbers))]
+        self._wrenches = [self.rank_wrench(index) for index in range(len(self.group.numbers))]
         return super()._store_contacts(x)
 
     def _obstacle_frequency(self, x: Values) -> float:
         # the squares of a body and an obstacle on one spring add up
         squares = [0.0]
-        for number, part in zip(self.numbers, self._parts, strict=True):
+        for number, part in zip(self.group.numbers, self._parts, strict=True):
             if number not in self.group.bodies.free:
                 continue
             obstacle, posed = cast("VerletObstacle", self.group.bodies.free[number]), self.group.bodies.posed[number]
@@ -537,7 +531,7 @@ class PenaltyMeshContact(PenaltyContact):
         It is that of the velocities at the start, without any contact; of the points of this rank.
         """
         if self.state.is_idle():
-            return [0.0] * len(self.obstacles)
+            return [0.0] * len(self.group.obstacles)
         x, surface = self._end_positions(), self.surface.current
         motion = self._dt * (surface.point_map.weights @ self.surface.nodal_values(self._start_velocity))
         result = []

@@ -105,7 +105,8 @@ class InsetPointContacts:
 
     def __init__(self, first: RigidObstacle, second: RigidObstacle) -> None:
         self._pair = ObstaclePair.between(first, second)
-        touching = [max(SAMPLES.touching_share * area.sum(), area.max()) for area in self._pair.areas if len(area)]
+        areas = [inset.areas for inset in self._pair.points if len(inset.points)]
+        touching = [max(SAMPLES.touching_share * area.sum(), area.max()) for area in areas]
         self.touching_area = float(min(touching, default=0.0))
         # (n, d) stretch of the springs at the points of both, m; 0 without contact
         self._slips = [np.zeros_like(inset.points) for inset in self._pair.points]
@@ -149,7 +150,7 @@ class InsetPointContacts:
             if len(points):
                 normal = target.normal(x[points])
                 surface = x[points] - self._pair.points[side].radius * normal
-                stiffness = self._penalty.rate * self._pair.areas[side][points]
+                stiffness = self._penalty.rate * self._pair.points[side].areas[points]
                 yield _InsetContacts(side, points, gap[points], normal, surface, stiffness)
 
     def near_springs(self, poses: Poses) -> tuple[Values, Values] | None:

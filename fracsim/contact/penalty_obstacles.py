@@ -227,7 +227,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
         With that of the lightest free obstacle: the squares of a body and an obstacle on one spring add up.
         """
-        free = {number: obstacle for number, obstacle in self.group.bodies.free.items() if number in self.numbers}
+        free = {number: obstacle for number, obstacle in self.group.bodies.free.items() if number in self.group.numbers}
         of_free, added = cast("dict[int, VerletObstacle]", free), self._added_frequency
         if self.is_far():
             return added
@@ -246,7 +246,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
         near = self.point_candidates(posed, self.positions, reach)
         near = near[posed.distance(self.positions[near]) < reach]
         stiffness = obstacle.spring_stiffness(self.positions[near], self.stiffness[near], posed)
-        if self.numbers.index(number) in self.facets.numbers:
+        if self.group.numbers.index(number) in self.facets.numbers:
             facets = self._facets.within_reach(posed, self.positions, reach)
             x = self._facets.closest_points(posed, self.positions, facets).position
             stiffness = stiffness + obstacle.spring_stiffness(x, self._facets.area[facets], posed)
@@ -282,7 +282,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
     def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
         """Forces of an obstacle at a given pose (collective)."""
         forces = self._normal_forces(number, posed)
-        if not (coefficient := self.obstacles[number].friction):
+        if not (coefficient := self.group.obstacles[number].friction):
             return forces
         if self.comm.size > 1 and number in self.facets.numbers:
             forces = self._at_shared_points(forces, posed)
@@ -329,7 +329,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
         if self._start_points is None:
             return np.zeros_like(x)
         start = self._start_points[points]
-        return np.asarray(x - start - self.group.bodies.point_motion(self.numbers[number], start))
+        return np.asarray(x - start - self.group.bodies.point_motion(self.group.numbers[number], start))
 
     def obstacle_forces(self) -> list[ContactForces]:
         """Forces of each obstacle at the current u (collective)."""
@@ -340,22 +340,22 @@ class PenaltyObstacleTerm(ObstacleTerm):
     def accept_step(self) -> None:
         """Sum the work of the step, and store springs and forces for the next one (collective)."""
         if self.is_far():
-            zeros: list[Values] = [np.zeros(self._domain.dim) for _ in self.obstacles]
+            zeros: list[Values] = [np.zeros(self._domain.dim) for _ in self.group.obstacles]
             self.group.friction_loss, self.group.work, self.group.forces = 0.0, [0.0] * len(zeros), zeros
             return
         forces, previous, group = (
-            [-self._current_force(n) for n in range(len(self.obstacles))],
+            [-self._current_force(n) for n in range(len(self.group.obstacles))],
             self._step_end,
             self.group,
         )
         group.friction_loss, group.forces = 0.0, [-force for force in forces]
-        for number, obstacle in enumerate(self.obstacles):
+        for number, obstacle in enumerate(self.group.obstacles):
             if obstacle.friction:
                 # minus the work by the trapezoidal rule, minus the change of the energy of the springs
                 for springs, sign in ((previous.springs[number], 1.0), (self._springs[number], -1.0)):
                     work = springs.work(self._relative_motion(number, springs.points))
                     group.friction_loss += sign * springs.energy - work
-        for number in (number for number, obstacle in enumerate(self.obstacles) if not obstacle.free):
+        for number in (number for number, obstacle in enumerate(self.group.obstacles) if not obstacle.free):
             shift = self.group.increments[number][: self._domain.dim]
             group.work[number] = float((forces[number] + previous.forces[number]) @ shift) / 2
         self._step_end, self._start_points = StepEnd(self._springs, forces, self._ends_far()), None
@@ -409,7 +409,9 @@ class PenaltyObstacleTerm(ObstacleTerm):
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint."""
         rows, forces = saved["springs"], saved["pushed"]
-        springs = [self._springs_from_rows(rows[rows[:, 0] == number, 1:]) for number in range(len(self.obstacles))]
+        springs = [
+            self._springs_from_rows(rows[rows[:, 0] == number, 1:]) for number in range(len(self.group.obstacles))
+        ]
         if len(forces) == self.comm.size:
             local = forces[self.comm.rank]
         else:

@@ -289,6 +289,7 @@ class ObstacleGroup:
         numbers: numbers of those of the group.
         obstacles: these.
         free: numbers of the free ones among them.
+        barrier_width: gap to the body below which contact acts, m.
         work: of each on the body in the last step, J.
         friction_loss: dissipation by friction in the last step, J.
         forces: (d,) of the body on each at the end of the last step, N; further numbers may follow. None: no step yet.
@@ -300,6 +301,7 @@ class ObstacleGroup:
         self,
         bodies: RigidObstacles,
         numbers: Sequence[int],
+        barrier_width: float,
         gap: Callable[[int], float],
         current_force: Callable[[int], Values],
     ) -> None:
@@ -308,12 +310,14 @@ class ObstacleGroup:
         Args:
             bodies: motion of all obstacles of the study.
             numbers: numbers of those of the group.
+            barrier_width: gap to the body below which contact acts, m.
             gap: index in the group -> least distance from the body at the current u, m; of this rank's surface.
             current_force: index -> force (d,) of the body at the current u, N, which counts before the first step.
         """
         self.bodies, self.numbers, self._gap, self._current_force = bodies, tuple(numbers), gap, current_force
         self.obstacles = tuple(bodies.obstacles[number] for number in numbers)
         self.free = [number for number in numbers if bodies.obstacles[number].free]
+        self.barrier_width = barrier_width
         self.work, self.friction_loss = [0.0] * len(self.obstacles), 0.0
 
     # --- motion ---

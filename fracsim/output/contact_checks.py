@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ..contact.obstacle import RigidObstacle, find_overlaps, free_pairs
+from ..contact.obstacle import find_overlaps, free_pairs
 from ..mesh.domain import Domain
 from ..meshes.data import format_point
 from ..timestepping.state import State
 
 if TYPE_CHECKING:
-    from ..contact.rigid_obstacles import RigidObstacles
+    from ..contact.rigid_obstacles import ObstacleGroup, RigidObstacles
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
@@ -25,12 +25,10 @@ class ObstacleContact(Protocol):
     """Contact term of obstacles, as the monitor sees it.
 
     Attributes:
-        obstacles: obstacles with their names.
-        barrier_width: distance below which they act, m.
+        group: obstacles, and the distance below which they act.
     """
 
-    obstacles: tuple[RigidObstacle, ...]
-    barrier_width: float
+    group: ObstacleGroup
 
     def closing_distances(self) -> list[float]:
         """Largest decrease of each obstacle's gap in the last step without contact, m, on this rank (collective)."""
@@ -48,7 +46,8 @@ class ObstacleContactMonitor:
     def __init__(self, domain: Domain, contacts: Sequence[ObstacleContact]) -> None:
         """Start without any step; `contacts` are the contact terms of the obstacles (collective)."""
         self._contacts, self._comm, self._edge = contacts, domain.comm, domain.mean_edge_length
-        self._width = {obstacle.name: contact.barrier_width for contact in contacts for obstacle in contact.obstacles}
+        groups = [contact.group for contact in contacts]
+        self._width = {obstacle.name: group.barrier_width for group in groups for obstacle in group.obstacles}
         self.least_gap = dict.fromkeys(self._width, (math.inf, 0.0))
         self.largest_closing = dict.fromkeys(self.least_gap, (0.0, 0.0, 0.0))
 
