@@ -270,7 +270,6 @@ class ContactState:
     lagged: list[LaggedContact | None]
     level: TimeLevel
     _step_starts: list[StepStart | None]  # points at the start of the step, where barriers are averaged over it
-    _started_near: list[Ints]  # points on which each obstacle acted then
 
     def __init__(self, domain: Domain, u: fem.Function, group: ObstacleGroup, law: ObstacleLaw) -> None:
         """Raise InputError where the body at rest, or a free obstacle, overlaps an obstacle (collective)."""
@@ -404,8 +403,6 @@ class ContactState:
             lag_contact(x, gap, self.surface.area, shape, barrier) for gap, shape in zip(gaps, posed, strict=True)
         ]
         if self.level.contact_weights.time_averaged:
-            width, area = barrier.width, self.surface.area
-            self._started_near = [np.flatnonzero((gap < width) & (area > 0)) for gap in gaps]
             self._step_starts = [StepStart(gap, contact) for gap, contact in zip(gaps, lagged, strict=True)]
         # for the work of normal forces by the trapezoidal rule
         self._start_forces = [contact.force @ contact.normal for contact in lagged]
@@ -463,7 +460,8 @@ class ContactState:
             friction = CoulombFriction(obstacle.friction, self._sticking_slips[number])
             self._directions.setdefault(number, FrictionDirection(friction, lagged.normal))
         obstacle_motion, start = self.contact_point_motion(number), self._step_starts[number]
-        start_posed, candidates = self.group.start_posed[number], self._candidates(number, posed)
+        start_posed = self.group.start_posed[number]
+        candidates = self.point_candidates(posed, self.positions, self.law.barrier.width)
         if start is not None:
             start = start.carried_with(start_posed.pose, posed.pose)
         points = self.positions, self.surface.area, posed, self.law.barrier
@@ -474,11 +472,6 @@ class ContactState:
         facet_start = None if start is None else (start_posed, self._start_positions)
         of_facets = evaluate_facets(self.facets.active, posed, self.positions, self.law.barrier, facet_start)
         return merge_forces(of_points, *of_facets)
-
-    def _candidates(self, number: int, posed: PosedShape) -> Ints:
-        """(k,) points on which an obstacle may act, or acted at the start of the step."""
-        near, start = self.point_candidates(posed, self.positions, self.law.barrier.width), self._step_starts[number]
-        return near if start is None else np.union1d(near, self._started_near[number])
 
     def _compute_sticking_slips(self) -> list[float]:
         """Slip in the step that counts as sticking, m, at each obstacle (collective)."""

@@ -201,10 +201,12 @@ def evaluate_points(
         friction: law of friction.
         obstacle_motion: (d,) motion of the obstacle in the step, or (k, d) of its points in lagged contact, m.
         start: points at the start of the step, where the barrier is averaged over the step.
-        candidates: (m,) points, ascending, that may be in contact now or were at the start; None: all.
+        candidates: (m,) points, ascending, that may be in contact now; None: all.
         direction: of friction, for its tangent; None: the tangent is exact.
     """
     points = np.arange(len(x)) if candidates is None else candidates
+    if start is not None and candidates is not None:
+        points = np.union1d(points, np.flatnonzero(start.gap < barrier.width))
     gap = posed.distance(x[points])
     near = ((gap if start is None else np.minimum(gap, start.gap[points])) < barrier.width) & (area[points] > 0)
     points, gap = points[near], gap[near]

@@ -53,13 +53,11 @@ class IdleState:
         is_near: whether anything was near contact at the end of the last step.
         displacement: (owned dofs,) where nothing was near, m; None: not known.
         clearance: approach of any two nodes from there on before anything is near, m.
-        surface_count: number of surfaces so far.
     """
 
     is_near: bool = False
     displacement: Values | None = None
     clearance: float = 0.0
-    surface_count: int = 0
 
 
 class PenaltyState:
@@ -119,7 +117,7 @@ class PenaltyState:
 
     def surface_changed(self) -> None:
         """Discard the clearance, as it is another surface."""
-        self._idle_state = IdleState(self._idle_state.is_near, surface_count=self._idle_state.surface_count + 1)
+        self._idle_state = IdleState(self._idle_state.is_near)
         self.discard()
 
     def begin_step(self) -> None:
@@ -140,13 +138,15 @@ class PenaltyState:
     def snapshot(self) -> object:
         """Contacts, numbering of the surface, and idle state."""
         histories = self._restored or [(part.keys, part.contact.history) for part in self._surface.current.parts]
-        return histories, -1 if self._restored else self._surface.exchange_count, self._idle_state
+        counts = self._surface.surface_count, -1 if self._restored else self._surface.exchange_count
+        return histories, counts, self._idle_state
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective)."""
-        histories, exchange_count, idle = cast("tuple[list[KeyedHistory], int, IdleState]", memory)
+        histories, counts, idle = cast("tuple[list[KeyedHistory], tuple[int, int], IdleState]", memory)
         if idle is self._idle_state:
             return
+        surface_count, exchange_count = counts
         if exchange_count == self._surface.exchange_count:
             self._restored = None
             for part, (_, history) in zip(self._surface.current.parts, histories, strict=True):
@@ -154,8 +154,7 @@ class PenaltyState:
         else:
             self._restored = histories
         # edges may have broken since: it is another surface
-        count = self._idle_state.surface_count
-        self._idle_state = idle if idle.surface_count == count else IdleState(idle.is_near, surface_count=count)
+        self._idle_state = idle if surface_count == self._surface.surface_count else IdleState(idle.is_near)
         self.discard()
 
     def to_checkpoint(self) -> dict[str, Values]:
@@ -172,7 +171,7 @@ class PenaltyState:
         count = len(self._surface.current.parts)
         histories = [PenaltyHistory.from_checkpoint(saved, f"_{index}") for index in range(count)]
         is_near = any(not history.is_empty for history in histories)
-        self._idle_state = IdleState(is_near, surface_count=self._idle_state.surface_count)
+        self._idle_state = IdleState(is_near)
         if self._comm.rank:
             histories = [history.select(NO_ROWS, NO_ROWS) for history in histories]
         self._surface.set_history(histories)
