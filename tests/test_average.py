@@ -96,11 +96,16 @@ def test_linear_fields_are_reproduced_inside(size: list[float], h: float, kernel
     np.testing.assert_allclose(means, 0, atol=len(error) * EPS)
 
 
+@pytest.mark.filterwarnings("error:overflow")
+@pytest.mark.parametrize("radius", (1e-3 * H, 1e-300))
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_a_small_radius_is_local(body: Body, kernel: str) -> None:
+def test_a_small_radius_is_local(body: Body, kernel: str, radius: float) -> None:
     """With no other centroid in reach each cell keeps its value."""
     values = np.random.default_rng(3).uniform(-1, 1, (len(body.volumes), 3))
-    np.testing.assert_allclose(body.average(1e-3 * H, kernel)(values), values, rtol=4 * EPS)
+    average, norms = body.average(radius, kernel), np.linalg.norm(values, axis=1)
+    np.testing.assert_allclose(average(values), values, rtol=4 * EPS)
+    bound = float(np.median(norms))
+    np.testing.assert_array_equal(average.find_averages_above(values, norms, bound)[0], np.flatnonzero(norms >= bound))
 
 
 def test_a_large_constant_kernel_is_the_mean_over_the_body(body: Body) -> None:

@@ -332,8 +332,9 @@ def tangential(normal: Values, motion: Values) -> Values:
 
 def slipped(stretch: Values, max_length: Values) -> Values:
     """(n, d) stretch (n, d) of springs of friction, m, after those longer than `max_length` (n,) have slipped."""
-    length = np.maximum(np.linalg.norm(stretch, axis=1), np.finfo(float).tiny)
-    return np.asarray(np.minimum(1.0, max_length / length)[:, None] * stretch)
+    length = np.linalg.norm(stretch, axis=1)
+    share = np.divide(max_length, length, out=np.ones(len(length)), where=length > max_length)
+    return np.asarray(share[:, None] * stretch)
 
 
 def _require_positive(kind: str, **lengths: float) -> None:

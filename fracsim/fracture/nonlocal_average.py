@@ -49,6 +49,7 @@ class AverageLimits:
         max_columns: values of a cell that are averaged at once.
         coarse_share: 1 less the relative rounding error of sums in single precision, for 10,000 points.
         max_coarse: largest norm over the bound in single precision; beyond it an average reaches the bound anyhow.
+        least_radius: radius over the edge of a bin, below which it counts as larger: no cells are as close together.
         least_extent: extent of a body over its largest one, below which it counts as flat.
         bound_round_off: relative rounding error of an average that is compared with a bound.
     """
@@ -58,6 +59,7 @@ class AverageLimits:
     max_columns: int = 7
     coarse_share: float = 0.999
     max_coarse: float = 1e20
+    least_radius: float = 1e-9
     least_extent: float = 1e-9
     bound_round_off: float = 1e-12
 
@@ -191,6 +193,7 @@ class _Bins:
         extent = (high - low)[high - low > LIMITS.least_extent * np.max(high - low)]
         spacing = (np.prod(extent) / comm.allreduce(len(centres))) ** (1 / max(len(extent), 1))
         size = max(radius / LIMITS.bins_per_radius, float(spacing) / LIMITS.bins_per_spacing)
+        radius = max(radius, LIMITS.least_radius * size)
         bin_indices = np.floor((points - low) / size).astype(np.int64)
         first = bin_indices.min(axis=0) if len(points) else np.zeros(3, np.int64)
         bins = np.max(bin_indices - first, axis=0, initial=0) + 1
