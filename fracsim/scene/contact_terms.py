@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from ..contact.laws import Penalty
     from ..contact.mesh_pairs import MeshPair
     from ..contact.shape_kernels import CompiledShapeKernels
-    from ..contact.triangle_mesh_shape import TriangleMeshShape
 
 Values = npt.NDArray[np.float64]
 
@@ -198,19 +197,27 @@ def _build_obstacle(
     return RigidObstacle(entry.name, shape, entry.reference_point, entry.displacement, entry.friction)
 
 
-def _build_free_obstacle(entry: ObstaclePlacement, motion: FreeObstacleMotion, shape: Shape) -> RigidObstacle:
-    """Return an obstacle with a mass; if it has a hinge, that is its reference point."""
+def _build_free_obstacle(
+    entry: ObstaclePlacement, motion: FreeObstacleMotion, shape: Shape, centre: Values | None = None
+) -> RigidObstacle:
+    """Return an obstacle with a mass; its reference point is its centre of mass, or its hinge.
+
+    `centre`: (d,) centre of mass of the shape, m, away from its reference point; None: they are the same.
+    """
     from ..contact.obstacle import FreeObstacle
     from ..contact.shapes import TranslatedShape
+    from ..contact.triangle_mesh_shape import TriangleMeshShape
 
+    mass_centre = entry.reference_point if centre is None else entry.reference_point + centre
+    point = mass_centre if motion.hinge is None else motion.hinge
     density = motion.density or (motion.mass or 0.0) / shape.volume
-    point, centre = entry.reference_point, 0 * entry.reference_point
-    if motion.hinge is not None:
-        point, centre = motion.hinge, entry.reference_point - motion.hinge
-        shape = TranslatedShape(shape, centre)
+    if (offset := entry.reference_point - point).any():
+        moved = shape.translated(offset) if isinstance(shape, TriangleMeshShape) else TranslatedShape(shape, offset)
+        shape = cast("Shape", moved)
     return FreeObstacle(
         entry.name, shape, point, friction=entry.friction, mass=density * shape.volume, inertia=shape.inertia(density),
-        motion_basis=motion.pose_basis, mass_centre=centre, gravity=motion.gravity, start_rate=motion.initial_rate,
+        motion_basis=motion.pose_basis, mass_centre=mass_centre - point, gravity=motion.gravity,
+        start_rate=motion.initial_rate,
     )  # fmt: skip
 
 
@@ -262,24 +269,8 @@ def _read_obstacle(comm: MPI.Intracomm, entry: ObstaclePlacement, number: int) -
     surface = from_root(comm, lambda: read_obstacle_surface(file, scale, f"obstacle.{number}"))
     shape = TriangleMeshShape(surface.points, surface.triangles)
     if entry.free_motion is not None:
-        return _build_free_mesh_obstacle(entry, entry.free_motion, shape)
+        return _build_free_obstacle(entry, entry.free_motion, shape, shape.centre)
     return RigidObstacle(entry.name, shape, entry.reference_point, entry.displacement, entry.friction, entry.spin)
-
-
-def _build_free_mesh_obstacle(
-    entry: ObstaclePlacement, motion: FreeObstacleMotion, shape: TriangleMeshShape
-) -> RigidObstacle:
-    """Return an obstacle with a mass; its reference point is its centre of mass, or its hinge."""
-    from ..contact.obstacle import FreeObstacle
-
-    density, centre = motion.density or (motion.mass or 0.0) / shape.volume, shape.centre
-    point = entry.reference_point + centre if motion.hinge is None else motion.hinge
-    shape = shape.translated(entry.reference_point - point)
-    return FreeObstacle(
-        entry.name, shape, point, friction=entry.friction, mass=density * shape.volume, inertia=shape.inertia(density),
-        motion_basis=motion.pose_basis, mass_centre=entry.reference_point + centre - point,
-        gravity=motion.gravity, start_rate=motion.initial_rate,
-    )  # fmt: skip
 
 
 # --- self-contact ---
