@@ -153,6 +153,10 @@ class RetractableSurface:
         """Numbers (m,) of the elements that the pairs have."""
         return np.delete(np.arange(len(self.elements)), self._excluded)
 
+    def remaining_elements(self) -> Ints:
+        """(k, d) points of the elements that the pairs have."""
+        return np.delete(self.elements, self._excluded, axis=0)
+
     def snapshot(self) -> SurfaceSnapshot:
         """Factors of arms, excluded elements, and steps to the next release of faces."""
         return self.point_map.share, self._excluded, self._release_interval
@@ -306,6 +310,11 @@ class SelfContactSurface(RetractableSurface):
             share, pressure = self._previous_state(previous, u)
             self.point_map = self.point_map.with_arm_share(share)
             self._retract_faces(u, pressure)
+
+    @property
+    def rest_positions(self) -> Values:
+        """(n, d) reference positions of its points with the gap of new cracks, m."""
+        return self._rest_positions
 
     def represents(self, pattern: npt.NDArray[np.uint8]) -> bool:
         """Whether the surface is also that of a pattern (cells,): most edges break within fragments."""

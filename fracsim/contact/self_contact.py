@@ -29,6 +29,7 @@ from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.quadratic_surface import subdivided_input_mesh
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .clearance import FollowingPoints
+from .contact_patch import PatchContact
 from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface, SurfaceSnapshot
 from .laws import stiffness_factor
 from .pair_search import max_length
@@ -170,6 +171,7 @@ class SelfContact(Term):
         surface: its surface.
         level: time level of the current or last step.
         friction: lagged friction of the step; None: without.
+        sticking_slip: slip in the step that counts as sticking, m.
         start_positions: (n, d) of the surface at the start of the step, m.
         allows_exact_tangent: whether tangents are exact near the solution.
     """
@@ -178,6 +180,7 @@ class SelfContact(Term):
     leaves_tangent_incomplete = True
     allows_exact_tangent: bool = True
     level: TimeLevel
+    sticking_slip: float
     _attempts = 0  # of Newton's method in the step
     _start_displacement: Values | None = None  # of the step
     _fitted_displacement: Values | None = None  # at which crack faces have found their room within the step
@@ -198,7 +201,7 @@ class SelfContact(Term):
         self._coupling = CouplingBuilder(domain)
         build = build or partial(SelfContactSurface, comm=domain.comm)
         self.surface = BreakingSurface(domain, u, law, build)
-        self.parts = self.surface, CollisionLimit(self)
+        self.parts = self.surface, CollisionLimit(self), PatchContact(self)
         self._discard_surface()
 
     # --- surface ---
@@ -226,14 +229,15 @@ class SelfContact(Term):
         self.level, self._is_stale, self.friction, self._attempts = level, True, None, 0
         if not level.dt:
             return
-        nodal, slip, surface = self.surface.nodal_values(level.u_n), self._sticking_slip(level), self.surface.current
+        nodal, surface = self.surface.nodal_values(level.u_n), self.surface.current
+        self.sticking_slip = self._sticking_slip(level)
         if not self._is_repeated(level.u_n):
             self._fitted_displacement = None
         if self._fitted_displacement is None:
             surface.extend_faces(nodal)
         self.start_positions = x = surface.point_map(nodal)
         if self.surface.law.friction:
-            self.friction = surface.pairs.lag_friction(x, x, slip)
+            self.friction = surface.pairs.lag_friction(x, x, self.sticking_slip)
 
     def _is_repeated(self, u_n: Values) -> bool:
         """Whether a step begins where the last one did, at u_n (owned dofs,), m: it is repeated (collective)."""
