@@ -326,16 +326,15 @@ class Simulation:
         """
         from .output.surface.vtk_files import fragment_values
 
-        frame = self._surface_frame()
-        return self.comm.bcast(None if frame is None else fragment_values(frame.fragments))
+        # the same on all ranks
+        return fragment_values(self._surface_frame().fragments)
 
     def surface(self) -> Any:
         """Return the split surface now (pyvista.PolyData) on rank 0, None on the other ranks (collective).
 
         It is closed around every fragment. Cells have `piece`, `origin`, `age` and the cell fields of output.fields.
         """
-        part = self._surface_frame()
-        frame = None if part is None else part.gather()
+        frame = self._surface_frame().gather()
         if frame is None:
             return None
         import pyvista
@@ -351,8 +350,8 @@ class Simulation:
         surface.field_data["origins"] = frame.origins
         return surface
 
-    def _surface_frame(self) -> SurfaceFrame | None:
-        """Return the part of the split surface that this rank has, None without a part (collective)."""
+    def _surface_frame(self) -> SurfaceFrame:
+        """Return the part of the split surface that this rank has (collective)."""
         self._check_open()
         balance, study = self.scene.balance, self.study
         if self._surface is None:

@@ -20,6 +20,9 @@ from fracsim.contact.pose import Pose, PosedShape, rotation_derivative
 from fracsim.contact.pose_derivatives import PoseCoupling, contact_wrench
 from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylinder, Shape, Sphere
 from fracsim.contact.step_limit import safe_motion_fractions
+from fracsim.mesh.split_surface.closed_surface import build_split_surface
+from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
+from support.drawn import drawn_at
 from support.scenes import each_step, make_scene, march
 
 Values = npt.NDArray[np.float64]
@@ -409,15 +412,13 @@ def test_what_breaks_under_a_ball_gains_nothing() -> None:
     contact.facets.from_checkpoint(contact.facets.to_checkpoint())
     np.testing.assert_array_equal(contact.facets._excluded, left_out)
     # what is drawn: all of it, beside the ball
-    at, (elements, _), u = (
-        skin.local.point_map,
-        skin.local.facets(),
-        skin.interpolation.nodal_values(contact.end_displacement),
-    )
-    whole = at.with_arm_share(np.ones(len(at.share)))
-    shares = np.random.default_rng(1).dirichlet(np.full(3, 0.7), 200)
+    skeleton, u = EntityNumbering(scene.domain.input_mesh), contact.end_displacement
+    pattern = scene.domain.input_numbering.gather_cells(scene.fracture.graph.pattern)
+    split = build_split_surface(skeleton, pattern)
+    surface = drawn_at(skeleton, pattern, split, scene.domain.input_numbering.gather_nodes(u.reshape(-1, 3)))
+    whole, shares = surface.placed_points(), np.random.default_rng(1).dirichlet(np.full(3, 0.7), 200)
     least = [
-        placed.distance(np.einsum("sc,kcd->ksd", shares, each(u)[elements]).reshape(-1, 3)).min()
-        for each in (whole, contact.separate_surface(whole, elements, u, state.t))
+        placed.distance(np.einsum("sc,kcd->ksd", shares, each.rest[split.elements]).reshape(-1, 3)).min()
+        for each in (whole, contact.separate_surface(whole, surface, u, state.t))
     ]
     assert least[0] < 0 < least[1]

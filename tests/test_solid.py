@@ -7,15 +7,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from fracsim.mesh.ghost_exchange import KeyLookup
 from fracsim.mesh.split_surface.closed_surface import build_split_surface
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
 from fracsim.mesh.split_surface.fragment_surface import (
+    PlanarPoints,
     build_fragment_surface,
     has_same_fragments,
     project_onto_fragments,
 )
 from fracsim.mesh.split_surface.surface_map import make_surface_map
 from fracsim.meshes.topology import signed_measures
+from support.drawn import drawn_at
 from support.solids import assert_closed, cloud, components, enclosed, lattice, patterns, separated, torn
 
 
@@ -122,11 +125,14 @@ def test_walls_are_drawn_where_they_are_cut_flat(dim: int) -> None:
         of_flat = make_surface_map(flat, skeleton, pattern, flat.points).with_arm_share(
             rng.uniform(0.5, 1.0, len(flat.points))
         )
-        before = make_surface_map(drawn, skeleton, pattern, drawn.points)
-        after = project_onto_fragments(before, skeleton, pattern, of_flat)
+        surface = drawn_at(skeleton, pattern, drawn, u)
+        before = surface.placed_points()
+        assert flat.numbering is not None
+        rows = KeyLookup(flat.numbering.keys(np.arange(len(x))))
+        after = project_onto_fragments(before, surface, PlanarPoints(rows, of_flat.rest, of_flat(u)))
         each = [
-            enclosed(places(u), made.elements, inner[made.parents.first_parent[made.elements[:, 0]]], 2)[0][1]
-            for made, places in ((flat, of_flat), (drawn, after), (drawn, before))
+            enclosed(places, made.elements, inner[made.parents.first_parent[made.elements[:, 0]]], 2)[0][1]
+            for made, places in ((flat, of_flat(u)), (drawn, after.rest), (drawn, before.rest))
         ]
         assert each[1] == pytest.approx(each[0], rel=1e-12) and abs(each[2] - each[0]) > 1e-2 * each[0]
     sides = np.isin(drawn.edge, np.flatnonzero(crack & (inner[skeleton.edges] == 1).all(axis=1)))

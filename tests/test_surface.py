@@ -148,7 +148,7 @@ def test_smooth_cuts_make_a_crack_flat(dim: int) -> None:
     mesh = cloud(dim, 3, nodes=1000)
     skeleton = EntityNumbering(mesh)
     broken = separated(skeleton, (mesh.points[:, 0] > 0.5).astype(int))
-    cut = smooth_cuts(skeleton, broken)
+    cut = smooth_cuts(WholeMesh(skeleton), broken)
     assert (
         np.array_equal(~np.isnan(cut), broken)
         and cut[broken].min() >= CUTS.min_distance
@@ -167,10 +167,10 @@ def test_smooth_cuts_leave_a_place_that_is_known() -> None:
     skeleton = EntityNumbering(mesh)
     broken = separated(skeleton, (mesh.points[:, 0] > 0.5).astype(int))
     known = np.where(broken & (np.arange(len(broken)) % 3 == 0), 0.21, np.nan)
-    cut = smooth_cuts(skeleton, broken, known)
+    cut = smooth_cuts(WholeMesh(skeleton), broken, known)
     given = ~np.isnan(known)
     assert (cut[given] == 0.21).all() and np.isfinite(cut[broken]).all() and np.unique(cut[broken & ~given]).size > 9
-    assert np.isnan(smooth_cuts(skeleton, np.zeros_like(broken))).all()
+    assert np.isnan(smooth_cuts(WholeMesh(skeleton), np.zeros_like(broken))).all()
 
 
 @pytest.mark.parametrize("dim", DIMS)

@@ -10,7 +10,7 @@ import pytest
 import pyvista
 
 from support.ranks import Arrays, OnRanks, run_on_ranks
-from support.surface_parts import BODIES, FRAMES
+from support.surface_parts import BODIES, FRAMES, RANK_KINDS
 from test_surface_output import rows_of
 
 RANKS = (1, 2, 3)
@@ -35,19 +35,22 @@ def of_body(found: Arrays, name: str) -> Arrays:
 @pytest.mark.ranks
 @pytest.mark.parametrize("ranks", RANKS)
 @pytest.mark.parametrize("name", BODIES)
-def test_the_surface_is_the_one_that_rank_0_builds_alone(surfaces: OnRanks, name: str, ranks: int) -> None:
-    """Topology, reference places, parents, pieces and names, to the last bit, on any number of ranks.
+def test_the_surface_is_that_of_the_whole_mesh_on_one_rank(surfaces: OnRanks, name: str, ranks: int) -> None:
+    """Topology, reference places, parents, pieces and names, to the last bit, on any number of ranks; smooth ones too.
 
     Broken edges cross borders between ranks; the square has two cells, so that of three ranks one has none.
     """
     (serial, _), (found, _) = surfaces(1), surfaces(ranks)
-    expected, surface, restarted = (of_body(*each) for each in (
-        (serial, f"{name}-gathered"), (found, name), (found, f"{name}-restarted")))  # fmt: skip
+    expected, expected_smooth, surface, restarted, smooth = (of_body(*each) for each in (
+        (serial, f"{name}-whole"), (serial, f"{name}-whole-smooth"),
+        (found, name), (found, f"{name}-restarted"), (found, f"{name}-smooth")))  # fmt: skip
     assert np.array_equal(surface["graph-piece"], surface["piece"])
     for key, values in expected.items():
         assert np.array_equal(surface[key], values), key
         assert key == "overlap" or np.array_equal(restarted[key], values), key
+        assert np.array_equal(smooth[key], expected_smooth[key]), key
     if name != "square":
+        assert not np.array_equal(smooth["points"], surface["points"])
         assert surface["nodes"].max() > 1 == surface["nodes"].min()
         # nodes are split: several points follow one node alone
         single = surface["parents"][np.count_nonzero(surface["parents"] >= 0, axis=1) == 1, 0]
@@ -58,12 +61,13 @@ def test_the_surface_is_the_one_that_rank_0_builds_alone(surfaces: OnRanks, name
 @pytest.mark.parametrize("ranks", RANKS)
 @pytest.mark.parametrize("name", BODIES)
 def test_the_files_are_those_of_one_rank(surfaces: OnRanks, name: str, ranks: int) -> None:
-    """Those of a restarted run too; on one rank they have the bytes of the files that rank 0 builds alone."""
+    """Those of a restarted run too; on one rank they have the bytes of the files of the whole mesh."""
     (_, one), (_, several) = surfaces(1), surfaces(ranks)
     files = [f"surface/surface_{number:06d}.vtu" for number in range(FRAMES)]
-    for kind in ("", "-gathered", "-restarted"):
+    for kind in RANK_KINDS:
+        of_whole = f"{name}-whole" + "-smooth" * (kind == "-smooth")
         for file in files:
-            path, twin = several / f"{name}{kind}" / file, one / f"{name}-gathered" / file
+            path, twin = several / f"{name}{kind}" / file, one / of_whole / file
             assert ranks > 1 or path.read_bytes() == twin.read_bytes()
             expected, read = pyvista.read(twin), pyvista.read(path)
             assert np.array_equal(read.cells, expected.cells)
@@ -77,7 +81,7 @@ def test_the_files_are_those_of_one_rank(surfaces: OnRanks, name: str, ranks: in
             for key in expected.point_data:
                 assert np.allclose(read.point_data[key], expected.point_data[key], rtol=1e-6, atol=1e-6), key
             assert np.allclose(read.points, expected.points, rtol=1e-6, atol=1e-6)
-        rows, expected_rows = rows_of(several / f"{name}{kind}"), rows_of(one / f"{name}-gathered")
+        rows, expected_rows = rows_of(several / f"{name}{kind}"), rows_of(one / of_whole)
         assert len(rows) == len(expected_rows) >= FRAMES
         for row, expected_row in zip(rows, expected_rows, strict=True):
             assert row.keys() == expected_row.keys()
@@ -114,4 +118,4 @@ def test_an_overlap_is_found_across_ranks(surfaces: OnRanks, ranks: int) -> None
     (serial, _), (found, _) = surfaces(1), surfaces(ranks)
     for name in ("solid", "plate", "curved"):
         (overlap,) = found[f"{name}:overlap"].tolist()
-        assert overlap == serial[f"{name}-gathered:overlap"].tolist()[0] and "'pieces'" in overlap
+        assert overlap == serial[f"{name}-whole:overlap"].tolist()[0] and "'pieces'" in overlap

@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import gather
+from ..mesh.split_surface.drawn_surface import DrawnSurface
 from ..mesh.split_surface.point_matching import match_points
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .clearance import Clearance, FollowingPoints, ProximityCandidates, ShapeDistance, outline_radius
@@ -108,12 +109,13 @@ class SurfaceFacets:
         is_open = bool((self.gaps(posed, self.active, x) > 0).all())
         return bool(self._surface.comm.allreduce(is_open, op=MPI.LAND))
 
-    def separate(self, at: SurfaceMap, elements: Ints, u: Values, posed: Sequence[PosedShape]) -> SurfaceMap:
-        """Surface for output of elements (m, d) with its points retracted where curved obstacles cut elements."""
+    def separate(self, points: SurfaceMap, surface: DrawnSurface, posed: Sequence[PosedShape]) -> SurfaceMap:
+        """Points for output retracted where curved obstacles cut elements (collective)."""
         if not self.numbers:
-            return at
+            return points
+        elements = surface.split.elements
         facets = ContactFacets(elements, np.ones(len(elements)), FACETS.smoothing * self._width)
-        return retract_cut_elements(at, u, elements, lambda x: self.gaps(posed, facets, x, 0.0) <= 0)
+        return retract_cut_elements(points, surface, lambda x: self.gaps(posed, facets, x, 0.0) <= 0)
 
     # --- new crack faces ---
 

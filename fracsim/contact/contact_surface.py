@@ -23,6 +23,7 @@ from scipy.sparse import bsr_matrix, csr_matrix
 from ..mesh.domain import Domain
 from ..mesh.parallel import allgather, gather, sum_over_ranks
 from ..mesh.simplices import local_edges
+from ..mesh.split_surface.drawn_surface import DrawnSurface
 from ..mesh.split_surface.local_surface import LocalSurface, ParentMatrix
 from ..mesh.split_surface.point_matching import match_points
 from ..mesh.split_surface.surface_map import SurfaceMap, row_entries
@@ -123,26 +124,25 @@ def retract_points(
     return point_map if unchanged else point_map.with_arm_share(new_share), points[remaining]
 
 
-def retract_cut_elements(
-    point_map: SurfaceMap, u: Values, elements: Ints, cut: Callable[[Values], Flags]
-) -> SurfaceMap:
-    """Retract points of elements until no element is cut, or its points are at their nodes.
+def retract_cut_elements(points: SurfaceMap, surface: DrawnSurface, cut: Callable[[Values], Flags]) -> SurfaceMap:
+    """Retract drawn points of elements until no element is cut, or its points are at their nodes (collective).
 
     Args:
-        point_map: map from nodes to points.
-        u: (nodes, d) displacements, m.
-        elements: (m, d) points of elements.
-        cut: function of positions (n, d), m, that returns (m,) flags.
+        points: drawn points, as a map without nodes.
+        surface: the drawn surface.
+        cut: function of positions (n, d), m, that returns (m,) flags of the elements.
     """
+    has_arm = np.zeros(len(points.share), bool)
+    has_arm[points.copies] = True
     for factor in RETRACTION.cut_trials:
-        points = np.intersect1d(elements[cut(point_map(u))], point_map.copies)
-        points = points[point_map.share[points] > 0]
-        if not len(points):
+        retracted: Flags = np.zeros(len(has_arm), bool)
+        retracted[surface.split.elements[cut(points.rest)]] = True
+        retracted &= has_arm & (points.share > 0)
+        if not surface.shared.has_any(retracted):
             break
-        share = point_map.share.copy()
-        share[points] *= factor
-        point_map = point_map.with_arm_share(share)
-    return point_map
+        retracted = surface.shared.any_over_ranks(retracted)
+        points = points.with_arm_share(np.where(retracted, factor * points.share, points.share))
+    return points
 
 
 def extend_points(point_map: SurfaceMap, u: Values, min_gap: float, gaps: GapFunction) -> SurfaceMap:
@@ -350,12 +350,16 @@ def _blocks_of_nodes(W: csr_matrix, corners: Ints, blocks: Values) -> tuple[Ints
     return node[first], node[second], (weight[first] * weight[second])[:, None, None] * B
 
 
-def retract_from_obstacles(point_map: SurfaceMap, u: Values, gaps: GapFunction) -> SurfaceMap:
-    """Retract points on crack faces that would lie in an obstacle, as those of contact are."""
-    inside = point_map.copies[gaps(point_map(u))[point_map.copies] <= 0]
+def retract_from_obstacles(points: SurfaceMap, gaps: GapFunction) -> SurfaceMap:
+    """Retract drawn points on crack faces that would lie in an obstacle, as those of contact are.
+
+    `points`: a map without nodes.
+    """
+    inside = points.copies[gaps(points.rest)[points.copies] <= 0]
     if not len(inside):
-        return point_map
-    return retract_points(point_map, u, inside, point_map.share[inside], np.full(len(inside), TINY), gaps)[0]
+        return points
+    no_nodes, min_gap = np.empty((0, points.rest.shape[1])), np.full(len(inside), TINY)
+    return retract_points(points, no_nodes, inside, points.share[inside], min_gap, gaps)[0]
 
 
 # --- cells whose crack faces are part of the surface ---

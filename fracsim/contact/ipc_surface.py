@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import chain, repeat
 from typing import TYPE_CHECKING, ClassVar
 
@@ -23,10 +24,17 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from ..errors import InputError
+from ..mesh.ghost_exchange import KeyLookup
 from ..mesh.parallel import allgather
 from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
+from ..mesh.split_surface.drawn_surface import DrawnSurface
 from ..mesh.split_surface.entity_numbering import CRACK, EntityNumbering
-from ..mesh.split_surface.fragment_surface import build_fragment_surface, has_same_fragments, project_onto_fragments
+from ..mesh.split_surface.fragment_surface import (
+    PlanarPoints,
+    build_fragment_surface,
+    has_same_fragments,
+    project_onto_fragments,
+)
 from ..mesh.split_surface.point_matching import match_points, point_identity
 from ..mesh.split_surface.surface_map import SurfaceMap, make_surface_map
 from ..meshes.data import format_point
@@ -322,9 +330,16 @@ class SelfContactSurface(RetractableSurface):
             self._pattern = pattern
         return same
 
-    def place_faces(self, point_map: SurfaceMap) -> SurfaceMap:
-        """Map of all crack faces of the body with those between fragments where they are here."""
-        return project_onto_fragments(point_map, self._skeleton, self._pattern, self.point_map)
+    def place_faces(self, points: SurfaceMap, surface: DrawnSurface, u: Values) -> SurfaceMap:
+        """Drawn points with those between fragments where they are here, at u (nodes, d), m (collective)."""
+        return project_onto_fragments(
+            points, surface, PlanarPoints(self._rows_by_key, self.point_map.rest, self.point_map(u))
+        )
+
+    @cached_property
+    def _rows_by_key(self) -> KeyLookup:
+        assert self.split.numbering is not None
+        return KeyLookup(self.split.numbering.keys(np.arange(len(self._skeleton.points))))
 
     def _check_apart(self) -> None:
         """Raise InputError where a body at rest intersects or touches itself."""

@@ -23,6 +23,7 @@ from petsc4py import PETSc
 from ..mechanics.extra_couplings import CouplingBuilder
 from ..mechanics.term import Term
 from ..mesh.domain import Domain
+from ..mesh.split_surface.drawn_surface import DrawnSurface
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .contact_state import ContactState
 from .contact_surface import retract_from_obstacles
@@ -285,15 +286,12 @@ class ObstacleTerm(ContactState, Term):
 
     # --- fracture, and surfaces for output ---
 
-    def gather_separation(self) -> None:
-        """Do nothing: obstacles are on all ranks."""
-
-    def separate_surface(self, position: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
+    def separate_surface(self, points: SurfaceMap, surface: DrawnSurface, u: Values, t: float) -> SurfaceMap:
         """Retract points of a surface for output that would lie in an obstacle, as those of contact are."""
         all_posed = self.group.bodies.posed_at(t)
         posed = [all_posed[number] for number in self.group.numbers]
-        position = retract_from_obstacles(position, u, partial(min_distance, posed))
-        return self.facets.separate(position, elements, u, posed)
+        points = retract_from_obstacles(points, partial(min_distance, posed))
+        return self.facets.separate(points, surface, posed)
 
     def clear_search(self) -> None:
         """Discard results of searches, which a checkpoint does not hold (not collective)."""

@@ -25,8 +25,14 @@ from ..mesh.ghost_exchange import KeyedReduction, KeyLookup, min_over_ranks
 from ..mesh.parallel import allgather, gather, max_over_ranks, on_root
 from ..mesh.simplices import is_split
 from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
+from ..mesh.split_surface.drawn_surface import DrawnSurface
 from ..mesh.split_surface.entity_numbering import EntityNumbering
-from ..mesh.split_surface.fragment_surface import build_surface_of_open_edges, moves_alike, project_onto_fragments
+from ..mesh.split_surface.fragment_surface import (
+    PlanarPoints,
+    build_surface_of_open_edges,
+    moves_alike,
+    project_onto_fragments,
+)
 from ..mesh.split_surface.local_surface import (
     NodeExchange,
     contact_elements,
@@ -40,7 +46,7 @@ from ..mesh.split_surface.surface_motion import PointParents
 from ..meshes.topology import boundary_facets
 from .clearance import FollowingPoints
 from .ipc_pairs import vertex_areas
-from .ipc_surface import SURFACE, SelfContactLaw, build_contact_surface, offset_crack_faces, refuse_intersections
+from .ipc_surface import SURFACE, SelfContactLaw, offset_crack_faces, refuse_intersections
 from .mesh_obstacles import MeshObstacle
 from .penalty_contacts import NodalMassShare, PenaltyHistory
 from .penalty_point_facet import POINT_FACET, penalty_stiffness
@@ -94,7 +100,6 @@ class PartitionedSurface:
     # values at the nodes of all points, and of this rank's points
     _nodes: NodeExchange | None = None
     _own_nodes: NodeExchange | None = None
-    _drawn: SurfaceMap | None = None
 
     def __init__(
         self,
@@ -402,38 +407,24 @@ class PartitionedSurface:
         if self.law.fragments_only:
             self._cuts = cuts
 
-    def gather_separation(self) -> None:
-        """Build the map of all crack faces on rank 0, as that rank draws all of them (collective)."""
-        pattern = self._domain.input_numbering.gather_cells(self._pattern)
-        rows, share = self._point_rows, self.current.point_map.share
-        retracted = np.flatnonzero(share[rows] < 1)
-        arms = gather(self._comm, (self.element_set.points.keys[retracted], share[rows[retracted]]))
-        cuts = gather(self._comm, self._cuts()) if self._cuts is not None else None
-        mesh, self._drawn = self._domain.input_mesh, None
-        if mesh is None or pattern is None or arms is None or not pattern.any():
-            return
-        topology = EntityNumbering(mesh)
-        cut = None
-        if cuts is not None:
-            edges, positions = (np.concatenate(parts) for parts in zip(*cuts, strict=True))
-            cut = topology.edge_values(edges, positions[:, 0])
-        split, _, point_map = build_contact_surface(topology, pattern, self.law, self._face_gap, cut)
-        assert split.numbering is not None
-        keys, shares = (np.concatenate(parts) for parts in zip(*arms, strict=True))
-        points = KeyLookup(split.numbering.keys(np.arange(len(mesh.points))))(keys)
-        share = np.ones(len(split.points))
-        share[points[points >= 0]] = shares[points >= 0]
-        self._drawn = point_map.with_arm_share(share)
-        self._drawn_topology, self._drawn_pattern = topology, pattern
-
-    def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
+    def separate_surface(self, points: SurfaceMap, surface: DrawnSurface, u: Values, t: float) -> SurfaceMap:
         """Move points of a surface for output to the crack faces of contact, which are offset and retracted."""
-        if (drawn := self._drawn) is None:
-            return at
+        assert self._own_nodes is not None
+        share, nodal = self.current.point_map.share[self._point_rows], self._own_nodes(u).copy()
+        row_of_key = KeyLookup(self.element_set.points.keys)
         if self.law.fragments_only:
-            return project_onto_fragments(at, self._drawn_topology, self._drawn_pattern, drawn)
+            faces = self._own_map.with_arm_share(share)
+            return project_onto_fragments(points, surface, PlanarPoints(row_of_key, faces.rest, faces(nodal)))
+        rows = row_of_key(surface.numbering.keys(surface.part.node_numbers))
+        # in 2D points within the body are none of contact
+        which = np.flatnonzero(rows >= 0)
         # faces without an offset stay where other terms have moved them
-        return (drawn if self._face_gap else at).with_arm_share(np.minimum(drawn.share, at.share))
+        if self._face_gap:
+            full_arms = self._own_map.with_arm_share(np.ones(len(share)))(nodal)
+            points = points.move_points(which, full_arms[rows[which]])
+        drawn_share = points.share.copy()
+        drawn_share[which] = np.minimum(share[rows[which]], drawn_share[which])
+        return points.with_arm_share(drawn_share)
 
     # --- state ---
 

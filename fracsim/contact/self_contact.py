@@ -25,6 +25,7 @@ from ..mechanics.term import Term, TimeLevel
 from ..mechanics.term_protocols import CutPositions
 from ..mesh.domain import Domain
 from ..mesh.parallel import Gather, allgather, bcast, sum_over_ranks
+from ..mesh.split_surface.drawn_surface import DrawnSurface
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.quadratic_surface import subdivided_input_mesh
 from ..mesh.split_surface.surface_map import SurfaceMap
@@ -130,16 +131,19 @@ class BreakingSurface[S: SelfContactSurface]:
             self.law = replace(self.law, stiffness=stiffness)
             self.current.set_stiffness(stiffness)
 
-    def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
+    def separate_surface(self, points: SurfaceMap, surface: DrawnSurface, u: Values, t: float) -> SurfaceMap:
         """Move points of a surface for output to the crack faces of contact, which are offset and retracted."""
+        if self._parts > 1:
+            return points
+        current, nodal = self.current, self.nodal_values(u)
         if self.law.fragments_only:
-            return self.current.place_faces(at)
-        point_map = self.current.point_map
+            return current.place_faces(points, surface, nodal)
+        rows, share = surface.whole.points, current.point_map.share
         # faces without an offset stay where other terms have moved them
-        return (point_map if self.current.face_gap else at).with_arm_share(np.minimum(point_map.share, at.share))
-
-    def gather_separation(self) -> None:
-        """Do nothing: every rank has the surface."""
+        if current.face_gap:
+            full_arms = current.point_map.with_arm_share(np.ones(len(share)))(nodal)
+            points = points.move_points(np.arange(len(rows)), full_arms[rows])
+        return points.with_arm_share(np.minimum(share[rows], points.share))
 
     def snapshot(self) -> SurfaceSnapshot:
         """Retracted and excluded parts of the surface."""

@@ -21,6 +21,7 @@ from .term import Flags, Ints, Term, Values
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
+    from ..mesh.split_surface.drawn_surface import DrawnSurface
     from ..mesh.split_surface.surface_map import SurfaceMap
     from .block_matrix import TieMatrix
 
@@ -252,16 +253,13 @@ class HistoryColumns(Protocol):
 class SurfaceSeparator(Protocol):
     """Term that keeps surfaces apart, in output as well."""
 
-    def gather_separation(self) -> None:
-        """Gather on rank 0 what `separate_surface` needs (collective)."""
-
-    def separate_surface(self, at: SurfaceMap, elements: Ints, u: Values, t: float) -> SurfaceMap:
-        """Split surface without overlaps (on rank 0, not collective).
+    def separate_surface(self, points: SurfaceMap, surface: DrawnSurface, u: Values, t: float) -> SurfaceMap:
+        """Points of the split surface of this rank's cells without overlaps (collective).
 
         Args:
-            at: split surface without regard to contact.
-            elements: (m, d) points of its segments or triangles.
-            u: (nodes, d) displacement, m.
+            points: drawn points, as a map without nodes.
+            surface: the surface without regard to contact.
+            u: (owned dofs,) displacement, m.
             t: time of the state, s.
         """
 

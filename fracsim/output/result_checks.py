@@ -281,8 +281,10 @@ class InterpenetrationMonitor:
         part = surface.part
         cells, is_owned = surface.skeleton.cells[surface.undamaged_cells], part.owner == part.comm.rank
         if self._in_contact == "pieces":
-            # nodes without an undamaged cell have no contact; with contact one rank has the whole surface
-            is_owned &= np.isin(np.arange(len(is_owned)), cells)
+            # nodes without an undamaged cell have no contact
+            is_loose = np.ones(len(is_owned), np.int64)
+            is_loose[cells] = 0
+            is_owned &= part.least(is_loose) == 0
         nodes = RankNodes(part.comm, part.node_numbers, is_owned)
         overlap = find_interpenetration(surface.skeleton.points + u, cells, surface.split.node_fragment, nodes)
         if overlap is not None:

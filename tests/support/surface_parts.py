@@ -1,4 +1,4 @@
-"""Split surfaces of bodies broken by rule, whose parts are on all ranks, beside those that rank 0 builds alone."""
+"""Split surfaces of bodies broken by rule, whose parts are on all ranks, beside those of whole meshes on one rank."""
 
 from __future__ import annotations
 
@@ -15,15 +15,18 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from fracsim.fracture.edge_history import EdgeHistory
-from fracsim.mesh.domain import distribute
+from fracsim.mesh.domain import Domain, distribute
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.fragments import find_fragments
 from fracsim.mesh.parallel import Gather
+from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
+from fracsim.mesh.split_surface.mesh_part import WholeMesh
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.topology import boundary_facets, facets_on_nodes
 from fracsim.output.fields_file import Field
 from fracsim.output.result_checks import InterpenetrationMonitor
 from fracsim.output.surface.body_surface import BodySurface
+from fracsim.output.surface.part_values import RankValues
 from fracsim.output.surface.surface_output import SurfaceOutput
 from fracsim.scene import Scene, build_scene_on
 
@@ -32,6 +35,9 @@ from .solids import lattice
 
 Arrays = dict[str, npt.NDArray[Any]]
 FRAMES = 4
+RANK_KINDS = ("", "-restarted", "-smooth")
+WHOLE_KINDS = ("-whole", "-whole-smooth")
+KINDS = (*RANK_KINDS, *WHOLE_KINDS)
 
 
 def noise(points: Values) -> Values:
@@ -97,16 +103,39 @@ def frames(scene: Scene, law: Law, record: EdgeHistory) -> Iterator[tuple[Any, l
         yield replace(state, t=float(t), u=u, v=v), fields
 
 
+class WholeValues:
+    """Values of the whole body in the order of the input mesh, in place of RankValues (one rank)."""
+
+    def __init__(self, domain: Domain) -> None:
+        mesh, self._domain = domain.input_mesh, domain
+        assert mesh is not None
+        self.part = WholeMesh(EntityNumbering(mesh))
+
+    def of_nodes(self, values: Values) -> Values:
+        rows = self._domain.input_numbering.gather_nodes(values.reshape(-1, self._domain.dim))
+        return np.asarray(rows)[: len(self.part.node_numbers)]
+
+    def of_cells(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        return np.asarray(self._domain.input_numbering.gather_cells(values))
+
+    def of_drawn_cells(self, values: npt.NDArray[Any], drawn: npt.NDArray[np.bool_]) -> npt.NDArray[Any]:
+        return self.of_cells(np.where(drawn.reshape(-1, *np.ones(values.ndim - 1, int)), values, 0))
+
+    def of_broken_edges(self, history: EdgeHistory) -> tuple[Values, Values]:
+        edges, (times, cuts) = (rows.T for rows in history.gather_broken())  # type: ignore[union-attr]
+        return self.part.skeleton.edge_values(edges.T, times), self.part.skeleton.edge_values(edges.T, cuts)
+
+
 def written(name: str, folder: Path) -> Arrays:
-    """Surfaces of a body in folders `name` and `name`-gathered, and, restarted, `name`-restarted (collective)."""
+    """Surfaces of a body, restarted and smooth ones too, and on one rank those of the whole mesh (collective)."""
     mesh, law, order = BODIES[name]
     comm = MPI.COMM_WORLD
     domain = distribute(comm, mesh if comm.rank == 0 else None, order)
     scene = build_scene_on(domain, make_study(fracture={"strength": 1.0}))
     density, found = scene.balance.stress.material.density, Arrays()
-    for kind in ("", "-gathered", "-restarted"):
+    for kind in KINDS if comm.size == 1 else RANK_KINDS:
         target, record, monitor = folder / f"{name}{kind}", EdgeHistory(EdgeGraph(domain)), InterpenetrationMonitor()
-        options: Any = {"whole": kind == "-gathered", "passing": monitor}
+        options: Any = {"passing": monitor, "smooth": "smooth" in kind}
         if kind == "-restarted":
             if comm.rank == 0:
                 shutil.copytree(folder / name, target)
@@ -117,18 +146,18 @@ def written(name: str, folder: Path) -> Arrays:
             if kind == "-restarted" and state.t < 1:
                 continue
             if output is None:
-                output = SurfaceOutput(target, domain, density, record, **options)
+                values = WholeValues if kind in WHOLE_KINDS else RankValues
+                with mock.patch("fracsim.output.surface.surface_output.RankValues", values):
+                    output = SurfaceOutput(target, domain, density, record, **options)
             output.write_frame(state, fields)
         assert output is not None
-        part = output.make_frame(state, fields)
-        frame = None if part is None else part.gather()
-        if output.surface is not None:
-            arrays = gathered_surface(output.surface) | {"overlap": np.array([str(monitor.first_overlap)])}
-            if frame is not None:
-                arrays |= {"frame-triangles": frame.triangles, "frame-segments": frame.segments}
-                arrays |= {f"frame-{key}": values for key, values in frame.element_fields.items()}
-                arrays["frame-velocity"] = frame.point_fields["velocity"]
-            found |= {f"{name}{kind}:{key}": values for key, values in arrays.items()}
+        frame = output.make_frame(state, fields).gather()
+        arrays = gathered_surface(output.surface) | {"overlap": np.array([str(monitor.first_overlap)])}
+        if frame is not None:
+            arrays |= {"frame-triangles": frame.triangles, "frame-segments": frame.segments}
+            arrays |= {f"frame-{key}": values for key, values in frame.element_fields.items()}
+            arrays["frame-velocity"] = frame.point_fields["velocity"]
+        found |= {f"{name}{kind}:{key}": values for key, values in arrays.items()}
     piece = domain.input_numbering.gather_corners(find_fragments(record.graph).node_fragment[: domain.node_count])
     return found | {f"{name}:graph-piece": piece}
 
@@ -163,8 +192,9 @@ def main(path: str) -> None:
     found = Arrays()
     for name in BODIES:
         if MPI.COMM_WORLD.rank == 0:
-            for kind in ("", "-gathered"):
-                (folder / f"{name}{kind}").mkdir(parents=True, exist_ok=True)
+            for kind in KINDS:
+                if kind != "-restarted":
+                    (folder / f"{name}{kind}").mkdir(parents=True, exist_ok=True)
         MPI.COMM_WORLD.barrier()
         with mock.patch("fracsim.output.surface.vtu_file.ROWS_PER_BLOCK", 50):
             found |= written(name, folder)

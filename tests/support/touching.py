@@ -18,7 +18,7 @@ from fracsim.fracture.edge_history import EdgeHistory
 from fracsim.mechanics.term_protocols import SurfaceSeparator, fulfilling
 from fracsim.meshes.data import MeshData
 from fracsim.meshes.write import write_mesh
-from fracsim.output.surface.body_surface import BodySurface
+from fracsim.output.surface.surface_output import SurfaceOutput
 from fracsim.scene import Scene
 from support.scenes import Walk, break_across, each_step, make_scene, positions
 from support.solids import lattice
@@ -400,23 +400,15 @@ class DrawnSurfaces:
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
-        assert scene.domain.input_mesh is not None
-        self._body = BodySurface(scene.domain.input_mesh, 1.0)
-        terms = fulfilling(scene.balance.terms, SurfaceSeparator)
-        self._terms, self._corrections = terms, [term.separate_surface for term in terms]
+        terms, record = fulfilling(scene.balance.terms, SurfaceSeparator), None
+        if scene.fracture is not None:
+            record = EdgeHistory(scene.fracture.graph)
+        self._output = SurfaceOutput(None, scene.domain, 1.0, record, apart=terms)
 
     def at(self, state: Walk) -> tuple[Values, Ints]:
         """Points (n, d), m, and elements (m, d) of all surfaces at the present time."""
-        scene, domain, d = self._scene, self._scene.domain, self._scene.domain.dim
-        if scene.fracture is not None:
-            pattern = domain.input_numbering.gather_cells(scene.fracture.graph.pattern)
-            edges, history = EdgeHistory(scene.fracture.graph).gather_broken()
-            self._body.update(pattern, self._body.skeleton.edge_values(edges, history[:, 1]))
-        u, v = (domain.input_numbering.gather_nodes(values.reshape(-1, d)) for values in (state.u, state.v))
-        for term in self._terms:
-            term.gather_separation()
-        frame = self._body.make_frame(state.t, u, v, corrections=self._corrections)
-        surfaces = [(frame.points, self._body.split.elements), *obstacle_surfaces(scene, state)]
+        frame = self._output.make_frame(state.state, [])
+        surfaces = [(frame.points, self._output.surface.split.elements), *obstacle_surfaces(self._scene, state)]
         first = np.cumsum([0, *(len(points) for points, _ in surfaces)])
         elements = [sides + start for (_, sides), start in zip(surfaces, first, strict=False)]
         return np.concatenate([points for points, _ in surfaces]), np.concatenate(elements)

@@ -9,11 +9,12 @@ fragment_surface    the split surface with crack faces between fragments alone, 
 smooth_cuts         positions of cuts that give a smooth surface
 surface_motion      motion of points with their parents: x = mean over p of x_p + R_p (X - X_p)
 surface_map         linear map from nodal displacements to points, with shortened arms
+drawn_surface       the surface at a time, whose points contact moves before they are drawn
 local_surface       the split surface of the cells of one rank, linear in the nodes
 quadratic_surface   the split surface of quadratic cells
 point_matching      points that are the same before and after edges break
 polyhedron_moments  volume, centre and second moments within closed surfaces
 
 Nodes and cells are in the order of the input mesh, also where a rank has a part of it, so that the surface does not
-depend on the number of ranks. smooth_cuts, fragment_surface and surface_map need the whole mesh on one rank.
+depend on the number of ranks. build_fragment_surface and make_surface_map need the whole mesh on one rank.
 """

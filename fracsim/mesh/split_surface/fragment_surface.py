@@ -8,18 +8,21 @@ In output, crack faces between fragments are projected onto these planes, so tha
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix, eye_array
+from scipy.sparse import csr_matrix
 
+from ..ghost_exchange import KeyLookup
 from ..simplices import is_split
 from .closed_surface import SplitSurface, SurfacePoints, build_split_surface, build_surface_points
 from .cut_patterns import face_centre_weights, planar_cut_table
+from .drawn_surface import DrawnSurface
 from .entity_numbering import EntityNumbering
+from .mesh_part import MeshPart, WholeMesh
 from .smooth_cuts import CUTS
-from .surface_map import SurfaceMap, make_surface_map
+from .surface_map import SurfaceMap
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
@@ -33,7 +36,7 @@ def build_fragment_surface(topology: EntityNumbering, pattern: Patterns, cut: Va
     A loose node has no undamaged cell. Edges between fragments, and to loose nodes, are open. `cut`: (E,) as in
     build_split_surface, at least `CUTS.min_distance` from the ends.
     """
-    apart, loose, _ = find_open_edges(topology, pattern)
+    apart, loose, _ = find_open_edges(WholeMesh(topology), pattern)
     return build_surface_of_open_edges(topology, apart, loose, cut)
 
 
@@ -51,7 +54,8 @@ def build_surface_of_open_edges(
 
 def has_same_fragments(topology: EntityNumbering, pattern: Patterns, before: Patterns) -> bool:
     """Whether the surface of fragments is the same for two damage patterns (C,), and moves alike with the nodes."""
-    edges, before_edges = (find_open_edges(topology, of_time)[:2] for of_time in (pattern, before))
+    part = WholeMesh(topology)
+    edges, before_edges = (find_open_edges(part, of_time)[:2] for of_time in (pattern, before))
     return moves_alike(topology, (pattern, *edges), (before, *before_edges))
 
 
@@ -72,16 +76,16 @@ def moves_alike(
     return np.array_equal(split_patterns[pattern[affected]], split_patterns[pattern_before[affected]])
 
 
-def find_open_edges(topology: EntityNumbering, pattern: Patterns) -> tuple[Flags, Flags, Ints]:
-    """(E,) flags of open edges, (N,) flags of loose nodes, and (N,) the fragment of each node.
+def find_open_edges(part: MeshPart, pattern: Patterns) -> tuple[Flags, Flags, Ints]:
+    """(E,) flags of open edges, (N,) flags of loose nodes, and (N,) the fragment of each node (collective).
 
     Fragments are connected by edges that are intact and do not lead to a loose node.
     """
-    loose = np.ones(len(topology.points), bool)
-    loose[topology.cells[pattern == 0]] = False
-    ends = topology.edges
+    topology, has_no_cell = part.skeleton, np.ones(len(part.node_numbers), np.int64)
+    has_no_cell[topology.cells[pattern == 0]] = 0
+    loose, ends = part.least(has_no_cell) > 0, topology.edges
     cut = topology.broken_edges(pattern) | loose[ends].any(axis=1)
-    _, node_fragment = topology.find_fragments(cut)
+    _, node_fragment = part.find_fragments(cut)
     return cut & (node_fragment[ends[:, 0]] != node_fragment[ends[:, 1]]), loose, node_fragment
 
 
@@ -91,35 +95,43 @@ def patterns_with_broken(topology: EntityNumbering, broken: Flags) -> Patterns:
     return np.asarray((broken[topology.cell_edges] << bits).sum(axis=1), np.uint8)
 
 
-def project_onto_fragments(
-    surface_map: SurfaceMap, topology: EntityNumbering, pattern: npt.NDArray[np.integer], flat: SurfaceMap
-) -> SurfaceMap:
-    """The `surface_map` with points on crack faces between fragments projected onto the planar cuts `flat`.
+@dataclass(frozen=True)
+class PlanarPoints:
+    """Points of a surface of fragments, which lie on the planes of its cuts.
 
-    Points of loose nodes are not projected.
+    Attributes:
+        rows: rows of points by their keys (SurfacePoints.keys).
+        reference: (n, d) reference positions, m.
+        positions: (n, d) present positions, m.
     """
-    drawn = build_surface_points(topology, pattern)
-    points, mean, cracked = _planar_means(topology, pattern, drawn)
-    surface_map = surface_map.project_onto(points[~cracked], mean[~cracked], flat)
-    if not cracked.any():
-        return surface_map
+
+    rows: KeyLookup
+    reference: Values
+    positions: Values
+
+
+def project_onto_fragments(points: SurfaceMap, surface: DrawnSurface, planar: PlanarPoints) -> SurfaceMap:
+    """The drawn points with those on crack faces between fragments projected onto the planes (collective).
+
+    Points of loose nodes are not projected. `points`: a map without nodes.
+    """
+    which, mean, keys, cracked = _planar_means(surface)
+    rows = planar.rows(keys)
+    positions = mean @ planar.positions[rows]
     # beside a crack within the fragment a point lies on the plane in the reference configuration, and moves with its
     # own nodes
-    positions, beside = drawn.positions.copy(), points[cracked]
-    positions[beside] = mean[cracked] @ flat.rest
-    return surface_map.project_onto(
-        beside, eye_array(len(positions), format="csr")[beside], make_surface_map(drawn, topology, pattern, positions)
-    )
+    positions[cracked] = surface.positions(which[cracked], (mean @ planar.reference[rows])[cracked])
+    return points.move_points(which, positions)
 
 
-def _planar_means(
-    topology: EntityNumbering, pattern: npt.NDArray[np.integer], drawn: SurfacePoints
-) -> tuple[Ints, csr_matrix, Flags]:
-    """Points (k,) of `drawn` on crack faces between fragments, and their means of points of the planar surface.
+def _planar_means(surface: DrawnSurface) -> tuple[Ints, csr_matrix, Ints, Flags]:
+    """Drawn points (k,) on crack faces between fragments, and their means of points of the planar surface (collective).
 
-    Also returns (k, m) the matrix of the means, and (k,) flags of points beside a crack within the fragment.
+    Also returns (k, m) the matrix of the means, (m,) keys of its columns, and (k,) flags of points beside a crack
+    within the fragment.
     """
-    apart, loose, node_fragment = find_open_edges(topology, pattern)
+    part, drawn, topology = surface.part, surface.numbering, surface.part.skeleton
+    apart, loose, node_fragment = find_open_edges(part, surface.pattern)
     flat = build_surface_points(topology, patterns_with_broken(topology, apart), planar_cut_table)
     node = topology.cells[drawn.cell]
     lead = node[np.arange(len(node)), drawn.group.argmax(axis=1)]
@@ -132,9 +144,10 @@ def _planar_means(
     row, i, j = np.nonzero(share)
     ends = np.stack([node[between[row], i], node[between[row], j]], axis=1)
     column = flat.first + np.searchsorted(_planar_point_keys(topology, flat), _edge_end_keys(topology, ends))
-    shape = len(between), len(flat.positions)
+    used, column = np.unique(column, return_inverse=True)
+    mean = csr_matrix((share[row, i, j], (row, column)), shape=(len(between), len(used)))
     cracked = (drawn.group != same_side)[between].any(axis=1)
-    return drawn.first + between, csr_matrix((share[row, i, j], (row, column)), shape=shape), cracked
+    return drawn.first + between, mean, flat.keys(part.node_numbers)[used], cracked
 
 
 def _planar_point_keys(topology: EntityNumbering, flat: SurfacePoints) -> Ints:

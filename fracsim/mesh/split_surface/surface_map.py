@@ -59,14 +59,16 @@ class SurfaceMap:
         """The map with shares `share` (n,) of the arms."""
         return SurfaceMap(self._mean, self._middle, self._arms, self._out, share)
 
-    def project_onto(self, points: Ints, mean: csr_matrix, other: SurfaceMap) -> SurfaceMap:
-        """The map with `points` (k,) at means, rows (k, m), of the points of `other` with s = 1."""
-        n = len(self.share)
-        to = csr_matrix((np.ones(len(points)), (points, np.arange(len(points)))), shape=(n, len(points)))
-        keep, out = diags(1.0 - np.bincount(points, minlength=n)), self._out.copy()
-        out[points] = mean @ other.rest - self._middle[points]
-        arms = keep @ self._arms + to @ (mean @ other.weights - self._mean[points])
-        return SurfaceMap(self._mean, self._middle, arms.tocsr(), out, self.share)
+    def place(self, u: Values) -> SurfaceMap:
+        """The map without nodes whose points are at the positions x for nodal displacements u (nodes, d), m."""
+        middle, out = self._middle + self._mean @ u, self._out + self._arms @ u
+        return placed_points(middle, out).with_arm_share(self.share)
+
+    def move_points(self, points: Ints, positions: Values) -> SurfaceMap:
+        """The map without nodes with `points` (k,) at positions (k, d), m, for s = 1."""
+        out = self._out.copy()
+        out[points] = positions - self._middle[points]
+        return SurfaceMap(self._mean, self._middle, self._arms, out, self.share)
 
     def __call__(self, u: Values) -> Values:
         """(n, d) positions x for nodal displacements u (nodes, d), m."""
@@ -94,6 +96,12 @@ class SurfaceMap:
         points = np.unique(np.flatnonzero(np.diff(rows.indptr)) // d)
         used = (d * points[:, None] + np.arange(d)).reshape(-1)
         return kron(self.weights[points], np.eye(d), format="csr"), used
+
+
+def placed_points(middle: Values, arm: Values) -> SurfaceMap:
+    """A map without nodes: points at x = middle + s arm, (n, d), m, whose arms can still be shortened."""
+    no_nodes = csr_matrix((len(middle), 0))
+    return SurfaceMap(no_nodes, middle, no_nodes, arm)
 
 
 def row_entries(matrix: csr_matrix, rows: Ints) -> tuple[Ints, Ints]:

@@ -98,6 +98,47 @@ class PointParents:
         return self._mean(displacement)
 
 
+class NodalGradients:
+    """Volume averages of grad u over the unsplit cells around nodes; 0 at nodes without such a cell.
+
+    Attributes:
+        row: (N,) row of each node in the results, -1 for other nodes.
+    """
+
+    def __init__(self, part: MeshPart, pattern: npt.NDArray[np.integer], wanted: npt.NDArray[np.bool_]) -> None:
+        """`wanted`: (N,) flags of nodes; those that any rank flags have rows (collective)."""
+        # here, since output of an undamaged body does not need SciPy
+        from scipy.sparse import csr_matrix
+
+        topology = part.skeleton
+        self._part, self._dim = part, topology.dim
+        everywhere = np.arange(len(topology.points))
+        self._nodes = np.flatnonzero(part.sum_at(everywhere, wanted[:, None].astype(float))[:, 0])
+        self.row = np.full(len(topology.points), -1)
+        self.row[self._nodes] = np.arange(len(self._nodes))
+        around = np.any(self.row[topology.cells] >= 0, axis=1) & ~is_split(self._dim)[pattern]
+        self._cells = topology.cells[around]
+        span = topology.points[self._cells]
+        # rows X_k - X_0
+        span = span[:, 1:] - span[:, :1]
+        # d! V (X_k - X_0)^-1
+        self._inverse = np.linalg.inv(span) * np.abs(np.linalg.det(span))[:, None, None]
+        target = self.row[self._cells]
+        cell, corner = np.nonzero(target >= 0)
+        ones = np.ones(len(cell))
+        self._sum = csr_matrix((ones, (target[cell, corner], cell)), shape=(len(self._nodes), len(self._cells)))
+        volume = part.sum_at(self._nodes, (self._sum @ np.abs(np.linalg.det(span)))[:, None])
+        self._per_volume = 1.0 / np.where(volume > 0, volume, 1.0)
+
+    def __call__(self, u: Values) -> Values:
+        """(rows, d, d) averages for displacements u (N, d), m (collective)."""
+        d, moved = self._dim, u[self._cells]
+        moved = moved[:, 1:] - moved[:, :1]
+        gradient = np.einsum("nkj,nki->nij", np.swapaxes(self._inverse, 1, 2), moved)
+        mean = self._part.sum_at(self._nodes, self._sum @ gradient.reshape(-1, d * d)) * self._per_volume
+        return mean.reshape(-1, d, d)
+
+
 class NodalRotations:
     """Rotations R of nodes: polar rotations of the volume average of F over the unsplit cells around each node.
 
@@ -107,52 +148,26 @@ class NodalRotations:
 
     def __init__(self, part: MeshPart, pattern: npt.NDArray[np.integer], nodes: Ints) -> None:
         """`nodes`: (k,) of this rank (collective)."""
-        topology = part.skeleton
-        d, comm = topology.dim, part.comm
-        self._part, self._identity = part, np.eye(d)
+        comm, self._identity = part.comm, np.eye(part.skeleton.dim)
         # of all nodes, since ranks find the nearest ones together
         sources = _rotation_source(part, pattern)[nodes]
         self._is_used = comm.allreduce(len(nodes) > 0, op=MPI.LOR)
         if not self._is_used:
             return
-        from scipy.sparse import csr_matrix
-
         keys, self._of = np.unique(sources, return_inverse=True)
         # the owner of a node has its rotation
         self._routing = RowRouting(comm, keys % comm.size)
         asked = np.searchsorted(part.node_numbers, self._routing.send(keys) // comm.size)
-        is_asked = np.zeros(len(topology.points), bool)
+        is_asked = np.zeros(len(part.node_numbers), bool)
         is_asked[asked] = True
-        everywhere = np.arange(len(topology.points))
-        self._nodes = np.flatnonzero(part.sum_at(everywhere, is_asked[:, None].astype(float))[:, 0])
-        row = np.full(len(topology.points), -1)
-        row[self._nodes] = np.arange(len(self._nodes))
-        self._asked = row[asked]
-        around = np.any(row[topology.cells] >= 0, axis=1) & ~is_split(d)[pattern]
-        self._cells = topology.cells[around]
-        span = topology.points[self._cells]
-        # rows X_k - X_0
-        span = span[:, 1:] - span[:, :1]
-        # d! V (X_k - X_0)^-1
-        self._inverse = np.linalg.inv(span) * np.abs(np.linalg.det(span))[:, None, None]
-        target = row[self._cells]
-        cell, corner = np.nonzero(target >= 0)
-        ones = np.ones(len(cell))
-        self._sum = csr_matrix((ones, (target[cell, corner], cell)), shape=(len(self._nodes), len(self._cells)))
-        volume = part.sum_at(self._nodes, (self._sum @ np.abs(np.linalg.det(span)))[:, None])
-        # without cells the mean is 0 and F the identity
-        self._per_volume = 1.0 / np.where(volume > 0, volume, 1.0)
+        self._gradients = NodalGradients(part, pattern, is_asked)
+        self._asked = self._gradients.row[asked]
 
     def __call__(self, u: Values) -> Values:
         """(nodes, d, d) rotations R for displacements u (N, d), m, with F = 1 + mean of grad u (collective)."""
-        d = len(self._identity)
         if not self._is_used:
-            return np.empty((0, d, d))
-        moved = u[self._cells]
-        moved = moved[:, 1:] - moved[:, :1]
-        gradient = np.einsum("nkj,nki->nij", np.swapaxes(self._inverse, 1, 2), moved)
-        mean = self._part.sum_at(self._nodes, self._sum @ gradient.reshape(-1, d * d)) * self._per_volume
-        F = mean.reshape(-1, d, d) + self._identity
+            return np.empty((0, *self._identity.shape))
+        F = self._gradients(u) + self._identity
         return self._routing.send_back(polar_rotation(F)[self._asked])[self._of]
 
 

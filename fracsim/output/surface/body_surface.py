@@ -1,6 +1,6 @@
 """Split surface of a body at a time: built again if edges broke, otherwise only moved.
 
-Each rank has the surface of its part of the mesh (mesh_part), which is a whole mesh on one rank, or its own cells.
+Each rank has the surface of its part of the mesh (mesh_part): its own cells, or a whole mesh on one rank.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ...mesh.parallel import Gather, allgather
 from ...mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from ...mesh.split_surface.entity_numbering import BODY, EntityNumbering
 from ...mesh.split_surface.mesh_part import MeshPart, WholeMesh, total
-from ...mesh.split_surface.surface_motion import NodalRotations
+from ...mesh.split_surface.surface_motion import NodalGradients, NodalRotations
 from ...mesh.split_surface.surface_numbering import SurfaceNumbering, number_surface, number_whole_surface
 from ...meshes.data import MeshData
 from ...meshes.topology import signed_measures
@@ -28,14 +28,14 @@ from .fragment_table import FragmentNames, FragmentTable, enclosed_volumes, grou
 from .vtu_file import CompressedGrid, GridCompressor
 
 if TYPE_CHECKING:
+    from ...mesh.split_surface.drawn_surface import DrawnSurface, SharedPoints
     from ...mesh.split_surface.surface_map import SurfaceMap
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Arrays = dict[str, npt.NDArray[np.generic]]
-# Correction of drawn points, so that nothing is drawn inside an obstacle or another fragment: from the points, their
-# elements, the nodal displacement u and the time t.
-type PointCorrection = Callable[[SurfaceMap, Ints, Values, float], SurfaceMap]
+# Correction of drawn points, so that nothing is drawn inside an obstacle or another fragment (collective).
+type PointCorrection = Callable[[SurfaceMap, DrawnSurface], SurfaceMap]
 # viewers use single precision
 MAX_COORDINATE = float(np.finfo(np.float32).max)
 
@@ -127,7 +127,7 @@ class BodySurface:
         Args:
             mesh: input mesh on one rank, or the part of it that this rank has.
             density: mass density, kg/m^3; one number or (C,).
-            smooth: broken edges without a given cut are cut so that cracks are smooth; of a whole mesh.
+            smooth: broken edges without a given cut are cut so that cracks are smooth.
         """
         self._smooth = smooth
         part: MeshPart = WholeMesh(EntityNumbering(mesh)) if isinstance(mesh, MeshData) else mesh
@@ -176,12 +176,12 @@ class BodySurface:
         if self._smooth:
             from ...mesh.split_surface.smooth_cuts import smooth_cuts
 
-            cut = smooth_cuts(topology, topology.broken_edges(self._pattern), cut)
+            cut = smooth_cuts(part, topology.broken_edges(self._pattern), cut)
         self.split = built = build_split_surface(topology, self._pattern, cut, fragments=part.find_fragments)
         self._rotations = NodalRotations(part, self._pattern, built.parents.rotating_nodes)
         self._use_surface(number_surface(part, built, self._pattern), self._is_owned)
-        # map from nodal displacement to points, before corrections
-        self._uncorrected: SurfaceMap | None = None
+        # what corrections of points need
+        self._corrected: tuple[SharedPoints, NodalGradients] | None = None
 
     def _use_surface(self, numbering: SurfaceNumbering, is_owned: npt.NDArray[np.bool_]) -> None:
         """Names, sizes and volumes of the fragments of `split`; `is_owned` (N,): nodes of this rank (collective)."""
@@ -217,14 +217,14 @@ class BodySurface:
             broken_at: times (E,) at which edges broke, s, for the age of the crack.
             fields: further fields. Nodal ones are averaged over the parent nodes; an element has the value of the cell
                 behind it.
-            corrections: corrections of the drawn points, of a whole mesh.
+            corrections: corrections of the drawn points.
 
         Raises:
             NotConverged: a displacement or velocity is not finite in single precision; with fragment and cell.
         """
         self._check_finite(t, u, v)
         follow = self.split.parents
-        displacement = self._point_displacement(t, u, corrections)
+        displacement = self._point_displacement(u, corrections)
         fields = [field for field in fields if field.name not in ("displacement", "velocity", "piece")]
         point_fields: Arrays = {"velocity": follow.mean(v)}
         point_fields |= {field.name: follow.mean(field.values) for field in fields if field.centre == "Node"}
@@ -273,19 +273,21 @@ class BodySurface:
             table, self.numbering, self._compressor,
         )  # fmt: skip
 
-    def _point_displacement(self, t: float, u: Values, corrections: Sequence[PointCorrection]) -> Values:
-        """Displacements (n, d) of the points, m."""
+    def _point_displacement(self, u: Values, corrections: Sequence[PointCorrection]) -> Values:
+        """Displacements (n, d) of the points, m (collective)."""
         built = self.split
         if not corrections:
             return built.parents.displacement(u, self._rotations(u))
-        if self._uncorrected is None:
-            from ...mesh.split_surface.surface_map import make_surface_map
+        from ...mesh.split_surface.drawn_surface import DrawnSurface, SharedPoints, gradients_of_copies
 
-            self._uncorrected = make_surface_map(built, self.skeleton, self._pattern, built.points)
-        point_map = self._uncorrected
+        if self._corrected is None:
+            shared = SharedPoints(self.part, built, self.numbering)
+            self._corrected = shared, gradients_of_copies(self.part, self._pattern, built)
+        surface = DrawnSurface.at_displacement(self.part, self._pattern, built, self.numbering, *self._corrected, u)
+        points = surface.placed_points()
         for correct in corrections:
-            point_map = correct(point_map, built.elements, u, t)
-        return point_map(u) - built.points
+            points = correct(points, surface)
+        return points.rest - built.points
 
     def _elements(self) -> tuple[Ints, Ints, Ints, Arrays]:
         """Triangles, segments, the cell behind each element, and the fields that do not depend on the motion."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,36 +10,18 @@ import numpy.typing as npt
 from ...fracture.edge_history import EdgeHistory
 from ...mesh.domain import Domain
 from ...mesh.ghost_exchange import with_ghosts
-from ...mesh.parallel import gather
-from ...mesh.split_surface.entity_numbering import EntityNumbering
-from ...mesh.split_surface.mesh_part import MeshPart, RankCells, WholeMesh
+from ...mesh.split_surface.mesh_part import RankCells
 
 Rows = npt.NDArray[Any]
 Values = npt.NDArray[np.float64]
 
 
-class PartValues(Protocol):
-    """Values of the entities of the part that a rank has; None on ranks without a part."""
-
-    @property
-    def part(self) -> MeshPart | None:
-        """Part of the mesh; None on ranks without one."""
-
-    def of_nodes(self, values: Values) -> Values | None:
-        """Rows (N, d) of the corners of cells, from values of the dofs that this rank owns (collective)."""
-
-    def of_cells(self, values: Rows) -> Rows | None:
-        """Rows (C, ...) of values (cells, ...) of the cells of this rank (collective)."""
-
-    def of_drawn_cells(self, values: Rows, drawn: npt.NDArray[np.bool_]) -> Rows | None:
-        """Rows (C, ...) as of_cells, right for cells with flags `drawn` (cells,) alone (collective)."""
-
-    def of_broken_edges(self, history: EdgeHistory) -> tuple[Values, Values] | None:
-        """Break times and cut positions (E,) of the edges, NaN for intact ones (collective)."""
-
-
 class RankValues:
-    """Values on the cells of each rank: nothing is gathered (PartValues)."""
+    """Values on the entities of the cells of this rank; nothing is gathered.
+
+    Attributes:
+        part: these cells.
+    """
 
     def __init__(self, domain: Domain) -> None:
         """Number the entities of the cells of this rank (collective)."""
@@ -47,24 +29,24 @@ class RankValues:
         self._part_edges: npt.NDArray[np.int64] | None = None
 
     def of_nodes(self, values: Values) -> Values:
-        """See PartValues."""
+        """Rows (N, d) of the corners of cells, from values of the dofs that this rank owns (collective)."""
         d = self._domain.dim
         owned = np.asarray(values[: self._domain.node_count * d])
         return with_ghosts(self._domain, owned).reshape(-1, d)[self.part.nodes]
 
     def of_cells(self, values: Rows) -> Rows:
-        """See PartValues."""
+        """Rows (C, ...) of values (cells, ...) of the cells of this rank."""
         return np.asarray(values[self.part.cells])
 
     def of_drawn_cells(self, values: Rows, drawn: npt.NDArray[np.bool_]) -> Rows:
-        """See PartValues."""
+        """Rows (C, ...) as of_cells, right for cells with flags `drawn` (cells,) alone."""
         result = np.zeros_like(values)
         rows = np.flatnonzero(drawn[self.part.cells])
         result[rows] = values[self.part.cells[rows]]
         return result
 
     def of_broken_edges(self, history: EdgeHistory) -> tuple[Values, Values]:
-        """See PartValues."""
+        """Break times and cut positions (E,) of the edges, NaN for intact ones."""
         skeleton, broken = self.part.skeleton, np.flatnonzero(history.graph.broken)
         ends = self.part.part_node[history.graph.edge_nodes[broken]]
         # a rank may have ghost edges that none of its cells has
@@ -74,41 +56,3 @@ class RankValues:
             skeleton.edge_values(keys, history.break_times[rows]),
             skeleton.edge_values(keys, history.cut_positions[rows]),
         )
-
-
-class GatheredValues:
-    """Values of the whole body on rank 0 (PartValues)."""
-
-    def __init__(self, domain: Domain) -> None:
-        """Gather the mesh, where rank 0 does not have it (collective)."""
-        self._domain, mesh = domain, domain.input_mesh
-        self.part = None if mesh is None else WholeMesh(EntityNumbering(mesh))
-
-    def of_nodes(self, values: Values) -> Values | None:
-        """See PartValues."""
-        rows, midside_nodes = values.reshape(-1, self._domain.dim), self._domain.midside_nodes
-        gathered = self._domain.input_numbering.gather_nodes(rows)
-        return gathered if gathered is None or midside_nodes is None else gathered[: midside_nodes.points]
-
-    def of_cells(self, values: Rows) -> Rows | None:
-        """See PartValues."""
-        return self._domain.input_numbering.gather_cells(values)
-
-    def of_drawn_cells(self, values: Rows, drawn: npt.NDArray[np.bool_]) -> Rows | None:
-        """See PartValues."""
-        rows = np.flatnonzero(drawn)
-        parts = gather(self._domain.comm, (self._domain.input_numbering.cells[rows], values[rows]))
-        if parts is None or self.part is None:
-            return None
-        result = np.zeros((len(self.part.cell_numbers), *values.shape[1:]), values.dtype)
-        for cells, of_rank in parts:
-            result[cells] = of_rank
-        return result
-
-    def of_broken_edges(self, history: EdgeHistory) -> tuple[Values, Values] | None:
-        """See PartValues."""
-        broken = history.gather_broken()
-        if broken is None or self.part is None:
-            return None
-        edges, (times, cuts) = broken[0], broken[1].T
-        return self.part.skeleton.edge_values(edges, times), self.part.skeleton.edge_values(edges, cuts)

@@ -1,12 +1,10 @@
-"""Output of the split surface in a run: each rank builds the part of its cells, and all ranks compress the file.
-
-Where something needs the whole surface, values are gathered, and rank 0 builds it by the same code.
-"""
+"""Output of the split surface in a run: each rank builds the part of its cells, and all ranks compress the file."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +19,7 @@ from ..atomic_write import write_on_root
 from ..fields_file import Field
 from ..result_checks import InterpenetrationMonitor
 from .body_surface import BodySurface, SurfaceFrame
-from .part_values import GatheredValues, PartValues, RankValues
+from .part_values import RankValues
 from .vtk_files import SurfaceFiles
 
 
@@ -30,7 +28,7 @@ class SurfaceOutput:
 
     Attributes:
         record: time and position of each break; None without fracture.
-        surface: surface of the part of the mesh that this rank has; None without a part.
+        surface: surface of the part of the mesh that this rank has.
         files: files on rank 0; None on the other ranks, and without a folder.
     """
 
@@ -47,7 +45,6 @@ class SurfaceOutput:
         smooth: bool = False,
         resume_at: float | None = None,
         precision: str = "single",
-        whole: bool = False,
     ) -> None:
         """Open the files (collective).
 
@@ -62,7 +59,6 @@ class SurfaceOutput:
             smooth: draw cracks smooth.
             resume_at: keep the frames up to this time, s; None: a new run.
             precision: of points and fields, "single" or "double".
-            whole: rank 0 builds the whole surface, as it does for terms that keep it apart and for smooth cracks.
 
         Raises:
             CannotWrite: a file cannot be written.
@@ -70,8 +66,7 @@ class SurfaceOutput:
         self._domain, self.record, self._separators = domain, record, apart
         self._obstacle_terms, self._interpenetration, self._precision = beside, passing, precision
         self._path = (folder or Path()) / "surface.pvd"
-        self._is_whole = whole or smooth or len(apart) > 0
-        self._values: PartValues = GatheredValues(domain) if self._is_whole else RankValues(domain)
+        self._values = RankValues(domain)
         cell_density = self._values.of_cells(np.broadcast_to(np.asarray(density, float), domain.cell_count))
         self.files = None
         if folder is not None:
@@ -79,24 +74,12 @@ class SurfaceOutput:
                 domain.comm, self._path, lambda: SurfaceFiles(folder, domain.dim, resume_at, precision=precision)
             )
         times = domain.comm.bcast([] if self.files is None or resume_at is None else self.files.times)
-        broken = self._values.of_broken_edges(record) if record is not None and times else None
+        self.surface = BodySurface(self._values.part, cell_density, smooth=smooth)
+        if record is not None and times:
+            self.surface.replay_fragment_names(self._values.of_broken_edges(record)[0], times)
 
-        def build() -> BodySurface | None:
-            if (part := self._values.part) is None or cell_density is None:
-                return None
-            surface = BodySurface(part, cell_density, smooth=smooth)
-            if broken is not None:
-                surface.replay_fragment_names(broken[0], times)
-            return surface
-
-        self.surface = self._on_parts(build)
-
-    def _on_parts[T](self, work: Callable[[], T | None]) -> T | None:
-        """The result of work on the ranks that have a part of the surface, None elsewhere (collective)."""
-        return write_on_root(self._domain.comm, self._path, work) if self._is_whole else work()
-
-    def make_frame(self, state: State, fields: list[Field]) -> SurfaceFrame | None:
-        """Parts of the split surface of a state, None on ranks without a part (collective).
+    def make_frame(self, state: State, fields: list[Field]) -> SurfaceFrame:
+        """Part of the split surface of a state (collective).
 
         Args:
             state: present state.
@@ -104,28 +87,18 @@ class SurfaceOutput:
         """
         values, record = self._values, self.record
         u, v = (values.of_nodes(of_dofs) for of_dofs in (state.u, state.v))
-        pattern = None if record is None else values.of_cells(record.graph.pattern)
-        broken = None if record is None else values.of_broken_edges(record)
+        broken_at = None
+        if record is not None:
+            broken_at, cut = values.of_broken_edges(record)
+            self.surface.update(values.of_cells(record.graph.pattern), cut)
         drawn = self._cells_with_elements()
         cell_fields = [
             replace(field, values=values.of_drawn_cells(field.values, drawn))
             for field in fields
             if field.centre == "Cell"
         ]
-        for term in self._separators:
-            term.gather_separation()
-
-        def make() -> SurfaceFrame | None:
-            if (surface := self.surface) is None or u is None or v is None:
-                return None
-            broken_at = None
-            if broken is not None and pattern is not None:
-                broken_at, cut = broken
-                surface.update(pattern, cut)
-            corrections = [term.separate_surface for term in self._separators]
-            return surface.make_frame(state.t, u, v, broken_at=broken_at, fields=cell_fields, corrections=corrections)
-
-        return self._on_parts(make)
+        corrections = [partial(term.separate_surface, u=state.u, t=state.t) for term in self._separators]
+        return self.surface.make_frame(state.t, u, v, broken_at=broken_at, fields=cell_fields, corrections=corrections)
 
     def _cells_with_elements(self) -> npt.NDArray[np.bool_]:
         """Flags (cells,) of the cells of this rank that have elements of the surface."""
@@ -151,10 +124,10 @@ class SurfaceOutput:
         if comm.bcast(files is not None and state.t in files.times):
             return
         frame = self.make_frame(state, fields)
-        grid = None if frame is None else frame.compress(self._precision)
+        grid = frame.compress(self._precision)
 
         def write() -> None:
-            assert frame is not None and files is not None
+            assert files is not None
             drawn = {
                 name: data for term in self._obstacle_terms for name, data in term.output_surfaces(state.t).items()
             }
@@ -162,11 +135,4 @@ class SurfaceOutput:
 
         write_on_root(comm, self._path, write)
         if self._interpenetration is not None:
-            self._check_interpenetration(self._interpenetration, state)
-
-    def _check_interpenetration(self, monitor: InterpenetrationMonitor, state: State) -> None:
-        """Record where fragments overlap (collective)."""
-        u = self._values.of_nodes(state.u)
-        self._on_parts(
-            lambda: None if self.surface is None or u is None else monitor.record_frame(state.t, self.surface, u)
-        )
+            self._interpenetration.record_frame(state.t, self.surface, self._values.of_nodes(state.u))
