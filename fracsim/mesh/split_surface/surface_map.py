@@ -59,11 +59,6 @@ class SurfaceMap:
         """The map with shares `share` (n,) of the arms."""
         return SurfaceMap(self._mean, self._middle, self._arms, self._out, share)
 
-    def place(self, u: Values) -> SurfaceMap:
-        """The map without nodes whose points are at the positions x for nodal displacements u (nodes, d), m."""
-        middle, out = self._middle + self._mean @ u, self._out + self._arms @ u
-        return placed_points(middle, out).with_arm_share(self.share)
-
     def move_points(self, points: Ints, positions: Values) -> SurfaceMap:
         """The map without nodes with `points` (k,) at positions (k, d), m, for s = 1."""
         out = self._out.copy()
