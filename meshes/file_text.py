@@ -161,9 +161,9 @@ def is_not_integer(values: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
     return wrong
 
 
-def excerpt(text: bytes, length: int = 60) -> str:
-    """The first line of a text, cut to `length` characters, for a message."""
-    return text.strip().split(b"\n")[0][:length].decode("utf-8", "replace").rstrip()
+def excerpt(text: bytes) -> str:
+    """The first line of a text, cut to 60 characters, for a message."""
+    return text.strip().split(b"\n")[0][:60].decode("utf-8", "replace").rstrip()
 
 
 def decode_text(text: bytes) -> str:

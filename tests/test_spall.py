@@ -13,7 +13,7 @@ from fracsim.fracture.cohesive_cracks import CohesiveFracturePass
 from fracsim.mesh.domain import distribute
 from fracsim.meshes import BUILDERS
 from fracsim.scene import build_scene_on
-from fracsim.studies.evidence.spalling import Pulse, spall
+from fracsim.studies.evidence.spalling import Pulse, SpalledBar, spall
 from support.scenes import Walk, make_study
 
 # 10 MPa on 250 mm: the front is sharp, and the pulse 100 mm long.
@@ -21,6 +21,11 @@ SHARP = Pulse(young=5e10, density=2500.0, length=0.25, peak=1e7, rise=0.0, fall=
 # The pulse of shared/cases/spall.toml.
 STEEP = Pulse(young=3e10, density=2400.0, length=0.2, peak=2e7, rise=3e-6, fall=17e-6)
 STRENGTH, ENERGY = 8e6, 30.0  # Pa, J/m^2: l_ch = 14 mm
+
+
+def end_speed(bar: SpalledBar, plane: float) -> float:
+    """Mean velocity nearer to the free end than `plane`, m."""
+    return float(bar.velocity[bar.distance < plane * (1 - 1e-9)].mean())
 
 
 def test_a_sharp_pulse_spalls_once() -> None:
@@ -31,7 +36,7 @@ def test_a_sharp_pulse_spalls_once() -> None:
     bar = spall(SHARP, np.full(2501, strength), 0.0, 1.05e-4)
     planes = bar.distance[bar.opening > 0]
     np.testing.assert_allclose(planes, 0.030, rtol=0.005)
-    assert bar.end_speed(planes.min()) == pytest.approx(1.252, rel=0.005)
+    assert end_speed(bar, planes.min()) == pytest.approx(1.252, rel=0.005)
 
 
 def test_a_pulse_that_rises_breaks_every_place() -> None:
@@ -41,7 +46,7 @@ def test_a_pulse_that_rises_breaks_every_place() -> None:
     planes = np.sort(bar.distance[bar.opening > 0])
     assert planes[0] == pytest.approx(STEEP.first_plane(STRENGTH), abs=2e-4)
     assert planes[0] == pytest.approx(0.01202, abs=2e-4)
-    assert bar.end_speed(planes[0]) == pytest.approx(STEEP.piece_speed(STRENGTH), rel=0.002)
+    assert end_speed(bar, planes[0]) == pytest.approx(STEEP.piece_speed(STRENGTH), rel=0.002)
     assert len(planes) > 40 and np.diff(planes).max() < 5e-4
 
 
@@ -96,6 +101,6 @@ def test_a_cohesive_plane_with_inertia(scheme: str, dt: float, size: tuple[float
     bar = spall(replace(STEEP, length=size[0]), strength, ENERGY, 7.5e-5)
     free = scene.domain.nodes[: len(state.v) // d, 0] > x.max() + 5e-4
     mass, velocity = scene.balance.mass.lumped[::d][free], state.v[::d][free]
-    assert mass @ velocity / mass.sum() == pytest.approx(bar.end_speed(bar.distance[node]), rel=0.025)
+    assert mass @ velocity / mass.sum() == pytest.approx(end_speed(bar, bar.distance[node]), rel=0.025)
     assert state.dissipated == pytest.approx(ENERGY * np.prod(size[1:]), rel=0.025)
     assert state.work == pytest.approx(kinetic + state.elastic + state.dissipated, rel=2e-3)

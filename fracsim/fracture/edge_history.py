@@ -10,7 +10,6 @@ import numpy.typing as npt
 from ..mesh.edge_graph import EdgeGraph, EdgeRows
 from ..mesh.ghost_exchange import min_over_ranks
 
-Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
 
@@ -52,14 +51,6 @@ class EdgeHistory:
             latest = negative_time <= min_over_ranks(edges, negative_time)
             columns = [min_over_ranks(edges, np.where(latest, column, np.inf)) for column in tip_states.T]
             self.tip_states = np.column_stack(columns)
-
-    def gather_broken(self) -> tuple[Ints, Values] | None:
-        """Gather all broken edges on rank 0 (collective).
-
-        Returns:
-            Sorted keys (n, 2), and break times and cut positions (n, 2); None on other ranks.
-        """
-        return self.graph.gather_broken(np.column_stack([self.break_times, self.cut_positions]))
 
     def weakened_rows(self) -> Values:
         """(edges, 2 or more) times, cuts and tip states, which a checkpoint has of weakened edges."""

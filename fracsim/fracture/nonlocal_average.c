@@ -23,7 +23,9 @@ typedef struct {
     const int64_t *start;        /* (bins + 1,) first point of each bin, x fastest */
     const double *x, *y, *z;     /* (points,) */
     const float *coarse;         /* (3, points) coordinates over the radius, relative to the origin, rounded */
-    double size, radius, margin; /* edge of a bin; radius; rounding error of coarse distances over the radius */
+    double size, radius;         /* edge of a bin; radius */
+    double slack, margin;        /* rounding may move a point so far into another bin; rounding error of coarse distances
+                                    over the radius */
     int64_t points, kernel;
 } Points;
 
@@ -40,11 +42,9 @@ static int64_t clip(double place, int64_t count)
 
 static void begin_search(const Points *p, Search *s)
 {
-    const double slack = 1e-6 * p->size;
     s->inverse_size = 1 / p->size;
     for (int i = 0; i < 3; i++) {
-        /* by so much rounding may move a point into another bin */
-        s->low[i] -= p->origin[i] + slack, s->high[i] += slack - p->origin[i];
+        s->low[i] -= p->origin[i] + p->slack, s->high[i] += p->slack - p->origin[i];
         s->first[i] = clip((s->low[i] - p->radius) * s->inverse_size, p->bins[i]);
         s->last[i] = clip((s->high[i] + p->radius) * s->inverse_size, p->bins[i]);
     }

@@ -46,6 +46,7 @@ class AverageLimits:
     Attributes:
         bins_per_radius: bins along the radius. With 4 a group of centres sees twice the points that it needs.
         bins_per_spacing: bins along the mean distance of cells, at most, which bounds the memory of the bins.
+        bin_round_off: by so many edges of a bin rounding may move a point into another bin.
         max_columns: values of a cell that are averaged at once.
         coarse_share: 1 less the relative rounding error of sums in single precision, for 10,000 points.
         max_coarse: largest norm over the bound in single precision; beyond it an average reaches the bound anyhow.
@@ -56,6 +57,7 @@ class AverageLimits:
 
     bins_per_radius: float = 4.0
     bins_per_spacing: float = 2.0
+    bin_round_off: float = 1e-6
     max_columns: int = 7
     coarse_share: float = 0.999
     max_coarse: float = 1e20
@@ -168,8 +170,8 @@ class _Points(Structure):
 
     _fields_ = (
         ("origin", Float64), ("bins", Int64), ("start", Int64), ("x", Float64), ("y", Float64), ("z", Float64),
-        ("coarse", Float32), ("size", c_double), ("radius", c_double), ("margin", c_double), ("points", c_int64),
-        ("kernel", c_int64),
+        ("coarse", Float32), ("size", c_double), ("radius", c_double), ("slack", c_double), ("margin", c_double),
+        ("points", c_int64), ("kernel", c_int64),
     )  # fmt: skip
 
 
@@ -204,8 +206,7 @@ class _Bins:
         self.are_coarse = math.prod(self._shape) < len(points)
         self._bins_per_radius, self._kernel = radius / size, kernel
         self._bin_of_centre, self._bin_in_order = bin_of[: len(centres)], bin_of[self.order]
-        # with the round-off that the search in C admits
-        self._reach = math.ceil(radius / size * (1 + 1e-6))
+        self._reach = math.ceil(radius / size * (1 + LIMITS.bin_round_off))
         start = np.concatenate([[0], np.cumsum(np.bincount(bin_of, minlength=int(bins.prod())))])
         origin, sorted_points = low + first * size, points[self.order].T.copy()
         coarse = ((sorted_points - origin[:, None]) / radius).astype(np.float32)
@@ -213,7 +214,7 @@ class _Bins:
         margin = 2.0**-20 + float(np.max(coarse, initial=0.0)) * 2.0**-21
         # The C structure has addresses only: these references keep the arrays alive.
         self._arrays = origin, bins, start, *sorted_points, coarse
-        sizes = size, radius, margin, len(points), KERNELS.index(kernel)
+        sizes = size, radius, LIMITS.bin_round_off * size, margin, len(points), KERNELS.index(kernel)
         self._points = _Points(*map(struct_pointer, self._arrays), *sizes)
         self.pointer = byref(self._points)
 
@@ -246,8 +247,8 @@ class _Bins:
         away = np.abs(np.arange(-self._reach, self._reach + 1))
         shape = [next_fast_len(count + 2 * self._reach, real=True) for count in self._shape]
         transforms = []
-        # 1e-6: by so much rounding may move a point into another bin
-        for steps in (np.maximum(away - 1 - 1e-6, 0.0), away + 1 + 1e-6):
+        slack = LIMITS.bin_round_off
+        for steps in (np.maximum(away - 1 - slack, 0.0), away + 1 + slack):
             squares = np.square(steps / self._bins_per_radius)
             q = np.sqrt(squares[:, None, None] + squares[:, None] + squares)
             transforms.append(rfftn(_weights(self._kernel, q), shape))

@@ -170,13 +170,13 @@ def _triangles(*corners: Ints) -> Ints:
 # --- solid bodies ---
 
 
-def convex_parts(body: Polyhedron, edge: float = 0.0, max_parts: int = SETTINGS.max_parts) -> list[Values]:
+def convex_parts(body: Polyhedron, edge: float = 0.0) -> list[Values]:
     """Return the corners (n, 3), m, of the hulls of the parts of a body; `edge`: mean edge of the mesh, m."""
     hull = body.convex_hull
     heap: list[tuple[float, int, Polyhedron, ConvexHullPart]] = [(-hull.excess_volume, 0, body, hull)]
     number, excess = 1, hull.excess_volume
     accepted = max(SETTINGS.excess_volume * float(body.moments.volume[0]), SETTINGS.roughness * edge * hull.area)
-    while excess > accepted and len(heap) < max_parts:
+    while excess > accepted and len(heap) < SETTINGS.max_parts:
         *_, part, part_hull = heap[0]
         halves = _best_halves(part)
         if not halves:

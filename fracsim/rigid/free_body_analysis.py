@@ -76,7 +76,7 @@ class SolidStiffness:
     def __init__(self, stress: Stress, density: Values) -> None:
         """Compile the forms."""
         domain = stress.domain
-        self.stress, self.density, self._space = stress, density, domain.space
+        self.stress, self.density = stress, density
         v, w = ufl.TrialFunction(domain.space), ufl.TestFunction(domain.space)
         self._form = CellForm(stress.tangent_form(v, w, cell_measure(domain)))
         sigma = cauchy_stress(stress.energy, deformation_gradient(stress.u))

@@ -28,6 +28,7 @@ class TangentOperators:
     """K of a balance at the present displacement, in one matrix or several.
 
     Attributes:
+        block_operator: context of `products`; None without blocks.
         operator: K for the products of a Krylov method, with low-rank updates.
         products: K for products without low-rank updates; None: `matrix` serves.
         eigenvalue_floor: that of the last assembly (mechanics.psd_projection); None: the tangent is exact.
@@ -45,7 +46,7 @@ class TangentOperators:
         self._balance, self._tangent, self._policy = balance, balance.tangent, policy
         self._may_use_blocks = may_use_blocks
         self._near_nullspace = near_nullspace(balance.domain) if for_multigrid else None
-        self._block_operator: BlockOperator | None = None
+        self.block_operator: BlockOperator | None = None
         self._low_rank_operator: PETSc.Mat | None = None
         self.eigenvalue_floor: float | None = None
         self._known_pattern = self._tangent.pattern_version
@@ -60,14 +61,9 @@ class TangentOperators:
         return self._tangent.matrix
 
     @property
-    def block_operator(self) -> BlockOperator | None:
-        """Context of `products`; None without blocks."""
-        return self._block_operator
-
-    @property
     def blocks(self) -> BlockMatrix | None:
         """Blocks in which K is assembled; None if it is not."""
-        return None if self._block_operator is None else self._block_operator.assembled
+        return None if self.block_operator is None else self.block_operator.assembled
 
     def _make_operators(self) -> None:
         """Set up the matrices for the present pattern (collective)."""
@@ -76,8 +72,8 @@ class TangentOperators:
         self.products: PETSc.Mat | None = None
         pay_off = self._may_use_blocks and blocks_pay_off(tangent.domain.space.dofmap, self._policy.min_block_dofs)
         if pay_off and (blocks := tangent.switch_to_blocks()) is not None:
-            self._block_operator = BlockOperator(tangent.matrix, blocks)
-            self.products = self._block_operator.to_petsc()
+            self.block_operator = BlockOperator(tangent.matrix, blocks)
+            self.products = self.block_operator.to_petsc()
         self.operator = self.products or tangent.matrix
         if tangent.may_be_incomplete:
             from .low_rank import LowRankOperator
@@ -134,12 +130,12 @@ class TangentOperators:
 
     def multiply_by(self, fine_level: FineLevel | None) -> None:
         """Multiply with this copy of the tangent in single precision; None: in double precision (collective)."""
-        if self._block_operator is None:
+        if self.block_operator is None:
             return
         # Inertia has to exceed the rounding error of the stiffness.
         if fine_level is not None and mass_stiffness_ratio(self._balance) <= self._policy.min_single_precision_inertia:
             fine_level = None
-        self._block_operator.multiply_by(fine_level)
+        self.block_operator.multiply_by(fine_level)
 
     def attach_to(self, ksp: PETSc.KSP, pc: PETSc.PC) -> None:
         """Give the tangent to a KSP with this preconditioner, and set both up (collective)."""
@@ -153,7 +149,7 @@ class TangentOperators:
 
     def _release_operators(self) -> None:
         """Free the matrices for products."""
-        self._block_operator = None
+        self.block_operator = None
         if self._low_rank_operator is not None:
             self._low_rank_operator.destroy()
             self._low_rank_operator = None

@@ -23,14 +23,14 @@ class Outline:
     points: Points
     pieces: Indices
 
-    def conforming(self, max_halvings: int = 40) -> Outline:
+    def conforming(self) -> Outline:
         """The outline with pieces halved until each of them is an edge of the Delaunay triangles of its points.
 
         Raises:
             MeshError: pieces cross one another.
         """
         outline = self
-        for _ in range(max_halvings):
+        for _ in range(40):
             lost = outline._missing(delaunay(outline.points).simplices)
             if not lost.any():
                 return outline

@@ -62,10 +62,6 @@ class SpalledBar:
     opening: Values
     velocity: Values
 
-    def end_speed(self, plane: float) -> float:
-        """Mean velocity nearer to the free end than `plane`, m."""
-        return float(self.velocity[self.distance < plane * (1 - 1e-9)].mean())
-
 
 def spall(pulse: Pulse, strength: Values, energy: float, end: float) -> SpalledBar:
     """The bar at a time `end` (s), whose nodes open by sigma = f_t exp(-w f_t / G_c); at once where G_c = 0.

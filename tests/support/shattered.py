@@ -77,8 +77,8 @@ def cuts_of(name: str, scene: Scene) -> Found:
     """Where edges are cut, by sorted keys."""
     record = EdgeHistory(scene.fracture.graph)
     record.record_breaks(0.0, scene.fracture.criterion.cut_positions)
-    gathered = record.gather_broken()
-    return {} if gathered is None else {f"{name}-cut": gathered[1][:, 1]}
+    gathered = record.graph.gather_broken(record.cut_positions[:, None])
+    return {} if gathered is None else {f"{name}-cut": gathered[1][:, 0]}
 
 
 def compared() -> Found:

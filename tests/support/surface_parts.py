@@ -122,7 +122,8 @@ class WholeValues:
         return self.of_cells(np.where(drawn.reshape(-1, *np.ones(values.ndim - 1, int)), values, 0))
 
     def of_broken_edges(self, history: EdgeHistory) -> tuple[Values, Values]:
-        edges, (times, cuts) = (rows.T for rows in history.gather_broken())  # type: ignore[union-attr]
+        values = np.column_stack([history.break_times, history.cut_positions])
+        edges, (times, cuts) = (rows.T for rows in history.graph.gather_broken(values))  # type: ignore[union-attr]
         return self.part.skeleton.edge_values(edges.T, times), self.part.skeleton.edge_values(edges.T, cuts)
 
 

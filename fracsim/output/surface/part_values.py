@@ -26,7 +26,6 @@ class RankValues:
     def __init__(self, domain: Domain) -> None:
         """Number the entities of the cells of this rank (collective)."""
         self._domain, self.part = domain, RankCells(domain)
-        self._part_edges: npt.NDArray[np.int64] | None = None
 
     def of_nodes(self, values: Values) -> Values:
         """Rows (N, d) of the corners of cells, from values of the dofs that this rank owns (collective)."""
