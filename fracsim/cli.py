@@ -345,7 +345,7 @@ def schema() -> None:
         return
     import json
 
-    from .study.json_schema import study_schema
+    from .study.documentation import study_schema
 
     print(json.dumps(study_schema(), indent=1))
 

@@ -1,6 +1,6 @@
 """Parts, instances and the assembly that an Abaqus input file defines, with nodes, elements, sets and surfaces.
 
-Sets and surfaces are kept as they are written; `abaqus_sets` resolves them.
+Sets and surfaces are kept as they are written; `abaqus.SetResolver` resolves them.
 """
 
 from __future__ import annotations

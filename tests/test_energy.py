@@ -20,7 +20,6 @@ from fracsim.fracture.energy.configurational_force import (
     plateau,
 )
 from fracsim.fracture.energy.cut_plane import centroid_cuts, exit_cuts, plane_crossings, points_on_edges
-from fracsim.fracture.energy.gradient_operators import GradientOperators
 from fracsim.fracture.energy.mixed_mode import (
     TipDiscFields,
     intensity_contributions,
@@ -30,7 +29,7 @@ from fracsim.fracture.energy.mixed_mode import (
     phase_angles,
 )
 from fracsim.fracture.energy.tip_criterion import TipCriterion, kinked_release
-from fracsim.fracture.energy.tip_fields import TipFields
+from fracsim.fracture.energy.tip_fields import GradientOperators, TipFields
 from fracsim.fracture.energy.tip_parameters import TIP
 from fracsim.mesh.domain import distribute
 from fracsim.mesh.small_matrices import barycentric_gradients

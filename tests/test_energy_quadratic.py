@@ -9,7 +9,7 @@ import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 
-from fracsim.fracture.energy.gradient_operators import GradientOperators
+from fracsim.fracture.energy.tip_fields import GradientOperators
 from fracsim.mesh.domain import Domain, distribute
 from fracsim.mesh.small_matrices import barycentric_gradients
 from fracsim.meshes import BUILDERS

@@ -14,7 +14,7 @@ import pytest
 from cases import fracsim
 from fracsim.errors import Exit
 from fracsim.studies import folder
-from fracsim.study.json_schema import study_schema
+from fracsim.study.documentation import study_schema
 
 NAMES = sorted(path.stem for path in folder().glob("*.toml"))
 

@@ -17,12 +17,12 @@ from fracsim.errors import InputError
 from fracsim.scene import build_scene
 from fracsim.study.check import build_checked_mesh, check_study
 from fracsim.study.check_limits import LIMITS
+from fracsim.study.check_report import unit_questions
 from fracsim.study.material_library import MATERIALS
 from fracsim.study.mesh_source import build_mesh
 from fracsim.study.overlap_checks import containment_depth
 from fracsim.study.reader import load_study, validate
 from fracsim.study.step_checks import estimated_explicit_step
-from fracsim.study.unit_checks import unit_questions
 
 HELD = [{"on": {"point": [0.0, 0.0], "normal": [1.0, 0.0]}, "fix": "xy"}]
 

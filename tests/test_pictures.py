@@ -33,7 +33,7 @@ from fracsim.report.pictures.picture_options import (
 from fracsim.report.pictures.renderer import crack_opening
 from fracsim.report.pictures.shadows import SHADOW_STYLE, DepthWindow, lamp_camera, lamp_directions, shadow_shares
 from fracsim.report.pictures.surroundings import PLANE_COLOUR
-from fracsim.report.units import readable_unit
+from fracsim.report.plots import readable_unit
 from fracsim.study.time_and_output import LOOKS
 from support.solids import lattice, patterns, separated
 

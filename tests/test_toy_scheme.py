@@ -22,7 +22,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from fracsim.forms.schemes.scheme import Array, EndOfStepScheme
+from fracsim.forms.schemes import Array, EndOfStepScheme
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from scipy.optimize import brentq
 import fracsim as package
 from cases import STRIP, changed, fracsim_here
 from fracsim.errors import InputError
-from fracsim.forms.schemes import SCHEMES, QuasiStatic
-from fracsim.forms.schemes.scheme import EndOfStepScheme
+from fracsim.forms.schemes import SCHEMES, EndOfStepScheme, QuasiStatic
 from fracsim.simulation import Simulation, load
 from fracsim.study import plugins
 from fracsim.study.scheme_check import check_scheme

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from scipy.optimize import brentq
 
-from fracsim.forms.waves import rayleigh_wave_speed
+from fracsim.mechanics.stability_limit import rayleigh_wave_speed
 
 
 @pytest.mark.parametrize(("poisson", "within"), [(0.0, 1.4e-2), (0.1, 7e-3), (0.25, 3e-3), (0.4, 3e-3), (0.49, 3e-3)])

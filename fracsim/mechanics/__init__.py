@@ -18,7 +18,7 @@ plasticity, return_mapping  history of plastic flow; flow at the end of a step
 tensor_functions            eigenvalues and powers of many tensors
 cell_energy                 energy, forces and stiffness of single cells
 psd_projection              positive semi-definite moduli
-stability_limit             stable step from frequencies of single cells
+stability_limit             stable step from frequencies of single cells; speed of Rayleigh waves
 jit                         compiled forms and expressions
 kernel_selection            choice between DOLFINx and kernels in C: the one place
 matrix_assembly             assembly of vectors and of the tangent

@@ -10,9 +10,8 @@ from ..errors import InputError
 from ..meshes.plain_files import atomic_replacement_of_all
 from .compare import ReferenceCurve, column_unit, history_series, read_reference
 from .content import Plot, Series
-from .plots import gapped_array, save_plot
+from .plots import gapped_array, readable_unit, save_plot
 from .runs import find_runs
-from .units import readable_unit
 
 _FORMATS = (".svg", ".png", ".pdf")
 

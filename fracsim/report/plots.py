@@ -352,3 +352,20 @@ def _overlap(first: Box, second: Box) -> bool:
 
 def _is_inside(box: Box, frame: Box) -> bool:
     return box[0] >= frame[0] and box[2] <= frame[2] and box[1] >= frame[1] and box[3] <= frame[3]
+
+
+# prefixes by their power of 1,000
+_PREFIXES = {-4: "p", -3: "n", -2: "µ", -1: "m", 0: "", 1: "k", 2: "M", 3: "G"}
+
+
+def readable_unit(unit: str, largest: float) -> tuple[str, float]:
+    """Unit whose numbers have one to three digits before the point at a value, and the SI value of one such unit.
+
+    Args:
+        unit: SI unit; "" for numbers without a unit, which have no prefix.
+        largest: the value, in SI units.
+    """
+    if not unit or not 0 < largest < math.inf:
+        return unit, 1.0
+    power = min(max(math.floor(math.log10(largest) / 3 + 1e-9), min(_PREFIXES)), max(_PREFIXES))
+    return _PREFIXES[power] + unit, 1000.0**power

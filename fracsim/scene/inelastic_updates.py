@@ -134,7 +134,7 @@ def _build_energy_pass(
 
 def _add_elastic_zone(flow: PlasticFlowProtocol, tips: TipCriterion, graph: EdgeGraph) -> None:
     """Let the body stay elastic around its crack tips (collective)."""
-    from ..fracture.energy.elastic_zone import ElasticZone
+    from ..fracture.energy.critical_distance import ElasticZone
     from ..mechanics.return_mapping import ReturnMapping
 
     assert isinstance(flow, ReturnMapping)

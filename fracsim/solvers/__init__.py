@@ -11,9 +11,8 @@ direct_solver          factors of the tangent (MUMPS), and their cost
 preconditioner         multigrid or SSOR: when it is rebuilt, and from what
 plain_solver           linear solver of `plain = true`: PETSc alone
 deflation              two-level preconditioner for fragments that are hardly attached
-coupled_nodes          preconditioner of a tangent with stiffness between few nodes beside it, as of contact
-low_rank               products with low-rank updates of the tangent
-tangent_operators      tangent as the matrices that a KSP takes
+coupled_nodes          products and preconditioner of a tangent with low-rank updates, or few coupled nodes
+tangent_operators      tangent as the matrices that a KSP takes, in blocks of a node's dofs too
 multigrid              V cycle in single precision
 policy                 tuned numbers
 petsc_options          options of one solver in PETSc's database

@@ -1,4 +1,6 @@
-"""Preconditioner of a tangent with a coupling of few nodes beside it, as contact of a body with itself has.
+"""Products and preconditioner of a tangent with low-rank updates or a coupling of few nodes, as contact has.
+
+The preconditioner of a tangent K with a coupling C of few nodes is
 
     P = Q + (1 - Q A) M (1 - A Q),   Q = Z E^-1 Z^T,   E = Z^T A Z,   A = K + C
 
@@ -12,6 +14,7 @@ Equations: docs/theory.md#linear-systems.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -81,3 +84,29 @@ def _solver_of(E: csr_matrix) -> Callable[[Values], Values] | None:
         return splu(E.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).solve
     except RuntimeError:  # a pivot is 0
         return None
+
+
+class LowRankOperator:
+    """Context of the PETSc matrix K - sum of U C U^T + C', for products.
+
+    U C U^T belong to unknowns that terms have eliminated, C' couples few nodes. Preconditioners are set up from K
+    alone: an update of rank k costs k more iterations, and `CoupledNodesPreconditioner` has C'.
+    """
+
+    def __init__(self, matrix: PETSc.Mat, tangent: Tangent) -> None:
+        """Combine products with K, `matrix`, and the updates of the present `tangent`."""
+        self._matrix, self._tangent = matrix, tangent
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Evaluate y = (K - sum of U C U^T + C') x (collective)."""
+        self._matrix.mult(x, y)
+        for U, C in self._tangent.low_rank_updates:
+            y.array_w[:] -= U @ (C @ sum_over_ranks(self._matrix.comm.tompi4py(), U.T @ x.array_r))
+        if (coupling := self._tangent.couplings.beside) is not None:
+            coupling.add_product(x.array_r, y.array_w)
+
+    def to_petsc(self) -> PETSc.Mat:
+        """Return the operator as a PETSc matrix."""
+        result: Any = PETSc.Mat().createPython(self._matrix.getSizes(), self, comm=self._matrix.comm)
+        result.setUp()
+        return result

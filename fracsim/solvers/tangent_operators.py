@@ -2,19 +2,59 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
-from .multigrid.block_operator import BlockOperator, blocks_pay_off
 from .policy import SolverPolicy
 from .preconditioner import mass_stiffness_ratio, rigid_body_nullspace
 
 if TYPE_CHECKING:
+    from dolfinx.fem import DofMap
+
     from ..mechanics.block_matrix import BlockMatrix
     from .multigrid.levels import FineLevel
+
+
+class BlockOperator:
+    """Context of a PETSc matrix for products with the tangent in blocks of the d dofs of a node.
+
+    One index is read for d^2 values instead of for d: a product takes half the time. The matrix of single entries, which
+    smoothed aggregation needs, is updated for a set-up of multigrid.
+
+    Attributes:
+        tangent: matrix of single entries.
+        assembled: blocks in which K is assembled.
+        fine_level: copy of the tangent in single precision that products use; None: double precision.
+    """
+
+    def __init__(self, tangent: PETSc.Mat, assembled: BlockMatrix) -> None:
+        self.tangent, self.assembled = tangent, assembled
+        self.fine_level: FineLevel | None = None
+
+    def multiply_by(self, fine_level: FineLevel | None) -> None:
+        """Multiply with this copy of the tangent in single precision; None: in double precision."""
+        self.fine_level = fine_level
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Evaluate y = K x (collective)."""
+        if self.fine_level is not None:
+            self.fine_level.multiply(x, y)
+        else:
+            self.assembled.mult(x, y)
+
+    def to_petsc(self) -> PETSc.Mat:
+        """Return the operator as a PETSc matrix."""
+        result: Any = PETSc.Mat().createPython(self.tangent.getSizes(), self, comm=self.tangent.comm)
+        result.setUp()
+        return result
+
+
+def blocks_pay_off(dofs: DofMap, min_dofs: int) -> bool:
+    """Return True if products in blocks are faster; small matrices stay in the cache in any form."""
+    return dofs.index_map_bs > 1 and dofs.index_map.size_global * dofs.index_map_bs >= min_dofs
 
 
 class PatternListener(Protocol):
@@ -76,7 +116,7 @@ class TangentOperators:
             self.products = self.block_operator.to_petsc()
         self.operator = self.products or tangent.matrix
         if tangent.may_be_incomplete:
-            from .low_rank import LowRankOperator
+            from .coupled_nodes import LowRankOperator
 
             self._low_rank_operator = LowRankOperator(self.operator, tangent).to_petsc()
             self.operator = self._low_rank_operator

@@ -12,8 +12,7 @@ study                  schema of a whole study
 table_checks           conditions between the tables of a study
 values                 types of values, and the documentation of a key
 material_library       named materials with their sources
-documentation          docs/study-file.md, written from the schema
-json_schema            JSON schema of study files, for editors
+documentation          docs/study-file.md and the JSON schema of study files, for editors
 reader                 read a study by path or name, override values, write all defaults
 error_messages         errors of validation as sentences
 conditions             boundary conditions, loads, obstacles and cracks for a dimension
@@ -21,10 +20,9 @@ mesh_source            from [mesh] to arrays
 quadratic_checks       limits of quadratic displacement, and its curved cells
 check                  validation of a study against its mesh
 mesh_summary           size, extent and groups of a mesh, before it is built if possible
-check_report           lines of `fracsim check`
+check_report           lines of `fracsim check`, and questions on values of another unit
 check_limits           thresholds of its notes and questions
 length_checks          strength, fracture energy, cell size and body against each other
-unit_checks            values that look like those of another unit
 step_checks            number and stability of time steps
 load_resultants        areas and resultants of loads
 overlap_checks         overlap of body and obstacles at the start

@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from ..errors import InputError
-from ..forms.waves import rayleigh_wave_speed
+from ..mechanics.stability_limit import rayleigh_wave_speed
 from . import FractureSettings, Study
 from .body import RegionSettings
 from .check_limits import LIMITS

@@ -23,7 +23,7 @@ def check_scheme(scheme: Any, label: str) -> None:
         InputError: that begins with `label`, if something is missing or wrong.
     """
     if missing := [name for name in _MEMBERS if not hasattr(scheme, name)]:
-        raise InputError(f"{label} has no {missing[0]}; derive it from fracsim.forms.schemes.scheme.EndOfStepScheme")
+        raise InputError(f"{label} has no {missing[0]}; derive it from fracsim.forms.schemes.EndOfStepScheme")
     if not scheme.implicit:
         raise InputError(f"{label} is explicit, and explicit steps are those of the program: implicit = True is needed")
     try:

@@ -24,7 +24,7 @@ Values = npt.NDArray[np.float64]
 
 
 class ExplicitStepper(BalanceStepper):
-    """Stepper of central differences (forms.schemes.newmark); the step of the study is an upper bound."""
+    """Stepper of central differences (forms.schemes); the step of the study is an upper bound."""
 
     # u, v and a at the end of the attempted step
     _end_of_step: tuple[Values, Values, Values]

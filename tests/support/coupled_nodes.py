@@ -9,8 +9,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from fracsim.contact.self_contact import SelfContact
-from fracsim.solvers.coupled_nodes import CoupledNodesPreconditioner
-from fracsim.solvers.low_rank import LowRankOperator
+from fracsim.solvers.coupled_nodes import CoupledNodesPreconditioner, LowRankOperator
 from support.scenes import make_scene
 from support.stacked import MESH
 

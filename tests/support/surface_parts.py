@@ -26,8 +26,7 @@ from fracsim.meshes.topology import boundary_facets, facets_on_nodes
 from fracsim.output.fields_file import Field
 from fracsim.output.result_checks import InterpenetrationMonitor
 from fracsim.output.surface.body_surface import BodySurface
-from fracsim.output.surface.part_values import RankValues
-from fracsim.output.surface.surface_output import SurfaceOutput
+from fracsim.output.surface.surface_output import RankValues, SurfaceOutput
 from fracsim.scene import Scene, build_scene_on
 
 from .scenes import Values, make_study

@@ -7,7 +7,7 @@ crack_initiation       criterion: where cracks start, and which cells are cut in
 front_advance          3D without inertia: a stretch of a front advances at once
 crack_speed            2D with inertia: speed of tips, and where they branch
 branching              2D: several tips in one disc
-tip_fields             stress, Eshelby stress and inertia around tips
+tip_fields             stress, Eshelby stress and inertia around tips; gradients as matrices
 tip_neighbourhoods     cells around tips, and weighted sums over them
 configurational_force  Eshelby stress, weight function, springs of closed cracks
 crack_front            3D: area that an advance makes, energy release rate along a front
@@ -15,7 +15,6 @@ mixed_mode             2D: stress intensities, kink angle, energy release of a k
 cut_plane              the line or plane that cuts a cell
 hinges                 nodes by which parts without a ligament still hang on one another
 cut_cells              cut positions, cut polygons, and the cut cells of all ranks
-gradient_operators     gradients of fields around tips, as matrices
 neighbour_search       cells near points, and values of cells of other ranks
 tip_parameters         lengths and thresholds
 tip_record             tips of a step before they advance, for tips.csv

@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
-from ...forms.waves import rayleigh_wave_speed
 from ...mechanics.material_fields import PerCell
+from ...mechanics.stability_limit import rayleigh_wave_speed
 from ...mechanics.stress import Stress
 from ...mesh.domain import Domain
 from ...mesh.edge_graph import EdgeGraph

@@ -12,7 +12,7 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from ..units import readable_unit
+from ..plots import readable_unit
 from .annotations import ColourLegend, annotate, format_time
 from .camera import ViewBounds, aim_camera, camera_axes, pixel_width, prepare_grid
 from .colour_maps import colour_range, field_title, field_unit, map_colours, select_array

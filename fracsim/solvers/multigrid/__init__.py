@@ -4,5 +4,4 @@ vcycle          V cycle as a preconditioner
 hierarchy       levels copied from PETSc's multigrid
 levels          a level and its Chebyshev smoother; the finest level, whose products serve CG as well
 bcsr            products with block CSR matrices and prolongations (C)
-block_operator  products with the tangent in node blocks, in double precision
 """
