@@ -12,7 +12,7 @@ import numpy as np
 from .data import Indices, MeshError, Points
 from .quality import POOR, radius_ratios
 from .random_points.faces import GmshElement, scatter_faces, scatter_plane
-from .sizing import INNER_SIZE_FACTOR, SizeField
+from .sizing import SizeField
 from .topology import orient_cells
 
 
@@ -104,7 +104,9 @@ def _move_nodes(gmsh: Any, move: Callable[[Points], Points]) -> None:
 
 def fill_volumes(gmsh: Any, sizing: SizeField) -> None:
     """Fill the volumes of a model whose surfaces are meshed with tetrahedra."""
-    sizing.apply(gmsh, INNER_SIZE_FACTOR)
+    # For a size h gmsh makes surface edges of length h, but inner edges of 1.3 h: its criterion is on the circumsphere.
+    # With the factor 0.7 inside, the median edge is h within 2 % (boxes of 3 000 to 340 000 cells, algorithm HXT).
+    sizing.apply(gmsh, 0.7)
     # HXT is several times as fast as gmsh's Delaunay algorithm, but may fail
     for algorithm in (Algorithm.HXT, Algorithm.DELAUNAY):
         gmsh.option.setNumber("Mesh.Algorithm3D", algorithm)

@@ -14,10 +14,6 @@ from .topology import Floats
 # regular tetrahedron 0.118 h^3, but regular tetrahedra do not fill space, and random points make other triangles.
 SHARE = {2: 0.404, 3: 0.092}
 
-# For a size h gmsh makes surface edges of length h, but inner edges of 1.3 h: its criterion is on the circumsphere.
-# With this factor inside, the median edge is h within 2 % (the same boxes, algorithm HXT).
-INNER_SIZE_FACTOR = 0.7
-
 
 @dataclass(frozen=True)
 class SizeField:

@@ -40,7 +40,6 @@ KINDS: dict[int, tuple[str, list[int]] | None] = {
     116: ("hexahedron20", [0, 2, 4, 6, 12, 14, 16, 18, 1, 3, 5, 7, 8, 9, 10, 11, 13, 15, 17, 19]),
     **dict.fromkeys((121, 122, 136, 137, 138, 139, 141, 142, 151, 152, 161)),
 }  # fmt: skip
-BEAMS = range(11, 40)  # element types with a line of orientation and sections before their nodes
 NODE_LINE = "a node has a line `number 1 1 11`, then a line `x y z`"
 ELEMENT_LINE = "an element has a line `number type property material colour nodes`, then its nodes, eight on a line"
 GROUP_LINE = "a group has a line of eight whole numbers, a line with its name, then its members"
@@ -135,7 +134,8 @@ class _UniversalFile:
         while line < len(lines):
             head = self._head(lines, line)
             type_, size = int(head[1]), int(head[5])
-            beam = type_ in BEAMS
+            # beams have a line of orientation and sections before their nodes
+            beam = 11 <= type_ < 40
             # numbers on each line of an element: its head, the line of a beam, eight nodes on a line
             widths = [6, *([3] if beam else []), *([8] * (size // 8) + ([size % 8] if size % 8 else []))]
             period = len(widths)

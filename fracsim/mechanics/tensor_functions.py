@@ -18,7 +18,6 @@ import numpy.typing as npt
 Values = npt.NDArray[np.float64]
 
 EPS = float(np.finfo(float).eps)
-MIN_DETERMINANT = 100 * EPS  # relative to the product of the rows' lengths: a smaller determinant is round-off
 
 
 def eigenvalues(C: Values) -> Values:
@@ -84,5 +83,6 @@ def multiply_unimodular(A: Values, S: Values) -> Values:
     P = np.stack([A[3 * i] * u + A[3 * i + 1] * v + A[3 * i + 2] * w for i in range(3) for u, v, w in columns])
     det = P[0] * (P[4] * P[8] - P[5] * P[7]) - P[1] * (P[3] * P[8] - P[5] * P[6]) + P[2] * (P[3] * P[7] - P[4] * P[6])
     lengths = np.sqrt(np.prod((P * P).reshape(3, 3, -1).sum(axis=1), axis=0))
-    P /= np.cbrt(np.where(det > MIN_DETERMINANT * lengths, det, 1.0))
+    # A determinant below 100 EPS times the product of the rows' lengths is round-off.
+    P /= np.cbrt(np.where(det > 100 * EPS * lengths, det, 1.0))
     return P

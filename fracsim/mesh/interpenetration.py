@@ -18,8 +18,6 @@ from .parallel import allgather, alltoall, concatenate_over_ranks, max_over_rank
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-# cells at most that give the usual size of a cell
-SAMPLED_CELLS = 10_000
 
 
 @dataclass(frozen=True, order=True)
@@ -81,7 +79,8 @@ def find_interpenetration(x: Values, cells: Ints, fragment: Ints, nodes: RankNod
     searched = np.flatnonzero(holds[cell_fragment])
     box_of_near = _bounding_boxes(comm, x[near], np.array([len(near)]))
     searched = searched[_cells_at_box(x, box_of_near[0][0], box_of_near[1][0], cells[searched])]
-    sampled = cells[searched[:: len(searched) // SAMPLED_CELLS + 1]]
+    # 10,000 cells give the usual size of a cell
+    sampled = cells[searched[:: len(searched) // 10_000 + 1]]
     radii = concatenate_over_ranks(comm, _balls(x, sampled)[1])
     if not len(radii):
         return None

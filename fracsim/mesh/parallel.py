@@ -19,8 +19,6 @@ from mpi4py import MPI
 
 # s that a rank which failed waits for the failure messages of other ranks
 FAILURE_WAIT = 5.0
-# s that mpirun has to pass on what a rank has printed, before all ranks end
-FORWARDING_WAIT = 0.5
 # first letters of the names of processes that start ranks
 LAUNCHERS = ("prte", "orte", "mpirun", "mpiexec", "hydra", "slurmstepd")
 Values = npt.NDArray[np.float64]
@@ -97,8 +95,8 @@ def abort_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, lat
         # meanwhile a lower rank prints its message and ends all ranks
         time.sleep(FAILURE_WAIT)
     print(message or f"fracsim: rank {comm.rank} ended alone", file=sys.stderr, flush=True)
-    # MPICH's mpirun ends without what it has not passed on yet
-    time.sleep(FORWARDING_WAIT)
+    # MPICH's mpirun ends without what it has not passed on yet: it has half a second for that
+    time.sleep(0.5)
     comm.Abort(code or 1)
     # MPICH may return before mpirun has ended this rank
     os._exit(code or 1)

@@ -112,9 +112,6 @@ def _round_down(value: float) -> float:
     return math.floor(value / unit * (1 + 1e-9)) * unit
 
 
-MIN_OVERLAP = 0.1  # overlap, in sizes of a free obstacle, from which on it is told of
-
-
 class ObstacleOverlapMonitor:
     """Deepest overlap of two obstacles in explicit steps, whose penalty fast ones may pass. The same on all ranks.
 
@@ -131,7 +128,8 @@ class ObstacleOverlapMonitor:
         """Record the poses of the obstacles at time t in s (not collective)."""
         if not self._pairs:
             return
-        for first, second, depth in find_overlaps(self._motion.posed_at(t), self._pairs, MIN_OVERLAP):
+        # An overlap from 0.1 of the size of a free obstacle on is told of.
+        for first, second, depth in find_overlaps(self._motion.posed_at(t), self._pairs, 0.1):
             if depth > self.deepest_overlap.get("depth", 0.0):
                 names = [self._motion.obstacles[number].name for number in (first, second)]
                 self.deepest_overlap = {"time": t, "depth": depth, "both": names}

@@ -31,8 +31,6 @@ COMPONENTS_ATTRIBUTE = "components"
 _ATTRIBUTE_TYPES = {1: "Scalar", 3: "Vector", len(TENSOR_COMPONENTS): "Matrix"}
 # by nodes per cell
 _TOPOLOGY_TYPES = {3: "Triangle", 4: "Tetrahedron", 6: "Triangle_6", 10: "Tetrahedron_10"}
-# bytes that HDF5 needs to find a chunk
-CHUNK_INDEX_BYTES = 128
 _COMPONENT_NAMES = np.bytes_(" ".join(TENSOR_COMPONENTS))
 _TAIL = "    </Grid>\n  </Domain>\n</Xdmf>\n"
 _HEAD = (
@@ -259,7 +257,8 @@ def _filters(shape: tuple[int, ...]) -> dict[str, Any]:
 
 def _stored_bytes(field: CompressedField) -> int:
     """Bytes that a field takes in the file."""
-    return HDF5_OVERHEAD_BYTES + sum(len(chunk) + CHUNK_INDEX_BYTES for chunk in field.chunks)
+    # HDF5 needs 128 bytes to find a chunk.
+    return HDF5_OVERHEAD_BYTES + sum(len(chunk) + 128 for chunk in field.chunks)
 
 
 def pad_to_3d(values: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ..errors import InputError
 from .pictures.colour_maps import rgb
-from .pictures.frames import VTK_TRIANGLE, FrameSource, is_crack, load_grid, with_normals, without_single_nodes
+from .pictures.frames import FrameSource, is_crack, load_grid, with_normals, without_single_nodes
 from .pictures.picture_options import MaterialLook
 from .pictures.surroundings import OBSTACLE_COLOUR, PLANE_COLOUR, obstacle_surface
 
@@ -92,8 +92,10 @@ def read_fragments(frame: FrameSource, dust: bool = True) -> list[Surface]:
     Raises:
         InputError: the body is in 2D and has no closed surface.
     """
+    import pyvista
+
     grid = load_grid(frame) if dust else without_single_nodes(load_grid(frame))
-    if not np.all(grid.celltypes == VTK_TRIANGLE):
+    if not np.all(grid.celltypes == pyvista.CellType.TRIANGLE):
         raise InputError(f"{frame.folder}: a body in 2D has no closed surface to export")
     triangles = np.asarray(grid.cell_connectivity).reshape(-1, 3)
     material = np.where(is_crack(grid), INSIDE, SKIN)

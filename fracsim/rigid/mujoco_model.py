@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntFlag
 from functools import cached_property
 from typing import Any
 
@@ -51,9 +52,18 @@ class ModelSettings:
 SETTINGS = ModelSettings()
 
 
-# Bits of MuJoCo's masks of what collides: planes with primitive shapes alone, since PlaneContacts finds their contacts
-# with hulls; cylinders with cylinders, and prisms in them (obstacles) with prisms; all with everything else.
-PLANE_BIT, GENERAL_BIT, CYLINDER_BIT, PRISM_BIT = 1, 2, 4, 8
+class CollisionBit(IntFlag):
+    """Bits of MuJoCo's masks of what collides.
+
+    Planes collide with primitive shapes alone, since PlaneContacts finds their contacts with hulls; cylinders with
+    cylinders, and prisms in them (obstacles) with prisms; all with everything else.
+    """
+
+    PLANE = 1
+    GENERAL = 2
+    CYLINDER = 4
+    PRISM = 8
+
 
 _warned: set[str] = set()
 
@@ -323,11 +333,13 @@ def _add_parts(
             geom.type = getattr(mujoco.mjtGeom, f"mjGEOM_{part.kind.upper()}")
             geom.size = part.size
             geom.quat = Rotation.from_matrix(rotation @ part.rotation).as_quat(scalar_first=True)
-            bits = PLANE_BIT if is_plane else PLANE_BIT | (CYLINDER_BIT if has_prism else GENERAL_BIT)
+            bits = CollisionBit.PLANE
+            if not is_plane:
+                bits |= CollisionBit.CYLINDER if has_prism else CollisionBit.GENERAL
         else:
             corners = part if not isinstance(part, PrimitiveShape) else part.corners
             assert meshes is not None and corners is not None
             geom.type, geom.meshname = mujoco.mjtGeom.mjGEOM_MESH, meshes.name(spec, corners)
-            geom.quat, bits = quat, PRISM_BIT if has_prism else GENERAL_BIT
-        geom.contype, geom.conaffinity = bits, bits | (0 if is_plane else GENERAL_BIT)
+            geom.quat, bits = quat, CollisionBit.PRISM if has_prism else CollisionBit.GENERAL
+        geom.contype, geom.conaffinity = bits, bits | (0 if is_plane else CollisionBit.GENERAL)
     return len(parts)

@@ -17,9 +17,6 @@ from ..mesh.parallel import sum_over_ranks
 from .policy import DEFAULT_POLICY, SolverPolicy
 from .weak_callbacks import weak_callback
 
-# Merit, J, so low that every line search accepts the step.
-ACCEPTED_MERIT = -1e100
-
 
 class MeritFunction:
     """Merit function of a SNES: rise of the incremental potential since the start of the iteration, J.
@@ -74,7 +71,7 @@ class MeritFunction:
             return 0.0
         if self._by_norm:
             if not self._balance.contact.is_active() and self._norm_at(x) < self._start_norm:
-                return ACCEPTED_MERIT
+                return -1e100  # so low that every line search accepts the step
             self._evaluate_start(x)
         potential, size = self._potential()
         rise, slack = potential - self._start_potential, self._policy.potential_round_off * size

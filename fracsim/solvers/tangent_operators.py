@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 class BlockOperator:
     """Context of a PETSc matrix for products with the tangent in blocks of the d dofs of a node.
 
-    One index is read for d^2 values instead of for d: a product takes half the time. The matrix of single entries, which
-    smoothed aggregation needs, is updated for a set-up of multigrid.
+    One index is read for d^2 values instead of for d: a product takes half the time. The matrix of single entries,
+    which smoothed aggregation needs, is updated for a set-up of multigrid.
 
     Attributes:
         tangent: matrix of single entries.

@@ -314,7 +314,6 @@ def _description(model: type[BaseModel]) -> str:
     return " ".join((model.__doc__ or "").split())
 
 
-DIALECT = "https://json-schema.org/draft/2020-12/schema"
 # keys that [material] like supplies, by table
 _SUPPLIED = {
     "MaterialSettings": ["young", "poisson", "density"],
@@ -336,7 +335,7 @@ def study_schema() -> dict[str, Any]:
             table["anyOf"] = [{"required": ["like"]}, {"required": _SUPPLIED[title]}]
             # tables inside [material] are regions of the mesh
             table["additionalProperties"] = table["properties"].pop("regions")["additionalProperties"]
-    return {"$schema": DIALECT} | _without_infinity(schema)
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | _without_infinity(schema)
 
 
 def _without_infinity(part: Any) -> Any:

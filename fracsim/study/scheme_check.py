@@ -12,8 +12,6 @@ _MEMBERS = (
     "inertia", "implicit", "carries_acceleration", "alpha_f", "check_parameters", "rate_coefficients",
     "reference_displacements", "complete_step", "prescribed_dof_rates",
 )  # fmt: skip
-# least ratio of errors when steps are halved, largest amplitude of an oscillator that begins with 1, steps of that
-MIN_RATIO, MAX_AMPLITUDE, STEPS = 1.7, 2.0, 200
 
 
 def check_scheme(scheme: Any, label: str) -> None:
@@ -53,13 +51,14 @@ def _uniform_motion_fault(scheme: Any) -> str:
 
 def _oscillator_fault(scheme: Any) -> str:
     """Return what is wrong with the motion u'' = -u from u = 1 at rest, u = cos t; empty: nothing."""
+    # When steps are halved, errors fall by a factor of 1.7 at least.
     errors = [abs(_oscillate(scheme, 2.0 / steps, steps)[0] - math.cos(2.0)) for steps in (50, 100, 200)]
-    if errors[0] > 0.2 or any(after > 1e-9 and before < MIN_RATIO * after for before, after in pairwise(errors)):
+    if errors[0] > 0.2 or any(after > 1e-9 and before < 1.7 * after for before, after in pairwise(errors)):
         listed = ", ".join(f"{error:.2g}" for error in errors)
         return f"does not converge: with steps of 0.04, 0.02 and 0.01 an oscillator is off by {listed}"
     for dt in (1.0, 5.0, 50.0):
-        if not (largest := _oscillate(scheme, dt, STEPS)[1]) <= MAX_AMPLITUDE:
-            return f"is not stable: in {STEPS} steps of omega dt = {dt:g} an oscillator grows from 1 to {largest:.3g}"
+        if not (largest := _oscillate(scheme, dt, 200)[1]) <= 2:
+            return f"is not stable: in 200 steps of omega dt = {dt:g} an oscillator grows from 1 to {largest:.3g}"
     return ""
 
 

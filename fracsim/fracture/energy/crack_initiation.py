@@ -6,6 +6,7 @@ Equations: docs/theory.md#tip-criterion.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 from functools import cached_property
 from typing import Protocol
 
@@ -28,8 +29,12 @@ Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 
-# First column of the rank of a proposal: tips come before new cracks.
-TIP_ADVANCE, NEW_CRACK = 0, 1
+
+class CutKind(IntEnum):
+    """First column of the rank of a proposal: tips come before new cracks."""
+
+    TIP_ADVANCE = 0
+    NEW_CRACK = 1
 
 
 @dataclass(frozen=True)
@@ -76,11 +81,11 @@ def empty_proposal(dim: int, course_width: int) -> CutProposal:
     return CutProposal(np.empty((0, dim + 4)), none, np.empty((0, dim, dim)), none, ahead, no, no)
 
 
-def rank_rows(kind: int, sigma: Values, key: Values, points: Values, exclusion: Values) -> Values:
+def rank_rows(kind: CutKind, sigma: Values, key: Values, points: Values, exclusion: Values) -> Values:
     """Return the rows of `CutProposal.rank`.
 
     Args:
-        kind: TIP_ADVANCE or NEW_CRACK.
+        kind: advance of a tip, or new crack.
         sigma: (n,) first principal stress, Pa, or load; cells are selected from the largest on.
         key: (n, ...) numbers that the hash is of, the same on any number of ranks.
         points: (n, d) m.
@@ -110,7 +115,7 @@ def select_proposals(
     # By kind, then by stress, then by hash.
     remaining = list(np.lexsort(rows[:, 2::-1].T))
     if one_start:
-        tips = [row for row in remaining if rows[row, 0] == TIP_ADVANCE]
+        tips = [row for row in remaining if rows[row, 0] == CutKind.TIP_ADVANCE]
         remaining = tips or remaining[:1]
     selected = np.zeros(len(rows), bool)
     while remaining:
@@ -201,7 +206,7 @@ class CrackInitiation:
         overloaded = first_principal_stress(mean) >= self._start.threshold[cells]
         cells = cells[overloaded]
         centres = evaluator.centres[cells]
-        rank = rank_rows(NEW_CRACK, load[cells], centres, centres, self._distance[cells])
+        rank = rank_rows(CutKind.NEW_CRACK, load[cells], centres, centres, self._distance[cells])
         return CutProposal(rank, cells, mean[overloaded])
 
     def _is_largest(self, cells: Ints, load: Values) -> Flags:

@@ -36,9 +36,6 @@ from .tip_parameters import TIP
 Flags = npt.NDArray[np.bool_]
 Values = npt.NDArray[np.float64]
 
-# Slowness 1 - v / c_R at the largest speed: G* is that of two cracks there, and G that of one.
-MIN_SLOWNESS = 1 / TIP.branching_ratio
-
 
 class TipState(IntEnum):
     """Columns of the state of a tip, stored at the edge by which it came in."""
@@ -55,10 +52,11 @@ AT_REST = 1.0, 0.0, 0.0, np.nan
 def relax_slowness(slowness: Values, flow: Values, time: Values) -> Values:
     """Return 1 - v / c_R (n,) after a time (n,), in R / c_R, in which G is `flow` (n,), in G_c.
 
-    The target is G_c / G* = slowness / flow, between that of a crack at rest and MIN_SLOWNESS.
+    The target is G_c / G* = slowness / flow, between 1 at rest and 1 / TIP.branching_ratio.
     """
     target = slowness / np.maximum(flow, slowness)
-    return np.maximum(relax(slowness, target, time), MIN_SLOWNESS)
+    # At the largest speed G* is that of two cracks, and G that of one.
+    return np.maximum(relax(slowness, target, time), 1 / TIP.branching_ratio)
 
 
 def relax(before: Values, target: Values, time: Values) -> Values:

@@ -26,8 +26,8 @@ from ..principal_stress import first_principal_stress
 from ..strength import EdgeStrength
 from .branching import release_rate, rotate, unit_or_zero
 from .crack_initiation import (
-    TIP_ADVANCE,
     CrackInitiation,
+    CutKind,
     CutProposal,
     Initiation,
     cell_strength,
@@ -258,7 +258,7 @@ class TipCriterion:
         rows = candidates[active]
         cells = tips.cell[rows]
         rank = rank_rows(
-            TIP_ADVANCE, sigma[active], input_numbers(self._domain, cells), tips.point[rows], exclusion[rows]
+            CutKind.TIP_ADVANCE, sigma[active], input_numbers(self._domain, cells), tips.point[rows], exclusion[rows]
         )
         entry = self._graph.first_broken_edge(cells)
         return CutProposal(rank, cells, mean[active], entry, ahead[rows], turns[rows], branches[rows])
@@ -353,7 +353,7 @@ class TipCriterion:
             ahead = np.maximum(1 - passed, 0.0)[:, None] * ahead
             self.cells = np.concatenate([self.cells, cells])
             turns, zeros = entry >= 0, np.zeros(len(cells))
-            rank = rank_rows(TIP_ADVANCE, zeros, point, point, zeros)
+            rank = rank_rows(CutKind.TIP_ADVANCE, zeros, point, point, zeros)
             proposal = CutProposal(rank, cells, np.empty((len(cells), 2, 2)), entry, ahead, turns, ~turns)
             edges, courses = self._store_cuts(self._cut_rows(proposal, cuts))
             all_edges.append(edges)

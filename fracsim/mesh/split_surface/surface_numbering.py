@@ -18,8 +18,6 @@ from .mesh_part import MeshPart
 
 Flags = npt.NDArray[np.bool_]
 Ints = npt.NDArray[np.int64]
-# of the keys of a rank one in so many tells how keys are distributed
-SAMPLED_KEYS = 256
 
 
 @dataclass(frozen=True)
@@ -79,7 +77,8 @@ def number_rows(comm: MPI.Intracomm, rows: Ints, preference: Ints | None = None)
     """
     preference = np.zeros(len(rows), np.int64) if preference is None else preference
     # rows with one first column meet on one rank; ranks have the columns in rising order
-    sample = np.sort(np.concatenate(allgather(comm, np.sort(rows[:, 0])[::SAMPLED_KEYS])))
+    # every 256th key of a rank tells how keys are distributed
+    sample = np.sort(np.concatenate(allgather(comm, np.sort(rows[:, 0])[::256])))
     borders = sample[len(sample) * np.arange(1, comm.size) // comm.size] if len(sample) else sample
     routing = RowRouting(comm, np.searchsorted(borders, rows[:, 0], side="right"))
     arrived = routing.send(np.column_stack([rows, preference]))

@@ -24,11 +24,6 @@ from ...output.surface.vtk_files import PvdEntry, read_pvd, reorder_tensors
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
-# VTK's numbers of cell types
-VTK_LINE, VTK_TRIANGLE = 3, 5
-# by nodes per cell
-CELL_TYPES = {3: "TRIANGLE", 4: "TETRA", 6: "QUADRATIC_TRIANGLE", 10: "QUADRATIC_TETRA"}
-
 
 @dataclass(frozen=True)
 class FilmTiming:
@@ -165,7 +160,8 @@ def load_grid(frame: FrameSource) -> Any:
     with _read_hdf5(frame.file) as file:
         stored = file["frames"][sorted(file["frames"])[frame.index]]
         cells = file["cells"][()]
-        cell_type = pyvista.CellType[CELL_TYPES[cells.shape[1]]]
+        types = {3: "TRIANGLE", 4: "TETRA", 6: "QUADRATIC_TRIANGLE", 10: "QUADRATIC_TETRA"}  # by nodes per cell
+        cell_type = pyvista.CellType[types[cells.shape[1]]]
         grid = pyvista.UnstructuredGrid({cell_type: cells}, file["points"][()] + stored["displacement"][()])
         for name, data in stored.items():
             (grid.point_data if data.attrs["centre"] == "Node" else grid.cell_data)[name] = read_field(data)
@@ -214,12 +210,14 @@ class FrameParts:
 
 def frame_parts(grid: Any) -> FrameParts:
     """Parts of a split surface. Of a mesh the surface of the less damaged cells, which shows the crack open."""
+    import pyvista
+
     if "origin" not in grid.cell_data:
         if "damage" in grid.cell_data:
             intact = np.flatnonzero(grid.cell_data["damage"] < 0.5)
             grid = grid.extract_cells(intact) if len(intact) else grid
         return FrameParts(grid.extract_surface(), None, None)
-    is_line = np.asarray(grid.celltypes) == VTK_LINE
+    is_line = np.asarray(grid.celltypes) == pyvista.CellType.LINE
     crack = is_crack(grid)
     if is_line.any():
         return FrameParts(_extract_triangles(grid, ~is_line), None, grid.extract_cells(np.flatnonzero(is_line)))

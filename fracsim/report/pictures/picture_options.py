@@ -20,8 +20,6 @@ VIEWS = {
 DEFAULT_SIZE = (1400, 900)
 # least and largest side of a picture in pixels; graphics drivers give no more
 _SIDE_LIMITS = (16, 8192)
-# colours of the boundary and of cracks, if neither a material nor a field colours them
-BOUNDARY_COLOUR, CRACK_COLOUR = "#b4bac4", "#e0762b"
 _HEX_COLOUR = re.compile(r"#[0-9a-fA-F]{6}")
 
 
@@ -129,7 +127,7 @@ class MaterialLook:
 
 
 MATERIAL_LOOKS = {
-    "plain": MaterialLook(BOUNDARY_COLOUR, CRACK_COLOUR, 0.0, "#ffffff"),
+    "plain": MaterialLook("#b4bac4", "#e0762b", 0.0, "#ffffff"),
     "bread": MaterialLook("#b9712c", "#f0deb6", 0.12, "#f3efe6"),
     "porcelain": MaterialLook("#f4f2ee", "#d8bf9c", 0.6, "#c9d2dc"),
     "glass": MaterialLook("#bcd6d0", "#eef7f4", 0.8, "#dfe6ec"),

@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 
 from .colour_maps import rgb
-from .frames import VTK_LINE, VTK_TRIANGLE
 from .shadows import DepthWindow
 
 Values = npt.NDArray[np.float64]
@@ -99,7 +98,7 @@ def obstacle_surface(file: Path) -> Any:
     import pyvista
 
     grid = pyvista.read(file)
-    return grid.extract_cells(np.flatnonzero(grid.celltypes == VTK_TRIANGLE)).extract_surface()
+    return grid.extract_cells(np.flatnonzero(grid.celltypes == pyvista.CellType.TRIANGLE)).extract_surface()
 
 
 def hiding_obstacles(
@@ -173,8 +172,11 @@ def add_flat_obstacle(plotter: Any, file: Path) -> None:
     import pyvista
 
     grid = pyvista.read(file)
-    styles = ((VTK_TRIANGLE, {"color": OBSTACLE_COLOUR}), (VTK_LINE, {"color": _OBSTACLE_EDGE_COLOUR, "line_width": 2}))
-    for cell_type, style in styles:
+    styles: dict[Any, dict[str, Any]] = {
+        pyvista.CellType.TRIANGLE: {"color": OBSTACLE_COLOUR},
+        pyvista.CellType.LINE: {"color": _OBSTACLE_EDGE_COLOUR, "line_width": 2},
+    }
+    for cell_type, style in styles.items():
         cells = np.flatnonzero(grid.celltypes == cell_type)
         if len(cells):
             plotter.add_mesh(grid.extract_cells(cells), lighting=False, **style)

@@ -46,10 +46,6 @@ class SmoothingParameters(NamedTuple):
     cycles: int = 1
 
 
-# Defaults of PETSc's multigrid.
-DEFAULT_SMOOTHING = SmoothingParameters(2, 0.1)
-
-
 class SmoothedLevel:
     """A level with a smoother.
 
@@ -83,7 +79,7 @@ class SmoothedLevel:
         self._inverse = BlockDiagonal(code, size, nodes.size_local)
         self.b, self.x, self.residual, self._direction, self._next_x = (GhostedVector(nodes, size) for _ in range(5))
         self._previous_x = GhostedVector(nodes, size) if data.matrix else None
-        self.smoothing = DEFAULT_SMOOTHING
+        self.smoothing = SmoothingParameters(2, 0.1)  # defaults of PETSc's multigrid
         row = np.repeat(np.arange(nodes.size_local, dtype=np.int32), np.diff(pattern.starts))
         # Blocks on the diagonal, and their rows.
         self._on_diagonal = np.flatnonzero(pattern.columns == row)

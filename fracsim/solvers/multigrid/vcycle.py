@@ -41,8 +41,6 @@ Values = npt.NDArray[np.float64]
 # By the size of a level's blocks; by the sizes of the finer level's and the coarser's for prolongations.
 type CompiledProducts = dict[tuple[int, ...], CDLL]
 
-# Smoother of PETSc's levels that the cycle replaces: Krylov method, preconditioner, steps.
-PETSC_SMOOTHER = ("chebyshev", "jacobi", 2)
 # Smoothing of the second finest level, of the next, and of all coarser ones, if coarse levels converge slowly. The
 # coarsest have so few numbers that more steps cost nothing but calls.
 THOROUGH_SMOOTHING = (
@@ -192,7 +190,8 @@ def create_vcycle(
     if gamg.getType() != "gamg" or gamg.getMGLevels() < 2:
         return None
     smoothers = [gamg.getMGSmoother(level) for level in range(gamg.getMGLevels())]
-    if any((ksp.getType(), ksp.getPC().getType(), ksp.max_it) != PETSC_SMOOTHER for ksp in smoothers[1:]):
+    # The cycle stands for PETSc's default smoother alone.
+    if any((ksp.getType(), ksp.getPC().getType(), ksp.max_it) != ("chebyshev", "jacobi", 2) for ksp in smoothers[1:]):
         return None
     sizes = [ksp.getOperators()[1].getBlockSize() for ksp in smoothers]
     codes = _compile_products(gamg.comm.tompi4py(), sizes)
