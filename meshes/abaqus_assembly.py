@@ -12,8 +12,7 @@ from functools import cached_property
 import numpy as np
 
 from .abaqus_deck import KeywordBlock
-from .abaqus_elements import facet_columns
-from .abaqus_model import NO_INDICES, Component, Deck, ElementBlock, SetEntry, label_key
+from .abaqus_model import NO_INDICES, Component, Deck, ElementBlock, SetEntry, facet_columns, label_key
 from .data import Indices, Points, list_some
 from .mesh_conversion import DAMAGE, dimension_of, shape_of
 from .topology import Mask, distinct_rows, positions_of

@@ -15,8 +15,7 @@ from fracsim.meshes import BUILDERS
 from fracsim.meshes.data import MeshData, MeshError
 from fracsim.meshes.directions import preferred_directions
 from fracsim.meshes.quality import mesh_quality
-from fracsim.meshes.random_points.outline import Outline
-from fracsim.meshes.random_points.points import SAMPLING, circumcircles, scatter
+from fracsim.meshes.random_points.points import SAMPLING, Outline, circumcircles, scatter
 from fracsim.meshes.sizing import SizeField
 from fracsim.meshes.topology import boundary_facets, edges_of, signed_measures
 from fracsim.study.mesh_source import build_mesh

@@ -11,8 +11,7 @@ from mpi4py import MPI
 
 from fracsim.mesh.domain import distribute
 from fracsim.meshes.data import MeshData
-from fracsim.meshes.random_points.outline import Outline
-from fracsim.meshes.random_points.points import scatter
+from fracsim.meshes.random_points.points import Outline, scatter
 from fracsim.meshes.sizing import SizeField
 from fracsim.meshes.topology import boundary_facets, facet_groups_on_planes, orient_cells
 from fracsim.scene import Scene, build_scene_on

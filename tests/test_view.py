@@ -28,8 +28,7 @@ from mpi4py import MPI
 
 from fracsim.deformable_run import run_study
 from fracsim.errors import InputError
-from fracsim.report.view_data import PackedRun
-from fracsim.report.view_page import ViewServer, page_text, write_view
+from fracsim.report.view_page import PackedRun, ViewServer, page_text, write_view
 from fracsim.study.reader import load_study
 from programs import Chromium
 from support.exported import dropped_bar

@@ -15,8 +15,7 @@ import numpy as np
 from ..data import Indices, Points
 from ..sizing import SizeField
 from ..topology import Floats
-from .outline import Outline
-from .points import scatter
+from .points import Outline, scatter
 
 
 class GmshElement(IntEnum):

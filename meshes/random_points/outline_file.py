@@ -12,8 +12,7 @@ from ..file_text import decode_text
 from ..parameters import check_extent, require_affordable, require_positive
 from ..plain_files import unreadable_reason
 from ..topology import Floats, boundary_facets, signed_measures
-from .outline import Outline
-from .points import scatter
+from .points import Outline, scatter
 
 
 @dataclass(frozen=True)

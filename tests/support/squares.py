@@ -6,7 +6,7 @@ import numpy as np
 
 from fracsim.meshes import BUILDERS
 from fracsim.meshes.data import Indices, MeshData, Points
-from fracsim.meshes.random_points.outline import Outline, delaunay
+from fracsim.meshes.random_points.points import Outline, delaunay
 from fracsim.meshes.topology import boundary_facets, facet_groups_on_planes, orient_cells
 
 KINDS = ("structured", "alternating", "rotated", "unstructured")
