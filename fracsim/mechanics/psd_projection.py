@@ -80,6 +80,7 @@ def plain_psd_correction(A: Values, tolerance: float, factor: float, C: Values, 
     eigenvalues, vectors = np.linalg.eigh(A)
     corrected = eigenvalues[:, 0] < -tolerance * eigenvalues.mean(axis=1)
     negative = np.where(corrected[:, None], np.minimum(eigenvalues, 0.0), 0.0)
+    # A + C = V (L - k min(L, 0)) V^T: eigenvalues below 0 become 0 with k = 1, their absolute values with k = 2.
     C[:] = -factor * (vectors * negative[:, None]) @ vectors.transpose(0, 2, 1)
     nonzero[:] = negative.any(axis=1)
 

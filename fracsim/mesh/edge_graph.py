@@ -185,6 +185,7 @@ class EdgeGraph:
         if self.domain.comm.size == 1:
             return flags
         self._shared.array[:] = flags
+        # DOLFINx adds at the owner or inserts, and has no logical or: a sum above 0 is one.
         self._shared.scatter_reverse(la.InsertMode.add)
         self._shared.scatter_forward()
         return self._shared.array > 0

@@ -91,9 +91,11 @@ class DirectSolver:
         """Measure the cost of the last factorisation, and whether the tangent is positive definite (collective)."""
         # The preconditioner of the KSP may be another one, which corrects for a coupling beside K (coupled_nodes).
         factors, entries = self.pc.getFactorMatrix(), ksp.getOperators()[1].getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)
+        # RINFOG(3) of MUMPS: floating-point operations of the elimination.
         operations = factors.getMumpsRinfog(3)
         self.equivalent_iterations = operations / (self._policy.flops_per_iteration * entries["nz_used"])
         self.trial_iterations = self._policy.tangents_on_trial * self.equivalent_iterations
+        # INFOG(12): K = L D L^T has as many negative eigenvalues as D has negative pivots (Sylvester's law of inertia).
         negative_pivots = factors.getMumpsInfog(12)
         self.is_positive = not self._symmetric or negative_pivots == 0
 

@@ -63,6 +63,7 @@ class LinearStepCG:
         self._options = PetscOptionSet(FISCHER_OPTIONS)
         ksp.setOptionsPrefix(self._options.prefix)
         ksp.setType("cg")
+        # The tolerance is on the forces r; PETSc would test the norm of M r.
         ksp.setNormType(PETSc.KSP.NormType.UNPRECONDITIONED)
         ksp.setFromOptions()
         ksp.setConvergenceHistory(max_iterations + 1, reset=True)
@@ -77,6 +78,7 @@ class LinearStepCG:
             Whether CG says that it is solved. `residual_norm` is |b - A x|, which CG's recursion may fall below.
         """
         ksp = self._ksp
+        # PETSc would set the preconditioner up again for each new tangent.
         pc.setReusePreconditioner(True)
         ksp.setPC(pc)
         ksp.setOperators(A, K)
@@ -266,7 +268,7 @@ class LinearSolver:
         self.operators.assemble(eigenvalue_floor)
         self._tell_of_last_solve()
         if tangent.low_rank_updates and self.ksp.getType() == "preonly":
-            # Factors leave out the low-rank updates.
+            # Factors leave out the low-rank updates: they are a preconditioner, and no direct solver.
             self.ksp.setType("gmres")
         if self.direct.serves:
             self.direct.update(self.ksp, self.operators)

@@ -167,6 +167,7 @@ class AppliedPreconditioner:
         if deflation is None or deflation.base_pc is not base:
             return
         if deflation.update_operator(operators.matrix):
+            # The two-level preconditioner applies this one as it is.
             self.pc.setReusePreconditioner(True)
             renew_smoothers(self.pc)
             self.serving = deflation.pc
