@@ -15,7 +15,7 @@ DOCKERFILE, APPTAINER = (ROOT / "Dockerfile").read_text(), (ROOT / "apptainer.de
 # names that conda-forge gives packages of PyPI
 CONDA_NAMES = {
     "gmsh": "python-gmsh", "matplotlib": "matplotlib-base", "dolfinx-solver-real": "fenics-dolfinx",
-    "mujoco-core": "mujoco-python", "usd-core": "openusd",
+    "isal": "python-isal", "mujoco-core": "mujoco-python", "usd-core": "openusd",
 }  # fmt: skip
 
 

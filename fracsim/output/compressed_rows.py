@@ -6,20 +6,20 @@ compressed bytes only, and writes them. Chunks do not depend on the number of ra
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from isal import isal_zlib
 from mpi4py import MPI
 
 from ..mesh.parallel import RowRouting, gather
 
 Ints = npt.NDArray[np.int64]
 ROWS_PER_CHUNK = 1 << 15
-# of zlib; higher levels take longer and save 3 %
+# of zlib streams; higher levels take longer and save 3 %
 COMPRESSION_LEVEL = 1
 
 
@@ -42,10 +42,15 @@ class CompressedField:
     chunks: list[bytes] = field(default_factory=list)
 
 
+def deflate(data: npt.NDArray[Any] | bytes) -> bytes:
+    """Zlib stream of the bytes of a contiguous array, by ISA-L: an eighth of the time of zlib's own, 1 % longer."""
+    return bytes(isal_zlib.compress(data, COMPRESSION_LEVEL))
+
+
 def compress_chunk(values: npt.NDArray[Any]) -> bytes:
     """Bytes of a chunk after the filters shuffle and deflate of HDF5: a zlib stream of its byte planes."""
     planes = values.reshape(-1).view(np.uint8).reshape(-1, values.itemsize).T
-    return zlib.compress(np.ascontiguousarray(planes), COMPRESSION_LEVEL)
+    return deflate(np.ascontiguousarray(planes))
 
 
 class RowCompressor:

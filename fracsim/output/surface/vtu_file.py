@@ -7,7 +7,6 @@ reads and writes the same format: https://docs.vtk.org/en/latest/vtk_file_format
 from __future__ import annotations
 
 import sys
-import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ import numpy.typing as npt
 
 from ...mesh.split_surface.surface_numbering import SurfaceNumbering
 from ...meshes.plain_files import create
-from ..compressed_rows import COMPRESSION_LEVEL, RowCompressor
+from ..compressed_rows import RowCompressor, deflate
 from ..fields_file import TENSOR_COMPONENTS, pad_to_3d
 
 Ints = npt.NDArray[np.integer]
@@ -30,10 +29,6 @@ ROWS_PER_BLOCK = 1 << 13
 _TRIANGLE, _LINE = 5, 3
 _TYPE_NAMES = {"f4": "Float32", "f8": "Float64", "i4": "Int32", "i8": "Int64", "u1": "UInt8"}
 _SECTIONS = ("PointData", "CellData", "Points", "Cells")
-
-
-def _compress_block(values: npt.NDArray[Any]) -> bytes:
-    return zlib.compress(np.ascontiguousarray(values), COMPRESSION_LEVEL)
 
 
 @dataclass(frozen=True)
@@ -101,7 +96,7 @@ class CompressedGrid:
         data, field_data = list[bytes](), ""
         if self.origins:
             text = "".join(f"{name}\0" for name in self.origins).encode()
-            data += _with_sizes([zlib.compress(text)], len(text) + 1, len(text))
+            data += _with_sizes([deflate(text)], len(text) + 1, len(text))
             field_data = (
                 f'    <FieldData>\n      <Array type="String" Name="origins" NumberOfTuples="{len(self.origins)}" '
                 'format="appended" offset="0"/>\n    </FieldData>\n'
@@ -157,7 +152,7 @@ class GridCompressor:
 
     def _compressor(self, numbers: npt.NDArray[np.int64]) -> RowCompressor:
         comm = self._numbering.comm
-        return RowCompressor(comm, numbers, ROWS_PER_BLOCK, compress=_compress_block, fill_last=False)
+        return RowCompressor(comm, numbers, ROWS_PER_BLOCK, compress=deflate, fill_last=False)
 
     def __call__(
         self, points: Rows, point_fields: dict[str, Rows], element_fields: dict[str, Rows], origins: Iterable[str] = ()
