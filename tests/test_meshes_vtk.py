@@ -386,7 +386,7 @@ def test_a_file_that_crashes_the_reader_is_a_message(tmp_path: Path) -> None:
         read_mesh(tmp_path / "bad.exo")
 
 
-@pytest.mark.parametrize("mode", ["ascii", "binary", "raw", "base64", "zlib", "lzma"])
+@pytest.mark.parametrize("mode", ["ascii", "binary", "raw", "base64", "zlib", "lz4", "lzma"])
 @pytest.mark.parametrize("ending", ["vtu", "vtp"])
 @pytest.mark.parametrize("wide", [False, True])
 def test_xml_that_declares_too_few(tmp_path: Path, mode: str, ending: str, wide: bool) -> None:
@@ -404,7 +404,7 @@ def test_xml_that_declares_too_few(tmp_path: Path, mode: str, ending: str, wide:
     writer.SetInputConnection((skin if ending == "vtp" else source).GetOutputPort())
     writer.SetDataMode({"ascii": 0, "binary": 1}.get(mode, 2))
     writer.SetEncodeAppendedData(mode == "base64")
-    writer.SetCompressorType({"zlib": 2, "lzma": 3}.get(mode, 0))
+    writer.SetCompressorType({"zlib": 1, "lz4": 2, "lzma": 3}.get(mode, 0))
     writer.SetHeaderType(64 if wide else 32)
     path = tmp_path / f"part.{ending}"
     writer.SetFileName(str(path))

@@ -14,6 +14,7 @@ from typing import Any
 from xml.etree import ElementTree
 
 import h5py
+import meshio
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -114,6 +115,21 @@ def test_the_summary_is_complete(output: Output) -> None:
     assert summary["ranks"] == 1 and summary["peak_memory_MiB"] > 10 and summary["wall"] > 0
     assert summary["cpu"] > 0  # threads may make it more than the wall time
     assert (summary["nodes"], summary["cells"]) == ((20, 24) if "bar" in output.study.title else (27, 32))
+
+
+def test_meshio_reads_the_fields(output: Output) -> None:
+    """A reader that shares no code with ours: cells, positions and displacements of all frames."""
+    with (
+        h5py.File(output.folder / "fields.h5") as file,
+        meshio.xdmf.TimeSeriesReader(output.folder / "fields.xdmf") as series,
+    ):
+        points, cells = series.read_points_cells()
+        frames = sorted(file["frames"])
+        assert series.num_steps == len(frames) > 1
+        assert np.array_equal(points, file["points"]) and np.array_equal(cells[0].data, file["cells"])
+        for k, name in enumerate(frames):
+            _, point_data, _ = series.read_data(k)
+            assert np.array_equal(point_data["displacement"], file["frames"][name]["displacement"])
 
 
 def test_the_strip_tears(output: Output) -> None:

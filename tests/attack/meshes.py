@@ -163,7 +163,7 @@ def _write_with_vtk(top: Path, box: meshio.Mesh, surface: meshio.Mesh) -> None:
             mode, writer.SetDataModeToAppended
         )()
         writer.SetEncodeAppendedData(mode == "zlib")
-        writer.SetCompressorType({"zlib": 2, "lzma": 3}.get(mode, 0))  # vtkXMLWriter::CompressorType
+        writer.SetCompressorType({"zlib": 1, "lzma": 3}.get(mode, 0))  # vtkXMLWriter::CompressorType
         writer.SetInputData(data)
         writer.SetFileName(str(_folder(top, name) / name))
         writer.Write()
