@@ -21,7 +21,6 @@ from .output.summary import ResourceMeter, irregular_event_text
 if TYPE_CHECKING:
     from .output.contact_checks import (
         IntersectionMonitor,
-        ObstacleContact,
         ObstacleContactMonitor,
         ObstacleOverlapMonitor,
         SelfContactTerm,
@@ -165,15 +164,14 @@ def _obstacle_monitors(scene: Scene) -> tuple[ObstacleContactMonitor | None, Obs
     obstacles = scene.study.obstacle
     if not obstacles:
         return None, None
-    from .contact.rigid_obstacles import VerletRigidObstacles
+    from .contact.penalty_obstacle_pairs import VerletRigidObstacles
+    from .contact.rigid_obstacles import RigidObstacles
     from .output.contact_checks import ObstacleContactMonitor, ObstacleOverlapMonitor
 
-    terms = [term for term in scene.balance.terms if term.name in ("obstacles", "solids")]
-    contact_monitor = ObstacleContactMonitor(scene.domain, cast("list[ObstacleContact]", terms))
-    motions = [term for term in scene.balance.terms if isinstance(term, VerletRigidObstacles)]
-    if not motions or len(obstacles) == 1:
-        return contact_monitor, None
-    return contact_monitor, ObstacleOverlapMonitor(motions[0])
+    (motion,) = (term for term in scene.balance.terms if isinstance(term, RigidObstacles))
+    contact_monitor = ObstacleContactMonitor(scene.domain, motion.contacts)
+    moves_freely = isinstance(motion, VerletRigidObstacles) and len(obstacles) > 1
+    return contact_monitor, ObstacleOverlapMonitor(motion) if moves_freely else None
 
 
 def _interpenetration_monitor(study: Study) -> InterpenetrationMonitor | None:

@@ -101,7 +101,8 @@ def test_a_point_in_an_obstacle_is_pushed_straight_out_of_it(along: bool) -> Non
     )
     assert found.energy == np.inf and found.potential == np.inf
     assert (found.normal[:, 0] == 0).all() and found.normal[0, 1] > 1e150 and 0 < found.normal[1, 1] < 1e8
-    assert not found.stiffness[0].any() and found.stiffness[1, 1, 1] > 0
+    stiffness = found.tangent(exact=False)
+    assert not stiffness[0].any() and stiffness[1, 1, 1] > 0
     facets = ContactFacets(np.array([[0, 1]]), np.array([0.2]), 1e-4)
     inner, stored, _ = evaluate_facets(
         facets, PosedShape(Sphere(0.1, dim=2), Pose.at_point(np.array([0.4, -0.05]))), x, BARRIER

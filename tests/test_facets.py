@@ -14,10 +14,16 @@ from fracsim.contact.closest_point import find_closest_points, minimise_on_simpl
 from fracsim.contact.contact_surface import nodal_stiffness
 from fracsim.contact.facet_contact import ContactFacets, FacetForces, add_facet_friction, evaluate_facets, merge_forces
 from fracsim.contact.laws import Barrier, CoulombFriction
-from fracsim.contact.node_contact import ContactForces, evaluate_points, lag_contact, no_contact
+from fracsim.contact.node_contact import (
+    ContactForces,
+    PoseCoupling,
+    contact_wrench,
+    evaluate_points,
+    lag_contact,
+    no_contact,
+)
 from fracsim.contact.obstacle_term import ObstacleTerm
 from fracsim.contact.pose import Pose, PosedShape, rotation_derivative
-from fracsim.contact.pose_derivatives import PoseCoupling, contact_wrench
 from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylinder, Shape, Sphere
 from fracsim.contact.step_limit import safe_motion_fractions
 from fracsim.mesh.split_surface.closed_surface import build_split_surface
@@ -338,7 +344,7 @@ def test_forces_before_an_obstacle_that_spins_and_rubs(name: str) -> None:
     np.testing.assert_allclose(on.gradient, by_energy, atol=1e-5 * abs(on.gradient).max())
     # what is left of the points once the pose has given way is a potential that goes up: CG may solve with it
     rough, C = positive.mixed_hessian(), np.linalg.inv(positive.derivatives().hessian + 1e-6 * np.eye(p))
-    K = block_diag(*found.stiffness)
+    K = block_diag(*found.tangent(exact=False))
     for of, block in zip(np.searchsorted(found.points, inner.corners), inner.stiffness, strict=True):
         at = (d * of[:, None] + np.arange(d)).reshape(-1)
         K[np.ix_(at, at)] += block

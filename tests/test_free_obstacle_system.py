@@ -9,10 +9,10 @@ import numpy.typing as npt
 import pytest
 
 from fracsim.contact.laws import Barrier
+from fracsim.contact.node_contact import mixed_pose_hessian
 from fracsim.contact.obstacle import RigidObstacle
 from fracsim.contact.obstacle_pairs import ObstaclePair
 from fracsim.contact.pose import Pose
-from fracsim.contact.pose_derivatives import mixed_pose_hessian
 from fracsim.contact.rigid_pose import FreeRigidObstacles
 from fracsim.contact.shapes import Capsule, RoundedBox, RoundedCylinder, Shape, Sphere
 from support.scenes import Scene, Walk, each_step, make_scene, march

@@ -12,7 +12,7 @@ import pytest
 from pydantic import ValidationError
 
 from fracsim.contact.obstacle_term import ObstacleTerm
-from fracsim.contact.rigid_obstacles import VerletRigidObstacles
+from fracsim.contact.penalty_obstacle_pairs import VerletRigidObstacles
 from fracsim.contact.rigid_pose import FreeRigidObstacles
 from fracsim.errors import InputError
 from fracsim.output.contact_checks import ObstacleOverlapMonitor

@@ -11,7 +11,7 @@ import pytest
 import pyvista
 from mpi4py import MPI
 
-from fracsim.contact.obstacle_tessellation import ObstacleTessellation
+from fracsim.contact.obstacle import tessellate_obstacle
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.shapes import HalfSpace, Sphere
 from fracsim.deformable_run import Run
@@ -113,19 +113,20 @@ def test_a_plane_is_a_slab_behind_it_near_the_body(dim: int) -> None:
     n = direction / np.linalg.norm(direction)
     lower, upper = np.full(dim, 2.0), np.full(dim, 3.0)
     placed = PosedShape(HalfSpace(tuple(direction)), Pose.at_point(point))
-    drawn = ObstacleTessellation(placed, lower, upper)(placed)
+    points, triangles, segments = tessellate_obstacle(placed, lower, upper)
+    points = placed.pose.points_to_space(points)
     side = 2 * np.sqrt(dim)
-    height = (drawn.points - point) @ n
+    height = (points - point) @ n
     assert height.max() == pytest.approx(0, abs=1e-12) and height.min() == pytest.approx(-0.01 * side)
-    face = drawn.points[height > -1e-9]
+    face = points[height > -1e-9]
     middle = (lower + upper) / 2
     np.testing.assert_allclose(face.mean(axis=0), middle - (middle - point) @ n * n, atol=1e-12)
-    x = drawn.points[drawn.segments if dim == 2 else drawn.triangles]
+    x = points[segments if dim == 2 else triangles]
     measure = np.linalg.det(x).sum() / (2 if dim == 2 else 6)
     assert measure == pytest.approx(0.01 * side**dim)
 
 
 def test_a_hollow_disk_is_not_filled() -> None:
     placed = PosedShape(Sphere(0.5, 2, hollow=True), Pose.at_point(np.zeros(2)))
-    drawn = ObstacleTessellation(placed, np.zeros(2), np.ones(2))(placed)
-    assert len(drawn.triangles) == 0 and len(drawn.segments) == 48
+    _, triangles, segments = tessellate_obstacle(placed, np.zeros(2), np.ones(2))
+    assert len(triangles) == 0 and len(segments) == 48

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
+from fracsim.contact.penalty_obstacle_pairs import VerletRigidObstacles
 from fracsim.contact.pose import Pose, PosedShape
-from fracsim.contact.rigid_obstacles import VerletRigidObstacles
 from fracsim.scene import Scene
 from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import Walk, each_step, make_scene

@@ -8,8 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.linalg import expm
 
-from fracsim.contact.pose import Pose, PosedShape, rotation_derivative, rotation_second_derivative
-from fracsim.contact.pose_derivatives import point_jacobian
+from fracsim.contact.pose import Pose, PosedShape, point_jacobian, rotation_derivative, rotation_second_derivative
 from fracsim.contact.shapes import Shape
 from support.laws import rotation
 from support.shapes import ALL, Values, differences, points
@@ -96,8 +95,6 @@ def test_derivatives_by_the_pose(shape: Shape) -> None:
     h, steps = 1e-6, np.eye(p)
     by_pose = np.stack([(after(h * e).distance(x) - after(-h * e).distance(x)) / (2 * h) for e in steps], axis=-1)
     np.testing.assert_allclose(gradient_by_pose(placed, x), by_pose, atol=1e-8)
-    mixed = np.stack([(after(h * e).normal(x) - after(-h * e).normal(x)) / (2 * h) for e in steps], axis=-1)
-    np.testing.assert_allclose(placed.mixed_hessian(x), mixed, atol=1e-6)
     np.testing.assert_allclose(placed.normal(x), differences(placed.distance, x), atol=1e-8)
     np.testing.assert_allclose(placed.curvature(x), differences(placed.normal, x), atol=1e-6)
 

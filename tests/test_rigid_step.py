@@ -10,10 +10,9 @@ import pytest
 from scipy.linalg import expm
 
 from fracsim.contact.laws import Barrier, CoulombFriction
-from fracsim.contact.node_contact import evaluate_points, lag_contact
+from fracsim.contact.node_contact import PoseCoupling, PoseDerivatives, evaluate_points, lag_contact
 from fracsim.contact.obstacle import FreeObstacle
 from fracsim.contact.pose import PosedShape, left_jacobian, left_jacobian_derivative
-from fracsim.contact.pose_derivatives import PoseCoupling, PoseDerivatives
 from fracsim.contact.rigid_body import RigidStep, RigidSystem, SystemDerivatives
 from fracsim.contact.shapes import Sphere, TranslatedShape
 from fracsim.forms.schemes import BackwardEuler, GeneralizedAlpha, Newmark, Scheme

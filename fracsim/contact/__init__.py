@@ -5,10 +5,11 @@ with itself, is computed by ipctk.
 
 Terms of the balance:
 
-    rigid_obstacles       motion of all obstacles; groups of obstacles, and what they did to the body in a step
+    rigid_obstacles       motion of all obstacles; groups of obstacles, what they did to the body in a step, contact of
+                          the body as they see it, and their tessellation for output
     rigid_pose            free obstacles in implicit steps: poses as unknowns of Newton's method
     obstacle_term         the body before analytic obstacles; contact_state: points, facets and obstacles in a step
-    mesh_obstacle_term    the body before triangle-mesh obstacles
+    mesh_obstacle_term    the body before triangle-mesh obstacles; pairs of these
     self_contact          a body with itself, and its fragments with one another; its surface as edges break
     penalty_obstacles     the body before analytic obstacles in explicit steps
     penalty_contact       the body with itself, and before triangle-mesh obstacles, in explicit steps
@@ -16,8 +17,8 @@ Terms of the balance:
 Laws and geometry:
 
     laws                  barrier, penalty, mean force over a step, Coulomb friction
-    pose, obstacle        rigid poses and distances to shapes; obstacles, their motion and overlaps
-    obstacle_tessellation  tessellation of obstacles for output
+    pose                  rigid poses and distances to shapes
+    obstacle              obstacles, their motion, overlaps and tessellation
     shape_base, shapes    signed distances, moments and tessellations of half space, sphere, capsule, box, cylinder
     shape_kernels         compiled distances, closest points of facets and their energy; the modules beside it are plain
     triangle_mesh_shape   closed surfaces of triangles
@@ -28,7 +29,7 @@ Laws and geometry:
 Points and facets before analytic obstacles:
 
     contact_surface       points of the split surface; retraction of new crack faces; cells that show theirs
-    node_contact          forces on points, lagged friction
+    node_contact          forces on points, lagged friction, derivatives by the pose of an obstacle
     closest_point, facet_contact  forces on facets between their nodes
     step_limit            conservative advancement, first guesses, motion of obstacles in a step
 
@@ -45,9 +46,8 @@ Surfaces with ipctk:
 Free obstacles:
 
     rigid_body            states of motion; incremental potential of poses
-    pose_derivatives      derivatives of contact by a pose; contact of the body as the obstacles see it
-    obstacle_pairs, mesh_pairs  contact between obstacles: pairs with an analytic one, pairs of triangle meshes
-    penalty_obstacle_pairs  both in explicit steps
+    obstacle_pairs        contact between obstacles of which one at least is analytic
+    penalty_obstacle_pairs  contact between obstacles, and motion of free ones, in explicit steps
 
 Modules without DOLFINx and MPI: laws, closest_point, node_contact, obstacle, pose, shape_base, shapes,
 triangle_mesh_shape. Every rank evaluates its own points.

@@ -33,17 +33,6 @@ Flags = npt.NDArray[np.bool_]
 PATCH_MOTION = 3.0
 
 
-class PatchContact:
-    """Contact of a term around few nodes (PatchContactTerm)."""
-
-    def __init__(self, term: SelfContact) -> None:
-        self._term = term
-
-    def patch(self, nodes: Ints) -> SelfContactPatch:
-        """Contact of nodes (k,), by their ascending global numbers, that move from the current u (collective)."""
-        return SelfContactPatch(self._term, nodes)
-
-
 class SelfContactPatch:
     """Potential of the contact of k nodes that move by w (k, d), m, with all others fixed (ContactPatch).
 
@@ -57,14 +46,12 @@ class SelfContactPatch:
     def __init__(self, term: SelfContact, nodes: Ints) -> None:
         """Choose the part of the surface around nodes (k,), by their ascending global numbers (collective)."""
         surface, law, x = term.surface.current, term.surface.law, term.end_positions()
-        all_pairs = surface.pairs
-        assert isinstance(all_pairs, IpcPairs)
         self._level, self._max_motion = term.level, PATCH_MOTION * law.distance
         all_weights = _columns(surface.point_map.weights, term.surface.node_numbers, nodes)
         moves, elements = np.diff(all_weights.indptr) > 0, surface.remaining_elements()
-        near, start = all_pairs.points_near(x, moves, self._max_motion), term.start_positions
+        near, start = term.pairs.points_near(x, moves, self._max_motion), term.start_positions
         if term.friction is not None and start is not None:
-            near |= all_pairs.points_near(start, moves, 0.0)
+            near |= term.pairs.points_near(start, moves, 0.0)
         self.points, numbers = np.unique(elements[near[elements].any(axis=1)], return_inverse=True)
         self._start, self._weights = x[self.points], all_weights[self.points]
         self._dof_weights = kron(self._weights, np.eye(x.shape[1]), format="csr")

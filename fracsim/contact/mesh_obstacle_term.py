@@ -1,10 +1,10 @@
-"""Term of the balance for contact of a body with triangle-mesh obstacles, held or driven.
+"""Contact of triangle-mesh obstacles with the body, a term of the balance, and with one another.
 
 As for contact of a body with itself (self_contact), each rank holds the split surface and has a share of the pairs in
 contact. The points of an obstacle are no unknowns; they are where its motion says at the end of a step. Nothing is
-gathered while bounding boxes of body and obstacles are apart.
+gathered while bounding boxes of body and obstacles are apart. Barrier and lagged friction are those of ipctk.
 
-Equations: docs/theory.md#contact.
+Equations: docs/theory.md#contact, docs/theory.md#rigid-obstacles.
 """
 
 from __future__ import annotations
@@ -16,33 +16,40 @@ from typing import cast
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
+from scipy.sparse import csr_matrix
 
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
 from ..mesh.parallel import sum_over_ranks
 from .clearance import Clearance
+from .ipc_pairs import IpcPairs
 from .ipc_surface import SelfContactLaw
+from .laws import ObstacleLaw
 from .mesh_obstacles import (
+    MESH,
     AllMeshPairs,
     MeshContactSurface,
     MeshFriction,
     MeshObstacle,
     MeshObstaclePairs,
+    free_fraction_on_arcs,
 )
-from .pose import Pose
-from .pose_derivatives import PoseContact, PoseDerivatives, closing_distance, point_jacobian, point_set_derivatives
-from .rigid_obstacles import ObstacleGroup, RigidObstacles
+from .node_contact import PoseDerivatives, point_set_derivatives
+from .obstacle import RigidObstacle
+from .obstacle_pairs import Numbers, PairDerivatives, PosedObstacles
+from .pose import Pose, point_jacobian
+from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 from .sample_points import IpcFriction
-from .self_contact import Pattern, SelfContact, mean_velocities
+from .self_contact import Pattern, SurfaceContact, mean_velocities
 from .step_limit import PoseMotion, stop_before_meshes
-from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
+from .triangle_mesh_shape import StackedMeshes, TriangleMeshShape, refine_triangles
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
-class MeshObstacleTerm(SelfContact):
+class MeshObstacleTerm(SurfaceContact):
     """Triangle-mesh obstacles that the body cannot penetrate.
 
     Attributes:
@@ -78,7 +85,8 @@ class MeshObstacleTerm(SelfContact):
         self._place_meshes(self.group.poses)
         super().__init__(domain, u, law, partial(MeshContactSurface, obstacles=self._meshes, comm=domain.comm))
         self.clearance = Clearance(domain, self._meshes, law.distance, self.surface.following_points)
-        self.parts, self.pose_contact = (self.surface, self.group, self.clearance), PoseContact(self)
+        self.pose_contact = PoseContact(self)
+        self.parts = self.surface, self.group, self.clearance, self.pose_contact
 
     # --- surface and obstacles ---
 
@@ -136,7 +144,7 @@ class MeshObstacleTerm(SelfContact):
                 self.surface.current,
             )
             self._place_meshes(self.group.start_poses)
-            surface.extend_faces(nodal)
+            self._extend_faces(level.u_n, nodal)
             self.start_positions = x = surface.point_map(nodal)
             self._start_gradients = [pairs.full_gradient(x)[len(x) :] for pairs in self.pairs.pairs]
             if any(mesh.friction for mesh in self._meshes):
@@ -175,15 +183,7 @@ class MeshObstacleTerm(SelfContact):
             mean_gradient = end_weight * gradient + (1 - end_weight) * start_gradients[number]
             self.group.work[number] = float(np.vdot(mean_gradient, motion)) + friction_work
 
-    def damping_forces(self) -> None:
-        """Return None: dissipation is summed step by step (`step_work`)."""
-
     # --- step limits ---
-
-    def max_step_fraction(self, change: Values) -> float:
-        """Fraction of a correction of u (owned dofs,), m, and free poses without a collision (collective)."""
-        moving = self.group.correction_motions()
-        return self.safe_fraction(self.end_displacement, np.divide(change, self.level.fraction), moving)
 
     def safe_fraction(self, u: Values, change: Values | None, moving: Mapping[int, PoseMotion]) -> float:
         """Fraction of motions of the body and of obstacles without a collision (collective).
@@ -232,7 +232,7 @@ class MeshObstacleTerm(SelfContact):
         start, end = self.surface.positions(u_n), self.surface.positions(u_end)
         return self.pairs.moving_free_fraction(start, end, self.group.start_poses) == 1
 
-    # --- contact as the obstacles see it (pose_derivatives.PoseContact) ---
+    # --- contact as the obstacles see it (PoseContact) ---
 
     def rank_wrench(self, index: int) -> Values:
         """(6,) force and moment on an obstacle, of this rank's pairs, N and N m (collective)."""
@@ -289,19 +289,11 @@ class MeshObstacleTerm(SelfContact):
             return self.clearance.least_gap(number, self.end_displacement, self.group.posed)
         return self.pairs.pairs[number].gap(self.end_positions())
 
-    def closing_distances(self) -> list[float]:
-        """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
-
-        It is that of the velocities at the start, without any contact.
-        """
-        if self.is_far():
-            return [0.0] * len(self.group.obstacles)
-        x, v = self.end_positions(), self.surface.nodal_values(self._start_velocity)
-        motion, result = self.group.bodies.dt * (self.surface.current.point_map.weights @ v), []
-        for pairs, start_pose in zip(self.pairs.pairs, self.group.start_poses, strict=True):
-            force = -sum_over_ranks(self.comm, pairs.body_gradient(x))
-            result.append(closing_distance(start_pose, pairs.mesh.pose, x, force, motion))
-        return result
+    def pushed_points(self) -> list[tuple[Values, Values, Values]]:
+        """(n, 3) points of the body before each obstacle, m, normal forces, N, start velocities, m/s."""
+        x, nodal = self.end_positions(), self.surface.nodal_values(self._start_velocity)
+        velocity = self.surface.current.point_map.weights @ nodal
+        return [(x, -sum_over_ranks(self.comm, pairs.body_gradient(x)), velocity) for pairs in self.pairs.pairs]
 
 
 def build_mesh_obstacles(group: ObstacleGroup, edge: float) -> list[MeshObstacle]:
@@ -314,3 +306,100 @@ def build_mesh_obstacles(group: ObstacleGroup, edge: float) -> list[MeshObstacle
         name, rotates = f"obstacle.{number}: {obstacle.name}", obstacle.free or obstacle.spin is not None
         result.append(MeshObstacle(name, points, triangles, obstacle.friction, rotates=rotates))
     return result
+
+
+# --- two triangle meshes ---
+
+
+class MeshPair:
+    """A pair of triangle-mesh obstacles, as obstacle_pairs.BarrierPair."""
+
+    def __init__(
+        self, numbers: Numbers, obstacles: Mapping[int, RigidObstacle], law: ObstacleLaw, stiffness: float
+    ) -> None:
+        """`obstacles`: by their numbers; `law`: distance and friction; `stiffness`: of the barrier, Pa."""
+        self.numbers, self._law, members = numbers, law, [obstacles[number] for number in numbers]
+        self._meshes = StackedMeshes(*(obstacle.shape for obstacle in members))
+        self._coefficient = max(obstacle.friction for obstacle in members)
+
+        def build(distance: float) -> IpcPairs:
+            return IpcPairs(
+                self._meshes.points, self._meshes.triangles, distance=distance, stiffness=stiffness,
+                friction=self._coefficient, patch=self._meshes.patches,
+            )  # fmt: skip
+
+        self._distance, self._pairs = law.barrier.width, build(law.barrier.width)
+        start = self._meshes.positions([obstacle.posed_at(0.0).pose for obstacle in members])
+        if (gap := self._pairs.min_gap(start)) < self._distance:
+            self._distance = MESH.gap_share * gap
+            self._pairs = build(self._distance)
+        self._friction: IpcFriction | None = None
+        self._start: Values = start  # (n, 3) points of both at the start of the step, m
+
+    def _near_positions(self, posed: PosedObstacles) -> Values | None:
+        """(n, 3) points of both obstacles, m; None: they are far, and were so at the start of the step."""
+        max_gap = self._distance if self._friction is None else np.inf
+        return self._meshes.near_positions([posed[number].pose for number in self.numbers], max_gap)
+
+    def begin_step(self, motion: RigidObstacles, dt: float, *, time_averaged: bool) -> None:
+        """Begin a step of dt, s: friction is lagged; forces are those of the end of the step, whatever the scheme."""
+        self._friction = None
+        if self._coefficient and (x := self._near_positions(motion.start_posed)) is not None:
+            parts = [(n, x[rows]) for n, rows in zip(self.numbers, self._meshes.rows, strict=True)]
+            velocity = np.concatenate([np.broadcast_to(motion.velocity(n, y), y.shape) for n, y in parts])
+            pressed = self._pairs.gradient(x).any(axis=1)
+            if pressed.any():
+                speed = float(np.linalg.norm(np.ptp(velocity[pressed], axis=0)))
+                slip = dt * max(self._law.sticking_speed, self._law.sticking_ratio * speed)
+                self._start, self._friction = x, self._pairs.lag_friction(x, x, slip)
+
+    def is_open(self, posed: PosedObstacles) -> bool:
+        """Whether the obstacles do not intersect."""
+        return (x := self._near_positions(posed)) is None or not len(self._pairs.intersections(x))
+
+    def energies(self, posed: PosedObstacles) -> tuple[float, float]:
+        """Energy of the barrier, and potential of all forces in the step, J."""
+        if (x := self._near_positions(posed)) is None:
+            return 0.0, 0.0
+        energy = self._pairs.energy(x)
+        return energy, energy + (0.0 if self._friction is None else self._friction.energy(x))
+
+    def derivatives(self, posed: PosedObstacles, *, exact: bool) -> PairDerivatives | None:
+        """Derivatives of the potential by both poses; None: out of contact."""
+        if (x := self._near_positions(posed)) is None:
+            return None
+        gradient = self._pairs.gradient(x)
+        if self._friction is not None:
+            gradient = gradient + self._friction.gradient(x)
+        if not gradient.any():
+            return None
+        H = self._pairs.hessian(x, exact=exact)
+        if self._friction is not None:
+            H = csr_matrix(H + self._friction.hessian(x, exact=exact))
+        energy, first, rows = self.energies(posed)[1], 3 * self._meshes.count, self._meshes.rows
+        dofs = slice(None, first), slice(first, None)
+        arms = [x[part] - posed[number].pose.centre for number, part in zip(self.numbers, rows, strict=True)]
+        by_first, by_second = (
+            point_set_derivatives(energy, gradient[part], H[columns, columns], arm, exact=exact)
+            for part, columns, arm in zip(rows, dofs, arms, strict=True)
+        )
+        J, J_second = (point_jacobian(arm).reshape(arm.size, -1) for arm in arms)
+        return by_first, by_second, np.asarray(J.T @ (H[dofs[0], dofs[1]] @ J_second))
+
+    def dissipated(self, posed: PosedObstacles) -> float:
+        """Energy dissipated by friction in the step, J."""
+        if self._friction is None or (x := self._near_positions(posed)) is None:
+            return 0.0
+        return float(np.vdot(self._friction.gradient(x), x - self._start))
+
+    def safe_fraction(self, first: PoseMotion, second: PoseMotion) -> float:
+        """Fraction of the motions of both that leaves a tenth of each gap."""
+        moving = first, second
+        if not any(q.any() for _, q in moving):
+            return 1.0
+
+        def positions(fraction: float) -> Values:
+            return self._meshes.positions([posed.pose.incremented(fraction * q) for posed, q in moving])
+
+        rotation = max(float(np.linalg.norm(q[3:])) for _, q in moving)
+        return free_fraction_on_arcs(self._pairs.free_fraction, positions, rotation)

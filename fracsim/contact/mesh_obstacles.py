@@ -309,10 +309,6 @@ class AllMeshPairs:
         """Least distance within the barrier, m; infinite where there is none."""
         return min((pairs.contact.min_gap(pairs.with_mesh(x)) for pairs in self._near(x)), default=np.inf)
 
-    def free_fraction(self, x: Values, end: Values) -> float:
-        """Fraction in (0, 1] of the straight motion of the body from x to `end` with obstacles at rest."""
-        return self.moving_free_fraction(x, end, [pairs.mesh.pose for pairs in self.pairs])
-
     def moving_free_fraction(self, x: Values, end: Values, start_poses: Sequence[Pose]) -> float:
         """Fraction of the motions of body and obstacles without a collision; obstacles come from `start_poses`."""
         items = zip(self.pairs, start_poses, strict=True)

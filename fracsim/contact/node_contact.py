@@ -1,4 +1,4 @@
-"""Contact of points of a surface with one obstacle: barrier and lagged friction, forces and second derivatives.
+"""Contact of points of a surface with one obstacle: barrier and lagged friction, with derivatives by points and pose.
 
 Second-order schemes use the curved gap of a step. With the normal n at the end of a motion d from gap g_n to g the
 force of a barrier does the work p n . d instead of p (g - g_n). A point that slides round a sphere would gain the
@@ -9,7 +9,11 @@ difference, about p d . H d / 2 with the curvature H, in every step. The barrier
 Where e is not small beside g, f = g (g + e / 2) / (g + e), which is open wherever g is. The start of the step is taken
 in the frame of the obstacle.
 
-Equations: docs/theory.md#contact-in-a-time-step.
+Points depend on the obstacle through x - c alone, in its frame. With D the energy of a point by its position there, y
+its arm and J = [-1, G(y)] (pose), the derivative by an increment (t, w) is J^T D'. The second derivative is J^T D'' J
+and, of forces D' that rotate with the obstacle, G(D') between t and w and `rotation_second_derivative` in w.
+
+Equations: docs/theory.md#contact-in-a-time-step, docs/theory.md#rigid-obstacles.
 """
 
 from __future__ import annotations
@@ -23,9 +27,19 @@ import numpy as np
 import numpy.typing as npt
 
 from .laws import CoulombFriction, FrictionDirection, GapPotential, TimeAveragedPotential
-from .pose import Pose, PosedShape
+from .pose import (
+    Pose,
+    PosedShape,
+    arm_jacobian,
+    point_jacobian,
+    resultant,
+    rotation_derivative,
+    rotation_second_derivative,
+)
 
 if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
     from .facet_contact import FacetForces
 
 Values = npt.NDArray[np.float64]
@@ -162,11 +176,6 @@ class ContactForces:
         """(k, d, d) positive semi-definite part of `normal_hessian`, N/m."""
         return positive_part(self.normal_hessian)
 
-    @property
-    def stiffness(self) -> Values:
-        """(k, d, d) minus the derivative of all forces, positive semi-definite, N/m."""
-        return self.tangent(exact=False)
-
     def tangent(self, *, exact: bool) -> Values:
         """(k, d, d) minus the derivative of all forces, N/m; positive semi-definite unless `exact`."""
         return (self.normal_hessian if exact else self.normal_stiffness) + self.friction_hessian
@@ -261,3 +270,159 @@ def positive_part(blocks: Values) -> Values:
     is_open = np.all(abs(blocks) < CLOSED_STIFFNESS, axis=(1, 2), keepdims=True)
     values, vectors = np.linalg.eigh(np.where(is_open, blocks, 0.0))
     return np.asarray((vectors * np.maximum(values, 0.0)[:, None, :]) @ vectors.transpose(0, 2, 1))
+
+
+# --- derivatives by the pose of an obstacle ---
+
+
+@dataclass(frozen=True)
+class PoseDerivatives:
+    """Energy of contact of one obstacle, and its derivatives by an increment of the pose.
+
+    Attributes:
+        energy: of barrier and friction, J.
+        gradient: (p,) minus force and moment, N and N m.
+        hessian: (p, p), exact or its positive semi-definite part.
+    """
+
+    energy: float
+    gradient: Values
+    hessian: Values
+
+    @classmethod
+    def none(cls, size: int) -> PoseDerivatives:
+        """Without contact, by p = `size` components."""
+        return cls(0.0, np.zeros(size), np.zeros((size, size)))
+
+    @classmethod
+    def from_array(cls, numbers: Values) -> PoseDerivatives:
+        """From energy, gradient and second derivatives in one row."""
+        p = int(np.sqrt(len(numbers) - 0.75) - 0.5)  # 1 + p + p^2 numbers
+        return cls(float(numbers[0]), numbers[1 : 1 + p], numbers[1 + p :].reshape(p, p))
+
+    def __add__(self, second: PoseDerivatives) -> PoseDerivatives:
+        """Sum of both."""
+        sums = self.energy + second.energy, self.gradient + second.gradient, self.hessian + second.hessian
+        return PoseDerivatives(*sums)
+
+
+class PoseCoupling:
+    """Contact of points with one obstacle, and how it changes with the pose of the obstacle.
+
+    Friction holds the points of the obstacle that were under the points in lagged contact: with other arms Newton's
+    method would creep.
+    """
+
+    def __init__(
+        self, contact: ContactForces, x: Values, pose: Pose, lagged: LaggedContact | None, start: Pose, *, exact: bool
+    ) -> None:
+        """Coupling of points and pose.
+
+        Args:
+            contact: forces on points.
+            x: (n, d) points, m.
+            pose: of the obstacle.
+            lagged: contact at the start of the step.
+            start: pose of the obstacle at the start of the step.
+            exact: whether second derivatives are exact; else they are those of the positive semi-definite part.
+        """
+        self._contact, self._exact, self._arm = contact, exact, x[contact.points] - pose.centre
+        self._jacobian = arm_jacobian(self._arm)
+        self._by_normal = np.asarray(
+            (contact.normal_hessian if exact else contact.normal_stiffness) @ self._jacobian, np.float64
+        )
+        if (facets := contact.facets) is not None:
+            rows = np.searchsorted(contact.points, facets.corners)
+            J = self._jacobian[rows]
+            k, c, d, p = J.shape
+            forces = (facets.hessian if exact else facets.stiffness) @ J.reshape(k, c * d, p)
+            np.add.at(self._by_normal, rows, forces.reshape(J.shape))
+        self._has_friction = lagged is not None and bool(len(lagged.points))
+        if lagged is not None and self._has_friction:
+            self._friction_arm, rotation = self._arm.copy(), pose.rotation @ start.rotation.T
+            rows = np.searchsorted(contact.points, lagged.points)
+            self._friction_arm[rows] = (lagged.obstacle_point - start.centre) @ rotation.T
+            self._friction_jacobian = arm_jacobian(self._friction_arm)
+            self._by_friction = np.asarray(contact.friction_hessian @ self._friction_jacobian, np.float64)
+
+    def mixed_hessian(self) -> Values:
+        """(k, d, p) derivatives of minus the forces on points by an increment of the pose."""
+        result = self._by_normal + self._by_friction if self._has_friction else self._by_normal.copy()
+        if self._exact:
+            result[:, :, self._arm.shape[1] :] += rotation_derivative(self._contact.normal)
+        return result
+
+    def derivatives(self) -> PoseDerivatives:
+        """Derivatives of the energy of contact by the pose."""
+        contact, arm, d = self._contact, self._arm, self._arm.shape[1]
+        gradient = -np.einsum("ndp,nd->p", self._jacobian, contact.normal)
+        hessian = _product(self._jacobian, self._by_normal)
+        if self._exact:  # normal forces rotate with the obstacle
+            mixed = rotation_derivative(-contact.normal).sum(axis=0)
+            hessian[:d, d:] += mixed
+            hessian[d:, :d] += mixed.T
+            hessian[d:, d:] += rotation_second_derivative(-contact.normal, arm).sum(axis=0)
+        if self._has_friction:
+            gradient -= np.einsum("ndp,nd->p", self._friction_jacobian, contact.friction)
+            hessian += _product(self._friction_jacobian, self._by_friction)
+            if self._exact:
+                hessian[d:, d:] += rotation_second_derivative(contact.friction, self._friction_arm).sum(axis=0)
+        return PoseDerivatives(contact.potential, np.asarray(gradient), hessian)
+
+
+def carried_point_derivatives(contact: ContactForces, x: Values, pose: Pose, *, exact: bool) -> PoseDerivatives:
+    """Derivatives of contact of points x (n, d), m, that the obstacle itself carries, by its pose."""
+    arm = x[contact.points] - pose.centre
+    J, d = arm_jacobian(arm), pose.dim
+    hessian = _product(J, contact.tangent(exact=exact) @ J)
+    if exact:
+        hessian[d:, d:] += rotation_second_derivative(-contact.normal, arm).sum(axis=0)
+    # points move by -J q
+    return PoseDerivatives(contact.potential, np.einsum("ndp,nd->p", J, contact.normal), hessian)
+
+
+def mixed_pose_hessian(contact: ContactForces, x: Values, carrier: Pose, second: Pose, *, exact: bool) -> Values:
+    """(p, p) second derivatives of the energy by the poses of a carrier of points and of another obstacle.
+
+    Args:
+        contact: forces on points.
+        x: (n, d) points, m.
+        carrier: pose of the obstacle that carries the points.
+        second: pose of the obstacle before them.
+        exact: whether they are exact; else those of the positive semi-definite part.
+    """
+    points, d = x[contact.points], carrier.dim
+    by_second = contact.tangent(exact=exact) @ arm_jacobian(points - second.centre)
+    if exact:
+        by_second[:, :, d:] += rotation_derivative(contact.normal)
+    return -_product(arm_jacobian(points - carrier.centre), by_second)
+
+
+def point_set_derivatives(
+    energy: float, gradient: Values, blocks: csr_matrix, arm: Values, *, exact: bool
+) -> PoseDerivatives:
+    """Derivatives by the pose of an energy of all points that the obstacle carries.
+
+    Args:
+        energy: J.
+        gradient: (m, d) by the points, N.
+        blocks: (m d, m d) second derivatives by the points, N/m, or their positive semi-definite part.
+        arm: (m, d) of the points about the centre, m.
+        exact: whether the second derivatives are exact.
+    """
+    d, J = arm.shape[1], point_jacobian(arm).reshape(arm.size, -1)
+    hessian = np.asarray(J.T @ (blocks @ J))
+    if exact:
+        hessian[d:, d:] += rotation_second_derivative(gradient, arm).sum(axis=0)
+    return PoseDerivatives(energy, J.T @ gradient.reshape(-1), hessian)
+
+
+def contact_wrench(contact: ContactForces, x: Values, pose: Pose) -> Values:
+    """(p,) force and moment of the body, points x (n, d), on the obstacle about its reference point, N and N m."""
+    return resultant(-(contact.normal + contact.friction), x[contact.points] - pose.centre)
+
+
+def _product(J: Values, values: Values) -> Values:
+    """(p, q) sum of J^T V over n points, J (n, d, p), V (n, d, q)."""
+    n, d, p = J.shape
+    return np.asarray(J.reshape(n * d, p).T @ values.reshape(n * d, values.shape[2]))

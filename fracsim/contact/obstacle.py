@@ -1,4 +1,4 @@
-"""Rigid obstacles: held or driven, and free ones with a mass; their state of motion and their overlaps."""
+"""Rigid obstacles: held or driven, and free ones with a mass; their motion, overlaps, and tessellation for output."""
 
 from __future__ import annotations
 
@@ -9,12 +9,22 @@ from itertools import combinations
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 
 from ..errors import InputError
 from ..mechanics.time_functions import TimeFunction
 from ..meshes.data import AXES
-from .pose import Pose, PosedShape, Values, rotation_derivative, rotation_second_derivative, solve_matrix
-from .shape_base import Shape
+from .pose import (
+    Pose,
+    PosedShape,
+    Values,
+    point_jacobian,
+    rotation_derivative,
+    rotation_second_derivative,
+    solve_matrix,
+)
+from .shape_base import Shape, frame_about, unit_vector
+from .shapes import HalfSpace
 from .triangle_mesh_shape import TriangleMeshShape, penetration_depth, surfaces_intersect
 
 
@@ -243,9 +253,7 @@ class VerletObstacle:
 
     def spring_stiffness(self, x: Values, k: Values, posed: PosedShape) -> Values:
         """(k, k) stiffness by z of springs k (n,), N/m, in any direction at positions x (n, d), m."""
-        arm = x - posed.pose.centre
-        translation = np.broadcast_to(-np.eye(arm.shape[1]), (len(arm), arm.shape[1], arm.shape[1]))
-        J = np.concatenate([translation, rotation_derivative(arm)], axis=2) @ self.body.motion_basis
+        J = point_jacobian(x - posed.pose.centre) @ self.body.motion_basis
         return np.asarray(np.einsum("n,nip,niq->pq", k, J, J))
 
     def max_frequency(self, stiffness: Values, posed: PosedShape) -> float:
@@ -320,3 +328,78 @@ def check_free_obstacles(
             f"obstacle.{numbers[a]}: {obstacles[numbers[a]][0]} moves freely and overlaps {obstacles[numbers[b]][0]} "
             f"at the start, by {max(0.0, depth):.4g} m; move it away or make it smaller"
         )
+
+
+# --- tessellation for output ---
+
+
+@dataclass(frozen=True)
+class SlabPolicy:
+    """Slab that stands for a half space in output.
+
+    Attributes:
+        patch_size: its edge, in diagonals of the body's bounding box.
+        thickness: in its edge, so that it is seen from the side.
+    """
+
+    patch_size: float = 2.0
+    thickness: float = 0.01
+
+
+SLAB = SlabPolicy()
+
+
+type ObstacleTessellation = tuple[Values, npt.NDArray[np.int32], npt.NDArray[np.int32]]
+
+
+def tessellate_obstacle(posed: PosedShape, lower: Values, upper: Values) -> ObstacleTessellation:
+    """Points (n, d), m, in the frame of a shape, triangles (k, 3) and, in 2D, segments (m, 2) around them.
+
+    Of a half space it is a slab near the body.
+
+    Args:
+        posed: the shape at the start.
+        lower: (d,) lower corner of the body's bounding box then, m.
+        upper: (d,) upper corner.
+    """
+    if isinstance(posed.shape, HalfSpace):
+        middle = posed.pose.to_body((lower + upper)[None] / 2)[0]
+        side = SLAB.patch_size * float(np.linalg.norm(upper - lower))
+        points, elements = slab(unit_vector(posed.shape.direction), middle, side)
+    else:
+        points, elements = posed.shape.tessellate()
+    if posed.shape.dim == 2:
+        return points, _fan(posed.shape, len(points)), elements
+    return points, elements, np.empty((0, 2), np.int32)
+
+
+def slab(normal: Values, middle: Values, side: float) -> tuple[Values, npt.NDArray[np.int32]]:
+    """Tessellation of a slab behind the plane n . x = 0.
+
+    Args:
+        normal: (d,) n.
+        middle: (d,) point over the middle of the slab, m.
+        side: edge of the slab, m.
+    """
+    d = len(normal)
+    ranges = [*[[-0.5, 0.5]] * (d - 1), [-SLAB.thickness, 0.0]]
+    corners = np.stack(np.meshgrid(*ranges, indexing="ij"), axis=-1).reshape(-1, d)
+    foot = middle - (middle @ normal) * normal
+    points = foot + side * corners @ frame_about(normal).T
+    if d == 2:
+        order = np.array([0, 2, 3, 1])  # counterclockwise
+        return points[order], np.array([[0, 1], [1, 2], [2, 3], [3, 0]], np.int32)
+    # the number of a corner is the sum of these for its upper coordinates
+    x, y, z = 4, 2, 1
+    squares = [[0, y, x + y, x], [z, x + z, x + y + z, y + z], [0, x, x + z, z], [y, y + z, x + y + z, x + y],
+               [0, z, y + z, y], [x, x + y, x + y + z, x + z]]  # fmt: skip
+    a, b, c, e = np.array(squares, np.int32).T
+    return points, np.concatenate([np.column_stack([a, b, c]), np.column_stack([a, c, e])])
+
+
+def _fan(shape: Shape, count: int) -> npt.NDArray[np.int32]:
+    """(k, 3) fan of triangles over a convex polygon of `count` points; empty for a hollow shape."""
+    if not shape.convex:
+        return np.empty((0, 3), np.int32)
+    second = np.arange(1, count - 1, dtype=np.int32)
+    return np.column_stack([np.zeros_like(second), second, second + 1])

@@ -20,23 +20,25 @@ import numpy as np
 import numpy.typing as npt
 
 from .laws import BARRIER, CoulombFriction, GapPotential, ObstacleLaw, tangential
-from .node_contact import ContactForces, StepStart, evaluate_points, lag_contact
-from .obstacle import RigidObstacle
-from .pose import Pose, PosedShape, rotation_second_derivative
-from .pose_derivatives import (
+from .node_contact import (
+    ContactForces,
     PoseCoupling,
     PoseDerivatives,
+    StepStart,
     carried_point_derivatives,
+    evaluate_points,
+    lag_contact,
     mixed_pose_hessian,
-    point_jacobian,
 )
+from .obstacle import RigidObstacle
+from .pose import Pose, PosedShape, point_jacobian, rotation_second_derivative
 from .shape_base import Shape, frame_about, unit_vector
 from .shapes import Capsule, OffsetShape, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
 from .step_limit import PointMotion, PoseMotion
 from .triangle_mesh_shape import TriangleMeshShape
 
 if TYPE_CHECKING:
-    from .mesh_pairs import MeshPair  # with ipctk
+    from .mesh_obstacle_term import MeshPair  # with ipctk
     from .rigid_obstacles import RigidObstacles
 
 Values = npt.NDArray[np.float64]

@@ -28,17 +28,9 @@ from ..mesh.split_surface.surface_map import SurfaceMap
 from .contact_state import ContactState
 from .contact_surface import retract_from_obstacles
 from .laws import ObstacleLaw
-from .node_contact import ContactForces
-from .pose import min_distance
-from .pose_derivatives import (
-    PoseContact,
-    PoseCoupling,
-    PoseDerivatives,
-    closing_distance,
-    contact_wrench,
-    resultant,
-)
-from .rigid_obstacles import ObstacleGroup, RigidObstacles
+from .node_contact import ContactForces, PoseCoupling, PoseDerivatives, contact_wrench
+from .pose import min_distance, resultant
+from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 from .step_limit import PoseMotion, safe_motion_fractions, stop_before_obstacles
 
 Values = npt.NDArray[np.float64]
@@ -93,9 +85,9 @@ class ObstacleTerm(ContactState, Term):
         )
         # facets after the points that they are made of
         facets = (self.facets,) if self.facets.numbers else ()
-        self.parts = (self.surface, *facets, self.group, self.clearance)
-        self._has_tangent = False  # in this attempt of Newton's method
         self.pose_contact, self._coupling = PoseContact(self), CouplingBuilder(domain)
+        self.parts = (self.surface, *facets, self.group, self.clearance, self.pose_contact)
+        self._has_tangent = False  # in this attempt of Newton's method
         # index of an obstacle, whether exact -> forces that a coupling with its pose is of, and the coupling
         self._couplings: dict[tuple[int, bool], tuple[ContactForces, PoseCoupling]] = {}
         self._is_exact: bool | None = None  # whether the tangent at the current u and poses is; None: not known yet
@@ -198,11 +190,6 @@ class ObstacleTerm(ContactState, Term):
 
     # --- step limits ---
 
-    def max_step_fraction(self, change: Values) -> float:
-        """Fraction of a change of u (owned dofs,), m, that leaves a tenth of every gap (collective)."""
-        moving = self.group.correction_motions()
-        return self.safe_fraction(self.end_displacement, np.divide(change, self.level.fraction), moving)
-
     def safe_fraction(self, u: Values, change: Values | None, moving: Mapping[int, PoseMotion]) -> float:
         """Fraction of motions of the body and of obstacles that leaves a tenth of every gap (collective).
 
@@ -250,7 +237,7 @@ class ObstacleTerm(ContactState, Term):
             self.group.posed, x
         )
 
-    # --- contact as the obstacles see it (pose_derivatives.PoseContact) ---
+    # --- contact as the obstacles see it (PoseContact) ---
 
     allows_exact_tangent = True
 
@@ -323,17 +310,8 @@ class ObstacleTerm(ContactState, Term):
         facet_distances = facets.distances(posed, self.positions, self.law.barrier.width)
         return min(point_gap, float(facet_distances.min(initial=np.inf)))
 
-    def closing_distances(self) -> list[float]:
-        """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
-
-        It is that of the velocities at the start, without any contact; of this rank's points.
-        """
-        if self.is_far():
-            return [0.0] * len(self.group.obstacles)
-        motion, result = self.group.bodies.dt * self.surface.interpolation(self._start_velocity), list[float]()
-        for start_pose, pose, contact in zip(
-            self.group.start_poses, self.group.poses, self.obstacle_forces(), strict=True
-        ):
-            x, points = self.positions[contact.points], contact.points
-            result.append(closing_distance(start_pose, pose, x, contact.normal, motion[points]))
-        return result
+    def pushed_points(self) -> list[tuple[Values, Values, Values]]:
+        """(k, d) points of this rank in contact with each obstacle, m, normal forces, N, start velocities, m/s."""
+        velocity = self.surface.interpolation(self._start_velocity)
+        contacts = self.obstacle_forces()
+        return [(self.positions[contact.points], contact.normal, velocity[contact.points]) for contact in contacts]

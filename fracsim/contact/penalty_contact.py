@@ -34,9 +34,8 @@ from .penalty_contacts import PenaltyHistory
 from .penalty_pairs import NO_ROWS, PairSprings
 from .penalty_point_facet import POINT_FACET
 from .penalty_surface import PenaltyPart
-from .pose import Pose, PosedShape
-from .pose_derivatives import PoseContact, closing_distance, resultant
-from .rigid_obstacles import ObstacleGroup, RigidObstacles
+from .pose import Pose, PosedShape, resultant
+from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -374,14 +373,8 @@ class PenaltyContact(Term):
             is_near |= not part.contact.history.is_empty
         return is_near
 
-    # --- of implicit steps (ContactTerm): nothing to do ---
-
     def begin_solve(self) -> None:
         """Do nothing: no system is solved."""
-
-    def max_step_fraction(self, change: Values) -> float:
-        """Return 1: gaps may close."""
-        return 1.0
 
 
 class PenaltyMeshContact(PenaltyContact):
@@ -407,7 +400,6 @@ class PenaltyMeshContact(PenaltyContact):
         """`bodies`: motion of all obstacles; `numbers`: of the triangle meshes; the others as for PenaltyContact."""
         self.group = ObstacleGroup(bodies, numbers, law.distance, self._gap, self._wrench)
         self._all_meshes = build_mesh_obstacles(self.group, domain.mean_edge_length)
-        self._dt = 0.0  # s, of the current or last step
         # of the last step and of this rank's contacts: force and moment on each, N and N m
         self._wrenches: list[Values] = [np.zeros(6) for _ in numbers]
         self._posed = [bodies.posed[number] for number in numbers]
@@ -462,7 +454,7 @@ class PenaltyMeshContact(PenaltyContact):
     def begin_step(self, level: TimeLevel) -> None:
         """Move obstacles to the end of the step; springs of friction begin with those of the last one (collective)."""
         self.group.bodies.begin_step(level)
-        self._start_velocity, self._dt = level.v_n, level.dt or self._dt
+        self._start_velocity = level.v_n
         # springs of friction begin with both sides at the start
         self._move_to(self.group.bodies.start_posed)
         super().begin_step(level)
@@ -499,7 +491,7 @@ class PenaltyMeshContact(PenaltyContact):
                 squares.append(obstacle.max_frequency(obstacle.spring_stiffness(positions, stiffness, posed), posed))
         return max(squares)
 
-    # --- contact as the obstacles see it (pose_derivatives.PoseContact) ---
+    # --- contact as the obstacles see it (PoseContact) ---
 
     def is_far(self) -> bool:
         """Whether nothing can be in contact at the current u, nor was in the last step (collective)."""
@@ -524,19 +516,13 @@ class PenaltyMeshContact(PenaltyContact):
             return self._clearance.least_gap(index, self._end_displacement(), self._posed)
         return self._parts[index].gap(self._end_positions())
 
-    def closing_distances(self) -> list[float]:
-        """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
-
-        It is that of the velocities at the start, without any contact; of the points of this rank.
-        """
-        if self.state.is_idle():
-            return [0.0] * len(self.group.obstacles)
+    def pushed_points(self) -> list[tuple[Values, Values, Values]]:
+        """(n, 3) points near this rank before each obstacle, m, normal forces, N, start velocities, m/s."""
         x, surface = self._end_positions(), self.surface.current
-        motion = self._dt * (surface.point_map.weights @ self.surface.nodal_values(self._start_velocity))
-        result = []
-        for mesh, part, start_pose in zip(self._all_meshes, self._parts, self.group.start_poses, strict=True):
+        velocity, result = surface.point_map.weights @ self.surface.nodal_values(self._start_velocity), []
+        for part in self._parts:
             gradient = np.zeros_like(x) if part.is_far(x) else part.contact.gradient(part.points(x))[: len(x)]
-            result.append(closing_distance(start_pose, mesh.pose, x, -surface.sum_at_points(gradient), motion))
+            result.append((x, -surface.sum_at_points(gradient), velocity))
         return result
 
     # --- state: wrenches at the end of the last step (HistoryTerm) ---

@@ -1,4 +1,4 @@
-"""Penalty and Coulomb friction between two rigid obstacles of which one at least is free, in explicit steps.
+"""Free obstacles in explicit steps: penalty and Coulomb friction before other obstacles, and velocity Verlet.
 
     analytic obstacles        at inset points of each before the other (obstacle_pairs)
     two triangle meshes       points before facets, and sharp edges, of both (penalty_pairs)
@@ -18,11 +18,12 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import numpy.typing as npt
 
+from ..mesh.domain import Domain
 from .laws import Penalty, slipped, tangential
-from .obstacle import FreeObstacle, RigidObstacle, free_pairs
+from .obstacle import FreeObstacle, RigidObstacle, VerletObstacle, free_pairs
 from .obstacle_pairs import SAMPLES, Numbers, ObstaclePair
-from .pose import Pose, PosedShape
-from .pose_derivatives import resultant
+from .pose import Pose, PosedShape, resultant
+from .rigid_obstacles import RigidObstacles
 from .triangle_mesh_shape import StackedMeshes, TriangleMeshShape
 
 if TYPE_CHECKING:
@@ -345,6 +346,89 @@ def penalty_pairs_of(obstacles: Mapping[int, RigidObstacle], penalty: Penalty, m
         limit = PAIR_PENALTY.share * max_added * mass * penalty.width / area
         pair.contacts.set_penalty(replace(penalty, stiffness=min(penalty.stiffness, limit)))
     return pairs
+
+
+class VerletRigidObstacles(RigidObstacles):
+    """Obstacles of which some are free, in explicit steps; between these and others a penalty acts, with friction.
+
+    Attributes:
+        free: free obstacles by their numbers.
+    """
+
+    free: dict[int, VerletObstacle]
+
+    def __init__(self, domain: Domain, obstacles: Sequence[RigidObstacle], pairs: Sequence[PenaltyPair]) -> None:
+        """`obstacles`: by their numbers in the study; `pairs`: of free ones and others."""
+        numbered = enumerate(obstacles)
+        free = {n: VerletObstacle(obstacle) for n, obstacle in numbered if isinstance(obstacle, FreeObstacle)}
+        self._contact_work = dict.fromkeys(free, 0.0)  # of the body on each in the last step, J
+        self._pairs = pairs
+        super().__init__(domain, obstacles, free)
+        self.parts = (*self.parts, *pairs)
+
+    def _place(self, start: float, end: float) -> None:
+        super()._place(start, end)
+        if end > start:
+            for number, obstacle in self.free.items():
+                self.posed[number] = obstacle.begin_step(end - start)
+                self.increments[number] = obstacle.increment
+
+    def accept_step(self) -> None:
+        """Give free obstacles their momentum (collective)."""
+        work_of_pairs = dict.fromkeys(range(len(self.obstacles)), 0.0)
+        of_pairs = [np.zeros_like(q) for q in self.increments]
+        for pair in self._pairs:
+            pair.end_step(self.start_posed, self.posed, self.increments)
+            for number, wrench, work in zip(pair.numbers, pair.forces.wrenches, pair.work, strict=True):
+                of_pairs[number] += wrench
+                work_of_pairs[number] += work
+        of_body = {number: wrench for contact in self.contacts for number, wrench in contact.wrenches().items()}
+        # each obstacle ends its step once, with all that acts on it
+        for number, wrench_of_body in of_body.items():
+            work = self.free[number].end_step(self.posed[number], wrench_of_body + of_pairs[number])
+            self._contact_work[number] = work - work_of_pairs[number]
+
+    def stored_energy(self) -> float:
+        """Energy of penalty and springs between obstacles at the end of the last step, on rank 0, J."""
+        energies = [pair.forces.penalty_energy + pair.forces.spring_energy for pair in self._pairs]
+        return 0.0 if self.comm.rank else sum(energies)
+
+    def frequency_bound(self) -> float:
+        """Increase of the square of the highest frequency if all near points were in contact, 1/s^2.
+
+        With the largest eigenvalues l_i, l_j of M^-1 K of both obstacles of a pair it is at most the largest sum of
+        l_i + sqrt(l_i l_j) over the pairs of an obstacle (Gershgorin's bound for blocks).
+        """
+        sums = dict.fromkeys(self.free, 0.0)
+        for pair in self._pairs:
+            springs: tuple[Values, Values] | None = pair.contacts.near_springs(pair.poses(self.posed))
+            if springs is None:
+                continue
+            squares = {
+                number: obstacle.max_frequency(obstacle.spring_stiffness(*springs, posed), posed)
+                for number in pair.numbers
+                if number in self.free
+                for obstacle, posed in [(self.free[number], self.posed[number])]
+            }
+            coupling = float(np.sqrt(np.prod(list(squares.values())))) if len(squares) == 2 else 0.0
+            for number, square in squares.items():
+                sums[number] += square + coupling
+        return max(sums.values())
+
+    def work_on_body(self, number: int, by_forces: float) -> float:
+        """Work of an obstacle on the body in the last step, J; of a free one that of its momentum, on rank 0."""
+        if number not in self.free:
+            return by_forces
+        return 0.0 if self.comm.rank else -self._contact_work[number]
+
+    def step_work(self) -> tuple[float, float]:
+        """Work of gravity and prescribed obstacles on free ones, and dissipation between obstacles, on rank 0, J."""
+        if self.comm.rank:
+            return 0.0, 0.0
+        items = [(number, work) for pair in self._pairs for number, work in zip(pair.numbers, pair.work, strict=True)]
+        by_prescribed = -sum(work for number, work in items if number not in self.free)
+        by_gravity = sum(obstacle.gravity_work for obstacle in self.free.values())
+        return by_gravity + by_prescribed, sum(pair.dissipated for pair in self._pairs)
 
 
 def _motions(x: Values, start: Pose, end: Pose) -> Values:

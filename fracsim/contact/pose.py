@@ -174,11 +174,6 @@ class PosedShape:
         decrease = np.minimum(n * (lower - nearest), n * (upper - nearest)).sum()
         return float((self.distance(nearest) + decrease).item())
 
-    def mixed_hessian(self, x: Values) -> Values:
-        """(n, d, p) second derivatives by the point and q."""
-        H, G = self.curvature(x), rotation_derivative(x - self.pose.centre)
-        return np.concatenate([-H, H @ G - rotation_derivative(self.normal(x))], axis=2)
-
 
 def rotation_second_derivative(n: Values, y: Values) -> Values:
     """(n, r, r) second derivatives of n . exp(-w) y by w at w = 0, of vectors n and y (n, d)."""
@@ -244,3 +239,43 @@ def _cross(w: Values) -> Values:
 def solve_matrix(matrix: Values, values: Values) -> Values:
     """A^-1 b of a matrix (k, k) and values (k,) or (k, m)."""
     return np.asarray(np.linalg.solve(matrix, values), np.float64)
+
+
+# --- points that a pose carries, and forces on them ---
+
+
+def point_jacobian(arm: Values) -> Values:
+    """(m, d, p) derivatives of points with arms (m, d), m, by an increment of the pose."""
+    return -arm_jacobian(arm)
+
+
+def resultant(force: Values, arm: Values) -> Values:
+    """(p,) sums of forces (n, d) and of their moments arm x force."""
+    moment = -np.einsum("ndr,nd->r", rotation_derivative(arm), force)
+    return np.concatenate([force.sum(axis=0), moment])
+
+
+def closing_distance(start: Pose, end: Pose, x: Values, force: Values, motion: Values) -> float:
+    """Largest approach in a step of an obstacle and the points that it pushes, m.
+
+    Args:
+        start: pose of the obstacle.
+        end: its pose at the end of the step.
+        x: (n, d) points of the body then, m.
+        force: (n, d) normal forces on these, N.
+        motion: (n, d) of these without contact, m.
+    """
+    size = np.linalg.norm(force, axis=1)
+    pushed = size > 0
+    obstacle_motion = x[pushed] - start.points_to_space(end.to_body(x[pushed]))
+    normal = force[pushed] / size[pushed, None]
+    distance = np.einsum("ni,ni->n", obstacle_motion - motion[pushed], normal)
+    return float(distance.max(initial=0.0))
+
+
+def arm_jacobian(arm: Values) -> Values:
+    """(n, d, p) J of arms (n, d), m."""
+    d, by_rotation = arm.shape[1], rotation_derivative(arm)
+    J = np.empty((len(arm), d, d + by_rotation.shape[2]))
+    J[:, :, :d], J[:, :, d:] = -np.eye(d), by_rotation
+    return J

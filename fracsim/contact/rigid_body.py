@@ -28,9 +28,9 @@ import numpy.typing as npt
 from ..forms.schemes import Scheme
 from ..mechanics.contact_time_weights import acceleration_change
 from ..mechanics.term_protocols import TermColumns
+from .node_contact import PoseDerivatives
 from .obstacle import FreeObstacle, RigidMotion, column_names
 from .pose import Pose, PosedShape, left_jacobian, left_jacobian_derivative, rotation_derivative, solve_matrix
-from .pose_derivatives import PoseDerivatives
 
 Values = npt.NDArray[np.float64]
 

@@ -1,10 +1,11 @@
 """Rigid obstacles of a study: their motion in a step, and the groups of them that terms of contact are about.
 
     RigidObstacles         held and driven obstacles: motion prescribed, or restricted to a part of it
-    VerletRigidObstacles   with free ones in explicit steps: velocity Verlet
     ObstacleGroup          obstacles of one term of contact, and what they did to the body in a step
+    PoseContact            contact of the body with them, as the obstacles see it
 
-With free ones in implicit steps: rigid_pose. Terms of contact have the obstacles' poses from here.
+With free ones: rigid_pose in implicit steps, penalty_obstacle_pairs in explicit ones. Terms of contact have the
+obstacles' poses from here.
 
 Equations: docs/theory.md#rigid-obstacles.
 """
@@ -12,7 +13,7 @@ Equations: docs/theory.md#rigid-obstacles.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,20 +22,38 @@ import numpy.typing as npt
 from ..mechanics.term import Term, TimeLevel
 from ..mechanics.term_protocols import SurfaceData, TermColumns
 from ..mesh.domain import Domain
+from ..mesh.parallel import sum_over_ranks
 from ..meshes.data import AXES
-from .obstacle import FreeObstacle, RigidObstacle, VerletObstacle
-from .obstacle_tessellation import ObstacleTessellations
-from .pose import Pose, PosedShape
-from .pose_derivatives import PoseContact
+from .node_contact import PoseDerivatives
+from .obstacle import ObstacleTessellation, RigidObstacle, tessellate_obstacle
+from .pose import Pose, PosedShape, closing_distance
 from .rigid_body import FreeMotions, MovingObstacle
 from .step_limit import PoseMotion
 
 if TYPE_CHECKING:
-    from .penalty_obstacle_pairs import PenaltyPair
+    from .mesh_obstacle_term import MeshObstacleTerm
+    from .obstacle_term import ObstacleTerm
 
 Values = npt.NDArray[np.float64]
 
 type Increments = Mapping[int, Values]  # (p,) of poses, by the numbers of obstacles
+
+
+class ObstacleTessellations:
+    """Tessellations of obstacles for output, made in their own frames when they are first needed."""
+
+    def __init__(self, obstacles: Sequence[RigidObstacle], lower: Values, upper: Values) -> None:
+        """`lower`, `upper`: (d,) corners of the body's bounding box at the start, m."""
+        self._obstacles, self._box = obstacles, (lower, upper)
+
+    @cached_property
+    def _tessellations(self) -> list[ObstacleTessellation]:
+        return [tessellate_obstacle(obstacle.posed_at(0.0), *self._box) for obstacle in self._obstacles]
+
+    def __call__(self, posed: Sequence[PosedShape]) -> dict[str, SurfaceData]:
+        """Tessellations by the names of obstacles, at the poses of `posed`."""
+        items = zip(self._obstacles, self._tessellations, [shape.pose for shape in posed], strict=True)
+        return {it.name: SurfaceData(pose.points_to_space(X), *elements) for it, (X, *elements), pose in items}
 
 
 class RigidObstacles(Term):
@@ -129,6 +148,10 @@ class RigidObstacles(Term):
         """(d,) velocity of an obstacle at the start of the step, or (n, d) of its points at x (n, d), m/s."""
         return np.asarray(self.increments[number][: self.dim] / self.dt)
 
+    def work_on_body(self, number: int, by_forces: float) -> float:
+        """Work of an obstacle on the body in the last step, J; `by_forces`: that of the forces of contact."""
+        return by_forces
+
     def correction_increments(self) -> Increments:
         """Increments of free poses in a correction of Newton's method."""
         return {}
@@ -196,87 +219,6 @@ class RigidObstacles(Term):
     def _tell_moved(self) -> None:
         for contact in self.contacts:
             contact.poses_moved()
-
-
-class VerletRigidObstacles(RigidObstacles):
-    """Obstacles of which some are free, in explicit steps; between these and others a penalty acts, with friction.
-
-    Attributes:
-        free: free obstacles by their numbers.
-    """
-
-    free: dict[int, VerletObstacle]
-
-    def __init__(self, domain: Domain, obstacles: Sequence[RigidObstacle], pairs: Sequence[PenaltyPair]) -> None:
-        """`obstacles`: by their numbers in the study; `pairs`: of free ones and others."""
-        numbered = enumerate(obstacles)
-        free = {n: VerletObstacle(obstacle) for n, obstacle in numbered if isinstance(obstacle, FreeObstacle)}
-        self._contact_work = dict.fromkeys(free, 0.0)  # of the body on each in the last step, J
-        self._pairs = pairs
-        super().__init__(domain, obstacles, free)
-        self.parts = (*self.parts, *pairs)
-
-    def _place(self, start: float, end: float) -> None:
-        super()._place(start, end)
-        if end > start:
-            for number, obstacle in self.free.items():
-                self.posed[number] = obstacle.begin_step(end - start)
-                self.increments[number] = obstacle.increment
-
-    def accept_step(self) -> None:
-        """Give free obstacles their momentum (collective)."""
-        work_of_pairs = dict.fromkeys(range(len(self.obstacles)), 0.0)
-        of_pairs = [np.zeros_like(q) for q in self.increments]
-        for pair in self._pairs:
-            pair.end_step(self.start_posed, self.posed, self.increments)
-            for number, wrench, work in zip(pair.numbers, pair.forces.wrenches, pair.work, strict=True):
-                of_pairs[number] += wrench
-                work_of_pairs[number] += work
-        of_body = {number: wrench for contact in self.contacts for number, wrench in contact.wrenches().items()}
-        # each obstacle ends its step once, with all that acts on it
-        for number, wrench_of_body in of_body.items():
-            work = self.free[number].end_step(self.posed[number], wrench_of_body + of_pairs[number])
-            self._contact_work[number] = work - work_of_pairs[number]
-
-    def stored_energy(self) -> float:
-        """Energy of penalty and springs between obstacles at the end of the last step, on rank 0, J."""
-        energies = [pair.forces.penalty_energy + pair.forces.spring_energy for pair in self._pairs]
-        return 0.0 if self.comm.rank else sum(energies)
-
-    def frequency_bound(self) -> float:
-        """Increase of the square of the highest frequency if all near points were in contact, 1/s^2.
-
-        With the largest eigenvalues l_i, l_j of M^-1 K of both obstacles of a pair it is at most the largest sum of
-        l_i + sqrt(l_i l_j) over the pairs of an obstacle (Gershgorin's bound for blocks).
-        """
-        sums = dict.fromkeys(self.free, 0.0)
-        for pair in self._pairs:
-            springs: tuple[Values, Values] | None = pair.contacts.near_springs(pair.poses(self.posed))
-            if springs is None:
-                continue
-            squares = {
-                number: obstacle.max_frequency(obstacle.spring_stiffness(*springs, posed), posed)
-                for number in pair.numbers
-                if number in self.free
-                for obstacle, posed in [(self.free[number], self.posed[number])]
-            }
-            coupling = float(np.sqrt(np.prod(list(squares.values())))) if len(squares) == 2 else 0.0
-            for number, square in squares.items():
-                sums[number] += square + coupling
-        return max(sums.values())
-
-    def work_on_body(self, number: int) -> float:
-        """Work of a free obstacle on the body in the last step, on rank 0, J."""
-        return 0.0 if self.comm.rank else -self._contact_work[number]
-
-    def step_work(self) -> tuple[float, float]:
-        """Work of gravity and prescribed obstacles on free ones, and dissipation between obstacles, on rank 0, J."""
-        if self.comm.rank:
-            return 0.0, 0.0
-        items = [(number, work) for pair in self._pairs for number, work in zip(pair.numbers, pair.work, strict=True)]
-        by_prescribed = -sum(work for number, work in items if number not in self.free)
-        by_gravity = sum(obstacle.gravity_work for obstacle in self.free.values())
-        return by_gravity + by_prescribed, sum(pair.dissipated for pair in self._pairs)
 
 
 class ObstacleGroup:
@@ -391,7 +333,102 @@ class ObstacleGroup:
         return force[axis : axis + 1]
 
     def _work_reading(self, index: int) -> float:
-        """Work of an obstacle in the last step, J; of a free one in explicit steps that of its momentum."""
-        if isinstance(self.bodies, VerletRigidObstacles) and self.obstacles[index].free:
-            return self.bodies.work_on_body(self.numbers[index])
-        return self.work[index]
+        """Work of an obstacle on the body in the last step, J."""
+        return self.bodies.work_on_body(self.numbers[index], self.work[index])
+
+
+class PoseContact:
+    """Contact of the body with some obstacles, as the obstacles see it.
+
+    Attributes:
+        group: these obstacles.
+    """
+
+    def __init__(self, term: ObstacleTerm | MeshObstacleTerm) -> None:
+        """`term`: of the contact; one of explicit steps is asked for `wrenches` alone."""
+        self._term, self.group = term, term.group
+        self._free = [(number, self.group.numbers.index(number)) for number in self.group.free]
+
+    def poses_moved(self) -> None:
+        """Take over the poses of obstacles, and discard forces (not collective)."""
+        self._term.poses_moved()
+
+    def wrenches(self) -> dict[int, Values]:
+        """(p,) force and moment of the body on free ones at the current u, N and N m, of all ranks (collective)."""
+        if not self._free or self._term.is_far():
+            return {number: np.zeros_like(self.group.bodies.increments[number]) for number, _ in self._free}
+        return self._summed([self._term.rank_wrench(index) for _, index in self._free])
+
+    def _summed(self, local: Sequence[Values]) -> dict[int, Values]:
+        """Sums over the ranks of values of free obstacles, by their numbers (collective)."""
+        sums = sum_over_ranks(self._term.comm, np.array(local))
+        return {number: values for (number, _), values in zip(self._free, sums, strict=True)}
+
+    def closing_distances(self) -> list[float]:
+        """Distance by which each obstacle and the points it pushes would have approached in the step, m (collective).
+
+        It is that of the velocities at the start, without any contact; of points of this rank.
+        """
+        group = self.group
+        if self._term.is_far():
+            return [0.0] * len(group.obstacles)
+        dt, items = group.bodies.dt, zip(group.start_poses, group.poses, self._term.pushed_points(), strict=True)
+        return [closing_distance(start, end, x, force, dt * v) for start, end, (x, force, v) in items]
+
+    # --- in implicit steps ---
+
+    def max_step_fraction(self, change: Values) -> float:
+        """Fraction of a correction of u (owned dofs,), m, and of free poses on which no gap closes (collective)."""
+        term, moving = self._term, self.group.correction_motions()
+        return term.safe_fraction(term.end_displacement, np.divide(change, term.level.fraction), moving)
+
+    def rest_fraction(self, increments: Mapping[int, Values], u: Values | None) -> float:
+        """Fraction of increments (p,) from the current poses on which no gap to the body closes (collective).
+
+        `u`: (owned dofs,) displacement of the body at rest, m; None: the current one at the end of the step.
+        """
+        u, posed = self._term.end_displacement if u is None else u, self.group.posed
+        moving = {i: (posed[i], increments[n]) for i, n in enumerate(self.group.numbers) if n in increments}
+        return self._term.safe_fraction(u, None, moving) if moving else 1.0
+
+    def start_fraction(self, number: int, q: Values, u: Values) -> float:
+        """Fraction of an increment (p,) of an obstacle and the motion of the body that closes no gap (collective).
+
+        Both from the start of the step; `u`: (owned dofs,) displacement of the level after the motion, m.
+        """
+        level, index = self._term.level, self.group.numbers.index(number)
+        change = level.displacement_at_end(u) - level.u_n
+        return self._term.safe_fraction(level.u_n, change, {index: (self.group.start_posed[index], q)})
+
+    def pose_derivatives(self, *, exact: bool) -> dict[int, PoseDerivatives]:
+        """Energy and derivatives by the poses of free ones, of all ranks (collective)."""
+        if not self._free:
+            return {}
+        parts = [PoseDerivatives.none(len(self.group.bodies.increments[number])) for number, _ in self._free]
+        if not self._term.is_far():
+            parts = [self._term.rank_derivatives(index, exact=exact) for _, index in self._free]
+            rows = [np.concatenate([[part.energy], part.gradient, part.hessian.reshape(-1)]) for part in parts]
+            parts = [PoseDerivatives.from_array(row) for row in self._summed(rows).values()]
+        return {number: part for (number, _), part in zip(self._free, parts, strict=True)}
+
+    def mixed_hessians(self) -> dict[int, Values]:
+        """(owned dofs, p) d2E/dx dq by the increments q of poses, of free ones in contact (collective)."""
+        if not self._free or self._term.is_far():
+            return {}
+        parts = [self._term.rank_mixed_hessian(index) for _, index in self._free]
+        touching = self._summed([np.array(part.any(), float) for part in parts])
+        items = zip(self._free, parts, strict=True)
+        return {
+            number: self._term.assemble_mixed_hessian(index, part)
+            for (number, index), part in items
+            if touching[number]
+        }
+
+    def uses_exact_tangent(self) -> bool:
+        """Whether the tangent at the current u has negative eigenvalues of contact (collective)."""
+        return self._term.uses_exact_tangent()
+
+    @property
+    def allows_exact_tangent(self) -> bool:
+        """Whether tangents are exact near the solution."""
+        return self._term.allows_exact_tangent

@@ -23,10 +23,10 @@ from ..forms.schemes import Scheme
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
+from .node_contact import PoseDerivatives
 from .obstacle import FreeObstacle, RigidMotion, RigidObstacle
 from .obstacle_pairs import ObstaclePairs
 from .pose import PosedShape, solve_matrix
-from .pose_derivatives import PoseDerivatives
 from .rigid_body import SOLVER, RigidStep, RigidSystem, SystemDerivatives, is_positive_definite
 from .rigid_obstacles import Increments, RigidObstacles
 

@@ -30,7 +30,8 @@ from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.quadratic_surface import subdivided_input_mesh
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .clearance import FollowingPoints
-from .contact_patch import PatchContact
+from .contact_patch import SelfContactPatch
+from .ipc_pairs import IpcPairs
 from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface, SurfaceSnapshot
 from .laws import stiffness_factor
 from .pair_search import max_length
@@ -168,44 +169,32 @@ class BreakingSurface[S: SelfContactSurface]:
         self.current.restore((saved["share"], saved["left_out"].astype(np.int64), (pause, remaining)))
 
 
-class SelfContact(Term):
-    """A body that cannot penetrate itself.
+class SurfaceContact(Term):
+    """Barrier of a body's surface, before itself or obstacles; a subclass begins steps and limits them.
 
     Attributes:
-        surface: its surface.
+        surface: the surface of the body.
         level: time level of the current or last step.
         friction: lagged friction of the step; None: without.
-        sticking_slip: slip in the step that counts as sticking, m.
         start_positions: (n, d) of the surface at the start of the step, m.
         allows_exact_tangent: whether tangents are exact near the solution.
     """
 
-    name = "contact"
     leaves_tangent_incomplete = True
     allows_exact_tangent: bool = True
     level: TimeLevel
-    sticking_slip: float
     _attempts = 0  # of Newton's method in the step
-    _start_displacement: Values | None = None  # of the step
+    _start_displacement: Values | None = None  # of the last step in which faces may have been extended
     _fitted_displacement: Values | None = None  # at which crack faces have found their room within the step
 
     def __init__(
-        self,
-        domain: Domain,
-        u: fem.Function,
-        law: SelfContactLaw,
-        build: SurfaceBuilder[SelfContactSurface] | None = None,
+        self, domain: Domain, u: fem.Function, law: SelfContactLaw, build: SurfaceBuilder[SelfContactSurface]
     ) -> None:
-        """Raise InputError where the surface at rest intersects itself (collective).
-
-        `build`: function that builds its surface; None: in contact with itself.
-        """
+        """`build`: function that builds the surface. It refuses bodies that intersect at rest (collective)."""
         self._domain, self._u = domain, u
         self._owned, self.comm = domain.node_count * domain.dim, domain.comm
         self._coupling = CouplingBuilder(domain)
-        build = build or partial(SelfContactSurface, comm=domain.comm)
         self.surface = BreakingSurface(domain, u, law, build)
-        self.parts = self.surface, CollisionLimit(self), PatchContact(self)
         self._discard_surface()
 
     # --- surface ---
@@ -226,33 +215,16 @@ class SelfContact(Term):
         self._discard_surface()
         self._fitted_displacement = self._u.x.array[: self._owned].copy()
 
-    # --- steps ---
+    def _extend_faces(self, u_n: Values, nodal: Values) -> None:
+        """Extend crack faces at the start of a step, unless edges broke in an earlier pass of it (collective).
 
-    def begin_step(self, level: TimeLevel) -> None:
-        """Lag friction with the contact at the start of the step."""
-        self.level, self._is_stale, self.friction, self._attempts = level, True, None, 0
-        if not level.dt:
-            return
-        nodal, surface = self.surface.nodal_values(level.u_n), self.surface.current
-        self.sticking_slip = self._sticking_slip(level)
-        if not self._is_repeated(level.u_n):
+        A step that begins where the last one did, at u_n (owned dofs,), m, is repeated. `nodal`: (nodes, d) of u_n.
+        """
+        before, self._start_displacement = self._start_displacement, u_n.copy()
+        if not self.comm.allreduce(before is not None and np.array_equal(before, u_n), op=MPI.LAND):
             self._fitted_displacement = None
         if self._fitted_displacement is None:
-            surface.extend_faces(nodal)
-        self.start_positions = x = surface.point_map(nodal)
-        if self.surface.law.friction:
-            self.friction = surface.pairs.lag_friction(x, x, self.sticking_slip)
-
-    def _is_repeated(self, u_n: Values) -> bool:
-        """Whether a step begins where the last one did, at u_n (owned dofs,), m: it is repeated (collective)."""
-        before, self._start_displacement = self._start_displacement, u_n.copy()
-        return self.comm.allreduce(before is not None and np.array_equal(before, u_n), op=MPI.LAND)
-
-    def _sticking_slip(self, level: TimeLevel) -> float:
-        """Slip in the step that counts as sticking, m, with speeds relative to the body's mean (collective)."""
-        square, mean = mean_velocities(self.comm, level.v_n.reshape(-1, self._domain.dim))
-        speed = float(np.sqrt(max(float(square - mean @ mean), 0.0)))
-        return level.dt * self.surface.law.sticking_speed_at(speed)
+            self.surface.current.extend_faces(nodal)
 
     def update_displacement(self) -> None:
         """Discard positions and forces, as u has changed."""
@@ -320,26 +292,10 @@ class SelfContact(Term):
         coupling = sum_few_nodes(self._domain, part, nodes, SURFACE.max_coupled_nodes) if self.level.dt else None
         return self._coupling(part, nodes) if coupling is None else coupling
 
-    def fits(self, u: Values) -> bool:
-        """Whether crack faces have found their room at u (owned dofs,), m, the end of the step (collective)."""
-        if self._fitted_displacement is None:
-            return False
-        change = np.max(np.abs(u - self._fitted_displacement), initial=0.0)
-        return bool(self.comm.allreduce(change <= SURFACE.round_off * self.surface.law.distance, op=MPI.LAND))
-
     def min_gap(self) -> float:
         """Least distance within the barrier at the current u, m; infinite where none is active (collective)."""
         x = self.surface.positions(self._u.x.array[: self._owned])
         return float(self.comm.allreduce(self.surface.current.pairs.min_gap(x), op=MPI.MIN))
-
-    def find_intersections(self) -> tuple[Values, Flags]:
-        """(k, d) midpoints of pairs of elements that intersect at the current u, m (collective).
-
-        Also returns (k,) flags of pairs of which one is excluded: a crack face without room.
-        """
-        surface, nodal = self.surface.current, self.surface.nodal_values(self._u.x.array[: self._owned])
-        pairs, without_room = surface.find_intersections(nodal)
-        return surface.point_map(nodal)[surface.elements[pairs]].mean(axis=(1, 2)), without_room
 
     def stored_energy(self) -> float:
         """Energy of the barrier at the current u, of this rank's pairs, J (collective)."""
@@ -366,10 +322,6 @@ class SelfContact(Term):
         self.surface.set_stiffness(factor * law.stiffness)
         return energy
 
-    def damping_forces(self) -> Values | None:
-        """(owned dofs,) minus the forces of friction, N (collective)."""
-        return -self._nodal_forces(self.end_positions(), normal=False) if self.surface.law.friction else None
-
     def potential(self) -> float:
         """Potential of barrier and friction as they enter the residual, of this rank's pairs, J (collective)."""
         if self.is_far():
@@ -393,31 +345,89 @@ class SelfContact(Term):
         self._coupling.destroy()
 
 
-class CollisionLimit:
-    """Step limits of a body that moves along straight lines and cannot collide with itself."""
+class SelfContact(SurfaceContact):
+    """A body that cannot penetrate itself.
 
-    def __init__(self, term: SelfContact) -> None:
-        self._term = term
+    Attributes:
+        sticking_slip: slip in the step that counts as sticking, m.
+    """
+
+    name = "contact"
+    sticking_slip: float
+
+    def __init__(self, domain: Domain, u: fem.Function, law: SelfContactLaw) -> None:
+        """Raise InputError where the surface at rest intersects itself (collective)."""
+        super().__init__(domain, u, law, partial(SelfContactSurface, comm=domain.comm))
+        self.parts = (self.surface,)
+
+    @property
+    def pairs(self) -> IpcPairs:
+        """Pairs of the surface."""
+        return cast("IpcPairs", self.surface.current.pairs)
+
+    def begin_step(self, level: TimeLevel) -> None:
+        """Lag friction with the contact at the start of the step."""
+        self.level, self._is_stale, self.friction, self._attempts = level, True, None, 0
+        if not level.dt:
+            return
+        nodal, surface = self.surface.nodal_values(level.u_n), self.surface.current
+        self.sticking_slip = self._sticking_slip(level)
+        self._extend_faces(level.u_n, nodal)
+        self.start_positions = x = surface.point_map(nodal)
+        if self.surface.law.friction:
+            self.friction = self.pairs.lag_friction(x, x, self.sticking_slip)
+
+    def _sticking_slip(self, level: TimeLevel) -> float:
+        """Slip in the step that counts as sticking, m, with speeds relative to the body's mean (collective)."""
+        square, mean = mean_velocities(self.comm, level.v_n.reshape(-1, self._domain.dim))
+        speed = float(np.sqrt(max(float(square - mean @ mean), 0.0)))
+        return level.dt * self.surface.law.sticking_speed_at(speed)
+
+    def damping_forces(self) -> Values | None:
+        """(owned dofs,) minus the forces of friction, N (collective)."""
+        return -self._nodal_forces(self.end_positions(), normal=False) if self.surface.law.friction else None
+
+    def find_intersections(self) -> tuple[Values, Flags]:
+        """(k, d) midpoints of pairs of elements that intersect at the current u, m (collective).
+
+        Also returns (k,) flags of pairs of which one is excluded: a crack face without room.
+        """
+        surface, nodal = self.surface.current, self.surface.nodal_values(self._u.x.array[: self._owned])
+        pairs, without_room = surface.find_intersections(nodal)
+        return surface.point_map(nodal)[surface.elements[pairs]].mean(axis=(1, 2)), without_room
+
+    def patch(self, nodes: Ints) -> SelfContactPatch:
+        """Contact of nodes (k,), by their ascending global numbers, that move from the current u (collective)."""
+        return SelfContactPatch(self, nodes)
+
+    # --- step limits ---
 
     def max_step_fraction(self, change: Values) -> float:
         """Fraction of a change of u (owned dofs,), m, without a collision (collective)."""
-        return self._free_fraction(self._term.end_positions(), np.divide(change, self._term.level.fraction))
+        return self._free_fraction(self.end_positions(), np.divide(change, self.level.fraction))
 
     def _free_fraction(self, x: Values, motion: Values) -> float:
         """Fraction of a motion (owned dofs,) from positions x (n, d), m, without a collision (collective)."""
-        surface, nodal = self._term.surface.current, self._term.surface.nodal_values(motion)
-        return surface.pairs.free_fraction(x, x + surface.point_map.weights @ nodal)
+        surface, nodal = self.surface.current, self.surface.nodal_values(motion)
+        return self.pairs.free_fraction(x, x + surface.point_map.weights @ nodal)
 
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) first guess of u, m, as far on its way from the start as there is no collision (collective).
 
         Where edges broke within the step, new crack faces have room at the last solution, but maybe not at the start.
         """
-        level, start = self._term.level, self._term.start_positions
-        if not level.dt or start is None or self._term.fits(level.displacement_at_end(u)):
+        level, start = self.level, self.start_positions
+        if not level.dt or start is None or self._fits(level.displacement_at_end(u)):
             return u
         fraction = self._free_fraction(start, level.displacement_at_end(u) - level.u_n)
         return u if fraction == 1 else np.asarray(level.u_n + fraction * (u - level.u_n))
+
+    def _fits(self, u: Values) -> bool:
+        """Whether crack faces have found their room at u (owned dofs,), m, the end of the step (collective)."""
+        if self._fitted_displacement is None:
+            return False
+        change = np.max(np.abs(u - self._fitted_displacement), initial=0.0)
+        return bool(self.comm.allreduce(change <= SURFACE.round_off * self.surface.law.distance, op=MPI.LAND))
 
 
 def mean_velocities(comm: MPI.Intracomm, v: Values) -> tuple[float, Values]:

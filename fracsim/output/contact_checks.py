@@ -15,23 +15,10 @@ from ..meshes.data import format_point
 from ..timestepping.state import State
 
 if TYPE_CHECKING:
-    from ..contact.rigid_obstacles import ObstacleGroup, RigidObstacles
+    from ..contact.rigid_obstacles import PoseContact, RigidObstacles
 
 Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
-
-
-class ObstacleContact(Protocol):
-    """Contact term of obstacles, as the monitor sees it.
-
-    Attributes:
-        group: obstacles, and the distance below which they act.
-    """
-
-    group: ObstacleGroup
-
-    def closing_distances(self) -> list[float]:
-        """Largest decrease of each obstacle's gap in the last step without contact, m, on this rank (collective)."""
 
 
 class ObstacleContactMonitor:
@@ -43,8 +30,8 @@ class ObstacleContactMonitor:
             size of that step in s), on this rank.
     """
 
-    def __init__(self, domain: Domain, contacts: Sequence[ObstacleContact]) -> None:
-        """Start without any step; `contacts` are the contact terms of the obstacles (collective)."""
+    def __init__(self, domain: Domain, contacts: Sequence[PoseContact]) -> None:
+        """Start without any step; `contacts`: of the body with obstacles (collective)."""
         self._contacts, self._comm, self._edge = contacts, domain.comm, domain.mean_edge_length
         groups = [contact.group for contact in contacts]
         self._width = {obstacle.name: group.barrier_width for group in groups for obstacle in group.obstacles}

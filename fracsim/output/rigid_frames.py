@@ -14,8 +14,8 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from ..contact.obstacle import RigidObstacle
-from ..contact.obstacle_tessellation import ObstacleTessellations
 from ..contact.pose import PosedShape
+from ..contact.rigid_obstacles import ObstacleTessellations
 from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.mesh_part import WholeMesh

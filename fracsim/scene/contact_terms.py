@@ -33,7 +33,7 @@ from ..study.overlap_checks import build_shape
 
 if TYPE_CHECKING:
     from ..contact.laws import Penalty
-    from ..contact.mesh_pairs import MeshPair
+    from ..contact.mesh_obstacle_term import MeshPair
     from ..contact.shape_kernels import CompiledShapeKernels
 
 Values = npt.NDArray[np.float64]
@@ -140,7 +140,6 @@ def _build_motion(
         return RigidObstacles(domain, obstacles)
     from ..contact.obstacle import OVERLAP, check_free_obstacles, free_pairs
     from ..contact.obstacle_pairs import BarrierPair, ObstaclePairs
-    from ..contact.rigid_obstacles import VerletRigidObstacles
     from ..contact.rigid_pose import FreeRigidObstacles
     from ..contact.supporting_obstacles import pair_obstacles
     from ..contact.triangle_mesh_shape import TriangleMeshShape
@@ -151,14 +150,14 @@ def _build_motion(
     check_free_obstacles(placed, -OVERLAP.min_overlap)
     in_pairs = pair_obstacles(obstacles, law.barrier.width, domain.mean_edge_length)
     if not scheme.implicit:
-        from ..contact.penalty_obstacle_pairs import penalty_pairs_of
+        from ..contact.penalty_obstacle_pairs import VerletRigidObstacles, penalty_pairs_of
 
         penalty = cast("Penalty", law.barrier)
         return VerletRigidObstacles(domain, obstacles, penalty_pairs_of(in_pairs, penalty, max_added))
     pairs: list[BarrierPair | MeshPair] = []
     for numbers in free_pairs([obstacle.free for obstacle in obstacles]):
         if all(is_mesh[number] for number in numbers):
-            from ..contact.mesh_pairs import MeshPair  # with ipctk
+            from ..contact.mesh_obstacle_term import MeshPair  # with ipctk
 
             pairs.append(MeshPair(numbers, in_pairs, law, mesh_stiffness))
         else:
