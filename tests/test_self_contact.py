@@ -338,10 +338,10 @@ def test_intersecting_faces_keep_their_numbers_where_others_are_excluded() -> No
     none, arms = csr_matrix((6, 1)), csr_matrix(np.ones((6, 1)))
     elements = np.array([[0, 1], [2, 3], [4, 5]])
     surface = _Crossing(elements, SurfaceMap(none, x, arms, np.zeros_like(x)), 1.0)
-    surface._include_all()
+    surface.pairs = surface._build_pairs(elements)
     u = np.zeros((1, 2))
     assert surface._intersecting_faces(u).tolist() == [1, 2]
     surface._exclude(np.array([0]))
     assert surface._intersecting_faces(u).tolist() == [1, 2]
-    surface._include_all()
+    surface._exclude(np.empty(0, np.int64))
     assert surface._intersecting_faces(u).tolist() == [1, 2]

@@ -40,8 +40,7 @@ Surfaces with ipctk:
     mesh_obstacles        pairs of a body and a triangle-mesh obstacle
     penalty_pairs         penalty between points and facets, and between edges, with friction
     penalty_contacts, penalty_point_facet, penalty_edges  energy of contacts; points before facets; edges
-    surface_exchange      elements of a rank, and exchange of those that may come near one another
-    partitioned_surface, penalty_surface  surface distributed over the ranks; its elements and contacts on a rank
+    penalty_surface, partitioned_surface  elements of a rank and their contacts; surface distributed over the ranks
 
 Free obstacles:
 

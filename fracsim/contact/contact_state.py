@@ -235,7 +235,7 @@ class SurfaceFacets:
         self._excluded = self._match(saved["cut"])
 
     def clear_caches(self) -> None:
-        """Discard facets and their closest points, from which searches start."""
+        """Discard facets, and candidates among them."""
         vars(self).pop("_all_facets", None)
         self._active = None
 

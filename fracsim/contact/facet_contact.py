@@ -66,19 +66,11 @@ class ContactFacets:
         corners: (m, c) points.
         area: (m,) m^2 (2D: m).
         smoothing: mu of closest points, m.
-        warm_start: searches begin at the closest points found last. Without it these depend on positions alone, so that
-            a run that goes on from a checkpoint takes the same explicit steps.
     """
 
     corners: Ints
     area: Values
     smoothing: float
-    warm_start: bool = True
-
-    @cached_property
-    def _last_barycentric(self) -> Values:
-        """(m, c) closest points found last, from which the next search starts; nan: not known yet."""
-        return np.full(self.corners.shape, np.nan)
 
     @cached_property
     def _candidates(self) -> ProximityCandidates:
@@ -91,26 +83,7 @@ class ContactFacets:
 
     def closest_points(self, posed: PosedShape, x: Values, facets: Ints) -> FacetClosestPoints:
         """Closest points of facets (k,), with points at x (n, d), m."""
-        corners, start = x[self.corners[facets]], self._last_barycentric[facets]
-        if not len(facets):
-            return FacetClosestPoints(posed, corners, self.smoothing, start)
-        closest = find_closest_points(posed, corners, self.smoothing, start)
-        if self.warm_start:
-            self._last_barycentric[facets] = closest.barycentric
-        return closest
-
-    def start(self, posed: PosedShape, x: Values, reach: float) -> FacetStart:
-        """Facets before an obstacle at the start of a step, with points at x (n, d), m; searched once for a step."""
-        last = self._starts.get(id(posed.shape))
-        if last is None or last.posed is not posed or last.x is not x:
-            near, unknown = self.within_reach(posed, x, reach), np.full(len(self.area), np.nan)
-            last = self._starts[id(posed.shape)] = FacetStart(self, posed, x, near, unknown)
-        return last
-
-    @cached_property
-    def _starts(self) -> dict[int, FacetStart]:
-        """By the id of the shape."""
-        return {}
+        return find_closest_points(posed, x[self.corners[facets]], self.smoothing)
 
     def within_reach(self, posed: PosedShape, x: Values, reach: float) -> Ints:
         """(k,) facets that may come nearer than `reach`, m, to an obstacle, with points at x (n, d), m."""
@@ -168,33 +141,6 @@ class ContactFacets:
         near, gaps = self.within_reach(posed, x, reach), np.full(len(self.area), np.inf)
         gaps[near] = self.closest_points(posed, x, near).gap
         return gaps
-
-
-@dataclass(frozen=True, eq=False)
-class FacetStart:
-    """Facets before an obstacle at the start of a step.
-
-    Attributes:
-        facets: all facets.
-        posed: the obstacle then.
-        x: (n, d) points then, m.
-        near: (k,) facets within the width of the barrier.
-        stored_gaps: (m,) gaps, m; nan: not searched for yet.
-    """
-
-    facets: ContactFacets
-    posed: PosedShape
-    x: Values
-    near: Ints
-    stored_gaps: Values
-
-    def gaps(self, facets: Ints, barycentric: Values) -> Values:
-        """(k,) gaps of facets (k,), m; `barycentric`: (k, c) coordinates to search from."""
-        if (new := np.isnan(self.stored_gaps[facets])).any():
-            corners = self.x[self.facets.corners[facets[new]]]
-            closest = find_closest_points(self.posed, corners, self.facets.smoothing, barycentric[new])
-            self.stored_gaps[facets[new]] = closest.gap
-        return np.asarray(self.stored_gaps[facets])
 
 
 @dataclass(frozen=True, eq=False)
@@ -360,16 +306,15 @@ def evaluate_facets(
         start: obstacle and points (n, d) at the start of the step, where the barrier is averaged over the step.
     """
     near = facets.within_reach(posed, x, law.width)
-    step_start = None if start is None else facets.start(*start, law.width)
-    if step_start is not None:
-        near = np.union1d(near, step_start.near)
+    if start is not None:
+        near = np.union1d(near, facets.within_reach(*start, law.width))
     closest = facets.closest_points(posed, x, near)
     if not len(near):
         return FacetForces.from_closest(facets.corners[near], facets.area[near], closest, law), 0.0, float("inf")
     least_gap = float(closest.gap.min())
     start_gap, acting = None, closest.gap < law.width  # elsewhere gap' >= gap, and F = 0 with its derivatives
-    if step_start is not None:
-        start_gap = step_start.gaps(near, closest.barycentric)
+    if start is not None:
+        start_gap = facets.closest_points(*start, near).gap
         acting |= start_gap < law.width
     rows = np.flatnonzero(acting)
     plane, closest = _soft_min_gap(posed, x, facets.corners[near[rows]], facets.smoothing), closest.select(rows)

@@ -90,6 +90,7 @@ class SurfacePolicy:
 
 
 SURFACE = SurfacePolicy()
+NO_ELEMENTS: Ints = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,7 @@ class SelfContactLaw:
 class RetractableSurface:
     """Elements in contact, of which crack faces are retracted where there is no room for them.
 
-    A surface that ranks share overrides what needs them: `_pressures`, `_intersecting_faces` and the agreements.
+    A surface that ranks share overrides what needs them: `pressures`, `_intersecting_faces` and the agreements.
 
     Attributes:
         elements: (m, d) points of the elements.
@@ -140,7 +141,7 @@ class RetractableSurface:
         is_copy = np.zeros(len(point_map.share), bool)
         is_copy[point_map.copies] = True
         self._crack_faces = np.flatnonzero(is_copy[elements].any(axis=1))
-        self._excluded: Ints = np.empty(0, np.int64)
+        self._excluded = NO_ELEMENTS
         self._release_interval = (1, 1)  # steps between two attempts to release faces, and to the next one
 
     def _build_pairs(self, elements: Ints) -> SurfacePairs:
@@ -148,14 +149,10 @@ class RetractableSurface:
         raise NotImplementedError("a subclass builds pairs")
 
     def _exclude(self, elements: Ints) -> None:
-        """Build pairs without these elements (k,)."""
-        if len(elements):
+        """Leave out these elements (k,) and no others."""
+        if len(elements) or len(self._excluded):
             self.pairs = self._build_pairs(np.delete(self.elements, elements, axis=0))
         self._excluded = elements
-
-    def _include_all(self) -> None:
-        """Build pairs of all elements."""
-        self.pairs, self._excluded = self._build_pairs(self.elements), np.empty(0, np.int64)
 
     def _remaining(self) -> Ints:
         """Numbers (m,) of the elements that the pairs have."""
@@ -171,7 +168,7 @@ class RetractableSurface:
 
     # --- what ranks agree on, if they share the surface ---
 
-    def _pressures(self, u: Values) -> Values:
+    def pressures(self, u: Values) -> Values:
         """(n,) pressure on each point at displacements u (nodes, d), m; Pa (collective)."""
         return self.pairs.pressure(self.point_map(u))
 
@@ -199,7 +196,7 @@ class RetractableSurface:
         return pressed if self._on_any_rank(len(pressed) > 0) else self._intersecting_faces(u)
 
     def _pressed_faces(self, u: Values, max_pressure: Values) -> Ints:
-        above = self._pressures(u) > max_pressure * (1 + SURFACE.round_off)
+        above = self.pressures(u) > max_pressure * (1 + SURFACE.round_off)
         return self._crack_faces[above[self.elements[self._crack_faces]].any(axis=1)]
 
     def _shorten(self, u: Values, faces: Ints, factor: float) -> bool:
@@ -247,11 +244,11 @@ class RetractableSurface:
         if remaining:
             self._release_interval = pause, remaining - 1
             return
-        load = self._pressures(u)
+        load = self.pressures(u)
         if is_retracted:
             self._extend_retracted(u, load)
         if is_excluded:
-            self._include_all()
+            self._exclude(NO_ELEMENTS)
             self._retract_faces(u, load)
         same = np.array_equal(share, self.point_map.share) and np.array_equal(excluded, self._excluded)
         pause = 1 if self._on_any_rank(not same) else min(2 * pause, SURFACE.max_pause)
@@ -376,7 +373,6 @@ class SelfContactSurface(RetractableSurface):
         if share is not self.point_map.share:
             self.point_map = self.point_map.with_arm_share(share)
         if excluded is not self._excluded:
-            self._include_all()
             self._exclude(excluded)
 
     def _identity(self) -> Values:

@@ -124,6 +124,14 @@ class MeshObstacle:
         """(m, 3) its points at a pose, m."""
         return pose.points_to_space(self.points)
 
+    def triangle_ranks(self, ranks: int) -> Ints:
+        """(k,) rank that has each triangle: slabs of equally many along the longest axis."""
+        centroids = self.points[self.triangles].mean(axis=1)
+        axis = int(np.ptp(centroids, axis=0).argmax())
+        result = np.empty(len(centroids), np.int64)
+        result[np.argsort(centroids[:, axis], kind="stable")] = np.arange(len(centroids)) * ranks // len(centroids)
+        return result
+
     def is_far(self, x: Values, distance: float) -> bool:
         """Whether its bounding box is farther than `distance` from that of points x (n, 3), m."""
         if self._bounds is None:

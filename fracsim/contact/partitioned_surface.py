@@ -1,7 +1,7 @@
 """Surface of a body with penalty contact, distributed over the ranks: no rank has all of it.
 
-Elements of other ranks come by surface_exchange, and are exchanged again before anything can be missing: any two points
-have come nearer by at most the diagonal of the bounding box of the motions of all points.
+Elements of other ranks are exchanged again before anything can be missing: any two points have come nearer by at most
+the diagonal of the bounding box of the motions of all points.
 
 Equations: docs/theory.md#explicit-contact.
 """
@@ -50,8 +50,14 @@ from .ipc_surface import SURFACE, SelfContactLaw, offset_crack_faces, refuse_int
 from .mesh_obstacles import MeshObstacle
 from .penalty_contacts import NodalMassShare, PenaltyHistory
 from .penalty_point_facet import POINT_FACET, penalty_stiffness
-from .penalty_surface import PenaltySurface, triangle_ranks
-from .surface_exchange import EXCHANGE, ElementRows, ElementSet, PointRows, exchange_elements
+from .penalty_surface import (
+    EXCHANGE,
+    ElementRows,
+    ElementSet,
+    PenaltySurface,
+    PointRows,
+    exchange_elements,
+)
 from .triangle_mesh_shape import refuse_overlap
 
 Values = npt.NDArray[np.float64]
@@ -331,7 +337,7 @@ class PartitionedSurface:
 
     def _mesh_boxes(self) -> list[Values]:
         """(k, 2, d) bounding boxes of this rank's triangles of each obstacle, m."""
-        sides = [mesh.triangles[triangle_ranks(mesh, self._comm.size) == self._comm.rank] for mesh in self._meshes]
+        sides = [mesh.triangles[mesh.triangle_ranks(self._comm.size) == self._comm.rank] for mesh in self._meshes]
         return [_bounding_boxes(mesh.positions[rows]) for mesh, rows in zip(self._meshes, sides, strict=True)]
 
     def set_history(self, histories: Sequence[PenaltyHistory]) -> None:
@@ -340,11 +346,12 @@ class PartitionedSurface:
         Collective.
         """
         for part, history in zip(self.current.parts, histories, strict=True):
-            stored = part.contact.store(part.lookup(history.points.points[:, 0]), part.lookup(history.edges.points))
+            lookup = KeyLookup(part.keys)
+            stored = part.contact.store(lookup(history.points.points[:, 0]), lookup(history.edges.points))
             if self._comm.size > 1:
                 elsewhere = history.select(*(~flags for flags in stored))
                 history = PenaltyHistory.join([history.select(*stored), *allgather(self._comm, elsewhere)])
-            part.contact.set_history(history.by_numbers(part.lookup, part.max_stiffness))
+            part.contact.set_history(history.by_numbers(lookup, part.max_stiffness))
 
     # --- positions and forces ---
 

@@ -217,7 +217,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
             limit = PENALTY.facet_share * self._max_added
             k = np.minimum(k, limit * facets.area / np.where(rate > 0, rate, np.inf))
         acts = ~is_copy[facets.corners].any(axis=1)
-        self._facets = ContactFacets(facets.corners[acts], k[acts], facets.smoothing, warm_start=False)
+        self._facets = ContactFacets(facets.corners[acts], k[acts], facets.smoothing)
         corners = surface.rest_positions[self._facets.corners]
         side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0.0))
         self._facet_reach = self.law.barrier.width + PENALTY.max_stretch * self.comm.allreduce(side, op=MPI.MAX)

@@ -79,47 +79,22 @@ class PointFacetPairs:
         )
 
 
-class ClosestPointCache:
-    """Closest points of pairs of a point and a facet, computed again where either has moved.
-
-    Attributes:
-        points: (k,).
-        corners: (k, d) of the facets.
-    """
-
-    def __init__(self, points: Ints, corners: Ints) -> None:
-        self.points, self.corners = points, corners
-        self._barycentric, self._offset = np.zeros(corners.shape), np.zeros(corners.shape)
-        self._x: Values | None = None
-
-    def __call__(self, x: Values) -> tuple[Values, Values]:
-        """(k, d) barycentric coordinates, and vectors (k, d), m, from closest points to the points at x (n, d)."""
-        new: Ints = np.arange(len(self.points))
-        if self._x is not None and x.shape == self._x.shape:
-            moved = (x != self._x).any(axis=1)
-            new = np.flatnonzero(moved[self.points] | moved[self.corners].any(axis=1))
-        self._x = x
-        if len(new):
-            self._barycentric[new], self._offset[new] = _closest_points(x, self.points[new], self.corners[new])
-        return self._barycentric, self._offset
-
-
 def closest_distance(x: Values, points: Ints, corners: Ints, limit: float) -> float:
     """Least distance of points to facets (k, d), at most `limit`, m, with points at x (n, d)."""
     _, offset = _closest_points(x, points, corners)
     return min(limit, float(np.linalg.norm(offset, axis=1).min(initial=limit)))
 
 
-def point_facet_pairs(x: Values, cache: ClosestPointCache, reach: float, tolerance: float) -> PointFacetPairs:
-    """Pairs nearer than `reach`, m, one facet for each closest point.
+def point_facet_pairs(x: Values, points: Ints, corners: Ints, reach: float, tolerance: float) -> PointFacetPairs:
+    """Pairs of points and facets (k, d) nearer than `reach`, m, one facet for each closest point.
 
     Of facets that share a closest point, at equal distances within `tolerance`, m, the one is taken whose normal is
     most parallel to the offset: it tells the side of the point.
     """
-    barycentric, offset = cache(x)
+    barycentric, offset = _closest_points(x, points, corners)
     distance = np.linalg.norm(offset, axis=1)
     near = np.flatnonzero(distance < reach)
-    points, corners = cache.points[near], cache.corners[near]
+    points, corners = points[near], corners[near]
     barycentric, offset, distance = barycentric[near], offset[near], distance[near]
     normal = unit_normals(x[corners])
     height = np.einsum("kd,kd->k", offset, normal)
@@ -128,7 +103,7 @@ def point_facet_pairs(x: Values, cache: ClosestPointCache, reach: float, toleran
     group = np.cumsum(np.r_[False, is_new][: len(order)])
     steepest = np.zeros(len(order))
     np.maximum.at(steepest, group, abs(height[order]))
-    # round-off decides nothing: of several facets the first one of the cache
+    # round-off decides nothing: of several facets the first one
     level = abs(height[order]) >= steepest[group] - tolerance
     selected = np.sort(_first_rows(group[level], order[level]))
     gap = np.where(height < 0, -1.0, 1.0) * distance
@@ -190,8 +165,6 @@ class PointFacetContacts:
         self._sets = SimplexPairs.of(owned[:, None], facets, reach)
         where = PairFilter.of(len(self._used), None if patch is None else patch[self._used])
         self._search = PairSearch(where, [self._sets], POINT_FACET.search_margin * distance)
-        self._searched: Ints | None = None  # pairs of which closest points are cached
-        self._cache: ClosestPointCache
         self._last: tuple[Values, PointFacetPairs] | None = None
         self.set_history(ContactHistory.none(1 + dim, dim))
 
@@ -237,7 +210,7 @@ class PointFacetContacts:
 
     def anything_is_near(self, x: Values) -> bool:
         """Whether any point has contact, or may be near a facet, at x (n, d), m."""
-        return bool(self.history.stiffness.any()) or len(self._candidates(x).points) > 0
+        return bool(self.history.stiffness.any()) or len(self._candidates(x)[0]) > 0
 
     def clearance(self, x: Values, reach: float) -> float:
         """Least distance between points and facets at x (n, d), m, at most `reach`."""
@@ -252,9 +225,9 @@ class PointFacetContacts:
     def _all_pairs(self, x: Values) -> PointFacetPairs:
         """Pairs of points in front of facets or behind; those of the last x are kept."""
         if self._last is None or not np.array_equal(x, self._last[0]):
-            positions, cache = x.copy(), self._candidates(x)
+            positions, candidates = x.copy(), self._candidates(x)
             reach, tolerance = POINT_FACET.max_gap * self._width, POINT_FACET.same_distance * self._edge
-            self._last = positions, point_facet_pairs(positions, cache, reach, tolerance)
+            self._last = positions, point_facet_pairs(positions, *candidates, reach, tolerance)
         return self._last[1]
 
     def _stiffness_of(self, pairs: PointFacetPairs) -> Values:
@@ -270,14 +243,11 @@ class PointFacetContacts:
         previous = self._start_stiffness[pairs.points]
         return np.where(previous > 0, previous, np.minimum(largest, limit))
 
-    def _candidates(self, x: Values) -> ClosestPointCache:
-        """Pairs that may be as near, or as deep, as counts, with points at x (n, d), m."""
+    def _candidates(self, x: Values) -> tuple[Ints, Ints]:
+        """(k,) points and (k, d) facets that may be as near, or as deep, as counts, with points at x (n, d), m."""
         (pairs,) = self._search.pairs(x[self._used])
-        if pairs is not self._searched:
-            points, facets = pairs.T
-            self._searched = pairs
-            self._cache = ClosestPointCache(self._owned_points[points], self._elements[facets])
-        return self._cache
+        points, facets = pairs.T
+        return self._owned_points[points], self._elements[facets]
 
 
 def penalty_stiffness(
