@@ -174,7 +174,7 @@ def find_closest_points(
         posed: convex obstacle.
         x: (k, c, d) corners, m.
         smoothing: mu, m.
-        start: (k, c) barycentric coordinates to start from; nan, or None for all: from `initial_barycentric`.
+        start: (k, c) barycentric coordinates to start from; None: from `initial_barycentric`.
         tolerance: remaining derivative by barycentric coordinates, in smoothings mu.
     """
     lam = np.full(x.shape[:2], np.nan) if start is None else start.copy()
@@ -182,8 +182,8 @@ def find_closest_points(
         kernels.find_closest_points(posed.packed, x, smoothing, tolerance, lam)
         return FacetClosestPoints(posed, x, smoothing, lam)
     max_residual = np.maximum(tolerance * smoothing, SEARCH.round_off * abs(x).max(axis=(1, 2), initial=0.0))
-    if (new := np.isnan(lam[:, 0])).any():
-        lam[new] = initial_barycentric(posed, x[new], smoothing)
+    if start is None:
+        lam = initial_barycentric(posed, x, smoothing)
     slope, active = _SlopeFunction(posed, x, smoothing)(lam), np.arange(len(x))
     for _ in range(SEARCH.max_iterations):
         rise = _rise(slope[active], lam[active])

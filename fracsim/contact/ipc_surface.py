@@ -274,6 +274,7 @@ class SelfContactSurface(RetractableSurface):
 
     Attributes:
         split: the surface.
+        rest_positions: (n, d) reference positions of its points with the gap of new cracks, m.
         face_gap: gap between the sides of a new crack, in distances of the barrier.
     """
 
@@ -302,10 +303,11 @@ class SelfContactSurface(RetractableSurface):
             comm: ranks that share the pairs.
         """
         self._skeleton, self._pattern, self._fragments_only = skeleton, pattern, law.fragments_only
-        gap = self.face_gap * law.distance
-        self.split, self._rest_positions, point_map = build_contact_surface(skeleton, pattern, law, gap, cut)
-        super().__init__(self.split.elements, point_map, law.stiffness)
-        self._share = PairShare.by_slabs(comm, self._rest_positions, self.point_map.copies)
+        fragments = law.fragments_only
+        split = build_fragment_surface(skeleton, pattern, cut) if fragments else build_split_surface(skeleton, pattern)
+        self.split, self.rest_positions = split, offset_crack_faces(split, self.face_gap * law.distance)
+        super().__init__(split.elements, make_surface_map(split, skeleton, pattern, self.rest_positions), law.stiffness)
+        self._share = PairShare.by_slabs(comm, self.rest_positions, self.point_map.copies)
         self._parameters = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
         self._nodes, self._size = len(skeleton.points), float(np.linalg.norm(np.ptp(skeleton.points, axis=0)))
         self.pairs = self._build_pairs(self.split.elements)
@@ -315,11 +317,6 @@ class SelfContactSurface(RetractableSurface):
             share, pressure = self._previous_state(previous, u)
             self.point_map = self.point_map.with_arm_share(share)
             self._retract_faces(u, pressure)
-
-    @property
-    def rest_positions(self) -> Values:
-        """(n, d) reference positions of its points with the gap of new cracks, m."""
-        return self._rest_positions
 
     def represents(self, pattern: npt.NDArray[np.uint8]) -> bool:
         """Whether the surface is also that of a pattern (cells,): most edges break within fragments."""
@@ -354,7 +351,7 @@ class SelfContactSurface(RetractableSurface):
         return pairs, np.asarray(np.isin(pairs, self._excluded).any(axis=1))
 
     def _build_pairs(self, elements: Ints) -> SurfacePairs:
-        return IpcPairs(self._rest_positions, elements, **self._parameters, share=self._share, patch=None)
+        return IpcPairs(self.rest_positions, elements, **self._parameters, share=self._share, patch=None)
 
     def set_stiffness(self, stiffness: float) -> None:
         """Set the stiffness of the barrier, Pa."""
@@ -392,20 +389,6 @@ class SelfContactSurface(RetractableSurface):
         nodes = min(old.min(initial=len(pressure)), self.point_map.copies.min(initial=len(load)))
         load[:nodes] = pressure[:nodes]
         return share, load
-
-
-def build_contact_surface(
-    skeleton: EntityNumbering, pattern: npt.NDArray[np.uint8], law: SelfContactLaw, gap: float, cut: Values | None
-) -> tuple[SplitSurface, Values, SurfaceMap]:
-    """Split surface of a whole mesh, reference positions (n, d) of its points with a gap of new cracks, m, and its map.
-
-    Arguments as for SelfContactSurface.
-    """
-    split = (
-        build_fragment_surface(skeleton, pattern, cut) if law.fragments_only else build_split_surface(skeleton, pattern)
-    )
-    positions = offset_crack_faces(split, gap)
-    return split, positions, make_surface_map(split, skeleton, pattern, positions)
 
 
 def refuse_intersections(positions: Values) -> None:

@@ -411,7 +411,7 @@ class MeshContactSurface(SelfContactSurface):
             refuse_overlap(pairs.mesh.name, body, pairs.mesh.surface, cut=is_cut)
 
     def _build_pairs(self, elements: Ints) -> AllMeshPairs:
-        X, parameters = self._rest_positions, {name: self._parameters[name] for name in ("distance", "stiffness")}
+        X, parameters = self.rest_positions, {name: self._parameters[name] for name in ("distance", "stiffness")}
         return AllMeshPairs(
             [MeshObstaclePairs(X, elements, mesh, **parameters, share=self._share) for mesh in self._obstacles]
         )

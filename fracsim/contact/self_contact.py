@@ -68,7 +68,8 @@ class BreakingSurface[S: SelfContactSurface]:
             build: function that builds a surface. It refuses bodies that intersect at rest.
         """
         self.law, self._domain, self._u, self._build = law, domain, u, build
-        self.gather, is_refined = node_gather(domain, law), domain.order == 2 and not law.corners_only
+        numbering, is_refined = domain.input_numbering, domain.order == 2 and not law.corners_only
+        self.gather: Gather = numbering.gather_corners if law.corners_only else numbering.gather_nodes
         # subdivided quadratic cells do not break
         self._parts = 2**domain.dim if is_refined else 1
         mesh = subdivided_input_mesh(domain) if is_refined else domain.input_mesh
@@ -434,8 +435,3 @@ def mean_velocities(comm: MPI.Intracomm, v: Values) -> tuple[float, Values]:
     """Mean square speed of nodes, (m/s)^2, and their mean velocity (d,), m/s; v: (n, d) of owned ones (collective)."""
     square, count, *total = sum_over_ranks(comm, np.array([np.vdot(v, v), len(v), *v.sum(axis=0)]))
     return float(square / count), np.array(total) / count
-
-
-def node_gather(domain: Domain, law: SelfContactLaw) -> Gather:
-    """Gathering of the nodes that the surface depends on."""
-    return domain.input_numbering.gather_corners if law.corners_only else domain.input_numbering.gather_nodes
