@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from fracsim.meshes import BUILDERS
 from fracsim.meshes.data import MeshData, MeshError
 from fracsim.meshes.directions import preferred_directions
 from fracsim.meshes.quality import mesh_quality
-from fracsim.meshes.random_points.points import SAMPLING, Outline, circumcircles, scatter
+from fracsim.meshes.random_points.points import SAMPLING, Outline, circumcircles, scatter, spaced
 from fracsim.meshes.sizing import SizeField
 from fracsim.meshes.topology import boundary_facets, edges_of, signed_measures
 from fracsim.study.mesh_source import build_mesh
@@ -165,3 +166,25 @@ def test_the_page_has_what_packaged_studies_have() -> None:
         assert low <= values["directions"] <= high, name
         assert faces[0] <= values.get("directions_faces", faces[0]) <= faces[1], name
     assert float(found.group(9)) == pytest.approx(180 / 21, abs=0.05)
+
+
+def test_points_keep_their_distance_from_earlier_ones() -> None:
+    """Against all distances, with spacings that vary by a factor of ten."""
+    random = np.random.default_rng(2)
+    points = random.random((800, 2))
+    apart = 0.005 + 0.05 * points[:, 0]
+    distances = np.linalg.norm(points[:, None] - points, axis=2)
+    near = np.tril(distances < np.maximum(apart[:, None], apart), -1)
+    assert 0.2 < near.any(axis=1).mean() < 0.8
+    assert np.array_equal(spaced(points, apart), ~near.any(axis=1))
+
+
+def test_a_strongly_graded_mesh_needs_no_more_memory() -> None:
+    """10,000 points within a thousandth of the largest spacing: pairs within that spacing took 0.8 GB."""
+    points = np.concatenate([1e-3 * np.random.default_rng(3).random((10_000, 2)), [[5.0, 5.0]]])
+    apart = np.append(np.full(10_000, 1e-6), 1.0)
+    tracemalloc.start()
+    spaced(points, apart)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 20e6

@@ -127,7 +127,7 @@ def scatter(outline: Outline, size: Size, seed: int = 1) -> tuple[Points, Indice
         inside = outline.inside(points, triangles.simplices)
         new = _gap_points(points[triangles.simplices[inside]], size, random)
         new = new[_in_body(triangles, inside, new)]
-        new = new[_spaced(new, SAMPLING.distance * size(new))]
+        new = new[spaced(new, SAMPLING.distance * size(new))]
         if len(new) == 0:
             return points, orient_cells(points, triangles.simplices[inside].astype(np.int64))[0]
         points = np.concatenate([points, new])
@@ -148,7 +148,7 @@ def _random_points(outline: Outline, size: Size, random: np.random.Generator) ->
         apart = SAMPLING.distance * size(new)
         free = cKDTree(points).query(new, distance_upper_bound=2 * apart.max(initial=0.0))[0] >= apart
         new, apart = new[free], apart[free]
-        points = np.concatenate([points, new[_spaced(new, apart)]])
+        points = np.concatenate([points, new[spaced(new, apart)]])
     return points
 
 
@@ -206,14 +206,18 @@ def _solve_pairs(A: Floats, b: Floats) -> Floats:
     return np.stack([(b[row, pivot] - y * first[:, 1]) / first[:, 0], y], axis=1)
 
 
-def _spaced(points: Points, apart: Floats) -> Mask:
+def spaced(points: Points, apart: Floats) -> Mask:
     """(n,) whether each point has its distance from all earlier ones."""
     from scipy.spatial import cKDTree
 
     keep = np.ones(len(points), bool)
     if len(points) < 2:
         return keep
-    pairs = cKDTree(points).query_pairs(float(apart.max()), output_type="ndarray")
-    near = np.linalg.norm(points[pairs[:, 0]] - points[pairs[:, 1]], axis=1) < apart[pairs].max(axis=1)
-    keep[pairs[near, 1]] = False  # even if the earlier one is left out too: the next round fills the gap
+    # each point's own distance: the largest one would find most of the points of a finely meshed part
+    within = cKDTree(points).query_ball_point(points, apart)
+    first = np.repeat(np.arange(len(points)), [len(numbers) for numbers in within])
+    second = np.concatenate(within)
+    near = (np.linalg.norm(points[first] - points[second], axis=1) < apart[first]) & (first != second)
+    # even if the earlier one is left out too: the next round fills the gap
+    keep[np.maximum(first, second)[near]] = False
     return keep
