@@ -21,7 +21,7 @@ from scipy.sparse import csr_matrix
 from ..mechanics.term_protocols import CutPositions
 from ..mesh.domain import Domain
 from ..mesh.fragments import find_components
-from ..mesh.ghost_exchange import KeyedReduction, KeyLookup, min_over_ranks
+from ..mesh.ghost_exchange import KeyedReduction, KeyLookup, min_over_ranks, sum_at_nodes
 from ..mesh.parallel import allgather, gather, max_over_ranks, on_root
 from ..mesh.simplices import is_split
 from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
@@ -38,7 +38,6 @@ from ..mesh.split_surface.local_surface import (
     contact_elements,
     local_map_parts,
     local_mesh,
-    sum_at_shared_nodes,
 )
 from ..mesh.split_surface.quadratic_surface import subdivided_local_mesh
 from ..mesh.split_surface.surface_map import SurfaceMap
@@ -136,7 +135,7 @@ class PartitionedSurface:
         # subdivided quadratic cells do not break
         self._cell_parts = 2**domain.dim if is_refined else 1
         self._topology = EntityNumbering(subdivided_local_mesh(domain) if is_refined else local_mesh(domain))
-        self._is_shared = sum_at_shared_nodes(domain, np.arange(len(domain.nodes)), 1.0) > 1
+        self._is_shared = sum_at_nodes(domain, np.arange(len(domain.nodes)), np.ones((len(domain.nodes), 1)))[:, 0] > 1
         self._pattern: Pattern = np.zeros(domain.cell_count, np.uint8)
         self._reach = POINT_FACET.clearance_gap * law.distance
         self._margin = EXCHANGE.margin * domain.mean_edge_length
@@ -248,13 +247,13 @@ class PartitionedSurface:
         d, nodes = self._domain.dim, self._own_nodes
         assert nodes is not None
 
-        def sum_at_nodes(values: Values) -> Values:
+        def nodal_sums(values: Values) -> Values:
             total = nodes.sum_at_nodes(np.repeat(values[:, None], d, axis=1))
             return nodes(total)[:, 0].copy()
 
         # before obstacles twice that of self-contact, where both sides yield
         limit = (2 if self._meshes else 1) * self._max_added
-        mass_share = NodalMassShare(weights, nodes(self._mass)[:, 0].copy(), sum_at_nodes)
+        mass_share = NodalMassShare(weights, nodes(self._mass)[:, 0].copy(), nodal_sums)
         return penalty_stiffness(mass_share, area, self.law.stiffness / self.law.distance, limit, local_area)
 
     def _over_border(self, values: Values, operation: np.ufunc) -> Values:

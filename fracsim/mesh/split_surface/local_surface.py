@@ -15,13 +15,13 @@ from __future__ import annotations
 import dolfinx
 import numpy as np
 import numpy.typing as npt
-from dolfinx import la
 from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from ...meshes.data import MeshData
 from ..domain import Domain
+from ..ghost_exchange import sum_at_nodes
 from ..parallel import rank_offset
 from ..simplices import is_split
 from .closed_surface import SplitSurface, build_split_surface
@@ -131,25 +131,15 @@ def _gradient_entries(domain: Domain, intact: npt.NDArray[np.bool_], parents: In
     are among the `parents` of any rank (collective).
     """
     d = domain.dim
-    is_parent = sum_at_shared_nodes(domain, parents, 1.0) > 0
+    is_parent = sum_at_nodes(domain, parents, np.ones((len(parents), 1)))[:, 0] > 0
     cells = np.flatnonzero(intact & is_parent[domain.cell_nodes].any(axis=1))
     corners, volume = domain.cell_nodes[cells].astype(np.int64), domain.volumes[cells][:, None]
     # sums at other nodes lack cells: their rows are not used
-    around = np.maximum(sum_at_shared_nodes(domain, corners, volume), np.finfo(float).tiny)
+    around = np.maximum(sum_at_nodes(domain, corners, volume)[:, 0], np.finfo(float).tiny)
     rows, columns, values = gradient_entries(domain.nodes[corners], volume / around[corners], corners)
     nodes = _global_numbers(domain, np.arange(len(domain.nodes)))
     shape = d * len(nodes), domain.space.dofmap.index_map.size_global
     return csr_matrix((values, (rows, nodes[columns])), shape=shape), _by_axis(nodes, d)
-
-
-def sum_at_shared_nodes(domain: Domain, nodes: Ints, values: Values | float) -> Values:
-    """(nodes,) sums over all ranks of `values` at `nodes` (collective)."""
-    result = la.vector(domain.space.dofmap.index_map, 1, np.float64)
-    weights = np.broadcast_to(values, nodes.shape).reshape(-1)
-    result.array[:] = np.bincount(nodes.reshape(-1), weights, len(result.array))
-    result.scatter_reverse(la.InsertMode.add)
-    result.scatter_forward()
-    return np.asarray(result.array)
 
 
 def _global_numbers(domain: Domain, nodes: Ints) -> Ints:
