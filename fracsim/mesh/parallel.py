@@ -95,7 +95,7 @@ def abort_unless_all_failed(comm: MPI.Intracomm, message: str, code: int, *, lat
         # meanwhile a lower rank prints its message and ends all ranks
         time.sleep(FAILURE_WAIT)
     print(message or f"fracsim: rank {comm.rank} ended alone", file=sys.stderr, flush=True)
-    # MPICH's mpirun ends without what it has not passed on yet: it has half a second for that
+    # MPICH's mpirun ends without what it has not passed on yet: half a second is enough
     time.sleep(0.5)
     comm.Abort(code or 1)
     # MPICH may return before mpirun has ended this rank

@@ -19,7 +19,7 @@ from ..mesh.parallel import RowRouting, gather
 
 Ints = npt.NDArray[np.int64]
 ROWS_PER_CHUNK = 1 << 15
-# of zlib streams; higher levels take longer and save 3 %
+# of zlib streams; level 3, the highest of ISA-L, takes three times as long and saves 0.4 %
 COMPRESSION_LEVEL = 1
 
 
