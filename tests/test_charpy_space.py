@@ -46,11 +46,15 @@ def broken(study: str, options: list[str], out: Path) -> tuple[Run, Values, list
 
 
 def check_two_pieces(run: Run, masses: list[float], thickness: float) -> None:
-    """Two halves and crumbs of less than a hundredth of the bar; the crack takes G_c times the ligament, to 15 %."""
+    """Two halves and crumbs of less than a hundredth of the bar.
+
+    The cracks take at least G_c times the ligament, to 15 %, and at most G_c times their own area, which is rough.
+    """
     shares = np.array(masses) / sum(masses)
     assert shares[:2].min() > 0.45 and shares[2:].sum() < 0.01
-    toughness = run.scene.study.fracture.energy
-    assert run.state.dissipated == pytest.approx(toughness * thickness * (HEIGHT - NOTCH), rel=0.15)
+    area = np.genfromtxt(run.folder / "history.csv", delimiter=",", names=True)["crack_area"][-1]
+    taken = run.state.dissipated / run.scene.study.fracture.energy
+    assert 0.85 * thickness * (HEIGHT - NOTCH) < taken < area
 
 
 def test_a_slice_of_the_brittle_bar_ends_as_two_pieces(tmp_path: Path) -> None:
@@ -101,7 +105,7 @@ def test_the_ductile_bar_bends_and_cracks_in_part(tmp_path: Path) -> None:
 @pytest.mark.timeout(1200)
 def test_the_brittle_izod_bar_ends_as_two_pieces(tmp_path: Path) -> None:
     """Its halves come apart, though loose nodes are attached to both of them."""
-    _, rows, masses = broken("izod-3d", ["time.end=4.5e-4"], tmp_path / "out")
+    _, rows, masses = broken("izod-3d", ["time.end=6e-4"], tmp_path / "out")
     shares = np.array(masses) / sum(masses)
     assert shares[:2].min() > 0.45 and shares[2:].sum() < 0.01
     assert rows[-1, 0] < 0.01 * rows[:, 0].max()

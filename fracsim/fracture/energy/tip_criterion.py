@@ -1,8 +1,9 @@
 """Criterion of a body with a fracture energy G_c: which crack tips advance, and where cracks start.
 
 A tip advances by a cell if the configurational force over a disc of 5 h (3D: a ball of 4 h) reaches G_c, once the crack
-behind it is longer than the disc (a mature tip). Young tips advance, and cracks start, by the mean stress ahead
-(critical_distance); where a crack starts the stress has to reach the strength, too.
+behind it is longer than the disc (a mature tip), or if the strain of its cell alone releases the energy of the cut.
+Young tips advance, and cracks start, by the mean stress ahead (critical_distance); where a crack starts the stress has
+to reach the strength, too.
 
 Equations: docs/theory.md#tip-criterion.
 """
@@ -20,9 +21,10 @@ from ...mesh.domain import Domain
 from ...mesh.edge_graph import EdgeGraph
 from ...mesh.parallel import allgather, sum_over_ranks
 from ...mesh.simplices import local_edges
+from ...mesh.small_matrices import barycentric_gradients
 from ..criterion import Edges
 from ..node_retention import NodeAttachment
-from ..principal_stress import first_principal_stress
+from ..principal_stress import first_principal_stress, symmetric_tensors
 from ..strength import EdgeStrength
 from .branching import release_rate, rotate, unit_or_zero
 from .crack_initiation import (
@@ -244,16 +246,21 @@ class TipCriterion:
         if self.may_branch:
             branches = turns & enough_for_branches
             ahead = np.where(branches[:, None], tips.course, ahead)
+        # A tip that reaches G_c has its crack speed, a young one the stress ahead.
+        overstrained = tips.mature & (size < toughness) & self._is_overstrained(tips.cell, fields.cell_stress)
         # A branch is inactive behind the other unless there is enough energy for both.
         is_inactive = (tips.is_inactive & (size < TIP.branching_ratio * toughness)) | self._excluded_cells[tips.cell]
-        candidates = np.flatnonzero((~mature | enough) & ~is_inactive)
+        candidates = np.flatnonzero((~mature | enough | overstrained) & ~is_inactive)
         if not sum_over_ranks(self._domain.comm, len(candidates))[0]:
             return empty_proposal(d, self.course_width)
         mean = fields.mean_stress(candidates)
+        # The mean of a narrow ligament is that of the fragments beside it, which carry little.
+        local = overstrained[candidates]
+        mean[local] = symmetric_tensors(fields.cell_stress[tips.cell[candidates[local]]], d)
         sigma = first_principal_stress(mean)
-        active = (sigma > 0) & mature[candidates]
+        active = (sigma > 0) & (mature[candidates] | local)
         # The stress ahead of a young tip is that ahead of a place at which a crack starts.
-        young = np.flatnonzero(~mature[candidates] & (sigma > 0))
+        young = np.flatnonzero(~active & (sigma > 0))
         active[young] = self._is_overloaded(fields, candidates[young], mean[young])
         rows = candidates[active]
         cells = tips.cell[rows]
@@ -270,6 +277,20 @@ class TipCriterion:
         radii = start.radius[cells], start.least_radius[cells]
         ahead = evaluator.mean_stress_ahead(fields.tips.point[rows], normals, *radii, fields.cell_stress)
         return np.asarray(first_principal_stress(ahead) >= self._start.threshold[cells])
+
+    def _is_overstrained(self, cells: Ints, stress: Values) -> Flags:
+        """Return in which cells (n,) a cut releases G_c times its area from the strain of the cell alone.
+
+        V sigma_1^2 / (2 (lambda + 2 mu)) >= G_c A, with the stress (cells, 3 or 6), Pa, and the area A of the largest
+        facet, which no cut exceeds. The force on a tip in a ligament narrower than its disc is that of several tips.
+        """
+        material, gradients = self._stress.material, barycentric_gradients(reference_corners(self._domain, cells))
+        modulus = np.broadcast_to(np.asarray(material.lmbda) + 2 * np.asarray(material.mu), len(self._h))[cells]
+        toughness = np.broadcast_to(self.toughness, len(self._h))[cells]
+        # A = d V |grad N| of the corner opposite to the facet
+        area_per_volume = self._domain.dim * np.linalg.norm(gradients, axis=2).max(axis=1, initial=0.0)
+        sigma = np.maximum(first_principal_stress(symmetric_tensors(stress[cells], self._domain.dim)), 0.0)
+        return np.asarray(sigma**2 / (2 * modulus) >= toughness * area_per_volume)
 
     def _find_critical_tips(self, size: Values, toughness: Values, tips: CrackTips) -> tuple[Flags, Flags]:
         """Return which tips (n,) with release rates `size` (n,) reach G_c, and which branch (collective)."""
