@@ -105,16 +105,20 @@ def test_what_is_left_on_a_grip_is_a_piece_of_its_own(scene: Scene) -> None:
 
 @pytest.mark.parametrize("dim", (2, 3))
 def test_cracks_that_take_an_energy_cut_no_node_off(dim: int) -> None:
-    """A plate, a block that flies apart: with crumbs most of its pieces are single nodes, without there is none; a cell
-    is cut as its crack goes, or not at all, the cracks are of one size by half, and a restart breaks the same."""
+    """A plate, a block that flies apart: with crumbs most of its pieces are single nodes, without there are pieces, and
+    none of a single node. A cell is cut as its crack goes, or not at all, and a restart breaks the same. The cracks are
+    of half to two and a half times the size: where no node comes off, ligaments of a cell hold until their own strain
+    breaks them."""
     split, crumbs = [], []
     for single in (True, False):
         scene = burst(dim, single)
         graph = scene.fracture.graph
-        crumbs.append(np.count_nonzero(np.bincount(find_fragments(graph).node_fragment) == 1))
+        fragments = find_fragments(graph)
+        assert fragments.count > 1
+        crumbs.append(np.count_nonzero(np.bincount(fragments.node_fragment) == 1))
         split.append(np.count_nonzero(graph.split))
         assert np.isnan(scene.fracture.criterion.cut_positions[~graph.broken]).all()  # what was spared is not cut
-    assert crumbs[0] > 10 and crumbs[1] == 0 and split[1] == pytest.approx(split[0], rel=0.5)
+    assert crumbs[0] > 10 and crumbs[1] == 0 and 0.5 < split[1] / split[0] < 2.5
     other = burst(dim, False, forgetful=True)
     np.testing.assert_array_equal(other.fracture.graph.broken, scene.fracture.graph.broken)
 
