@@ -20,6 +20,7 @@ from fracsim.solvers.policy import DEFAULT_POLICY
 from fracsim.studies.evidence.crack_count_cost import random_planes
 from support.scenes import Walk
 from support.solver_policy import set_policy
+from support.torn import hanging_parts
 
 pytestmark = pytest.mark.fast_solver_only("multigrid of another kind for a body in pieces, deflation, blocks")
 
@@ -116,6 +117,26 @@ def test_what_hangs_is_solved_for_by_itself_in_long_steps(monkeypatch: pytest.Mo
         set_policy(monkeypatch, max_deflated_inertia=held)
         its.append(sum(shattered(0.04, 10, {}, 6, step=0.1, energy="linear")[1][-3:]))
     assert its[0] < 0.6 * its[1], f"{its[0]} iterations, {its[1]} without"
+
+
+def test_deflation_of_an_earlier_tangent_remains_positive() -> None:
+    """Fragments are deflated by the tangent with which a step begins: applied to later ones, P is as it was."""
+    scene, deflation, _, _ = hanging_parts()
+    balance, rng = scene.balance, np.random.default_rng(4)
+    nodes = scene.domain.node_count
+    balance.u.x.array[:] += 0.02 * rng.standard_normal(len(balance.u.x.array))
+    balance.tangent.assemble()
+    deflation.base_pc.setOperators(balance.tangent.matrix)
+    x, y = balance.work_vector.duplicate(), balance.work_vector.duplicate()
+    given = rng.standard_normal((30, 3 * nodes))
+    found = np.empty_like(given)
+    for row, result in zip(given, found, strict=True):
+        x.array_w[:] = row
+        deflation.apply(deflation.pc, x, y)
+        result[:] = y.array_r
+    products = given @ found.T
+    np.testing.assert_allclose(products, products.T, atol=1e-9 * np.abs(products).max())
+    assert np.linalg.eigvalsh(products).min() > 0
 
 
 def test_sweeps_do_for_what_is_in_pieces_in_short_steps(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -64,6 +64,8 @@ class DeflatedPreconditioner:
     def update_operator(self, tangent: PETSc.Mat) -> bool:
         """Set up P for a tangent at the present displacement (collective).
 
+        P remains symmetric and positive definite for later tangents, with K of this one.
+
         Returns:
             False if all motions of the fragments are prescribed, so that there is nothing to deflate.
         """

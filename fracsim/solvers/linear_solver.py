@@ -245,6 +245,7 @@ class LinearSolver:
 
     def begin_attempt(self) -> None:
         """Begin an attempt of Newton's method."""
+        self.preconditioner.begin_solution()
         if self.forcing is not None:
             self.forcing.begin_attempt()
         if self._free_forcing is not None:
@@ -372,6 +373,7 @@ class LinearSolver:
         Returns:
             |r| that is left, inf if it is unknown, and iterations; None if it was not solved.
         """
+        self.preconditioner.begin_solution()
         if self._step_cg is None or self.ksp.getType() != "cg":
             return (np.inf, self.ksp.its) if self.solve(eigenvalue_floor) else None
         if not self.balance.scheme.inertia:

@@ -117,6 +117,7 @@ class AppliedPreconditioner:
         self.pc = self.serving = ksp.getPC()
         self.vcycle: SinglePrecisionVCycle | None = None
         self._deflation: DeflatedPreconditioner | None = None
+        self._deflates = False  # whether any motion of the fragments is free
 
     def change_kind(self, options: PetscOptions) -> None:
         """Change options of `pc`, which has to be rebuilt after this."""
@@ -149,10 +150,13 @@ class AppliedPreconditioner:
         """Whether fragments may be deflated: without inertia they hang by a residual stiffness."""
         return self._is_default and self._balance.scheme.inertia and self.pc.getType() == "gamg"
 
-    def serve(self, operators: TangentOperators, *, new_fragments: bool) -> None:
+    def serve(self, operators: TangentOperators, *, new_fragments: bool, moved: bool) -> None:
         """Choose `serving` for the tangent of the next solve (collective).
 
-        `new_fragments`: whether rigid motions of the present fragments are deflated, unless inertia holds them.
+        Args:
+            operators: tangent.
+            new_fragments: whether rigid motions of the present fragments are deflated, unless inertia holds them.
+            moved: whether these motions and their forces are evaluated anew.
         """
         base = self.serving = self.pc if self.vcycle is None else self.vcycle.pc
         if self.vcycle is not None:
@@ -166,7 +170,9 @@ class AppliedPreconditioner:
         deflation = self._deflation
         if deflation is None or deflation.base_pc is not base:
             return
-        if deflation.update_operator(operators.matrix):
+        if new_fragments or moved:
+            self._deflates = deflation.update_operator(operators.matrix)
+        if self._deflates:
             # The two-level preconditioner applies this one as it is.
             self.pc.setReusePreconditioner(True)
             renew_smoothers(self.pc)
@@ -225,6 +231,7 @@ class Preconditioner:
         self._ever_broken = False
         self._pattern_is_new = False
         self._looks_for_fragments = False  # before the next solve
+        self._fragments_moved = True  # beyond what Newton's method moves them
         # --- decisions ---
         self._due, self._keeps = Update.REBUILD, keeps
         self._last_update = Update.NONE  # before the last solve
@@ -260,6 +267,10 @@ class Preconditioner:
             equivalent: that of a solve to full accuracy; 0: unknown.
         """
         self._iterations, self._equivalent = iterations, equivalent
+
+    def begin_solution(self) -> None:
+        """Record that a nonlinear or linear step is solved next: fragments have moved since the last one."""
+        self._fragments_moved = True
 
     def solve_failed(self) -> None:
         """Record that a solve failed: smoothers of an older tangent need not be positive for this one."""
@@ -398,7 +409,8 @@ class Preconditioner:
             self._set_up(operators, self._last_update)
         new_fragments = self._looks_for_fragments and self.applied.may_deflate
         self._looks_for_fragments = self._looks_for_fragments and not new_fragments
-        self.applied.serve(operators, new_fragments=new_fragments)
+        self.applied.serve(operators, new_fragments=new_fragments, moved=self._fragments_moved)
+        self._fragments_moved = False
 
     def _set_up(self, operators: TangentOperators, update: Update) -> None:
         rebuild = update == Update.REBUILD

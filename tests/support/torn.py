@@ -22,7 +22,7 @@ from fracsim.mesh.fragments import find_fragments
 from fracsim.mesh.node_cells import node_components
 from fracsim.mesh.parallel import RemoteRows, sum_over_ranks
 from fracsim.scene import Scene, build_scene
-from fracsim.solvers.deflation import create_deflation
+from fracsim.solvers.deflation import DeflatedPreconditioner, create_deflation
 from fracsim.timestepping.state import State
 from support.solver_policy import other_policy
 
@@ -228,9 +228,9 @@ def some_whole(cells: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
     return np.cos(cells) > -0.5
 
 
-def hanging() -> Found:
-    """Parts of a body of which a third of the cells has come apart, in steps so long that inertia holds nothing: what
-    is made of Jacobi's preconditioner for it, applied to anything, and to the forces of a part that turns."""
+def hanging_parts() -> tuple[Scene, DeflatedPreconditioner, npt.NDArray[np.int64], int]:
+    """A body of which a third of the cells has come apart, in steps so long that inertia holds nothing, Jacobi's
+    preconditioner with its deflation, the part of each node, and the number of parts."""
     fixed = [{"on": "left", "fix": "xyz"}]
     scene, state = make_scene(
         mesh=MESHES["3d"], material=SOFT | {"energy": "neo-hookean"}, fracture={"strength": 1e9}, boundary=fixed,
@@ -248,6 +248,13 @@ def hanging() -> Found:
     count, part = node_components(domain, whole)
     loose = create_deflation(balance, jacobi)
     assert loose is not None and loose.update_operator(balance.tangent.matrix)
+    return scene, loose, part, count
+
+
+def hanging() -> Found:
+    """What the deflated preconditioner of `hanging_parts` makes of anything, and of the forces of a part that turns."""
+    scene, loose, part, count = hanging_parts()
+    domain, balance = scene.domain, scene.balance
     x = domain.nodes[: domain.node_count]
     turned = np.where((part == 1)[:, None], np.cross([1.0, 2.0, 3.0], x) + np.array([1.0, 0.0, -1.0]), 0.0)
     turned[~balance.motion.free_dofs.reshape(-1, 3)] = 0.0
