@@ -84,6 +84,9 @@ class PlainPreconditioner:
     def solved(self, iterations: int, equivalent: int) -> None:
         """Ignored."""
 
+    def begin_solution(self) -> None:
+        """Ignored."""
+
     def solve_failed(self) -> None:
         """Ignored."""
 
