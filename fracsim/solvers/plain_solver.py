@@ -54,8 +54,8 @@ class PlainPreconditioner:
         self._ksp = ksp
         self.pc = self.serving = ksp.getPC()
 
-    def update(self, operators: TangentOperators) -> None:
-        """Set up for the tangent of the next solve (collective)."""
+    def update(self, operators: TangentOperators, *, begins: bool) -> None:
+        """Set up for the tangent of the next solve, whether a step `begins` or not (collective)."""
         operators.update_entries()
         renew_smoothers(self.pc)
         operators.attach_to(self._ksp, self.pc)
@@ -82,9 +82,6 @@ class PlainPreconditioner:
         """Ignored."""
 
     def solved(self, iterations: int, equivalent: int) -> None:
-        """Ignored."""
-
-    def begin_solution(self) -> None:
         """Ignored."""
 
     def solve_failed(self) -> None:

@@ -231,7 +231,6 @@ class Preconditioner:
         self._ever_broken = False
         self._pattern_is_new = False
         self._looks_for_fragments = False  # before the next solve
-        self._fragments_moved = True  # beyond what Newton's method moves them
         # --- decisions ---
         self._due, self._keeps = Update.REBUILD, keeps
         self._last_update = Update.NONE  # before the last solve
@@ -267,10 +266,6 @@ class Preconditioner:
             equivalent: that of a solve to full accuracy; 0: unknown.
         """
         self._iterations, self._equivalent = iterations, equivalent
-
-    def begin_solution(self) -> None:
-        """Record that a nonlinear or linear step is solved next: fragments have moved since the last one."""
-        self._fragments_moved = True
 
     def solve_failed(self) -> None:
         """Record that a solve failed: smoothers of an older tangent need not be positive for this one."""
@@ -399,8 +394,11 @@ class Preconditioner:
 
     # --- setting up ---
 
-    def update(self, operators: TangentOperators) -> None:
-        """Update the preconditioner to the tangent of the next solve (collective)."""
+    def update(self, operators: TangentOperators, *, begins: bool) -> None:
+        """Update the preconditioner to the tangent of the next solve (collective).
+
+        `begins`: whether a step begins, so that fragments have moved since the last one.
+        """
         # SNES only knows a fixed number of tangents between two set-ups
         self._last_update = self._decide(counts_solve=True)
         if self._last_update != Update.NONE:
@@ -409,8 +407,7 @@ class Preconditioner:
             self._set_up(operators, self._last_update)
         new_fragments = self._looks_for_fragments and self.applied.may_deflate
         self._looks_for_fragments = self._looks_for_fragments and not new_fragments
-        self.applied.serve(operators, new_fragments=new_fragments, moved=self._fragments_moved)
-        self._fragments_moved = False
+        self.applied.serve(operators, new_fragments=new_fragments, moved=begins)
 
     def _set_up(self, operators: TangentOperators, update: Update) -> None:
         rebuild = update == Update.REBUILD

@@ -1,6 +1,8 @@
 """Critical distance: the stress ahead of a place at which a crack starts, and the elastic zone around crack tips.
 
-Equations: docs/theory.md#critical-distance, docs/theory.md#elastic-zone.
+Also the strain at which a cell releases the energy of its own cut.
+
+Equations: docs/theory.md#critical-distance, docs/theory.md#tip-criterion, docs/theory.md#elastic-zone.
 """
 
 from __future__ import annotations
@@ -17,10 +19,13 @@ from ...mesh.edge_graph import EdgeGraph
 from ...mesh.ghost_exchange import sum_at_nodes
 from ...mesh.parallel import concatenate_over_ranks
 from ...mesh.small_matrices import barycentric_gradients
+from ..principal_stress import first_principal_stress, symmetric_tensors
 from .tip_parameters import TIP
 
 if TYPE_CHECKING:
+    from ...mechanics.material_fields import PerCell
     from ...mechanics.plasticity import PlasticHistory
+    from ...mechanics.stress import Stress
     from .tip_criterion import TipCriterion
 
 Flags = npt.NDArray[np.bool_]
@@ -66,6 +71,27 @@ def critical_distance(dim: int, modulus: Values, toughness: Values, strength: Va
     return CriticalDistance(
         length, radius, least_radius, np.minimum(strength, c * np.sqrt(energy / (2 * np.pi * radius)))
     )
+
+
+def release_cut_energy(body: Stress, toughness: PerCell, cells: Ints, stress: Values) -> Flags:
+    """Return in which cells (n,) a cut releases G_c times its area from the strain of the cell alone.
+
+    V sigma_1^2 / (2 (lambda + 2 mu)) >= G_c A, with the area A of the largest facet, which no plane cut exceeds. The
+    force on a tip in a ligament narrower than its disc is that of several tips.
+
+    Args:
+        body: gives the material and the mesh.
+        toughness: G_c, J/m^2, one number or (n,).
+        cells: (n,) cells.
+        stress: (cells, 3 or 6) Cauchy stress of all cells, Pa.
+    """
+    material, domain = body.material, body.domain
+    modulus = np.broadcast_to(np.asarray(material.lmbda) + 2 * np.asarray(material.mu), domain.cell_count)[cells]
+    gradients = barycentric_gradients(domain.nodes[domain.cell_nodes[cells]])
+    # A = d V |grad N| of the corner opposite to the facet
+    area_per_volume = domain.dim * np.linalg.norm(gradients, axis=2).max(axis=1, initial=0.0)
+    sigma = np.maximum(first_principal_stress(symmetric_tensors(stress[cells], domain.dim)), 0.0)
+    return np.asarray(sigma**2 / (2 * modulus) >= toughness * area_per_volume)
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,6 @@ from ...mesh.domain import Domain
 from ...mesh.edge_graph import EdgeGraph
 from ...mesh.parallel import allgather, sum_over_ranks
 from ...mesh.simplices import local_edges
-from ...mesh.small_matrices import barycentric_gradients
 from ..criterion import Edges
 from ..node_retention import NodeAttachment
 from ..principal_stress import first_principal_stress, symmetric_tensors
@@ -37,7 +36,7 @@ from .crack_initiation import (
     rank_rows,
     select_proposals,
 )
-from .critical_distance import CriticalDistance, critical_distance
+from .critical_distance import CriticalDistance, critical_distance, release_cut_energy
 from .cut_plane import EdgeCuts, branching_cuts, centroid_cuts, exit_cuts, plane_cuts
 from .mixed_mode import kink_angle, kink_gain, phase_angles
 from .neighbour_search import local_mesh_size
@@ -247,7 +246,11 @@ class TipCriterion:
             branches = turns & enough_for_branches
             ahead = np.where(branches[:, None], tips.course, ahead)
         # A tip that reaches G_c has its crack speed, a young one the stress ahead.
-        overstrained = tips.mature & (size < toughness) & self._is_overstrained(tips.cell, fields.cell_stress)
+        overstrained = (
+            tips.mature
+            & (size < toughness)
+            & release_cut_energy(self._stress, toughness, tips.cell, fields.cell_stress)
+        )
         # A branch is inactive behind the other unless there is enough energy for both.
         is_inactive = (tips.is_inactive & (size < TIP.branching_ratio * toughness)) | self._excluded_cells[tips.cell]
         candidates = np.flatnonzero((~mature | enough | overstrained) & ~is_inactive)
@@ -277,20 +280,6 @@ class TipCriterion:
         radii = start.radius[cells], start.least_radius[cells]
         ahead = evaluator.mean_stress_ahead(fields.tips.point[rows], normals, *radii, fields.cell_stress)
         return np.asarray(first_principal_stress(ahead) >= self._start.threshold[cells])
-
-    def _is_overstrained(self, cells: Ints, stress: Values) -> Flags:
-        """Return in which cells (n,) a cut releases G_c times its area from the strain of the cell alone.
-
-        V sigma_1^2 / (2 (lambda + 2 mu)) >= G_c A, with the stress (cells, 3 or 6), Pa, and the area A of the largest
-        facet, which no cut exceeds. The force on a tip in a ligament narrower than its disc is that of several tips.
-        """
-        material, gradients = self._stress.material, barycentric_gradients(reference_corners(self._domain, cells))
-        modulus = np.broadcast_to(np.asarray(material.lmbda) + 2 * np.asarray(material.mu), len(self._h))[cells]
-        toughness = np.broadcast_to(self.toughness, len(self._h))[cells]
-        # A = d V |grad N| of the corner opposite to the facet
-        area_per_volume = self._domain.dim * np.linalg.norm(gradients, axis=2).max(axis=1, initial=0.0)
-        sigma = np.maximum(first_principal_stress(symmetric_tensors(stress[cells], self._domain.dim)), 0.0)
-        return np.asarray(sigma**2 / (2 * modulus) >= toughness * area_per_volume)
 
     def _find_critical_tips(self, size: Values, toughness: Values, tips: CrackTips) -> tuple[Flags, Flags]:
         """Return which tips (n,) with release rates `size` (n,) reach G_c, and which branch (collective)."""
