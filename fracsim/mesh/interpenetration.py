@@ -55,6 +55,8 @@ class RankNodes:
 def find_interpenetration(x: Values, cells: Ints, fragment: Ints, nodes: RankNodes | None = None) -> Overlap | None:
     """The node that lies deepest inside a cell of another fragment; None if there is none (collective).
 
+    Of nodes that are equally deep, to 1e-9 of a cell, the one of the largest number counts, on any number of ranks.
+
     Args:
         x: (N, d) current positions, m.
         cells: (C, d + 1) intact cells of this rank.
@@ -89,11 +91,11 @@ def find_interpenetration(x: Values, cells: Ints, fragment: Ints, nodes: RankNod
     cell = searched[cell]
     foreign = near_fragment[node] != cell_fragment[cell]
     node, cell = node[foreign], cell[foreign]
-    depth = _min_barycentric(near_x[node], x[cells[cell]])
+    depth = np.round(_min_barycentric(near_x[node], x[cells[cell]]), 9)
     overlaps = []
     # least barycentric coordinate of a node that counts as inside: bodies that only touch do not interpenetrate
     if len(depth) and depth.max() > 0.05:
-        deepest = np.argmax(depth)
+        deepest = np.lexsort((cell_fragment[cell], near_number[node], depth))[-1]
         inner, outer = node[deepest], cell[deepest]
         pair = int(near_fragment[inner]), int(cell_fragment[outer])
         overlaps = [Overlap(float(depth[deepest]), int(near_number[inner]), tuple(near_x[inner].tolist()), pair)]
