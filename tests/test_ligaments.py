@@ -1,4 +1,4 @@
-"""Ligaments narrower than the ball of a tip break once their own strain pays for the cut."""
+"""Ligaments narrower than the ball of a tip break once the strain of a cell releases the energy of its cut."""
 
 from __future__ import annotations
 
