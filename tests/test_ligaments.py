@@ -10,7 +10,7 @@ import pytest
 from mpi4py import MPI
 
 from fracsim.forms.kinematics import SYMMETRIC_COMPONENTS
-from fracsim.fracture.energy.critical_distance import release_cut_energy
+from fracsim.fracture.energy.critical_distance import releases_cut_energy
 from fracsim.mesh.fragments import find_fragments
 from fracsim.scene import Scene, build_scene
 from support.scenes import make_study
@@ -60,7 +60,7 @@ def test_the_energy_of_a_cell_against_that_of_its_largest_facet(dim: int) -> Non
     stored = scene.domain.volumes * sigma**2 / (2 * modulus)
     rows, columns = np.array(SYMMETRIC_COMPONENTS[dim]).T
     components = stress[:, rows, columns]
-    found = release_cut_energy(scene.fracture.stress, TOUGHNESS, np.arange(len(corners)), components)
+    found = releases_cut_energy(scene.fracture.stress, TOUGHNESS, np.arange(len(corners)), components)
     np.testing.assert_array_equal(found, stored >= TOUGHNESS * area)
     assert 0.1 < found.mean() < 0.9
 

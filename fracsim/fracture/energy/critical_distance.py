@@ -73,7 +73,7 @@ def critical_distance(dim: int, modulus: Values, toughness: Values, strength: Va
     )
 
 
-def release_cut_energy(body: Stress, toughness: PerCell, cells: Ints, stress: Values) -> Flags:
+def releases_cut_energy(body: Stress, toughness: PerCell, cells: Ints, stress: Values) -> Flags:
     """Return in which cells (n,) a cut releases G_c times its area from the strain of the cell alone.
 
     V sigma_1^2 / (2 (lambda + 2 mu)) >= G_c A, with the area A of the largest facet, which no plane cut exceeds. The
@@ -86,12 +86,12 @@ def release_cut_energy(body: Stress, toughness: PerCell, cells: Ints, stress: Va
         stress: (cells, 3 or 6) Cauchy stress of all cells, Pa.
     """
     material, domain = body.material, body.domain
-    modulus = np.broadcast_to(np.asarray(material.lmbda) + 2 * np.asarray(material.mu), domain.cell_count)[cells]
+    mu, lmbda = (np.broadcast_to(values, domain.cell_count)[cells] for values in (material.mu, material.lmbda))
     gradients = barycentric_gradients(domain.nodes[domain.cell_nodes[cells]])
     # A = d V |grad N| of the corner opposite to the facet
     area_per_volume = domain.dim * np.linalg.norm(gradients, axis=2).max(axis=1, initial=0.0)
     sigma = np.maximum(first_principal_stress(symmetric_tensors(stress[cells], domain.dim)), 0.0)
-    return np.asarray(sigma**2 / (2 * modulus) >= toughness * area_per_volume)
+    return np.asarray(sigma**2 / (2 * (lmbda + 2 * mu)) >= toughness * area_per_volume)
 
 
 @dataclass(frozen=True)

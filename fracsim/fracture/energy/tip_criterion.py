@@ -36,7 +36,7 @@ from .crack_initiation import (
     rank_rows,
     select_proposals,
 )
-from .critical_distance import CriticalDistance, critical_distance, release_cut_energy
+from .critical_distance import CriticalDistance, critical_distance, releases_cut_energy
 from .cut_plane import EdgeCuts, branching_cuts, centroid_cuts, exit_cuts, plane_cuts
 from .mixed_mode import kink_angle, kink_gain, phase_angles
 from .neighbour_search import local_mesh_size
@@ -249,7 +249,7 @@ class TipCriterion:
         overstrained = (
             tips.mature
             & (size < toughness)
-            & release_cut_energy(self._stress, toughness, tips.cell, fields.cell_stress)
+            & releases_cut_energy(self._stress, toughness, tips.cell, fields.cell_stress)
         )
         # A branch is inactive behind the other unless there is enough energy for both.
         is_inactive = (tips.is_inactive & (size < TIP.branching_ratio * toughness)) | self._excluded_cells[tips.cell]
