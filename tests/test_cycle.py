@@ -261,6 +261,28 @@ def test_coarse_spaces_are_kept_where_no_edge_has_broken(monkeypatch: pytest.Mon
         assert (preconditioner.pc.getMGInterpolation(1).handle == spaces.handle) == spaces_kept, (extra, broke)
 
 
+@pytest.mark.parametrize("dim", (2, 3))
+def test_a_large_body_frees_multigrid_and_its_matrix(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once the cycle has been copied: steps that break edges are the same to the last bit, and a refresh rebuilds."""
+    ends = []
+    for kept in (10**9, 0):
+        set_policy(monkeypatch, min_block_dofs=0, max_kept_multigrid_dofs=kept)
+        scene = bar(dim, {"snes_type": "newtonls"}, fracture={"strength": 5e4})
+        walk = Walk(scene)
+        reports = [walk.advance() for _ in range(4)]
+        linear = linear_of(scene)
+        assert (linear.operators.matrix.getInfo()["nz_used"] == 0) == (kept == 0)
+        assert all(report.solve.converged for report in reports) and sum(report.broken for report in reports)
+        iterations = [report.solve.krylov_iterations for report in reports]
+        ends.append((iterations, scene.fracture.graph.broken, walk.state.u))  # type: ignore[union-attr]
+        linear.preconditioner._due = Update.REFRESH
+        assert linear.preconditioner.next_update() == (Update.REFRESH if kept else Update.REBUILD)
+        assert linear.solve()
+    assert ends[0][0] == ends[1][0]
+    for kept_array, freed_array in zip(ends[0][1:], ends[1][1:], strict=True):
+        np.testing.assert_array_equal(kept_array, freed_array)
+
+
 def test_without_a_compiler_petscs_own_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     set_policy(monkeypatch, min_block_dofs=0)
     monkeypatch.setattr(bcsr, "compile_block_csr", lambda *_: None)

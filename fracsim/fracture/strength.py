@@ -106,7 +106,7 @@ class EdgeStrength:
             return np.zeros(edges.shape)
         result = self._noise[edges]
         # Few edges are ever near their strength, so that the hash is computed on demand.
-        if len(unknown := edges[np.isnan(result)]):
+        if len(unknown := np.unique(edges[np.isnan(result)])):
             self._noise[unknown] = hash_points(self._twice_midpoints(unknown))
             result = self._noise[edges]
         return result

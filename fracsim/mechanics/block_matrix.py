@@ -108,9 +108,10 @@ class BlockMatrix:
         return result
 
     def destroy(self) -> None:
-        """Free PETSc's objects."""
+        """Free the blocks, also where a solver of PETSc refers to this object still."""
         if self._ghosted is not None:
             self._ghosted.destroy()
+        del self.matrix
 
 
 def compile_block_product(comm: MPI.Comm, size: int) -> CDLL | None:

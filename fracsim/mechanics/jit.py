@@ -210,10 +210,9 @@ class CellExpression:
             self._kernel = kernels.expression(
                 self._compiled, mesh, cells, lambda: kernel_source(self._compiled, mesh, jit_options())
             )
-        self._values: npt.NDArray[np.float64] | None = None
 
     def __call__(self, cells: npt.NDArray[np.int32] | None = None) -> npt.NDArray[np.float64]:
-        """(cells, width) mean values in all owned cells (an array that the next such call overwrites) or in `cells`."""
+        """(cells, width) mean values in all owned cells or in `cells`."""
         values = self.evaluate_at_points(cells)
         return (
             values if self.points_per_cell == 1 else values.reshape(-1, self.points_per_cell, self.width).mean(axis=1)
@@ -222,9 +221,7 @@ class CellExpression:
     def evaluate_at_points(self, cells: npt.NDArray[np.int32] | None = None) -> npt.NDArray[np.float64]:
         """(cells, points_per_cell width) values at each of the points."""
         if cells is None:
-            if self._values is None:
-                self._values = np.empty((len(self._all), self.points_per_cell * self.width))
-            return self._into(self._values, self._all)
+            cells = self._all
         return self._into(np.empty((len(cells), self.points_per_cell * self.width)), cells)
 
     def _into(self, values: npt.NDArray[np.float64], cells: npt.NDArray[np.int32]) -> npt.NDArray[np.float64]:

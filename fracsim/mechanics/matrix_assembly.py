@@ -6,8 +6,9 @@ ms instead of 25 for 24,000 tetrahedra. The price is a second copy of the values
 assembled at a time (kernel_selection).
 
 The matrix can be summed in blocks of the d dofs of a node. Products use the blocks (block_matrix). PETSc's matrix of
-single entries, from which multigrid is set up, is updated on demand. Where a body falls apart, entries of dead cells
-are zeros that every product still reads; they are dropped from time to time. The unknowns stay.
+single entries, from which multigrid is set up, is updated on demand, and may be without entries in between. Where a
+body falls apart, entries of dead cells are zeros that every product still reads; they are dropped from time to time.
+The unknowns stay.
 """
 
 from __future__ import annotations
@@ -61,6 +62,7 @@ class TangentAssembler:
         self.entries_outdated = False
         self._dead: Flags | None = None
         self._matrix: PETSc.Mat | None = None
+        self._has_entries = True
 
     @property
     def matrix(self) -> PETSc.Mat:
@@ -96,7 +98,7 @@ class TangentAssembler:
         owned = self.form.function_spaces[0].dofmap.index_map.size_local
         pattern.insert_diagonal(np.arange(owned, dtype=np.int32))
         pattern.finalize()
-        self._matrix = create_matrix(self.form.mesh.comm, pattern)
+        self._matrix, self._has_entries = create_matrix(self.form.mesh.comm, pattern), True
         self._sum = make_scalar_csr(pattern) if block_code is None else make_block_csr(pattern)
         self._kernel_of = KernelCache(lambda form: self.kernels.bilinear_form(form, self._sum))
         rows, columns = (self._sum.index_map(axis) for axis in (0, 1))
@@ -114,25 +116,24 @@ class TangentAssembler:
             row_of_block = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
             self.diagonal_blocks = np.flatnonzero(self._sum.indices[self._owned] == row_of_block)
 
-    def shrink(self, dead: Flags, share: float) -> bool:
-        """Replace the matrices by smaller ones, or by larger ones for cells that are alive again (collective).
+    def may_shrink(self, dead: Flags, share: float) -> bool:
+        """Return True if `shrink` would replace the matrices by smaller ones, or revive cells (collective).
 
         Args:
             dead: (owned cells,) cells that the form excludes now.
-            share: largest share of living cells among those in the pattern at which the matrices are replaced.
-
-        Returns:
-            Whether they were.
+            share: largest share of living cells among those in the pattern at which the matrices are to be replaced.
         """
         was_dead = np.zeros_like(dead) if self._dead is None else self._dead
         counts = np.array([np.sum(~dead), np.sum(~was_dead), np.sum(was_dead & ~dead)])
         alive, in_pattern, revived = sum_over_ranks(self.form.mesh.comm, counts)
-        if not revived and (alive == in_pattern or alive > share * in_pattern):
-            return False
+        return bool(revived or (alive < in_pattern and alive <= share * in_pattern))
+
+    def shrink(self, dead: Flags) -> None:
+        """Replace the matrices by those of the cells that are alive; the old ones are freed first (collective)."""
         self._dead = dead.copy()
+        self.release_entries()
         self.destroy()
         self._create(self._block_code)
-        return True
 
     def __call__(
         self, bcs: list[fem.DirichletBC], extra_form: fem.Form | None = None, mass: MassBlocks | None = None
@@ -191,19 +192,40 @@ class TangentAssembler:
         if outdated := self.entries_outdated:
             d = self.matrix.getBlockSize()
             values = self._sum.data[: d * d * self._owned.stop]
+            if not self._has_entries:
+                self.matrix.setPreallocationNNZ(self._entries_of_rows())
+                self._has_entries = True
             self.matrix.setValuesBlockedIJV(self._starts, self._columns, values)
             self.matrix.assemble()
             self.entries_outdated = False
         return outdated
 
+    def release_entries(self) -> None:
+        """Free the entries of `matrix` until they are updated from the blocks (collective).
+
+        The matrix itself stays, since solvers of PETSc refer to it.
+        """
+        self.matrix.setPreallocationNNZ((0, 0))
+        self._has_entries, self.entries_outdated = False, True
+
+    def _entries_of_rows(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
+        """(owned dofs,) numbers of entries in columns of this rank, and in other columns."""
+        d, (first, last) = self.matrix.getBlockSize(), self._sum.index_map(1).local_range
+        is_local = (self._columns >= first) & (self._columns < last)
+        local = np.add.reduceat(is_local, self._starts[:-1], dtype=np.int32)  # each row has its diagonal
+        return np.repeat(d * local, d), np.repeat(d * (np.diff(self._starts) - local), d)
+
     def destroy(self) -> None:
-        """Free PETSc's matrices."""
-        if self._matrix is not None:
-            self._matrix.destroy()
-            self._matrix = None
+        """Free the matrices."""
+        if self._matrix is None:
+            return
+        self._matrix.destroy()
+        self._matrix = None
         if self.blocks is not None:
             self.blocks.destroy()
-            self.blocks, self.entries_outdated = None, False
+            self.blocks = None
+        self.entries_outdated = False
+        del self._sum, self._kernel_of
 
 
 class VectorAssembler:

@@ -237,12 +237,24 @@ class Tangent:
         if self._psd is not None:
             _exclude_dead_cells(self._stress, self._psd.form)
 
+    def release_entries(self) -> None:
+        """Free the entries of `matrix` until `update_entries`, if there are blocks (collective)."""
+        if self._assembler.blocks is not None:
+            self._assembler.release_entries()
+
+    def may_shrink(self, share: float) -> bool:
+        """Return True if `shrink` would drop entries: at most a share of its cells are alive (collective)."""
+        dead = self._stress.dead_cells
+        return dead is not None and self._mass.is_diagonal and self._assembler.may_shrink(dead, share)
+
     def shrink(self, share: float) -> bool:
         """Drop entries of dead cells if at most a share of its cells are alive; returns whether it did (collective)."""
         dead = self._stress.dead_cells
-        changed = dead is not None and self._mass.is_diagonal and self._assembler.shrink(dead, share)
-        self.pattern_version += changed
-        return changed
+        if dead is None or not self.may_shrink(share):
+            return False
+        self._assembler.shrink(dead)
+        self.pattern_version += 1
+        return True
 
     # --- a solve ---
 

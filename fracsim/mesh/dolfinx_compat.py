@@ -23,6 +23,7 @@ mechanics.simd_kernels reads the C code that FFCx writes. Where bind_to_cells do
 
 from __future__ import annotations
 
+import ctypes
 import os
 from collections.abc import Callable, Sequence
 from copy import copy
@@ -54,6 +55,27 @@ from .library_cache import kernel_file, load_kernel, write_digest
 Ints = npt.NDArray[np.int32]
 VERSION = str(dolfinx.__version__)  # type: ignore[attr-defined]
 IS_0_9 = VERSION.split(".")[:2] == ["0", "9"]
+
+# --- memory ---------------------------------------------------------------------------------------------------------
+
+
+def _return_freed_memory() -> None:
+    """Make the C library return large freed arrays to the system, as it does by default.
+
+    SuperLU_DIST, which Debian's PETSc loads, turns that off in the whole process: no freed byte would ever go back.
+    """
+    trim_threshold, mmap_threshold, mmap_max = -1, -3, -4  # M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_MMAP_MAX of malloc.h
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (AttributeError, OSError):
+        return  # not glibc
+    # Larger arrays come from the system, one by one; smaller ones are cheaper to allocate from the heap.
+    mallopt(mmap_threshold, 8 << 20)
+    mallopt(trim_threshold, 16 << 20)
+    mallopt(mmap_max, 1 << 16)
+
+
+_return_freed_memory()
 
 # --- mesh -----------------------------------------------------------------------------------------------------------
 

@@ -87,6 +87,8 @@ class DirectSolver:
         if self._pc is not None:
             self._pc.reset()
 
+    matrix_ends = pattern_changed
+
     def measure_cost(self, ksp: PETSc.KSP) -> None:
         """Measure the cost of the last factorisation, and whether the tangent is positive definite (collective)."""
         # The preconditioner of the KSP may be another one, which corrects for a coupling beside K (coupled_nodes).

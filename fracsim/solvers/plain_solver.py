@@ -67,6 +67,8 @@ class PlainPreconditioner:
         """The tangent is another matrix or has entries at other places, which PETSc's multigrid does not notice."""
         self.pc.reset()
 
+    matrix_ends = pattern_changed
+
     def next_update(self) -> Update:
         """Rebuild, for every tangent."""
         return Update.REBUILD

@@ -122,6 +122,9 @@ class SolverPolicy:
     min_ssor_inertia: float = 1e-2
     # Dofs up to which products of multigrid's set-up are stored on one rank: half of its time for 0.5 KB a tetrahedron.
     max_stored_product_dofs: int = 250_000
+    # Dofs up to which PETSc's multigrid stays beside the V cycle, so that a refresh keeps its coarse spaces. It and its
+    # matrix take 0.55 KB a tetrahedron (1.5 million), which larger bodies need more than a cheap refresh.
+    max_kept_multigrid_dofs: int = 250_000
     # Iterations of a whole body from which on aggregates of strong links are tried, and share of these that the new
     # aggregates may take. Measured: 38 iterations for 77 on a sheet of 234,000 tetrahedra, nu = 0.45.
     slow_iterations: int = 25

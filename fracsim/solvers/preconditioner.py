@@ -106,6 +106,7 @@ class AppliedPreconditioner:
         pc: PETSc's preconditioner of the whole body.
         serving: preconditioner that is applied: `pc`, the V cycle copied from it, or deflation around one of these.
         vcycle: V cycle in single precision, copied from `pc`; None: PETSc's own is applied.
+        keeps_coarse_spaces: whether `pc` is still set up, so that a refresh is possible.
     """
 
     def __init__(
@@ -116,6 +117,7 @@ class AppliedPreconditioner:
         self._is_default = is_default
         self.pc = self.serving = ksp.getPC()
         self.vcycle: SinglePrecisionVCycle | None = None
+        self.keeps_coarse_spaces = True
         self._deflation: DeflatedPreconditioner | None = None
         self._deflates = False  # whether any motion of the fragments is free
 
@@ -143,7 +145,9 @@ class AppliedPreconditioner:
         if self._is_default and operators.blocks is not None:
             from .multigrid.vcycle import create_vcycle
 
-            self.vcycle = create_vcycle(self.pc, operators.blocks, self._policy)
+            self.keeps_coarse_spaces = operators.matrix.getSize()[0] <= self._policy.max_kept_multigrid_dofs
+            release_entries = None if self.keeps_coarse_spaces else operators.release_entries
+            self.vcycle = create_vcycle(self.pc, operators.blocks, self._policy, release_entries)
 
     @property
     def may_deflate(self) -> bool:
@@ -258,6 +262,11 @@ class Preconditioner:
         """Record that the tangent is another matrix or has another nonzero pattern."""
         self._pattern_is_new = True
 
+    def matrix_ends(self) -> None:
+        """Free multigrid, since another matrix is about to take the place of the tangent."""
+        self.applied.release_vcycle()
+        self.applied.pc.reset()
+
     def solved(self, iterations: int, equivalent: int) -> None:
         """Record the iterations of the last solve, which may be told repeatedly.
 
@@ -316,7 +325,7 @@ class Preconditioner:
         if self.applied.vcycle is None and fresh and equivalent > self._rebuild_ratio * fresh + 2:
             self._due = Update.REBUILD
         # Factors and coarse spaces of another pattern would be written past the end of their arrays.
-        if self._pattern_is_new:
+        if self._pattern_is_new or (self._due == Update.REFRESH and not self.applied.keeps_coarse_spaces):
             self._due = Update.REBUILD
         if not counts_solve:
             return self._due
@@ -335,6 +344,7 @@ class Preconditioner:
                 self._due = Update.REBUILD
             elif (
                 not self._edges_since_rebuild  # its coarse spaces are good still
+                and self.applied.keeps_coarse_spaces
                 and self._extra_iterations > self._extra_at_refresh + factor * policy.vcycle_refresh_cost
             ):
                 self._due = max(self._due, Update.REFRESH)

@@ -63,6 +63,9 @@ class PatternListener(Protocol):
     def pattern_changed(self) -> None:
         """Note that the matrix is another one, or has entries at other positions."""
 
+    def matrix_ends(self) -> None:
+        """Free what was made for the matrix, since another one is about to take its place."""
+
 
 class TangentOperators:
     """K of a balance at the present displacement, in one matrix or several.
@@ -134,8 +137,13 @@ class TangentOperators:
         Returns:
             Whether there are new matrices.
         """
-        if not self._tangent.shrink(share):
+        if not self._tangent.may_shrink(share):
             return False
+        # First: what was made for the old matrix has as many bytes as the new one.
+        self.multiply_by(None)
+        for listener in self._listeners:
+            listener.matrix_ends()
+        self._tangent.shrink(share)
         self._make_operators()
         return True
 
@@ -167,6 +175,10 @@ class TangentOperators:
         # Ties are not part of the blocks, and may be new.
         self._check_pattern()
         self._attach_nullspace()
+
+    def release_entries(self) -> None:
+        """Free the entries of `matrix` until `update_entries`, if there are blocks (collective)."""
+        self._tangent.release_entries()
 
     def multiply_by(self, fine_level: FineLevel | None) -> None:
         """Multiply with this copy of the tangent in single precision; None: in double precision (collective)."""

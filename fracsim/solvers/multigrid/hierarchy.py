@@ -17,7 +17,7 @@ from ...mesh.dolfinx_compat import make_index_map
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 # Rows of a matrix that are brought into blocks at a time: in double precision all of them would take twice the memory.
-ROWS_AT_A_TIME = 1 << 15
+ROWS_AT_A_TIME = 1 << 13
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,8 @@ class LevelData:
 def copy_levels(gamg: PETSc.PC, finest: IndexMap) -> Iterator[LevelData]:
     """Yield the levels of a multigrid that is set up, from the coarsest on (collective).
 
-    One is copied at a time: together they have more bytes than the tangent.
+    One is copied at a time: together they have more bytes than the tangent. Entries of the finest matrix are not read
+    after the first level.
 
     Args:
         gamg: PETSc's multigrid.
@@ -73,13 +74,14 @@ def copy_levels(gamg: PETSc.PC, finest: IndexMap) -> Iterator[LevelData]:
     solvers = [gamg.getMGCoarseSolve(), *(gamg.getMGSmoother(level) for level in range(1, count))]
     matrices = [solver.getOperators()[1] for solver in solvers]
     sizes = [matrix.getBlockSize() for matrix in matrices]
+    diagonals = [matrix.getDiagonal().array_r for matrix in matrices]
     prolongation: Iterator[BlockCSRData] = iter(())
     for level, (matrix, size) in enumerate(zip(matrices, sizes, strict=True)):
         copied = [matrix] if 0 < level < count - 1 else []
         to_finer = [gamg.getMGInterpolation(level + 1)] if level < count - 1 else []
         nodes = _level_nodes(matrix, size, [*copied, *to_finer]) if to_finer else finest
         diagonal = la.vector(nodes, size)
-        diagonal.array[: nodes.size_local * size] = matrix.getDiagonal().array_r
+        diagonal.array[: nodes.size_local * size] = diagonals[level]
         diagonal.scatter_forward()
         blocks = MatrixEntries(matrix).in_blocks((size, size), nodes) if copied else None
         yield LevelData(nodes, size, diagonal.array.copy(), blocks, prolongation)
@@ -99,7 +101,10 @@ class MatrixEntries:
 
     def in_blocks(self, size: tuple[int, int], nodes: IndexMap) -> BlockCSRData:
         """Return the matrix in blocks with 0 for missing entries; `nodes`: of its columns."""
-        return self._rows_in_blocks(0, len(self._starts) - 1, size, nodes)
+        parts = list(self.parts(size, nodes))
+        blocks = np.concatenate([np.diff(part.starts) for part in parts])  # of each row
+        columns, values = (np.concatenate([getattr(part, name) for part in parts]) for name in ("columns", "values"))
+        return BlockCSRData(np.append(0, np.cumsum(blocks)), columns, values)
 
     def parts(self, size: tuple[int, int], nodes: IndexMap) -> Iterator[BlockCSRData]:
         """Yield its rows in blocks, some at a time (see `in_blocks`)."""

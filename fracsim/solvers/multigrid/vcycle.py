@@ -18,6 +18,7 @@ Equations: docs/theory.md#linear-systems.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from ctypes import CDLL
 from itertools import chain, pairwise, repeat
 from typing import TYPE_CHECKING
@@ -59,7 +60,12 @@ class SinglePrecisionVCycle:
     """
 
     def __init__(
-        self, gamg: PETSc.PC, blocks: BlockMatrix, codes: CompiledProducts, policy: SolverPolicy = DEFAULT_POLICY
+        self,
+        gamg: PETSc.PC,
+        blocks: BlockMatrix,
+        codes: CompiledProducts,
+        policy: SolverPolicy = DEFAULT_POLICY,
+        release_entries: Callable[[], None] | None = None,
     ) -> None:
         """Copy the levels (collective).
 
@@ -68,10 +74,13 @@ class SinglePrecisionVCycle:
             blocks: the tangent, whose values `update_operator` assigns.
             codes: compiled code for the sizes of the blocks.
             policy: tuned numbers.
+            release_entries: frees the entries from which `gamg` was set up; they and `gamg` are not kept then.
         """
         self.gamg, self._blocks, self._tangent, self._policy = gamg, blocks, blocks.matrix, policy
         levels = copy_levels(gamg, self._tangent.index_map(1))
         coarsest = next(levels)
+        if release_entries is not None:
+            release_entries()
         starts = self._tangent.indptr[: self._tangent.index_map(0).size_local + 1]
         pattern = BlockCSRData(starts, self._tangent.indices[: starts[-1]], self._values)
         self._levels: list[SmoothedLevel] = []
@@ -96,10 +105,16 @@ class SinglePrecisionVCycle:
         self._scale = scale[:owned].astype(np.float32)
         self._coarsest_b, self._coarsest_x = (GhostedVector(coarsest.nodes, coarsest.size) for _ in range(2))
         self._coarsest_solver = gamg.getMGCoarseSolve()
-        self._coarsest_vectors = self._coarsest_solver.getOperators()[1].createVecs()
+        coarsest_matrix = self._coarsest_solver.getOperators()[1]
+        self._coarsest_vectors = coarsest_matrix.createVecs()
         self.pc = PETSc.PC().createPython(ApplyContext(self.apply), comm=gamg.comm)
         # The preconditioner may serve a KSP that has no other operators.
         self.pc.setOperators(*gamg.getOperators())
+        if release_entries is not None:
+            # PETSc's product P^T A P keeps its factors: a copy does not.
+            coarsest_matrix = coarsest_matrix.copy()
+            gamg.reset()
+            self._coarsest_solver.setOperators(coarsest_matrix)
         self.has_thorough_smoothing = len(self._levels) > 1 and self.converges_slowly()
         if self.has_thorough_smoothing:
             smoothings = chain(THOROUGH_SMOOTHING, repeat(THOROUGH_SMOOTHING[-1]))
@@ -181,11 +196,15 @@ class SinglePrecisionVCycle:
 
 
 def create_vcycle(
-    gamg: PETSc.PC, blocks: BlockMatrix, policy: SolverPolicy = DEFAULT_POLICY
+    gamg: PETSc.PC,
+    blocks: BlockMatrix,
+    policy: SolverPolicy = DEFAULT_POLICY,
+    release_entries: Callable[[], None] | None = None,
 ) -> SinglePrecisionVCycle | None:
     """Return the cycle of a multigrid that was set up from a tangent in these blocks (collective).
 
-    None if it is not PETSc's default smoothed aggregation, or without a compiler.
+    None if it is not PETSc's default smoothed aggregation, or without a compiler. The arguments are those of
+    `SinglePrecisionVCycle`.
     """
     if gamg.getType() != "gamg" or gamg.getMGLevels() < 2:
         return None
@@ -195,7 +214,7 @@ def create_vcycle(
         return None
     sizes = [ksp.getOperators()[1].getBlockSize() for ksp in smoothers]
     codes = _compile_products(gamg.comm.tompi4py(), sizes)
-    return None if codes is None else SinglePrecisionVCycle(gamg, blocks, codes, policy)
+    return None if codes is None else SinglePrecisionVCycle(gamg, blocks, codes, policy, release_entries)
 
 
 def _compile_products(comm: MPI.Comm, sizes: list[int]) -> CompiledProducts | None:
