@@ -15,6 +15,7 @@ from mpi4py import MPI
 
 from fracsim.deformable_run import Run
 from fracsim.errors import Stopped
+from fracsim.mesh import interpenetration
 from fracsim.mesh.interpenetration import find_interpenetration
 from fracsim.scene import build_scene
 from support.scenes import make_study
@@ -236,3 +237,23 @@ def test_pieces_that_contact_keeps_apart_need_no_word(
     assert not run.monitors.interpenetration.first_overlap and not run.monitors.intersections.first_seen
     told = capsys.readouterr().err
     assert "pass through" not in told and "cut each other" not in told
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+def test_boxes_that_overlap(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of all pairs whose boxes overlap on each axis: boxes that touch, slabs, points and several batches."""
+    monkeypatch.setattr(interpenetration, "PAIRS_AT_A_TIME", 64)
+    random = np.random.default_rng(3)
+    lower = random.integers(0, 6, (90, dim)).astype(float)
+    upper = lower + random.integers(0, 4, (90, dim))
+    lower[:3, 0], upper[:3, 0] = 0.0, 20.0
+    count = random.integers(1, 5, 90)
+    small, large = interpenetration._overlapping_boxes(lower, upper, count)
+    expected = {
+        (i, j) if count[i] <= count[j] else (j, i)
+        for i in range(90)
+        for j in range(i + 1, 90)
+        if np.all((lower[i] < upper[j]) & (lower[j] < upper[i]))
+    }
+    assert len(small) == len(expected) > 90
+    assert set(zip(small.tolist(), large.tolist(), strict=True)) == expected

@@ -20,6 +20,10 @@ Values = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 
+# Pairs of boxes that are compared at a time, which bounds memory.
+PAIRS_AT_A_TIME = 1 << 22
+
+
 @dataclass(frozen=True, order=True)
 class Overlap:
     """A node of one fragment inside an intact cell of another.
@@ -137,14 +141,25 @@ def _nodes_at_cells(
 
 def _overlapping_boxes(lower: Values, upper: Values, count: Ints) -> tuple[Ints, Ints]:
     """(k,), (k,) pairs of fragments whose bounding boxes overlap, the one with fewer nodes first."""
-    pairs = []
-    # four million pairs of boxes are compared at a time, which bounds memory
-    rows = max(1, (1 << 22) // len(lower))
-    for first in range(0, len(lower), rows):
-        batch = slice(first, first + rows)
-        overlap = ((lower[batch, None] < upper) & (lower < upper[batch, None])).all(axis=2)
-        i, j = np.nonzero(overlap)
-        pairs.append(np.stack([i + first, j])[:, i + first < j])
+    # along one axis a box may overlap those after it that begin before it ends
+    orders = np.argsort(lower, axis=0)
+    ends = [np.searchsorted(lower[order, k], upper[order, k]) for k, order in enumerate(orders.T)]
+    axis = int(np.argmin([end.sum() for end in ends]))
+    order, positions = orders[:, axis], np.arange(len(lower))
+    after = np.maximum(ends[axis] - positions - 1, 0)
+    last = np.cumsum(after)
+    pairs, first = [np.empty((2, 0), np.int64)], 0
+    while first < len(lower):
+        stop = max(int(np.searchsorted(last, last[first] + PAIRS_AT_A_TIME)), first + 1)
+        batch = slice(first, stop)
+        i = np.repeat(positions[batch], after[batch])
+        j = i + 1 + np.arange(len(i)) - np.repeat(np.cumsum(after[batch]) - after[batch], after[batch])
+        i, j = order[i], order[j]
+        for k in range(lower.shape[1]):
+            overlap = (lower[i, k] < upper[j, k]) & (lower[j, k] < upper[i, k])
+            i, j = i[overlap], j[overlap]
+        pairs.append(np.sort([i, j], axis=0))
+        first = stop
     i, j = np.concatenate(pairs, axis=1)
     fewer = count[i] <= count[j]
     return np.where(fewer, i, j), np.where(fewer, j, i)

@@ -225,16 +225,29 @@ class RowRouting:
 
     def __init__(self, comm: MPI.Comm, rank: npt.NDArray[np.integer[Any]]) -> None:
         """`rank`: (n,) rank that each row goes to (collective)."""
-        self._comm, self._order = comm, np.argsort(rank, kind="stable")
+        self._comm = comm
+        if comm.size == 1:
+            return
+        self._order = np.argsort(rank, kind="stable")
         self._sent, self._received = np.bincount(rank, minlength=comm.size), np.empty(comm.size, np.int64)
         comm.Alltoall(self._sent, self._received)
 
     def send(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """(m, ...) rows that arrive at this rank, of the rows (n, ...) of all ranks in their order (collective)."""
+        """(m, ...) rows that arrive at this rank, of the rows (n, ...) of all ranks in their order (collective).
+
+        On one rank they are the same array.
+        """
+        if self._comm.size == 1:
+            return rows
         return exchange_rows(self._comm, rows[self._order], self._sent, self._received)
 
     def send_back(self, results: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """(n, ...) results for the rows that were sent, of results (m, ...) for those that arrived (collective)."""
+        """(n, ...) results for the rows that were sent, of results (m, ...) for those that arrived (collective).
+
+        On one rank they are the same array.
+        """
+        if self._comm.size == 1:
+            return results
         arrived = exchange_rows(self._comm, np.ascontiguousarray(results), self._received, self._sent)
         rows = np.empty_like(arrived)
         rows[self._order] = arrived

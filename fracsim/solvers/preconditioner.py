@@ -140,14 +140,15 @@ class AppliedPreconditioner:
             self.pc.setFailedReason(PETSc.PC.FailedReason.NOERROR)
         self.release_vcycle()
         renew_smoothers(self.pc)
+        is_large = operators.matrix.getSize()[0] > self._policy.max_kept_multigrid_dofs
         with stored_products(operators.matrix, self._policy.max_stored_product_dofs):
             operators.attach_to(self._ksp, self.pc)
         if self._is_default and operators.blocks is not None:
             from .multigrid.vcycle import create_vcycle
 
-            self.keeps_coarse_spaces = operators.matrix.getSize()[0] <= self._policy.max_kept_multigrid_dofs
-            release_entries = None if self.keeps_coarse_spaces else operators.release_entries
+            release_entries = operators.release_entries if is_large else None
             self.vcycle = create_vcycle(self.pc, operators.blocks, self._policy, release_entries)
+        self.keeps_coarse_spaces = self.vcycle is None or not is_large
 
     @property
     def may_deflate(self) -> bool:

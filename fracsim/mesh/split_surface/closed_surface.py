@@ -63,9 +63,12 @@ class SurfacePoints:
 
     def of_corners(self, corners: Ints, place: Ints, cell: Ints) -> Ints:
         """(n, w) points of PatternElements.corners (n, w); `place` (n,) is the index of `cell` (n,) in `damaged`."""
-        copy = np.minimum(self._first[place][:, None] + np.maximum(corners, 0), len(self._of_copy) - 1)
-        node = self._topology.cells[cell[:, None], np.maximum(-1 - corners, 0)]
-        return np.where(corners >= 0, self._of_copy[copy], self._of_node[node])
+        result = self._of_copy[np.clip(self._first[place][:, None] + corners, 0, len(self._of_copy) - 1)]
+        # crack faces have no corners at nodes
+        element, corner = np.nonzero(corners < 0)
+        node = self._topology.cells[cell[element], -1 - corners[element, corner]]
+        result[element, corner] = self._of_node[node]
+        return result
 
     def entity_nodes(self) -> npt.NDArray[np.bool_]:
         """(copies, d + 1) flags of the nodes of the edge, facet or cell that each copy is the centre of."""
@@ -180,12 +183,15 @@ def _facet_edges() -> Ints:
 def _number_keys(keys: Ints) -> tuple[Ints, Ints]:
     """The number of each key among the distinct keys, ascending, and the first position of each distinct key.
 
-    By counting, since the keys are dense.
+    By a table, since the keys are dense.
     """
     used = np.zeros(int(keys.max(initial=-1)) + 1, bool)
     used[keys] = True
-    number = np.cumsum(used)[keys] - 1
-    first_position = np.empty(np.count_nonzero(used), np.int64)
+    distinct = np.flatnonzero(used)
+    number_of_key = np.empty(len(used), np.int64)  # of the used keys alone
+    number_of_key[distinct] = np.arange(len(distinct))
+    number = number_of_key[keys]
+    first_position = np.empty(len(distinct), np.int64)
     first_position[number[::-1]] = np.arange(len(keys))[::-1]
     return number, first_position
 
