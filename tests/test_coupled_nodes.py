@@ -67,13 +67,15 @@ def test_the_preconditioner_is_that_of_dense_matrices(stiffness: float) -> None:
     np.testing.assert_allclose(P, P.T, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("kind", ["singular", "infinite"])
-def test_a_coupling_that_cannot_be_solved_for_is_left_to_the_body(kind: str) -> None:
-    """P = M where K + C of the coupled nodes is 0, or C is not finite as that of a gap of 0."""
+@pytest.mark.parametrize("kind", ["singular", "infinite", "indefinite"])
+def test_nodes_that_cannot_be_solved_for_end_cg(kind: str) -> None:
+    """P = -M where K + C of the nodes is 0 or has a negative eigenvalue, or C is not finite as that of a gap of 0."""
     d, numbers, K, x = 2, np.array([0, 2]), positive(6), RANDOM.normal(size=6)
     dofs = (d * numbers[:, None] + np.arange(d)).reshape(-1)
-    C = -K[np.ix_(dofs, dofs)] if kind == "singular" else np.full((4, 4), np.inf)
-    np.testing.assert_allclose(preconditioned(K, C, numbers, d, x), x / np.diag(K), rtol=1e-12)
+    of_nodes = K[np.ix_(dofs, dofs)]
+    lowest = np.linalg.eigvalsh(of_nodes)[0]
+    C = {"singular": -of_nodes, "infinite": np.full((4, 4), np.inf), "indefinite": -1.01 * lowest * np.eye(4)}[kind]
+    np.testing.assert_allclose(preconditioned(K, C, numbers, d, x), -x / np.diag(K), rtol=1e-12)
 
 
 def test_prescribed_dofs_are_not_coupled() -> None:

@@ -130,6 +130,20 @@ def sum_few_nodes(domain: Domain, part: csr_matrix, nodes: Ints, limit: int) -> 
     return FewNodesCoupling(domain, numbers, csr_matrix((values, (rows, columns)), shape=(size, size)))
 
 
+def with_nodes(domain: Domain, nodes: Ints, coupling: FewNodesCoupling | None) -> FewNodesCoupling:
+    """A coupling that also has owned nodes (k,), at which its stiffness is 0; None: it has these alone (collective)."""
+    from scipy.sparse import csr_matrix
+
+    d, parts = domain.dim, allgather(domain.comm, nodes + domain.space.dofmap.index_map.local_range[0])
+    numbers = np.unique(np.concatenate(parts if coupling is None else [*parts, coupling.numbers]))
+    shape = (d * len(numbers),) * 2
+    if coupling is None:
+        return FewNodesCoupling(domain, numbers, csr_matrix(shape))
+    dofs, entries = dofs_of_nodes(np.searchsorted(numbers, coupling.numbers), d), coupling.K.tocoo()
+    K = csr_matrix((entries.data, (dofs[entries.row], dofs[entries.col])), shape=shape)
+    return FewNodesCoupling(domain, numbers, K)
+
+
 def dofs_of_nodes(nodes: Ints, d: int) -> Ints:
     """(d n,) dofs of nodes (n,)."""
     return np.asarray(d * nodes[:, None] + np.arange(d)).reshape(-1)

@@ -70,8 +70,7 @@ def _return_freed_memory() -> None:
     except (AttributeError, OSError):
         return  # not glibc
     # Larger arrays come from the system, one by one; smaller ones are cheaper to allocate from the heap. Measured on
-    # 1.5 million tetrahedra: a step that sets up multigrid takes 5 % longer; with 64 MB it takes 3 % longer, with a
-    # peak that is 6 % higher.
+    # 1.5 million tetrahedra: a step that sets up multigrid takes 5 to 10 % longer. With 64 MB the peak is 6 % higher.
     mallopt(mmap_threshold, 8 << 20)
     mallopt(trim_threshold, 16 << 20)
     mallopt(mmap_max, 1 << 16)

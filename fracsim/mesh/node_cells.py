@@ -32,6 +32,15 @@ class NodeCellCount:
         return np.asarray(self._sum.array.copy())
 
 
+def with_neighbours(domain: Domain, nodes: Flags) -> Flags:
+    """(owned nodes,) flags of flagged owned nodes (n,) and of all nodes that share a cell with one (collective)."""
+    index_map = domain.space.dofmap.index_map
+    flags = np.zeros(index_map.size_local + index_map.num_ghosts)
+    flags[: domain.node_count] = nodes
+    touched: Flags = np.any(owner_values(index_map, flags)[domain.cell_nodes] > 0, axis=1)
+    return np.asarray(NodeCellCount(domain)(touched)[: domain.node_count] > 0)
+
+
 def node_components(domain: Domain, flags: Flags) -> tuple[int, Ints]:
     """The number of facet-connected components of the flagged cells, and (owned nodes,) that of each node (collective).
 

@@ -1,12 +1,15 @@
-"""Products and preconditioner of a tangent with low-rank updates or a coupling of few nodes, as contact has.
+"""Exact solutions for some nodes in a preconditioner, and products of a tangent with low-rank updates or a coupling.
 
-The preconditioner of a tangent K with a coupling C of few nodes is
+The preconditioner of a tangent K with a coupling C of few nodes, as contact has it, is
 
     P = Q + (1 - Q A) M (1 - A Q),   Q = Z E^-1 Z^T,   E = Z^T A Z,   A = K + C
 
-M is the preconditioner of the body, made for K. Z has the dofs of the nodes that C couples: Q solves for these nodes
-exactly, however stiff C is, and M for what is left. A Z has few rows (Mandel 1993; Tang et al. 2009). Where E is
-singular or not finite, P = M: the solve fails, and its step is halved.
+M is the preconditioner of the body, made for an earlier K. Z has the dofs of the nodes that C couples, and of those
+around which K has changed since M was set up (C = 0 there): Q solves for these nodes exactly, and M for what is left.
+A Z has few rows (Mandel 1993; Tang et al. 2009).
+
+Where E is singular, indefinite or not finite, P = -M: CG ends at once, as A is indefinite. With Q it might not notice,
+and converge to a solution that is no direction of descent.
 
 Equations: docs/theory.md#linear-systems.
 """
@@ -59,6 +62,7 @@ class CoupledNodesPreconditioner:
         coupling, residual, changed = self._coupling, self._residual, self._changed
         if self._solve is None:
             self._base_pc.apply(x, y)
+            y.scale(-1.0)  # which ends CG
             return
         x.copy(residual)
         motion = self._solve(coupling.at_all_nodes(x.array_r[coupling.dofs]))
@@ -81,9 +85,11 @@ def _solver_of(E: csr_matrix) -> Callable[[Values], Values] | None:
         return None
     options = {"SymmetricMode": True}
     try:
-        return splu(E.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options).solve
+        factors = splu(E.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     except RuntimeError:  # a pivot is 0
         return None
+    # with pivots on the diagonal E has as many negative eigenvalues as U has negative entries there
+    return factors.solve if factors.U.diagonal().min() > 0 else None
 
 
 class LowRankOperator:

@@ -17,6 +17,7 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
+from ..mechanics.extra_couplings import with_nodes
 from .direct_solver import DirectSolver
 from .forcing_terms import ContractionForcing, EisenstatWalkerForcing
 from .petsc_options import PetscOptions, PetscOptionSet, call_petsc
@@ -277,11 +278,20 @@ class LinearSolver:
         else:
             self.preconditioner.update(self.operators, begins=self._begins)
             self._begins = False
-        self._add_coupling(self.direct.pc if self.direct.serves else self.preconditioner.serving)
+        self._solve_some_nodes_exactly()
 
-    def _add_coupling(self, base: PETSc.PC) -> None:
-        """Add the coupling of few nodes to the preconditioner (collective)."""
-        coupling = self.tangent.couplings.beside
+    def _solve_some_nodes_exactly(self) -> None:
+        """Give the KSP its preconditioner, with exact solutions for nodes that this one does not know (collective).
+
+        These are nodes of a coupling beside the tangent, and nodes whose stiffness has changed since the set-up.
+        """
+        coupling, changed = self.tangent.couplings.beside, None
+        if self.direct.serves:
+            base = self.direct.pc
+        else:
+            base, changed = self.preconditioner.serving, self.preconditioner.changed_nodes
+        if changed is not None:
+            coupling = with_nodes(self.balance.domain, changed, coupling)
         if coupling is None:
             self.ksp.setPC(base)
             return
@@ -383,7 +393,7 @@ class LinearSolver:
         if self._asked_rtol:
             solved_norm = min(solved_norm, self._asked_rtol * self.balance.work_vector.norm())
         self._prepare(eigenvalue_floor)
-        K, pc, cg = self.operators.matrix, self.preconditioner.serving, self._step_cg
+        K, pc, cg = self.operators.matrix, self.ksp.getPC(), self._step_cg
         solved = cg.solve(self.operators.products or K, K, pc, self.balance.work_vector, self.correction, solved_norm)
         self._equivalent = cg.equivalent_iterations(float(self.ksp.rtol))
         return (cg.residual_norm, cg.iterations) if solved else None

@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
 from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
@@ -45,9 +47,11 @@ class PlainPreconditioner:
     Attributes:
         pc, serving: PETSc's preconditioner.
         is_indefinite: whether factors tell that the last tangent was indefinite.
+        changed_nodes: None, as it is set up for each tangent.
     """
 
     fine_level: FineLevel | None = None  # no copy in single precision
+    changed_nodes: npt.NDArray[np.int64] | None = None
     is_indefinite = False
 
     def __init__(self, ksp: PETSc.KSP) -> None:

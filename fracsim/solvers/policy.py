@@ -154,6 +154,17 @@ class SolverPolicy:
     # by three times the iterations; with two solves a jelly that tumbles was set up in each step.
     solves_after_setup: int = 5
 
+    # --- changed nodes ---
+    # Iterations of a solve of a broken body, above which nodes whose stiffness changes are solved for exactly from then
+    # on. A Charpy bar that crumbles, with 10 iterations a solve, would take 1.06 times as long.
+    changed_iterations: int = 30
+    # |D_0^-1 D - 1| of the block D of a node and D_0 of the set-up, above which the stiffness has changed.
+    changed_stiffness: float = 0.2
+    # Share of all nodes, and their number, up to which they are solved for exactly, with their neighbours. A set-up for
+    # 5,900 of 33,000 nodes takes 0.2 s, new coarse spaces 1 s.
+    max_changed_share: float = 0.2
+    max_changed_nodes: int = 6000
+
     # --- deflation ---
     # Share of the largest eigenvalue of a fragment's Gram matrix, below which rigid motions are linearly dependent.
     dependent_motion_tolerance: float = 1e-8

@@ -20,6 +20,7 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
+from ..mesh.node_cells import with_neighbours
 from ..mesh.parallel import sum_over_ranks
 from .petsc_options import PetscOptions, PetscOptionSet, stored_products
 from .policy import SolverPolicy
@@ -107,7 +108,11 @@ class AppliedPreconditioner:
         serving: preconditioner that is applied: `pc`, the V cycle copied from it, or deflation around one of these.
         vcycle: V cycle in single precision, copied from `pc`; None: PETSc's own is applied.
         keeps_coarse_spaces: whether `pc` is still set up, so that a refresh is possible.
+        changed_nodes: (n,) owned nodes around those whose stiffness has changed since the set-up, to be solved for
+            exactly; None: there are none, or too many.
     """
+
+    changed_nodes: npt.NDArray[np.int64] | None = None
 
     def __init__(
         self, ksp: PETSc.KSP, options: PetscOptionSet, balance: Balance, policy: SolverPolicy, *, is_default: bool
@@ -183,6 +188,17 @@ class AppliedPreconditioner:
             renew_smoothers(self.pc)
             self.serving = deflation.pc
 
+    def find_changed_nodes(self) -> None:
+        """Find `changed_nodes` for the tangent of the next solve (collective)."""
+        self.changed_nodes = None
+        if self.vcycle is None:
+            return
+        domain, policy = self._balance.domain, self._policy
+        nodes = with_neighbours(domain, self.vcycle.fine_level.changed_nodes(policy.changed_stiffness))
+        limit = min(policy.max_changed_share * domain.space.dofmap.index_map.size_global, policy.max_changed_nodes)
+        if 0 < domain.comm.allreduce(int(np.count_nonzero(nodes))) <= limit:
+            self.changed_nodes = np.flatnonzero(nodes)
+
     def release_vcycle(self) -> None:
         """Free the V cycle."""
         if self.vcycle is not None:
@@ -234,6 +250,7 @@ class Preconditioner:
         self._edges_since_update = 0
         self._edges_since_rebuild = False
         self._ever_broken = False
+        self._finds_changes = False  # for exact solutions around changed nodes
         self._pattern_is_new = False
         self._looks_for_fragments = False  # before the next solve
         # --- decisions ---
@@ -276,6 +293,7 @@ class Preconditioner:
             equivalent: that of a solve to full accuracy; 0: unknown.
         """
         self._iterations, self._equivalent = iterations, equivalent
+        self._finds_changes |= self._ever_broken and iterations > self._policy.changed_iterations
 
     def solve_failed(self) -> None:
         """Record that a solve failed: smoothers of an older tangent need not be positive for this one."""
@@ -419,6 +437,8 @@ class Preconditioner:
         new_fragments = self._looks_for_fragments and self.applied.may_deflate
         self._looks_for_fragments = self._looks_for_fragments and not new_fragments
         self.applied.serve(operators, new_fragments=new_fragments, moved=begins)
+        if self._finds_changes:
+            self.applied.find_changed_nodes()
 
     def _set_up(self, operators: TangentOperators, update: Update) -> None:
         rebuild = update == Update.REBUILD
@@ -443,6 +463,11 @@ class Preconditioner:
     def serving(self) -> PETSc.PC:
         """Preconditioner that is applied."""
         return self.applied.serving
+
+    @property
+    def changed_nodes(self) -> npt.NDArray[np.int64] | None:
+        """Nodes to be solved for exactly (AppliedPreconditioner)."""
+        return self.applied.changed_nodes
 
     @property
     def fine_level(self) -> FineLevel | None:

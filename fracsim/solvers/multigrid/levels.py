@@ -227,13 +227,25 @@ class FineLevel(SmoothedLevel):
         super().__init__(data, pattern, code, policy)
         nodes, size = data.nodes, data.size
         self._unscale = 1 / self.scale
+        self._inverse_at_setup: Single | None = None  # (owned nodes, size, size) of the blocks on the diagonal
         self._unscaled_x = GhostedVector(nodes, size, np.float64)
         self._lost = np.zeros((nodes.size_local, size, size), np.float32)
 
     def assign_values(self, values: Values, couplings: Sequence[NodeCoupling] = ()) -> None:
         """Assign the blocks of A and its couplings, and compute the rounding loss of the blocks (collective)."""
         super().assign_values(values, couplings)
+        if self._inverse_at_setup is None:
+            self._inverse_at_setup = self._inverse.blocks.copy()
         self._matrix.compute_rounding_loss(values, self._unscale, self._unscale, self._lost)
+
+    def changed_nodes(self, share: float) -> npt.NDArray[np.bool_]:
+        """(owned nodes,) flags of nodes of which the block D on the diagonal differs from D_0, that of the set-up.
+
+        That is where |D_0^-1 D - 1| > `share`, in the norm of Frobenius.
+        """
+        assert self._inverse_at_setup is not None
+        change = self._inverse_at_setup @ self._diagonal_blocks() - np.eye(self._size, dtype=np.float32)
+        return np.asarray(np.einsum("nij,nij->n", change, change) > share**2)
 
     def multiply(self, x: PETSc.Vec, y: PETSc.Vec) -> None:
         """Compute y = A x, in double precision but for A' and L (collective)."""
