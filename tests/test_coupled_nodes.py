@@ -32,7 +32,9 @@ def positive(n: int) -> np.ndarray:
     return root @ root.T + np.eye(n)
 
 
-def preconditioned(K: np.ndarray, C: np.ndarray, numbers: np.ndarray, d: int, values: np.ndarray) -> np.ndarray:
+def preconditioned(
+    K: np.ndarray, C: np.ndarray, numbers: np.ndarray, d: int, values: np.ndarray, *, must_be_positive: bool = False
+) -> np.ndarray:
     """P of `values`, with M = 1 / diag K."""
     n, body = len(K), body_of(len(K) // d, d)
     rows = csr_matrix(K)
@@ -47,7 +49,8 @@ def preconditioned(K: np.ndarray, C: np.ndarray, numbers: np.ndarray, d: int, va
     base.setUp()
     x, y = operator.createVecs()
     x.array_w[:] = values
-    CoupledNodesPreconditioner(base, FewNodesCoupling(body, numbers, csr_matrix(C)), tangent, x).apply(base, x, y)
+    coupling = FewNodesCoupling(body, numbers, csr_matrix(C))
+    CoupledNodesPreconditioner(base, coupling, tangent, x, must_be_positive=must_be_positive).apply(base, x, y)
     return np.asarray(y.array_r.copy())
 
 
@@ -67,15 +70,24 @@ def test_the_preconditioner_is_that_of_dense_matrices(stiffness: float) -> None:
     np.testing.assert_allclose(P, P.T, rtol=0, atol=1e-8)
 
 
-@pytest.mark.parametrize("kind", ["singular", "infinite", "indefinite"])
-def test_nodes_that_cannot_be_solved_for_end_cg(kind: str) -> None:
-    """P = -M where K + C of the nodes is 0 or has a negative eigenvalue, or C is not finite as that of a gap of 0."""
+@pytest.mark.parametrize("kind", ["singular", "infinite"])
+def test_a_coupling_that_cannot_be_solved_for_is_left_to_the_body(kind: str) -> None:
+    """P = M where K + C of the coupled nodes is 0, or C is not finite as that of a gap of 0."""
     d, numbers, K, x = 2, np.array([0, 2]), positive(6), RANDOM.normal(size=6)
     dofs = (d * numbers[:, None] + np.arange(d)).reshape(-1)
-    of_nodes = K[np.ix_(dofs, dofs)]
-    lowest = np.linalg.eigvalsh(of_nodes)[0]
-    C = {"singular": -of_nodes, "infinite": np.full((4, 4), np.inf), "indefinite": -1.01 * lowest * np.eye(4)}[kind]
-    np.testing.assert_allclose(preconditioned(K, C, numbers, d, x), -x / np.diag(K), rtol=1e-12)
+    C = -K[np.ix_(dofs, dofs)] if kind == "singular" else np.full((4, 4), np.inf)
+    np.testing.assert_allclose(preconditioned(K, C, numbers, d, x), x / np.diag(K), rtol=1e-12)
+
+
+@pytest.mark.parametrize("shift", [1.01, 0.99])
+def test_nodes_with_an_indefinite_stiffness_end_cg(shift: float) -> None:
+    """P = -M, where that is asked for, once K + C of the nodes has a negative eigenvalue, and not before."""
+    d, numbers, K, x = 2, np.array([0, 2]), positive(6), RANDOM.normal(size=6)
+    dofs = (d * numbers[:, None] + np.arange(d)).reshape(-1)
+    C = -shift * np.linalg.eigvalsh(K[np.ix_(dofs, dofs)])[0] * np.eye(4)
+    found = preconditioned(K, C, numbers, d, x, must_be_positive=True)
+    exact = preconditioned(K, C, numbers, d, x)
+    np.testing.assert_allclose(found, -x / np.diag(K) if shift > 1 else exact, rtol=1e-12)
 
 
 def test_prescribed_dofs_are_not_coupled() -> None:

@@ -8,22 +8,22 @@ M is the preconditioner of the body, made for an earlier K. Z has the dofs of th
 around which K has changed since M was set up (C = 0 there): Q solves for these nodes exactly, and M for what is left.
 A Z has few rows (Mandel 1993; Tang et al. 2009).
 
-Where E is singular, indefinite or not finite, P = -M: CG ends at once, as A is indefinite. With Q it might not notice,
-and converge to a solution that is no direction of descent.
+Where E is singular or not finite, P = M: the solve fails, and its step is halved. Where nodes have changed and E is
+indefinite, P = -M: CG ends at once, as A is indefinite. With Q it might not notice, and converge to a solution that is
+no direction of descent.
 
 Equations: docs/theory.md#linear-systems.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix, vstack
-from scipy.sparse.linalg import splu
+from scipy.sparse.linalg import SuperLU, splu
 
 from ..mechanics.extra_couplings import FewNodesCoupling, dofs_of_nodes
 from ..mechanics.tangent import Tangent
@@ -35,7 +35,10 @@ Values = npt.NDArray[np.float64]
 class CoupledNodesPreconditioner:
     """Context of the PETSc preconditioner P."""
 
-    def __init__(self, base_pc: PETSc.PC, coupling: FewNodesCoupling, tangent: Tangent, like: PETSc.Vec) -> None:
+    def __init__(
+        self, base_pc: PETSc.PC, coupling: FewNodesCoupling, tangent: Tangent, like: PETSc.Vec,
+        *, must_be_positive: bool = False,
+    ) -> None:  # fmt: skip
         """Compute A Z and the factors of E (collective).
 
         Args:
@@ -43,6 +46,7 @@ class CoupledNodesPreconditioner:
             coupling: C.
             tangent: K.
             like: a vector of the size of P.
+            must_be_positive: whether P = -M where E is indefinite.
         """
         self._base_pc, self._coupling, self._comm = base_pc, coupling, like.comm.tompi4py()
         self._residual = like.duplicate()
@@ -51,7 +55,10 @@ class CoupledNodesPreconditioner:
         rows = csr_matrix(vstack(allgather(self._comm, tangent.owned_rows(coupling.nodes))))
         coupled = dofs_of_nodes(coupling.numbers, tangent.domain.dim)
         E = rows[:, coupled] + coupling.K
-        self._solve = _solver_of(E)
+        factors = _factors_of(E)
+        # with pivots on the diagonal E has as many negative eigenvalues as U has negative entries there
+        self._is_indefinite = must_be_positive and factors is not None and factors.U.diagonal().min() <= 0
+        self._solve = None if factors is None or self._is_indefinite else factors.solve
         columns = csr_matrix(rows[:, first:end].T)
         self._changed = np.flatnonzero(np.diff(columns.indptr))  # owned dofs in which K Z has entries
         self._KZ = columns[self._changed]
@@ -62,7 +69,8 @@ class CoupledNodesPreconditioner:
         coupling, residual, changed = self._coupling, self._residual, self._changed
         if self._solve is None:
             self._base_pc.apply(x, y)
-            y.scale(-1.0)  # which ends CG
+            if self._is_indefinite:
+                y.scale(-1.0)  # which ends CG
             return
         x.copy(residual)
         motion = self._solve(coupling.at_all_nodes(x.array_r[coupling.dofs]))
@@ -79,17 +87,15 @@ class CoupledNodesPreconditioner:
         self._residual.destroy()
 
 
-def _solver_of(E: csr_matrix) -> Callable[[Values], Values] | None:
-    """Solution of E x = b by factors, for symmetric E; None where E is singular or not finite."""
+def _factors_of(E: csr_matrix) -> SuperLU | None:
+    """Factors of a symmetric matrix; None where E is singular or not finite."""
     if not np.isfinite(E.data).all():
         return None
     options = {"SymmetricMode": True}
     try:
-        factors = splu(E.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+        return splu(E.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
     except RuntimeError:  # a pivot is 0
         return None
-    # with pivots on the diagonal E has as many negative eigenvalues as U has negative entries there
-    return factors.solve if factors.U.diagonal().min() > 0 else None
 
 
 class LowRankOperator:

@@ -299,7 +299,9 @@ class LinearSolver:
 
         base.setReusePreconditioner(True)
         renew_smoothers(base)
-        context = CoupledNodesPreconditioner(base, coupling, self.tangent, self.balance.work_vector)
+        context = CoupledNodesPreconditioner(
+            base, coupling, self.tangent, self.balance.work_vector, must_be_positive=changed is not None
+        )
         pc = PETSc.PC().createPython(context, comm=self.ksp.comm)
         self.ksp.setPC(pc)
         pc.destroy()
