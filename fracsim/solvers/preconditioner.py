@@ -20,7 +20,6 @@ from mpi4py import MPI
 from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
-from ..mesh.node_cells import with_neighbours
 from ..mesh.parallel import sum_over_ranks
 from .petsc_options import PetscOptions, PetscOptionSet, stored_products
 from .policy import SolverPolicy
@@ -193,6 +192,8 @@ class AppliedPreconditioner:
         self.changed_nodes = None
         if self.vcycle is None:
             return
+        from ..mesh.node_cells import with_neighbours
+
         domain, policy = self._balance.domain, self._policy
         nodes = with_neighbours(domain, self.vcycle.fine_level.changed_nodes(policy.changed_stiffness))
         limit = min(policy.max_changed_share * domain.space.dofmap.index_map.size_global, policy.max_changed_nodes)
