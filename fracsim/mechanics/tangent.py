@@ -247,14 +247,11 @@ class Tangent:
         dead = self._stress.dead_cells
         return dead is not None and self._mass.is_diagonal and self._assembler.may_shrink(dead, share)
 
-    def shrink(self, share: float) -> bool:
-        """Drop entries of dead cells if at most a share of its cells are alive; returns whether it did (collective)."""
-        dead = self._stress.dead_cells
-        if dead is None or not self.may_shrink(share):
-            return False
-        self._assembler.shrink(dead)
+    def shrink(self) -> None:
+        """Drop the entries of dead cells, where `may_shrink` (collective)."""
+        assert self._stress.dead_cells is not None
+        self._assembler.shrink(self._stress.dead_cells)
         self.pattern_version += 1
-        return True
 
     # --- a solve ---
 

@@ -143,7 +143,7 @@ class TangentOperators:
         self.multiply_by(None)
         for listener in self._listeners:
             listener.matrix_ends()
-        self._tangent.shrink(share)
+        self._tangent.shrink()
         self._make_operators()
         return True
 

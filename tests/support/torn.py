@@ -211,7 +211,8 @@ def dead_cells(mass: str, *ways: str) -> Found:
     found: Found = {}
     for name in ("with", "without", *(f"{way}-without" for way in ways)):
         if name.startswith("fitted"):
-            assert balance.tangent.shrink(0.7)
+            assert balance.tangent.may_shrink(0.7)
+            balance.tangent.shrink()
         blocks = balance.tangent.switch_to_blocks() if name.startswith(("blocks", "brought")) else None
         balance.tangent.assemble(blocks_only=name.startswith("blocks"))
         (balance.tangent.matrix if blocks is None or name.startswith("brought") else blocks).mult(x, y)
