@@ -122,6 +122,7 @@ def test_what_hangs_is_solved_for_by_itself_in_long_steps(monkeypatch: pytest.Mo
 def test_deflation_of_an_earlier_tangent_remains_positive() -> None:
     """Fragments are deflated by the tangent with which a step begins: applied to later ones, P is as it was."""
     scene, deflation, _, _ = hanging_parts()
+    assert deflation.pc is not None
     balance, rng = scene.balance, np.random.default_rng(4)
     nodes = scene.domain.node_count
     balance.u.x.array[:] += 0.02 * rng.standard_normal(len(balance.u.x.array))
@@ -132,7 +133,7 @@ def test_deflation_of_an_earlier_tangent_remains_positive() -> None:
     found = np.empty_like(given)
     for row, result in zip(given, found, strict=True):
         x.array_w[:] = row
-        deflation.apply(deflation.pc, x, y)
+        deflation.pc.apply(x, y)
         result[:] = y.array_r
     products = given @ found.T
     np.testing.assert_allclose(products, products.T, atol=1e-9 * np.abs(products).max())

@@ -21,6 +21,7 @@ from petsc4py import PETSc
 from ..mesh.c_library import FAST_FLAGS, compile_on_all_ranks
 from ..mesh.dolfinx_compat import create_vector
 from ..mesh.parallel import allgather, sum_over_ranks
+from .extra_couplings import dofs_of_nodes
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -186,7 +187,7 @@ class CouplingMatrix:
         # global numbers of all coupled nodes, and the indices of this rank's among them
         self._numbers: Ints = np.unique(np.concatenate(allgather(self._comm, coupled)))
         self._indices = np.searchsorted(self._numbers, owned)
-        rows, columns = (_dofs_of(nodes, d) for nodes in (self.nodes, self._numbers))
+        rows, columns = (dofs_of_nodes(nodes, d) for nodes in (self.nodes, self._numbers))
         self._K = csr_matrix(local[rows][:, columns])
         self._shape = len(self.nodes), d
 
@@ -220,8 +221,3 @@ class CouplingMatrix:
         row, column = row[inside], self._numbers[K.col[inside] // d]
         entries = d * row + K.row[inside] % d, d * column + K.col[inside] % d
         return csr_matrix((K.data[inside], entries), shape=(d * len(nodes), d * node_map.size_global))
-
-
-def _dofs_of(nodes: Ints, d: int) -> Ints:
-    """(d n,) dofs of nodes (n,)."""
-    return np.asarray(d * nodes[:, None] + np.arange(d)).reshape(-1)

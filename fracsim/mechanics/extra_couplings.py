@@ -2,7 +2,7 @@
 
 Two points in contact move as one along their normal. Smoothers and aggregates of multigrid do not represent such a
 motion: with 15 pairs in contact CG takes 75 iterations where the body alone takes 12. A coupling of few nodes stays
-beside the tangent, and its preconditioner solves for these nodes exactly (solvers.coupled_nodes).
+beside the tangent, and its preconditioner solves for these nodes exactly (solvers.balancing).
 """
 
 from __future__ import annotations
@@ -121,27 +121,11 @@ def sum_few_nodes(domain: Domain, part: csr_matrix, nodes: Ints, limit: int) -> 
     numbers = np.unique(np.concatenate(parts))
     if len(numbers) > limit:
         return None
-    position = np.zeros(len(nodes), np.int64)
-    position[used] = np.searchsorted(numbers, nodes[used])
-    row, column = (d * position[index // d] + index % d for index in (entries.row, entries.col))
-    all_parts = zip(*allgather(domain.comm, (row, column, entries.data)), strict=True)
+    dofs = dofs_of_nodes(np.searchsorted(numbers, nodes), d)  # of the nodes that have entries
+    all_parts = zip(*allgather(domain.comm, (dofs[entries.row], dofs[entries.col], entries.data)), strict=True)
     rows, columns, values = (np.concatenate(items) for items in all_parts)
     size = d * len(numbers)
     return FewNodesCoupling(domain, numbers, csr_matrix((values, (rows, columns)), shape=(size, size)))
-
-
-def with_nodes(domain: Domain, nodes: Ints, coupling: FewNodesCoupling | None) -> FewNodesCoupling:
-    """A coupling that also has owned nodes (k,), at which its stiffness is 0; None: it has these alone (collective)."""
-    from scipy.sparse import csr_matrix
-
-    d, parts = domain.dim, allgather(domain.comm, nodes + domain.space.dofmap.index_map.local_range[0])
-    numbers = np.unique(np.concatenate(parts if coupling is None else [*parts, coupling.numbers]))
-    shape = (d * len(numbers),) * 2
-    if coupling is None:
-        return FewNodesCoupling(domain, numbers, csr_matrix(shape))
-    dofs, entries = dofs_of_nodes(np.searchsorted(numbers, coupling.numbers), d), coupling.K.tocoo()
-    K = csr_matrix((entries.data, (dofs[entries.row], dofs[entries.col])), shape=shape)
-    return FewNodesCoupling(domain, numbers, K)
 
 
 def dofs_of_nodes(nodes: Ints, d: int) -> Ints:

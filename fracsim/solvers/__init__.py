@@ -10,9 +10,9 @@ linear_solver          systems with the tangent: options, Krylov method, steps t
 direct_solver          factors of the tangent (MUMPS), and their cost
 preconditioner         multigrid or SSOR: when it is rebuilt, and from what
 plain_solver           linear solver of `plain = true`: PETSc alone
-deflation              two-level preconditioner for fragments that are hardly attached
-coupled_nodes          products and preconditioner of a tangent with low-rank updates, or few coupled nodes
-tangent_operators      tangent as the matrices that a KSP takes, in blocks of a node's dofs too
+balancing              balancing preconditioner: exact solutions in a coarse space, as for nodes in contact
+deflation              coarse space of fragments that are hardly attached
+tangent_operators      tangent as the matrices that a KSP takes: in blocks of a node's dofs, with low-rank updates
 multigrid              V cycle in single precision
 policy                 tuned numbers
 petsc_options          options of one solver in PETSc's database

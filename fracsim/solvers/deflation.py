@@ -1,13 +1,9 @@
-"""Deflation: a two-level preconditioner for fragments that are attached by a node or an edge, or detached.
+"""Deflation: the rigid motions of fragments that are attached by a node or an edge, or detached, as a coarse space.
 
 Inertia alone resists the rigid motion of such fragments, some 1e-7 of a stiffness in long steps, and there are hundreds
-of them along a crack. Multigrid's aggregates span the hinges, so that CG needs iterations for each motion.
-
-    P = Q + (1 - Q K) M (1 - K Q),   Q = Z E^-1 Z^T,   E = Z^T K Z
-
-M is the preconditioner of the body. Z has the rigid motions of all fragments but the largest, with the nodes that no
-larger fragment has and the nodes that are tied to it (mechanics.node_ties). K Z has few rows, so that P costs as much
-as M (Nicolaides 1987; Mandel 1993; Tang et al. 2009).
+of them along a crack. Multigrid's aggregates span the hinges, so that CG needs iterations for each motion. Z of the
+balancing preconditioner (solvers.balancing) has the rigid motions of all fragments but the largest, with the nodes that
+no larger fragment has and the nodes that are tied to it (mechanics.node_ties). Source: Nicolaides (1987).
 
 Equations: docs/theory.md#linear-systems.
 """
@@ -19,26 +15,26 @@ import numpy.typing as npt
 from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
-from scipy.sparse.linalg import splu
 
 from ..mechanics.balance import Balance
+from ..mechanics.extra_couplings import dofs_of_nodes
 from ..mechanics.term_protocols import TieTerm
 from ..mesh.domain import Domain
 from ..mesh.node_cells import node_components
 from ..mesh.parallel import allgather, sum_over_ranks
+from .balancing import BalancingPreconditioner
 from .policy import DEFAULT_POLICY, SolverPolicy
-from .weak_callbacks import ApplyContext
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
-class DeflatedPreconditioner:
-    """Context of the PETSc preconditioner P.
+class FragmentDeflation:
+    """Balancing preconditioner with the rigid motions of fragments.
 
     Attributes:
         base_pc: M.
-        pc: P.
+        pc: P; None if all motions of the fragments are prescribed, so that there is nothing to deflate.
     """
 
     def __init__(
@@ -56,71 +52,47 @@ class DeflatedPreconditioner:
         """
         self._balance, self.base_pc, self._policy = balance, base_pc, policy
         self._nodes, self._fragment, self._count = nodes, fragment, count
-        self.pc = PETSc.PC().create(balance.domain.comm)
-        self.pc.setType("python")
-        self.pc.setPythonContext(ApplyContext(self.apply))
-        self._residual = balance.work_vector.duplicate()
+        self.pc: PETSc.PC | None = None
 
-    def update_operator(self, tangent: PETSc.Mat) -> bool:
-        """Set up P for a tangent at the present displacement (collective).
+    def update(self) -> None:
+        """Set up P for the tangent K at the present displacement (collective).
 
         P remains symmetric and positive definite for later tangents, with K of this one.
-
-        Returns:
-            False if all motions of the fragments are prescribed, so that there is nothing to deflate.
         """
-        balance, domain = self._balance, self._balance.domain
-        x, free = domain.nodes[self._nodes], balance.motion.free_dofs.reshape(-1, domain.dim)[self._nodes]
+        self.destroy()
+        Zt = self._transposed_motions()
+        if not Zt.shape[0]:
+            return
+        balance, comm = self._balance, self._balance.domain.comm
+        first = balance.work_vector.getOwnershipRange()[0]
+        owned_Zt = Zt[:, first + dofs_of_nodes(self._nodes, balance.domain.dim)]
+        ZtK = _sum_over_ranks(comm, owned_Zt @ balance.tangent.owned_rows(self._nodes))
+        Zt = _sum_over_ranks(comm, Zt)
+        self.pc = BalancingPreconditioner(self.base_pc, Zt, ZtK, balance.work_vector).to_petsc()
+
+    def _transposed_motions(self) -> csr_matrix:
+        """Return the part of Z^T of this rank's nodes, (columns of Z, dofs of all ranks) (collective)."""
+        balance, domain, d = self._balance, self._balance.domain, self._balance.domain.dim
+        x, free = domain.nodes[self._nodes], balance.motion.free_dofs.reshape(-1, d)[self._nodes]
         if not balance.linear:
-            x = x + balance.u.x.array.reshape(-1, domain.dim)[self._nodes]
+            x = x + balance.u.x.array.reshape(-1, d)[self._nodes]
         columns, values, width = _rigid_motions(domain, self._fragment, x, free, self._count, self._policy)
-        if not width:
-            return False
-        self._factorise(columns, values, width)
-        self.pc.setOperators(tangent)
-        return True
-
-    def _factorise(self, columns: Ints, values: Values, width: int) -> None:
-        """Compute Z, K Z, their transposes and the factors of E (collective)."""
-        domain = self._balance.domain
-        comm, d = domain.comm, domain.dim
-        nodes = domain.space.dofmap.index_map
-        first, size = d * nodes.local_range[0], d * nodes.size_global
-        self._dofs: Ints = (d * self._nodes[:, None] + np.arange(d)).reshape(-1)
+        first = balance.work_vector.getOwnershipRange()[0]
+        dofs = first + dofs_of_nodes(self._nodes, d).reshape(-1, d, 1)
         present = np.broadcast_to((columns >= 0)[:, None], values.shape)
-        row, column = (np.broadcast_to(item, values.shape)[present] for item in
-                       (first + self._dofs.reshape(-1, d, 1), columns[:, None]))  # fmt: skip
-        Z = csr_matrix((values[present], (row, column)), shape=(size, width))
-        self._Z = Z[first + self._dofs]
-        self._Zt = self._Z.T.tocsr()
-        ZtK = _sum_over_ranks(comm, self._Zt @ self._balance.tangent.owned_rows(self._nodes))
-        E = ZtK @ _sum_over_ranks(comm, Z)
-        self._solve_coarse = splu(E.tocsc()).solve
-        owned = ZtK[:, first : first + d * nodes.size_local].T.tocsr()
-        # Owned dofs in which K Z has entries.
-        self._coupled_dofs = np.flatnonzero(np.diff(owned.indptr))
-        self._KZ = owned[self._coupled_dofs]
-        self._KZt = self._KZ.T.tocsr()
-
-    def apply(self, _: PETSc.PC, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Evaluate y = P x (collective)."""
-        comm, dofs, coupled, residual = self._balance.domain.comm, self._dofs, self._coupled_dofs, self._residual
-        x.copy(residual)
-        motion = self._solve_coarse(sum_over_ranks(comm, self._Zt @ residual.array_r[dofs]))
-        residual.array_w[coupled] -= self._KZ @ motion
-        self.base_pc.apply(residual, y)
-        motion -= self._solve_coarse(sum_over_ranks(comm, self._KZt @ y.array_r[coupled]))
-        y.array_w[dofs] += self._Z @ motion
+        column, dof = (np.broadcast_to(item, values.shape)[present] for item in (columns[:, None], dofs))
+        return csr_matrix((values[present], (column, dof)), shape=(width, balance.work_vector.getSize()))
 
     def destroy(self) -> None:
-        """Free PETSc's objects."""
-        self.pc.destroy()
-        self._residual.destroy()
+        """Free P."""
+        if self.pc is not None:
+            self.pc.destroy()
+            self.pc = None
 
 
 def create_deflation(
     balance: Balance, base_pc: PETSc.PC, policy: SolverPolicy = DEFAULT_POLICY
-) -> DeflatedPreconditioner | None:
+) -> FragmentDeflation | None:
     """Return the deflation of the present body; None if it is in one piece or cannot break (collective)."""
     domain, multiplier = balance.domain, balance.stress.energy_multiplier
     # A restart tells of damage that may have changed, also to a body that cannot break.
@@ -132,7 +104,7 @@ def create_deflation(
     nodes = np.flatnonzero(fragment > 0)
     if count <= 1:
         return None
-    return DeflatedPreconditioner(balance, base_pc, nodes, fragment[nodes] - 1, count - 1, policy)
+    return FragmentDeflation(balance, base_pc, nodes, fragment[nodes] - 1, count - 1, policy)
 
 
 def _assign_tied_nodes(balance: Balance, fragment: Ints) -> None:

@@ -91,7 +91,6 @@ class DirectSolver:
 
     def measure_cost(self, ksp: PETSc.KSP) -> None:
         """Measure the cost of the last factorisation, and whether the tangent is positive definite (collective)."""
-        # The preconditioner of the KSP may be another one, which corrects for a coupling beside K (coupled_nodes).
         factors, entries = self.pc.getFactorMatrix(), ksp.getOperators()[1].getInfo(PETSc.Mat.InfoType.GLOBAL_SUM)
         # RINFOG(3) of MUMPS: floating-point operations of the elimination.
         operations = factors.getMumpsRinfog(3)

@@ -17,7 +17,6 @@ import numpy.typing as npt
 from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
-from ..mechanics.extra_couplings import with_nodes
 from .direct_solver import DirectSolver
 from .forcing_terms import ContractionForcing, EisenstatWalkerForcing
 from .petsc_options import PetscOptions, PetscOptionSet, call_petsc
@@ -275,34 +274,25 @@ class LinearSolver:
             self.ksp.setType("gmres")
         if self.direct.serves:
             self.direct.update(self.ksp, self.operators)
-        else:
-            self.preconditioner.update(self.operators, begins=self._begins)
-            self._begins = False
-        self._solve_some_nodes_exactly()
+            return
+        self.preconditioner.update(self.operators, begins=self._begins)
+        self._begins = False
+        self._attach_preconditioner()
 
-    def _solve_some_nodes_exactly(self) -> None:
+    def _attach_preconditioner(self) -> None:
         """Give the KSP its preconditioner, with exact solutions for nodes that this one does not know (collective).
 
         These are nodes of a coupling beside the tangent, and nodes whose stiffness has changed since the set-up.
         """
-        coupling, changed = self.tangent.couplings.beside, None
-        if self.direct.serves:
-            base = self.direct.pc
-        else:
-            base, changed = self.preconditioner.serving, self.preconditioner.changed_nodes
-        if changed is not None:
-            coupling = with_nodes(self.balance.domain, changed, coupling)
-        if coupling is None:
+        base, changed = self.preconditioner.serving, self.preconditioner.changed_nodes
+        if changed is None and self.tangent.couplings.beside is None:
             self.ksp.setPC(base)
             return
-        from .coupled_nodes import CoupledNodesPreconditioner
+        from .balancing import solve_nodes_exactly
 
         base.setReusePreconditioner(True)
         renew_smoothers(base)
-        context = CoupledNodesPreconditioner(
-            base, coupling, self.tangent, self.balance.work_vector, must_be_positive=changed is not None
-        )
-        pc = PETSc.PC().createPython(context, comm=self.ksp.comm)
+        pc = solve_nodes_exactly(base, self.tangent, changed, self.balance.work_vector)
         self.ksp.setPC(pc)
         pc.destroy()
 

@@ -25,7 +25,7 @@ from .petsc_options import PetscOptions, PetscOptionSet, stored_products
 from .policy import SolverPolicy
 
 if TYPE_CHECKING:
-    from .deflation import DeflatedPreconditioner
+    from .deflation import FragmentDeflation
     from .multigrid.levels import FineLevel
     from .multigrid.vcycle import SinglePrecisionVCycle
     from .tangent_operators import TangentOperators
@@ -122,8 +122,7 @@ class AppliedPreconditioner:
         self.pc = self.serving = ksp.getPC()
         self.vcycle: SinglePrecisionVCycle | None = None
         self.keeps_coarse_spaces = True
-        self._deflation: DeflatedPreconditioner | None = None
-        self._deflates = False  # whether any motion of the fragments is free
+        self._deflation: FragmentDeflation | None = None
 
     def change_kind(self, options: PetscOptions) -> None:
         """Change options of `pc`, which has to be rebuilt after this."""
@@ -180,9 +179,9 @@ class AppliedPreconditioner:
         if deflation is None or deflation.base_pc is not base:
             return
         if new_fragments or moved:
-            self._deflates = deflation.update_operator(operators.matrix)
-        if self._deflates:
-            # The two-level preconditioner applies this one as it is.
+            deflation.update()
+        if deflation.pc is not None:
+            # The balancing preconditioner applies this one as it is.
             self.pc.setReusePreconditioner(True)
             renew_smoothers(self.pc)
             self.serving = deflation.pc

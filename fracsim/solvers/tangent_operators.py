@@ -8,6 +8,7 @@ from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
 from ..mesh.domain import Domain
+from ..mesh.parallel import sum_over_ranks
 from .policy import SolverPolicy
 from .preconditioner import mass_stiffness_ratio, rigid_body_nullspace
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from dolfinx.fem import DofMap
 
     from ..mechanics.block_matrix import BlockMatrix
+    from ..mechanics.tangent import Tangent
     from .multigrid.levels import FineLevel
 
 
@@ -48,6 +50,32 @@ class BlockOperator:
     def to_petsc(self) -> PETSc.Mat:
         """Return the operator as a PETSc matrix."""
         result: Any = PETSc.Mat().createPython(self.tangent.getSizes(), self, comm=self.tangent.comm)
+        result.setUp()
+        return result
+
+
+class LowRankOperator:
+    """Context of the PETSc matrix K - sum of U C U^T + C', for products.
+
+    U C U^T belong to unknowns that terms have eliminated, C' couples few nodes. Preconditioners are set up from K
+    alone: an update of rank k costs k more iterations, and a balancing preconditioner has C' (solvers.balancing).
+    """
+
+    def __init__(self, matrix: PETSc.Mat, tangent: Tangent) -> None:
+        """Combine products with K, `matrix`, and the updates of the present `tangent`."""
+        self._matrix, self._tangent = matrix, tangent
+
+    def mult(self, _: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
+        """Evaluate y = (K - sum of U C U^T + C') x (collective)."""
+        self._matrix.mult(x, y)
+        for U, C in self._tangent.low_rank_updates:
+            y.array_w[:] -= U @ (C @ sum_over_ranks(self._matrix.comm.tompi4py(), U.T @ x.array_r))
+        if (coupling := self._tangent.couplings.beside) is not None:
+            coupling.add_product(x.array_r, y.array_w)
+
+    def to_petsc(self) -> PETSc.Mat:
+        """Return the operator as a PETSc matrix."""
+        result: Any = PETSc.Mat().createPython(self._matrix.getSizes(), self, comm=self._matrix.comm)
         result.setUp()
         return result
 
@@ -119,8 +147,6 @@ class TangentOperators:
             self.products = self.block_operator.to_petsc()
         self.operator = self.products or tangent.matrix
         if tangent.may_be_incomplete:
-            from .coupled_nodes import LowRankOperator
-
             self._low_rank_operator = LowRankOperator(self.operator, tangent).to_petsc()
             self.operator = self._low_rank_operator
         self._attach_nullspace()

@@ -46,7 +46,7 @@ PLASTIC_MODULES = (
     "forms.plasticity",
 )  # fmt: skip
 AVERAGE, SURFACE, BRITTLE = "fracture.nonlocal_average", ("mesh.split_surface", "output.surface"), "fracture.brittle"
-CONTACT_MODULES = ("contact", "scene.contact_terms", "solvers.coupled_nodes", *SURFACE)
+CONTACT_MODULES = ("contact", "scene.contact_terms", "solvers.balancing", *SURFACE)
 BALL: dict[str, Any] = {"name": "ball", "shape": "sphere", "radius": 0.5, "at": [5.0, 0.5, 2.0]}  # far from the bar
 OPTIONAL = (
     *FRACTURE_MODULES, *CONTACT_MODULES, *PLASTIC_MODULES, AVERAGE, BRITTLE, "forms.damage", "forms.crack_closure",

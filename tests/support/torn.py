@@ -22,7 +22,7 @@ from fracsim.mesh.fragments import find_fragments
 from fracsim.mesh.node_cells import node_components
 from fracsim.mesh.parallel import RemoteRows, sum_over_ranks
 from fracsim.scene import Scene, build_scene
-from fracsim.solvers.deflation import DeflatedPreconditioner, create_deflation
+from fracsim.solvers.deflation import FragmentDeflation, create_deflation
 from fracsim.timestepping.state import State
 from support.solver_policy import other_policy
 
@@ -229,7 +229,7 @@ def some_whole(cells: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:
     return np.cos(cells) > -0.5
 
 
-def hanging_parts() -> tuple[Scene, DeflatedPreconditioner, npt.NDArray[np.int64], int]:
+def hanging_parts() -> tuple[Scene, FragmentDeflation, npt.NDArray[np.int64], int]:
     """A body of which a third of the cells has come apart, in steps so long that inertia holds nothing, Jacobi's
     preconditioner with its deflation, the part of each node, and the number of parts."""
     fixed = [{"on": "left", "fix": "xyz"}]
@@ -248,13 +248,15 @@ def hanging_parts() -> tuple[Scene, DeflatedPreconditioner, npt.NDArray[np.int64
     jacobi.setOperators(balance.tangent.matrix)
     count, part = node_components(domain, whole)
     loose = create_deflation(balance, jacobi)
-    assert loose is not None and loose.update_operator(balance.tangent.matrix)
+    assert loose is not None
+    loose.update()
     return scene, loose, part, count
 
 
 def hanging() -> Found:
     """What the deflated preconditioner of `hanging_parts` makes of anything, and of the forces of a part that turns."""
     scene, loose, part, count = hanging_parts()
+    assert loose.pc is not None
     domain, balance = scene.domain, scene.balance
     x = domain.nodes[: domain.node_count]
     turned = np.where((part == 1)[:, None], np.cross([1.0, 2.0, 3.0], x) + np.array([1.0, 0.0, -1.0]), 0.0)

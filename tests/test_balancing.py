@@ -1,8 +1,8 @@
-"""Stiffness between few nodes beside the tangent: its product, and its preconditioner against a dense one."""
+"""Balancing preconditioner of a stiffness between few nodes beside the tangent, against a dense one; its product."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from functools import cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -13,15 +13,16 @@ from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
 from fracsim.mechanics.extra_couplings import FewNodesCoupling
-from fracsim.solvers.coupled_nodes import CoupledNodesPreconditioner
-from support.ranks import run_on_ranks
+from fracsim.solvers.balancing import solve_nodes_exactly
+from support.ranks import Results, run_on_ranks
 
+ON_RANKS = pytest.mark.parametrize("ranks", [1, *(pytest.param(count, marks=pytest.mark.ranks) for count in (2, 3))])
 RANDOM = np.random.default_rng(5)
 
 
 def body_of(nodes: int, d: int) -> Any:
     """A mesh as a coupling needs it: the number of its nodes."""
-    numbers = SimpleNamespace(local_range=(0, nodes))
+    numbers = SimpleNamespace(local_range=(0, nodes), size_global=nodes)
     space = SimpleNamespace(dofmap=SimpleNamespace(index_map=numbers))
     return SimpleNamespace(comm=MPI.COMM_SELF, dim=d, node_count=nodes, space=space)
 
@@ -35,12 +36,13 @@ def positive(n: int) -> np.ndarray:
 def preconditioned(
     K: np.ndarray, C: np.ndarray, numbers: np.ndarray, d: int, values: np.ndarray, *, must_be_positive: bool = False
 ) -> np.ndarray:
-    """P of `values`, with M = 1 / diag K."""
+    """P of `values`, with M = 1 / diag K; nodes have changed, though none more, where P must be positive."""
     n, body = len(K), body_of(len(K) // d, d)
     rows = csr_matrix(K)
     tangent: Any = SimpleNamespace(
-        domain=body, owned_rows=lambda nodes: rows[(d * nodes[:, None] + np.arange(d)).reshape(-1)]
-    )
+        domain=body, owned_rows=lambda nodes: rows[(d * nodes[:, None] + np.arange(d)).reshape(-1)],
+        couplings=SimpleNamespace(beside=FewNodesCoupling(body, numbers, csr_matrix(C))),
+    )  # fmt: skip
     operator = PETSc.Mat().createDense((n, n), array=np.asfortranarray(K), comm=MPI.COMM_SELF)
     operator.assemble()
     base = PETSc.PC().create(MPI.COMM_SELF)
@@ -49,8 +51,7 @@ def preconditioned(
     base.setUp()
     x, y = operator.createVecs()
     x.array_w[:] = values
-    coupling = FewNodesCoupling(body, numbers, csr_matrix(C))
-    CoupledNodesPreconditioner(base, coupling, tangent, x, must_be_positive=must_be_positive).apply(base, x, y)
+    solve_nodes_exactly(base, tangent, np.zeros(0, np.int64) if must_be_positive else None, x).apply(x, y)
     return np.asarray(y.array_r.copy())
 
 
@@ -102,10 +103,35 @@ def test_prescribed_dofs_are_not_coupled() -> None:
     np.testing.assert_allclose(y, [*expected[:2], 0, 0, *expected[2:]], rtol=1e-12)
 
 
-@pytest.mark.parametrize("ranks", [1, *(pytest.param(count, marks=pytest.mark.ranks) for count in (2, 3))])
-def test_contact_beside_the_tangent_is_that_in_it(ranks: int, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def plates(tmp_path_factory: pytest.TempPathFactory) -> Results:
+    """Results by the number of ranks."""
+    return cache(lambda ranks: run_on_ranks("support.balancing", ranks, tmp_path_factory.mktemp("plates")))
+
+
+@ON_RANKS
+def test_contact_beside_the_tangent_is_that_in_it(plates: Results, ranks: int) -> None:
     """Plates pressed together: products are the same, CG converges, and P solves for the coupled nodes exactly."""
-    result = run_on_ranks("support.coupled_nodes", ranks, tmp_path)
-    assert result["coupled"] > 200 and result["iterations"] < 100
-    assert result["product"] < 1e-12 and result["inverse"] < 1e-8
-    assert result["solution"] < 1e-5
+    assert plates(ranks)["contact-product"] < 1e-12
+    solved_as_on_one_rank(plates, ranks, "contact")
+
+
+@pytest.mark.fast_solver_only("multigrid of an earlier tangent")
+@ON_RANKS
+def test_changed_nodes_are_solved_for_with_those_in_contact(plates: Results, ranks: int) -> None:
+    """Cells of the plates become stiffer, at nodes in contact and at others. P solves for both kinds exactly."""
+    in_contact, has_changed = plates(ranks)["changed-exact"].T > 0
+    for nodes in (in_contact & has_changed, in_contact & ~has_changed, has_changed & ~in_contact):
+        assert np.count_nonzero(nodes) > 50
+    assert not plates(ranks)["contact-exact"][:, 1].any()
+    solved_as_on_one_rank(plates, ranks, "changed")
+
+
+def solved_as_on_one_rank(plates: Results, ranks: int, case: str) -> None:
+    """P A x = x at the nodes of P, which are those of one rank, as is the solution."""
+    result, serial = plates(ranks), plates(1)
+    assert result[f"{case}-iterations"] < 100 and result[f"{case}-solution"] < 1e-5
+    assert result[f"{case}-inverse"] < 1e-8
+    np.testing.assert_array_equal(result[f"{case}-exact"], serial[f"{case}-exact"])
+    x = serial[f"{case}-x"]
+    np.testing.assert_allclose(result[f"{case}-x"], x, rtol=0, atol=1e-7 * np.abs(x).max())
