@@ -250,7 +250,6 @@ class Preconditioner:
         self._edges_since_update = 0
         self._edges_since_rebuild = False
         self._ever_broken = False
-        self._finds_changes = False  # for exact solutions around changed nodes
         self._pattern_is_new = False
         self._looks_for_fragments = False  # before the next solve
         # --- decisions ---
@@ -293,7 +292,6 @@ class Preconditioner:
             equivalent: that of a solve to full accuracy; 0: unknown.
         """
         self._iterations, self._equivalent = iterations, equivalent
-        self._finds_changes |= self._ever_broken and iterations > self._policy.changed_iterations
 
     def solve_failed(self) -> None:
         """Record that a solve failed: smoothers of an older tangent need not be positive for this one."""
@@ -437,7 +435,7 @@ class Preconditioner:
         new_fragments = self._looks_for_fragments and self.applied.may_deflate
         self._looks_for_fragments = self._looks_for_fragments and not new_fragments
         self.applied.serve(operators, new_fragments=new_fragments, moved=begins)
-        if self._finds_changes:
+        if self._ever_broken:
             self.applied.find_changed_nodes()
 
     def _set_up(self, operators: TangentOperators, update: Update) -> None:
