@@ -9,11 +9,11 @@ import pytest
 
 from fracsim.mesh.split_surface.closed_surface import build_split_surface
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
-from fracsim.mesh.split_surface.surface_map import make_surface_map
 from support.drawn import drawn_at
 from support.drawn_contact import CASES
 from support.ranks import Results, run_on_ranks
 from support.solids import lattice
+from support.whole_surface import make_surface_map
 
 RANKS = (2, 3)
 

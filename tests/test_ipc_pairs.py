@@ -15,7 +15,7 @@ from support.solids import four_cells, lattice, separated, torn, two_cells
 
 pytest.importorskip("ipctk", reason="an environment made without a network")
 from fracsim.contact.ipc_pairs import PAIRS, IpcPairs, PairShare
-from fracsim.contact.ipc_surface import offset_crack_faces
+from fracsim.contact.retractable_surface import offset_crack_faces
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -114,14 +114,17 @@ class OneOfSeveral:
     def allreduce(self, value, op=MPI.SUM):
         return value
 
+    def Allreduce(self, values, result, op=MPI.SUM):
+        result[:] = values
+
 
 def shares_of(points: Values, elements: Ints, ranks: int, obstacle: int | None) -> list[IpcPairs]:
     """The pairs of each rank; `obstacle`: its number of points behind those of a body, None: a body with itself."""
     law, shares = {"distance": REACH, "stiffness": STIFF, "friction": 0.5}, []
     patch = np.repeat(np.arange(2, dtype=np.int32), [len(points) - (obstacle or 0), obstacle or 0])
     for rank in range(ranks):
-        share = PairShare.by_slabs(OneOfSeveral(rank, ranks), points[patch == 0], np.arange(0))
-        share = share if obstacle is None else share.with_others(obstacle)
+        points_of_rank = np.digitize(points[:, 0], np.quantile(points[:, 0], np.arange(1, ranks) / ranks)) == rank
+        share = PairShare(OneOfSeveral(rank, ranks), points_of_rank & (patch == 0), np.ones(len(points), bool))
         shares.append(IpcPairs(points, elements, **law, share=share, patch=None if obstacle is None else patch))
     return shares
 
@@ -149,20 +152,6 @@ def test_shares_of_ranks_add_up(dim, ranks, of_obstacle):
     assert min(part.min_gap(x) for part in parts) == whole.min_gap(x)
     assert min(part.free_fraction(x, end) for part in parts) == pytest.approx(whole.free_fraction(x, end), rel=1e-12)
     assert whole.free_fraction(x, end) < 1
-
-
-def test_slabs_cut_across_cracks():
-    """A crack across the longest side of a body: ranks have as many of its points, and both sides of each facet."""
-    rng = np.random.default_rng(2)
-    crack = np.insert(rng.uniform(size=(400, 2)), 0, 5.0, axis=1)
-    gap = np.array([1e-3, 0.0, 0.0])
-    sides = np.concatenate([crack - gap, crack + gap])
-    x = np.concatenate([rng.uniform(size=(300, 3)) * [10.0, 1.0, 1.0], sides])
-    on_cracks = np.arange(300, len(x))
-    shares = np.array([PairShare.by_slabs(OneOfSeveral(rank, 3), x, on_cracks).points for rank in range(3)])
-    assert np.all(shares.sum(axis=0) == 1)
-    assert np.ptp(shares[:, on_cracks].sum(axis=1)) <= 12
-    assert np.array_equal(shares[:, 300:700], shares[:, 700:])
 
 
 @pytest.mark.parametrize("dim", [2, 3])

@@ -11,8 +11,9 @@ import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 
+from fracsim.contact.barrier_surface import BarrierBodySurface, BarrierSurface
 from fracsim.contact.mesh_obstacle_term import MeshObstacleTerm
-from fracsim.contact.mesh_obstacles import AllMeshPairs, MeshContactSurface, MeshObstacle, MeshObstaclePairs
+from fracsim.contact.mesh_obstacles import AllMeshPairs, MeshObstacle, MeshObstaclePairs
 from fracsim.contact.pose import Pose, PosedShape
 from fracsim.contact.rigid_pose import FreePose
 from fracsim.contact.shapes import RoundedBox
@@ -218,7 +219,7 @@ def test_walls_that_come_to_light_are_outside(order: int) -> None:
         broken += report.broken
         x, facing = term.end_positions(), term.surface.current.pairs.pairs[0]
         assert len(facing.cut_elements(x)) == 0
-        used = np.unique(np.delete(term.surface.current.split.elements, term.surface.current._excluded, axis=0))
+        used = np.unique(term.surface.current.elements[term.surface.current.remaining()])
         assert not is_inside(x[used], facing.mesh.positions[facing.mesh.triangles]).any()
         drawn_in += int((term.surface.current.point_map.share < 1).sum())
     assert broken > 5 and drawn_in > 0
@@ -227,14 +228,14 @@ def test_walls_that_come_to_light_are_outside(order: int) -> None:
 def test_walls_are_extended_at_the_start_of_a_step_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Passes after edges broke begin at the same displacement with another surface, which stays as it is."""
     scene, state = make_scene(**RUNS["hewn"] | {"fracture": RUNS["hewn"]["fracture"] | {"passes": 4}})
-    surfaces: dict[bytes, set[MeshContactSurface]] = {}
+    surfaces: dict[bytes, set[BarrierSurface]] = {}
 
-    def extend_faces(surface: MeshContactSurface, u: Values) -> None:
-        surfaces.setdefault(u.tobytes(), set()).add(surface)
+    def extend_faces(surface: BarrierBodySurface, u: Values) -> None:
+        surfaces.setdefault(u.tobytes(), set()).add(surface.current)
 
     (term,) = [term for term in scene.balance.terms if isinstance(term, MeshObstacleTerm)]
     first = term.surface.current
-    monkeypatch.setattr(MeshContactSurface, "extend_faces", extend_faces)
+    monkeypatch.setattr(BarrierBodySurface, "extend_faces", extend_faces)
     march(scene, state)
     assert term.surface.current is not first and len(surfaces) == 4
     assert all(len(extended) == 1 for extended in surfaces.values())

@@ -1,4 +1,4 @@
-"""Contact surfaces in explicit steps are distributed: no rank has all of one, and contacts are those of one rank."""
+"""Contact surfaces are distributed: no rank has all of one, and contacts are those of one rank."""
 
 from __future__ import annotations
 
@@ -37,3 +37,27 @@ def test_contacts_of_a_long_body_in_pieces(ranks: int, alone: Arrays, tmp_path: 
         whole = one["counts"][0, 0]
         assert own.sum() == whole and own.max() < 1.4 * whole / ranks
         assert (held > own).all() and held.max() < 0.9 * whole and held.min() < 0.6 * whole
+
+
+@pytest.mark.parametrize("ranks", (2, 3))
+def test_cracks_that_the_barrier_closes(ranks: int, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Forces with lagged friction, stiffness, energies, gaps and free ways are those of one rank, also after an end has
+    moved away and back, for which elements are exchanged within the step. No rank has the whole surface."""
+    one, several = (
+        run_on_ranks("support.partitioned_barrier", count, tmp_path_factory.mktemp("closed")) for count in (1, ranks)
+    )
+    for case in ("2-True", "2-pieces", "3-True", "3-pieces"):
+        for name in ("closed", "away", "back"):
+            for key in ("f", "K", "energies", "fraction", "gap"):
+                expected = one[f"{case}-{name}-{key}"]
+                assert np.abs(expected).max() > 0
+                found = several[f"{case}-{name}-{key}"]
+                np.testing.assert_allclose(
+                    found, expected, rtol=1e-9, atol=1e-10 * np.abs(expected).max(), err_msg=name
+                )
+        assert one[f"{case}-back-gap"] < 1 and one[f"{case}-back-fraction"] < 1
+        own, held, exchanges = several[f"{case}-counts"].T
+        whole = one[f"{case}-counts"][0, 0]
+        assert own.sum() == whole and own.max() < 1.4 * whole / ranks
+        assert (held > own).all() and held.max() < 0.95 * whole
+        assert (exchanges > one[f"{case}-counts"][0, 2]).all()

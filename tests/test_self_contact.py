@@ -9,14 +9,15 @@ from typing import Any
 import meshio
 import numpy as np
 import pytest
+from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
-from fracsim.contact.ipc_pairs import IpcPairs
-from fracsim.contact.ipc_surface import RetractableSurface
+from fracsim.contact.barrier_surface import BarrierSurface
+from fracsim.contact.element_exchange import ElementRows, ElementSet, PointRows
 from fracsim.contact.laws import BARRIER
+from fracsim.contact.retractable_surface import SelfContactLaw
 from fracsim.contact.self_contact import SelfContact
 from fracsim.errors import InputError, NotConverged
-from fracsim.mesh.split_surface.surface_map import SurfaceMap
 from fracsim.meshes.builders.box import Box
 from fracsim.output.contact_checks import IntersectionMonitor
 from fracsim.scene import Scene
@@ -326,19 +327,14 @@ def test_a_hammer_goes_on_through_crumbs() -> None:
     assert scene.fracture.graph.broken_count > 10
 
 
-class _Crossing(RetractableSurface):
-    """Three segments, of which the last two cross; the first is excluded."""
-
-    def _build_pairs(self, elements: np.ndarray) -> IpcPairs:
-        return IpcPairs(self.point_map.rest, elements, distance=0.01, stiffness=1.0, friction=0.0)
-
-
 def test_intersecting_faces_keep_their_numbers_where_others_are_excluded() -> None:
+    """Three segments, of which the last two cross; the first is excluded."""
     x = np.array([[5.0, 0.0], [6.0, 0.0], [0.0, 0.0], [1.0, 1.0], [0.0, 1.0], [1.0, 0.0]])
-    none, arms = csr_matrix((6, 1)), csr_matrix(np.ones((6, 1)))
-    elements = np.array([[0, 1], [2, 3], [4, 5]])
-    surface = _Crossing(elements, SurfaceMap(none, x, arms, np.zeros_like(x)), 1.0)
-    surface.pairs = surface._build_pairs(elements)
+    none, arms, numbers, one = csr_matrix((6, 1)), csr_matrix(np.ones((6, 1))), np.arange(6), np.ones(6)
+    points = PointRows(numbers, numbers, x, np.zeros_like(x), none, arms, one, area=one, stiffness=0 * one)
+    elements = ElementRows(numbers.reshape(3, 2), np.zeros(3, int), np.zeros(3, bool))
+    law = SelfContactLaw(distance=0.01, stiffness=1.0, friction=0.0, sticking_speed=1.0)
+    surface = BarrierSurface(MPI.COMM_SELF, ElementSet(points, elements), law, (), 1.0)
     u = np.zeros((1, 2))
     assert surface._intersecting_faces(u).tolist() == [1, 2]
     surface._exclude(np.array([0]))

@@ -10,16 +10,11 @@ from hypothesis import strategies as st
 from fracsim.mesh.ghost_exchange import KeyLookup
 from fracsim.mesh.split_surface.closed_surface import build_split_surface
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
-from fracsim.mesh.split_surface.fragment_surface import (
-    PlanarPoints,
-    build_fragment_surface,
-    has_same_fragments,
-    project_onto_fragments,
-)
-from fracsim.mesh.split_surface.surface_map import make_surface_map
+from fracsim.mesh.split_surface.fragment_surface import PlanarPoints, project_onto_fragments
 from fracsim.meshes.topology import signed_measures
 from support.drawn import drawn_at
 from support.solids import assert_closed, cloud, components, enclosed, lattice, patterns, separated, torn
+from support.whole_surface import build_fragment_surface, has_same_fragments, make_surface_map
 
 
 @given(st.sampled_from([2, 3]), st.integers(0, 1000), st.sampled_from([0.01, 0.05, 0.2]))

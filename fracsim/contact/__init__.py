@@ -10,7 +10,7 @@ Terms of the balance:
     rigid_pose            free obstacles in implicit steps: poses as unknowns of Newton's method
     obstacle_term         the body before analytic obstacles; contact_state: points, facets and obstacles in a step
     mesh_obstacle_term    the body before triangle-mesh obstacles; pairs of these
-    self_contact          a body with itself, and its fragments with one another; its surface as edges break
+    self_contact          a body with itself, and its fragments with one another
     penalty_obstacles     the body before analytic obstacles in explicit steps
     penalty_contact       the body with itself, and before triangle-mesh obstacles, in explicit steps
 
@@ -36,11 +36,15 @@ Points and facets before analytic obstacles:
 Surfaces with ipctk:
 
     pair_search           points, edges and triangles that may come near one another in a motion
-    ipc_surface, ipc_pairs, sample_points  split surface, pairs of elements, sample points and friction at them
+    partitioned_surface   surface distributed over the ranks, built again as edges break
+    element_exchange      elements of a rank and of others near them
+    retractable_surface   crack faces that are retracted where there is no room
+    barrier_surface, ipc_pairs, sample_points  surface and pairs of the barrier; sample points and friction at them
+    contact_patch         contact around the few nodes of a nonlinear elimination
     mesh_obstacles        pairs of a body and a triangle-mesh obstacle
     penalty_pairs         penalty between points and facets, and between edges, with friction
     penalty_contacts, penalty_point_facet, penalty_edges  energy of contacts; points before facets; edges
-    penalty_surface, partitioned_surface  elements of a rank and their contacts; surface distributed over the ranks
+    penalty_surface       surface and contacts of the penalty
 
 Free obstacles:
 

@@ -10,6 +10,7 @@ Equations: docs/theory.md#newtons-method.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,10 +18,13 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix, kron
 
 from ..mechanics.term_protocols import ContactPatchValues
+from ..mesh.parallel import allgather
+from .element_exchange import ElementSet, join_element_sets
 from .ipc_pairs import IpcPairs
 from .pair_search import max_length
 
 if TYPE_CHECKING:
+    from .barrier_surface import BarrierSurface
     from .sample_points import IpcFriction
     from .self_contact import SelfContact
 
@@ -37,31 +41,29 @@ class SelfContactPatch:
     """Potential of the contact of k nodes that move by w (k, d), m, with all others fixed (ContactPatch).
 
     Attributes:
-        points: (p,) points of the part of the surface.
-        pairs: its pairs.
+        pairs: pairs of the part of the surface.
     """
 
     _friction: IpcFriction | None = None
 
     def __init__(self, term: SelfContact, nodes: Ints) -> None:
         """Choose the part of the surface around nodes (k,), by their ascending global numbers (collective)."""
-        surface, law, x = term.surface.current, term.surface.law, term.end_positions()
+        law, x, surface = term.surface.law, term.end_positions(), term.surface.current
         self._level, self._max_motion = term.level, PATCH_MOTION * law.distance
-        all_weights = _columns(surface.point_map.weights, term.surface.node_numbers, nodes)
-        moves, elements = np.diff(all_weights.indptr) > 0, surface.remaining_elements()
+        moves = np.diff(_columns(surface.point_map.weights, surface.columns, nodes).indptr) > 0
         near, start = term.pairs.points_near(x, moves, self._max_motion), term.start_positions
         if term.friction is not None and start is not None:
             near |= term.pairs.points_near(start, moves, 0.0)
-        self.points, numbers = np.unique(elements[near[elements].any(axis=1)], return_inverse=True)
-        self._start, self._weights = x[self.points], all_weights[self.points]
+        part, (self._start, start_positions) = _gather_part(surface, near, (x, x if start is None else start))
+        columns, point_map = part.point_map()
+        self._weights = _columns(point_map.weights, columns, nodes)
         self._dof_weights = kron(self._weights, np.eye(x.shape[1]), format="csr")
         self.pairs = IpcPairs(
-            surface.rest_positions[self.points], numbers.reshape(-1, elements.shape[1]), distance=law.distance,
+            part.points.middle + part.points.out, part.elements.corners, distance=law.distance,
             stiffness=law.stiffness, friction=law.friction, search_margin=self._max_motion,
         )  # fmt: skip
         if term.friction is not None and start is not None:
-            start = start[self.points]
-            self._friction = self.pairs.lag_friction(start, start, term.sticking_slip)
+            self._friction = self.pairs.lag_friction(start_positions, start_positions, term.sticking_slip)
 
     def _positions(self, w: Values) -> Values:
         """(p, d) positions of its points, m."""
@@ -87,6 +89,28 @@ class SelfContactPatch:
         left = max(self._max_motion - max_length(x - self._start), 0.0)
         allowed = min(1.0, left / length)
         return allowed * self.pairs.free_fraction(x, x + allowed * motion)
+
+
+def _gather_part(surface: BarrierSurface, near: Flags, fields: tuple[Values, ...]) -> tuple[ElementSet, list[Values]]:
+    """Remaining elements of all ranks that have a point near, and the values of fields at their points (collective).
+
+    Args:
+        surface: surface of this rank.
+        near: (n,) flags of points on this rank.
+        fields: (n, d) values at points, each.
+    """
+    is_near = surface.over_points(near, np.logical_or)
+    elements = surface.remaining()
+    of_rank = elements[surface.element_set.elements.rank[elements] == surface.comm.rank]
+    near_elements = of_rank[is_near[surface.elements[of_rank]].any(axis=1)]
+    points = np.unique(surface.elements[near_elements])
+    current = replace(surface.element_set.points, share=surface.point_map.share)
+    part = replace(surface.element_set, points=current).select(near_elements)
+    parts = allgather(surface.comm, (part, [values[points] for values in fields]))
+    joined = join_element_sets([element_set for element_set, _ in parts])
+    keys, first = np.unique(np.concatenate([element_set.points.keys for element_set, _ in parts]), return_index=True)
+    rows = first[np.searchsorted(keys, joined.points.keys)]
+    return joined, [np.concatenate(of_field)[rows] for of_field in zip(*(values for _, values in parts), strict=True)]
 
 
 def _columns(weights: csr_matrix, numbers: Ints, nodes: Ints) -> csr_matrix:

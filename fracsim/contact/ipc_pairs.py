@@ -11,8 +11,8 @@ share a point do not touch each other.
 
 The caller maps nodes to points of the surface and forces back: x = W u and W^T f; ipctk's displacement map is unused.
 
-Ranks share the pairs of a surface that all of them hold (PairShare): energies, gradients and second derivatives are
-those of a rank's own pairs, and their sums over the ranks are the totals.
+Ranks share the pairs of a surface (PairShare): energies, gradients and second derivatives are those of a rank's own
+pairs, and their sums over the ranks are the totals.
 
 Equations: docs/theory.md#barrier, docs/theory.md#friction.
 """
@@ -28,7 +28,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
-from ..mesh.parallel import allgather, sum_over_ranks
+from ..mesh.parallel import sum_over_ranks
 from .laws import BARRIER
 from .pair_search import (
     PairFilter,
@@ -46,7 +46,6 @@ from .sample_points import (
     Vertices,
     gradient_at_points,
     hessian_at_points,
-    measures,
     projection,
 )
 
@@ -69,8 +68,6 @@ class PairPolicy:
         max_box_growth: mean measure of the bounding boxes of a piece, in that of one around an edge.
         max_ccd_rounds: evaluations of the distance of a pair in collision detection.
         distance_tolerance: relative tolerance of distances of pairs on which a barrier may act.
-        slabs: slabs of points of a rank. With several a rank has part of a contact that is somewhere alone; with 8
-            candidates at their borders cost a fifth.
     """
 
     vertex_distance: float = 0.8
@@ -80,7 +77,6 @@ class PairPolicy:
     max_box_growth: float = 3.0
     max_ccd_rounds: int = 100
     distance_tolerance: float = 1e-6
-    slabs: int = 2
 
 
 PAIRS = PairPolicy()
@@ -94,29 +90,28 @@ class PairShare:
     searches all candidates that have one of its points. The weights of ipctk's "improved max" set depend on all
     candidates between the points of a pair, and on no others.
 
+    Points have the same order on all ranks. The rank has all elements at its own points, and all that may come near
+    these.
+
     Attributes:
-        comm: ranks that share the pairs. Each of them holds the whole surface.
-        points: (n,) flags of the points of this rank.
+        comm: ranks that share the pairs.
+        points: (n,) flags of the points of this rank; each point belongs to one rank.
+        counted: (n,) flags of the points that count on this rank in means over all points.
     """
 
     comm: MPI.Intracomm
     points: Flags
+    counted: Flags
 
     @classmethod
-    def by_slabs(cls, comm: MPI.Intracomm, x: Values, on_cracks: Ints) -> PairShare:
-        """Points x (n, d) in slabs of equally many points on cracks, or of all where there are none, in turn.
-
-        The slabs lie across the axis along which these points spread most: a slab along a crack would have points of
-        all its pairs. `on_cracks`: (k,) numbers of points.
-        """
-        spread, count = x[on_cracks] if len(on_cracks) else x, PAIRS.slabs * comm.size
-        axis = int(spread.std(axis=0).argmax())
-        bounds = np.quantile(spread[:, axis], np.arange(1, count) / count)
-        return cls(comm, np.searchsorted(bounds, x[:, axis], "right") % comm.size == comm.rank)
+    def of(cls, comm: MPI.Intracomm, points: Flags) -> PairShare:
+        """Share of a rank with its own points (n,)."""
+        return cls(comm, points, points)
 
     def with_others(self, count: int) -> PairShare:
-        """The share of a surface with `count` more points that are in pairs with the first ones alone."""
-        return PairShare(self.comm, np.append(self.points, np.zeros(count, bool)))
+        """The share of a surface with `count` more points, on all ranks, in pairs with the first ones alone."""
+        none, on_root = np.zeros(count, bool), np.full(count, self.comm.rank == 0)
+        return PairShare(self.comm, np.append(self.points, none), np.append(self.counted, on_root))
 
 
 class OwnPairs:
@@ -251,6 +246,7 @@ class IpcPairs:
 
     Attributes:
         comm: ranks that share the pairs.
+        edge: mean length of edges, m.
     """
 
     def __init__(
@@ -264,6 +260,7 @@ class IpcPairs:
         share: PairShare | None = None,
         patch: npt.NDArray[np.int32] | None = None,
         search_margin: float | None = None,
+        edge: float | None = None,
     ) -> None:
         """Pairs of a surface; points of no element are ignored.
 
@@ -276,6 +273,7 @@ class IpcPairs:
             share: of this rank in the pairs; None: all of them.
             patch: (n,) numbers of parts of the surface that touch others alone; None: all touch.
             search_margin: motion of points after which candidates are searched again, m; None: that of the policy.
+            edge: mean length of edges, m; None: of these elements.
         """
         self._elements, is_3d = elements, rest_positions.shape[1] == 3
         self._mesh = collision_mesh(rest_positions, elements)
@@ -310,19 +308,15 @@ class IpcPairs:
             for pairs, weight in zip(sets, self._weights, strict=True)
         ]
         self._clear_active()
-        self._edge = ipctk.mean_edge_length(self._mesh.rest_positions, self._mesh.rest_positions, self._mesh.edges)[0]
+        X = self._mesh.rest_positions
+        self.edge = float(ipctk.mean_edge_length(X, X, self._mesh.edges)[0]) if edge is None else edge
+        self._counted = np.ones(len(used), bool) if share is None else share.counted[used]
         self._friction, self._distance = friction, distance
-        self._area = vertex_areas(rest_positions, elements)
 
     @property
     def collision_mesh(self) -> ipctk.CollisionMesh:
         """Surface of ipctk: the points of elements alone."""
         return self._mesh
-
-    @property
-    def mean_edge_length(self) -> float:
-        """Mean length of edges at rest, m."""
-        return float(self._edge)
 
     # --- candidates and active pairs ---
 
@@ -420,16 +414,20 @@ class IpcPairs:
         The motion is divided into pieces. A pair that would collide keeps at least `BARRIER.min_gap_ratio` of its
         distance at the begin of the piece.
         """
-        return float(self.comm.allreduce(self._own_free_fraction(x, end), op=MPI.MIN))
-
-    def _own_free_fraction(self, x: Values, end: Values) -> float:
-        """Fraction of the motion from x to `end` (n, d) without a collision of this rank's pairs."""
         vertices, motion = x[self._points], end[self._points] - x[self._points]
-        if len(motion):
-            motion -= motion.mean(axis=0)  # the mean motion brings nothing together
-        if self._is_short(vertices, motion):
+        total = self._sum(np.column_stack([motion, np.ones(len(motion))]))
+        motion -= total[:-1] / max(total[-1], 1.0)  # the mean motion brings nothing together
+        if self.comm.allreduce(self._is_short(vertices, motion), op=MPI.LAND):
             return 1.0
         pieces = self._piece_count(motion)
+        return float(self.comm.allreduce(self._own_free_fraction(vertices, motion, pieces), op=MPI.MIN))
+
+    def _sum(self, values: Values) -> Values:
+        """(k,) sum over all points of values (n, k) (collective)."""
+        return sum_over_ranks(self.comm, values[self._counted].sum(axis=0))
+
+    def _own_free_fraction(self, vertices: Values, motion: Values, pieces: int) -> float:
+        """Fraction of a motion (n, d), in pieces, without a collision of this rank's pairs."""
         for piece in range(min(pieces, PAIRS.max_pieces)):
             start, stop = piece / pieces, (piece + 1) / pieces
             fraction = self._piece_fraction(vertices + start * motion, vertices + stop * motion)
@@ -455,35 +453,19 @@ class IpcPairs:
         return approach <= PAIRS.edge_distance * self._distance and approach <= self._gap_at(vertices)
 
     def _piece_count(self, motion: Values) -> int:
-        """Number of pieces in which a motion (n, d) is searched.
+        """Number of pieces in which a motion (n, d) is searched (collective).
 
         The bounding boxes of a piece have on average at most `max_box_growth` times the measure of one around an
         edge. A few fast points alone do not make pieces shorter.
         """
-        pieces = 1
-        while (
-            pieces < 2**30
-            and np.mean(np.prod(1.0 + abs(motion) / (pieces * self._edge), axis=1)) > PAIRS.max_box_growth
-        ):
+        pieces, count = 1, self._sum(np.ones((len(motion), 1)))
+        while pieces < 2**30:
+            growth = self._sum(np.prod(1.0 + abs(motion) / (pieces * self.edge), axis=1)[:, None])
+            if not growth > PAIRS.max_box_growth * count:
+                break
             pieces *= 2
         return pieces
 
     def intersections(self, x: Values) -> Ints:
-        """(k, 2) elements that intersect, of all ranks (collective)."""
-        surface = self._kinds[0].simplices.second
-        rank_pairs = intersecting_pairs(surface, self._search.filter, x[self._points])
-        return np.unique(np.concatenate(allgather(self.comm, rank_pairs)), axis=0)
-
-    def pressure(self, x: Values) -> Values:
-        """(n,) force of the barrier on each point by its share of the reference area, Pa; 0 where it has none.
-
-        Of the pairs of all ranks (collective).
-        """
-        force, area = np.linalg.norm(sum_over_ranks(self.comm, self.gradient(x)), axis=1), self._area
-        return np.asarray(np.divide(force, area, out=np.zeros_like(area), where=area > 0))
-
-
-def vertex_areas(x: Values, elements: Ints) -> Values:
-    """(n,) share of each point in the measure of the elements around it, m^2 (2D: m)."""
-    measure, d = measures(x, elements), x.shape[1]
-    return np.asarray(np.bincount(elements.reshape(-1), np.repeat(measure / d, d), minlength=len(x)), float)
+        """(k, 2) elements that intersect, of which one has a point of this rank."""
+        return intersecting_pairs(self._kinds[0].simplices.second, self._search.filter, x[self._points])

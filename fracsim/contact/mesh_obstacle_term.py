@@ -1,8 +1,8 @@
 """Contact of triangle-mesh obstacles with the body, a term of the balance, and with one another.
 
-As for contact of a body with itself (self_contact), each rank holds the split surface and has a share of the pairs in
-contact. The points of an obstacle are no unknowns; they are where its motion says at the end of a step. Nothing is
-gathered while bounding boxes of body and obstacles are apart. Barrier and lagged friction are those of ipctk.
+As for contact of a body with itself (self_contact), each rank has its own elements of the split surface, and the pairs
+of its points. The points of an obstacle are no unknowns; they are where its motion says at the end of a step. Nothing
+is gathered while bounding boxes of body and obstacles are apart. Barrier and lagged friction are those of ipctk.
 
 Equations: docs/theory.md#contact, docs/theory.md#rigid-obstacles.
 """
@@ -10,7 +10,6 @@ Equations: docs/theory.md#contact, docs/theory.md#rigid-obstacles.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
 from typing import cast
 
 import numpy as np
@@ -21,15 +20,13 @@ from scipy.sparse import csr_matrix
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
-from ..mesh.parallel import sum_over_ranks
+from .barrier_surface import BarrierBodySurface
 from .clearance import Clearance
 from .ipc_pairs import IpcPairs
-from .ipc_surface import SelfContactLaw
 from .laws import ObstacleLaw
 from .mesh_obstacles import (
     MESH,
     AllMeshPairs,
-    MeshContactSurface,
     MeshFriction,
     MeshObstacle,
     MeshObstaclePairs,
@@ -39,6 +36,7 @@ from .node_contact import PoseDerivatives, point_set_derivatives
 from .obstacle import RigidObstacle
 from .obstacle_pairs import Numbers, PairDerivatives, PosedObstacles
 from .pose import Pose, point_jacobian
+from .retractable_surface import SelfContactLaw
 from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 from .sample_points import IpcFriction
 from .self_contact import Pattern, SurfaceContact, mean_velocities
@@ -83,7 +81,7 @@ class MeshObstacleTerm(SurfaceContact):
         self._started_near = True
         self._far: bool | None = None  # at the current u; None: not known yet
         self._place_meshes(self.group.poses)
-        super().__init__(domain, u, law, partial(MeshContactSurface, obstacles=self._meshes, comm=domain.comm))
+        super().__init__(domain, u, BarrierBodySurface(domain, u, law, self._meshes))
         self.clearance = Clearance(domain, self._meshes, law.distance, self.surface.following_points)
         self.pose_contact = PoseContact(self)
         self.parts = self.surface, self.group, self.clearance, self.pose_contact
@@ -131,21 +129,18 @@ class MeshObstacleTerm(SurfaceContact):
         if self.group.bodies.evaluates_result:
             return  # friction is still that of the step
         self._start_velocity = level.v_n
-        self.friction = self._tangent_positions = None
+        self.friction = self._tangent_displacement = None
         self._started_near = not self.clearance.is_far([level.u_n], self.group.step_motions)
         self.start_positions = None
         # one row that stands for all points of an obstacle
         zero: Values = np.zeros((1, 3))
         self._start_gradients = [zero for _ in self.group.obstacles]
         if level.dt and self._started_near:
-            nodal, slip, surface = (
-                self.surface.nodal_values(level.u_n),
-                self._sticking_slip(level),
-                self.surface.current,
-            )
+            slip = self._sticking_slip(level)
             self._place_meshes(self.group.start_poses)
-            self._extend_faces(level.u_n, nodal)
-            self.start_positions = x = surface.point_map(nodal)
+            self._extend_faces(level.u_n)
+            self.start_positions = x = self.surface.positions(level.u_n)
+            self._exchange_count = self.surface.exchange_count
             self._start_gradients = [pairs.full_gradient(x)[len(x) :] for pairs in self.pairs.pairs]
             if any(mesh.friction for mesh in self._meshes):
                 self.friction = self.pairs.lag_friction(x, x, slip)
@@ -213,13 +208,12 @@ class MeshObstacleTerm(SurfaceContact):
             return u
         if self.clearance.is_far([level.u_n, level.displacement_at_end(u)], self.group.step_motions):
             return u
-        start, end = (self.surface.nodal_values(nodal) for nodal in (level.u_n, level.displacement_at_end(u)))
         prescribed = [index for index, obstacle in enumerate(self.group.obstacles) if not obstacle.free]
         start_poses = [self.group.start_poses[index] for index in prescribed]
-        point_map, pairs = self.surface.current.point_map, self.pairs.select(prescribed)
-        if (guess := stop_before_meshes(point_map, pairs, start, end, start_poses)) is end:
+        end, pairs = level.displacement_at_end(u), self.pairs.select(prescribed)
+        if (guess := stop_before_meshes(self.surface, pairs, level.u_n, end, start_poses)) is end:
             return u
-        change: Values = self.surface.gather.owned(guess - end).reshape(-1)
+        change: Values = guess - end
         if self.surface.law.corners_only:
             change = with_straight_edges(self._domain, change)
         return np.asarray(u + level.fraction * change)
@@ -253,7 +247,7 @@ class MeshObstacleTerm(SurfaceContact):
         return point_set_derivatives(energy, gradient[len(x) :], H[mesh, mesh], pairs.mesh.arms, exact=exact)
 
     def rank_mixed_hessian(self, index: int) -> Values:
-        """(nodes, 18) second derivatives by nodes and the pose of an obstacle, of this rank's pairs (collective)."""
+        """(columns, 18) second derivatives by nodes and the pose of an obstacle, of this rank's pairs (collective)."""
         x, pairs = self.end_positions(), self.pairs.pairs[index]
         point_map, body = self.surface.current.point_map, slice(None, x.size)
         if pairs.is_far(x):
@@ -267,7 +261,8 @@ class MeshObstacleTerm(SurfaceContact):
 
     def assemble_mixed_hessian(self, index: int, part: Values) -> Values:
         """(owned dofs, 6) sums at the nodes of what `rank_mixed_hessian` returned (collective)."""
-        return self.surface.gather.sum_owned(part).reshape(-1, 6)
+        columns = part.reshape(-1, 3, 6)
+        return np.stack([self.surface.sum_at_nodes(columns[:, :, axis]) for axis in range(6)], axis=1)
 
     def _friction_with(self, pairs: MeshObstaclePairs) -> IpcFriction | None:
         """Lagged friction with one obstacle; None: without friction."""
@@ -290,10 +285,10 @@ class MeshObstacleTerm(SurfaceContact):
         return self.pairs.pairs[number].gap(self.end_positions())
 
     def pushed_points(self) -> list[tuple[Values, Values, Values]]:
-        """(n, 3) points of the body before each obstacle, m, normal forces, N, start velocities, m/s."""
-        x, nodal = self.end_positions(), self.surface.nodal_values(self._start_velocity)
-        velocity = self.surface.current.point_map.weights @ nodal
-        return [(x, -sum_over_ranks(self.comm, pairs.body_gradient(x)), velocity) for pairs in self.pairs.pairs]
+        """(n, 3) points of this rank before each obstacle, m, normal forces, N, start velocities, m/s (collective)."""
+        x, nodal, surface = self.end_positions(), self.surface.nodal_values(self._start_velocity), self.surface.current
+        velocity = surface.point_map.weights @ nodal
+        return [(x, -surface.sum_at_points(pairs.body_gradient(x)), velocity) for pairs in self.pairs.pairs]
 
 
 def build_mesh_obstacles(group: ObstacleGroup, edge: float) -> list[MeshObstacle]:

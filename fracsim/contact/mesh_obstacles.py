@@ -12,18 +12,15 @@ from dataclasses import dataclass
 import ipctk
 import numpy as np
 import numpy.typing as npt
-from mpi4py import MPI
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
-from ..mesh.split_surface.entity_numbering import EntityNumbering
 from .clearance import bounding_box
 from .ipc_pairs import IpcPairs, PairShare
-from .ipc_surface import SelfContactLaw, SelfContactSurface
 from .laws import BARRIER
 from .pose import Pose, PosedShape
 from .sample_points import IpcFriction
-from .triangle_mesh_shape import ClosedSurface, refuse_overlap
+from .triangle_mesh_shape import ClosedSurface
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -181,6 +178,7 @@ class MeshObstaclePairs:
         distance: float,
         stiffness: float,
         share: PairShare | None = None,
+        edge: float | None = None,
     ) -> None:
         """Pairs of both surfaces.
 
@@ -191,6 +189,7 @@ class MeshObstaclePairs:
             distance: at which contact begins, m.
             stiffness: of the barrier, Pa.
             share: of this rank in the pairs; None: all of them.
+            edge: mean length of edges, m; None: of these elements.
         """
         self.mesh, self._reach = mesh, distance
         self.body_count, self._element_count = len(rest_positions), len(elements)
@@ -201,7 +200,7 @@ class MeshObstaclePairs:
         patches = np.repeat(np.array([0, 1], np.int32), [len(rest_positions), len(mesh.points)])
         parameters = {"distance": distance, "stiffness": stiffness, "friction": mesh.friction}
         share = None if share is None else share.with_others(len(mesh.points))
-        self.contact = IpcPairs(points, triangles, **parameters, share=share, patch=patches)
+        self.contact = IpcPairs(points, triangles, **parameters, share=share, patch=patches, edge=edge)
 
     def with_mesh(self, x: Values) -> Values:
         """(n + m, 3) points of the body at x (n, 3), and of the obstacle at its current pose, m."""
@@ -258,14 +257,13 @@ class MeshObstaclePairs:
     def safe_distances(self, x: Values, limit: float) -> Values:
         """(n,) distances that each point of the body at x (n, 3) may move by itself, m; infinite from `limit` on.
 
-        Of the pairs of all ranks (collective).
+        Of this rank's points.
         """
         collision_mesh = self.contact.collision_mesh
         vertices, candidates = collision_mesh.vertices(self.with_mesh(x)), ipctk.Candidates()
         candidates.build(collision_mesh, vertices, limit, ipctk.LBVH())
         safe = candidates.compute_per_vertex_safe_distances(collision_mesh, vertices, limit)
         distances = np.array(collision_mesh.to_full_dof(np.repeat(safe, 3))[: 3 * self.body_count : 3])
-        self.contact.comm.Allreduce(MPI.IN_PLACE, distances, MPI.MIN)
         unlimited = np.ones(self.body_count, bool)
         unlimited[self._body_points] = distances[self._body_points] >= MESH.unlimited * limit
         return np.where(unlimited, np.inf, distances)
@@ -322,16 +320,6 @@ class AllMeshPairs:
         items = zip(self.pairs, start_poses, strict=True)
         return min((pairs.moving_free_fraction(x, end, pose) for pairs, pose in items), default=1.0)
 
-    def pressure(self, x: Values) -> Values:
-        """(n,) sum of the pressures of all barriers on each point, Pa."""
-        pressures = [pairs.contact.pressure(pairs.with_mesh(x))[: len(x)] for pairs in self._near(x)]
-        return np.sum(pressures, axis=0) if pressures else np.zeros(len(x))
-
-    def intersections(self, x: Values) -> Ints:
-        """(k, 2) elements of the body that obstacles intersect, twice each."""
-        cut = np.concatenate([pairs.cut_elements(x) for pairs in self.pairs])
-        return np.column_stack([cut, cut])
-
     def lag_friction(self, x: Values, start: Values, slip: float) -> MeshFriction:
         """Friction with pressures and tangents at x and obstacles at their current poses; as of IpcPairs."""
         rubbing = [pairs for pairs in self._near(x) if pairs.mesh.friction]
@@ -378,40 +366,3 @@ class MeshFriction:
         for pairs, friction in zip(self.pairs, self.friction, strict=True):
             H = H + friction.hessian(pairs.with_mesh(x), exact=exact)[:size, :size]
         return csr_matrix(H)
-
-
-class MeshContactSurface(SelfContactSurface):
-    """Surface of a body, and its pairs with triangle-mesh obstacles.
-
-    Crack faces are not offset from one another: they are in contact with obstacles alone.
-    """
-
-    face_gap = 0.0
-    pairs: AllMeshPairs
-
-    def __init__(
-        self,
-        skeleton: EntityNumbering,
-        pattern: npt.NDArray[np.uint8],
-        law: SelfContactLaw,
-        u: Values,
-        previous: SelfContactSurface | None,
-        cut: Values | None = None,
-        *,
-        obstacles: Sequence[MeshObstacle],
-        comm: MPI.Intracomm = MPI.COMM_SELF,
-    ) -> None:
-        """As for SelfContactSurface. Raises InputError where an obstacle overlaps the body at rest."""
-        self._obstacles = obstacles
-        super().__init__(skeleton, pattern, law, u, previous, cut, comm)
-
-    def _check_apart(self) -> None:
-        for pairs in self.pairs.pairs:
-            is_cut, body = len(pairs.cut_elements(self.split.points)) > 0, (self.split.points, self.split.elements)
-            refuse_overlap(pairs.mesh.name, body, pairs.mesh.surface, cut=is_cut)
-
-    def _build_pairs(self, elements: Ints) -> AllMeshPairs:
-        X, parameters = self.rest_positions, {name: self._parameters[name] for name in ("distance", "stiffness")}
-        return AllMeshPairs(
-            [MeshObstaclePairs(X, elements, mesh, **parameters, share=self._share) for mesh in self._obstacles]
-        )

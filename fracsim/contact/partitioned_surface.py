@@ -1,15 +1,17 @@
-"""Surface of a body with penalty contact, distributed over the ranks: no rank has all of it.
+"""Surface of a body in contact, distributed over the ranks: no rank has all of it.
 
-Elements of other ranks are exchanged again before anything can be missing: any two points have come nearer by at most
-the diagonal of the bounding box of the motions of all points.
+Each rank has the elements of its own cells and those of others that may come near them. These are exchanged for a path
+of displacements: for all positions within a margin of its straight parts. Beyond it they are exchanged again: any two
+points have come nearer by at most the diagonal of the bounding box of the motions of all points.
 
-Equations: docs/theory.md#explicit-contact.
+Equations: docs/theory.md#contact, docs/theory.md#explicit-contact.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import cast
 
 import numpy as np
@@ -22,7 +24,7 @@ from ..mechanics.term_protocols import CutPositions
 from ..mesh.domain import Domain
 from ..mesh.fragments import find_components
 from ..mesh.ghost_exchange import KeyedReduction, KeyLookup, min_over_ranks, sum_at_nodes
-from ..mesh.parallel import allgather, gather, max_over_ranks, on_root
+from ..mesh.parallel import allgather, gather, max_over_ranks, on_root, sum_over_ranks
 from ..mesh.simplices import is_split
 from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from ..mesh.split_surface.drawn_surface import DrawnSurface
@@ -44,19 +46,16 @@ from ..mesh.split_surface.surface_map import SurfaceMap
 from ..mesh.split_surface.surface_motion import PointParents
 from ..meshes.topology import boundary_facets
 from .clearance import FollowingPoints
-from .ipc_pairs import vertex_areas
-from .ipc_surface import SURFACE, SelfContactLaw, offset_crack_faces, refuse_intersections
+from .element_exchange import ElementRows, ElementSet, PointRows, bounding_boxes, exchange_elements
 from .mesh_obstacles import MeshObstacle
-from .penalty_contacts import NodalMassShare, PenaltyHistory
-from .penalty_point_facet import POINT_FACET, penalty_stiffness
-from .penalty_surface import (
-    EXCHANGE,
-    ElementRows,
-    ElementSet,
-    PenaltySurface,
-    PointRows,
-    exchange_elements,
+from .retractable_surface import (
+    SURFACE,
+    RetractableSurface,
+    SelfContactLaw,
+    offset_crack_faces,
+    refuse_intersections,
 )
+from .sample_points import vertex_areas
 from .triangle_mesh_shape import refuse_overlap
 
 Values = npt.NDArray[np.float64]
@@ -84,7 +83,7 @@ class SurfaceState:
     interval: tuple[int, int]
 
 
-class PartitionedSurface:
+class PartitionedSurface[S: RetractableSurface]:
     """Contact surface of a body, built again when edges break (HistoryTerm, CutFaces, SurfaceSeparator).
 
     Attributes:
@@ -94,10 +93,13 @@ class PartitionedSurface:
         surface_count: number of surfaces until now.
         exchange_count: number of exchanges of elements until now: points have new numbers after each.
         has_retracted: whether any face on any rank is retracted or left out.
+        start_displacement: (owned dofs,) at the start of the step, which each exchange serves too, m; None: none.
     """
 
-    current: PenaltySurface
+    current: S
     element_set: ElementSet
+    _path: list[list[Values]]  # points at each displacement for which elements were exchanged, m
+    start_displacement: Values | None = None
     _cuts: CutPositions | None = None
     # pattern, open edges and loose nodes of the current surface, in contact between fragments
     _open: tuple[Pattern, Flags, Flags] | None = None
@@ -111,9 +113,9 @@ class PartitionedSurface:
         domain: Domain,
         u: fem.Function,
         law: SelfContactLaw,
-        mass: Values,
-        max_added: float,
-        meshes: Sequence[MeshObstacle] = (),
+        meshes: Sequence[MeshObstacle],
+        reach: float,
+        margin: float,
     ) -> None:
         """Build the surface (collective).
 
@@ -121,15 +123,14 @@ class PartitionedSurface:
             domain: mesh.
             u: displacement.
             law: contact law.
-            mass: (owned dofs,) lumped, kg.
-            max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
             meshes: obstacles; none: the body touches itself.
+            reach: distance within which elements of other ranks are wanted, m.
+            margin: approach of two points after which elements are exchanged again, m; infinite: as edges break alone.
 
         Raises:
             InputError: if the surface at rest intersects itself, or an obstacle.
         """
         self.law, self._domain, self._u, self._meshes = law, domain, u, meshes
-        self._mass, self._max_added = mass, max_added
         self._comm, self._owned = domain.comm, domain.node_count * domain.dim
         is_refined = domain.order == 2 and not law.corners_only
         # subdivided quadratic cells do not break
@@ -137,15 +138,38 @@ class PartitionedSurface:
         self._topology = EntityNumbering(subdivided_local_mesh(domain) if is_refined else local_mesh(domain))
         self._is_shared = sum_at_nodes(domain, np.arange(len(domain.nodes)), np.ones((len(domain.nodes), 1)))[:, 0] > 1
         self._pattern: Pattern = np.zeros(domain.cell_count, np.uint8)
-        self._reach = POINT_FACET.clearance_gap * law.distance
-        self._margin = EXCHANGE.margin * domain.mean_edge_length
+        self._margin, self._search_reach = margin, reach + margin if np.isfinite(margin) else reach
         # before obstacles alone crack faces are not offset from one another
         self._face_gap = 0.0 if meshes else SURFACE.face_gap * law.distance
         self.surface_count = self.exchange_count = self._version = 0
         self.has_retracted = False
         self._build_own_elements()
-        self._exchange(self._current_u)
+        self._exchange([self._current_u])
         self._refuse_contact()
+
+    # --- contacts, which a subclass has ---
+
+    def _build_surface(self, element_set: ElementSet) -> S:
+        """Elements of this rank and of others near them, with their contacts."""
+        raise NotImplementedError("a subclass has contacts")
+
+    def _point_stiffness(self, weights: csr_matrix, area: Values, local_area: Values) -> Values:
+        """(n,) stiffness of the points of this rank, N/m (collective); 0 where contact has none of points."""
+        return np.zeros(len(area))
+
+    def _keep_history(self, previous: S) -> None:
+        """Take over the contacts at the end of the last step (collective)."""
+
+    def _searched_boxes(self, boxes: Values) -> Values:
+        """(k, 2, d) boxes, m, near which elements of other ranks are wanted; `boxes`: (m, 2, d) of the elements.
+
+        Those of the elements around the points of each element: the weights of a pair depend on the pairs beside it.
+        """
+        corners, d, count = self.element_set.elements.corners, boxes.shape[2], len(self.element_set.points.keys)
+        bounds, at_points = np.concatenate([boxes[:, 0], -boxes[:, 1]], axis=1), np.full((count, 2 * d), np.inf)
+        np.minimum.at(at_points, corners, bounds[:, None])
+        around = self._over_border(at_points, np.minimum)[corners].min(axis=1)
+        return np.stack([around[:, :d], -around[:, d:]], axis=1)
 
     @property
     def _current_u(self) -> Values:
@@ -168,8 +192,8 @@ class PartitionedSurface:
         states = self._over_border(np.where((rows >= 0)[:, None], states[rows], [-1.0, 0.0]), np.maximum)
         self.element_set = replace(self.element_set, points=replace(self.element_set.points, share=-states[:, 0]))
         self.surface_count += 1
-        self._exchange(u)
-        self.set_history([part.contact.history.by_keys(part.keys) for part in previous.parts])
+        self._exchange([u])
+        self._keep_history(previous)
         self.current.retract_faces(self.nodal_values(u), self.element_set.points.keys, states[:, 1])
         self._faces_changed()
 
@@ -242,20 +266,6 @@ class PartitionedSurface:
         cut = np.where(rows >= 0, positions[rows, 0] if len(positions) else np.nan, np.nan)
         return np.where(ends[:, 0] > ends[:, 1], 1 - cut, cut)
 
-    def _point_stiffness(self, weights: csr_matrix, area: Values, local_area: Values) -> Values:
-        """(n,) stiffness of the points of this rank, N/m: constant while a surface lasts (collective)."""
-        d, nodes = self._domain.dim, self._own_nodes
-        assert nodes is not None
-
-        def nodal_sums(values: Values) -> Values:
-            total = nodes.sum_at_nodes(np.repeat(values[:, None], d, axis=1))
-            return nodes(total)[:, 0].copy()
-
-        # before obstacles twice that of self-contact, where both sides yield
-        limit = (2 if self._meshes else 1) * self._max_added
-        mass_share = NodalMassShare(weights, nodes(self._mass)[:, 0].copy(), nodal_sums)
-        return penalty_stiffness(mass_share, area, self.law.stiffness / self.law.distance, limit, local_area)
-
     def _over_border(self, values: Values, operation: np.ufunc) -> Values:
         """(n, ...) values of this rank's points, of those that ranks share an operation on all (collective)."""
         result = values.copy()
@@ -264,15 +274,13 @@ class PartitionedSurface:
 
     def _refuse_contact(self) -> None:
         """Raise InputError where the body at rest intersects itself or an obstacle (collective)."""
-        positions, surface, comm = self.current.rest_positions, self.current, self._comm
-        rank, count = surface.element_set.elements.rank, len(surface.elements)
+        surface, comm = self.current, self._comm
+        positions = surface.rest_positions
         if not self._meshes:
-            pairs = surface.parts[0].contact.intersections(positions)
-            pairs = pairs[rank[pairs.min(axis=1, initial=count)] == comm.rank]
-            centres = positions[surface.elements[pairs]].mean(axis=(1, 2))
-            refuse_intersections(np.concatenate(allgather(comm, centres)))
+            pairs, _ = surface.find_intersections(positions)
+            refuse_intersections(np.concatenate(allgather(comm, positions[surface.elements[pairs]].mean(axis=(1, 2)))))
             return
-        is_cut = [max_over_ranks(comm, len(part.cut_elements(positions, count))) for part in surface.parts]
+        is_cut = [max_over_ranks(comm, len(cut)) for cut in surface.cut_by_obstacles(positions)]
 
         mesh = self._domain.input_mesh
 
@@ -285,72 +293,70 @@ class PartitionedSurface:
 
     # --- elements of other ranks ---
 
-    def refresh(self, u: Values) -> None:
-        """Exchange elements again if one may be missing at displacements u (owned dofs,), m (collective)."""
-        if self._restored is None and not self._moved_far(u):
+    def refresh(self, *displacements: Values) -> None:
+        """Exchange elements again if one may be missing at displacements (owned dofs,), m, or between (collective)."""
+        if self._restored is None and self._serves(displacements):
             return
-        histories = [part.contact.history.by_keys(part.keys) for part in self.current.parts]
-        state, self._restored = self._restored or self.snapshot(), None
+        previous, state = self.current, self._restored or self.snapshot()
+        self._restored = None
         rows, faces = self.element_set.points, self.element_set.elements
         self.element_set = ElementSet(replace(rows, share=state.share), replace(faces, is_excluded=state.is_excluded))
-        self._exchange(u)
+        self._exchange(displacements)
         self.current.set_release_interval(state.interval)
-        self.set_history(histories)
+        self._keep_history(previous)
 
-    def _moved_far(self, u: Values) -> bool:
-        """Whether points may have come nearer by more than the margin since the last exchange (collective)."""
-        if self._comm.size == 1:
-            return False
-        moved = [end - start for end, start in zip(self._arm_ends(u), self._start, strict=True)]
-        moved += [mesh.positions - start for mesh, start in zip(self._meshes, self._start_obstacles, strict=True)]
-        return motion_diagonal(self._comm, moved) > self._margin
+    def _serves(self, displacements: Sequence[Values]) -> bool:
+        """Whether no element can be missing at displacements (owned dofs,), m, or between (collective)."""
+        if self._comm.size == 1 or not np.isfinite(self._margin):
+            return True
+        positions, comm = [self._moving_points(u) for u in displacements], self._comm
+        # mostly all are near points of the path, and one message tells it
+        from_points = [[_differences(x, stop) for stop in self._path] for x in positions]
+        if self._is_within(motion_diagonals(comm, from_points)):
+            return True
+        motions = list(pairwise(self._path))
+        from_motions = [[_away_from_motion(comm, x, *ends) for ends in motions] for x in positions]
+        return bool(motions) and self._is_within(motion_diagonals(comm, from_motions))
 
-    def _arm_ends(self, u: Values) -> list[Values]:
-        """(n, d) positions of this rank's points without arms and with full arms, m (collective)."""
+    def _is_within(self, diagonals: Values) -> bool:
+        """Whether one diagonal of each row is within the margin; positions that are no numbers have no elements."""
+        distances = diagonals.min(axis=1)
+        return not np.any((distances > self._margin) & np.isfinite(distances))
+
+    def _moving_points(self, u: Values) -> list[Values]:
+        """(n, d) positions of this rank's points without arms and with full arms, m (collective).
+
+        A subclass adds those of points of obstacles, if elements are wanted near these.
+        """
         assert self._own_nodes is not None
-        nodal, count = self._own_nodes(u), len(self.element_set.points.keys)
-        points, share = np.arange(count), np.ones(count)
-        return [self._own_map.evaluate_points(nodal, points, factor * share) for factor in (0.0, 1.0)]
+        return self._own_map.arm_ends(self._own_nodes(u))
 
-    def _exchange(self, u: Values) -> None:
-        """Get elements of other ranks near those of this rank at displacements u (owned dofs,), m (collective)."""
+    def _exchange(self, displacements: Sequence[Values]) -> None:
+        """Get elements of other ranks that come near those of this rank on a path of displacements, m (collective).
+
+        The path begins at the start of the step, if that is set.
+        """
         element_set, comm = self.element_set, self._comm
         if comm.size > 1:
-            self._start, self._start_obstacles = self._arm_ends(u), [mesh.positions for mesh in self._meshes]
-            corners = np.concatenate([x[self.element_set.elements.corners] for x in self._start], axis=1)
-            searched = boxes = _bounding_boxes(corners)
-            if self._meshes:
-                on_border = np.zeros(len(element_set.points.keys), bool)
-                on_border[self._border] = True
-                searched = np.concatenate(
-                    [boxes[on_border[element_set.elements.corners].any(axis=1)], *self._mesh_boxes()]
-                )
-            element_set = exchange_elements(comm, element_set, boxes, searched, self._reach + self._margin)
-        edge, self.exchange_count = self._domain.mean_edge_length, self.exchange_count + 1
-        self.current = PenaltySurface(comm, element_set, self.law, self._meshes, edge, self.law.distance)
-        self._point_rows = KeyLookup(element_set.points.keys)(self.element_set.points.keys)
+            path = displacements if self.start_displacement is None else [self.start_displacement, *displacements]
+            self._path = [self._moving_points(u) for u in path]
+            ends = [x[element_set.elements.corners] for points in self._path for x in points[:2]]
+            boxes = bounding_boxes(np.concatenate(ends, axis=1))
+            searched = self._searched_boxes(boxes)
+            element_set = exchange_elements(comm, element_set, boxes, searched, self._search_reach)
+        self.current, self.exchange_count = self._build_surface(element_set), self.exchange_count + 1
+        points = self.current.element_set.points
+        self._point_rows = KeyLookup(points.keys)(self.element_set.points.keys)
         self._element_rows = np.flatnonzero(element_set.elements.rank == comm.rank)
         if self._nodes is not None and self._nodes is not self._own_nodes:
             self._nodes.destroy()
         self._nodes = self._own_nodes if comm.size == 1 else NodeExchange(self._domain, self.current.columns)
 
-    def _mesh_boxes(self) -> list[Values]:
-        """(k, 2, d) bounding boxes of this rank's triangles of each obstacle, m."""
-        sides = [mesh.triangles[mesh.triangle_ranks(self._comm.size) == self._comm.rank] for mesh in self._meshes]
-        return [_bounding_boxes(mesh.positions[rows]) for mesh, rows in zip(self._meshes, sides, strict=True)]
-
-    def set_history(self, histories: Sequence[PenaltyHistory]) -> None:
-        """Set the contacts of each part at the end of the last step; each goes to the rank that it belongs to.
-
-        Collective.
-        """
-        for part, history in zip(self.current.parts, histories, strict=True):
-            lookup = KeyLookup(part.keys)
-            stored = part.contact.store(lookup(history.points.points[:, 0]), lookup(history.edges.points))
-            if self._comm.size > 1:
-                elsewhere = history.select(*(~flags for flags in stored))
-                history = PenaltyHistory.join([history.select(*stored), *allgather(self._comm, elsewhere)])
-            part.contact.set_history(history.by_numbers(lookup, part.max_stiffness))
+    def border_elements(self) -> Ints:
+        """Elements (k,) of this rank at points that other ranks have too."""
+        on_border = np.zeros(len(self.element_set.points.keys), bool)
+        on_border[self._border] = True
+        return np.flatnonzero(on_border[self.element_set.elements.corners].any(axis=1))
 
     # --- positions and forces ---
 
@@ -369,27 +375,16 @@ class PartitionedSurface:
         assert self._nodes is not None
         return self._nodes.sum_at_nodes(parts)
 
-    def max_added_frequency(self, x: Values) -> float:
-        """Bound of what contact adds to the square of a frequency with points at x (n, d), m; 1/s^2 (collective)."""
-        loads, d = self.current.added_loads(x), self._domain.dim
-        largest = np.zeros(loads.shape[1])
-        if self._comm.allreduce(bool(loads.any()), op=MPI.LOR):
-            for part in range(loads.shape[1]):
-                total = self.sum_at_nodes(np.repeat(loads[:, part, None], d, axis=1))
-                largest[part] = (total / self._mass).max(initial=0.0)
-            self._comm.Allreduce(MPI.IN_PLACE, largest, MPI.MAX)
-        return float(largest.sum())
-
     def extend_faces(self, u: Values) -> None:
         """Extend retracted faces where there is room, at displacements u (owned dofs,), m (collective)."""
         if self.has_retracted:
             self.refresh(u)
-            self.current.extend_faces(self.nodal_values(u))
-            self._faces_changed()
+            self._faces_changed(self.current.extend_faces(self.nodal_values(u)))
 
-    def _faces_changed(self) -> None:
+    def _faces_changed(self, changed: bool = True) -> None:
+        """Note whether faces are retracted or left out, and that others are than before (collective)."""
         share, excluded, _ = self.current.snapshot()
-        self._version += 1
+        self._version += changed
         self.has_retracted = bool(max_over_ranks(self._comm, int(bool(np.any(share < 1)) or len(excluded) > 0)))
 
     def reach_of_points(self) -> float:
@@ -415,6 +410,8 @@ class PartitionedSurface:
 
     def separate_surface(self, points: SurfaceMap, surface: DrawnSurface, u: Values, t: float) -> SurfaceMap:
         """Move points of a surface for output to the crack faces of contact, which are offset and retracted."""
+        if self._cell_parts > 1:
+            return points
         assert self._own_nodes is not None
         share, nodal = self.current.point_map.share[self._point_rows], self._own_nodes(u).copy()
         row_of_key = KeyLookup(self.element_set.points.keys)
@@ -479,28 +476,63 @@ class PartitionedSurface:
         return arrays | {"pause": np.array(state.interval, float)}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set the state from the arrays of a checkpoint (collective)."""
-        share = np.ones(len(self.element_set.points.keys))
-        rows = KeyLookup(self.element_set.points.keys)(saved["retracted"].astype(np.int64))
-        share[rows[rows >= 0]] = saved["share"][rows >= 0]
-        is_excluded = np.isin(self.element_set.element_keys, saved["left_out"])
+        """Set the state from the arrays of a checkpoint (collective).
+
+        Raises ValueError if it names points or elements that the surface has not.
+        """
+        retracted, left_out, share = saved["retracted"].astype(np.int64), saved["left_out"], saved["share"]
+        rows, is_excluded = (
+            KeyLookup(self.element_set.points.keys)(retracted),
+            np.isin(self.element_set.element_keys, left_out),
+        )
+        is_known = np.append(rows >= 0, np.isin(left_out, self.element_set.element_keys))
+        self._comm.Allreduce(MPI.IN_PLACE, is_known, MPI.LOR)
+        if len(share) != len(retracted) or not is_known.all():
+            raise ValueError(f"{len(share)} retracted points, {len(retracted)} names, {np.sum(~is_known)} of no point")
+        full = np.ones(len(self.element_set.points.keys))
+        full[rows[rows >= 0]] = share[rows >= 0]
         pause, remaining = (int(number) for number in saved["pause"])
-        self._restored = SurfaceState(self.surface_count, self._version, share, is_excluded, (pause, remaining))
+        self._restored = SurfaceState(self.surface_count, self._version, full, is_excluded, (pause, remaining))
         self.refresh(self._current_u)
         self._faces_changed()
 
 
-def _bounding_boxes(corners: Values) -> Values:
-    """(m, 2, d) lowest and highest corners of the bounding boxes of points (m, c, d), m."""
-    return np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
+def _differences(x: Sequence[Values], start: Sequence[Values]) -> list[Values]:
+    return [end - begin for end, begin in zip(x, start, strict=True)]
 
 
-def motion_diagonal(comm: MPI.Intracomm, motions: Sequence[Values]) -> float:
-    """Diagonal of the bounding box of motions (k, d) on all ranks, m: no two points approach by more (collective)."""
-    d = motions[0].shape[1]
+def _away_from_motion(comm: MPI.Intracomm, x: list[Values], start: list[Values], stop: list[Values]) -> list[Values]:
+    """Differences of positions (n, d) from those at one time of a straight motion, which is fitted, m (collective)."""
+    offset, change, d = _differences(x, start), _differences(stop, start), x[0].shape[1]
+    o, c = (np.concatenate(vectors) for vectors in (offset, change))
+    count, square, product, *sums = sum_over_ranks(
+        comm, np.array([len(c), np.vdot(c, c), np.vdot(o, c), *c.sum(axis=0), *o.sum(axis=0)])
+    )
+    # all may have moved alike besides
+    mean_change, mean_offset = np.array(sums[:d]) / count, np.array(sums[d:]) / count
+    square, product = square - count * (mean_change @ mean_change), product - count * (mean_offset @ mean_change)
+    along = min(max(product / square, 0.0), 1.0) if square > 0 else 0.0
+    return [of_points - along * motion for of_points, motion in zip(offset, change, strict=True)]
+
+
+def motion_diagonals(comm: MPI.Intracomm, motions: Sequence[Sequence[Sequence[Values]]]) -> Values:
+    """(m, k) diagonals of the bounding boxes of m times k motions on all ranks, m (collective).
+
+    A motion is that of several sets of points (n, d): no two points approach by more.
+    """
+    if not motions or not motions[0]:
+        return np.empty((len(motions), 0))
+    d = motions[0][0][0].shape[1]
     # by columns: minima along the first axis take twenty times as long
-    lowest = [min(motion[:, axis].min(initial=np.inf) for motion in motions) for axis in range(d)]
-    highest = [max(motion[:, axis].max(initial=-np.inf) for motion in motions) for axis in range(d)]
-    bounds = np.array([*lowest, *(-value for value in highest)])
+    bounds = np.array(
+        [
+            [
+                [min(part[:, axis].min(initial=np.inf) for part in motion) for axis in range(d)]
+                + [min(-part[:, axis].max(initial=-np.inf) for part in motion) for axis in range(d)]
+                for motion in row
+            ]
+            for row in motions
+        ]
+    )
     comm.Allreduce(MPI.IN_PLACE, bounds, MPI.MIN)
-    return float(np.linalg.norm(bounds.reshape(2, -1).sum(axis=0)))
+    return np.asarray(np.linalg.norm(bounds[..., :d] + bounds[..., d:], axis=2))

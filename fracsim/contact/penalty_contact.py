@@ -25,16 +25,16 @@ from ..mechanics.term import Term, TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import allgather, gather, max_over_ranks, sum_over_ranks
 from .clearance import Clearance
-from .ipc_surface import SelfContactLaw
 from .mesh_obstacle_term import build_mesh_obstacles
 from .mesh_obstacles import MeshObstacle
 from .obstacle import VerletObstacle
-from .partitioned_surface import PartitionedSurface, motion_diagonal
+from .partitioned_surface import motion_diagonals
 from .penalty_contacts import PenaltyHistory
 from .penalty_pairs import NO_ROWS, PairSprings
 from .penalty_point_facet import POINT_FACET
-from .penalty_surface import PenaltyPart
+from .penalty_surface import PenaltyBodySurface, PenaltyPart
 from .pose import Pose, PosedShape, resultant
+from .retractable_surface import SelfContactLaw
 from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 
 Values = npt.NDArray[np.float64]
@@ -66,7 +66,7 @@ class PenaltyState:
     """
 
     def __init__(
-        self, domain: Domain, u: fem.Function, surface: PartitionedSurface, is_far: Callable[[], bool] | None
+        self, domain: Domain, u: fem.Function, surface: PenaltyBodySurface, is_far: Callable[[], bool] | None
     ) -> None:
         """Begin with nothing in contact.
 
@@ -100,7 +100,7 @@ class PenaltyState:
         if (reference := self._idle_state.displacement) is None:
             return False
         motion = (self._u.x.array[: self._owned] - reference).reshape(-1, self._dim)
-        return motion_diagonal(self._comm, [motion]) <= self._idle_state.clearance
+        return float(motion_diagonals(self._comm, [[[motion]]])[0, 0]) <= self._idle_state.clearance
 
     def measure_clearance(self, x: Values) -> None:
         """Store how far nodes may approach from points x (n, d), m, before anything is near (collective)."""
@@ -215,7 +215,7 @@ class PenaltyContact(Term):
         self.law, self._domain, self._u, self.comm = law, domain, u, domain.comm
         self._owned = domain.node_count * domain.dim
         self._friction_loss = 0.0
-        self.surface = PartitionedSurface(domain, u, law, mass, max_added, meshes)
+        self.surface = PenaltyBodySurface(domain, u, law, mass, max_added, meshes)
         self.state = PenaltyState(domain, u, self.surface, is_far)
         self.parts: tuple[object, ...] = (self.surface, self.state)
         self._set_start(None)
@@ -224,7 +224,7 @@ class PenaltyContact(Term):
     # --- surface ---
 
     @property
-    def _parts(self) -> list[PenaltyPart]:
+    def _parts(self) -> Sequence[PenaltyPart]:
         return self.surface.current.parts
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:

@@ -78,13 +78,6 @@ class ElementRanks:
         return np.asarray(self.rank[elements].min(axis=1, initial=np.iinfo(np.int64).max) == self.this)
 
 
-def own_points(rank: Ints, elements: Ints, count: int, this: int) -> Flags:
-    """(n,) whether a rank is the lowest one of the elements (m, d), of ranks (m,), at points n = `count`."""
-    lowest = np.full(count, np.iinfo(np.int64).max)
-    np.minimum.at(lowest, elements, rank[:, None])
-    return np.asarray(lowest == this)
-
-
 @dataclass(frozen=True)
 class PenaltyContacts:
     """Contacts within some gap.

@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from .ipc_surface import unit_normals
 from .pair_search import PairFilter, PairSearch, SimplexPairs, near_pairs
 from .penalty_contacts import ContactHistory, ElementRanks, PenaltyContacts
+from .retractable_surface import unit_normals
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

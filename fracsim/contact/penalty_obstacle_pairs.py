@@ -203,7 +203,7 @@ class MeshContacts:
     """Contacts between two triangle meshes, as InsetPointContacts."""
 
     def __init__(self, first: RigidObstacle, second: RigidObstacle) -> None:
-        from .ipc_pairs import vertex_areas
+        from .sample_points import vertex_areas
 
         meshes = self._meshes = StackedMeshes(first.shape, second.shape)
         self._area, self._friction = vertex_areas(meshes.points, meshes.triangles), max(first.friction, second.friction)

@@ -18,9 +18,9 @@ import numpy as np
 import numpy.typing as npt
 
 from .closest_point import minimise_on_simplex
-from .ipc_surface import unit_normals
 from .pair_search import PairFilter, PairSearch, SimplexPairs, near_pairs
 from .penalty_contacts import NO_POINT, ContactHistory, ContactStiffness, NodalMassShare, PenaltyContacts
+from .retractable_surface import unit_normals
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

@@ -1,247 +1,38 @@
-"""Elements of a surface on a rank, of its own cells and of others near them, with penalty contact.
-
-Each rank marks the cubes of a grid that its elements overlap, grown by a distance. It sends the marks to ranks whose
-bounding boxes they overlap. These send the elements that overlap a marked cube, with their points. So two elements
-within the distance are on a common rank, and a rank has all elements at the points of its own elements. Names are keys
-(topology.row_keys); the order is that of the input mesh.
+"""Penalty contact of a body's surface with itself, or with triangle-mesh obstacles, on the elements of a rank.
 
 The contact of a point, or of an edge with one that comes later in the order of the surface, belongs to the lowest rank
-that has an element at the point or edge. Ranks decide alike where crack faces have no room: pressures are summed, and
-arms are the shortest of all ranks.
+that has an element at the point or edge.
 
 Equations: docs/theory.md#explicit-contact.
-
-Source: S. Plimpton and others (1998), Parallel transient dynamics simulations: algorithms for contact detection and
-smoothed particle hydrodynamics, Journal of Parallel and Distributed Computing 50, 104-122.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
-from itertools import product
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from dolfinx import fem
 from mpi4py import MPI
-from scipy.sparse import csr_matrix, vstack
+from scipy.sparse import csr_matrix
 
-from ..mesh.ghost_exchange import KeyedReduction, KeyLookup
-from ..mesh.parallel import allgather, alltoall
-from ..mesh.split_surface.local_surface import restrict_to_used_columns
-from ..mesh.split_surface.surface_map import SurfaceMap
-from ..meshes.topology import row_keys
-from .ipc_pairs import vertex_areas
-from .ipc_surface import RetractableSurface, SelfContactLaw
+from ..mesh.domain import Domain
+from ..mesh.ghost_exchange import KeyLookup
+from ..mesh.parallel import allgather
+from .element_exchange import EXCHANGE, ElementSet, bounding_boxes, own_points
 from .mesh_obstacles import MeshObstacle
-from .penalty_contacts import NO_POINT, ContactStiffness, ElementRanks, own_points
+from .partitioned_surface import PartitionedSurface
+from .penalty_contacts import NO_POINT, ContactStiffness, ElementRanks, NodalMassShare, PenaltyHistory
 from .penalty_pairs import PenaltyPairs
+from .penalty_point_facet import POINT_FACET, penalty_stiffness
 from .pose import Pose
+from .retractable_surface import RetractableSurface, SelfContactLaw
+from .sample_points import vertex_areas
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
-
-
-# --- elements, and their exchange ---
-
-
-@dataclass(frozen=True)
-class ExchangePolicy:
-    """Tuned numbers of the exchange.
-
-    Attributes:
-        margin: motion, in mean edges of the mesh, after which elements are exchanged again.
-        cube: side of a cube in mean sizes of elements.
-        max_cubes: cubes along the largest element at most.
-        bits: bits of the number of a cube along an axis.
-    """
-
-    margin: float = 0.5
-    cube: float = 2.0
-    max_cubes: int = 4
-    bits: int = 20
-
-
-EXCHANGE = ExchangePolicy()
-
-
-@dataclass(frozen=True)
-class PointRows:
-    """Points of a part of a surface, row by row.
-
-    Attributes:
-        keys: (n,) names.
-        lead: (n,) lowest node that each follows, in the input mesh.
-        middle, out: (n, d) mean reference position of its nodes, and arm from there, m.
-        mean, arms: (n, nodes of the mesh) weights of a SurfaceMap.
-        share: (n,) factors of the arms.
-        area: (n,) m^2, of the elements of all ranks.
-        stiffness: (n,) k_p, N/m.
-    """
-
-    keys: Ints
-    lead: Ints
-    middle: Values
-    out: Values
-    mean: csr_matrix
-    arms: csr_matrix
-    share: Values
-    area: Values
-    stiffness: Values
-
-
-@dataclass(frozen=True)
-class ElementRows:
-    """Elements of a part of a surface, row by row.
-
-    Attributes:
-        corners: (m, d) rows of points.
-        rank: (m,) rank of the cell.
-        is_excluded: (m,) whether there is no room for the element, so that it has no contact.
-    """
-
-    corners: Ints
-    rank: Ints
-    is_excluded: Flags
-
-
-@dataclass(frozen=True)
-class ElementSet:
-    """Part of a surface.
-
-    Attributes:
-        points: its points.
-        elements: its elements.
-    """
-
-    points: PointRows
-    elements: ElementRows
-
-    @property
-    def element_keys(self) -> Ints:
-        """(m,) names of the elements."""
-        return row_keys(np.sort(self.points.keys[self.elements.corners], axis=1))
-
-    def select(self, elements: Ints) -> ElementSet:
-        """Some of the elements (k,), with their points."""
-        chosen = _take(self.elements, elements)
-        rows, corners = np.unique(chosen.corners, return_inverse=True)
-        return ElementSet(_take(self.points, rows), replace(chosen, corners=corners.reshape(chosen.corners.shape)))
-
-    def ordered(self) -> ElementSet:
-        """Points by their lowest nodes and keys, and elements by their first points and keys."""
-        points = self.points
-        order = np.lexsort((points.keys, points.lead))
-        row = np.empty(len(order), np.int64)
-        row[order] = np.arange(len(order))
-        corners = row[self.elements.corners]
-        # the lowest corner first, so that nothing depends on the cell's numbering on its rank
-        d = corners.shape[1]
-        turned = (corners.argmin(axis=1)[:, None] + np.arange(d)) % d if d == 3 else np.arange(d)[None]
-        corners = np.take_along_axis(corners, np.broadcast_to(turned, corners.shape), axis=1)
-        by_corner = np.lexsort((self.element_keys, corners.min(axis=1, initial=len(row))))
-        elements = _take(replace(self.elements, corners=corners), by_corner)
-        return ElementSet(_take(points, order), elements)
-
-    def point_map(self) -> tuple[Ints, SurfaceMap]:
-        """Global numbers of the nodes that the points follow, and the map from these to the points."""
-        points = self.points
-        columns, (mean, arms) = restrict_to_used_columns([points.mean, points.arms])
-        return columns, SurfaceMap(mean, points.middle, arms, points.out, points.share)
-
-
-def _take[Rows: (PointRows, ElementRows)](rows: Rows, numbers: Ints) -> Rows:
-    """Some of the rows."""
-    return type(rows)(**{field.name: getattr(rows, field.name)[numbers] for field in fields(rows)})
-
-
-def join_element_sets(sets: Sequence[ElementSet]) -> ElementSet:
-    """Union of parts of a surface whose elements differ, in its order."""
-    arrays = {}
-    for field in fields(PointRows):
-        columns = [getattr(element_set.points, field.name) for element_set in sets]
-        is_sparse = isinstance(columns[0], csr_matrix)
-        arrays[field.name] = vstack(columns, format="csr") if is_sparse else np.concatenate(columns)
-    points = PointRows(**arrays)
-    _, first, number = np.unique(points.keys, return_index=True, return_inverse=True)
-    starts = np.cumsum([0, *(len(element_set.points.keys) for element_set in sets)])
-    corners = [number[rows.elements.corners + start] for rows, start in zip(sets, starts, strict=False)]
-    elements = ElementRows(
-        np.concatenate(corners),
-        np.concatenate([element_set.elements.rank for element_set in sets]),
-        np.concatenate([element_set.elements.is_excluded for element_set in sets]),
-    )
-    return ElementSet(_take(points, first), elements).ordered()
-
-
-def exchange_elements(
-    comm: MPI.Intracomm, element_set: ElementSet, boxes: Values, searched: Values, reach: float
-) -> ElementSet:
-    """Elements of a rank and those of other ranks within `reach`, m, of boxes, in the order of a surface (collective).
-
-    Args:
-        comm: ranks.
-        element_set: elements of this rank.
-        boxes: (m, 2, d) lower and upper corners of their bounding boxes, m.
-        searched: (k, 2, d) boxes near which elements of other ranks are wanted, m.
-        reach: m.
-    """
-    if comm.size == 1:
-        return element_set
-    grown = searched + reach * np.array([[-1.0], [1.0]])
-    origin, side = _grid(comm, boxes, grown)
-    element, cube = _overlapped_cubes(boxes, origin, side)
-    _, wanted = _overlapped_cubes(grown, origin, side)
-    limits = allgather(comm, (_bounds(boxes), _bounds(grown)))
-    # a rank asks those ranks alone whose elements may be near
-    none: Ints = np.empty(0, np.int64)
-    asks = [
-        rank != comm.rank and bool(np.all(_bounds(grown)[0] <= high) and np.all(low <= _bounds(grown)[1]))
-        for rank, ((low, high), _) in enumerate(limits)
-    ]
-    wanted = np.unique(wanted)
-    requests = alltoall(comm, [wanted if ask else none for ask in asks])
-    sent: list[ElementSet | None] = [None] * comm.size
-    for rank, cubes in enumerate(requests):
-        if len(cubes) and len(near := np.unique(element[np.isin(cube, cubes)])):
-            sent[rank] = element_set.select(near)
-    arrived = [rows for rows in alltoall(comm, sent) if rows is not None]
-    return join_element_sets([element_set, *arrived])
-
-
-def _bounds(boxes: Values) -> Values:
-    """(2, d) bounding box of boxes (k, 2, d)."""
-    return np.stack([boxes[:, 0].min(axis=0, initial=np.inf), boxes[:, 1].max(axis=0, initial=-np.inf)])
-
-
-def _grid(comm: MPI.Intracomm, boxes: Values, grown: Values) -> tuple[Values, float]:
-    """(d,) lowest corner of all boxes, m, and the side of the cubes, m (collective)."""
-    size = (boxes[:, 1] - boxes[:, 0]).max(axis=1, initial=0.0)
-    sums = np.array([size.sum(), len(size)])
-    comm.Allreduce(MPI.IN_PLACE, sums, MPI.SUM)
-    extremes = np.append(_bounds(np.concatenate([boxes, grown]))[0], -size.max(initial=0.0))
-    comm.Allreduce(MPI.IN_PLACE, extremes, MPI.MIN)
-    mean = sums[0] / max(sums[1], 1.0)
-    return extremes[:-1], float(max(EXCHANGE.cube * mean, -extremes[-1] / EXCHANGE.max_cubes))
-
-
-def _overlapped_cubes(boxes: Values, origin: Values, side: float) -> tuple[Ints, Ints]:
-    """(k,) boxes, and (k,) the numbers of the cubes that each overlaps."""
-    low, high = (np.floor((boxes[:, end] - origin) / side).astype(np.int64) for end in range(2))
-    rows, cubes, span = [], [], high - low
-    for offset in product(*(range(int(largest) + 1) for largest in span.max(axis=0, initial=0))):
-        overlap = np.flatnonzero((span >= np.array(offset)).all(axis=1))
-        # beyond the bits, in a body that has flown apart, far cubes share a number: more is sent than needed
-        position = (low[overlap] + np.array(offset)) & ((1 << EXCHANGE.bits) - 1)
-        number = position[:, 0]
-        for axis in range(1, boxes.shape[2]):
-            number = (number << EXCHANGE.bits) | position[:, axis]
-        rows.append(overlap)
-        cubes.append(number)
-    return np.concatenate(rows), np.concatenate(cubes)
 
 
 @dataclass(frozen=True)
@@ -301,13 +92,11 @@ class PenaltySurface(RetractableSurface):
     """Elements of this rank and of others near them, and their contacts.
 
     Attributes:
-        element_set: points and elements.
-        columns: global numbers of the nodes that the points follow.
-        rest_positions: (n, d) of its points with full arms, m.
         parts: contact with itself, or with each obstacle.
     """
 
     closed_pressure: ClassVar[float] = 0.0  # a face that is pressed at all has no room
+    parts: Sequence[PenaltyPart] = ()
 
     def __init__(
         self,
@@ -316,7 +105,6 @@ class PenaltySurface(RetractableSurface):
         law: SelfContactLaw,
         meshes: Sequence[MeshObstacle],
         edge: float,
-        distance_reach: float,
     ) -> None:
         """Contacts of elements.
 
@@ -326,30 +114,37 @@ class PenaltySurface(RetractableSurface):
             law: contact law.
             meshes: obstacles; none: the body touches itself.
             edge: mean length of edges of the mesh, m.
-            distance_reach: distance of bounding boxes from which on nothing is in contact, m.
         """
-        self.columns, point_map = element_set.point_map()
-        super().__init__(element_set.elements.corners, point_map, law.stiffness)
-        self.comm, self.element_set, self._law, self._meshes = comm, element_set, law, meshes
-        self._edge, self._reach = edge, distance_reach
-        self.rest_positions = element_set.points.middle + element_set.points.out
-        self._owned_points = own_points(element_set.elements.rank, self.elements, len(self.rest_positions), comm.rank)
-        self.parts = self._build_parts(np.arange(len(self.elements)))
-        self._exclude(np.flatnonzero(element_set.elements.is_excluded))
+        self._meshes, self._edge = meshes, edge
+        super().__init__(comm, element_set, law)
 
-    # --- contacts ---
+    def _build_contacts(self, elements: Ints) -> None:
+        """Build the contacts of elements (k,), with their histories."""
+        histories = [part.contact.history for part in self.parts]
+        self.parts = self._parts_of(elements)
+        for part, history in zip(self.parts, histories, strict=False):
+            part.contact.set_history(history)
 
-    def _build_parts(self, elements: Ints) -> list[PenaltyPart]:
+    def _gradients(self, x: Values) -> list[Values]:
+        zero = np.zeros_like(x)
+        return [zero if part.is_far(x) else part.contact.gradient(part.points(x))[: len(x)] for part in self.parts]
+
+    def cut_by_obstacles(self, x: Values) -> list[Ints]:
+        """Remaining elements (k,) that the body itself, or each obstacle, intersects with points at x (n, d), m."""
+        count = len(self.remaining())
+        return [part.cut_elements(x, count) for part in self.parts]
+
+    def _parts_of(self, elements: Ints) -> list[PenaltyPart]:
         """Contacts of elements (k,), without a history."""
         corners, rank = self.elements[elements], self.element_set.elements.rank[elements]
         k, keys, X = self.element_set.points.stiffness, self.element_set.points.keys, self.rest_positions
-        distance, edge, body_points = self._law.distance, self._edge, np.unique(corners)
+        distance, edge, body_points = self.law.distance, self._edge, np.unique(corners)
         if not self._meshes:
-            ranks = None if self.comm.size == 1 else ElementRanks(rank, self.comm.rank, self._owned_points)
+            ranks = None if self.comm.size == 1 else ElementRanks(rank, self.comm.rank, self.own_points)
             stiffness = ContactStiffness.of_one_body(k)
             pairs = PenaltyPairs(X, corners, stiffness, distance=distance, ranks=ranks, edge=edge)
-            return [PenaltyPart(pairs, self._law.friction, keys, k, body_points, self._reach)]
-        pressure, count, parts = self._law.stiffness / self._law.distance, len(X), []
+            return [PenaltyPart(pairs, self.law.friction, keys, k, body_points, distance)]
+        pressure, count, parts = self.law.stiffness / self.law.distance, len(X), []
         area = self.element_set.points.area
         reduction = np.divide(k, 0.5 * pressure * area, out=np.ones(len(k)), where=area > 0)
         of_body = ContactStiffness(k, k, reduction)
@@ -360,7 +155,7 @@ class PenaltySurface(RetractableSurface):
             if self.comm.size > 1:
                 of_triangles = mesh.triangle_ranks(self.comm.size)
                 owned = own_points(of_triangles, mesh.triangles, size, self.comm.rank)
-                all_ranks, all_owned = np.append(rank, of_triangles), np.append(self._owned_points, owned)
+                all_ranks, all_owned = np.append(rank, of_triangles), np.append(self.own_points, owned)
                 ranks = ElementRanks(all_ranks, self.comm.rank, all_owned)
             pairs = PenaltyPairs(
                 np.concatenate([X, mesh.points]), np.concatenate([corners, triangles]), of_body.followed_by(of_mesh),
@@ -369,18 +164,9 @@ class PenaltySurface(RetractableSurface):
             # keys of the body are not negative
             mesh_keys, limits = NO_POINT - 1 - np.arange(size), np.append(k, np.full(size, np.inf))
             parts.append(
-                PenaltyPart(pairs, mesh.friction, np.append(keys, mesh_keys), limits, body_points, self._reach, mesh)
+                PenaltyPart(pairs, mesh.friction, np.append(keys, mesh_keys), limits, body_points, distance, mesh)
             )
         return parts
-
-    def _exclude(self, elements: Ints) -> None:
-        """Leave out these elements (k,) and no others."""
-        if len(elements) or len(self._excluded):
-            histories = [part.contact.history for part in self.parts]
-            self.parts = self._build_parts(np.delete(np.arange(len(self.elements)), elements))
-            for part, history in zip(self.parts, histories, strict=True):
-                part.contact.set_history(history)
-        self._excluded = elements
 
     def added_loads(self, x: Values) -> Values:
         """(columns, parts) bounds of what contacts of this rank add to M omega^2 of each node, N/m."""
@@ -393,58 +179,88 @@ class PenaltySurface(RetractableSurface):
                     load += contacts.added_load(weights)
         return loads
 
-    def retract_faces(self, u: Values, keys: Ints, load: Values) -> None:
-        """Retract crack faces under pressure at displacements u (columns, d), m (collective).
 
-        `load`: (k,) pressures, Pa, of points with `keys` that may stay.
+class PenaltyBodySurface(PartitionedSurface[PenaltySurface]):
+    """Contact surface of a body with a penalty."""
+
+    def __init__(
+        self,
+        domain: Domain,
+        u: fem.Function,
+        law: SelfContactLaw,
+        mass: Values,
+        max_added: float,
+        meshes: Sequence[MeshObstacle] = (),
+    ) -> None:
+        """Build the surface (collective).
+
+        Args:
+            domain: mesh.
+            u: displacement.
+            law: contact law.
+            mass: (owned dofs,) lumped, kg.
+            max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
+            meshes: obstacles; none: the body touches itself.
+
+        Raises:
+            InputError: if the surface at rest intersects itself, or an obstacle.
         """
-        loads: Values = np.zeros(len(self.rest_positions))
-        loads[KeyLookup(self.element_set.points.keys)(keys)] = load
-        self._retract_faces(u, self._over_points(loads, np.maximum))
+        self._mass, self._max_added = mass, max_added
+        reach, margin = POINT_FACET.clearance_gap * law.distance, EXCHANGE.margin * domain.mean_edge_length
+        super().__init__(domain, u, law, meshes, reach, margin)
 
-    def set_release_interval(self, interval: tuple[int, int]) -> None:
-        """Set the steps between two attempts to release faces, and to the next one."""
-        self._release_interval = interval
+    def _build_surface(self, element_set: ElementSet) -> PenaltySurface:
+        return PenaltySurface(self._comm, element_set, self.law, self._meshes, self._domain.mean_edge_length)
 
-    # --- what ranks agree on ---
+    def _point_stiffness(self, weights: csr_matrix, area: Values, local_area: Values) -> Values:
+        """(n,) stiffness of the points of this rank, N/m: constant while a surface lasts (collective)."""
+        d, nodes = self._domain.dim, self._own_nodes
+        assert nodes is not None
 
-    @cached_property
-    def _over_points(self) -> KeyedReduction:
-        return KeyedReduction(self.comm, self.element_set.points.keys)
+        def nodal_sums(values: Values) -> Values:
+            total = nodes.sum_at_nodes(np.repeat(values[:, None], d, axis=1))
+            return nodes(total)[:, 0].copy()
 
-    @cached_property
-    def _over_elements(self) -> KeyedReduction:
-        return KeyedReduction(self.comm, self.element_set.element_keys)
+        # before obstacles twice that of self-contact, where both sides yield
+        limit = (2 if self._meshes else 1) * self._max_added
+        mass_share = NodalMassShare(weights, nodes(self._mass)[:, 0].copy(), nodal_sums)
+        return penalty_stiffness(mass_share, area, self.law.stiffness / self.law.distance, limit, local_area)
 
-    def sum_at_points(self, vectors: Values) -> Values:
-        """(n, d) sums of vectors at the points over all ranks (collective)."""
-        return self._over_points(vectors, np.add)
+    def _moving_points(self, u: Values) -> list[Values]:
+        return [*super()._moving_points(u), *(mesh.positions for mesh in self._meshes)]
 
-    def pressures(self, u: Values) -> Values:
-        """(n,) pressure on each point at displacements u (columns, d), m; Pa (collective)."""
-        x, result = self.point_map(u), np.zeros(len(self.rest_positions))
-        remaining = self._remaining()
-        of_rank = remaining[self.element_set.elements.rank[remaining] == self.comm.rank]
-        area = self._over_points(vertex_areas(self.rest_positions, self.elements[of_rank]), np.add)
-        for part in self.parts:
-            near = not part.is_far(x)
-            gradient = part.contact.gradient(part.points(x))[: len(x)] if near else np.zeros_like(x)
-            force = np.linalg.norm(self.sum_at_points(gradient), axis=1)
-            result += np.divide(force, area, out=np.zeros_like(area), where=area > 0)
-        return result
+    def _searched_boxes(self, boxes: Values) -> Values:
+        if not self._meshes:
+            return boxes
+        sides = [mesh.triangles[mesh.triangle_ranks(self._comm.size) == self._comm.rank] for mesh in self._meshes]
+        near = [bounding_boxes(mesh.positions[rows]) for mesh, rows in zip(self._meshes, sides, strict=True)]
+        return np.concatenate([boxes[self.border_elements()], *near])
 
-    def _intersecting_faces(self, u: Values) -> Ints:
-        x, is_cut = self.point_map(u), np.zeros(len(self.elements), bool)
-        remaining = self._remaining()
-        for part in self.parts:
-            is_cut[remaining[part.cut_elements(x, len(remaining))]] = True
-        return np.intersect1d(self._crack_faces, np.flatnonzero(self._over_elements(is_cut, np.logical_or)))
+    # --- contacts ---
 
-    def _common_share(self, share: Values) -> Values:
-        return self._over_points(share, np.minimum)
+    def _keep_history(self, previous: PenaltySurface) -> None:
+        self.set_history([part.contact.history.by_keys(part.keys) for part in previous.parts])
 
-    def _common_flags(self, flags: Flags) -> Flags:
-        return self._over_points(flags, np.logical_and)
+    def set_history(self, histories: Sequence[PenaltyHistory]) -> None:
+        """Set the contacts of each part at the end of the last step; each goes to the rank that it belongs to.
 
-    def _on_any_rank(self, flag: bool) -> bool:
-        return bool(flag) if self.comm.size == 1 else bool(self.comm.allreduce(bool(flag), op=MPI.LOR))
+        Collective.
+        """
+        for part, history in zip(self.current.parts, histories, strict=True):
+            lookup = KeyLookup(part.keys)
+            stored = part.contact.store(lookup(history.points.points[:, 0]), lookup(history.edges.points))
+            if self._comm.size > 1:
+                elsewhere = history.select(*(~flags for flags in stored))
+                history = PenaltyHistory.join([history.select(*stored), *allgather(self._comm, elsewhere)])
+            part.contact.set_history(history.by_numbers(lookup, part.max_stiffness))
+
+    def max_added_frequency(self, x: Values) -> float:
+        """Bound of what contact adds to the square of a frequency with points at x (n, d), m; 1/s^2 (collective)."""
+        loads, d = self.current.added_loads(x), self._domain.dim
+        largest = np.zeros(loads.shape[1])
+        if self._comm.allreduce(bool(loads.any()), op=MPI.LOR):
+            for part in range(loads.shape[1]):
+                total = self.sum_at_nodes(np.repeat(loads[:, part, None], d, axis=1))
+                largest[part] = (total / self._mass).max(initial=0.0)
+            self._comm.Allreduce(MPI.IN_PLACE, largest, MPI.MAX)
+        return float(largest.sum())

@@ -131,6 +131,12 @@ def measures(x: Values, elements: Ints) -> Values:
     return np.asarray(np.linalg.norm(spanned, axis=1))
 
 
+def vertex_areas(x: Values, elements: Ints) -> Values:
+    """(n,) share of each point in the measure of the elements around it, m^2 (2D: m)."""
+    measure, d = measures(x, elements), x.shape[1]
+    return np.asarray(np.bincount(elements.reshape(-1), np.repeat(measure / d, d), minlength=len(x)), float)
+
+
 class SlipFriction(Protocol):
     """Lagged friction of a surface at positions x (n, d), m: a potential of the slip."""
 

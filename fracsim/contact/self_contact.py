@@ -1,16 +1,14 @@
 """Term of the balance for contact of a body with itself, and of its fragments with one another, in implicit steps.
 
-Each rank holds the split surface, finds its share of the pairs in contact (ipc_pairs), and maps their forces and
-stiffness to the nodes: x = W u, f = W^T dE/dx, K = W^T d2E/dx2 W. Nodal values are summed over the ranks.
+Each rank has its own elements of the split surface and those of others near them (partitioned_surface), finds its pairs
+in contact (ipc_pairs), and maps their forces and stiffness to the nodes: x = W u, f = W^T dE/dx, K = W^T d2E/dx2 W.
+Nodal values are summed over the ranks.
 
 Equations: docs/theory.md#contact.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
-from functools import partial
 from typing import cast
 
 import numpy as np
@@ -22,152 +20,20 @@ from scipy.sparse import csr_matrix
 
 from ..mechanics.extra_couplings import CouplingBuilder, FewNodesCoupling, sum_few_nodes
 from ..mechanics.term import Term, TimeLevel
-from ..mechanics.term_protocols import CutPositions
 from ..mesh.domain import Domain
-from ..mesh.parallel import Gather, allgather, bcast, sum_over_ranks
-from ..mesh.split_surface.drawn_surface import DrawnSurface
-from ..mesh.split_surface.entity_numbering import EntityNumbering
-from ..mesh.split_surface.quadratic_surface import subdivided_input_mesh
-from ..mesh.split_surface.surface_map import SurfaceMap
-from .clearance import FollowingPoints
+from ..mesh.parallel import allgather, max_over_ranks, sum_over_ranks
+from .barrier_surface import BarrierBodySurface
 from .contact_patch import SelfContactPatch
 from .ipc_pairs import IpcPairs
-from .ipc_surface import SURFACE, SelfContactLaw, SelfContactSurface, SurfaceSnapshot
 from .laws import stiffness_factor
 from .pair_search import max_length
+from .retractable_surface import SURFACE, SelfContactLaw
 from .sample_points import SlipFriction
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 Pattern = npt.NDArray[np.uint8]
-
-# skeleton, pattern (cells,), law, u (nodes, d), surface until now, positions of cuts (edges,) -> surface
-type SurfaceBuilder[S] = Callable[[EntityNumbering, Pattern, SelfContactLaw, Values, S | None, Values | None], S]
-
-
-class BreakingSurface[S: SelfContactSurface]:
-    """Contact surface of a body, built again when edges break (HistoryTerm, CutFaces, SurfaceSeparator).
-
-    Attributes:
-        law: contact law, whose stiffness may grow.
-        gather: gathering of the nodes that the surface depends on.
-        node_numbers: (nodes,) global numbers of these, where the surface is held.
-    """
-
-    _cuts: CutPositions | None = None
-    _surface: S | None = None
-
-    def __init__(self, domain: Domain, u: fem.Function, law: SelfContactLaw, build: SurfaceBuilder[S]) -> None:
-        """Build the surface of the whole body on every rank (collective).
-
-        Args:
-            domain: mesh.
-            u: displacement.
-            law: contact law.
-            build: function that builds a surface. It refuses bodies that intersect at rest.
-        """
-        self.law, self._domain, self._u, self._build = law, domain, u, build
-        numbering, is_refined = domain.input_numbering, domain.order == 2 and not law.corners_only
-        self.gather: Gather = numbering.gather_corners if law.corners_only else numbering.gather_nodes
-        # subdivided quadratic cells do not break
-        self._parts = 2**domain.dim if is_refined else 1
-        mesh = subdivided_input_mesh(domain) if is_refined else domain.input_mesh
-        self._skeleton = EntityNumbering(bcast(domain.comm, mesh))
-        self._pattern: Pattern = np.zeros(domain.cell_count, np.uint8)
-        first = domain.space.dofmap.index_map.local_range[0]
-        # (nodes,) global numbers of nodes in input order
-        self.node_numbers = self.gather.to_all_ranks(first + np.arange(domain.node_count))
-        self._rebuild()
-
-    def _rebuild(self) -> None:
-        """Build the surface of the current damage (collective)."""
-        pattern = self._domain.input_numbering.gather_cells.to_all_ranks(self._pattern)
-        u = self.nodal_values(self._u.x.array[: self._domain.node_count * self._domain.dim])
-        cut = None
-        if self._cuts is not None:
-            rows = allgather(self._domain.comm, self._cuts())
-            edges, positions = (np.concatenate(parts) for parts in zip(*rows, strict=True))
-            cut = self._skeleton.edge_values(edges, positions[:, 0])
-        cells = np.repeat(pattern, self._parts)
-        # most edges break within fragments
-        if self._surface is None or not self._surface.represents(cells):
-            self._surface = self._build(self._skeleton, cells, self.law, u, self._surface, cut)
-
-    @property
-    def current(self) -> S:
-        """Surface of the current damage."""
-        assert self._surface is not None
-        return self._surface
-
-    def nodal_values(self, u: Values) -> Values:
-        """(nodes, d) owned displacements u in the order of the input mesh (collective)."""
-        return self.gather.to_all_ranks(np.asarray(u).reshape(-1, self._domain.dim))
-
-    def positions(self, u: Values) -> Values:
-        """(n, d) positions of its points for owned displacements u, m (collective)."""
-        return self.current.point_map(self.nodal_values(u))
-
-    def following_points(self) -> FollowingPoints:
-        """Points of the surface."""
-        surface = self.current
-        share, excluded, _ = surface.snapshot()
-        nodes = np.unique(surface.point_map.weights.indices)
-        may_stay = not len(excluded) and bool(np.all(share == 1))
-        weights, numbers = surface.point_map.weights[:, nodes], self.node_numbers[nodes]
-        return FollowingPoints(surface.point_map.rest, weights, numbers, surface.elements, may_stay=may_stay)
-
-    def set_cuts(self, cuts: CutPositions) -> None:
-        """Set where edges are cut; used for faces between fragments."""
-        if self.law.fragments_only:
-            self._cuts = cuts
-
-    def edges_broke(self, pattern: Pattern) -> None:
-        """Add new crack faces, retracted where there is no room (collective)."""
-        self._pattern = pattern
-        self._rebuild()
-
-    def set_stiffness(self, stiffness: float) -> None:
-        """Set the stiffness of the barrier, Pa."""
-        if stiffness != self.law.stiffness:
-            self.law = replace(self.law, stiffness=stiffness)
-            self.current.set_stiffness(stiffness)
-
-    def separate_surface(self, points: SurfaceMap, surface: DrawnSurface, u: Values, t: float) -> SurfaceMap:
-        """Move points of a surface for output to the crack faces of contact, which are offset and retracted."""
-        if self._parts > 1:
-            return points
-        current, nodal = self.current, self.nodal_values(u)
-        if self.law.fragments_only:
-            return current.place_faces(points, surface, nodal)
-        rows, share = surface.whole.points, current.point_map.share
-        # faces without an offset stay where other terms have moved them
-        if current.face_gap:
-            full_arms = current.point_map.with_arm_share(np.ones(len(share)))(nodal)
-            points = points.move_points(np.arange(len(rows)), full_arms[rows])
-        return points.with_arm_share(np.minimum(share[rows], points.share))
-
-    def snapshot(self) -> SurfaceSnapshot:
-        """Retracted and excluded parts of the surface."""
-        return self.current.snapshot()
-
-    def restore(self, memory: object) -> None:
-        """Restore a snapshot (not collective)."""
-        self.current.restore(cast("SurfaceSnapshot", memory))
-
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Factors of arms, numbers of excluded elements, steps to the next release of faces, and stiffness."""
-        share, excluded, pause = self.current.snapshot()
-        return {"share": share, "left_out": np.asarray(excluded, float), "pause": np.array(pause, float),
-                "stiffness": np.array([self.law.stiffness])}  # fmt: skip
-
-    def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set the state from the arrays of a checkpoint."""
-        self.set_stiffness(float(saved["stiffness"][0]))
-        if len(saved["share"]) != len(self.current.point_map.share):
-            raise ValueError(f"{len(saved['share'])} points of the contact surface instead of those of its damage")
-        pause, remaining = (int(number) for number in saved["pause"])
-        self.current.restore((saved["share"], saved["left_out"].astype(np.int64), (pause, remaining)))
 
 
 class SurfaceContact(Term):
@@ -188,14 +54,10 @@ class SurfaceContact(Term):
     _start_displacement: Values | None = None  # of the last step in which faces may have been extended
     _fitted_displacement: Values | None = None  # at which crack faces have found their room within the step
 
-    def __init__(
-        self, domain: Domain, u: fem.Function, law: SelfContactLaw, build: SurfaceBuilder[SelfContactSurface]
-    ) -> None:
-        """`build`: function that builds the surface. It refuses bodies that intersect at rest (collective)."""
-        self._domain, self._u = domain, u
+    def __init__(self, domain: Domain, u: fem.Function, surface: BarrierBodySurface) -> None:
+        self._domain, self._u, self.surface = domain, u, surface
         self._owned, self.comm = domain.node_count * domain.dim, domain.comm
         self._coupling = CouplingBuilder(domain)
-        self.surface = BreakingSurface(domain, u, law, build)
         self._discard_surface()
 
     # --- surface ---
@@ -206,9 +68,9 @@ class SurfaceContact(Term):
         self._contact_force: Values | None = None
         self._stored: float | None = None
         self.start_positions: Values | None = None
-        self._tangent_positions: Values | None = None
+        self._tangent_displacement: Values | None = None
         self.friction: SlipFriction | None = None
-        self._is_stale = True
+        self._is_stale, self._exchange_count = True, self.surface.exchange_count
 
     def edges_broke(self, pattern: Pattern) -> None:
         """Add new crack faces, retracted where there is no room (collective)."""
@@ -216,16 +78,16 @@ class SurfaceContact(Term):
         self._discard_surface()
         self._fitted_displacement = self._u.x.array[: self._owned].copy()
 
-    def _extend_faces(self, u_n: Values, nodal: Values) -> None:
+    def _extend_faces(self, u_n: Values) -> None:
         """Extend crack faces at the start of a step, unless edges broke in an earlier pass of it (collective).
 
-        A step that begins where the last one did, at u_n (owned dofs,), m, is repeated. `nodal`: (nodes, d) of u_n.
+        A step that begins where the last one did, at u_n (owned dofs,), m, is repeated.
         """
         before, self._start_displacement = self._start_displacement, u_n.copy()
         if not self.comm.allreduce(before is not None and np.array_equal(before, u_n), op=MPI.LAND):
             self._fitted_displacement = None
         if self._fitted_displacement is None:
-            self.surface.current.extend_faces(nodal)
+            self.surface.extend_faces(u_n)
 
     def update_displacement(self) -> None:
         """Discard positions and forces, as u has changed."""
@@ -238,10 +100,16 @@ class SurfaceContact(Term):
 
     def end_positions(self) -> Values:
         """(n, d) positions at the end of the step that belongs to the current u, m (collective)."""
-        if self._is_stale or self._positions is None:
+        if self._is_stale or self._positions is None or self._exchange_count != self.surface.exchange_count:
             self._positions, self._is_stale = self.surface.positions(self.end_displacement), False
             self._contact_force = self._stored = None
+            if self._exchange_count != self.surface.exchange_count:
+                self._exchange_count = self.surface.exchange_count
+                self._renumber_start()
         return self._positions
+
+    def _renumber_start(self) -> None:
+        """Compute again what belongs to the points at the start of the step, which have other numbers (collective)."""
 
     def is_far(self) -> bool:
         """Whether nothing can be in contact at the current u (collective); of a body with itself it is not asked."""
@@ -259,7 +127,7 @@ class SurfaceContact(Term):
         gradient = self.surface.current.pairs.gradient(x) if normal else np.zeros_like(x)
         if self.friction is not None:
             gradient = gradient + self.friction.gradient(x)
-        return self.surface.gather.sum_owned(self.surface.current.point_map.nodal_forces(-gradient)).reshape(-1)
+        return self.surface.sum_at_nodes(self.surface.current.point_map.nodal_forces(-gradient))
 
     def contact_forces(self) -> Values | None:
         """(owned dofs,) contact forces at the end of the step, N; None: nothing is near (collective)."""
@@ -279,19 +147,26 @@ class SurfaceContact(Term):
         if self.is_far():
             return None
         x, surface = self.end_positions(), self.surface.current
-        limit = SURFACE.exact_tangent if self._attempts <= 1 else SURFACE.later_exact_tangent
-        last, self._tangent_positions = self._tangent_positions, x
-        is_near = last is not None and max_length(x - last) < limit * self.surface.law.distance
-        exact = is_near and self.allows_exact_tangent
+        exact = self._is_near_last_tangent() and self.allows_exact_tangent
         H = surface.pairs.hessian(x, exact=exact)
         if self.friction is not None:
             H = H + self.friction.hessian(x, exact=exact)
         H = csr_matrix(self.level.contact_weights.factor * H)
         if not self.comm.allreduce(H.nnz):
             return None
-        part, nodes = surface.point_map.nodal_stiffness(H), self.surface.node_numbers
+        part, nodes = surface.point_map.nodal_stiffness(H), surface.columns
         coupling = sum_few_nodes(self._domain, part, nodes, SURFACE.max_coupled_nodes) if self.level.dt else None
         return self._coupling(part, nodes) if coupling is None else coupling
+
+    def _is_near_last_tangent(self) -> bool:
+        """Whether no point has moved by more than a limit since the last tangent (collective)."""
+        u, last = self.end_displacement, self._tangent_displacement
+        self._tangent_displacement = u.copy()
+        if last is None:
+            return False
+        moved = max_length(self.surface.current.point_map.weights @ self.surface.nodal_values(u - last))
+        limit = SURFACE.exact_tangent if self._attempts <= 1 else SURFACE.later_exact_tangent
+        return max_over_ranks(self.comm, moved) < limit * self.surface.law.distance
 
     def min_gap(self) -> float:
         """Least distance within the barrier at the current u, m; infinite where none is active (collective)."""
@@ -334,7 +209,7 @@ class SurfaceContact(Term):
 
     def begin_solve(self) -> None:
         """Count an attempt of Newton's method; after a failure tangents become exact later."""
-        self._tangent_positions, self._attempts = None, self._attempts + 1
+        self._tangent_displacement, self._attempts = None, self._attempts + 1
 
     def clear_search(self) -> None:
         """Discard the candidates of collision detection (not collective)."""
@@ -358,7 +233,7 @@ class SelfContact(SurfaceContact):
 
     def __init__(self, domain: Domain, u: fem.Function, law: SelfContactLaw) -> None:
         """Raise InputError where the surface at rest intersects itself (collective)."""
-        super().__init__(domain, u, law, partial(SelfContactSurface, comm=domain.comm))
+        super().__init__(domain, u, BarrierBodySurface(domain, u, law))
         self.parts = (self.surface,)
 
     @property
@@ -371,11 +246,19 @@ class SelfContact(SurfaceContact):
         self.level, self._is_stale, self.friction, self._attempts = level, True, None, 0
         if not level.dt:
             return
-        nodal, surface = self.surface.nodal_values(level.u_n), self.surface.current
         self.sticking_slip = self._sticking_slip(level)
-        self._extend_faces(level.u_n, nodal)
-        self.start_positions = x = surface.point_map(nodal)
+        self.surface.start_displacement = level.u_n.copy()
+        self._extend_faces(level.u_n)
+        self.start_positions = x = self.surface.positions(level.u_n)
+        self._exchange_count = self.surface.exchange_count
         if self.surface.law.friction:
+            self.friction = self.pairs.lag_friction(x, x, self.sticking_slip)
+
+    def _renumber_start(self) -> None:
+        if self.start_positions is None:
+            return
+        self.start_positions = x = self.surface.current.point_map(self.surface.nodal_values(self.level.u_n))
+        if self.friction is not None:
             self.friction = self.pairs.lag_friction(x, x, self.sticking_slip)
 
     def _sticking_slip(self, level: TimeLevel) -> float:
@@ -393,9 +276,12 @@ class SelfContact(SurfaceContact):
 
         Also returns (k,) flags of pairs of which one is excluded: a crack face without room.
         """
-        surface, nodal = self.surface.current, self.surface.nodal_values(self._u.x.array[: self._owned])
-        pairs, without_room = surface.find_intersections(nodal)
-        return surface.point_map(nodal)[surface.elements[pairs]].mean(axis=(1, 2)), without_room
+        x, surface = self.surface.positions(self._u.x.array[: self._owned]), self.surface.current
+        pairs, without_room = surface.find_intersections(x)
+        parts = allgather(self.comm, (x[surface.elements[pairs]].mean(axis=(1, 2)), without_room))
+        midpoints, flags = (np.concatenate(values) for values in zip(*parts, strict=True))
+        order = np.lexsort(midpoints.T[::-1])
+        return midpoints[order], flags[order]
 
     def patch(self, nodes: Ints) -> SelfContactPatch:
         """Contact of nodes (k,), by their ascending global numbers, that move from the current u (collective)."""
@@ -405,22 +291,25 @@ class SelfContact(SurfaceContact):
 
     def max_step_fraction(self, change: Values) -> float:
         """Fraction of a change of u (owned dofs,), m, without a collision (collective)."""
-        return self._free_fraction(self.end_positions(), np.divide(change, self.level.fraction))
+        return self._free_fraction(self.end_displacement, np.divide(change, self.level.fraction))
 
-    def _free_fraction(self, x: Values, motion: Values) -> float:
-        """Fraction of a motion (owned dofs,) from positions x (n, d), m, without a collision (collective)."""
-        surface, nodal = self.surface.current, self.surface.nodal_values(motion)
-        return self.pairs.free_fraction(x, x + surface.point_map.weights @ nodal)
+    def _free_fraction(self, u: Values, motion: Values) -> float:
+        """Fraction of a motion from displacements u, (owned dofs,), m, without a collision (collective)."""
+        self.surface.refresh(u, u + motion)
+        x = self.surface.current.point_map(self.surface.nodal_values(u))
+        return self.pairs.free_fraction(
+            x, x + self.surface.current.point_map.weights @ self.surface.nodal_values(motion)
+        )
 
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) first guess of u, m, as far on its way from the start as there is no collision (collective).
 
         Where edges broke within the step, new crack faces have room at the last solution, but maybe not at the start.
         """
-        level, start = self.level, self.start_positions
-        if not level.dt or start is None or self._fits(level.displacement_at_end(u)):
+        level = self.level
+        if not level.dt or self.start_positions is None or self._fits(level.displacement_at_end(u)):
             return u
-        fraction = self._free_fraction(start, level.displacement_at_end(u) - level.u_n)
+        fraction = self._free_fraction(level.u_n, level.displacement_at_end(u) - level.u_n)
         return u if fraction == 1 else np.asarray(level.u_n + fraction * (u - level.u_n))
 
     def _fits(self, u: Values) -> bool:

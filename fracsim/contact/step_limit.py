@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from ..mesh.parallel import max_over_ranks, sum_over_ranks
 from .clearance import ProximityCandidates
 from .closest_point import FacetClosestPoints, find_closest_points
 from .contact_surface import ContactSurface
@@ -26,7 +27,7 @@ from .pose import Pose, PosedShape, rotate_vectors
 from .shape_base import lengths
 
 if TYPE_CHECKING:
-    from ..mesh.split_surface.surface_map import SurfaceMap
+    from .barrier_surface import BarrierBodySurface
     from .mesh_obstacles import AllMeshPairs, MeshObstaclePairs
 
 Values = npt.NDArray[np.float64]
@@ -351,43 +352,49 @@ def _corrections(area: Values, motions: Sequence[ObstacleMotion], x: Values, mot
 
 
 def stop_before_meshes(
-    point_map: SurfaceMap, pairs: AllMeshPairs, start: Values, end: Values, start_poses: Sequence[Pose]
+    surface: BarrierBodySurface, pairs: AllMeshPairs, start: Values, end: Values, start_poses: Sequence[Pose]
 ) -> Values:
     """First guess with points stopped where they would cross a triangle mesh; the same array where none would.
 
+    Collective.
+
     Args:
-        point_map: map from nodes to the points of the body's surface.
+        surface: surface of the body.
         pairs: of obstacles, which are at the end of their motion.
-        start: (nodes, 3) displacements at the start, m.
-        end: (nodes, 3) first guess of displacements at the end, m.
+        start: (owned dofs,) displacements at the start, m.
+        end: (owned dofs,) first guess of displacements at the end, m.
         start_poses: of the obstacles at the start.
     """
-    x, weights = point_map(start), abs(point_map.weights).T
+    x, local = surface.positions(start), surface.current
+    weights = abs(local.point_map.weights).T
     for _ in range(LIMITS.mesh_rounds):
-        x_end = point_map(end)
+        x_end = surface.positions(end)
         if pairs.moving_free_fraction(x, x_end, start_poses) == 1:
             return end
         items = zip(pairs.pairs, start_poses, strict=True)
         correction = np.sum([_mesh_corrections(*item, x, x_end) for item in items], axis=0)
-        if not correction.any():
+        correction[~local.own_points] = 0.0
+        is_stopped = correction.any(axis=1)
+        if not sum_over_ranks(local.comm, is_stopped.sum())[0]:
             return end
         # of each node the mean over its points that are stopped
-        weight = (weights @ correction.any(axis=1).astype(float))[:, None]
-        counts = weight > LIMITS.min_weight
-        end = end + np.where(counts, (weights @ correction) / np.where(counts, weight, 1.0), 0.0)
+        weight = surface.sum_at_nodes(weights @ np.repeat(is_stopped[:, None].astype(float), x.shape[1], axis=1))
+        counts, change = weight > LIMITS.min_weight, surface.sum_at_nodes(weights @ correction)
+        end = end + np.where(counts, change / np.where(counts, weight, 1.0), 0.0)
     return end
 
 
 def _mesh_corrections(pairs: MeshObstaclePairs, start_pose: Pose, x: Values, end: Values) -> Values:
-    """(n, 3) differences of safe motions of points and their motions from x to `end`, m.
+    """(n, 3) differences of safe motions of points and their motions from x to `end`, m (collective).
 
     In the frame of the obstacle a point stops where it comes as near to it as a tenth of its distance; piece by piece,
     each point by itself.
     """
     # motion relative to the obstacle
-    motion = end - pairs.mesh.pose.points_to_space(start_pose.to_body(x))
-    edge = pairs.contact.mean_edge_length
-    count = min(max(1, int(np.ceil(lengths(motion).max(initial=0.0) / edge))), LIMITS.max_pieces)
+    motion, comm = end - pairs.mesh.pose.points_to_space(start_pose.to_body(x)), pairs.contact.comm
+    edge = pairs.contact.edge
+    largest = max_over_ranks(comm, float(lengths(motion).max(initial=0.0)))
+    count = min(max(1, int(np.ceil(largest / edge))), LIMITS.max_pieces)
     # safe and unlimited positions, before the obstacle at its end
     safe_x, free_x = end - motion, end - motion
     is_moving = np.ones(len(x), bool)
@@ -395,7 +402,7 @@ def _mesh_corrections(pairs: MeshObstaclePairs, start_pose: Pose, x: Values, end
     for piece in range(count):
         step = end - motion * (1 - (piece + 1) / count) - free_x
         length = lengths(step)
-        reach = LIMITS.search_margin * float(length.max(initial=0.0)) / open_ratio
+        reach = LIMITS.search_margin * max_over_ranks(comm, float(length.max(initial=0.0))) / open_ratio
         is_moving &= length <= open_ratio * pairs.safe_distances(safe_x, min(reach, LIMITS.max_search_edges * edge))
         safe_x = safe_x + np.where(is_moving[:, None], step, 0.0)
         free_x = free_x + step

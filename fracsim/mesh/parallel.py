@@ -409,25 +409,6 @@ class Gather:
             self.comm.Scatterv(_received(values[self._order], self._counts), _sent(result))
         return result
 
-    def to_all_ranks(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """(N, ...) rows of all ranks in input order, on every rank (collective); `values` (n, ...) as for a call."""
-        result = self(values)
-        if self.comm.size == 1:
-            assert result is not None
-            return result
-        kind = self.comm.bcast(None if result is None else (result.dtype.str, result.shape))
-        rows = np.empty(kind[1], kind[0]) if result is None else result
-        self.comm.Bcast(_sent(rows))
-        return rows
-
-    def sum_owned(self, parts: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
-        """(n, ...) sums over the ranks of their `parts` (N, ...) in input order, in the owned rows (collective)."""
-        return self.owned(sum_over_ranks(self.comm, parts))
-
-    def owned(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """(n, ...) owned rows of values (N, ...) in input order."""
-        return np.asarray(values[self._owned])
-
 
 class GatherSubset(Gather):
     """Gathers a subset of the owned rows; the other rows are 0 when scattered."""
@@ -444,10 +425,6 @@ class GatherSubset(Gather):
     def scatter(self, values: npt.NDArray[Any] | None) -> npt.NDArray[Any]:
         """(n, ...) rows of the owned entities, 0 outside the subset, of `values` (N, ...) on rank 0."""
         return self._spread(super().scatter(values))
-
-    def owned(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
-        """(n, ...) rows of owned entities, 0 outside the subset, of values (N, ...) of the subset."""
-        return self._spread(super().owned(values))
 
     def _spread(self, rows: npt.NDArray[Any]) -> npt.NDArray[Any]:
         """(entities, ...) rows of the subset among zeros."""

@@ -239,7 +239,7 @@ def _build_mesh_obstacle_term(
     Raises InputError if one overlaps the body at the start, or without ipctk.
     """
     try:
-        from ..contact import ipc_surface
+        from ..contact import retractable_surface
         from ..contact.mesh_obstacle_term import MeshObstacleTerm
     except ImportError:
         raise InputError(
@@ -247,7 +247,7 @@ def _build_mesh_obstacle_term(
         ) from None
     contact, material = _contact(study), stress.material
     stiffness = contact.stiffness or DEFAULTS.self_stiffness * _max_young(domain, material)
-    law = ipc_surface.SelfContactLaw(
+    law = retractable_surface.SelfContactLaw(
         _obstacle_law(contact, domain, material).barrier.width, stiffness, 0.0, obstacle_law.sticking_speed,
         obstacle_law.sticking_ratio, corners_only=_uses_corners_only(study),
     )  # fmt: skip
@@ -306,10 +306,10 @@ def _build_self_contact(
     study: Study, domain: Domain, material: MaterialFields, distance_ratio: float, make: Callable[[Any], Any]
 ) -> Term:
     """Return the term that `make` returns for a law; `distance_ratio`: default of the distance, in mean edges."""
-    from ..contact import ipc_surface
+    from ..contact import retractable_surface
 
     contact = _contact(study)
-    law = ipc_surface.SelfContactLaw(
+    law = retractable_surface.SelfContactLaw(
         contact.distance or distance_ratio * domain.mean_edge_length,
         contact.stiffness or DEFAULTS.self_stiffness * _max_young(domain, material),
         contact.friction,

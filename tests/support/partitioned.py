@@ -9,8 +9,8 @@ import numpy.typing as npt
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
+from fracsim.contact.element_exchange import ElementRows, ElementSet, PointRows, exchange_elements
 from fracsim.contact.penalty_contact import PenaltyContact
-from fracsim.contact.penalty_surface import ElementRows, ElementSet, PointRows, exchange_elements
 from fracsim.mesh.split_surface.closed_surface import row_keys
 from support.scenes import break_across, make_scene, march
 

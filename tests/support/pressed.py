@@ -71,15 +71,15 @@ def main(path: str) -> None:
             value = make_patch(scene, nodes).evaluate(np.zeros((len(nodes), u.shape[1])))
             forces = np.zeros_like(u)
             forces[own] = value.forces[np.isin(nodes, own + first)]
-            arrays[f"{name} forces"] = gather.to_all_ranks(forces)
+            arrays[f"{name} forces"] = gather(forces)
             u[own] += 0.05 * contact.surface.law.distance * np.cos(np.arange(u.shape[1]))
             scene.balance.set_displacement(u.reshape(-1))
             scene.balance.update_forces()
             few = nonlinear_elimination.create_elimination(scene.balance, policy)
             assert few is not None and few.relax_nodes(0.0)
             at_rest = scene.balance.u.x.array[: u.size].reshape(u.shape)
-            arrays[f"{name} at rest"] = gather.to_all_ranks(at_rest)
-            arrays[f"{name} moved"] = gather.to_all_ranks(1.0 * (np.abs(at_rest - u) > 1e-9))
+            arrays[f"{name} at rest"] = gather(at_rest)
+            arrays[f"{name} moved"] = gather(1.0 * (np.abs(at_rest - u) > 1e-9))
     if comm.rank == 0:
         np.savez(path, **arrays)  # type: ignore[arg-type]
 

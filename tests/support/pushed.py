@@ -24,7 +24,7 @@ def main(path: str) -> None:
         gather = scene.domain.input_numbering.gather_nodes
         while state.t < 0.3 * (1 - 1e-12):
             march(scene, state, 1)
-            arrays[f"{scheme} {state.t:.3g}"] = gather.to_all_ranks(state.u.reshape(-1, 2))
+            arrays[f"{scheme} {state.t:.3g}"] = gather(state.u.reshape(-1, 2))
         X, monitor = positions(scene), IntersectionMonitor(self_contact(scene))
         for depth in (0.02, 0.3, 0.1):
             u = np.where(X[: scene.domain.node_count, :1] > 1.01, [[-0.05 - depth, 0.0]], 0.0).reshape(-1)

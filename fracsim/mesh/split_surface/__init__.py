@@ -16,5 +16,5 @@ point_matching      points that are the same before and after edges break
 polyhedron_moments  volume, centre and second moments within closed surfaces
 
 Nodes and cells are in the order of the input mesh, also where a rank has a part of it, so that the surface does not
-depend on the number of ranks. build_fragment_surface and make_surface_map need the whole mesh on one rank.
+depend on the number of ranks.
 """

@@ -20,7 +20,7 @@ from .closed_surface import SplitSurface, SurfacePoints, build_split_surface, bu
 from .cut_patterns import face_centre_weights, planar_cut_table
 from .drawn_surface import DrawnSurface
 from .entity_numbering import EntityNumbering
-from .mesh_part import MeshPart, WholeMesh
+from .mesh_part import MeshPart
 from .smooth_cuts import CUTS
 from .surface_map import SurfaceMap
 
@@ -30,33 +30,20 @@ Values = npt.NDArray[np.float64]
 Patterns = npt.NDArray[np.integer]
 
 
-def build_fragment_surface(topology: EntityNumbering, pattern: Patterns, cut: Values | None = None) -> SplitSurface:
-    """The split surface of damage patterns (C,) without crack faces within fragments and without loose nodes.
-
-    A loose node has no undamaged cell. Edges between fragments, and to loose nodes, are open. `cut`: (E,) as in
-    build_split_surface, at least `CUTS.min_distance` from the ends.
-    """
-    apart, loose, _ = find_open_edges(WholeMesh(topology), pattern)
-    return build_surface_of_open_edges(topology, apart, loose, cut)
-
-
 def build_surface_of_open_edges(
     topology: EntityNumbering, apart: Flags, loose: Flags, cut: Values | None = None
 ) -> SplitSurface:
-    """The split surface of open edges (E,) without loose nodes (N,); `cut` as in build_fragment_surface."""
+    """The split surface of open edges (E,), without crack faces within fragments and without loose nodes (N,).
+
+    A loose node has no undamaged cell. `cut`: (E,) as in build_split_surface; it is kept `CUTS.min_distance` from the
+    ends of edges.
+    """
     cut = None if cut is None else np.clip(cut, CUTS.min_distance, 1 - CUTS.min_distance)
     surface = build_split_surface(topology, patterns_with_broken(topology, apart), cut, planar_cut_table)
     # all corners of an element follow nodes of the same side
     selected = ~loose[surface.parents.first_parent[surface.elements[:, 0]]]
     fields = {name: getattr(surface, name)[selected] for name in ("elements", "cell", "edge", "origin")}
     return replace(surface, **fields)
-
-
-def has_same_fragments(topology: EntityNumbering, pattern: Patterns, before: Patterns) -> bool:
-    """Whether the surface of fragments is the same for two damage patterns (C,), and moves alike with the nodes."""
-    part = WholeMesh(topology)
-    edges, before_edges = (find_open_edges(part, of_time)[:2] for of_time in (pattern, before))
-    return moves_alike(topology, (pattern, *edges), (before, *before_edges))
 
 
 def moves_alike(

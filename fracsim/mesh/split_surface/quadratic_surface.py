@@ -14,7 +14,6 @@ import numpy.typing as npt
 from ...meshes.data import MeshData
 from ...meshes.topology import orient_cells
 from ..domain import Domain
-from ..midside_nodes import with_midside_nodes
 from ..simplices import local_edges
 from .closed_surface import SplitSurface, boundary_corners
 from .entity_numbering import CRACK, EntityNumbering
@@ -74,18 +73,6 @@ def _midside_nodes(domain: Domain, cell: Ints, low: Ints, high: Ints) -> Ints:
     return np.asarray(
         np.take_along_axis(domain.cell_midside_nodes.of_edges[cell], same.argmax(axis=-1), axis=1), np.int64
     )
-
-
-def subdivided_input_mesh(domain: Domain) -> MeshData | None:
-    """The input mesh on rank 0, None elsewhere; for quadratic displacement its cells are divided, without groups.
-
-    Collective. Its points are numbered by `Domain.input_numbering.nodes`.
-    """
-    if domain.midside_nodes is None or domain.input_mesh is None:
-        return domain.input_mesh
-    whole = with_midside_nodes(domain.input_mesh, domain.midside_nodes)
-    cells = _subdivide(_node_table(*np.split(whole.cells, [domain.dim + 1], axis=1)))
-    return MeshData(whole.points, orient_cells(whole.points, cells)[0])
 
 
 def subdivided_local_mesh(domain: Domain) -> MeshData:

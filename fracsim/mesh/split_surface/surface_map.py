@@ -15,9 +15,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix, diags, kron
 
-from ..simplices import is_split
-from .closed_surface import SplitSurface, SurfacePoints
-from .entity_numbering import EntityNumbering
 from .surface_motion import PointParents
 
 Ints = npt.NDArray[np.int64]
@@ -74,6 +71,11 @@ class SurfaceMap:
         middle = self._middle[points] + self._mean[points] @ u
         return np.asarray(middle + share[:, None] * (self._out[points] + self._arms[points] @ u))
 
+    def arm_ends(self, u: Values) -> list[Values]:
+        """(n, d) positions x without arms and with full arms; u (nodes, d), m."""
+        middle = self._middle + self._mean @ u
+        return [middle, middle + self._out + self._arms @ u]
+
     # --- from points to nodes ---
 
     def nodal_forces(self, forces: Values) -> Values:
@@ -115,30 +117,6 @@ def mean_parent_positions(points: Values, follow: PointParents) -> Values:
     start = follow.start
     result: Values = points - np.add.reduceat(follow.arm, start[:-1], axis=0) / np.diff(start)[:, None]
     return result
-
-
-def make_surface_map(
-    surface: SplitSurface | SurfacePoints, topology: EntityNumbering, pattern: npt.NDArray[np.integer], places: Values
-) -> SurfaceMap:
-    """The map of points at reference positions `places` (n, d), m, on a rank that holds the whole mesh."""
-    d, count, follow = topology.dim, len(places), surface.parents
-    parents = np.diff(follow.start)
-    rows = np.repeat(np.arange(count), parents)
-    share, arm = np.repeat(1.0 / parents, parents), places[rows] - topology.points[follow.parents]
-    mean = csr_matrix((share, (rows, follow.parents)), shape=(count, follow.nodes))
-    armed = np.zeros(follow.nodes, bool)
-    armed[follow.parents[np.any(arm != 0, axis=1)]] = True
-    corners = topology.cells[~is_split(d)[pattern] & armed[topology.cells].any(axis=1)]
-    X = topology.points[corners]
-    volume = np.abs(np.linalg.det(X[:, 1:] - X[:, :1]))
-    around = np.bincount(corners.reshape(-1), np.repeat(volume, d + 1), minlength=follow.nodes)
-    matrix_rows, matrix_columns, values = gradient_entries(X, volume[:, None] / around[corners], corners)
-    gradients = csr_matrix((values, (matrix_rows, matrix_columns)), shape=(d * follow.nodes, follow.nodes))
-    of_arm = (d * follow.parents[:, None] + np.arange(d)).reshape(-1)
-    arms = csr_matrix(((share[:, None] * arm).reshape(-1), (np.repeat(rows, d), of_arm)),
-                      shape=(count, d * follow.nodes))  # fmt: skip
-    middle = np.asarray(mean @ topology.points)
-    return SurfaceMap(mean, middle, (arms @ gradients).tocsr(), places - middle)
 
 
 def gradient_entries(X: Values, share: Values, number: Ints) -> tuple[Ints, Ints, Values]:

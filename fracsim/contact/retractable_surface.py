@@ -1,12 +1,13 @@
-"""Surface of a body for contact with itself, with crack faces retracted where there is no room.
-
-Each rank holds the whole surface and decides alike; the pairs are shared (ipc_pairs.PairShare).
+"""Elements of a surface in contact, whose crack faces are retracted where there is no room for them.
 
 The two sides of a new crack coincide. They are offset by a gap of twice the distance of the barrier, so that no
 barrier acts as an edge breaks; with the default distance there is room for a strain of about 1 %. Where that is not
 enough, in a compressed body or for a single-node fragment without a deformation gradient, faces are retracted towards
-their nodes until no barrier acts more strongly than before: contact gains no energy. Faces without room even so are
+their nodes until no contact acts more strongly than before: contact gains no energy. Faces without room even so are
 excluded. In later steps faces are extended and included again where nothing acts on them.
+
+A rank has the elements of its own cells and others near them. Ranks decide alike where crack faces have no room:
+pressures are summed, and arms are the shortest of all ranks.
 
 Equations: docs/theory.md#new-crack-faces.
 """
@@ -17,41 +18,24 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, repeat
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
 from ..errors import InputError
-from ..mesh.ghost_exchange import KeyLookup
-from ..mesh.parallel import allgather
-from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
-from ..mesh.split_surface.drawn_surface import DrawnSurface
-from ..mesh.split_surface.entity_numbering import CRACK, EntityNumbering
-from ..mesh.split_surface.fragment_surface import (
-    PlanarPoints,
-    build_fragment_surface,
-    has_same_fragments,
-    project_onto_fragments,
-)
-from ..mesh.split_surface.point_matching import match_points, point_identity
-from ..mesh.split_surface.surface_map import SurfaceMap, make_surface_map
+from ..mesh.ghost_exchange import KeyedReduction, KeyLookup
+from ..mesh.split_surface.closed_surface import SplitSurface
+from ..mesh.split_surface.entity_numbering import CRACK
 from ..meshes.data import format_point
-from .ipc_pairs import IpcPairs, PairShare
+from .element_exchange import ElementSet, own_points
 from .pair_search import PairFilter, intersecting_pairs
-
-if TYPE_CHECKING:
-    from .mesh_obstacles import AllMeshPairs
+from .sample_points import vertex_areas
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
-
-# pairs of a body with itself, or with several obstacles
-type SurfacePairs = IpcPairs | AllMeshPairs
-# factors of arms, excluded elements, steps between two releases of faces and steps to the next
-SurfaceSnapshot = tuple[Values, Ints, tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -91,6 +75,8 @@ class SurfacePolicy:
 
 SURFACE = SurfacePolicy()
 NO_ELEMENTS: Ints = np.empty(0, np.int64)
+# factors of arms, excluded elements, steps between two releases of faces and steps to the next
+type SurfaceSnapshot = tuple[Values, Ints, tuple[int, int]]
 
 
 @dataclass(frozen=True)
@@ -121,72 +107,110 @@ class SelfContactLaw:
 
 
 class RetractableSurface:
-    """Elements in contact, of which crack faces are retracted where there is no room for them.
-
-    A surface that ranks share overrides what needs them: `pressures`, `_intersecting_faces` and the agreements.
+    """Elements of this rank and of others near them; a subclass has their contacts.
 
     Attributes:
+        comm: ranks.
+        law: contact law.
+        element_set: points and elements.
         elements: (m, d) points of the elements.
-        point_map: map from nodes to points, with new faces retracted.
-        pairs: pairs that may be in contact.
+        columns: global numbers of the nodes that the points follow.
+        point_map: map from these nodes to points, with new faces retracted.
+        rest_positions: (n, d) reference positions of the points with full arms, m.
+        own_points: (n,) flags of points of which this rank is the lowest one that has an element there.
         closed_pressure: pressure, in stiffnesses, of faces without room.
     """
 
-    closed_pressure: ClassVar[float] = SURFACE.closed_pressure
-    pairs: SurfacePairs
+    closed_pressure: ClassVar[float]
 
-    def __init__(self, elements: Ints, point_map: SurfaceMap, stiffness: float) -> None:
-        """`stiffness`: of the law, Pa."""
-        self.elements, self.point_map, self._stiffness = elements, point_map, stiffness
-        is_copy = np.zeros(len(point_map.share), bool)
-        is_copy[point_map.copies] = True
-        self._crack_faces = np.flatnonzero(is_copy[elements].any(axis=1))
+    def __init__(self, comm: MPI.Intracomm, element_set: ElementSet, law: SelfContactLaw) -> None:
+        self.comm, self.law, self.element_set, faces = comm, law, element_set, element_set.elements
+        self.columns, self.point_map = element_set.point_map()
+        self.elements, self.rest_positions = faces.corners, element_set.points.middle + element_set.points.out
+        self.own_points = own_points(faces.rank, faces.corners, len(self.rest_positions), comm.rank)
+        is_copy = np.zeros(len(self.rest_positions), bool)
+        is_copy[self.point_map.copies] = True
+        self._crack_faces = np.flatnonzero(is_copy[self.elements].any(axis=1))
         self._excluded = NO_ELEMENTS
         self._release_interval = (1, 1)  # steps between two attempts to release faces, and to the next one
+        self._build_contacts(np.arange(len(self.elements)))
+        self._exclude(np.flatnonzero(faces.is_excluded))
 
-    def _build_pairs(self, elements: Ints) -> SurfacePairs:
-        """Pairs of elements (k, d)."""
-        raise NotImplementedError("a subclass builds pairs")
+    # --- contacts ---
+
+    def _build_contacts(self, elements: Ints) -> None:
+        """Build the contacts of elements (k,)."""
+        raise NotImplementedError("a subclass builds contacts")
+
+    def _gradients(self, x: Values) -> list[Values]:
+        """(n, d) minus the forces of this rank's contacts with itself, or with each obstacle; points at x, m; N."""
+        raise NotImplementedError("a subclass has contacts")
+
+    def cut_by_obstacles(self, x: Values) -> list[Ints]:
+        """Remaining elements (k,) that the body itself, or each obstacle, intersects with points at x (n, d), m."""
+        raise NotImplementedError("a subclass has contacts")
 
     def _exclude(self, elements: Ints) -> None:
         """Leave out these elements (k,) and no others."""
         if len(elements) or len(self._excluded):
-            self.pairs = self._build_pairs(np.delete(self.elements, elements, axis=0))
+            self._build_contacts(np.delete(np.arange(len(self.elements)), elements))
         self._excluded = elements
 
-    def _remaining(self) -> Ints:
-        """Numbers (m,) of the elements that the pairs have."""
+    def remaining(self) -> Ints:
+        """Numbers (m,) of the elements that are not excluded."""
         return np.delete(np.arange(len(self.elements)), self._excluded)
-
-    def remaining_elements(self) -> Ints:
-        """(k, d) points of the elements that the pairs have."""
-        return np.delete(self.elements, self._excluded, axis=0)
 
     def snapshot(self) -> SurfaceSnapshot:
         """Factors of arms, excluded elements, and steps to the next release of faces."""
         return self.point_map.share, self._excluded, self._release_interval
 
-    # --- what ranks agree on, if they share the surface ---
+    def set_release_interval(self, interval: tuple[int, int]) -> None:
+        """Set the steps between two attempts to release faces, and to the next one."""
+        self._release_interval = interval
+
+    def find_intersections(self, x: Values) -> tuple[Ints, Flags]:
+        """(k, 2) elements that intersect, of which this rank has the first, with points at x (n, d), m.
+
+        Excluded elements count too. Also returns (k,) flags of pairs of which one is excluded.
+        """
+        pairs = intersecting_pairs(self.elements, PairFilter.of(len(x)), x)
+        pairs = pairs[self.element_set.elements.rank[pairs.min(axis=1, initial=len(self.elements))] == self.comm.rank]
+        return pairs, np.asarray(np.isin(pairs, self._excluded).any(axis=1))
+
+    # --- what ranks agree on ---
+
+    @cached_property
+    def over_points(self) -> KeyedReduction:
+        """Sums, minima and the like of values at points over all ranks that have the point."""
+        return KeyedReduction(self.comm, self.element_set.points.keys)
+
+    @cached_property
+    def _over_elements(self) -> KeyedReduction:
+        return KeyedReduction(self.comm, self.element_set.element_keys)
+
+    def sum_at_points(self, vectors: Values) -> Values:
+        """(n, d) sums of vectors at the points over all ranks (collective)."""
+        return self.over_points(vectors, np.add)
 
     def pressures(self, u: Values) -> Values:
-        """(n,) pressure on each point at displacements u (nodes, d), m; Pa (collective)."""
-        return self.pairs.pressure(self.point_map(u))
+        """(n,) pressure on each point at displacements u (columns, d), m; Pa (collective)."""
+        x, result, remaining = self.point_map(u), np.zeros(len(self.rest_positions)), self.remaining()
+        of_rank = remaining[self.element_set.elements.rank[remaining] == self.comm.rank]
+        area = self.over_points(vertex_areas(self.rest_positions, self.elements[of_rank]), np.add)
+        for gradient in self._gradients(x):
+            force = np.linalg.norm(self.sum_at_points(gradient), axis=1)
+            result += np.divide(force, area, out=np.zeros_like(area), where=area > 0)
+        return result
 
     def _intersecting_faces(self, u: Values) -> Ints:
-        """Crack faces that intersect at displacements u (nodes, d), m (collective)."""
-        return np.intersect1d(self._crack_faces, self._remaining()[self.pairs.intersections(self.point_map(u))])
-
-    def _common_share(self, share: Values) -> Values:
-        """(n,) least factor of the arm of each point on all ranks (collective)."""
-        return share
-
-    def _common_flags(self, flags: Flags) -> Flags:
-        """(n,) flags of points that are set on all ranks that have the point (collective)."""
-        return flags
+        """Crack faces that intersect at displacements u (columns, d), m (collective)."""
+        is_cut, cut = np.zeros(len(self.elements), bool), np.concatenate(self.cut_by_obstacles(self.point_map(u)))
+        is_cut[self.remaining()[cut]] = True
+        return np.intersect1d(self._crack_faces, np.flatnonzero(self._over_elements(is_cut, np.logical_or)))
 
     def _on_any_rank(self, flag: bool) -> bool:
         """Whether a flag is set on any rank (collective)."""
-        return flag
+        return bool(flag) if self.comm.size == 1 else bool(self.comm.allreduce(bool(flag), op=MPI.LOR))
 
     # --- retraction and release of crack faces ---
 
@@ -203,16 +227,25 @@ class RetractableSurface:
         """Shorten the arms of crack faces by a factor; whether any arm has changed."""
         share, points = self.point_map.share.copy(), np.unique(self.elements[faces])
         share[points] = np.maximum(factor * share[points], np.minimum(SURFACE.min_arm, share[points]))
-        share = self._common_share(share)
+        share = self.over_points(share, np.minimum)
         changed = self._on_any_rank(not np.array_equal(share, self.point_map.share))
         if changed:
             self.point_map = self.point_map.with_arm_share(share)
         return changed
 
+    def retract_faces(self, u: Values, keys: Ints, load: Values) -> None:
+        """Retract crack faces under pressure at displacements u (columns, d), m (collective).
+
+        `load`: (k,) pressures, Pa, of points with `keys` that may stay.
+        """
+        loads: Values = np.zeros(len(self.rest_positions))
+        loads[KeyLookup(self.element_set.points.keys)(keys)] = load
+        self._retract_faces(u, self.over_points(loads, np.maximum))
+
     def _retract_faces(self, u: Values, load: Values) -> None:
         """Retract faces with a pressure above `load` (n,), Pa, and exclude those without room even so.
 
-        The pairs are those of all elements.
+        No element is excluded.
         """
         start = self.point_map.share
         for factor in chain(repeat(SURFACE.factor, SURFACE.gentle_rounds), repeat(SURFACE.min_arm)):
@@ -221,29 +254,29 @@ class RetractableSurface:
                 or self._shorten(u, cut := self._intersecting_faces(u), factor)
             ):
                 break
-        max_pressure = np.maximum(load, self.closed_pressure * self._stiffness)
+        max_pressure = np.maximum(load, self.closed_pressure * self.law.stiffness)
         without_room = np.union1d(self._pressed_faces(u, max_pressure), cut)
         self._exclude(without_room)
         if self._on_any_rank(len(without_room) > 0):
             # points of excluded faces alone keep their arms, so as not to come back smaller each time
             unused: Flags = np.ones(len(start), bool)
             unused[np.delete(self.elements, without_room, axis=0)] = False
-            unused = self._common_flags(unused)
+            unused = self.over_points(unused, np.logical_and)
             self.point_map = self.point_map.with_arm_share(np.where(unused, start, self.point_map.share))
 
-    def extend_faces(self, u: Values) -> None:
-        """Extend retracted faces and include excluded ones where there is room, at displacements u (nodes, d), m.
+    def extend_faces(self, u: Values) -> bool:
+        """Extend retracted faces and include excluded ones where there is room, at displacements u (columns, d), m.
 
         Not in the step after edges broke, and less often where there is no room: each attempt costs as much as two
-        iterations of Newton's method (collective).
+        iterations of Newton's method. Returns whether anything has changed (collective).
         """
         share, excluded, (pause, remaining) = self.snapshot()
         is_retracted, is_excluded = (self._on_any_rank(flag) for flag in (bool(np.any(share < 1)), len(excluded) > 0))
         if not is_retracted and not is_excluded:
-            return
+            return False
         if remaining:
             self._release_interval = pause, remaining - 1
-            return
+            return False
         load = self.pressures(u)
         if is_retracted:
             self._extend_retracted(u, load)
@@ -251,8 +284,10 @@ class RetractableSurface:
             self._exclude(NO_ELEMENTS)
             self._retract_faces(u, load)
         same = np.array_equal(share, self.point_map.share) and np.array_equal(excluded, self._excluded)
-        pause = 1 if self._on_any_rank(not same) else min(2 * pause, SURFACE.max_pause)
+        changed = self._on_any_rank(not same)
+        pause = 1 if changed else min(2 * pause, SURFACE.max_pause)
         self._release_interval = pause, pause - 1
+        return changed
 
     def _extend_retracted(self, u: Values, load: Values) -> None:
         previous = self.point_map.share
@@ -264,131 +299,9 @@ class RetractableSurface:
                 return
             share, points = self.point_map.share.copy(), np.unique(self.elements[crowded])
             share[points] = previous[points]
-            self.point_map = self.point_map.with_arm_share(self._common_share(share))
+            self.point_map = self.point_map.with_arm_share(self.over_points(share, np.minimum))
         if self._on_any_rank(len(self._crowded_faces(u, load)) > 0):
             self.point_map = self.point_map.with_arm_share(previous)
-
-
-class SelfContactSurface(RetractableSurface):
-    """Split surface and its pairs for a state of damage; every rank holds all of it.
-
-    Attributes:
-        split: the surface.
-        rest_positions: (n, d) reference positions of its points with the gap of new cracks, m.
-        face_gap: gap between the sides of a new crack, in distances of the barrier.
-    """
-
-    face_gap: ClassVar[float] = SURFACE.face_gap
-
-    def __init__(
-        self,
-        skeleton: EntityNumbering,
-        pattern: npt.NDArray[np.uint8],
-        law: SelfContactLaw,
-        u: Values,
-        previous: SelfContactSurface | None,
-        cut: Values | None = None,
-        comm: MPI.Intracomm = MPI.COMM_SELF,
-    ) -> None:
-        """Build the surface (collective).
-
-        Args:
-            skeleton: of the mesh.
-            pattern: (cells,) broken edges of each cell.
-            law: contact law.
-            u: (nodes, d) displacements, m.
-            previous: surface until now.
-            cut: (edges,) positions at which edges are cut, for contact between fragments; other edges are cut in the
-                middle, which leaves both sides most room.
-            comm: ranks that share the pairs.
-        """
-        self._skeleton, self._pattern, self._fragments_only = skeleton, pattern, law.fragments_only
-        fragments = law.fragments_only
-        split = build_fragment_surface(skeleton, pattern, cut) if fragments else build_split_surface(skeleton, pattern)
-        self.split, self.rest_positions = split, offset_crack_faces(split, self.face_gap * law.distance)
-        super().__init__(split.elements, make_surface_map(split, skeleton, pattern, self.rest_positions), law.stiffness)
-        self._share = PairShare.by_slabs(comm, self.rest_positions, self.point_map.copies)
-        self._parameters = {"distance": law.distance, "stiffness": law.stiffness, "friction": law.friction}
-        self._nodes, self._size = len(skeleton.points), float(np.linalg.norm(np.ptp(skeleton.points, axis=0)))
-        self.pairs = self._build_pairs(self.split.elements)
-        if previous is None:
-            self._check_apart()
-        else:
-            share, pressure = self._previous_state(previous, u)
-            self.point_map = self.point_map.with_arm_share(share)
-            self._retract_faces(u, pressure)
-
-    def represents(self, pattern: npt.NDArray[np.uint8]) -> bool:
-        """Whether the surface is also that of a pattern (cells,): most edges break within fragments."""
-        if same := self._fragments_only and has_same_fragments(self._skeleton, pattern, self._pattern):
-            self._pattern = pattern
-        return same
-
-    def place_faces(self, points: SurfaceMap, surface: DrawnSurface, u: Values) -> SurfaceMap:
-        """Drawn points with those between fragments where they are here, at u (nodes, d), m (collective)."""
-        return project_onto_fragments(
-            points, surface, PlanarPoints(self._rows_by_key, self.point_map.rest, self.point_map(u))
-        )
-
-    @cached_property
-    def _rows_by_key(self) -> KeyLookup:
-        assert self.split.numbering is not None
-        return KeyLookup(self.split.numbering.keys(np.arange(len(self._skeleton.points))))
-
-    def _check_apart(self) -> None:
-        """Raise InputError where a body at rest intersects or touches itself."""
-        cut_pairs = self.pairs.intersections(self.split.points)
-        refuse_intersections(self.split.points[self.split.elements[cut_pairs]].mean(axis=(1, 2)))
-
-    def find_intersections(self, u: Values) -> tuple[Ints, Flags]:
-        """(k, 2) elements that intersect, excluded ones too, at displacements u (nodes, d), m (collective).
-
-        Also returns (k,) flags of pairs of which one is excluded.
-        """
-        x, share = self.point_map(u), self._share
-        rank_pairs = intersecting_pairs(self.elements, PairFilter.of(len(x), is_owned=share.points), x)
-        pairs = np.unique(np.concatenate(allgather(share.comm, rank_pairs)), axis=0)
-        return pairs, np.asarray(np.isin(pairs, self._excluded).any(axis=1))
-
-    def _build_pairs(self, elements: Ints) -> SurfacePairs:
-        return IpcPairs(self.rest_positions, elements, **self._parameters, share=self._share, patch=None)
-
-    def set_stiffness(self, stiffness: float) -> None:
-        """Set the stiffness of the barrier, Pa."""
-        self._parameters["stiffness"] = self._stiffness = stiffness
-        self.pairs.set_stiffness(stiffness)
-
-    def restore(self, memory: SurfaceSnapshot) -> None:
-        """Restore a snapshot of this surface.
-
-        Where edges have broken since, in an earlier pass of the step, the surface is another one and stays as it is.
-        """
-        share, excluded, interval = memory
-        if len(share) != len(self.point_map.share):
-            return
-        self._release_interval = interval
-        if share is not self.point_map.share:
-            self.point_map = self.point_map.with_arm_share(share)
-        if excluded is not self._excluded:
-            self._exclude(excluded)
-
-    def _identity(self) -> Values:
-        return point_identity(self.split, self.point_map.copies, np.arange(self._nodes), self._size)
-
-    def _previous_state(self, previous: SelfContactSurface, u: Values) -> tuple[Values, Values]:
-        """(n,) factors of arms and pressures, Pa, of points on the previous surface; of new points 1 and 0."""
-        # new points have full arms and no pressure that they may keep
-        share, load = np.ones(len(self.split.points)), np.zeros(len(self.split.points))
-        pressure, old = previous.pairs.pressure(previous.point_map(u)), previous.point_map.copies
-        selected = np.flatnonzero((pressure[old] > 0) | (previous.point_map.share[old] < 1))
-        rows = match_points(previous._identity()[selected], self._identity())
-        points = self.point_map.copies[rows[rows >= 0]]
-        share[points] = previous.point_map.share[old[selected]][rows >= 0]
-        load[points] = pressure[old[selected]][rows >= 0]
-        # nodes have kept their numbers, and come before copies
-        nodes = min(old.min(initial=len(pressure)), self.point_map.copies.min(initial=len(load)))
-        load[:nodes] = pressure[:nodes]
-        return share, load
 
 
 def refuse_intersections(positions: Values) -> None:
