@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,7 +20,7 @@ import pytest
 
 from fracsim.errors import Exit
 from fracsim.study.catalogue import catalogue
-from test_page_commands import PAGES, code_lines
+from test_page_commands import PAGES, ROOT, code_lines
 
 ELSEWHERE = ("gallery", "paper-figures", "tutorials", "batch", "install")
 COMMAND = r"(?:\./env )?((?:mpirun -n \d+ )?fracsim .*|python3 -m fracsim\..*)"
@@ -63,7 +64,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], None]:
             name = word.removeprefix("out/")
             if (folder / word).exists() or f"-o {word}" in command:
                 continue
-            if word in FILES:
+            if (ROOT / word).is_file():  # readers run the command in the root folder of the repository
+                (folder / word).parent.mkdir(parents=True, exist_ok=True)
+                shutil.copy(ROOT / word, folder / word)
+            elif word in FILES:
                 execute(FILES[word])
             elif word.startswith("out/") and name in catalogue()["studies"]:
                 execute(f"fracsim run {name}")
