@@ -15,7 +15,6 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from mpi4py import MPI
 
 from ..mesh.domain import Domain
 from .contact_patch import PATCH_MOTION
@@ -39,36 +38,16 @@ class BarrierSurface(RetractableSurface):
     closed_pressure: ClassVar[float] = SURFACE.closed_pressure
     pairs: IpcPairs | AllMeshPairs
 
-    def __init__(
-        self,
-        comm: MPI.Intracomm,
-        element_set: ElementSet,
-        law: SelfContactLaw,
-        obstacles: Sequence[MeshObstacle],
-        edge: float,
-    ) -> None:
-        """Pairs of elements.
-
-        Args:
-            comm: ranks.
-            element_set: points and elements.
-            law: contact law.
-            obstacles: that the body touches; none: the body touches itself.
-            edge: mean length of edges of the mesh, m.
-        """
-        self._obstacles, self._edge = obstacles, edge
-        super().__init__(comm, element_set, law)
-
     def _build_contacts(self, elements: Ints) -> None:
         corners, X, law, edge = self.elements[elements], self.rest_positions, self.law, self._edge
         D, k, share = law.distance, law.stiffness, self._share
-        if not self._obstacles:
+        if not self._meshes:
             self.pairs = IpcPairs(X, corners, distance=D, stiffness=k, friction=law.friction, share=share, edge=edge)
         else:
             self.pairs = AllMeshPairs(
                 [
                     MeshObstaclePairs(X, corners, mesh, distance=D, stiffness=k, share=share, edge=edge)
-                    for mesh in self._obstacles
+                    for mesh in self._meshes
                 ]
             )
 

@@ -98,26 +98,6 @@ class PenaltySurface(RetractableSurface):
     closed_pressure: ClassVar[float] = 0.0  # a face that is pressed at all has no room
     parts: Sequence[PenaltyPart] = ()
 
-    def __init__(
-        self,
-        comm: MPI.Intracomm,
-        element_set: ElementSet,
-        law: SelfContactLaw,
-        meshes: Sequence[MeshObstacle],
-        edge: float,
-    ) -> None:
-        """Contacts of elements.
-
-        Args:
-            comm: ranks.
-            element_set: points and elements.
-            law: contact law.
-            meshes: obstacles; none: the body touches itself.
-            edge: mean length of edges of the mesh, m.
-        """
-        self._meshes, self._edge = meshes, edge
-        super().__init__(comm, element_set, law)
-
     def _build_contacts(self, elements: Ints) -> None:
         """Build the contacts of elements (k,), with their histories."""
         histories = [part.contact.history for part in self.parts]

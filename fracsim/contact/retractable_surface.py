@@ -14,7 +14,7 @@ Equations: docs/theory.md#new-crack-faces.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, repeat
@@ -30,6 +30,7 @@ from ..mesh.split_surface.closed_surface import SplitSurface
 from ..mesh.split_surface.entity_numbering import CRACK
 from ..meshes.data import format_point
 from .element_exchange import ElementSet, own_points
+from .mesh_obstacles import MeshObstacle
 from .pair_search import PairFilter, intersecting_pairs
 from .sample_points import vertex_areas
 
@@ -123,7 +124,24 @@ class RetractableSurface:
 
     closed_pressure: ClassVar[float]
 
-    def __init__(self, comm: MPI.Intracomm, element_set: ElementSet, law: SelfContactLaw) -> None:
+    def __init__(
+        self,
+        comm: MPI.Intracomm,
+        element_set: ElementSet,
+        law: SelfContactLaw,
+        meshes: Sequence[MeshObstacle],
+        edge: float,
+    ) -> None:
+        """Build the contacts of elements.
+
+        Args:
+            comm: ranks.
+            element_set: points and elements.
+            law: contact law.
+            meshes: obstacles; none: the body touches itself.
+            edge: mean length of edges of the mesh, m.
+        """
+        self._meshes, self._edge = meshes, edge
         self.comm, self.law, self.element_set, faces = comm, law, element_set, element_set.elements
         self.columns, self.point_map = element_set.point_map()
         self.elements, self.rest_positions = faces.corners, element_set.points.middle + element_set.points.out
