@@ -297,6 +297,21 @@ def test_a_surface_without_elements_touches_nothing(dim: int) -> None:
         assert not len(pairs.intersections(x))
 
 
+@pytest.mark.parametrize("tilt", [-0.1, 0.0, 1e-9, 0.1])
+def test_a_point_is_not_behind_the_side_of_its_body(tilt: float) -> None:
+    """At the end of a slit: the point is before the upper face, and the edge of a side facet is as near. The point lies
+    in the plane of that facet, or nearly: this tells nothing."""
+    height, D = 0.019, 0.02
+    point, above = [0.0, 0.0, 0.0], [0.0, 0.0, height]
+    x = np.array([point, above, [-1.0, 0.0, 0.0], [-1.0, tilt, 1.0], [1.0, 1.0, height], [1.0, 0.0, height]])
+    elements = np.array([[2, 0, 1], [2, 1, 3], [1, 4, 5]])  # its own facet, the side facet, the upper face
+    pairs = PenaltyPairs(x, elements, ContactStiffness.of_one_body(np.ones(len(x))), distance=D)
+    pairs.end_step(x)
+    assert 0 in pairs.history.points.points[:, 0]
+    assert pairs.min_gap(x) == pytest.approx(height, rel=1e-3)
+    assert pairs.energy(x) < 10 * 0.5 * (D - height) ** 2
+
+
 @pytest.mark.parametrize("dim", (2, 3))
 def test_forces_do_not_depend_on_the_order_of_facets(dim: int) -> None:
     """Two lattices, one over the other, with points over edges and nodes, and masses that differ from point to point:

@@ -1,8 +1,8 @@
 """Points before facets of a surface, for a penalty in explicit steps.
 
 g_p is the distance, m, of a point p to the nearest facet of those that p is in front of. A point that was near a facet
-at the end of the last step may lie behind it, or one beside it: g_p < 0. All other points behind a facet are on the far
-side of its body. Facets of which a point is a corner do not act on it.
+at the end of the last step may lie behind it, or one beside it, within 60 degrees of its normal: g_p < 0. All other
+points behind a facet are on the far side of its body. Facets of which a point is a corner do not act on it.
 
 k_p is the stiffness that the point, or a corner of its facet, may have as contact begins, and is constant during
 contact. The weights of a contact are 1 of the point and minus the barycentric coordinates on the facet.
@@ -35,6 +35,8 @@ class PointFacetPolicy:
         max_gap: largest gap, or depth, of a pair; a deeper point has passed through.
         search_margin: motion of points after which pairs are searched again.
         same_distance: difference of distances, in mean edges, of facets that share a closest point.
+        min_slope: cosine between the normal of a facet and the direction to a point behind it. A facet that is seen
+            from its side tells nothing: its plane has points of the same body in it.
         min_barycentric: coordinate of a corner below which the corner does not carry a point.
         clearance_gap: gaps that are searched where nothing is within reach.
         ahead_gap: gap of points that may be in contact a step later; below that of the faces of a new crack
@@ -45,6 +47,7 @@ class PointFacetPolicy:
     max_gap: float = 3.0
     search_margin: float = 1.0
     same_distance: float = 1e-9
+    min_slope: float = 0.5
     min_barycentric: float = 1e-3
     clearance_gap: float = 10.0
     ahead_gap: float = 1.99
@@ -182,8 +185,11 @@ class PointFacetContacts:
         """Nearest facet of each point that has one within `reach`, m, with points at x (n, d), m."""
         pairs = self._all_pairs(x)
         previous = self._facets[pairs.points]
-        # facets of the last step, or beside them, may be in front of a point that lies behind
+        # a point may be behind facets of the last step, or those beside them
         stays = (previous[:, :, None] == pairs.corners[:, None]).any(axis=(1, 2))
+        behind = np.flatnonzero((pairs.gap <= 0) & stays)
+        slope = np.einsum("kd,kd->k", pairs.normal[behind], unit_normals(x[pairs.corners[behind]]))
+        stays[behind] = abs(slope) >= POINT_FACET.min_slope
         pairs = pairs.select((pairs.gap > 0) | stays)
         depth = np.full(len(x), np.inf)
         np.minimum.at(depth, pairs.points, abs(pairs.gap))
