@@ -95,7 +95,7 @@ def test_check_tells_what_contact_costs(tmp_path: Path) -> None:
         told = {line.split()[0]: line for line in check_study(validate(data, "test.toml"))}
         assert f"acts on the points of {facets}, and of cracks" in told["acts"]
         assert "nothing is gathered" in told["acts"]
-        assert "friction 0.3; gathered and detected on one rank" in told["contact"]
+        assert "friction 0.3; each rank detects contact of its part" in told["contact"]
         assert f"its surface has {facets}" in told["its"]
 
 
