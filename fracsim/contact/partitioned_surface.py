@@ -93,7 +93,8 @@ class PartitionedSurface[S: RetractableSurface]:
         surface_count: number of surfaces until now.
         exchange_count: number of exchanges of elements until now: points have new numbers after each.
         has_retracted: whether any face on any rank is retracted or left out.
-        start_displacement: (owned dofs,) at the start of the step, which each exchange serves too, m; None: none.
+        start_displacement: (owned dofs,) at the start of the last step in which faces may have been extended, which
+            each exchange serves too, m; None: none.
     """
 
     current: S

@@ -51,7 +51,6 @@ class SurfaceContact(Term):
     allows_exact_tangent: bool = True
     level: TimeLevel
     _attempts = 0  # of Newton's method in the step
-    _start_displacement: Values | None = None  # of the last step in which faces may have been extended
     _fitted_displacement: Values | None = None  # at which crack faces have found their room within the step
 
     def __init__(self, domain: Domain, u: fem.Function, surface: BarrierBodySurface) -> None:
@@ -83,7 +82,7 @@ class SurfaceContact(Term):
 
         A step that begins where the last one did, at u_n (owned dofs,), m, is repeated.
         """
-        before, self._start_displacement = self._start_displacement, u_n.copy()
+        before, self.surface.start_displacement = self.surface.start_displacement, u_n.copy()
         if not self.comm.allreduce(before is not None and np.array_equal(before, u_n), op=MPI.LAND):
             self._fitted_displacement = None
         if self._fitted_displacement is None:
@@ -247,7 +246,6 @@ class SelfContact(SurfaceContact):
         if not level.dt:
             return
         self.sticking_slip = self._sticking_slip(level)
-        self.surface.start_displacement = level.u_n.copy()
         self._extend_faces(level.u_n)
         self.start_positions = x = self.surface.positions(level.u_n)
         self._exchange_count = self.surface.exchange_count

@@ -232,11 +232,11 @@ def run_from_file(name: str, path: Path) -> dict[str, Any]:
         return torn.run(name)
 
 
-def gathered_by_a_run(path: Path, folder: Path, surface: dict[str, Any]) -> tuple[bool, int]:
+def gathered_by_a_run(path: Path, folder: Path, surface: dict[str, Any], **more: Any) -> tuple[bool, int]:
     """Whether rank 0 has the whole mesh after a run with frames, breaks and a checkpoint; broken edges (collective)."""
     comm = MPI.COMM_WORLD
     study = make_study(**torn.RUNS["block"] | {"mesh": {"file": str(path)}, "solver": torn.TIGHT}
-                       | {"output": {"every": 2, "picture": False, **surface}})  # fmt: skip
+                       | {"output": {"every": 2, "picture": False, **surface}} | more)  # fmt: skip
     scene = build_scene(comm, study)
     run = Run(scene, folder)
     summary = run()
@@ -283,6 +283,9 @@ def main(path: str) -> None:
     surfaces = {"none": {"surface": False}, "surface": {"surface": True}, "smooth": {"surface": True, "cut": "smooth"}}
     for kind, surface in surfaces.items():
         found[f"gathered-{kind}"] = np.array(gathered_by_a_run(files["block"], folder / f"out-{kind}", surface))
+    found["gathered-contact"] = np.array(
+        gathered_by_a_run(files["block"], folder / "out-contact", {"surface": True}, contact={})
+    )
     if comm.rank == 0:
         with h5py.File(folder / "out-none" / "fields.h5") as file:
             found |= {f"fields-{name}": file[name][:] for name in ("points", "cells")}
