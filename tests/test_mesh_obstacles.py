@@ -260,7 +260,7 @@ def test_beside_contact_of_the_body_with_itself(itself: bool | str) -> None:
     for _ in each_step(scene, state):
         for name in ("solids", "contact"):
             x = terms[name].end_positions()
-            assert not any(len(cut) for cut in terms[name].surface.current.cut_by_obstacles(x))
+            assert not any(len(cut) for cut in terms[name].surface.current.cut_elements(x))
 
 
 # --- free, and turning ----------------------------------------------------------------------------------------------

@@ -40,7 +40,7 @@ class BarrierSurface(RetractableSurface):
 
     def _build_contacts(self, elements: Ints) -> None:
         corners, X, law, edge = self.elements[elements], self.rest_positions, self.law, self._edge
-        D, k, share = law.distance, law.stiffness, self._share
+        D, k, share = law.distance, law.stiffness, PairShare.of(self.comm, self.own_points)
         if not self._meshes:
             self.pairs = IpcPairs(X, corners, distance=D, stiffness=k, friction=law.friction, share=share, edge=edge)
         else:
@@ -51,16 +51,12 @@ class BarrierSurface(RetractableSurface):
                 ]
             )
 
-    @property
-    def _share(self) -> PairShare:
-        return PairShare.of(self.comm, self.own_points)
-
     def _gradients(self, x: Values) -> list[Values]:
         if isinstance(self.pairs, AllMeshPairs):
             return [pairs.body_gradient(x) for pairs in self.pairs.pairs]
         return [self.pairs.gradient(x)]
 
-    def cut_by_obstacles(self, x: Values) -> list[Ints]:
+    def cut_elements(self, x: Values) -> list[Ints]:
         """Remaining elements (k,) that the body itself, or each obstacle, intersects with points at x (n, d), m."""
         if isinstance(self.pairs, AllMeshPairs):
             return [pairs.cut_elements(x) for pairs in self.pairs.pairs]

@@ -281,7 +281,7 @@ class PartitionedSurface[S: RetractableSurface]:
             pairs, _ = surface.find_intersections(positions)
             refuse_intersections(np.concatenate(allgather(comm, positions[surface.elements[pairs]].mean(axis=(1, 2)))))
             return
-        is_cut = [max_over_ranks(comm, len(cut)) for cut in surface.cut_by_obstacles(positions)]
+        is_cut = [max_over_ranks(comm, len(cut)) for cut in surface.cut_elements(positions)]
 
         mesh = self._domain.input_mesh
 

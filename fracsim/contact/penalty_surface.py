@@ -109,7 +109,7 @@ class PenaltySurface(RetractableSurface):
         zero = np.zeros_like(x)
         return [zero if part.is_far(x) else part.contact.gradient(part.points(x))[: len(x)] for part in self.parts]
 
-    def cut_by_obstacles(self, x: Values) -> list[Ints]:
+    def cut_elements(self, x: Values) -> list[Ints]:
         """Remaining elements (k,) that the body itself, or each obstacle, intersects with points at x (n, d), m."""
         count = len(self.remaining())
         return [part.cut_elements(x, count) for part in self.parts]

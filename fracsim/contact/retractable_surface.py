@@ -164,7 +164,7 @@ class RetractableSurface:
         """(n, d) minus the forces of this rank's contacts with itself, or with each obstacle; points at x, m; N."""
         raise NotImplementedError("a subclass has contacts")
 
-    def cut_by_obstacles(self, x: Values) -> list[Ints]:
+    def cut_elements(self, x: Values) -> list[Ints]:
         """Remaining elements (k,) that the body itself, or each obstacle, intersects with points at x (n, d), m."""
         raise NotImplementedError("a subclass has contacts")
 
@@ -222,7 +222,7 @@ class RetractableSurface:
 
     def _intersecting_faces(self, u: Values) -> Ints:
         """Crack faces that intersect at displacements u (columns, d), m (collective)."""
-        is_cut, cut = np.zeros(len(self.elements), bool), np.concatenate(self.cut_by_obstacles(self.point_map(u)))
+        is_cut, cut = np.zeros(len(self.elements), bool), np.concatenate(self.cut_elements(self.point_map(u)))
         is_cut[self.remaining()[cut]] = True
         return np.intersect1d(self._crack_faces, np.flatnonzero(self._over_elements(is_cut, np.logical_or)))
 

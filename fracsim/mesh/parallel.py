@@ -370,8 +370,7 @@ class Gather:
         """`input_index`: (n,) index in the input mesh of each entity that this rank owns."""
         self.comm = comm
         self.count = len(input_index)
-        self._owned = np.ascontiguousarray(input_index)
-        parts = gather(comm, self._owned)
+        parts = gather(comm, np.ascontiguousarray(input_index))
         self._counts = [len(part) for part in parts] if parts is not None else None
         self._order = np.concatenate(parts) if parts is not None else None
 
