@@ -14,12 +14,13 @@ from mpi4py import MPI
 from ..errors import InputError
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
+from ..mesh.ghost_exchange import find_saved_keys
 from ..mesh.parallel import gather
 from ..mesh.split_surface.drawn_surface import DrawnSurface
-from ..mesh.split_surface.point_matching import match_points
 from ..mesh.split_surface.surface_map import SurfaceMap
+from ..meshes.topology import row_keys
 from .clearance import Clearance, FollowingPoints, ProximityCandidates, ShapeDistance, outline_radius
-from .contact_surface import RETRACTION, TINY, ContactSurface, ShownCells, SurfaceVersion, retract_cut_elements
+from .contact_surface import RETRACTION, TINY, ContactSurface, ShownCells, retract_cut_elements
 from .facet_contact import FACETS, ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
 from .laws import CoulombFriction, FrictionDirection, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
@@ -119,25 +120,22 @@ class SurfaceFacets:
 
     # --- new crack faces ---
 
-    def edges_broke(self, add_faces: Callable[[], Values], u: Values, posed: Sequence[PosedShape]) -> None:
+    def edges_broke(self, add_faces: Callable[[], Ints], u: Values, posed: Sequence[PosedShape]) -> None:
         """Retract new points of facets that would be cut or in contact; exclude facets for which this fails.
 
         Args:
-            add_faces: function that adds new faces to the surface, and returns the identity of its points until then.
+            add_faces: function that adds new faces to the surface, and returns the keys of the points of old ones.
             u: (owned dofs,) displacement, m.
             posed: obstacles.
         """
-        excluded = self._corner_identities(self._excluded)
-        # identified before, as their points have other numbers afterwards
-        old_identity, surface = add_faces(), self._surface
+        excluded = self._keys(self._excluded)
+        old_keys, surface = add_faces(), self._surface
         self.clear_caches()
         if not self.numbers or self._may_be_cut:
             return
-        self._excluded, copies = self._match(excluded), surface.local.point_map.copies
+        self._excluded, copies = self._find_facets(excluded), surface.local.point_map.copies
         is_new = np.zeros(len(surface.area), bool)
-        is_new[copies] = True
-        rows = match_points(old_identity, surface.local.identify_points())
-        is_new[copies[rows[rows >= 0]]] = False
+        is_new[copies] = ~np.isin(surface.local.keys[copies], old_keys)
         nodal = surface.interpolation.nodal_values(u)
         for _ in range(RETRACTION.facet_rounds):
             point_map, facets = surface.local.point_map, self.active
@@ -197,42 +195,40 @@ class SurfaceFacets:
         if len(np.setdiff1d(facets, self._excluded)):
             self._excluded = np.union1d(facets, self._excluded)
 
-    def _corner_identities(self, facets: Ints) -> Values:
-        """(k c, 2 d + 1) rows that identify the corners of facets (k,)."""
-        corners = self._all_facets.corners[facets].reshape(-1) if len(facets) else facets
-        return self._surface.local.identify_points(corners)
+    def _keys(self, facets: Ints) -> Ints:
+        """(k,) keys of facets (k,), of the keys of their corners."""
+        if not len(facets):
+            return facets
+        return row_keys(np.sort(self._surface.local.keys[self._all_facets.corners[facets]], axis=1))
 
-    def _match(self, identity: Values) -> Ints:
-        """Facets whose corners have the rows that `_corner_identities` returned."""
-        if not len(identity):
-            return np.empty(0, np.int64)
-        corners = np.sort(self._all_facets.corners, axis=1)
-        all_identities = self._surface.local.identify_points(np.arange(len(self._surface.area)))
-        matched = match_points(identity, all_identities).reshape(-1, corners.shape[1])
-        matched = np.sort(matched[(matched >= 0).all(axis=1)], axis=1)
-        _, group = np.unique(np.concatenate([matched, corners]), axis=0, return_inverse=True)
-        return np.flatnonzero(np.isin(group.reshape(-1)[len(matched) :], group.reshape(-1)[: len(matched)]))
+    def _find_facets(self, keys: Ints) -> Ints:
+        """Numbers of the facets with `keys` (k,) that this rank has."""
+        return np.flatnonzero(np.isin(self._all_keys(), keys)) if len(keys) else keys
+
+    def _all_keys(self) -> Ints:
+        return self._keys(np.arange(len(self._all_facets.corners)))
 
     # --- state ---
 
     def snapshot(self) -> object:
-        """Excluded facets, and the surface that they are of."""
-        return self._excluded, self._surface.version
+        """Excluded facets, and the keys of the points of their surface."""
+        return self._excluded, self._surface.local.keys
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective); where edges have broken since it stays as it is."""
-        excluded, version = cast("tuple[Ints, SurfaceVersion]", memory)
-        if excluded is not self._excluded and self._surface.has_version(version):
+        excluded, keys = cast("tuple[Ints, Ints]", memory)
+        if excluded is not self._excluded and self._surface.has_points(keys):
             self._excluded = excluded
 
     def to_checkpoint(self) -> dict[str, Values]:
-        """Rows that identify the corners of excluded facets, on rank 0 (collective)."""
-        gathered = gather(self._surface.comm, self._corner_identities(self._excluded))
-        return {} if gathered is None else {"cut": np.concatenate(gathered)}
+        """Keys of excluded facets, on rank 0 (collective)."""
+        gathered = gather(self._surface.comm, self._keys(self._excluded))
+        return {} if gathered is None else {"cut_facets": np.concatenate(gathered)}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set the excluded facets from the rows of a checkpoint."""
-        self._excluded = self._match(saved["cut"])
+        """Set the excluded facets from the keys of a checkpoint (collective)."""
+        rows = find_saved_keys(self._surface.comm, self._all_keys(), saved["cut_facets"])
+        self._excluded = np.sort(rows[rows >= 0])
 
     def clear_caches(self) -> None:
         """Discard facets, and candidates among them."""

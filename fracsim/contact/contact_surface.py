@@ -21,11 +21,11 @@ from mpi4py import MPI
 from scipy.sparse import bsr_matrix, csr_matrix
 
 from ..mesh.domain import Domain
-from ..mesh.parallel import allgather, gather, sum_over_ranks
+from ..mesh.ghost_exchange import KeyedReduction, KeyLookup, find_saved_keys
+from ..mesh.parallel import gather, sum_over_ranks
 from ..mesh.simplices import local_edges
 from ..mesh.split_surface.drawn_surface import DrawnSurface
 from ..mesh.split_surface.local_surface import LocalSurface, ParentMatrix
-from ..mesh.split_surface.point_matching import match_points
 from ..mesh.split_surface.surface_map import SurfaceMap, row_entries
 from .pose import PosedShape, min_distance
 
@@ -61,7 +61,6 @@ class RetractionPolicy:
 RETRACTION = RetractionPolicy()
 TINY = float(np.finfo(float).tiny)
 
-type SurfaceVersion = tuple[int, Ints]
 type GapFunction = Callable[[Values], Values]  # (n,) distances of positions (n, d) to the nearest obstacle, m
 
 
@@ -70,25 +69,24 @@ class RetractedPoints:
     """Points on crack faces near an obstacle or retracted, to be matched after edges break.
 
     Attributes:
-        identity: (k, 2 d + 1) rows that identify the points.
+        keys: (k,) of the points.
         share: (k,) factors of their arms.
         gap: (k,) m; nan: excluded.
     """
 
-    identity: Values
+    keys: Ints
     share: Values
     gap: Values
 
     @classmethod
-    def select(cls, identity: Values, share: Values, gap: Values, width: float) -> RetractedPoints:
+    def select(cls, keys: Ints, share: Values, gap: Values, width: float) -> RetractedPoints:
         """Those of all points on crack faces that are within `width`, m, of an obstacle or retracted."""
         selected = np.flatnonzero(~(gap >= width) | (share < 1))
-        return cls(identity[selected], share[selected], gap[selected])
+        return cls(keys[selected], share[selected], gap[selected])
 
-    def match(self, identity: Values, width: float) -> tuple[Values, Values]:
-        """(n,) factors that points begin with, and gaps that they must keep, m: `width` for new points."""
-        share, gap = np.ones(len(identity)), np.full(len(identity), width)
-        rows = match_points(self.identity, identity)
+    def match(self, keys: Ints, width: float) -> tuple[Values, Values]:
+        """(n,) factors that points with `keys` begin with, and gaps that they must keep, m: `width` for new points."""
+        share, gap, rows = np.ones(len(keys)), np.full(len(keys), width), KeyLookup(keys)(self.keys)
         share[rows[rows >= 0]], gap[rows[rows >= 0]] = self.share[rows >= 0], self.gap[rows >= 0]
         return share, np.where(np.isnan(gap), width, np.minimum(gap, width))
 
@@ -174,12 +172,7 @@ class ContactSurface:
 
     def sum_at_points(self, points: Ints, values: Values) -> Values:
         """(k, m) sums over all ranks of values (k, m) at points (k,) that ranks share (collective)."""
-        parts = allgather(self.comm, (self.local.identify_points(points), values))
-        _, row = np.unique(np.concatenate([identity for identity, _ in parts]), axis=0, return_inverse=True)
-        sums = np.zeros((len(row), values.shape[1]))
-        np.add.at(sums, row.reshape(-1), np.concatenate([part for _, part in parts]))
-        first = sum(len(identity) for identity, _ in parts[: self.comm.rank])
-        return np.asarray(sums[row.reshape(-1)[first : first + len(points)]])
+        return np.asarray(KeyedReduction(self.comm, self.local.keys[points])(values, np.add))
 
     @property
     def rest_positions(self) -> Values:
@@ -209,8 +202,8 @@ class ContactSurface:
 
     # --- new crack faces ---
 
-    def edges_broke(self, pattern: npt.NDArray[np.uint8], shown: Flags | None, u: Values, gaps: GapFunction) -> Values:
-        """Add new crack faces, retracted where they would lie in an obstacle; identity of the old ones (collective).
+    def edges_broke(self, pattern: npt.NDArray[np.uint8], shown: Flags | None, u: Values, gaps: GapFunction) -> Ints:
+        """Add new crack faces, retracted where they would lie in an obstacle; keys of the old ones (collective).
 
         Args:
             pattern: (cells,) broken edges of each cell.
@@ -219,22 +212,23 @@ class ContactSurface:
             gaps: gap function of points.
 
         Returns:
-            (k, 2 d + 1) rows that identify the points of crack faces until now.
+            (k,) keys of the points of crack faces until now.
         """
-        old_map, old_identity = self.local.point_map, self.local.identify_points()
+        old_map = self.local.point_map
         # nan: excluded points have no gap to keep
         gap = np.where(self.area > 0, gaps(self.positions(u)), np.nan)
         copies = old_map.copies
-        retracted = RetractedPoints.select(old_identity, old_map.share[copies], gap[copies], self._width)
+        old_keys = self.local.keys[copies]
+        retracted = RetractedPoints.select(old_keys, old_map.share[copies], gap[copies], self._width)
         self.local.update_damage(pattern, shown)
         self.interpolation.destroy()
         self.interpolation = ParentMatrix(self._domain, self.local)
         point_map, nodal = self.local.point_map, self.interpolation.nodal_values(u)
-        # points keep their identity, whatever numbers they have on the new surface
-        share, gap = retracted.match(self.local.identify_points(), self._width)
+        # points keep their keys, whatever numbers they have on the new surface
+        share, gap = retracted.match(self.local.keys[point_map.copies], self._width)
         self.local.point_map, without_room = retract_points(point_map, nodal, point_map.copies, share, gap, gaps)
         self.exclude_points(without_room)
-        return old_identity
+        return old_keys
 
     def release_points(self, u: Values, gaps: GapFunction) -> None:
         """Extend retracted points, and include excluded ones, as far as there is room (collective)."""
@@ -257,53 +251,50 @@ class ContactSurface:
 
     # --- state ---
 
-    @property
-    def version(self) -> SurfaceVersion:
-        """Number of points, and columns of their weights: another surface once edges have broken has others."""
-        return len(self.local.point_map.share), self.local.columns
-
-    def has_version(self, version: SurfaceVersion) -> bool:
-        """Whether the surface is still that of a version."""
-        count, columns = version
-        return count == len(self.local.point_map.share) and np.array_equal(columns, self.local.columns)
+    def has_points(self, keys: Ints) -> bool:
+        """Whether the surface has just the points with `keys` (n,), as it has until edges break."""
+        return keys is self.local.keys or np.array_equal(keys, self.local.keys)
 
     def snapshot(self) -> object:
-        """Factors of arms, areas, and version."""
-        return self.local.point_map.share, self.area, self.version
+        """Factors of arms, areas, and keys of the points."""
+        return self.local.point_map.share, self.area, self.local.keys
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot of this surface (not collective).
 
         Where edges have broken since, in an earlier pass of the step, the surface is another one and stays as it is.
         """
-        share, area, version = cast("tuple[Values, Values, SurfaceVersion]", memory)
+        share, area, keys = cast("tuple[Values, Values, Ints]", memory)
         if share is self.local.point_map.share and area is self.area:
             return
-        if not self.has_version(version):
+        if not self.has_points(keys):
             return
         if share is not self.local.point_map.share:
             self.set_arms(share)
         self.area = area
 
     def to_checkpoint(self) -> dict[str, Values]:
-        """Rows of points that are retracted or excluded: identity, factor, whether excluded; on rank 0 (collective)."""
-        point_map = self.local.point_map
-        excluded = self.area[point_map.copies] == 0
-        selected = np.flatnonzero((point_map.share[point_map.copies] < 1) | excluded)
-        identity = self.local.identify_points()[selected]
-        points = point_map.copies[selected]
-        rows = np.column_stack([identity, point_map.share[points], self.area[points] == 0])
-        gathered = gather(self.comm, rows)
-        return {} if gathered is None else {"drawn_in": np.concatenate(gathered)}
+        """Keys and factors of retracted points, and keys of excluded ones, on rank 0 (collective)."""
+        share, keys = self.local.point_map.share, self.local.keys
+        parts = gather(self.comm, (keys[share < 1], share[share < 1], keys[self.area == 0]))
+        if parts is None:
+            return {}
+        names = "retracted", "share", "excluded"
+        return {name: np.concatenate(rows) for name, rows in zip(names, zip(*parts, strict=True), strict=True)}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set the state from the rows of a checkpoint."""
-        rows, point_map = saved["drawn_in"], self.local.point_map
-        matched = match_points(rows[:, :-2], self.local.identify_points())
-        points, share = point_map.copies[matched[matched >= 0]], np.ones(len(point_map.share))
-        share[points] = rows[matched >= 0, -2]
+        """Set the state from the arrays of a checkpoint (collective).
+
+        Raises ValueError if it has keys of no point, or not as many factors as keys.
+        """
+        keys, saved_share = self.local.keys, saved["share"]
+        retracted, excluded = (find_saved_keys(self.comm, keys, saved[name]) for name in ("retracted", "excluded"))
+        if len(saved_share) != len(retracted):
+            raise ValueError(f"{len(saved_share)} factors of {len(retracted)} retracted points")
+        share = np.ones(len(keys))
+        share[retracted[retracted >= 0]] = saved_share[retracted >= 0]
         self.set_arms(share)
-        self.exclude_points(points[rows[matched >= 0, -1] > 0])
+        self.exclude_points(excluded[excluded >= 0])
 
     def destroy(self) -> None:
         """Destroy the objects of PETSc."""

@@ -23,7 +23,7 @@ from scipy.sparse import csr_matrix
 from ..mechanics.term_protocols import CutPositions
 from ..mesh.domain import Domain
 from ..mesh.fragments import find_components
-from ..mesh.ghost_exchange import KeyedReduction, KeyLookup, min_over_ranks, sum_at_nodes
+from ..mesh.ghost_exchange import KeyedReduction, KeyLookup, find_saved_keys, min_over_ranks, sum_at_nodes
 from ..mesh.parallel import allgather, gather, max_over_ranks, on_root, sum_over_ranks
 from ..mesh.simplices import is_split
 from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
@@ -479,19 +479,16 @@ class PartitionedSurface[S: RetractableSurface]:
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint (collective).
 
-        Raises ValueError if it names points or elements that the surface has not.
+        Raises ValueError if it has keys of no point or element, or not as many factors as keys.
         """
-        retracted, left_out, share = saved["retracted"].astype(np.int64), saved["left_out"], saved["share"]
-        rows, is_excluded = (
-            KeyLookup(self.element_set.points.keys)(retracted),
-            np.isin(self.element_set.element_keys, left_out),
-        )
-        is_known = np.append(rows >= 0, np.isin(left_out, self.element_set.element_keys))
-        self._comm.Allreduce(MPI.IN_PLACE, is_known, MPI.LOR)
-        if len(share) != len(retracted) or not is_known.all():
-            raise ValueError(f"{len(share)} retracted points, {len(retracted)} names, {np.sum(~is_known)} of no point")
-        full = np.ones(len(self.element_set.points.keys))
+        keys, element_keys, share = self.element_set.points.keys, self.element_set.element_keys, saved["share"]
+        rows = find_saved_keys(self._comm, keys, saved["retracted"])
+        excluded = find_saved_keys(self._comm, element_keys, saved["left_out"])
+        if len(share) != len(rows):
+            raise ValueError(f"{len(share)} factors of {len(rows)} retracted points")
+        full, is_excluded = np.ones(len(keys)), np.zeros(len(element_keys), bool)
         full[rows[rows >= 0]] = share[rows >= 0]
+        is_excluded[excluded[excluded >= 0]] = True
         pause, remaining = (int(number) for number in saved["pause"])
         self._restored = SurfaceState(self.surface_count, self._version, full, is_excluded, (pause, remaining))
         self.refresh(self._current_u)

@@ -30,8 +30,8 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..mesh.domain import Domain
+from ..mesh.ghost_exchange import KeyLookup, find_saved_keys
 from ..mesh.parallel import gather, max_over_ranks, sum_over_ranks
-from ..mesh.split_surface.point_matching import match_points
 from .facet_contact import ContactFacets, evaluate_facets, merge_forces
 from .laws import ObstacleLaw, Penalty, slipped, tangential
 from .node_contact import ContactForces
@@ -364,16 +364,14 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
         """Add new crack faces; springs of points that still exist stay (collective)."""
-        springs = [(spring, self.surface.local.identify_points(spring.points)) for spring in self._step_end.springs]
+        springs = [(spring, self.surface.local.keys[spring.points]) for spring in self._step_end.springs]
         super().edges_broke(pattern)
         self._step_end = replace(self._step_end, springs=[self._matched_springs(*item) for item in springs])
         self._update_stiffness()
 
-    def _matched_springs(self, spring: FrictionSprings, identity: Values) -> FrictionSprings:
-        """Springs of points with rows of `identity`, on the current surface."""
-        points = spring.points
-        if len(identity):
-            points = match_points(identity, self.surface.local.identify_points(np.arange(len(self.surface.area))))
+    def _matched_springs(self, spring: FrictionSprings, keys: Ints) -> FrictionSprings:
+        """Springs of points with `keys` (k,), on the current surface."""
+        points = KeyLookup(self.surface.local.keys)(keys) if len(keys) else spring.points
         matched = np.flatnonzero(points >= 0)
         matched = matched[np.argsort(points[matched])]
         return FrictionSprings(points[matched], spring.slip[matched], spring.stiffness[matched])
@@ -391,26 +389,33 @@ class PenaltyObstacleTerm(ObstacleTerm):
     def to_checkpoint(self) -> dict[str, Values]:
         """Arrays for a checkpoint (collective).
 
-        Rows of springs on rank 0: obstacle, rank, area, identity, stretch, stiffness; and sums of forces on each
-        rank. Ranks that share a point have a spring each.
+        Of springs on rank 0: keys of points, and rows of obstacle, rank, area, stretch, stiffness; and sums of forces
+        on each rank. Ranks that share a point have a spring each.
         """
+        springs = self._step_end.springs
         rows = [
             np.column_stack([np.full(len(spring.points), number), np.full(len(spring.points), self.comm.rank),
-                             self.surface.area[spring.points], self.surface.local.identify_points(spring.points),
-                             spring.slip, spring.stiffness])
-            for number, spring in enumerate(self._step_end.springs)
+                             self.surface.area[spring.points], spring.slip, spring.stiffness])
+            for number, spring in enumerate(springs)
         ]  # fmt: skip
-        gathered = gather(self.comm, (np.concatenate(rows), np.array(self._step_end.forces)))
+        keys = self.surface.local.keys[np.concatenate([spring.points for spring in springs])]
+        gathered = gather(self.comm, (keys, np.concatenate(rows), np.array(self._step_end.forces)))
         if gathered is None:
             return {}
-        springs, forces = zip(*gathered, strict=True)
-        return {"springs": np.concatenate(springs), "pushed": np.array(forces)}
+        all_keys, all_rows, forces = zip(*gathered, strict=True)
+        return {
+            "spring_points": np.concatenate(all_keys),
+            "springs": np.concatenate(all_rows),
+            "pushed": np.array(forces),
+        }
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set the state from the arrays of a checkpoint."""
+        """Set the state from the arrays of a checkpoint (collective)."""
         rows, forces = saved["springs"], saved["pushed"]
+        points = find_saved_keys(self.comm, self.surface.local.keys, saved["spring_points"])
         springs = [
-            self._springs_from_rows(rows[rows[:, 0] == number, 1:]) for number in range(len(self.group.obstacles))
+            self._springs_from_rows(points[of_obstacle], rows[of_obstacle, 1:])
+            for of_obstacle in (rows[:, 0] == number for number in range(len(self.group.obstacles)))
         ]
         if len(forces) == self.comm.size:
             local = forces[self.comm.rank]
@@ -419,14 +424,15 @@ class PenaltyObstacleTerm(ObstacleTerm):
             local = forces.sum(axis=0) if self.comm.rank == 0 else np.zeros_like(forces[0])
         self._step_end = StepEnd(springs, list(local))
 
-    def _springs_from_rows(self, rows: Values) -> FrictionSprings:
-        """Springs of the points of this rank, from rows of all ranks in a checkpoint.
+    def _springs_from_rows(self, matched: Ints, rows: Values) -> FrictionSprings:
+        """Springs of the points of this rank, from rows (k, 3 + d) of all ranks in a checkpoint.
+
+        `matched`: (k,) point of each row; -1: it is of another rank.
 
         Where several ranks had a spring at one point, that of this rank counts, or of the lowest one, for the area
         that this rank has now.
         """
-        rank, area, identity, slip, k = np.split(rows, [1, 2, -1 - self._domain.dim, -1], axis=1)
-        matched = match_points(identity, self.surface.local.identify_points(np.arange(len(self.surface.area))))
+        rank, area, slip, k = np.split(rows, [1, 2, -1], axis=1)
         order = np.lexsort((rank[:, 0], rank[:, 0] != self.comm.rank, matched))
         order = order[matched[order] >= 0]
         points, first = np.unique(matched[order], return_index=True)

@@ -94,6 +94,21 @@ class KeyLookup:
         return np.where(self._sorted[position] == keys, self._order[position], -1)
 
 
+def find_saved_keys(
+    comm: MPI.Comm, keys: npt.NDArray[np.int64], saved: npt.NDArray[np.number[Any]]
+) -> npt.NDArray[np.int64]:
+    """(k,) positions of saved keys (k,), equal on all ranks, among those of this rank; -1: not here (collective).
+
+    Raises ValueError if no rank has one of them.
+    """
+    positions = KeyLookup(keys)(saved.astype(np.int64))
+    is_found = positions >= 0
+    comm.Allreduce(MPI.IN_PLACE, is_found, MPI.LOR)
+    if not is_found.all():
+        raise ValueError(f"{np.count_nonzero(~is_found)} of {len(saved)} keys are of no point or element")
+    return positions
+
+
 class KeyedReduction:
     """Sums, minima and the like over the ranks of values with equal keys.
 

@@ -12,7 +12,6 @@ surface_map         linear map from nodal displacements to points, with shortene
 drawn_surface       the surface at a time, whose points contact moves before they are drawn
 local_surface       the split surface of the cells of one rank, linear in the nodes
 quadratic_surface   the split surface of quadratic cells
-point_matching      points that are the same before and after edges break
 polyhedron_moments  volume, centre and second moments within closed surfaces
 
 Nodes and cells are in the order of the input mesh, also where a rank has a part of it, so that the surface does not

@@ -87,11 +87,11 @@ class SurfacePoints:
         lost nodes is another point.
         """
         nodes, corners = number[self.parents.parents[: self.first]], number[self._topology.cells[self.cell]]
-        rows = np.full((self.first + len(corners), 2, corners.shape[1]), -1)
-        rows[: self.first, :, -1] = nodes[:, None]
-        rows[self.first :, 0] = np.sort(np.where(self.entity_nodes(), corners, -1), axis=1)
-        rows[self.first :, 1] = np.sort(np.where(self.group, corners, -1), axis=1)
-        return row_keys(rows.reshape(len(rows), -1))
+        of_entity, followed = (
+            np.sort(np.where(flags, corners, -1), axis=1) for flags in (self.entity_nodes(), self.group)
+        )
+        of_copies = row_keys(np.concatenate([of_entity, followed], axis=1))
+        return np.concatenate([node_keys(nodes, self._topology.dim), of_copies])
 
     def order_keys(self, node_numbers: Ints, cell_numbers: Ints) -> tuple[Ints, Ints]:
         """(n, 3) keys that order the points of several parts of a mesh as those of the whole mesh.
@@ -172,6 +172,13 @@ class SurfacePoints:
             cuts = self._edge_points(edges[selected].ravel()).reshape(*edges[selected].shape, self._topology.dim)
             centre[selected] = np.einsum("ne,nei->ni", weight, cuts)
         return centre
+
+
+def node_keys(numbers: Ints, dim: int) -> Ints:
+    """(n,) keys, as of SurfacePoints.keys, of points at nodes with `numbers` (n,) in the input mesh."""
+    alone = np.full((len(numbers), dim + 1), -1)
+    alone[:, -1] = numbers
+    return row_keys(np.concatenate([alone, alone], axis=1))
 
 
 @cache

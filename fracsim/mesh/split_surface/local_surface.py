@@ -24,9 +24,8 @@ from ..domain import Domain
 from ..ghost_exchange import sum_at_nodes
 from ..parallel import rank_offset
 from ..simplices import is_split
-from .closed_surface import SplitSurface, build_split_surface
+from .closed_surface import SplitSurface, build_split_surface, node_keys
 from .entity_numbering import CRACK, EntityNumbering
-from .point_matching import point_identity
 from .surface_map import SurfaceMap, gradient_entries, mean_parent_positions, row_entries
 
 Ints = npt.NDArray[np.int64]
@@ -41,6 +40,7 @@ class LocalSurface:
         point_map: map from nodal displacements to the n points.
         area: (n,) area of each point, m^2 (2D: length, m).
         columns: global numbers of the nodes in the columns of the weights of `point_map`.
+        keys: (n,) keys of the points, equal on all ranks and as edges break (SurfacePoints.keys).
     """
 
     def __init__(self, domain: Domain) -> None:
@@ -57,30 +57,24 @@ class LocalSurface:
             shown: (cells,) flags of cells that are split; all others are drawn as if whole. None: all cells are.
         """
         of_shown = pattern if shown is None else np.where(shown, pattern, np.uint8(0))
-        surface = build_split_surface(self._topology, of_shown)
+        surface, numbers = build_split_surface(self._topology, of_shown), self._domain.input_numbering.nodes
+        assert surface.numbering is not None
+        keys = surface.numbering.keys(numbers)
         if self._domain.order == 2:
             from .quadratic_surface import with_midside_points
 
             surface = with_midside_points(surface, self._domain, of_shown)
+            midside = surface.parents.first_parent[len(keys) :]
+            keys = np.append(keys, node_keys(numbers[midside], self._domain.dim))
         area = _areas(surface, self._topology)
         self._contact_points = np.flatnonzero(area > 0)
-        self.area, self._split_surface = area[self._contact_points], surface
+        self.area, self.keys, self._split_surface = area[self._contact_points], keys[self._contact_points], surface
         intact = ~is_split(self._domain.dim)[pattern]
         if shown is not None:
             intact &= shown  # so that damage elsewhere changes no arm
         means, middle, arms, out = local_map_parts(self._domain, surface, self._contact_points, intact)
         self.columns, (means, arms) = restrict_to_used_columns([means, arms])
         self.point_map = SurfaceMap(means, middle, arms, out)
-
-    def identify_points(self, points: Ints | None = None) -> Values:
-        """(k, 2 d + 1) rows that identify `points` (k,), by default `point_map.copies`, as edges break.
-
-        See point_matching.point_identity.
-        """
-        domain, which = self._domain, self.point_map.copies if points is None else points
-        return point_identity(
-            self._split_surface, self._contact_points[which], domain.input_numbering.nodes, domain.bounds.diagonal
-        )
 
     def facets(self) -> tuple[Ints, Values]:
         """(m, d) points of the elements that `area` is the sum of, and (m,) their areas, m^2 (2D: lengths, m)."""
