@@ -288,7 +288,6 @@ class ContactState:
         self._nodal_forces: Values | None = None  # of the present contact forces
         self._sticking_slips: list[float] | None = None  # m, of each obstacle in the step; None: not known yet
         self._directions: dict[int, FrictionDirection] = {}  # in this attempt, by the numbers of obstacles
-        self._attempts = 0  # of Newton's method in the step
         self._tangent_positions: Values | None = None  # of the points at the last tangent of this attempt
         for number, obstacle in zip(self.group.numbers, self.group.obstacles, strict=True):
             refuse_closed_gaps(
@@ -305,7 +304,7 @@ class ContactState:
     def begin_step(self, level: TimeLevel) -> None:
         """Move obstacles to the end of the step, and store the contact at its start for friction."""
         self.group.bodies.begin_step(level)
-        self.level, self._attempts = level, 0
+        self.level = level
         self.discard_forces()
         if self.group.bodies.evaluates_result:
             return  # lagged contact is still that of the step

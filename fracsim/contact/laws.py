@@ -33,6 +33,9 @@ class BarrierPolicy:
         averaging: c in [0, 1], weight of Radau's rule in the mean of a force over a step. With 1 a gap that steps do
             not resolve oscillates without end; with 0.8 the part c / (2 - c) = 2/3 of the oscillation is left.
         closed_value: Pa and Pa/m, pressure and stiffness of a closed gap. Infinity has no product with 0.
+        exact_tangent: motion of points since the last tangent, in barrier distances, below which tangents are exact.
+            A tangent without its negative eigenvalues gains less than a digit an iteration to the end. Farther from
+            the solution CG may find no solution with them.
     """
 
     min_gap_ratio: float = 0.1
@@ -40,6 +43,7 @@ class BarrierPolicy:
     target_gap: float = 0.1
     averaging: float = 0.8
     closed_value: float = 1e200
+    exact_tangent: float = 0.01
 
     @property
     def early_weight(self) -> float:

@@ -125,7 +125,7 @@ class MeshObstacleTerm(SurfaceContact):
     def begin_step(self, level: TimeLevel) -> None:
         """Move obstacles to the end of the step, and lag friction with the contact at its start."""
         self.group.bodies.begin_step(level)
-        self.level, self._is_stale, self._far, self._attempts = level, True, None, 0
+        self.level, self._is_stale, self._far = level, True, None
         if self.group.bodies.evaluates_result:
             return  # friction is still that of the step
         self._start_velocity = level.v_n

@@ -11,7 +11,6 @@ Equations: docs/theory.md#contact.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -27,7 +26,7 @@ from ..mesh.split_surface.drawn_surface import DrawnSurface
 from ..mesh.split_surface.surface_map import SurfaceMap
 from .contact_state import ContactState
 from .contact_surface import retract_from_obstacles
-from .laws import ObstacleLaw
+from .laws import BARRIER, ObstacleLaw
 from .node_contact import ContactForces, PoseCoupling, PoseDerivatives, contact_wrench
 from .pose import min_distance, resultant
 from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
@@ -35,25 +34,6 @@ from .step_limit import PoseMotion, safe_motion_fractions, stop_before_obstacles
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class ExactTangentPolicy:
-    """Motion of points in contact since the last tangent, in barrier widths, below which tangents are exact.
-
-    A tangent without its negative eigenvalues gains less than a digit an iteration to the end. Farther from the
-    solution CG may find no solution with them.
-
-    Attributes:
-        first_attempt: in the first attempt at a step.
-        later_attempts: after Newton's method has failed.
-    """
-
-    first_attempt: float = 0.01
-    later_attempts: float = 0.001
-
-
-EXACT_TANGENT = ExactTangentPolicy()
 
 
 class ObstacleTerm(ContactState, Term):
@@ -139,14 +119,13 @@ class ObstacleTerm(ContactState, Term):
                 moved = np.linalg.norm((self.positions - self._tangent_positions)[points], axis=1)
                 motion = float(moved.max(initial=0.0))
             motion = self.comm.allreduce(motion, op=MPI.MAX)
-            first = self._attempts <= 1
-            limit = EXACT_TANGENT.first_attempt if first else EXACT_TANGENT.later_attempts
-            self._is_exact = bool(motion < limit * self.law.barrier.width) and self.group.bodies.may_use_exact_tangent()
+            is_near = motion < BARRIER.exact_tangent * self.law.barrier.width
+            self._is_exact = bool(is_near) and self.group.bodies.may_use_exact_tangent()
         return self._is_exact
 
     def begin_solve(self) -> None:
-        """Count an attempt of Newton's method; after a failure tangents become exact later."""
-        self._tangent_positions, self._is_exact, self._attempts = None, None, self._attempts + 1
+        """Discard the last tangent, as an attempt of Newton's method begins."""
+        self._tangent_positions = self._is_exact = None
         self._directions, self._has_tangent = {}, False
 
     def stored_energy(self) -> float:

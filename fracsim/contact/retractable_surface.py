@@ -53,11 +53,6 @@ class SurfacePolicy:
         max_pause: largest number of steps between two attempts to release faces.
         closed_pressure: pressure, in stiffnesses, of faces without room: that of a fifth of the barrier's distance.
         round_off: relative tolerance of pressures.
-        exact_tangent: length of steps of Newton's method, in distances of the barrier, below which tangents of the
-            first attempt are exact. CG finds no solution with indefinite ones: a torn loaf failed in all attempts and
-            converged in the second one with positive ones.
-        later_exact_tangent: the same in later attempts. With positive tangents to the end |r| fell by a third to a
-            half in each iteration: a torn loaf took 26 iterations of the second attempt in place of 10.
         max_coupled_nodes: nodes in contact up to which their stiffness is kept apart from the matrix.
     """
 
@@ -69,8 +64,6 @@ class SurfacePolicy:
     max_pause: int = 16
     closed_pressure: float = 10.0
     round_off: float = 1e-6
-    exact_tangent: float = 1.0
-    later_exact_tangent: float = 0.01
     max_coupled_nodes: int = 3000
 
 

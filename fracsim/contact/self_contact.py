@@ -25,7 +25,7 @@ from ..mesh.parallel import allgather, max_over_ranks, sum_over_ranks
 from .barrier_surface import BarrierBodySurface
 from .contact_patch import SelfContactPatch
 from .ipc_pairs import IpcPairs
-from .laws import stiffness_factor
+from .laws import BARRIER, stiffness_factor
 from .pair_search import max_length
 from .retractable_surface import SURFACE, SelfContactLaw
 from .sample_points import SlipFriction
@@ -50,7 +50,6 @@ class SurfaceContact(Term):
     leaves_tangent_incomplete = True
     allows_exact_tangent: bool = True
     level: TimeLevel
-    _attempts = 0  # of Newton's method in the step
     _fitted_displacement: Values | None = None  # at which crack faces have found their room within the step
 
     def __init__(self, domain: Domain, u: fem.Function, surface: BarrierBodySurface) -> None:
@@ -164,8 +163,7 @@ class SurfaceContact(Term):
         if last is None:
             return False
         moved = max_length(self.surface.current.point_map.weights @ self.surface.nodal_values(u - last))
-        limit = SURFACE.exact_tangent if self._attempts <= 1 else SURFACE.later_exact_tangent
-        return max_over_ranks(self.comm, moved) < limit * self.surface.law.distance
+        return max_over_ranks(self.comm, moved) < BARRIER.exact_tangent * self.surface.law.distance
 
     def min_gap(self) -> float:
         """Least distance within the barrier at the current u, m; infinite where none is active (collective)."""
@@ -207,8 +205,8 @@ class SurfaceContact(Term):
         return self.level.contact_weight * self.level.fraction * energy
 
     def begin_solve(self) -> None:
-        """Count an attempt of Newton's method; after a failure tangents become exact later."""
-        self._tangent_displacement, self._attempts = None, self._attempts + 1
+        """Discard the last tangent, as an attempt of Newton's method begins."""
+        self._tangent_displacement = None
 
     def clear_search(self) -> None:
         """Discard the candidates of collision detection (not collective)."""
@@ -242,7 +240,7 @@ class SelfContact(SurfaceContact):
 
     def begin_step(self, level: TimeLevel) -> None:
         """Lag friction with the contact at the start of the step."""
-        self.level, self._is_stale, self.friction, self._attempts = level, True, None, 0
+        self.level, self._is_stale, self.friction = level, True, None
         if not level.dt:
             return
         self.sticking_slip = self._sticking_slip(level)
