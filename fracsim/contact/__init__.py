@@ -40,7 +40,6 @@ Surfaces with ipctk:
     element_exchange      elements of a rank and of others near them
     retractable_surface   crack faces that are retracted where there is no room
     barrier_surface, ipc_pairs, sample_points  surface and pairs of the barrier; sample points and friction at them
-    contact_patch         contact around the few nodes of a nonlinear elimination
     mesh_obstacles        pairs of a body and a triangle-mesh obstacle
     penalty_pairs         penalty between points and facets, and between edges, with friction
     penalty_contacts, penalty_point_facet, penalty_edges  energy of contacts; points before facets; edges

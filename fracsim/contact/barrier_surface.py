@@ -17,7 +17,6 @@ import numpy.typing as npt
 from dolfinx import fem
 
 from ..mesh.domain import Domain
-from .contact_patch import PATCH_MOTION
 from .element_exchange import EXCHANGE, ElementSet
 from .ipc_pairs import IpcPairs, PairShare
 from .mesh_obstacles import AllMeshPairs, MeshObstacle, MeshObstaclePairs
@@ -75,11 +74,9 @@ class BarrierBodySurface(PartitionedSurface[BarrierSurface]):
         self, domain: Domain, u: fem.Function, law: SelfContactLaw, obstacles: Sequence[MeshObstacle] = ()
     ) -> None:
         """As of PartitionedSurface (collective)."""
-        # nonlinear elimination looks for pairs within the motion of its nodes
-        reach, margin = (1 + 2 * PATCH_MOTION) * law.distance, EXCHANGE.barrier_margin * domain.mean_edge_length
-        if obstacles:  # elements that share a point are always near each other
-            reach, margin = law.distance, np.inf
-        super().__init__(domain, u, law, obstacles, reach, margin)
+        # before obstacles: elements that share a point are always near each other
+        margin = np.inf if obstacles else EXCHANGE.barrier_margin * domain.mean_edge_length
+        super().__init__(domain, u, law, obstacles, law.distance, margin)
 
     def _build_surface(self, element_set: ElementSet) -> BarrierSurface:
         return BarrierSurface(self._comm, element_set, self.law, self._meshes, self._domain.mean_edge_length)

@@ -37,7 +37,6 @@ from .pair_search import (
     free_fractions,
     intersecting_pairs,
     max_length,
-    near_pairs,
     pair_distances,
 )
 from .sample_points import (
@@ -259,7 +258,6 @@ class IpcPairs:
         friction: float = 0.0,
         share: PairShare | None = None,
         patch: npt.NDArray[np.int32] | None = None,
-        search_margin: float | None = None,
         edge: float | None = None,
     ) -> None:
         """Pairs of a surface; points of no element are ignored.
@@ -272,7 +270,6 @@ class IpcPairs:
             friction: coefficient of friction.
             share: of this rank in the pairs; None: all of them.
             patch: (n,) numbers of parts of the surface that touch others alone; None: all touch.
-            search_margin: motion of points after which candidates are searched again, m; None: that of the policy.
             edge: mean length of edges, m; None: of these elements.
         """
         self._elements, is_3d = elements, rest_positions.shape[1] == 3
@@ -301,8 +298,7 @@ class IpcPairs:
             of_patches = ipctk.make_vertex_patches_filter(patch)
             mesh.can_collide = of_patches if vertices is None else of_patches & mesh.can_collide
         where = PairFilter.of(mesh.num_vertices, patch, vertices)
-        margin = PAIRS.search_margin * distance if search_margin is None else search_margin
-        self._search = PairSearch(where, sets, margin)
+        self._search = PairSearch(where, sets, PAIRS.search_margin * distance)
         self._kinds = [
             PairKind(pairs, weight * stiffness, centroids if pairs.centroids else at_vertices, vertices)
             for pairs, weight in zip(sets, self._weights, strict=True)
@@ -351,24 +347,6 @@ class IpcPairs:
         vertices, method = x[self._points], projection(exact=exact)
         total = sum(pairs.hessian(method) for pairs in self._active_pairs(vertices))
         return hessian_at_points(total, self._points, x.shape)
-
-    def points_near(self, x: Values, moving: Flags, motion: float) -> Flags:
-        """(n,) flags of points of pairs that may come within their distances, as some points move, of all ranks' pairs.
-
-        Args:
-            x: (n, d) positions, m.
-            moving: (n,) flags of the points that move; a pair has one of them at least.
-            motion: by which they move at most, m.
-        """
-        vertices, result = x[self._points], np.zeros(len(x), bool)
-        where = replace(self._search.filter, is_owned=np.ones(len(vertices), bool))
-        for kind in self._kinds:
-            simplices = kind.simplices
-            reach = simplices.distance + 2 * motion
-            pairs = near_pairs(simplices, where, vertices, vertices, reach, moving[self._points])
-            for vertex_sets, numbers in zip((simplices.first, simplices.second), pairs.T, strict=True):
-                result[self._points[vertex_sets[numbers]]] = True
-        return result
 
     def set_stiffness(self, stiffness: float) -> None:
         """Set the stiffness k, Pa."""

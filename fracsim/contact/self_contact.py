@@ -23,7 +23,6 @@ from ..mechanics.term import Term, TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import allgather, max_over_ranks, sum_over_ranks
 from .barrier_surface import BarrierBodySurface
-from .contact_patch import SelfContactPatch
 from .ipc_pairs import IpcPairs
 from .laws import BARRIER, stiffness_factor
 from .pair_search import max_length
@@ -278,10 +277,6 @@ class SelfContact(SurfaceContact):
         midpoints, flags = (np.concatenate(values) for values in zip(*parts, strict=True))
         order = np.lexsort(midpoints.T[::-1])
         return midpoints[order], flags[order]
-
-    def patch(self, nodes: Ints) -> SelfContactPatch:
-        """Contact of nodes (k,), by their ascending global numbers, that move from the current u (collective)."""
-        return SelfContactPatch(self, nodes)
 
     # --- step limits ---
 
