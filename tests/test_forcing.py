@@ -8,10 +8,7 @@ import numpy as np
 import pytest
 
 import fracsim.mechanics.tangent as tangent_module
-from fracsim.solvers.forcing_terms import (
-    ContractionForcing,
-    EisenstatWalkerForcing,
-)
+from fracsim.solvers.forcing_terms import ContractionForcing
 from fracsim.solvers.policy import DEFAULT_POLICY
 from support.scenes import make_scene, march, positions
 from support.solver_policy import set_policy
@@ -23,26 +20,6 @@ RTOL = 1e-5
 def nothing() -> float:
     """|r| that CG has left."""
     return 0.0
-
-
-def test_digits_are_asked_for_as_the_residual_falls() -> None:
-    """0.9 (|r_k| / |r_k-1|)^2 between rtol and max_contact_rtol; no more of them than the solution needs."""
-    forcing = EisenstatWalkerForcing(RTOL)
-    assert forcing.tolerance_for(10.0, 0.0) == DEFAULT_POLICY.max_contact_rtol  # nothing is known of the first
-    assert forcing.tolerance_for(5.0, 0.0) == DEFAULT_POLICY.max_contact_rtol
-    assert forcing.tolerance_for(0.1, 0.0) == pytest.approx(0.9 * 0.02**2)
-    assert forcing.tolerance_for(1e-6, 0.0) == RTOL
-    assert forcing.tolerance_for(1e-8, 1e-10) == pytest.approx(1e-3)
-    forcing.begin_attempt()
-    assert forcing.tolerance_for(1e-6, 0.0) == DEFAULT_POLICY.max_contact_rtol and forcing.tight_tolerance() == RTOL
-
-
-def test_iterations_are_those_of_an_exact_solve() -> None:
-    """A residual that falls to a tenth an iteration takes 2 to 1e-2 and 5 to 1e-5."""
-    forcing = EisenstatWalkerForcing(RTOL)
-    assert forcing.equivalent_iterations(5) == 5
-    forcing.tolerance_for(1.0, 0.0)
-    assert forcing.equivalent_iterations(2) == 5
 
 
 def test_without_contact_a_solve_leaves_a_share_of_what_the_tangent_leaves() -> None:

@@ -11,45 +11,8 @@ from collections.abc import Callable
 from .policy import DEFAULT_POLICY, SolverPolicy
 
 
-class EisenstatWalkerForcing:
-    """Tolerances of the linear solves of an attempt while contact acts.
-
-    eta_k = min(eta_max, max(rtol, 0.9 (|r_k| / |r_{k-1}|)^2, |r|_solution / (10 |r_k|)))
-
-    The second choice of S. C. Eisenstat and H. F. Walker, Choosing the forcing terms in an inexact Newton method, 1996.
-    While the contact pairs change from iterate to iterate, an exact correction is of no use.
-    """
-
-    def __init__(self, rtol: float, policy: SolverPolicy = DEFAULT_POLICY) -> None:
-        """Begin without a residual; `rtol` is the tight tolerance."""
-        self._rtol = self._used = rtol
-        self._policy = policy
-        self._last_norm = 0.0
-
-    def begin_attempt(self) -> None:
-        """Forget the residuals of earlier attempts."""
-        self._last_norm = 0.0
-
-    def tight_tolerance(self) -> float:
-        """Return the tolerance where no contact acts."""
-        self._last_norm, self._used = 0.0, self._rtol
-        return self._used
-
-    def tolerance_for(self, norm: float, solved_norm: float) -> float:
-        """Return eta_k at |r_k| = `norm` (N), where a solution has |r| = `solved_norm` (N)."""
-        reduction = (norm / self._last_norm) ** 2 if self._last_norm else 1.0
-        enough = 0.1 * solved_norm / norm if norm else 1.0
-        self._last_norm = norm
-        self._used = min(self._policy.max_contact_rtol, max(self._rtol, 0.9 * reduction, enough))
-        return self._used
-
-    def equivalent_iterations(self, its: int) -> int:
-        """Return the iterations of a solve to the tight tolerance at the rate of the last solve, which took `its`."""
-        return round(its * math.log(self._rtol) / math.log(self._used))
-
-
 class ContractionForcing:
-    """Tolerances of the linear solves of an attempt without contact.
+    """Tolerances of the linear solves of an attempt with inertia.
 
     CG may leave a share of what the linearisation leaves, q_k^2 of r with q_k = |r_{k+1}| / |r_k|, or a small share of
     the residual of a solution. The last tangent is used again where it suffices, and leaves 2 q_k of r, as one that is

@@ -18,7 +18,7 @@ from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
 from .direct_solver import DirectSolver
-from .forcing_terms import ContractionForcing, EisenstatWalkerForcing
+from .forcing_terms import ContractionForcing
 from .petsc_options import PetscOptions, PetscOptionSet, call_petsc
 from .plain_solver import PlainPreconditioner, plain_method
 from .policy import SolverPolicy
@@ -170,12 +170,6 @@ class LinearSolver:
         # SNES asks the KSP to keep the set-up of its preconditioner after each tangent
         ksp.setPreSolve(renew_smoothers_before_solve)
         self.forcing = None if self._asked_rtol else _forcing(balance, chosen, policy)
-        # of attempts of a body that may touch something, until it does
-        self._free_forcing: ContractionForcing | None = None
-        if isinstance(self.forcing, EisenstatWalkerForcing) and balance.scheme.inertia:
-            self._free_forcing = ContractionForcing(float(chosen["ksp_rtol"]), policy)
-        self._touches = self._free_forcing is None
-        self._last_forcing = self.forcing  # of the last solve
         dofs = balance.work_vector.getSize()
         self.direct = DirectSolver(symmetric=balance.symmetric, dofs=dofs, dim=balance.domain.dim, policy=policy)
         self.operators.add_pattern_listeners(self.preconditioner, self.direct)
@@ -223,25 +217,21 @@ class LinearSolver:
             solved_norm: |r| of a solution, N.
             eigenvalue_floor: see `TangentOperators`.
         """
-        forcing = self._forcing_at_iterate()
+        forcing = self.forcing
         if forcing is None:
             self._prepare(eigenvalue_floor)
             return
-        assert self._last_forcing is not None
-        self._equivalent = self._last_forcing.equivalent_iterations(self.ksp.its)
-        self._last_forcing = forcing
-        if isinstance(forcing, EisenstatWalkerForcing):
+        self._equivalent = forcing.equivalent_iterations(self.ksp.its)
+        keeps_tangent = forcing.record_iterate(norm, solved_norm, self._residual_left_by_cg)
+        keeps_tangent = keeps_tangent and self.operators.eigenvalue_floor == eigenvalue_floor
+        if not keeps_tangent:
             self._prepare(eigenvalue_floor)
-            in_contact = self.tangent.couplings.has_contact
-            rtol = forcing.tolerance_for(norm, solved_norm) if in_contact else forcing.tight_tolerance()
-        else:
-            keeps_tangent = forcing.record_iterate(norm, solved_norm, self._residual_left_by_cg)
-            keeps_tangent = keeps_tangent and self.operators.eigenvalue_floor == eigenvalue_floor
-            if not keeps_tangent:
-                self._prepare(eigenvalue_floor)
-                if self.ksp.getType() == "cg":
-                    self.operators.multiply_by(self.preconditioner.fine_level)
-            rtol = forcing.tolerance_for(solved_norm, exact=not keeps_tangent and eigenvalue_floor is None)
+            if self.ksp.getType() == "cg":
+                self.operators.multiply_by(self.preconditioner.fine_level)
+        rtol = forcing.tolerance_for(solved_norm, exact=not keeps_tangent and eigenvalue_floor is None)
+        # Without inertia a fragment is attached by 1e-8 of its stiffness: a small residual leaves its position open.
+        if not self.balance.scheme.inertia and not self.tangent.couplings.has_contact:
+            rtol = forcing.tight_tolerance()
         self.ksp.setTolerances(rtol=rtol)
 
     def begin_attempt(self) -> None:
@@ -249,14 +239,6 @@ class LinearSolver:
         self._begins = True
         if self.forcing is not None:
             self.forcing.begin_attempt()
-        if self._free_forcing is not None:
-            self._free_forcing.begin_attempt()
-            self._touches = False
-
-    def _forcing_at_iterate(self) -> EisenstatWalkerForcing | ContractionForcing | None:
-        """Return the tolerances of the present solve: those of a body without contact until it touches (collective)."""
-        self._touches = self._touches or self.balance.contact.is_active()
-        return self.forcing if self._touches else self._free_forcing
 
     def _residual_left_by_cg(self) -> float:
         """Return |r| that the last solve of CG has left of the linear system, N; 0 of other methods (collective)."""
@@ -362,7 +344,6 @@ class LinearSolver:
         self._equivalent = None
         if self.forcing is not None:
             ksp.setTolerances(rtol=self.forcing.tight_tolerance())
-            self._last_forcing = self.forcing
         ksp.setOperators(self.operators.operator, self.operators.matrix)
         ksp.solve(self.balance.work_vector, self.correction)
         return bool(ksp.reason > 0)
@@ -421,22 +402,18 @@ def chosen_options(balance: Balance, given: PetscOptions, *, plain: bool = False
 def steps_are_linear(balance: Balance, given: PetscOptions, method: str) -> bool:
     """Return True if a step is one linear solve: of a linear balance, by CG or factors, without other options."""
     allowed = all(key in SINGLE_SOLVE_OPTIONS or key.startswith(("pc_", "mg_")) for key in given)
-    # Without inertia a small residual leaves the position of a fragment open (`_forcing`).
+    # Without inertia a small residual leaves the position of a fragment open (`linearise`).
     has_fragments = balance.stress.chi is not None and not balance.scheme.inertia
     holds = method == "preonly" or (method == "cg" and not has_fragments)
     return allowed and balance.linear and balance.symmetric and holds
 
 
-def _forcing(
-    balance: Balance, chosen: PetscOptions, policy: SolverPolicy
-) -> EisenstatWalkerForcing | ContractionForcing | None:
+def _forcing(balance: Balance, chosen: PetscOptions, policy: SolverPolicy) -> ContractionForcing | None:
     """Return the tolerances of Newton's method; None: `ksp_rtol` in every solve."""
-    # Without inertia a fragment is attached by 1e-8 of its stiffness: a small residual leaves its position open.
-    rtol = float(chosen["ksp_rtol"])
-    if balance.contact.limits_newton_steps:
-        return EisenstatWalkerForcing(rtol, policy) if balance.conservative else None
-    inexact = balance.scheme.inertia and chosen["snes_type"] == "newtonls"
-    return ContractionForcing(rtol, policy) if inexact else None
+    has_contact = balance.contact.limits_newton_steps
+    may_be_rough = balance.conservative if has_contact else balance.scheme.inertia
+    inexact = may_be_rough and chosen["snes_type"] == "newtonls"
+    return ContractionForcing(float(chosen["ksp_rtol"]), policy) if inexact else None
 
 
 def _is_default_preconditioner(given: PetscOptions) -> bool:

@@ -57,8 +57,6 @@ class SolverPolicy:
     eigenvalue_floor: float = 1e-2
 
     # --- inexact Newton (forcing_terms) ---
-    # Largest relative tolerance of CG while contact acts. CG takes four times as many iterations with contact.
-    max_contact_rtol: float = 1e-2
     # Shares of the residual left by the linearisation, which CG may leave: in the preconditioned norm, and in |r|.
     cg_share: float = 0.1
     cg_share_of_residual: float = 0.3
