@@ -17,6 +17,7 @@ from fracsim.mechanics.matrix_assembly import TangentAssembler
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers.nonlinear_solver import NonlinearSolver
 from fracsim.solvers.policy import DEFAULT_POLICY
+from fracsim.solvers.preconditioner import Preconditioner
 from fracsim.studies.evidence.crack_count_cost import random_planes
 from support.scenes import Walk
 from support.solver_policy import set_policy
@@ -67,6 +68,24 @@ def test_multigrid_of_another_kind_takes_over_where_a_body_is_in_pieces() -> Non
     """Ten planes through a bar, and none: a user who asks for a kind keeps it."""
     assert [smoother(planes, {}) for planes in (0, 10)] == ["chebyshev", "richardson"]
     assert smoother(10, {"pc_gamg_agg_nsmooths": 1}) == "chebyshev"
+
+
+def test_multigrid_of_another_kind_that_fails_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a solve that failed a bar in pieces has its first kind again, with the V cycle in single precision, and
+    keeps it. With short steps SSOR takes over still."""
+    set_policy(monkeypatch, min_block_dofs=0)
+    scene, _ = shattered(0.025, 10, {}, 3)
+    solver = scene.solver
+    assert isinstance(solver, NonlinearSolver) and set(smoothers(scene)) == {("sor", 1)}
+    preconditioner = solver.linear.preconditioner
+    assert isinstance(preconditioner, Preconditioner) and preconditioner.applied.vcycle is None
+    preconditioner.solve_failed()
+    for _ in range(3):
+        solver.linear_response(np.ones(scene.balance.owned_dof_count))
+        assert set(smoothers(scene)) == {("jacobi", 2)} and preconditioner.applied.vcycle is not None
+    preconditioner._policy = replace(DEFAULT_POLICY, min_ssor_inertia=0.0)
+    solver.linear_response(np.ones(scene.balance.owned_dof_count))
+    assert preconditioner.pc.getType() == "sor"
 
 
 def test_a_thin_body_has_aggregates_of_strong_links(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -46,6 +46,13 @@ FRAGMENT_OPTIONS: PetscOptions = {
     "mg_levels_ksp_max_it": 1,
     "mg_levels_pc_type": "sor",
 }
+# A body for which FRAGMENT_OPTIONS have failed: the options from before.
+WHOLE_BODY_OPTIONS: PetscOptions = {
+    "pc_gamg_agg_nsmooths": 1,
+    "mg_levels_ksp_type": "chebyshev",
+    "mg_levels_ksp_max_it": 2,
+    "mg_levels_pc_type": "jacobi",
+}
 MULTIGRID_TYPES = ("gamg", "mg", "ml")
 SSOR_OPTIONS: PetscOptions = {"pc_type": "sor"}
 MULTIGRID_OPTIONS: PetscOptions = {"pc_type": "gamg"}
@@ -294,8 +301,15 @@ class Preconditioner:
         self._iterations, self._equivalent = iterations, equivalent
 
     def solve_failed(self) -> None:
-        """Record that a solve failed: smoothers of an older tangent need not be positive for this one."""
+        """Record that a solve failed: smoothers of an older tangent need not be positive for this one (collective).
+
+        Multigrid of another kind for fragments is given up. It does not solve for changed nodes exactly, as is done
+        beside the V cycle: CG may not converge while a body tears.
+        """
         self._due = Update.REBUILD
+        if self._uses_ssor is False:
+            self._rebuild_ratio = self._policy.rebuild_ratio
+            self.applied.change_kind(WHOLE_BODY_OPTIONS)
 
     def tangent_was_indefinite(self) -> None:
         """Record that the last tangent was indefinite: what was set up for it is set up again for the next one."""
