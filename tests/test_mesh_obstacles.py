@@ -91,12 +91,24 @@ def test_distance_and_depth_are_those_of_a_box() -> None:
     assert penetration_depth((0.2 * CORNERS, SIDES), (CORNERS, SIDES), cut=False) == pytest.approx(0.4)
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e-3, 1e-30])
+def test_a_coarse_solid_that_turns_is_not_stopped_by_a_small_body(scale: float) -> None:
+    """The solid turns beside a body whose edges are as long as its own, or shorter by `scale`, and touches nothing."""
+    points, triangles = refine_triangles(CORNERS, SIDES, 0.4)
+    x = scale * points + [2.0, 0.0, 0.0]
+    solid = MeshObstacle("block", *refine_triangles(CORNERS, SIDES, 0.3), 0.0)
+    pairs = MeshObstaclePairs(x, triangles, solid, distance=0.1 * scale, stiffness=50.0, edge=0.4 * scale)
+    start = solid.pose
+    solid.move_to(start.incremented(np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.2])))
+    assert pairs.moving_free_fraction(x, x, start) == 1.0
+
+
 def test_what_acts_on_a_solid_is_the_derivative_by_its_place() -> None:
     """Minus the sum of the forces on the body, against differences of the energy as the solid is moved; and the Hessian
     against those of the gradient."""
     points, triangles = refine_triangles(CORNERS, SIDES, 0.4)
     solid = MeshObstacle("block", *refine_triangles(CORNERS * [0.5, 0.4, 0.3] + [0.1, 0.05, 0.68], SIDES, 0.3), 0.0)
-    facings = AllMeshPairs([MeshObstaclePairs(points, triangles, solid, distance=0.1, stiffness=50.0)])
+    facings = AllMeshPairs([MeshObstaclePairs(points, triangles, solid, distance=0.1, stiffness=50.0, edge=0.4)])
     x, step = points + 0.01 * np.sin(30 * points), 1e-6
     moved = []
     for axis in range(3):

@@ -245,7 +245,6 @@ class IpcPairs:
 
     Attributes:
         comm: ranks that share the pairs.
-        edge: mean length of edges, m.
     """
 
     def __init__(
@@ -258,7 +257,7 @@ class IpcPairs:
         friction: float = 0.0,
         share: PairShare | None = None,
         patch: npt.NDArray[np.int32] | None = None,
-        edge: float | None = None,
+        edge: float | Values | None = None,
     ) -> None:
         """Pairs of a surface; points of no element are ignored.
 
@@ -270,7 +269,7 @@ class IpcPairs:
             friction: coefficient of friction.
             share: of this rank in the pairs; None: all of them.
             patch: (n,) numbers of parts of the surface that touch others alone; None: all touch.
-            edge: mean length of edges, m; None: of these elements.
+            edge: length of edges, m, or that of edges around each point (n,); None: the mean of these elements.
         """
         self._elements, is_3d = elements, rest_positions.shape[1] == 3
         self._mesh = collision_mesh(rest_positions, elements)
@@ -305,7 +304,8 @@ class IpcPairs:
         ]
         self._clear_active()
         X = self._mesh.rest_positions
-        self.edge = float(ipctk.mean_edge_length(X, X, self._mesh.edges)[0]) if edge is None else edge
+        edge = float(ipctk.mean_edge_length(X, X, self._mesh.edges)[0]) if edge is None else edge
+        self._edges = np.broadcast_to(edge, len(rest_positions))[used]
         self._counted = np.ones(len(used), bool) if share is None else share.counted[used]
         self._friction, self._distance = friction, distance
 
@@ -436,9 +436,10 @@ class IpcPairs:
         The bounding boxes of a piece have on average at most `max_box_growth` times the measure of one around an
         edge. A few fast points alone do not make pieces shorter.
         """
-        pieces, count = 1, self._sum(np.ones((len(motion), 1)))
+        pieces, (edges, count) = 1, self._sum(np.column_stack([self._edges, np.ones(len(motion))]))
+        edge = edges / max(count, 1.0)
         while pieces < 2**30:
-            growth = self._sum(np.prod(1.0 + abs(motion) / (pieces * self.edge), axis=1)[:, None])
+            growth = self._sum(np.prod(1.0 + abs(motion) / (pieces * edge), axis=1)[:, None])
             if not growth > PAIRS.max_box_growth * count:
                 break
             pieces *= 2

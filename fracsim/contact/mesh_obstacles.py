@@ -83,6 +83,7 @@ class MeshObstacle:
         rotates: whether its rotation may change.
         radius: largest distance of a point from the reference point, m.
         max_error: largest distance of a point of a triangle from its nearest corner, m.
+        edge: mean length of edges, m.
         pose: current pose.
     """
 
@@ -90,7 +91,8 @@ class MeshObstacle:
         self.name, self.points, self.triangles, self.friction = name, points, triangles, friction
         self.rotates, self.radius = rotates, float(np.linalg.norm(points, axis=1).max())
         sides = points[triangles] - points[np.roll(triangles, 1, axis=1)]
-        self.max_error = float(np.linalg.norm(sides, axis=2).max() / np.sqrt(3))
+        lengths = np.linalg.norm(sides, axis=2)
+        self.max_error, self.edge = float(lengths.max() / np.sqrt(3)), float(lengths.mean())
         self._tree, self._box = cKDTree(points), (points.min(axis=0), points.max(axis=0))
         self.move_to(Pose.at_point(np.zeros(3)))
 
@@ -166,6 +168,7 @@ class MeshObstaclePairs:
     Attributes:
         mesh: the obstacle.
         body_count: n.
+        edge: mean length of edges of the body, m.
         contact: barrier between the elements of both.
     """
 
@@ -177,8 +180,8 @@ class MeshObstaclePairs:
         *,
         distance: float,
         stiffness: float,
+        edge: float,
         share: PairShare | None = None,
-        edge: float | None = None,
     ) -> None:
         """Pairs of both surfaces.
 
@@ -188,10 +191,10 @@ class MeshObstaclePairs:
             mesh: the obstacle, whose coefficient of friction counts.
             distance: at which contact begins, m.
             stiffness: of the barrier, Pa.
+            edge: mean length of edges of the body, m.
             share: of this rank in the pairs; None: all of them.
-            edge: mean length of edges, m; None: of these elements.
         """
-        self.mesh, self._reach = mesh, distance
+        self.mesh, self.edge, self._reach = mesh, edge, distance
         self.body_count, self._element_count = len(rest_positions), len(elements)
         self._body_points = np.unique(elements)
         # the obstacle in its own frame, so that the measures of its elements are constant
@@ -200,7 +203,9 @@ class MeshObstaclePairs:
         patches = np.repeat(np.array([0, 1], np.int32), [len(rest_positions), len(mesh.points)])
         parameters = {"distance": distance, "stiffness": stiffness, "friction": mesh.friction}
         share = None if share is None else share.with_others(len(mesh.points))
-        self.contact = IpcPairs(points, triangles, **parameters, share=share, patch=patches, edge=edge)
+        # the mean of both bounds the pieces of a motion: an obstacle may be coarser than the body
+        edges = np.repeat([edge, mesh.edge], [len(rest_positions), len(mesh.points)])
+        self.contact = IpcPairs(points, triangles, **parameters, share=share, patch=patches, edge=edges)
 
     def with_mesh(self, x: Values) -> Values:
         """(n + m, 3) points of the body at x (n, 3), and of the obstacle at its current pose, m."""

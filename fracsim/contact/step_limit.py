@@ -392,9 +392,8 @@ def _mesh_corrections(pairs: MeshObstaclePairs, start_pose: Pose, x: Values, end
     """
     # motion relative to the obstacle
     motion, comm = end - pairs.mesh.pose.points_to_space(start_pose.to_body(x)), pairs.contact.comm
-    edge = pairs.contact.edge
     largest = max_over_ranks(comm, float(lengths(motion).max(initial=0.0)))
-    count = min(max(1, int(np.ceil(largest / edge))), LIMITS.max_pieces)
+    count = min(max(1, int(np.ceil(largest / pairs.edge))), LIMITS.max_pieces)
     # safe and unlimited positions, before the obstacle at its end
     safe_x, free_x = end - motion, end - motion
     is_moving = np.ones(len(x), bool)
@@ -403,7 +402,9 @@ def _mesh_corrections(pairs: MeshObstaclePairs, start_pose: Pose, x: Values, end
         step = end - motion * (1 - (piece + 1) / count) - free_x
         length = lengths(step)
         reach = LIMITS.search_margin * max_over_ranks(comm, float(length.max(initial=0.0))) / open_ratio
-        is_moving &= length <= open_ratio * pairs.safe_distances(safe_x, min(reach, LIMITS.max_search_edges * edge))
+        is_moving &= length <= open_ratio * pairs.safe_distances(
+            safe_x, min(reach, LIMITS.max_search_edges * pairs.edge)
+        )
         safe_x = safe_x + np.where(is_moving[:, None], step, 0.0)
         free_x = free_x + step
     return np.where(is_moving[:, None], 0.0, safe_x - end)
