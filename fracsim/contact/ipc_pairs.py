@@ -36,7 +36,6 @@ from .pair_search import (
     SimplexPairs,
     free_fractions,
     intersecting_pairs,
-    max_length,
     pair_distances,
 )
 from .sample_points import (
@@ -307,7 +306,7 @@ class IpcPairs:
         edge = float(ipctk.mean_edge_length(X, X, self._mesh.edges)[0]) if edge is None else edge
         self._edges = np.broadcast_to(edge, len(rest_positions))[used]
         self._counted = np.ones(len(used), bool) if share is None else share.counted[used]
-        self._friction, self._distance = friction, distance
+        self._friction = friction
 
     @property
     def collision_mesh(self) -> ipctk.CollisionMesh:
@@ -361,10 +360,8 @@ class IpcPairs:
 
     def min_gap(self, x: Values) -> float:
         """Least distance of this rank's pairs on which the barrier acts, m; infinite where there is none."""
-        return self._gap_at(x[self._points])
-
-    def _gap_at(self, vertices: Values) -> float:
-        return float(np.sqrt(min(pairs.least_squared_distance() for pairs in self._active_pairs(vertices))))
+        active = self._active_pairs(x[self._points])
+        return float(np.sqrt(min(pairs.least_squared_distance() for pairs in active)))
 
     # --- friction ---
 
@@ -395,8 +392,6 @@ class IpcPairs:
         vertices, motion = x[self._points], end[self._points] - x[self._points]
         total = self._sum(np.column_stack([motion, np.ones(len(motion))]))
         motion -= total[:-1] / max(total[-1], 1.0)  # the mean motion brings nothing together
-        if self.comm.allreduce(self._is_short(vertices, motion), op=MPI.LAND):
-            return 1.0
         pieces = self._piece_count(motion)
         return float(self.comm.allreduce(self._own_free_fraction(vertices, motion, pieces), op=MPI.MIN))
 
@@ -421,14 +416,6 @@ class IpcPairs:
             if not kind.simplices.centroids
         )
         return min(float(of_kind.min(initial=1.0)) for of_kind in fractions)
-
-    def _is_short(self, vertices: Values, motion: Values) -> bool:
-        """Whether a motion (n, d) is safe in whatever direction points move, as half of Newton's steps are.
-
-        A pair on which no barrier acts is no nearer than the distance at which that of edges begins.
-        """
-        approach = 2.0 * max_length(motion) / (1.0 - BARRIER.min_gap_ratio)
-        return approach <= PAIRS.edge_distance * self._distance and approach <= self._gap_at(vertices)
 
     def _piece_count(self, motion: Values) -> int:
         """Number of pieces in which a motion (n, d) is searched (collective).
