@@ -75,44 +75,6 @@ def test_points_follow_affine_motions_and_hand_down_forces_and_moments(dim: int,
     np.testing.assert_allclose(both[:, 1], 2 * both[:, 0], atol=1e-14)
 
 
-@pytest.mark.parametrize("mass", ("lumped", "consistent"))
-def test_the_tangent_of_the_body_is_reused_beside_new_contact(mass: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """After a motion of 1e-4 edges K has the contact of the new place exactly, ties of the old one nowhere, and the
-    body's part of the old place: by K less its parts, each assembled anew."""
-    scene, state = make_scene(
-        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25}, material=SOFT, obstacle=[floor(-0.005)],
-        contact={"itself": False, "distance": 0.02}, boundary=[{"on": "top", "velocity": [0.0, -0.1]}],
-        time={"scheme": "newmark", "step": 1e-2, "end": 0.02, "mass": mass},
-    )  # fmt: skip
-    march(scene, state)
-    balance, u = scene.balance, state.u.copy()
-    balance.begin_step(state.t + 1e-2, 1e-2, state.u, state.v, state.a)
-    tangent, assembled = balance.tangent, []
-    add = type(tangent._assembler)._add
-    monkeypatch.setattr(type(tangent._assembler), "_add", lambda *args: (assembled.append(1), add(*args))[1])
-
-    def entries(*, anew: bool, contact: bool = True) -> Values:
-        if anew:
-            balance.begin_solve()
-        if contact:
-            tangent.assemble()
-        else:
-            with tangent.without_contact():
-                tangent.assemble()
-        count = tangent.matrix.getSize()[0]
-        return np.asarray(tangent.matrix.getValues(range(count), range(count)))
-
-    balance.set_displacement(u)
-    body, old = entries(anew=True, contact=False), entries(anew=True)
-    balance.set_displacement(u - 2.5e-5 * np.tile([0.0, 1.0], len(u) // 2))
-    before = len(assembled)
-    reused = entries(anew=False)
-    assert len(assembled) == before
-    new_body, new = entries(anew=True, contact=False), entries(anew=True)
-    assert abs(new - new_body - old + body).max() > 0.1 * abs(old - body).max() > 0
-    np.testing.assert_allclose(reused - body, new - new_body, atol=1e-12 * abs(new).max())
-
-
 # --- impulse, rest, pressure ----------------------------------------------------------------------------------------
 
 

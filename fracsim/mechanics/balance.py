@@ -119,7 +119,7 @@ class Balance:
         self._set_level(TimeLevel(0.0, 0.0, zero, zero, self.c_a, self.c_v, zero, zero), motion.displacements_at(0.0))
 
     def _new_tangent(self) -> Tangent:
-        return Tangent(self.u, self.terms, self.stress, self.motion, self.mass)
+        return Tangent(self.terms, self.stress, self.motion, self.mass)
 
     # --- a step, or the evaluation of a state ---
 
@@ -292,7 +292,6 @@ class Balance:
 
     def begin_solve(self) -> None:
         """Begin an attempt of Newton's method at the step."""
-        self.tangent.begin_solve()
         self.contact.begin_solve()
         if self.eliminated is not None:
             self.eliminated.begin_solve()
@@ -304,7 +303,6 @@ class Balance:
         fraction = self.contact.max_step_fraction(change)
         if self.eliminated is not None:
             self.eliminated.allow(fraction)
-        self.tangent.record_step_fraction(fraction)
         return fraction
 
     def feasible_guess(self, u: Values) -> Values:

@@ -152,16 +152,12 @@ class TangentAssembler:
             self._add(form, bcs)
         self._sum.scatter_reverse()
         if self.blocks is None:
-            self.set_entries()
+            self.matrix.setValuesIJV(self._starts, self._columns, self._sum.data[self._owned])
+            self.matrix.assemble()
             return
         if mass is not None:
             self._block_diagonals[mass.blocks] += mass.values
         self.entries_outdated = True
-
-    def set_entries(self) -> None:
-        """Set the entries in the pattern of the form to the values assembled last, without blocks (collective)."""
-        self.matrix.setValuesIJV(self._starts, self._columns, self._sum.data[self._owned])
-        self.matrix.assemble()
 
     def assemble_block_diagonals(self, form: fem.Form, bcs: list[fem.DirichletBC]) -> Values:
         """(blocks of owned rows, d) diagonals of the blocks of a form of the same pattern (collective).

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -30,7 +29,7 @@ from .matrix_assembly import TangentAssembler
 from .prescribed_motion import PrescribedMotion
 from .stress import Stress
 from .term import Term, overriding, sum_of_forms
-from .term_protocols import EliminatingTerm, StepLimiter, TieTerm, fulfilling
+from .term_protocols import EliminatingTerm, TieTerm, fulfilling
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -43,22 +42,6 @@ Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class ReusePolicy:
-    """Bounds below which the body's part of the tangent is reused within an attempt, while fragments are in contact.
-
-    Attributes:
-        max_move: largest displacement since it was assembled, in mean edge lengths.
-        max_fraction: fraction of a Newton step that contact allowed; the next step, its remainder, uses the same part.
-    """
-
-    max_move: float = 1e-3
-    max_fraction: float = 0.5
-
-
-REUSE = ReusePolicy()
-
-
 class Couplings:
     """Couplings between nodes of different cells, which the terms of a balance add to its tangent.
 
@@ -66,7 +49,6 @@ class Couplings:
         beside: coupling of the last tangent that the assembled matrix lacks; None: it has all.
         has_contact: whether terms coupled nodes in the last tangent, except by constants.
         in_entries: whether the matrix of single entries has ever had one.
-        varying: whether a coupling that is no constant has ever been added to K.
     """
 
     def __init__(self, terms: Sequence[Term], motion: PrescribedMotion, domain: Domain) -> None:
@@ -76,19 +58,18 @@ class Couplings:
         self.beside: FewNodesCoupling | None = None
         self._beside_blocks: list[PETSc.Mat] = []  # of the last tangent, but for ties
         self._builder, self._keeps_beside = CouplingBuilder(domain), True
-        self.has_contact = self.in_entries = self.varying = False
+        self.has_contact = self.in_entries = False
 
     def keep_beside(self, keep: bool) -> None:
         """Keep a FewNodesCoupling beside the matrix from now on, or add it to the matrix, as factors need it."""
         self._keeps_beside = keep
 
-    def add_to_entries(self, K: PETSc.Mat, *, with_contact: bool, only_varying: bool) -> bool:
+    def add_to_entries(self, K: PETSc.Mat, *, with_contact: bool) -> bool:
         """Add stiffness and couplings of the terms to the entries (collective).
 
         Args:
             K: tangent in single entries.
             with_contact: whether couplings are added.
-            only_varying: whether K has the constant couplings already.
 
         Returns:
             Whether the nonzero pattern has changed.
@@ -96,9 +77,7 @@ class Couplings:
         self.beside, self.has_contact, changed = None, False, False
         for term in self._coupled:
             term.add_stiffness(K)
-            if not with_contact or (coupling := self._coupling_of(term)) is None:
-                continue
-            if not (only_varying and term.linear):
+            if with_contact and (coupling := self._coupling_of(term)) is not None:
                 changed |= self._add(K, coupling)
         return changed
 
@@ -133,8 +112,7 @@ class Couplings:
             if self._keeps_beside:
                 self.beside = coupling.without_dofs(self._domain, self._motion.owned_dofs)
                 return None
-            coupling = self._builder(coupling.owned_rows(), coupling.numbers)
-        self.varying |= not term.linear
+            return self._builder(coupling.owned_rows(), coupling.numbers)
         return coupling
 
     def _add(self, K: PETSc.Mat, coupling: PETSc.Mat) -> bool:
@@ -168,13 +146,10 @@ class Tangent:
         may_be_incomplete: whether the assembled matrix may lack low-rank updates or a coupling.
     """
 
-    def __init__(
-        self, u: fem.Function, terms: Sequence[Term], stress: Stress, motion: PrescribedMotion, mass: MassMatrix
-    ) -> None:
+    def __init__(self, terms: Sequence[Term], stress: Stress, motion: PrescribedMotion, mass: MassMatrix) -> None:
         """Compile the sum of the terms' forms (collective)."""
         self.domain, self.c_v = stress.domain, 0.0
-        self._u, self._terms, self._stress, self._motion, self._mass = u, terms, stress, motion, mass
-        self._owned = u.x.index_map.size_local * u.x.block_size
+        self._terms, self._stress, self._motion, self._mass = terms, stress, motion, mass
         self.pattern_version, self.couplings = 0, Couplings(terms, motion, self.domain)
         self.low_rank_updates: list[tuple[Values, Values]] = []
         self._eliminating = fulfilling(terms, EliminatingTerm)
@@ -183,9 +158,6 @@ class Tangent:
         self._linear = all(term.linear for term in terms)
         self._with_contact = True
         self._psd: PsdProjection | None = None
-        # tolerance of the moduli and displacement of the last tangent in this attempt
-        self._assembled_at: tuple[float | None, Values] | None = None
-        self._step_fraction = 1.0  # of the last Newton step
         self._last: tuple[object, list[Values]] | None = None  # rates and damage of the last linear tangent
         v, w, dx = ufl.TrialFunction(self.domain.space), ufl.TestFunction(self.domain.space), cell_measure(self.domain)
         self.form = CellForm(sum_of_forms([term.tangent_form(v, w, dx) for term in terms]))
@@ -255,14 +227,6 @@ class Tangent:
 
     # --- a solve ---
 
-    def begin_solve(self) -> None:
-        """Begin an attempt of Newton's method at the step."""
-        self._assembled_at, self._step_fraction = None, 1.0
-
-    def record_step_fraction(self, share: float) -> None:
-        """Record which fraction of a Newton step was taken."""
-        self._step_fraction = share
-
     @contextmanager
     def without_contact(self) -> Iterator[None]:
         """Context in which K is that of a body without contact."""
@@ -285,20 +249,12 @@ class Tangent:
             self.update_entries()
 
     def _assemble_all(self, psd_tolerance: float | None) -> None:
-        reused = self._is_reusable(psd_tolerance)
-        # single entries are sums of the body's part and of couplings, blocks have no couplings
-        has_old_couplings = self.couplings.varying and self._assembler.blocks is None
-        if not reused or has_old_couplings:
-            self._assemble_body(psd_tolerance, reuse=reused)
+        self._assemble_body(psd_tolerance)
         with_contact = self._with_contact
         if (blocks := self._assembler.blocks) is not None:
             self.couplings.put_beside(blocks, with_contact=with_contact)
-            # entries have the couplings of the last tangent, also where its blocks are reused
-            self._assembler.entries_outdated = True
         else:
-            has_constant = reused and not has_old_couplings
-            changed = self.couplings.add_to_entries(self.matrix, with_contact=with_contact, only_varying=has_constant)
-            self.pattern_version += changed
+            self.pattern_version += self.couplings.add_to_entries(self.matrix, with_contact=with_contact)
         eliminating = self._eliminating if with_contact else []
         self.low_rank_updates = [update for term in eliminating for update in term.low_rank_updates()]
         for U, _ in self.low_rank_updates:
@@ -306,50 +262,19 @@ class Tangent:
 
     # --- the body's part ---
 
-    def _assemble_body(self, psd_tolerance: float | None, *, reuse: bool) -> None:
-        """Assemble forms and inertia, without couplings; `reuse`: the forms are those of the last assembly."""
+    def _assemble_body(self, psd_tolerance: float | None) -> None:
+        """Assemble forms and inertia, without couplings."""
         if self.couplings.in_entries and self._assembler.blocks is None:
             self.matrix.zeroEntries()  # entries beyond the pattern of the cells
         factor = sum(term.mass_factor for term in self._inertial)
-        psd_form = None
-        if not reuse and psd_tolerance is not None:
-            psd_form = self._psd_form(psd_tolerance, has_inertia=factor > 0)
+        psd_form = None if psd_tolerance is None else self._psd_form(psd_tolerance, has_inertia=factor > 0)
         if self._assembler.blocks is not None:
             mass = self._mass.block_values(self._assembler, factor) if factor else None
             self._assembler(self._motion.bcs, psd_form, mass)
         else:
-            if reuse:
-                self._assembler.set_entries()
-            else:
-                self._assembler(self._motion.bcs, psd_form)
+            self._assembler(self._motion.bcs, psd_form)
             if factor:
                 self._mass.add_to(self.matrix, factor, more_entries=self.couplings.in_entries)
-        if not reuse:
-            u = self._u.x.array[: self._owned]
-            self._assembled_at = (psd_tolerance, u.copy()) if self._depends_on_u_alone else None
-
-    def _is_reusable(self, psd_tolerance: float | None) -> bool:
-        """Whether the last K of this attempt is the body's part, and u has hardly changed since (collective).
-
-        In contact most Newton steps are small against a mean edge, and only the barrier is nonlinear. While fragments
-        come into contact one after another, the same step is found again and again.
-        """
-        if self._assembled_at is None or not self.couplings.has_contact:
-            return False
-        tolerance, u = self._assembled_at
-        if tolerance != psd_tolerance:
-            return False
-        if self._step_fraction < REUSE.max_fraction:
-            return True
-        moved = float(np.abs(self._u.x.array[: self._owned] - u).max(initial=0.0))
-        return bool(self.domain.comm.allreduce(moved, op=MPI.MAX) <= REUSE.max_move * self.domain.mean_edge_length)
-
-    @cached_property
-    def _depends_on_u_alone(self) -> bool:
-        """Whether terms add only couplings to K, and its other part is a function of u alone (collective)."""
-        adds_entries = bool(overriding(self._terms, "add_stiffness"))
-        limited = bool(fulfilling(self._terms, StepLimiter))
-        return limited and all([term.potential() is not None for term in self._terms]) and not adds_entries
 
     def _psd_form(self, tolerance: float, *, has_inertia: bool) -> fem.Form:
         """Form of the correction of the moduli at the current u."""

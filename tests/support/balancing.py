@@ -87,7 +87,6 @@ def changed() -> dict[str, Any]:
     chi.x.array[: domain.cell_count][is_stiff] = 30.0
     chi.x.scatter_forward()
     scene.balance.damage_changed()
-    scene.balance.tangent.begin_solve()
     scene.stepper.solver.linear.preconditioner.edges_broke(0)
     return solved(scene)
 

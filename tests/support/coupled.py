@@ -81,7 +81,6 @@ def main(path: str) -> None:
 
     # PETSc's multigrid smooths by the entries of its last update
     size = entries.norm()
-    tangent.begin_solve()
     tangent.assemble(blocks_only=True)
     product = expected.array_r.reshape(-1, d)[nodes].reshape(-1)
     found = {
