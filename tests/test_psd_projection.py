@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from fracsim.mechanics.psd_projection import plain_psd_correction, psd_correction
-from fracsim.solvers.policy import DEFAULT_POLICY
 from support.reference import dense_tangent
 from support.scenes import displacement, make_scene, positions
 from support.solver_policy import set_policy
@@ -103,22 +102,3 @@ def test_a_first_guess_that_is_inside_out_gives_way_to_the_start_of_the_step(mon
     ends = np.linalg.det(np.diff((x + state.u.reshape(-1, 3))[cells], axis=1))
     assert (volumes[0] * ends > 0).all()
     np.testing.assert_allclose((mass * state.v.reshape(-1, 3)).sum(axis=0), (mass * v).sum(axis=0), atol=1e-6)
-
-
-def test_what_crawls_goes_on_down_the_potential(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A step of a block that is swung, by the norm of its residual and, from the first iteration on, down its
-    potential: to the same place, which no norm has to be halved for."""
-    found = []
-    for crawl in (DEFAULT_POLICY.halving_iterations, 0):
-        set_policy(monkeypatch, halving_iterations=crawl)
-        scene, state = make_scene(
-            mesh={"builder": "box", "size": [1.0, 1.0, 1.0], "h": 0.34}, solver={"snes_rtol": 1e-10},
-            material={"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 1.0},
-            boundary=[{"on": "left", "fix": "xyz"}], time={"scheme": "backward-euler", "step": 0.05, "end": 0.05},
-        )  # fmt: skip
-        state.v = np.where(state.u == 0, 3.0 * positions(scene)[:, [1, 2, 0]].reshape(-1), 0.0)
-        state.settle()
-        state.advance()
-        assert scene.solver is not None and (scene.solver._newton._second_modified is not None) == (crawl == 0)
-        found.append(state.u.copy())
-    np.testing.assert_allclose(found[1], found[0], atol=1e-7 * np.abs(found[0]).max())

@@ -175,7 +175,6 @@ POSITIVE_TANGENTS = (
     TangentModification("strictly positive tangents to the end", 0.0, 0.0, from_last_iterate=True),
     TangentModification("strictly positive tangents, preconditioner for each", 0.0, 0.0, rebuild_preconditioner=True),
 )
-EXACT_TANGENTS = TangentModification("exact tangents, descent of the potential", math.inf, 0.0, from_last_iterate=True)
 
 
 class ModifiedNewton:

@@ -70,7 +70,7 @@ class ConvergenceTest:
     """Convergence test of SNES: |r| <= rtol max(|r_0|, |forces|), or below round-off.
 
     PETSc's own test against |r_0| alone requires more digits as the first guess gets better. An attempt is also ended
-    if it costs too much, if its line search makes no progress, or if a stop was requested.
+    if it costs too much, if it cycles, or if a stop was requested.
 
     Attributes:
         solved_norm: largest |r| of a solution, N.
@@ -85,7 +85,7 @@ class ConvergenceTest:
         self._rtol, self._first_norm = rtol, 0.0
         self.stop_requested: Callable[[], bool] = lambda: False
         self._elimination: NonlinearElimination | None = None  # of a body with broken edges
-        self._norms: list[float] = []  # |r| of the iterates of the attempt
+        self._last_norm = 0.0  # |r| of the last iterate
         self._eliminations = 0
         self._modified: ModifiedNewton | None = None
         self._limit: CostLimit = UNLIMITED_COST
@@ -112,23 +112,12 @@ class ConvergenceTest:
             is_second: whether it is by the second SNES.
         """
         self._limit, self._modified, self._is_second = limit, modified, is_second
-        self._norms, self._eliminations, self.stopped_for_cost = [], 0, False
+        self._eliminations, self.stopped_for_cost = 0, False
 
     def begin_solve(self, *, intermediate: bool) -> None:
         """Begin a solve of the attempt; `intermediate`: with a part of the obstacles' motion alone."""
         self._rtol = self._policy.intermediate_rtol if intermediate else self._asked_rtol
         self.aborted = False
-
-    def crawls(self, snes: PETSc.SNES) -> bool:
-        """Whether the line search on |r| has made the last steps too short.
-
-        The residual of one cell that is nearly flat grows before it decreases. The incremental potential, where there
-        is one that this attempt does not use, allows whole steps. Without inertia factors replace slow attempts.
-        """
-        norms, balance, count = self._norms, self._balance, self._policy.halving_iterations
-        is_slow = len(norms) > count and norms[-1] > norms[-1 - count] / 2
-        has_other_merit = self._modified is None and balance.conservative and balance.scheme.inertia
-        return is_slow and has_other_merit and snes.ksp.getType() == "cg"
 
     def reason_to_end(self, snes: PETSc.SNES, its: int, norms: tuple[float, float, float]) -> int:
         """Reason for SNES to end after `its` iterations, 0 to continue; `norms`: |x|, |dx| and |r| (collective)."""
@@ -147,8 +136,8 @@ class ConvergenceTest:
         has_inertia = self._balance.scheme.inertia
         if self._modified is not None and has_inertia and self._modified.has_stalled(snes.getFunctionNorm(), its):
             return int(reason.DIVERGED_MAX_IT)  # half the step is solved in a few iterations
-        self._norms.append(snes.getFunctionNorm())
-        return int(reason.DIVERGED_LINE_SEARCH if self.crawls(snes) else reason.ITERATING)
+        self._last_norm = snes.getFunctionNorm()
+        return int(reason.ITERATING)
 
     def _all_solved(self, snes: PETSc.SNES, norm: float, its: int) -> bool:
         """Whether r = 0 for u and for the unknowns that are eliminated from the linear systems (collective).
@@ -178,7 +167,7 @@ class ConvergenceTest:
         may_relax = self._modified is not None or self._eliminations < self._policy.max_eliminations
         if self._elimination is None or not its or not may_relax:
             return False
-        if snes.getFunctionNorm() < self._policy.fast_reduction_ratio * self._norms[-1]:
+        if snes.getFunctionNorm() < self._policy.fast_reduction_ratio * self._last_norm:
             return False
         if not self._elimination.relax_nodes(self.solved_norm):
             return False
@@ -265,11 +254,6 @@ class NewtonSolver:
     def descended_potential(self) -> bool:
         """Whether the line search of the last attempt minimised the incremental potential."""
         return self._modified is not None
-
-    @property
-    def crawls(self) -> bool:
-        """Whether the line search on |r| made the last steps too short (ConvergenceTest.crawls)."""
-        return self._convergence.crawls(self.snes)
 
     # --- the tangent ---
 

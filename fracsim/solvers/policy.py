@@ -28,8 +28,6 @@ class SolverPolicy:
     fast_reduction_ratio: float = 0.1
     # Eliminations in an attempt with the merit function |r|, which may rise in each of them: bounds a cycle.
     max_eliminations: int = 4
-    # Iterations in which |r| has to be halved where it is the merit function; a slower attempt is given up.
-    halving_iterations: int = 2
     # Linear solves of a step with a linear balance, before Newton's method takes over. One is the rule.
     max_linear_solves: int = 3
     # Solves of a step in which jammed obstacles advance, at most, and before advancing may be judged as too slow.

@@ -1,7 +1,7 @@
 """Strategies to solve the balance of forces of a step, the order in which they are tried, and which one begins.
 
-A strategy is tried where it applies after the last attempt: Newton's method with exact tangents, down another merit
-function, with tangents made positive, with a fresh preconditioner, with GMRES, with factors. `STRATEGIES` is the list.
+A strategy is tried where it applies after the last attempt: Newton's method with exact tangents, with tangents made
+positive, with a fresh preconditioner, with GMRES, with factors. `STRATEGIES` is the list.
 
 Equations: docs/theory.md#newtons-method.
 """
@@ -20,7 +20,7 @@ from petsc4py import PETSc
 
 from ..mechanics.balance import Balance
 from .direct_solver import DirectSolver
-from .line_search import EXACT_TANGENTS, POSITIVE_TANGENTS, TangentModification
+from .line_search import POSITIVE_TANGENTS, TangentModification
 from .linear_solver import LinearSolver
 from .newton import UNLIMITED_COST, CostLimit, NewtonSolver, SolveResult
 from .policy import SolverPolicy
@@ -51,14 +51,12 @@ class Attempt:
         strategy: name of its strategy.
         result: its result.
         linear_solves_failed: whether it did not converge because linear solves failed.
-        crawled: whether the line search on |r| made its steps too short (NewtonSolver.crawls).
         start: (owned dofs,) u from which the next strategy starts, m; None: from the last iterate.
     """
 
     strategy: str
     result: SolveResult
     linear_solves_failed: bool = False
-    crawled: bool = False
     start: Values | None = None
 
 
@@ -245,7 +243,6 @@ def try_in_turn(strategies: Sequence[Strategy], solvers: Solvers, task: Task) ->
 
 FACTORS_OF_SPELL = "factors, as in the last solves"
 EXACT = "exact tangents"
-EXACT_DESCENT = EXACT_TANGENTS.name
 FRESH_PRECONDITIONER = "preconditioner updated for each tangent"
 GMRES = "GMRES"
 FACTORS_FROM_LAST_ITERATE = "factors, from the last iterate"
@@ -265,7 +262,7 @@ def _factors_of_spell(solvers: Solvers, task: Task, last: Attempt | None) -> Att
     return Attempt(FACTORS_OF_SPELL, result) if solvers.selector.accepts_factors(result) else None
 
 
-# --- exact tangents: down |r|, then down the incremental potential ---
+# --- exact tangents ---
 
 
 def _begins_with_exact_tangents(solvers: Solvers, last: Attempt | None) -> bool:
@@ -273,29 +270,13 @@ def _begins_with_exact_tangents(solvers: Solvers, last: Attempt | None) -> bool:
 
 
 def _exact_tangents(solvers: Solvers, task: Task, last: Attempt | None) -> Attempt:
+    """Attempt with exact tangents; after a descent of the potential the next one continues from the last iterate."""
     result = solvers.newton.attempt(task.guess, limit=task.limit)
-    attempt = _after_exact_tangents(EXACT, solvers, result, task)
-    if not attempt.crawled:
-        _count_first_tangent(solvers, attempt)
-    return attempt
-
-
-def _crawled(solvers: Solvers, last: Attempt | None) -> bool:
-    return last is not None and last.strategy == EXACT and last.crawled
-
-
-def _exact_descent(solvers: Solvers, task: Task, last: Attempt | None) -> Attempt:
-    result = solvers.newton.attempt(None, EXACT_TANGENTS, task.limit)
-    attempt = _after_exact_tangents(EXACT_DESCENT, solvers, result, task)
+    continues = solvers.newton.descended_potential and not solvers.balance.contact.remaining_motion()
+    start = None if continues else task.guess
+    attempt = Attempt(EXACT, result, solvers.linear_solves_failed(result), start)
     _count_first_tangent(solvers, attempt)
     return attempt
-
-
-def _after_exact_tangents(name: str, solvers: Solvers, result: SolveResult, task: Task) -> Attempt:
-    """Attempt with exact tangents; after a descent of the potential the next one continues from the last iterate."""
-    continues = solvers.newton.descended_potential and not solvers.balance.contact.remaining_motion()
-    crawled = name == EXACT and solvers.newton.crawls
-    return Attempt(name, result, solvers.linear_solves_failed(result), crawled, None if continues else task.guess)
 
 
 def _count_first_tangent(solvers: Solvers, attempt: Attempt) -> None:
@@ -306,7 +287,7 @@ def _count_first_tangent(solvers: Solvers, attempt: Attempt) -> None:
 
 
 def _exact_tangents_failed(last: Attempt | None) -> bool:
-    return last is not None and last.strategy in (EXACT, EXACT_DESCENT) and last.linear_solves_failed
+    return last is not None and last.strategy == EXACT and last.linear_solves_failed
 
 
 # --- tangents made positive ---
@@ -448,7 +429,6 @@ def _factors_from_start(solvers: Solvers, task: Task, last: Attempt | None) -> A
 
 ITERATIVE_STRATEGIES = (
     Strategy(EXACT, _begins_with_exact_tangents, _exact_tangents),
-    Strategy(EXACT_DESCENT, _crawled, _exact_descent),
     Strategy(POSITIVE_TANGENTS[0].name, _needs_positive_tangents, _first_positive_tangents),
     *(_following(later, earlier) for earlier, later in pairwise(POSITIVE_TANGENTS)),
     Strategy(FRESH_PRECONDITIONER, _needs_fresh_preconditioner, _fresh_preconditioner),
