@@ -355,6 +355,7 @@ def test_levels_that_are_not_positive_for_positive_tangents_are_made_again(monke
     Walk(scene).advance()
     linear, solvers = linear_of(scene), scene.solver._solvers  # type: ignore[union-attr]
     guess = np.zeros(3)
+    failed = Attempt("exact tangents", SolveResult(False, 0, 0, ""), linear_solves_failed=True, start=guess)
     for code, expected in (
         (reason.DIVERGED_INDEFINITE_PC, [(True, Update.NONE), (False, Update.REBUILD)]),
         (reason.DIVERGED_INDEFINITE_MAT, [(True, Update.NONE)]),
@@ -366,9 +367,10 @@ def test_levels_that_are_not_positive_for_positive_tangents_are_made_again(monke
             linear.ksp.setConvergedReason(code if len(calls) == 1 else reason.CONVERGED_RTOL)
             return SolveResult(len(calls) > 1, 1, 1, "")
 
-        linear.preconditioner._due = Update.NONE
+        linear.preconditioner._due = linear.preconditioner._last_update = Update.NONE
+        linear.ksp.setConvergedReason(reason.DIVERGED_INDEFINITE_MAT)
         monkeypatch.setattr(solvers.newton, "attempt", attempt)
-        result = _first_positive_tangents(solvers, Task(guess, UNLIMITED_COST, []), None)
+        result = _first_positive_tangents(solvers, Task(guess, UNLIMITED_COST, []), failed)
         assert calls == expected and result.start is guess
         assert result.result.converged == (len(expected) == 2)
 

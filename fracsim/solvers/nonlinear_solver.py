@@ -18,7 +18,7 @@ from .linear_solver import LinearSolver
 from .newton import NewtonSolver, SolveResult
 from .petsc_options import PetscOptions, option_errors
 from .policy import SolverPolicy
-from .strategies import ITERATIVE_NAMES, STRATEGIES, PositiveTangentSpell, Solvers, SolverSelector, Task, try_in_turn
+from .strategies import ITERATIVE_NAMES, STRATEGIES, Solvers, SolverSelector, Task, try_in_turn
 
 Values = npt.NDArray[np.float64]
 
@@ -66,8 +66,7 @@ class NonlinearSolver:
             may_prefer=is_default and direct_is_cheap,
             has_inertia=balance.scheme.inertia,
         )
-        spell = PositiveTangentSpell(policy.positive_tangent_solves)
-        self._solvers = Solvers(balance, newton, self.selector, spell, policy)
+        self._solvers = Solvers(balance, newton, self.selector, policy)
 
     @property
     def snes(self) -> PETSc.SNES:

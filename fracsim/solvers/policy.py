@@ -106,8 +106,6 @@ class SolverPolicy:
     # --- fallbacks (strategies) ---
     # Restart length of GMRES. With PETSc's 30 it stalls on nearly incompressible bodies.
     gmres_restart: int = 200
-    # Solves that begin with positive tangents after exact first tangents have failed in two solves in a row.
-    positive_tangent_solves: int = 8
 
     # --- preconditioner ---
     # c_a rho h^2 / Y. Above it inertia resists the motion of parts that are attached by a node or an edge, and no

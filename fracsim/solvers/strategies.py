@@ -119,31 +119,6 @@ class SolverSelector(CostLimit):
         return self._direct.equivalent_iterations * counted
 
 
-class PositiveTangentSpell:
-    """Number of solves to come that begin with tangents made positive.
-
-    It is set after the first exact tangent gave no descent direction in two solves in a row.
-    """
-
-    def __init__(self, length: int) -> None:
-        self._length, self._remaining, self._failures = length, 0, 0
-
-    @property
-    def is_active(self) -> bool:
-        """Whether the next solve begins with positive tangents."""
-        return self._remaining > 0
-
-    def solve_begins(self) -> None:
-        """Count a solve that begins with positive tangents."""
-        self._remaining -= 1
-
-    def first_exact_tangent_tried(self, *, failed: bool) -> None:
-        """Count first exact tangents that failed in a row."""
-        self._failures = self._failures + 1 if failed else 0
-        if self._failures > 1:
-            self._remaining = self._length
-
-
 @dataclass(frozen=True)
 class Solvers:
     """Solvers that the strategies of a nonlinear solver share.
@@ -152,14 +127,12 @@ class Solvers:
         balance: equations.
         newton: Newton's method.
         selector: choice between Krylov iterations and factors.
-        positive_spell: solves that begin with positive tangents.
         policy: limits of the strategies.
     """
 
     balance: Balance
     newton: NewtonSolver
     selector: SolverSelector
-    positive_spell: PositiveTangentSpell
     policy: SolverPolicy
 
     @property
@@ -265,25 +238,11 @@ def _factors_of_spell(solvers: Solvers, task: Task, last: Attempt | None) -> Att
 # --- exact tangents ---
 
 
-def _begins_with_exact_tangents(solvers: Solvers, last: Attempt | None) -> bool:
-    return last is None and not solvers.positive_spell.is_active
-
-
 def _exact_tangents(solvers: Solvers, task: Task, last: Attempt | None) -> Attempt:
     """Attempt with exact tangents; after a descent of the potential the next one continues from the last iterate."""
     result = solvers.newton.attempt(task.guess, limit=task.limit)
     continues = solvers.newton.descended_potential and not solvers.balance.contact.remaining_motion()
-    start = None if continues else task.guess
-    attempt = Attempt(EXACT, result, solvers.linear_solves_failed(result), start)
-    _count_first_tangent(solvers, attempt)
-    return attempt
-
-
-def _count_first_tangent(solvers: Solvers, attempt: Attempt) -> None:
-    """Tell whether the first exact tangent of a solve failed, where positive tangents may be better."""
-    may_be_better = solvers.balance.scheme.inertia and solvers.balance.conservative
-    failed = may_be_better and not attempt.result.newton_iterations and attempt.linear_solves_failed
-    solvers.positive_spell.first_exact_tangent_tried(failed=failed)
+    return Attempt(EXACT, result, solvers.linear_solves_failed(result), None if continues else task.guess)
 
 
 def _exact_tangents_failed(last: Attempt | None) -> bool:
@@ -294,15 +253,12 @@ def _exact_tangents_failed(last: Attempt | None) -> bool:
 
 
 def _needs_positive_tangents(solvers: Solvers, last: Attempt | None) -> bool:
-    return last is None or (solvers.balance.conservative and _exact_tangents_failed(last))
+    return solvers.balance.conservative and _exact_tangents_failed(last)
 
 
 def _first_positive_tangents(solvers: Solvers, task: Task, last: Attempt | None) -> Attempt:
-    if last is None:
-        solvers.positive_spell.solve_begins()
-        start: Values | None = task.guess
-    else:
-        start = solvers.start_after_failure(last)
+    assert last is not None
+    start = solvers.start_after_failure(last)
     attempt = _modified_tangents(solvers, POSITIVE_TANGENTS[0], start, task)
     if attempt.linear_solves_failed and solvers.ksp.reason == PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_PC:
         solvers.linear.preconditioner.solve_failed()  # that of an earlier tangent is not positive
@@ -428,7 +384,7 @@ def _factors_from_start(solvers: Solvers, task: Task, last: Attempt | None) -> A
 # --- the list ---
 
 ITERATIVE_STRATEGIES = (
-    Strategy(EXACT, _begins_with_exact_tangents, _exact_tangents),
+    Strategy(EXACT, _has_no_result, _exact_tangents),
     Strategy(POSITIVE_TANGENTS[0].name, _needs_positive_tangents, _first_positive_tangents),
     *(_following(later, earlier) for earlier, later in pairwise(POSITIVE_TANGENTS)),
     Strategy(FRESH_PRECONDITIONER, _needs_fresh_preconditioner, _fresh_preconditioner),
