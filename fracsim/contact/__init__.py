@@ -31,6 +31,7 @@ Points and facets before analytic obstacles:
     contact_surface       points of the split surface; retraction of new crack faces; cells that show theirs
     node_contact          forces on points, lagged friction, derivatives by the pose of an obstacle
     closest_point, facet_contact  forces on facets between their nodes
+    obstacle_patch        contact of few nodes that move while all others stay, for nonlinear elimination
     step_limit            conservative advancement, first guesses, motion of obstacles in a step
 
 Surfaces with ipctk:

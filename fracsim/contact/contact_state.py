@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import cast
 
@@ -22,7 +23,7 @@ from ..meshes.topology import row_keys
 from .clearance import Clearance, FollowingPoints, ProximityCandidates, ShapeDistance, outline_radius
 from .contact_surface import RETRACTION, TINY, ContactSurface, ShownCells, retract_cut_elements
 from .facet_contact import FACETS, ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
-from .laws import CoulombFriction, FrictionDirection, ObstacleLaw, tangential
+from .laws import CoulombFriction, FrictionDirection, GapPotential, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
 from .obstacle import RigidObstacle
 from .pose import PosedShape, min_distance
@@ -246,6 +247,67 @@ def refuse_closed_gaps(comm: MPI.Intracomm, gaps: Values, number: int, obstacle:
         )
 
 
+@dataclass(frozen=True)
+class StepContact:
+    """Contact of an obstacle at the start of a step, on which its forces at the end depend.
+
+    Attributes:
+        lagged: contact with which friction is lagged; None: without friction.
+        friction: law of friction.
+        obstacle_motion: (d,) motion of the obstacle in the step, or (k, d) of its points in lagged contact, m.
+        points: points at the start, where the barrier is averaged over the step; None: it is not.
+        facets: obstacle and points (n, d) at the start, m, of which facets take their gaps.
+    """
+
+    lagged: LaggedContact | None
+    friction: CoulombFriction | None
+    obstacle_motion: Values
+    points: StepStart | None
+    facets: tuple[PosedShape, Values] | None
+
+    def select(self, points: Ints) -> StepContact:
+        """That of points (k,), ascending, which have their numbers in this order."""
+        lagged, motion = self.lagged, self.obstacle_motion
+        if lagged is not None and motion.ndim == 2:
+            motion = motion[np.isin(lagged.points, points)]
+        return StepContact(
+            lagged and lagged.select(points),
+            self.friction,
+            motion,
+            self.points and self.points.select(points),
+            self.facets and (self.facets[0], self.facets[1][points]),
+        )
+
+
+def evaluate_contact(
+    x: Values,
+    area: Values,
+    posed: PosedShape,
+    barrier: GapPotential,
+    start: StepContact,
+    facets: ContactFacets | None,
+    candidates: Ints | None = None,
+    direction: FrictionDirection | None = None,
+) -> ContactForces:
+    """Forces of an obstacle on points, and on the facets between them.
+
+    Args:
+        x: (n, d) positions of the points, m.
+        area: (n,) areas of the points, m^2; 0 of those left out.
+        posed: the obstacle.
+        barrier: b.
+        start: contact at the start of the step.
+        facets: facets on which the obstacle acts; None: it acts on points alone.
+        candidates: (m,) points, ascending, that may be in contact now; None: all.
+        direction: of friction, for its tangent; None: the tangent is exact.
+    """
+    lagged = start.lagged, start.friction, start.obstacle_motion
+    of_points = evaluate_points(x, area, posed, barrier, *lagged, start.points, candidates, direction)
+    if facets is None:
+        return of_points
+    return merge_forces(of_points, *evaluate_facets(facets, posed, x, barrier, start.facets))
+
+
 class ContactState:
     """Obstacles, and the points of a body that they act on at the end of a step.
 
@@ -451,24 +513,24 @@ class ContactState:
 
     def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
         """Forces of an obstacle at a given pose on the points."""
-        obstacle, lagged = self.group.obstacles[number], self.lagged[number]
-        friction = None
-        if lagged is not None and self._sticking_slips is not None:
-            friction = CoulombFriction(obstacle.friction, self._sticking_slips[number])
-            self._directions.setdefault(number, FrictionDirection(friction, lagged.normal))
-        obstacle_motion, start = self.contact_point_motion(number), self._step_starts[number]
-        start_posed = self.group.start_posed[number]
+        start = self.step_contact(number)
+        if start.friction is not None and start.lagged is not None:
+            self._directions.setdefault(number, FrictionDirection(start.friction, start.lagged.normal))
         candidates = self.point_candidates(posed, self.positions, self.law.barrier.width)
+        facets = self.facets.active if number in self.facets.numbers else None
+        points, barrier = (self.positions, self.surface.area), self.law.barrier
+        return evaluate_contact(*points, posed, barrier, start, facets, candidates, self._directions.get(number))
+
+    def step_contact(self, number: int) -> StepContact:
+        """Contact of an obstacle at the start of the step, as its forces at the current pose depend on it."""
+        lagged, start, friction, facet_start = self.lagged[number], self._step_starts[number], None, None
+        if lagged is not None and self._sticking_slips is not None:
+            friction = CoulombFriction(self.group.obstacles[number].friction, self._sticking_slips[number])
         if start is not None:
-            start = start.carried_with(start_posed.pose, posed.pose)
-        points = self.positions, self.surface.area, posed, self.law.barrier
-        direction = self._directions.get(number)
-        of_points = evaluate_points(*points, lagged, friction, obstacle_motion, start, candidates, direction)
-        if number not in self.facets.numbers:
-            return of_points
-        facet_start = None if start is None else (start_posed, self._start_positions)
-        of_facets = evaluate_facets(self.facets.active, posed, self.positions, self.law.barrier, facet_start)
-        return merge_forces(of_points, *of_facets)
+            start_posed = self.group.start_posed[number]
+            start = start.carried_with(start_posed.pose, self.group.posed[number].pose)
+            facet_start = start_posed, self._start_positions
+        return StepContact(lagged, friction, self.contact_point_motion(number), start, facet_start)
 
     def _compute_sticking_slips(self) -> list[float]:
         """Slip in the step that counts as sticking, m, at each obstacle (collective)."""

@@ -67,6 +67,12 @@ class LaggedContact:
     position: Values
     obstacle_point: Values
 
+    def select(self, points: Ints) -> LaggedContact:
+        """That of points (m,) of the surface, ascending, which have their numbers in this order."""
+        rows = np.isin(self.points, points)
+        arrays = self.force, self.normal, self.position, self.obstacle_point
+        return LaggedContact(np.searchsorted(points, self.points[rows]), *(values[rows] for values in arrays))
+
 
 @dataclass(frozen=True, eq=False)
 class StepStart:
@@ -79,6 +85,10 @@ class StepStart:
 
     gap: Values
     contact: LaggedContact | None = None
+
+    def select(self, points: Ints) -> StepStart:
+        """The start of points (m,), ascending, which have their numbers in this order."""
+        return StepStart(self.gap[points], self.contact and self.contact.select(points))
 
     def carried_with(self, start: Pose, end: Pose) -> StepStart:
         """The same start, moved with an obstacle from its pose at the start to that at the end."""

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +32,9 @@ from .node_contact import ContactForces, PoseCoupling, PoseDerivatives, contact_
 from .pose import min_distance, resultant
 from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 from .step_limit import PoseMotion, safe_motion_fractions, stop_before_obstacles
+
+if TYPE_CHECKING:
+    from .obstacle_patch import ObstaclePatch
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -93,13 +97,9 @@ class ObstacleTerm(ContactState, Term):
         # the next tangent is exact where points have hardly moved since
         self._tangent_positions = self.positions
         self._update_directions()
-        points = np.concatenate([contact.points for contact in contacts])
-        if not self.comm.allreduce(len(points)):
+        if not self.comm.allreduce(sum(len(contact.points) for contact in contacts)):
             return None
-        groups = [(points[:, None], np.concatenate([contact.tangent(exact=exact) for contact in contacts]))]
-        for facets in (contact.facets for contact in contacts if contact.facets is not None):
-            groups.append((facets.corners, facets.hessian if exact else facets.stiffness))
-        matrix = self.surface.stiffness(groups)
+        matrix = self.surface.stiffness(stiffness_blocks(contacts, exact=exact))
         return self._coupling(self.level.contact_weights.factor * matrix, self.surface.local.columns)
 
     def _update_directions(self) -> None:
@@ -191,6 +191,12 @@ class ObstacleTerm(ContactState, Term):
             limits = self.facets_for(index), self.point_candidates, min_gap
             fractions.append(safe_motion_fractions(posed, x, motion, q, *limits))
         return self.surface.min_fraction(np.min(fractions, axis=0))
+
+    def patch(self, nodes: Ints) -> ObstaclePatch:
+        """Contact of nodes (k,), by their ascending global numbers, that move from the current u (collective)."""
+        from .obstacle_patch import ObstaclePatch  # in steps after edges broke alone
+
+        return ObstaclePatch(self, nodes)
 
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) first guess of u, m, that crosses no obstacle on its way from the start (collective)."""
@@ -294,3 +300,12 @@ class ObstacleTerm(ContactState, Term):
         velocity = self.surface.interpolation(self._start_velocity)
         contacts = self.obstacle_forces()
         return [(self.positions[contact.points], contact.normal, velocity[contact.points]) for contact in contacts]
+
+
+def stiffness_blocks(contacts: Sequence[ContactForces], *, exact: bool) -> list[tuple[Ints, Values]]:
+    """(k, c) points and (k, c d, c d) minus the derivatives of their forces, N/m: of points, and of facets."""
+    points = np.concatenate([contact.points for contact in contacts])
+    groups = [(points[:, None], np.concatenate([contact.tangent(exact=exact) for contact in contacts]))]
+    for facets in (contact.facets for contact in contacts if contact.facets is not None):
+        groups.append((facets.corners, facets.hessian if exact else facets.stiffness))
+    return groups

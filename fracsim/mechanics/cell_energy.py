@@ -41,7 +41,7 @@ class CellEnergy:
         components = [(i, j) for i in range(d) for j in range(d)]
         parts = [psi, *(P[ij] for ij in components), *(A[ij + kl] for ij in components for kl in components)]
         self._parts = point_expression(domain, ufl.as_vector(parts))
-        self._volumes, self._d = domain.volumes, d
+        self._volumes, self._d, self._rotation = domain.volumes, d, stress.rotation
         corners = domain.nodes[domain.cell_nodes]
         inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
         self._gradients = np.concatenate([-inverse.sum(axis=1, keepdims=True), inverse], axis=1)
@@ -49,6 +49,8 @@ class CellEnergy:
     def __call__(self, cells: npt.NDArray[np.int32]) -> CellEnergyDerivatives:
         """Energy and derivatives of owned cells (k,) at the current u (not collective)."""
         d, g = self._d, self._gradients[cells]
+        if self._rotation is not None:
+            self._rotation.update(cells)
         values = self._parts.evaluate_at_points(cells) * self._volumes[cells, None]
         P, A = values[:, 1 : 1 + d * d].reshape(-1, d, d), values[:, 1 + d * d :].reshape((-1, d, d, d, d))
         return CellEnergyDerivatives(values[:, 0], g @ P.transpose(0, 2, 1), _stiffness(g, A))

@@ -42,13 +42,14 @@ class PolarRotation:
         self.field.x.array.reshape(-1, d, d)[:] = np.eye(d)
         self._gradient = point_expression(domain, F, kernels=kernels)
         self._rotations = kernels.polar_rotation(domain.comm, d) or polar_rotation
-        self._d = d
+        self._d, self._cell_count = d, domain.cell_count
 
-    def update(self) -> None:
-        """Evaluate R at the current displacement (not collective)."""
+    def update(self, cells: npt.NDArray[np.int32] | None = None) -> None:
+        """Evaluate R at the current displacement in owned cells (k,); None: in all of them (not collective)."""
         # ghosts need no update: cells are not ghosted
-        F = self._gradient.evaluate_at_points().reshape(-1, self._d, self._d)
-        self.field.x.array[:] = self._rotations(F).reshape(-1)
+        F = self._gradient.evaluate_at_points(cells).reshape(-1, self._d, self._d)
+        values = self.field.x.array.reshape(self._cell_count, -1)
+        values[slice(None) if cells is None else cells] = self._rotations(F).reshape(-1, values.shape[1])
 
 
 def compiled_polar_rotation(comm: MPI.Comm, dim: int) -> Rotations | None:

@@ -148,6 +148,11 @@ class Stress(Term):
         return CrackClosureEnergy(energy, _floored(self.chi, self._floor), share, self.integrity, edges, bends)
 
     @property
+    def is_projected(self) -> bool:
+        """Whether strain is projected on edges, each with its integrity."""
+        return self.integrity is not None and self.chi is None
+
+    @property
     def damage_fields(self) -> list[fem.Function]:
         """Fields chi and integrity, as far as the approach has them."""
         return [field for field in (self.chi, self.integrity) if field is not None]
@@ -311,8 +316,7 @@ def turning_moduli(stress: Stress, of_v: Expr, of_w: Expr) -> Expr | None:
     Energies without a rotation have none. The stress of a strain that is projected on edges does not commute with the
     stretch: its tangent is that of a fixed rotation.
     """
-    is_projected = stress.integrity is not None and stress.chi is None
-    if stress.rotation_field is None or is_projected:
+    if stress.rotation_field is None or stress.is_projected:
         return None
     energy, F = stress.material.energy, deformation_gradient(stress.u)
     moduli = energy.turning_moduli(F, stress.rotation_field, of_v, of_w)  # type: ignore[attr-defined]

@@ -9,16 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import numpy.typing as npt
 from mpi4py import MPI
 
 from ..mesh.parallel import sum_over_ranks
-from .term import Flags, Term, Values
+from .term import Flags, Ints, Term, Values
 
 if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
     from ..mesh.split_surface.drawn_surface import DrawnSurface
     from ..mesh.split_surface.surface_map import SurfaceMap
     from .block_matrix import TieMatrix
@@ -84,6 +86,38 @@ class ContactTerm(Protocol):
 
     def clear_search(self) -> None:
         """Clear caches of the contact search and initial guesses: what a checkpoint does not have (collective)."""
+
+
+class ContactPatchValues(NamedTuple):
+    """Potential of contact where k nodes move.
+
+    Attributes:
+        potential: J.
+        forces: (k, d) its gradient, N.
+        stiffness: (k d, k d) its second derivatives, N/m.
+    """
+
+    potential: float
+    forces: Values
+    stiffness: csr_matrix
+
+
+class ContactPatch(Protocol):
+    """Contact of k nodes that move by w (k, d), m, with all others fixed; the same on all ranks."""
+
+    def evaluate(self, w: Values) -> ContactPatchValues:
+        """Potential at w, m, with its derivatives."""
+
+    def free_fraction(self, w: Values, step: Values) -> float:
+        """Fraction in [0, 1] of a step (k, d), m, from w (k, d) that is allowed."""
+
+
+@runtime_checkable
+class PatchContactTerm(Protocol):
+    """Term whose contact can be evaluated for few nodes that move, with all others fixed."""
+
+    def patch(self, nodes: Ints) -> ContactPatch:
+        """Contact of nodes (k,), by their ascending global numbers, that move from the current u (collective)."""
 
 
 @runtime_checkable

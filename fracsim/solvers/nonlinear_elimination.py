@@ -4,12 +4,13 @@ Where a body tears, single cells are almost flat, turn over, or are attached by 
 on the whole body for their sake. If an iteration has not reduced |r| to a tenth, the nodes that hold nearly all of
 |r|^2, with their neighbours, move to a minimum of the incremental potential of these nodes,
 
-    min  sum V (psi(u + w) - psi(u))  +  w (m c_a + k) w / 2  +  (r - f(u)) w
+    min  sum V (psi(u + w) - psi(u))  +  w (m c_a + k) w / 2  +  (r - f(u)) w  +  E(u + w) - E(u)
 
-with the stiffness k of ties (mechanics.node_ties). Connected nodes make a *patch*. A trust-region method with exact
-tangents finds the minima of all patches at once, also through a snap-through; at a minimum the exact tangent of the
-body is positive, too. The solution of the step is the same. Every rank does the same computation; only cells are
-evaluated by their owners.
+with the stiffness k of ties (mechanics.node_ties) and the potential E of contact with analytic obstacles. Connected
+nodes make a *patch*; where there is contact all nodes are one. A trust-region method with exact tangents finds the
+minima of all patches at once, also through a snap-through; at a minimum the exact tangent of the body is positive, too.
+Contact shortens its steps as it shortens Newton's; obstacles stay. The solution of the step is the same. Every rank
+does the same computation; only cells and contact are evaluated by their owners.
 
 Sources: Lanzkron, Rose and Wilkes, SIAM J. Sci. Comput. 17, 1996; Cai and Keyes, 24, 2002; Steihaug, SIAM J. Numer.
 Anal. 20, 1983.
@@ -19,18 +20,26 @@ Equations: docs/theory.md#newtons-method.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import bsr_array, coo_array, sparray
+from scipy.sparse import bsr_array, coo_array, csr_array, csr_matrix, sparray
 from scipy.sparse.csgraph import connected_components
 
 from ..mechanics.balance import Balance
 from ..mechanics.cell_energy import CellEnergy
 from ..mechanics.term import overriding
-from ..mechanics.term_protocols import StepLimiter, TieTerm, fulfilling
+from ..mechanics.term_protocols import (
+    ContactPatch,
+    EliminatingTerm,
+    PatchContactTerm,
+    StepLimiter,
+    TieTerm,
+    fulfilling,
+)
 from ..mesh.parallel import allgather, sum_over_ranks
 from .policy import DEFAULT_POLICY, SolverPolicy
 
@@ -92,14 +101,20 @@ def sum_by_patch(patch: Ints, values: Values, count: int) -> Values:
 def create_elimination(balance: Balance, policy: SolverPolicy = DEFAULT_POLICY) -> NonlinearElimination | None:
     """Return the nonlinear elimination of a balance; None if it has no suitable potential (collective).
 
-    All its parts but the stress of each cell have to be constant forces, inertia and ties.
+    All its parts but the stress of each cell have to be constant forces, inertia, ties, and contact with analytic
+    obstacles.
     """
-    remaining_terms = [term for term in balance.terms if term is not balance.stress]
+    contacts = [term for term in balance.terms if fulfilling([term], PatchContactTerm)]
+    stress = balance.stress
+    remaining_terms = [term for term in balance.terms if term is not stress and term not in contacts]
     has_ties_alone = all(isinstance(term, TieTerm) for term in overriding(remaining_terms, "coupling_matrix"))
     are_constant = has_ties_alone and not overriding(remaining_terms, "tangent_form", "add_stiffness")
-    has_cell_energy = balance.domain.order == 1 and balance.stress.rotation is None
+    # forces from a strain that is projected are no derivative of the energy where the rotation changes
+    has_cell_energy = balance.domain.order == 1 and (stress.rotation is None or not stress.is_projected)
     has_lumped_inertia = balance.mass.is_diagonal and balance.scheme.inertia
-    has_potential = balance.conservative and not fulfilling(remaining_terms, StepLimiter)
+    # terms with unknowns of their own limit these; they stay
+    limiters = [term for term in remaining_terms if fulfilling([term], StepLimiter)]
+    has_potential = balance.conservative and all(fulfilling([term], EliminatingTerm) for term in limiters)
     is_suitable = has_cell_energy and has_lumped_inertia and are_constant and has_potential
     return NonlinearElimination(balance, policy) if is_suitable else None
 
@@ -109,6 +124,7 @@ class NonlinearElimination:
 
     def __init__(self, balance: Balance, policy: SolverPolicy) -> None:
         self._balance, self._policy = balance, policy
+        self._contacts = fulfilling(balance.terms, PatchContactTerm)
         numbers = balance.domain.space.dofmap.index_map
         self._count = numbers.size_global
         self._global_numbers = numbers.local_to_global(np.arange(numbers.size_local + numbers.num_ghosts))
@@ -176,7 +192,10 @@ class NonlinearElimination:
         numbers, local = numbers[order], np.flatnonzero(chosen)
         of_local, positions = np.searchsorted(numbers, self._global_numbers[local]), _positions_in(corners, numbers)
         forces = inertia[order], r[order], free[order], self._ties(numbers)
-        return PatchRegion(balance, self._energy, cells, local, of_local, positions, *forces, policy=self._policy)
+        contacts = [contact.patch(numbers) for contact in self._contacts]
+        return PatchRegion(
+            balance, self._energy, cells, local, of_local, positions, *forces, contacts, policy=self._policy
+        )
 
     def _ties(self, region: Ints) -> coo_array:
         """Return the stiffness (n, n) of ties between nodes, N/m, the same along each axis (collective).
@@ -221,7 +240,8 @@ class PatchRegion:
 
     def __init__(
         self, balance: Balance, energy: CellEnergy, cells: npt.NDArray[np.int32], local: Ints, of_local: Ints,
-        corners: Ints, inertia: Values, r: Values, free: Values, ties: coo_array, *, policy: SolverPolicy,
+        corners: Ints, inertia: Values, r: Values, free: Values, ties: coo_array, contacts: Sequence[ContactPatch], *,
+        policy: SolverPolicy,
     ) -> None:  # fmt: skip
         """Gather the region from all ranks (collective).
 
@@ -236,6 +256,7 @@ class PatchRegion:
             r: (n, d) residual, N.
             free: (n, d) 0 where the displacement is prescribed, else 1.
             ties: (n, n) stiffness of ties, N/m.
+            contacts: contact of the nodes.
             policy: eigenvalues of blocks.
         """
         n, d = self.shape = r.shape
@@ -246,10 +267,12 @@ class PatchRegion:
         rows, columns = np.repeat(corners, corners.shape[1], axis=1).ravel(), np.tile(corners, corners.shape[1]).ravel()
         self._is_inside = (rows >= 0) & (columns >= 0)
         self._rows, self._columns = rows[self._is_inside], columns[self._is_inside]
-        self._ties = ties
+        self._ties, self._contacts = ties, contacts
         joined = np.concatenate([self._rows, ties.row]), np.concatenate([self._columns, ties.col])
         links = coo_array((np.ones(len(joined[0])), joined), shape=(n, n))
         self.count, self.patch_of_node = connected_components(links, directed=False)
+        if contacts:
+            self.count, self.patch_of_node = 1, np.zeros(n, np.int64)
         self.patch_of_cell = self.patch_of_node[corners.max(axis=1)]
         self._constant: Values = np.zeros((n, d))
         start = self.evaluate(np.zeros((n, d)))
@@ -269,9 +292,22 @@ class PatchRegion:
         work = ((linear / 2 + self._constant) * w).sum(axis=1)
         sums = linear + self._constant
         np.add.at(sums, self._corners[inside], forces[inside])
-        of_cells = sum_by_patch(self.patch_of_cell, energy, self.count)
-        of_nodes = sum_by_patch(self.patch_of_node, work, self.count)
-        return PatchValues(of_cells + of_nodes, abs(of_cells) + abs(of_nodes), sums * self._free, stiffness)
+        parts = [
+            sum_by_patch(self.patch_of_cell, energy, self.count),
+            sum_by_patch(self.patch_of_node, work, self.count),
+        ]
+        coupling = None
+        for contact in self._contacts:
+            value = contact.evaluate(w)
+            parts.append(np.array([value.potential]))
+            sums += value.forces
+            coupling = value.stiffness if coupling is None else coupling + value.stiffness
+        size = sum(abs(part) for part in parts)
+        return PatchValues(np.sum(parts, axis=0), np.asarray(size), sums * self._free, stiffness, coupling)
+
+    def free_fraction(self, w: Values, step: Values) -> float:
+        """Return the fraction in [0, 1] of a step (n, d) from w (n, d), m, that contact leaves free."""
+        return min((contact.free_fraction(w, step) for contact in self._contacts), default=1.0)
 
     @cached_property
     def _pattern(self) -> BlockPattern:
@@ -295,12 +331,20 @@ class PatchRegion:
 
     def tangent(self, values: PatchValues) -> tuple[sparray, Values]:
         """Return K of the nodes, and the inverses of its diagonal blocks, made positive."""
-        (n, d), pattern = self._inertia.shape, self._pattern
-        of_cells = values.stiffness.reshape(-1, d, d)[self._is_inside]
-        blocks = np.concatenate([of_cells, self._inertia_and_ties]) * pattern.free
+        n, d = self._inertia.shape
+        stiffness, diagonal = values.stiffness, np.zeros((n, d, d))
+        pattern = self._pattern
+        blocks = np.concatenate([stiffness.reshape(-1, d, d)[self._is_inside], self._inertia_and_ties]) * pattern.free
         data = np.add.reduceat(blocks[pattern.order], pattern.first)
         K: sparray = bsr_array((data, pattern.columns, pattern.starts), shape=(n * d, n * d))
-        eigenvalues, vectors = np.linalg.eigh(data[pattern.diagonal])
+        if values.coupling is not None:
+            entries, free_dofs = values.coupling.tocoo(), self._free.reshape(-1)
+            data_of_free = entries.data * free_dofs[entries.row] * free_dofs[entries.col]
+            same = entries.row // d == entries.col // d
+            block_entries = entries.row[same] // d, entries.row[same] % d, entries.col[same] % d
+            np.add.at(diagonal, block_entries, data_of_free[same])
+            K = K.tocsr() + csr_array((data_of_free, (entries.row, entries.col)), shape=K.shape)
+        eigenvalues, vectors = np.linalg.eigh(data[pattern.diagonal] + diagonal)
         largest = abs(eigenvalues).max(axis=1, keepdims=True)
         lowest = np.where(largest > 0, self._policy.min_block_eigenvalue * largest, 1.0)
         inverse = (vectors / np.maximum(abs(eigenvalues), lowest)[:, None, :]) @ vectors.transpose(0, 2, 1)
@@ -339,12 +383,14 @@ class PatchValues(NamedTuple):
         size: (count,) sum of the absolute values of its summands, J.
         forces: (n, d) its gradient, N.
         stiffness: blocks of all cells, N/m.
+        coupling: (n d, n d) stiffness of contact, N/m, of a single patch; None: there is none.
     """
 
     potential: Values
     size: Values
     forces: Values
     stiffness: Values
+    coupling: csr_matrix | None = None
 
     def where(self, chosen: Flags, other: PatchValues, region: PatchRegion) -> PatchValues:
         """Return these values for the `chosen` patches, those of `other` for the rest."""
@@ -352,7 +398,7 @@ class PatchValues(NamedTuple):
             return self if chosen.all() else other
         of_nodes, of_cells = chosen[region.patch_of_node, None], chosen[region.patch_of_cell, None, None, None, None]
         flags = chosen, chosen, of_nodes, of_cells
-        return PatchValues(*(np.where(*item) for item in zip(flags, self, other, strict=True)))
+        return PatchValues(*(np.where(*item) for item in zip(flags, self[:4], other[:4], strict=True)))
 
 
 def minimise_patches(region: PatchRegion, solved_norm: float, edge: float, policy: SolverPolicy) -> bool:
@@ -373,6 +419,13 @@ def minimise_patches(region: PatchRegion, solved_norm: float, edge: float, polic
         gradient = np.where(active[region.patch_of_node, None], current.forces, 0.0)
         tangent, inverse = region.tangent(current)
         step, predicted = steihaug_step(tangent, inverse, gradient, region.patch_of_node, radius, policy)
+        if (fraction := region.free_fraction(w, step)) < 1:
+            # along the step the model is linear and quadratic: -predicted = slope + curvature
+            slope = sum_by_patch(region.patch_of_node, (gradient * step).sum(axis=1), region.count)
+            predicted = -fraction * slope + fraction**2 * (predicted + slope)
+            step = fraction * step
+            if not step.any():
+                break
         trial = region.evaluate(w + step)
         decrease, slack = current.potential - trial.potential, policy.potential_round_off * current.size
         ratio = np.divide(decrease, predicted, out=np.zeros_like(decrease), where=predicted > 0)
