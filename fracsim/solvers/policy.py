@@ -111,7 +111,7 @@ class SolverPolicy:
     # c_a rho h^2 / Y. Above it inertia resists the motion of parts that are attached by a node or an edge, and no
     # deflation is needed.
     max_deflated_inertia: float = 1e-3
-    # c_a rho h^2 / Y. Above it SSOR alone serves a body in fragments. Measured on a porcelain figure that shatters
+    # c_a rho h^2 / Y. Above it SSOR alone serves a broken body. Measured on a porcelain figure that shatters
     # (46,000 tetrahedra, a sixth): 2.5 times the iterations, half the time.
     min_ssor_inertia: float = 1e-2
     # Dofs up to which products of multigrid's set-up are stored on one rank: half of its time for 0.5 KB a tetrahedron.
