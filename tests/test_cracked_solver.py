@@ -42,8 +42,6 @@ def test_a_crack_does_not_slow_the_linear_solver(scheme: str) -> None:
             solver=SOLVER | given,
         )
         scene = build_scene(MPI.COMM_SELF, data)
-        # short steps are for SSOR
-        scene.stepper.solver.linear.preconditioner._policy = replace(DEFAULT_POLICY, min_ssor_inertia=1.0)
         state = Walk(scene)
         before = [state.advance().solve.krylov_iterations for _ in range(2)][-1]
         cut(scene, [(np.array([1.0, 0.0, 0.0]), np.array([0.31, 0.0, 0.0]))])

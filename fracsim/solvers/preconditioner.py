@@ -380,15 +380,12 @@ class Preconditioner:
             ):
                 self._due = max(self._due, Update.REFRESH)
         # The step size calls for sweeps or for multigrid.
-        if self._uses_ssor is not None and self._uses_ssor != self._has_short_steps:
+        if self._uses_ssor is not None and self._uses_ssor != (
+            mass_stiffness_ratio(self._balance) > policy.min_ssor_inertia
+        ):
             self._uses_ssor, self._fresh_iterations = not self._uses_ssor, 0
             self._change_kind(SSOR_OPTIONS if self._uses_ssor else MULTIGRID_OPTIONS)
         return self._due
-
-    @property
-    def _has_short_steps(self) -> bool:
-        """Whether steps are so short that inertia makes SSOR the better preconditioner of a broken body."""
-        return mass_stiffness_ratio(self._balance) > self._policy.min_ssor_inertia
 
     def _learn_from_solve(self, equivalent: int) -> None:
         """Change the kind of multigrid if the iterations of a solve since the last update were many (collective)."""
@@ -401,7 +398,8 @@ class Preconditioner:
                 return
             self._whole_iterations = self._whole_iterations or equivalent
             limit = self._policy.fragmented_ratio * self._whole_iterations + 2
-            if self._ever_broken and self._may_suit_fragments and (equivalent > limit or self._has_short_steps):
+            has_short_steps = mass_stiffness_ratio(self._balance) > self._policy.min_ssor_inertia_broken
+            if self._ever_broken and self._may_suit_fragments and (equivalent > limit or has_short_steps):
                 self._suit_fragments()
         if not self._keeps:
             self._due = max(self._due, Update.REFRESH)
