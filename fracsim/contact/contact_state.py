@@ -266,7 +266,7 @@ class StepContact:
     facets: tuple[PosedShape, Values] | None
 
     def select(self, points: Ints) -> StepContact:
-        """That of points (k,), ascending, which have their numbers in this order."""
+        """Contact of points (k,), ascending, which are numbered in this order."""
         lagged, motion = self.lagged, self.obstacle_motion
         if lagged is not None and motion.ndim == 2:
             motion = motion[np.isin(lagged.points, points)]

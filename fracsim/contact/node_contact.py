@@ -68,7 +68,7 @@ class LaggedContact:
     obstacle_point: Values
 
     def select(self, points: Ints) -> LaggedContact:
-        """That of points (m,) of the surface, ascending, which have their numbers in this order."""
+        """Contact of points (m,) of the surface, ascending, which are numbered in this order."""
         rows = np.isin(self.points, points)
         arrays = self.force, self.normal, self.position, self.obstacle_point
         return LaggedContact(np.searchsorted(points, self.points[rows]), *(values[rows] for values in arrays))
@@ -87,7 +87,7 @@ class StepStart:
     contact: LaggedContact | None = None
 
     def select(self, points: Ints) -> StepStart:
-        """The start of points (m,), ascending, which have their numbers in this order."""
+        """Start of points (m,), ascending, which are numbered in this order."""
         return StepStart(self.gap[points], self.contact and self.contact.select(points))
 
     def carried_with(self, start: Pose, end: Pose) -> StepStart:
