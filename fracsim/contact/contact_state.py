@@ -517,9 +517,9 @@ class ContactState:
         if start.friction is not None and start.lagged is not None:
             self._directions.setdefault(number, FrictionDirection(start.friction, start.lagged.normal))
         candidates = self.point_candidates(posed, self.positions, self.law.barrier.width)
-        facets = self.facets.active if number in self.facets.numbers else None
-        points, barrier = (self.positions, self.surface.area), self.law.barrier
-        return evaluate_contact(*points, posed, barrier, start, facets, candidates, self._directions.get(number))
+        points, facets = (self.positions, self.surface.area), self.facets_for(number)
+        direction = self._directions.get(number)
+        return evaluate_contact(*points, posed, self.law.barrier, start, facets, candidates, direction)
 
     def step_contact(self, number: int) -> StepContact:
         """Contact of an obstacle at the start of the step, as its forces at the current pose depend on it."""

@@ -106,10 +106,10 @@ class ContactPatch(Protocol):
     """Contact of k nodes that move by w (k, d), m, with all others fixed; the same on all ranks."""
 
     def evaluate(self, w: Values) -> ContactPatchValues:
-        """Potential at w, m, with its derivatives."""
+        """Potential at w, m, with its derivatives (collective)."""
 
     def free_fraction(self, w: Values, step: Values) -> float:
-        """Fraction in [0, 1] of a step (k, d), m, from w (k, d) that is allowed."""
+        """Fraction in [0, 1] of a step (k, d), m, from w (k, d) that is allowed (collective)."""
 
 
 @runtime_checkable
