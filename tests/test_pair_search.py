@@ -4,6 +4,7 @@ from itertools import product
 
 import numpy as np
 import pytest
+from scipy.spatial import Delaunay
 
 from fracsim.contact.pair_search import (
     PairFilter,
@@ -153,6 +154,29 @@ def test_an_edge_opposite_to_a_common_vertex_may_pass_through():
     assert len(intersecting_pairs(elements, where, x)) == 1
     x[4, 2] = 0.5
     assert not len(intersecting_pairs(elements, where, x))
+
+
+# Heights over the plane; the search counts those below 1e-10 of the sizes as zero.
+@pytest.mark.parametrize("height", [1e-3, 1e-8, 1e-9, 1e-10, 1e-11])
+def test_triangles_of_a_bent_sheet_do_not_intersect(height):
+    """Beside a Delaunay triangulation, whose triangles lie beside each other in the plane and in each bent sheet."""
+    rng = np.random.default_rng(8)
+    plane = rng.random((600, 2))
+    bent = height * (plane[:, 0] ** 2 - 0.7 * plane[:, 1] ** 2 + 0.3 * plane[:, 0] * plane[:, 1])
+    x = np.column_stack([plane, bent + 0.1 * height * rng.random(len(plane))])
+    elements = Delaunay(plane).simplices
+    assert not len(intersecting_pairs(elements, PairFilter.of(len(x)), x))
+
+
+def test_a_vertex_in_a_triangle_touches_it_and_one_beside_it_does_not():
+    triangle = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    for place, touches in (((0.2, 0.2), True), ((0.5, 0.5), True), ((0.6, 0.5), False), ((-0.1, 0.5), False)):
+        for slope in (1.0, 1e-8):  # of an edge that would pass through the triangle beyond its end
+            first, upward = np.array([*place, 0.0]), np.array([0.0, 0.0, 1.0])
+            second = np.array([1 / 3, 1 / 3, slope])
+            x = np.vstack([triangle, first, second, second + upward])
+            found = intersecting_pairs(np.arange(6).reshape(2, 3), PairFilter.of(6), x)
+            assert bool(len(found)) == touches, (place, slope)
 
 
 @pytest.mark.parametrize("name", CASES)

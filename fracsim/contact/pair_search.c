@@ -206,7 +206,8 @@ static Grid grid_of(int64_t n, const Box *boxes)
 }
 
 /* Whether an edge passes through a triangle (3, 3): its ends are on both sides of the plane, and it turns in the same
-   sense about all three sides. An edge in the plane, but for round-off, does not. */
+   sense about all three sides. An end in the plane, but for round-off, has to lie in the triangle: the direction of the
+   edge says nothing there. An edge in the plane does not pass through the triangle. */
 static int pierces(const double *start, const double *end, const double *corners)
 {
     double a[3], b[3], normal[3], arm[3], direction[3], heights[2];
@@ -217,9 +218,11 @@ static int pierces(const double *start, const double *end, const double *corners
     double size = ROUND_OFF * sqrt(dot(normal, normal) * (dot(a, a) + dot(b, b) + dot(direction, direction)));
     for (int k = 0; k < 2; k++) heights[k] = fabs(heights[k]) > size ? heights[k] : 0;
     if (heights[0] * heights[1] > 0 || heights[0] == heights[1]) return 0;
+    const double *point = heights[1] == 0 ? end : start;
+    for (int k = 0; k < 3 && heights[0] * heights[1] == 0; k++) direction[k] = normal[k];
     int positive = 1, negative = 1;
     for (int c = 0; c < 3; c++) {
-        subtract(a, corners + 3 * c, start), subtract(b, corners + 3 * ((c + 1) % 3), start);
+        subtract(a, corners + 3 * c, point), subtract(b, corners + 3 * ((c + 1) % 3), point);
         double sense = 0;
         for (int k = 0; k < 3; k++)
             sense += direction[k] * (a[(k + 1) % 3] * b[(k + 2) % 3] - a[(k + 2) % 3] * b[(k + 1) % 3]);
