@@ -259,13 +259,18 @@ class PartitionedSurface[S: RetractableSurface]:
         return cut & (fragment[:, 0] != fragment[:, 1]), is_loose
 
     def _cut_positions(self, keys: Ints, positions: Values) -> Values:
-        """(edges,) positions of cuts from the lower local node; NaN: none. Of edges with keys (k, 2) (CutPositions)."""
+        """(edges,) positions of cuts from the lower local node; NaN: none. Of edges with keys (k, 2) (CutPositions).
+
+        They leave room for the barrier between the points around an end of an edge.
+        """
         ends = self._domain.input_numbering.nodes[self._topology.edges]
         low, high = np.sort(ends, axis=1).T
         size = np.int64(1) << 32
         rows = KeyLookup(keys @ np.array([size, 1]))(low * size + high)
         cut = np.where(rows >= 0, positions[rows, 0] if len(positions) else np.nan, np.nan)
-        return np.where(ends[:, 0] > ends[:, 1], 1 - cut, cut)
+        length = np.linalg.norm(np.diff(self._topology.points[self._topology.edges], axis=1)[:, 0], axis=1)
+        margin = np.minimum(SURFACE.min_cut_length * self.law.distance / length, 0.5)
+        return np.asarray(np.clip(np.where(ends[:, 0] > ends[:, 1], 1 - cut, cut), margin, 1 - margin))
 
     def _over_border(self, values: Values, operation: np.ufunc) -> Values:
         """(n, ...) values of this rank's points, of those that ranks share an operation on all (collective)."""

@@ -48,6 +48,10 @@ class SurfacePolicy:
         max_offset: part of the way to its nodes by which a crack face is offset at most, for slivers.
         factor: of an arm each time that it is shortened.
         min_arm: arm, in the full one, below which it is not shortened.
+        min_arm_length: the same in distances of the barrier. With shorter arms the points around a node would be
+            within that distance of one another.
+        min_cut_length: distance of a cut from the ends of its edge, in distances of the barrier, where half the edge
+            is longer: an arm before its face is offset.
         gentle_rounds: rounds with `factor`, after which arms are shortened to `min_arm` at once. One face makes room
             for the next, and each round costs a search.
         max_pause: largest number of steps between two attempts to release faces.
@@ -60,6 +64,8 @@ class SurfacePolicy:
     max_offset: float = 0.4
     factor: float = 0.7
     min_arm: float = 0.2
+    min_arm_length: float = 3.0
+    min_cut_length: float = 4.0
     gentle_rounds: int = 4
     max_pause: int = 16
     closed_pressure: float = 10.0
@@ -230,6 +236,15 @@ class RetractableSurface:
         pressed = self._pressed_faces(u, max_pressure)
         return pressed if self._on_any_rank(len(pressed) > 0) else self._intersecting_faces(u)
 
+    @cached_property
+    def _min_share(self) -> Values:
+        """(n,) factors of arms below which they are not shortened."""
+        length = np.linalg.norm(self.element_set.points.out, axis=1)
+        at_length = np.divide(
+            SURFACE.min_arm_length * self.law.distance, length, out=np.ones_like(length), where=length > 0
+        )
+        return np.clip(at_length, SURFACE.min_arm, 1.0)
+
     def _pressed_faces(self, u: Values, max_pressure: Values) -> Ints:
         above = self.pressures(u) > max_pressure * (1 + SURFACE.round_off)
         return self._crack_faces[above[self.elements[self._crack_faces]].any(axis=1)]
@@ -237,7 +252,7 @@ class RetractableSurface:
     def _shorten(self, u: Values, faces: Ints, factor: float) -> bool:
         """Shorten the arms of crack faces by a factor; whether any arm has changed."""
         share, points = self.point_map.share.copy(), np.unique(self.elements[faces])
-        share[points] = np.maximum(factor * share[points], np.minimum(SURFACE.min_arm, share[points]))
+        share[points] = np.maximum(factor * share[points], np.minimum(self._min_share[points], share[points]))
         share = self.over_points(share, np.minimum)
         changed = self._on_any_rank(not np.array_equal(share, self.point_map.share))
         if changed:
