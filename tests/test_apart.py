@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from mpi4py import MPI
 
 from fracsim.contact.obstacle_term import ObstacleTerm
@@ -14,7 +15,7 @@ from fracsim.deformable_run import Run
 from fracsim.scene import build_scene
 from fracsim.studies.paper_table import SCENES, overrides
 from fracsim.study.reader import load_study
-from support.scenes import make_study
+from support.scenes import each_step, make_scene, make_study
 from support.vtu import Drawn, frames
 
 FLOOR, TOP, RADIUS, SPEED = -0.001, 0.132, 0.03, 3.0
@@ -77,11 +78,12 @@ def test_crumbs_between_hammer_and_floor(tmp_path: Path) -> None:
     assert max(rose) < 1e-3 * run.state.elastic
 
 
-def test_new_faces_beside_short_edges_gain_no_energy(tmp_path: Path) -> None:
+@pytest.mark.parametrize("itself", ['"pieces"', "true"])
+def test_new_faces_beside_short_edges_gain_no_energy(itself: str, tmp_path: Path) -> None:
     """A Charpy bar that snaps along one surface: its edges at the notch are an eighth of others. Without room for the
     barrier between the points around one node, the barriers had 20 times the energy of the blow."""
     sets = [*overrides(SCENES["brittle-charpy"], small=False), "mesh.h=4e-3", "mesh.h_notch=5e-4"]
-    run = Run(build_scene(MPI.COMM_SELF, load_study("charpy", sets)), tmp_path / "out")
+    run = Run(build_scene(MPI.COMM_SELF, load_study("charpy", [*sets, f"contact.itself={itself}"])), tmp_path / "out")
     while not run.breaks.counts[0]:
         run.step()
     run.step()
@@ -91,3 +93,27 @@ def test_new_faces_beside_short_edges_gain_no_energy(tmp_path: Path) -> None:
     surplus = history["kinetic"] + history["elastic"] + history["dissipated"] - work
     assert run.breaks.counts[2] == 2 and work[-1] > 0.2
     assert surplus.max() < 0.02 * work[-1]
+
+
+@pytest.mark.parametrize("itself", ["pieces", True])
+def test_crack_faces_in_contact_lie_on_the_surface_that_cut_the_body(itself: str | bool) -> None:
+    """A bar pulled until one plane parts it. Faces through the middle of edges would be 0.23 h from the plane."""
+    h, size = 0.02, [0.2, 0.08, 0.08]
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": size, "h": h, "pattern": "unstructured"},
+        material={"energy": "corotated", "young": 1e7, "poisson": 0.3, "density": 1000.0},
+        fracture={"strength": 1e5, "crumbs": False},
+        brittle={"surfaces": 1},
+        contact={"itself": itself, "distance": 1e-3 * h},
+        boundary=[{"on": "left", "fix": "xyz"}, {"on": "right", "velocity": [0.5, 0.0, 0.0]}],
+        time={"scheme": "backward-euler", "step": 1e-3, "end": 0.1},
+    )
+    while not next(each_step(scene, state)).broken:
+        pass
+    [term] = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
+    surface = term.surface.current
+    x = surface.rest_positions[np.unique(surface.elements[surface._crack_faces])]
+    x = x[(np.abs(x - np.array(size) / 2) < np.array(size) / 2 - 1e-9).all(axis=1)]
+    centre = x.mean(axis=0)
+    away = (x - centre) @ np.linalg.svd(x - centre)[2][-1]
+    assert len(x) > 50 and np.sqrt(np.mean(away**2)) < 0.06 * h

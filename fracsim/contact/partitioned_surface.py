@@ -239,15 +239,14 @@ class PartitionedSurface[S: RetractableSurface]:
         """Split surface of the cells of this rank; None: as before on all ranks (collective)."""
         cells = np.repeat(self._pattern, self._cell_parts)
         if not self.law.fragments_only:
-            return build_split_surface(self._topology, cells)
+            return build_split_surface(self._topology, cells, self._cut_positions())
         state = cells, *self._open_edges(cells)
         # most edges break within fragments
         same = self._open is not None and moves_alike(self._topology, state, self._open)
         self._open = state
         if self._comm.allreduce(same, op=MPI.LAND):
             return None
-        cut = None if self._cuts is None else self._cut_positions(*self._cuts())
-        return build_surface_of_open_edges(self._topology, *state[1:], cut)
+        return build_surface_of_open_edges(self._topology, *state[1:], self._cut_positions())
 
     def _open_edges(self, pattern: Pattern) -> tuple[Flags, Flags]:
         """Flags of open edges and of loose nodes of this rank (fragment_surface.find_open_edges; collective)."""
@@ -258,18 +257,22 @@ class PartitionedSurface[S: RetractableSurface]:
         fragment = find_components(self._domain, topology.edges[~cut]).node_fragment[topology.edges]
         return cut & (fragment[:, 0] != fragment[:, 1]), is_loose
 
-    def _cut_positions(self, keys: Ints, positions: Values) -> Values:
-        """(edges,) positions of cuts from the lower local node; NaN: none. Of edges with keys (k, 2) (CutPositions).
+    def _cut_positions(self) -> Values | None:
+        """(edges,) positions of cuts from the lower local node; NaN: in the middle; None: all in the middle.
 
         They leave room for the barrier between the points around an end of an edge.
         """
+        if self._cuts is None:
+            return None
+        keys, positions = self._cuts()
         ends = self._domain.input_numbering.nodes[self._topology.edges]
         low, high = np.sort(ends, axis=1).T
         size = np.int64(1) << 32
         rows = KeyLookup(keys @ np.array([size, 1]))(low * size + high)
         cut = np.where(rows >= 0, positions[rows, 0] if len(positions) else np.nan, np.nan)
         length = np.linalg.norm(np.diff(self._topology.points[self._topology.edges], axis=1)[:, 0], axis=1)
-        margin = np.minimum(SURFACE.min_cut_length * self.law.distance / length, 0.5)
+        room = SURFACE.min_planar_cut_length if self.law.fragments_only else SURFACE.min_cut_length
+        margin = np.minimum(room * self.law.distance / length, 0.5)
         return np.asarray(np.clip(np.where(ends[:, 0] > ends[:, 1], 1 - cut, cut), margin, 1 - margin))
 
     def _over_border(self, values: Values, operation: np.ufunc) -> Values:
@@ -410,9 +413,8 @@ class PartitionedSurface[S: RetractableSurface]:
     # --- faces for output ---
 
     def set_cuts(self, cuts: CutPositions) -> None:
-        """Set where edges are cut; used for faces between fragments."""
-        if self.law.fragments_only:
-            self._cuts = cuts
+        """Set where edges are cut."""
+        self._cuts = cuts
 
     def separate_surface(self, points: SurfaceMap, surface: DrawnSurface, u: Values, t: float) -> SurfaceMap:
         """Move points of a surface for output to the crack faces of contact, which are offset and retracted."""

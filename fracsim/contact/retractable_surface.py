@@ -51,7 +51,9 @@ class SurfacePolicy:
         min_arm_length: the same in distances of the barrier. With shorter arms the points around a node would be
             within that distance of one another.
         min_cut_length: distance of a cut from the ends of its edge, in distances of the barrier, where half the edge
-            is longer: an arm before its face is offset.
+            is longer.
+        min_planar_cut_length: the same of cuts between fragments, without points of facets and cells between those of
+            edges.
         gentle_rounds: rounds with `factor`, after which arms are shortened to `min_arm` at once. One face makes room
             for the next, and each round costs a search.
         max_pause: largest number of steps between two attempts to release faces.
@@ -64,8 +66,9 @@ class SurfacePolicy:
     max_offset: float = 0.4
     factor: float = 0.7
     min_arm: float = 0.2
-    min_arm_length: float = 3.0
-    min_cut_length: float = 4.0
+    min_arm_length: float = 8.0
+    min_cut_length: float = 12.0
+    min_planar_cut_length: float = 4.0
     gentle_rounds: int = 4
     max_pause: int = 16
     closed_pressure: float = 10.0
