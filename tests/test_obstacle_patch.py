@@ -123,6 +123,7 @@ def test_steps_end_as_without_and_take_fewer_tangents(monkeypatch: pytest.Monkey
         scene, state = make_scene(**STUDIES["2d"] | {"time": {"scheme": "backward-euler", "step": 0.02, "end": 0.2}})
         break_across(scene, [1.0, 0.1], 0.52)
         break_across(scene, [0.1, 1.0], 0.3)
+        state.remember()
         scene.solver.edges_broke(1)
         iterations.append(sum(report.solve.newton_iterations for report in each_step(scene, state)))
         motions.append(state.u.copy())

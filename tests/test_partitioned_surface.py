@@ -55,6 +55,8 @@ def test_cracks_that_the_barrier_closes(ranks: int, tmp_path_factory: pytest.Tem
                 np.testing.assert_allclose(
                     found, expected, rtol=1e-9, atol=1e-10 * np.abs(expected).max(), err_msg=name
                 )
+            assert np.array_equal(several[f"{case}-{name}-followed"], one[f"{case}-{name}-followed"])
+        assert 0.2 < one[f"{case}-back-followed"].mean() < 1
         assert one[f"{case}-back-gap"] < 1 and one[f"{case}-back-fraction"] < 1
         own, held, exchanges = several[f"{case}-counts"].T
         whole = one[f"{case}-counts"][0, 0]

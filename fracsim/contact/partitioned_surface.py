@@ -384,6 +384,11 @@ class PartitionedSurface[S: RetractableSurface]:
         assert self._nodes is not None
         return self._nodes.sum_at_nodes(parts)
 
+    def followed_nodes(self) -> Flags:
+        """(owned nodes,) flags of the nodes that points follow (collective)."""
+        parts = np.ones((len(self.current.columns), self._domain.dim))
+        return np.asarray(self.sum_at_nodes(parts).reshape(-1, self._domain.dim)[:, 0] > 0)
+
     def extend_faces(self, u: Values) -> None:
         """Extend retracted faces where there is room, at displacements u (owned dofs,), m (collective)."""
         if self.has_retracted:

@@ -112,6 +112,10 @@ class SurfaceContact(Term):
         """Whether nothing can be in contact at the current u (collective); of a body with itself it is not asked."""
         return False
 
+    def followed_nodes(self) -> Flags:
+        """(owned nodes,) flags of the nodes that points of the surface follow (collective)."""
+        return self.surface.followed_nodes()
+
     # --- forces, tangent and energy ---
 
     def _nodal_forces(self, x: Values, *, normal: bool = True) -> Values:

@@ -121,6 +121,14 @@ class PatchContactTerm(Protocol):
 
 
 @runtime_checkable
+class FollowingSurface(Protocol):
+    """Contact whose surface follows nodes: it does not change where others move."""
+
+    def followed_nodes(self) -> npt.NDArray[np.bool_]:
+        """(owned nodes,) flags of the nodes that points of the surface follow (collective)."""
+
+
+@runtime_checkable
 class InitialGuess(Protocol):
     """Term that moves an initial guess to where no gap is closed."""
 

@@ -9,8 +9,9 @@ on the whole body for their sake. If an iteration has not reduced |r| to a tenth
 with the stiffness k of ties (mechanics.node_ties) and the potential E of contact with analytic obstacles. Connected
 nodes make a *patch*; where there is contact all nodes are one. A trust-region method with exact tangents finds the
 minima of all patches at once, also through a snap-through; at a minimum the exact tangent of the body is positive, too.
-Contact shortens its steps as it shortens Newton's; obstacles stay. The solution of the step is the same. Every rank
-does the same computation; only cells and contact are evaluated by their owners.
+Contact shortens its steps as it shortens Newton's; obstacles stay. With contact of other kinds all nodes stay that the
+points of its surface follow. The solution of the step is the same. Every rank does the same computation; only cells and
+contact are evaluated by their owners.
 
 Sources: Lanzkron, Rose and Wilkes, SIAM J. Sci. Comput. 17, 1996; Cai and Keyes, 24, 2002; Steihaug, SIAM J. Numer.
 Anal. 20, 1983.
@@ -35,6 +36,7 @@ from ..mechanics.term import overriding
 from ..mechanics.term_protocols import (
     ContactPatch,
     EliminatingTerm,
+    FollowingSurface,
     PatchContactTerm,
     StepLimiter,
     TieTerm,
@@ -101,10 +103,9 @@ def sum_by_patch(patch: Ints, values: Values, count: int) -> Values:
 def create_elimination(balance: Balance, policy: SolverPolicy = DEFAULT_POLICY) -> NonlinearElimination | None:
     """Return the nonlinear elimination of a balance; None if it has no suitable potential (collective).
 
-    All its parts but the stress of each cell have to be constant forces, inertia, ties, and contact with analytic
-    obstacles.
+    All its parts but the stress of each cell have to be constant forces, inertia, ties, and contact.
     """
-    contacts = [term for term in balance.terms if fulfilling([term], PatchContactTerm)]
+    contacts = [term for term in balance.terms if isinstance(term, PatchContactTerm | FollowingSurface)]
     stress = balance.stress
     remaining_terms = [term for term in balance.terms if term is not stress and term not in contacts]
     has_ties_alone = all(isinstance(term, TieTerm) for term in overriding(remaining_terms, "coupling_matrix"))
@@ -125,11 +126,12 @@ class NonlinearElimination:
     def __init__(self, balance: Balance, policy: SolverPolicy) -> None:
         self._balance, self._policy = balance, policy
         self._contacts = fulfilling(balance.terms, PatchContactTerm)
+        self._surfaces = fulfilling(balance.terms, FollowingSurface)
         numbers = balance.domain.space.dofmap.index_map
         self._count = numbers.size_global
         self._global_numbers = numbers.local_to_global(np.arange(numbers.size_local + numbers.num_ghosts))
-        self._free = np.ones(balance.owned_dof_count)
-        self._free[balance.motion.owned_dofs] = 0.0
+        self._not_prescribed = np.ones(balance.owned_dof_count)
+        self._not_prescribed[balance.motion.owned_dofs] = 0.0
 
     @cached_property
     def _energy(self) -> CellEnergy:
@@ -145,6 +147,9 @@ class NonlinearElimination:
         Returns:
             Whether any node has moved.
         """
+        self._free = self._not_prescribed.copy()
+        for surface in self._surfaces:
+            self._free.reshape(-1, self._balance.domain.dim)[surface.followed_nodes()] = 0.0
         nodes = self._dominant_nodes()
         if not len(nodes):
             return False

@@ -46,6 +46,7 @@ def closed(dim: int, itself: bool | str) -> dict[str, npt.NDArray[np.generic]]:
         before, u = scene.balance.u.x.array[: u.size].copy(), u.reshape(-1)
         fraction = term.max_step_fraction(u - before)
         scene.balance.set_displacement(u)
+        arrays[f"{name}-followed"] = gather(1.0 * term.followed_nodes()[:, None])
         forces = term.contact_forces()
         coupling = term.coupling_matrix()
         product = np.zeros_like(u)
