@@ -17,7 +17,7 @@ from fracsim.mechanics.matrix_assembly import TangentAssembler
 from fracsim.scene import Scene, build_scene
 from fracsim.solvers.nonlinear_solver import NonlinearSolver
 from fracsim.solvers.policy import DEFAULT_POLICY
-from fracsim.solvers.preconditioner import Preconditioner
+from fracsim.solvers.preconditioner import Preconditioner, mass_stiffness_ratio
 from fracsim.studies.evidence.crack_count_cost import random_planes
 from support.scenes import Walk
 from support.solver_policy import set_policy
@@ -136,6 +136,19 @@ def test_what_hangs_is_solved_for_by_itself_in_long_steps(monkeypatch: pytest.Mo
         set_policy(monkeypatch, max_deflated_inertia=held)
         its.append(sum(shattered(0.04, 10, {}, 6, step=0.1, energy="linear")[1][-3:]))
     assert its[0] < 0.6 * its[1], f"{its[0]} iterations, {its[1]} without"
+
+
+def test_halves_are_left_to_multigrid(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One plane through a bar in long steps: CG takes no more iterations once the rigid motions of the smaller half are
+    not solved for by themselves, as they are in steps that are longer still."""
+    scene, its = shattered(0.025, 1, {}, 4, step=0.03)
+    ratio = mass_stiffness_ratio(scene.balance)
+    assert DEFAULT_POLICY.max_large_deflated_inertia < ratio < DEFAULT_POLICY.max_deflated_inertia
+    set_policy(monkeypatch, max_large_deflated_inertia=np.inf)
+    other, deflated = shattered(0.025, 1, {}, 4, step=0.03)
+    solvers = [each.solver for each in (scene, other)]
+    assert [solver.linear.preconditioner.applied._deflation is None for solver in solvers] == [True, False]  # type: ignore[union-attr]
+    assert sum(its[1:]) <= sum(deflated[1:])
 
 
 def test_deflation_of_an_earlier_tangent_remains_positive() -> None:

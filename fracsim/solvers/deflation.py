@@ -2,8 +2,9 @@
 
 Inertia alone resists the rigid motion of such fragments, some 1e-7 of a stiffness in long steps, and there are hundreds
 of them along a crack. Multigrid's aggregates span the hinges, so that CG needs iterations for each motion. Z of the
-balancing preconditioner (solvers.balancing) has the rigid motions of all fragments but the largest, with the nodes that
-no larger fragment has and the nodes that are tied to it (mechanics.node_ties). Source: Nicolaides (1987).
+balancing preconditioner (solvers.balancing) has the rigid motions of small fragments, with the nodes that no larger
+fragment has and the nodes that are tied to it (mechanics.node_ties). A larger one has aggregates of its own. Source:
+Nicolaides (1987).
 
 Equations: docs/theory.md#linear-systems.
 """
@@ -91,20 +92,30 @@ class FragmentDeflation:
 
 
 def create_deflation(
-    balance: Balance, base_pc: PETSc.PC, policy: SolverPolicy = DEFAULT_POLICY
+    balance: Balance, base_pc: PETSc.PC, policy: SolverPolicy = DEFAULT_POLICY, max_nodes: float = np.inf
 ) -> FragmentDeflation | None:
-    """Return the deflation of the present body; None if it is in one piece or cannot break (collective)."""
+    """Return the deflation of the present body; None if it has no such fragment or cannot break (collective).
+
+    Args:
+        balance: balance of forces.
+        base_pc: M.
+        policy: tolerance of dependent motions.
+        max_nodes: largest number of nodes of a deflated fragment.
+    """
     domain, multiplier = balance.domain, balance.stress.energy_multiplier
     # A restart tells of damage that may have changed, also to a body that cannot break.
     if multiplier is None:
         return None
     count, fragment = node_components(domain, multiplier.x.array[: domain.cell_count] > 0)
-    # Fragment 0 is the largest.
     _assign_tied_nodes(balance, fragment)
-    nodes = np.flatnonzero(fragment > 0)
-    if count <= 1:
+    sizes = sum_over_ranks(domain.comm, np.bincount(fragment[fragment >= 0], minlength=count))
+    is_small = sizes <= max_nodes
+    is_small[:1] = False  # the largest fragment
+    if not is_small.any():
         return None
-    return FragmentDeflation(balance, base_pc, nodes, fragment[nodes] - 1, count - 1, policy)
+    nodes = np.flatnonzero((fragment >= 0) & is_small[fragment])
+    number = np.cumsum(is_small) - 1
+    return FragmentDeflation(balance, base_pc, nodes, number[fragment[nodes]], int(is_small.sum()), policy)
 
 
 def _assign_tied_nodes(balance: Balance, fragment: Ints) -> None:

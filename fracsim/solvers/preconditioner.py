@@ -9,6 +9,7 @@ Equations: docs/theory.md#linear-systems.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import IntEnum
@@ -178,10 +179,12 @@ class AppliedPreconditioner:
             self.vcycle.update_operator()
         if new_fragments:
             self.release_deflation()
-            if mass_stiffness_ratio(self._balance) <= self._policy.max_deflated_inertia:
+            if (inertia := mass_stiffness_ratio(self._balance)) <= self._policy.max_deflated_inertia:
                 from .deflation import create_deflation
 
-                self._deflation = create_deflation(self._balance, base, self._policy)
+                is_held = inertia > self._policy.max_large_deflated_inertia
+                max_nodes = self._policy.max_deflated_nodes if is_held else math.inf
+                self._deflation = create_deflation(self._balance, base, self._policy, max_nodes)
         deflation = self._deflation
         if deflation is None or deflation.base_pc is not base:
             return
