@@ -11,7 +11,7 @@ from fracsim.contact.self_contact import SelfContact
 from fracsim.scene import Scene
 from fracsim.solvers import nonlinear_elimination, nonlinear_solver
 from support.scenes import Values, Walk, break_across, each_step, make_scene
-from support.solver_policy import set_policy
+from support.solver_policy import record_relaxations, set_policy
 from support.torn import TIGHT
 
 SOFT = {"energy": "neo-hookean", "young": 1e4, "poisson": 0.3, "density": 100.0}
@@ -84,13 +84,7 @@ def test_nodes_come_to_rest_beside_contact_that_stays(dim: int, monkeypatch: pyt
 def test_steps_of_a_torn_body_in_contact_end_as_without(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two halves that are pushed together, with many broken edges within them."""
     set_policy(monkeypatch, max_relaxed_nodes=0.1)
-    relaxed: list[bool] = []
-    relax = nonlinear_elimination.NonlinearElimination.relax_nodes
-    monkeypatch.setattr(
-        nonlinear_elimination.NonlinearElimination,
-        "relax_nodes",
-        lambda self, norm: (relaxed.append(moved := relax(self, norm)), moved)[1],
-    )
+    relaxed = record_relaxations(monkeypatch)
     motions, touched = [], 0.0
     for _ in range(2):
         scene, state, term = torn_block(2, boundary=PUSHED)

@@ -15,7 +15,7 @@ from fracsim.solvers import nonlinear_elimination, nonlinear_solver
 from support.pushed_nodes import DISTANCE, STUDIES, make_patch, nodes_in_contact, pressed
 from support.ranks import run_on_ranks
 from support.scenes import Values, break_across, each_step, make_scene
-from support.solver_policy import set_policy
+from support.solver_policy import record_relaxations, set_policy
 
 RANDOM = np.random.default_rng(7)
 
@@ -111,13 +111,7 @@ def test_nodes_in_contact_come_to_rest(monkeypatch: pytest.MonkeyPatch, name: st
 def test_steps_end_as_without_and_take_fewer_tangents(monkeypatch: pytest.MonkeyPatch) -> None:
     """A torn block under a ball, with nodes that are relaxed separately and without: the same motion."""
     set_policy(monkeypatch, max_relaxed_nodes=0.1)
-    relaxed: list[bool] = []
-    relax = nonlinear_elimination.NonlinearElimination.relax_nodes
-    monkeypatch.setattr(
-        nonlinear_elimination.NonlinearElimination,
-        "relax_nodes",
-        lambda self, norm: (relaxed.append(moved := relax(self, norm)), moved)[1],
-    )
+    relaxed = record_relaxations(monkeypatch)
     motions, iterations = [], []
     for _ in range(2):
         scene, state = make_scene(**STUDIES["2d"] | {"time": {"scheme": "backward-euler", "step": 0.02, "end": 0.2}})

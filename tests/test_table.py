@@ -78,6 +78,8 @@ def test_each_row_names_its_differences_from_the_paper() -> None:
         assert ("f" in scene.differs) == bool(whole.plasticity and whole.plasticity.flow_rate < math.inf), name
         assert ("j" in scene.differs) == bool(whole.obstacle), name
         assert ("k" in scene.differs) == any(obstacle.name == "striker" for obstacle in whole.obstacle), name
+        breaking_step = whole.time.breaking_step
+        assert ("n" in scene.differs) == (breaking_step is not None and breaking_step < whole.time.step), name
         assert ("l" in scene.differs) == (whole.brittle is not None), name
 
 

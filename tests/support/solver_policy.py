@@ -1,4 +1,4 @@
-"""Other numbers for the solvers that are made from here on."""
+"""Other numbers for the solvers that are made from here on, and a record of their nonlinear elimination."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from fracsim.solvers import policy
+from fracsim.solvers import nonlinear_elimination, policy
 
 
 def set_policy(patch: pytest.MonkeyPatch, **changes: Any) -> policy.SolverPolicy:
@@ -24,3 +24,15 @@ def other_policy(**changes: Any) -> Iterator[policy.SolverPolicy]:
     """The same within a block, where no test is at hand."""
     with pytest.MonkeyPatch.context() as patch:
         yield set_policy(patch, **changes)
+
+
+def record_relaxations(patch: pytest.MonkeyPatch) -> list[bool]:
+    """For each nonlinear elimination from here on: whether any node has moved."""
+    moved, relax = list[bool](), nonlinear_elimination.NonlinearElimination.relax_nodes
+
+    def recorded(self: nonlinear_elimination.NonlinearElimination, solved_norm: float) -> bool:
+        moved.append(relax(self, solved_norm))
+        return moved[-1]
+
+    patch.setattr(nonlinear_elimination.NonlinearElimination, "relax_nodes", recorded)
+    return moved
