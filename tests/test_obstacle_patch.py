@@ -60,7 +60,7 @@ def test_a_patch_has_the_potential_of_the_body(name: str) -> None:
         scale = max(abs(body[0]), abs(start[0]))
         assert value.potential - at_start.potential == pytest.approx(body[0] - start[0], rel=1e-6, abs=1e-11 * scale)
         np.testing.assert_allclose(value.forces, body[1], rtol=1e-7, atol=1e-9 * np.abs(body[1]).max())
-    difference = 1e-5 * step * direction
+    difference = 1e-6 * step * direction
     ends = [of_body(sign * difference)[1] for sign in (1, -1)]
     product = at_start.stiffness @ (2 * difference).reshape(-1)
     np.testing.assert_allclose(product, (ends[0] - ends[1]).reshape(-1), atol=1e-5 * np.abs(product).max())
