@@ -219,7 +219,8 @@ static int pierces(const double *start, const double *end, const double *corners
     for (int k = 0; k < 2; k++) heights[k] = fabs(heights[k]) > size ? heights[k] : 0;
     if (heights[0] * heights[1] > 0 || heights[0] == heights[1]) return 0;
     const double *point = heights[1] == 0 ? end : start;
-    for (int k = 0; k < 3 && heights[0] * heights[1] == 0; k++) direction[k] = normal[k];
+    if (heights[0] * heights[1] == 0)
+        for (int k = 0; k < 3; k++) direction[k] = normal[k];
     int positive = 1, negative = 1;
     for (int c = 0; c < 3; c++) {
         subtract(a, corners + 3 * c, point), subtract(b, corners + 3 * ((c + 1) % 3), point);
