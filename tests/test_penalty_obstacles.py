@@ -10,7 +10,7 @@ import numpy.typing as npt
 import pytest
 from pydantic import ValidationError
 
-from fracsim.contact.penalty_contacts import NodalMassShare
+from fracsim.contact.penalty_law import NodalMassShare
 from fracsim.contact.penalty_obstacles import PenaltyObstacleTerm
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.mesh.split_surface.local_surface import LocalSurface

@@ -13,9 +13,8 @@ from scipy.sparse import eye
 
 from fracsim.contact.ipc_pairs import IpcPairs
 from fracsim.contact.penalty_contact import PenaltyContact, PenaltyState
-from fracsim.contact.penalty_contacts import ContactStiffness, NodalMassShare
+from fracsim.contact.penalty_law import ContactStiffness, NodalMassShare, penalty_stiffness
 from fracsim.contact.penalty_pairs import PenaltyPairs
-from fracsim.contact.penalty_point_facet import penalty_stiffness
 from fracsim.contact.penalty_surface import PenaltySurface
 from fracsim.meshes.builders.box import Box
 from fracsim.scene import Scene
@@ -86,7 +85,7 @@ def test_it_is_no_faster_than_said(dim: int) -> None:
         K += rate * np.outer(row.reshape(-1), row.reshape(-1))
     m = np.repeat(mass, dim)
     fastest = float(np.linalg.eigvalsh(K / np.sqrt(m[:, None] * m)).max())
-    bound = float((pairs.contacts_ahead(x).added_load(eye(n, format="csr")) / mass).max())
+    bound = float((pairs.near_contacts(x).added_load(eye(n, format="csr")) / mass).max())
     assert 0.3 * bound < fastest <= bound
     own = penalty_stiffness(NodalMassShare(eye(n, format="csr"), mass), np.ones(n), np.inf, 4.0)
     np.testing.assert_allclose(own, mass, rtol=1e-12)
@@ -160,13 +159,13 @@ def test_what_breaks_in_touch_gains_nothing(tmp_path: Path) -> None:
     while contact.stored_energy() < 0.5:
         march(scene, state, 1)
     before, graph = contact.stored_energy(), scene.fracture.graph
-    pushed_keys = surface.element_set.points.keys[surface.parts[0].contact.history.points.points[:, 0]]
+    pushed_keys = surface.element_set.points.keys[surface.parts[0].contact.history.points[:, 0]]
     graph.break_edges(np.random.default_rng(2).random(len(graph.broken)) < 0.5)
     scene.fracture.mark_changed()
     scene.balance.edges_broke(graph.pattern)
     _, again = contact_of(scene)
     assert again is not surface and len(again.rest_positions) > len(surface.rest_positions)
-    pushed = again.parts[0].contact.history.points.points[:, 0]
+    pushed = again.parts[0].contact.history.points[:, 0]
     assert np.isin(again.element_set.points.keys[pushed], pushed_keys).any()
     assert 0.1 * before < contact.stored_energy() <= before * (1 + 1e-6)
 
@@ -274,7 +273,7 @@ def test_rubbing_is_in_the_books(tmp_path: Path) -> None:
         assert x is not None
         pairs = surface.parts[0].contact
         met = pairs.contacts(x)
-        history, slips = pairs.history.points, np.zeros_like(x)
+        history, slips = pairs.history, np.zeros_like(x)
         slips[history.points[:, 0]] = history.slip
         pull = met.spring_stiffness * np.linalg.norm(slips[met.points[:, 0]], axis=1)
         assert (pull <= 0.3 * met.spring_stiffness * (pairs.width - met.gap) * (1 + 1e-12)).all()
@@ -307,7 +306,7 @@ def test_a_point_is_not_behind_the_side_of_its_body(tilt: float) -> None:
     elements = np.array([[2, 0, 1], [2, 1, 3], [1, 4, 5]])  # its own facet, the side facet, the upper face
     pairs = PenaltyPairs(x, elements, ContactStiffness.of_one_body(np.ones(len(x))), distance=D)
     pairs.end_step(x)
-    assert 0 in pairs.history.points.points[:, 0]
+    assert 0 in pairs.history.points[:, 0]
     assert pairs.min_gap(x) == pytest.approx(height, rel=1e-3)
     assert pairs.energy(x) < 10 * 0.5 * (D - height) ** 2
 

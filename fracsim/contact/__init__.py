@@ -42,8 +42,8 @@ Surfaces with ipctk:
     retractable_surface   crack faces that are retracted where there is no room
     barrier_surface, ipc_pairs, sample_points  surface and pairs of the barrier; sample points and friction at them
     mesh_obstacles        pairs of a body and a triangle-mesh obstacle
-    penalty_pairs         penalty between points and facets, and between edges, with friction
-    penalty_contacts, penalty_point_facet, penalty_edges  energy of contacts; points before facets; edges
+    penalty_law           energy, forces, friction, stiffness and history of contacts of a penalty
+    penalty_pairs, penalty_edges  points before facets, and edges before edges
     penalty_surface       surface and contacts of the penalty
 
 Free obstacles:

@@ -29,9 +29,8 @@ from .mesh_obstacle_term import build_mesh_obstacles
 from .mesh_obstacles import MeshObstacle
 from .obstacle import VerletObstacle
 from .partitioned_surface import motion_diagonals
-from .penalty_contacts import PenaltyHistory
-from .penalty_pairs import NO_ROWS, PairSprings
-from .penalty_point_facet import POINT_FACET
+from .penalty_law import ContactHistory, PenaltyForces
+from .penalty_pairs import PAIRS
 from .penalty_surface import PenaltyBodySurface, PenaltyPart
 from .pose import Pose, PosedShape, resultant
 from .retractable_surface import SelfContactLaw
@@ -41,7 +40,7 @@ Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 # keys of points, and contacts
-type KeyedHistory = tuple[Ints, PenaltyHistory]
+type KeyedHistory = tuple[Ints, ContactHistory]
 
 
 @dataclass(frozen=True)
@@ -162,17 +161,17 @@ class PenaltyState:
         arrays: dict[str, Values] = {}
         for index, part in enumerate(self._surface.current.parts):
             if (rows := gather(self._comm, part.contact.history.by_keys(part.keys))) is not None:
-                arrays |= PenaltyHistory.join(rows).to_checkpoint(f"_{index}")
+                arrays |= ContactHistory.join(rows).to_checkpoint(f"_{index}")
         return arrays
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint (collective)."""
         count = len(self._surface.current.parts)
-        histories = [PenaltyHistory.from_checkpoint(saved, f"_{index}") for index in range(count)]
-        is_near = any(not history.is_empty for history in histories)
+        histories = [ContactHistory.from_checkpoint(saved, f"_{index}") for index in range(count)]
+        is_near = any(len(history.points) for history in histories)
         self._idle_state = IdleState(is_near)
         if self._comm.rank:
-            histories = [history.select(NO_ROWS, NO_ROWS) for history in histories]
+            histories = [history.select(slice(0)) for history in histories]
         self._surface.set_history(histories)
         self.discard()
 
@@ -239,6 +238,7 @@ class PenaltyContact(Term):
         self.state.discard()
         self._positions: Values | None = None
         self._nodal_forces: Values | None = None
+        self._forces: list[PenaltyForces | None] | None = None
         self._gradients: list[Values] | None = None
 
     def clear_search(self) -> None:
@@ -276,22 +276,22 @@ class PenaltyContact(Term):
         gaps = [part.contact.min_gap(part.points(x)) for part in self._parts if not part.is_far(x)]
         return -max_over_ranks(self.comm, -min(gaps, default=np.inf))
 
-    def _springs(self, index: int, part: PenaltyPart) -> PairSprings:
-        """Springs of friction of a part."""
-        return PairSprings(part.contact, part.friction, None if self._starts is None else self._starts[index])
+    def _part_forces(self, x: Values) -> list[PenaltyForces | None]:
+        """Forces of each part with the body at x (n, d), m; None: it is far."""
+        if self._forces is None:
+            starts = [None] * len(self._parts) if self._starts is None else self._starts
+            self._forces = [
+                None if part.is_far(x) else part.contact.forces(part.points(x), start, part.friction)
+                for part, start in zip(self._parts, starts, strict=True)
+            ]
+        return self._forces
 
     def _part_gradients(self, x: Values) -> list[Values]:
-        """(n + m, d) minus the forces of each part, friction included, with the body at x (n, d), m."""
+        """(n + m, d) minus the forces of each part on its points with the body at x (n, d), m; N."""
         if self._gradients is None:
-            self._gradients = []
-            for index, part in enumerate(self._parts):
-                points = part.points(x)
-                gradient = np.zeros_like(points)
-                if not part.is_far(x):
-                    gradient = part.contact.gradient(points)
-                    if part.friction:
-                        gradient = gradient + self._springs(index, part).gradient(points)
-                self._gradients.append(gradient)
+            parts = zip(self._parts, self._part_forces(x), strict=True)
+            zero = np.zeros_like(x)
+            self._gradients = [zero if forces is None else forces.gradient(len(part.keys)) for part, forces in parts]
         return self._gradients
 
     def contact_forces(self) -> Values | None:
@@ -309,13 +309,7 @@ class PenaltyContact(Term):
         """Energy of the penalty and of the springs of friction at the current u, of this rank, J (collective)."""
         if self.state.is_idle():
             return 0.0
-        x, energy = self._end_positions(), 0.0
-        for index, part in enumerate(self._parts):
-            if not part.is_far(x):
-                points = part.points(x)
-                springs = self._springs(index, part).energy(points) if part.friction else 0.0
-                energy += part.contact.energy(points) + springs
-        return energy
+        return sum(forces.energy for forces in self._part_forces(self._end_positions()) if forces is not None)
 
     def step_work(self) -> tuple[float, float]:
         """Work from outside, 0, and dissipation by friction, of this rank, J."""
@@ -361,16 +355,14 @@ class PenaltyContact(Term):
     def _store_contacts(self, x: Values) -> bool:
         """Store contacts at the end of a step with the body at x (n, d), m; whether any are near on this rank."""
         is_near = False
-        for index, part in enumerate(self._parts):
-            if part.is_far(x) and part.contact.history.is_empty:
+        for part, forces in zip(self._parts, self._part_forces(x), strict=True):
+            history = part.contact.history
+            if forces is None and not len(history.points):
                 continue
-            points, slips = part.points(x), None
-            if part.friction:
-                springs = self._springs(index, part)
-                slips = springs.slips(points)
-                self._friction_loss += springs.dissipated(points)
-            part.contact.end_step(points, slips)
-            is_near |= not part.contact.history.is_empty
+            forces = forces or part.contact.forces(part.points(x))
+            self._friction_loss += forces.dissipated(history.spring_energy)
+            part.contact.end_step(part.points(x), forces.slips)
+            is_near |= len(part.contact.history.points) > 0
         return is_near
 
     def begin_solve(self) -> None:
@@ -406,7 +398,7 @@ class PenaltyMeshContact(PenaltyContact):
         for mesh, posed in zip(self._all_meshes, self._posed, strict=True):
             mesh.move_to(posed.pose)
         super().__init__(domain, u, law, mass, max_added, self._all_meshes, self._is_far)
-        reach = POINT_FACET.max_gap * law.distance
+        reach = PAIRS.max_gap * law.distance
         self._clearance = Clearance(domain, self._all_meshes, reach, self.surface.following_points)
         self.parts, self.pose_contact = (*self.parts, self.group, self._clearance), PoseContact(cast("Any", self))
 
@@ -484,7 +476,7 @@ class PenaltyMeshContact(PenaltyContact):
             rows: tuple[Values, Values] = np.empty((0, 3)), np.empty(0)
             if not part.is_far(x):
                 points = part.points(x)
-                near = part.contact.contacts_ahead(points)
+                near = part.contact.near_contacts(points)
                 rows = near.positions(points, np.arange(len(points)) >= len(x)), near.stiffness
             positions, stiffness = (np.concatenate(arrays) for arrays in zip(*allgather(self.comm, rows), strict=True))
             if len(stiffness):
@@ -501,6 +493,8 @@ class PenaltyMeshContact(PenaltyContact):
         """(6,) force and moment on an obstacle at the current u, of this rank's contacts, N and N m (collective)."""
         x, mesh = self._end_positions(), self._all_meshes[index]
         force = -self._part_gradients(x)[index][len(x) :]
+        if not len(force):
+            return np.zeros(6)
         pressed = force.any(axis=1)
         return resultant(force[pressed], mesh.positions[pressed] - mesh.pose.centre)
 

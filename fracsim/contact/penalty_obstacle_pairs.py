@@ -27,7 +27,7 @@ from .rigid_obstacles import RigidObstacles
 from .triangle_mesh_shape import StackedMeshes, TriangleMeshShape
 
 if TYPE_CHECKING:
-    from .penalty_contacts import PenaltyHistory
+    from .penalty_law import ContactHistory
     from .penalty_pairs import PenaltyPairs  # with ipctk
 
 Values = npt.NDArray[np.float64]
@@ -219,7 +219,7 @@ class MeshContacts:
             self._pairs = self._build_pairs(Penalty(penalty.rate * width, width))
 
     def _build_pairs(self, penalty: Penalty) -> PenaltyPairs:
-        from .penalty_contacts import ContactStiffness
+        from .penalty_law import ContactStiffness
         from .penalty_pairs import PenaltyPairs
 
         meshes, stiffness = self._meshes, ContactStiffness.of_one_body(0.5 * penalty.rate * self._area)
@@ -231,34 +231,34 @@ class MeshContacts:
 
     def end_step(self, starts: Poses, ends: Poses) -> PairForces | None:
         """Forces at the end of a step, of which the contacts are stored; None: out of contact."""
-        from .penalty_pairs import PairSprings
-
         if (x := self._near_positions(ends)) is None:
             return None
-        springs = PairSprings(self._pairs, self._friction, self._meshes.positions(starts))
-        contacts, slips, is_first = self._pairs.contacts(x), springs.slips(x), self._meshes.patches == 0
-        press, energies = -self._pairs.gradient(x), (self._pairs.energy(x), springs.energy(x))
+        forces, is_first = (
+            self._pairs.forces(x, self._meshes.positions(starts), self._friction),
+            self._meshes.patches == 0,
+        )
+        contacts, press = forces.contacts, -self._pairs.gradient(x)
         parts = zip(self._meshes.rows, ends, strict=True)
         of_press = [resultant(press[rows], x[rows] - pose.centre) for rows, pose in parts]
         # at one point, in the middle of the gap, so that friction has no moment
         middle = 0.5 * (contacts.positions(x, is_first) + contacts.positions(x, ~is_first))
         sign = np.sum(contacts.weights * is_first[contacts.points], axis=1)
-        friction = _wrenches(-(sign * contacts.spring_stiffness)[:, None] * slips, middle, ends)
-        self._pairs.end_step(x, slips)
-        return PairForces(np.array(of_press) + friction, friction, *energies)
+        friction, spring_energy = _wrenches(sign[:, None] * forces.spring_force, middle, ends), forces.spring_energy
+        self._pairs.end_step(x, forces.slips)
+        return PairForces(np.array(of_press) + friction, friction, forces.energy - spring_energy, spring_energy)
 
     def near_springs(self, poses: Poses) -> tuple[Values, Values] | None:
         """Positions (k, 3), m, and stiffness (k,), N/m, of contacts that may act a step later; None: none."""
         if (x := self._near_positions(poses)) is None:
             return None
-        near = self._pairs.contacts_ahead(x)
+        near = self._pairs.near_contacts(x)
         return (near.positions(x, self._meshes.patches == 0), near.stiffness) if len(near.gap) else None
 
-    def snapshot(self) -> PenaltyHistory:
+    def snapshot(self) -> ContactHistory:
         """Contacts at the end of the last step."""
         return self._pairs.history
 
-    def restore(self, memory: PenaltyHistory) -> None:
+    def restore(self, memory: ContactHistory) -> None:
         """Restore a snapshot."""
         self._pairs.set_history(memory)
 
@@ -268,10 +268,9 @@ class MeshContacts:
 
     def from_checkpoint(self, saved: dict[str, Values], suffix: str) -> None:
         """Set contacts from the arrays of a checkpoint."""
-        from .penalty_contacts import PenaltyHistory
+        from .penalty_law import ContactHistory
 
-        unlimited = np.full(len(self._meshes.points), np.inf)
-        self._pairs.set_history(PenaltyHistory.from_checkpoint(saved, suffix).by_numbers(np.asarray, unlimited))
+        self._pairs.set_history(ContactHistory.from_checkpoint(saved, suffix))
 
 
 class PenaltyPair:

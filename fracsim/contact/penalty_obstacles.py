@@ -37,7 +37,7 @@ from .laws import ObstacleLaw, Penalty, slipped, tangential
 from .node_contact import ContactForces
 from .obstacle import VerletObstacle
 from .obstacle_term import ObstacleTerm
-from .penalty_contacts import NodalMassShare
+from .penalty_law import NodalMassShare
 from .pose import PosedShape, min_distance
 from .rigid_obstacles import RigidObstacles
 

@@ -1,43 +1,172 @@
-"""Penalty between points and facets, and between edges, of surfaces in explicit steps, with friction.
+"""Pairs of a penalty between the elements of a surface in explicit steps: points before facets, and edges.
 
-Of a body with itself, of bodies and triangle meshes, and of triangle meshes with one another.
+Of a body with itself, of bodies and triangle meshes, and of triangle meshes with one another; edges against edges in 3D
+alone (penalty_edges). Energy, forces and friction are those of penalty_law.
 
-    E(x) = sum over points p of k_p (D - g_p)^2 / 2 + sum over edges of k h (D - g)^2 / 2    where g < D
+g_p is the distance, m, of a point p to the nearest facet of those that p is in front of. A point that was near a facet
+at the end of the last step may lie behind it, or one beside it, within 60 degrees of its normal: g_p < 0. All other
+points behind a facet are on the far side of its body. Facets of which a point is a corner do not act on it.
 
-(penalty_contacts). Points before facets: penalty_point_facet; edges against edges, in 3D: penalty_edges.
-
-Coulomb friction: each contact has a spring that slips (Cundall and Strack 1979),
-
-    f = -k h s,    s += (1 - n n^T) sum_i w_i dx_i in a step, shortened to |s| <= mu (D - g)
+k_p is the stiffness that the point, or a corner of its facet, may have as contact begins, and is constant during
+contact. The weights of a contact are 1 of the point and minus the barycentric coordinates on the facet.
 
 Equations: docs/theory.md#explicit-contact.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
-from .laws import slipped, tangential
-from .pair_search import PairFilter, intersecting_pairs
-from .penalty_contacts import (
-    ContactHistory,
-    ContactStiffness,
-    ElementRanks,
-    PenaltyContacts,
-    PenaltyHistory,
-    concatenate_contacts,
-)
+from .closest_point import minimise_on_simplex
+from .pair_search import PairFilter, PairSearch, SimplexPairs, intersecting_pairs, near_pairs, pair_distances
 from .penalty_edges import EdgeContacts
-from .penalty_point_facet import POINT_FACET, PointFacetContacts
+from .penalty_law import NO_POINT, ContactHistory, ContactStiffness, ElementRanks, PenaltyContacts, PenaltyForces
+from .retractable_surface import unit_normals
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 
-NO_ROWS: Ints = np.empty(0, np.int64)
+
+@dataclass(frozen=True)
+class PenaltyPairPolicy:
+    """Tuned numbers of pairs; lengths in D.
+
+    Attributes:
+        max_gap: largest gap, or depth, of a pair; what is deeper has passed through.
+        search_margin: motion of points after which pairs are searched again.
+        same_distance: difference of distances, in mean edges, of facets that share a closest point.
+        min_slope: cosine between the normal of a facet and the direction to a point behind it. A facet that is seen
+            from its side tells nothing: its plane has points of the same body in it.
+        min_barycentric: coordinate of a corner below which the corner does not carry a point.
+        clearance_gap: gaps that are searched where nothing is within reach.
+        ahead_gap: gap of contacts that may be closed a step later; below that of the faces of a new crack
+            (SURFACE.face_gap), which round-off would decide about.
+    """
+
+    max_gap: float = 3.0
+    search_margin: float = 1.0
+    same_distance: float = 1e-9
+    min_slope: float = 0.5
+    min_barycentric: float = 1e-3
+    clearance_gap: float = 10.0
+    ahead_gap: float = 1.99
+
+
+PAIRS = PenaltyPairPolicy()
+
+
+class PointFacetContacts:
+    """Points of a surface before its facets.
+
+    Attributes:
+        candidates: pairs of points of this rank and facets that are searched.
+    """
+
+    def __init__(
+        self, elements: Ints, stiffness: ContactStiffness, distance: float, edge: float, is_owned: Flags
+    ) -> None:
+        """Points and facets of a surface.
+
+        Args:
+            elements: (k, d) facets.
+            stiffness: of points.
+            distance: D, m.
+            edge: mean length of edges, m.
+            is_owned: (n,) points whose contacts belong to this rank.
+        """
+        self._elements, self._stiffness, self._is_owned = elements, stiffness, is_owned
+        self._max_gap, self._tolerance = PAIRS.max_gap * distance, PAIRS.same_distance * edge
+        used, facets = np.unique(elements, return_inverse=True)
+        owned = np.flatnonzero(is_owned[used])
+        self._points = used[owned]
+        self.candidates = SimplexPairs.of(owned[:, None], facets.reshape(elements.shape), self._max_gap)
+
+    def set_history(self, history: ContactHistory) -> ContactHistory:
+        """Set the contacts at the end of the last step; returns those of points of this rank."""
+        history = history.select(self._is_owned[history.points[:, 0]])
+        points, (count, dim) = history.points[:, 0], (len(self._is_owned), self._elements.shape[1])
+        # of all points: corners of the facets that they were before, k_p of those in contact, and slip
+        self._facets = np.full((count, dim), NO_POINT)
+        self._start_stiffness, self._slip = np.zeros(count), np.zeros((count, dim))
+        self._facets[points] = history.points[:, 1:]
+        self._start_stiffness[points], self._slip[points] = history.stiffness, history.slip
+        return history
+
+    def contacts_within(self, x: Values, pairs: Ints, reach: float) -> PenaltyContacts:
+        """Nearest facet of each point that has one within `reach`, m, among candidates (k, 2); points at x (n, d), m.
+
+        Of facets that share a closest point the one is taken whose normal is most parallel to the offset: it tells the
+        side of the point. Of equally near facets the first one counts, whatever round-off.
+        """
+        points, corners = self._points[pairs[:, 0]], self._elements[pairs[:, 1]]
+        barycentric, offset = _closest_points(x, points, corners)
+        distance = np.linalg.norm(offset, axis=1)
+        near = np.flatnonzero(distance < self._max_gap)
+        near_normal = unit_normals(x[corners[near]])
+        near_height = np.einsum("kd,kd->k", offset[near], near_normal)
+        steepest = self._steepest_facets(points[near], distance[near], abs(near_height))
+        rows, height = near[steepest], near_height[steepest]
+        points, corners, distance = points[rows], corners[rows], distance[rows]
+        # a point may be behind facets of the last step, or those beside them
+        may_be_behind = (self._facets[points][:, :, None] == corners[:, None]).any(axis=(1, 2))
+        may_be_behind &= abs(height) + self._tolerance >= PAIRS.min_slope * distance
+        counts = np.flatnonzero(((height >= 0) & (distance > 0)) | may_be_behind)
+        nearest = np.full(len(x), np.inf)
+        np.minimum.at(nearest, points[counts], distance[counts])
+        counts = counts[distance[counts] <= nearest[points[counts]] + self._tolerance]
+        counts = _first_rows(points[counts], counts)
+        gap = np.where(height[counts] < 0, -1.0, 1.0) * distance[counts]
+        within = gap < reach
+        gap, counts = gap[within], counts[within]
+        rows, points, corners, is_clear = rows[counts], points[counts], corners[counts], abs(gap) > self._tolerance
+        normal = offset[rows] / np.where(is_clear, gap, 1.0)[:, None]
+        normal = np.where(is_clear[:, None], normal, near_normal[steepest[counts]])
+        weights = np.column_stack([np.ones(len(rows)), -barycentric[rows]])
+        stiffness, start = self._stiffness_of(points, corners, barycentric[rows]), self._start_stiffness[points]
+        members = np.column_stack([points, corners])
+        return PenaltyContacts.of_points(members, weights, gap, normal, stiffness, self._slip[points], start)
+
+    def _steepest_facets(self, points: Ints, distance: Values, height: Values) -> Ints:
+        """(j,) one row (k,) for each closest point of a point: the highest, ascending."""
+        order = np.lexsort((distance, points))
+        is_new = (np.diff(points[order]) > 0) | (np.diff(distance[order]) > self._tolerance)
+        group = np.cumsum(np.r_[False, is_new][: len(order)])
+        highest = np.zeros(len(order))
+        np.maximum.at(highest, group, height[order])
+        level = height[order] >= highest[group] - self._tolerance
+        return np.sort(_first_rows(group[level], order[level]))
+
+    def _stiffness_of(self, points: Ints, corners: Ints, barycentric: Values) -> Values:
+        """(k,) k_p, N/m: at most what a corner that carries the point may have; constant during contact.
+
+        So all facets that share a closest point give the same stiffness.
+        """
+        allowed, carries = self._stiffness, barycentric > PAIRS.min_barycentric
+        weight = np.where(carries, barycentric, 1.0)
+        limit = np.where(carries, allowed.limit[corners] / weight, np.inf).min(axis=1, initial=np.inf)
+        reduction = np.where(carries, allowed.reduction[corners], 1.0).min(axis=1, initial=1.0)
+        previous = self._start_stiffness[points]
+        return np.where(previous > 0, previous, np.minimum(allowed.point[points] * reduction, limit))
+
+
+def _first_rows(groups: Ints, rows: Ints) -> Ints:
+    """(g,) lowest of the rows (k,) of each group (k,), in the order of the groups."""
+    order = np.lexsort((rows, groups))
+    return rows[order[np.unique(groups[order], return_index=True)[1]]]
+
+
+def _closest_points(x: Values, points: Ints, corners: Ints) -> tuple[Values, Values]:
+    """(k, d) barycentric coordinates of closest points, and vectors (k, d) from there to the points, m."""
+    k, d = corners.shape
+    arms = x[corners] - x[points][:, None]
+    centroid = np.full((k, d), 1 / d)
+    slope = np.einsum("kcd,kd->kc", arms, arms.mean(axis=1))
+    barycentric = minimise_on_simplex(arms @ arms.transpose(0, 2, 1), slope, centroid)
+    return barycentric, -np.einsum("kcd,kc->kd", arms, barycentric)
 
 
 class PenaltyPairs:
@@ -45,7 +174,10 @@ class PenaltyPairs:
 
     Attributes:
         width: D, m.
+        history: contacts of this rank near each other at the end of the last step.
     """
+
+    history: ContactHistory
 
     def __init__(
         self,
@@ -69,51 +201,37 @@ class PenaltyPairs:
             ranks: of the elements; None: all are of this rank.
             edge: mean length of edges, m; None: of these elements.
         """
-        self.width, is_3d = distance, rest_positions.shape[1] == 3
+        self.width, (count, dim) = distance, rest_positions.shape
         if edge is None:
             sides = rest_positions[elements] - rest_positions[np.roll(elements, 1, axis=1)]
             edge = float(np.linalg.norm(sides, axis=2).mean()) if len(elements) else distance
-        self._elements, self._filter = elements, PairFilter.of(len(rest_positions), patch)
-        is_owned = None if ranks is None else ranks.own_points
-        self._points = PointFacetContacts(
-            elements, stiffness, distance=distance, edge=edge, patch=patch, is_owned=is_owned
-        )
-        self._edges = (
-            EdgeContacts(rest_positions, elements, stiffness.limit, distance=distance, patch=patch, ranks=ranks)
-            if is_3d
-            else None
-        )
-        self._near: tuple[Values, PenaltyContacts, PenaltyContacts] | None = None  # of the last x
+        self._elements, self._patch, self._used = elements, patch, np.unique(elements)
+        is_owned: Flags = np.ones(count, bool) if ranks is None else ranks.own_points
+        self._points = PointFacetContacts(elements, stiffness, distance, edge, is_owned)
+        self._edges = None
+        if dim == 3:
+            max_gap = PAIRS.max_gap * distance
+            self._edges = EdgeContacts(rest_positions, elements, stiffness.limit, max_gap=max_gap, ranks=ranks)
+        self._kinds: list[PointFacetContacts | EdgeContacts] = [self._points]
+        self._kinds += [] if self._edges is None else [self._edges]
+        self._filter = PairFilter.of(len(self._used), None if patch is None else patch[self._used])
+        self._sets = [kind.candidates for kind in self._kinds]
+        self._search = PairSearch(self._filter, self._sets, PAIRS.search_margin * distance)
+        self._near: tuple[Values, PenaltyContacts] | None = None  # of the last x
         self._touching: PenaltyContacts | None = None  # those of them in contact
-        self._ahead: tuple[Values, PenaltyContacts] | None = None  # of the end of the last step
-        self._history: PenaltyHistory | None = None
+        self.set_history(ContactHistory.none(dim))
 
-    @property
-    def history(self) -> PenaltyHistory:
-        """Contacts at the end of the last step; the same object as long as they are the same."""
-        if self._history is None:
-            edges = ContactHistory.none(4, 2) if self._edges is None else self._edges.history
-            self._history = PenaltyHistory(self._points.history, edges)
-        return self._history
-
-    def set_history(self, history: PenaltyHistory) -> None:
+    def set_history(self, history: ContactHistory) -> None:
         """Set the contacts at the end of the last step; those of other ranks are left out."""
-        if history is self._history:
-            return
-        self._points.set_history(history.points)
-        if self._edges is not None:
-            self._edges.set_history(history.edges)
-        self._history = None
-        self._near = self._ahead = None
+        self._near = self._touching = None
+        self._set_history(history)
 
-    def store(self, points: Ints, edges: Ints) -> tuple[Flags, Flags]:
-        """(k,) whether contacts of points (k,), -1: none, and (m,) of edges with ends (m, 4) can be of this rank."""
-        of_points = points >= 0
-        of_points[of_points] = self._points.is_owned[points[of_points]]
-        of_edges: Flags = np.asarray((edges >= 0).all(axis=1))
+    def _set_history(self, history: ContactHistory) -> None:
+        of_edges = history.is_of_edges
+        parts = [self._points.set_history(history.select(~of_edges))]
         if self._edges is not None:
-            of_edges[of_edges] = self._edges.store(edges[of_edges])
-        return of_points, of_edges
+            parts.append(self._edges.set_history(history.select(of_edges)))
+        self.history = ContactHistory.join(parts)
 
     def energy(self, x: Values) -> float:
         """Energy E(x), J."""
@@ -136,110 +254,48 @@ class PenaltyPairs:
 
     def near_contacts(self, x: Values) -> PenaltyContacts:
         """Contacts that may be closed a step later, with points at x; those of the last x are kept."""
-        return concatenate_contacts(self._near_parts(x))
-
-    def contacts_ahead(self, x: Values) -> PenaltyContacts:
-        """The same points, weights and stiffness; of the end of a step those that were found before it was stored."""
-        if self._ahead is None or not np.array_equal(x, self._ahead[0]):
-            return self.near_contacts(x)
-        return self._ahead[1]
-
-    def _near_parts(self, x: Values) -> list[PenaltyContacts]:
         if self._near is None or not np.array_equal(x, self._near[0]):
-            reach = POINT_FACET.ahead_gap * self.width
-            points = self._points.contacts_within(x, reach)
-            edges = points.select(NO_ROWS) if self._edges is None else self._edges.contacts_within(x, reach)
-            self._near, self._touching = (x.copy(), points, edges), None
-        _, points, edges = self._near
-        return [points, edges] if len(edges.gap) else [points]
+            items, reach = (
+                zip(self._kinds, self._search.pairs(x[self._used]), strict=True),
+                PAIRS.ahead_gap * self.width,
+            )
+            near = PenaltyContacts.join([kind.contacts_within(x, pairs, reach) for kind, pairs in items])
+            self._near, self._touching = (x.copy(), near), None
+        return self._near[1]
+
+    def forces(self, x: Values, start: Values | None = None, friction: float = 0.0) -> PenaltyForces:
+        """Forces with points at x, and at `start` (n, d) at the start of the step, m; None: at x."""
+        contacts = self.contacts(x)
+        motion = contacts.relative(x - start) if friction and start is not None else np.zeros_like(contacts.normal)
+        return PenaltyForces(contacts, motion, friction, self.width)
 
     def end_step(self, x: Values, slips: Values | None = None) -> None:
         """Store contacts at the end of a step, and slips (k, d) of the springs of `contacts`, m."""
-        self._ahead, self._history = (x.copy(), self.near_contacts(x)), None
-        points, *edges = self._near_parts(x)
-        count = int((points.gap < self.width).sum())
-        all_slips = _of_near(points, self.width, None if slips is None else slips[:count])
-        self._points.end_step(points, all_slips)
-        if self._edges is not None:
-            near = edges[0] if edges else points.select(NO_ROWS)
-            self._edges.end_step(x, near, _of_near(near, self.width, None if slips is None else slips[count:]))
-        self._near = self._touching = None
+        near = self.near_contacts(x)
+        touches, all_slips = near.gap < self.width, np.zeros_like(near.normal)
+        if slips is not None:
+            all_slips[touches] = slips
+        near = replace(near, slip=all_slips, start_stiffness=np.where(touches, near.spring_stiffness, 0.0))
+        self._near, self._touching = (x.copy(), near), None
+        self._set_history(ContactHistory.of(near))
 
     def intersections(self, x: Values) -> Ints:
         """(k, 2) elements that intersect with points at x."""
-        return intersecting_pairs(self._elements, self._filter, x)
+        return intersecting_pairs(self._elements, PairFilter.of(len(x), self._patch), x)
 
     def anything_is_near(self, x: Values) -> bool:
         """Whether any point has contact, or may be near a facet, at x."""
-        return self._points.anything_is_near(x)
+        return bool(self.history.stiffness.any()) or len(self._search.pairs(x[self._used])[0]) > 0
 
     def clearance(self, x: Values) -> float:
         """Distance by which any two points at x may approach before anything is near, m; nothing is near at x."""
-        reach = POINT_FACET.clearance_gap * self.width
-        distance = self._points.clearance(x, reach)
-        if self._edges is not None:
-            distance = self._edges.clearance(x, distance)
-        return max(0.0, distance - POINT_FACET.ahead_gap * self.width)
+        vertices, distance = x[self._used], PAIRS.clearance_gap * self.width
+        for pairs in self._sets:
+            near = near_pairs(pairs, self._filter, vertices, vertices, distance)
+            distance = float(pair_distances(pairs, near, vertices).min(initial=distance))
+        return max(0.0, distance - PAIRS.ahead_gap * self.width)
 
     def clear_caches(self) -> None:
         """Discard the candidates of collision detection."""
-        self._points.clear_caches()
-        if self._edges is not None:
-            self._edges.clear_caches()
+        self._search.clear_caches()
         self._near = self._touching = None
-
-
-def _of_near(near: PenaltyContacts, width: float, slips: Values | None) -> Values | None:
-    """(k, d) slips of near contacts, of which those with gaps below `width`, m, have some."""
-    if slips is None:
-        return None
-    result = np.zeros_like(near.normal)
-    result[near.gap < width] = slips
-    return result
-
-
-@dataclass(frozen=True)
-class PairSprings:
-    """Springs of friction at the contacts of a penalty.
-
-    Attributes:
-        pairs: penalty.
-        coefficient: of friction.
-        start: (n, d) points at the start of the step, m; None: the step is accepted.
-    """
-
-    pairs: PenaltyPairs
-    coefficient: float
-    start: Values | None
-
-    def gradient(self, x: Values) -> Values:
-        """(n, d) minus the forces on the points, N."""
-        contacts = self.pairs.contacts(x)
-        return contacts.sum_at_points(contacts.spring_stiffness[:, None] * self.slips(x), len(x))
-
-    def energy(self, x: Values) -> float:
-        """Energy of the springs, J."""
-        return 0.5 * float(self.pairs.contacts(x).spring_stiffness @ np.sum(self.slips(x) ** 2, axis=1))
-
-    def slips(self, x: Values) -> Values:
-        """(k, d) stretch of the springs of the contacts at x, m; zero for new contacts."""
-        contacts = self.pairs.contacts(x)
-        slip = tangential(contacts.normal, contacts.slip + self._relative_motion(x))
-        return slipped(slip, self.coefficient * (self.pairs.width - contacts.gap))
-
-    def dissipated(self, x: Values) -> float:
-        """Energy dissipated in the step, J: minus the work by the trapezoidal rule, minus the change of energy."""
-        contacts, history = self.pairs.contacts(x), self.pairs.history
-        start, end = (
-            contacts.start_stiffness[:, None] * contacts.slip,
-            contacts.spring_stiffness[:, None] * self.slips(x),
-        )
-        work = -0.5 * float(np.vdot(start + end, self._relative_motion(x)))
-        return history.points.spring_energy + history.edges.spring_energy - self.energy(x) - work
-
-    def _relative_motion(self, x: Values) -> Values:
-        """(k, d) motion at contacts that stay in contact since the start of the step, m."""
-        contacts = self.pairs.contacts(x)
-        if self.start is None:
-            return np.zeros_like(contacts.normal)
-        return np.where((contacts.start_stiffness > 0)[:, None], contacts.relative(x - self.start), 0.0)

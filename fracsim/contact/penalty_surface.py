@@ -24,9 +24,15 @@ from ..mesh.parallel import allgather
 from .element_exchange import EXCHANGE, ElementSet, bounding_boxes, own_points
 from .mesh_obstacles import MeshObstacle
 from .partitioned_surface import PartitionedSurface
-from .penalty_contacts import NO_POINT, ContactStiffness, ElementRanks, NodalMassShare, PenaltyHistory
-from .penalty_pairs import PenaltyPairs
-from .penalty_point_facet import POINT_FACET, penalty_stiffness
+from .penalty_law import (
+    NO_POINT,
+    ContactHistory,
+    ContactStiffness,
+    ElementRanks,
+    NodalMassShare,
+    penalty_stiffness,
+)
+from .penalty_pairs import PAIRS, PenaltyPairs
 from .pose import Pose
 from .retractable_surface import RetractableSurface, SelfContactLaw
 from .sample_points import vertex_areas
@@ -154,7 +160,7 @@ class PenaltySurface(RetractableSurface):
         loads = np.zeros((weights.shape[1], len(self.parts)))
         for part, load in zip(self.parts, loads.T, strict=True):
             if not part.is_far(x):
-                contacts = part.contact.contacts_ahead(part.points(x))
+                contacts = part.contact.near_contacts(part.points(x))
                 if len(contacts.gap):
                     load += contacts.added_load(weights)
         return loads
@@ -186,7 +192,7 @@ class PenaltyBodySurface(PartitionedSurface[PenaltySurface]):
             InputError: if the surface at rest intersects itself, or an obstacle.
         """
         self._mass, self._max_added = mass, max_added
-        reach, margin = POINT_FACET.clearance_gap * law.distance, EXCHANGE.margin * domain.mean_edge_length
+        reach, margin = PAIRS.clearance_gap * law.distance, EXCHANGE.margin * domain.mean_edge_length
         super().__init__(domain, u, law, meshes, reach, margin)
 
     def _build_surface(self, element_set: ElementSet) -> PenaltySurface:
@@ -221,18 +227,15 @@ class PenaltyBodySurface(PartitionedSurface[PenaltySurface]):
     def _keep_history(self, previous: PenaltySurface) -> None:
         self.set_history([part.contact.history.by_keys(part.keys) for part in previous.parts])
 
-    def set_history(self, histories: Sequence[PenaltyHistory]) -> None:
+    def set_history(self, histories: Sequence[ContactHistory]) -> None:
         """Set the contacts of each part at the end of the last step; each goes to the rank that it belongs to.
 
         Collective.
         """
         for part, history in zip(self.current.parts, histories, strict=True):
             lookup = KeyLookup(part.keys)
-            stored = part.contact.store(lookup(history.points.points[:, 0]), lookup(history.edges.points))
-            if self._comm.size > 1:
-                elsewhere = history.select(*(~flags for flags in stored))
-                history = PenaltyHistory.join([history.select(*stored), *allgather(self._comm, elsewhere)])
-            part.contact.set_history(history.by_numbers(lookup, part.max_stiffness))
+            of_all = history if self._comm.size == 1 else ContactHistory.join(allgather(self._comm, history))
+            part.contact.set_history(of_all.by_numbers(lookup, part.max_stiffness))
 
     def max_added_frequency(self, x: Values) -> float:
         """Bound of what contact adds to the square of a frequency with points at x (n, d), m; 1/s^2 (collective)."""
