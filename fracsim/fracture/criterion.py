@@ -23,9 +23,6 @@ Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 Edges = npt.NDArray[np.integer]
 
-# Relative margin of a computed upper bound: rounding may make the bound that much too low.
-BOUND_ROUND_OFF = 1e-12
-
 
 class FractureCriterion(Protocol):
     """Interface of a criterion: it finds the edges that fail in a fracture pass."""
@@ -111,7 +108,7 @@ class IntactEdgeStress:
         """Find cells whose averaged stress may reach `bound` (Pa) in some direction, and that stress (collective)."""
         # The largest normal stress of an average is at most the average of the largest normal stresses: a scalar
         # average excludes most cells.
-        norms, bound = normal_stress_bound(carried, self._edge_stress.dim), bound * (1 - BOUND_ROUND_OFF)
+        norms = normal_stress_bound(carried, self._edge_stress.dim)
         if self._average is not None:
             return self._average.find_averages_above(carried, norms, bound, active)
         cells = np.flatnonzero(norms >= bound)
@@ -155,7 +152,7 @@ class OverloadedEdges:
         """Find the intact edges of cells (n,) whose normal stress under `averaged` (n, 3 or 6) reaches the strength."""
         # One scalar a cell excludes most cells before the normal stress of their edges is computed.
         norms = normal_stress_bound(averaged, self._edge_stress.dim)
-        candidate = norms >= self.strength.minimum_in(cells) * (1 - BOUND_ROUND_OFF)
+        candidate = norms >= self.strength.minimum_in(cells)
         cells, averaged = cells[candidate], averaged[candidate]
         edges = self._graph.cell_edges[cells]
         normal_stress = self._edge_stress.normal_stress(cells, averaged)

@@ -37,18 +37,12 @@ def edge_vectors(corners: Values) -> Values:
     return corners[:, j] - corners[:, i]
 
 
-def frobenius_norm(components: Values, dim: int) -> Values:
-    """Return sqrt(s : s) (n,) of symmetric tensors given by components (n, 3 or 6); no normal stress is larger."""
-    normal, shear = components[:, :dim], components[:, dim:]
-    square = np.einsum("ni,ni->n", normal, normal) + 2 * np.einsum("ni,ni->n", shear, shear)
-    return np.asarray(np.sqrt(square))
-
-
 def normal_stress_bound(components: Values, dim: int) -> Values:
-    """Return max(0, tr s / d + sqrt(1 - 1/d) |dev s|) (n,), an upper bound of the normal stress in any direction.
+    """Return an upper bound (n,) of the first principal stress, not below 0, of tensors (n, 3 or 6).
 
-    In 2D it is the first principal stress. It is convex in s and homogeneous of degree one, so that the bound of an
-    average is at most the average of the bounds.
+    No normal stress is larger. In 2D it is that stress, in 3D at most 6 % of |dev s| / sqrt(6) above it. 1e-12 |s| is
+    added for round-off. The first principal stress of an average is at most the average of the bounds, since it is
+    convex and homogeneous of degree one.
     """
     result = np.empty(len(components))
     _code().normal_stress_bound(c_int64(dim), c_int64(len(components)), np.ascontiguousarray(components), result)

@@ -23,13 +23,6 @@ def symmetric_tensors(components: Values, dim: int) -> Values:
     return result
 
 
-def principal_stress_bound(stress: Values) -> Values:
-    """Return an upper bound (n,) of the largest eigenvalue of tensors (n, d, d), by Gershgorin's discs."""
-    diagonal = np.einsum("nii->ni", stress)
-    radius = np.abs(stress).sum(axis=2) - np.abs(diagonal)
-    return np.asarray((diagonal + radius).max(axis=1))
-
-
 def first_principal_stress(stress: Values) -> Values:
     """Return the largest principal stress (n,) of tensors (n, d, d)."""
     return np.asarray(np.linalg.eigvalsh(stress)[:, -1])

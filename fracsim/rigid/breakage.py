@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ..fracture.brittle.surface_criterion import BrittleSurfaces
 from ..fracture.criterion import CellAverage
-from ..fracture.edge_stress import frobenius_norm
+from ..fracture.edge_stress import normal_stress_bound
 from ..fracture.nonlocal_average import NeighbourAverage
 from ..mesh.edge_graph import EdgeGraph
 from ..mesh.input_topology import MeshTopology
@@ -303,7 +303,7 @@ class BreakableBody:
         """Return whether no average can reach the strength, since no cell of the fragment does."""
         assert self._criterion is not None
         cells = np.flatnonzero(self._average.in_fragment & ~self.graph.split)
-        size = frobenius_norm(stress[cells], self._domain.dim)
-        below = float(size.max(initial=0.0)) < self._criterion.strength.minimum * (1 - 1e-9)
+        bounds = normal_stress_bound(stress[cells], self._domain.dim)
+        below = float(bounds.max(initial=0.0)) < self._criterion.strength.minimum * (1 - 1e-9)
         # a cell in which a crack ends may have an average above its own stress
         return below and not self.graph.damaged[cells].any()

@@ -17,7 +17,8 @@ from ...mesh.parallel import from_root, gather, sum_over_ranks
 from ...mesh.simplices import local_edges
 from ...meshes.data import MeshData
 from ..criterion import CellAverage, Edges, IntactEdgeStress
-from ..principal_stress import first_principal_stress, principal_stress_bound, symmetric_tensors
+from ..edge_stress import normal_stress_bound
+from ..principal_stress import first_principal_stress, symmetric_tensors
 from ..strength import EdgeStrength
 from .crack_level_set import DirectionField
 from .grains import SurfaceParameters
@@ -120,9 +121,8 @@ class BrittleSurfaces:
     def _find_overloaded(self, cells: Cells, averaged: Values) -> OverloadedCells:
         """Find those of cells (n,) whose first principal stress reaches their strength."""
         dim = self._domain.dim
-        stress = symmetric_tensors(averaged, dim)
-        candidates = np.flatnonzero(principal_stress_bound(stress) >= self.strength.minimum)
-        cells, stress = cells[candidates], stress[candidates]
+        candidates = np.flatnonzero(normal_stress_bound(averaged, dim) >= self.strength.minimum)
+        cells, stress = cells[candidates], symmetric_tensors(averaged[candidates], dim)
         load = first_principal_stress(stress) / self._cell_strength(cells)
         overloaded = np.flatnonzero(load >= 1)
         cells = cells[overloaded]
