@@ -24,11 +24,12 @@ from .topology import (
 SAME_PLACE = 1e-6  # distance over the size of the mesh within which nodes coincide
 
 
-def check_mesh(mesh: MeshData, *, join: bool = False) -> MeshData:
+def check_mesh(mesh: MeshData, *, join: bool = False, conforming: bool = False) -> MeshData:
     """The mesh without the faults that can be mended, with notes for the user.
 
     Mended: nodes without cells are removed (groups and regions follow); inverted cells are turned.
     Joined, with `join`: coincident nodes of different bodies.
+    With `conforming`, positive cells of one body that share whole facets, only coordinates and measures are checked.
     Noted: nodes at the same place that are not joined, separate bodies, parts that are connected by an edge or node
     only, group facets inside the body, cells in several regions.
 
@@ -39,6 +40,9 @@ def check_mesh(mesh: MeshData, *, join: bool = False) -> MeshData:
     """
     _check_arrays(mesh)
     _check_coordinates(mesh)
+    if conforming:
+        _check_flat(mesh)
+        return mesh
     mesh = _without_orphans(mesh)
     mesh = join_bodies(mesh) if join else mesh
     mesh = _without_repeated_facets(_oriented(mesh))

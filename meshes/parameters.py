@@ -16,7 +16,11 @@ SHORTEST, LONGEST = 1e-30, 1e30  # [m]: squares and cubes of lengths in between 
 
 
 class Builder(Protocol):
-    """A body with parameters that can be meshed; every class of BUILDERS is one."""
+    """A body with parameters that can be meshed; every class of BUILDERS is one.
+
+    A builder may have `is_conforming`, true where cells are positive and share whole facets by construction: then only
+    coordinates and measures are checked.
+    """
 
     @property
     def name(self) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import signal
 import sys
+from dataclasses import replace
 from functools import cache
 from math import comb, cos, log, pi, radians, sin, tan
 from subprocess import run
@@ -102,6 +103,25 @@ def test_cells_are_positive_and_the_check_has_nothing_to_say(built: tuple[Any, M
     # gmsh may not move the surface of a figure, so that it cannot mend every cell below it: a few in ten thousand
     assert quality["radius_ratio_min"] > (0.05 if builder.name == "figure" else 0.15)
     assert quality["poor_cells"] <= 5e-4 * quality["cells"]
+
+
+@pytest.mark.parametrize("size", [(1.0, 2.0), (1.0, 0.5, 0.25)])
+def test_a_conforming_mesh_stays_as_it_is_unless_its_cells_are_flat(size: tuple[float, ...]) -> None:
+    """The full check, which does not know that the box is conforming, changes nothing either."""
+    box = BUILDERS["box"](size=size, h=0.25)
+    assert box.is_conforming and not replace(box, pattern="unstructured").is_conforming
+    mesh = box.build()
+    checked = check_mesh(mesh)
+    assert check_mesh(mesh, conforming=True) is mesh and not checked.notes
+    np.testing.assert_array_equal(checked.points, mesh.points)
+    np.testing.assert_array_equal(checked.cells, mesh.cells)
+    assert list(checked.facet_groups) == list(mesh.facet_groups)
+    for name, facets in mesh.facet_groups.items():
+        np.testing.assert_array_equal(checked.facet_groups[name], facets)
+    # the sides of cells are as long as the round-off of coordinates
+    far = replace(box, origin=(2e15,) * len(size)).build()
+    with pytest.raises(MeshError, match="cells have no"):
+        check_mesh(far, conforming=True)
 
 
 def test_facets_are_shared_by_two_cells_and_the_boundary_is_closed(built: tuple[Any, MeshData]) -> None:

@@ -228,7 +228,8 @@ def build_mesh(mesh: MeshSettings, surface: ClosedSurface | None = None) -> Mesh
             assert mesh.file is not None
             data = read_mesh(mesh.file)
         join = mesh.file is not None and bool(mesh.parameters.get("join"))
-        return _scaled(check_mesh(data, join=join), mesh)
+        conforming = getattr(builder, "is_conforming", False)
+        return _scaled(check_mesh(data, join=join, conforming=conforming), mesh)
 
 
 def find_shared_mesh(mesh: MeshSettings) -> FileMesh | None:

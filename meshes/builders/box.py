@@ -62,6 +62,11 @@ class Box:
         """Names of the facet groups."""
         return tuple(self._planes())
 
+    @property
+    def is_conforming(self) -> bool:
+        """Whether cells are positive and share whole facets by construction."""
+        return self.pattern == "structured"
+
     def bounds(self) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Lower and upper corner of the bounding box [m]."""
         origin = self.origin or (0.0,) * len(self.size)
