@@ -2,17 +2,13 @@
 
     E(u) = sum over obstacles of  sum over points in contact of  k_p (d - gap)^2 / 2 + k_p |s|^2 / 2
 
-and where an obstacle is round, of the deepest points of facets off crack faces (facet_contact, with k_f in place of
-areas). d is the gap below which the penalty acts, k_p the stiffness of a point, s the stretch of the spring of
-friction. k_p = kappa A_p / d, A_p the share of the point in the surface, but at most `max_added` M_p, M_p its share of
-its nodes' mass. So contact adds at most `max_added` to the square of the body's highest frequency, from which the step
-is taken.
+and the same of the deepest points of facets off crack faces, where an obstacle is round (closest_point), with k_f and
+the barycentric coordinates as weights. d is the gap below which the penalty acts, s the stretch of the spring of
+friction (penalty_law). k_p = kappa A_p / d, A_p the share of the point in the surface, but at most `max_added` M_p, M_p
+its share of its nodes' mass. So contact adds at most `max_added` to the square of the body's highest frequency, from
+which the step is taken.
 Forces at the end of a step are those that the next one starts with; the work of both is summed by the trapezoidal rule,
 as in velocity Verlet.
-
-Coulomb friction: each point in contact has a spring that slips when it pulls harder than mu N (Cundall and Strack 1979,
-A discrete numerical model for granular assemblies). So a body at rest on a slope stays; with friction that depends on
-the velocity alone it would creep.
 
 Equations: docs/theory.md#explicit-contact.
 """
@@ -30,14 +26,15 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..mesh.domain import Domain
-from ..mesh.ghost_exchange import KeyLookup, find_saved_keys
+from ..mesh.ghost_exchange import KeyLookup
 from ..mesh.parallel import gather, max_over_ranks, sum_over_ranks
-from .facet_contact import ContactFacets, evaluate_facets, merge_forces
-from .laws import ObstacleLaw, Penalty, slipped, tangential
+from ..meshes.topology import row_keys
+from .facet_contact import ContactFacets
+from .laws import ObstacleLaw
 from .node_contact import ContactForces
 from .obstacle import VerletObstacle
 from .obstacle_term import ObstacleTerm
-from .penalty_law import NodalMassShare
+from .penalty_law import NodalMassShare, PenaltyContacts, PenaltyForces
 from .pose import PosedShape, min_distance
 from .rigid_obstacles import RigidObstacles
 
@@ -52,70 +49,34 @@ class PenaltyPolicy:
     Attributes:
         near_gap: gap, in widths of the penalty, of points that may be in contact a step later.
         facet_share: part of what contact may add to the square of a frequency that facets may cause beside points.
-        max_stretch: of facets, up to which ranks agree on the points at facets in contact.
     """
 
     near_gap: float = 3.0
     facet_share: float = 0.5
-    max_stretch: float = 1.5
 
 
 PENALTY = PenaltyPolicy()
 
 
 @dataclass(frozen=True)
-class FrictionSprings:
-    """Springs of friction of one obstacle.
+class Slips:
+    """Stretch of the springs of points or facets in contact with an obstacle.
 
     Attributes:
-        points: (k,) of the surface, ascending.
-        slip: (k, d) stretch, m.
-        stiffness: (k,) N/m.
+        keys: (k,) names of the points, or facets, which stay as edges break.
+        slip: (k, d) m.
     """
 
-    points: Ints
+    keys: Ints
     slip: Values
-    stiffness: Values
 
-    @classmethod
-    def none(cls, dim: int) -> FrictionSprings:
-        """No springs."""
-        return cls(np.empty(0, np.int64), np.empty((0, dim)), np.empty(0))
-
-    @property
-    def force(self) -> Values:
-        """(k, d) forces on the points, N."""
-        return -self.stiffness[:, None] * self.slip
-
-    @property
-    def energy(self) -> float:
-        """Stored energy, J."""
-        return 0.5 * float(self.stiffness @ np.sum(self.slip**2, axis=1))
-
-    def stretched(
-        self, points: Ints, motion: Values, normal: Values, stiffness: Values, max_force: Values
-    ) -> FrictionSprings:
-        """Springs after a motion of points in contact; points out of contact lose theirs, new ones begin with none.
-
-        Args:
-            points: (k,) in contact.
-            motion: (k, d) relative to the obstacle, m.
-            normal: (k, d) unit normals.
-            stiffness: (k,) N/m.
-            max_force: (k,) mu N, N.
-        """
-        slip = motion.copy()
-        if len(points) and len(self.points):
-            rows = np.minimum(np.searchsorted(points, self.points), len(points) - 1)
-            stays = points[rows] == self.points
-            slip[rows[stays]] += self.slip[stays]
-        slip = tangential(normal, slip)
-        max_slip = np.divide(max_force, stiffness, out=np.zeros(len(slip)), where=stiffness > 0)
-        return FrictionSprings(points, slipped(slip, max_slip), stiffness)
-
-    def work(self, motion: Values) -> float:
-        """Half the work of the forces by motions (k, d) of the points in a step, m, J."""
-        return 0.5 * float(np.vdot(self.force, motion))
+    def at(self, keys: Ints) -> tuple[Values, npt.NDArray[np.bool_]]:
+        """(m, d) stretch of the springs with `keys` (m,), m, and (m,) flags of those that are in contact."""
+        rows = KeyLookup(self.keys)(keys)
+        touches = rows >= 0
+        slip: Values = np.zeros((len(keys), self.slip.shape[1]))
+        slip[touches] = self.slip[rows[touches]]
+        return slip, touches
 
 
 @dataclass(frozen=True)
@@ -123,13 +84,15 @@ class StepEnd:
     """Contact at the end of a step.
 
     Attributes:
-        springs: of each obstacle.
+        slips: of points, and of facets, in contact with each obstacle.
         forces: (d,) sum of the forces of each obstacle on the body, N.
+        spring_energy: of all springs, J.
         all_far: whether the body is known to be far from all obstacles.
     """
 
-    springs: list[FrictionSprings]
+    slips: list[list[Slips]]
     forces: list[Values]
+    spring_energy: float = 0.0
     all_far: bool = False
 
 
@@ -170,9 +133,11 @@ class PenaltyObstacleTerm(ObstacleTerm):
         """
         self._mass, self._max_added = mass, max_added
         dim, count = domain.dim, len(numbers)
-        self._step_end = StepEnd([FrictionSprings.none(dim)] * count, [np.zeros(dim)] * count)
+        none = Slips(np.empty(0, np.int64), np.empty((0, dim)))
+        self._step_end = StepEnd([[none, none]] * count, [np.zeros(dim)] * count)
         self._start_points: Values | None = None  # (n, d) at the start of a step that is not accepted yet, m
-        self._springs = self._step_end.springs
+        # of each obstacle at the current u: forces on points and on facets, and the keys of these
+        self._parts: list[list[tuple[PenaltyForces, Ints]]] = [[]] * count
         super().__init__(domain, u, bodies, numbers, law)
         self._update_stiffness()
 
@@ -218,9 +183,6 @@ class PenaltyObstacleTerm(ObstacleTerm):
             k = np.minimum(k, limit * facets.area / np.where(rate > 0, rate, np.inf))
         acts = ~is_copy[facets.corners].any(axis=1)
         self._facets = ContactFacets(facets.corners[acts], k[acts], facets.smoothing)
-        corners = surface.rest_positions[self._facets.corners]
-        side = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(initial=0.0))
-        self._facet_reach = self.law.barrier.width + PENALTY.max_stretch * self.comm.allreduce(side, op=MPI.MAX)
 
     def frequency_bound(self) -> float:
         """Increase of the square of the highest frequency if all points were in contact, 1/s^2 (collective).
@@ -243,13 +205,9 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
     def _obstacle_frequency(self, number: int, obstacle: VerletObstacle) -> float:
         posed, reach = self.group.bodies.posed[number], PENALTY.near_gap * self.law.barrier.width
-        near = self.point_candidates(posed, self.positions, reach)
-        near = near[posed.distance(self.positions[near]) < reach]
-        stiffness = obstacle.spring_stiffness(self.positions[near], self.stiffness[near], posed)
-        if self.group.numbers.index(number) in self.facets.numbers:
-            facets = self._facets.within_reach(posed, self.positions, reach)
-            x = self._facets.closest_points(posed, self.positions, facets).position
-            stiffness = stiffness + obstacle.spring_stiffness(x, self._facets.area[facets], posed)
+        parts, d = self._contacts(self.group.numbers.index(number), posed, reach), self._domain.dim
+        x = np.concatenate([contacts.relative(self.positions) for contacts, _ in parts] or [np.empty((0, d))])
+        stiffness = obstacle.spring_stiffness(x, np.concatenate([contacts.stiffness for contacts, _ in parts]), posed)
         return obstacle.max_frequency(sum_over_ranks(self.comm, stiffness.reshape(-1)).reshape(stiffness.shape), posed)
 
     # --- steps ---
@@ -279,63 +237,52 @@ class PenaltyObstacleTerm(ObstacleTerm):
             self._update_stiffness()
         self._start_points = self.surface.positions(self.level.u_n)
 
+    def _contacts(self, number: int, posed: PosedShape, reach: float) -> list[tuple[PenaltyContacts, Ints]]:
+        """Points nearer than `reach`, m, to an obstacle, and facets that may be, and their keys."""
+        x, names = self.positions, self.surface.local.keys
+        points = self.point_candidates(posed, x, reach)
+        gap = posed.distance(x[points])
+        near = (gap < reach) & (self.surface.area[points] > 0)
+        points, gap = points[near], gap[near]
+        ones: Values = np.ones((len(points), 1))
+        items = [(points[:, None], ones, gap, posed.normal(x[points]), self.stiffness[points])]
+        if number in self.facets.numbers:
+            facets = self._facets.within_reach(posed, x, reach)
+            closest = self._facets.closest_points(posed, x, facets)
+            geometry = self._facets.corners[facets], closest.barycentric, closest.gap, closest.normal
+            items.append((*geometry, self._facets.area[facets]))
+        result = []
+        for item, slips in zip(items, self._step_end.slips[number], strict=False):
+            members, stiffness = item[0], item[-1]
+            keys = row_keys(np.sort(names[members], axis=1)) if members.shape[1] > 1 else names[members[:, 0]]
+            slip, touched = slips.at(keys)
+            result.append((PenaltyContacts.of_points(*item, slip, stiffness * touched), keys))
+        return result
+
     def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
-        """Forces of an obstacle at a given pose (collective)."""
-        forces = self._normal_forces(number, posed)
-        if not (coefficient := self.group.obstacles[number].friction):
-            return forces
-        if self.comm.size > 1 and number in self.facets.numbers:
-            forces = self._at_shared_points(forces, posed)
-        points, k, normal = forces.points, self.stiffness[forces.points], forces.normal
-        total, k_total = normal, k
-        if self.comm.size > 1 and number in self.facets.numbers:
-            # of a point and the facets at it ranks have other parts of the force than of the stiffness
-            sums = self.surface.sum_at_points(points, np.column_stack([normal, k]))
-            total, k_total = sums[:, :-1], sums[:, -1]
-        size = np.linalg.norm(total, axis=1)
-        direction = total / np.where(size > 0, size, 1.0)[:, None]
-        max_force = coefficient * size * k / np.where(k_total > 0, k_total, 1.0)
-        motion = self._relative_motion(number, points)
-        springs = self._step_end.springs[number].stretched(points, motion, direction, k, max_force)
-        self._springs[number] = springs
-        return replace(forces, friction=springs.force, energy=forces.energy + springs.energy)
+        """Forces of an obstacle at a given pose."""
+        width, friction = self.law.barrier.width, self.group.obstacles[number].friction
+        self._parts[number] = parts = []
+        for near, keys in self._contacts(number, posed, width):
+            touches = near.gap < width
+            contacts = near.select(touches)
+            motion = self._relative_motion(number, contacts)
+            parts.append((PenaltyForces(contacts, motion, friction, width), keys[touches]))
+        points = np.unique(np.concatenate([forces.contacts.points.reshape(-1) for forces, _ in parts]))
+        normal, rub = np.zeros((2, len(points), self._domain.dim))
+        for forces, _ in parts:
+            contacts = replace(forces.contacts, points=np.searchsorted(points, forces.contacts.points))
+            normal -= contacts.gradient(width, len(points))
+            rub += contacts.sum_at_points(forces.spring_force, len(points))
+        return ContactForces(points, sum(forces.energy for forces, _ in parts), normal, rub, 0.0, _no_tangent)
 
-    def _at_shared_points(self, forces: ContactForces, posed: PosedShape) -> ContactForces:
-        """The same forces, with all points at facets in contact, which other ranks may have, by distances alone."""
-        near = self.point_candidates(posed, self.positions, self._facet_reach)
-        near = near[posed.distance(self.positions[near]) < self._facet_reach]
-        points = np.union1d(forces.points, near)
-        normal = np.zeros((len(points), self._domain.dim))
-        normal[np.searchsorted(points, forces.points)] = forces.normal
-        return replace(forces, points=points, normal=normal, friction=np.zeros_like(normal))
-
-    def _normal_forces(self, number: int, posed: PosedShape) -> ContactForces:
-        """Forces of the penalty of points, and of facets that an obstacle acts on."""
-        law, points = self.law.barrier, self.point_candidates(posed, self.positions, self.law.barrier.width)
-        gap = posed.distance(self.positions[points])
-        touches = (gap < law.width) & (self.surface.area[points] > 0)
-        points, closure = points[touches], law.width - gap[touches]
-        pressure, normal = self.stiffness[points] * closure, posed.normal(self.positions[points])
-        energy, no_friction = 0.5 * float(pressure @ closure), np.zeros_like(normal)
-        forces = ContactForces(points, energy, pressure[:, None] * normal, no_friction, 0.0, _no_tangent)
-        if number not in self.facets.numbers:
-            return forces
-        of_unit_rate = Penalty(law.width, law.width)
-        return merge_forces(forces, *evaluate_facets(self._facets, posed, self.positions, of_unit_rate))
-
-    def _relative_motion(self, number: int, points: Ints) -> Values:
-        """(k, d) motion of points relative to an obstacle in the step, m; zero once the step is accepted."""
-        x = self.positions[points]
-        if self._start_points is None:
-            return np.zeros_like(x)
-        start = self._start_points[points]
-        return np.asarray(x - start - self.group.bodies.point_motion(self.group.numbers[number], start))
-
-    def obstacle_forces(self) -> list[ContactForces]:
-        """Forces of each obstacle at the current u (collective)."""
-        if self._contact_forces is None:
-            self._springs = list(self._step_end.springs)
-        return super().obstacle_forces()
+    def _relative_motion(self, number: int, contacts: PenaltyContacts) -> Values:
+        """(k, d) motion of contacts relative to an obstacle in the step, m; zero once the step is accepted."""
+        if self._start_points is None or not self.group.obstacles[number].friction:
+            return np.zeros_like(contacts.normal)
+        start = contacts.relative(self._start_points)
+        motion = self.group.bodies.point_motion(self.group.numbers[number], start)
+        return np.asarray(contacts.relative(self.positions) - start - motion)
 
     def accept_step(self) -> None:
         """Sum the work of the step, and store springs and forces for the next one (collective)."""
@@ -343,38 +290,24 @@ class PenaltyObstacleTerm(ObstacleTerm):
             zeros: list[Values] = [np.zeros(self._domain.dim) for _ in self.group.obstacles]
             self.group.friction_loss, self.group.work, self.group.forces = 0.0, [0.0] * len(zeros), zeros
             return
-        forces, previous, group = (
-            [-self._current_force(n) for n in range(len(self.group.obstacles))],
-            self._step_end,
-            self.group,
-        )
-        group.friction_loss, group.forces = 0.0, [-force for force in forces]
-        for number, obstacle in enumerate(self.group.obstacles):
-            if obstacle.friction:
-                # minus the work by the trapezoidal rule, minus the change of the energy of the springs
-                for springs, sign in ((previous.springs[number], 1.0), (self._springs[number], -1.0)):
-                    work = springs.work(self._relative_motion(number, springs.points))
-                    group.friction_loss += sign * springs.energy - work
+        forces = [-self._current_force(number) for number in range(len(self.group.obstacles))]
+        previous, group, all_parts = self._step_end, self.group, [part for parts in self._parts for part, _ in parts]
+        group.forces = [-force for force in forces]
+        group.friction_loss = previous.spring_energy + sum(part.dissipated(0.0) for part in all_parts)
         for number in (number for number, obstacle in enumerate(self.group.obstacles) if not obstacle.free):
             shift = self.group.increments[number][: self._domain.dim]
             group.work[number] = float((forces[number] + previous.forces[number]) @ shift) / 2
-        self._step_end, self._start_points = StepEnd(self._springs, forces, self._ends_far()), None
+        slips = [[Slips(keys, part.slips) for part, keys in parts] for parts in self._parts]
+        slips = [new + old[len(new) :] for new, old in zip(slips, previous.slips, strict=True)]
+        energy = sum(part.spring_energy for part in all_parts)
+        self._step_end, self._start_points = StepEnd(slips, forces, energy, self._ends_far()), None
 
     # --- state ---
 
     def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
-        """Add new crack faces; springs of points that still exist stay (collective)."""
-        springs = [(spring, self.surface.local.keys[spring.points]) for spring in self._step_end.springs]
+        """Add new crack faces; springs of points and facets that still exist stay (collective)."""
         super().edges_broke(pattern)
-        self._step_end = replace(self._step_end, springs=[self._matched_springs(*item) for item in springs])
         self._update_stiffness()
-
-    def _matched_springs(self, spring: FrictionSprings, keys: Ints) -> FrictionSprings:
-        """Springs of points with `keys` (k,), on the current surface."""
-        points = KeyLookup(self.surface.local.keys)(keys) if len(keys) else spring.points
-        matched = np.flatnonzero(points >= 0)
-        matched = matched[np.argsort(points[matched])]
-        return FrictionSprings(points[matched], spring.slip[matched], spring.stiffness[matched])
 
     # --- state: contact at the end of the last step (HistoryTerm) ---
 
@@ -387,59 +320,30 @@ class PenaltyObstacleTerm(ObstacleTerm):
         self._step_end = cast("StepEnd", memory)
 
     def to_checkpoint(self) -> dict[str, Values]:
-        """Arrays for a checkpoint (collective).
+        """Arrays for a checkpoint, on rank 0 (collective).
 
-        Of springs on rank 0: keys of points, and rows of obstacle, rank, area, stretch, stiffness; and sums of forces
-        on each rank. Ranks that share a point have a spring each.
+        Of springs: keys, and rows of obstacle, kind and stretch. Ranks that share a point have the same spring there.
         """
-        springs = self._step_end.springs
-        rows = [
-            np.column_stack([np.full(len(spring.points), number), np.full(len(spring.points), self.comm.rank),
-                             self.surface.area[spring.points], spring.slip, spring.stiffness])
-            for number, spring in enumerate(springs)
-        ]  # fmt: skip
-        keys = self.surface.local.keys[np.concatenate([spring.points for spring in springs])]
-        gathered = gather(self.comm, (keys, np.concatenate(rows), np.array(self._step_end.forces)))
-        if gathered is None:
+        end = self._step_end
+        sums = sum_over_ranks(self.comm, np.append(np.array(end.forces).reshape(-1), end.spring_energy))
+        numbered = [(number, kind, slips) for number, kinds in enumerate(end.slips) for kind, slips in enumerate(kinds)]
+        rows = [np.column_stack([np.tile([number, kind], (len(slips.keys), 1)), slips.slip])
+                for number, kind, slips in numbered]  # fmt: skip
+        keys = np.concatenate([slips.keys for *_, slips in numbered])
+        if (gathered := gather(self.comm, (keys, np.concatenate(rows)))) is None:
             return {}
-        all_keys, all_rows, forces = zip(*gathered, strict=True)
-        return {
-            "spring_points": np.concatenate(all_keys),
-            "springs": np.concatenate(all_rows),
-            "pushed": np.array(forces),
-        }
+        all_keys, all_rows = (np.concatenate(arrays) for arrays in zip(*gathered, strict=True))
+        _, first = np.unique(np.column_stack([all_rows[:, :2], all_keys]), axis=0, return_index=True)
+        return {"spring_points": all_keys[first], "springs": all_rows[first], "pushed": sums}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint (collective)."""
-        rows, forces = saved["springs"], saved["pushed"]
-        points = find_saved_keys(self.comm, self.surface.local.keys, saved["spring_points"])
-        springs = [
-            self._springs_from_rows(points[of_obstacle], rows[of_obstacle, 1:])
-            for of_obstacle in (rows[:, 0] == number for number in range(len(self.group.obstacles)))
-        ]
-        if len(forces) == self.comm.size:
-            local = forces[self.comm.rank]
-        else:
-            # written by another number of ranks: only the sum counts
-            local = forces.sum(axis=0) if self.comm.rank == 0 else np.zeros_like(forces[0])
-        self._step_end = StepEnd(springs, list(local))
-
-    def _springs_from_rows(self, matched: Ints, rows: Values) -> FrictionSprings:
-        """Springs of the points of this rank, from rows (k, 3 + d) of all ranks in a checkpoint.
-
-        `matched`: (k,) point of each row; -1: it is of another rank.
-
-        Where several ranks had a spring at one point, that of this rank counts, or of the lowest one, for the area
-        that this rank has now.
-        """
-        rank, area, slip, k = np.split(rows, [1, 2, -1], axis=1)
-        order = np.lexsort((rank[:, 0], rank[:, 0] != self.comm.rank, matched))
-        order = order[matched[order] >= 0]
-        points, first = np.unique(matched[order], return_index=True)
-        selected = order[first]
-        old_area = area[selected, 0]
-        factor = np.where(old_area > 0, self.surface.area[points] / np.where(old_area > 0, old_area, 1.0), 1.0)
-        return FrictionSprings(points, slip[selected], factor * k[selected, 0])
+        rows, keys, is_root = saved["springs"], saved["spring_points"], self.comm.rank == 0
+        *forces, energy = saved["pushed"] * is_root
+        selected = [[(rows[:, :2] == (number, kind)).all(axis=1) for kind in range(2)]
+                    for number in range(len(self.group.obstacles))]  # fmt: skip
+        slips = [[Slips(keys[which].astype(np.int64), rows[which, 2:]) for which in kinds] for kinds in selected]
+        self._step_end = StepEnd(slips, list(np.reshape(forces, (len(slips), -1))), float(energy))
 
 
 def _no_tangent() -> tuple[Values, Values]:
