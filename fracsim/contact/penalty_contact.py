@@ -39,9 +39,6 @@ from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-# keys of points, and contacts
-type KeyedHistory = tuple[Ints, ContactHistory]
-
 
 @dataclass(frozen=True)
 class IdleState:
@@ -78,8 +75,8 @@ class PenaltyState:
         """
         self._comm, self._dim, self._u, self._owned = domain.comm, domain.dim, u, domain.node_count * domain.dim
         self._surface, self._is_far, self._idle_state = surface, is_far, IdleState()
-        # contacts of a snapshot of a surface with other numbers, to be set when all ranks come together
-        self._restored: list[KeyedHistory] | None = None
+        # contacts of a snapshot of another surface, to be set when all ranks come together
+        self._restored: list[ContactHistory] | None = None
         self.discard()
 
     def discard(self) -> None:
@@ -118,61 +115,53 @@ class PenaltyState:
         self._idle_state = IdleState(self._idle_state.is_near)
         self.discard()
 
-    def begin_step(self) -> None:
-        """Begin a step that is not idle: the state is another one than that of the snapshot, as faces may move."""
-        self._idle_state = replace(self._idle_state)
-
     def end_step(self, *, is_near: bool) -> None:
         """Note whether anything is near contact at the end of a step, on any rank (collective)."""
         any_near = bool(max_over_ranks(self._comm, int(is_near)))
         self._idle_state = replace(self._idle_state, is_near=any_near)
 
+    @property
+    def _histories(self) -> list[ContactHistory]:
+        return [part.contact.history for part in self._surface.current.parts]
+
     def settle(self) -> None:
-        """Set contacts of a snapshot whose surface had other numbers (collective)."""
+        """Set contacts of a snapshot of another surface, of which points may belong to other ranks (collective)."""
         if self._restored is not None:
             histories, self._restored = self._restored, None
-            self._surface.set_history([history.by_keys(keys) for keys, history in histories])
+            self._surface.set_history(histories)
 
     def snapshot(self) -> object:
-        """Contacts, numbering of the surface, and idle state."""
-        histories = self._restored or [(part.keys, part.contact.history) for part in self._surface.current.parts]
-        counts = self._surface.surface_count, -1 if self._restored else self._surface.exchange_count
-        return histories, counts, self._idle_state
+        """Contacts, number of the surface, and idle state."""
+        count = -1 if self._restored else self._surface.surface_count
+        return self._restored or self._histories, count, self._idle_state
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot (not collective)."""
-        histories, counts, idle = cast("tuple[list[KeyedHistory], tuple[int, int], IdleState]", memory)
-        if idle is self._idle_state:
-            return
-        surface_count, exchange_count = counts
-        if exchange_count == self._surface.exchange_count:
-            self._restored = None
-            for part, (_, history) in zip(self._surface.current.parts, histories, strict=True):
+        histories, count, idle = cast("tuple[list[ContactHistory], int, IdleState]", memory)
+        is_same = count == self._surface.surface_count
+        self._restored, self._idle_state = (None, idle) if is_same else (histories, IdleState(idle.is_near))
+        for part, history in zip(self._surface.current.parts, histories, strict=True):
+            if history is not part.contact.history:
                 part.contact.set_history(history)
-        else:
-            self._restored = histories
-        # edges may have broken since: it is another surface
-        self._idle_state = idle if surface_count == self._surface.surface_count else IdleState(idle.is_near)
         self.discard()
 
     def to_checkpoint(self) -> dict[str, Values]:
-        """Contacts of each part by keys of points, on rank 0 (collective)."""
+        """Contacts of each part, on rank 0 (collective)."""
         self.settle()
         arrays: dict[str, Values] = {}
-        for index, part in enumerate(self._surface.current.parts):
-            if (rows := gather(self._comm, part.contact.history.by_keys(part.keys))) is not None:
-                arrays |= ContactHistory.join(rows).to_checkpoint(f"_{index}")
+        for index, history in enumerate(self._histories):
+            if (rows := gather(self._comm, history)) is not None:
+                of_all = ContactHistory.join(rows)
+                arrays |= {f"points_{index}": cast("Values", of_all.points), f"values_{index}": of_all.values}
         return arrays
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint (collective)."""
-        count = len(self._surface.current.parts)
-        histories = [ContactHistory.from_checkpoint(saved, f"_{index}") for index in range(count)]
-        is_near = any(len(history.points) for history in histories)
-        self._idle_state = IdleState(is_near)
-        if self._comm.rank:
-            histories = [history.select(slice(0)) for history in histories]
-        self._surface.set_history(histories)
+        names = [(f"points_{index}", f"values_{index}") for index in range(len(self._histories))]
+        histories = [ContactHistory(cast("Ints", saved[points]), saved[values]) for points, values in names]
+        self._idle_state = IdleState(is_near=any(len(history.points) for history in histories))
+        for part, history in zip(self._surface.current.parts, histories, strict=True):
+            part.contact.set_history(history)
         self.discard()
 
 
@@ -291,7 +280,9 @@ class PenaltyContact(Term):
         if self._gradients is None:
             parts = zip(self._parts, self._part_forces(x), strict=True)
             zero = np.zeros_like(x)
-            self._gradients = [zero if forces is None else forces.gradient(len(part.keys)) for part, forces in parts]
+            self._gradients = [
+                zero if forces is None else forces.gradient(len(part.contact.keys)) for part, forces in parts
+            ]
         return self._gradients
 
     def contact_forces(self) -> Values | None:
@@ -339,7 +330,6 @@ class PenaltyContact(Term):
         self._friction_loss = 0.0
         if is_idle:
             return
-        self.state.begin_step()
         self.surface.refresh(level.u_n)
         self.state.settle()
         self.surface.extend_faces(level.u_n)

@@ -117,18 +117,19 @@ class EdgeContacts:
         self.candidates = SimplexPairs.of(edges, edges, max_gap)
         self._is_owned: Flags = np.ones(len(ends), bool) if ranks is None else ranks.own(self._sharp.triangles)
 
-    def set_history(self, history: ContactHistory) -> ContactHistory:
-        """Set the pairs near each other at the end of the last step; returns those of sharp edges of this rank.
+    def set_history(self, points: Ints, history: ContactHistory) -> Flags:
+        """Set the pairs near each other at the end of the last step; returns (k,) flags of those of this rank.
 
         The lower edge of a pair comes first, and the lower end of an edge, whatever numbers points have: their order
         is that of the input mesh.
+
+        `points`: (k, 4) their numbers; -1: a point that is no more.
         """
-        edges = self._number(history.points.reshape(-1, 2, 2) @ self._key)
-        stays: Flags = np.asarray((edges >= 0).all(axis=1))
-        stays[stays] = self._is_owned[edges[stays, 0]]
-        self._history = history.select(stays)
-        self._row = KeyLookup(self._pair_key(edges[stays]))
-        return self._history
+        edges = self._number(np.maximum(points, 0).reshape(-1, 2, 2) @ self._key)
+        is_own: Flags = np.asarray((points >= 0).all(axis=1) & (edges >= 0).all(axis=1))
+        is_own[is_own] = self._is_owned[edges[is_own, 0]]
+        self._history, self._row = history.select(is_own), KeyLookup(self._pair_key(edges[is_own]))
+        return is_own
 
     def _pair_key(self, pairs: Ints) -> Ints:
         return np.asarray(pairs @ np.array([len(self._sharp.ends), 1]))

@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -36,8 +35,6 @@ Flags = npt.NDArray[np.bool_]
 
 # weight of a node, in the sum of all of a point, below which it is round-off of arms that cancel
 MIN_WEIGHT = 1e-6
-# number of a corner that is no more
-NO_POINT = -1
 # part of the allowed increase of the square of a frequency that the points at a node may cause
 MAX_ADDED = 0.25
 
@@ -222,38 +219,33 @@ class ContactHistory:
     """Contacts of elements of surfaces near each other at the end of the last step.
 
     Attributes:
-        points: (k, m) numbers of points, or their keys; -1: a corner that is no more.
-        values: (k, 3 + d) side, stiffness, share and slip.
+        points: (k, m) keys of points, which depend neither on the ranks nor on edges that break.
+        values: (k, 3 + d) side, stiffness (0: without contact), share and slip.
     """
 
     points: Ints
     values: Values
 
     @classmethod
-    def of(cls, near: PenaltyContacts) -> ContactHistory:
-        """Contacts near each other; slip and stiffness at the start of a step are those to be kept."""
+    def of(cls, near: PenaltyContacts, keys: Ints) -> ContactHistory:
+        """Contacts near each other, whose `start_stiffness` and slip are those to be kept; `keys`: (n,) of points."""
         stiffness = np.where(near.start_stiffness > 0, near.stiffness, 0.0)
-        return cls(near.points, np.column_stack([near.side, stiffness, near.share, near.slip]))
+        return cls(keys[near.points], np.column_stack([near.side, stiffness, near.share, near.slip]))
 
     @classmethod
     def none(cls, dim: int) -> ContactHistory:
         """No contacts."""
         return cls(np.empty((0, 1 + dim), np.int64), np.empty((0, 3 + dim)))
 
-    def select(self, rows: Flags | Ints | slice) -> ContactHistory:
+    def select(self, rows: Flags | Ints) -> ContactHistory:
         """Some of the contacts."""
         return ContactHistory(self.points[rows], self.values[rows])
 
     @classmethod
     def join(cls, parts: Sequence[ContactHistory]) -> ContactHistory:
-        """Contacts of several kinds or ranks."""
+        """Contacts of several ranks."""
         points = np.concatenate([part.points for part in parts])
         return cls(points, np.concatenate([part.values for part in parts]))
-
-    @property
-    def is_of_edges(self) -> Flags:
-        """(k,) flags of contacts of edges; others are of points before facets."""
-        return np.asarray(self.side != 0)
 
     @property
     def side(self) -> Values:
@@ -279,31 +271,6 @@ class ContactHistory:
     def spring_energy(self) -> float:
         """Energy of the springs of friction, J."""
         return 0.5 * float(self.spring_stiffness @ np.sum(self.slip**2, axis=1))
-
-    def by_keys(self, keys: Ints) -> ContactHistory:
-        """Contacts by the keys (n,) of all points, which do not depend on the ranks."""
-        return ContactHistory(np.where(self.points >= 0, keys[self.points], NO_POINT), self.values)
-
-    def by_numbers(self, lookup: Callable[[Ints], Ints], max_stiffness: Values) -> ContactHistory:
-        """Contacts by keys of the points of a surface, no stiffer than `max_stiffness` (n,) of the first point, N/m.
-
-        `lookup`: function that returns the point of each key; -1: none. Contacts without their point, or with edges
-        that are no more, are left out.
-        """
-        points = lookup(self.points)
-        remain = (points[:, 0] >= 0) & (~self.is_of_edges | (points >= 0).all(axis=1))
-        points, values = points[remain], self.values[remain]
-        values[:, 1] = np.minimum(values[:, 1], max_stiffness[points[:, 0]])
-        return ContactHistory(points, values)
-
-    def to_checkpoint(self, suffix: str) -> dict[str, Any]:
-        """Arrays of names with a suffix."""
-        return {f"points{suffix}": self.points, f"values{suffix}": self.values}
-
-    @classmethod
-    def from_checkpoint(cls, saved: dict[str, Any], suffix: str) -> ContactHistory:
-        """Contacts from the arrays of a checkpoint."""
-        return cls(saved[f"points{suffix}"], saved[f"values{suffix}"])
 
 
 # --- stiffness ---

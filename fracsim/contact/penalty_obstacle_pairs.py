@@ -264,13 +264,15 @@ class MeshContacts:
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Arrays of contacts."""
-        return self._pairs.history.to_checkpoint("")
+        history = self._pairs.history
+        return {"points": cast("Values", history.points), "values": history.values}
 
     def from_checkpoint(self, saved: dict[str, Values], suffix: str) -> None:
         """Set contacts from the arrays of a checkpoint."""
         from .penalty_law import ContactHistory
 
-        self._pairs.set_history(ContactHistory.from_checkpoint(saved, suffix))
+        points, values = cast("Any", saved[f"points{suffix}"]), saved[f"values{suffix}"]
+        self._pairs.set_history(ContactHistory(points, values))
 
 
 class PenaltyPair:

@@ -20,10 +20,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from ..mesh.ghost_exchange import KeyLookup
 from .closest_point import minimise_on_simplex
 from .pair_search import PairFilter, PairSearch, SimplexPairs, intersecting_pairs, near_pairs, pair_distances
 from .penalty_edges import EdgeContacts
-from .penalty_law import NO_POINT, ContactHistory, ContactStiffness, ElementRanks, PenaltyContacts, PenaltyForces
+from .penalty_law import ContactHistory, ContactStiffness, ElementRanks, PenaltyContacts, PenaltyForces
 from .retractable_surface import unit_normals
 
 Values = npt.NDArray[np.float64]
@@ -85,16 +86,21 @@ class PointFacetContacts:
         self._points = used[owned]
         self.candidates = SimplexPairs.of(owned[:, None], facets.reshape(elements.shape), self._max_gap)
 
-    def set_history(self, history: ContactHistory) -> ContactHistory:
-        """Set the contacts at the end of the last step; returns those of points of this rank."""
-        history = history.select(self._is_owned[history.points[:, 0]])
-        points, (count, dim) = history.points[:, 0], (len(self._is_owned), self._elements.shape[1])
+    def set_history(self, points: Ints, history: ContactHistory) -> Flags:
+        """Set the contacts at the end of the last step; returns (k,) flags of those of points of this rank.
+
+        `points`: (k, 1 + d) their numbers; -1: a point that is no more.
+        """
+        is_own = points[:, 0] >= 0
+        is_own[is_own] = self._is_owned[points[is_own, 0]]
+        (point, *facet), count, own = points[is_own].T, len(self._is_owned), history.select(is_own)
         # of all points: corners of the facets that they were before, k_p of those in contact, and slip
-        self._facets = np.full((count, dim), NO_POINT)
-        self._start_stiffness, self._slip = np.zeros(count), np.zeros((count, dim))
-        self._facets[points] = history.points[:, 1:]
-        self._start_stiffness[points], self._slip[points] = history.stiffness, history.slip
-        return history
+        self._facets, self._slip = np.full((count, len(facet)), -1), np.zeros((count, len(facet)))
+        self._facets[point], self._slip[point] = np.column_stack(facet), own.slip
+        self._start_stiffness: Values = np.zeros(count)
+        # edges that broke may have left less of a point
+        self._start_stiffness[point] = np.minimum(own.stiffness, self._stiffness.limit[point])
+        return is_own
 
     def contacts_within(self, x: Values, pairs: Ints, reach: float) -> PenaltyContacts:
         """Nearest facet of each point that has one within `reach`, m, among candidates (k, 2); points at x (n, d), m.
@@ -174,6 +180,7 @@ class PenaltyPairs:
 
     Attributes:
         width: D, m.
+        keys: (n,) of the points.
         history: contacts of this rank near each other at the end of the last step.
     """
 
@@ -189,6 +196,7 @@ class PenaltyPairs:
         patch: npt.NDArray[np.int32] | None = None,
         ranks: ElementRanks | None = None,
         edge: float | None = None,
+        keys: Ints | None = None,
     ) -> None:
         """Pairs of a surface.
 
@@ -200,20 +208,21 @@ class PenaltyPairs:
             patch: (n,) numbers of parts of the surface that touch others alone; None: all touch.
             ranks: of the elements; None: all are of this rank.
             edge: mean length of edges, m; None: of these elements.
+            keys: (n,) of the points, which do not depend on the ranks; None: their numbers.
         """
         self.width, (count, dim) = distance, rest_positions.shape
         if edge is None:
             sides = rest_positions[elements] - rest_positions[np.roll(elements, 1, axis=1)]
             edge = float(np.linalg.norm(sides, axis=2).mean()) if len(elements) else distance
         self._elements, self._patch, self._used = elements, patch, np.unique(elements)
+        self.keys: Ints = np.arange(count) if keys is None else keys
+        self._number = KeyLookup(self.keys)
         is_owned: Flags = np.ones(count, bool) if ranks is None else ranks.own_points
-        self._points = PointFacetContacts(elements, stiffness, distance, edge, is_owned)
-        self._edges = None
+        points = PointFacetContacts(elements, stiffness, distance, edge, is_owned)
+        self._kinds: list[PointFacetContacts | EdgeContacts] = [points]
         if dim == 3:
             max_gap = PAIRS.max_gap * distance
-            self._edges = EdgeContacts(rest_positions, elements, stiffness.limit, max_gap=max_gap, ranks=ranks)
-        self._kinds: list[PointFacetContacts | EdgeContacts] = [self._points]
-        self._kinds += [] if self._edges is None else [self._edges]
+            self._kinds.append(EdgeContacts(rest_positions, elements, stiffness.limit, max_gap=max_gap, ranks=ranks))
         self._filter = PairFilter.of(len(self._used), None if patch is None else patch[self._used])
         self._sets = [kind.candidates for kind in self._kinds]
         self._search = PairSearch(self._filter, self._sets, PAIRS.search_margin * distance)
@@ -227,11 +236,11 @@ class PenaltyPairs:
         self._set_history(history)
 
     def _set_history(self, history: ContactHistory) -> None:
-        of_edges = history.is_of_edges
-        parts = [self._points.set_history(history.select(~of_edges))]
-        if self._edges is not None:
-            parts.append(self._edges.set_history(history.select(of_edges)))
-        self.history = ContactHistory.join(parts)
+        numbers, of_edges = self._number(history.points), history.side != 0
+        is_own = np.zeros(len(of_edges), bool)
+        for kind, rows in zip(self._kinds, (~of_edges, of_edges), strict=False):
+            is_own[rows] = kind.set_history(numbers[rows], history.select(rows))
+        self.history = history.select(is_own)
 
     def energy(self, x: Values) -> float:
         """Energy E(x), J."""
@@ -277,7 +286,7 @@ class PenaltyPairs:
             all_slips[touches] = slips
         near = replace(near, slip=all_slips, start_stiffness=np.where(touches, near.spring_stiffness, 0.0))
         self._near, self._touching = (x.copy(), near), None
-        self._set_history(ContactHistory.of(near))
+        self._set_history(ContactHistory.of(near, self.keys))
 
     def intersections(self, x: Values) -> Ints:
         """(k, 2) elements that intersect with points at x."""

@@ -19,13 +19,11 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
 from ..mesh.domain import Domain
-from ..mesh.ghost_exchange import KeyLookup
 from ..mesh.parallel import allgather
 from .element_exchange import EXCHANGE, ElementSet, bounding_boxes, own_points
 from .mesh_obstacles import MeshObstacle
 from .partitioned_surface import PartitionedSurface
 from .penalty_law import (
-    NO_POINT,
     ContactHistory,
     ContactStiffness,
     ElementRanks,
@@ -50,26 +48,20 @@ class PenaltyPart:
     Attributes:
         contact: penalty.
         friction: coefficient.
-        keys: (n + m,) names of its points.
-        max_stiffness: (n + m,) stiffness that a point may keep where the surface changes, N/m.
         body_points: (k,) points of the body's elements.
-        reach: distance of bounding boxes from which on nothing is in contact, m.
         mesh: the obstacle; None: the body with itself.
     """
 
     contact: PenaltyPairs
     friction: float
-    keys: Ints
-    max_stiffness: Values
     body_points: Ints
-    reach: float
     mesh: MeshObstacle | None = None
 
     def is_far(self, x: Values) -> bool:
         """Whether the obstacle is out of contact with the body at x (n, d), m, on this rank."""
         if self.mesh is None:
             return False
-        return not len(self.body_points) or self.mesh.is_far(x[self.body_points], self.reach)
+        return not len(self.body_points) or self.mesh.is_far(x[self.body_points], self.contact.width)
 
     def points(self, x: Values, pose: Pose | None = None) -> Values:
         """(n + m, d) points with the body at x (n, d), m, and the obstacle at a pose; None: the current one."""
@@ -82,7 +74,7 @@ class PenaltyPart:
         if self.mesh is None or not len(self.body_points):
             return np.inf
         gap = np.inf if self.is_far(x) else self.contact.min_gap(self.points(x))
-        return gap if gap < np.inf else max(self.mesh.vertex_distance(x[self.body_points]), self.reach)
+        return gap if gap < np.inf else max(self.mesh.vertex_distance(x[self.body_points]), self.contact.width)
 
     def cut_elements(self, x: Values, count: int) -> Ints:
         """(k,) elements of the body, below `count`, that others intersect with the body at x (n, d), m."""
@@ -128,8 +120,8 @@ class PenaltySurface(RetractableSurface):
         if not self._meshes:
             ranks = None if self.comm.size == 1 else ElementRanks(rank, self.comm.rank, self.own_points)
             stiffness = ContactStiffness.of_one_body(k)
-            pairs = PenaltyPairs(X, corners, stiffness, distance=distance, ranks=ranks, edge=edge)
-            return [PenaltyPart(pairs, self.law.friction, keys, k, body_points, distance)]
+            pairs = PenaltyPairs(X, corners, stiffness, distance=distance, ranks=ranks, edge=edge, keys=keys)
+            return [PenaltyPart(pairs, self.law.friction, body_points)]
         pressure, count, parts = self.law.stiffness / self.law.distance, len(X), []
         area = self.element_set.points.area
         reduction = np.divide(k, 0.5 * pressure * area, out=np.ones(len(k)), where=area > 0)
@@ -146,12 +138,9 @@ class PenaltySurface(RetractableSurface):
             pairs = PenaltyPairs(
                 np.concatenate([X, mesh.points]), np.concatenate([corners, triangles]), of_body.followed_by(of_mesh),
                 distance=distance, patch=np.repeat(np.array([0, 1], np.int32), [count, size]), ranks=ranks, edge=edge,
+                keys=np.append(keys, -1 - np.arange(size)),
             )  # fmt: skip
-            # keys of the body are not negative
-            mesh_keys, limits = NO_POINT - 1 - np.arange(size), np.append(k, np.full(size, np.inf))
-            parts.append(
-                PenaltyPart(pairs, mesh.friction, np.append(keys, mesh_keys), limits, body_points, distance, mesh)
-            )
+            parts.append(PenaltyPart(pairs, mesh.friction, body_points, mesh))
         return parts
 
     def added_loads(self, x: Values) -> Values:
@@ -225,7 +214,7 @@ class PenaltyBodySurface(PartitionedSurface[PenaltySurface]):
     # --- contacts ---
 
     def _keep_history(self, previous: PenaltySurface) -> None:
-        self.set_history([part.contact.history.by_keys(part.keys) for part in previous.parts])
+        self.set_history([part.contact.history for part in previous.parts])
 
     def set_history(self, histories: Sequence[ContactHistory]) -> None:
         """Set the contacts of each part at the end of the last step; each goes to the rank that it belongs to.
@@ -233,9 +222,8 @@ class PenaltyBodySurface(PartitionedSurface[PenaltySurface]):
         Collective.
         """
         for part, history in zip(self.current.parts, histories, strict=True):
-            lookup = KeyLookup(part.keys)
             of_all = history if self._comm.size == 1 else ContactHistory.join(allgather(self._comm, history))
-            part.contact.set_history(of_all.by_numbers(lookup, part.max_stiffness))
+            part.contact.set_history(of_all)
 
     def max_added_frequency(self, x: Values) -> float:
         """Bound of what contact adds to the square of a frequency with points at x (n, d), m; 1/s^2 (collective)."""
