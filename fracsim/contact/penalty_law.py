@@ -27,6 +27,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
+from ..mesh.ghost_exchange import KeyLookup
 from .laws import slipped, tangential
 
 Values = npt.NDArray[np.float64]
@@ -271,6 +272,32 @@ class ContactHistory:
     def spring_energy(self) -> float:
         """Energy of the springs of friction, J."""
         return 0.5 * float(self.spring_stiffness @ np.sum(self.slip**2, axis=1))
+
+
+@dataclass(frozen=True)
+class Slips:
+    """Stretch of the springs of points or facets in contact with a rigid shape, at the end of the last step.
+
+    Attributes:
+        keys: (k,) names of the points, or facets, which stay as edges break.
+        slip: (k, d) m.
+    """
+
+    keys: Ints
+    slip: Values
+
+    @classmethod
+    def none(cls, dim: int) -> Slips:
+        """No springs."""
+        return cls(np.empty(0, np.int64), np.empty((0, dim)))
+
+    def at(self, keys: Ints) -> tuple[Values, Flags]:
+        """(m, d) stretch of the springs with `keys` (m,), m, and (m,) flags of those that are in contact."""
+        rows = KeyLookup(self.keys)(keys)
+        touches = rows >= 0
+        slip: Values = np.zeros((len(keys), self.slip.shape[1]))
+        slip[touches] = self.slip[rows[touches]]
+        return slip, touches
 
 
 # --- stiffness ---

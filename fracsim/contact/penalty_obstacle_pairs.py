@@ -11,7 +11,7 @@ Equations: docs/theory.md#explicit-contact.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
@@ -19,18 +19,19 @@ import numpy as np
 import numpy.typing as npt
 
 from ..mesh.domain import Domain
-from .laws import Penalty, slipped, tangential
+from .laws import Penalty
 from .obstacle import FreeObstacle, RigidObstacle, VerletObstacle, free_pairs
 from .obstacle_pairs import SAMPLES, Numbers, ObstaclePair
+from .penalty_law import ContactHistory, ContactStiffness, PenaltyContacts, PenaltyForces, Slips
 from .pose import Pose, PosedShape, resultant
 from .rigid_obstacles import RigidObstacles
 from .triangle_mesh_shape import StackedMeshes, TriangleMeshShape
 
 if TYPE_CHECKING:
-    from .penalty_law import ContactHistory
     from .penalty_pairs import PenaltyPairs  # with ipctk
 
 Values = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 type Poses = tuple[Pose, Pose]
 
@@ -60,192 +61,126 @@ class PairForces:
     Attributes:
         wrenches: (2, p) forces and moments on both, N and N m.
         friction: (2, p) those of friction alone.
-        penalty_energy: J.
-        spring_energy: of the springs of friction, J.
+        energies: (2,) of the penalty, and of the springs of friction, J.
     """
 
     wrenches: Values
     friction: Values
-    penalty_energy: float = 0.0
-    spring_energy: float = 0.0
-
-    def __add__(self, other: PairForces) -> PairForces:
-        """Sum of forces at other points of the same pair."""
-        return PairForces(
-            self.wrenches + other.wrenches,
-            self.friction + other.friction,
-            self.penalty_energy + other.penalty_energy,
-            self.spring_energy + other.spring_energy,
-        )
+    energies: Values
 
     @classmethod
     def none(cls, dim: int) -> PairForces:
         """No forces."""
         p = 3 if dim == 2 else 6
-        return cls(np.zeros((2, p)), np.zeros((2, p)))
-
-    def to_array(self) -> Values:
-        """(4 p + 2,) numbers for a checkpoint."""
-        return np.concatenate([self.wrenches.ravel(), self.friction.ravel(), [self.penalty_energy, self.spring_energy]])
+        return cls(np.zeros((2, p)), np.zeros((2, p)), np.zeros(2))
 
     @classmethod
-    def from_array(cls, numbers: Values) -> PairForces:
-        """Forces from the numbers of `to_array`."""
-        wrenches, friction = numbers[:-2].reshape(2, 2, -1)
-        return cls(wrenches, friction, float(numbers[-2]), float(numbers[-1]))
+    def of(cls, forces: PenaltyForces, press: Values, friction: Values) -> PairForces:
+        """Forces of contacts, with wrenches (2, p) of normal forces and of friction, N and N m."""
+        energies = forces.contacts.energy(forces.width), forces.spring_energy
+        return cls(press + friction, friction, np.array(energies))
 
 
 class InsetPointContacts:
     """Contacts at the inset points of two obstacles of which one at least is analytic.
 
     Friction acts on the surface of the point's obstacle, where this is nearest to the other one.
-
-    Attributes:
-        touching_area: area that may touch at once, m^2.
     """
 
-    def __init__(self, first: RigidObstacle, second: RigidObstacle) -> None:
-        self._pair = ObstaclePair.between(first, second)
-        areas = [inset.areas for inset in self._pair.points if len(inset.points)]
-        touching = [max(SAMPLES.touching_share * area.sum(), area.max()) for area in areas]
-        self.touching_area = float(min(touching, default=0.0))
-        # (n, d) stretch of the springs at the points of both, m; 0 without contact
-        self._slips = [np.zeros_like(inset.points) for inset in self._pair.points]
+    def __init__(self, pair: ObstaclePair, penalty: Penalty) -> None:
+        self._pair, self._penalty = pair, penalty
+        self._slips = Slips.none(pair.points[0].points.shape[1])
 
-    def set_penalty(self, penalty: Penalty) -> None:
-        """Set the penalty."""
-        self._penalty = penalty
-
-    def end_step(self, starts: Poses, ends: Poses) -> PairForces | None:
-        """Forces at the end of a step, of which the springs are stored; None: out of contact."""
-        old, self._slips = self._slips, [np.zeros_like(slip) for slip in self._slips]
-        total: PairForces | None = None
-        for contacts in self._near_contacts(ends, self._penalty.width):
-            side, points, normal = contacts.side, contacts.points, contacts.normal
-            closure = self._penalty.width - contacts.gap
-            motions = [_motions(contacts.surface, *poses) for poses in zip(starts, ends, strict=True)]
-            stretch = tangential(normal, old[side][points] + motions[side] - motions[1 - side])
-            self._slips[side][points] = stretch = slipped(stretch, self._pair.friction * closure)
-            sign = 1.0 - 2.0 * side  # forces are those on the first
-            press, rub = (
-                sign * (contacts.stiffness * closure)[:, None] * normal,
-                -sign * contacts.stiffness[:, None] * stretch,
-            )
-            friction = _wrenches(rub, contacts.surface, ends)
-            forces = PairForces(
-                _wrenches(press, contacts.surface, ends) + friction,
-                friction,
-                0.5 * float(contacts.stiffness @ closure**2),
-                0.5 * float(contacts.stiffness @ np.sum(stretch**2, axis=1)),
-            )
-            total = forces if total is None else total + forces
-        return total
-
-    def _near_contacts(self, poses: Poses, max_gap: float) -> Iterator[_InsetContacts]:
-        """Contacts at gaps below `max_gap`, m, of the points of each obstacle."""
+    def _near_contacts(self, poses: Poses, max_gap: float) -> tuple[PenaltyContacts, Values, Ints] | None:
+        """Contacts with gaps below `max_gap`, m, with normals on the first; positions (k, d), m, and numbers (k,)."""
         if self._pair.gap_bound(*poses) >= max_gap:
-            return
-        for side, (x, target) in enumerate(self._pair.sides(*poses)):
+            return None
+        parts, count = [], 0
+        for sign, inset, (x, target) in zip((1.0, -1.0), self._pair.points, self._pair.sides(*poses), strict=True):
             gap = target.distance(x)
-            points = np.flatnonzero(gap < max_gap)
-            if len(points):
-                normal = target.normal(x[points])
-                surface = x[points] - self._pair.points[side].radius * normal
-                stiffness = self._penalty.rate * self._pair.points[side].areas[points]
-                yield _InsetContacts(side, points, gap[points], normal, surface, stiffness)
+            near = np.flatnonzero(gap < max_gap)
+            normal, k = target.normal(x[near]), self._penalty.rate * inset.areas[near]
+            parts.append((count + near, gap[near], sign * normal, x[near] - inset.radius * normal, k))
+            count += len(x)
+        numbers, gap, normal, position, stiffness = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        if not len(numbers):
+            return None
+        slip, touched = self._slips.at(numbers)
+        rows, ones, start = np.arange(len(numbers))[:, None], np.ones((len(numbers), 1)), stiffness * touched
+        return PenaltyContacts.of_points(rows, ones, gap, normal, stiffness, slip, start), position, numbers
+
+    def end_step(self, starts: Poses, ends: Poses) -> tuple[PenaltyForces, Values, Values] | None:
+        """Forces at the end of a step, whose springs are stored, and (2, p) wrenches of normal forces and of friction.
+
+        None: out of contact.
+        """
+        width, near = self._penalty.width, self._near_contacts(ends, self._penalty.width)
+        if near is None:
+            self._slips = Slips.none(ends[0].dim)
+            return None
+        contacts, x, numbers = near
+        first, second = (x - start.points_to_space(end.to_body(x)) for start, end in zip(starts, ends, strict=True))
+        forces = PenaltyForces(contacts, first - second, self._pair.friction, width)
+        self._slips = Slips(numbers, forces.slips)
+        press = _wrenches(-contacts.gradient(width, len(x)), x, ends)
+        return forces, press, _wrenches(forces.spring_force, x, ends)
 
     def near_springs(self, poses: Poses) -> tuple[Values, Values] | None:
         """Positions (k, d), m, and stiffness (k,), N/m, of contacts that may act a step later; None: none."""
-        near = list(self._near_contacts(poses, PAIR_PENALTY.near_gap * self._penalty.width))
-        if not near:
-            return None
-        return np.concatenate([part.surface for part in near]), np.concatenate([part.stiffness for part in near])
+        near = self._near_contacts(poses, PAIR_PENALTY.near_gap * self._penalty.width)
+        return None if near is None else (near[1], near[0].stiffness)
 
-    def snapshot(self) -> list[Values]:
-        """Stretch of springs."""
+    @property
+    def history(self) -> Slips:
+        """Springs at the end of the last step."""
         return self._slips
 
-    def restore(self, memory: list[Values]) -> None:
-        """Restore a snapshot."""
-        self._slips = memory
-
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Stretch of springs."""
-        return {"slips": np.concatenate(self._slips)}
-
-    def from_checkpoint(self, saved: dict[str, Values], suffix: str) -> None:
-        """Set the stretch of springs from the arrays of a checkpoint."""
-        self._slips = np.split(saved[f"slips{suffix}"], [len(self._slips[0])])
-
-
-@dataclass(frozen=True)
-class _InsetContacts:
-    """Inset points of one obstacle near the other.
-
-    Attributes:
-        side: number of the points' obstacle, 0 or 1.
-        points: (k,).
-        gap: (k,) m.
-        normal: (k, d) of the other obstacle.
-        surface: (k, d) points of the surface of the points' obstacle, m.
-        stiffness: (k,) N/m.
-    """
-
-    side: int
-    points: npt.NDArray[np.int64]
-    gap: Values
-    normal: Values
-    surface: Values
-    stiffness: Values
+    def set_history(self, history: Slips) -> None:
+        """Set the springs at the end of the last step."""
+        self._slips = history
 
 
 class MeshContacts:
-    """Contacts between two triangle meshes, as InsetPointContacts."""
+    """Contacts between two triangle meshes, as InsetPointContacts.
 
-    def __init__(self, first: RigidObstacle, second: RigidObstacle) -> None:
+    The width of the penalty is smaller for obstacles that start nearer.
+    """
+
+    def __init__(self, first: RigidObstacle, second: RigidObstacle, penalty: Penalty) -> None:
+        meshes = self._meshes = StackedMeshes(first.shape, second.shape)
+        self._friction = max(first.friction, second.friction)
+        self._pairs = self._build_pairs(penalty.rate, penalty.width)
+        gap = self._pairs.min_gap(meshes.positions((first.posed_at(0.0).pose, second.posed_at(0.0).pose)))
+        if gap < penalty.width:
+            self._pairs = self._build_pairs(penalty.rate, PAIR_PENALTY.gap_share * gap)
+
+    def _build_pairs(self, rate: float, width: float) -> PenaltyPairs:
+        """Pairs of the meshes; each side has one half of the penalty's `rate`, Pa/m."""
+        from .penalty_pairs import PenaltyPairs
         from .sample_points import vertex_areas
 
-        meshes = self._meshes = StackedMeshes(first.shape, second.shape)
-        self._area, self._friction = vertex_areas(meshes.points, meshes.triangles), max(first.friction, second.friction)
-        areas = [self._area[rows].sum() for rows in meshes.rows]
-        self.touching_area = SAMPLES.touching_share * float(min(areas))
-        self._start = meshes.positions((first.posed_at(0.0).pose, second.posed_at(0.0).pose))
-
-    def set_penalty(self, penalty: Penalty) -> None:
-        """Set the penalty, of which each side has one half; its width is smaller for obstacles that start nearer."""
-        self._pairs = self._build_pairs(penalty)
-        if (gap := self._pairs.min_gap(self._start)) < penalty.width:
-            width = PAIR_PENALTY.gap_share * gap
-            self._pairs = self._build_pairs(Penalty(penalty.rate * width, width))
-
-    def _build_pairs(self, penalty: Penalty) -> PenaltyPairs:
-        from .penalty_law import ContactStiffness
-        from .penalty_pairs import PenaltyPairs
-
-        meshes, stiffness = self._meshes, ContactStiffness.of_one_body(0.5 * penalty.rate * self._area)
-        return PenaltyPairs(meshes.points, meshes.triangles, stiffness, distance=penalty.width, patch=meshes.patches)
+        points, triangles = self._meshes.points, self._meshes.triangles
+        stiffness = ContactStiffness.of_one_body(0.5 * rate * vertex_areas(points, triangles))
+        return PenaltyPairs(points, triangles, stiffness, distance=width, patch=self._meshes.patches)
 
     def _near_positions(self, poses: Poses) -> Values | None:
         """(n, 3) points of both obstacles, m; None: they are too far apart."""
         return self._meshes.near_positions(poses, PAIR_PENALTY.near_gap * self._pairs.width)
 
-    def end_step(self, starts: Poses, ends: Poses) -> PairForces | None:
-        """Forces at the end of a step, of which the contacts are stored; None: out of contact."""
+    def end_step(self, starts: Poses, ends: Poses) -> tuple[PenaltyForces, Values, Values] | None:
+        """Forces at the end of a step, whose contacts are stored, and wrenches; as of InsetPointContacts."""
         if (x := self._near_positions(ends)) is None:
             return None
-        forces, is_first = (
-            self._pairs.forces(x, self._meshes.positions(starts), self._friction),
-            self._meshes.patches == 0,
-        )
-        contacts, press = forces.contacts, -self._pairs.gradient(x)
+        forces = self._pairs.forces(x, self._meshes.positions(starts), self._friction)
+        contacts, press, is_first = forces.contacts, -self._pairs.gradient(x), self._meshes.patches == 0
         parts = zip(self._meshes.rows, ends, strict=True)
         of_press = [resultant(press[rows], x[rows] - pose.centre) for rows, pose in parts]
         # at one point, in the middle of the gap, so that friction has no moment
         middle = 0.5 * (contacts.positions(x, is_first) + contacts.positions(x, ~is_first))
         sign = np.sum(contacts.weights * is_first[contacts.points], axis=1)
-        friction, spring_energy = _wrenches(sign[:, None] * forces.spring_force, middle, ends), forces.spring_energy
+        friction = _wrenches(sign[:, None] * forces.spring_force, middle, ends)
         self._pairs.end_step(x, forces.slips)
-        return PairForces(np.array(of_press) + friction, friction, forces.energy - spring_energy, spring_energy)
+        return forces, np.array(of_press), friction
 
     def near_springs(self, poses: Poses) -> tuple[Values, Values] | None:
         """Positions (k, 3), m, and stiffness (k,), N/m, of contacts that may act a step later; None: none."""
@@ -254,29 +189,18 @@ class MeshContacts:
         near = self._pairs.near_contacts(x)
         return (near.positions(x, self._meshes.patches == 0), near.stiffness) if len(near.gap) else None
 
-    def snapshot(self) -> ContactHistory:
+    @property
+    def history(self) -> ContactHistory:
         """Contacts at the end of the last step."""
         return self._pairs.history
 
-    def restore(self, memory: ContactHistory) -> None:
-        """Restore a snapshot."""
-        self._pairs.set_history(memory)
-
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Arrays of contacts."""
-        history = self._pairs.history
-        return {"points": cast("Values", history.points), "values": history.values}
-
-    def from_checkpoint(self, saved: dict[str, Values], suffix: str) -> None:
-        """Set contacts from the arrays of a checkpoint."""
-        from .penalty_law import ContactHistory
-
-        points, values = cast("Any", saved[f"points{suffix}"]), saved[f"values{suffix}"]
-        self._pairs.set_history(ContactHistory(points, values))
+    def set_history(self, history: ContactHistory) -> None:
+        """Set the contacts at the end of the last step."""
+        self._pairs.set_history(history)
 
 
 class PenaltyPair:
-    """A pair of obstacles, its contacts and forces at the end of the last step.
+    """A free obstacle and another one, their contacts and forces at the end of the last step.
 
     Attributes:
         numbers: of both.
@@ -285,15 +209,32 @@ class PenaltyPair:
         work: (2,) of the forces on each obstacle in that step, J.
     """
 
-    def __init__(self, numbers: Numbers, obstacles: Mapping[int, RigidObstacle], suffix: str) -> None:
-        """`obstacles`: all by their numbers; `suffix`: of the names of its arrays in checkpoints."""
-        self._suffix = suffix
+    def __init__(
+        self, numbers: Numbers, obstacles: Mapping[int, RigidObstacle], penalty: Penalty, max_added: float, suffix: str
+    ) -> None:
+        """Build the contacts of a pair.
+
+        Args:
+            numbers: of both.
+            obstacles: all by their numbers, apart at the start.
+            penalty: of points in contact; less stiff where it would add more than a share of `max_added`.
+            max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
+            suffix: of the names of its arrays in checkpoints.
+        """
         first, second = (obstacles[number] for number in numbers)
-        meshes = [isinstance(obstacle.shape, TriangleMeshShape) for obstacle in (first, second)]
-        if meshes[1] and not meshes[0]:  # a triangle mesh comes first, since it is in contact at its own points
+        are_meshes = [isinstance(obstacle.shape, TriangleMeshShape) for obstacle in (first, second)]
+        if are_meshes[1] and not are_meshes[0]:  # a triangle mesh comes first: it is in contact at its own points
             numbers, first, second = (numbers[1], numbers[0]), second, first
-        self.numbers = numbers
-        self.contacts: Any = MeshContacts(first, second) if all(meshes) else InsetPointContacts(first, second)
+        self.numbers, self._suffix = numbers, suffix
+        pair = ObstaclePair.between(first, second)
+        areas = [inset.areas for inset in pair.points if len(inset.points)]
+        touching = min((max(SAMPLES.touching_share * area.sum(), area.max()) for area in areas), default=0.0)
+        mass = min(obstacle.mass for obstacle in (first, second) if isinstance(obstacle, FreeObstacle))
+        limit = PAIR_PENALTY.share * max_added * mass * penalty.width / max(touching, np.finfo(float).tiny)
+        penalty = replace(penalty, stiffness=min(penalty.stiffness, limit))
+        self.contacts: Any = (
+            MeshContacts(first, second, penalty) if all(are_meshes) else InsetPointContacts(pair, penalty)
+        )
         self.forces = self._none = PairForces.none(len(first.start_point))
         self.dissipated, self.work = 0.0, (0.0, 0.0)
 
@@ -303,50 +244,40 @@ class PenaltyPair:
 
     def end_step(self, starts: Sequence[PosedShape], ends: Sequence[PosedShape], increments: Sequence[Values]) -> None:
         """Take over the forces of the end of a step, with poses at its start and end, and increments (p,) between."""
-        start, end = self.forces, self.contacts.end_step(self.poses(starts), self.poses(ends)) or self._none
+        start, evaluated = self.forces, self.contacts.end_step(self.poses(starts), self.poses(ends))
+        self.forces = self._none if evaluated is None else PairForces.of(*evaluated)
+        start_energy = float(start.energies[1])
+        self.dissipated = start_energy if evaluated is None else evaluated[0].dissipated(start_energy)
         q = np.array([increments[number] for number in self.numbers])
-        first, second = np.einsum("bp,bp->b", start.wrenches + end.wrenches, q) / 2
+        first, second = np.einsum("bp,bp->b", start.wrenches + self.forces.wrenches, q) / 2
         self.work = float(first), float(second)
-        by_friction = float(np.vdot(start.friction + end.friction, q)) / 2
-        self.dissipated, self.forces = start.spring_energy - end.spring_energy - by_friction, end
 
     def snapshot(self) -> object:
         """Contacts and forces."""
-        return self.contacts.snapshot(), self.forces
+        return self.contacts.history, self.forces
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot."""
-        contacts, self.forces = cast("tuple[object, PairForces]", memory)
-        self.contacts.restore(contacts)
+        history, self.forces = cast("tuple[object, PairForces]", memory)
+        self.contacts.set_history(history)
 
     def to_checkpoint(self) -> dict[str, Values]:
         """Arrays for a checkpoint."""
-        arrays = {"forces": self.forces.to_array()} | self.contacts.to_checkpoint()
+        arrays = vars(self.forces) | {f"contact_{name}": values for name, values in vars(self.contacts.history).items()}
         return {f"{name}{self._suffix}": values for name, values in arrays.items()}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set contacts and forces from the arrays of a checkpoint."""
-        self.forces = PairForces.from_array(saved[f"forces{self._suffix}"])
-        self.contacts.from_checkpoint(saved, self._suffix)
+        arrays = {name: saved[f"{name}{self._suffix}"] for name in vars(self.forces)}
+        self.forces, history = PairForces(**arrays), self.contacts.history
+        names = {name: saved[f"contact_{name}{self._suffix}"] for name in vars(history)}
+        self.contacts.set_history(type(history)(**names))
 
 
 def penalty_pairs_of(obstacles: Mapping[int, RigidObstacle], penalty: Penalty, max_added: float) -> list[PenaltyPair]:
-    """Pairs of free obstacles and others.
-
-    Args:
-        obstacles: all by their numbers, apart at the start.
-        penalty: of points in contact; less stiff where it would add more than a share of `max_added`.
-        max_added: increase of the square of the highest frequency that contact may cause, 1/s^2.
-    """
-    all_numbers = free_pairs([obstacles[n].free for n in range(len(obstacles))])
-    pairs = [PenaltyPair(numbers, obstacles, f"_{index}") for index, numbers in enumerate(all_numbers)]
-    for pair in pairs:
-        members = (obstacles[number] for number in pair.numbers)
-        mass = min(obstacle.mass for obstacle in members if isinstance(obstacle, FreeObstacle))
-        area = max(pair.contacts.touching_area, np.finfo(float).tiny)
-        limit = PAIR_PENALTY.share * max_added * mass * penalty.width / area
-        pair.contacts.set_penalty(replace(penalty, stiffness=min(penalty.stiffness, limit)))
-    return pairs
+    """Pairs of free obstacles and others; as of PenaltyPair."""
+    all_numbers = enumerate(free_pairs([obstacles[n].free for n in range(len(obstacles))]))
+    return [PenaltyPair(numbers, obstacles, penalty, max_added, f"_{index}") for index, numbers in all_numbers]
 
 
 class VerletRigidObstacles(RigidObstacles):
@@ -391,8 +322,7 @@ class VerletRigidObstacles(RigidObstacles):
 
     def stored_energy(self) -> float:
         """Energy of penalty and springs between obstacles at the end of the last step, on rank 0, J."""
-        energies = [pair.forces.penalty_energy + pair.forces.spring_energy for pair in self._pairs]
-        return 0.0 if self.comm.rank else sum(energies)
+        return 0.0 if self.comm.rank else sum(float(pair.forces.energies.sum()) for pair in self._pairs)
 
     def frequency_bound(self) -> float:
         """Increase of the square of the highest frequency if all near points were in contact, 1/s^2.
@@ -430,11 +360,6 @@ class VerletRigidObstacles(RigidObstacles):
         by_prescribed = -sum(work for number, work in items if number not in self.free)
         by_gravity = sum(obstacle.gravity_work for obstacle in self.free.values())
         return by_gravity + by_prescribed, sum(pair.dissipated for pair in self._pairs)
-
-
-def _motions(x: Values, start: Pose, end: Pose) -> Values:
-    """(k, d) motion, between two poses, of the points that are at x (k, d) in the end, m."""
-    return x - start.points_to_space(end.to_body(x))
 
 
 def _wrenches(force: Values, x: Values, poses: Poses) -> Values:

@@ -26,7 +26,6 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..mesh.domain import Domain
-from ..mesh.ghost_exchange import KeyLookup
 from ..mesh.parallel import gather, max_over_ranks, sum_over_ranks
 from ..meshes.topology import row_keys
 from .facet_contact import ContactFacets
@@ -34,7 +33,7 @@ from .laws import ObstacleLaw
 from .node_contact import ContactForces
 from .obstacle import VerletObstacle
 from .obstacle_term import ObstacleTerm
-from .penalty_law import NodalMassShare, PenaltyContacts, PenaltyForces
+from .penalty_law import NodalMassShare, PenaltyContacts, PenaltyForces, Slips
 from .pose import PosedShape, min_distance
 from .rigid_obstacles import RigidObstacles
 
@@ -56,27 +55,6 @@ class PenaltyPolicy:
 
 
 PENALTY = PenaltyPolicy()
-
-
-@dataclass(frozen=True)
-class Slips:
-    """Stretch of the springs of points or facets in contact with an obstacle.
-
-    Attributes:
-        keys: (k,) names of the points, or facets, which stay as edges break.
-        slip: (k, d) m.
-    """
-
-    keys: Ints
-    slip: Values
-
-    def at(self, keys: Ints) -> tuple[Values, npt.NDArray[np.bool_]]:
-        """(m, d) stretch of the springs with `keys` (m,), m, and (m,) flags of those that are in contact."""
-        rows = KeyLookup(self.keys)(keys)
-        touches = rows >= 0
-        slip: Values = np.zeros((len(keys), self.slip.shape[1]))
-        slip[touches] = self.slip[rows[touches]]
-        return slip, touches
 
 
 @dataclass(frozen=True)
@@ -133,7 +111,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
         """
         self._mass, self._max_added = mass, max_added
         dim, count = domain.dim, len(numbers)
-        none = Slips(np.empty(0, np.int64), np.empty((0, dim)))
+        none = Slips.none(dim)
         self._step_end = StepEnd([[none, none]] * count, [np.zeros(dim)] * count)
         self._start_points: Values | None = None  # (n, d) at the start of a step that is not accepted yet, m
         # of each obstacle at the current u: forces on points and on facets, and the keys of these

@@ -93,13 +93,13 @@ class PointFacetContacts:
         """
         is_own = points[:, 0] >= 0
         is_own[is_own] = self._is_owned[points[is_own, 0]]
-        (point, *facet), count, own = points[is_own].T, len(self._is_owned), history.select(is_own)
+        (point, *facet), count, stored = points[is_own].T, len(self._is_owned), history.select(is_own)
         # of all points: corners of the facets that they were before, k_p of those in contact, and slip
         self._facets, self._slip = np.full((count, len(facet)), -1), np.zeros((count, len(facet)))
-        self._facets[point], self._slip[point] = np.column_stack(facet), own.slip
+        self._facets[point], self._slip[point] = np.column_stack(facet), stored.slip
         self._start_stiffness: Values = np.zeros(count)
         # edges that broke may have left less of a point
-        self._start_stiffness[point] = np.minimum(own.stiffness, self._stiffness.limit[point])
+        self._start_stiffness[point] = np.minimum(stored.stiffness, self._stiffness.limit[point])
         return is_own
 
     def contacts_within(self, x: Values, pairs: Ints, reach: float) -> PenaltyContacts:
