@@ -12,10 +12,10 @@ import pytest
 from scipy.sparse import eye
 
 from fracsim.contact.ipc_pairs import IpcPairs
-from fracsim.contact.penalty_contact import PenaltyContact, PenaltyState
+from fracsim.contact.penalty_contact import PenaltyContact
 from fracsim.contact.penalty_law import ContactStiffness, NodalMassShare, penalty_stiffness
 from fracsim.contact.penalty_pairs import PenaltyPairs
-from fracsim.contact.penalty_surface import PenaltySurface
+from fracsim.contact.penalty_surface import PenaltyState, PenaltySurface
 from fracsim.meshes.builders.box import Box
 from fracsim.scene import Scene
 from support.resumed import assert_alike, going_stopped_resumed

@@ -14,7 +14,6 @@ Equations: docs/theory.md#explicit-contact.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -23,146 +22,20 @@ from dolfinx import fem
 
 from ..mechanics.term import Term, TimeLevel
 from ..mesh.domain import Domain
-from ..mesh.parallel import allgather, gather, max_over_ranks, sum_over_ranks
+from ..mesh.parallel import allgather, max_over_ranks, sum_over_ranks
 from .clearance import Clearance
 from .mesh_obstacle_term import build_mesh_obstacles
 from .mesh_obstacles import MeshObstacle
 from .obstacle import VerletObstacle
-from .partitioned_surface import motion_diagonals
-from .penalty_law import ContactHistory, PenaltyForces
+from .penalty_law import PenaltyForces
 from .penalty_pairs import PAIRS
-from .penalty_surface import PenaltyBodySurface, PenaltyPart
+from .penalty_surface import PenaltyBodySurface, PenaltyPart, PenaltyState
 from .pose import Pose, PosedShape, resultant
 from .retractable_surface import SelfContactLaw
 from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class IdleState:
-    """What lets steps be idle.
-
-    Attributes:
-        is_near: whether anything was near contact at the end of the last step.
-        displacement: (owned dofs,) where nothing was near, m; None: not known.
-        clearance: approach of any two nodes from there on before anything is near, m.
-    """
-
-    is_near: bool = False
-    displacement: Values | None = None
-    clearance: float = 0.0
-
-
-class PenaltyState:
-    """Contacts at the end of the last step, and the test whether steps are idle (HistoryTerm).
-
-    A step is idle where nothing can be in contact, nor was at the end of the last one: nothing is exchanged.
-    """
-
-    def __init__(
-        self, domain: Domain, u: fem.Function, surface: PenaltyBodySurface, is_far: Callable[[], bool] | None
-    ) -> None:
-        """Begin with nothing in contact.
-
-        Args:
-            domain: mesh.
-            u: displacement.
-            surface: surface of the body.
-            is_far: function that tells whether the body is far from all obstacles at the current u (collective); None:
-                the body touches itself.
-        """
-        self._comm, self._dim, self._u, self._owned = domain.comm, domain.dim, u, domain.node_count * domain.dim
-        self._surface, self._is_far, self._idle_state = surface, is_far, IdleState()
-        # contacts of a snapshot of another surface, to be set when all ranks come together
-        self._restored: list[ContactHistory] | None = None
-        self.discard()
-
-    def discard(self) -> None:
-        """Discard whether the step is idle, as u or poses have changed."""
-        self._idle: bool | None = None  # at the current u; None: not known yet
-
-    def is_idle(self) -> bool:
-        """Whether nothing can be in contact at the current u, nor was in the last step (collective)."""
-        if self._idle is None:
-            self._idle = not self._idle_state.is_near and self._nothing_is_near()
-        return self._idle
-
-    def _nothing_is_near(self) -> bool:
-        """Whether nothing can be in contact at the current u (collective)."""
-        if self._is_far is not None:
-            return self._is_far()
-        if (reference := self._idle_state.displacement) is None:
-            return False
-        motion = (self._u.x.array[: self._owned] - reference).reshape(-1, self._dim)
-        return float(motion_diagonals(self._comm, [[[motion]]])[0, 0]) <= self._idle_state.clearance
-
-    def measure_clearance(self, x: Values) -> None:
-        """Store how far nodes may approach from points x (n, d), m, before anything is near (collective)."""
-        if self._is_far is not None:
-            return  # bounding boxes are compared in each step
-        contact, clearance = self._surface.current.parts[0].contact, 0.0
-        # a search of wide gaps is worth it on all ranks or on none
-        if not max_over_ranks(self._comm, int(self._surface.has_retracted or contact.anything_is_near(x))):
-            reach = max_over_ranks(self._comm, self._surface.reach_of_points())
-            clearance = -max_over_ranks(self._comm, -contact.clearance(x)) / reach
-        displacement = self._u.x.array[: self._owned].copy() if clearance else None
-        self._idle_state = replace(self._idle_state, displacement=displacement, clearance=clearance)
-
-    def surface_changed(self) -> None:
-        """Discard the clearance, as it is another surface."""
-        self._idle_state = IdleState(self._idle_state.is_near)
-        self.discard()
-
-    def end_step(self, *, is_near: bool) -> None:
-        """Note whether anything is near contact at the end of a step, on any rank (collective)."""
-        any_near = bool(max_over_ranks(self._comm, int(is_near)))
-        self._idle_state = replace(self._idle_state, is_near=any_near)
-
-    @property
-    def _histories(self) -> list[ContactHistory]:
-        return [part.contact.history for part in self._surface.current.parts]
-
-    def settle(self) -> None:
-        """Set contacts of a snapshot of another surface, of which points may belong to other ranks (collective)."""
-        if self._restored is not None:
-            histories, self._restored = self._restored, None
-            self._surface.set_history(histories)
-
-    def snapshot(self) -> object:
-        """Contacts, number of the surface, and idle state."""
-        count = -1 if self._restored else self._surface.surface_count
-        return self._restored or self._histories, count, self._idle_state
-
-    def restore(self, memory: object) -> None:
-        """Restore a snapshot (not collective)."""
-        histories, count, idle = cast("tuple[list[ContactHistory], int, IdleState]", memory)
-        is_same = count == self._surface.surface_count
-        self._restored, self._idle_state = (None, idle) if is_same else (histories, IdleState(idle.is_near))
-        for part, history in zip(self._surface.current.parts, histories, strict=True):
-            if history is not part.contact.history:
-                part.contact.set_history(history)
-        self.discard()
-
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Contacts of each part, on rank 0 (collective)."""
-        self.settle()
-        arrays: dict[str, Values] = {}
-        for index, history in enumerate(self._histories):
-            if (rows := gather(self._comm, history)) is not None:
-                of_all = ContactHistory.join(rows)
-                arrays |= {f"points_{index}": cast("Values", of_all.points), f"values_{index}": of_all.values}
-        return arrays
-
-    def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set the state from the arrays of a checkpoint (collective)."""
-        names = [(f"points_{index}", f"values_{index}") for index in range(len(self._histories))]
-        histories = [ContactHistory(cast("Ints", saved[points]), saved[values]) for points, values in names]
-        self._idle_state = IdleState(is_near=any(len(history.points) for history in histories))
-        for part, history in zip(self._surface.current.parts, histories, strict=True):
-            part.contact.set_history(history)
-        self.discard()
 
 
 class PenaltyContact(Term):
@@ -206,7 +79,7 @@ class PenaltyContact(Term):
         self.surface = PenaltyBodySurface(domain, u, law, mass, max_added, meshes)
         self.state = PenaltyState(domain, u, self.surface, is_far)
         self.parts: tuple[object, ...] = (self.surface, self.state)
-        self._set_start(None)
+        self._start_u: Values | None = None  # at the start of a step that is not accepted yet, (owned dofs,), m
         self.update_displacement()
 
     # --- surface ---
@@ -219,16 +92,15 @@ class PenaltyContact(Term):
         """Add new crack faces, retracted where there is no room (collective)."""
         self.surface.edges_broke(pattern)
         self.state.surface_changed()
-        self._set_start(None)
+        self._start_u = None
         self.update_displacement()
 
     def update_displacement(self) -> None:
         """Discard positions and forces, as u has changed."""
         self.state.discard()
         self._positions: Values | None = None
-        self._nodal_forces: Values | None = None
         self._forces: list[PenaltyForces | None] | None = None
-        self._gradients: list[Values] | None = None
+        self._nodal_forces: Values | None = None
 
     def clear_search(self) -> None:
         """Discard the candidates of collision detection (not collective)."""
@@ -243,47 +115,27 @@ class PenaltyContact(Term):
         if self._positions is None:
             self._positions = self.surface.positions(self._u.x.array[: self._owned])
             self.state.settle()
-            if self._start_u is not None and self._start_count != self.surface.exchange_count:
-                self._set_start(self._start_u)
+            # those at the start of the step, with the elements of its end
+            surface, u = self.surface, self._start_u
+            self._start = None if u is None else surface.current.point_map(surface.nodal_values(u))
         return self._positions
-
-    def _set_start(self, u: Values | None) -> None:
-        """Set the points at the start of the step at displacements u (owned dofs,), m; None: accepted (collective)."""
-        self._start_u, self._start_count, self._starts = u, self.surface.exchange_count, None
-        if u is not None:
-            x = self.surface.current.point_map(self.surface.nodal_values(u))
-            poses = self._start_poses()
-            self._starts = [part.points(x, pose) for part, pose in zip(self._parts, poses, strict=True)]
 
     def _start_poses(self) -> Sequence[Pose | None]:
         """Pose of the obstacle of each part at the start of the step."""
         return [None]
 
-    def min_gap(self) -> float:
-        """Least gap within the penalty at the current u, m; infinite where none is (collective)."""
-        x = self._end_positions()
-        gaps = [part.contact.min_gap(part.points(x)) for part in self._parts if not part.is_far(x)]
-        return -max_over_ranks(self.comm, -min(gaps, default=np.inf))
-
     def _part_forces(self, x: Values) -> list[PenaltyForces | None]:
         """Forces of each part with the body at x (n, d), m; None: it is far."""
         if self._forces is None:
-            starts = [None] * len(self._parts) if self._starts is None else self._starts
-            self._forces = [
-                None if part.is_far(x) else part.contact.forces(part.points(x), start, part.friction)
-                for part, start in zip(self._parts, starts, strict=True)
-            ]
+            parts = zip(self._parts, self._start_poses(), strict=True)
+            self._forces = [None if part.is_far(x) else part.forces(x, self._start, pose) for part, pose in parts]
         return self._forces
 
-    def _part_gradients(self, x: Values) -> list[Values]:
-        """(n + m, d) minus the forces of each part on its points with the body at x (n, d), m; N."""
-        if self._gradients is None:
-            parts = zip(self._parts, self._part_forces(x), strict=True)
-            zero = np.zeros_like(x)
-            self._gradients = [
-                zero if forces is None else forces.gradient(len(part.contact.keys)) for part, forces in parts
-            ]
-        return self._gradients
+    def min_gap(self) -> float:
+        """Least gap within the penalty at the current u, m; infinite where none is (collective)."""
+        all_forces = [forces for forces in self._part_forces(self._end_positions()) if forces is not None]
+        gaps = [float(forces.contacts.gap.min(initial=np.inf)) for forces in all_forces]
+        return -max_over_ranks(self.comm, -min(gaps, default=np.inf))
 
     def contact_forces(self) -> Values | None:
         """(owned dofs,) contact forces at the current u, N; None: nothing is near (collective)."""
@@ -291,8 +143,9 @@ class PenaltyContact(Term):
             return None
         x = self._end_positions()
         if self._nodal_forces is None:
-            total = np.sum([gradient[: len(x)] for gradient in self._part_gradients(x)], axis=0)
-            self._nodal_forces = self.surface.sum_at_nodes(self.surface.current.point_map.nodal_forces(-total))
+            of_parts = [forces.force[: len(x)] for forces in self._part_forces(x) if forces is not None]
+            total = sum(of_parts, np.zeros_like(x))
+            self._nodal_forces = self.surface.sum_at_nodes(self.surface.current.point_map.nodal_forces(total))
             self.state.measure_clearance(x)
         return self._nodal_forces
 
@@ -324,7 +177,7 @@ class PenaltyContact(Term):
         # of the end of the last step, before it is discarded
         is_idle = self.state.is_idle()
         self.update_displacement()
-        self._set_start(None)
+        self._start_u = None
         if not level.dt:
             return
         self._friction_loss = 0.0
@@ -333,14 +186,14 @@ class PenaltyContact(Term):
         self.surface.refresh(level.u_n)
         self.state.settle()
         self.surface.extend_faces(level.u_n)
-        self._set_start(level.u_n)
+        self._start_u = level.u_n
 
     def accept_step(self) -> None:
         """Store contacts and dissipation of the step (collective)."""
         if self.state.is_idle():
             return
         self.state.end_step(is_near=self._store_contacts(self._end_positions()))
-        self._set_start(None)
+        self._start_u = self._start = None
 
     def _store_contacts(self, x: Values) -> bool:
         """Store contacts at the end of a step with the body at x (n, d), m; whether any are near on this rank."""
@@ -349,7 +202,7 @@ class PenaltyContact(Term):
             history = part.contact.history
             if forces is None and not len(history.points):
                 continue
-            forces = forces or part.contact.forces(part.points(x))
+            forces = forces or part.forces(x)
             self._friction_loss += forces.dissipated(history.spring_energy)
             part.contact.end_step(part.points(x), forces.slips)
             is_near |= len(part.contact.history.points) > 0
@@ -482,9 +335,9 @@ class PenaltyMeshContact(PenaltyContact):
     def rank_wrench(self, index: int) -> Values:
         """(6,) force and moment on an obstacle at the current u, of this rank's contacts, N and N m (collective)."""
         x, mesh = self._end_positions(), self._all_meshes[index]
-        force = -self._part_gradients(x)[index][len(x) :]
-        if not len(force):
+        if (forces := self._part_forces(x)[index]) is None:
             return np.zeros(6)
+        force = forces.force[len(x) :]
         pressed = force.any(axis=1)
         return resultant(force[pressed], mesh.positions[pressed] - mesh.pose.centre)
 
@@ -504,9 +357,9 @@ class PenaltyMeshContact(PenaltyContact):
         """(n, 3) points near this rank before each obstacle, m, normal forces, N, start velocities, m/s."""
         x, surface = self._end_positions(), self.surface.current
         velocity, result = surface.point_map.weights @ self.surface.nodal_values(self._start_velocity), []
-        for part in self._parts:
-            gradient = np.zeros_like(x) if part.is_far(x) else part.contact.gradient(part.points(x))[: len(x)]
-            result.append((x, -surface.sum_at_points(gradient), velocity))
+        for forces in self._part_forces(x):
+            force = np.zeros_like(x) if forces is None else forces.normal_force[: len(x)]
+            result.append((x, surface.sum_at_points(force), velocity))
         return result
 
     # --- state: wrenches at the end of the last step (HistoryTerm) ---

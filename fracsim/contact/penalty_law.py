@@ -145,12 +145,14 @@ class PenaltyForces:
         motion: (k, d) relative motion since the start of the step, m; it counts where contact stays since then.
         friction: coefficient of friction.
         width: D, m.
+        count: n, number of the points that contacts refer to.
     """
 
     contacts: PenaltyContacts
     motion: Values
     friction: float
     width: float
+    count: int
 
     @cached_property
     def _motion(self) -> Values:
@@ -179,10 +181,20 @@ class PenaltyForces:
         """Energy of penalty and springs, J."""
         return self.contacts.energy(self.width) + self.spring_energy
 
-    def gradient(self, count: int) -> Values:
-        """(n, d) minus the forces on the points n = `count`, N."""
-        normal = self.contacts.gradient(self.width, count)
-        return normal - self.contacts.sum_at_points(self.spring_force, count) if self.friction else normal
+    @cached_property
+    def normal_force(self) -> Values:
+        """(n, d) forces of the penalty on all points, N."""
+        return -self.contacts.gradient(self.width, self.count)
+
+    @cached_property
+    def friction_force(self) -> Values:
+        """(n, d) forces of the springs on all points, N."""
+        return self.contacts.sum_at_points(self.spring_force, self.count)
+
+    @cached_property
+    def force(self) -> Values:
+        """(n, d) forces on all points, N."""
+        return self.normal_force + self.friction_force if self.friction else self.normal_force
 
     def dissipated(self, start_energy: float) -> float:
         """Energy dissipated in the step, J: minus the work of the springs, minus the change of their energy.

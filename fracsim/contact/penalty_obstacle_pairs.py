@@ -120,10 +120,9 @@ class InsetPointContacts:
             return None
         contacts, x, numbers = near
         first, second = (x - start.points_to_space(end.to_body(x)) for start, end in zip(starts, ends, strict=True))
-        forces = PenaltyForces(contacts, first - second, self._pair.friction, width)
+        forces = PenaltyForces(contacts, first - second, self._pair.friction, width, len(x))
         self._slips = Slips(numbers, forces.slips)
-        press = _wrenches(-contacts.gradient(width, len(x)), x, ends)
-        return forces, press, _wrenches(forces.spring_force, x, ends)
+        return forces, _wrenches(forces.normal_force, x, ends), _wrenches(forces.friction_force, x, ends)
 
     def near_springs(self, poses: Poses) -> tuple[Values, Values] | None:
         """Positions (k, d), m, and stiffness (k,), N/m, of contacts that may act a step later; None: none."""
@@ -172,7 +171,7 @@ class MeshContacts:
         if (x := self._near_positions(ends)) is None:
             return None
         forces = self._pairs.forces(x, self._meshes.positions(starts), self._friction)
-        contacts, press, is_first = forces.contacts, -self._pairs.gradient(x), self._meshes.patches == 0
+        contacts, press, is_first = forces.contacts, forces.normal_force, self._meshes.patches == 0
         parts = zip(self._meshes.rows, ends, strict=True)
         of_press = [resultant(press[rows], x[rows] - pose.centre) for rows, pose in parts]
         # at one point, in the middle of the gap, so that friction has no moment

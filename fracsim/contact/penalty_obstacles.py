@@ -240,18 +240,16 @@ class PenaltyObstacleTerm(ObstacleTerm):
     def _evaluate_obstacle(self, number: int, posed: PosedShape) -> ContactForces:
         """Forces of an obstacle at a given pose."""
         width, friction = self.law.barrier.width, self.group.obstacles[number].friction
+        touching = [(near.select(touches := near.gap < width), keys[touches])
+                    for near, keys in self._contacts(number, posed, width)]  # fmt: skip
+        points = np.unique(np.concatenate([contacts.points.reshape(-1) for contacts, _ in touching]))
         self._parts[number] = parts = []
-        for near, keys in self._contacts(number, posed, width):
-            touches = near.gap < width
-            contacts = near.select(touches)
-            motion = self._relative_motion(number, contacts)
-            parts.append((PenaltyForces(contacts, motion, friction, width), keys[touches]))
-        points = np.unique(np.concatenate([forces.contacts.points.reshape(-1) for forces, _ in parts]))
-        normal, rub = np.zeros((2, len(points), self._domain.dim))
-        for forces, _ in parts:
-            contacts = replace(forces.contacts, points=np.searchsorted(points, forces.contacts.points))
-            normal -= contacts.gradient(width, len(points))
-            rub += contacts.sum_at_points(forces.spring_force, len(points))
+        for contacts, keys in touching:
+            motion, rows = self._relative_motion(number, contacts), np.searchsorted(points, contacts.points)
+            forces = PenaltyForces(replace(contacts, points=rows), motion, friction, width, len(points))
+            parts.append((forces, keys))
+        normal = np.sum([forces.normal_force for forces, _ in parts], axis=0)
+        rub = np.sum([forces.friction_force for forces, _ in parts], axis=0)
         return ContactForces(points, sum(forces.energy for forces, _ in parts), normal, rub, 0.0, _no_tangent)
 
     def _relative_motion(self, number: int, contacts: PenaltyContacts) -> Values:

@@ -276,7 +276,7 @@ class PenaltyPairs:
         """Forces with points at x, and at `start` (n, d) at the start of the step, m; None: at x."""
         contacts = self.contacts(x)
         motion = contacts.relative(x - start) if friction and start is not None else np.zeros_like(contacts.normal)
-        return PenaltyForces(contacts, motion, friction, self.width)
+        return PenaltyForces(contacts, motion, friction, self.width, len(x))
 
     def end_step(self, x: Values, slips: Values | None = None) -> None:
         """Store contacts at the end of a step, and slips (k, d) of the springs of `contacts`, m."""

@@ -1,5 +1,8 @@
 """Penalty contact of a body's surface with itself, or with triangle-mesh obstacles, on the elements of a rank.
 
+    PenaltySurface        contacts of the elements of a rank; PenaltyBodySurface: surface of the body on all ranks
+    PenaltyState          contacts at the end of the last step, and whether steps are idle
+
 The contact of a point, or of an edge with one that comes later in the order of the surface, belongs to the lowest rank
 that has an element at the point or edge.
 
@@ -8,9 +11,9 @@ Equations: docs/theory.md#explicit-contact.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import ClassVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -19,15 +22,16 @@ from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
 from ..mesh.domain import Domain
-from ..mesh.parallel import allgather
+from ..mesh.parallel import allgather, gather, max_over_ranks
 from .element_exchange import EXCHANGE, ElementSet, bounding_boxes, own_points
 from .mesh_obstacles import MeshObstacle
-from .partitioned_surface import PartitionedSurface
+from .partitioned_surface import PartitionedSurface, motion_diagonals
 from .penalty_law import (
     ContactHistory,
     ContactStiffness,
     ElementRanks,
     NodalMassShare,
+    PenaltyForces,
     penalty_stiffness,
 )
 from .penalty_pairs import PAIRS, PenaltyPairs
@@ -68,6 +72,11 @@ class PenaltyPart:
         if self.mesh is None:
             return x
         return np.concatenate([x, self.mesh.positions if pose is None else self.mesh.positions_at(pose)])
+
+    def forces(self, x: Values, start: Values | None = None, start_pose: Pose | None = None) -> PenaltyForces:
+        """Forces with the body at x (n, d), m, and at `start` at the start of the step; None: it is accepted."""
+        starts = None if start is None or not self.friction else self.points(start, start_pose)
+        return self.contact.forces(self.points(x), starts, self.friction)
 
     def gap(self, x: Values) -> float:
         """Least distance from an obstacle of points at x (n, d), m; beyond contact that of vertices."""
@@ -235,3 +244,128 @@ class PenaltyBodySurface(PartitionedSurface[PenaltySurface]):
                 largest[part] = (total / self._mass).max(initial=0.0)
             self._comm.Allreduce(MPI.IN_PLACE, largest, MPI.MAX)
         return float(largest.sum())
+
+
+@dataclass(frozen=True)
+class IdleState:
+    """What lets steps be idle.
+
+    Attributes:
+        is_near: whether anything was near contact at the end of the last step.
+        displacement: (owned dofs,) where nothing was near, m; None: not known.
+        clearance: approach of any two nodes from there on before anything is near, m.
+    """
+
+    is_near: bool = False
+    displacement: Values | None = None
+    clearance: float = 0.0
+
+
+class PenaltyState:
+    """Contacts at the end of the last step, and the test whether steps are idle (HistoryTerm).
+
+    A step is idle where nothing can be in contact, nor was at the end of the last one: nothing is exchanged.
+    """
+
+    def __init__(
+        self, domain: Domain, u: fem.Function, surface: PenaltyBodySurface, is_far: Callable[[], bool] | None
+    ) -> None:
+        """Begin with nothing in contact.
+
+        Args:
+            domain: mesh.
+            u: displacement.
+            surface: surface of the body.
+            is_far: function that tells whether the body is far from all obstacles at the current u (collective); None:
+                the body touches itself.
+        """
+        self._comm, self._dim, self._u, self._owned = domain.comm, domain.dim, u, domain.node_count * domain.dim
+        self._surface, self._is_far, self._idle_state = surface, is_far, IdleState()
+        # contacts of a snapshot of another surface, to be set when all ranks come together
+        self._restored: list[ContactHistory] | None = None
+        self.discard()
+
+    def discard(self) -> None:
+        """Discard whether the step is idle, as u or poses have changed."""
+        self._idle: bool | None = None  # at the current u; None: not known yet
+
+    def is_idle(self) -> bool:
+        """Whether nothing can be in contact at the current u, nor was in the last step (collective)."""
+        if self._idle is None:
+            self._idle = not self._idle_state.is_near and self._nothing_is_near()
+        return self._idle
+
+    def _nothing_is_near(self) -> bool:
+        """Whether nothing can be in contact at the current u (collective)."""
+        if self._is_far is not None:
+            return self._is_far()
+        if (reference := self._idle_state.displacement) is None:
+            return False
+        motion = (self._u.x.array[: self._owned] - reference).reshape(-1, self._dim)
+        return float(motion_diagonals(self._comm, [[[motion]]])[0, 0]) <= self._idle_state.clearance
+
+    def measure_clearance(self, x: Values) -> None:
+        """Store how far nodes may approach from points x (n, d), m, before anything is near (collective)."""
+        if self._is_far is not None:
+            return  # bounding boxes are compared in each step
+        contact, clearance = self._surface.current.parts[0].contact, 0.0
+        # a search of wide gaps is worth it on all ranks or on none
+        if not max_over_ranks(self._comm, int(self._surface.has_retracted or contact.anything_is_near(x))):
+            reach = max_over_ranks(self._comm, self._surface.reach_of_points())
+            clearance = -max_over_ranks(self._comm, -contact.clearance(x)) / reach
+        displacement = self._u.x.array[: self._owned].copy() if clearance else None
+        self._idle_state = replace(self._idle_state, displacement=displacement, clearance=clearance)
+
+    def surface_changed(self) -> None:
+        """Discard the clearance, as it is another surface."""
+        self._idle_state = IdleState(self._idle_state.is_near)
+        self.discard()
+
+    def end_step(self, *, is_near: bool) -> None:
+        """Note whether anything is near contact at the end of a step, on any rank (collective)."""
+        any_near = bool(max_over_ranks(self._comm, int(is_near)))
+        self._idle_state = replace(self._idle_state, is_near=any_near)
+
+    @property
+    def _histories(self) -> list[ContactHistory]:
+        return [part.contact.history for part in self._surface.current.parts]
+
+    def settle(self) -> None:
+        """Set contacts of a snapshot of another surface, of which points may belong to other ranks (collective)."""
+        if self._restored is not None:
+            histories, self._restored = self._restored, None
+            self._surface.set_history(histories)
+
+    def snapshot(self) -> object:
+        """Contacts, number of the surface, and idle state."""
+        count = -1 if self._restored else self._surface.surface_count
+        return self._restored or self._histories, count, self._idle_state
+
+    def restore(self, memory: object) -> None:
+        """Restore a snapshot (not collective)."""
+        histories, count, idle = cast("tuple[list[ContactHistory], int, IdleState]", memory)
+        is_same = count == self._surface.surface_count
+        self._restored, self._idle_state = (None, idle) if is_same else (histories, IdleState(idle.is_near))
+        for part, history in zip(self._surface.current.parts, histories, strict=True):
+            if history is not part.contact.history:
+                part.contact.set_history(history)
+        self.discard()
+
+    def to_checkpoint(self) -> dict[str, Values]:
+        """Contacts of each part, on rank 0 (collective)."""
+        self.settle()
+        arrays: dict[str, Values] = {}
+        for index, history in enumerate(self._histories):
+            if (rows := gather(self._comm, history)) is not None:
+                of_all = ContactHistory.join(rows)
+                arrays |= {f"points_{index}": cast("Values", of_all.points), f"values_{index}": of_all.values}
+        return arrays
+
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
+        """Set the state from the arrays of a checkpoint (collective)."""
+        names = [(f"points_{index}", f"values_{index}") for index in range(len(self._histories))]
+        histories = [ContactHistory(cast("Ints", saved[points]), saved[values]) for points, values in names]
+        self._idle_state = IdleState(is_near=any(len(history.points) for history in histories))
+        for part, history in zip(self._surface.current.parts, histories, strict=True):
+            part.contact.set_history(history)
+        self.discard()
