@@ -26,6 +26,7 @@ from dolfinx import fem
 from mpi4py import MPI
 
 from ..mesh.domain import Domain
+from ..mesh.ghost_exchange import find_saved_keys
 from ..mesh.parallel import gather, max_over_ranks, sum_over_ranks
 from ..meshes.topology import row_keys
 from .facet_contact import ContactFacets
@@ -313,7 +314,14 @@ class PenaltyObstacleTerm(ObstacleTerm):
         return {"spring_points": all_keys[first], "springs": all_rows[first], "pushed": sums}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set the state from the arrays of a checkpoint (collective)."""
+        """Set the state from the arrays of a checkpoint (collective).
+
+        Raises ValueError if it has keys of no element.
+        """
+        names = self.surface.local.keys
+        corners = self._facets.corners if self.facets.numbers else np.empty((0, self._domain.dim), np.int64)
+        of_facets = row_keys(np.sort(names[corners], axis=1))
+        find_saved_keys(self.comm, np.append(names, of_facets), saved["spring_points"])
         rows, keys, is_root = saved["springs"], saved["spring_points"], self.comm.rank == 0
         *forces, energy = saved["pushed"] * is_root
         selected = [[(rows[:, :2] == (number, kind)).all(axis=1) for kind in range(2)]
