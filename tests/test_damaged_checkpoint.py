@@ -98,7 +98,7 @@ def test_on_two_ranks_there_is_one_message(stopped: Path, tmp_path: Path) -> Non
         assert done.stderr.count("fracsim: --restart: cannot read") == 1 and "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize("name", ["pause", "share", "stiffness", "left_out"])
+@pytest.mark.parametrize("name", ["is_new", "share", "stiffness", "left_out"])
 def test_histories_of_contact_that_do_not_fit_are_refused(name: str, tmp_path: Path) -> None:
     """Arrays with other rows: how many there are, and of what, is known to the surface alone."""
     pytest.importorskip("ipctk", reason="an environment made without a network")

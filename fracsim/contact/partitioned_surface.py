@@ -73,14 +73,14 @@ class SurfaceState:
         version: number of changes of arms and of left-out elements until then.
         share: (n,) factors of the arms of this rank's points.
         is_excluded: (m,) flags of this rank's elements.
-        interval: steps between two attempts to release faces, and steps to the next one.
+        is_new: whether edges broke in the last step.
     """
 
     surface_count: int
     version: int
     share: Values
     is_excluded: Flags
-    interval: tuple[int, int]
+    is_new: bool
 
 
 class PartitionedSurface[S: RetractableSurface]:
@@ -311,7 +311,7 @@ class PartitionedSurface[S: RetractableSurface]:
         rows, faces = self.element_set.points, self.element_set.elements
         self.element_set = ElementSet(replace(rows, share=state.share), replace(faces, is_excluded=state.is_excluded))
         self._exchange(displacements)
-        self.current.set_release_interval(state.interval)
+        self.current.is_new = state.is_new
         self._keep_history(previous)
 
     def _serves(self, displacements: Sequence[Values]) -> bool:
@@ -448,11 +448,11 @@ class PartitionedSurface[S: RetractableSurface]:
         """Retracted and left-out parts of this rank."""
         if self._restored is not None:
             return self._restored
-        share, excluded, interval = self.current.snapshot()
+        share, excluded, is_new = self.current.snapshot()
         is_excluded = np.zeros(len(self.current.elements), bool)
         is_excluded[excluded] = True
         return SurfaceState(
-            self.surface_count, self._version, share[self._point_rows], is_excluded[self._element_rows], interval
+            self.surface_count, self._version, share[self._point_rows], is_excluded[self._element_rows], is_new
         )
 
     def restore(self, memory: object) -> None:
@@ -464,13 +464,13 @@ class PartitionedSurface[S: RetractableSurface]:
         if state.surface_count != self.surface_count:
             return
         if state.version == self._version:
-            self.current.set_release_interval(state.interval)
+            self.current.is_new = state.is_new
             return
         self._version, self._restored = state.version, state
         self.has_retracted = True  # until faces are extended again
 
     def to_checkpoint(self) -> dict[str, Values]:
-        """Names and factors of retracted points, names of left-out elements, and steps to the next release of faces.
+        """Names and factors of retracted points, names of left-out elements, and whether edges broke in the last step.
 
         On rank 0 (collective).
         """
@@ -486,7 +486,7 @@ class PartitionedSurface[S: RetractableSurface]:
             return {}
         names = "retracted", "share", "left_out"
         arrays = {name: np.concatenate(rows) for name, rows in zip(names, zip(*parts, strict=True), strict=True)}
-        return arrays | {"pause": np.array(state.interval, float)}
+        return arrays | {"is_new": np.array([state.is_new], float)}
 
     def from_checkpoint(self, saved: dict[str, Values]) -> None:
         """Set the state from the arrays of a checkpoint (collective).
@@ -501,8 +501,8 @@ class PartitionedSurface[S: RetractableSurface]:
         full, is_excluded = np.ones(len(keys)), np.zeros(len(element_keys), bool)
         full[rows[rows >= 0]] = share[rows >= 0]
         is_excluded[excluded[excluded >= 0]] = True
-        pause, remaining = (int(number) for number in saved["pause"])
-        self._restored = SurfaceState(self.surface_count, self._version, full, is_excluded, (pause, remaining))
+        (is_new,) = saved["is_new"]
+        self._restored = SurfaceState(self.surface_count, self._version, full, is_excluded, bool(is_new))
         self.refresh(self._current_u)
         self._faces_changed()
 

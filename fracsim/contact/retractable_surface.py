@@ -56,7 +56,6 @@ class SurfacePolicy:
             edges.
         gentle_rounds: rounds with `factor`, after which arms are shortened to `min_arm` at once. One face makes room
             for the next, and each round costs a search.
-        max_pause: largest number of steps between two attempts to release faces.
         closed_pressure: pressure, in stiffnesses, of faces without room: that of a fifth of the barrier's distance.
         round_off: relative tolerance of pressures.
         max_coupled_nodes: nodes in contact up to which their stiffness is kept apart from the matrix.
@@ -70,7 +69,6 @@ class SurfacePolicy:
     min_cut_length: float = 12.0
     min_planar_cut_length: float = 4.0
     gentle_rounds: int = 4
-    max_pause: int = 16
     closed_pressure: float = 10.0
     round_off: float = 1e-6
     max_coupled_nodes: int = 3000
@@ -78,8 +76,8 @@ class SurfacePolicy:
 
 SURFACE = SurfacePolicy()
 NO_ELEMENTS: Ints = np.empty(0, np.int64)
-# factors of arms, excluded elements, steps between two releases of faces and steps to the next
-type SurfaceSnapshot = tuple[Values, Ints, tuple[int, int]]
+# factors of arms, excluded elements, and whether edges broke in the last step
+type SurfaceSnapshot = tuple[Values, Ints, bool]
 
 
 @dataclass(frozen=True)
@@ -121,6 +119,7 @@ class RetractableSurface:
         point_map: map from these nodes to points, with new faces retracted.
         rest_positions: (n, d) reference positions of the points with full arms, m.
         own_points: (n,) flags of points of which this rank is the lowest one that has an element there.
+        is_new: whether edges broke in the last step.
         closed_pressure: pressure, in stiffnesses, of faces without room.
     """
 
@@ -152,7 +151,7 @@ class RetractableSurface:
         is_copy[self.point_map.copies] = True
         self._crack_faces = np.flatnonzero(is_copy[self.elements].any(axis=1))
         self._excluded = NO_ELEMENTS
-        self._release_interval = (1, 1)  # steps between two attempts to release faces, and to the next one
+        self.is_new = True
         self._build_contacts(np.arange(len(self.elements)))
         self._exclude(np.flatnonzero(faces.is_excluded))
 
@@ -181,12 +180,8 @@ class RetractableSurface:
         return np.delete(np.arange(len(self.elements)), self._excluded)
 
     def snapshot(self) -> SurfaceSnapshot:
-        """Factors of arms, excluded elements, and steps to the next release of faces."""
-        return self.point_map.share, self._excluded, self._release_interval
-
-    def set_release_interval(self, interval: tuple[int, int]) -> None:
-        """Set the steps between two attempts to release faces, and to the next one."""
-        self._release_interval = interval
+        """Factors of arms, excluded elements, and whether edges broke in the last step."""
+        return self.point_map.share, self._excluded, self.is_new
 
     def find_intersections(self, x: Values) -> tuple[Ints, Flags]:
         """(k, 2) elements that intersect, of which this rank has the first, with points at x (n, d), m.
@@ -296,15 +291,12 @@ class RetractableSurface:
     def extend_faces(self, u: Values) -> bool:
         """Extend retracted faces and include excluded ones where there is room, at displacements u (columns, d), m.
 
-        Not in the step after edges broke, and less often where there is no room: each attempt costs as much as two
-        iterations of Newton's method. Returns whether anything has changed (collective).
+        Not in the step after edges broke. Returns whether anything has changed (collective).
         """
-        share, excluded, (pause, remaining) = self.snapshot()
+        share, excluded, is_new = self.snapshot()
+        self.is_new = False
         is_retracted, is_excluded = (self._on_any_rank(flag) for flag in (bool(np.any(share < 1)), len(excluded) > 0))
-        if not is_retracted and not is_excluded:
-            return False
-        if remaining:
-            self._release_interval = pause, remaining - 1
+        if is_new or not (is_retracted or is_excluded):
             return False
         load = self.pressures(u)
         if is_retracted:
@@ -313,10 +305,7 @@ class RetractableSurface:
             self._exclude(NO_ELEMENTS)
             self._retract_faces(u, load)
         same = np.array_equal(share, self.point_map.share) and np.array_equal(excluded, self._excluded)
-        changed = self._on_any_rank(not same)
-        pause = 1 if changed else min(2 * pause, SURFACE.max_pause)
-        self._release_interval = pause, pause - 1
-        return changed
+        return self._on_any_rank(not same)
 
     def _extend_retracted(self, u: Values, load: Values) -> None:
         previous = self.point_map.share
