@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import subprocess
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -13,10 +14,12 @@ import mpi4py.MPI  # noqa: F401  before dolfinx, whose wheel needs its MPI libra
 import pytest
 from hypothesis import settings
 
+from fracsim.meshes import time_limit
 from fracsim.meshes.data import MeshData
 from fracsim.study import MeshSettings, check
 from fracsim.study.solver_options import PLAIN_VARIABLE
 from repeats import REPEATS
+from support.forked_readers import ForkedReaders
 from support.ranks import Arrays, OnRanks, run_on_ranks
 
 # The same examples on every machine and in every run: a failure can be repeated, and no deadline depends on the load.
@@ -57,6 +60,22 @@ def meshes_built_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(check, "build_mesh", build_once)
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def readers_forked() -> Iterator[None]:
+    """Calls with a time limit are forked from one process; `python_started` has those of the package."""
+    readers = ForkedReaders()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(time_limit, "subprocess", readers)
+        yield
+    readers.close()
+
+
+@pytest.fixture
+def python_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each call with a time limit starts a Python, as in the package."""
+    monkeypatch.setattr(time_limit, "subprocess", subprocess)
 
 
 @pytest.fixture

@@ -329,6 +329,7 @@ def test_cells_are_expected_within_a_factor(tmp_path: Path, made: Made, h: float
     assert expected_cells(surface, h) == pytest.approx(len(fill_closed(surface, h, "S").cells), rel=0.5)
 
 
+@pytest.mark.usefixtures("python_started")
 def test_work_in_a_process_of_its_own() -> None:
     """Results and exceptions come back; what takes too long or dies is told."""
     assert call_with_time_limit(20, divmod, 7, 2) == (3, 1)
@@ -355,6 +356,7 @@ def test_volume_mesh_is_no_surface(tmp_path: Path) -> None:
         fill_surface(tmp_path / "solid.vtu", 0.1)
 
 
+@pytest.mark.usefixtures("python_started")
 def test_arrays_of_another_process_are_not_copied() -> None:
     """They can be written to, and Python allocates no memory of their size."""
     import tracemalloc

@@ -74,6 +74,7 @@ EVERY: dict[str, tuple[int, Table, Table, int, float]] = {  # cells, regions, gr
 }  # fmt: skip
 
 
+@pytest.mark.usefixtures("python_started")
 @pytest.mark.parametrize("name", EVERY)
 def test_every_file_has_its_cells_regions_groups_and_bodies(name: str) -> None:
     cells, regions, groups, bodies, volume = EVERY[name]
@@ -637,6 +638,7 @@ def test_the_line_at_which_a_reader_stopped(tmp_path: Path) -> None:
         read_mesh(path)
 
 
+@pytest.mark.usefixtures("python_started")
 def test_a_reader_that_does_not_end_is_ended(tmp_path: Path) -> None:
     """Here one that waits for a pipe, which `read_mesh` would refuse before."""
     os.mkfifo(tmp_path / "part.xyz")
