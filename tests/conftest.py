@@ -20,7 +20,7 @@ from fracsim.study import MeshSettings, check
 from fracsim.study.solver_options import PLAIN_VARIABLE
 from repeats import REPEATS
 from support.forked_readers import ForkedReaders
-from support.ranks import Arrays, OnRanks, run_on_ranks
+from support.ranks import Arrays, OnRanks, run_on_ranks, share_starts
 
 # The same examples on every machine and in every run: a failure can be repeated, and no deadline depends on the load.
 settings.register_profile("fracsim", derandomize=True, deadline=None, max_examples=25, database=None)
@@ -111,6 +111,10 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.skip(f"of the fast solver: {about_fast.args[0]}"))
         if item.get_closest_marker("xdist_group") is None:
             item.add_marker(pytest.mark.xdist_group(item.path.stem))
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    share_starts(item.path.stem for item in session.items if item.get_closest_marker("ranks") is not None)
 
 
 @pytest.hookimpl(optionalhook=True)
