@@ -21,8 +21,9 @@ parallel := -n $(workers) --dist loadgroup
 
 on_ranks = $(shell grep -l "mark.ranks" $(wildcard tests/test_*.py))
 # Three ranks on two cores wait for one another at every message: beside other tests for minutes, alone for seconds.
+# `one_release=1`: without the tests that know of no DOLFINx, which another release has run.
 test: readers
-	./env pytest $(parallel) -m "not slow and not ranks"
+	./env pytest $(parallel) -m "not slow and not ranks$(if $(one_release), and not any_release)"
 	./env pytest -m "not slow and ranks" $(on_ranks)
 
 # The same tests, of PETSc and DOLFINx alone.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -21,6 +22,8 @@ from fracsim.study.solver_options import PLAIN_VARIABLE
 from repeats import REPEATS
 from support.forked_readers import ForkedReaders
 from support.ranks import Arrays, OnRanks, run_on_ranks, share_starts
+
+OF_DOLFINX = ("dolfinx", "basix", "ffcx", "ufl", "petsc4py")
 
 # The same examples on every machine and in every run: a failure can be repeated, and no deadline depends on the load.
 settings.register_profile("fracsim", derandomize=True, deadline=None, max_examples=25, database=None)
@@ -76,6 +79,14 @@ def readers_forked() -> Iterator[None]:
 def python_started(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each call with a time limit starts a Python, as in the package."""
     monkeypatch.setattr(time_limit, "subprocess", subprocess)
+
+
+@pytest.fixture(autouse=True)
+def no_dolfinx(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is marked `any_release` cannot import what comes with a release of DOLFINx."""
+    if request.node.get_closest_marker("any_release") is not None:
+        for name in OF_DOLFINX:
+            monkeypatch.setitem(sys.modules, name, None)
 
 
 @pytest.fixture

@@ -16,6 +16,8 @@ from fracsim.errors import Exit
 from fracsim.studies import folder
 from fracsim.study.documentation import study_schema
 
+pytestmark = pytest.mark.any_release
+
 NAMES = sorted(path.stem for path in folder().glob("*.toml"))
 
 

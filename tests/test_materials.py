@@ -13,6 +13,8 @@ from fracsim.study.check import check_study
 from fracsim.study.material_library import MATERIALS
 from fracsim.study.reader import study_text, validate
 
+pytestmark = pytest.mark.any_release
+
 GLASS = MATERIALS["soda-lime glass"]
 
 

@@ -17,6 +17,8 @@ from fracsim.meshes.mesh_conversion import MeshFileContents
 from fracsim.meshes.read import read_contents, read_mesh
 from fracsim.meshes.topology import signed_measures
 
+pytestmark = pytest.mark.any_release
+
 Write = Callable[[str], Path]
 
 # A unit cube of six tetrahedra about the diagonal from node 1 to node 7; nodes in the order of C3D8.

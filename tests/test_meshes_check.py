@@ -14,6 +14,8 @@ from fracsim.meshes.check import check_mesh
 from fracsim.meshes.quality import mesh_quality
 from fracsim.meshes.topology import boundary_facets, edges_of, facets_of, signed_measures, sorted_rows
 
+pytestmark = pytest.mark.any_release
+
 SQUARE = MeshData(np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]]), np.array([[0, 1, 2], [0, 2, 3]]))
 
 

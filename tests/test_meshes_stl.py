@@ -14,6 +14,8 @@ from fracsim.meshes import MeshError, stl
 from fracsim.meshes.read import read_contents
 from fracsim.meshes.surfaces.closed import read_surface
 
+pytestmark = pytest.mark.any_release
+
 FILES = Path(__file__).parent / "meshes"
 TETRAHEDRON = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], float)
 FACES = TETRAHEDRON[[[0, 2, 1], [0, 1, 3], [1, 2, 3], [2, 0, 3]]]

@@ -17,6 +17,8 @@ from fracsim.study.catalogue import catalogue
 from fracsim.study.check import check_study
 from fracsim.study.reader import find_study, load_study
 
+pytestmark = pytest.mark.any_release
+
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 STUDIES = sorted((ROOT / "studies").glob("*.toml"))

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.any_release
+
 ROOT = Path(__file__).parent.parent
 SOURCES = ("fracsim", "forms", "meshes", "studies", "tests")
 THEORY = ROOT / "docs" / "theory.md"

@@ -20,6 +20,8 @@ from fracsim.study.reader import validate
 from fracsim.study.rigid_bodies import BodySettings
 from fracsim.study.values import TimeTable
 
+pytestmark = pytest.mark.any_release
+
 Data = dict[str, Any]
 Path = tuple[str | int, ...]
 

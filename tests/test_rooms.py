@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -15,6 +16,9 @@ import pytest
 import fracsim
 import fracsim.forms
 import fracsim.meshes
+from conftest import OF_DOLFINX
+
+pytestmark = pytest.mark.any_release
 
 ROOT, FORMS = Path(fracsim.__file__).parent, Path(fracsim.forms.__file__).parent
 MESHES = Path(fracsim.meshes.__file__).parent
@@ -98,6 +102,16 @@ def test_a_study_is_read_without_dolfinx() -> None:
         assert not {name.split(".")[0] for name in used} & {"dolfinx", "petsc4py", "mpi4py", "ufl"}
         inner = {name for name in used if rooms_of({name.removeprefix("fracsim.")}) & set(LAYERS)}
         assert {name.removeprefix("fracsim.") for name in inner} <= WITHOUT_DOLFINX
+
+
+def test_tests_for_any_release_import_no_dolfinx() -> None:
+    """Their modules are imported, in a process of their own; conftest has them import none later."""
+    tests = Path(__file__).parent
+    mark = "\npytestmark = pytest.mark.any_release\n"
+    marked = [path.stem for path in sorted(tests.glob("test_*.py")) if mark in path.read_text(encoding="utf-8")]
+    assert len(marked) > 10
+    code = f"import sys; sys.modules |= dict.fromkeys({OF_DOLFINX}); import {', '.join(marked)}"
+    subprocess.run([sys.executable, "-c", code], cwd=tests, check=True, capture_output=True)
 
 
 def test_reports_read_files() -> None:

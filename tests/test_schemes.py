@@ -8,6 +8,8 @@ import pytest
 from fracsim.forms.schemes import BackwardEuler, GeneralizedAlpha, Newmark, QuasiStatic, Scheme
 from support.oscillator import Values, exact, run, slopes
 
+pytestmark = pytest.mark.any_release
+
 EPS = np.finfo(float).eps
 W, START = 3.0, (0.7, -1.1)
 

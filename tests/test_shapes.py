@@ -15,6 +15,8 @@ from fracsim.contact.shapes import SHAPES, Capsule, HalfSpace, RoundedBox, Round
 from fracsim.errors import InputError
 from support.shapes import ALL, BODIES, HOLLOW, differences, enclosed, facing, points, sampled
 
+pytestmark = pytest.mark.any_release
+
 EPS = np.finfo(float).eps
 all_shapes = pytest.mark.parametrize("shape", ALL.values(), ids=ALL.keys())
 bodies = pytest.mark.parametrize("shape", BODIES.values(), ids=BODIES.keys())

@@ -17,6 +17,8 @@ from fracsim.study import Study
 from fracsim.study.mesh_source import find_builder
 from fracsim.study.reader import find_study, load_study, study_text, validate
 
+pytestmark = pytest.mark.any_release
+
 Data = dict[str, Any]
 
 
