@@ -8,6 +8,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+from contextlib import chdir
 from pathlib import Path
 
 import pytest
@@ -30,7 +31,8 @@ def run_section(title: str, folder: Path) -> None:
             continue
         program, *arguments = shlex.split(command)
         if program == "fracsim":
-            result = fracsim(*arguments, cwd=folder, timeout=300)
+            with chdir(folder):
+                result = fracsim(*arguments, timeout=300)
         else:
             assert program == "python3"
             result = subprocess.run(
