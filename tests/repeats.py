@@ -142,4 +142,17 @@ REPEATS = (
     "test_rolling_ball.py::test_a_ball_begins_to_roll_alike_on_any_number_of_ranks[2]",
     # a weight that slides: just below the tangent, and solids at half of it
     "test_obstacle_pairs.py::test_a_weight_rubs_on_a_held_floor[0.3]",
+    # thick boats of small cells: thin ones of small cells, thick ones of large cells; a block that slides, solved by
+    # projections: with the other friction
+    "test_rigid_shells.py::test_a_boat_dropped_into_a_boat_comes_to_lie_in_it[0.2-0.04]",
+    "test_engine.py::test_a_block_slides_as_coulomb_says[projections-0.2]",
+    # an obstacle from a file beside a torn body: by its barrier if it spins, by its penalty if it does not
+    "test_clearance.py::test_nothing_far_is_near[spinning mesh-explicit-torn]",
+    "test_clearance.py::test_nothing_far_is_near[mesh-implicit-torn]",
+    # a bar that spalls, by generalized-alpha: by Newmark
+    "test_spall.py::test_a_cohesive_plane_with_inertia[generalized-alpha",
+    # round bodies of large cells that roll down an incline: of small cells; of large cells down a box
+    "test_rigid_rolling.py::test_round_bodies_roll_down_an_incline[cylinder-0.05",
+    "test_rigid_rolling.py::test_round_bodies_roll_down_an_incline[capsule-0.05",
+    "test_rigid_rolling.py::test_round_bodies_roll_down_an_incline[sphere-0.05",
 )
