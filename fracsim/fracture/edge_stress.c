@@ -197,7 +197,7 @@ void intact_edge_stress(
 
 /* Upper bound of the largest eigenvalue of dev s / p, p = |dev s| / sqrt(6), where dev s / p has the determinant 2 r.
 
-Roots of x^3 - 3 x - 2 r lie in [-2, 2]. The largest, 2 cos(acos(r) / 3), is concave in r, so that tangents bound it.
+   Roots of x^3 - 3 x - 2 r lie in [-2, 2]. The largest, 2 cos(acos(r) / 3), is concave in r, so that tangents bound it.
    From there Newton's method stays above it: by less than 1e-6 for r > -0.8, by 6 % where two eigenvalues are equal. */
 static inline double largest_root_bound(double r)
 {
