@@ -257,7 +257,7 @@ class PairSearch:
     def _search(self, x: Values, end: Values) -> None:
         """Search all pairs along a motion."""
         motion = self._motion(x, end)
-        self._pairs = [_sorted(pairs, self._along(motion, pairs)) for pairs in self._sets]
+        self._pairs = [sort_pairs(pairs, self._along(motion, pairs)) for pairs in self._sets]
         self._all, self._later = (motion, self._pairs), None
 
     def _search_moved(self, x: Values, end: Values, moved: Flags) -> None:
@@ -266,7 +266,7 @@ class PairSearch:
         motion, result = self._motion(x, end), []
         for pairs, numbers in zip(self._sets, self._all[1], strict=True):
             is_moved = moved[pairs.first[numbers[:, 0]]].any(axis=1) | moved[pairs.second[numbers[:, 1]]].any(axis=1)
-            result.append(_sorted(pairs, np.concatenate([numbers[~is_moved], self._along(motion, pairs, moved)])))
+            result.append(sort_pairs(pairs, np.concatenate([numbers[~is_moved], self._along(motion, pairs, moved)])))
         self._pairs, self._later = result, (motion, moved)
 
     def _motion(self, x: Values, end: Values) -> SearchedMotion:
@@ -279,7 +279,7 @@ class PairSearch:
         return near_pairs(pairs, self.filter, motion.start, motion.start + motion.change, reach, moved)
 
 
-def _sorted(pairs: SimplexPairs, numbers: Ints) -> Ints:
+def sort_pairs(pairs: SimplexPairs, numbers: Ints) -> Ints:
     """Pairs (k, 2) in the order of their numbers."""
     return numbers[np.argsort(numbers[:, 0] * len(pairs.second) + numbers[:, 1])]
 

@@ -22,7 +22,15 @@ import numpy.typing as npt
 
 from ..mesh.ghost_exchange import KeyLookup
 from .closest_point import minimise_on_simplex
-from .pair_search import PairFilter, SimplexPairs, intersecting_pairs, max_length, near_pairs, pair_distances
+from .pair_search import (
+    PairFilter,
+    SimplexPairs,
+    intersecting_pairs,
+    max_length,
+    near_pairs,
+    pair_distances,
+    sort_pairs,
+)
 from .penalty_edges import EdgeContacts
 from .penalty_law import ContactHistory, ContactStiffness, ElementRanks, PenaltyContacts, PenaltyForces
 from .retractable_surface import unit_normals
@@ -266,10 +274,7 @@ class PenaltyPairs:
     def near_contacts(self, x: Values) -> PenaltyContacts:
         """Contacts that may be closed a step later, with points at x; those of the last x are kept."""
         if self._near is None or not np.array_equal(x, self._near[0]):
-            items, reach = (
-                zip(self._kinds, self._candidates(x), strict=True),
-                PAIRS.ahead_gap * self.width,
-            )
+            items, reach = zip(self._kinds, self._candidates(x), strict=True), PAIRS.ahead_gap * self.width
             near = PenaltyContacts.join([kind.contacts_within(x, pairs, reach) for kind, pairs in items])
             self._near, self._touching = (x.copy(), near), None
         return self._near[1]
@@ -288,7 +293,7 @@ class PenaltyPairs:
         result = []
         for pairs in self._sets:
             near = near_pairs(pairs, self._filter, vertices, vertices, pairs.distance + 2 * self._margin)
-            result.append(near[np.lexsort(near.T[::-1])])
+            result.append(sort_pairs(pairs, near))
         self._searched = vertices, result
         return result
 

@@ -40,9 +40,9 @@ def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 600) -> A
     """Run `main(path)` of a module on ranks, one in this process; returns the arrays that its rank 0 saved.
     AssertionError with its output where it fails.
     """
-    if module in _sharing:
+    if module in _sharing and ranks > 1:
         if (module, ranks) not in _shared:
-            _run_shared(module, ranks, folder)
+            _run_shared(ranks, folder)
         if (module, ranks) in _shared:
             return _shared[module, ranks]
     target = target_of(module, ranks, folder)
@@ -55,12 +55,10 @@ def run_on_ranks(module: str, ranks: int, folder: Path, seconds: int = 600) -> A
     return loaded(target)
 
 
-def _run_shared(module: str, ranks: int, folder: Path) -> None:
+def _run_shared(ranks: int, folder: Path) -> None:
     """One start for the modules of all files that share them; where it fails, each has its own."""
-    modules = [module] if ranks == 1 else list(_sharing)
-    if ranks == 1:
-        import_module(module).main(str(target_of(module, 1, folder)))
-    elif started(ranks, ["support.joint", str(folder), *modules], 600).returncode:
+    modules = list(_sharing)
+    if started(ranks, ["support.joint", str(folder), *modules], 600).returncode:
         warnings.warn(f"{', '.join(modules)} failed together on {ranks} ranks, and are run one by one", stacklevel=2)
         _sharing.clear()
         return
