@@ -65,14 +65,14 @@ def test_a_point_over_a_facet_and_a_facet_over_a_point(tmp_path: Path) -> None:
     )
     term = term_of(scene)
     surface = term.surface.current
-    x, pairs = surface.rest_positions.copy(), surface.parts[0]
+    x, part = surface.rest_positions.copy(), surface.parts[0]
     lowest = np.flatnonzero(x[:, 2] == x[:, 2].min())
     x[lowest, 2] -= 0.007  # 0.003 apart, of 0.005
-    contacts = pairs.contact.contacts(pairs.points(x))
+    contacts = part.pairs.contacts(part.points(x))
     own = (contacts.points[:, 0] < len(x)) & (contacts.gap < 0.004)
     np.testing.assert_array_equal(np.sort(contacts.points[own, 0]), lowest)
     np.testing.assert_allclose(contacts.gap[own], 0.003)
-    only = contacts.select(own).gradient(term.law.distance, len(x) + len(pairs.mesh.points))
+    only = contacts.select(own).gradient(term.law.distance, len(x) + len(part.mesh.points))
     np.testing.assert_allclose(-only[contacts.points[own, 0], 2], contacts.stiffness[own] * 0.002)
     np.testing.assert_allclose(only.sum(axis=0), 0.0, atol=1e-12)
 

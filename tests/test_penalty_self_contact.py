@@ -15,7 +15,8 @@ from fracsim.contact.ipc_pairs import IpcPairs
 from fracsim.contact.penalty_contact import PenaltyContact
 from fracsim.contact.penalty_law import ContactStiffness, NodalMassShare, penalty_stiffness
 from fracsim.contact.penalty_pairs import PenaltyPairs
-from fracsim.contact.penalty_surface import PenaltyState, PenaltySurface
+from fracsim.contact.penalty_surface import PenaltyPart, PenaltyState
+from fracsim.contact.retractable_surface import RetractableSurface
 from fracsim.meshes.builders.box import Box
 from fracsim.scene import Scene
 from support.resumed import assert_alike, going_stopped_resumed
@@ -26,7 +27,7 @@ from test_self_contact import SOFT, two_blocks
 Values = npt.NDArray[np.float64]
 
 
-def contact_of(scene: Scene) -> tuple[PenaltyContact, PenaltySurface]:
+def contact_of(scene: Scene) -> tuple[PenaltyContact, RetractableSurface[PenaltyPart]]:
     (found,) = [term for term in scene.balance.terms if isinstance(term, PenaltyContact)]
     return found, found.surface.current
 
@@ -114,7 +115,7 @@ def test_two_bodies_collide(tmp_path: Path, dim: int) -> None:
         x = contact._end_positions()
         assert x is not None
         touched += contact.stored_energy() > 0
-        assert surface.parts[0].contact.contacts(x).gap.min(initial=1.0) > -0.01
+        assert surface.parts[0].pairs.contacts(x).gap.min(initial=1.0) > -0.01
     right = X[:, 0] > 1.01
     assert touched > 5 and (m * state.v.reshape(-1, dim))[right, 0].sum() > 0.7 * before[0]
     assert min(steps) > 0.75 * max(steps)
@@ -159,13 +160,13 @@ def test_what_breaks_in_touch_gains_nothing(tmp_path: Path) -> None:
     while contact.stored_energy() < 0.5:
         march(scene, state, 1)
     before, graph = contact.stored_energy(), scene.fracture.graph
-    pushed_keys = surface.parts[0].contact.history.points[:, 0]
+    pushed_keys = surface.parts[0].pairs.history.points[:, 0]
     graph.break_edges(np.random.default_rng(2).random(len(graph.broken)) < 0.5)
     scene.fracture.mark_changed()
     scene.balance.edges_broke(graph.pattern)
     _, again = contact_of(scene)
     assert again is not surface and len(again.rest_positions) > len(surface.rest_positions)
-    assert np.isin(again.parts[0].contact.history.points[:, 0], pushed_keys).any()
+    assert np.isin(again.parts[0].pairs.history.points[:, 0], pushed_keys).any()
     assert 0.1 * before < contact.stored_energy() <= before * (1 + 1e-6)
 
 
@@ -270,7 +271,7 @@ def test_rubbing_is_in_the_books(tmp_path: Path) -> None:
         assert report.kinetic + report.elastic + state.dissipated == pytest.approx(began, rel=0.02)
         x = contact._end_positions()
         assert x is not None
-        pairs = surface.parts[0].contact
+        pairs = surface.parts[0].pairs
         met = pairs.contacts(x)
         pull = met.spring_stiffness * np.linalg.norm(met.slip, axis=1)
         assert (pull <= 0.3 * met.spring_stiffness * (pairs.width - met.gap) * (1 + 1e-12)).all()

@@ -8,14 +8,15 @@ from typing import Any
 
 import meshio
 import numpy as np
+import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
-from fracsim.contact.barrier_surface import BarrierSurface
 from fracsim.contact.element_exchange import ElementRows, ElementSet, PointRows
 from fracsim.contact.laws import BARRIER
-from fracsim.contact.retractable_surface import SelfContactLaw
+from fracsim.contact.mesh_obstacles import BarrierPart
+from fracsim.contact.retractable_surface import RetractableSurface, SelfContactLaw
 from fracsim.contact.self_contact import SelfContact
 from fracsim.errors import InputError, NotConverged
 from fracsim.meshes.builders.box import Box
@@ -68,7 +69,7 @@ def test_two_bodies_collide(tmp_path: Path, dim: int, scheme: str, order: int) -
     for report in each_step(scene, state):
         assert report.kinetic + report.elastic < 0.5 * before[0] * (1 + 1e-6)
         x = contact.end_positions()
-        assert len(contact.surface.current.pairs.intersections(x)) == 0
+        assert len(contact.surface.current.parts[0].pairs.intersections(x)) == 0
         touched += contact.stored_energy() > 0
         after = (m * state.v.reshape(-1, dim)).sum(axis=0)
         np.testing.assert_allclose(after, before, atol=1e-5 * np.abs(before).max())
@@ -88,7 +89,7 @@ def test_a_block_meets_one_that_is_held(tmp_path: Path) -> None:
     m, before, impulse = scene.balance.mass.lumped[::2], state.v[::2].copy(), 0.0
     (contact,) = [term for term in scene.balance.terms if isinstance(term, SelfContact)]
     for report in each_step(scene, state):
-        assert len(contact.surface.current.pairs.intersections(contact.end_positions())) == 0
+        assert len(contact.surface.current.parts[0].pairs.intersections(contact.end_positions())) == 0
         assert (positions(scene) + state.u.reshape(-1, 2))[:, 0].max() > 1.8
         impulse += report.dt * scene.probes()[0]
     right = positions(scene)[:, 0] > 1.01
@@ -323,7 +324,7 @@ def test_a_hammer_goes_on_through_crumbs() -> None:
     for _ in each_step(scene, state):
         hammer = at + state.t * velocity
         assert np.linalg.norm(positions(scene) + state.u.reshape(-1, 2) - hammer, axis=1).min() > 0.15
-    assert len(contact.surface.current.pairs.intersections(contact.end_positions())) == 0
+    assert len(contact.surface.current.parts[0].pairs.intersections(contact.end_positions())) == 0
     assert scene.fracture.graph.broken_count > 10
 
 
@@ -334,7 +335,11 @@ def test_intersecting_faces_keep_their_numbers_where_others_are_excluded() -> No
     points = PointRows(numbers, numbers, x, np.zeros_like(x), none, arms, one, area=one, stiffness=0 * one)
     elements = ElementRows(numbers.reshape(3, 2), np.zeros(3, int), np.zeros(3, bool))
     law = SelfContactLaw(distance=0.01, stiffness=1.0, friction=0.0, sticking_speed=1.0)
-    surface = BarrierSurface(MPI.COMM_SELF, ElementSet(points, elements), law, (), 1.0)
+
+    def build(surface: RetractableSurface[BarrierPart], rows: npt.NDArray[np.int64]) -> list[BarrierPart]:
+        return [BarrierPart.build(x, surface.elements[rows], distance=law.distance, stiffness=1.0, edge=1.0)]
+
+    surface = RetractableSurface(MPI.COMM_SELF, ElementSet(points, elements), law, build, 1.0)
     u = np.zeros((1, 2))
     assert surface._intersecting_faces(u).tolist() == [1, 2]
     surface._exclude(np.array([0]))

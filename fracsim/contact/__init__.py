@@ -40,8 +40,8 @@ Surfaces with ipctk:
     partitioned_surface   surface distributed over the ranks, built again as edges break
     element_exchange      elements of a rank and of others near them
     retractable_surface   crack faces that are retracted where there is no room
-    barrier_surface, ipc_pairs, sample_points  surface and pairs of the barrier; sample points and friction at them
-    mesh_obstacles        pairs of a body and a triangle-mesh obstacle
+    ipc_pairs, sample_points  pairs of the barrier; sample points and friction at them
+    mesh_obstacles        triangle-mesh obstacles; contact of a body with itself or with one of them
     penalty_law           energy, forces, friction, stiffness and history of contacts of a penalty
     penalty_pairs, penalty_edges  points before facets, and edges before edges
     penalty_surface       surface and contacts of the penalty

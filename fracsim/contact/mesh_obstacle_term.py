@@ -10,7 +10,6 @@ Equations: docs/theory.md#contact, docs/theory.md#rigid-obstacles.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -20,18 +19,10 @@ from scipy.sparse import csr_matrix
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
-from .barrier_surface import BarrierBodySurface
 from .clearance import Clearance
 from .ipc_pairs import IpcPairs
 from .laws import ObstacleLaw
-from .mesh_obstacles import (
-    MESH,
-    AllMeshPairs,
-    MeshFriction,
-    MeshObstacle,
-    MeshObstaclePairs,
-    free_fraction_on_arcs,
-)
+from .mesh_obstacles import MESH, MeshObstacle, free_fraction_on_arcs
 from .node_contact import PoseDerivatives, point_set_derivatives
 from .obstacle import RigidObstacle
 from .obstacle_pairs import Numbers, PairDerivatives, PosedObstacles
@@ -39,7 +30,7 @@ from .pose import Pose, point_jacobian
 from .retractable_surface import SelfContactLaw
 from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 from .sample_points import IpcFriction
-from .self_contact import Pattern, SurfaceContact, mean_velocities
+from .self_contact import BarrierBodySurface, Pattern, SurfaceContact, mean_velocities
 from .step_limit import PoseMotion, stop_before_meshes
 from .triangle_mesh_shape import StackedMeshes, TriangleMeshShape, refine_triangles
 
@@ -57,7 +48,6 @@ class MeshObstacleTerm(SurfaceContact):
     """
 
     name = "solids"
-    friction: MeshFriction | None
 
     def __init__(
         self, domain: Domain, u: fem.Function, bodies: RigidObstacles, numbers: Sequence[int], law: SelfContactLaw
@@ -87,11 +77,6 @@ class MeshObstacleTerm(SurfaceContact):
         self.parts = self.surface, self.group, self.clearance, self.pose_contact
 
     # --- surface and obstacles ---
-
-    @property
-    def pairs(self) -> AllMeshPairs:
-        """Pairs of the surface and the obstacles."""
-        return cast("AllMeshPairs", self.surface.current.pairs)
 
     def _place_meshes(self, poses: Sequence[Pose]) -> None:
         """Move the meshes to poses."""
@@ -129,7 +114,7 @@ class MeshObstacleTerm(SurfaceContact):
         if self.group.bodies.evaluates_result:
             return  # friction is still that of the step
         self._start_velocity = level.v_n
-        self.friction = self._tangent_displacement = None
+        self.friction, self._tangent_displacement = self._no_friction(), None
         self._started_near = not self.clearance.is_far([level.u_n], self.group.step_motions)
         self.start_positions = None
         # one row that stands for all points of an obstacle
@@ -141,9 +126,8 @@ class MeshObstacleTerm(SurfaceContact):
             self._extend_faces(level.u_n)
             self.start_positions = x = self.surface.positions(level.u_n)
             self._exchange_count = self.surface.exchange_count
-            self._start_gradients = [pairs.full_gradient(x)[len(x) :] for pairs in self.pairs.pairs]
-            if any(mesh.friction for mesh in self._meshes):
-                self.friction = self.pairs.lag_friction(x, x, slip)
+            self._start_gradients = [part.full_gradient(x)[len(x) :] for part in self.contacts]
+            self.friction = [part.lag_friction(x, slip) for part in self.contacts]
         self._place_meshes(self.group.poses)
 
     def _sticking_slip(self, level: TimeLevel) -> float:
@@ -165,16 +149,17 @@ class MeshObstacleTerm(SurfaceContact):
     def _record_work(self, x: Values, forces: list[Values]) -> None:
         """Record work of this rank's pairs with the body at x (n, 3), m, and add forces on obstacles to `forces`, N."""
         end_weight, start_gradients, n = self.level.contact_weights.end_work_share, self._start_gradients, len(x)
-        for number, (pairs, start_pose) in enumerate(zip(self.pairs.pairs, self.group.start_poses, strict=True)):
+        poses = self.group.start_poses
+        for number, (part, mesh, start_pose) in enumerate(zip(self.contacts, self._meshes, poses, strict=True)):
             # of the obstacle on the body, at the points of the obstacle
-            gradient, friction_work = pairs.full_gradient(x)[n:], 0.0
+            gradient, friction_work = part.full_gradient(x)[n:], 0.0
             forces[number] -= gradient.sum(axis=0)
-            motion = pairs.mesh.positions - pairs.mesh.positions_at(start_pose)
-            if self.friction is not None and self.start_positions is not None:
-                friction = self.friction.full_gradient(pairs, x)
-                friction_work = float(np.vdot(friction[n:], motion))
-                self.group.friction_loss += friction_work + float(np.vdot(friction[:n], x - self.start_positions))
-                forces[number] -= friction[n:].sum(axis=0)
+            motion = mesh.positions - mesh.positions_at(start_pose)
+            if (friction := self.friction[number]) is not None and self.start_positions is not None:
+                of_friction = friction.gradient(part.points(x))
+                friction_work = float(np.vdot(of_friction[n:], motion))
+                self.group.friction_loss += friction_work + float(np.vdot(of_friction[:n], x - self.start_positions))
+                forces[number] -= of_friction[n:].sum(axis=0)
             mean_gradient = end_weight * gradient + (1 - end_weight) * start_gradients[number]
             self.group.work[number] = float(np.vdot(mean_gradient, motion)) + friction_work
 
@@ -194,11 +179,11 @@ class MeshObstacleTerm(SurfaceContact):
         x, fraction = self.surface.positions(u), 1.0
         end = x if change is None else x + self.surface.current.point_map.weights @ self.surface.nodal_values(change)
         for index, (posed, _) in moving.items():
-            pairs, (_, end_posed) = self.pairs.pairs[index], motions[index]
-            # pairs take the obstacle from the given pose to where it is
-            pairs.mesh.move_to(end_posed.pose)
-            fraction = min(fraction, pairs.moving_free_fraction(x, end, posed.pose))
-            pairs.mesh.move_to(self.group.poses[index])
+            mesh, (_, end_posed) = self._meshes[index], motions[index]
+            # contacts take the obstacle from the given pose to where it is
+            mesh.move_to(end_posed.pose)
+            fraction = min(fraction, self.contacts[index].free_fraction(x, end, posed.pose))
+            mesh.move_to(self.group.poses[index])
         return fraction
 
     def feasible_guess(self, u: Values) -> Values:
@@ -210,8 +195,8 @@ class MeshObstacleTerm(SurfaceContact):
             return u
         prescribed = [index for index, obstacle in enumerate(self.group.obstacles) if not obstacle.free]
         start_poses = [self.group.start_poses[index] for index in prescribed]
-        end, pairs = level.displacement_at_end(u), self.pairs.select(prescribed)
-        if (guess := stop_before_meshes(self.surface, pairs, level.u_n, end, start_poses)) is end:
+        end, parts = level.displacement_at_end(u), [self.contacts[index] for index in prescribed]
+        if (guess := stop_before_meshes(self.surface, parts, level.u_n, end, start_poses)) is end:
             return u
         change: Values = guess - end
         if self.surface.law.corners_only:
@@ -224,7 +209,8 @@ class MeshObstacleTerm(SurfaceContact):
         if self.clearance.is_far([u_n, u_end], self.group.step_motions):
             return True
         start, end = self.surface.positions(u_n), self.surface.positions(u_end)
-        return self.pairs.moving_free_fraction(start, end, self.group.start_poses) == 1
+        parts = zip(self.contacts, self.group.start_poses, strict=True)
+        return min([part.free_fraction(start, end, pose) for part, pose in parts]) == 1
 
     # --- contact as the obstacles see it (PoseContact) ---
 
@@ -234,39 +220,28 @@ class MeshObstacleTerm(SurfaceContact):
 
     def rank_derivatives(self, index: int, *, exact: bool) -> PoseDerivatives:
         """Energy and derivatives by the pose of an obstacle, of this rank's pairs (collective)."""
-        x, pairs = self.end_positions(), self.pairs.pairs[index]
+        x, part, friction = self.end_positions(), self.contacts[index], self.friction[index]
         # far on this rank; others may be near
-        if pairs.is_far(x):
+        if part.is_far(x):
             return PoseDerivatives.none(6)
-        points, mesh = pairs.with_mesh(x), slice(x.size, None)
-        energy, gradient = pairs.contact.energy(points), pairs.contact.gradient(points)
-        H = pairs.contact.hessian(points, exact=exact)
-        if (friction := self._friction_with(pairs)) is not None:
-            energy, gradient = energy + friction.energy(points), gradient + friction.gradient(points)
-            H = H + friction.hessian(points, exact=exact)
-        return point_set_derivatives(energy, gradient[len(x) :], H[mesh, mesh], pairs.mesh.arms, exact=exact)
+        energy = part.energy(x) + (0.0 if friction is None else friction.energy(part.points(x)))
+        gradient, mesh = part.full_gradient(x, friction)[len(x) :], slice(x.size, None)
+        H = part.full_hessian(x, friction, exact=exact)[mesh, mesh]
+        return point_set_derivatives(energy, gradient, H, self._meshes[index].arms, exact=exact)
 
     def rank_mixed_hessian(self, index: int) -> Values:
         """(columns, 18) second derivatives by nodes and the pose of an obstacle, of this rank's pairs (collective)."""
-        x, pairs = self.end_positions(), self.pairs.pairs[index]
-        point_map, body = self.surface.current.point_map, slice(None, x.size)
-        if pairs.is_far(x):
+        x, part, point_map = self.end_positions(), self.contacts[index], self.surface.current.point_map
+        if part.is_far(x):
             return np.zeros((point_map.weights.shape[1], 18))
-        points = pairs.with_mesh(x)
-        H = pairs.contact.hessian(points)
-        if (friction := self._friction_with(pairs)) is not None:
-            H = H + friction.hessian(points)
-        mixed = H[body, x.size :] @ point_jacobian(pairs.mesh.arms).reshape(-1, 6)
+        H = part.full_hessian(x, self.friction[index])[: x.size, x.size :]
+        mixed = H @ point_jacobian(self._meshes[index].arms).reshape(-1, 6)
         return point_map.nodal_forces(mixed.reshape(len(x), -1))
 
     def assemble_mixed_hessian(self, index: int, part: Values) -> Values:
         """(owned dofs, 6) sums at the nodes of what `rank_mixed_hessian` returned (collective)."""
         columns = part.reshape(-1, 3, 6)
         return np.stack([self.surface.sum_at_nodes(columns[:, :, axis]) for axis in range(6)], axis=1)
-
-    def _friction_with(self, pairs: MeshObstaclePairs) -> IpcFriction | None:
-        """Lagged friction with one obstacle; None: without friction."""
-        return None if self.friction is None else self.friction.friction_with(pairs)
 
     def uses_exact_tangent(self) -> bool:
         """Whether the tangent at the current u may have negative eigenvalues: not with free obstacles."""
@@ -276,19 +251,19 @@ class MeshObstacleTerm(SurfaceContact):
 
     def _current_force(self, number: int) -> Values:
         """(3,) force of the body on an obstacle at the current u, of this rank's pairs, N (collective)."""
-        return np.asarray(self.pairs.pairs[number].body_gradient(self.end_positions()).sum(axis=0))
+        return np.asarray(self.contacts[number].gradient(self.end_positions()).sum(axis=0))
 
     def _gap(self, number: int) -> float:
         """Least distance between an obstacle and the body, m, of this rank's pairs (collective)."""
         if self.is_far():
             return self.clearance.least_gap(number, self.end_displacement, self.group.posed)
-        return self.pairs.pairs[number].gap(self.end_positions())
+        return self.contacts[number].gap(self.end_positions())
 
     def pushed_points(self) -> list[tuple[Values, Values, Values]]:
         """(n, 3) points of this rank before each obstacle, m, normal forces, N, start velocities, m/s (collective)."""
         x, nodal, surface = self.end_positions(), self.surface.nodal_values(self._start_velocity), self.surface.current
         velocity = surface.point_map.weights @ nodal
-        return [(x, -surface.sum_at_points(pairs.body_gradient(x)), velocity) for pairs in self.pairs.pairs]
+        return [(x, -surface.sum_at_points(part.gradient(x)), velocity) for part in self.contacts]
 
 
 def build_mesh_obstacles(group: ObstacleGroup, edge: float) -> list[MeshObstacle]:

@@ -1,13 +1,14 @@
-"""Barrier, friction and collision detection between the surface of a body and triangle-mesh obstacles.
+"""Triangle-mesh obstacles, and contact of the surface of a body with itself or with one of them.
 
-The points of an obstacle are no unknowns: x (n, 3) are those of the body, and the force on an obstacle is minus the sum
-of its forces on them. Each obstacle has pairs of its own with the body: its friction, its force, its gap.
+Each obstacle has pairs of its own with the body: its friction, its force, its gap. The points of an obstacle are no
+unknowns: x (n, d) are those of the body, and pairs have the points (n + m, d) of the body and of the obstacle.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import ipctk
 import numpy as np
@@ -160,214 +161,172 @@ class MeshObstacle:
         return distance
 
 
-class MeshObstaclePairs:
-    """Pairs of a body's surface and one obstacle.
+class ElementPairs(Protocol):
+    """Pairs of the elements of a surface, with a barrier or a penalty; points at x (n, d), m."""
 
-    Points are (n + m, 3): those of the body, then those of the obstacle.
+    def energy(self, x: Values) -> float:
+        """Energy, J."""
+
+    def gradient(self, x: Values) -> Values:
+        """(n, d) derivatives of the energy, N: minus the forces on the points."""
+
+    def min_gap(self, x: Values) -> float:
+        """Least distance within contact, m; infinite where there is none."""
+
+    def intersections(self, x: Values) -> Ints:
+        """(k, 2) elements that intersect."""
+
+    def clear_caches(self) -> None:
+        """Discard the candidates of collision detection."""
+
+
+class SurfacePart[P: ElementPairs]:
+    """Contact of the surface of a body with itself, or with one obstacle; x (n, d) of the body, m.
 
     Attributes:
-        mesh: the obstacle.
-        body_count: n.
-        edge: mean length of edges of the body, m.
-        contact: barrier between the elements of both.
+        pairs: barrier or penalty of the points (n + m, d) of the body and of the obstacle.
+        reach: distance within which it acts, m.
+        mesh: the obstacle; None: the body with itself.
+        body_points: (k,) points of the body's elements.
+        friction: coefficient.
     """
 
     def __init__(
-        self,
-        rest_positions: Values,
+        self, pairs: P, elements: Ints, reach: float, friction: float, mesh: MeshObstacle | None = None
+    ) -> None:
+        """`elements`: (k, d) of the body; they precede those of the obstacle."""
+        self.pairs, self.reach, self.friction, self.mesh = pairs, reach, friction, mesh
+        self.body_points, self._element_count = np.unique(elements), len(elements)
+
+    def is_far(self, x: Values) -> bool:
+        """Whether no point of the body can be in contact with the obstacle."""
+        if self.mesh is None:
+            return False
+        return not len(self.body_points) or self.mesh.is_far(x[self.body_points], self.reach)
+
+    def points(self, x: Values, pose: Pose | None = None) -> Values:
+        """(n + m, d) points, with the obstacle at a pose, m; None: the current one."""
+        if self.mesh is None:
+            return x
+        return np.concatenate([x, self.mesh.positions if pose is None else self.mesh.positions_at(pose)])
+
+    def gradient(self, x: Values) -> Values:
+        """(n, d) derivatives of the energy by the points of the body, N."""
+        return np.zeros_like(x) if self.is_far(x) else self.pairs.gradient(self.points(x))[: len(x)]
+
+    def gap(self, x: Values) -> float:
+        """Least distance from the obstacle, m; beyond contact that of vertices."""
+        if self.mesh is None or not len(self.body_points):
+            return np.inf
+        gap = np.inf if self.is_far(x) else self.pairs.min_gap(self.points(x))
+        return gap if gap < np.inf else max(self.mesh.vertex_distance(x[self.body_points]), self.reach)
+
+    def cut_elements(self, x: Values) -> Ints:
+        """(k,) elements of the body that others of it, or the obstacle, intersect."""
+        if self.is_far(x):
+            return np.empty(0, np.int64)
+        pairs = self.pairs.intersections(self.points(x))
+        if self.mesh is not None:
+            pairs = pairs[(pairs < self._element_count).sum(axis=1) == 1]
+        return np.unique(pairs[pairs < self._element_count])
+
+
+class BarrierPart(SurfacePart[IpcPairs]):
+    """Part with a barrier, and with lagged friction if it is given."""
+
+    @classmethod
+    def build(
+        cls,
+        X: Values,
         elements: Ints,
-        mesh: MeshObstacle,
+        mesh: MeshObstacle | None = None,
         *,
         distance: float,
         stiffness: float,
         edge: float,
+        friction: float = 0.0,
         share: PairShare | None = None,
-    ) -> None:
-        """Pairs of both surfaces.
+    ) -> BarrierPart:
+        """Part of a surface.
 
         Args:
-            rest_positions: (n, 3) of the body, m.
-            elements: (k, 3) of the body.
-            mesh: the obstacle, whose coefficient of friction counts.
+            X: (n, d) reference positions of the body, m.
+            elements: (k, d) of the body.
+            mesh: the obstacle, whose coefficient of friction counts; None: the body with itself.
             distance: at which contact begins, m.
             stiffness: of the barrier, Pa.
             edge: mean length of edges of the body, m.
+            friction: coefficient.
             share: of this rank in the pairs; None: all of them.
         """
-        self.mesh, self.edge, self._reach = mesh, edge, distance
-        self.body_count, self._element_count = len(rest_positions), len(elements)
-        self._body_points = np.unique(elements)
+        if mesh is None:
+            pairs = IpcPairs(
+                X, elements, distance=distance, stiffness=stiffness, friction=friction, share=share, edge=edge
+            )
+            return cls(pairs, elements, distance, friction)
         # the obstacle in its own frame, so that the measures of its elements are constant
-        points = np.concatenate([rest_positions, mesh.points])
-        triangles = np.concatenate([elements, mesh.triangles + len(rest_positions)])
-        patches = np.repeat(np.array([0, 1], np.int32), [len(rest_positions), len(mesh.points)])
-        parameters = {"distance": distance, "stiffness": stiffness, "friction": mesh.friction}
-        share = None if share is None else share.with_others(len(mesh.points))
+        n, m = len(X), len(mesh.points)
+        points, triangles = np.concatenate([X, mesh.points]), np.concatenate([elements, mesh.triangles + n])
         # the mean of both bounds the pieces of a motion: an obstacle may be coarser than the body
-        edges = np.repeat([edge, mesh.edge], [len(rest_positions), len(mesh.points)])
-        self.contact = IpcPairs(points, triangles, **parameters, share=share, patch=patches, edge=edges)
+        edges, patch = np.repeat([edge, mesh.edge], [n, m]), np.repeat(np.array([0, 1], np.int32), [n, m])
+        share = None if share is None else share.with_others(m)
+        pairs = IpcPairs(
+            points, triangles, distance=distance, stiffness=stiffness, friction=mesh.friction, share=share,
+            patch=patch, edge=edges,
+        )  # fmt: skip
+        return cls(pairs, elements, distance, mesh.friction, mesh)
 
-    def with_mesh(self, x: Values) -> Values:
-        """(n + m, 3) points of the body at x (n, 3), and of the obstacle at its current pose, m."""
-        return np.concatenate([x, self.mesh.positions])
+    def energy(self, x: Values) -> float:
+        """Energy of the barrier, J."""
+        return 0.0 if self.is_far(x) else self.pairs.energy(self.points(x))
 
-    def is_far(self, x: Values) -> bool:
-        """Whether no point of the body at x (n, 3) can be within the barrier."""
-        return not len(self._body_points) or self.mesh.is_far(x[self._body_points], self._reach)
+    def full_gradient(self, x: Values, friction: IpcFriction | None = None) -> Values:
+        """(n + m, d) derivatives of the energy, and of the potential of friction, by all points, N."""
+        points = self.points(x)
+        gradient = np.zeros_like(points) if self.is_far(x) else self.pairs.gradient(points)
+        return gradient if friction is None else gradient + friction.gradient(points)
 
-    def body_gradient(self, x: Values) -> Values:
-        """(n, 3) dE/dx with the body at x (n, 3), N: minus the forces of the obstacle on the body."""
-        return self.full_gradient(x)[: self.body_count]
+    def full_hessian(self, x: Values, friction: IpcFriction | None = None, *, exact: bool = False) -> csr_matrix:
+        """(n d + m d, n d + m d) second derivatives by all points, N/m; as of IpcPairs."""
+        points = self.points(x)
+        H = csr_matrix((points.size,) * 2) if self.is_far(x) else self.pairs.hessian(points, exact=exact)
+        return H if friction is None else csr_matrix(H + friction.hessian(points, exact=exact))
 
-    def full_gradient(self, x: Values) -> Values:
-        """(n + m, 3) dE/dx by the points of the body and of the obstacle, N."""
-        points = self.with_mesh(x)
-        return np.zeros_like(points) if self.is_far(x) else self.contact.gradient(points)
+    def lag_friction(self, x: Values, slip: float) -> IpcFriction | None:
+        """Friction of a step that starts at x; None: there is none.
 
-    def moving_free_fraction(self, x: Values, end: Values, start_pose: Pose) -> float:
-        """Fraction of the motions of body and obstacle without a collision.
-
-        Args:
-            x: (n, 3) points of the body at the start, m.
-            end: (n, 3) points of the body at the end of their straight motion, m.
-            start_pose: pose of the obstacle at the start; it is at the end now.
+        `slip`: from which on friction has its full size, m.
         """
-        end_pose, q, motion = self.mesh.pose, start_pose.increment_to(self.mesh.pose), end - x
+        if not self.friction or self.is_far(x):
+            return None
+        return self.pairs.lag_friction(points := self.points(x), points, slip)
+
+    def free_fraction(self, x: Values, end: Values, start_pose: Pose | None = None) -> float:
+        """Fraction of the straight motion from x to `end` (n, d) without a collision (collective).
+
+        `start_pose`: pose of the obstacle at the start; it is at the end now.
+        """
+        if self.mesh is None or start_pose is None:
+            return self.pairs.free_fraction(x, end)
+        q, motion = start_pose.increment_to(self.mesh.pose), end - x
         if not q[3:].any():
-            return self.contact.free_fraction(self._points_at(x, start_pose), self._points_at(end, end_pose))
+            return self.pairs.free_fraction(self.points(x, start_pose), self.points(end))
 
         def positions(fraction: float) -> Values:
-            return self._points_at(x + fraction * motion, start_pose.incremented(fraction * q))
+            return self.points(x + fraction * motion, start_pose.incremented(fraction * q))
 
-        return free_fraction_on_arcs(self.contact.free_fraction, positions, float(np.linalg.norm(q[3:])))
-
-    def _points_at(self, x: Values, pose: Pose) -> Values:
-        return np.concatenate([x, self.mesh.positions_at(pose)])
-
-    def cut_elements(self, x: Values) -> Ints:
-        """(k,) elements of the body at x (n, 3) that the obstacle intersects."""
-        if self.is_far(x):
-            return np.empty(0, np.int64)
-        pairs = np.sort(self.contact.intersections(self.with_mesh(x)), axis=1)
-        of_both = (pairs[:, 0] < self._element_count) & (pairs[:, 1] >= self._element_count)
-        return np.unique(pairs[of_both, 0])
-
-    def gap(self, x: Values) -> float:
-        """Least distance with the body at x (n, 3), m; beyond the barrier that of vertices."""
-        if not len(self._body_points):
-            return float("inf")
-        gap = float("inf") if self.is_far(x) else self.contact.min_gap(self.with_mesh(x))
-        return gap if gap < float("inf") else max(self.mesh.vertex_distance(x[self._body_points]), self._reach)
+        return free_fraction_on_arcs(self.pairs.free_fraction, positions, float(np.linalg.norm(q[3:])))
 
     def safe_distances(self, x: Values, limit: float) -> Values:
-        """(n,) distances that each point of the body at x (n, 3) may move by itself, m; infinite from `limit` on.
+        """(n,) distances that each point of the body may move by itself, m; infinite from `limit` on.
 
         Of this rank's points.
         """
-        collision_mesh = self.contact.collision_mesh
-        vertices, candidates = collision_mesh.vertices(self.with_mesh(x)), ipctk.Candidates()
+        collision_mesh = self.pairs.collision_mesh
+        vertices, candidates = collision_mesh.vertices(self.points(x)), ipctk.Candidates()
         candidates.build(collision_mesh, vertices, limit, ipctk.LBVH())
         safe = candidates.compute_per_vertex_safe_distances(collision_mesh, vertices, limit)
-        distances = np.array(collision_mesh.to_full_dof(np.repeat(safe, 3))[: 3 * self.body_count : 3])
-        unlimited = np.ones(self.body_count, bool)
-        unlimited[self._body_points] = distances[self._body_points] >= MESH.unlimited * limit
+        distances = np.array(collision_mesh.to_full_dof(np.repeat(safe, 3))[: 3 * len(x) : 3])
+        unlimited = np.ones(len(x), bool)
+        unlimited[self.body_points] = distances[self.body_points] >= MESH.unlimited * limit
         return np.where(unlimited, np.inf, distances)
-
-
-class AllMeshPairs:
-    """Pairs of a body's surface and several obstacles; x (n, 3) of the body, m.
-
-    Attributes:
-        pairs: of each obstacle.
-    """
-
-    def __init__(self, pairs: Sequence[MeshObstaclePairs]) -> None:
-        self.pairs = pairs
-
-    def select(self, numbers: Sequence[int]) -> AllMeshPairs:
-        """Pairs of some of the obstacles."""
-        return AllMeshPairs([self.pairs[number] for number in numbers])
-
-    def _near(self, x: Values) -> Sequence[MeshObstaclePairs]:
-        return [pairs for pairs in self.pairs if not pairs.is_far(x)]
-
-    def energy(self, x: Values) -> float:
-        """Energy E, J."""
-        return sum(pairs.contact.energy(pairs.with_mesh(x)) for pairs in self._near(x))
-
-    def gradient(self, x: Values) -> Values:
-        """(n, 3) dE/dx, N."""
-        return np.sum([pairs.body_gradient(x) for pairs in self.pairs], axis=0)
-
-    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
-        """(3 n, 3 n) d2E/dx2, N/m; as for IpcPairs."""
-        H, size = csr_matrix((x.size, x.size)), x.size
-        for pairs in self._near(x):
-            H = H + pairs.contact.hessian(pairs.with_mesh(x), exact=exact)[:size, :size]
-        return csr_matrix(H)
-
-    def set_stiffness(self, stiffness: float) -> None:
-        """Set the stiffness of the barriers, Pa."""
-        for pairs in self.pairs:
-            pairs.contact.set_stiffness(stiffness)
-
-    def clear_caches(self) -> None:
-        """Discard the candidates of collision detection."""
-        for pairs in self.pairs:
-            pairs.contact.clear_caches()
-
-    def min_gap(self, x: Values) -> float:
-        """Least distance within the barrier, m; infinite where there is none."""
-        return min((pairs.contact.min_gap(pairs.with_mesh(x)) for pairs in self._near(x)), default=np.inf)
-
-    def moving_free_fraction(self, x: Values, end: Values, start_poses: Sequence[Pose]) -> float:
-        """Fraction of the motions of body and obstacles without a collision; obstacles come from `start_poses`."""
-        items = zip(self.pairs, start_poses, strict=True)
-        return min((pairs.moving_free_fraction(x, end, pose) for pairs, pose in items), default=1.0)
-
-    def lag_friction(self, x: Values, start: Values, slip: float) -> MeshFriction:
-        """Friction with pressures and tangents at x and obstacles at their current poses; as of IpcPairs."""
-        rubbing = [pairs for pairs in self._near(x) if pairs.mesh.friction]
-        friction = [pairs.contact.lag_friction(pairs.with_mesh(x), pairs.with_mesh(start), slip) for pairs in rubbing]
-        return MeshFriction(rubbing, friction)
-
-
-@dataclass(frozen=True)
-class MeshFriction:
-    """Lagged friction with several obstacles; x (n, 3) of the body, m.
-
-    Attributes:
-        pairs: of obstacles with friction.
-        friction: of each.
-    """
-
-    pairs: Sequence[MeshObstaclePairs]
-    friction: list[IpcFriction]
-
-    def energy(self, x: Values) -> float:
-        """Potential, J; as of IpcFriction."""
-        return sum(
-            friction.energy(pairs.with_mesh(x)) for pairs, friction in zip(self.pairs, self.friction, strict=True)
-        )
-
-    def full_gradient(self, pairs: MeshObstaclePairs, x: Values) -> Values:
-        """(n + m, 3) derivatives of the friction with one obstacle by the points of both, N."""
-        points, friction = pairs.with_mesh(x), self.friction_with(pairs)
-        return np.zeros_like(points) if friction is None else friction.gradient(points)
-
-    def friction_with(self, pairs: MeshObstaclePairs) -> IpcFriction | None:
-        """Friction with one obstacle; None: without friction."""
-        items = zip(self.pairs, self.friction, strict=True)
-        return next((friction for item_pairs, friction in items if item_pairs is pairs), None)
-
-    def gradient(self, x: Values) -> Values:
-        """(n, 3) derivatives by the points of the body, N."""
-        gradients = (self.full_gradient(pairs, x)[: len(x)] for pairs in self.pairs)
-        return np.sum([np.zeros_like(x), *gradients], axis=0)
-
-    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
-        """(3 n, 3 n) second derivatives by the points of the body, N/m."""
-        H, size = csr_matrix((x.size, x.size)), x.size
-        for pairs, friction in zip(self.pairs, self.friction, strict=True):
-            H = H + friction.hessian(pairs.with_mesh(x), exact=exact)[:size, :size]
-        return csr_matrix(H)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import cast
+from typing import Any, ClassVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -47,7 +47,7 @@ from ..mesh.split_surface.surface_motion import PointParents
 from ..meshes.topology import boundary_facets
 from .clearance import FollowingPoints
 from .element_exchange import ElementRows, ElementSet, PointRows, bounding_boxes, exchange_elements
-from .mesh_obstacles import MeshObstacle
+from .mesh_obstacles import MeshObstacle, SurfacePart
 from .retractable_surface import (
     SURFACE,
     RetractableSurface,
@@ -83,11 +83,12 @@ class SurfaceState:
     is_new: bool
 
 
-class PartitionedSurface[S: RetractableSurface]:
+class PartitionedSurface[Part: SurfacePart[Any]]:
     """Contact surface of a body, built again when edges break (HistoryTerm, CutFaces, SurfaceSeparator).
 
     Attributes:
         law: contact law.
+        mean_edge: mean length of edges of the mesh, m.
         current: elements of this rank and of others near them.
         element_set: those of this rank, with their factors and flags at the last exchange.
         surface_count: number of surfaces until now.
@@ -97,7 +98,8 @@ class PartitionedSurface[S: RetractableSurface]:
             each exchange serves too, m; None: none.
     """
 
-    current: S
+    closed_pressure: ClassVar[float]  # pressure, in stiffnesses, of faces without room
+    current: RetractableSurface[Part]
     element_set: ElementSet
     _path: list[list[Values]]  # points at each displacement for which elements were exchanged, m
     start_displacement: Values | None = None
@@ -132,7 +134,7 @@ class PartitionedSurface[S: RetractableSurface]:
             InputError: if the surface at rest intersects itself, or an obstacle.
         """
         self.law, self._domain, self._u, self._meshes = law, domain, u, meshes
-        self._comm, self._owned = domain.comm, domain.node_count * domain.dim
+        self._comm, self._owned, self.mean_edge = domain.comm, domain.node_count * domain.dim, domain.mean_edge_length
         is_refined = domain.order == 2 and not law.corners_only
         # subdivided quadratic cells do not break
         self._cell_parts = 2**domain.dim if is_refined else 1
@@ -150,15 +152,19 @@ class PartitionedSurface[S: RetractableSurface]:
 
     # --- contacts, which a subclass has ---
 
-    def _build_surface(self, element_set: ElementSet) -> S:
-        """Elements of this rank and of others near them, with their contacts."""
+    def _build_parts(self, surface: RetractableSurface[Part], elements: Ints) -> list[Part]:
+        """Contacts of elements (k,) of a surface, with themselves or with each obstacle."""
+        return [self._build_part(surface, elements, mesh) for mesh in self._meshes or (None,)]
+
+    def _build_part(self, surface: RetractableSurface[Part], elements: Ints, mesh: MeshObstacle | None) -> Part:
+        """Contacts of elements (k,) of a surface with themselves (None), or with an obstacle."""
         raise NotImplementedError("a subclass has contacts")
 
     def _point_stiffness(self, weights: csr_matrix, area: Values, local_area: Values) -> Values:
         """(n,) stiffness of the points of this rank, N/m (collective); 0 where contact has none of points."""
         return np.zeros(len(area))
 
-    def _keep_history(self, previous: S) -> None:
+    def _keep_history(self, previous: RetractableSurface[Part]) -> None:
         """Take over the contacts at the end of the last step (collective)."""
 
     def _searched_boxes(self, boxes: Values) -> Values:
@@ -353,7 +359,8 @@ class PartitionedSurface[S: RetractableSurface]:
             boxes = bounding_boxes(np.concatenate(ends, axis=1))
             searched = self._searched_boxes(boxes)
             element_set = exchange_elements(comm, element_set, boxes, searched, self._search_reach)
-        self.current, self.exchange_count = self._build_surface(element_set), self.exchange_count + 1
+        self.current = RetractableSurface(comm, element_set, self.law, self._build_parts, self.closed_pressure)
+        self.exchange_count += 1
         points = self.current.element_set.points
         self._point_rows = KeyLookup(points.keys)(self.element_set.points.keys)
         self._element_rows = np.flatnonzero(element_set.elements.rank == comm.rank)

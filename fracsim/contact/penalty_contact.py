@@ -106,7 +106,7 @@ class PenaltyContact(Term):
         """Discard the candidates of collision detection (not collective)."""
         self.update_displacement()
         for part in self._parts:
-            part.contact.clear_caches()
+            part.pairs.clear_caches()
 
     # --- forces and energy ---
 
@@ -199,13 +199,13 @@ class PenaltyContact(Term):
         """Store contacts at the end of a step with the body at x (n, d), m; whether any are near on this rank."""
         is_near = False
         for part, forces in zip(self._parts, self._part_forces(x), strict=True):
-            history = part.contact.history
+            history = part.pairs.history
             if forces is None and not len(history.points):
                 continue
             forces = forces or part.forces(x)
             self._friction_loss += forces.dissipated(history.spring_energy)
-            part.contact.end_step(part.points(x), forces.slips)
-            is_near |= len(part.contact.history.points) > 0
+            part.pairs.end_step(part.points(x), forces.slips)
+            is_near |= len(part.pairs.history.points) > 0
         return is_near
 
     def begin_solve(self) -> None:
@@ -319,7 +319,7 @@ class PenaltyMeshContact(PenaltyContact):
             rows: tuple[Values, Values] = np.empty((0, 3)), np.empty(0)
             if not part.is_far(x):
                 points = part.points(x)
-                near = part.contact.near_contacts(points)
+                near = part.pairs.near_contacts(points)
                 rows = near.positions(points, np.arange(len(points)) >= len(x)), near.stiffness
             positions, stiffness = (np.concatenate(arrays) for arrays in zip(*allgather(self.comm, rows), strict=True))
             if len(stiffness):

@@ -1,6 +1,6 @@
 """Penalty contact of a body's surface with itself, or with triangle-mesh obstacles, on the elements of a rank.
 
-    PenaltySurface        contacts of the elements of a rank; PenaltyBodySurface: surface of the body on all ranks
+    PenaltyPart           contacts of the elements of a rank; PenaltyBodySurface: surface of the body on all ranks
     PenaltyState          contacts at the end of the last step, and whether steps are idle
 
 The contact of a point, or of an edge with one that comes later in the order of the surface, belongs to the lowest rank
@@ -23,8 +23,8 @@ from scipy.sparse import csr_matrix
 
 from ..mesh.domain import Domain
 from ..mesh.parallel import allgather, gather, max_over_ranks
-from .element_exchange import EXCHANGE, ElementSet, bounding_boxes, own_points
-from .mesh_obstacles import MeshObstacle
+from .element_exchange import EXCHANGE, bounding_boxes, own_points
+from .mesh_obstacles import MeshObstacle, SurfacePart
 from .partitioned_surface import PartitionedSurface, motion_diagonals
 from .penalty_law import (
     ContactHistory,
@@ -43,129 +43,27 @@ Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class PenaltyPart:
-    """Contact of the surface of a body with itself, or with one obstacle.
-
-    Its points are (n + m, d): those of the body, then those of the obstacle.
-
-    Attributes:
-        contact: penalty.
-        friction: coefficient.
-        body_points: (k,) points of the body's elements.
-        mesh: the obstacle; None: the body with itself.
-    """
-
-    contact: PenaltyPairs
-    friction: float
-    body_points: Ints
-    mesh: MeshObstacle | None = None
-
-    def is_far(self, x: Values) -> bool:
-        """Whether the obstacle is out of contact with the body at x (n, d), m, on this rank."""
-        if self.mesh is None:
-            return False
-        return not len(self.body_points) or self.mesh.is_far(x[self.body_points], self.contact.width)
-
-    def points(self, x: Values, pose: Pose | None = None) -> Values:
-        """(n + m, d) points with the body at x (n, d), m, and the obstacle at a pose; None: the current one."""
-        if self.mesh is None:
-            return x
-        return np.concatenate([x, self.mesh.positions if pose is None else self.mesh.positions_at(pose)])
+class PenaltyPart(SurfacePart[PenaltyPairs]):
+    """Part with a penalty."""
 
     def forces(self, x: Values, start: Values | None = None, start_pose: Pose | None = None) -> PenaltyForces:
         """Forces with the body at x (n, d), m, and at `start` at the start of the step; None: it is accepted."""
         starts = None if start is None or not self.friction else self.points(start, start_pose)
-        return self.contact.forces(self.points(x), starts, self.friction)
+        return self.pairs.forces(self.points(x), starts, self.friction)
 
-    def gap(self, x: Values) -> float:
-        """Least distance from an obstacle of points at x (n, d), m; beyond contact that of vertices."""
-        if self.mesh is None or not len(self.body_points):
-            return np.inf
-        gap = np.inf if self.is_far(x) else self.contact.min_gap(self.points(x))
-        return gap if gap < np.inf else max(self.mesh.vertex_distance(x[self.body_points]), self.contact.width)
+    def added_load(self, x: Values, weights: csr_matrix) -> Values:
+        """(columns,) bounds of what this rank's contacts add to M omega^2 of each node, N/m.
 
-    def cut_elements(self, x: Values, count: int) -> Ints:
-        """(k,) elements of the body, below `count`, that others intersect with the body at x (n, d), m."""
-        if self.is_far(x):
-            return np.empty(0, np.int64)
-        pairs = self.contact.intersections(self.points(x))
-        if self.mesh is not None:
-            pairs = pairs[(pairs < count).sum(axis=1) == 1]
-        return np.unique(pairs[pairs < count])
+        `weights`: (n, columns) with which the points of the body follow nodes.
+        """
+        near = None if self.is_far(x) else self.pairs.near_contacts(self.points(x))
+        return np.zeros(weights.shape[1]) if near is None or not len(near.gap) else near.added_load(weights)
 
 
-class PenaltySurface(RetractableSurface):
-    """Elements of this rank and of others near them, and their contacts.
-
-    Attributes:
-        parts: contact with itself, or with each obstacle.
-    """
+class PenaltyBodySurface(PartitionedSurface[PenaltyPart]):
+    """Contact surface of a body with a penalty."""
 
     closed_pressure: ClassVar[float] = 0.0  # a face that is pressed at all has no room
-    parts: Sequence[PenaltyPart] = ()
-
-    def _build_contacts(self, elements: Ints) -> None:
-        """Build the contacts of elements (k,), with their histories."""
-        histories = [part.contact.history for part in self.parts]
-        self.parts = self._parts_of(elements)
-        for part, history in zip(self.parts, histories, strict=False):
-            part.contact.set_history(history)
-
-    def _gradients(self, x: Values) -> list[Values]:
-        zero = np.zeros_like(x)
-        return [zero if part.is_far(x) else part.contact.gradient(part.points(x))[: len(x)] for part in self.parts]
-
-    def cut_elements(self, x: Values) -> list[Ints]:
-        """Remaining elements (k,) that the body itself, or each obstacle, intersects with points at x (n, d), m."""
-        count = len(self.remaining())
-        return [part.cut_elements(x, count) for part in self.parts]
-
-    def _parts_of(self, elements: Ints) -> list[PenaltyPart]:
-        """Contacts of elements (k,), without a history."""
-        corners, rank = self.elements[elements], self.element_set.elements.rank[elements]
-        k, keys, X = self.element_set.points.stiffness, self.element_set.points.keys, self.rest_positions
-        distance, edge, body_points = self.law.distance, self._edge, np.unique(corners)
-        if not self._meshes:
-            ranks = None if self.comm.size == 1 else ElementRanks(rank, self.comm.rank, self.own_points)
-            stiffness = ContactStiffness.of_one_body(k)
-            pairs = PenaltyPairs(X, corners, stiffness, distance=distance, ranks=ranks, edge=edge, keys=keys)
-            return [PenaltyPart(pairs, self.law.friction, body_points)]
-        pressure, count, parts = self.law.stiffness / self.law.distance, len(X), []
-        area = self.element_set.points.area
-        reduction = np.divide(k, 0.5 * pressure * area, out=np.ones(len(k)), where=area > 0)
-        of_body = ContactStiffness(k, k, reduction)
-        for mesh in self._meshes:
-            area, size = vertex_areas(mesh.points, mesh.triangles), len(mesh.points)
-            of_mesh = ContactStiffness(0.5 * pressure * area, np.full(size, np.inf), np.ones(size))
-            triangles, ranks = mesh.triangles + count, None
-            if self.comm.size > 1:
-                of_triangles = mesh.triangle_ranks(self.comm.size)
-                owned = own_points(of_triangles, mesh.triangles, size, self.comm.rank)
-                all_ranks, all_owned = np.append(rank, of_triangles), np.append(self.own_points, owned)
-                ranks = ElementRanks(all_ranks, self.comm.rank, all_owned)
-            pairs = PenaltyPairs(
-                np.concatenate([X, mesh.points]), np.concatenate([corners, triangles]), of_body.followed_by(of_mesh),
-                distance=distance, patch=np.repeat(np.array([0, 1], np.int32), [count, size]), ranks=ranks, edge=edge,
-                keys=np.append(keys, -1 - np.arange(size)),
-            )  # fmt: skip
-            parts.append(PenaltyPart(pairs, mesh.friction, body_points, mesh))
-        return parts
-
-    def added_loads(self, x: Values) -> Values:
-        """(columns, parts) bounds of what contacts of this rank add to M omega^2 of each node, N/m."""
-        weights = self.point_map.weights
-        loads = np.zeros((weights.shape[1], len(self.parts)))
-        for part, load in zip(self.parts, loads.T, strict=True):
-            if not part.is_far(x):
-                contacts = part.contact.near_contacts(part.points(x))
-                if len(contacts.gap):
-                    load += contacts.added_load(weights)
-        return loads
-
-
-class PenaltyBodySurface(PartitionedSurface[PenaltySurface]):
-    """Contact surface of a body with a penalty."""
 
     def __init__(
         self,
@@ -193,8 +91,41 @@ class PenaltyBodySurface(PartitionedSurface[PenaltySurface]):
         reach, margin = PAIRS.clearance_gap * law.distance, EXCHANGE.margin * domain.mean_edge_length
         super().__init__(domain, u, law, meshes, reach, margin)
 
-    def _build_surface(self, element_set: ElementSet) -> PenaltySurface:
-        return PenaltySurface(self._comm, element_set, self.law, self._meshes, self._domain.mean_edge_length)
+    def _build_parts(self, surface: RetractableSurface[PenaltyPart], elements: Ints) -> list[PenaltyPart]:
+        """Contacts of elements (k,) of a surface, with the history of those that it has."""
+        parts = super()._build_parts(surface, elements)
+        for part, previous in zip(parts, surface.parts, strict=False):
+            part.pairs.set_history(previous.pairs.history)
+        return parts
+
+    def _build_part(
+        self, surface: RetractableSurface[PenaltyPart], elements: Ints, mesh: MeshObstacle | None
+    ) -> PenaltyPart:
+        corners, rank = surface.elements[elements], surface.element_set.elements.rank[elements]
+        points, X, distance = surface.element_set.points, surface.rest_positions, self.law.distance
+        k, keys, is_own = points.stiffness, points.keys, surface.own_points
+        this, size = self._comm.rank, self._comm.size
+        if mesh is None:
+            ranks, stiffness = ElementRanks(rank, this, is_own), ContactStiffness.of_one_body(k)
+            pairs = PenaltyPairs(
+                X, corners, stiffness, distance=distance, ranks=ranks if size > 1 else None, edge=self.mean_edge,
+                keys=keys,
+            )  # fmt: skip
+            return PenaltyPart(pairs, corners, distance, self.law.friction)
+        pressure, n, m = self.law.stiffness / distance, len(X), len(mesh.points)
+        reduction = np.divide(k, 0.5 * pressure * points.area, out=np.ones(n), where=points.area > 0)
+        of_mesh = 0.5 * pressure * vertex_areas(mesh.points, mesh.triangles)
+        rigid = ContactStiffness(of_mesh, np.full(m, np.inf), np.ones(m))
+        stiffness = ContactStiffness(k, k, reduction).followed_by(rigid)
+        triangle_ranks = mesh.triangle_ranks(size)
+        is_own = np.append(is_own, own_points(triangle_ranks, mesh.triangles, m, this))
+        ranks = ElementRanks(np.append(rank, triangle_ranks), this, is_own)
+        pairs = PenaltyPairs(
+            np.concatenate([X, mesh.points]), np.concatenate([corners, mesh.triangles + n]), stiffness,
+            distance=distance, patch=np.repeat(np.array([0, 1], np.int32), [n, m]),
+            ranks=ranks if size > 1 else None, edge=self.mean_edge, keys=np.append(keys, -1 - np.arange(m)),
+        )  # fmt: skip
+        return PenaltyPart(pairs, corners, distance, mesh.friction, mesh)
 
     def _point_stiffness(self, weights: csr_matrix, area: Values, local_area: Values) -> Values:
         """(n,) stiffness of the points of this rank, N/m: constant while a surface lasts (collective)."""
@@ -222,8 +153,8 @@ class PenaltyBodySurface(PartitionedSurface[PenaltySurface]):
 
     # --- contacts ---
 
-    def _keep_history(self, previous: PenaltySurface) -> None:
-        self.set_history([part.contact.history for part in previous.parts])
+    def _keep_history(self, previous: RetractableSurface[PenaltyPart]) -> None:
+        self.set_history([part.pairs.history for part in previous.parts])
 
     def set_history(self, histories: Sequence[ContactHistory]) -> None:
         """Set the contacts of each part at the end of the last step; each goes to the rank that it belongs to.
@@ -232,15 +163,16 @@ class PenaltyBodySurface(PartitionedSurface[PenaltySurface]):
         """
         for part, history in zip(self.current.parts, histories, strict=True):
             of_all = history if self._comm.size == 1 else ContactHistory.join(allgather(self._comm, history))
-            part.contact.set_history(of_all)
+            part.pairs.set_history(of_all)
 
     def max_added_frequency(self, x: Values) -> float:
         """Bound of what contact adds to the square of a frequency with points at x (n, d), m; 1/s^2 (collective)."""
-        loads, d = self.current.added_loads(x), self._domain.dim
-        largest = np.zeros(loads.shape[1])
-        if self._comm.allreduce(bool(loads.any()), op=MPI.LOR):
-            for part in range(loads.shape[1]):
-                total = self.sum_at_nodes(np.repeat(loads[:, part, None], d, axis=1))
+        weights, d = self.current.point_map.weights, self._domain.dim
+        loads = [part.added_load(x, weights) for part in self.current.parts]
+        largest = np.zeros(len(loads))
+        if self._comm.allreduce(bool(np.any(loads)), op=MPI.LOR):
+            for part, load in enumerate(loads):
+                total = self.sum_at_nodes(np.repeat(load[:, None], d, axis=1))
                 largest[part] = (total / self._mass).max(initial=0.0)
             self._comm.Allreduce(MPI.IN_PLACE, largest, MPI.MAX)
         return float(largest.sum())
@@ -308,11 +240,11 @@ class PenaltyState:
         """Store how far nodes may approach from points x (n, d), m, before anything is near (collective)."""
         if self._is_far is not None:
             return  # bounding boxes are compared in each step
-        contact, clearance = self._surface.current.parts[0].contact, 0.0
+        pairs, clearance = self._surface.current.parts[0].pairs, 0.0
         # a search of wide gaps is worth it on all ranks or on none
-        if not max_over_ranks(self._comm, int(self._surface.has_retracted or contact.anything_is_near(x))):
+        if not max_over_ranks(self._comm, int(self._surface.has_retracted or pairs.anything_is_near(x))):
             reach = max_over_ranks(self._comm, self._surface.reach_of_points())
-            clearance = -max_over_ranks(self._comm, -contact.clearance(x)) / reach
+            clearance = -max_over_ranks(self._comm, -pairs.clearance(x)) / reach
         displacement = self._u.x.array[: self._owned].copy() if clearance else None
         self._idle_state = replace(self._idle_state, displacement=displacement, clearance=clearance)
 
@@ -328,7 +260,7 @@ class PenaltyState:
 
     @property
     def _histories(self) -> list[ContactHistory]:
-        return [part.contact.history for part in self._surface.current.parts]
+        return [part.pairs.history for part in self._surface.current.parts]
 
     def settle(self) -> None:
         """Set contacts of a snapshot of another surface, of which points may belong to other ranks (collective)."""
@@ -347,8 +279,8 @@ class PenaltyState:
         is_same = count == self._surface.surface_count
         self._restored, self._idle_state = (None, idle) if is_same else (histories, IdleState(idle.is_near))
         for part, history in zip(self._surface.current.parts, histories, strict=True):
-            if history is not part.contact.history:
-                part.contact.set_history(history)
+            if history is not part.pairs.history:
+                part.pairs.set_history(history)
         self.discard()
 
     def to_checkpoint(self) -> dict[str, Values]:
@@ -367,5 +299,5 @@ class PenaltyState:
         histories = [ContactHistory(cast("Ints", saved[points]), saved[values]) for points, values in names]
         self._idle_state = IdleState(is_near=any(len(history.points) for history in histories))
         for part, history in zip(self._surface.current.parts, histories, strict=True):
-            part.contact.set_history(history)
+            part.pairs.set_history(history)
         self.discard()

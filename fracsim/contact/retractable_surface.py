@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, repeat
-from typing import ClassVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +30,7 @@ from ..mesh.split_surface.closed_surface import SplitSurface
 from ..mesh.split_surface.entity_numbering import CRACK
 from ..meshes.data import format_point
 from .element_exchange import ElementSet, own_points
-from .mesh_obstacles import MeshObstacle
+from .mesh_obstacles import SurfacePart
 from .pair_search import PairFilter, intersecting_pairs
 from .sample_points import vertex_areas
 
@@ -107,8 +107,8 @@ class SelfContactLaw:
         return max(self.sticking_speed, self.sticking_speed_ratio * speed)
 
 
-class RetractableSurface:
-    """Elements of this rank and of others near them; a subclass has their contacts.
+class RetractableSurface[Part: SurfacePart[Any]]:
+    """Elements of this rank and of others near them, and their contacts.
 
     Attributes:
         comm: ranks.
@@ -120,18 +120,16 @@ class RetractableSurface:
         rest_positions: (n, d) reference positions of the points with full arms, m.
         own_points: (n,) flags of points of which this rank is the lowest one that has an element there.
         is_new: whether edges broke in the last step.
-        closed_pressure: pressure, in stiffnesses, of faces without room.
+        parts: contact with itself, or with each obstacle.
     """
-
-    closed_pressure: ClassVar[float]
 
     def __init__(
         self,
         comm: MPI.Intracomm,
         element_set: ElementSet,
         law: SelfContactLaw,
-        meshes: Sequence[MeshObstacle],
-        edge: float,
+        build_parts: Callable[[RetractableSurface[Part], Ints], Sequence[Part]],
+        closed_pressure: float,
     ) -> None:
         """Build the contacts of elements.
 
@@ -139,10 +137,10 @@ class RetractableSurface:
             comm: ranks.
             element_set: points and elements.
             law: contact law.
-            meshes: obstacles; none: the body touches itself.
-            edge: mean length of edges of the mesh, m.
+            build_parts: surface, elements (k,) -> their contacts.
+            closed_pressure: pressure, in stiffnesses, of faces without room.
         """
-        self._meshes, self._edge = meshes, edge
+        self._build_parts, self._closed_pressure = build_parts, closed_pressure
         self.comm, self.law, self.element_set, faces = comm, law, element_set, element_set.elements
         self.columns, self.point_map = element_set.point_map()
         self.elements, self.rest_positions = faces.corners, element_set.points.middle + element_set.points.out
@@ -152,27 +150,24 @@ class RetractableSurface:
         self._crack_faces = np.flatnonzero(is_copy[self.elements].any(axis=1))
         self._excluded = NO_ELEMENTS
         self.is_new = True
-        self._build_contacts(np.arange(len(self.elements)))
+        self.parts: Sequence[Part] = ()
+        self.parts = build_parts(self, np.arange(len(self.elements)))
         self._exclude(np.flatnonzero(faces.is_excluded))
 
     # --- contacts ---
 
-    def _build_contacts(self, elements: Ints) -> None:
-        """Build the contacts of elements (k,)."""
-        raise NotImplementedError("a subclass builds contacts")
-
-    def _gradients(self, x: Values) -> list[Values]:
-        """(n, d) minus the forces of this rank's contacts with itself, or with each obstacle; points at x, m; N."""
-        raise NotImplementedError("a subclass has contacts")
+    def set_law(self, law: SelfContactLaw) -> None:
+        """Set another contact law, which the contacts have already."""
+        self.law = law
 
     def cut_elements(self, x: Values) -> list[Ints]:
         """Remaining elements (k,) that the body itself, or each obstacle, intersects with points at x (n, d), m."""
-        raise NotImplementedError("a subclass has contacts")
+        return [part.cut_elements(x) for part in self.parts]
 
     def _exclude(self, elements: Ints) -> None:
         """Leave out these elements (k,) and no others."""
         if len(elements) or len(self._excluded):
-            self._build_contacts(np.delete(np.arange(len(self.elements)), elements))
+            self.parts = self._build_parts(self, np.delete(np.arange(len(self.elements)), elements))
         self._excluded = elements
 
     def remaining(self) -> Ints:
@@ -212,8 +207,8 @@ class RetractableSurface:
         x, result, remaining = self.point_map(u), np.zeros(len(self.rest_positions)), self.remaining()
         of_rank = remaining[self.element_set.elements.rank[remaining] == self.comm.rank]
         area = self.over_points(vertex_areas(self.rest_positions, self.elements[of_rank]), np.add)
-        for gradient in self._gradients(x):
-            force = np.linalg.norm(self.sum_at_points(gradient), axis=1)
+        for part in self.parts:
+            force = np.linalg.norm(self.sum_at_points(part.gradient(x)), axis=1)
             result += np.divide(force, area, out=np.zeros_like(area), where=area > 0)
         return result
 
@@ -278,7 +273,7 @@ class RetractableSurface:
                 or self._shorten(u, cut := self._intersecting_faces(u), factor)
             ):
                 break
-        max_pressure = np.maximum(load, self.closed_pressure * self.law.stiffness)
+        max_pressure = np.maximum(load, self._closed_pressure * self.law.stiffness)
         without_room = np.union1d(self._pressed_faces(u, max_pressure), cut)
         self._exclude(without_room)
         if self._on_any_rank(len(without_room) > 0):

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
 
 import ipctk
 import numpy as np
@@ -135,19 +134,6 @@ def vertex_areas(x: Values, elements: Ints) -> Values:
     """(n,) share of each point in the measure of the elements around it, m^2 (2D: m)."""
     measure, d = measures(x, elements), x.shape[1]
     return np.asarray(np.bincount(elements.reshape(-1), np.repeat(measure / d, d), minlength=len(x)), float)
-
-
-class SlipFriction(Protocol):
-    """Lagged friction of a surface at positions x (n, d), m: a potential of the slip."""
-
-    def energy(self, x: Values) -> float:
-        """Potential, J."""
-
-    def gradient(self, x: Values) -> Values:
-        """(n, d) minus the forces on the points, N."""
-
-    def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
-        """(n d, n d) second derivatives, N/m."""
 
 
 @dataclass(frozen=True)

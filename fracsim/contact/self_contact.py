@@ -9,7 +9,9 @@ Equations: docs/theory.md#contact.
 
 from __future__ import annotations
 
-from typing import cast
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -22,17 +24,66 @@ from ..mechanics.extra_couplings import CouplingBuilder, FewNodesCoupling, sum_f
 from ..mechanics.term import Term, TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import allgather, max_over_ranks, sum_over_ranks
-from .barrier_surface import BarrierBodySurface
-from .ipc_pairs import IpcPairs
+from .element_exchange import EXCHANGE
+from .ipc_pairs import IpcPairs, PairShare
 from .laws import BARRIER, stiffness_factor
+from .mesh_obstacles import BarrierPart, MeshObstacle
 from .pair_search import max_length
-from .retractable_surface import SURFACE, SelfContactLaw
-from .sample_points import SlipFriction
+from .partitioned_surface import PartitionedSurface
+from .retractable_surface import SURFACE, RetractableSurface, SelfContactLaw
+from .sample_points import IpcFriction
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
 Pattern = npt.NDArray[np.uint8]
+
+
+class BarrierBodySurface(PartitionedSurface[BarrierPart]):
+    """Contact surface of a body with the barrier, whose stiffness may grow.
+
+    A pair belongs to the rank of its lowest point (ipc_pairs.PairShare). Before obstacles a rank needs the elements
+    around the points of its own ones alone, since every rank has the whole obstacle.
+    """
+
+    closed_pressure: ClassVar[float] = SURFACE.closed_pressure
+
+    def __init__(
+        self, domain: Domain, u: fem.Function, law: SelfContactLaw, obstacles: Sequence[MeshObstacle] = ()
+    ) -> None:
+        """As of PartitionedSurface (collective)."""
+        # before obstacles: elements that share a point are always near each other
+        margin = np.inf if obstacles else EXCHANGE.barrier_margin * domain.mean_edge_length
+        super().__init__(domain, u, law, obstacles, law.distance, margin)
+
+    def _build_part(
+        self, surface: RetractableSurface[BarrierPart], elements: Ints, mesh: MeshObstacle | None
+    ) -> BarrierPart:
+        law, share = self.law, PairShare.of(self._comm, surface.own_points)
+        return BarrierPart.build(
+            surface.rest_positions, surface.elements[elements], mesh, distance=law.distance, stiffness=law.stiffness,
+            edge=self.mean_edge, friction=law.friction, share=share,
+        )  # fmt: skip
+
+    def _searched_boxes(self, boxes: Values) -> Values:
+        return boxes[self.border_elements()] if self._meshes else super()._searched_boxes(boxes)
+
+    def set_stiffness(self, stiffness: float) -> None:
+        """Set the stiffness of the barrier, Pa."""
+        if stiffness != self.law.stiffness:
+            self.law = replace(self.law, stiffness=stiffness)
+            self.current.set_law(self.law)
+            for part in self.current.parts:
+                part.pairs.set_stiffness(stiffness)
+
+    def to_checkpoint(self) -> dict[str, Values]:
+        """As of PartitionedSurface, and the stiffness."""
+        return {**super().to_checkpoint(), "stiffness": np.array([self.law.stiffness])}
+
+    def from_checkpoint(self, saved: dict[str, Values]) -> None:
+        """Set the state from the arrays of a checkpoint (collective)."""
+        self.set_stiffness(float(saved["stiffness"][0]))
+        super().from_checkpoint(saved)
 
 
 class SurfaceContact(Term):
@@ -41,7 +92,7 @@ class SurfaceContact(Term):
     Attributes:
         surface: the surface of the body.
         level: time level of the current or last step.
-        friction: lagged friction of the step; None: without.
+        friction: lagged friction of the step in each part of the contact; None: without.
         start_positions: (n, d) of the surface at the start of the step, m.
         allows_exact_tangent: whether tangents are exact near the solution.
     """
@@ -66,8 +117,16 @@ class SurfaceContact(Term):
         self._stored: float | None = None
         self.start_positions: Values | None = None
         self._tangent_displacement: Values | None = None
-        self.friction: SlipFriction | None = None
+        self.friction: Sequence[IpcFriction | None] = self._no_friction()
         self._is_stale, self._exchange_count = True, self.surface.exchange_count
+
+    @property
+    def contacts(self) -> Sequence[BarrierPart]:
+        """Contact of the surface with itself, or with each obstacle."""
+        return self.surface.current.parts
+
+    def _no_friction(self) -> list[IpcFriction | None]:
+        return [None] * len(self.contacts)
 
     def edges_broke(self, pattern: Pattern) -> None:
         """Add new crack faces, retracted where there is no room (collective)."""
@@ -125,9 +184,12 @@ class SurfaceContact(Term):
             x: (n, d) positions of the surface, m.
             normal: whether normal forces are included; otherwise those of friction alone.
         """
-        gradient = self.surface.current.pairs.gradient(x) if normal else np.zeros_like(x)
-        if self.friction is not None:
-            gradient = gradient + self.friction.gradient(x)
+        gradient = np.zeros_like(x)
+        for part, friction in zip(self.contacts, self.friction, strict=True):
+            if normal:
+                gradient += part.gradient(x)
+            if friction is not None:
+                gradient += friction.gradient(part.points(x))[: len(x)]
         return self.surface.sum_at_nodes(self.surface.current.point_map.nodal_forces(-gradient))
 
     def contact_forces(self) -> Values | None:
@@ -149,10 +211,9 @@ class SurfaceContact(Term):
             return None
         x, surface = self.end_positions(), self.surface.current
         exact = self._is_near_last_tangent() and self.allows_exact_tangent
-        H = surface.pairs.hessian(x, exact=exact)
-        if self.friction is not None:
-            H = H + self.friction.hessian(x, exact=exact)
-        H = csr_matrix(self.level.contact_weights.factor * H)
+        parts = zip(self.contacts, self.friction, strict=True)
+        blocks = [part.full_hessian(x, friction, exact=exact)[: x.size, : x.size] for part, friction in parts]
+        H = csr_matrix(self.level.contact_weights.factor * sum(blocks[1:], blocks[0]))
         if not self.comm.allreduce(H.nnz):
             return None
         part, nodes = surface.point_map.nodal_stiffness(H), surface.columns
@@ -171,7 +232,12 @@ class SurfaceContact(Term):
     def min_gap(self) -> float:
         """Least distance within the barrier at the current u, m; infinite where none is active (collective)."""
         x = self.surface.positions(self._u.x.array[: self._owned])
-        return float(self.comm.allreduce(self.surface.current.pairs.min_gap(x), op=MPI.MIN))
+        return float(self.comm.allreduce(self._own_min_gap(x), op=MPI.MIN))
+
+    def _own_min_gap(self, x: Values) -> float:
+        """Least distance within the barrier of this rank's pairs, with points at x (n, d), m."""
+        near = (part for part in self.contacts if not part.is_far(x))
+        return min((part.pairs.min_gap(part.points(x)) for part in near), default=np.inf)
 
     def stored_energy(self) -> float:
         """Energy of the barrier at the current u, of this rank's pairs, J (collective)."""
@@ -180,7 +246,7 @@ class SurfaceContact(Term):
         x = self.end_positions()
         # kept, as the line search and the energy balance both need it
         if self._stored is None:
-            self._stored = self.surface.current.pairs.energy(x)
+            self._stored = sum(part.energy(x) for part in self.contacts)
         return self._stored
 
     def stiffen_contact(self) -> float:
@@ -190,11 +256,11 @@ class SurfaceContact(Term):
         """
         if self.is_far():
             return 0.0
-        x, pairs, law = self.end_positions(), self.surface.current.pairs, self.surface.law
-        gap = self.comm.allreduce(pairs.min_gap(x), op=MPI.MIN)
+        x, law = self.end_positions(), self.surface.law
+        gap = self.comm.allreduce(self._own_min_gap(x), op=MPI.MIN)
         if (factor := stiffness_factor(gap / law.distance)) <= 1:
             return 0.0
-        energy = (factor - 1) * pairs.energy(x)
+        energy = (factor - 1) * sum(part.energy(x) for part in self.contacts)
         self.surface.set_stiffness(factor * law.stiffness)
         return energy
 
@@ -203,8 +269,8 @@ class SurfaceContact(Term):
         if self.is_far():
             return 0.0
         x, energy = self.end_positions(), self.stored_energy()
-        if self.friction is not None:
-            energy += self.friction.energy(x)
+        for part, friction in zip(self.contacts, self.friction, strict=True):
+            energy += 0.0 if friction is None else friction.energy(part.points(x))
         return self.level.contact_weight * self.level.fraction * energy
 
     def begin_solve(self) -> None:
@@ -214,7 +280,8 @@ class SurfaceContact(Term):
     def clear_search(self) -> None:
         """Discard the candidates of collision detection (not collective)."""
         self._is_stale = True
-        self.surface.current.pairs.clear_caches()
+        for part in self.contacts:
+            part.pairs.clear_caches()
 
     def destroy(self) -> None:
         """Destroy the objects of PETSc."""
@@ -239,26 +306,24 @@ class SelfContact(SurfaceContact):
     @property
     def pairs(self) -> IpcPairs:
         """Pairs of the surface."""
-        return cast("IpcPairs", self.surface.current.pairs)
+        return self.contacts[0].pairs
 
     def begin_step(self, level: TimeLevel) -> None:
         """Lag friction with the contact at the start of the step."""
-        self.level, self._is_stale, self.friction = level, True, None
+        self.level, self._is_stale, self.friction = level, True, [None]
         if not level.dt:
             return
         self.sticking_slip = self._sticking_slip(level)
         self._extend_faces(level.u_n)
         self.start_positions = x = self.surface.positions(level.u_n)
         self._exchange_count = self.surface.exchange_count
-        if self.surface.law.friction:
-            self.friction = self.pairs.lag_friction(x, x, self.sticking_slip)
+        self.friction = [self.contacts[0].lag_friction(x, self.sticking_slip)]
 
     def _renumber_start(self) -> None:
         if self.start_positions is None:
             return
         self.start_positions = x = self.surface.current.point_map(self.surface.nodal_values(self.level.u_n))
-        if self.friction is not None:
-            self.friction = self.pairs.lag_friction(x, x, self.sticking_slip)
+        self.friction = [self.contacts[0].lag_friction(x, self.sticking_slip)]
 
     def _sticking_slip(self, level: TimeLevel) -> float:
         """Slip in the step that counts as sticking, m, with speeds relative to the body's mean (collective)."""

@@ -27,8 +27,8 @@ from .pose import Pose, PosedShape, rotate_vectors
 from .shape_base import lengths
 
 if TYPE_CHECKING:
-    from .barrier_surface import BarrierBodySurface
-    from .mesh_obstacles import AllMeshPairs, MeshObstaclePairs
+    from .mesh_obstacles import BarrierPart
+    from .self_contact import BarrierBodySurface
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -352,7 +352,7 @@ def _corrections(area: Values, motions: Sequence[ObstacleMotion], x: Values, mot
 
 
 def stop_before_meshes(
-    surface: BarrierBodySurface, pairs: AllMeshPairs, start: Values, end: Values, start_poses: Sequence[Pose]
+    surface: BarrierBodySurface, parts: Sequence[BarrierPart], start: Values, end: Values, start_poses: Sequence[Pose]
 ) -> Values:
     """First guess with points stopped where they would cross a triangle mesh; the same array where none would.
 
@@ -360,7 +360,7 @@ def stop_before_meshes(
 
     Args:
         surface: surface of the body.
-        pairs: of obstacles, which are at the end of their motion.
+        parts: contact with obstacles, which are at the end of their motion.
         start: (owned dofs,) displacements at the start, m.
         end: (owned dofs,) first guess of displacements at the end, m.
         start_poses: of the obstacles at the start.
@@ -369,10 +369,10 @@ def stop_before_meshes(
     weights = abs(local.point_map.weights).T
     for _ in range(LIMITS.mesh_rounds):
         x_end = surface.positions(end)
-        if pairs.moving_free_fraction(x, x_end, start_poses) == 1:
+        items = list(zip(parts, start_poses, strict=True))
+        if all([part.free_fraction(x, x_end, pose) == 1 for part, pose in items]):
             return end
-        items = zip(pairs.pairs, start_poses, strict=True)
-        correction = np.sum([_mesh_corrections(*item, x, x_end) for item in items], axis=0)
+        correction = np.sum([_mesh_corrections(*item, surface.mean_edge, x, x_end) for item in items], axis=0)
         correction[~local.own_points] = 0.0
         is_stopped = correction.any(axis=1)
         if not sum_over_ranks(local.comm, is_stopped.sum())[0]:
@@ -384,16 +384,19 @@ def stop_before_meshes(
     return end
 
 
-def _mesh_corrections(pairs: MeshObstaclePairs, start_pose: Pose, x: Values, end: Values) -> Values:
+def _mesh_corrections(part: BarrierPart, start_pose: Pose, edge: float, x: Values, end: Values) -> Values:
     """(n, 3) differences of safe motions of points and their motions from x to `end`, m (collective).
+
+    `edge`: mean length of edges of the body, m.
 
     In the frame of the obstacle a point stops where it comes as near to it as a tenth of its distance; piece by piece,
     each point by itself.
     """
     # motion relative to the obstacle
-    motion, comm = end - pairs.mesh.pose.points_to_space(start_pose.to_body(x)), pairs.contact.comm
+    assert part.mesh is not None
+    motion, comm = end - part.mesh.pose.points_to_space(start_pose.to_body(x)), part.pairs.comm
     largest = max_over_ranks(comm, float(lengths(motion).max(initial=0.0)))
-    count = min(max(1, int(np.ceil(largest / pairs.edge))), LIMITS.max_pieces)
+    count = min(max(1, int(np.ceil(largest / edge))), LIMITS.max_pieces)
     # safe and unlimited positions, before the obstacle at its end
     safe_x, free_x = end - motion, end - motion
     is_moving = np.ones(len(x), bool)
@@ -402,9 +405,7 @@ def _mesh_corrections(pairs: MeshObstaclePairs, start_pose: Pose, x: Values, end
         step = end - motion * (1 - (piece + 1) / count) - free_x
         length = lengths(step)
         reach = LIMITS.search_margin * max_over_ranks(comm, float(length.max(initial=0.0))) / open_ratio
-        is_moving &= length <= open_ratio * pairs.safe_distances(
-            safe_x, min(reach, LIMITS.max_search_edges * pairs.edge)
-        )
+        is_moving &= length <= open_ratio * part.safe_distances(safe_x, min(reach, LIMITS.max_search_edges * edge))
         safe_x = safe_x + np.where(is_moving[:, None], step, 0.0)
         free_x = free_x + step
     return np.where(is_moving[:, None], 0.0, safe_x - end)

@@ -102,7 +102,8 @@ def _time_contact_steps(run: Any, contact: Any) -> list[tuple[float, int]]:
 
 def time_pair_operations(surface: Any, x: Any) -> dict[str, Any]:
     """Median processor time of each pair operation, s, at positions x (n, d); long displacement: half the body."""
-    pairs = surface.pairs
+    (part,) = surface.parts
+    pairs = part.pairs
     upper = (x[:, 2] > np.median(x[:, 2]))[:, None]
     short, long = (x - upper * np.array([0.0, 0.0, distance]) for distance in (1e-5, 0.5))
     away = x + 1e-12 * np.arange(x.size).reshape(x.shape)  # a change of position avoids cached pairs

@@ -40,8 +40,8 @@ def pressed(dim: int, itself: bool | str) -> dict[str, npt.NDArray[np.generic]]:
     (term,) = [term for term in scene.balance.terms if isinstance(term, PenaltyContact)]
     surface = term.surface
     (part,) = surface.current.parts
-    near = part.contact.near_contacts(term._end_positions())
-    numbers, points = near.points, part.contact.keys
+    near = part.pairs.near_contacts(term._end_positions())
+    numbers, points = near.points, part.pairs.keys
     rows = np.column_stack([points[numbers], np.round(near.gap / 1e-9).astype(np.int64)])
     counts = len(surface.element_set.elements.corners), len(surface.current.elements)
     gathered = comm.gather((rows, near.stiffness, counts))
