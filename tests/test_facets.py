@@ -11,7 +11,6 @@ from scipy.linalg import block_diag
 from scipy.sparse import csr_matrix
 
 from fracsim.contact.closest_point import find_closest_points, minimise_on_simplex, smoothing_error
-from fracsim.contact.contact_surface import nodal_stiffness
 from fracsim.contact.facet_contact import ContactFacets, FacetForces, add_facet_friction, evaluate_facets, merge_forces
 from fracsim.contact.laws import Barrier, CoulombFriction
 from fracsim.contact.node_contact import (
@@ -28,6 +27,7 @@ from fracsim.contact.shapes import Capsule, HalfSpace, RoundedBox, RoundedCylind
 from fracsim.contact.step_limit import safe_motion_fractions
 from fracsim.mesh.split_surface.closed_surface import build_split_surface
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
+from fracsim.mesh.split_surface.surface_map import nodal_stiffness
 from support.drawn import drawn_at
 from support.scenes import each_step, make_scene, march
 
@@ -412,11 +412,11 @@ def test_what_breaks_under_a_ball_gains_nothing() -> None:
     assert contact.stored_energy() <= before * (1 + 1e-6)
     skin, placed = contact.surface, contact.group.posed[0]
     x = skin.positions(contact.end_displacement)
-    assert (contact.facets.active.gaps(placed, x, 1.0) > 0).all()
-    left_out = contact.facets._excluded
-    assert len(left_out) > 0 and len(contact.facets.active.area) > 100
-    contact.facets.from_checkpoint(contact.facets.to_checkpoint())
-    np.testing.assert_array_equal(contact.facets._excluded, left_out)
+    assert (contact.surface.facets.gaps(placed, x, 1.0) > 0).all()
+    left_out = contact.surface._excluded
+    assert len(left_out) > 0 and len(contact.surface.facets.area) > 100
+    contact.surface.from_checkpoint(contact.surface.to_checkpoint())
+    np.testing.assert_array_equal(contact.surface._excluded, left_out)
     # what is drawn: all of it, beside the ball
     skeleton, u = EntityNumbering(scene.domain.input_mesh), contact.end_displacement
     pattern = scene.domain.input_numbering.gather_cells(scene.fracture.graph.pattern)

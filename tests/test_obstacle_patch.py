@@ -30,7 +30,7 @@ def displaced(scene: Scene, u: Values, nodes: npt.NDArray[np.int64], w: Values) 
 def least_gap(contact: ObstacleTerm) -> float:
     """Least gap of a point, or of a facet before the ball, at the current displacement, m."""
     x, posed = contact.surface.positions(contact.end_displacement), contact.group.posed
-    facets = contact.facets.gaps(posed, contact.facets.active, x)
+    facets = contact.surface.facet_gaps(posed, contact.surface.facets, x)
     return min(float(min_distance(posed, x).min()), float(facets.min()))
 
 

@@ -11,11 +11,11 @@ import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 
+from fracsim.contact.contact_surface import ContactSurface
 from fracsim.contact.obstacle_term import ObstacleTerm
 from fracsim.deformable_run import Run
 from fracsim.errors import InputError
 from fracsim.mesh.edge_graph import EdgeGraph
-from fracsim.mesh.split_surface.local_surface import LocalSurface, ParentMatrix
 from fracsim.scene import Scene, build_scene
 from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import Walk, each_step, make_scene, make_study, march, positions
@@ -54,24 +54,24 @@ def test_points_follow_affine_motions_and_hand_down_forces_and_moments(dim: int,
     mesh = {"builder": "box", "size": [1.0] * dim, "h": 0.25, "pattern": "unstructured", "order": order}
     scene, _ = make_scene(mesh=mesh)
     domain = scene.domain
-    surface, graph = LocalSurface(domain), EdgeGraph(domain)
+    surface, graph = ContactSurface(domain, 0.01), EdgeGraph(domain)
     assert surface.area.sum() == pytest.approx(2 * dim)
     ends = domain.nodes[graph.edge_nodes][:, :, 0]
     graph.break_edges((ends.min(axis=1) < 0.5) & (ends.max(axis=1) > 0.5))
     surface.update_damage(graph.pattern)
     assert surface.area.sum() > 2 * dim + 1.5
-    follow, X = ParentMatrix(domain, surface), positions(scene)
+    X = positions(scene)
     A, b = np.random.default_rng(dim).normal(size=(dim, dim)), np.arange(dim) + 1.0
-    x = follow((X @ A.T + b).reshape(-1))
+    x = surface.interpolate((X @ A.T + b).reshape(-1))
     np.testing.assert_allclose(x, surface.point_map.rest @ A.T + b, atol=1e-13)
     f = np.sin(100 * surface.point_map.rest) * surface.area[:, None]
-    nodal = follow.assemble_to_nodes(f).reshape(-1, dim)
+    nodal = surface.nodal_forces(f).reshape(-1, dim)
     np.testing.assert_allclose(nodal.sum(axis=0), f.sum(axis=0), atol=1e-13)
     np.testing.assert_allclose(X.T @ nodal, surface.point_map.rest.T @ f, atol=1e-13)
     some = np.flatnonzero(np.arange(len(f)) % 3 == 0)
     f[np.arange(len(f)) % 3 != 0] = 0.0
-    both = follow.assemble_points_to_nodes(some, np.stack([f[some], 2 * f[some]], axis=2))
-    np.testing.assert_allclose(both[:, 0], follow.assemble_to_nodes(f), atol=1e-14)
+    both = surface.nodal_forces_of(some, np.stack([f[some], 2 * f[some]], axis=2))
+    np.testing.assert_allclose(both[:, 0], surface.nodal_forces(f), atol=1e-14)
     np.testing.assert_allclose(both[:, 1], 2 * both[:, 0], atol=1e-14)
 
 

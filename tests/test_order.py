@@ -16,9 +16,9 @@ from scipy.linalg import eigh
 from scipy.sparse import csr_matrix
 
 import xdmf_reader
+from fracsim.contact.contact_surface import ContactSurface
 from fracsim.deformable_run import run_study
 from fracsim.mesh.edge_graph import EdgeGraph
-from fracsim.mesh.split_surface.local_surface import LocalSurface
 from fracsim.output.fracture_log import FractureLog
 from fracsim.studies.evidence.precision.manufactured_solution import relative_errors, solve
 from fracsim.study.check import check_study
@@ -250,7 +250,7 @@ def test_cells_with_broken_edges_are_touched_by_their_corners() -> None:
     for order in (1, 2):
         scene, _ = make_scene(mesh={"builder": "box", "size": [1.0, 1.0, 0.5], "h": 0.25, "order": order})
         domain = scene.domain
-        surface, graph = LocalSurface(domain), EdgeGraph(domain)
+        surface, graph = ContactSurface(domain, 0.01), EdgeGraph(domain)
         ends = domain.nodes[graph.edge_nodes][:, :, 0]
         graph.break_edges((ends.min(axis=1) < 0.5) & (ends.max(axis=1) > 0.4))
         surface.update_damage(graph.pattern)

@@ -10,10 +10,10 @@ import numpy.typing as npt
 import pytest
 from pydantic import ValidationError
 
+from fracsim.contact.contact_surface import ContactSurface
 from fracsim.contact.penalty_law import NodalMassShare
 from fracsim.contact.penalty_obstacles import PenaltyObstacleTerm
 from fracsim.mesh.edge_graph import EdgeGraph
-from fracsim.mesh.split_surface.local_surface import LocalSurface
 from fracsim.scene import Scene
 from support.resumed import assert_alike, going_stopped_resumed
 from support.scenes import each_step, make_scene, make_study, march, positions
@@ -42,7 +42,7 @@ def test_springs_at_points_are_no_faster_than_said() -> None:
     bound, for any k_p; and at most 1, but not much less, for what points carry of the nodes' masses."""
     mesh = {"builder": "box", "size": [1.0, 0.6], "h": 0.2, "pattern": "unstructured"}
     scene, _ = make_scene(mesh=mesh)
-    surface, graph = LocalSurface(scene.domain), EdgeGraph(scene.domain)
+    surface, graph = ContactSurface(scene.domain, 0.01), EdgeGraph(scene.domain)
     graph.break_edges(np.random.default_rng(1).random(len(graph.broken)) < 0.4)
     surface.update_damage(graph.pattern)
     W, m = surface.point_map.weights.toarray(), masses(scene)[surface.columns, 0]
@@ -171,7 +171,7 @@ def test_a_ball_smaller_than_an_edge_does_not_pass_a_facet(radius: float, fricti
         time={"scheme": "explicit", "step": 0.02, "end": 0.12},
     )  # fmt: skip
     (contact,) = [term for term in scene.balance.terms if isinstance(term, PenaltyObstacleTerm)]
-    corners, X, m = contact.facets.active.corners, positions(scene), masses(scene)
+    corners, X, m = contact.surface.facets.corners, positions(scene), masses(scene)
 
     def momentum() -> Values:
         flight, p = contact.group.bodies.free[0].motion, m * state.v.reshape(-1, 3)

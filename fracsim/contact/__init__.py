@@ -8,7 +8,8 @@ Terms of the balance:
     rigid_obstacles       motion of all obstacles; groups of obstacles, what they did to the body in a step, contact of
                           the body as they see it, and their tessellation for output
     rigid_pose            free obstacles in implicit steps: poses as unknowns of Newton's method
-    obstacle_term         the body before analytic obstacles; contact_state: points, facets and obstacles in a step
+    obstacle_term         the body before analytic obstacles; contact of few nodes for nonlinear elimination
+    contact_state         surface and analytic obstacles in a step; cells that show their crack faces
     mesh_obstacle_term    the body before triangle-mesh obstacles; pairs of these
     self_contact          a body with itself, and its fragments with one another
     penalty_obstacles     the body before analytic obstacles in explicit steps
@@ -28,10 +29,9 @@ Laws and geometry:
 
 Points and facets before analytic obstacles:
 
-    contact_surface       points of the split surface; retraction of new crack faces; cells that show theirs
+    contact_surface       points and facets of the split surface; retraction of new crack faces
     node_contact          forces on points, lagged friction, derivatives by the pose of an obstacle
     closest_point, facet_contact  forces on facets between their nodes
-    obstacle_patch        contact of few nodes that move while all others stay, for nonlinear elimination
     step_limit            conservative advancement, first guesses, motion of obstacles in a step
 
 Surfaces with ipctk:

@@ -1,28 +1,23 @@
-"""State of contact between a body and obstacles in a time step: points, facets, obstacles and lagged friction."""
+"""State of contact between a body and analytic obstacles in a time step: surface, obstacles and lagged friction."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import cast
 
 import numpy as np
 import numpy.typing as npt
-from dolfinx import fem
+from dolfinx import fem, la
 from mpi4py import MPI
 
 from ..errors import InputError
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
-from ..mesh.ghost_exchange import find_saved_keys
-from ..mesh.parallel import gather
-from ..mesh.split_surface.drawn_surface import DrawnSurface
-from ..mesh.split_surface.surface_map import SurfaceMap
-from ..meshes.topology import row_keys
+from ..mesh.parallel import sum_over_ranks
+from ..mesh.simplices import local_edges
 from .clearance import Clearance, FollowingPoints, ProximityCandidates, ShapeDistance, outline_radius
-from .contact_surface import RETRACTION, TINY, ContactSurface, ShownCells, retract_cut_elements
-from .facet_contact import FACETS, ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
+from .contact_surface import ContactSurface
+from .facet_contact import ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
 from .laws import CoulombFriction, FrictionDirection, GapPotential, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
 from .obstacle import RigidObstacle
@@ -32,209 +27,7 @@ from .rigid_obstacles import ObstacleGroup
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 Flags = npt.NDArray[np.bool_]
-
-
-class SurfaceFacets:
-    """Facets of a surface before obstacles so curved that they touch facets between their nodes (HistoryTerm).
-
-    Facets of new crack faces without room are excluded.
-
-    Attributes:
-        numbers: numbers in their group of the obstacles that act on facets.
-    """
-
-    def __init__(
-        self, surface: ContactSurface, group: ObstacleGroup, width: float, edge: float, *, may_be_cut: bool
-    ) -> None:
-        """Raise InputError where an obstacle cuts a facet of the body at rest (collective).
-
-        Args:
-            surface: points of the body.
-            group: obstacles.
-            width: of the barrier, m.
-            edge: mean edge length of the mesh, m.
-            may_be_cut: whether facets may be cut later on: none is excluded.
-        """
-        self._surface, self._group, self._width, self._may_be_cut = surface, group, width, may_be_cut
-        shapes = [obstacle.shape for obstacle in group.obstacles]
-        self.numbers = [n for n, shape in enumerate(shapes) if facets_matter(shape.min_radius, edge, width)]
-        self._excluded: Ints = np.empty(0, np.int64)
-        # areas and excluded facets for which the active facets were selected, and these
-        self._active: tuple[Values, Ints, ContactFacets] | None = None
-        if self.numbers:
-            self._check_at_rest()
-
-    def _check_at_rest(self) -> None:
-        """Refuse facets that are cut; those that are cut only by the smoothing are excluded until there is room."""
-        x, group = self._surface.rest_positions, self._group
-        posed = [obstacle.posed_at(0.0) for obstacle in group.obstacles]
-        for number in self.numbers:
-            distances = self.active.distances(posed[number], x, 0.0)
-            refuse_closed_gaps(self._surface.comm, distances, group.numbers[number], group.obstacles[number])
-        if not self._may_be_cut:
-            self._excluded = np.flatnonzero(self.gaps(posed, self._all_facets, x) <= 0)
-
-    @cached_property
-    def _all_facets(self) -> ContactFacets:
-        return ContactFacets(*self._surface.local.facets(), FACETS.smoothing * self._width)
-
-    @property
-    def active(self) -> ContactFacets:
-        """Facets of which neither a corner nor the facet itself is excluded (not collective)."""
-        cached, area = self._active, self._surface.area
-        if cached is None or cached[0] is not area or cached[1] is not self._excluded:
-            selected = facets = self._all_facets
-            if len(self._excluded) or (area == 0).any():
-                active = np.asarray((area > 0)[facets.corners].all(axis=1))
-                active[self._excluded] = False
-                selected = ContactFacets(facets.corners[active], facets.area[active], facets.smoothing)
-            cached = self._active = area, self._excluded, selected
-        return cached[2]
-
-    @property
-    def excluded_count(self) -> int:
-        """Number of excluded facets of this rank."""
-        return len(self._excluded)
-
-    def gaps(self, posed: Sequence[PosedShape], facets: ContactFacets, x: Values, reach: float | None = None) -> Values:
-        """(m,) least gaps of facets to the curved ones of the obstacles, with points at x (n, d), m; infinite far away.
-
-        `reach`: gap from which on an obstacle is far, m; None: the width of the barrier.
-        """
-        reach = self._width if reach is None else reach
-        return np.asarray(np.min([facets.gaps(posed[n], x, reach) for n in self.numbers], axis=0))
-
-    def are_open(self, posed: Sequence[PosedShape], x: Values) -> bool:
-        """Whether no facet is cut with points at x (n, d), m (collective)."""
-        if not self.numbers or self._may_be_cut:
-            return True
-        is_open = bool((self.gaps(posed, self.active, x) > 0).all())
-        return bool(self._surface.comm.allreduce(is_open, op=MPI.LAND))
-
-    def separate(self, points: SurfaceMap, surface: DrawnSurface, posed: Sequence[PosedShape]) -> SurfaceMap:
-        """Points for output retracted where curved obstacles cut elements (collective)."""
-        if not self.numbers:
-            return points
-        elements = surface.split.elements
-        facets = ContactFacets(elements, np.ones(len(elements)), FACETS.smoothing * self._width)
-        return retract_cut_elements(points, surface, lambda x: self.gaps(posed, facets, x, 0.0) <= 0)
-
-    # --- new crack faces ---
-
-    def edges_broke(self, add_faces: Callable[[], Ints], u: Values, posed: Sequence[PosedShape]) -> None:
-        """Retract new points of facets that would be cut or in contact; exclude facets for which this fails.
-
-        Args:
-            add_faces: function that adds new faces to the surface, and returns the keys of the points of old ones.
-            u: (owned dofs,) displacement, m.
-            posed: obstacles.
-        """
-        excluded = self._keys(self._excluded)
-        old_keys, surface = add_faces(), self._surface
-        self.clear_caches()
-        if not self.numbers or self._may_be_cut:
-            return
-        self._excluded, copies = self._find_facets(excluded), surface.local.point_map.copies
-        is_new = np.zeros(len(surface.area), bool)
-        is_new[copies] = ~np.isin(surface.local.keys[copies], old_keys)
-        nodal = surface.interpolation.nodal_values(u)
-        for _ in range(RETRACTION.facet_rounds):
-            point_map, facets = surface.local.point_map, self.active
-            has_new = is_new[facets.corners].any(axis=1)
-            too_close = self.gaps(posed, facets, point_map(nodal)) < np.where(has_new, self._width, TINY)
-            points = np.unique(facets.corners[too_close])
-            points = points[is_new[points] & (point_map.share[points] > RETRACTION.min_arm)]
-            if not len(points):
-                break
-            share = point_map.share.copy()
-            share[points] *= RETRACTION.facet_factor
-            surface.set_arms(share)
-        closed = np.flatnonzero(is_new & (surface.area > 0))
-        closed = closed[min_distance(posed, surface.local.point_map(nodal)[closed]) <= 0]
-        if len(closed):
-            surface.exclude_points(np.union1d(closed, np.flatnonzero(surface.area == 0)))
-        self._exclude(np.flatnonzero(self._too_close(is_new, nodal, posed)))
-
-    def release(self, release_points: Callable[[], None], u: Values, posed: Sequence[PosedShape]) -> None:
-        """Undo releases of points that bring a facet into contact; include facets not in contact (collective).
-
-        Args:
-            release_points: function that releases points of the surface.
-            u: (owned dofs,) displacement, m.
-            posed: obstacles.
-        """
-        surface = self._surface
-        old_map, excluded = surface.local.point_map, surface.area == 0
-        release_points()
-        if not self.numbers or self._may_be_cut:
-            return
-        # Every rank takes part, also those on which nothing has changed.
-        point_map, nodal = surface.local.point_map, surface.interpolation.nodal_values(u)
-        if point_map is old_map and not excluded.any() and not len(self._excluded):
-            return
-        moved = (point_map.share != old_map.share) | excluded
-        undone = np.unique(self._all_facets.corners[self._too_close(moved, nodal, posed)])
-        undone = undone[moved[undone]]
-        if len(undone):
-            share = point_map.share.copy()
-            share[undone] = old_map.share[undone]
-            surface.set_arms(share)
-        if len(self._excluded):
-            gap = self.gaps(posed, self._all_facets, surface.local.point_map(nodal))[self._excluded]
-            if (gap >= self._width).any():
-                self._excluded = self._excluded[gap < self._width]
-        self._exclude(np.flatnonzero(self._too_close(excluded, nodal, posed)))
-
-    def _too_close(self, moved: Flags, u: Values, posed: Sequence[PosedShape]) -> Flags:
-        """(m,) facets that are cut, or have a point that has `moved` (n,) and would be in contact; u (nodes, d), m."""
-        facets = self._all_facets
-        min_gap = np.where(moved[facets.corners].any(axis=1), self._width, TINY)
-        return np.asarray(self.gaps(posed, facets, self._surface.local.point_map(u)) < min_gap)
-
-    def _exclude(self, facets: Ints) -> None:
-        """Exclude these facets as well."""
-        if len(np.setdiff1d(facets, self._excluded)):
-            self._excluded = np.union1d(facets, self._excluded)
-
-    def _keys(self, facets: Ints) -> Ints:
-        """(k,) keys of facets (k,), of the keys of their corners."""
-        if not len(facets):
-            return facets
-        return row_keys(np.sort(self._surface.local.keys[self._all_facets.corners[facets]], axis=1))
-
-    def _find_facets(self, keys: Ints) -> Ints:
-        """Numbers of the facets with `keys` (k,) that this rank has."""
-        return np.flatnonzero(np.isin(self._all_keys(), keys)) if len(keys) else keys
-
-    def _all_keys(self) -> Ints:
-        return self._keys(np.arange(len(self._all_facets.corners)))
-
-    # --- state ---
-
-    def snapshot(self) -> object:
-        """Excluded facets, and the keys of the points of their surface."""
-        return self._excluded, self._surface.local.keys
-
-    def restore(self, memory: object) -> None:
-        """Restore a snapshot (not collective); where edges have broken since it stays as it is."""
-        excluded, keys = cast("tuple[Ints, Ints]", memory)
-        if excluded is not self._excluded and self._surface.has_points(keys):
-            self._excluded = excluded
-
-    def to_checkpoint(self) -> dict[str, Values]:
-        """Keys of excluded facets, on rank 0 (collective)."""
-        gathered = gather(self._surface.comm, self._keys(self._excluded))
-        return {} if gathered is None else {"cut_facets": np.concatenate(gathered)}
-
-    def from_checkpoint(self, saved: dict[str, Values]) -> None:
-        """Set the excluded facets from the keys of a checkpoint (collective)."""
-        rows = find_saved_keys(self._surface.comm, self._all_keys(), saved["cut_facets"])
-        self._excluded = np.sort(rows[rows >= 0])
-
-    def clear_caches(self) -> None:
-        """Discard facets, and candidates among them."""
-        vars(self).pop("_all_facets", None)
-        self._active = None
+Pattern = npt.NDArray[np.uint8]
 
 
 def refuse_closed_gaps(comm: MPI.Intracomm, gaps: Values, number: int, obstacle: RigidObstacle) -> None:
@@ -308,14 +101,108 @@ def evaluate_contact(
     return merge_forces(of_points, *evaluate_facets(facets, posed, x, barrier, start.facets))
 
 
+# --- cells whose crack faces are part of the surface ---
+
+
+@dataclass(frozen=True)
+class CellReachPolicy:
+    """Distances from obstacles, beyond barrier width and motion of a step, in longest edges of a cell.
+
+    Points of crack faces, and all points of their facets, are less than 1.5 edges from a node of their cell.
+
+    Attributes:
+        required: distance within which crack faces of a cell have to be part of the surface.
+        shown: distance within which they are part of it once it is made.
+    """
+
+    required: float = 1.5
+    shown: float = 2.5
+
+
+CELL_REACH = CellReachPolicy()
+
+
+class ShownCells:
+    """Cells whose crack faces are part of a contact surface; all others are too far from obstacles to touch them.
+
+    Attributes:
+        flags: (cells,) flags of these cells; None: all cells.
+    """
+
+    def __init__(self, domain: Domain, width: float) -> None:
+        """Begin with a surface of a whole body; `width`: of the barrier, m."""
+        self._domain, self._width = domain, width
+        ends = domain.nodes[domain.cell_nodes[:, local_edges(domain.dim)]]
+        self._longest_edge: Values = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2).max(axis=1, initial=0.0)
+        self.flags: Flags | None = np.zeros(domain.cell_count, bool)
+        self._pattern: Pattern | None = np.zeros(domain.cell_count, np.uint8)  # of the surface; None: to be made again
+
+    def discard(self) -> None:
+        """Require a new surface at the next update."""
+        self._pattern = None
+
+    def show_all(self) -> None:
+        """Select all cells until the next update."""
+        self.flags = self._pattern = None
+
+    def update(
+        self, pattern: Pattern, obstacles: Sequence[PosedShape], u: Values, motion: Values | None, shift: float
+    ) -> bool:
+        """Select the cells near obstacles anew if the surface lacks damage there (collective).
+
+        Args:
+            pattern: (cells,) broken edges of each cell.
+            obstacles: obstacles at their poses.
+            u: (owned dofs,) displacement, m.
+            motion: (owned dofs,) motion of nodes until the next update, m; None: none.
+            shift: largest motion of obstacles until then, m.
+
+        Returns:
+            Whether the surface has to be made again.
+        """
+        distance = min_distance(obstacles, self._domain.nodes + self._at_nodes(u))
+        if motion is not None:
+            distance = distance - np.linalg.norm(self._at_nodes(motion), axis=1)
+        beyond = (self._at_cells(distance) - shift - self._width) / self._longest_edge
+        if not sum_over_ranks(self._domain.comm, int(self._is_outdated(pattern, beyond)))[0]:
+            return False
+        self.flags, self._pattern = beyond < CELL_REACH.shown, pattern.copy()
+        return True
+
+    def _is_outdated(self, pattern: Pattern, beyond: Values) -> bool:
+        """Whether cells that are shown or, (cells,) edges `beyond` reach, have to be, are not shown as damaged."""
+        if self.flags is None or self._pattern is None:
+            return True
+        required = self.flags | (beyond < CELL_REACH.required)
+        return bool((pattern != np.where(self.flags, self._pattern, 0))[required].any())
+
+    def face_distances(self, obstacles: Sequence[PosedShape], u: Values) -> list[float]:
+        """Bounds of the distances of crack faces of this rank's cells from each obstacle, m; as of `update`."""
+        x, faces = self._domain.nodes + self._at_nodes(u), CELL_REACH.required * self._longest_edge
+        return [float((self._at_cells(posed.distance(x)) - faces).min(initial=np.inf)) for posed in obstacles]
+
+    def _at_cells(self, values: Values) -> Values:
+        """(cells,) least of the values (nodes,) at the corners."""
+        return np.asarray(np.minimum.reduce([values[nodes] for nodes in self._domain.cell_nodes.T]))
+
+    def _at_nodes(self, owned: Values) -> Values:
+        """(nodes, d) values of a field at the nodes of this rank, with ghosts, for its owned dofs (collective)."""
+        field = la.vector(self._domain.space.dofmap.index_map, self._domain.dim, np.float64)
+        field.array[: len(owned)] = owned
+        field.scatter_forward()
+        return np.asarray(field.array.reshape(-1, self._domain.dim))
+
+
+# --- state in a step ---
+
+
 class ContactState:
     """Obstacles, and the points of a body that they act on at the end of a step.
 
     Attributes:
         group: the obstacles, which are analytic, and what they did to the body in the last step.
         law: contact law.
-        surface: points of the body that may touch.
-        facets: facets between them.
+        surface: points and facets of the body that may touch.
         positions: (n, d) positions of these points at the end of the step that belongs to u, m.
         level: time level of the current or last step.
         lagged: contact of each obstacle at the start of the step; None: without friction.
@@ -334,9 +221,11 @@ class ContactState:
     def __init__(self, domain: Domain, u: fem.Function, group: ObstacleGroup, law: ObstacleLaw) -> None:
         """Raise InputError where the body at rest, or a free obstacle, overlaps an obstacle (collective)."""
         self.group, self.law = group, law
-        self.surface = ContactSurface(domain, law.barrier.width)
+        shapes, edge = [obstacle.shape for obstacle in group.obstacles], domain.mean_edge_length
+        curved = [n for n, shape in enumerate(shapes) if facets_matter(shape.min_radius, edge, law.barrier.width)]
+        self.surface = ContactSurface(domain, law.barrier.width, curved, facets_may_be_cut=self.facets_may_be_cut)
         self._shown = ShownCells(domain, law.barrier.width)
-        self._pattern: npt.NDArray[np.uint8] = np.zeros(domain.cell_count, np.uint8)
+        self._pattern: Pattern = np.zeros(domain.cell_count, np.uint8)
         self._domain, self._u, self._owned = domain, u, domain.node_count * domain.dim
         self.comm = domain.comm
         self._is_damaged = False
@@ -351,17 +240,23 @@ class ContactState:
         self._sticking_slips: list[float] | None = None  # m, of each obstacle in the step; None: not known yet
         self._directions: dict[int, FrictionDirection] = {}  # in this attempt, by the numbers of obstacles
         self._tangent_positions: Values | None = None  # of the points at the last tangent of this attempt
-        for number, obstacle in zip(self.group.numbers, self.group.obstacles, strict=True):
-            refuse_closed_gaps(
-                self.comm, obstacle.posed_at(0.0).distance(self.surface.rest_positions), number, obstacle
-            )
-        self.point_candidates = ProximityCandidates(domain.mean_edge_length)
-        edge, may_be_cut = domain.mean_edge_length, self.facets_may_be_cut
-        self.facets = SurfaceFacets(self.surface, group, law.barrier.width, edge, may_be_cut=may_be_cut)
+        self.point_candidates = ProximityCandidates(edge)
+        self._refuse_contact()
+
+    def _refuse_contact(self) -> None:
+        """Raise InputError where the body at rest overlaps an obstacle (collective)."""
+        group, x = self.group, self.surface.rest_positions
+        posed = [obstacle.posed_at(0.0) for obstacle in group.obstacles]
+        for index, shape in enumerate(posed):
+            refuse_closed_gaps(self.comm, shape.distance(x), group.numbers[index], group.obstacles[index])
+        for index in self.surface.curved:
+            distances = self.surface.facets.distances(posed[index], x, 0.0)
+            refuse_closed_gaps(self.comm, distances, group.numbers[index], group.obstacles[index])
+        self.surface.exclude_cut_facets(posed)
 
     def facets_for(self, number: int) -> ContactFacets | None:
         """Facets on which an obstacle acts; None if it acts on points alone."""
-        return self.facets.active if number in self.facets.numbers else None
+        return self.surface.facets if number in self.surface.curved else None
 
     def begin_step(self, level: TimeLevel) -> None:
         """Move obstacles to the end of the step, and store the contact at its start for friction."""
@@ -402,12 +297,10 @@ class ContactState:
 
     def _following_points(self) -> FollowingPoints:
         """Points of this rank."""
-        local, dim, area = self.surface.local, self._domain.dim, self.surface.area
-        corners = self.facets.active.corners if self.facets.numbers else np.empty((0, dim), np.int64)
-        retracted = (area == 0).any() or (local.point_map.share < 1).any() or self.facets.excluded_count
-        return FollowingPoints(
-            local.point_map.rest, local.point_map.weights, local.columns, corners, may_stay=not retracted
-        )
+        surface, point_map = self.surface, self.surface.point_map
+        corners = surface.facets.corners if surface.curved else np.empty((0, self._domain.dim), np.int64)
+        may_stay = not surface.is_retracted()
+        return FollowingPoints(point_map.rest, point_map.weights, surface.columns, corners, may_stay=may_stay)
 
     def _hidden_distances(self, u: Values, posed: Sequence[PosedShape]) -> Sequence[float]:
         """Bounds of the distances of crack faces outside the surface from each obstacle, m (collective)."""
@@ -417,7 +310,7 @@ class ContactState:
 
     # --- surface ---
 
-    def edges_broke(self, pattern: npt.NDArray[np.uint8]) -> None:
+    def edges_broke(self, pattern: Pattern) -> None:
         """Add new crack faces near obstacles to the surface (collective)."""
         self._pattern, u = pattern.copy(), self.end_displacement
         self._is_damaged = self.comm.allreduce(bool(pattern.any()), op=MPI.LOR)
@@ -435,9 +328,8 @@ class ContactState:
             u: (owned dofs,) displacement, m.
             posed: obstacles at their poses.
         """
-        gaps = partial(min_distance, posed)
         self.clearance.discard()
-        self.facets.edges_broke(partial(self.surface.edges_broke, self._pattern, self._shown.flags, u, gaps), u, posed)
+        self.surface.edges_broke(self._pattern, self._shown.flags, u, posed)
         self._discard_start()
 
     def _show_cells_of_step(self, posed: Sequence[PosedShape]) -> None:
@@ -455,7 +347,7 @@ class ContactState:
         posed, barrier = self.group.start_posed, self.law.barrier
         self._show_cells_of_step(posed)
         u_n = self.level.u_n
-        self.facets.release(partial(self.surface.release_points, u_n, partial(min_distance, posed)), u_n, posed)
+        self.surface.release(u_n, posed)
         x = self.surface.positions(u_n)
         gaps = [shape.distance(x) for shape in posed]
         lagged = [
@@ -466,8 +358,8 @@ class ContactState:
         # for the work of normal forces by the trapezoidal rule
         self._start_forces = [contact.force @ contact.normal for contact in lagged]
         sum_at_points = None if self.comm.size == 1 else self.surface.sum_at_points
-        for number in self.facets.numbers:
-            of_facets, *_ = evaluate_facets(self.facets.active, posed[number], x, barrier)
+        for number in self.surface.curved:
+            of_facets, *_ = evaluate_facets(self.surface.facets, posed[number], x, barrier)
             self._start_forces[number] = self._start_forces[number] + of_facets.forces.sum(axis=(0, 1))
             if self.group.obstacles[number].friction:
                 lagged[number] = add_facet_friction(lagged[number], of_facets, x, sum_at_points)
@@ -536,7 +428,7 @@ class ContactState:
         """Slip in the step that counts as sticking, m, at each obstacle (collective)."""
         speeds = np.zeros(len(self.group.obstacles))
         if self.law.sticking_ratio and any(obstacle.friction for obstacle in self.group.obstacles):
-            velocity = self.surface.interpolation(self._start_velocity)
+            velocity = self.surface.interpolate(self._start_velocity)
             for number, lagged in enumerate(self.lagged):
                 if lagged is not None and len(lagged.points):
                     of_obstacle = self.group.bodies.velocity(self.group.numbers[number], lagged.position)
@@ -561,5 +453,5 @@ class ContactState:
         if self._nodal_forces is None:
             points = np.concatenate([contact.points for contact in contacts])
             forces = np.concatenate([contact.normal + contact.friction for contact in contacts])
-            self._nodal_forces = self.surface.interpolation.assemble_points_to_nodes(points, forces[..., None])[:, 0]
+            self._nodal_forces = self.surface.nodal_forces_of(points, forces[..., None])[:, 0]
         return self._nodal_forces

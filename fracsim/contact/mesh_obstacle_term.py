@@ -222,7 +222,7 @@ class MeshObstacleTerm(SurfaceContact):
         """Energy and derivatives by the pose of an obstacle, of this rank's pairs (collective)."""
         x, part, friction = self.end_positions(), self.contacts[index], self.friction[index]
         # far on this rank; others may be near
-        if part.is_far(x):
+        if part.is_far(x) and friction is None:
             return PoseDerivatives.none(6)
         energy = part.energy(x) + (0.0 if friction is None else friction.energy(part.points(x)))
         gradient, mesh = part.full_gradient(x, friction)[len(x) :], slice(x.size, None)
@@ -232,7 +232,7 @@ class MeshObstacleTerm(SurfaceContact):
     def rank_mixed_hessian(self, index: int) -> Values:
         """(columns, 18) second derivatives by nodes and the pose of an obstacle, of this rank's pairs (collective)."""
         x, part, point_map = self.end_positions(), self.contacts[index], self.surface.current.point_map
-        if part.is_far(x):
+        if part.is_far(x) and self.friction[index] is None:
             return np.zeros((point_map.weights.shape[1], 18))
         H = part.full_hessian(x, self.friction[index])[: x.size, x.size :]
         mixed = H @ point_jacobian(self._meshes[index].arms).reshape(-1, 6)

@@ -11,30 +11,29 @@ Equations: docs/theory.md#contact.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
+from scipy.sparse import csr_matrix
 
 from ..mechanics.extra_couplings import CouplingBuilder
 from ..mechanics.term import Term
+from ..mechanics.term_protocols import ContactPatchValues
 from ..mesh.domain import Domain
+from ..mesh.ghost_exchange import KeyLookup
+from ..mesh.parallel import allgather, sum_over_ranks
 from ..mesh.split_surface.drawn_surface import DrawnSurface
-from ..mesh.split_surface.surface_map import SurfaceMap
-from .contact_state import ContactState
-from .contact_surface import retract_from_obstacles
+from ..mesh.split_surface.surface_map import SurfaceMap, nodal_stiffness
+from .contact_state import ContactState, evaluate_contact
+from .facet_contact import ContactFacets
 from .laws import BARRIER, ObstacleLaw
 from .node_contact import ContactForces, PoseCoupling, PoseDerivatives, contact_wrench
-from .pose import min_distance, resultant
+from .pose import resultant
 from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 from .step_limit import PoseMotion, safe_motion_fractions, stop_before_obstacles
-
-if TYPE_CHECKING:
-    from .obstacle_patch import ObstaclePatch
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -67,10 +66,8 @@ class ObstacleTerm(ContactState, Term):
         super().__init__(
             domain, u, ObstacleGroup(bodies, numbers, law.barrier.width, self._gap, self._current_force), law
         )
-        # facets after the points that they are made of
-        facets = (self.facets,) if self.facets.numbers else ()
         self.pose_contact, self._coupling = PoseContact(self), CouplingBuilder(domain)
-        self.parts = (self.surface, *facets, self.group, self.clearance, self.pose_contact)
+        self.parts = (self.surface, self.group, self.clearance, self.pose_contact)
         self._has_tangent = False  # in this attempt of Newton's method
         # index of an obstacle, whether exact -> forces that a coupling with its pose is of, and the coupling
         self._couplings: dict[tuple[int, bool], tuple[ContactForces, PoseCoupling]] = {}
@@ -99,8 +96,8 @@ class ObstacleTerm(ContactState, Term):
         self._update_directions()
         if not self.comm.allreduce(sum(len(contact.points) for contact in contacts)):
             return None
-        matrix = self.surface.stiffness(stiffness_blocks(contacts, exact=exact))
-        return self._coupling(self.level.contact_weights.factor * matrix, self.surface.local.columns)
+        matrix = nodal_stiffness(self.surface.point_map.weights, stiffness_blocks(contacts, exact=exact))
+        return self._coupling(self.level.contact_weights.factor * matrix, self.surface.columns)
 
     def _update_directions(self) -> None:
         """Take the directions of friction of this iterate, of which the tangent is, as the last ones."""
@@ -183,7 +180,7 @@ class ObstacleTerm(ContactState, Term):
         if is_current:
             self.evaluate_near()
         x = self.positions if is_current else self.surface.positions(u)
-        motion = np.zeros_like(x) if change is None else self.surface.interpolation(change)
+        motion = np.zeros_like(x) if change is None else self.surface.interpolate(change)
         fractions: list[Values] = [np.ones(len(x))]
         for index, (posed, q) in moving.items():
             # gaps of the current forces are those at the current poses
@@ -194,8 +191,6 @@ class ObstacleTerm(ContactState, Term):
 
     def patch(self, nodes: Ints) -> ObstaclePatch:
         """Contact of nodes (k,), by their ascending global numbers, that move from the current u (collective)."""
-        from .obstacle_patch import ObstaclePatch  # in steps after edges broke alone
-
         return ObstaclePatch(self, nodes)
 
     def feasible_guess(self, u: Values) -> Values:
@@ -218,9 +213,7 @@ class ObstacleTerm(ContactState, Term):
         if self.clearance.is_far([u_n, self.level.displacement_at_end(u)], self.group.step_motions):
             return True
         x = self.surface.positions(self.level.displacement_at_end(u))
-        return self.surface.gaps_are_open(min_distance(self.group.posed, x)) and self.facets.are_open(
-            self.group.posed, x
-        )
+        return self.surface.is_open(self.group.posed, x)
 
     # --- contact as the obstacles see it (PoseContact) ---
 
@@ -244,7 +237,7 @@ class ObstacleTerm(ContactState, Term):
 
     def assemble_mixed_hessian(self, index: int, part: Values) -> Values:
         """(owned dofs, p) sums at the nodes of what `rank_mixed_hessian` returned (collective)."""
-        return self.surface.interpolation.assemble_points_to_nodes(self.obstacle_forces()[index].points, part)
+        return self.surface.nodal_forces_of(self.obstacle_forces()[index].points, part)
 
     def _pose_coupling(self, index: int, *, exact: bool) -> PoseCoupling:
         """Coupling of the points and the pose of an obstacle at the current u and poses (collective)."""
@@ -261,13 +254,11 @@ class ObstacleTerm(ContactState, Term):
     def separate_surface(self, points: SurfaceMap, surface: DrawnSurface, u: Values, t: float) -> SurfaceMap:
         """Retract points of a surface for output that would lie in an obstacle, as those of contact are."""
         all_posed = self.group.bodies.posed_at(t)
-        posed = [all_posed[number] for number in self.group.numbers]
-        points = retract_from_obstacles(points, partial(min_distance, posed))
-        return self.facets.separate(points, surface, posed)
+        return self.surface.separate(points, surface, [all_posed[number] for number in self.group.numbers])
 
     def clear_search(self) -> None:
         """Discard results of searches, which a checkpoint does not hold (not collective)."""
-        self.facets.clear_caches()
+        self.surface.clear_search()
         self._shown.discard()
         self.discard_forces()
 
@@ -297,7 +288,7 @@ class ObstacleTerm(ContactState, Term):
 
     def pushed_points(self) -> list[tuple[Values, Values, Values]]:
         """(k, d) points of this rank in contact with each obstacle, m, normal forces, N, start velocities, m/s."""
-        velocity = self.surface.interpolation(self._start_velocity)
+        velocity = self.surface.interpolate(self._start_velocity)
         contacts = self.obstacle_forces()
         return [(self.positions[contact.points], contact.normal, velocity[contact.points]) for contact in contacts]
 
@@ -309,3 +300,73 @@ def stiffness_blocks(contacts: Sequence[ContactForces], *, exact: bool) -> list[
     for facets in (contact.facets for contact in contacts if contact.facets is not None):
         groups.append((facets.corners, facets.hessian if exact else facets.stiffness))
     return groups
+
+
+# --- few nodes that move while all others stay, for nonlinear elimination (docs/theory.md#newtons-method) ---
+
+
+class ObstaclePatch:
+    """Potential of the contact of k nodes that move by w (k, d), m, with all others fixed (ContactPatch).
+
+    A point is x = x_0 + W w / f, with the part f of the step that has passed at the displacement. Obstacles stay. The
+    potential is that of the points that follow these nodes, and of all corners of facets with such a point: others add
+    a constant. Each rank evaluates its points, and all have the sums.
+    """
+
+    def __init__(self, term: ObstacleTerm, nodes: Ints) -> None:
+        """Choose the points that follow nodes (k,), by their ascending global numbers (collective)."""
+        term.evaluate_near()
+        self._level, self._comm, self._barrier, surface = term.level, term.comm, term.law.barrier, term.surface
+        weights = _columns_of(nodes, surface.point_map.weights, surface.columns)
+        moves = np.diff(weights.indptr) > 0
+        used, facets = moves.copy(), None
+        if surface.curved:
+            active = surface.facets
+            chosen = moves[active.corners].any(axis=1)
+            corners = active.corners[chosen]
+            used[corners] = True
+            facets = ContactFacets((np.cumsum(used) - 1)[corners], active.area[chosen], active.smoothing)
+        points, self._at_rest = np.flatnonzero(used), np.zeros_like(term.group.increments[0])
+        self._start, self._area, self._weights = term.positions[points], surface.area[points], weights[points]
+        self._contacts = [
+            (posed, term.step_contact(number).select(points), facets if number in surface.curved else None)
+            for number, posed in enumerate(term.group.posed)
+        ]
+
+    def _positions(self, w: Values) -> Values:
+        """(n, d) positions of its points, m."""
+        return np.asarray(self._start + self._weights @ w / self._level.fraction)
+
+    def evaluate(self, w: Values) -> ContactPatchValues:
+        """Potential at w (k, d), m, with its derivatives (collective)."""
+        x, level = self._positions(w), self._level
+        contacts = [
+            evaluate_contact(x, self._area, posed, self._barrier, start, facets)
+            for posed, start, facets in self._contacts
+        ]
+        forces = np.zeros(x.shape)
+        for contact in contacts:
+            forces[contact.points] -= contact.normal + contact.friction
+        potential = sum_over_ranks(self._comm, np.array([sum(contact.potential for contact in contacts)]))
+        gradient = sum_over_ranks(self._comm, self._weights.T @ forces)
+        blocks = nodal_stiffness(self._weights, stiffness_blocks(contacts, exact=True))
+        stiffness, weight = sum(allgather(self._comm, blocks)), level.contact_weight
+        return ContactPatchValues(
+            weight * level.fraction * float(potential[0]), weight * gradient, level.contact_weights.factor * stiffness
+        )
+
+    def free_fraction(self, w: Values, step: Values) -> float:
+        """Fraction in [0, 1] of a step (k, d), m, from w (k, d) that leaves a tenth of every gap (collective)."""
+        x, motion, fraction = self._positions(w), np.asarray(self._weights @ step / self._level.fraction), 1.0
+        for posed, _, facets in self._contacts:
+            fractions = safe_motion_fractions(posed, x, motion, self._at_rest, facets)
+            fraction = min(fraction, float(fractions[self._area > 0].min(initial=1.0)))
+        return float(self._comm.allreduce(fraction, op=MPI.MIN))
+
+
+def _columns_of(nodes: Ints, weights: csr_matrix, numbers: Ints) -> csr_matrix:
+    """(n, k) columns of nodes (k,) in weights (n, m), whose columns are of nodes with global `numbers` (m,)."""
+    rows = KeyLookup(numbers)(nodes)
+    present = np.flatnonzero(rows >= 0)
+    selection = np.ones(len(present)), (rows[present], present)
+    return weights @ csr_matrix(selection, shape=(len(numbers), len(nodes)))

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import cast
 
 import numpy as np
@@ -35,7 +34,7 @@ from .node_contact import ContactForces
 from .obstacle import VerletObstacle
 from .obstacle_term import ObstacleTerm
 from .penalty_law import NodalMassShare, PenaltyContacts, PenaltyForces, Slips
-from .pose import PosedShape, min_distance
+from .pose import PosedShape
 from .rigid_obstacles import RigidObstacles
 
 Values = npt.NDArray[np.float64]
@@ -122,27 +121,27 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
     def facets_for(self, number: int) -> ContactFacets | None:
         """Facets on which an obstacle acts, with their stiffness as areas; None if it acts on points alone."""
-        return self._facets if number in self.facets.numbers else None
+        return self._facets if number in self.surface.curved else None
 
     # --- stiffness ---
 
     def _update_stiffness(self) -> None:
         """Compute the stiffness of the points of the current surface (collective)."""
-        point_map, area = self.surface.local.point_map, self.surface.area
-        mass = self.surface.interpolation.nodal_values(self._mass)[:, 0].copy()
+        point_map, area = self.surface.point_map, self.surface.area
+        mass = self.surface.nodal_values(self._mass)[:, 0].copy()
         self._mass_share = mass_share = NodalMassShare(point_map.weights, mass, self._sum_at_nodes)
         self.stiffness: Values = self.law.barrier.curvature(np.zeros(len(area))) * area
         if np.isfinite(self._max_added):
             self.stiffness = np.minimum(self.stiffness, self._max_added * mass_share.point_masses(area))
         self._added_frequency, self._stiffness_of = self._max_rate(self.stiffness), (point_map, area)
-        if self.facets.numbers:
+        if self.surface.curved:
             self._update_facets()
 
     def _sum_at_nodes(self, values: Values) -> Values:
         """(columns,) sums over the ranks of values (columns,) at the nodes of the points (collective)."""
-        vector, interpolation = np.zeros((len(values), self._domain.dim)), self.surface.interpolation
+        vector: Values = np.zeros((len(values), self._domain.dim))
         vector[:, 0] = values
-        return np.asarray(interpolation.nodal_values(interpolation.sum_at_nodes(vector))[:, 0])
+        return np.asarray(self.surface.nodal_values(self.surface.sum_at_nodes(vector))[:, 0])
 
     def _max_rate(self, stiffness: Values) -> float:
         """Bound of omega^2 of springs k (n,), N/m, at the points of all ranks, 1/s^2 (collective)."""
@@ -151,8 +150,8 @@ class PenaltyObstacleTerm(ObstacleTerm):
     def _update_facets(self) -> None:
         """Compute the stiffness k_f of facets off crack faces, kept as areas of ContactFacets (collective)."""
         surface, is_copy = self.surface, np.zeros(len(self.surface.area), bool)
-        is_copy[surface.local.point_map.copies] = True
-        facets, k = self.facets.active, self.law.barrier.curvature(np.zeros(1)) * self.facets.active.area
+        is_copy[surface.point_map.copies] = True
+        facets, k = self.surface.facets, self.law.barrier.curvature(np.zeros(1)) * self.surface.facets.area
         if np.isfinite(self._max_added):
             masses = self._mass_share.point_masses(surface.area)
             per_mass = np.divide(surface.area, masses, out=np.zeros(len(masses)), where=masses > 0)
@@ -173,9 +172,9 @@ class PenaltyObstacleTerm(ObstacleTerm):
         if self.is_far():
             return added
         self.obstacle_forces()
-        if self.facets.numbers:
+        if self.surface.curved:
             load, reach = np.zeros(len(self.stiffness)), PENALTY.near_gap * self.law.barrier.width
-            for number in self.facets.numbers:
+            for number in self.surface.curved:
                 near = self._facets.within_reach(self.group.posed[number], self.positions, reach)
                 np.add.at(load, self._facets.corners[near], self._facets.area[near][:, None])
             if self.comm.allreduce(bool(load.any()), op=MPI.LOR):
@@ -210,22 +209,22 @@ class PenaltyObstacleTerm(ObstacleTerm):
         return self._step_end.all_far
 
     def _begin_new_step(self) -> None:
-        self.surface.release_points(self.level.u_n, partial(min_distance, self.group.start_posed))
+        self.surface.release(self.level.u_n, self.group.start_posed)
         point_map, area = self._stiffness_of
-        if self.comm.allreduce(point_map is not self.surface.local.point_map or area is not self.surface.area):
+        if self.comm.allreduce(point_map is not self.surface.point_map or area is not self.surface.area):
             self._update_stiffness()
         self._start_points = self.surface.positions(self.level.u_n)
 
     def _contacts(self, number: int, posed: PosedShape, reach: float) -> list[tuple[PenaltyContacts, Ints]]:
         """Points nearer than `reach`, m, to an obstacle, and facets that may be, and their keys."""
-        x, names = self.positions, self.surface.local.keys
+        x, names = self.positions, self.surface.keys
         points = self.point_candidates(posed, x, reach)
         gap = posed.distance(x[points])
         near = (gap < reach) & (self.surface.area[points] > 0)
         points, gap = points[near], gap[near]
         ones: Values = np.ones((len(points), 1))
         items = [(points[:, None], ones, gap, posed.normal(x[points]), self.stiffness[points])]
-        if number in self.facets.numbers:
+        if number in self.surface.curved:
             facets = self._facets.within_reach(posed, x, reach)
             closest = self._facets.closest_points(posed, x, facets)
             geometry = self._facets.corners[facets], closest.barycentric, closest.gap, closest.normal
@@ -318,8 +317,8 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
         Raises ValueError if it has keys of no element.
         """
-        names = self.surface.local.keys
-        corners = self._facets.corners if self.facets.numbers else np.empty((0, self._domain.dim), np.int64)
+        names = self.surface.keys
+        corners = self._facets.corners if self.surface.curved else np.empty((0, self._domain.dim), np.int64)
         of_facets = row_keys(np.sort(names[corners], axis=1))
         find_saved_keys(self.comm, np.append(names, of_facets), saved["spring_points"])
         rows, keys, is_root = saved["springs"], saved["spring_points"], self.comm.rank == 0

@@ -328,13 +328,13 @@ def stop_before_obstacles(
         start: (owned dofs,) displacements at the start, m.
         end: (owned dofs,) first guess of those at the end, m.
     """
-    x, interpolation = surface.positions(start), surface.interpolation
+    x = surface.positions(start)
     for _ in range(LIMITS.max_rounds):
-        correction, stopped = _corrections(surface.area, motions, x, interpolation(end - start))
+        correction, stopped = _corrections(surface.area, motions, x, surface.interpolate(end - start))
         if not surface.comm.allreduce(int(stopped.any())):
             return end
-        weight = interpolation.assemble_to_nodes(np.repeat(stopped[:, None], x.shape[1], axis=1).astype(float))
-        change = interpolation.assemble_to_nodes(correction)
+        weight = surface.nodal_forces(np.repeat(stopped[:, None], x.shape[1], axis=1).astype(float))
+        change = surface.nodal_forces(correction)
         counts = np.abs(weight) > LIMITS.min_weight
         end = end + np.where(counts, change / np.where(counts, weight, 1.0), 0.0)
     return end

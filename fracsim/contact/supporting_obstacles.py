@@ -91,8 +91,8 @@ def _rest_gaps(term: ObstacleTerm) -> Values:
     """
     x, posed = term.surface.rest_positions, [obstacle.posed_at(0.0) for obstacle in term.group.obstacles]
     gaps = np.array([term.surface.min_distance(shape.distance(x)) for shape in posed])
-    for number in term.facets.numbers:
-        facet_gaps = term.facets.active.gaps(posed[number], x, term.group.barrier_width)
+    for number in term.surface.curved:
+        facet_gaps = term.surface.facets.gaps(posed[number], x, term.group.barrier_width)
         gaps[number] = min(gaps[number], float(facet_gaps.min(initial=np.inf)))
     term.comm.Allreduce(MPI.IN_PLACE, gaps, MPI.MIN)
     return gaps

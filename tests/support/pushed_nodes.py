@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from mpi4py import MPI
 
-from fracsim.contact.obstacle_patch import ObstaclePatch
-from fracsim.contact.obstacle_term import ObstacleTerm
+from fracsim.contact.obstacle_term import ObstaclePatch, ObstacleTerm
 from fracsim.mechanics.term_protocols import PatchContactTerm, fulfilling
 from fracsim.mesh.parallel import allgather
 from fracsim.scene import Scene

@@ -9,6 +9,8 @@ import numpy.typing as npt
 from mpi4py import MPI
 
 from fracsim.contact.contact_surface import ContactSurface
+from fracsim.contact.pose import Pose, PosedShape
+from fracsim.contact.shapes import HalfSpace
 from fracsim.mesh.edge_graph import EdgeGraph
 from support.scenes import make_scene
 
@@ -26,22 +28,19 @@ def broken_stages(dim: int, order: int) -> list[tuple[Ints, Values, list[tuple[i
     scene, _ = make_scene(mesh=mesh)
     domain, graph, stages = scene.domain, EdgeGraph(scene.domain), []
     surface = ContactSurface(domain, 0.01)
+    far = PosedShape(HalfSpace((1.0,) + (0.0,) * (dim - 1)), Pose.at_point(np.full(dim, -9.0)))
     middles = domain.nodes[graph.edge_nodes].mean(axis=1)
     noise = np.modf(1e4 * np.sin(1e3 * np.round(middles, 6) @ np.array([1.0, 2.7, 7.3])[:dim]))[0] ** 2
     for share in SHARES:
         graph.break_edges(noise < share)
-        surface.edges_broke(graph.pattern, None, np.zeros(domain.node_count * dim), lambda x: np.ones(len(x)))
-        local = surface.local
-        split, points = local._split_surface, local._contact_points
-        follow, numbers = split.parents, domain.input_numbering.nodes
+        surface.edges_broke(graph.pattern, None, np.zeros(domain.node_count * dim), [far])
+        rest, mean = surface.point_map.rest, surface.point_map._mean
         descriptions = [
-            (*np.rint(1e7 * split.points[point]).astype(int).tolist(),
-             *np.sort(numbers[follow.parents[follow.start[point] : follow.start[point + 1]]]).tolist())
-            for point in points
-        ]  # fmt: skip
-        stages.append(
-            (local.keys, surface.sum_at_points(np.arange(len(points)), local.area[:, None])[:, 0], descriptions)
-        )
+            (*np.rint(1e7 * rest[point]).astype(int).tolist(), *np.sort(surface.columns[mean[point].indices]).tolist())
+            for point in range(len(rest))
+        ]
+        area = surface.sum_at_points(np.arange(len(rest)), surface.area[:, None])[:, 0]
+        stages.append((surface.keys, area, descriptions))
     return stages
 
 

@@ -23,64 +23,13 @@ from ...meshes.data import MeshData
 from ..domain import Domain
 from ..ghost_exchange import sum_at_nodes
 from ..parallel import rank_offset
-from ..simplices import is_split
-from .closed_surface import SplitSurface, build_split_surface, node_keys
+from .closed_surface import SplitSurface
 from .entity_numbering import CRACK, EntityNumbering
-from .surface_map import SurfaceMap, gradient_entries, mean_parent_positions, row_entries
+from .surface_map import gradient_entries, mean_parent_positions
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
 OUTSIDE = "outside"  # facet group of the boundary of the body; borders between ranks do not belong to it
-
-
-class LocalSurface:
-    """Points of the split surface of the cells of this rank.
-
-    Attributes:
-        point_map: map from nodal displacements to the n points.
-        area: (n,) area of each point, m^2 (2D: length, m).
-        columns: global numbers of the nodes in the columns of the weights of `point_map`.
-        keys: (n,) keys of the points, equal on all ranks and as edges break (SurfacePoints.keys).
-    """
-
-    def __init__(self, domain: Domain) -> None:
-        self._domain = domain
-        mesh = local_mesh(domain)
-        self._topology = EntityNumbering(mesh)
-        self.update_damage(np.zeros(len(mesh.cells), np.uint8))
-
-    def update_damage(self, pattern: npt.NDArray[np.uint8], shown: npt.NDArray[np.bool_] | None = None) -> None:
-        """Rebuild the surface (collective).
-
-        Args:
-            pattern: (cells,) broken edges of each cell.
-            shown: (cells,) flags of cells that are split; all others are drawn as if whole. None: all cells are.
-        """
-        of_shown = pattern if shown is None else np.where(shown, pattern, np.uint8(0))
-        surface, numbers = build_split_surface(self._topology, of_shown), self._domain.input_numbering.nodes
-        assert surface.numbering is not None
-        keys = surface.numbering.keys(numbers)
-        if self._domain.order == 2:
-            from .quadratic_surface import with_midside_points
-
-            surface = with_midside_points(surface, self._domain, of_shown)
-            midside = surface.parents.first_parent[len(keys) :]
-            keys = np.append(keys, node_keys(numbers[midside], self._domain.dim))
-        area = _areas(surface, self._topology)
-        self._contact_points = np.flatnonzero(area > 0)
-        self.area, self.keys, self._split_surface = area[self._contact_points], keys[self._contact_points], surface
-        intact = ~is_split(self._domain.dim)[pattern]
-        if shown is not None:
-            intact &= shown  # so that damage elsewhere changes no arm
-        means, middle, arms, out = local_map_parts(self._domain, surface, self._contact_points, intact)
-        self.columns, (means, arms) = restrict_to_used_columns([means, arms])
-        self.point_map = SurfaceMap(means, middle, arms, out)
-
-    def facets(self) -> tuple[Ints, Values]:
-        """(m, d) points of the elements that `area` is the sum of, and (m,) their areas, m^2 (2D: lengths, m)."""
-        elements, measure = contact_elements(self._split_surface, self._topology)
-        real = measure > 0
-        return np.searchsorted(self._contact_points, elements[real]), measure[real]
 
 
 def local_map_parts(
@@ -185,13 +134,6 @@ def contact_elements(surface: SplitSurface, topology: EntityNumbering) -> tuple[
     return elements, np.linalg.norm(spanned, axis=1) / 2
 
 
-def _areas(surface: SplitSurface, topology: EntityNumbering) -> Values:
-    """(points,) 1 / d of the area of the elements around each point."""
-    elements, measure = contact_elements(surface, topology)
-    shares = np.repeat(measure / topology.dim, topology.dim)
-    return np.asarray(np.bincount(elements.reshape(-1), shares, len(surface.points)), np.float64)
-
-
 def _parents_of(surface: SplitSurface, points: Ints) -> tuple[Ints, Ints]:
     """(k + 1,) start of the parents of each of the points (k,), and their positions in `surface.parents.parents`."""
     begin, count = surface.parents.start[points], np.diff(surface.parents.start)[points]
@@ -253,42 +195,3 @@ class NodeExchange:
         """Free the PETSc objects."""
         for petsc_object in (self._nodes, self._local, self._scatter):
             petsc_object.destroy()
-
-
-class ParentMatrix:
-    """The matrix from nodes of all ranks to the surface points of this rank, and its transpose.
-
-    Attributes:
-        dim: dimension of the body.
-        comm: communicator of the body.
-        nodal_values: values (columns, d) at the nodes in the columns.
-    """
-
-    def __init__(self, domain: Domain, surface: LocalSurface) -> None:
-        """For the present state of `surface` (collective)."""
-        self._surface, self.dim, self.comm = surface, domain.dim, domain.comm
-        self.nodal_values = NodeExchange(domain, surface.columns)
-
-    def __call__(self, owned: Values) -> Values:
-        """(n, d) values at the points of a field with `owned` dofs (collective)."""
-        return np.asarray(self._surface.point_map.weights @ self.nodal_values(owned))
-
-    def assemble_to_nodes(self, forces: Values) -> Values:
-        """(owned dofs,) nodal forces equivalent to `forces` (n, d) at the points, N (collective)."""
-        return self.sum_at_nodes(self._surface.point_map.weights.T @ forces)
-
-    def assemble_points_to_nodes(self, points: Ints, forces: Values) -> Values:
-        """(owned dofs, m) nodal forces equivalent to m sets of forces (k, d, m) at points (k,) (collective)."""
-        W, m = self._surface.point_map.weights, forces.shape[2]
-        entry, row = row_entries(W, points)
-        at_nodes = np.zeros((W.shape[1], *forces.shape[1:]))
-        np.add.at(at_nodes, W.indices[entry], W.data[entry][:, None, None] * forces[row])
-        return np.stack([self.sum_at_nodes(at_nodes[:, :, i]) for i in range(m)], axis=1)
-
-    def sum_at_nodes(self, parts: Values) -> Values:
-        """(owned dofs,) sums over ranks of `parts` (columns, d) at the nodes in the columns (collective)."""
-        return self.nodal_values.sum_at_nodes(parts)
-
-    def destroy(self) -> None:
-        """Free the PETSc objects."""
-        self.nodal_values.destroy()

@@ -9,11 +9,12 @@ affine motions of the reference position X_s are reproduced, and sum w_a = 1.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csr_matrix, diags, kron
+from scipy.sparse import bsr_matrix, csr_matrix, diags, kron
 
 from .surface_motion import PointParents
 
@@ -110,6 +111,46 @@ def row_entries(matrix: csr_matrix, rows: Ints) -> tuple[Ints, Ints]:
     row = np.repeat(np.arange(len(rows)), lengths)
     starts = matrix.indptr[rows] - np.cumsum(lengths) + lengths
     return np.arange(len(row)) + starts[row], row
+
+
+def nodal_stiffness(W: csr_matrix, groups: Sequence[tuple[Ints, Values]]) -> csr_matrix:
+    """(m d, m d) W^T B W of blocks B at groups of points.
+
+    Blocks are summed pair of nodes by pair: products of sparse matrices take ten times as long for few groups, and the
+    sum of a matrix for each kind of group twice as long.
+
+    Args:
+        W: (n, m) weights of m nodes in the positions of n points.
+        groups: (k, c) points of each group, and their (k, c d, c d) B; c may differ from kind to kind.
+    """
+    parts = [_blocks_of_nodes(W, corners, blocks) for corners, blocks in groups]
+    first, second, values = (np.concatenate(part) for part in zip(*parts, strict=True))
+    m, d = W.shape[1], values.shape[1]
+    pair = first.astype(np.int64) * m + second
+    order = np.argsort(pair, kind="stable")
+    pair = pair[order]
+    starts = np.flatnonzero(np.diff(pair, prepend=-1))
+    row, column = np.divmod(pair[starts], m)
+    data = np.add.reduceat(values[order], starts, axis=0) if len(starts) else values
+    return bsr_matrix((data, column, np.searchsorted(row, np.arange(m + 1))), shape=(d * m, d * m)).tocsr()
+
+
+def _blocks_of_nodes(W: csr_matrix, corners: Ints, blocks: Values) -> tuple[Ints, Ints, Values]:
+    """(p,) first and (p,) second nodes, and (p, d, d) w_i w_j B_ij of all pairs of corners i, j of groups.
+
+    As of `nodal_stiffness`.
+    """
+    (k, c), points = corners.shape, corners.reshape(-1)
+    d = blocks.shape[1] // c
+    entry, corner = row_entries(W, points)
+    node, weight, group = W.indices[entry], W.data[entry], corner // c
+    # pairs of entries of a group
+    counts = np.bincount(group, minlength=k)
+    partners, starts = counts[group], (np.cumsum(counts) - counts)[group]
+    first = np.repeat(np.arange(len(entry)), partners)
+    second = np.arange(len(first)) + np.repeat(starts - np.cumsum(partners) + partners, partners)
+    B = blocks.reshape(k, c, d, c, d)[group[first], corner[first] % c, :, corner[second] % c]
+    return node[first], node[second], (weight[first] * weight[second])[:, None, None] * B
 
 
 def mean_parent_positions(points: Values, follow: PointParents) -> Values:
