@@ -170,6 +170,23 @@ def test_what_breaks_in_touch_gains_nothing(tmp_path: Path) -> None:
     assert 0.1 * before < contact.stored_energy() <= before * (1 + 1e-6)
 
 
+@pytest.mark.parametrize("scheme", ["explicit", "backward-euler"])
+def test_a_body_of_single_nodes_has_no_fragments_to_touch(scheme: str) -> None:
+    """All edges break, so that contact between fragments is left without a surface: nodes fly on in free fall."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.5}, material=SOFT, contact={"itself": "pieces"},
+        fracture={"strength": 1e9}, load={"gravity": [0.0, -1.0]}, time={"scheme": scheme, "step": 0.02, "end": 0.1},
+    )  # fmt: skip
+    graph = scene.fracture.graph
+    graph.break_edges(np.ones(len(graph.broken), bool))
+    scene.fracture.damage_restored()
+    scene.balance.damage_changed()
+    scene.balance.edges_broke(graph.pattern)
+    state.remember()
+    march(scene, state)
+    np.testing.assert_allclose(state.v.reshape(-1, 2), np.tile([0.0, -0.1], (9, 1)), atol=1e-9)
+
+
 @pytest.mark.slow
 def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:
     """A plate that is crushed and breaks, its pieces in touch and rubbing: stopped and resumed, the same but for

@@ -409,10 +409,13 @@ class PartitionedSurface[Part: SurfacePart[Any]]:
         self.has_retracted = bool(max_over_ranks(self._comm, int(bool(np.any(share < 1)) or len(excluded) > 0)))
 
     def reach_of_points(self) -> float:
-        """Largest motion of a point of this rank where no node moves by more than 1; infinite with retracted faces."""
+        """Largest motion of a point of this rank where no node moves by more than 1; infinite with retracted faces.
+
+        At least 1, as points move with their nodes in a translation; 1 of a surface without points.
+        """
         if self.has_retracted:
             return np.inf
-        return float(abs(self.current.point_map.weights).sum(axis=1).max()) if len(self.current.elements) else 0.0
+        return float(abs(self.current.point_map.weights).sum(axis=1).max()) if len(self.current.elements) else 1.0
 
     def following_points(self) -> FollowingPoints:
         """Points of this rank."""
