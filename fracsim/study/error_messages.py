@@ -36,7 +36,7 @@ _PATTERNS = {
 
 
 def validation_message(errors: Sequence[Any], table: str = "") -> str:
-    """Returns the first error as a sentence.
+    """Returns the first error as a sentence, all missing keys in one.
 
     An unknown key precedes a missing one, since it is usually the missing key with a typing error.
 
@@ -45,23 +45,37 @@ def validation_message(errors: Sequence[Any], table: str = "") -> str:
         table: path of the table that was validated, if it is not the whole study.
     """
     error = next((error for error in errors if error["type"] == "extra_forbidden"), errors[0])
-    location = _location(error["loc"])
-    where = ".".join(map(str, [table, *location] if table else location))
+    location, where = _location(error["loc"]), _key(error, table)
     if error["type"] == "extra_forbidden":
         return unknown_key_message(where, _known_keys(location[:-1]))
     if error["type"] == "missing":
-        return f"{where} is missing; {_owner(location)} needs it"
+        # a key may be missing in one type of a value alone
+        missing = [_key(entry, table) for entry in errors if entry["type"] == "missing" and not _in_union(entry)]
+        if _in_union(error) or len(missing) == 1:
+            return f"{where} is missing; {_owner(location)} needs it"
+        return f"{', '.join(missing[:-1])} and {missing[-1]} are missing; the study needs them"
     if error["type"] == "value_error":
         return f"{where}: {error['ctx']['error']}" if where else str(error["ctx"]["error"])
     return f"{where} = {_show(error['input'])}: {_sentence(error)}"
 
 
 def unknown_key_message(where: str, known: Iterable[str]) -> str:
-    """Returns a sentence on an unknown key, with the nearest known key, or all known keys of its table."""
-    keys = sorted(known)
-    near = difflib.get_close_matches(where.rpartition(".")[2], keys, n=1, cutoff=0.5)
-    hint = f"did you mean {near[0]}?" if near else f"known here: {', '.join(keys)}"
-    return f"{where} is not a known key; {hint}"
+    """Returns a sentence on an unknown key, with the nearest known key, and all known keys of its table."""
+    keys = sorted(set(known))
+    near = difflib.get_close_matches(where.rpartition(".")[2], keys, n=1, cutoff=0.6)
+    hint = f"did you mean {near[0]}? Known" if near else "known"
+    return f"{where} is not a known key; {hint} here: {', '.join(keys)}"
+
+
+def _key(error: Any, table: str) -> str:
+    """Path of the key of an error; `table`: path of the table that was validated, if it is not the whole study."""
+    location = _location(error["loc"])
+    return ".".join(map(str, [table, *location] if table else location))
+
+
+def _in_union(error: Any) -> bool:
+    """Whether an error is one of several for a value that may have several types."""
+    return any(str(part).startswith("<") for part in error["loc"])
 
 
 def _location(parts: Sequence[Any]) -> list[Any]:
