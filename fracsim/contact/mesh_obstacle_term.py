@@ -14,16 +14,14 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
-from scipy.sparse import csr_matrix
 
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
 from .clearance import Clearance
-from .ipc_pairs import IpcPairs
 from .laws import ObstacleLaw
-from .mesh_obstacles import MESH, MeshObstacle, free_fraction_on_arcs
-from .node_contact import PoseDerivatives, point_set_derivatives
+from .mesh_obstacles import MESH, BarrierPart, MeshObstacle, free_fraction_on_arcs
+from .node_contact import PoseDerivatives, carried_derivatives
 from .obstacle import RigidObstacle
 from .obstacle_pairs import Numbers, PairDerivatives, PosedObstacles
 from .pose import Pose, point_jacobian
@@ -32,7 +30,7 @@ from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 from .sample_points import IpcFriction
 from .self_contact import BarrierBodySurface, Pattern, SurfaceContact, mean_velocities
 from .step_limit import PoseMotion, stop_before_meshes
-from .triangle_mesh_shape import StackedMeshes, TriangleMeshShape, refine_triangles
+from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -227,7 +225,7 @@ class MeshObstacleTerm(SurfaceContact):
         energy = part.energy(x) + (0.0 if friction is None else friction.energy(part.points(x)))
         gradient, mesh = part.full_gradient(x, friction)[len(x) :], slice(x.size, None)
         H = part.full_hessian(x, friction, exact=exact)[mesh, mesh]
-        return point_set_derivatives(energy, gradient, H, self._meshes[index].arms, exact=exact)
+        return carried_derivatives(energy, gradient, H, self._meshes[index].arms, exact=exact)
 
     def rank_mixed_hessian(self, index: int) -> Values:
         """(columns, 18) second derivatives by nodes and the pose of an obstacle, of this rank's pairs (collective)."""
@@ -288,79 +286,78 @@ class MeshPair:
         self, numbers: Numbers, obstacles: Mapping[int, RigidObstacle], law: ObstacleLaw, stiffness: float
     ) -> None:
         """`obstacles`: by their numbers; `law`: distance and friction; `stiffness`: of the barrier, Pa."""
-        self.numbers, self._law, members = numbers, law, [obstacles[number] for number in numbers]
-        self._meshes = StackedMeshes(*(obstacle.shape for obstacle in members))
-        self._coefficient = max(obstacle.friction for obstacle in members)
+        self.numbers, self._law = numbers, law
+        first, second = (obstacles[number] for number in numbers)
+        friction = max(first.friction, second.friction)
+        self._first, self._second = (MeshObstacle.of(obstacle, friction) for obstacle in (first, second))
 
-        def build(distance: float) -> IpcPairs:
-            return IpcPairs(
-                self._meshes.points, self._meshes.triangles, distance=distance, stiffness=stiffness,
-                friction=self._coefficient, patch=self._meshes.patches,
-            )  # fmt: skip
+        def build(distance: float) -> BarrierPart:
+            mesh = self._first
+            return BarrierPart.build(
+                mesh.points, mesh.triangles, self._second, distance=distance, stiffness=stiffness, edge=mesh.edge
+            )
 
-        self._distance, self._pairs = law.barrier.width, build(law.barrier.width)
-        start = self._meshes.positions([obstacle.posed_at(0.0).pose for obstacle in members])
-        if (gap := self._pairs.min_gap(start)) < self._distance:
-            self._distance = MESH.gap_share * gap
-            self._pairs = build(self._distance)
+        self._part = build(law.barrier.width)
+        self._start = self._first.positions_at(first.posed_at(0.0).pose)  # (n, 3) of the first at the step's start, m
+        self._start_pose = second.posed_at(0.0).pose  # of the second then
+        if (gap := self._part.pairs.min_gap(self._part.points(self._start, self._start_pose))) < law.barrier.width:
+            self._part = build(MESH.gap_share * gap)
         self._friction: IpcFriction | None = None
-        self._start: Values = start  # (n, 3) points of both at the start of the step, m
 
     def _near_positions(self, posed: PosedObstacles) -> Values | None:
-        """(n, 3) points of both obstacles, m; None: they are far, and were so at the start of the step."""
-        max_gap = self._distance if self._friction is None else np.inf
-        return self._meshes.near_positions([posed[number].pose for number in self.numbers], max_gap)
+        """(n, 3) points of the first, m, with the second at its pose; None: far, now and at the start of the step."""
+        first, second = (posed[number].pose for number in self.numbers)
+        if self._friction is None and self._first.spheres_are_far(first, self._second, second, self._part.reach):
+            return None
+        self._second.move_to(second)
+        x = self._first.positions_at(first)
+        return None if self._friction is None and self._part.is_far(x) else x
 
     def begin_step(self, motion: RigidObstacles, dt: float, *, time_averaged: bool) -> None:
         """Begin a step of dt, s: friction is lagged; forces are those of the end of the step, whatever the scheme."""
-        self._friction = None
-        if self._coefficient and (x := self._near_positions(motion.start_posed)) is not None:
-            parts = [(n, x[rows]) for n, rows in zip(self.numbers, self._meshes.rows, strict=True)]
-            velocity = np.concatenate([np.broadcast_to(motion.velocity(n, y), y.shape) for n, y in parts])
-            pressed = self._pairs.gradient(x).any(axis=1)
-            if pressed.any():
-                speed = float(np.linalg.norm(np.ptp(velocity[pressed], axis=0)))
-                slip = dt * max(self._law.sticking_speed, self._law.sticking_ratio * speed)
-                self._start, self._friction = x, self._pairs.lag_friction(x, x, slip)
+        self._friction, posed = None, motion.start_posed
+        if not self._part.friction or (x := self._near_positions(posed)) is None:
+            return
+        pressed = self._part.full_gradient(x).any(axis=1)
+        if pressed.any():
+            sides = zip(self.numbers, (x, self._second.positions), strict=True)
+            velocity = np.concatenate([np.broadcast_to(motion.velocity(n, y), y.shape) for n, y in sides])
+            speed = float(np.linalg.norm(np.ptp(velocity[pressed], axis=0)))
+            slip = dt * max(self._law.sticking_speed, self._law.sticking_ratio * speed)
+            self._start, self._start_pose = x, posed[self.numbers[1]].pose
+            self._friction = self._part.lag_friction(x, slip)
 
     def is_open(self, posed: PosedObstacles) -> bool:
         """Whether the obstacles do not intersect."""
-        return (x := self._near_positions(posed)) is None or not len(self._pairs.intersections(x))
+        return (x := self._near_positions(posed)) is None or not len(self._part.cut_elements(x))
 
     def energies(self, posed: PosedObstacles) -> tuple[float, float]:
         """Energy of the barrier, and potential of all forces in the step, J."""
         if (x := self._near_positions(posed)) is None:
             return 0.0, 0.0
-        energy = self._pairs.energy(x)
-        return energy, energy + (0.0 if self._friction is None else self._friction.energy(x))
+        energy = self._part.energy(x)
+        return energy, energy + (0.0 if self._friction is None else self._friction.energy(self._part.points(x)))
 
     def derivatives(self, posed: PosedObstacles, *, exact: bool) -> PairDerivatives | None:
         """Derivatives of the potential by both poses; None: out of contact."""
         if (x := self._near_positions(posed)) is None:
             return None
-        gradient = self._pairs.gradient(x)
-        if self._friction is not None:
-            gradient = gradient + self._friction.gradient(x)
+        gradient = self._part.full_gradient(x, self._friction)
         if not gradient.any():
             return None
-        H = self._pairs.hessian(x, exact=exact)
-        if self._friction is not None:
-            H = csr_matrix(H + self._friction.hessian(x, exact=exact))
-        energy, first, rows = self.energies(posed)[1], 3 * self._meshes.count, self._meshes.rows
-        dofs = slice(None, first), slice(first, None)
-        arms = [x[part] - posed[number].pose.centre for number, part in zip(self.numbers, rows, strict=True)]
-        by_first, by_second = (
-            point_set_derivatives(energy, gradient[part], H[columns, columns], arm, exact=exact)
-            for part, columns, arm in zip(rows, dofs, arms, strict=True)
-        )
+        H, energy, n = self._part.full_hessian(x, self._friction, exact=exact), self.energies(posed)[1], len(x)
+        arms = x - posed[self.numbers[0]].pose.centre, self._second.arms
+        by_first = carried_derivatives(energy, gradient[:n], H[: x.size, : x.size], arms[0], exact=exact)
+        by_second = carried_derivatives(energy, gradient[n:], H[x.size :, x.size :], arms[1], exact=exact)
         J, J_second = (point_jacobian(arm).reshape(arm.size, -1) for arm in arms)
-        return by_first, by_second, np.asarray(J.T @ (H[dofs[0], dofs[1]] @ J_second))
+        return by_first, by_second, np.asarray(J.T @ (H[: x.size, x.size :] @ J_second))
 
     def dissipated(self, posed: PosedObstacles) -> float:
         """Energy dissipated by friction in the step, J."""
         if self._friction is None or (x := self._near_positions(posed)) is None:
             return 0.0
-        return float(np.vdot(self._friction.gradient(x), x - self._start))
+        points, start = self._part.points(x), self._part.points(self._start, self._start_pose)
+        return float(np.vdot(self._friction.gradient(points), points - start))
 
     def safe_fraction(self, first: PoseMotion, second: PoseMotion) -> float:
         """Fraction of the motions of both that leaves a tenth of each gap."""
@@ -369,7 +366,8 @@ class MeshPair:
             return 1.0
 
         def positions(fraction: float) -> Values:
-            return self._meshes.positions([posed.pose.incremented(fraction * q) for posed, q in moving])
+            first_pose, second_pose = (posed.pose.incremented(fraction * q) for posed, q in moving)
+            return self._part.points(self._first.positions_at(first_pose), second_pose)
 
         rotation = max(float(np.linalg.norm(q[3:])) for _, q in moving)
-        return free_fraction_on_arcs(self._pairs.free_fraction, positions, rotation)
+        return free_fraction_on_arcs(self._part.pairs.free_fraction, positions, rotation)

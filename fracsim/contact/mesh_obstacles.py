@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from .clearance import bounding_box
 from .ipc_pairs import IpcPairs, PairShare
 from .laws import BARRIER
+from .obstacle import RigidObstacle
 from .pose import Pose, PosedShape
 from .sample_points import IpcFriction
 from .triangle_mesh_shape import ClosedSurface
@@ -97,6 +98,12 @@ class MeshObstacle:
         self._tree, self._box = cKDTree(points), (points.min(axis=0), points.max(axis=0))
         self.move_to(Pose.at_point(np.zeros(3)))
 
+    @classmethod
+    def of(cls, obstacle: RigidObstacle, friction: float) -> MeshObstacle:
+        """Obstacle of a triangle mesh, with a coefficient of friction."""
+        points, triangles = obstacle.shape.tessellate()
+        return cls(obstacle.name, points, triangles.astype(np.int64), friction)
+
     def move_to(self, pose: Pose) -> None:
         """Move to a pose; points are computed when they are asked for, as most obstacles are far in most steps."""
         self.pose = pose
@@ -131,6 +138,11 @@ class MeshObstacle:
         result = np.empty(len(centroids), np.int64)
         result[np.argsort(centroids[:, axis], kind="stable")] = np.arange(len(centroids)) * ranks // len(centroids)
         return result
+
+    def spheres_are_far(self, pose: Pose, other: MeshObstacle, other_pose: Pose, distance: float) -> bool:
+        """Whether the bounding spheres of two obstacles at poses are farther apart than `distance`, m."""
+        between = float(np.linalg.norm(pose.centre - other_pose.centre))
+        return between - self.radius - other.radius >= distance
 
     def is_far(self, x: Values, distance: float) -> bool:
         """Whether its bounding box is farther than `distance` from that of points x (n, 3), m."""

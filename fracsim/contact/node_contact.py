@@ -380,17 +380,6 @@ class PoseCoupling:
         return PoseDerivatives(contact.potential, np.asarray(gradient), hessian)
 
 
-def carried_point_derivatives(contact: ContactForces, x: Values, pose: Pose, *, exact: bool) -> PoseDerivatives:
-    """Derivatives of contact of points x (n, d), m, that the obstacle itself carries, by its pose."""
-    arm = x[contact.points] - pose.centre
-    J, d = arm_jacobian(arm), pose.dim
-    hessian = _product(J, contact.tangent(exact=exact) @ J)
-    if exact:
-        hessian[d:, d:] += rotation_second_derivative(-contact.normal, arm).sum(axis=0)
-    # points move by -J q
-    return PoseDerivatives(contact.potential, np.einsum("ndp,nd->p", J, contact.normal), hessian)
-
-
 def mixed_pose_hessian(contact: ContactForces, x: Values, carrier: Pose, second: Pose, *, exact: bool) -> Values:
     """(p, p) second derivatives of the energy by the poses of a carrier of points and of another obstacle.
 
@@ -408,23 +397,25 @@ def mixed_pose_hessian(contact: ContactForces, x: Values, carrier: Pose, second:
     return -_product(arm_jacobian(points - carrier.centre), by_second)
 
 
-def point_set_derivatives(
-    energy: float, gradient: Values, blocks: csr_matrix, arm: Values, *, exact: bool
+def carried_derivatives(
+    energy: float, gradient: Values, hessian: Values | csr_matrix, arm: Values, *, exact: bool
 ) -> PoseDerivatives:
-    """Derivatives by the pose of an energy of all points that the obstacle carries.
+    """Derivatives by the pose of an energy of points that the obstacle carries.
 
     Args:
         energy: J.
         gradient: (m, d) by the points, N.
-        blocks: (m d, m d) second derivatives by the points, N/m, or their positive semi-definite part.
+        hessian: second derivatives by the points, N/m, or their positive semi-definite part: (m d, m d), or blocks
+            (m, d, d) of points that are independent of one another.
         arm: (m, d) of the points about the centre, m.
         exact: whether the second derivatives are exact.
     """
-    d, J = arm.shape[1], point_jacobian(arm).reshape(arm.size, -1)
-    hessian = np.asarray(J.T @ (blocks @ J))
+    d, J = arm.shape[1], point_jacobian(arm)
+    by_points = hessian @ J if isinstance(hessian, np.ndarray) else (hessian @ J.reshape(arm.size, -1)).reshape(J.shape)
+    by_pose = _product(J, by_points)
     if exact:
-        hessian[d:, d:] += rotation_second_derivative(gradient, arm).sum(axis=0)
-    return PoseDerivatives(energy, J.T @ gradient.reshape(-1), hessian)
+        by_pose[d:, d:] += rotation_second_derivative(gradient, arm).sum(axis=0)
+    return PoseDerivatives(energy, np.einsum("ndp,nd->p", J, gradient), by_pose)
 
 
 def contact_wrench(contact: ContactForces, x: Values, pose: Pose) -> Values:

@@ -25,13 +25,13 @@ from .node_contact import (
     PoseCoupling,
     PoseDerivatives,
     StepStart,
-    carried_point_derivatives,
+    carried_derivatives,
     evaluate_points,
     lag_contact,
     mixed_pose_hessian,
 )
 from .obstacle import RigidObstacle
-from .pose import Pose, PosedShape, point_jacobian, rotation_second_derivative
+from .pose import Pose, PosedShape, point_jacobian
 from .shape_base import Shape, frame_about, unit_vector
 from .shapes import Capsule, OffsetShape, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
 from .step_limit import PointMotion, PoseMotion
@@ -178,16 +178,15 @@ class PairFriction:
 
     def derivatives(self, poses: tuple[Pose, Pose], *, exact: bool) -> tuple[PoseDerivatives, PoseDerivatives, Values]:
         """Derivatives by the pose of each, with the whole energy; (p, p) second derivatives by both."""
-        gradient, slip, d = -self.on_first(poses), self.slip(poses), poses[0].dim
-        H, energy, result, J = self.law.hessian(self.force, self.normal, slip), self.energy(poses), [], []
-        for pose, x, sign in zip(poses, self._carried(poses), (1.0, -1.0), strict=True):
-            arm = x - pose.centre
-            J.append(sign * point_jacobian(arm))
-            hessian = np.asarray(np.einsum("kip,kij,kjq->pq", J[-1], H, J[-1]))
-            if exact:
-                hessian[d:, d:] += rotation_second_derivative(sign * gradient, arm).sum(axis=0)
-            result.append(PoseDerivatives(energy, np.einsum("kdp,kd->p", J[-1], gradient), hessian))
-        return result[0], result[1], np.asarray(np.einsum("kip,kij,kjq->pq", J[0], H, J[1]))
+        gradient, energy = -self.on_first(poses), self.energy(poses)
+        H = self.law.hessian(self.force, self.normal, self.slip(poses))
+        arms = [x - pose.centre for x, pose in zip(self._carried(poses), poses, strict=True)]
+        first, second = (
+            carried_derivatives(energy, sign * gradient, H, arm, exact=exact)
+            for sign, arm in zip((1.0, -1.0), arms, strict=True)
+        )
+        mixed = -np.einsum("kip,kij,kjq->pq", point_jacobian(arms[0]), H, point_jacobian(arms[1]))
+        return first, second, np.asarray(mixed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -355,16 +354,22 @@ class BarrierPair:
         if (sides := self._contact_forces(poses)) is None:
             return None
         (of_first, x), (of_second, y) = sides
-        by_first = carried_point_derivatives(of_first, x, first, exact=exact)
+        by_first = self._by_carrier(of_first, x, first, exact=exact)
         by_first = by_first + PoseCoupling(of_second, y, first, None, first, exact=exact).derivatives()
         by_second = PoseCoupling(of_first, x, second, None, second, exact=exact).derivatives()
-        by_second = by_second + carried_point_derivatives(of_second, y, second, exact=exact)
+        by_second = by_second + self._by_carrier(of_second, y, second, exact=exact)
         by_both = mixed_pose_hessian(of_first, x, first, second, exact=exact)
         by_both = by_both + mixed_pose_hessian(of_second, y, second, first, exact=exact).T
         if self._friction is None:
             return by_first, by_second, by_both
         of_friction = self._friction.derivatives(poses, exact=exact)
         return by_first + of_friction[0], by_second + of_friction[1], by_both + of_friction[2]
+
+    @staticmethod
+    def _by_carrier(contact: ContactForces, x: Values, pose: Pose, *, exact: bool) -> PoseDerivatives:
+        """Derivatives of contact of points x (n, d), m, by the pose of the obstacle that carries them."""
+        arm = x[contact.points] - pose.centre
+        return carried_derivatives(contact.potential, -contact.normal, contact.tangent(exact=exact), arm, exact=exact)
 
     def energies(self, posed: PosedObstacles) -> tuple[float, float]:
         """Energy of the barrier, and potential of all forces in the step, J."""

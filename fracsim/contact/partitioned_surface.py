@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 from typing import Any, ClassVar, cast
 
@@ -32,6 +33,7 @@ from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.fragment_surface import (
     PlanarPoints,
     build_surface_of_open_edges,
+    find_open_edges,
     moves_alike,
     project_onto_fragments,
 )
@@ -246,22 +248,19 @@ class PartitionedSurface[Part: SurfacePart[Any]]:
         cells = np.repeat(self._pattern, self._cell_parts)
         if not self.law.fragments_only:
             return build_split_surface(self._topology, cells, self._cut_positions())
-        state = cells, *self._open_edges(cells)
+        minima = partial(min_over_ranks, self._domain.space.dofmap.index_map)
+        apart, loose, _ = find_open_edges(self._topology, cells, minima, self._node_fragments)
+        state = cells, apart, loose
         # most edges break within fragments
         same = self._open is not None and moves_alike(self._topology, state, self._open)
         self._open = state
         if self._comm.allreduce(same, op=MPI.LAND):
             return None
-        return build_surface_of_open_edges(self._topology, *state[1:], self._cut_positions())
+        return build_surface_of_open_edges(self._topology, apart, loose, self._cut_positions())
 
-    def _open_edges(self, pattern: Pattern) -> tuple[Flags, Flags]:
-        """Flags of open edges and of loose nodes of this rank (fragment_surface.find_open_edges; collective)."""
-        topology, loose = self._topology, np.ones(len(self._topology.points))
-        loose[topology.cells[pattern == 0]] = 0.0
-        is_loose = min_over_ranks(self._domain.space.dofmap.index_map, loose) > 0
-        cut = topology.broken_edges(pattern) | is_loose[topology.edges].any(axis=1)
-        fragment = find_components(self._domain, topology.edges[~cut]).node_fragment[topology.edges]
-        return cut & (fragment[:, 0] != fragment[:, 1]), is_loose
+    def _node_fragments(self, broken: Flags) -> Ints:
+        """(N,) fragment of each node of this rank for `broken` edges (E,) (collective)."""
+        return find_components(self._domain, self._topology.edges[~broken]).node_fragment
 
     def _cut_positions(self) -> Values | None:
         """(edges,) positions of cuts from the lower local node; NaN: in the middle; None: all in the middle.

@@ -25,10 +25,11 @@ from .obstacle_pairs import SAMPLES, Numbers, ObstaclePair
 from .penalty_law import ContactHistory, ContactStiffness, PenaltyContacts, PenaltyForces, Slips
 from .pose import Pose, PosedShape, resultant
 from .rigid_obstacles import RigidObstacles
-from .triangle_mesh_shape import StackedMeshes, TriangleMeshShape
+from .triangle_mesh_shape import TriangleMeshShape
 
 if TYPE_CHECKING:
-    from .penalty_pairs import PenaltyPairs  # with ipctk
+    from .mesh_obstacles import SurfacePart  # with ipctk
+    from .penalty_pairs import PenaltyPairs
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -146,56 +147,77 @@ class MeshContacts:
     """
 
     def __init__(self, first: RigidObstacle, second: RigidObstacle, penalty: Penalty) -> None:
-        meshes = self._meshes = StackedMeshes(first.shape, second.shape)
-        self._friction = max(first.friction, second.friction)
-        self._pairs = self._build_pairs(penalty.rate, penalty.width)
-        gap = self._pairs.min_gap(meshes.positions((first.posed_at(0.0).pose, second.posed_at(0.0).pose)))
-        if gap < penalty.width:
-            self._pairs = self._build_pairs(penalty.rate, PAIR_PENALTY.gap_share * gap)
+        from .mesh_obstacles import MeshObstacle
 
-    def _build_pairs(self, rate: float, width: float) -> PenaltyPairs:
-        """Pairs of the meshes; each side has one half of the penalty's `rate`, Pa/m."""
+        friction = max(first.friction, second.friction)
+        self._first, self._second = (MeshObstacle.of(obstacle, friction) for obstacle in (first, second))
+        self._part = self._build_part(penalty.rate, penalty.width)
+        start = self._part.points(self._first.positions_at(first.posed_at(0.0).pose), second.posed_at(0.0).pose)
+        if (gap := self._part.pairs.min_gap(start)) < penalty.width:
+            self._part = self._build_part(penalty.rate, PAIR_PENALTY.gap_share * gap)
+
+    def _build_part(self, rate: float, width: float) -> SurfacePart[PenaltyPairs]:
+        """Contact of the meshes; each side has one half of the penalty's `rate`, Pa/m."""
+        from .mesh_obstacles import SurfacePart
         from .penalty_pairs import PenaltyPairs
         from .sample_points import vertex_areas
 
-        points, triangles = self._meshes.points, self._meshes.triangles
+        first, second, n = self._first, self._second, len(self._first.points)
+        points = np.concatenate([first.points, second.points])
+        triangles = np.concatenate([first.triangles, second.triangles + n])
         stiffness = ContactStiffness.of_one_body(0.5 * rate * vertex_areas(points, triangles))
-        return PenaltyPairs(points, triangles, stiffness, distance=width, patch=self._meshes.patches)
+        patch = (np.arange(len(points)) >= n).astype(np.int32)
+        pairs = PenaltyPairs(points, triangles, stiffness, distance=width, patch=patch)
+        return SurfacePart(pairs, first.triangles, PAIR_PENALTY.near_gap * width, second.friction, second)
 
     def _near_positions(self, poses: Poses) -> Values | None:
         """(n, 3) points of both obstacles, m; None: they are too far apart."""
-        return self._meshes.near_positions(poses, PAIR_PENALTY.near_gap * self._pairs.width)
+        first, second = poses
+        if self._first.spheres_are_far(first, self._second, second, self._part.reach):
+            return None
+        self._second.move_to(second)
+        x = self._first.positions_at(first)
+        return None if self._part.is_far(x) else self._part.points(x)
+
+    @property
+    def _is_first(self) -> npt.NDArray[np.bool_]:
+        """(n,) flags of the points of the first among those of both."""
+        return np.arange(len(self._part.pairs.keys)) < len(self._first.points)
 
     def end_step(self, starts: Poses, ends: Poses) -> tuple[PenaltyForces, Values, Values] | None:
         """Forces at the end of a step, whose contacts are stored, and wrenches; as of InsetPointContacts."""
         if (x := self._near_positions(ends)) is None:
             return None
-        forces = self._pairs.forces(x, self._meshes.positions(starts), self._friction)
-        contacts, press, is_first = forces.contacts, forces.normal_force, self._meshes.patches == 0
-        parts = zip(self._meshes.rows, ends, strict=True)
-        of_press = [resultant(press[rows], x[rows] - pose.centre) for rows, pose in parts]
+        pairs, is_first, n = self._part.pairs, self._is_first, len(self._first.points)
+        start = self._part.points(self._first.positions_at(starts[0]), starts[1])
+        forces = pairs.forces(x, start, self._part.friction)
+        contacts, press = forces.contacts, forces.normal_force
+        of_press = [
+            resultant(press[rows], x[rows] - pose.centre)
+            for rows, pose in zip((slice(n), slice(n, None)), ends, strict=True)
+        ]
         # at one point, in the middle of the gap, so that friction has no moment
         middle = 0.5 * (contacts.positions(x, is_first) + contacts.positions(x, ~is_first))
         sign = np.sum(contacts.weights * is_first[contacts.points], axis=1)
         friction = _wrenches(sign[:, None] * forces.spring_force, middle, ends)
-        self._pairs.end_step(x, forces.slips)
+        pairs.end_step(x, forces.slips)
         return forces, np.array(of_press), friction
 
     def near_springs(self, poses: Poses) -> tuple[Values, Values] | None:
         """Positions (k, 3), m, and stiffness (k,), N/m, of contacts that may act a step later; None: none."""
         if (x := self._near_positions(poses)) is None:
             return None
-        near = self._pairs.near_contacts(x)
-        return (near.positions(x, self._meshes.patches == 0), near.stiffness) if len(near.gap) else None
+        near = self._part.pairs.near_contacts(x)
+        return (near.positions(x, self._is_first), near.stiffness) if len(near.gap) else None
 
     @property
     def history(self) -> ContactHistory:
         """Contacts at the end of the last step."""
-        return self._pairs.history
+        return self._part.pairs.history
 
     def set_history(self, history: ContactHistory) -> None:
         """Set the contacts at the end of the last step."""
-        self._pairs.set_history(history)
+        self._part.pairs.set_history(history)
 
 
 class PenaltyPair:

@@ -24,12 +24,11 @@ from ..mesh.ghost_exchange import KeyLookup
 from .closest_point import minimise_on_simplex
 from .pair_search import (
     PairFilter,
+    PairSearch,
     SimplexPairs,
     intersecting_pairs,
-    max_length,
     near_pairs,
     pair_distances,
-    sort_pairs,
 )
 from .penalty_edges import EdgeContacts
 from .penalty_law import ContactHistory, ContactStiffness, ElementRanks, PenaltyContacts, PenaltyForces
@@ -232,10 +231,9 @@ class PenaltyPairs:
         if dim == 3:
             max_gap = PAIRS.max_gap * distance
             self._kinds.append(EdgeContacts(rest_positions, elements, stiffness.limit, max_gap=max_gap, ranks=ranks))
-        self._filter = PairFilter.of(len(self._used), None if patch is None else patch[self._used])
+        where = PairFilter.of(len(self._used), None if patch is None else patch[self._used])
         self._sets = [kind.candidates for kind in self._kinds]
-        self._margin = PAIRS.search_margin * distance
-        self._searched: tuple[Values, list[Ints]] | None = None  # positions of the last search, and its pairs
+        self._search = PairSearch(where, self._sets, PAIRS.search_margin * distance)
         self._near: tuple[Values, PenaltyContacts] | None = None  # of the last x
         self._touching: PenaltyContacts | None = None  # those of them in contact
         self.set_history(ContactHistory.none(dim))
@@ -274,28 +272,11 @@ class PenaltyPairs:
     def near_contacts(self, x: Values) -> PenaltyContacts:
         """Contacts that may be closed a step later, with points at x; those of the last x are kept."""
         if self._near is None or not np.array_equal(x, self._near[0]):
-            items, reach = zip(self._kinds, self._candidates(x), strict=True), PAIRS.ahead_gap * self.width
+            pairs_of_kinds, reach = self._search.pairs(x[self._used]), PAIRS.ahead_gap * self.width
+            items = zip(self._kinds, pairs_of_kinds, strict=True)
             near = PenaltyContacts.join([kind.contacts_within(x, pairs, reach) for kind, pairs in items])
             self._near, self._touching = (x.copy(), near), None
         return self._near[1]
-
-    def _candidates(self, x: Values) -> list[Ints]:
-        """(k, 2) pairs of each kind that may be as near as counts, in the order of their numbers.
-
-        They are searched again once a vertex has moved by more than the margin, apart from a motion that all share.
-        """
-        vertices = x[self._used]
-        if self._searched is not None and len(vertices):
-            motion = vertices - self._searched[0]
-            motion -= 0.5 * (motion.max(axis=0) + motion.min(axis=0))
-            if max_length(motion) <= self._margin:
-                return self._searched[1]
-        result = []
-        for pairs in self._sets:
-            near = near_pairs(pairs, self._filter, vertices, vertices, pairs.distance + 2 * self._margin)
-            result.append(sort_pairs(pairs, near))
-        self._searched = vertices, result
-        return result
 
     def forces(self, x: Values, start: Values | None = None, friction: float = 0.0) -> PenaltyForces:
         """Forces with points at x, and at `start` (n, d) at the start of the step, m; None: at x."""
@@ -319,16 +300,17 @@ class PenaltyPairs:
 
     def anything_is_near(self, x: Values) -> bool:
         """Whether any point has contact, or may be near a facet, at x."""
-        return bool(self.history.stiffness.any()) or len(self._candidates(x)[0]) > 0
+        return bool(self.history.stiffness.any()) or len(self._search.pairs(x[self._used])[0]) > 0
 
     def clearance(self, x: Values) -> float:
         """Distance by which any two points at x may approach before anything is near, m; nothing is near at x."""
         vertices, distance = x[self._used], PAIRS.clearance_gap * self.width
         for pairs in self._sets:
-            near = near_pairs(pairs, self._filter, vertices, vertices, distance)
+            near = near_pairs(pairs, self._search.filter, vertices, vertices, distance)
             distance = float(pair_distances(pairs, near, vertices).min(initial=distance))
         return max(0.0, distance - PAIRS.ahead_gap * self.width)
 
     def clear_caches(self) -> None:
         """Discard the candidates of collision detection."""
-        self._near = self._touching = self._searched = None
+        self._near = self._touching = None
+        self._search.clear_caches()

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +13,7 @@ from scipy.sparse.csgraph import connected_components
 from ..errors import InputError
 from ..meshes.surfaces.triangle_geometry import BATCH_SIZE, batches, enclosed_volumes, winding_numbers
 from ..meshes.topology import distinct_rows
-from .shape_base import Shape, Tessellation
-
-if TYPE_CHECKING:
-    from .pose import Pose
+from .shape_base import Tessellation
 
 Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -110,44 +106,6 @@ class TriangleMeshShape:
         """(k,) signed volumes, m^3, and (k, 3) centroids, m, of tetrahedra of triangles and the reference point."""
         corners = self.points[self.triangles]
         return np.linalg.det(corners) / 6, corners.sum(axis=1) / 4
-
-
-class StackedMeshes:
-    """Points and triangles of two triangle meshes that move, those of the first before those of the second.
-
-    Attributes:
-        count: number of points of the first.
-        points: (n, 3) of both in their own frames, m.
-        triangles: (k, 3) of both.
-        patches: (n,) 0 for points of the first, 1 for those of the second.
-    """
-
-    def __init__(self, first: Shape, second: Shape) -> None:
-        meshes = first.tessellate(), second.tessellate()
-        self._points, self.count = [points for points, _ in meshes], len(meshes[0][0])
-        self.points = np.concatenate(self._points)
-        self.triangles: Ints = np.concatenate([meshes[0][1], meshes[1][1] + self.count]).astype(np.int64)
-        self.patches = np.repeat(np.array([0, 1], np.int32), [self.count, len(self.points) - self.count])
-        # sum of the radii of both about their reference points
-        self._radii = sum(float(np.linalg.norm(points, axis=1).max()) for points in self._points)
-
-    @property
-    def rows(self) -> tuple[slice, slice]:
-        """Rows of the points of both."""
-        return slice(None, self.count), slice(self.count, None)
-
-    def positions(self, poses: Sequence[Pose]) -> Values:
-        """(n, 3) points of both at poses, m."""
-        return np.concatenate([pose.points_to_space(X) for pose, X in zip(poses, self._points, strict=True)])
-
-    def near_positions(self, poses: Sequence[Pose], max_gap: float) -> Values | None:
-        """(n, 3) points of both at poses, m; None: bounding spheres or boxes are farther than `max_gap` apart."""
-        first, second = poses
-        if float(np.linalg.norm(first.centre - second.centre)) - self._radii >= max_gap:
-            return None
-        x = self.positions(poses)
-        (low, high), (second_low, second_high) = ((x[rows].min(axis=0), x[rows].max(axis=0)) for rows in self.rows)
-        return x if np.maximum(low - second_high, second_low - high).max() < max_gap else None
 
 
 def refine_triangles(points: Values, triangles: Ints, edge: float) -> tuple[Values, Ints]:

@@ -14,6 +14,7 @@ from fracsim.mesh.split_surface.mesh_part import WholeMesh
 from fracsim.mesh.split_surface.surface_map import SurfaceMap, gradient_entries
 
 Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 Patterns = npt.NDArray[np.integer]
 
 
@@ -22,14 +23,19 @@ def build_fragment_surface(topology: EntityNumbering, pattern: Patterns, cut: Va
 
     Edges between fragments, and to loose nodes, are open. `cut`: (E,) as in build_surface_of_open_edges.
     """
-    apart, loose, _ = find_open_edges(WholeMesh(topology), pattern)
+    apart, loose = _open_edges(topology, pattern)
     return build_surface_of_open_edges(topology, apart, loose, cut)
+
+
+def _open_edges(topology: EntityNumbering, pattern: Patterns) -> tuple[Flags, Flags]:
+    part = WholeMesh(topology)
+    apart, loose, _ = find_open_edges(topology, pattern, part.least, lambda broken: part.find_fragments(broken)[1])
+    return apart, loose
 
 
 def has_same_fragments(topology: EntityNumbering, pattern: Patterns, before: Patterns) -> bool:
     """Whether the surface of fragments is the same for two damage patterns (C,), and moves alike with the nodes."""
-    part = WholeMesh(topology)
-    edges, before_edges = (find_open_edges(part, of_time)[:2] for of_time in (pattern, before))
+    edges, before_edges = (_open_edges(topology, of_time) for of_time in (pattern, before))
     return moves_alike(topology, (pattern, *edges), (before, *before_edges))
 
 

@@ -8,6 +8,7 @@ In output, crack faces between fragments are projected onto these planes, so tha
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,7 +21,6 @@ from .closed_surface import SplitSurface, SurfacePoints, build_split_surface, bu
 from .cut_patterns import face_centre_weights, planar_cut_table
 from .drawn_surface import DrawnSurface
 from .entity_numbering import EntityNumbering
-from .mesh_part import MeshPart
 from .smooth_cuts import CUTS
 from .surface_map import SurfaceMap
 
@@ -63,16 +63,27 @@ def moves_alike(
     return np.array_equal(split_patterns[pattern[affected]], split_patterns[pattern_before[affected]])
 
 
-def find_open_edges(part: MeshPart, pattern: Patterns) -> tuple[Flags, Flags, Ints]:
+def find_open_edges(
+    topology: EntityNumbering,
+    pattern: Patterns,
+    least: Callable[[Ints], Ints],
+    node_fragments: Callable[[Flags], Ints],
+) -> tuple[Flags, Flags, Ints]:
     """(E,) flags of open edges, (N,) flags of loose nodes, and (N,) the fragment of each node (collective).
 
     Fragments are connected by edges that are intact and do not lead to a loose node.
+
+    Args:
+        topology: edges of the part of the mesh on this rank.
+        pattern: (C,) broken edges of each cell.
+        least: values (N,) at the nodes -> their minima over the ranks.
+        node_fragments: flags (E,) of broken edges -> fragment (N,) of each node.
     """
-    topology, has_no_cell = part.skeleton, np.ones(len(part.node_numbers), np.int64)
+    has_no_cell = np.ones(len(topology.points), np.int64)
     has_no_cell[topology.cells[pattern == 0]] = 0
-    loose, ends = part.least(has_no_cell) > 0, topology.edges
+    loose, ends = least(has_no_cell) > 0, topology.edges
     cut = topology.broken_edges(pattern) | loose[ends].any(axis=1)
-    _, node_fragment = part.find_fragments(cut)
+    node_fragment = node_fragments(cut)
     return cut & (node_fragment[ends[:, 0]] != node_fragment[ends[:, 1]]), loose, node_fragment
 
 
@@ -118,7 +129,9 @@ def _planar_means(surface: DrawnSurface) -> tuple[Ints, csr_matrix, Ints, Flags]
     within the fragment.
     """
     part, drawn, topology = surface.part, surface.numbering, surface.part.skeleton
-    apart, loose, node_fragment = find_open_edges(part, surface.pattern)
+    apart, loose, node_fragment = find_open_edges(
+        topology, surface.pattern, part.least, lambda broken: part.find_fragments(broken)[1]
+    )
     flat = build_surface_points(topology, patterns_with_broken(topology, apart), planar_cut_table)
     node = topology.cells[drawn.cell]
     lead = node[np.arange(len(node)), drawn.group.argmax(axis=1)]
