@@ -26,7 +26,7 @@ ARCHITECTURE = Path(__file__).parent.parent / "docs" / "architecture.md"
 # rooms of a floor do not know one another; they may use the floors before theirs
 FLOORS = ({"mesh"}, {"mechanics"}, {"contact", "fracture", "solvers"}, {"timestepping"}, {"rigid"}, {"output"})
 LAYERS = tuple(room for floor in FLOORS for room in sorted(floor))
-BELOW = {"errors", "forms", "meshes"}  # what any of them may use
+BELOW = {"array_types", "errors", "forms", "meshes"}  # what any of them may use
 # modules that the study room uses: those without DOLFINx
 WITHOUT_DOLFINX = {
     "mesh.free_motion",
@@ -136,7 +136,7 @@ def test_the_study_is_for_the_way_in_alone() -> None:
 RUN = ("deformable_run.py", "rigid_run.py", "monitors.py")  # the files of the room "run"
 PYTHON = ("simulation.py", "simulation_inputs.py")  # those of the interface of Python
 CLI = ("cli.py", "doctor.py", "__main__.py")  # those of the command line
-EVERYWHERE = {"errors", "studies"}  # below all rooms, and the folder of packaged studies
+EVERYWHERE = {"array_types", "errors", "studies"}  # below all rooms, and the folder of packaged studies
 
 
 def arrows() -> set[tuple[str, str]]:

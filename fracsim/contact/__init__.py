@@ -9,7 +9,7 @@ Terms of the balance:
                           the body as they see it, and their tessellation for output
     rigid_pose            free obstacles in implicit steps: poses as unknowns of Newton's method
     obstacle_term         the body before analytic obstacles; contact of few nodes for nonlinear elimination
-    contact_state         surface and analytic obstacles in a step; cells that show their crack faces
+    contact_state         surface and analytic obstacles in a step
     mesh_obstacle_term    the body before triangle-mesh obstacles; pairs of these
     self_contact          a body with itself, and its fragments with one another
     penalty_obstacles     the body before analytic obstacles in explicit steps
@@ -29,7 +29,8 @@ Laws and geometry:
 
 Points and facets before analytic obstacles:
 
-    contact_surface       points and facets of the split surface; retraction of new crack faces
+    contact_surface       points and facets of the split surface
+    crack_faces           cells that show their crack faces; retraction of new ones
     node_contact          forces on points, lagged friction, derivatives by the pose of an obstacle
     closest_point, facet_contact  forces on facets between their nodes
     step_limit            conservative advancement, first guesses, motion of obstacles in a step

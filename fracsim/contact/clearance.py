@@ -25,10 +25,10 @@ from operator import le
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
+from ..array_types import Ints, Values
 from ..mesh.domain import Domain
 from ..mesh.split_surface.local_surface import NodeExchange
 from .obstacle import RigidObstacle
@@ -37,8 +37,6 @@ from .pose import Pose, PosedShape
 if TYPE_CHECKING:
     from .mesh_obstacles import MeshObstacle  # with ipctk
 
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 type Motion = tuple[PosedShape, PosedShape]  # an obstacle at its start and its end
 

@@ -6,28 +6,22 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
-from dolfinx import fem, la
+from dolfinx import fem
 from mpi4py import MPI
 
+from ..array_types import Ints, Pattern, Values
 from ..errors import InputError
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
-from ..mesh.parallel import sum_over_ranks
-from ..mesh.simplices import local_edges
 from .clearance import Clearance, FollowingPoints, ProximityCandidates, ShapeDistance, outline_radius
 from .contact_surface import ContactSurface
+from .crack_faces import ShownCells
 from .facet_contact import ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
 from .laws import CoulombFriction, FrictionDirection, GapPotential, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
 from .obstacle import RigidObstacle
-from .pose import PosedShape, min_distance
+from .pose import PosedShape
 from .rigid_obstacles import ObstacleGroup
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
-Pattern = npt.NDArray[np.uint8]
 
 
 def refuse_closed_gaps(comm: MPI.Intracomm, gaps: Values, number: int, obstacle: RigidObstacle) -> None:
@@ -99,101 +93,6 @@ def evaluate_contact(
     if facets is None:
         return of_points
     return merge_forces(of_points, *evaluate_facets(facets, posed, x, barrier, start.facets))
-
-
-# --- cells whose crack faces are part of the surface ---
-
-
-@dataclass(frozen=True)
-class CellReachPolicy:
-    """Distances from obstacles, beyond barrier width and motion of a step, in longest edges of a cell.
-
-    Points of crack faces, and all points of their facets, are less than 1.5 edges from a node of their cell.
-
-    Attributes:
-        required: distance within which crack faces of a cell have to be part of the surface.
-        shown: distance within which they are part of it once it is made.
-    """
-
-    required: float = 1.5
-    shown: float = 2.5
-
-
-CELL_REACH = CellReachPolicy()
-
-
-class ShownCells:
-    """Cells whose crack faces are part of a contact surface; all others are too far from obstacles to touch them.
-
-    Attributes:
-        flags: (cells,) flags of these cells; None: all cells.
-    """
-
-    def __init__(self, domain: Domain, width: float) -> None:
-        """Begin with a surface of a whole body; `width`: of the barrier, m."""
-        self._domain, self._width = domain, width
-        ends = domain.nodes[domain.cell_nodes[:, local_edges(domain.dim)]]
-        self._longest_edge: Values = np.linalg.norm(ends[:, :, 1] - ends[:, :, 0], axis=2).max(axis=1, initial=0.0)
-        self.flags: Flags | None = np.zeros(domain.cell_count, bool)
-        self._pattern: Pattern | None = np.zeros(domain.cell_count, np.uint8)  # of the surface; None: to be made again
-
-    def discard(self) -> None:
-        """Require a new surface at the next update."""
-        self._pattern = None
-
-    def show_all(self) -> None:
-        """Select all cells until the next update."""
-        self.flags = self._pattern = None
-
-    def update(
-        self, pattern: Pattern, obstacles: Sequence[PosedShape], u: Values, motion: Values | None, shift: float
-    ) -> bool:
-        """Select the cells near obstacles anew if the surface lacks damage there (collective).
-
-        Args:
-            pattern: (cells,) broken edges of each cell.
-            obstacles: obstacles at their poses.
-            u: (owned dofs,) displacement, m.
-            motion: (owned dofs,) motion of nodes until the next update, m; None: none.
-            shift: largest motion of obstacles until then, m.
-
-        Returns:
-            Whether the surface has to be made again.
-        """
-        distance = min_distance(obstacles, self._domain.nodes + self._at_nodes(u))
-        if motion is not None:
-            distance = distance - np.linalg.norm(self._at_nodes(motion), axis=1)
-        beyond = (self._at_cells(distance) - shift - self._width) / self._longest_edge
-        if not sum_over_ranks(self._domain.comm, int(self._is_outdated(pattern, beyond)))[0]:
-            return False
-        self.flags, self._pattern = beyond < CELL_REACH.shown, pattern.copy()
-        return True
-
-    def _is_outdated(self, pattern: Pattern, beyond: Values) -> bool:
-        """Whether cells that are shown or, (cells,) edges `beyond` reach, have to be, are not shown as damaged."""
-        if self.flags is None or self._pattern is None:
-            return True
-        required = self.flags | (beyond < CELL_REACH.required)
-        return bool((pattern != np.where(self.flags, self._pattern, 0))[required].any())
-
-    def face_distances(self, obstacles: Sequence[PosedShape], u: Values) -> list[float]:
-        """Bounds of the distances of crack faces of this rank's cells from each obstacle, m; as of `update`."""
-        x, faces = self._domain.nodes + self._at_nodes(u), CELL_REACH.required * self._longest_edge
-        return [float((self._at_cells(posed.distance(x)) - faces).min(initial=np.inf)) for posed in obstacles]
-
-    def _at_cells(self, values: Values) -> Values:
-        """(cells,) least of the values (nodes,) at the corners."""
-        return np.asarray(np.minimum.reduce([values[nodes] for nodes in self._domain.cell_nodes.T]))
-
-    def _at_nodes(self, owned: Values) -> Values:
-        """(nodes, d) values of a field at the nodes of this rank, with ghosts, for its owned dofs (collective)."""
-        field = la.vector(self._domain.space.dofmap.index_map, self._domain.dim, np.float64)
-        field.array[: len(owned)] = owned
-        field.scatter_forward()
-        return np.asarray(field.array.reshape(-1, self._domain.dim))
-
-
-# --- state in a step ---
 
 
 class ContactState:

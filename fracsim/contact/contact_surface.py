@@ -1,29 +1,25 @@
-"""Points and facets of a body's split surface that obstacles act on, with new crack faces retracted where needed.
+"""Points and facets of a body's split surface that analytic obstacles act on.
 
-A crack may open where an obstacle or the body itself leaves no gap. A point of a new face is therefore retracted
-towards the nodes that it follows: the factor of its arm from them is the largest at which no barrier acts. A point
-that existed before keeps at least its gap, so that contact gains no energy. A point without room even at its nodes is
-excluded. In every step points are extended again as far as the barrier allows.
-
-Before obstacles so curved that they touch facets between their nodes new points are also retracted until their facets
-are open and out of contact; facets for which this fails are excluded.
+New crack faces are retracted where they have no room (crack_faces). Before obstacles so curved that they touch facets
+between their nodes new points are also retracted until their facets are open and out of contact; facets for which this
+fails are excluded.
 
 Equations: docs/theory.md#new-crack-faces.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from typing import cast
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
+from ..array_types import Flags, Ints, Pattern, Values
 from ..mesh.domain import Domain
-from ..mesh.ghost_exchange import KeyedReduction, KeyLookup, find_saved_keys
+from ..mesh.ghost_exchange import KeyedReduction, find_saved_keys
 from ..mesh.parallel import gather
 from ..mesh.simplices import is_split
 from ..mesh.split_surface.closed_surface import build_split_surface, node_keys
@@ -38,132 +34,17 @@ from ..mesh.split_surface.local_surface import (
 )
 from ..mesh.split_surface.surface_map import SurfaceMap, row_entries
 from ..meshes.topology import row_keys
+from .crack_faces import (
+    RETRACTION,
+    TINY,
+    RetractedPoints,
+    extend_points,
+    retract_cut_elements,
+    retract_from_obstacles,
+    retract_points,
+)
 from .facet_contact import FACETS, ContactFacets
 from .pose import PosedShape, min_distance
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
-Pattern = npt.NDArray[np.uint8]
-
-
-@dataclass(frozen=True)
-class RetractionPolicy:
-    """Tuned numbers of the retraction of crack faces; arms are measured as factors of the full arm.
-
-    Attributes:
-        trials: factors of the current arm that are tried for a point, in turn.
-        cut_trials: factors for the points of an element that is cut, applied one after another.
-        extension: arm that one step gives back.
-        facet_rounds: rounds in which points of new facets are retracted.
-        facet_factor: factor of the arm in each round.
-        min_arm: arm below which points of new facets are not retracted further.
-        round_off: relative tolerance of gaps that have to be kept.
-    """
-
-    trials: tuple[float, ...] = tuple(np.linspace(1.0, 0.0, 11))
-    cut_trials: tuple[float, ...] = (0.8,) * 12 + (0.0,)
-    extension: float = 0.2
-    facet_rounds: int = 10
-    facet_factor: float = 0.7
-    min_arm: float = 0.05
-    round_off: float = 1e-9
-
-
-RETRACTION = RetractionPolicy()
-TINY = float(np.finfo(float).tiny)
-
-type GapFunction = Callable[[Values], Values]  # (n,) distances of positions (n, d) to the nearest obstacle, m
-
-
-@dataclass(frozen=True)
-class RetractedPoints:
-    """Points on crack faces near an obstacle or retracted, to be matched after edges break.
-
-    Attributes:
-        keys: (k,) of the points.
-        share: (k,) factors of their arms.
-        gap: (k,) m; nan: excluded.
-    """
-
-    keys: Ints
-    share: Values
-    gap: Values
-
-    @classmethod
-    def select(cls, keys: Ints, share: Values, gap: Values, width: float) -> RetractedPoints:
-        """Those of all points on crack faces that are within `width`, m, of an obstacle or retracted."""
-        selected = np.flatnonzero(~(gap >= width) | (share < 1))
-        return cls(keys[selected], share[selected], gap[selected])
-
-    def match(self, keys: Ints, width: float) -> tuple[Values, Values]:
-        """(n,) factors that points with `keys` begin with, and gaps that they must keep, m: `width` for new points."""
-        share, gap, rows = np.ones(len(keys)), np.full(len(keys), width), KeyLookup(keys)(self.keys)
-        share[rows[rows >= 0]], gap[rows[rows >= 0]] = self.share[rows >= 0], self.gap[rows >= 0]
-        return share, np.where(np.isnan(gap), width, np.minimum(gap, width))
-
-
-def retract_points(
-    point_map: SurfaceMap, u: Values, points: Ints, share: Values, min_gap: Values, gaps: GapFunction
-) -> tuple[SurfaceMap, Ints]:
-    """Retract points until their gaps suffice.
-
-    Args:
-        point_map: map from nodes to points.
-        u: (nodes, d) displacements, m.
-        points: (k,) points to retract.
-        share: (k,) factors of their arms to start from.
-        min_gap: (k,) gaps that suffice, m.
-        gaps: gap function.
-
-    Returns:
-        The new map, and the points without room, whose arms stay.
-    """
-    new_share, remaining = point_map.share.copy(), np.arange(len(points))
-    new_share[points] = share
-    for factor in RETRACTION.trials:
-        trial = factor * share[remaining]
-        gap = gaps(point_map.evaluate_points(u, points[remaining], trial))
-        # the gap of a point that does not move may change by round-off
-        fits = gap >= min_gap[remaining] - RETRACTION.round_off * abs(min_gap[remaining])
-        new_share[points[remaining[fits]]] = trial[fits]
-        remaining = remaining[~fits]
-        if not len(remaining):
-            break
-    unchanged = np.array_equal(new_share, point_map.share)
-    return point_map if unchanged else point_map.with_arm_share(new_share), points[remaining]
-
-
-def retract_cut_elements(points: SurfaceMap, surface: DrawnSurface, cut: Callable[[Values], Flags]) -> SurfaceMap:
-    """Retract drawn points of elements until no element is cut, or its points are at their nodes (collective).
-
-    Args:
-        points: drawn points, as a map without nodes.
-        surface: the drawn surface.
-        cut: function of positions (n, d), m, that returns (m,) flags of the elements.
-    """
-    has_arm = np.zeros(len(points.share), bool)
-    has_arm[points.copies] = True
-    for factor in RETRACTION.cut_trials:
-        retracted: Flags = np.zeros(len(has_arm), bool)
-        retracted[surface.split.elements[cut(points.rest)]] = True
-        retracted &= has_arm & (points.share > 0)
-        if not surface.shared.has_any(retracted):
-            break
-        retracted = surface.shared.any_over_ranks(retracted)
-        points = points.with_arm_share(np.where(retracted, factor * points.share, points.share))
-    return points
-
-
-def extend_points(point_map: SurfaceMap, u: Values, min_gap: float, gaps: GapFunction) -> SurfaceMap:
-    """Extend retracted points by one increment where their gap stays at least `min_gap`, m."""
-    retracted = np.flatnonzero(point_map.share < 1)
-    if not len(retracted):
-        return point_map
-    trial, share = np.minimum(point_map.share[retracted] + RETRACTION.extension, 1.0), point_map.share.copy()
-    fits = gaps(point_map.evaluate_points(u, retracted, trial)) >= min_gap
-    share[retracted[fits]] = trial[fits]
-    return point_map.with_arm_share(share)
 
 
 class ContactSurface:
@@ -491,15 +372,3 @@ class ContactSurface:
         """Destroy the objects of PETSc."""
         if self._nodes is not None:
             self._nodes.destroy()
-
-
-def retract_from_obstacles(points: SurfaceMap, gaps: GapFunction) -> SurfaceMap:
-    """Retract drawn points on crack faces that would lie in an obstacle, as those of contact are.
-
-    `points`: a map without nodes.
-    """
-    inside = points.copies[gaps(points.rest)[points.copies] <= 0]
-    if not len(inside):
-        return points
-    no_nodes, min_gap = np.empty((0, points.rest.shape[1])), np.full(len(inside), TINY)
-    return retract_points(points, no_nodes, inside, points.share[inside], min_gap, gaps)[0]

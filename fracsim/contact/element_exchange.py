@@ -13,21 +13,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import product
+from itertools import pairwise, product
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 from scipy.sparse import csr_matrix, vstack
 
-from ..mesh.parallel import allgather, alltoall
+from ..array_types import Flags, Ints, Values
+from ..mesh.parallel import allgather, alltoall, sum_over_ranks
 from ..mesh.split_surface.local_surface import restrict_to_used_columns
 from ..mesh.split_surface.surface_map import SurfaceMap
 from ..meshes.topology import row_keys
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -239,3 +235,79 @@ def own_points(rank: Ints, elements: Ints, count: int, this: int) -> Flags:
 def bounding_boxes(corners: Values) -> Values:
     """(m, 2, d) lowest and highest corners of the bounding boxes of points (m, c, d), m."""
     return np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
+
+
+# --- path of displacements for which elements were exchanged ---
+
+
+@dataclass(frozen=True)
+class ExchangePath:
+    """Path of displacements for which elements were exchanged; it serves all positions near its straight parts.
+
+    Any two points have come nearer than on it by at most the diagonal of the bounding box of the motions of all points.
+
+    Attributes:
+        comm: ranks.
+        margin: approach of two points up to which positions are served, m.
+        stops: positions (n, d) of several sets of this rank's points at each displacement, m.
+    """
+
+    comm: MPI.Intracomm
+    margin: float
+    stops: Sequence[list[Values]]
+
+    def serves(self, positions: Sequence[list[Values]]) -> bool:
+        """Whether no element can be missing at positions as of `stops` (collective)."""
+        # mostly all are near points of the path, and one message tells it
+        from_points = [[_differences(x, stop) for stop in self.stops] for x in positions]
+        if self._is_within(motion_diagonals(self.comm, from_points)):
+            return True
+        motions = list(pairwise(self.stops))
+        from_motions = [[_away_from_motion(self.comm, x, *ends) for ends in motions] for x in positions]
+        return bool(motions) and self._is_within(motion_diagonals(self.comm, from_motions))
+
+    def _is_within(self, diagonals: Values) -> bool:
+        """Whether one diagonal of each row is within the margin; positions that are no numbers have no elements."""
+        distances = diagonals.min(axis=1)
+        return not np.any((distances > self.margin) & np.isfinite(distances))
+
+
+def _differences(x: Sequence[Values], start: Sequence[Values]) -> list[Values]:
+    return [end - begin for end, begin in zip(x, start, strict=True)]
+
+
+def _away_from_motion(comm: MPI.Intracomm, x: list[Values], start: list[Values], stop: list[Values]) -> list[Values]:
+    """Differences of positions (n, d) from those at one time of a straight motion, which is fitted, m (collective)."""
+    offset, change, d = _differences(x, start), _differences(stop, start), x[0].shape[1]
+    o, c = (np.concatenate(vectors) for vectors in (offset, change))
+    count, square, product, *sums = sum_over_ranks(
+        comm, np.array([len(c), np.vdot(c, c), np.vdot(o, c), *c.sum(axis=0), *o.sum(axis=0)])
+    )
+    # all may have moved alike besides
+    mean_change, mean_offset = np.array(sums[:d]) / count, np.array(sums[d:]) / count
+    square, product = square - count * (mean_change @ mean_change), product - count * (mean_offset @ mean_change)
+    along = min(max(product / square, 0.0), 1.0) if square > 0 else 0.0
+    return [of_points - along * motion for of_points, motion in zip(offset, change, strict=True)]
+
+
+def motion_diagonals(comm: MPI.Intracomm, motions: Sequence[Sequence[Sequence[Values]]]) -> Values:
+    """(m, k) diagonals of the bounding boxes of m times k motions on all ranks, m (collective).
+
+    A motion is that of several sets of points (n, d): no two points approach by more.
+    """
+    if not motions or not motions[0]:
+        return np.empty((len(motions), 0))
+    d = motions[0][0][0].shape[1]
+    # by columns: minima along the first axis take twenty times as long
+    bounds = np.array(
+        [
+            [
+                [min(part[:, axis].min(initial=np.inf) for part in motion) for axis in range(d)]
+                + [min(-part[:, axis].max(initial=-np.inf) for part in motion) for axis in range(d)]
+                for motion in row
+            ]
+            for row in motions
+        ]
+    )
+    comm.Allreduce(MPI.IN_PLACE, bounds, MPI.MIN)
+    return np.asarray(np.linalg.norm(bounds[..., :d] + bounds[..., d:], axis=2))

@@ -17,17 +17,13 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 
 import numpy as np
-import numpy.typing as npt
 
+from ..array_types import Ints, Values
 from .clearance import ProximityCandidates
 from .closest_point import FacetClosestPoints, SoftMinGap, find_closest_points, smoothing_error
 from .laws import BARRIER, Barrier, GapPotential, TimeAveragedPotential
 from .node_contact import ContactForces, LaggedContact, positive_part
 from .pose import PosedShape
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

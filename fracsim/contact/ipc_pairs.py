@@ -28,6 +28,7 @@ import numpy.typing as npt
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
+from ..array_types import Flags, Ints, Values
 from ..mesh.parallel import sum_over_ranks
 from .laws import BARRIER
 from .pair_search import (
@@ -46,10 +47,6 @@ from .sample_points import (
     hessian_at_points,
     projection,
 )
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

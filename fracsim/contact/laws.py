@@ -13,11 +13,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from ..array_types import Values
 from ..errors import InputError
-
-Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

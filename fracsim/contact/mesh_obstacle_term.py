@@ -12,9 +12,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 
+from ..array_types import Pattern, Values
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
@@ -28,12 +28,9 @@ from .pose import Pose, point_jacobian
 from .retractable_surface import SelfContactLaw
 from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 from .sample_points import IpcFriction
-from .self_contact import BarrierBodySurface, Pattern, SurfaceContact, mean_velocities
+from .self_contact import BarrierBodySurface, SurfaceContact, mean_velocities
 from .step_limit import PoseMotion, stop_before_meshes
 from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 class MeshObstacleTerm(SurfaceContact):

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING
 
 import ipctk
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.spatial import cKDTree
 
+from ..array_types import Ints, Values
 from .clearance import bounding_box
 from .ipc_pairs import IpcPairs, PairShare
 from .laws import BARRIER
@@ -24,8 +24,8 @@ from .pose import Pose, PosedShape
 from .sample_points import IpcFriction
 from .triangle_mesh_shape import ClosedSurface
 
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+if TYPE_CHECKING:
+    from .penalty_pairs import PenaltyPairs
 
 
 @dataclass(frozen=True)
@@ -173,26 +173,7 @@ class MeshObstacle:
         return distance
 
 
-class ElementPairs(Protocol):
-    """Pairs of the elements of a surface, with a barrier or a penalty; points at x (n, d), m."""
-
-    def energy(self, x: Values) -> float:
-        """Energy, J."""
-
-    def gradient(self, x: Values) -> Values:
-        """(n, d) derivatives of the energy, N: minus the forces on the points."""
-
-    def min_gap(self, x: Values) -> float:
-        """Least distance within contact, m; infinite where there is none."""
-
-    def intersections(self, x: Values) -> Ints:
-        """(k, 2) elements that intersect."""
-
-    def clear_caches(self) -> None:
-        """Discard the candidates of collision detection."""
-
-
-class SurfacePart[P: ElementPairs]:
+class SurfacePart[P: (IpcPairs, PenaltyPairs)]:
     """Contact of the surface of a body with itself, or with one obstacle; x (n, d) of the body, m.
 
     Attributes:
@@ -207,7 +188,8 @@ class SurfacePart[P: ElementPairs]:
         self, pairs: P, elements: Ints, reach: float, friction: float, mesh: MeshObstacle | None = None
     ) -> None:
         """`elements`: (k, d) of the body; they precede those of the obstacle."""
-        self.pairs, self.reach, self.friction, self.mesh = pairs, reach, friction, mesh
+        self.pairs: P = pairs
+        self.reach, self.friction, self.mesh = reach, friction, mesh
         self.body_points, self._element_count = np.unique(elements), len(elements)
 
     def is_far(self, x: Values) -> bool:

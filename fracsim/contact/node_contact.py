@@ -24,8 +24,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from ..array_types import Flags, Ints, Values
 from .laws import CoulombFriction, FrictionDirection, GapPotential, TimeAveragedPotential
 from .pose import (
     Pose,
@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 
     from .facet_contact import FacetForces
 
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 # N/m, of a closed gap (laws.BARRIER.closed_value times an area)
 CLOSED_STIFFNESS = 1e150
@@ -126,7 +124,7 @@ class CurvedGap:
     remainder: Values
 
     @classmethod
-    def from_gaps(cls, g: Values, e: Values, n: Values, m: Values, has_excess: npt.NDArray[np.bool_]) -> CurvedGap:
+    def from_gaps(cls, g: Values, e: Values, n: Values, m: Values, has_excess: Flags) -> CurvedGap:
         """Curved gap of gaps g and excesses e (k,) with gradients n and m (k, d); f = g where there is no excess.
 
         In hollow obstacles e is negative, and f = g - e / 2.

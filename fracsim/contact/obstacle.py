@@ -11,13 +11,13 @@ from typing import ClassVar
 import numpy as np
 import numpy.typing as npt
 
+from ..array_types import Values
 from ..errors import InputError
 from ..mechanics.time_functions import TimeFunction
 from ..meshes.data import AXES
 from .pose import (
     Pose,
     PosedShape,
-    Values,
     point_jacobian,
     rotation_derivative,
     rotation_second_derivative,

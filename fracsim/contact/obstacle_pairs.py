@@ -17,8 +17,8 @@ from itertools import product
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-import numpy.typing as npt
 
+from ..array_types import Values
 from .laws import BARRIER, CoulombFriction, GapPotential, ObstacleLaw, tangential
 from .node_contact import (
     ContactForces,
@@ -40,8 +40,6 @@ from .triangle_mesh_shape import TriangleMeshShape
 if TYPE_CHECKING:
     from .mesh_obstacle_term import MeshPair  # with ipctk
     from .rigid_obstacles import RigidObstacles
-
-Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -13,12 +13,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
+from ..array_types import Ints, Values
 from ..mechanics.extra_couplings import CouplingBuilder
 from ..mechanics.term import Term
 from ..mechanics.term_protocols import ContactPatchValues
@@ -34,9 +34,6 @@ from .node_contact import ContactForces, PoseCoupling, PoseDerivatives, contact_
 from .pose import resultant
 from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 from .step_limit import PoseMotion, safe_motion_fractions, stop_before_obstacles
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 class ObstacleTerm(ContactState, Term):

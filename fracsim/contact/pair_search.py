@@ -16,11 +16,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from ..array_types import Flags, Ints, Values
 from ..mesh.c_library import load_library
 
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 Numbers = npt.NDArray[np.signedinteger]
 SOURCE = Path(__file__).with_suffix(".c")
 

@@ -12,20 +12,19 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 from typing import Any, ClassVar, cast
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
+from ..array_types import Flags, Ints, Pattern, Values
 from ..mechanics.term_protocols import CutPositions
 from ..mesh.domain import Domain
 from ..mesh.fragments import find_components
 from ..mesh.ghost_exchange import KeyedReduction, KeyLookup, find_saved_keys, min_over_ranks, sum_at_nodes
-from ..mesh.parallel import allgather, gather, max_over_ranks, on_root, sum_over_ranks
+from ..mesh.parallel import allgather, gather, max_over_ranks, on_root
 from ..mesh.simplices import is_split
 from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surface
 from ..mesh.split_surface.drawn_surface import DrawnSurface
@@ -48,7 +47,14 @@ from ..mesh.split_surface.surface_map import SurfaceMap
 from ..mesh.split_surface.surface_motion import PointParents
 from ..meshes.topology import boundary_facets
 from .clearance import FollowingPoints
-from .element_exchange import ElementRows, ElementSet, PointRows, bounding_boxes, exchange_elements
+from .element_exchange import (
+    ElementRows,
+    ElementSet,
+    ExchangePath,
+    PointRows,
+    bounding_boxes,
+    exchange_elements,
+)
 from .mesh_obstacles import MeshObstacle, SurfacePart
 from .retractable_surface import (
     SURFACE,
@@ -59,11 +65,6 @@ from .retractable_surface import (
 )
 from .sample_points import vertex_areas
 from .triangle_mesh_shape import refuse_overlap
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
-Pattern = npt.NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ class PartitionedSurface[Part: SurfacePart[Any]]:
     closed_pressure: ClassVar[float]  # pressure, in stiffnesses, of faces without room
     current: RetractableSurface[Part]
     element_set: ElementSet
-    _path: list[list[Values]]  # points at each displacement for which elements were exchanged, m
+    _path: ExchangePath  # for which elements were exchanged
     start_displacement: Values | None = None
     _cuts: CutPositions | None = None
     # pattern, open edges and loose nodes of the current surface, in contact between fragments
@@ -323,19 +324,7 @@ class PartitionedSurface[Part: SurfacePart[Any]]:
         """Whether no element can be missing at displacements (owned dofs,), m, or between (collective)."""
         if self._comm.size == 1 or not np.isfinite(self._margin):
             return True
-        positions, comm = [self._moving_points(u) for u in displacements], self._comm
-        # mostly all are near points of the path, and one message tells it
-        from_points = [[_differences(x, stop) for stop in self._path] for x in positions]
-        if self._is_within(motion_diagonals(comm, from_points)):
-            return True
-        motions = list(pairwise(self._path))
-        from_motions = [[_away_from_motion(comm, x, *ends) for ends in motions] for x in positions]
-        return bool(motions) and self._is_within(motion_diagonals(comm, from_motions))
-
-    def _is_within(self, diagonals: Values) -> bool:
-        """Whether one diagonal of each row is within the margin; positions that are no numbers have no elements."""
-        distances = diagonals.min(axis=1)
-        return not np.any((distances > self._margin) & np.isfinite(distances))
+        return self._path.serves([self._moving_points(u) for u in displacements])
 
     def _moving_points(self, u: Values) -> list[Values]:
         """(n, d) positions of this rank's points without arms and with full arms, m (collective).
@@ -353,8 +342,8 @@ class PartitionedSurface[Part: SurfacePart[Any]]:
         element_set, comm = self.element_set, self._comm
         if comm.size > 1:
             path = displacements if self.start_displacement is None else [self.start_displacement, *displacements]
-            self._path = [self._moving_points(u) for u in path]
-            ends = [x[element_set.elements.corners] for points in self._path for x in points[:2]]
+            self._path = ExchangePath(comm, self._margin, [self._moving_points(u) for u in path])
+            ends = [x[element_set.elements.corners] for points in self._path.stops for x in points[:2]]
             boxes = bounding_boxes(np.concatenate(ends, axis=1))
             searched = self._searched_boxes(boxes)
             element_set = exchange_elements(comm, element_set, boxes, searched, self._search_reach)
@@ -514,44 +503,3 @@ class PartitionedSurface[Part: SurfacePart[Any]]:
         self._restored = SurfaceState(self.surface_count, self._version, full, is_excluded, bool(is_new))
         self.refresh(self._current_u)
         self._faces_changed()
-
-
-def _differences(x: Sequence[Values], start: Sequence[Values]) -> list[Values]:
-    return [end - begin for end, begin in zip(x, start, strict=True)]
-
-
-def _away_from_motion(comm: MPI.Intracomm, x: list[Values], start: list[Values], stop: list[Values]) -> list[Values]:
-    """Differences of positions (n, d) from those at one time of a straight motion, which is fitted, m (collective)."""
-    offset, change, d = _differences(x, start), _differences(stop, start), x[0].shape[1]
-    o, c = (np.concatenate(vectors) for vectors in (offset, change))
-    count, square, product, *sums = sum_over_ranks(
-        comm, np.array([len(c), np.vdot(c, c), np.vdot(o, c), *c.sum(axis=0), *o.sum(axis=0)])
-    )
-    # all may have moved alike besides
-    mean_change, mean_offset = np.array(sums[:d]) / count, np.array(sums[d:]) / count
-    square, product = square - count * (mean_change @ mean_change), product - count * (mean_offset @ mean_change)
-    along = min(max(product / square, 0.0), 1.0) if square > 0 else 0.0
-    return [of_points - along * motion for of_points, motion in zip(offset, change, strict=True)]
-
-
-def motion_diagonals(comm: MPI.Intracomm, motions: Sequence[Sequence[Sequence[Values]]]) -> Values:
-    """(m, k) diagonals of the bounding boxes of m times k motions on all ranks, m (collective).
-
-    A motion is that of several sets of points (n, d): no two points approach by more.
-    """
-    if not motions or not motions[0]:
-        return np.empty((len(motions), 0))
-    d = motions[0][0][0].shape[1]
-    # by columns: minima along the first axis take twenty times as long
-    bounds = np.array(
-        [
-            [
-                [min(part[:, axis].min(initial=np.inf) for part in motion) for axis in range(d)]
-                + [min(-part[:, axis].max(initial=-np.inf) for part in motion) for axis in range(d)]
-                for motion in row
-            ]
-            for row in motions
-        ]
-    )
-    comm.Allreduce(MPI.IN_PLACE, bounds, MPI.MIN)
-    return np.asarray(np.linalg.norm(bounds[..., :d] + bounds[..., d:], axis=2))

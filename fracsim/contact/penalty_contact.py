@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from dolfinx import fem
 
+from ..array_types import Values
 from ..mechanics.term import Term, TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.parallel import allgather, max_over_ranks, sum_over_ranks
@@ -33,9 +34,6 @@ from .penalty_surface import PenaltyBodySurface, PenaltyPart, PenaltyState
 from .pose import Pose, PosedShape, resultant
 from .retractable_surface import SelfContactLaw
 from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 class PenaltyContact(Term):

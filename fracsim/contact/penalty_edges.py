@@ -18,16 +18,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from ..array_types import Flags, Ints, Values
 from ..mesh.ghost_exchange import KeyLookup
 from .pair_search import SimplexPairs
 from .penalty_law import ContactHistory, ElementRanks, PenaltyContacts
 from .retractable_surface import unit_normals
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -24,15 +24,11 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csr_matrix
 
+from ..array_types import Flags, Ints, Values
 from ..mesh.ghost_exchange import KeyLookup
 from .laws import slipped, tangential
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 # weight of a node, in the sum of all of a point, below which it is round-off of arms that cancel
 MIN_WEIGHT = 1e-6

@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import numpy.typing as npt
 
+from ..array_types import Flags, Ints, Values
 from ..mesh.domain import Domain
 from .laws import Penalty
 from .obstacle import FreeObstacle, RigidObstacle, VerletObstacle, free_pairs
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from .mesh_obstacles import SurfacePart  # with ipctk
     from .penalty_pairs import PenaltyPairs
 
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 type Poses = tuple[Pose, Pose]
 
@@ -180,7 +178,7 @@ class MeshContacts:
         return None if self._part.is_far(x) else self._part.points(x)
 
     @property
-    def _is_first(self) -> npt.NDArray[np.bool_]:
+    def _is_first(self) -> Flags:
         """(n,) flags of the points of the first among those of both."""
         return np.arange(len(self._part.pairs.keys)) < len(self._first.points)
 

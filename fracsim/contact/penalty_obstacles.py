@@ -24,6 +24,7 @@ import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 
+from ..array_types import Ints, Values
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import find_saved_keys
 from ..mesh.parallel import gather, max_over_ranks, sum_over_ranks
@@ -36,9 +37,6 @@ from .obstacle_term import ObstacleTerm
 from .penalty_law import NodalMassShare, PenaltyContacts, PenaltyForces, Slips
 from .pose import PosedShape
 from .rigid_obstacles import RigidObstacles
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)

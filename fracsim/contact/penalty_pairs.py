@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from ..array_types import Flags, Ints, Values
 from ..mesh.ghost_exchange import KeyLookup
 from .closest_point import minimise_on_simplex
 from .pair_search import (
@@ -33,10 +34,6 @@ from .pair_search import (
 from .penalty_edges import EdgeContacts
 from .penalty_law import ContactHistory, ContactStiffness, ElementRanks, PenaltyContacts, PenaltyForces
 from .retractable_surface import unit_normals
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

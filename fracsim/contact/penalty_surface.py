@@ -16,16 +16,16 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, cast
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 from scipy.sparse import csr_matrix
 
+from ..array_types import Ints, Values
 from ..mesh.domain import Domain
 from ..mesh.parallel import allgather, gather, max_over_ranks
-from .element_exchange import EXCHANGE, bounding_boxes, own_points
+from .element_exchange import EXCHANGE, bounding_boxes, motion_diagonals, own_points
 from .mesh_obstacles import MeshObstacle, SurfacePart
-from .partitioned_surface import PartitionedSurface, motion_diagonals
+from .partitioned_surface import PartitionedSurface
 from .penalty_law import (
     ContactHistory,
     ContactStiffness,
@@ -38,9 +38,6 @@ from .penalty_pairs import PAIRS, PenaltyPairs
 from .pose import Pose
 from .retractable_surface import RetractableSurface, SelfContactLaw
 from .sample_points import vertex_areas
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
 
 
 class PenaltyPart(SurfacePart[PenaltyPairs]):

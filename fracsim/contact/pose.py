@@ -23,12 +23,10 @@ from functools import cached_property
 from math import factorial
 
 import numpy as np
-import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
+from ..array_types import Values
 from .shape_base import Shape
-
-Values = npt.NDArray[np.float64]
 
 _IDENTITY = np.eye(3)
 

@@ -21,9 +21,9 @@ from itertools import chain, repeat
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
+from ..array_types import Flags, Ints, Values
 from ..errors import InputError
 from ..mesh.ghost_exchange import KeyedReduction, KeyLookup
 from ..mesh.split_surface.closed_surface import SplitSurface
@@ -33,10 +33,6 @@ from .element_exchange import ElementSet, own_points
 from .mesh_obstacles import SurfacePart
 from .pair_search import PairFilter, intersecting_pairs
 from .sample_points import vertex_areas
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

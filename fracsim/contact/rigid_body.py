@@ -23,16 +23,14 @@ from functools import cached_property, lru_cache, partial
 from typing import Protocol
 
 import numpy as np
-import numpy.typing as npt
 
+from ..array_types import Values
 from ..forms.schemes import Scheme
 from ..mechanics.contact_time_weights import acceleration_change
 from ..mechanics.term_protocols import TermColumns
 from .node_contact import PoseDerivatives
 from .obstacle import FreeObstacle, RigidMotion, column_names
 from .pose import Pose, PosedShape, left_jacobian, left_jacobian_derivative, rotation_derivative, solve_matrix
-
-Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from ..array_types import Values
 from ..mechanics.term import Term, TimeLevel
 from ..mechanics.term_protocols import SurfaceData, TermColumns
 from ..mesh.domain import Domain
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from .mesh_obstacle_term import MeshObstacleTerm
     from .obstacle_term import ObstacleTerm
 
-Values = npt.NDArray[np.float64]
 
 type Increments = Mapping[int, Values]  # (p,) of poses, by the numbers of obstacles
 

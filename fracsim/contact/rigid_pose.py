@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
+from ..array_types import Flags, Values
 from ..errors import InputError
 from ..forms.schemes import Scheme
 from ..mechanics.term import TimeLevel
@@ -29,8 +29,6 @@ from .obstacle_pairs import ObstaclePairs
 from .pose import PosedShape, solve_matrix
 from .rigid_body import SOLVER, RigidStep, RigidSystem, SystemDerivatives, is_positive_definite
 from .rigid_obstacles import Increments, RigidObstacles
-
-Values = npt.NDArray[np.float64]
 
 
 class FreePose:
@@ -140,7 +138,7 @@ class PoseSystem:
     """
 
     equations: PoseEquations
-    touching: npt.NDArray[np.bool_]
+    touching: Flags
     B: Values
 
     @cached_property

@@ -18,8 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.sparse import csr_matrix, identity, kron, vstack
 
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from ..array_types import Ints, Values
 
 
 @dataclass(frozen=True)

@@ -14,12 +14,12 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 from dolfinx import fem
 from mpi4py import MPI
 from petsc4py import PETSc
 from scipy.sparse import csr_matrix
 
+from ..array_types import Flags, Ints, Pattern, Values
 from ..mechanics.extra_couplings import CouplingBuilder, FewNodesCoupling, sum_few_nodes
 from ..mechanics.term import Term, TimeLevel
 from ..mesh.domain import Domain
@@ -32,11 +32,6 @@ from .pair_search import max_length
 from .partitioned_surface import PartitionedSurface
 from .retractable_surface import SURFACE, RetractableSurface, SelfContactLaw
 from .sample_points import IpcFriction
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
-Pattern = npt.NDArray[np.uint8]
 
 
 class BarrierBodySurface(PartitionedSurface[BarrierPart]):

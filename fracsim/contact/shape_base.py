@@ -17,14 +17,13 @@ import numpy.typing as npt
 from numpy.polynomial import Polynomial
 from scipy.special import beta
 
+from ..array_types import Values
 from ..errors import InputError
 
 if TYPE_CHECKING:
     from .laws import Barrier
 
-Values = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int32]
-Flags = npt.NDArray[np.bool_]
 Tessellation = tuple[Values, Ints]
 
 

@@ -15,16 +15,14 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
+from ..array_types import Values
 from ..mesh.c_library import FAST_FLAGS, array_pointer, compile_on_all_ranks, unchecked_function
 from .closest_point import SEARCH
 from .laws import BARRIER, Barrier
 from .shape_base import ConvexBody, Shape, frame_about, unit_vector
 from .shapes import Capsule, HalfSpace, OffsetShape, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
-
-Values = npt.NDArray[np.float64]
 
 SOURCE = Path(__file__).with_suffix(".c")
 _SEARCH = np.array([

@@ -13,16 +13,15 @@ from typing import ClassVar, Self
 
 import numpy as np
 
+from ..array_types import Flags, Values
 from ..errors import InputError
 from .shape_base import (
     SHAPE,
     ConvexBody,
-    Flags,
     QuadrantDistance,
     Shape,
     ShapeKernels,
     Tessellation,
-    Values,
     frame_about,
     lengths,
     polygon,

@@ -15,8 +15,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-import numpy.typing as npt
 
+from ..array_types import Flags, Ints, Values
 from ..mesh.parallel import max_over_ranks, sum_over_ranks
 from .clearance import ProximityCandidates
 from .closest_point import FacetClosestPoints, find_closest_points
@@ -29,10 +29,6 @@ from .shape_base import lengths
 if TYPE_CHECKING:
     from .mesh_obstacles import BarrierPart
     from .self_contact import BarrierBodySurface
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
-import numpy.typing as npt
 from mpi4py import MPI
 
+from ..array_types import Values
 from ..mesh.domain import Domain
 from .laws import ObstacleLaw
 from .obstacle import RigidObstacle, free_pairs
@@ -28,8 +28,6 @@ from .obstacle_term import ObstacleTerm
 from .shape_base import ConvexBody, Shape
 from .shapes import HalfSpace, TranslatedShape
 from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
-
-Values = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,18 +6,14 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-import numpy.typing as npt
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 
+from ..array_types import Flags, Ints, Values
 from ..errors import InputError
 from ..meshes.surfaces.triangle_geometry import BATCH_SIZE, batches, enclosed_volumes, winding_numbers
 from ..meshes.topology import distinct_rows
 from .shape_base import Tessellation
-
-Values = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
