@@ -20,7 +20,7 @@ The smallest gap, for output, is that of one of the points with g_0 <= min g_0 +
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from operator import le
 from typing import TYPE_CHECKING
 
@@ -207,6 +207,14 @@ class FollowingPoints:
     facets: Ints
     may_stay: bool = True
 
+    def select(self, rows: Ints) -> FollowingPoints:
+        """Some of the points, without facets."""
+        return replace(self, reference=self.reference[rows], weights=self.weights[rows], facets=self.facets[:0])
+
+    def positions(self, nodal: Values, count: int | None = None) -> Values:
+        """(count, d) positions of the first points for values (k, d) at the nodes, m; None: of all."""
+        return np.asarray(self.reference[:count] + self.weights[:count] @ nodal)
+
     def amplification(self) -> float:
         """A: largest motion of a point where no node moves by more than 1."""
         return float(abs(self.weights).sum(axis=1).max()) if len(self.reference) else 0.0
@@ -221,32 +229,6 @@ class FollowingPoints:
 
 
 @dataclass(frozen=True)
-class NearestPoints:
-    """Points of this rank that may be nearest to an obstacle.
-
-    Attributes:
-        gaps: (k,) lower bounds of g_0, ascending, m.
-        reference: (k, d) X, m.
-        weights: (k, nodes) w.
-    """
-
-    gaps: Values
-    reference: Values
-    weights: csr_matrix
-
-    @classmethod
-    def select(cls, points: FollowingPoints, gaps: Values, limit: float) -> NearestPoints:
-        """Points with gaps (n,) up to a limit, m."""
-        near = np.flatnonzero(gaps <= limit)
-        near = near[np.argsort(gaps[near], kind="stable")]
-        return cls(gaps[near], points.reference[near], points.weights[near])
-
-    def positions(self, nodal: Values, count: int) -> Values:
-        """(count, d) positions of the first points for nodal values (nodes, d), m."""
-        return np.asarray(self.reference[:count] + self.weights[:count] @ nodal)
-
-
-@dataclass(frozen=True)
 class GapSearch:
     """Gaps at the search, and what may be lost of them.
 
@@ -258,7 +240,7 @@ class GapSearch:
         clearance: (obstacles,) loss that leaves nothing near, m; at most 0: the obstacle is near.
         amplification: A.
         growth: loss of the gaps of points and facets by a motion of 1.
-        nearest: points nearest to each obstacle.
+        nearest: lower bounds of g_0, ascending, m, and points of this rank that may be nearest to each obstacle.
         nodal_values: values at the nodes of this rank's points.
     """
 
@@ -269,7 +251,7 @@ class GapSearch:
     clearance: list[float]
     amplification: float
     growth: float
-    nearest: Sequence[NearestPoints]
+    nearest: Sequence[tuple[Values, FollowingPoints]]
     nodal_values: NodeExchange
 
 
@@ -343,8 +325,8 @@ class Clearance:
             loss += _pose_motion(search.poses[number], posed[number].pose, obstacle.radius)
         if search is None or loss > 0.5 * CLEARANCE.surplus * self._edge:
             search, loss = self._measure(u, posed), 0.0
-        points, (nodal, _) = search.nearest[number], self._node_motion(search, u)
-        if not (count := int(points.gaps.searchsorted(search.min_gaps[number] + 2 * loss, "right"))):
+        (gaps, points), (nodal, _) = search.nearest[number], self._node_motion(search, u)
+        if not (count := int(gaps.searchsorted(search.min_gaps[number] + 2 * loss, "right"))):
             return np.inf
         return float(obstacle.distance(posed[number], points.positions(nodal, count)).min())
 
@@ -381,7 +363,7 @@ class Clearance:
         points, obstacles, count = self._points(), self._obstacles, len(posed)
         nodal_values = NodeExchange(self._domain, points.nodes)
         nodal = nodal_values(u).copy()
-        x = points.reference + points.weights @ nodal
+        x = points.positions(nodal)
         placed = list(zip(obstacles, posed, strict=True))
         gaps = [obstacle.lower_bounds(shape, x) if len(x) else np.empty(0) for obstacle, shape in placed]
         spheres = [
@@ -400,7 +382,11 @@ class Clearance:
         clearance = np.where(clearance > CLEARANCE.min_clearance * self._edge, clearance, np.minimum(clearance, 0.0))
         growth = amplification * (1 + 2 / np.sqrt(3)) if edge else amplification
         surplus = CLEARANCE.surplus * self._edge
-        nearest = [NearestPoints.select(points, g, m + surplus) for g, m in zip(gaps, min_gaps, strict=True)]
+        nearest = []
+        for bound, min_gap in zip(gaps, min_gaps, strict=True):
+            near = np.flatnonzero(bound <= min_gap + surplus)
+            near = near[np.argsort(bound[near], kind="stable")]
+            nearest.append((bound[near], points.select(near)))
         hidden_u = u.copy() if np.isfinite(of_hidden).any() else None
         poses, limits = [shape.pose for shape in posed], [float(limit) for limit in clearance]
         self._search = GapSearch(nodal, hidden_u, poses, min_gaps, limits, amplification, growth, nearest, nodal_values)

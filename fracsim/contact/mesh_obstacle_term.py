@@ -172,7 +172,7 @@ class MeshObstacleTerm(SurfaceContact):
         if self.clearance.is_far([u] if change is None else [u, u + change], motions):
             return 1.0
         x, fraction = self.surface.positions(u), 1.0
-        end = x if change is None else x + self.surface.current.point_map.weights @ self.surface.nodal_values(change)
+        end = x if change is None else x + self.surface.interpolate(change)
         for index, (posed, _) in moving.items():
             mesh, (_, end_posed) = self._meshes[index], motions[index]
             # contacts take the obstacle from the given pose to where it is
@@ -256,9 +256,8 @@ class MeshObstacleTerm(SurfaceContact):
 
     def pushed_points(self) -> list[tuple[Values, Values, Values]]:
         """(n, 3) points of this rank before each obstacle, m, normal forces, N, start velocities, m/s (collective)."""
-        x, nodal, surface = self.end_positions(), self.surface.nodal_values(self._start_velocity), self.surface.current
-        velocity = surface.point_map.weights @ nodal
-        return [(x, -surface.sum_at_points(part.gradient(x)), velocity) for part in self.contacts]
+        x, velocity = self.end_positions(), self.surface.interpolate(self._start_velocity)
+        return [(x, -self.surface.current.sum_at_points(part.gradient(x)), velocity) for part in self.contacts]
 
 
 def build_mesh_obstacles(group: ObstacleGroup, edge: float) -> list[MeshObstacle]:

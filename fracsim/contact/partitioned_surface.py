@@ -374,10 +374,18 @@ class PartitionedSurface[Part: SurfacePart[Any]]:
         self.refresh(u)
         return self.current.point_map(self.nodal_values(u))
 
+    def interpolate(self, owned: Values) -> Values:
+        """(n, d) values at these points of a field with `owned` dofs (collective)."""
+        return np.asarray(self.current.point_map.weights @ self.nodal_values(owned))
+
     def sum_at_nodes(self, parts: Values) -> Values:
         """(owned dofs,) sums over the ranks of values (columns, d) at the nodes that points follow (collective)."""
         assert self._nodes is not None
         return self._nodes.sum_at_nodes(parts)
+
+    def nodal_forces(self, forces: Values) -> Values:
+        """(owned dofs,) nodal forces W^T f equivalent to forces (n, d) at the points, N (collective)."""
+        return self.sum_at_nodes(self.current.point_map.nodal_forces(forces))
 
     def followed_nodes(self) -> Flags:
         """(owned nodes,) flags of the nodes that points follow (collective)."""

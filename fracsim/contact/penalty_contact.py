@@ -143,7 +143,7 @@ class PenaltyContact(Term):
         if self._nodal_forces is None:
             of_parts = [forces.force[: len(x)] for forces in self._part_forces(x) if forces is not None]
             total = sum(of_parts, np.zeros_like(x))
-            self._nodal_forces = self.surface.sum_at_nodes(self.surface.current.point_map.nodal_forces(total))
+            self._nodal_forces = self.surface.nodal_forces(total)
             self.state.measure_clearance(x)
         return self._nodal_forces
 
@@ -353,11 +353,10 @@ class PenaltyMeshContact(PenaltyContact):
 
     def pushed_points(self) -> list[tuple[Values, Values, Values]]:
         """(n, 3) points near this rank before each obstacle, m, normal forces, N, start velocities, m/s."""
-        x, surface = self._end_positions(), self.surface.current
-        velocity, result = surface.point_map.weights @ self.surface.nodal_values(self._start_velocity), []
+        x, velocity, result = self._end_positions(), self.surface.interpolate(self._start_velocity), []
         for forces in self._part_forces(x):
             force = np.zeros_like(x) if forces is None else forces.normal_force[: len(x)]
-            result.append((x, surface.sum_at_points(force), velocity))
+            result.append((x, self.surface.current.sum_at_points(force), velocity))
         return result
 
     # --- state: wrenches at the end of the last step (HistoryTerm) ---

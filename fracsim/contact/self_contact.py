@@ -185,7 +185,7 @@ class SurfaceContact(Term):
                 gradient += part.gradient(x)
             if friction is not None:
                 gradient += friction.gradient(part.points(x))[: len(x)]
-        return self.surface.sum_at_nodes(self.surface.current.point_map.nodal_forces(-gradient))
+        return self.surface.nodal_forces(-gradient)
 
     def contact_forces(self) -> Values | None:
         """(owned dofs,) contact forces at the end of the step, N; None: nothing is near (collective)."""
@@ -221,7 +221,7 @@ class SurfaceContact(Term):
         self._tangent_displacement = u.copy()
         if last is None:
             return False
-        moved = max_length(self.surface.current.point_map.weights @ self.surface.nodal_values(u - last))
+        moved = max_length(self.surface.interpolate(u - last))
         return max_over_ranks(self.comm, moved) < BARRIER.exact_tangent * self.surface.law.distance
 
     def min_gap(self) -> float:
@@ -352,9 +352,7 @@ class SelfContact(SurfaceContact):
         """Fraction of a motion from displacements u, (owned dofs,), m, without a collision (collective)."""
         self.surface.refresh(u, u + motion)
         x = self.surface.current.point_map(self.surface.nodal_values(u))
-        return self.pairs.free_fraction(
-            x, x + self.surface.current.point_map.weights @ self.surface.nodal_values(motion)
-        )
+        return self.pairs.free_fraction(x, x + self.surface.interpolate(motion))
 
     def feasible_guess(self, u: Values) -> Values:
         """(owned dofs,) first guess of u, m, as far on its way from the start as there is no collision (collective).
