@@ -181,10 +181,13 @@ class SearchedMotion:
     def far_vertices(self, x: Values) -> Flags:
         """(n,) flags of vertices at x (n, d), m, that are farther than the margin from one time of the motion.
 
-        All may have moved alike besides. The time and the common motion are fitted to most vertices.
+        All may have moved alike besides. The time and the common motion are fitted to most vertices, unless the middle
+        of all displacements from the start serves.
         """
         offset, weight = x - self.start, np.ones(len(x))
         far = weight > 0
+        if len(x) and max_length(offset - [0.5 * (u.max() + u.min()) for u in offset.T]) <= self.margin:
+            return ~far
         for _ in range(SEARCH.fits if len(x) else 0):
             away, change = (vectors - weight @ vectors / weight.sum() for vectors in (offset, self.change))
             weighted = weight[:, None] * change
@@ -214,9 +217,18 @@ class PairSearch:
         filter: vertices of which pairs are searched.
     """
 
-    def __init__(self, where: PairFilter, sets: Sequence[SimplexPairs], margin: float) -> None:
-        """`where`: the filter; `sets`: searched pairs; `margin`: motion, m, after which they are searched again."""
-        self.filter, self._sets, self._margin = where, sets, margin
+    def __init__(
+        self, where: PairFilter, sets: Sequence[SimplexPairs], margin: float, max_moved: float = SEARCH.max_moved
+    ) -> None:
+        """Begin without pairs.
+
+        Args:
+            where: the filter.
+            sets: searched pairs.
+            margin: motion, m, after which they are searched again.
+            max_moved: share of the vertices up to which pairs of those that have moved are searched again alone.
+        """
+        self.filter, self._sets, self._margin, self._max_moved = where, sets, margin, max_moved
         self.clear_caches()
 
     def clear_caches(self) -> None:
@@ -239,7 +251,7 @@ class PairSearch:
         moved = np.any([self._all[0].far_vertices(positions) for positions in ends], axis=0)
         if not moved.any():
             self._pairs, self._later = self._all[1], None
-        elif np.count_nonzero(moved) > SEARCH.max_moved * len(x):
+        elif np.count_nonzero(moved) > self._max_moved * len(x):
             self._search(x, end)
         elif not self._is_later_valid(moved, ends):
             self._search_moved(x, end, moved)

@@ -230,7 +230,8 @@ class PenaltyPairs:
             self._kinds.append(EdgeContacts(rest_positions, elements, stiffness.limit, max_gap=max_gap, ranks=ranks))
         where = PairFilter.of(len(self._used), None if patch is None else patch[self._used])
         self._sets = [kind.candidates for kind in self._kinds]
-        self._search = PairSearch(where, self._sets, PAIRS.search_margin * distance)
+        # steps are short: once a vertex has moved by more than the margin, others will have soon, and all are searched
+        self._search = PairSearch(where, self._sets, PAIRS.search_margin * distance, max_moved=0.0)
         self._near: tuple[Values, PenaltyContacts] | None = None  # of the last x
         self._touching: PenaltyContacts | None = None  # those of them in contact
         self.set_history(ContactHistory.none(dim))
