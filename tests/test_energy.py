@@ -19,6 +19,7 @@ from fracsim.fracture.energy.configurational_force import (
     first_piola_stress,
     plateau,
 )
+from fracsim.fracture.energy.crack_initiation import CutKind, rank_rows
 from fracsim.fracture.energy.cut_plane import centroid_cuts, exit_cuts, plane_crossings, points_on_edges
 from fracsim.fracture.energy.mixed_mode import (
     TipDiscFields,
@@ -147,6 +148,20 @@ def test_a_crack_does_not_turn_back() -> None:
     steep = np.array([[-0.94, -0.33]])  # out by where it came in: along that edge, by the end that lies ahead
     turned = exit_cuts(corners, entry, point, np.array([[0.33, -0.94]]), steep, whole)
     assert turned.edge.tolist() == [1] and points_on_edges(corners, np.full((1, 3), turned.share[0]))[0, 1, 0] < 0.02
+
+
+def test_cells_that_mirror_each_other_keep_their_order_as_stresses_vary_by_the_solution() -> None:
+    domain, cells, rng = distribute(MPI.COMM_SELF, square("structured", 4)), np.arange(20), np.random.default_rng(5)
+    orders = set()
+    for _ in range(20):
+        sigma = 3e5 * (1 + 1e-9 * rng.normal(size=len(cells)))
+        rows = rank_rows(CutKind.TIP_ADVANCE, sigma, domain, cells, domain.nodes[cells], np.zeros(len(cells)))
+        orders.add(tuple(np.lexsort(rows[:, 2::-1].T)))
+    assert len(orders) == 1
+    # a cell with more stress than that comes first all the same
+    sigma[7] *= 1 + 3e-6
+    rows = rank_rows(CutKind.TIP_ADVANCE, sigma, domain, cells, domain.nodes[cells], np.zeros(len(cells)))
+    assert np.lexsort(rows[:, 2::-1].T)[0] == 7
 
 
 def test_a_cell_is_let_go_in_the_time_of_a_rayleigh_wave() -> None:

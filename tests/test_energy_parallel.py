@@ -32,6 +32,6 @@ def test_the_same_cracks(results: Results, ranks: int, name: str) -> None:
     assert np.array_equal(found[f"{name}-broken"], serial[f"{name}-broken"])
     assert np.array_equal(found[f"{name}-pieces"], serial[f"{name}-pieces"])
     np.testing.assert_allclose(found[f"{name}-cut"], serial[f"{name}-cut"], atol=1e-7)
-    for quantity in ("u", "chi", "energy"):
+    for quantity in ("u", "chi", "energy", "dissipated"):
         expected = serial[f"{name}-{quantity}"]
         np.testing.assert_allclose(found[f"{name}-{quantity}"], expected, atol=1e-6 * np.abs(expected).max())

@@ -32,7 +32,7 @@ INTRODUCTION = """# Study file
 
 A study is one TOML file in SI units. `[mesh]`, `[material]` and `[time]` are required. A table that is absent costs
 nothing: without `[fracture]` there is no damage field, no graph and no average. Unknown keys are refused, with the
-nearest known key. `fracsim check` validates a study without solving.
+nearest known key and all of the table. `fracsim check` validates a study without solving.
 
 - Numbers are finite, at most 1e50 in magnitude; those that must be positive are at least 1e-50.
 - A value over time is a constant or a table `{ time = [..], value = [..] }`, linear between its times and constant

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from .scenes import make_scene, march
 from .shattered import cuts_of
 from .torn import TIGHT, Found, result_of
@@ -96,7 +98,8 @@ def run(name: str) -> Found:
     """A study to its end."""
     scene, state = make_scene(**RUNS[name], solver=TIGHT)
     rows = [[float(report.broken), report.kinetic, report.elastic] for report in march(scene, state)]
-    return result_of(name, scene, state, rows) | cuts_of(name, scene)
+    dissipated = {f"{name}-dissipated": np.array([state.dissipated])}
+    return result_of(name, scene, state, rows) | cuts_of(name, scene) | dissipated
 
 
 def compared() -> Found:

@@ -51,6 +51,7 @@ class TipParameters:
         front_lag: relative lack of G below G_c with which tips of a front advance with their neighbours.
         lead_distance: distance up to which a tip of a front leads its plane.
         force_round_off: relative rounding error of a sum over some thousand cells.
+        tie_break: relative change of stresses by a hash, by which cells are selected; as of the strength of edges.
     """
 
     disc_radius: Mapping[int, float] = _by_dimension(5.0, 4.0)
@@ -77,6 +78,7 @@ class TipParameters:
     front_lag: float = 0.03
     lead_distance: float = 0.65
     force_round_off: float = 1e-9
+    tie_break: float = 1e-6
 
 
 TIP = TipParameters()
