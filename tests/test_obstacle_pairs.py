@@ -24,6 +24,7 @@ BESIDE: list[tuple[Shape, Shape]] = [
     (RoundedBox((0.6, 0.4, 0.5), rounding=0.05), HalfSpace((0.0, 0.0, 1.0))),
     (Sphere(0.3), RoundedBox((0.6, 0.4, 0.5), rounding=0.05)),
     (RoundedCylinder(0.2, 0.5, rounding=0.05), Sphere(0.3)),
+    (RoundedCylinder(0.2, 0.5, rounding=0.05, axis=(0.0, 1.0, 0.3)), HalfSpace((0.0, 0.0, 1.0))),
     (Capsule(0.1, 0.5, axis=(1.0, 0.0, 0.0)), Capsule(0.1, 0.5, axis=(0.0, 1.0, 0.0))),
     (RoundedBox((0.6, 0.4), rounding=0.05), RoundedBox((0.5, 0.3), rounding=0.05)),
 ]
@@ -101,6 +102,7 @@ def thrown(
     end: float,
     dim: int = 2,
     gravity: Sequence[float] = (0.0, -10.0, 0.0),
+    distance: float = 0.03,
 ) -> Iterator[dict[str, float]]:
     """Columns of history.csv after each step, with the energy of all less what was put in and lost, J. Nothing lies in
     another one, beside a body that is out of the way."""
@@ -108,7 +110,7 @@ def thrown(
         mesh={"builder": "box", "size": [1.0] * dim, "h": 1.0}, boundary=[{"on": "bottom", "fix": "xyz"[:dim]}],
         material={"energy": "linear", "young": 1e5, "poisson": 0.0, "density": 1.0},
         load={"gravity": list(gravity[:dim])}, obstacle=obstacles,
-        contact={"distance": 0.03, "stiffness": 3e3, "itself": False}, solver={"snes_rtol": 1e-9, "ksp_rtol": 1e-9},
+        contact={"distance": distance, "stiffness": 3e3, "itself": False}, solver={"snes_rtol": 1e-9, "ksp_rtol": 1e-9},
         time={"scheme": scheme, "step": step, "end": end},
     )  # fmt: skip
     (contact,) = [term for term in scene.balance.terms if isinstance(term, FreeRigidObstacles)]
@@ -179,6 +181,35 @@ def test_a_weight_rubs_on_a_held_floor(ratio: float) -> None:
         assert abs(rows[-1]["velocity_it_x"]) < 2e-3
     energy = [row["energy"] for row in late]
     assert np.ptp(energy) < 0.02 * 5.0 * G * (late[-1]["position_it_x"] - late[0]["position_it_x"]) + 1e-3
+
+
+LOG = {"name": "it", "shape": "cylinder", "radius": 0.1, "length": 0.4, "axis": [0.0, 0.0, 1.0],
+       "at": [3.0, -0.88, 0.0], "mass": 5.0}  # fmt: skip
+TABLE: dict[str, dict[str, Any]] = {
+    "plane": {"shape": "plane", "at": [0.0, -1.0, 0.0], "normal": [0.0, 1.0, 0.0]},
+    "box": {"shape": "box", "size": [3.0, 0.2, 3.0], "at": [3.0, -1.1, 0.0]},
+}
+
+
+@pytest.mark.parametrize("table", TABLE)
+@pytest.mark.parametrize("scheme", ("backward-euler", "generalized-alpha"))
+def test_a_cylinder_spins_on_without_friction(scheme: str, table: str) -> None:
+    """The normal meets its axis: no moment about it, at whatever angle the cylinder is."""
+    log = LOG | {"velocity": [0.2, 0.0, 0.0], "spin": [0.0, 0.0, 5.0]}
+    rows = list(thrown([TABLE[table] | {"name": "floor"}, log], scheme, 5e-3, 0.2, dim=3, gravity=(0.0, -10.0, 0.0)))
+    np.testing.assert_allclose([row["spin_it_z"] for row in rows], 5.0, rtol=1e-9)
+    assert max(row["energy"] for row in rows) < rows[0]["energy"] + 1e-6
+
+
+def test_a_cylinder_rolls_down_a_slope() -> None:
+    """With 2/3 g sin(theta), on the friction of a plane; the gap of the barrier is a thousandth of the radius."""
+    gravity = [G * np.sin(SLOPE), -G * np.cos(SLOPE), 0.0]
+    floor = TABLE["plane"] | {"name": "floor", "friction": 0.6}
+    log = LOG | {"at": [3.0, -0.9, 0.0]}
+    rows = list(thrown([floor, log], "generalized-alpha", 2e-3, 0.16, dim=3, gravity=gravity, distance=1e-4))
+    time, speed = (np.array([row[key] for row in rows]) for key in ("time", "velocity_it_x"))
+    assert speed[-1] == pytest.approx(2 / 3 * G * np.sin(SLOPE) * time[-1], rel=3e-3)
+    assert 0.1 * rows[-1]["spin_it_z"] == pytest.approx(-speed[-1], rel=3e-3)
 
 
 def test_a_spinning_disk_drives_a_plate() -> None:

@@ -185,6 +185,19 @@ def test_a_ball_rolls_down_a_slope() -> None:
     assert state.dissipated < 0.02 * state.work
 
 
+def test_a_cylinder_spins_on_without_friction() -> None:
+    """On a plane the normal meets its axis: no moment about it, at whatever angle the cylinder is."""
+    plane = {"name": "floor", "shape": "plane", "at": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}
+    log = {"name": "it", "shape": "cylinder", "radius": 0.1, "length": 0.4, "axis": [1.0, 0.0, 0.0], "mass": 5.0,
+           "at": [0.0, 0.0, 0.125], "spin": [5.0, 0.0, 0.0], "velocity": [0.0, 0.2, 0.0]}  # fmt: skip
+    scene, state = beside(
+        3, plane, log, end=0.3, load={"gravity": [0.0, 0.0, -10.0]},
+        mesh={"builder": "box", "size": [1.0] * 3, "h": 0.5, "origin": [0.0, 9.0, 5.0]},
+    )  # fmt: skip
+    for _ in each_step(scene, state):
+        assert last(scene)["spin_it_x"] == pytest.approx(5.0, rel=1e-9)
+
+
 @pytest.mark.parametrize("kind", ("balls", "files"))
 def test_two_that_rub_keep_momentum(kind: str, tmp_path: Path) -> None:
     """They meet askew and spin: linear and angular momentum to round-off; what friction takes is in the books, and

@@ -2,10 +2,7 @@
 
     E = sum over points of both of  A b(gap),    gap: distance to the other shape minus the radius of the points
 
-A is the share of a point in the surface of its shape, b the barrier of the contact with the body. A shape is all within
-a radius of its inset points: for spheres and capsules a point or segment, for boxes and cylinders the edges without
-their rounding. Where two convex bodies are nearest to each other one of these points is nearest to the other body:
-exactly in 2D, and in 3D except for two edges that cross, of which points are sampled.
+A is the share of a point in the surface of its shape, b the barrier of the contact with the body.
 """
 
 from __future__ import annotations
@@ -13,12 +10,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from itertools import product
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from ..array_types import Values
+from .inset_points import InsetPoints, inset_points
 from .laws import BARRIER, CoulombFriction, GapPotential, ObstacleLaw, tangential
 from .node_contact import (
     ContactForces,
@@ -32,106 +29,14 @@ from .node_contact import (
 )
 from .obstacle import RigidObstacle
 from .pose import Pose, PosedShape, point_jacobian
-from .shape_base import Shape, frame_about, unit_vector
-from .shapes import Capsule, OffsetShape, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
+from .shape_base import Shape
+from .shapes import OffsetShape
 from .step_limit import PointMotion, PoseMotion
 from .triangle_mesh_shape import TriangleMeshShape
 
 if TYPE_CHECKING:
     from .mesh_obstacle_term import MeshPair  # with ipctk
     from .rigid_obstacles import RigidObstacles
-
-
-@dataclass(frozen=True)
-class InsetPolicy:
-    """Numbers of sampled points.
-
-    Attributes:
-        edge_points: points on an edge or a segment, and circles on a cylinder.
-        circle_points: points on a circle.
-        touching_share: share of a surface that touches at once in a penalty, as one face of a box.
-    """
-
-    edge_points: int = 9
-    circle_points: int = 24
-    touching_share: float = 0.25
-
-
-SAMPLES = InsetPolicy()
-
-
-@dataclass(frozen=True, eq=False)
-class InsetPoints:
-    """Points such that a shape is all within a radius of them.
-
-    Attributes:
-        points: (n, d) in the frame of the shape, m.
-        radius: m.
-        area: share of each point in the surface of the shape, m^2 (2D: m).
-    """
-
-    points: Values
-    radius: float
-    area: float = 0.0
-
-    @property
-    def areas(self) -> Values:
-        """(n,) shares of all points, m^2."""
-        return np.full(len(self.points), self.area)
-
-
-def inset_points(shape: Shape) -> InsetPoints:
-    """Inset points of a shape; none of half spaces and hollow shapes."""
-    if isinstance(shape, TranslatedShape):
-        original = inset_points(shape.shape)
-        return InsetPoints(original.points + shape.offset, original.radius, original.area)
-    if isinstance(shape, TriangleMeshShape):
-        return InsetPoints(shape.points, 0.0, surface_measure(shape) / len(shape.points))
-    points, radius = _points_and_radius(shape)
-    return InsetPoints(points, radius, surface_measure(shape) / max(len(points), 1))
-
-
-def _points_and_radius(shape: Shape) -> tuple[Values, float]:
-    if isinstance(shape, Sphere) and shape.convex:
-        return np.zeros((1, shape.dim)), shape.radius
-    if isinstance(shape, Capsule) and shape.convex:
-        along = np.linspace(-0.5, 0.5, SAMPLES.edge_points) * shape.length
-        return along[:, None] * unit_vector(shape.axis), shape.radius
-    if isinstance(shape, RoundedBox) and shape.convex:
-        return _edge_points(np.array(shape.size) / 2 - shape.fillet), shape.fillet
-    if isinstance(shape, RoundedCylinder) and shape.convex:
-        return _circle_points(shape), shape.fillet
-    return np.empty((0, shape.dim)), 0.0
-
-
-def surface_measure(shape: Shape) -> float:
-    """Area of the tessellation of a shape, m^2 (2D: length, m)."""
-    points, elements = shape.tessellate()
-    side = points[elements[:, 1:]] - points[elements[:, :1]]
-    if shape.dim == 2:
-        return float(np.linalg.norm(side[:, 0], axis=1).sum())
-    return float(np.linalg.norm(np.cross(side[:, 0], side[:, 1]), axis=1).sum() / 2)
-
-
-def _edge_points(half: Values) -> Values:
-    """Points on the edges of a box of half sizes (d,), m; in 2D its corners."""
-    d = len(half)
-    if d == 2:
-        return np.array(list(product((-1.0, 1.0), repeat=2))) * half
-    along = np.linspace(-1.0, 1.0, SAMPLES.edge_points)
-    lines = [np.insert(np.array(ends), axis, t) for axis in range(d) for ends in product((-1.0, 1.0), repeat=2)
-             for t in along]  # fmt: skip
-    return np.unique(np.array(lines), axis=0) * half
-
-
-def _circle_points(shape: RoundedCylinder) -> Values:
-    """Points on circles over the side of a cylinder."""
-    angle = np.arange(SAMPLES.circle_points) * (2 * np.pi / SAMPLES.circle_points)
-    radius, half = shape.radius - shape.fillet, shape.length / 2 - shape.fillet
-    circle = radius * np.column_stack([np.cos(angle), np.sin(angle)])
-    heights = np.linspace(-half, half, SAMPLES.edge_points)
-    rings = [np.column_stack([circle, np.full(SAMPLES.circle_points, height)]) for height in heights]
-    return np.concatenate(rings) @ frame_about(unit_vector(shape.axis)).T
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,8 +119,11 @@ class ObstaclePair:
 
     def sides(self, body: Pose, obstacle: Pose) -> Iterator[tuple[Values, PosedShape]]:
         """(n, d) points of each obstacle in space, m, and the shape that they are in contact with."""
-        yield body.points_to_space(self.points[0].points), PosedShape(self.targets[0], obstacle)
-        yield obstacle.points_to_space(self.points[1].points), PosedShape(self.targets[1], body)
+        poses = body, obstacle
+        sides = zip(self.points, poses, self.targets, poses[::-1], strict=True)
+        for inset, pose, shape, target_pose in sides:
+            target = PosedShape(shape, target_pose)
+            yield inset.posed(pose, target), target
 
     def gap_bound(self, body: Pose, obstacle: Pose) -> float:
         """Lower bound of all gaps, m: that of the centre of the first minus its radius; distances are Lipschitz."""
@@ -281,7 +189,10 @@ class ObstaclePair:
         if self.gap_bound(body, obstacle) * (1 - BARRIER.min_gap_ratio) > reach:
             return 1.0
         carriers, motions = ((body, q, other_q), (obstacle, other_q, q)), []
-        for (x, target), (carrier, motion, against) in zip(self.sides(body, obstacle), carriers, strict=True):
+        sides = zip(self.sides(body, obstacle), carriers, self.points, strict=True)
+        for (x, target), (carrier, motion, against), inset in sides:
+            if (spin := inset.spin_direction(carrier)) is not None:
+                motion = motion - (spin @ motion) * spin  # points of a cylinder do not spin with it
             shift, rotation = np.tile(motion[:d], (len(x), 1)), (carrier.centre, motion[d:])
             motions.append(PointMotion(target, x, shift, target.effective_increment(against), rotation))
         return min(points.safe_fraction() for points in motions)
@@ -348,26 +259,32 @@ class BarrierPair:
 
     def derivatives(self, posed: PosedObstacles, *, exact: bool) -> PairDerivatives | None:
         """Derivatives of the potential by both poses; None: out of contact."""
-        first, second = poses = self._poses(posed)
+        poses = self._poses(posed)
         if (sides := self._contact_forces(poses)) is None:
             return None
-        (of_first, x), (of_second, y) = sides
-        by_first = self._by_carrier(of_first, x, first, exact=exact)
-        by_first = by_first + PoseCoupling(of_second, y, first, None, first, exact=exact).derivatives()
-        by_second = PoseCoupling(of_first, x, second, None, second, exact=exact).derivatives()
-        by_second = by_second + self._by_carrier(of_second, y, second, exact=exact)
-        by_both = mixed_pose_hessian(of_first, x, first, second, exact=exact)
-        by_both = by_both + mixed_pose_hessian(of_second, y, second, first, exact=exact).T
+        of_first, of_second = (
+            self._of_side(*side, *ordered, inset, exact=exact)
+            for side, ordered, inset in zip(sides, (poses, poses[::-1]), self.pair.points, strict=True)
+        )
+        by_first, by_second = of_first[0] + of_second[1], of_first[1] + of_second[0]
+        by_both = of_first[2] + of_second[2].T
         if self._friction is None:
             return by_first, by_second, by_both
         of_friction = self._friction.derivatives(poses, exact=exact)
         return by_first + of_friction[0], by_second + of_friction[1], by_both + of_friction[2]
 
     @staticmethod
-    def _by_carrier(contact: ContactForces, x: Values, pose: Pose, *, exact: bool) -> PoseDerivatives:
-        """Derivatives of contact of points x (n, d), m, by the pose of the obstacle that carries them."""
-        arm = x[contact.points] - pose.centre
-        return carried_derivatives(contact.potential, -contact.normal, contact.tangent(exact=exact), arm, exact=exact)
+    def _of_side(
+        contact: ContactForces, x: Values, carrier: Pose, other: Pose, inset: InsetPoints, *, exact: bool
+    ) -> PairDerivatives:
+        """Derivatives of contact of points x (n, d), m, by the poses of their carrier and of the other obstacle."""
+        arm, stiffness = x[contact.points] - carrier.centre, contact.tangent(exact=exact)
+        by_carrier = carried_derivatives(contact.potential, -contact.normal, stiffness, arm, exact=exact)
+        by_other = PoseCoupling(contact, x, other, None, other, exact=exact).derivatives()
+        by_both = mixed_pose_hessian(contact, x, carrier, other, exact=exact)
+        if (spin := inset.spin_direction(carrier)) is None:
+            return by_carrier, by_other, by_both
+        return _without_spin(spin, by_carrier, by_other, by_both, exact=exact)
 
     def energies(self, posed: PosedObstacles) -> tuple[float, float]:
         """Energy of the barrier, and potential of all forces in the step, J."""
@@ -391,6 +308,27 @@ class BarrierPair:
         sides = self.pair.contact_forces(*poses, self._law.barrier, self._start)
         touches = self._friction is not None or any(len(contact.points) for contact, _ in sides)
         return sides if touches else None
+
+
+def _without_spin(
+    spin: Values, by_carrier: PoseDerivatives, by_other: PoseDerivatives, by_both: Values, *, exact: bool
+) -> PairDerivatives:
+    """Derivatives of contact whose points are turned about the axis of their carrier as both move.
+
+    The energy is stationary in that turn phi. Its second derivatives are H - h h^T / (a . H a), where h = H a has the
+    mixed ones by the poses and phi. a = `spin` (6,) is the increment of the carrier that turns the points with it. The
+    turn comes before the rotation w of the carrier: exp(w) exp(phi a) = exp(w + phi a + phi w x a / 2 + ...).
+    """
+    of_carrier, of_other = by_carrier.hessian @ spin, by_both.T @ spin
+    if abs(stiffness := float(spin @ of_carrier)) <= np.finfo(float).eps * np.linalg.norm(by_carrier.hessian):
+        return by_carrier, by_other, by_both
+    if exact:
+        of_carrier[3:] += 0.5 * np.cross(spin[3:], by_carrier.gradient[3:])
+    return (
+        replace(by_carrier, hessian=by_carrier.hessian - np.outer(of_carrier, of_carrier) / stiffness),
+        replace(by_other, hessian=by_other.hessian - np.outer(of_other, of_other) / stiffness),
+        by_both - np.outer(of_carrier, of_other) / stiffness,
+    )
 
 
 class ObstaclePairs:

@@ -19,9 +19,10 @@ import numpy as np
 
 from ..array_types import Flags, Ints, Values
 from ..mesh.domain import Domain
+from .inset_points import SAMPLES
 from .laws import Penalty
 from .obstacle import FreeObstacle, RigidObstacle, VerletObstacle, free_pairs
-from .obstacle_pairs import SAMPLES, Numbers, ObstaclePair
+from .obstacle_pairs import Numbers, ObstaclePair
 from .penalty_law import ContactHistory, ContactStiffness, PenaltyContacts, PenaltyForces, Slips
 from .pose import Pose, PosedShape, resultant
 from .rigid_obstacles import RigidObstacles
