@@ -341,6 +341,27 @@ def test_a_cracked_body_touches_with_its_walls() -> None:
     assert inside.sum() > 10 and contact.surface.area[inside].min() > 0
 
 
+def test_crack_faces_are_released_once_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not again as edges break in the step and it is solved anew: they have room at the last solution alone."""
+    released: list[Any] = []
+    release = ContactSurface.release
+
+    def recorded(surface: ContactSurface, u: Values, posed: Any) -> None:
+        released.append(u.copy())
+        release(surface, u, posed)
+
+    monkeypatch.setattr(ContactSurface, "release", recorded)
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 1.0], "h": 0.25, "pattern": "unstructured"},
+        material={"young": 1e4, "poisson": 0.2, "density": 1.0}, fracture={"strength": 300.0, "passes": 5},
+        time={"scheme": "backward-euler", "step": 5e-3, "end": 0.1}, boundary=[{"on": "bottom", "fix": "xy"}],
+        obstacle=[{"name": "press", "shape": "sphere", "radius": 0.3, "at": [0.5, 1.31], "velocity": [0.0, -2.0]}],
+    )  # fmt: skip
+    solves = [report.solve.newton_iterations for report in each_step(scene, state) if report.broken]
+    assert solves
+    assert len(released) == len({u.tobytes() for u in released})
+
+
 def test_crack_faces_far_from_obstacles_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk is driven along a crack and parts its walls: as with a surface of all crack faces, of which it needs only
     those near the disk."""

@@ -108,6 +108,8 @@ def add_step_energies(balance: Balance, end: State, step: StepEnergies) -> tuple
     kinetic = balance.energies.kinetic_energy(end.v) if balance.scheme.inertia else 0.0
     sums = sum_over_ranks(balance.domain.comm, np.array([work, dissipated, kinetic, elastic]))
     work, dissipated, kinetic, stored = map(float, sums)
+    if not math.isfinite(work + dissipated + kinetic + stored):
+        raise NonFiniteState
     end = replace(end, elastic=elastic, work=end.work + work, dissipated=end.dissipated + dissipated)
     return end, kinetic, stored
 
