@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -42,6 +43,17 @@ def on_ranks(tmp_path_factory: pytest.TempPathFactory) -> OnRanks:
         return run_on_ranks("support.every", ranks, folder), folder / f"every-{ranks}"
 
     return run
+
+
+@pytest.fixture(scope="session", autouse=True)
+def folder_of_mpi() -> Iterator[None]:
+    """Open MPI names a folder by the number of a process, and does not start where a killed run has left that folder."""
+    name = "PRTE_MCA_prte_tmpdir_base"
+    with tempfile.TemporaryDirectory(prefix="fracsim-mpi-", ignore_cleanup_errors=True) as folder:
+        given = os.environ.setdefault(name, folder)
+        yield
+        if given == folder:
+            del os.environ[name]
 
 
 @pytest.fixture(scope="session", autouse=True)
