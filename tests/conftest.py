@@ -47,7 +47,7 @@ def on_ranks(tmp_path_factory: pytest.TempPathFactory) -> OnRanks:
 
 @pytest.fixture(scope="session", autouse=True)
 def folder_of_mpi() -> Iterator[None]:
-    """Open MPI names a folder by the number of a process, and does not start where a killed run has left that folder."""
+    """Open MPI names a folder by the number of a process, and does not start where a killed run has left one."""
     name = "PRTE_MCA_prte_tmpdir_base"
     with tempfile.TemporaryDirectory(prefix="fracsim-mpi-", ignore_cleanup_errors=True) as folder:
         given = os.environ.setdefault(name, folder)
