@@ -155,12 +155,12 @@ def test_cells_that_mirror_each_other_keep_their_order_as_stresses_vary_by_the_s
     orders = set()
     for _ in range(20):
         sigma = 3e5 * (1 + 1e-9 * rng.normal(size=len(cells)))
-        rows = rank_rows(CutKind.TIP_ADVANCE, sigma, domain, cells, domain.nodes[cells], np.zeros(len(cells)))
+        rows = rank_rows(CutKind.TIP_ADVANCE, sigma, cells[:, None] + 0.0, domain.nodes[cells], np.zeros(len(cells)))
         orders.add(tuple(np.lexsort(rows[:, 2::-1].T)))
     assert len(orders) == 1
     # a cell with more stress than that comes first all the same
     sigma[7] *= 1 + 3e-6
-    rows = rank_rows(CutKind.TIP_ADVANCE, sigma, domain, cells, domain.nodes[cells], np.zeros(len(cells)))
+    rows = rank_rows(CutKind.TIP_ADVANCE, sigma, cells[:, None] + 0.0, domain.nodes[cells], np.zeros(len(cells)))
     assert np.lexsort(rows[:, 2::-1].T)[0] == 7
 
 

@@ -55,7 +55,7 @@ from .energy.crack_initiation import (
 )
 from .energy.critical_distance import CriticalDistance
 from .energy.cut_cells import CutGeometry
-from .energy.tip_criterion import TipCriterion
+from .energy.tip_criterion import TipCriterion, input_numbers
 from .energy.tip_fields import TipFieldEvaluator, TipFields
 from .energy.tip_parameters import TIP
 from .fracture_pass import FracturePass, FracturePassResult
@@ -297,7 +297,7 @@ class CohesiveInitiation:
         strength = cell_strength(self._strength, self._graph, cells)
         load = np.round(_larger_principal_stress(mean, stress[cells]) / strength, SOFTENING.load_digits)
         centres = self._evaluator.centres[cells]
-        rank = rank_rows(CutKind.NEW_CRACK, load, self._graph.domain, cells, centres, self._h[cells])
+        rank = rank_rows(CutKind.NEW_CRACK, load, centres, centres, self._h[cells])
         rows = np.concatenate(allgather(self._graph.domain.comm, rank[load >= 1]))
         first = rows[np.lexsort(rows[:, 2::-1].T)][:1]
         chosen = (rank == first).all(axis=1) if len(first) else np.zeros(len(cells), bool)
@@ -357,7 +357,9 @@ class CohesiveTipCriterion(TipCriterion):
         rows = np.flatnonzero(loaded & ~self._excluded_cells[tips.cell])
         cells, ahead, no = tips.cell[rows], tips.point[rows] - tips.behind[rows], np.zeros(len(rows), bool)
         exclusion = TIP.exclusion_radius[d] * self._h[cells]
-        rank = rank_rows(CutKind.TIP_ADVANCE, sigma[rows], self._domain, cells, tips.point[rows], exclusion)
+        rank = rank_rows(
+            CutKind.TIP_ADVANCE, sigma[rows], input_numbers(self._domain, cells), tips.point[rows], exclusion
+        )
         across = remove_normal_stress(mean[rows], ahead)
         return CutProposal(rank, cells, across, self._graph.first_broken_edge(cells), ahead, no, no)
 

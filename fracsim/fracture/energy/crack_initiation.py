@@ -81,21 +81,20 @@ def empty_proposal(dim: int, course_width: int) -> CutProposal:
     return CutProposal(np.empty((0, dim + 4)), none, np.empty((0, dim, dim)), none, ahead, no, no)
 
 
-def rank_rows(kind: CutKind, sigma: Values, domain: Domain, cells: Ints, points: Values, exclusion: Values) -> Values:
+def rank_rows(kind: CutKind, sigma: Values, key: Values, points: Values, exclusion: Values) -> Values:
     """Return the rows of `CutProposal.rank`.
 
-    A hash of the number of each cell in the input mesh changes its stress by 1e-6 at most. So cells that mirror each
-    other have one order on any number of ranks, where their stress differs by the error of the solution.
+    A hash changes each stress by 1e-6 at most. So cells that mirror each other have one order on any number of ranks,
+    where their stress differs by the error of the solution.
 
     Args:
         kind: advance of a tip, or new crack.
         sigma: (n,) first principal stress, Pa, or load; cells are selected from the largest on.
-        domain: gives the numbers of cells.
-        cells: (n,) local cells.
+        key: (n, ...) numbers that the hash is of, the same on any number of ranks.
         points: (n, d) m.
         exclusion: (n,) distance within which no other cell may be cut, m.
     """
-    hashed = hash_points(np.asarray(domain.input_numbering.cells[cells, None], float))
+    hashed = hash_points(key)
     order = -sigma * (1 + TIP.tie_break * hashed)
     return np.column_stack([np.full(len(sigma), float(kind)), order, hashed, points, exclusion])
 
@@ -210,7 +209,7 @@ class CrackInitiation:
         overloaded = first_principal_stress(mean) >= self._start.threshold[cells]
         cells = cells[overloaded]
         centres = evaluator.centres[cells]
-        rank = rank_rows(CutKind.NEW_CRACK, load[cells], self._domain, cells, centres, self._distance[cells])
+        rank = rank_rows(CutKind.NEW_CRACK, load[cells], centres, centres, self._distance[cells])
         return CutProposal(rank, cells, mean[overloaded])
 
     def _is_largest(self, cells: Ints, load: Values) -> Flags:

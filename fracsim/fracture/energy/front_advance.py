@@ -22,7 +22,7 @@ from ...mesh.simplices import is_split
 from ..criterion import Edges
 from .crack_initiation import CutKind, CutProposal, empty_proposal, rank_rows, select_proposals
 from .cut_plane import EdgeCuts, plane_cuts
-from .tip_criterion import TipCriterion, reference_corners
+from .tip_criterion import TipCriterion, input_numbers, reference_corners
 from .tip_fields import TipFields
 from .tip_neighbourhoods import CrackTips
 from .tip_parameters import TIP
@@ -126,7 +126,7 @@ class FrontTipCriterion(TipCriterion):
         near = np.linalg.norm(middle - planes[cells, :3], axis=1) <= TIP.lead_distance * self._h[cells]
         cells, middle = cells[near], middle[near]
         exclusion = TIP.exclusion_radius[3] * self._h[cells]
-        rank = rank_rows(CutKind.TIP_ADVANCE, planes[cells, 6], self._domain, cells, middle, exclusion)
+        rank = rank_rows(CutKind.TIP_ADVANCE, planes[cells, 6], input_numbers(self._domain, cells), middle, exclusion)
         stress, turns = np.empty((len(cells), 3, 3)), np.ones(len(cells), bool)
         return CutProposal(rank, cells, stress, np.zeros(len(cells), np.int64), planes[cells], turns, ~turns)
 

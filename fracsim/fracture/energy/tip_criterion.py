@@ -267,7 +267,9 @@ class TipCriterion:
         active[young] = self._is_overloaded(fields, candidates[young], mean[young])
         rows = candidates[active]
         cells = tips.cell[rows]
-        rank = rank_rows(CutKind.TIP_ADVANCE, sigma[active], self._domain, cells, tips.point[rows], exclusion[rows])
+        rank = rank_rows(
+            CutKind.TIP_ADVANCE, sigma[active], input_numbers(self._domain, cells), tips.point[rows], exclusion[rows]
+        )
         entry = self._graph.first_broken_edge(cells)
         return CutProposal(rank, cells, mean[active], entry, ahead[rows], turns[rows], branches[rows])
 
@@ -361,7 +363,7 @@ class TipCriterion:
             ahead = np.maximum(1 - passed, 0.0)[:, None] * ahead
             self.cells = np.concatenate([self.cells, cells])
             turns, zeros = entry >= 0, np.zeros(len(cells))
-            rank = rank_rows(CutKind.TIP_ADVANCE, zeros, domain, cells, point, zeros)
+            rank = rank_rows(CutKind.TIP_ADVANCE, zeros, input_numbers(domain, cells), point, zeros)
             proposal = CutProposal(rank, cells, np.empty((len(cells), 2, 2)), entry, ahead, turns, ~turns)
             edges, courses = self._store_cuts(self._cut_rows(proposal, cuts))
             all_edges.append(edges)
@@ -386,6 +388,11 @@ class TipCriterion:
 def reference_corners(domain: Domain, cells: Ints) -> Values:
     """Return the reference corners (n, d + 1, d) of cells (n,), m."""
     return domain.nodes[domain.cell_nodes[cells]]
+
+
+def input_numbers(domain: Domain, cells: Ints) -> Values:
+    """Return the numbers (n, 1) of cells in the input mesh, to be hashed: two tips may be at one point."""
+    return np.asarray(domain.input_numbering.cells[cells, None], float)
 
 
 def kinked_release(psi: Values, tips: CrackTips, force: Values) -> tuple[Values, Values]:
