@@ -95,7 +95,7 @@ def rank_rows(kind: CutKind, sigma: Values, key: Values, points: Values, exclusi
         exclusion: (n,) distance within which no other cell may be cut, m.
     """
     hashed = hash_points(key)
-    order = -sigma * (1 + TIP.tie_break * hashed)
+    order = -sigma * (1 - TIP.tie_break * hashed)
     return np.column_stack([np.full(len(sigma), float(kind)), order, hashed, points, exclusion])
 
 
