@@ -97,7 +97,7 @@ def add_step_energies(balance: Balance, end: State, step: StepEnergies) -> tuple
     Raises:
         NonFiniteState: the state or its energies are not finite.
     """
-    _check_finite(balance.domain.comm, end, step.work + step.dissipated + step.elastic)
+    _check_finite(balance.domain.comm, end)
     elastic = step.elastic
     elastic += sum(term.stored_energy() for term in balance.terms_with["stored_energy"] if term is not balance.stress)
     term_work, friction_loss = balance.energies.step_work()
@@ -114,10 +114,10 @@ def add_step_energies(balance: Balance, end: State, step: StepEnergies) -> tuple
     return end, kinetic, stored
 
 
-def _check_finite(comm: MPI.Comm, end: State, energies: float) -> None:
-    """Raise NonFiniteState if the end of a step, or the squares of its values, are not finite (collective)."""
+def _check_finite(comm: MPI.Comm, end: State) -> None:
+    """Raise NonFiniteState if the squares of the values at the end of a step are not finite (collective)."""
     squares = sum(float(np.vdot(values, values)) for values in (end.u, end.v, end.a, end.forces))
-    if not comm.allreduce(math.isfinite(squares + energies), op=MPI.LAND):
+    if not comm.allreduce(math.isfinite(squares), op=MPI.LAND):
         raise NonFiniteState
 
 
