@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Iterator
 from itertools import islice
@@ -165,6 +166,12 @@ def test_what_is_out_of_reach_is_told_with_what_is_allowed(tables: dict[str, Any
 
 def every_run() -> Iterator[str]:
     yield from (*BASES, *FILES)
+
+
+def test_a_body_that_is_too_small_for_an_obstacle_is_refused(files: dict[str, Data], tmp_path: Path) -> None:
+    """Its motion was searched in 2^30 pieces: minutes, in which no wall limit was looked at."""
+    message = ends_well(mutated(files["soft file"], ("mesh", "scale"), 1e-30), tmp_path / "out")
+    assert re.match(r"obstacle\.0, block: edges of the body are 6\.88e-32 m long, those of the obstacle", message)
 
 
 @pytest.mark.slow

@@ -15,6 +15,7 @@ import numpy as np
 from dolfinx import fem
 
 from ..array_types import Pattern, Values
+from ..errors import InputError
 from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from ..mesh.ghost_exchange import with_straight_edges
@@ -24,13 +25,14 @@ from .mesh_obstacles import MESH, BarrierPart, MeshObstacle, free_fraction_on_ar
 from .node_contact import PoseDerivatives, carried_derivatives
 from .obstacle import RigidObstacle
 from .obstacle_pairs import Numbers, PairDerivatives, PosedObstacles
+from .pair_search import max_length
 from .pose import Pose, point_jacobian
 from .retractable_surface import SelfContactLaw
 from .rigid_obstacles import ObstacleGroup, PoseContact, RigidObstacles
 from .sample_points import IpcFriction
 from .self_contact import BarrierBodySurface, SurfaceContact, mean_velocities
 from .step_limit import PoseMotion, stop_before_meshes
-from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
+from .triangle_mesh_shape import LIMITS, TriangleMeshShape, refine_triangles
 
 
 class MeshObstacleTerm(SurfaceContact):
@@ -261,12 +263,22 @@ class MeshObstacleTerm(SurfaceContact):
 
 
 def build_mesh_obstacles(group: ObstacleGroup, edge: float) -> list[MeshObstacle]:
-    """Obstacles of a group at the start, with edges of their triangles of at most `edge`, m, as those of the body."""
+    """Obstacles of a group at the start, with edges of their triangles of at most `edge`, m, as those of the body.
+
+    Raise InputError for a body too small for an obstacle: its motion would be searched in too many pieces.
+    """
     result = []
     for number, obstacle in zip(group.numbers, group.obstacles, strict=True):
         shape = obstacle.shape
         assert isinstance(shape, TriangleMeshShape)
         points, triangles = refine_triangles(shape.points, shape.triangles, edge)
+        longest = max_length((points[triangles] - points[np.roll(triangles, 1, axis=1)]).reshape(-1, 3))
+        if longest > LIMITS.max_edge_ratio * edge:
+            raise InputError(
+                f"obstacle.{number}, {obstacle.name}: edges of the body are {edge:.3g} m long, those of the obstacle "
+                f"{longest:.3g} m after refinement; their ratio may be {LIMITS.max_edge_ratio:g} at most; if the files "
+                "have different units, change mesh.scale or the obstacle's scale"
+            )
         name, rotates = f"obstacle.{number}: {obstacle.name}", obstacle.free or obstacle.spin is not None
         result.append(MeshObstacle(name, points, triangles, obstacle.friction, rotates=rotates))
     return result

@@ -22,11 +22,13 @@ class TriangleMeshPolicy:
 
     Attributes:
         max_triangles: about as many triangles result from a refinement at most.
+        max_edge_ratio: edge of an obstacle in edges of the body, beyond which a study is refused.
         max_products: pairs of a point and a triangle in a penetration test; beyond, points are left out evenly.
         min_winding: winding number from which on a point is inside.
     """
 
     max_triangles: int = 100_000
+    max_edge_ratio: float = 1e6
     max_products: int = 30 * BATCH_SIZE
     min_winding: float = 0.5
 
