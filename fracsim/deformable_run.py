@@ -45,7 +45,7 @@ from .scene import Scene, build_scene
 from .study import Study
 from .study.conditions import initial_cracks
 from .study.plugins import collect_physics, physics_lines
-from .study.reader import add_missing_defaults, study_text
+from .study.reader import add_missing_defaults, input_file_lines, study_text
 from .timestepping.stepper import StepReport
 
 if TYPE_CHECKING:
@@ -104,7 +104,8 @@ class Run:
         self.interrupt = interrupt or InterruptHandler(self.comm, wall_limit)
         self._progress = progress or ProgressReporter(first=self.comm.rank == 0, end=scene.study.time.end)
         versions = [f"{key}: {value}" for key, value in software_versions(self.comm).items()]
-        self._text = study_text(scene.study, [*versions, *scene.physics.lines])
+        files = from_root(self.comm, lambda: input_file_lines(scene.study))
+        self._text = study_text(scene.study, [*versions, *scene.physics.lines, *files])
         self._meter = ResourceMeter(self.comm, scene.stepper, began)
         self._forgets = False  # a checkpoint was written: the next step depends on what is in it alone
         stress, by_forces = scene.balance.stress, scene.study.output.cut == "forces"
@@ -487,7 +488,7 @@ def _run_rigid(
         progress.end_line()
         print_mesh_notes(scene)
         versions = [f"{key}: {value}" for key, value in software_versions(comm).items()]
-        text = study_text(study, [*versions, *collect_physics(study).lines])
+        text = study_text(study, [*versions, *collect_physics(study).lines, *input_file_lines(study)])
         summary = RigidRun(scene, folder, text, interrupt, restart=restart, progress=progress)()
         if study.output.picture:
             progress.set_stage("drawing the last frame")
@@ -524,8 +525,9 @@ def _check(
         *(item.file for item in study.obstacle),
     )
     check_output_folder(
-        folder, text, restart=restart, overwrite=overwrite, inputs=inputs, completed=add_missing_defaults
-    )
+        folder, text, restart=restart, overwrite=overwrite, inputs=inputs, completed=add_missing_defaults,
+        file_lines=partial(input_file_lines, study),
+    )  # fmt: skip
 
 
 def _draw(folder: Path) -> None:

@@ -102,6 +102,8 @@ class RigidRun:
         self.state, self._began, self._cpu = scene.initial_state, time.perf_counter(), time.process_time()
         self.broken = self.blows = self.loads = 0
         self._start = scene.initial_state.bodies.kinetic_energy
+        # of the parts of the run before a restart
+        self._effort_before: dict[str, Any] = {"analyses": 0, "wall": 0.0, "cpu": 0.0, "seconds": {}}
         arrays = self._resume() if restart else None
         step, t = (self.state.step, self.state.t) if arrays is not None else (None, None)
         # time of the last checkpoint, s
@@ -163,6 +165,8 @@ class RigidRun:
         ):
             raise restart_error(stored.path, "its bodies are not those that its broken edges leave")
         self.blows, self.loads, self._frame_counts = earlier["blows"], earlier["loads"], earlier["frames"]
+        # an earlier version stored none
+        self._effort_before |= earlier.get("effort", {})
         return arrays
 
     # --- a step, a frame, a checkpoint ---
@@ -207,11 +211,22 @@ class RigidRun:
         arrays["worked"] = np.array([*self.history.obstacle_work.values()])
         clock = {"t": state.t, "step": state.step, "work": state.work, "start": self._start}
         counts = {"blows": self.blows, "loads": self.loads, "frames": self.frames.files.frame_counts}
+        counts["effort"] = self._effort()
         notes = CheckpointNotes(self.text, counts)
         fingerprint = mesh_fingerprint(self.scene.mesh)
         write_on_root(ROOT_COMM, path, lambda: write_checkpoint_file(path, arrays, clock, fingerprint, notes))
         self._saved_at = state.t
         return path
+
+    def _effort(self) -> dict[str, Any]:
+        """Return the analyses and seconds of all parts of the run so far, as in summary.json."""
+        before, phases = self._effort_before, self.scene.stepper.phases.seconds
+        seconds = {name: round(before["seconds"].get(name, 0.0) + value, 4) for name, value in phases.items()}
+        return {
+            "analyses": before["analyses"] + self.scene.stepper.instances.analyses, "seconds": seconds,
+            "wall": round(before["wall"] + time.perf_counter() - self._began, 3),
+            "cpu": round(before["cpu"] + time.process_time() - self._cpu, 4),
+        }  # fmt: skip
 
     # --- to the end ---
 
@@ -303,9 +318,7 @@ class RigidRun:
             "split_cells": scene.stepper.instances.split_cell_count, "pieces": scene.stepper.fragment_count,
             **self._count_single_nodes(),
             "external_work": state.work, "dissipated": self._start + state.work - kinetic,
-            "blows": self.blows, "loads": self.loads, "analyses": scene.stepper.instances.analyses,
-            "seconds": {name: round(value, 4) for name, value in scene.stepper.phases.seconds.items()},
-            "wall": round(time.perf_counter() - self._began, 3), "cpu": round(time.process_time() - self._cpu, 4),
+            "blows": self.blows, "loads": self.loads, **self._effort(),
             "ranks": MPI.COMM_WORLD.size, "versions": software_versions(MPI.COMM_WORLD),
         }  # fmt: skip
         write_summary(ROOT_COMM, self.folder, summary)
@@ -338,7 +351,7 @@ def _check_stored(
     expected = initial | {"broken_at": np.empty(0), "worked": np.zeros(obstacles)}
     check_names(arrays, set(expected), {*expected, *OPTIONAL_ARRAYS}, path)
     check_names(stored.clock, set(CLOCK_NAMES), set(CLOCK_NAMES), path)
-    check_names(stored.notes.monitors, MONITOR_NAMES, MONITOR_NAMES, path)
+    check_names(stored.notes.monitors, MONITOR_NAMES, {*MONITOR_NAMES, "effort"}, path)
     bodies = len(arrays["body.mass"])
     for name, values in arrays.items():
         first = {"worked": (obstacles,)} | ({name: (bodies,)} if name.startswith("body.") else {})

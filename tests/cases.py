@@ -87,6 +87,10 @@ DUCTILE_TABLES: dict[str, Any] = {
 }
 
 
+# an obstacle file (OBJ), m
+WEDGE = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 3 1 4\n"
+
+
 def changed(base: dict[str, Any], **tables: Any) -> dict[str, Any]:
     """A copy of a study with keys of its tables set: changed(BAR, time={"end": 1.0}); None removes, others replace."""
     data = copy.deepcopy(base)

@@ -23,7 +23,7 @@ import numpy.typing as npt
 import pytest
 from mpi4py import MPI
 
-from cases import BAR, DUCTILE_TABLES, STRIP, changed, command, fracsim, mpirun, study, write_study
+from cases import BAR, DUCTILE_TABLES, STRIP, WEDGE, changed, command, fracsim, mpirun, study, write_study
 from fracsim.deformable_run import Run, run_study
 from fracsim.errors import Exit, InputError, NotConverged, Stopped
 from fracsim.output.frame_files import FieldEvaluator
@@ -324,6 +324,27 @@ def test_other_groups_on_the_same_mesh_are_another_mesh(tmp_path: Path) -> None:
     save_mesh(dataclasses.replace(data, facet_groups=groups), path)
     with pytest.raises(InputError, match="belongs to another mesh"):
         run(bar, tmp_path / "out", restart=True)
+
+
+@pytest.mark.parametrize("scheme", ["newmark", "rigid"])
+def test_another_obstacle_file_is_refused(tmp_path: Path, scheme: str) -> None:
+    """An obstacle of another shape under the same name; with the earlier file the run goes on."""
+    wedge, out = tmp_path / "wedge.obj", tmp_path / "out"
+    wedge.write_text(WEDGE)
+    obstacle = {"name": "wedge", "shape": "mesh", "file": str(wedge), "at": [0.5, 0.1, 1.0]}
+    data = {**BAR, "obstacle": [obstacle]}
+    if scheme == "rigid":
+        data = {name: data[name] for name in ("title", "mesh", "material", "obstacle")}
+    data["time"] = {"scheme": scheme, "step": 0.01, "end": 0.1}
+    with pytest.raises(Stopped):
+        run_study(MPI.COMM_SELF, study(data), out, wall_limit=0.0)
+    wedge.write_text(WEDGE.replace("0.1", "0.2"))
+    with pytest.raises(InputError, match="has changed since"):
+        run_study(MPI.COMM_SELF, study(data), out, restart=True)
+    with h5py.File(out / "checkpoint" / "state.h5", "r") as stored:
+        assert "# file obstacle.0.file: " in str(stored["notes"]["study"][()])
+    wedge.write_text(WEDGE)
+    run_study(MPI.COMM_SELF, study(data), out, restart=True)
 
 
 def test_what_may_change_changes(tmp_path: Path, stopped: Path) -> None:

@@ -134,11 +134,13 @@ def test_a_restart_goes_on_as_if_nothing_had_been(done: Path, tmp_path: Path) ->
 
 
 def test_a_restart_after_the_break_has_its_pieces(done: Path, tmp_path: Path) -> None:
-    """To 0.05 s, and on to 0.06 s."""
+    """To 0.05 s, and on to 0.06 s; summary.json counts the analyses and the seconds of both parts."""
     often = {"every": 10, "picture": False, "checkpoint": 1e-9}
     short = study(time={"scheme": "rigid", "step": 2e-3, "end": 0.05}, output=often)
-    run_study(MPI.COMM_SELF, short, tmp_path / "out")
-    run_study(MPI.COMM_SELF, study(), tmp_path / "out", restart=True)
+    first = run_study(MPI.COMM_SELF, short, tmp_path / "out")
+    summary = run_study(MPI.COMM_SELF, study(), tmp_path / "out", restart=True)
+    assert summary["analyses"] == json.loads((done / "summary.json").read_text())["analyses"] > 0
+    assert summary["cpu"] > first["cpu"] and summary["seconds"]["motion"] > first["seconds"]["motion"]
     found, expected = (rows(folder / "history.csv") for folder in (tmp_path / "out", done))
     assert expected["pieces"][24] > 1
     assert_same(found, expected)

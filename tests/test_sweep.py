@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import json
 import os
 import shlex
@@ -13,11 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from cases import BAR, command, fracsim, fracsim_here, mpirun, swept_here, write_study
+from cases import BAR, WEDGE, command, fracsim, fracsim_here, mpirun, study, swept_here, write_study
 from fracsim.errors import InputError
 from fracsim.report import sweep
 from fracsim.report.runs import read_last_message
 from fracsim.report.sweep import case_folder_name, split_values, sweep_cases
+from fracsim.study.mesh_source import build_mesh, save_mesh
 
 KEYS = ("--set", "mesh.h=0.25,0.125", "--set", "time.step=0.01,0.015")
 
@@ -105,6 +107,27 @@ def test_a_changed_study_is_run_again(tmp_path: Path) -> None:
     swept_here(bar, "--set", "mesh.h=0.25", "-o", out)
     write_study(bar, BAR, material={"young": 2e6})
     assert "done before" not in swept_here(bar, "--set", "mesh.h=0.25", "-o", out).stdout
+
+
+@pytest.mark.parametrize("kind", ["mesh", "obstacle"])
+def test_a_changed_file_is_run_again(tmp_path: Path, kind: str) -> None:
+    """A case is run again if its mesh or obstacle file has other contents, not if it was only written anew."""
+    part, wedge, out = tmp_path / "part.msh", tmp_path / "wedge.obj", tmp_path / "out"
+    data = build_mesh(study(BAR).mesh)
+    save_mesh(data, part)
+    wedge.write_text(WEDGE)
+    obstacle = {"name": "wedge", "shape": "mesh", "file": str(wedge), "at": [0.5, 0.1, 1.0]}
+    bar = write_study(tmp_path / "bar.toml", {**BAR, "mesh": {"file": str(part)}, "obstacle": [obstacle]})
+    keys = ("--set", "time.step=0.015", "-o", out)
+    assert swept_here(bar, *keys).returncode == 0
+    path = part if kind == "mesh" else wedge
+    path.write_bytes(path.read_bytes())
+    assert "done before" in swept_here(bar, *keys).stdout
+    if kind == "mesh":
+        save_mesh(dataclasses.replace(data, points=1.5 * data.points), part)
+    else:
+        wedge.write_text(WEDGE.replace("0.1", "0.2"))
+    assert "done before" not in swept_here(bar, *keys).stdout
 
 
 def test_a_failing_case_leaves_the_others_alone(tmp_path: Path) -> None:

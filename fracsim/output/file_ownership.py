@@ -30,6 +30,11 @@ ALLOWED_FOREIGN_FILES = ("log.txt", STUDY_FILE + NEW)
 _MAX_NAMED_FILES = 3
 
 
+def recorded_file_lines(study: str) -> list[str]:
+    """Lines `file KEY: SHA-256` of the text of a study.toml, one for each input file; earlier versions wrote none."""
+    return [line.removeprefix("# ") for line in study.splitlines() if line.startswith("# file ")]
+
+
 def own_files(folder: Path) -> Iterator[Path]:
     """Files that runs have written in a folder of fracsim, without study.toml."""
     for name in OUTPUT_FILES:

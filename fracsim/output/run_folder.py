@@ -23,7 +23,14 @@ from ..timestepping.step_sizes import count_intervals
 from .atomic_write import error_reason, replace_text
 from .checkpoint_file import checkpoint_path, read_notes
 from .fields_file import check_self_contained, read_frame_times
-from .file_ownership import STUDY_FILE, check_file_types, check_not_resumable, check_ownership, delete_own_files
+from .file_ownership import (
+    STUDY_FILE,
+    check_file_types,
+    check_not_resumable,
+    check_ownership,
+    delete_own_files,
+    recorded_file_lines,
+)
 from .history import read_earlier_rows
 
 CHANGEABLE_KEYS = (
@@ -54,6 +61,24 @@ def check_same_study(path: Path, earlier: dict[str, Any], present: dict[str, Any
         "time.end, time.adapt, time.smallest, time.breaking_step, time.until, [solver], [output] and the title may "
         "change; put the others back, or run without --restart in another folder"
     )
+
+
+def check_same_obstacle_files(path: Path, study: str, present: Iterable[str]) -> None:
+    """Raise InputError if an obstacle file has another content than when a checkpoint was written.
+
+    Args:
+        path: the checkpoint, named in the error.
+        study: text of study.toml in the checkpoint.
+        present: lines `file KEY: SHA-256` of the study to continue. Those of the mesh are not compared.
+    """
+    earlier = recorded_file_lines(study)
+    for line in [line for line in present if earlier and line not in earlier]:
+        key = line.removeprefix("file ").rpartition(": ")[0]
+        if key.startswith("obstacle."):
+            raise InputError(
+                f"--restart: the file of {key} has changed since {path} was written: put the earlier file back, or run "
+                "without --restart in another folder"
+            )
 
 
 def study_differences(earlier: dict[str, Any], present: dict[str, Any]) -> Iterator[str]:
@@ -120,6 +145,7 @@ def check_output_folder(
     overwrite: bool,
     inputs: Iterable[Path | None],
     completed: Callable[[dict[str, Any]], dict[str, Any]],
+    file_lines: Callable[[], Iterable[str]],
 ) -> None:
     """Raise InputError if a run may not write to a folder or cannot continue there. Nothing is changed (rank 0).
 
@@ -130,11 +156,13 @@ def check_output_folder(
         overwrite: an unfinished run in the folder may be deleted.
         inputs: files from which the study is read.
         completed: returns the tables of an earlier version's study with the defaults of keys added since.
+        file_lines: returns lines about the contents of the input files; called on a restart.
     """
     check_file_types(folder)
     if restart:
-        earlier = completed(read_notes(folder).study_tables())
-        check_same_study(checkpoint_path(folder), earlier, tomllib.loads(study))
+        notes = read_notes(folder)
+        check_same_study(checkpoint_path(folder), completed(notes.study_tables()), tomllib.loads(study))
+        check_same_obstacle_files(checkpoint_path(folder), notes.study, file_lines())
         # a restart may read study.toml of the run itself
         inputs = ()
     check_ownership(folder, inputs)

@@ -19,10 +19,10 @@ from typing import Any
 
 from ..errors import REPEATED_SIGNAL_INTERVAL, STOP_SIGNALS, Exit, InputError, NotConverged, Stopped, one_line
 from ..meshes.plain_files import atomic_replacement_of_all, create
-from ..output.file_ownership import check_ownership, has_resumable_run
+from ..output.file_ownership import check_ownership, has_resumable_run, recorded_file_lines
 from ..output.lock import FolderLock, describe_lock_holder
 from ..study.check import check_study
-from ..study.reader import load_study, study_text
+from ..study.reader import input_file_lines, load_study, study_text
 from .runs import MESSAGE_PREFIX, OUTCOMES, read_last_message
 
 # characters of a folder name, before a hash
@@ -185,13 +185,14 @@ def _safe_text(value: str) -> str:
 
 
 def _checked_study(path: Path, case: SweepCase) -> str:
-    """Text of study.toml of a case. Raises InputError, with the combination, if it cannot be run."""
+    """Text of study.toml of a case with lines on its files. Raises InputError, with the case, if it cannot be run."""
     try:
         study = load_study(path, case.overrides)
         check_study(study)
+        lines = input_file_lines(study)
     except InputError as error:
         raise InputError(f"{case.folder.name}: {error}. Nothing was run") from None
-    return study_text(study)
+    return study_text(study, lines)
 
 
 def _check_folder(case: SweepCase, study: str, path: Path, overwrite: bool) -> None:
@@ -246,9 +247,15 @@ def _run_environment() -> dict[str, str]:
 
 
 def _case_state(case: SweepCase, study: str) -> str:
-    """State of a case: "done", "begun" (with a checkpoint) or "new". Files of another study do not count."""
+    """State of a case: "done", "begun" (with a checkpoint) or "new".
+
+    Files of another study, or of one with another content of a mesh or obstacle file, do not count.
+    """
     try:
-        if tomllib.loads((case.folder / "study.toml").read_text(encoding="utf-8")) != tomllib.loads(study):
+        earlier = (case.folder / "study.toml").read_text(encoding="utf-8")
+        if tomllib.loads(earlier) != tomllib.loads(study):
+            return "new"
+        if recorded_file_lines(earlier) != recorded_file_lines(study):
             return "new"
     except (OSError, ValueError):
         return "new"

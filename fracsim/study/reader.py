@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
 from dataclasses import asdict
 from difflib import get_close_matches
@@ -100,6 +101,37 @@ def study_text(study: Study, comments: Iterable[str] = ()) -> str:
     data["material"] |= data["material"].pop("regions")
     data["mesh"] |= _builder_parameters(study)
     return "".join(f"# {line}\n" for line in comments) + tomli_w.dumps(data)
+
+
+def input_file_lines(study: Study) -> list[str]:
+    """Returns a line `file KEY: SHA-256` for each mesh and obstacle file of a study, for study.toml.
+
+    Files that these name in turn (`*INCLUDE`, pieces of .pvtu) are not read.
+
+    Raises:
+        InputError: a file cannot be read.
+    """
+    return [f"file {key}: {_file_digest(key, path)}" for key, path in _input_files(study)]
+
+
+def _input_files(study: Study) -> Iterator[tuple[str, Path]]:
+    """Pairs of the dotted key and the path of each mesh and obstacle file."""
+    tables = [("mesh", study.mesh), *((f"obstacle.{i}", entry) for i, entry in enumerate(study.obstacle))]
+    for name, table in tables:
+        for key in _PATH_KEYS[MeshSettings if name == "mesh" else ObstacleSettings]:
+            if (path := getattr(table, key)) is not None:
+                yield f"{name}.{key}", path
+
+
+def _file_digest(key: str, path: Path) -> str:
+    """SHA-256 of the contents of a file. InputError if it cannot be read."""
+    if wrong := unreadable_reason(path):
+        raise InputError(f"{key}: {path} {wrong}")
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise InputError(f"{key}: cannot read {path}: {error.strerror}") from None
 
 
 def add_missing_defaults(values: dict[str, Any]) -> dict[str, Any]:
