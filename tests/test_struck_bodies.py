@@ -201,6 +201,7 @@ def test_mass_and_momenta_are_kept_through_many_fractures() -> None:
         name = int(of_input[body.fragments.node_fragment == fragment].min())
         body.fragments.update()
         bodies = stepper._replace_by_fragments(bodies, {name})
+        assert np.array_equal(bodies.centre, stepper.shapes.moments.centre), "where bodies are drawn"
     assert len(bodies) > 15
     assert abs(bodies.mass / (DENSITY * stepper.shapes.moments.volume) - 1).max() > 1e-3
     size = float(start.mass.sum()) * 10

@@ -327,8 +327,10 @@ class RigidStepper:
         fragments = bodies.split_into(after.moments, parent)
         self.impact_detector.forget_bodies(np.array([*names], np.int64))
         self._broken_instances = {name // self.instances.node_count for name in names}
-        # bodies that did not break stay the same to the last digit, though cells that they share are cut anew
+        # Bodies that did not break stay the same to the last digit. If cells that they share were cut anew, they take
+        # the centre and inertia of their new shape, to which collision shapes are relative, with the same momenta.
         unbroken = ~np.isin(before.names[parent], list(names)) & (np.bincount(parent)[parent] == 1)
+        unbroken &= np.all(after.moments.centre == before.moments.centre[parent], axis=1)
         values = {name: np.array(array) for name, array in vars(fragments).items()}
         for name, array in values.items():
             array[unbroken] = getattr(bodies, name)[parent[unbroken]]
