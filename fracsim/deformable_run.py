@@ -448,9 +448,9 @@ def run_study(
         check = partial(_check, folder, study, study_text(study), source, restart=restart, overwrite=overwrite)
         on_root(comm, lambda: lock_checked_folder(lock, check))  # at once, not after a mesh of minutes
         scene = (build or build_scene)(comm, study, stage)
-        if scene.domain.notes:
+        if notes := [*scene.domain.notes, *scene.balance.motion.notes]:
             progress.end_line()
-            print_notes(comm, list(scene.domain.notes))
+            print_notes(comm, notes)
         try:
             options: dict[str, Any] = {"interrupt": interrupt, "progress": progress, "began": began}
             summary = Run(scene, folder, restart=restart, overwrite=overwrite, **options)()

@@ -221,6 +221,26 @@ def test_what_contradicts_itself_is_refused() -> None:
     )
 
 
+def test_motions_that_contradict_each_other_at_some_nodes_are_noted() -> None:
+    """A motion that another one replaces at all its nodes is refused, whatever the names of the places."""
+    held, side = {"on": "left", "fix": "xy"}, {"box": [[1.0, 0.0], [1.0, 0.25]]}
+    pulled = {"on": "right", "displacement": {"time": [0, 1], "value": [[0, 0], [0.1, 0]]}}
+
+    def notes(*boundary: dict[str, Any]) -> list[str]:
+        scene = build_scene(MPI.COMM_SELF, study(STRIP, boundary=[held, *boundary], probe=[]))
+        found = [*scene.balance.motion.notes]
+        scene.destroy()
+        return found
+
+    with pytest.raises(InputError, match="boundary.1 and boundary.2 prescribe different displacements along x at all"):
+        notes(pulled, {"on": side, "displacement": [0.05, "free"]})
+    assert notes(pulled, {"on": side, "displacement": pulled["displacement"]}) == []
+    assert notes(pulled, {"on": "top", "displacement": ["free", 0.1]}) == [
+        "boundary.0 and boundary.2 prescribe different displacements along y at 1 node, where boundary.2 holds",
+        "boundary.1 and boundary.2 prescribe different displacements along y at 1 node, where boundary.2 holds",
+    ]
+
+
 def test_ends_and_steps_that_cannot_be_are_refused() -> None:
     assert "there are: grip" in refused(time={"until": {"drop": 0.5, "of": "nobody"}})
     ball = {"name": "ball", "shape": "sphere", "radius": 0.1, "at": [0.5, 0.5]}

@@ -34,14 +34,15 @@ class PrescribedMotion:
         free_dofs: (owned dofs,) flags of all others.
         values: (owned_dofs,) prescribed displacements of `owned_dofs`, m.
         bcs: Dirichlet condition with the values of `set_values`; empty if no dof of any rank is prescribed.
+        notes: sentences for the user.
     """
 
-    def __init__(self, domain: Domain, entries: Sequence[Entry]) -> None:
+    def __init__(self, domain: Domain, entries: Sequence[Entry], notes: Sequence[str] = ()) -> None:
         """`entries`: local nodes, (d,) flags of their prescribed components, and displacement (d,) in m.
 
         A `PlacedFunction` has displacements (n d,) of the n nodes.
         """
-        size = domain.dim
+        size, self.notes = domain.dim, notes
         self._domain, self._functions = domain, [function for _, _, function in entries]
         # row of the table of all functions' values, for each component of each node
         row, first = np.full((len(domain.nodes), size), -1, np.int64), 0

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -25,10 +26,11 @@ from ..mechanics.stress import RESIDUAL_STIFFNESS, DegradationModel, Stress
 from ..mechanics.term import Term
 from ..mechanics.time_functions import PlacedFunction, PlaceFunction, TimeFunction
 from ..mesh.domain import Domain
+from ..mesh.parallel import sum_over_ranks
 from ..mesh.selection import select_facets, select_nodes
 from ..mesh.selectors import Group, check_regions
 from ..study import Study, solver_options
-from ..study.conditions import BoundaryCondition, boundary_conditions, volume_loads
+from ..study.conditions import AXES, BoundaryCondition, boundary_conditions, volume_loads
 from ..study.plugins import NO_PHYSICS, Physics, PhysicsPart
 
 # --- material ---
@@ -237,6 +239,36 @@ def _prescribed(domain: Domain, entry: BoundaryCondition, end: float) -> Entry:
     return nodes, entry.components, function
 
 
+def conflict_notes(
+    domain: Domain, motions: Sequence[BoundaryCondition], prescribed: Sequence[Entry], end: float
+) -> list[str]:
+    """Return sentences about nodes for which two entries prescribe different displacements (collective).
+
+    Raises:
+        InputError: at all nodes of an entry a later one prescribes another displacement.
+    """
+    notes = []
+    for (motion, entry), (later, later_entry) in combinations(zip(motions, prescribed, strict=True), 2):
+        (nodes, components, function), (later_nodes, later_components, later_function) = entry, later_entry
+        if isinstance(function, PlacedFunction) or isinstance(later_function, PlacedFunction):
+            continue
+        # steps of an irrational share of the run: no table of round times repeats between them
+        times = np.append(np.arange(0.0, end, end / (20 * np.pi)), end)
+        u, v = (np.array([at_time(t) for t in times]) for at_time in (function, later_function))
+        differs = np.abs(u - v).max(axis=0) > 1e-9 * max(np.nanmax(np.abs(u)), np.nanmax(np.abs(v)))
+        differs &= components & later_components
+        owned = nodes[nodes < domain.node_count]
+        common, count = sum_over_ranks(domain.comm, [np.isin(owned, later_nodes).sum(), len(owned)])
+        if not differs.any() or not common:
+            continue
+        axis = AXES[int(np.argmax(differs))]
+        message = f"{motion.key} and {later.key} prescribe different displacements along {axis}"
+        if common == count:
+            raise InputError(f"{message} at all nodes of {motion.key}: remove one of them, or make them equal")
+        notes.append(f"{message} at {common:g} node{'' if common == 1 else 's'}, where {later.key} holds")
+    return notes
+
+
 def _check_placed(domain: Domain, function: PlacedFunction, size: int, end: float, entry: BoundaryCondition) -> None:
     """Raise InputError on all ranks unless a function of the user has finite values at its places (collective)."""
     wrong = ""
@@ -259,8 +291,9 @@ def build_balance(
     kernels = KernelSelection(plain=solver_options.uses_plain_solver(study.solver))
     assembler, u = VectorAssembler(domain, kernels), fem.Function(domain.space, name="displacement")
     entries = boundary_conditions(study, domain.dim, physics.boundary)
-    prescribed = [_prescribed(domain, entry, study.time.end) for entry in entries if entry.prescribes_motion]
-    motion = PrescribedMotion(domain, prescribed)
+    motions = [entry for entry in entries if entry.prescribes_motion]
+    prescribed = [_prescribed(domain, entry, study.time.end) for entry in motions]
+    motion = PrescribedMotion(domain, prescribed, conflict_notes(domain, motions, prescribed, study.time.end))
     density = coefficient(domain, material.density)
     mass: MassMatrix = LumpedMass(assembler, density)
     if study.time.mass == "consistent":

@@ -55,7 +55,8 @@ class BoundarySettings(StudyTable):
     """A boundary condition on a facet group, a box or a plane.
 
     Give exactly one of fix, displacement, velocity, traction, force and pressure. Conditions that contradict each other
-    at the same place are refused.
+    at the same place are refused. Where two motions share some nodes only, the later one holds there, and a note says
+    so.
     """
 
     on: Selector = key("Name of a facet group, or a table that selects a box or a plane.", example="left")
