@@ -200,4 +200,7 @@ def _load_drop_monitor(study: Study) -> LoadDropMonitor | None:
         return None
     from .output.result_checks import LoadDropMonitor
 
-    return LoadDropMonitor(study.monitored_load, until.drop, until.above, breaks=study.fracture is not None)
+    fracture, inertia = study.fracture, study.time.scheme_class.inertia
+    # cohesive cracks carry load long before their edges break; without inertia nothing else makes it drop
+    breaks = fracture is not None and (fracture.law != "cohesive" or inertia)
+    return LoadDropMonitor(study.monitored_load, until.drop, until.above, breaks=breaks)

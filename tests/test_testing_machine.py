@@ -183,6 +183,20 @@ def test_a_body_in_space_without_a_crack_has_none_in_its_history(tmp_path: Path)
 # --- check tells, and refuses ---------------------------------------------------------------------------------------
 
 
+def test_a_cohesive_crack_ends_the_run_at_the_given_drop(tmp_path: Path) -> None:
+    """Its edges break at a hundredth of the load at most, long after the drop by half."""
+    cohesive = {"strength": STRENGTH, "energy": 6000.0, "law": "cohesive"}
+    found = run(
+        SMOOTH, tmp_path / "out", fracture=cohesive, time={"step": 0.02, "end": 10.0, "until": {"drop": 0.5}},
+        boundary=[
+            {"on": "left", "fix": "xy"},
+            {"on": "right", "displacement": {"time": [0, 10], "value": [[0, 0], [0.6, 0]]}},
+        ],
+    )  # fmt: skip
+    load = found["reaction_grip_x"]
+    assert load[-1] <= load.max() / 2 < load[-2] and found["broken_edges"][-1] == 0
+
+
 def test_check_tells_area_and_resultant_of_each_load() -> None:
     """Right end of 0.25 m x 0.25 m; 0.0625 m^3 of 1000 kg/m^3; the largest of a table."""
     loads = [

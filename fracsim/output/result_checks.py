@@ -339,7 +339,7 @@ class LoadDropMonitor:
             name: name of the probe or obstacle.
             drop: relative drop from the peak that ends the run.
             above: lower peaks do not count, N.
-            breaks: the study has fracture; a drop before the first broken edge does not count.
+            breaks: a drop before the first broken edge does not count.
         """
         self.name, self.drop_fraction, self.min_peak, self._breaks = name, drop, above, breaks
         self.peak, self.last_load, self.peak_time, self.has_dropped = 0.0, 0.0, 0.0, False

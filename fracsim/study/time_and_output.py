@@ -15,9 +15,12 @@ from .values import Finite, Flag, Name, NonNegative, OverTime, Positive, Seconds
 
 
 class StopCriterion(StudyTable):
-    """End of the run before `end`, when a load has fallen from its peak and something has broken."""
+    """End of the run before `end`, when a load has fallen from its peak."""
 
-    drop: Annotated[Finite, Field(gt=0, lt=1)] = key("Share of the peak that the load has lost.", example=0.8)
+    drop: Annotated[Finite, Field(gt=0, lt=1)] = key(
+        "Share of the peak that the load has lost. With [fracture] it counts once an edge has broken; with cohesive "
+        "cracks in quasi-static steps at once.", example=0.8,
+    )  # fmt: skip
     of: str | None = key(
         "Name of a probe that records a reaction, or of an obstacle.", default=None, example="grip",
         otherwise="the only probe or obstacle",
