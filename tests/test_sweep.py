@@ -20,6 +20,7 @@ from fracsim.report import sweep
 from fracsim.report.runs import read_last_message
 from fracsim.report.sweep import case_folder_name, split_values, sweep_cases
 from fracsim.study.mesh_source import build_mesh, save_mesh
+from fracsim.study.reader import input_file_lines
 
 KEYS = ("--set", "mesh.h=0.25,0.125", "--set", "time.step=0.01,0.015")
 
@@ -128,6 +129,19 @@ def test_a_changed_file_is_run_again(tmp_path: Path, kind: str) -> None:
     else:
         wedge.write_text(WEDGE.replace("0.1", "0.2"))
     assert "done before" not in swept_here(bar, *keys).stdout
+
+
+def test_a_file_beside_the_mesh_file_counts(tmp_path: Path) -> None:
+    """XDMF of meshio keeps points and cells in HDF5, and names it alone."""
+    mesh = tmp_path / "part.xdmf"
+    mesh.write_text("<Xdmf/>")
+    data = study({**BAR, "mesh": {"file": str(mesh)}})
+    (key,) = [line.rpartition(": ")[0] for line in input_file_lines(data)]
+    assert key == "file mesh.file"
+    mesh.with_suffix(".h5").write_bytes(b"1")
+    first = input_file_lines(data)
+    mesh.with_suffix(".h5").write_bytes(b"2")
+    assert len(first) == 2 and first[0] == input_file_lines(data)[0] and first[1] != input_file_lines(data)[1]
 
 
 def test_a_failing_case_leaves_the_others_alone(tmp_path: Path) -> None:

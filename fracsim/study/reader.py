@@ -25,6 +25,8 @@ _PATH_KEYS: dict[type[BaseModel], list[str]] = {
     kind: [key for key, field in kind.model_fields.items() if field.annotation == Path | None]
     for kind in (MeshSettings, ObstacleSettings)
 }
+# ending of a file beside a mesh file with most of its data
+_FILES_BESIDE = {".xdmf": ".h5", ".xmf": ".h5", ".ele": ".node", ".node": ".ele"}
 _TOO_DEEP = "lists or tables are nested too deeply; a study needs five levels or so"
 
 
@@ -106,7 +108,8 @@ def study_text(study: Study, comments: Iterable[str] = ()) -> str:
 def input_file_lines(study: Study) -> list[str]:
     """Returns a line `file KEY: SHA-256` for each mesh and obstacle file of a study, for study.toml.
 
-    Files that these name in turn (`*INCLUDE`, pieces of .pvtu) are not read.
+    The HDF5 file beside an XDMF file and the nodes of TetGen count too. Other files that a file names (`*INCLUDE`,
+    pieces of .pvtu) are not read.
 
     Raises:
         InputError: a file cannot be read.
@@ -119,8 +122,12 @@ def _input_files(study: Study) -> Iterator[tuple[str, Path]]:
     tables = [("mesh", study.mesh), *((f"obstacle.{i}", entry) for i, entry in enumerate(study.obstacle))]
     for name, table in tables:
         for key in _PATH_KEYS[MeshSettings if name == "mesh" else ObstacleSettings]:
-            if (path := getattr(table, key)) is not None:
-                yield f"{name}.{key}", path
+            if (path := getattr(table, key)) is None:
+                continue
+            yield f"{name}.{key}", path
+            beside = path.with_suffix(_FILES_BESIDE.get(path.suffix.lower(), path.suffix))
+            if beside != path and beside.is_file():
+                yield f"{name}.{key} ({beside.suffix})", beside
 
 
 def _file_digest(key: str, path: Path) -> str:
