@@ -173,3 +173,20 @@ def test_what_overlaps_is_refused_as_before() -> None:
     ball = {"name": "ball", "shape": "sphere", "radius": 0.05, "at": [0.4, -0.15 - 1e-3], "mass": 0.1}
     with pytest.raises(InputError, match=r"ball moves freely and overlaps it at the start, by 0\.001 m"):
         block(2, [SHAPES["line"][1] | {"name": "it", "at": [0.0, -0.2]}, ball])
+
+
+def test_a_free_ball_near_a_floor_keeps_its_radius() -> None:
+    """On a slope it rolls with 5/7 g sin, though floor and ball begin nearer than the distance of contact.
+
+    The floor is moved back, as it is under the body. The ball was inset as well, and rolled with 46 mm of 50.
+    """
+    down, radius = np.array([G / 2, 0.0, -G * np.cos(np.pi / 6)]), 0.05
+    floor = {"name": "floor", "shape": "plane", "normal": [0.0, 0.0, 1.0], "at": [0.0, 0.0, 0.0], "friction": 0.5}
+    ball = {"name": "ball", "shape": "sphere", "radius": radius, "at": [0.0, 2.0, 0.0508], "mass": 1.0}
+    scene, walk = block(3, [floor, ball], load={"gravity": [*down]}, contact={"distance": 0.005})
+    march(scene, walk, 100)
+    found = dict(zip(scene.probes.columns, scene.probes(), strict=True))
+    speed, spin = found["velocity_ball_x"], found["spin_ball_y"]
+    assert speed == pytest.approx(5 / 7 * down[0] * 0.2, rel=0.02)
+    assert speed / spin == pytest.approx(radius, rel=0.01)
+    assert found["position_ball_z"] == pytest.approx(radius, rel=0.01)

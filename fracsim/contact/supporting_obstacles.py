@@ -2,7 +2,8 @@
 
 Contact acts below a distance D. An obstacle with a smaller gap g at rest would throw the body, with an energy that no
 load has done. It is therefore moved back by D - g: a half space along its normal, other shapes are inset, a hollow one
-grows. So the body begins in equilibrium with it, and may also touch it (g = 0).
+grows. So the body begins in equilibrium with it, and may also touch it (g = 0). The same holds for a free obstacle and
+another one.
 
 A barrier that begins at g instead would be as stiff as g is small. Second-order schemes oscillate on such a barrier,
 and friction, which is that of the force at the start of a step, is then up to 2.5 times mu N.
@@ -66,12 +67,12 @@ def build_inactive_at_rest[Term: ObstacleTerm](
         mutual: whether free obstacles are in contact with others.
     """
     limits = np.array([_max_offset(obstacle.shape) for obstacle in obstacles])
-    gaps = _gaps_to_nodes(domain, obstacles)
-    if mutual:
-        _lower_to_others(gaps, obstacles)
+    gaps, pairs = _gaps_to_nodes(domain, obstacles), _pair_gaps(obstacles) if mutual else []
     for number in range(SET_DOWN.max_rounds):
-        width = min(law.barrier.width, float((gaps + limits).min()) / SET_DOWN.clearance)
+        room = min([*(gaps + limits), *(gap + limits[a] + limits[b] for a, b, gap in pairs)])
+        width = min(law.barrier.width, float(room) / SET_DOWN.clearance)
         offsets = np.clip(SET_DOWN.clearance * width - gaps, 0.0, limits)
+        _add_offsets_of_pairs(offsets, limits, pairs, obstacles, SET_DOWN.clearance * width)
         moved = [offset_obstacle(*item) for item in zip(obstacles, offsets, strict=True)]
         term = build(moved, _with_width(law, width))
         rest_gaps = _rest_gaps(term)
@@ -179,12 +180,34 @@ def _gaps_to_nodes(domain: Domain, obstacles: Sequence[RigidObstacle]) -> Values
     return np.where(gaps < -SET_DOWN.round_off * domain.bounds.diagonal, np.inf, gaps)
 
 
-def _lower_to_others(gaps: Values, obstacles: Sequence[RigidObstacle]) -> None:
-    """Reduce gaps (obstacles,) of free obstacles, m, to those to the others that they are in contact with."""
+def _pair_gaps(obstacles: Sequence[RigidObstacle]) -> list[tuple[int, int, float]]:
+    """Numbers of each free obstacle and another one, and their gap at t = 0, m; none of pairs that overlap."""
+    result = []
     for a, b in free_pairs([obstacle.free for obstacle in obstacles]):
         body, second = obstacles[a], obstacles[b]
         sides = ObstaclePair.between(body, second).gaps(body.posed_at(0.0).pose, second.posed_at(0.0).pose)
         gap = min(float(side.min(initial=np.inf)) for side in sides)
         size = float(np.ptp(body.shape.tessellate()[0], axis=0).max())
         if gap >= -SET_DOWN.round_off * size:
-            gaps[a] = min(gaps[a], gap)
+            result.append((a, b, gap))
+    return result
+
+
+def _add_offsets_of_pairs(
+    offsets: Values,
+    limits: Values,
+    pairs: Sequence[tuple[int, int, float]],
+    obstacles: Sequence[RigidObstacle],
+    min_gap: float,
+) -> None:
+    """Increase offsets (obstacles,), m, up to limits, until no pair of obstacles has a gap below `min_gap`, m.
+
+    An obstacle that is not free is moved back before a free one, which keeps the radius with which it rolls. Two free
+    ones are moved back by half each.
+    """
+    for a, b, gap in pairs:
+        missing = min_gap - gap - offsets[a] - offsets[b]
+        for number, share in ((b, 0.5 if obstacles[b].free else 1.0), (a, 1.0), (b, 1.0)):
+            added = min(max(share * missing, 0.0), limits[number] - offsets[number])
+            offsets[number] += added
+            missing -= added
