@@ -255,6 +255,15 @@ def test_motions_that_contradict_each_other_at_some_nodes_are_noted() -> None:
     ]
 
 
+@pytest.mark.parametrize("load", [{"traction": [10.0, 0.0]}, {"force": [0.0, 1.0]}, {"pressure": 5.0}])
+def test_a_load_on_nodes_that_another_entry_holds_is_refused(load: dict[str, Any]) -> None:
+    """The place has another name there; on a part of the held nodes, or along a free component, a load acts."""
+    held = {"on": {"point": [1.0, 0.0], "normal": [1.0, 0.0]}, "fix": "xy"}
+    with pytest.raises(InputError, match=r'boundary\.0\.\w+ acts on group "right", where other entries prescribe '):
+        build_scene(MPI.COMM_SELF, study(STRIP, boundary=[{"on": "right", **load}, held], probe=[]))
+    build_scene(MPI.COMM_SELF, study(STRIP, boundary=[{"on": "top", **load}, held], probe=[])).destroy()
+
+
 def test_ends_and_steps_that_cannot_be_are_refused() -> None:
     assert "there are: grip" in refused(time={"until": {"drop": 0.5, "of": "nobody"}})
     ball = {"name": "ball", "shape": "sphere", "radius": 0.1, "at": [0.5, 0.5]}

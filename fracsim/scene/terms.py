@@ -30,7 +30,7 @@ from ..mesh.parallel import sum_over_ranks
 from ..mesh.selection import select_facets, select_nodes
 from ..mesh.selectors import Group, check_regions
 from ..study import Study, solver_options
-from ..study.conditions import AXES, BoundaryCondition, boundary_conditions, volume_loads
+from ..study.conditions import AXES, BoundaryCondition, boundary_conditions, loaded_components, volume_loads
 from ..study.plugins import NO_PHYSICS, Physics, PhysicsPart
 
 # --- material ---
@@ -269,6 +269,28 @@ def conflict_notes(
     return notes
 
 
+def check_loads(domain: Domain, motion: PrescribedMotion, entries: Sequence[BoundaryCondition]) -> None:
+    """Raise InputError for a load along a component that is prescribed at all its nodes: it would do nothing.
+
+    A pressure, and a load by a user's function, are refused where all components are (collective).
+    """
+    free = motion.free_dofs.reshape(-1, domain.dim)
+    for load in entries:
+        if load.prescribes_motion:
+            continue
+        facets = select_facets(domain, load.selector, f"{load.key}.on")
+        nodes = fem.locate_dofs_topological(domain.space, domain.dim - 1, facets)
+        free_nodes = sum_over_ranks(domain.comm, free[nodes[nodes < domain.node_count]].sum(axis=0))
+        components = loaded_components(load, domain.dim)
+        held = components & (free_nodes == 0) if components.any() else np.full(domain.dim, not free_nodes.any())
+        if held.any():
+            what = AXES[int(np.argmax(held))] if components.any() else "all components"
+            raise InputError(
+                f"{load.key}.{load.kind} acts on {load.selector}, where other entries prescribe {what} of all nodes: "
+                "it would do nothing; remove it, or leave nodes free"
+            )
+
+
 def _check_placed(domain: Domain, function: PlacedFunction, size: int, end: float, entry: BoundaryCondition) -> None:
     """Raise InputError on all ranks unless a function of the user has finite values at its places (collective)."""
     wrong = ""
@@ -294,6 +316,7 @@ def build_balance(
     motions = [entry for entry in entries if entry.prescribes_motion]
     prescribed = [_prescribed(domain, entry, study.time.end) for entry in motions]
     motion = PrescribedMotion(domain, prescribed, conflict_notes(domain, motions, prescribed, study.time.end))
+    check_loads(domain, motion, entries)
     density = coefficient(domain, material.density)
     mass: MassMatrix = LumpedMass(assembler, density)
     if study.time.mass == "consistent":

@@ -135,7 +135,7 @@ def check_conflicts(entries: Sequence[BoundaryCondition], dim: int) -> None:
     for motion, second in permutations(entries, 2):
         if motion.selector != second.selector or not motion.prescribes_motion:
             continue
-        common = motion.components & (second.components if second.prescribes_motion else _loaded(second, dim))
+        common = motion.components & (second.components if second.prescribes_motion else loaded_components(second, dim))
         if not common.any():
             continue
         axis = AXES[int(np.argmax(common))]
@@ -151,7 +151,7 @@ def check_conflicts(entries: Sequence[BoundaryCondition], dim: int) -> None:
             )
 
 
-def _loaded(load: BoundaryCondition, dim: int) -> Flags:
+def loaded_components(load: BoundaryCondition, dim: int) -> Flags:
     """Components (d,) along which a traction or force acts at any time; none for a pressure or a user's function."""
     if not isinstance(load.function, TabulatedFunction) or load.kind == "pressure":
         return np.zeros(dim, bool)
