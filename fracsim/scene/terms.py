@@ -29,8 +29,9 @@ from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
 from ..mesh.selection import select_facets, select_nodes
 from ..mesh.selectors import Group, check_regions
+from ..meshes.data import AXES
 from ..study import Study, solver_options
-from ..study.conditions import AXES, BoundaryCondition, boundary_conditions, loaded_components, volume_loads
+from ..study.conditions import BoundaryCondition, boundary_conditions, loaded_components, volume_loads
 from ..study.plugins import NO_PHYSICS, Physics, PhysicsPart
 
 # --- material ---
@@ -281,12 +282,16 @@ def check_loads(domain: Domain, motion: PrescribedMotion, entries: Sequence[Boun
         facets = select_facets(domain, load.selector, f"{load.key}.on")
         nodes = fem.locate_dofs_topological(domain.space, domain.dim - 1, facets)
         free_nodes = sum_over_ranks(domain.comm, free[nodes[nodes < domain.node_count]].sum(axis=0))
-        components = loaded_components(load, domain.dim)
-        held = components & (free_nodes == 0) if components.any() else np.full(domain.dim, not free_nodes.any())
-        if held.any():
-            what = AXES[int(np.argmax(held))] if components.any() else "all components"
+        loaded, is_prescribed = loaded_components(load, domain.dim), free_nodes == 0
+        if loaded.any() and (loaded & is_prescribed).any():
+            axis = AXES[int(np.argmax(loaded & is_prescribed))]
+        elif not loaded.any() and is_prescribed.all():
+            axis = "all components"
+        else:
+            axis = ""
+        if axis:
             raise InputError(
-                f"{load.key}.{load.kind} acts on {load.selector}, where other entries prescribe {what} of all nodes: "
+                f"{load.key}.{load.kind} acts on {load.selector}, where other entries prescribe {axis} of all nodes: "
                 "it would do nothing; remove it, or leave nodes free"
             )
 
