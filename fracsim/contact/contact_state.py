@@ -15,7 +15,7 @@ from ..mechanics.term import TimeLevel
 from ..mesh.domain import Domain
 from .clearance import Clearance, FollowingPoints, ProximityCandidates, ShapeDistance, outline_radius
 from .contact_surface import ContactSurface
-from .crack_faces import RETRACTION, ShownCells
+from .crack_faces import ShownCells
 from .facet_contact import ContactFacets, add_facet_friction, evaluate_facets, facets_matter, merge_forces
 from .laws import CoulombFriction, FrictionDirection, GapPotential, ObstacleLaw, tangential
 from .node_contact import ContactForces, LaggedContact, StepStart, evaluate_points, lag_contact, no_contact
@@ -246,11 +246,11 @@ class ContactState:
     def _begin_new_step(self) -> None:
         posed, barrier = self.group.start_posed, self.law.barrier
         self._show_cells_of_step(posed)
-        u_n, began = self.level.u_n, self.level.t - self.level.fraction * self.level.dt
+        u_n = self.level.u_n
         # a step that begins again, as edges broke in it, goes on with the crack faces of its last solution
-        if self._released_at is None or abs(began - self._released_at) > RETRACTION.same_time * self.level.dt:
+        if not self.level.starts_at(self._released_at):
             self.surface.release(u_n, posed)
-            self._released_at = began
+            self._released_at = self.level.start_time
         x = self.surface.positions(u_n)
         gaps = [shape.distance(x) for shape in posed]
         lagged = [

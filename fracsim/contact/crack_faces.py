@@ -38,7 +38,6 @@ class RetractionPolicy:
         facet_factor: factor of the arm in each round.
         min_arm: arm below which points of new facets are not retracted further.
         round_off: relative tolerance of gaps that have to be kept.
-        same_time: difference of the starts of two steps, in their length, up to which the step is the same.
     """
 
     trials: tuple[float, ...] = tuple(np.linspace(1.0, 0.0, 11))
@@ -48,7 +47,6 @@ class RetractionPolicy:
     facet_factor: float = 0.7
     min_arm: float = 0.05
     round_off: float = 1e-9
-    same_time: float = 1e-6
 
 
 RETRACTION = RetractionPolicy()

@@ -95,6 +95,7 @@ class SurfaceContact(Term):
     leaves_tangent_incomplete = True
     allows_exact_tangent: bool = True
     level: TimeLevel
+    _extended_at: float | None = None  # start of the step in which crack faces were extended last, s
     _fitted_displacement: Values | None = None  # at which crack faces have found their room within the step
 
     def __init__(self, domain: Domain, u: fem.Function, surface: BarrierBodySurface) -> None:
@@ -130,13 +131,10 @@ class SurfaceContact(Term):
         self._fitted_displacement = self._u.x.array[: self._owned].copy()
 
     def _extend_faces(self, u_n: Values) -> None:
-        """Extend crack faces at the start of a step, unless edges broke in an earlier pass of it (collective).
-
-        A step that begins where the last one did, at u_n (owned dofs,), m, is repeated.
-        """
-        before, self.surface.start_displacement = self.surface.start_displacement, u_n.copy()
-        if not self.comm.allreduce(before is not None and np.array_equal(before, u_n), op=MPI.LAND):
-            self._fitted_displacement = None
+        """Extend crack faces at u_n (owned dofs,), m, unless edges broke earlier in the step (collective)."""
+        self.surface.start_displacement = u_n.copy()
+        if not self.level.starts_at(self._extended_at):
+            self._fitted_displacement, self._extended_at = None, self.level.start_time
         if self._fitted_displacement is None:
             self.surface.extend_faces(u_n)
 

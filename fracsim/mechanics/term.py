@@ -32,6 +32,9 @@ Flags = npt.NDArray[np.bool_]
 type Form = ufl.Form | int  # 0: no form
 
 
+SAME_TIME = 1e-6  # difference of the starts of two steps, in their length, up to which the step is the same
+
+
 @dataclass(frozen=True)
 class TimeLevel:
     """Time at which forces balance, and the rates of the scheme there, which are affine in u (forms.schemes).
@@ -59,6 +62,15 @@ class TimeLevel:
     u_v: Values
     fraction: float = 1.0
     contact_weights: ContactTimeWeights = UNWEIGHTED
+
+    @property
+    def start_time(self) -> float:
+        """Time at the start of the step, s."""
+        return self.t - self.fraction * self.dt
+
+    def starts_at(self, t: float | None) -> bool:
+        """Whether the step starts at t, s, as a step does that is repeated; never with None."""
+        return t is not None and abs(self.start_time - t) <= SAME_TIME * self.dt
 
     @property
     def contact_weight(self) -> float:
