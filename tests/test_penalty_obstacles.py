@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import pytest
 from pydantic import ValidationError
 
 from fracsim.contact.contact_surface import ContactSurface
-from fracsim.contact.penalty_law import NodalMassShare
+from fracsim.contact.penalty_law import NodalMassShare, Slips
 from fracsim.contact.penalty_obstacles import PenaltyObstacleTerm
 from fracsim.mesh.edge_graph import EdgeGraph
 from fracsim.scene import Scene
@@ -266,6 +267,25 @@ def test_what_breaks_in_touch_gains_nothing() -> None:
     assert (springs.start_stiffness > 0).sum() == len(held.keys)
     np.testing.assert_array_equal(np.sort(springs.slip[springs.start_stiffness > 0, 0]), np.sort(held.slip[:, 0]))
     assert 0.3 * before < contact.stored_energy() <= before * (1 + 1e-9)
+
+
+def test_springs_of_points_that_are_gone_are_not_in_a_checkpoint() -> None:
+    """As an edge breaks, a face gets other points. A run that ended just then was refused as damaged."""
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25}, material=RUBBER, load={"gravity": [2.0, -G]},
+        obstacle=[floor(2, -0.002, friction=0.5)], time={"scheme": "explicit", "step": 0.02, "end": 1.0},
+    )  # fmt: skip
+    (contact,) = [term for term in scene.balance.terms if isinstance(term, PenaltyObstacleTerm)]
+    while not len(contact._step_end.slips[0][0].keys):
+        march(scene, state, 5)
+    end = contact._step_end
+    held, *of_facets = end.slips[0]
+    with_gone = Slips(np.append(held.keys, 1), np.append(held.slip, [[0.1, 0.0]], axis=0))
+    contact.restore(replace(end, slips=[[with_gone, *of_facets]]))
+    contact.from_checkpoint(contact.to_checkpoint())
+    kept = contact._step_end.slips[0][0]
+    np.testing.assert_array_equal(kept.keys, np.sort(held.keys))
+    np.testing.assert_array_equal(kept.slip, held.slip[np.argsort(held.keys)])
 
 
 def test_a_restart_goes_on_as_the_run_would_have(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from mpi4py import MPI
 
 from ..array_types import Ints, Values
 from ..mesh.domain import Domain
-from ..mesh.ghost_exchange import find_saved_keys
+from ..mesh.ghost_exchange import KeyLookup, find_saved_keys
 from ..mesh.parallel import gather, max_over_ranks, sum_over_ranks
 from ..meshes.topology import row_keys
 from .facet_contact import ContactFacets
@@ -293,18 +293,26 @@ class PenaltyObstacleTerm(ObstacleTerm):
         """Restore a snapshot (not collective)."""
         self._step_end = cast("StepEnd", memory)
 
+    def _spring_keys(self) -> Ints:
+        """(k,) keys of all points and facets of this rank that may have a spring."""
+        names = self.surface.keys
+        corners = self._facets.corners if self.surface.curved else np.empty((0, self._domain.dim), np.int64)
+        return np.append(names, row_keys(np.sort(names[corners], axis=1)))
+
     def to_checkpoint(self) -> dict[str, Values]:
         """Arrays for a checkpoint, on rank 0 (collective).
 
         Of springs: keys, and rows of obstacle, kind and stretch. Ranks that share a point have the same spring there.
+        Points and facets that do not exist any more, since edges broke after the step, have none.
         """
-        end = self._step_end
+        end, exists = self._step_end, KeyLookup(self._spring_keys())
         sums = sum_over_ranks(self.comm, np.append(np.array(end.forces).reshape(-1), end.spring_energy))
         numbered = [(number, kind, slips) for number, kinds in enumerate(end.slips) for kind, slips in enumerate(kinds)]
         rows = [np.column_stack([np.tile([number, kind], (len(slips.keys), 1)), slips.slip])
                 for number, kind, slips in numbered]  # fmt: skip
         keys = np.concatenate([slips.keys for *_, slips in numbered])
-        if (gathered := gather(self.comm, (keys, np.concatenate(rows)))) is None:
+        which = exists(keys) >= 0
+        if (gathered := gather(self.comm, (keys[which], np.concatenate(rows)[which]))) is None:
             return {}
         all_keys, all_rows = (np.concatenate(arrays) for arrays in zip(*gathered, strict=True))
         _, first = np.unique(np.column_stack([all_rows[:, :2], all_keys]), axis=0, return_index=True)
@@ -315,10 +323,7 @@ class PenaltyObstacleTerm(ObstacleTerm):
 
         Raises ValueError if it has keys of no element.
         """
-        names = self.surface.keys
-        corners = self._facets.corners if self.surface.curved else np.empty((0, self._domain.dim), np.int64)
-        of_facets = row_keys(np.sort(names[corners], axis=1))
-        find_saved_keys(self.comm, np.append(names, of_facets), saved["spring_points"])
+        find_saved_keys(self.comm, self._spring_keys(), saved["spring_points"])
         rows, keys, is_root = saved["springs"], saved["spring_points"], self.comm.rank == 0
         *forces, energy = saved["pushed"] * is_root
         selected = [[(rows[:, :2] == (number, kind)).all(axis=1) for kind in range(2)]
