@@ -269,6 +269,8 @@ class BalanceStepper:
         end, result = self._break_edges(end, solved, dt)
         lost = viscous + (result.released_energy + released + flow_loss)
         if (softened := self.inelastic.fracture.softened_fields) is not None:
+            # Explicit steps find forces before they soften cells.
+            work, _ = step_work(balance, state, u, v, end.forces, damping, lumped=lumped)
             lost -= softening_work(balance, state, u, softened)
         energies = StepEnergies(work, lost, result.elastic_energy)
         return self._close_step(end, dt, solve, began, result.broken_edges + broken, energies)
