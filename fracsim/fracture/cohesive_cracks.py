@@ -393,6 +393,7 @@ class CohesiveFracturePass(FracturePass):
         """
         self.cut_graph, self._tips, self.softening = cut_graph, tips, softening
         super().__init__(stress, graph, tips, max_passes=max_passes, initial_cuts=initial_cuts)
+        self.weakens_gradually = True
         self.softens_gradually, self._step_start = has_inertia, -np.inf
         self._start_fields: list[Values] = []
         self._released, self._is_settled = 0.0, False

@@ -95,6 +95,7 @@ class FracturePass:
         max_passes: largest number of passes in a step; None: until nothing changes.
         initial_cuts: (edges,) cut positions of edges broken before the start, NaN elsewhere; None without such edges.
         tip_record: crack tips of the step; None: the criterion has no tips with a release rate.
+        weakens_gradually: damage grows with the load, by a law of edges that is not brittle, or of cohesive cracks.
         softens_gradually: cells soften in the course of a step with inertia, where its forces balance; otherwise
             energy is released at once, at the end of a step.
         softened_fields: damage fields at the start of the step, if cells softened in its course on any rank.
@@ -136,6 +137,7 @@ class FracturePass:
         """
         self.stress, self.graph, self.criterion, self.max_passes = stress, graph, criterion, max_passes
         self.law: EdgeLaw = law or BrittleEdgeLaw()
+        self.weakens_gradually = not self.law.all_or_nothing
         self.degradation: Degradation = degradation or make_degradation(stress, graph)
         self.initial_cuts, self._passes_per_second = initial_cuts, passes_per_second
         self._node_attachment, self.tip_record, self._hinges = node_attachment, tip_record, hinges

@@ -33,7 +33,7 @@ from .prescribed_motion import PrescribedMotion
 from .stress import Stress
 from .tangent import Tangent
 from .term import Term, TimeLevel, Values, overriding, sum_of_forms
-from .term_protocols import ContactTerms, RigidMotionTerm, StepWork, TermHistories, fulfilling
+from .term_protocols import ContactTerms, HistoryColumns, RigidMotionTerm, StepWork, TermHistories, fulfilling
 
 # methods of terms that are called in every step, of those terms alone that override them
 _STEP_METHODS = (
@@ -386,6 +386,11 @@ class EnergySums:
         """(work, dissipated) external work of the last step that no nodal force shows, of this rank, J (collective)."""
         works = [owner.step_work() for owner in self._working]
         return sum(work for work, _ in works), sum(dissipated for _, dissipated in works)
+
+    def obstacle_work(self) -> float:
+        """Work of obstacles in the step so far less the loss by friction on them, part of this rank, J (collective)."""
+        works = [owner.step_work() for owner in self._working if isinstance(owner, HistoryColumns)]
+        return sum(work - dissipated for work, dissipated in works)
 
     def applied_forces(self) -> Values:
         """(owned dofs,) external forces on the body at the current u, N; a copy (collective)."""

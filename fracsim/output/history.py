@@ -79,7 +79,7 @@ class ProbeReader:
             balance: balance of forces; its terms have readings as well.
             probes: groups of nodes.
             motions: prescribed displacement (d,) in m of each driven obstacle, by name.
-            onset_reactions: (owned dofs,) reactions before edges broke in the step, N, or None before the first step;
+            onset_reactions: (owned dofs,) reactions at which edges broke in the step, N, or None before the first step;
                 None: they are not recorded.
             contours: J-integrals (d,), J/m^2, by name.
             thickness: thickness of a 2D body, m; 1 in 3D.
@@ -165,7 +165,7 @@ class History:
     Attributes:
         comm: the ranks of the run.
         columns: names of the columns.
-        reaction_peaks: largest absolute value of each reaction so far, also before edges broke in a step, N.
+        reaction_peaks: largest absolute value of each reaction so far, also as edges broke within a step, N.
         obstacle_work: sum of the work of each obstacle so far, J.
         last_step: step of the last row.
         last_row: values of the last row by column.

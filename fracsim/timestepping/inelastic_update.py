@@ -51,6 +51,8 @@ class FractureProtocol(HistoryVariables, Protocol):
     Attributes:
         max_passes: largest number of passes in a step; None: until nothing changes.
         phase: name of the phase to which the time of a pass counts.
+        weakens_gradually: damage grows with the load, so that a body at rest carries no load with less damage than that
+            load gives; otherwise edges break at once.
         softens_gradually: cells soften in the course of a step with inertia, where its forces balance; otherwise
             energy is released at once, at the end of a step.
         softened_fields: damage fields at the start of the step, if cells softened in its course on any rank.
@@ -58,6 +60,7 @@ class FractureProtocol(HistoryVariables, Protocol):
 
     max_passes: int | None
     phase: str
+    weakens_gradually: bool
     softens_gradually: bool
     softened_fields: list[Values] | None
 
@@ -153,6 +156,7 @@ class NoFracture:
     nonfinite_cells = 0
     phase = "energies"
     broken_edge_patterns = None
+    weakens_gradually = False
     softens_gradually = False
     softened_fields: list[Values] | None = None
 

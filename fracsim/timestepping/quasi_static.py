@@ -53,6 +53,20 @@ class EquilibriumPath:
             self.lost -= float(self.out_of_balance @ change) / 2
         self.u, self.forces, self.damping, self.out_of_balance = u, forces, damping, None
 
+    def omit_first_equilibrium(self, start: State, obstacle_work: float) -> None:
+        """Replace the work by that of forces that are linear between start and end of the step.
+
+        A body that weakens gradually does not pass through the first equilibrium, whose damage is that of the start.
+        The work of its forces beyond those of the weakened body is no external work, and is not lost.
+
+        Args:
+            start: state at the start of the step.
+            obstacle_work: work of obstacles as evaluated at the first equilibrium, less that at the last one, J.
+        """
+        work = float((start.forces + self.forces) @ (self.u - start.u)) / 2
+        self.lost -= self.work - work + obstacle_work
+        self.work = work
+
     def set_unbalanced(self, reactions: Values, owned: npt.NDArray[np.int32], out_of_balance: Values) -> None:
         """Set loads and reactions of the dofs `owned`, and the residual of free dofs, after a pass."""
         self.forces = self.forces.copy()
@@ -86,14 +100,20 @@ class QuasiStaticStepper(ImplicitStepper):
         return super()._ease(state, dt, failed)
 
     def _finish(self, state: State, dt: float, solve: SolveResult, began: float) -> tuple[State, StepReport]:
-        """Break edges and solve in turn, until a pass changes nothing, or nothing that the solver would correct."""
+        """Break edges and solve in turn, until a pass changes nothing, or nothing that the solver would correct.
+
+        Edges break abruptly at the first equilibrium, whose load the body carries. A body that weakens gradually
+        carries that of the last one.
+        """
         path = EquilibriumPath(state.u, state.forces, state.damping, state.out_of_balance)
         broken, released, flow_loss, limit = 0, 0.0, 0.0, self.inelastic.max_passes
+        first_obstacle_work = 0.0
         start, continues = state, self.inelastic.flow.continues
         for number in range(limit):
             self.balance.accept_step()
             if number == 0:
                 self.onset_reactions = self.balance.reactions.copy()
+                first_obstacle_work = self.balance.energies.obstacle_work()
             path.continue_to(self._solution(), *balanced_forces(self.balance, lumped=False))
             flow_loss = self._flow() + (flow_loss if continues else 0.0)
             result = self._fracture_pass(path, dt)
@@ -111,6 +131,9 @@ class QuasiStaticStepper(ImplicitStepper):
                 self._return_to(path.u, start, dt)
             flow_loss = self._flow() + (flow_loss if continues else 0.0)
             break
+        if self.inelastic.fracture.weakens_gradually:
+            self.onset_reactions = self.balance.reactions.copy()
+            path.omit_first_equilibrium(state, first_obstacle_work - self.balance.energies.obstacle_work())
         energies = StepEnergies(path.work, path.lost + (released + flow_loss), result.elastic_energy)
         return self._close_step(self._end(state, dt, path), dt, solve, began, broken, energies)
 

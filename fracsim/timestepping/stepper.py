@@ -97,8 +97,9 @@ class Stepper(Protocol):
 
     Attributes:
         failures: numbers of failures on this rank.
-        onset_reactions: (owned dofs,) reactions in the first equilibrium of the last step, before edges broke, N; None:
-            no step has been solved again after edges broke.
+        onset_reactions: (owned dofs,) reactions at which edges broke in the last step, N: those of its first
+            equilibrium, or of its last one if the body weakens gradually; None: steps are not solved again after edges
+            broke, or there was none yet.
     """
 
     failures: FailureCounts
