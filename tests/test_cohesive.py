@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -9,20 +11,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 import pytest
+from mpi4py import MPI
 
+from fracsim.deformable_run import Run
 from fracsim.fracture.cohesive_cracks import (
     CohesiveFracturePass,
     OpeningCells,
     opening_widths,
     remove_normal_stress,
 )
-from fracsim.scene import Scene
+from fracsim.scene import Scene, build_scene
 from fracsim.studies import folder as packaged
 from fracsim.studies.evidence.cohesive_beam import DEPTH, load_by_springs
 from fracsim.study.check import check_study
 from support.cohesive_beam import bend
 from support.resumed import assert_alike, going_stopped_resumed
-from support.scenes import DIRECT, Walk, make_scene, make_study, march
+from support.scenes import DIRECT, Walk, each_step, make_scene, make_study, march
 from support.tearing import RUNS
 
 Values = npt.NDArray[np.float64]
@@ -197,6 +201,95 @@ def test_a_bar_of_random_tetrahedra(seed: int) -> None:
     _, _, stress, lost = bar("unstructured", 10, 600, size=[LENGTH, 0.3, 0.3], seed=seed)
     assert stress.max() == pytest.approx(STRENGTH, rel=0.01)
     assert lost == pytest.approx(ENERGY * 0.09, rel=0.03)
+
+
+# --- its work and its peak load --------------------------------------------------------------------------------------
+
+PEAK = LENGTH * STRENGTH / YOUNG  # m: motion of the end at the strength
+APART = 150 * PEAK  # m: a crack of the energy TOUGH carries nothing
+PULLED = {"time": [0.0, 1.0], "value": [0.0, APART]}
+UNLOADED = {"time": [0.0, 0.2, 0.3, 1.0], "value": [0.0, 0.2 * APART, 0.1 * APART, APART]}
+WIDE: dict[str, Any] = {"builder": "box", "size": [LENGTH, SECTION], "h": 0.1, "pattern": "structured"}
+COARSE = WIDE | {"h": 1 / 6, "pattern": "unstructured"}
+HIGH = WIDE | {"size": [SECTION, LENGTH], "pattern": "unstructured"}
+
+
+def pulled_bar(mesh: dict[str, Any], course: dict[str, list[float]], along: int = 0, **time: Any) -> dict[str, Any]:
+    """Tables of a bar whose end moves along an axis, in steps of 0.75 of the elastic limit by default."""
+    dim, ends = len(mesh["size"]), (("left", "right"), ("bottom", "top"))[along]
+    motion = [["free"] * along + [way] + ["free"] * (dim - 1 - along) for way in course["value"]]
+    return {
+        "mesh": mesh,
+        "material": {"energy": "linear", "young": YOUNG, "poisson": 0.0, "density": 1.0},
+        "fracture": {"strength": STRENGTH, "energy": TOUGH, "law": "cohesive"},
+        "boundary": [
+            {"on": ends[0], "fix": "xyz"[:dim]},
+            {"on": ends[1], "displacement": {"time": course["time"], "value": motion}},
+        ],
+        "probe": [{"name": "end", "on": ends[1]}],
+        "time": {"scheme": "quasi-static", "step": 0.75 / 150, "end": 1.0} | time,
+        "output": {"picture": False, "interval": 1.0},
+    }
+
+
+@pytest.mark.parametrize(
+    ("mesh", "course", "along"),
+    [(WIDE, PULLED, 0), (COARSE, PULLED, 0), (HIGH, PULLED, 1), (WIDE, UNLOADED, 0)],
+    ids=("lattice", "coarse", "along y", "unloaded"),
+)
+def test_long_steps_have_the_work_of_the_load_that_the_bar_carries(
+    tmp_path: Path, mesh: dict[str, Any], course: dict[str, list[float]], along: int
+) -> None:
+    """In steps of 0.75 of the elastic limit the bar takes G_c of its section, and its peak is that of its reaction.
+
+    The equilibrium with the damage of the start of a step has up to 1.75 times the strength, and is not carried.
+    """
+    scene = build_scene(MPI.COMM_SELF, make_study(**pulled_bar(mesh, course, along)))
+    Run(scene, tmp_path)()
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    with (tmp_path / "history.csv").open(newline="") as file:
+        rows = {name: np.array(column, float) for name, *column in zip(*csv.reader(file), strict=True)}
+    axis = "xy"[along]
+    load, way = (np.append(0.0, rows[f"{name}_end_{axis}"]) for name in ("reaction", "motion"))
+    assert summary["peak_reactions"][f"reaction_end_{axis}"] == pytest.approx(load.max(), rel=1e-9)
+    assert load.max() == pytest.approx(STRENGTH * SECTION, rel=0.025)
+    assert summary["dissipated"] == pytest.approx(TOUGH * SECTION, rel=0.015)
+    assert summary["external_work"] == pytest.approx(np.trapezoid(load, way), rel=1e-6)
+    total = rows["elastic"] + rows["dissipated"]
+    np.testing.assert_allclose(rows["external_work"], total, atol=3e-5 * total.max())
+
+
+def test_an_obstacle_that_bends_a_beam_does_the_work_that_the_beam_takes() -> None:
+    """Its work is that of contact at the end of each step; the beam lost 10 % more than that."""
+    tables = pulled_bar(WIDE | {"size": [0.8, 0.3], "pattern": "unstructured"}, PULLED, step=0.05)
+    del tables["probe"]
+    tables["fracture"]["energy"] = ENERGY
+    scene, state = make_scene(**tables | {
+        "boundary": [
+            {"on": {"box": [[-0.01, -0.01], [0.05, 0.01]]}, "fix": "xy"},
+            {"on": {"box": [[0.75, -0.01], [0.81, 0.01]]}, "fix": "y"},
+        ],
+        "obstacle": [
+            {"name": "pin", "shape": "sphere", "at": [0.4, 0.41], "radius": 0.1,
+             "displacement": {"time": [0.0, 1.0], "value": [[0.0, 0.0], [0.0, -0.04]]}},
+        ],
+        "contact": {"distance": 0.005},
+    })  # fmt: skip
+    gaps = [abs(state.work - report.elastic - state.dissipated) for report in each_step(scene, state)]
+    assert max(gaps) < 0.01 * state.work
+    assert state.dissipated > 0.9 * state.work and scene.fracture.graph.broken_count > 0
+
+
+def test_explicit_steps_have_the_work_of_the_softened_bar() -> None:
+    """Supports move on while forces are those of softened cells: work is the sum of all energies to 1e-4 of it."""
+    course = {"time": [0.0, 1.0], "value": [0.0, 12 * PEAK]}
+    tables = pulled_bar(WIDE, course, scheme="explicit", step=1.0)
+    tables["fracture"]["energy"] = ENERGY
+    scene, state = make_scene(**tables)
+    for report in each_step(scene, state):
+        total = report.elastic + report.kinetic + state.dissipated
+    assert state.work == pytest.approx(total, rel=1e-4)
+    assert state.dissipated == pytest.approx(ENERGY * SECTION, rel=0.02)
 
 
 def test_edges_hold_until_they_carry_nothing() -> None:

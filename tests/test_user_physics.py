@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import re
 import tomllib
 from collections.abc import Callable
@@ -243,6 +245,33 @@ def test_a_law_of_an_edge_softens_its_cells() -> None:
             simulation.step()
         np.testing.assert_allclose(simulation.scene.balance.stress.chi.x.array, 5 / 6, atol=1e-9)  # type: ignore[union-attr]
         assert not simulation.damage.x.array.any()
+
+
+def test_a_bar_whose_edges_soften_carries_what_its_reaction_says(tmp_path: Path) -> None:
+    """In steps of 1.3 times the strength external work is that of the reaction, and its peak that of the column."""
+    tables: dict[str, Any] = {
+        "title": "bar",
+        "mesh": {"builder": "box", "size": [0.4, 0.1], "h": 0.05},
+        "material": {"energy": "linear", "young": 1e4, "poisson": 0.0, "density": 1.0},
+        "boundary": [
+            {"on": "left", "fix": "xy"},
+            {"on": "right", "displacement": {"time": [0.0, 1.0], "value": [[0.0, "free"], [0.02, "free"]]}},
+        ],
+        "fracture": {"strength": 100.0},
+        "probe": [{"name": "end", "on": "right"}],
+        "time": {"scheme": "quasi-static", "step": 0.26, "end": 1.0},
+        "output": {"picture": False},
+        "solver": DIRECT,
+    }
+    with Simulation(tables, edge_law=lambda load: np.clip((4 - load) / (3 * load), 0, 1), out=tmp_path) as simulation:
+        simulation.run()
+    with (tmp_path / "history.csv").open(newline="") as file:
+        rows = {name: np.array(column, float) for name, *column in zip(*csv.reader(file), strict=True)}
+    load, way = (np.append(0.0, rows[f"{name}_end_x"]) for name in ("reaction", "motion"))
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["peak_reactions"]["reaction_end_x"] == pytest.approx(load.max(), rel=1e-9)
+    np.testing.assert_allclose(rows["external_work"][-1], np.trapezoid(load, way), rtol=1e-6)
+    np.testing.assert_allclose(rows["external_work"], rows["elastic"] + rows["dissipated"], rtol=1e-5)
 
 
 @pytest.mark.parametrize(
