@@ -14,6 +14,7 @@ from ..errors import NotConverged
 from .bodies import Bodies, fly, quaternions
 from .contact_points import Contacts
 from .core_contact import CoreContact
+from .face_contacts import FaceContacts
 from .fragment_overlap import AdmittedOverlaps
 from .mujoco_model import SETTINGS as MODEL_SETTINGS
 from .mujoco_model import ContactParameters, MujocoModel
@@ -98,7 +99,7 @@ class _MujocoSearch:
     def _compile(self) -> None:
         """Compile the model, with the memory of its description."""
         compiled = self._compiled = self._spec.compile()
-        self._data = mujoco.MjData(compiled)
+        self._data, self._faces = mujoco.MjData(compiled), FaceContacts.from_model(compiled)
         # MuJoCo's bodies: the world, bodies, driven obstacles; the last flag is that of all fixed obstacles
         body = np.concatenate([[-1], np.arange(self._count), self._driven])
         masks = [(compiled.geom_contype, self._body_of_geom), (compiled.body_contype, body)]
@@ -115,10 +116,11 @@ class _MujocoSearch:
         """
         while not self._find(centres, quat, margin, searching):
             self._enlarge_memory()
-        contact = self._data.contact
-        return [contact.geom.reshape(-1, 2).copy(), contact.pos.reshape(-1, 3).copy(),
-                contact.frame.reshape(-1, 3, 3).copy(), contact.dist.copy(),
-                contact.friction.reshape(-1, 5)[:, 0].copy()]  # fmt: skip
+        data, contact = self._data, self._data.contact
+        found = [contact.geom.reshape(-1, 2).astype(np.int64), contact.pos.reshape(-1, 3).copy(),
+                 contact.frame.reshape(-1, 3, 3).copy(), contact.dist.copy(),
+                 contact.friction.reshape(-1, 5)[:, 0].copy()]  # fmt: skip
+        return self._faces.complete(found, data.geom_xpos, data.geom_xmat)
 
     def _find(self, centres: Values, quat: Values, margin: Values, searching: Flags) -> bool:
         """Place the bodies and find the contacts; return whether there was memory for them.
@@ -190,7 +192,6 @@ class CollisionDetector:
         if chosen is not None:
             searching = np.append(chosen, np.zeros(len(obstacle_points) + 1, bool))
         geoms, point, axes, gap, friction = self._search(centres, quaternions(bodies.rotation), margin, searching)
-        geoms = geoms.astype(np.int64)
         contacts = Contacts.with_arms(geoms, model.body_of_geom[geoms], point, axes, gap, friction, centres)
         contacts = model.cylinders.select(contacts, bodies, centres)
         if self._shells is not None:
