@@ -252,6 +252,12 @@ def test_what_makes_no_sense_is_refused_in_one_sentence(name: str, tmp_path: Pat
     assert not (tmp_path / "out").exists()
 
 
+def test_check_refuses_a_hollow_obstacle_as_the_run_does() -> None:
+    """While the study is read."""
+    with pytest.raises(ValueError, match=r"obstacle ball is hollow, .* build it of boxes or planes"):
+        study(obstacle=[BALL | {"hollow": True}])
+
+
 def test_bad_input_ends_the_program_with_exit_code_2(tmp_path: Path) -> None:
     """One message, no traceback."""
     path = tmp_path / "lies.toml"

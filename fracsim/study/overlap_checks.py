@@ -202,8 +202,7 @@ def _check_rigid_bodies(study: Study, mesh: MeshData, entries: list[ObstaclePlac
     radius = float(np.linalg.norm(mesh.points - centre, axis=1).max())
     centres = poses.position + poses.rotation @ centre
     for number, entry in enumerate(entries):
-        # the run refuses hollow obstacles
-        if entry.shape == "mesh" or entry.geometry.get("hollow"):
+        if entry.shape == "mesh":
             continue
         placed = _placed(entry, number)
         for copy in np.flatnonzero(placed.distance(centres) < radius):

@@ -107,6 +107,12 @@ def check_rigid(study: Study) -> None:
             f'solver.{excess[0]} is not for time.scheme = "rigid": give options of ksp_, pc_ and mg_ alone'
         )
     for obstacle in study.obstacle:
+        if obstacle.hollow:
+            # the words of rigid.obstacles
+            raise ValueError(
+                f'obstacle {obstacle.name} is hollow, which time.scheme = "rigid" does not have: build it of boxes or '
+                "planes"
+            )
         constraints = [name for name in ("hinge", "guide") if getattr(obstacle, name) is not None]
         if constraints:
             raise ValueError(
