@@ -102,24 +102,31 @@ class FaceContacts:
         rows = self._first_rows(geoms)
         if not len(rows):
             return contacts
-        most, kept = SETTINGS.max_points, SETTINGS.mujoco_points
-        count, point, gap = np.empty(len(rows), np.int64), np.empty((len(rows), most, 3)), np.empty((len(rows), most))
+        max_points, mujoco_points = SETTINGS.max_points, SETTINGS.mujoco_points
+        count, point, gap = (
+            np.empty(len(rows), np.int64),
+            np.empty((len(rows), max_points, 3)),
+            np.empty((len(rows), max_points)),
+        )
         load_library(SOURCE).face_contacts(
             c_int64(len(rows)), geoms[rows], axes[rows], self.faces, self.normals, self.first_corner, self.corners,
-            self.vertices, np.ascontiguousarray(position), np.ascontiguousarray(rotation), c_int64(most),
+            self.vertices, np.ascontiguousarray(position), np.ascontiguousarray(rotation), c_int64(max_points),
             c_double(SETTINGS.least_share), count, point, gap,
         )  # fmt: skip
-        is_point = np.arange(most) < count[:, None]
+        is_point = np.arange(max_points) < count[:, None]
         # the first points take the rows of MuJoCo's, and others follow at the end
-        pair, number = np.nonzero(is_point[:, :kept])
+        pair, number = np.nonzero(is_point[:, :mujoco_points])
         points[rows[pair] + number], gaps[rows[pair] + number] = point[pair, number], gap[pair, number]
-        if np.all((count == kept) | (count == 0)):
+        if np.all((count == mujoco_points) | (count == 0)):
             return contacts
-        pair, number = np.nonzero((np.arange(kept) >= count[:, None]) & (count[:, None] > 0))
+        pair, number = np.nonzero((np.arange(mujoco_points) >= count[:, None]) & (count[:, None] > 0))
         retained = np.delete(np.arange(len(geoms)), rows[pair] + number)
-        pair, number = np.nonzero(is_point[:, kept:])
+        pair, number = np.nonzero(is_point[:, mujoco_points:])
         result = [values[np.concatenate([retained, rows[pair]])] for values in contacts]
-        result[1][len(retained) :], result[3][len(retained) :] = point[pair, kept + number], gap[pair, kept + number]
+        result[1][len(retained) :], result[3][len(retained) :] = (
+            point[pair, mujoco_points + number],
+            gap[pair, mujoco_points + number],
+        )
         return result
 
     def _first_rows(self, geoms: Ints) -> Ints:
