@@ -101,6 +101,8 @@ class RigidRun:
         self.scene, self.folder, self._interrupt, self.text = scene, folder, interrupt, text
         self.state, self._began, self._cpu = scene.initial_state, time.perf_counter(), time.process_time()
         self.broken = self.blows = self.loads = 0
+        # times, s, and errors of velocities, m/s, of steps in which contact did not converge
+        self._contact_errors: list[tuple[float, float]] = []
         self._start = scene.initial_state.bodies.kinetic_energy
         # of the parts of the run before a restart
         self._effort_before: dict[str, Any] = {"analyses": 0, "wall": 0.0, "cpu": 0.0, "seconds": {}}
@@ -185,6 +187,8 @@ class RigidRun:
             self.broken + report.broken, self.blows + report.blows, self.loads + report.loads
         )  # fmt: skip
         state, split = self.state, stepper.instances.split_cell_count
+        if report.contact_error:
+            self._contact_errors.append((state.t, report.contact_error))
         lost = self._start + state.work - report.kinetic_energy
         self.history.append_row([
             state.step, state.t, self.scene.study.time.max_step, report.kinetic_energy, 0.0, lost, state.work,
@@ -322,6 +326,7 @@ class RigidRun:
             "ranks": MPI.COMM_WORLD.size, "versions": software_versions(MPI.COMM_WORLD),
         }  # fmt: skip
         write_summary(ROOT_COMM, self.folder, summary)
+        print_notes(ROOT_COMM, contact_notes(self._contact_errors))
         return summary
 
     def _count_single_nodes(self) -> dict[str, float]:
@@ -329,6 +334,21 @@ class RigidRun:
         nodes = np.bincount(self.scene.stepper.shapes.node_fragment, minlength=self.scene.stepper.fragment_count)
         single = np.flatnonzero(nodes == 1)
         return {"dust": len(single), "dust_mass": float(self.state.bodies.mass[single].sum())}
+
+
+def contact_notes(errors: list[tuple[float, float]]) -> list[str]:
+    """Return a note on the steps in which contact did not converge.
+
+    `errors`: times, s, and errors of velocities, m/s, of these steps.
+    """
+    if not errors:
+        return []
+    t, worst = max(errors, key=lambda step: step[1])
+    steps = "1 step" if len(errors) == 1 else f"{len(errors)} steps"
+    return [
+        f"contact of rigid bodies did not converge in {steps}; velocities after the step to t = {t:g} s are off by "
+        f"up to {worst:.2g} m/s: compare a run with a smaller time.step"
+    ]
 
 
 def print_mesh_notes(scene: RigidScene) -> None:

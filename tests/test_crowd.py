@@ -60,7 +60,8 @@ def test_every_contact_of_a_crowd_keeps_coulombs_law(friction: float) -> None:
     still = np.zeros((1, 3))
     free = contacts.relative_velocities(np.concatenate([bodies.velocity, still]), np.concatenate([bodies.spin, still]))
     crowd = ProjectedGradientSolver.assemble(contacts, free, aim, bodies.mass, np.linalg.inv(bodies.inertia))
-    p = crowd.solve(1e-7, 5000, np.zeros_like(free))
+    p, error = crowd.solve(1e-7, 5000, np.zeros_like(free))
+    assert error == 0.0
     velocity, spin = np.concatenate([bodies.velocity, still]), np.concatenate([bodies.spin, still])
     for (first, second), at, axes, each in zip(contacts.pairs, contacts.point, contacts.axes, p, strict=True):
         for body, sign in ((first, -1.0), (second, 1.0)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,9 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 
 import mujoco
 
+from fracsim.rigid import contact_solver
 from fracsim.rigid.face_contacts import FaceContacts
+from fracsim.rigid_run import contact_notes
 from fracsim.scene.rigid_scene import RigidScene, build_rigid_scene
 from fracsim.study import Study
 
@@ -71,6 +74,27 @@ def test_a_stack_slides_below_the_limit_of_friction(friction: float, slides: boo
     moved, _ = run(stack(3, 0.1, 5e-3, obstacle=[floor]))
     expected = (2.0 - friction * 9.604) / 2 if slides else 0.0
     assert np.allclose(moved, expected, rtol=0.02, atol=2e-5)
+
+
+@pytest.mark.parametrize(
+    "limits",
+    [
+        {"newton_iterations": 1, "direct_iterations": 1, "compliance_factors": (1.0,)},
+        {"max_newton_contacts": 1, "gradient_work": 1, "gradient_iterations": 1},
+    ],
+    ids=["Newton", "projected gradients"],
+)
+def test_a_solve_that_ends_early_is_told(limits: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+    """One iteration is too few for a stack; the usual number is enough."""
+    built = stack(5, 0.1, 5e-3)
+    assert built.stepper.advance(built.initial_state)[1].contact_error == 0.0
+    monkeypatch.setattr(contact_solver, "SETTINGS", replace(contact_solver.SETTINGS, **limits))
+    built = stack(5, 0.1, 5e-3)
+    state, report = built.stepper.advance(built.initial_state)
+    assert report.contact_error > 0.01 * 2 * 9.81 * 5e-3
+    (note,) = contact_notes([(state.t, report.contact_error), (0.01, 1e-9)])
+    assert "did not converge in 2 steps" in note and f"t = 0.005 s are off by up to {report.contact_error:.2g}" in note
+    assert not contact_notes([])
 
 
 # --- points of faces ---

@@ -60,7 +60,7 @@ class ContactSolverSettings:
         slip_rounds: largest number of updates of the slip speeds.
         slip_tolerance: c_0; the slip speeds are accepted when mu times their change is below.
         max_newton_contacts: contacts in an event above which projected gradients take over.
-        gradient_tolerance: c_0; accepted error of velocities in projected gradients.
+        gradient_tolerance: c_0; accepted error of velocities.
         gradient_iterations: least number of iterations that projected gradients may take.
         gradient_work: contacts times iterations that they may take in any case.
         search_rounds: largest number of searches for contacts that were left out.
@@ -105,7 +105,7 @@ class MujocoNewtonSolver:
     def __init__(self, model: MujocoModel, parameters: ContactParameters) -> None:
         """Compile the model; `parameters` has time step, gravity and friction."""
         n = self._count = len(model.mass)
-        self._compiled = _dynamic_model(model, parameters)
+        self._compiled, self._extent = _dynamic_model(model, parameters), model.extent
         self._data, self._template = mujoco.MjData(self._compiled), _contact_template(parameters)
         moving = np.concatenate([np.arange(n), n + model.driven])
         things = int(np.concatenate([model.body_of_geom, moving]).max(initial=0)) + 1
@@ -181,6 +181,18 @@ class MujocoNewtonSolver:
         rows, contact_force = np.flatnonzero(closed), np.zeros((len(active), 3))
         contact_force[rows] = data.efc_force[data.contact.efc_address[rows, None] + np.arange(3)]
         return data.qfrc_constraint.reshape(-1, 6)[: self._count].copy(), contact_force, closed
+
+    def velocity_error(self) -> float:
+        """Return by how much the forces of the last solution miss the velocities that they follow from, m/s.
+
+        MuJoCo derives forces f(a) from accelerations a; the error is dt |a - a_0 - M^-1 f(a)|, a_0 without contact.
+        """
+        compiled, data = self._compiled, self._data
+        change: Values = np.empty((1, compiled.nv))
+        mujoco.mj_solveM(compiled, data, change, data.qfrc_constraint[None])
+        missing = (data.qacc - data.qacc_smooth - change[0]).reshape(-1, 6)[: self._count]
+        speed = np.linalg.norm(missing[:, :3], axis=1) + self._extent * np.linalg.norm(missing[:, 3:], axis=1)
+        return float(compiled.opt.timestep * speed.max(initial=0.0))
 
     def _run_solver(self, compliance_factor: float, max_iterations: int) -> None:
         """Solve with a multiple of the compliance, starting from the last solution."""
@@ -260,11 +272,15 @@ def has_many_contacts(event: ImpactEvent) -> bool:
 
 
 class ContactSolver:
-    """Solver for the contact forces of an event, of the bodies of a model."""
+    """Solver for the contact forces of an event, of the bodies of a model.
+
+    Attributes:
+        error: of the velocities of the last solution, m/s; 0 if it is within the tolerance.
+    """
 
     def __init__(self, model: MujocoModel, parameters: ContactParameters) -> None:
         """Keep the model; MuJoCo's solver is made when it is first needed."""
-        self._model, self._parameters = model, parameters
+        self._model, self._parameters, self.error = model, parameters, 0.0
         self._newton: MujocoNewtonSolver | None = None
 
     def __call__(
@@ -280,6 +296,7 @@ class ContactSolver:
         Returns:
             Forces and moments (n, 6), moments in the axes of the bodies, N and N m; the record; False if rough.
         """
+        self.error = 0.0
         if not np.any(event.constraints.may_touch):
             return np.zeros((len(event.bodies), 6)), ContactImpulses.empty(), True
         if has_many_contacts(event):
@@ -299,6 +316,7 @@ class ContactSolver:
     def _solve_by_newton(self, event: ImpactEvent, obstacle_points: Values) -> Values:
         """Return forces and moments (n, 6) by MuJoCo's solver."""
         dt, contacts, active, model = self._parameters.time_step, event.contacts, event.active, self._model
+        threshold = self._parameters.impact_threshold
         rates, newton = event.bounds.obstacle_velocity, self._newton or MujocoNewtonSolver(model, self._parameters)
         self._newton = newton
         points = obstacle_points[model.driven]
@@ -314,9 +332,14 @@ class ContactSolver:
             active, before = active | missed, slip_approach
             # with a slip speed that is too large the body would sink in by the difference in every step
             slip_approach = np.minimum(slip_approach, factor * contacts.slip_speeds(*motion, active))
-            change = (before - slip_approach)[closed]
-            if not np.any(missed) and np.all(change < SETTINGS.slip_tolerance * self._parameters.impact_threshold * dt):
+            change = float((before - slip_approach)[closed].max(initial=0.0)) / dt
+            if not np.any(missed) and change < SETTINGS.slip_tolerance * threshold:
                 break
+        error = max(newton.velocity_error() if np.any(closed) else 0.0, self._closing_error(event, missed, motion))
+        self.error = max(
+            change if change >= SETTINGS.slip_tolerance * threshold else 0.0,
+            error if error > SETTINGS.gradient_tolerance * threshold else 0.0,
+        )
         # without the forces of earlier searches
         event.impulse[:] = np.where(closed[:, None], dt * contact_force, 0.0)
         return force
@@ -336,7 +359,7 @@ class ContactSolver:
             iterations = max(SETTINGS.gradient_iterations, SETTINGS.gradient_work // max(len(rows), 1))
             if rough or search:
                 iterations = SETTINGS.rough_iterations
-            event.impulse[rows] = system.solve(
+            event.impulse[rows], self.error = system.solve(
                 SETTINGS.gradient_tolerance * threshold, iterations, event.impulse[rows]
             )  # fmt: skip
             change = system.velocity_changes(event.impulse[rows])
@@ -346,7 +369,18 @@ class ContactSolver:
             event.active |= missed
             if not np.any(missed):
                 break
+        error = self._closing_error(event, missed, motion)
+        if error > SETTINGS.gradient_tolerance * threshold:
+            self.error = max(self.error, error)
         return force
+
+    def _closing_error(self, event: ImpactEvent, missed: Flags, motion: Motions) -> float:
+        """Return the largest speed, m/s, at which contacts `missed` (k,) would overlap at the end of the step."""
+        if not np.any(missed):
+            return 0.0
+        dt, constraints = self._parameters.time_step, event.constraints
+        closing = dt * constraints.remaining_fraction * event.contacts.approach_speeds(*motion)
+        return float((closing - constraints.gap)[missed].max()) / dt
 
     def _find_missed(self, event: ImpactEvent, active: Flags, motion: Motions) -> Flags:
         """Return (k,) flags of contacts beyond the active ones that close with velocities and spins `motion`."""

@@ -152,6 +152,7 @@ typedef struct {
     double *square[2], *lambda; /* of each half: (bodies + 1, 36) sums of J^T J / w; (bodies + 1,) bounds of eigenvalues */
     double *beta;               /* Nesterov's factor by age */
     double worst[2], tolerance; /* of each half: square of the largest error, m/s; accepted error, m/s */
+    double error;               /* of the velocities, m/s; 0 within the tolerance */
     Row *row;                   /* selected contacts */
     int64_t selected, limit;    /* number of these; largest number of iterations */
     int missed;                 /* whether a contact without impulse closes */
@@ -298,7 +299,10 @@ static void iterate(State *state)
     for (int done = 0; spent < state->limit;) {
         int64_t until = spent + (spent > FIRST_SELECTION ? spent : FIRST_SELECTION);
         select_contacts(state);
-        if (!state->missed && done) break;
+        if (!state->missed && done) {
+            state->error = 0;
+            break;
+        }
         in_halves(state, sum_squares);
         in_halves(state, bound_bodies);
         in_halves(state, bound_contacts);
@@ -308,6 +312,7 @@ static void iterate(State *state)
             in_halves(state, update_velocities);
             in_halves(state, project_rows);
             double worst = fmax(state->worst[0], state->worst[1]);
+            state->error = sqrt(worst);
             done = worst < state->tolerance * state->tolerance && (spent + 1) % CHECK_INTERVAL == 0;
         }
         in_halves(state, store_rows);
@@ -355,14 +360,16 @@ static State *make_state(const System *system, double tolerance, int64_t limit, 
     return state;
 }
 
-/* Solve for the impulses p (count, 3), which are those to start from; return -1 where there is no memory, else 0. */
-int64_t solve(const System *system, double tolerance, int64_t limit, double *p)
+/* Solve for the impulses p (count, 3), which are those to start from. Return -1 where there is no memory, 0 if the solution
+   is within the tolerance, and otherwise the error of the velocities. */
+double solve(const System *system, double tolerance, int64_t limit, double *p)
 {
     State *state = make_state(system, tolerance, limit, p);
     if (!state) return -1;
     iterate(state);
+    double error = state->error;
     free_state(state);
-    return 0;
+    return error;
 }
 
 /* D (count,) of all contacts; return -1 where there is no memory, else 0. */

@@ -77,8 +77,10 @@ class ProjectedGradientSolver:
         pairs = np.ascontiguousarray(np.minimum(contacts.pairs, len(mass)))
         return cls(rows, pairs, 1 / mass, np.ascontiguousarray(inverse_inertia))
 
-    def solve(self, tolerance: float, max_iterations: int, start: Values) -> Values:
-        """Return the impulses (k, 3), N s, that second bodies receive, along the axes of the contacts.
+    def solve(self, tolerance: float, max_iterations: int, start: Values) -> tuple[Values, float]:
+        """Return the impulses (k, 3), N s, that second bodies receive, along the axes of the contacts, and their error.
+
+        The error is that of the velocities, m/s; 0 if it is within the tolerance.
 
         Args:
             tolerance: accepted error of velocities, m/s.
@@ -86,9 +88,10 @@ class ProjectedGradientSolver:
             start: (k, 3) impulses to start from, N s.
         """
         p = np.array(start, order="C")
-        if load_library(SOURCE).solve(self._struct, c_double(tolerance), c_int64(max_iterations), p):
+        error = load_library(SOURCE).solve(self._struct, c_double(tolerance), c_int64(max_iterations), p)
+        if error < 0:
             raise MemoryError(f"no room for {len(p)} contacts")
-        return p
+        return p, float(error)
 
     def velocity_changes(self, impulses: Values) -> Values:
         """Return the changes of velocity and spin (n, 6) by impulses (k, 3)."""

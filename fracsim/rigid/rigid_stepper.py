@@ -60,6 +60,7 @@ class RigidReport:
         obstacle_work: (obstacles,) work of each obstacle, J; of a free one: the energy that it lost.
         cg_iterations: in all analyses.
         seconds: wall time.
+        contact_error: of the velocities, m/s; 0 if contact is within the tolerance.
     """
 
     broken: int
@@ -70,6 +71,7 @@ class RigidReport:
     obstacle_work: Values
     cg_iterations: int
     seconds: float
+    contact_error: float
 
 
 @dataclass
@@ -241,6 +243,7 @@ class RigidStepper:
             clock = self.phases.add("pieces", clock)
             moved, impulses = self._move(state, bodies)
             self.phases.add("motion", clock)
+        contact_error = self._engine.contact_error if self._engine else 0.0
         self.impact_detector.record_step(impulses, bodies, self.body_names)
         shapes = self.instances.dented_shapes
         if dented := [number for number, shape in shapes.items() if shape is not shapes_before.get(number)]:
@@ -258,8 +261,9 @@ class RigidStepper:
         blows = sum(load.speed > 0 for load in result)
         cg_iterations, seconds = self.instances.cg_iterations - iterations, time.perf_counter() - began
         return after, RigidReport(
-            broken, blows, len(result) - blows, moved.kinetic_energy, forces, obstacle_work, cg_iterations, seconds
-        )
+            broken, blows, len(result) - blows, moved.kinetic_energy, forces, obstacle_work, cg_iterations, seconds,
+            contact_error,
+        )  # fmt: skip
 
     def _move(self, state: RigidState, bodies: Bodies) -> tuple[Bodies, ContactImpulses]:
         """Return the bodies of a state, or their present fragments, one step later, and the contact impulses."""
