@@ -131,8 +131,13 @@ class FaceContacts:
 
     def _first_rows(self, geoms: Ints) -> Ints:
         """Return the first contacts of the pairs of geoms (k, 2) of which MuJoCo may have left out points."""
-        is_first: npt.NDArray[np.bool_] = np.ones(len(geoms), bool)
-        is_first[1:] = (geoms[1:, 0] != geoms[:-1, 0]) | (geoms[1:, 1] != geoms[:-1, 1])
-        first = np.flatnonzero(is_first)
-        rows = first[np.diff(first, append=len(geoms)) == SETTINGS.mujoco_points]
-        return np.asarray(rows[~np.all(self.is_box[geoms[rows]], axis=1)])
+        count, code = SETTINGS.mujoco_points, geoms[:, 0] * len(self.is_box) + geoms[:, 1]
+        rows = (
+            np.flatnonzero(code[count - 1 :] == code[: len(code) - count + 1]) if len(code) >= count else geoms[:0, 0]
+        )
+        if not len(rows):
+            return rows
+        # neither before nor after them is one of the same pair
+        bounds = np.concatenate([[-1], code, [-1]])
+        rows = rows[(bounds[rows] != code[rows]) & (bounds[rows + count + 1] != code[rows])]
+        return np.asarray(rows[~(self.is_box[geoms[rows, 0]] & self.is_box[geoms[rows, 1]])])
