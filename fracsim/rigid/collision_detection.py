@@ -117,9 +117,10 @@ class _MujocoSearch:
         while not self._find(centres, quat, margin, searching):
             self._enlarge_memory()
         data, contact = self._data, self._data.contact
-        contacts = [contact.geom.reshape(-1, 2).astype(np.int64), contact.pos.reshape(-1, 3).copy(),
-                 contact.frame.reshape(-1, 3, 3).copy(), contact.dist.copy(),
-                 contact.friction.reshape(-1, 5)[:, 0].copy()]  # fmt: skip
+        contacts = [
+            contact.geom.reshape(-1, 2).astype(np.int64), contact.pos.reshape(-1, 3).copy(),
+            contact.frame.reshape(-1, 3, 3).copy(), contact.dist.copy(), contact.friction.reshape(-1, 5)[:, 0].copy(),
+        ]  # fmt: skip
         return self._faces.complete(contacts, data.geom_xpos, data.geom_xmat)
 
     def _find(self, centres: Values, quat: Values, margin: Values, searching: Flags) -> bool:
