@@ -396,6 +396,7 @@ SLOW = {"scheme": "quasi-static", "step": 1.0, "end": 1.0}
         ),
         ({"energy": 1.0, "unilateral": True}, SLOW, r"does not go with fracture\.unilateral: .*remove it"),
         ({"energy": 1.0, "crumbs": False}, SLOW, "remove crumbs"),
+        ({"energy": 1.0, "passes": 4}, SLOW, r"fracture\.passes in quasi-static steps: .*remove passes"),
         ({"energy": 1.0, "radius": 0.1}, SLOW, r"does not go with fracture\.radius"),
     ],
 )

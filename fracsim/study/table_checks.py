@@ -130,6 +130,10 @@ def _check_cohesive(study: Study, table: FractureSettings) -> None:
         ),
         "[plasticity]": (study.plasticity is not None, "the law of the crack is that of an elastic body: remove it"),
         "fracture.crumbs = false": (not table.crumbs, "no node is held while cells are half open: remove crumbs"),
+        "fracture.passes in quasi-static steps": (
+            table.passes is not None and not study.time.scheme_class.inertia,
+            "a crack that has not softened to its end in a step carries many times its strength: remove passes"
+        ),
     }  # fmt: skip
     for name, (present, why) in conflicts.items():
         if present:
