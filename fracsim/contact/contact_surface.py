@@ -75,6 +75,7 @@ class ContactSurface:
         self._may_be_cut = facets_may_be_cut or not curved
         self._topology = EntityNumbering(local_mesh(domain))
         self._nodes: NodeExchange | None = None
+        self._fingerprint = 0  # sum of the keys of all ranks: equal surfaces have equal ones
         self.update_damage(np.zeros(domain.cell_count, np.uint8))
 
     def update_damage(self, pattern: Pattern, shown: Flags | None = None) -> None:
@@ -106,6 +107,7 @@ class ContactSurface:
         self.columns, (means, arms) = restrict_to_used_columns([means, arms])
         self.point_map, self.keys = SurfaceMap(means, middle, arms, out), keys[points]
         self.area = self._full_area = area[points]
+        self._fingerprint = self.comm.allreduce(int(self.keys.view(np.uint64).sum()))
         corners, smoothing = np.searchsorted(points, elements[real]), FACETS.smoothing * self._width
         self._all_facets = ContactFacets(corners, measure[real], smoothing)
         self._active: tuple[Values, Ints, ContactFacets] | None = None  # with area and excluded facets that it is for
@@ -323,16 +325,17 @@ class ContactSurface:
     # --- state ---
 
     def snapshot(self) -> object:
-        """Factors of arms, areas, excluded facets, and keys of the points."""
-        return self.point_map.share, self.area, self._excluded, self.keys
+        """Factors of arms, areas, excluded facets, and fingerprint of the surface."""
+        return self.point_map.share, self.area, self._excluded, self._fingerprint
 
     def restore(self, memory: object) -> None:
         """Restore a snapshot of this surface (not collective).
 
-        Where edges have broken since, in an earlier pass of the step, the surface is another one and stays as it is.
+        Where edges have broken since, in an earlier pass of the step, the surface is another one and stays as it is: on
+        all ranks, also where the part of a rank is the same.
         """
-        share, area, excluded, keys = cast("tuple[Values, Values, Ints, Ints]", memory)
-        if keys is not self.keys and not np.array_equal(keys, self.keys):
+        share, area, excluded, fingerprint = cast("tuple[Values, Values, Ints, int]", memory)
+        if fingerprint != self._fingerprint:
             return
         if share is not self.point_map.share:
             self.point_map = self.point_map.with_arm_share(share)
