@@ -149,13 +149,16 @@ def test_a_restart_after_the_break_has_its_pieces(done: Path, tmp_path: Path) ->
 
 
 def test_a_slab_is_shot_through_and_not_carried_along(tmp_path: Path) -> None:
-    """Twelve milliseconds later most of its mass is where it was, without the ball, which took a piece along."""
+    """Twelve milliseconds later most of its mass is where it was, without the ball, which took a piece along.
+
+    Round-off decides in how many pieces it is: 10 with one DOLFINx, 23 with another.
+    """
     coarse = load_study(folder() / "rigid-slab.toml", ["mesh.h=0.018", "brittle.surfaces=30", "output.interval=0.012"])
     run_study(MPI.COMM_SELF, coarse, tmp_path / "out")
     pieces = rows(tmp_path / "out" / "pieces.csv")
     last = pieces["time"] == pieces["time"].max()
     mass, speed, z = (pieces[name][last] for name in ("mass", "velocity_z", "centre_z"))
-    assert mass.sum() == pytest.approx(2700 * 0.4 * 0.4 * 0.02, rel=1e-9) and len(mass) > 10
+    assert mass.sum() == pytest.approx(2700 * 0.4 * 0.4 * 0.02, rel=1e-9) and len(mass) > 6
     assert -(mass @ speed) < 0.3 * 60 * mass.sum(), "the ball has no end of momentum: whole it would have all of 60 m/s"
     assert mass[z > 0.1].sum() > 0.6 * mass.sum() and speed.min() < -40
 
