@@ -69,7 +69,8 @@ def run_sweep(
     if not only_list:
         _refuse_mpirun()
     cases = sweep_cases(sets, out)
-    texts = [_checked_study(path, case) for case in cases]
+    digests: dict[Path, str] = {}  # a file that many cases read is read once
+    texts = [_checked_study(path, case, digests) for case in cases]
     for case, text in zip(cases, texts, strict=True):
         _check_folder(case, text, path, overwrite)
     if only_list:
@@ -184,12 +185,15 @@ def _safe_text(value: str) -> str:
     return re.sub(r"[^A-Za-z0-9.+]+", "-", value).strip("-.")
 
 
-def _checked_study(path: Path, case: SweepCase) -> str:
-    """Text of study.toml of a case with lines on its files. Raises InputError, with the case, if it cannot be run."""
+def _checked_study(path: Path, case: SweepCase, digests: dict[Path, str]) -> str:
+    """Text of study.toml of a case with lines on its files. Raises InputError, with the case, if it cannot be run.
+
+    `digests`: of the files of earlier cases; it is added to.
+    """
     try:
         study = load_study(path, case.overrides)
         check_study(study)
-        lines = input_file_lines(study)
+        lines = input_file_lines(study, digests)
     except InputError as error:
         raise InputError(f"{case.folder.name}: {error}. Nothing was run") from None
     return study_text(study, lines)

@@ -378,16 +378,18 @@ class ContactSolver:
         """Return the largest speed, m/s, at which contacts `missed` (k,) would overlap at the end of the step."""
         if not np.any(missed):
             return 0.0
-        dt, constraints = self._parameters.time_step, event.constraints
-        closing = dt * constraints.remaining_fraction * event.contacts.approach_speeds(*motion)
-        return float((closing - constraints.gap)[missed].max()) / dt
+        overlap = self._closing_motion(event, event.contacts.approach_speeds(*motion)) - event.constraints.gap
+        return float(overlap[missed].max()) / self._parameters.time_step
+
+    def _closing_motion(self, event: ImpactEvent, speeds: Values) -> Values:
+        """Return by how much gaps (k,) close in the rest of the step at approach speeds (k,), m."""
+        return np.asarray(self._parameters.time_step * event.constraints.remaining_fraction * speeds)
 
     def _find_missed(self, event: ImpactEvent, active: Flags, motion: Motions) -> Flags:
         """Return (k,) flags of contacts beyond the active ones that close with velocities and spins `motion`."""
         parameters, constraints = self._parameters, event.constraints
         speeds = event.contacts.approach_speeds(*motion)
-        closing = parameters.time_step * constraints.remaining_fraction * speeds
-        missed: Flags = ~active & (constraints.gap < closing)
+        missed: Flags = ~active & (constraints.gap < self._closing_motion(event, speeds))
         if event.is_last:
             return missed
         return missed & ~impacts_later(constraints.gap, speeds, parameters.time_step, parameters.impact_threshold)

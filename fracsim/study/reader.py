@@ -105,8 +105,10 @@ def study_text(study: Study, comments: Iterable[str] = ()) -> str:
     return "".join(f"# {line}\n" for line in comments) + tomli_w.dumps(data)
 
 
-def input_file_lines(study: Study) -> list[str]:
+def input_file_lines(study: Study, digests: dict[Path, str] | None = None) -> list[str]:
     """Returns a line `file KEY: SHA-256` for each mesh and obstacle file of a study, for study.toml.
+
+    `digests`: of files that other studies have as well, which are read once; it is added to.
 
     The HDF5 file beside an XDMF file and the nodes of TetGen count too. Other files that a file names (`*INCLUDE`,
     pieces of .pvtu) are not read.
@@ -114,7 +116,11 @@ def input_file_lines(study: Study) -> list[str]:
     Raises:
         InputError: a file cannot be read.
     """
-    return [f"file {key}: {_file_digest(key, path)}" for key, path in _input_files(study)]
+    digest_of = {} if digests is None else digests
+    for key, path in (files := list(_input_files(study))):
+        if path not in digest_of:
+            digest_of[path] = _file_digest(key, path)
+    return [f"file {key}: {digest_of[path]}" for key, path in files]
 
 
 def _input_files(study: Study) -> Iterator[tuple[str, Path]]:

@@ -107,13 +107,14 @@ class QuasiStaticStepper(ImplicitStepper):
         """
         path = EquilibriumPath(state.u, state.forces, state.damping, state.out_of_balance)
         broken, released, flow_loss, limit = 0, 0.0, 0.0, self.inelastic.max_passes
-        first_obstacle_work = 0.0
+        first_obstacle_work, is_gradual = 0.0, self.inelastic.fracture.weakens_gradually
         start, continues = state, self.inelastic.flow.continues
         for number in range(limit):
             self.balance.accept_step()
             if number == 0:
                 self.onset_reactions = self.balance.reactions.copy()
-                first_obstacle_work = self.balance.energies.obstacle_work()
+                if is_gradual:
+                    first_obstacle_work = self.balance.energies.obstacle_work()
             path.continue_to(self._solution(), *balanced_forces(self.balance, lumped=False))
             flow_loss = self._flow() + (flow_loss if continues else 0.0)
             result = self._fracture_pass(path, dt)
@@ -131,7 +132,7 @@ class QuasiStaticStepper(ImplicitStepper):
                 self._return_to(path.u, start, dt)
             flow_loss = self._flow() + (flow_loss if continues else 0.0)
             break
-        if self.inelastic.fracture.weakens_gradually:
+        if is_gradual:
             self.onset_reactions = self.balance.reactions.copy()
             path.omit_first_equilibrium(state, first_obstacle_work - self.balance.energies.obstacle_work())
         energies = StepEnergies(path.work, path.lost + (released + flow_loss), result.elastic_energy)
