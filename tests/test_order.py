@@ -312,6 +312,23 @@ def test_lumped_mass_costs_the_order_of_frequencies() -> None:
         assert np.log2(found[0] / found[1]) == pytest.approx(order, abs=0.3)
 
 
+@pytest.mark.parametrize("mass", ["lumped", "consistent"])
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_body_in_free_fall_has_no_stress(dim: int, mass: str) -> None:
+    """All nodes fall by g t^2 / 2: gravity is M g with the mass matrix of inertia."""
+    g, steps, dt = np.array([2.0, 0.0, -9.81])[-dim:], 10, 0.02
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0] * dim, "h": 0.5, "pattern": "unstructured", "order": 2},
+        material={"young": 1e4, "poisson": 0.3, "density": 1000.0},
+        load={"gravity": g.tolist()},
+        time={"scheme": "newmark", "step": dt, "end": 1.0, "mass": mass},
+    )
+    fallen = g * (steps * dt) ** 2 / 2
+    march(scene, state, steps)
+    u = state.u.reshape(-1, dim)
+    np.testing.assert_allclose(u, np.broadcast_to(fallen, u.shape), atol=1e-6 * np.abs(fallen).max())
+
+
 def test_check_says_what_is_built() -> None:
     mesh = {"builder": "disk", "radius": 1.0, "h": 0.5, "order": 2}
     assert "cells of 6 nodes, round sides" in "\n".join(check_study(make_study(mesh=mesh)))

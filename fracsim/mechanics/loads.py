@@ -74,6 +74,7 @@ class DeadLoads(Term):
         *,
         tractions: Sequence[OnFacets] = (),
         gravity: tuple[Expr, TimeFunction] | None = None,
+        weights: Values | None = None,
         body_force: TimeFunction | None = None,
     ) -> None:
         """Compile the linear form of the loads (collective).
@@ -83,6 +84,7 @@ class DeadLoads(Term):
             u: displacement.
             tractions: facets, and tractions in Pa of the reference area.
             gravity: density as a UFL coefficient in kg/m^3, and acceleration in m/s^2.
+            weights: (owned dofs,) constant nodal forces of gravity, N, in place of `gravity`.
             body_force: N/m^3 of the reference volume.
         """
         domain, d = assembler.domain, assembler.domain.dim
@@ -99,13 +101,14 @@ class DeadLoads(Term):
         ]
         if densities:
             works.append(ufl.inner(sum(densities[1:], densities[0]), w) * dx)
-        self._form = compile_form(sum(works[1:], works[0]))
-        self.nodal_forces: Values = np.zeros(assembler.owned_dof_count)
+        self._form = compile_form(sum(works[1:], works[0])) if works else None
+        self._weights: Values = np.zeros(assembler.owned_dof_count) if weights is None else weights
+        self.nodal_forces: Values = self._weights
 
     def begin_step(self, level: TimeLevel) -> None:
         """Evaluate the loads at the time level."""
-        if self._constants.set_time(level.t):
-            self.nodal_forces = self._assembler(self._form)
+        if self._form is not None and self._constants.set_time(level.t):
+            self.nodal_forces = self._weights + self._assembler(self._form)
 
     def add_nodal_forces(self, forces: Values) -> None:
         """Subtract the loads from r (owned dofs,), N."""

@@ -156,9 +156,23 @@ def _dead_loads(inputs: TermInputs) -> list[Term]:
     )
     if not tractions and not on_volume:
         return []
-    gravity = (inputs.density, on_volume["gravity"]) if "gravity" in on_volume else None
-    body_force = on_volume.get("body_force")
-    return [DeadLoads(inputs.assembler, inputs.u, tractions=tractions, gravity=gravity, body_force=body_force)]
+    gravity, weights = on_volume.get("gravity"), None
+    if gravity is not None and _has_unequal_nodal_masses(inputs):
+        # M g with the mass matrix of inertia: a body in free fall has no stress
+        mass = inputs.mass.lumped
+        weights, gravity = mass * np.tile(gravity(0.0), len(mass) // inputs.domain.dim), None
+    density_and_gravity = None if gravity is None else (inputs.density, gravity)
+    return [
+        DeadLoads(
+            inputs.assembler, inputs.u, tractions=tractions, gravity=density_and_gravity, weights=weights,
+            body_force=on_volume.get("body_force"),
+        )
+    ]  # fmt: skip
+
+
+def _has_unequal_nodal_masses(inputs: TermInputs) -> bool:
+    """Return whether M g of inertia differs from int rho g w: the lumped mass of quadratic displacement does."""
+    return inputs.scheme.inertia and inputs.mass.is_diagonal and inputs.domain.order == 2
 
 
 def _force_tractions(inputs: TermInputs) -> list[OnFacets]:
