@@ -9,11 +9,13 @@ import pytest
 from mpi4py import MPI
 
 from fracsim.deformable_run import run_study
+from fracsim.mesh.selection import select_nodes
+from fracsim.mesh.selectors import Group
 from fracsim.scene import build_scene
 from fracsim.studies.evidence import stability_studies
 from fracsim.study.reader import validate
 from support.ranks import Arrays, OnRanks
-from support.scenes import Walk
+from support.scenes import Walk, make_scene, march
 from support.solver_policy import set_policy
 
 
@@ -63,6 +65,47 @@ def test_a_sound_body_is_not_accused(tmp_path: Path, capfd: pytest.CaptureFixtur
     exact = 0.5 * lateral_stretch(study["material"], 0.5) ** 2
     assert summary["smallest_J"] == pytest.approx(exact, rel=1e-6) and summary["inverted_cells"] == 0
     assert "inside out" not in capfd.readouterr().err
+
+
+def first_step(
+    dim: int, size: list[float], h: float, order: int, axis: int, displacement: float, **material: Any
+) -> float:
+    """Reaction, N, along an axis as the right end is displaced in one step; rolling (axis 0) or clamped left end."""
+    motion: list[Any] = ["free"] * dim
+    motion[axis] = displacement
+    still = [0.0 if value != "free" else "free" for value in motion]
+    supports: list[dict[str, Any]] = [{"on": "left", "fix": "xyz"[:dim]}]
+    if axis == 0:
+        small, edge = 1e-3 * h, [1e-3 * h, *[2 * length for length in size[1:]]]
+        supports = [{"on": "left", "fix": "x"}, {"on": {"box": [[-small] * dim, [small] * dim]}, "fix": "xyz"[:dim]}]
+        if dim == 3:
+            supports.append({"on": {"box": [[-small] * 3, [*edge[:2], small]]}, "fix": "z"})
+    right = {"on": "right", "displacement": {"time": [0.0, 1.0], "value": [still, motion]}}
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": size, "h": h, "order": order},
+        material={"young": 1e6, "density": 1e3, **material},
+        boundary=[*supports, right],
+        solver={},
+        time={"scheme": "quasi-static", "step": 1.0, "end": 1.0},
+    )
+    march(scene, state, 1)
+    nodes = select_nodes(scene.domain, Group("right"))
+    return float(scene.balance.reactions.reshape(-1, dim)[nodes, axis].sum())
+
+
+@pytest.mark.parametrize(("energy", "dim", "poisson"), [("linear", 2, 0.49999), ("linear", 3, 0.4999999)])
+def test_a_nearly_incompressible_block_in_its_first_step(energy: str, dim: int, poisson: float) -> None:
+    """Uniaxial tension, E A eps in 3D and E / (1 - nu^2) A eps in 2D: |r_0| is some thousand times that."""
+    strain, size = 5e-5, [0.2, 0.1, 0.1][:dim]
+    force = first_step(dim, size, 0.05, 1, 0, 0.2 * strain, energy=energy, poisson=poisson)
+    modulus = 1e6 / (1 - poisson**2) if dim == 2 else 1e6
+    assert force == pytest.approx(modulus * 0.1 ** (dim - 1) * strain, rel=1e-4)
+
+
+def test_a_slender_cantilever_in_its_first_step() -> None:
+    """3 E I w / L^3 at a displacement of a thousandth of the thickness, L = 300 t: |r_0| is a million times that."""
+    force = first_step(2, [300.0, 1.0], 1.0, 2, 1, 1e-3, energy="stvk", poisson=0.0)
+    assert force == pytest.approx(3 * 1e6 / 12 * 1e-3 / 300.0**3, rel=1e-3)
 
 
 def test_factors_where_iterations_fail(monkeypatch: pytest.MonkeyPatch) -> None:

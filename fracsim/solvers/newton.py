@@ -69,8 +69,11 @@ UNLIMITED_COST = CostLimit()
 class ConvergenceTest:
     """Convergence test of SNES: |r| <= rtol max(|r_0|, |forces|), or below round-off.
 
-    PETSc's own test against |r_0| alone requires more digits as the first guess gets better. An attempt is also ended
-    if it costs too much, if it cycles, or if a stop was requested.
+    PETSc's own test against |r_0| alone requires more digits as the first guess gets better. A first guess may be off
+    by far more than the forces of the solution: a slender body whose end is displaced, or a nearly incompressible one.
+    While no edge is broken, |r_0| therefore counts up to a multiple of |forces|, for a few iterations.
+
+    An attempt is also ended if it costs too much, if it cycles, or if a stop was requested.
 
     Attributes:
         solved_norm: largest |r| of a solution, N.
@@ -83,6 +86,8 @@ class ConvergenceTest:
         """`rtol`: relative tolerance of the residual."""
         self._balance, self._policy, self._asked_rtol = balance, policy, rtol
         self._rtol, self._first_norm = rtol, 0.0
+        # iterations of the solve whose |r| was small beside that of the first guess, but not beside the forces
+        self._further_iterations, self._is_intact = 0, True
         self.stop_requested: Callable[[], bool] = lambda: False
         self._elimination: NonlinearElimination | None = None  # of a body with broken edges
         self._last_norm = 0.0  # |r| of the last iterate
@@ -102,6 +107,10 @@ class ConvergenceTest:
             from .nonlinear_elimination import create_elimination
 
             self._elimination = create_elimination(self._balance, self._policy)
+
+    def edges_broke(self) -> None:
+        """Let |r_0| count in full from now on: the forces of a fragment that comes loose vanish."""
+        self._is_intact = False
 
     def begin_attempt(self, limit: CostLimit, modified: ModifiedNewton | None, *, is_second: bool) -> None:
         """Begin an attempt.
@@ -181,7 +190,19 @@ class ConvergenceTest:
         if its == 0:
             # a first guess that contact has cut is off by more than any force of the step, however stiff the body
             self._first_norm = 0.0 if self._balance.contact.limits_newton_steps else norm
-        return norm <= self.norm_of_solution(self._first_norm if its else 0.0)
+            self._further_iterations = 0
+            return norm <= self.norm_of_solution(0.0)
+        if norm > self.norm_of_solution(self._first_norm):
+            return False
+        if not self._is_intact or self._further_iterations == self._policy.max_further_iterations:
+            return True
+        scale, round_off = self._balance.energies.force_scale()
+        limit = max(self._rtol * self._policy.max_first_norm_ratio * scale, round_off)
+        if norm <= limit:
+            return True
+        self._further_iterations += 1
+        self.solved_norm = limit
+        return False
 
     def norm_of_solution(self, first_norm: float) -> float:
         """Largest |r| of a solution, N, where the first guess has `first_norm`, N (collective)."""
@@ -240,6 +261,8 @@ class NewtonSolver:
     def edges_broke(self, count: int | None) -> None:
         """React to the number of edges that broke on all ranks; None: an unknown number (collective)."""
         self.linear.edges_broke(count)
+        if count != 0:
+            self._convergence.edges_broke()
         if count != 0 and self._has_line_search and not self._plain:
             self._convergence.allow_elimination()
 
