@@ -75,6 +75,31 @@ def test_work_is_energy_and_what_was_lost(approach: str, energy: str, gap: float
     assert state.dissipated > 0.2 * state.work
 
 
+@pytest.mark.parametrize("friction", (0.0, 0.3))
+def test_an_obstacle_that_breaks_a_beam_does_the_work_up_to_the_break(friction: float) -> None:
+    """All of the work is dissipated once the beam is in two, which the punch no longer touches."""
+    way = {"time": [0.0, 1.0], "value": [[0.0, 0.0], [0.0, -0.02]]}
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [0.4, 0.1], "h": 0.02, "pattern": "unstructured"},
+        material={"energy": "linear", "young": 1e6, "poisson": 0.3, "density": 1e3},
+        fracture={"strength": 7e3, "radius": 0.04},
+        brittle={"surfaces": 1},
+        boundary=[{"on": "left", "fix": "xy"}],
+        obstacle=[
+            {"name": "punch", "shape": "sphere", "radius": 0.03, "at": [0.38, 0.1302], "displacement": way}
+            | {"friction": friction}
+        ],
+        time={"scheme": "quasi-static", "step": 0.25, "end": 1.0},
+    )
+    for report in each_step(scene, state):
+        if report.broken:
+            break
+    assert report.broken and report.elastic < 1e-6
+    assert state.work == pytest.approx(state.dissipated, rel=1e-2)
+    (punch,) = scene.balance.energies.works_of_obstacles()[0]
+    assert punch > 0.3  # J; by the force after the break it was 0.13
+
+
 def test_one_pass_is_made_up_for_in_the_next_step() -> None:
     """passes = 1 ends steps out of balance; what the body loses on its way back is booked with the next one."""
     scene, state = torn_plate(fracture={"strength": 0.02, "passes": 1}, solver=DIRECT | {"snes_rtol": 1e-10})

@@ -314,6 +314,10 @@ class ObstacleGroup:
         items = zip(self.work, self.obstacles, strict=True)
         return sum(work for work, obstacle in items if not obstacle.free), self.friction_loss
 
+    def replace_work(self, work: Sequence[float]) -> None:
+        """Replace the work of each obstacle in the last step, J, by that of an earlier equilibrium in it."""
+        self.work = list(work)
+
     def history_columns(self) -> TermColumns:
         """contact_NAME_AXIS: force of the body, N; work_NAME: work on the body, J; gap_NAME: least distance, m."""
         items = list(enumerate(self.obstacles))

@@ -33,7 +33,15 @@ from .prescribed_motion import PrescribedMotion
 from .stress import Stress
 from .tangent import Tangent
 from .term import Term, TimeLevel, Values, overriding, sum_of_forms
-from .term_protocols import ContactTerms, HistoryColumns, RigidMotionTerm, StepWork, TermHistories, fulfilling
+from .term_protocols import (
+    ContactTerms,
+    HistoryColumns,
+    ObstacleWork,
+    RigidMotionTerm,
+    StepWork,
+    TermHistories,
+    fulfilling,
+)
 
 # methods of terms that are called in every step, of those terms alone that override them
 _STEP_METHODS = (
@@ -359,6 +367,7 @@ class EnergySums:
             fulfilling(balance.terms, RigidMotionTerm),
             fulfilling(balance.terms, StepWork),
         )
+        self._obstacle_groups = fulfilling(balance.terms, ObstacleWork)
 
     def kinetic_energy(self, v: Values) -> float:
         """Kinetic energy of the body and of rigid obstacles, part of this rank, J; v: (owned dofs,), m/s."""
@@ -391,6 +400,15 @@ class EnergySums:
         """Work of obstacles in the step so far less the loss by friction on them, part of this rank, J (collective)."""
         works = [owner.step_work() for owner in self._working if isinstance(owner, HistoryColumns)]
         return sum(work - dissipated for work, dissipated in works)
+
+    def works_of_obstacles(self) -> list[list[float]]:
+        """Work of each obstacle in the step so far, by groups of contact, part of this rank, J."""
+        return [list(group.work) for group in self._obstacle_groups]
+
+    def replace_works_of_obstacles(self, works: Sequence[Sequence[float]]) -> None:
+        """Replace the work of obstacles in the step by what `works_of_obstacles` returned earlier in it."""
+        for group, work in zip(self._obstacle_groups, works, strict=True):
+            group.replace_work(work)
 
     def applied_forces(self) -> Values:
         """(owned dofs,) external forces on the body at the current u, N; a copy (collective)."""

@@ -7,7 +7,7 @@ its parts, fulfils those whose methods it has. `ContactTerms` and `TermHistories
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple, Protocol, runtime_checkable
 
@@ -187,6 +187,20 @@ class StepWork(Protocol):
 
         Parts of this rank, J; asked once a step (collective).
         """
+
+
+@runtime_checkable
+class ObstacleWork(Protocol):
+    """Part of a term that records the work of obstacles in a step.
+
+    Attributes:
+        work: of each obstacle on the body in the last step, part of this rank, J.
+    """
+
+    work: list[float]
+
+    def replace_work(self, work: Sequence[float]) -> None:
+        """Replace the work by that of an earlier equilibrium in the step."""
 
 
 @runtime_checkable

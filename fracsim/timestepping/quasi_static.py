@@ -108,11 +108,13 @@ class QuasiStaticStepper(ImplicitStepper):
         path = EquilibriumPath(state.u, state.forces, state.damping, state.out_of_balance)
         broken, released, flow_loss, limit = 0, 0.0, 0.0, self.inelastic.max_passes
         first_obstacle_work, is_gradual = 0.0, self.inelastic.fracture.weakens_gradually
+        works_of_obstacles: list[list[float]] = []
         start, continues = state, self.inelastic.flow.continues
         for number in range(limit):
             self.balance.accept_step()
             if number == 0:
                 self.onset_reactions = self.balance.reactions.copy()
+                works_of_obstacles = self.balance.energies.works_of_obstacles()
                 if is_gradual:
                     first_obstacle_work = self.balance.energies.obstacle_work()
             path.continue_to(self._solution(), *balanced_forces(self.balance, lumped=False))
@@ -135,6 +137,9 @@ class QuasiStaticStepper(ImplicitStepper):
         if is_gradual:
             self.onset_reactions = self.balance.reactions.copy()
             path.omit_first_equilibrium(state, first_obstacle_work - self.balance.energies.obstacle_work())
+        else:
+            # obstacles have moved before the first equilibrium, and stand still as edges break
+            self.balance.energies.replace_works_of_obstacles(works_of_obstacles)
         energies = StepEnergies(path.work, path.lost + (released + flow_loss), result.elastic_energy)
         return self._close_step(self._end(state, dt, path), dt, solve, began, broken, energies)
 
