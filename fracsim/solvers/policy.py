@@ -131,12 +131,10 @@ class SolverPolicy:
     # aggregates may take. Measured: 38 iterations for 77 on a sheet of 234,000 tetrahedra, nu = 0.45.
     slow_iterations: int = 25
     strong_link_gain: float = 0.9
-    # Iterations as a multiple of those after a set-up, plus 2, above which coarse spaces are set up again; second:
-    # without smoothing of aggregates, whose set-up takes a fifth.
+    # Iterations as a multiple of those after a set-up, plus 2, above which coarse spaces are set up again.
     rebuild_ratio: float = 1.3
-    rebuild_ratio_fragments: float = 1.1
-    # Iterations of a fresh set-up as a multiple of those of the whole body, plus 2, above which aggregates are not
-    # smoothed any more. Measured: a step in 0.85 of the time (33,000 tetrahedra, 10 planes), 0.7 after 100 planes.
+    # Iterations of a fresh set-up as a multiple of those of the whole body, plus 2, above which sweeps of SSOR may
+    # serve a broken body.
     fragmented_ratio: float = 1.5
     # Edges that broke for each node of the body, after which operators are refreshed; the V cycle is judged by its
     # iterations alone. Measured: a jelly that tears is set up in two steps of six in place of five.

@@ -40,20 +40,6 @@ GAMG_OPTIONS: PetscOptions = {
     "mg_levels_ksp_max_it": 2,
     "mg_levels_pc_type": "jacobi",
 }
-# A body in fragments: aggregates without smoothing cost a fifth of the set-up; a sweep of SSOR smooths what hangs.
-FRAGMENT_OPTIONS: PetscOptions = {
-    "pc_gamg_agg_nsmooths": 0,
-    "mg_levels_ksp_type": "richardson",
-    "mg_levels_ksp_max_it": 1,
-    "mg_levels_pc_type": "sor",
-}
-# A body for which FRAGMENT_OPTIONS have failed: the options from before.
-WHOLE_BODY_OPTIONS: PetscOptions = {
-    "pc_gamg_agg_nsmooths": 1,
-    "mg_levels_ksp_type": "chebyshev",
-    "mg_levels_ksp_max_it": 2,
-    "mg_levels_pc_type": "jacobi",
-}
 MULTIGRID_TYPES = ("gamg", "mg", "ml")
 SSOR_OPTIONS: PetscOptions = {"pc_type": "sor"}
 MULTIGRID_OPTIONS: PetscOptions = {"pc_type": "gamg"}
@@ -270,12 +256,11 @@ class Preconditioner:
         self._whole_iterations = 0  # of a fresh set-up while the body was whole
         self._extra_iterations = 0.0  # beyond the fresh ones since it was rebuilt
         self._extra_at_refresh = 0.0
-        # whether multigrid of another kind is used for a body in fragments, which inertia has to hold
-        self._may_suit_fragments = is_default and balance.scheme.inertia
+        # whether sweeps may come to serve a body in fragments, which inertia has to hold
+        self._may_use_ssor = is_default and balance.scheme.inertia
         # iterations with aggregates of all links, while strong ones are on trial; 0: unknown; None: settled
-        self._all_links_iterations: int | None = 0 if self._may_suit_fragments else None
-        self._uses_ssor: bool | None = None  # of a body in fragments; None: it is in one piece
-        self._rebuild_ratio = policy.rebuild_ratio
+        self._all_links_iterations: int | None = 0 if self._may_use_ssor else None
+        self._uses_ssor: bool | None = None  # of a body in fragments; None: multigrid takes few iterations
 
     # --- facts ---
 
@@ -304,15 +289,8 @@ class Preconditioner:
         self._iterations, self._equivalent = iterations, equivalent
 
     def solve_failed(self) -> None:
-        """Record that a solve failed: smoothers of an older tangent need not be positive for this one (collective).
-
-        Multigrid of another kind for fragments is given up. It does not solve for changed nodes exactly, as is done
-        beside the V cycle: CG may not converge while a body tears.
-        """
+        """Record that a solve failed: smoothers of an older tangent need not be positive for this one."""
         self._due = Update.REBUILD
-        if self._uses_ssor is False:
-            self._rebuild_ratio = self._policy.rebuild_ratio
-            self.applied.change_kind(WHOLE_BODY_OPTIONS)
 
     def tangent_was_indefinite(self) -> None:
         """Record that the last tangent was indefinite: what was set up for it is set up again for the next one."""
@@ -356,7 +334,7 @@ class Preconditioner:
         # Too many iterations. Also where a refresh is due: coarse spaces from before a crack carry the motion of one
         # side to the other.
         fresh = self._fresh_iterations
-        if self.applied.vcycle is None and fresh and equivalent > self._rebuild_ratio * fresh + 2:
+        if self.applied.vcycle is None and fresh and equivalent > policy.rebuild_ratio * fresh + 2:
             self._due = Update.REBUILD
         # Factors and coarse spaces of another pattern would be written past the end of their arrays.
         if self._pattern_is_new or (self._due == Update.REFRESH and not self.applied.keeps_coarse_spaces):
@@ -402,8 +380,8 @@ class Preconditioner:
             self._whole_iterations = self._whole_iterations or equivalent
             limit = self._policy.fragmented_ratio * self._whole_iterations + 2
             has_short_steps = mass_stiffness_ratio(self._balance) > self._policy.min_ssor_inertia_broken
-            if self._ever_broken and self._may_suit_fragments and (equivalent > limit or has_short_steps):
-                self._suit_fragments()
+            if self._ever_broken and self._may_use_ssor and (equivalent > limit or has_short_steps):
+                self._uses_ssor, self._may_use_ssor = False, False  # from now on the step size decides
         if not self._keeps:
             self._due = max(self._due, Update.REFRESH)
 
@@ -424,14 +402,6 @@ class Preconditioner:
             self._change_kind(ALL_LINKS if all_links else strong)
             self._fresh_iterations = 0
         return is_worse
-
-    def _suit_fragments(self) -> None:
-        """Aggregate without smoothing from now on, if inertia holds fragments that hang by a node (collective)."""
-        if mass_stiffness_ratio(self._balance) <= self._policy.max_deflated_inertia:
-            return
-        self._may_suit_fragments = self._uses_ssor = False
-        self._rebuild_ratio = self._policy.rebuild_ratio_fragments
-        self._change_kind(FRAGMENT_OPTIONS)
 
     def _change_kind(self, options: PetscOptions) -> None:
         self._due = Update.REBUILD
