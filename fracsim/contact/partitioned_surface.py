@@ -30,9 +30,9 @@ from ..mesh.split_surface.closed_surface import SplitSurface, build_split_surfac
 from ..mesh.split_surface.drawn_surface import DrawnSurface
 from ..mesh.split_surface.entity_numbering import EntityNumbering
 from ..mesh.split_surface.fragment_surface import (
+    OpenEdges,
     PlanarPoints,
     build_surface_of_open_edges,
-    find_open_edges,
     moves_alike,
     project_onto_fragments,
 )
@@ -107,8 +107,7 @@ class PartitionedSurface[Part: SurfacePart[Any]]:
     _path: ExchangePath  # for which elements were exchanged
     start_displacement: Values | None = None
     _cuts: CutPositions | None = None
-    # pattern, open edges and loose nodes of the current surface, in contact between fragments
-    _open: tuple[Pattern, Flags, Flags] | None = None
+    _open: OpenEdges | None = None  # of the current surface, in contact between fragments
     _restored: SurfaceState | None = None
     # values at the nodes of all points, and of this rank's points
     _nodes: NodeExchange | None = None
@@ -250,14 +249,13 @@ class PartitionedSurface[Part: SurfacePart[Any]]:
         if not self.law.fragments_only:
             return build_split_surface(self._topology, cells, self._cut_positions())
         minima = partial(min_over_ranks, self._domain.space.dofmap.index_map)
-        apart, loose, _ = find_open_edges(self._topology, cells, minima, self._node_fragments)
-        state = cells, apart, loose
+        edges = OpenEdges.find(self._comm, self._topology, cells, minima, self._node_fragments)
         # most edges break within fragments
-        same = self._open is not None and moves_alike(self._topology, state, self._open)
-        self._open = state
+        same = self._open is not None and moves_alike(self._topology, edges, self._open)
+        self._open = edges
         if self._comm.allreduce(same, op=MPI.LAND):
             return None
-        return build_surface_of_open_edges(self._topology, apart, loose, self._cut_positions())
+        return build_surface_of_open_edges(self._topology, edges, self._cut_positions())
 
     def _node_fragments(self, broken: Flags) -> Ints:
         """(N,) fragment of each node of this rank for `broken` edges (E,) (collective)."""

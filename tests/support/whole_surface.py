@@ -9,7 +9,7 @@ from scipy.sparse import csr_matrix
 from fracsim.mesh.simplices import is_split
 from fracsim.mesh.split_surface.closed_surface import SplitSurface, SurfacePoints
 from fracsim.mesh.split_surface.entity_numbering import EntityNumbering
-from fracsim.mesh.split_surface.fragment_surface import build_surface_of_open_edges, find_open_edges, moves_alike
+from fracsim.mesh.split_surface.fragment_surface import OpenEdges, build_surface_of_open_edges, moves_alike
 from fracsim.mesh.split_surface.mesh_part import WholeMesh
 from fracsim.mesh.split_surface.surface_map import SurfaceMap, gradient_entries
 
@@ -23,20 +23,17 @@ def build_fragment_surface(topology: EntityNumbering, pattern: Patterns, cut: Va
 
     Edges between fragments, and to loose nodes, are open. `cut`: (E,) as in build_surface_of_open_edges.
     """
-    apart, loose = _open_edges(topology, pattern)
-    return build_surface_of_open_edges(topology, apart, loose, cut)
+    return build_surface_of_open_edges(topology, _open_edges(topology, pattern), cut)
 
 
-def _open_edges(topology: EntityNumbering, pattern: Patterns) -> tuple[Flags, Flags]:
+def _open_edges(topology: EntityNumbering, pattern: Patterns) -> OpenEdges:
     part = WholeMesh(topology)
-    apart, loose, _ = find_open_edges(topology, pattern, part.least, lambda broken: part.find_fragments(broken)[1])
-    return apart, loose
+    return OpenEdges.find(part.comm, topology, pattern, part.least, lambda broken: part.find_fragments(broken)[1])
 
 
 def has_same_fragments(topology: EntityNumbering, pattern: Patterns, before: Patterns) -> bool:
     """Whether the surface of fragments is the same for two damage patterns (C,), and moves alike with the nodes."""
-    edges, before_edges = (_open_edges(topology, of_time) for of_time in (pattern, before))
-    return moves_alike(topology, (pattern, *edges), (before, *before_edges))
+    return moves_alike(topology, *(_open_edges(topology, of_time) for of_time in (pattern, before)))
 
 
 def make_surface_map(
