@@ -1,4 +1,4 @@
-"""Nodes that the surface of contact follows stay where others are relaxed separately, and others do not move it."""
+"""Nodes in contact stay where others are relaxed separately; all of the surface stay where these would collide."""
 
 from __future__ import annotations
 
@@ -57,17 +57,24 @@ def test_the_surface_moves_with_these_nodes_alone(dim: int) -> None:
     assert 0.1 < followed.mean() < 0.95
 
 
+@pytest.mark.parametrize("collides", [False, True])
 @pytest.mark.parametrize("dim", [2, 3])
-def test_nodes_come_to_rest_beside_contact_that_stays(dim: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nodes_come_to_rest_beside_contact_that_stays(
+    dim: int, collides: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     policy = set_policy(monkeypatch, max_relaxed_nodes=0.5)
     scene, state, term = torn_block(dim)
     balance, u = scene.balance, closing(scene, term)
     balance.begin_step(state.t, 5e-3, u.reshape(-1), *(0 * u.reshape(-1),) * 2)
     balance.set_displacement(u.reshape(-1))
-    stays, forces = term.followed_nodes(), term.contact_forces()
+    followed, forces = term.followed_nodes(), term.contact_forces()
+    stays = followed if collides else term.nodes_in_contact()
+    assert followed[stays].all()
+    if collides:
+        monkeypatch.setattr(term, "max_step_fraction", lambda change: 0.5)
     assert forces is not None and np.abs(forces).max() > 0
     forces = forces.copy()
-    node = np.flatnonzero(~stays)[3]
+    node = np.flatnonzero(~followed)[3]
     u[node] += 0.1 * scene.domain.mean_edge_length
     balance.set_displacement(u.reshape(-1))
     before = np.linalg.norm(balance.update_forces().reshape(u.shape)[node])
@@ -77,6 +84,7 @@ def test_nodes_come_to_rest_beside_contact_that_stays(dim: int, monkeypatch: pyt
     moved = np.abs(balance.u.x.array.reshape(u.shape) - u).max(axis=1) > 0
     assert moved[node] and not moved[stays].any()
     assert np.linalg.norm(after[moved]) < 0.05 * before
+    assert moved[followed].any() != collides
     assert np.array_equal(term.contact_forces(), forces)
 
 

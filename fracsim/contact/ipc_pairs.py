@@ -219,6 +219,11 @@ class ActivePairs:
         samples = self.kind.samples
         return samples.hessian(self.kind.barrier.hessian(self.pairs, samples.mesh, self.positions, projection))
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is no pair."""
+        return len(self.pairs) == 0
+
     def least_squared_distance(self) -> float:
         """Least squared distance of a pair, m^2."""
         return float(self.pairs.compute_minimum_distance(self.kind.samples.mesh, self.positions))
@@ -318,30 +323,30 @@ class IpcPairs:
         self._active_positions: Values = np.empty(0)
 
     def _active_pairs(self, vertices: Values) -> list[ActivePairs]:
-        """Pairs of each kind on which its barrier acts; those of the last positions are kept."""
+        """Pairs on which barriers act, of each kind with any; those of the last positions are kept."""
         if not self._active or not np.array_equal(vertices, self._active_positions):
             items = zip(self._kinds, self._search.pairs(vertices), strict=True)
             self._active = [kind.active_pairs(near, vertices) for kind, near in items]
             self._active_positions = vertices.copy()
-        return self._active
+        return [pairs for pairs in self._active if not pairs.is_empty]
 
     # --- barrier ---
 
     def energy(self, x: Values) -> float:
         """Energy E(x) of this rank's pairs, J."""
-        vertices = x[self._points]
-        return sum(pairs.energy() for pairs in self._active_pairs(vertices))
+        return sum((pairs.energy() for pairs in self._active_pairs(x[self._points])), 0.0)
 
     def gradient(self, x: Values) -> Values:
         """(n, d) dE/dx of this rank's pairs, N: minus the forces on the points."""
         vertices = x[self._points]
-        total = sum(pairs.gradient() for pairs in self._active_pairs(vertices))
+        total = sum((pairs.gradient() for pairs in self._active_pairs(vertices)), np.zeros(vertices.size))
         return gradient_at_points(total, self._points, x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2 of this rank's pairs, N/m; unless `exact`, each without its negative eigenvalues."""
         vertices, method = x[self._points], projection(exact=exact)
-        total = sum(pairs.hessian(method) for pairs in self._active_pairs(vertices))
+        none = csr_matrix((vertices.size, vertices.size))
+        total = sum((pairs.hessian(method) for pairs in self._active_pairs(vertices)), none)
         return hessian_at_points(total, self._points, x.shape)
 
     def set_stiffness(self, stiffness: float) -> None:
@@ -358,7 +363,7 @@ class IpcPairs:
     def min_gap(self, x: Values) -> float:
         """Least distance of this rank's pairs on which the barrier acts, m; infinite where there is none."""
         active = self._active_pairs(x[self._points])
-        return float(np.sqrt(min(pairs.least_squared_distance() for pairs in active)))
+        return float(np.sqrt(min((pairs.least_squared_distance() for pairs in active), default=np.inf)))
 
     # --- friction ---
 

@@ -385,9 +385,12 @@ class PartitionedSurface[Part: SurfacePart[Any]]:
         """(owned dofs,) nodal forces W^T f equivalent to forces (n, d) at the points, N (collective)."""
         return self.sum_at_nodes(self.current.point_map.nodal_forces(forces))
 
-    def followed_nodes(self) -> Flags:
-        """(owned nodes,) flags of the nodes that points follow (collective)."""
-        parts = np.ones((len(self.current.columns), self._domain.dim))
+    def nodes_of_points(self, points: Flags | None = None) -> Flags:
+        """(owned nodes,) flags of the nodes that points follow: flagged ones (n,), or all (collective)."""
+        counts: Values = np.ones(len(self.current.columns))
+        if points is not None:
+            counts = abs(self.current.point_map.weights).T @ points.astype(float)
+        parts = np.repeat(counts[:, None], self._domain.dim, axis=1)
         return np.asarray(self.sum_at_nodes(parts).reshape(-1, self._domain.dim)[:, 0] > 0)
 
     def extend_faces(self, u: Values) -> None:

@@ -166,19 +166,20 @@ class IpcFriction:
     def gradient(self, x: Values) -> Values:
         """(n, d) dE/dx, N: minus the forces on the points."""
         motion = self._motion(x)
-        total = sum(
+        of_parts = (
             samples.gradient(self.potential.gradient(pairs, samples.mesh, samples.positions(motion)))
             for samples, pairs in self.parts
         )
-        return gradient_at_points(total, self.points, x.shape)
+        return gradient_at_points(sum(of_parts, np.zeros(motion.size)), self.points, x.shape)
 
     def hessian(self, x: Values, *, exact: bool = False) -> csr_matrix:
         """(n d, n d) d2E/dx2, N/m; unless `exact`, each pair without its negative eigenvalues."""
         motion, method = self._motion(x), projection(exact=exact)
-        total = sum(
+        of_parts = (
             samples.hessian(self.potential.hessian(pairs, samples.mesh, samples.positions(motion), method))
             for samples, pairs in self.parts
         )
+        total = sum(of_parts, csr_matrix((motion.size, motion.size)))
         return hessian_at_points(total, self.points, x.shape)
 
     def _motion(self, x: Values) -> Values:

@@ -166,7 +166,7 @@ class SurfaceContact(Term):
 
     def followed_nodes(self) -> Flags:
         """(owned nodes,) flags of the nodes that points of the surface follow (collective)."""
-        return self.surface.followed_nodes()
+        return self.surface.nodes_of_points()
 
     # --- forces, tangent and energy ---
 
@@ -339,6 +339,11 @@ class SelfContact(SurfaceContact):
         midpoints, flags = (np.concatenate(values) for values in zip(*parts, strict=True))
         order = np.lexsort(midpoints.T[::-1])
         return midpoints[order], flags[order]
+
+    def nodes_in_contact(self) -> Flags:
+        """(owned nodes,) flags of the nodes that points in contact follow (collective)."""
+        acts = self.contacts[0].gradient(self.end_positions()).any(axis=1)
+        return self.surface.nodes_of_points(np.asarray(acts))
 
     # --- step limits ---
 

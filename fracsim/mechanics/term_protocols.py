@@ -129,6 +129,17 @@ class FollowingSurface(Protocol):
 
 
 @runtime_checkable
+class MovableSurface(FollowingSurface, StepLimiter, Protocol):
+    """Contact in which nodes away from contact may move as far as steps are not limited."""
+
+    def nodes_in_contact(self) -> npt.NDArray[np.bool_]:
+        """(owned nodes,) flags of the nodes that points in contact follow (collective)."""
+
+    def potential(self) -> float:
+        """As of Term (collective)."""
+
+
+@runtime_checkable
 class InitialGuess(Protocol):
     """Term that moves an initial guess to where no gap is closed."""
 

@@ -9,9 +9,10 @@ on the whole body for their sake. If an iteration has not reduced |r| to a tenth
 with the stiffness k of ties (mechanics.node_ties) and the potential E of contact with analytic obstacles. Connected
 nodes make a *patch*; where there is contact all nodes are one. A trust-region method with exact tangents finds the
 minima of all patches at once, also through a snap-through; at a minimum the exact tangent of the body is positive, too.
-Contact shortens its steps as it shortens Newton's; obstacles stay. With contact of other kinds all nodes stay that the
-points of its surface follow. The solution of the step is the same. Every rank does the same computation; only cells and
-contact are evaluated by their owners.
+Contact shortens its steps as it shortens Newton's; obstacles stay. With contact of other kinds the nodes stay that
+points in contact follow. If others collide, or come into contact, all nodes stay that points of the surface follow, as
+they do before obstacles from files. The solution of the step is the same. Every rank does the same computation; only
+cells and contact are evaluated by their owners.
 
 Sources: Lanzkron, Rose and Wilkes, SIAM J. Sci. Comput. 17, 1996; Cai and Keyes, 24, 2002; Steihaug, SIAM J. Numer.
 Anal. 20, 1983.
@@ -27,6 +28,7 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from mpi4py import MPI
 from scipy.sparse import bsr_array, coo_array, csr_array, csr_matrix, sparray
 from scipy.sparse.csgraph import connected_components
 
@@ -37,6 +39,7 @@ from ..mechanics.term_protocols import (
     ContactPatch,
     EliminatingTerm,
     FollowingSurface,
+    MovableSurface,
     PatchContactTerm,
     StepLimiter,
     TieTerm,
@@ -147,18 +150,46 @@ class NonlinearElimination:
         Returns:
             Whether any node has moved.
         """
-        self._free = self._not_prescribed.copy()
-        for surface in self._surfaces:
-            self._free.reshape(-1, self._balance.domain.dim)[surface.followed_nodes()] = 0.0
+        movable = [surface for surface in self._surfaces if isinstance(surface, MovableSurface)]
+        moved = self._relax(solved_norm, movable)
+        return bool(self._relax(solved_norm, []) if moved is None else moved)
+
+    def _relax(self, solved_norm: float, movable: Sequence[MovableSurface]) -> bool | None:
+        """Relax nodes; whether any has moved, None if that was undone (collective).
+
+        Args:
+            solved_norm: |r| of a solution of the body, N.
+            movable: surfaces of which nodes in contact stay; of others all nodes stay that points follow. Motions are
+                undone where they would collide or come into contact.
+        """
+        balance, self._free = self._balance, self._not_prescribed.copy()
+        free_nodes = self._free.reshape(-1, balance.domain.dim)
+        staying = [surface.nodes_in_contact() for surface in movable]
+        staying += [surface.followed_nodes() for surface in self._surfaces if surface not in movable]
+        for flags in staying:
+            free_nodes[flags] = 0.0
         nodes = self._dominant_nodes()
         if not len(nodes):
             return False
         region = self._make_region(nodes)
-        moved = minimise_patches(region, solved_norm, self._balance.domain.mean_edge_length, self._policy)
-        u = self._balance.u.x.array[: self._balance.owned_dof_count].copy()
+        if not minimise_patches(region, solved_norm, balance.domain.mean_edge_length, self._policy):
+            return False
+        u = balance.u.x.array[: balance.owned_dof_count].copy()
         region.displace(np.zeros(region.shape))  # terms are told of a change alone
-        self._balance.set_displacement(u)
-        return moved
+        start, comm = balance.u.x.array[: balance.owned_dof_count].copy(), balance.domain.comm
+        fraction = min((surface.max_step_fraction(u - start) for surface in movable), default=1.0)
+        if comm.allreduce(fraction, op=MPI.MIN) < 1:
+            return None
+        potential = self._contact_potential(movable)
+        balance.set_displacement(u)
+        if self._contact_potential(movable) > potential:
+            balance.set_displacement(start)
+            return None
+        return True
+
+    def _contact_potential(self, surfaces: Sequence[MovableSurface]) -> float:
+        """Potential of contact at the current u, J (collective)."""
+        return float(sum_over_ranks(self._balance.domain.comm, sum(surface.potential() for surface in surfaces))[0])
 
     def _dominant_nodes(self) -> Ints:
         """Return the global numbers of the nodes that hold `relaxed_share` of |r|^2 (collective).
