@@ -318,6 +318,11 @@ class PartitionedSurface[Part: SurfacePart[Any]]:
         self.current.is_new = state.is_new
         self._keep_history(previous)
 
+    def exchange_again(self) -> None:
+        """Exchange elements at the current displacement, as a run does that resumes from here (collective)."""
+        self.start_displacement, self._restored = None, self.snapshot()
+        self.refresh(self._current_u)
+
     def _serves(self, displacements: Sequence[Values]) -> bool:
         """Whether no element can be missing at displacements (owned dofs,), m, or between (collective)."""
         if self._comm.size == 1 or not np.isfinite(self._margin):

@@ -271,8 +271,9 @@ class SurfaceContact(Term):
         self._tangent_displacement = None
 
     def clear_search(self) -> None:
-        """Discard the candidates of collision detection (not collective)."""
+        """Discard the candidates of collision detection, and exchange elements again (collective)."""
         self._is_stale = True
+        self.surface.exchange_again()
         for part in self.contacts:
             part.pairs.clear_caches()
 
