@@ -249,6 +249,20 @@ def test_a_block_on_a_slope(share: float, sticks: bool, facets: bool) -> None:
         assert (after - before) / (steps / 2 * 0.01) == pytest.approx(down[0] + share * slope * down[1], rel=0.05)
 
 
+@pytest.mark.parametrize("end", [0.1, 3600.0])
+def test_a_slow_test_has_the_friction_of_a_fast_one(end: float) -> None:
+    """A plate is drawn along a block within `end` seconds, under mu times the normal force."""
+    way = {"time": [0.0, end / 10, end], "value": [[0.0, 0.0], [0.0, 0.02], [0.4, 0.02]]}
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": [1.0, 0.5], "h": 0.25}, material=SOFT, solver=FINE,
+        boundary=[{"on": "top", "fix": "xy"}], obstacle=[floor(-0.001, friction=0.3) | {"displacement": way}],
+        time={"scheme": "quasi-static", "step": end / 20, "end": end},
+    )  # fmt: skip
+    march(scene, state)
+    tangential, normal = np.abs(scene.balance.reactions.reshape(-1, 2).sum(axis=0))
+    assert tangential == pytest.approx(0.3 * normal, rel=1e-3)
+
+
 @pytest.mark.parametrize("dim", [2, 3])
 def test_friction_acts_between_corners(dim: int) -> None:
     """A ball of a tenth of a facet pressed into the middle of one and dragged over it: what it is held back by is mu

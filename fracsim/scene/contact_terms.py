@@ -52,7 +52,8 @@ class ContactDefaults:
             a thousandth of the distance, and Newton's method takes 20 iterations in place of 6.
         added_frequency: what the penalty of explicit steps may add to the square of the highest frequency of the body,
             relative to it. Steps are at least 0.82 of those without contact.
-        creep: sizes of the body per second; speed below which friction sticks.
+        creep: sizes of the body per second, or in the whole run if that takes longer: a slow test has the friction of a
+            fast one. Speed below which friction sticks.
         creep_ratio: likewise, in the speed of the nodes relative to their mean or an obstacle from a file, and in the
             largest slip velocity at the start of a step for others. Fragments at metres a second that change from
             sticking to slipping within micrometres a second take forty Newton iterations in place of fourteen, a
@@ -101,7 +102,7 @@ def build_obstacle_terms(
         barrier, make_term = Penalty, partial(PenaltyObstacleTerm, mass=mass, max_added=limit)
     else:
         limit = np.inf
-    law = _obstacle_law(contact, domain, stress.material, barrier)
+    law = _obstacle_law(study, domain, stress.material, barrier)
     mesh_stiffness = contact.stiffness or DEFAULTS.self_stiffness * _max_young(domain, stress.material)
 
     def make(moved: Sequence[RigidObstacle], law: ObstacleLaw) -> ObstacleTerm:
@@ -248,7 +249,7 @@ def _build_mesh_obstacle_term(
     contact, material = _contact(study), stress.material
     stiffness = contact.stiffness or DEFAULTS.self_stiffness * _max_young(domain, material)
     law = retractable_surface.SelfContactLaw(
-        _obstacle_law(contact, domain, material).barrier.width, stiffness, 0.0, obstacle_law.sticking_speed,
+        _obstacle_law(study, domain, material).barrier.width, stiffness, 0.0, obstacle_law.sticking_speed,
         obstacle_law.sticking_ratio, corners_only=_uses_corners_only(study),
     )  # fmt: skip
     make: Callable[..., Any] = partial(MeshObstacleTerm, domain, u, motion, numbers)
@@ -313,7 +314,7 @@ def _build_self_contact(
         contact.distance or distance_ratio * domain.mean_edge_length,
         contact.stiffness or DEFAULTS.self_stiffness * _max_young(domain, material),
         contact.friction,
-        contact.creep or DEFAULTS.creep * domain.bounds.diagonal,
+        contact.creep or _default_creep(study, domain),
         0.0 if contact.creep else DEFAULTS.creep_ratio,
         contact.itself == "pieces",
         _uses_corners_only(study),
@@ -352,13 +353,19 @@ def _uses_corners_only(study: Study) -> bool:
 
 
 def _obstacle_law(
-    contact: ContactSettings, domain: Domain, material: MaterialFields, barrier: type[Barrier | Penalty] = Barrier
+    study: Study, domain: Domain, material: MaterialFields, barrier: type[Barrier | Penalty] = Barrier
 ) -> ObstacleLaw:
     """Return the law of obstacles with a barrier or a penalty (collective)."""
+    contact = _contact(study)
     distance = contact.distance or DEFAULTS.distance * domain.mean_edge_length
     stiffness = contact.stiffness or DEFAULTS.stiffness * _max_young(domain, material)
-    creep = contact.creep or DEFAULTS.creep * domain.bounds.diagonal
+    creep = contact.creep or _default_creep(study, domain)
     return ObstacleLaw(barrier(stiffness, distance), creep, 0.0 if contact.creep else DEFAULTS.creep_ratio)
+
+
+def _default_creep(study: Study, domain: Domain) -> float:
+    """Return the sliding speed below which friction sticks if the study gives none, m/s."""
+    return DEFAULTS.creep * domain.bounds.diagonal / max(1.0, study.time.end)
 
 
 def _max_young(domain: Domain, material: MaterialFields) -> float:

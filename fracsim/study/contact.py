@@ -177,6 +177,6 @@ class ContactSettings(StudyTable):
     )
     creep: Positive | None = key(
         "Sliding speed below which friction counts as sticking.", "m/s", default=None, example=1e-3,
-        otherwise="1e-3 of the body's size per second; at least 0.05 of the speed of fragments, and of the largest "
-        "sliding speed at an obstacle",
+        otherwise="1e-3 of the body's size per second, or per run if that is longer; at least 0.05 of the speed of "
+        "fragments, and of the largest sliding speed at an obstacle",
     )  # fmt: skip
