@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +17,7 @@ pytest.importorskip("mujoco", reason="an environment made without a network")
 
 import mujoco
 
+import fracsim
 from fracsim.rigid import contact_solver
 from fracsim.rigid.face_contacts import FaceContacts
 from fracsim.rigid_run import contact_notes
@@ -80,7 +83,7 @@ def test_a_stack_slides_below_the_limit_of_friction(friction: float, slides: boo
     "limits",
     [
         {"newton_iterations": 1, "direct_iterations": 1, "compliance_factors": (1.0,)},
-        {"max_newton_contacts": 1, "gradient_work": 1, "gradient_iterations": 1},
+        {"max_newton_contacts": 1, "max_difficult_contacts": 0, "gradient_work": 1, "gradient_iterations": 1},
     ],
     ids=["Newton", "projected gradients"],
 )
@@ -95,6 +98,14 @@ def test_a_solve_that_ends_early_is_told(limits: dict[str, Any], monkeypatch: py
     (note,) = contact_notes([(state.t, report.contact_error), (0.01, 1e-9)])
     assert "did not converge in 2 steps" in note and f"t = 0.005 s are off by up to {report.contact_error:.2g}" in note
     assert not contact_notes([])
+
+
+def test_contact_of_a_slab_that_is_shot_through_converges(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """A thousand contacts, of which some close only by the impulses of others, in the step of the impact."""
+    fracsim.run("rigid-slab", tmp_path / "out", overrides=["time.end=0.002", "output.picture=false"])
+    assert "did not converge" not in capfd.readouterr().err
+    with (tmp_path / "out" / "history.csv").open() as file:
+        assert int(list(csv.DictReader(file))[-1]["broken_edges"]) > 5000
 
 
 # --- points of faces ---

@@ -60,11 +60,12 @@ class ContactSolverSettings:
         slip_rounds: largest number of updates of the slip speeds.
         slip_tolerance: c_0; the slip speeds are accepted when mu times their change is below.
         max_newton_contacts: contacts in an event above which projected gradients take over.
+        max_difficult_contacts: contacts up to which Newton's method is used where projected gradients do not converge.
         gradient_tolerance: c_0; accepted error of velocities.
         gradient_iterations: least number of iterations that projected gradients may take.
         gradient_work: contacts times iterations that they may take in any case.
         search_rounds: largest number of searches for contacts that were left out.
-        rough_iterations: iterations of a rough solution, and of searches after the first one.
+        rough_iterations: iterations of a rough solution.
         obstacle_mass: mass of a driven obstacle in MuJoCo, in masses of all bodies.
         bytes_per_body: memory for MuJoCo's arena.
         min_bytes: least memory for it.
@@ -76,13 +77,14 @@ class ContactSolverSettings:
     direct_iterations: int = 60
     compliance_factors: tuple[float, ...] = (100.0, 10.0, 1.0)
     island_rows: int = 300
-    slip_rounds: int = 10
+    slip_rounds: int = 30
     slip_tolerance: float = 0.02
     max_newton_contacts: int = 300
+    max_difficult_contacts: int = 1500
     gradient_tolerance: float = 0.01
     gradient_iterations: int = 150
     gradient_work: int = 3_000_000
-    search_rounds: int = 3
+    search_rounds: int = 6
     rough_iterations: int = 30
     obstacle_mass: float = 1e6
     bytes_per_body: int = 2**18
@@ -301,6 +303,8 @@ class ContactSolver:
             return np.zeros((len(event.bodies), 6)), ContactImpulses.empty(), True
         if has_many_contacts(event):
             force, accurate = self._solve_by_gradients(event, rough=rough), not rough
+            if accurate and self.error and np.count_nonzero(event.active) <= SETTINGS.max_difficult_contacts:
+                force = self._solve_by_newton(event, obstacle_points)
         else:
             force, accurate = self._solve_by_newton(event, obstacle_points), True
         rows = np.flatnonzero(event.impulse[:, 0] > 0)
@@ -350,14 +354,14 @@ class ContactSolver:
         rates, threshold = event.bounds.obstacle_velocity, self._parameters.impact_threshold
         inverse = bodies.rotation @ model.inverse_inertia @ np.swapaxes(bodies.rotation, 1, 2)
         free = velocities_of_all(self.apply_forces(event, np.zeros((len(bodies), 6))), rates)
-        for search in range(1 if rough else SETTINGS.search_rounds):
+        for _ in range(1 if rough else SETTINGS.search_rounds):
             rows = np.flatnonzero(event.active)
             contacts = event.contacts.select(rows)
             approach_rate: Values = np.asarray(event.constraints.allowed_approach[rows] / dt)
             relative = contacts.relative_velocities(*free)
             system = ProjectedGradientSolver.assemble(contacts, relative, approach_rate, model.mass, inverse)
             iterations = max(SETTINGS.gradient_iterations, SETTINGS.gradient_work // max(len(rows), 1))
-            if rough or search:
+            if rough:
                 iterations = SETTINGS.rough_iterations
             event.impulse[rows], self.error = system.solve(
                 SETTINGS.gradient_tolerance * threshold, iterations, event.impulse[rows]
