@@ -38,6 +38,21 @@ def test_a_fast_body_flies_on_in_short_steps(velocity: float, step: float) -> No
     assert np.allclose((mass * u).sum(axis=0) / mass.sum(), [velocity * step * 20, 0, 0], rtol=1e-12, atol=0.02 * step)
 
 
+@pytest.mark.parametrize("dim", [2, 3])
+def test_a_body_of_flat_cells_flies_on(dim: int) -> None:
+    """Cells 1e4 times as long as thick: the round-off of their forces is that of Y V / altitude^2 times u."""
+    size = [1.0, 1e-4, 0.3][:dim]
+    scene, state = make_scene(
+        mesh={"builder": "box", "size": size, "h": 0.1},
+        material={"energy": "neo-hookean", "young": 1e6, "poisson": 0.3, "density": 1e3},
+        initial={"velocity": [1.0, 2.0, -0.5][:dim]},
+        solver={},
+        time={"scheme": "newmark", "step": 0.01, "end": 0.1, "adapt": False},
+    )
+    assert len(march(scene, state)) == 10
+    np.testing.assert_allclose(state.v.reshape(-1, dim), np.tile([1.0, 2.0, -0.5][:dim], (len(state.v) // dim, 1)))
+
+
 def collapsed(energy: str) -> dict[str, Any]:
     """Saint Venant-Kirchhoff in uniaxial tension: E_t = -nu E_1, so that l_t^2 = 1 - nu (l_1^2 - 1) is negative beyond
     l_1 = 2.08 for nu = 0.3: there is no such body.

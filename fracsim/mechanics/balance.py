@@ -24,6 +24,7 @@ from ..forms.schemes import Scheme
 from ..mesh.dolfinx_compat import apply_lifting
 from ..mesh.domain import Domain
 from ..mesh.parallel import sum_over_ranks
+from ..mesh.small_matrices import barycentric_gradients
 from .contact_time_weights import ContactTimeWeights, acceleration_change
 from .eliminated_unknowns import EliminatedUnknowns
 from .inertia import MassMatrix
@@ -428,8 +429,8 @@ class EnergySums:
         """(size, round-off) of the forces in the residual, N, as root sums of squares over all dofs (collective).
 
         Size is the largest norm of the reactions and of the terms' reference forces. Round-off is eps times the norms
-        of what the residual consists of: the stiffness Y h^(d-2) of a node times the extent of the body and its
-        displacement, and M c_a u.
+        of what the residual consists of: the stiffness Y h^(d-2) of a node times the extent of the body, the stiffness
+        of its cells times its displacement, and M c_a u.
         """
         balance = self._balance
         u = balance.u.x.array[: balance.owned_dof_count]
@@ -445,8 +446,11 @@ class EnergySums:
             sum_over_ranks(self._comm, np.array([np.sum(np.square(part)) for part in parts]))
         )
         (stiffness, extent), eps = self._node_stiffness, np.finfo(float).eps
+        cell_stiffness = max(stiffness, self._cell_stiffness)
         # eight times: so much is left of a body far from its rest position, more than its forces in a short step
-        return float(max(loads)), float(eps * (stiffness * extent + 8 * (stiffness * moved + balance.c_a * carried)))
+        return float(max(loads)), float(
+            eps * (stiffness * extent + 8 * (cell_stiffness * moved + balance.c_a * carried))
+        )
 
     @cached_property
     def _node_stiffness(self) -> tuple[float, float]:
@@ -455,6 +459,18 @@ class EnergySums:
         dofs = domain.space.dofmap.index_map.size_global * domain.dim
         young = self._comm.allreduce(float(np.max(self._balance.stress.material.young, initial=0.0)), op=MPI.MAX)
         return float(young * domain.mean_edge_length ** (domain.dim - 2)), float(domain.bounds.diagonal * np.sqrt(dofs))
+
+    @cached_property
+    def _cell_stiffness(self) -> float:
+        """Root mean square of Y V |grad l|^2 over the cells, N/m: large where they are flat (collective).
+
+        |grad l| is the largest gradient of a barycentric coordinate, one over the least altitude of a cell.
+        """
+        domain, young = self._balance.domain, self._balance.stress.material.young
+        gradients = barycentric_gradients(domain.nodes[domain.cell_nodes])
+        stiffness = young * domain.volumes * np.square(gradients).sum(axis=2).max(axis=1)
+        total, count = sum_over_ranks(self._comm, np.array([np.square(stiffness).sum(), len(stiffness)]))
+        return float(np.sqrt(total / count))
 
 
 def _virtual_work(domain: Domain, terms: Sequence[Term], cells: npt.NDArray[np.int32] | None = None) -> CellForm:
