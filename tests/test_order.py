@@ -337,6 +337,14 @@ def test_check_says_what_is_built() -> None:
     assert "quadratic" not in "\n".join(check_study(make_study()))
 
 
+def test_check_notes_linear_cells_that_lock() -> None:
+    rubber = {"energy": "linear", "young": 1.0, "poisson": 0.49, "density": 1.0}
+    assert "linear cells lock at a Poisson's ratio of 0.49" in "\n".join(check_study(make_study(material=rubber)))
+    mesh = {"builder": "box", "size": [1.0, 1.0], "h": 0.5, "order": 2}
+    for tables in ({"mesh": mesh, "material": rubber}, {"material": rubber | {"plane": "stress"}}, {}):
+        assert "lock" not in "\n".join(check_study(make_study(**tables)))
+
+
 # --- pieces ---
 
 

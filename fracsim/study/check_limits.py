@@ -30,6 +30,7 @@ class CheckLimits:
         max_energy_ratio: factor between the energy of single edges and that of the material without a note.
         max_small_strain: strain at the strength below which large strains do not matter.
         max_linear_rotation: rotation of a fragment in rad from which its swelling by 1/cos is visible: half a percent.
+        max_linear_poisson: Poisson's ratio from which linear cells lock: with four across, a beam is a third too stiff.
         max_strength_share: strength over Young's modulus; only rubber is stronger.
         max_side, min_side: side lengths in m of bodies that break as one, and of a continuum.
         soft_young, soft_density: Pa and kg/m^3; rubber and gels are softer, and not as dense.
@@ -72,6 +73,7 @@ class CheckLimits:
     max_energy_ratio: float = 3.0
     max_small_strain: float = 0.005
     max_linear_rotation: float = 0.1
+    max_linear_poisson: float = 0.49
     max_strength_share: float = 0.1
     max_side: float = 20.0
     min_side: float = 1e-6

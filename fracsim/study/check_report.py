@@ -96,6 +96,18 @@ def _mesh_lines(study: Study, summary: MeshSummary) -> Iterator[str]:
     regions = f"; regions {', '.join(study.material.regions)}" if study.material.regions else ""
     like = f"; like {study.material.like}" if study.material.like else ""
     yield f"material    {study.material.energy}{plane}{regions}{like}"
+    for line in _locking_note(study, summary.dim):
+        yield f"{_INDENT}{line}"
+
+
+def _locking_note(study: Study, dim: int) -> Iterator[str]:
+    """Yield a note on linear cells of a nearly incompressible material."""
+    table = study.material
+    ratios = [table.elastic_constants(region)[1] for region in (RegionSettings(), *table.regions.values())]
+    is_plane_stress = dim == 2 and table.plane == "stress"
+    if study.mesh.order == 1 and not is_plane_stress and max(ratios) >= LIMITS.max_linear_poisson:
+        yield f"note: linear cells lock at a Poisson's ratio of {max(ratios):g}: bodies that bend are too stiff;"
+        yield "mesh.order = 2 does not lock"
 
 
 def _cell_count_question(study: Study, summary: MeshSummary) -> Iterator[str]:
