@@ -180,9 +180,9 @@ class NonlinearElimination:
         fraction = min((surface.max_step_fraction(u - start) for surface in movable), default=1.0)
         if comm.allreduce(fraction, op=MPI.MIN) < 1:
             return None
-        potential = self._contact_potential(movable)
+        limit = (1 + self._policy.potential_round_off) * self._contact_potential(movable)
         balance.set_displacement(u)
-        if self._contact_potential(movable) > potential:
+        if self._contact_potential(movable) > limit:
             balance.set_displacement(start)
             return None
         return True
