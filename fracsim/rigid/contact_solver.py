@@ -1,7 +1,7 @@
 """Impulses of all contacts of an event, with Coulomb friction.
 
 Up to a few hundred contacts are solved by MuJoCo: a convex problem with elliptic friction cones, by Newton's method.
-More contacts are solved by accelerated projected gradients on
+More contacts, and those whose solution by MuJoCo is not accurate, are solved by accelerated projected gradients on
 
     K_mu  3  p  _|_  u + (r / dt + mu |u_t|) n,   u = u_0 + J M^-1 J^T p,   K_mu = {|p_t| <= mu p_n}
 
@@ -25,7 +25,7 @@ import numpy.typing as npt
 
 from ..errors import NotConverged
 from .bodies import Bodies, apply_contact_forces, forces_for_velocity_changes, quaternions, velocities_of_all
-from .contact_law import impacts_later
+from .contact_law import LAW, impacts_later
 from .contact_points import ContactImpulses, Contacts
 from .impact_sequence import ImpactEvent
 from .mujoco_model import ContactParameters, MujocoModel
@@ -59,8 +59,8 @@ class ContactSolverSettings:
             one.
         slip_rounds: largest number of updates of the slip speeds.
         slip_tolerance: c_0; the slip speeds are accepted when mu times their change is below.
+        refining_work: contacts times iterations of projected gradients that may refine a solution of MuJoCo.
         max_newton_contacts: contacts in an event above which projected gradients take over.
-        max_difficult_contacts: contacts up to which Newton's method is used where projected gradients do not converge.
         gradient_tolerance: c_0; accepted error of velocities.
         gradient_iterations: least number of iterations that projected gradients may take.
         gradient_work: contacts times iterations that they may take in any case.
@@ -77,10 +77,10 @@ class ContactSolverSettings:
     direct_iterations: int = 60
     compliance_factors: tuple[float, ...] = (100.0, 10.0, 1.0)
     island_rows: int = 300
-    slip_rounds: int = 30
+    slip_rounds: int = 10
     slip_tolerance: float = 0.02
+    refining_work: int = 300_000
     max_newton_contacts: int = 300
-    max_difficult_contacts: int = 1500
     gradient_tolerance: float = 0.01
     gradient_iterations: int = 150
     gradient_work: int = 3_000_000
@@ -107,7 +107,7 @@ class MujocoNewtonSolver:
     def __init__(self, model: MujocoModel, parameters: ContactParameters) -> None:
         """Compile the model; `parameters` has time step, gravity and friction."""
         n = self._count = len(model.mass)
-        self._compiled, self._extent = _dynamic_model(model, parameters), model.extent
+        self._compiled = _dynamic_model(model, parameters)
         self._data, self._template = mujoco.MjData(self._compiled), _contact_template(parameters)
         moving = np.concatenate([np.arange(n), n + model.driven])
         things = int(np.concatenate([model.body_of_geom, moving]).max(initial=0)) + 1
@@ -183,18 +183,6 @@ class MujocoNewtonSolver:
         rows, contact_force = np.flatnonzero(closed), np.zeros((len(active), 3))
         contact_force[rows] = data.efc_force[data.contact.efc_address[rows, None] + np.arange(3)]
         return data.qfrc_constraint.reshape(-1, 6)[: self._count].copy(), contact_force, closed
-
-    def velocity_error(self) -> float:
-        """Return by how much the forces of the last solution miss the velocities that they follow from, m/s.
-
-        MuJoCo derives forces f(a) from accelerations a; the error is dt |a - a_0 - M^-1 f(a)|, a_0 without contact.
-        """
-        compiled, data = self._compiled, self._data
-        change: Values = np.empty((1, compiled.nv))
-        mujoco.mj_solveM(compiled, data, change, data.qfrc_constraint[None])
-        missing = (data.qacc - data.qacc_smooth - change[0]).reshape(-1, 6)[: self._count]
-        speed = np.linalg.norm(missing[:, :3], axis=1) + self._extent * np.linalg.norm(missing[:, 3:], axis=1)
-        return float(compiled.opt.timestep * speed.max(initial=0.0))
 
     def _run_solver(self, compliance_factor: float, max_iterations: int) -> None:
         """Solve with a multiple of the compliance, starting from the last solution."""
@@ -277,7 +265,8 @@ class ContactSolver:
     """Solver for the contact forces of an event, of the bodies of a model.
 
     Attributes:
-        error: of the velocities of the last solution, m/s; 0 if it is within the tolerance.
+        error: of the velocities of the last solution, m/s; 0 if it is below the speed at which overlapping bodies
+            separate, which those that are jammed do not reach.
     """
 
     def __init__(self, model: MujocoModel, parameters: ContactParameters) -> None:
@@ -302,11 +291,11 @@ class ContactSolver:
         if not np.any(event.constraints.may_touch):
             return np.zeros((len(event.bodies), 6)), ContactImpulses.empty(), True
         if has_many_contacts(event):
-            force, accurate = self._solve_by_gradients(event, rough=rough), not rough
-            if accurate and self.error and np.count_nonzero(event.active) <= SETTINGS.max_difficult_contacts:
-                force = self._solve_by_newton(event, obstacle_points)
+            force, accurate = self._solve_by_gradients(event, SETTINGS.gradient_work, rough=rough), not rough
         else:
-            force, accurate = self._solve_by_newton(event, obstacle_points), True
+            force, accurate = self._refine(event, self._solve_by_newton(event, obstacle_points)), True
+        if self.error <= LAW.recovery_speed * self._parameters.impact_threshold:
+            self.error = 0.0
         rows = np.flatnonzero(event.impulse[:, 0] > 0)
         impact_speed = np.where(event.impacts, event.constraints.impact_speed, 0.0)
         return force, event.contacts.impulse_record(rows, event.impulse[rows], impact_speed), accurate
@@ -339,42 +328,72 @@ class ContactSolver:
             change = float((before - slip_approach)[closed].max(initial=0.0)) / dt
             if not np.any(missed) and change < SETTINGS.slip_tolerance * threshold:
                 break
-        error = max(newton.velocity_error() if np.any(closed) else 0.0, self._closing_error(event, missed, motion))
-        self.error = max(
-            change if change >= SETTINGS.slip_tolerance * threshold else 0.0,
-            error if error > SETTINGS.gradient_tolerance * threshold else 0.0,
-        )
         # without the forces of earlier searches
         event.impulse[:] = np.where(closed[:, None], dt * contact_force, 0.0)
+        event.active[:] = active
         return force
 
-    def _solve_by_gradients(self, event: ImpactEvent, *, rough: bool) -> Values:
-        """Return forces and moments (n, 6) by projected gradients, starting from the impulses of the event."""
-        dt, bodies, model = self._parameters.time_step, event.bodies, self._model
-        rates, threshold = event.bounds.obstacle_velocity, self._parameters.impact_threshold
+    def _refine(self, event: ImpactEvent, force: Values) -> Values:
+        """Forces and moments (n, 6) of impulses that projected gradients have refined, unless `force` is accurate.
+
+        MuJoCo separates pressed contacts, or lets them approach, where it has a wrong slip speed.
+        """
+        if not np.any(event.active):
+            return force
+        error, active, impulse = self._error_of(event), event.active.copy(), event.impulse.copy()
+        if error <= self._tolerance:
+            return force
+        refined = self._solve_by_gradients(event, SETTINGS.refining_work, rough=False)
+        if self.error < error:
+            return refined
+        self.error, event.active[:], event.impulse[:] = error, active, impulse
+        return force
+
+    @property
+    def _tolerance(self) -> float:
+        """Accepted error of velocities, m/s."""
+        return SETTINGS.gradient_tolerance * self._parameters.impact_threshold
+
+    def _error_of(self, event: ImpactEvent) -> float:
+        """Error of the velocities that follow from the impulses of an event, m/s."""
+        rows, free = np.flatnonzero(event.active), self._motion_without_contact(event)
+        return self._system(event, rows, free).error(event.impulse[rows])
+
+    def _motion_without_contact(self, event: ImpactEvent) -> Motions:
+        """Velocities and spins of bodies and obstacles at the end of the step without contact forces."""
+        bodies = self.apply_forces(event, np.zeros((len(event.bodies), 6)))
+        return velocities_of_all(bodies, event.bounds.obstacle_velocity)
+
+    def _system(self, event: ImpactEvent, rows: Ints, free: Motions) -> ProjectedGradientSolver:
+        """Coulomb's law at contacts `rows` (k,) of bodies that move with `free` without contact."""
+        bodies, model, contacts = event.bodies, self._model, event.contacts.select(rows)
         inverse = bodies.rotation @ model.inverse_inertia @ np.swapaxes(bodies.rotation, 1, 2)
-        free = velocities_of_all(self.apply_forces(event, np.zeros((len(bodies), 6))), rates)
+        approach_rate: Values = np.asarray(event.constraints.allowed_approach[rows] / self._parameters.time_step)
+        relative = contacts.relative_velocities(*free)
+        return ProjectedGradientSolver.assemble(contacts, relative, approach_rate, model.mass, inverse)
+
+    def _solve_by_gradients(self, event: ImpactEvent, work: int, *, rough: bool) -> Values:
+        """Return forces and moments (n, 6) by projected gradients, starting from the impulses of the event.
+
+        `work`: contacts times iterations that they may take.
+        """
+        rates, free = event.bounds.obstacle_velocity, self._motion_without_contact(event)
         for _ in range(1 if rough else SETTINGS.search_rounds):
             rows = np.flatnonzero(event.active)
-            contacts = event.contacts.select(rows)
-            approach_rate: Values = np.asarray(event.constraints.allowed_approach[rows] / dt)
-            relative = contacts.relative_velocities(*free)
-            system = ProjectedGradientSolver.assemble(contacts, relative, approach_rate, model.mass, inverse)
-            iterations = max(SETTINGS.gradient_iterations, SETTINGS.gradient_work // max(len(rows), 1))
+            system = self._system(event, rows, free)
+            iterations = max(SETTINGS.gradient_iterations, work // max(len(rows), 1))
             if rough:
                 iterations = SETTINGS.rough_iterations
-            event.impulse[rows], self.error = system.solve(
-                SETTINGS.gradient_tolerance * threshold, iterations, event.impulse[rows]
-            )  # fmt: skip
+            event.impulse[rows], self.error = system.solve(self._tolerance, iterations, event.impulse[rows])
             change = system.velocity_changes(event.impulse[rows])
-            force = forces_for_velocity_changes(model, bodies, change, dt)
+            force = forces_for_velocity_changes(self._model, event.bodies, change, self._parameters.time_step)
             motion = velocities_of_all(self.apply_forces(event, force), rates)
             missed = self._find_missed(event, event.active, motion)
             event.active |= missed
             if not np.any(missed):
                 break
         error = self._closing_error(event, missed, motion)
-        if error > SETTINGS.gradient_tolerance * threshold:
+        if error > self._tolerance:
             self.error = max(self.error, error)
         return force
 

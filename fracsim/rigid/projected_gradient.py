@@ -93,6 +93,10 @@ class ProjectedGradientSolver:
             raise MemoryError(f"no room for {len(p)} contacts")
         return p, float(error)
 
+    def error(self, impulses: Values) -> float:
+        """Return the error of the velocities with impulses (k, 3), m/s: D times what an iteration changes them by."""
+        return self.solve(0.0, 1, impulses)[1]
+
     def velocity_changes(self, impulses: Values) -> Values:
         """Return the changes of velocity and spin (n, 6) by impulses (k, 3)."""
         changes: Values = np.empty((len(self.inverse_mass) + 1, 6))
