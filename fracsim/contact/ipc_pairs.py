@@ -324,11 +324,12 @@ class IpcPairs:
 
     def _active_pairs(self, vertices: Values) -> list[ActivePairs]:
         """Pairs on which barriers act, of each kind with any; those of the last positions are kept."""
-        if not self._active or not np.array_equal(vertices, self._active_positions):
+        if not np.array_equal(vertices, self._active_positions):
             items = zip(self._kinds, self._search.pairs(vertices), strict=True)
-            self._active = [kind.active_pairs(near, vertices) for kind, near in items]
+            active = [kind.active_pairs(near, vertices) for kind, near in items if len(near)]
+            self._active = [pairs for pairs in active if not pairs.is_empty]
             self._active_positions = vertices.copy()
-        return [pairs for pairs in self._active if not pairs.is_empty]
+        return self._active
 
     # --- barrier ---
 
@@ -353,7 +354,7 @@ class IpcPairs:
         """Set the stiffness k, Pa."""
         items = zip(self._kinds, self._weights, strict=True)
         self._kinds = [replace(kind, stiffness=weight * stiffness) for kind, weight in items]
-        self._active = [replace(pairs, kind=kind) for kind, pairs in zip(self._kinds, self._active, strict=False)]
+        self._clear_active()
 
     def clear_caches(self) -> None:
         """Discard the candidates of collision detection."""
