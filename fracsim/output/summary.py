@@ -66,6 +66,8 @@ class ResourceMeter:
 # Events despite which a run continued. A step that was halved and then succeeded is not among them.
 _EVENT_TEXTS = {
     "unbalanced_steps": "steps that ended out of balance, for the body weakened by a break had no solution",
+    "rough_solutions": "steps with |r| above 1e-4 of the forces, whose first guess was off by far more (smaller steps "
+    "have better ones)",
     "linear_failures": "linear solves that failed and were taken as no correction",
     "cells_not_finite": "cells crushed flat, whose stress was no number and counted as none",
 }

@@ -39,6 +39,7 @@ class SolveResult:
         newton_iterations, krylov_iterations: numbers of iterations.
         reason: a sentence if it did not converge.
         stopped_for_cost: whether it was ended because its Krylov iterations cost too much.
+        is_rough: whether |r| is small beside that of the first guess alone, not beside the forces.
     """
 
     converged: bool
@@ -46,6 +47,7 @@ class SolveResult:
     krylov_iterations: int
     reason: str
     stopped_for_cost: bool = False
+    is_rough: bool = False
 
     def with_iterations_of(self, other: SolveResult) -> SolveResult:
         """Return this result with the iterations of both."""
@@ -79,6 +81,7 @@ class ConvergenceTest:
         solved_norm: largest |r| of a solution, N.
         stopped_for_cost: whether the last attempt was ended because of its cost.
         aborted: whether the last solve was ended by a request to stop.
+        is_rough: whether |r| of the last solution is small beside that of the first guess alone.
         stop_requested: function (collective) called between iterations; a solve ends where it is true.
     """
 
@@ -95,7 +98,7 @@ class ConvergenceTest:
         self._modified: ModifiedNewton | None = None
         self._limit: CostLimit = UNLIMITED_COST
         self._is_second = False
-        self.solved_norm, self.stopped_for_cost, self.aborted = 0.0, False, False
+        self.solved_norm, self.stopped_for_cost, self.aborted, self.is_rough = 0.0, False, False, False
 
     def set_stop_request(self, stop_requested: Callable[[], bool]) -> None:
         """Set a function (collective) called between iterations; a solve ends where it is true."""
@@ -190,15 +193,16 @@ class ConvergenceTest:
         if its == 0:
             # a first guess that contact has cut is off by more than any force of the step, however stiff the body
             self._first_norm = 0.0 if self._balance.contact.limits_newton_steps else norm
-            self._further_iterations = 0
+            self._further_iterations, self.is_rough = 0, False
             return norm <= self.norm_of_solution(0.0)
         if norm > self.norm_of_solution(self._first_norm):
             return False
-        if not self._is_intact or self._further_iterations == self._policy.max_further_iterations:
+        if not self._is_intact:
             return True
         scale, round_off = self._balance.energies.force_scale()
         limit = max(self._rtol * self._policy.max_first_norm_ratio * scale, round_off)
-        if norm <= limit:
+        self.is_rough = norm > limit
+        if not self.is_rough or self._further_iterations == self._policy.max_further_iterations:
             return True
         self._further_iterations += 1
         self.solved_norm = limit
@@ -366,7 +370,8 @@ class NewtonSolver:
             reason = f"Obstacles are jammed: not there in {self._policy.max_obstacle_solves} solves"
             return SolveResult(False, newton, krylov, reason, self._convergence.stopped_for_cost)
         reason = "" if converged else self._failure()
-        return SolveResult(converged, newton, krylov, reason, self._convergence.stopped_for_cost)
+        is_rough = converged and self._convergence.is_rough
+        return SolveResult(converged, newton, krylov, reason, self._convergence.stopped_for_cost, is_rough)
 
     def _start_from(self, guess: Values | None) -> tuple[int, bool]:
         """Set x to a feasible first guess near `guess`; None: near the last iterate (collective).
@@ -449,7 +454,7 @@ class NewtonSolver:
                 norm = balance.work_vector.norm()
                 solved = self._convergence.is_solved(norm, solve)
             if solved:
-                return SolveResult(True, solve, krylov, "")
+                return SolveResult(True, solve, krylov, "", is_rough=self._convergence.is_rough)
             if self._convergence.stop_requested():
                 raise StepAborted
             if solve == self._policy.max_linear_solves:

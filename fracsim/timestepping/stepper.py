@@ -65,11 +65,13 @@ class FailureCounts:
         steps_failed: attempts that did not converge and were repeated in another way.
         unbalanced_steps: steps that ended out of balance, since the body weakened by a break had no solution.
         steps_retaken: steps that were repeated with a smaller size, since edges broke in them.
+        rough_solutions: steps whose |r| is above 1e-4 of the forces, since that of the first guess was far larger.
     """
 
     steps_failed: int = 0
     unbalanced_steps: int = 0
     steps_retaken: int = 0
+    rough_solutions: int = 0
 
 
 class StepTimer:
@@ -226,6 +228,7 @@ class BalanceStepper:
                 self.failures.steps_failed += 1
                 state = self._ease(state, dt, solve)
                 continue
+            self.failures.rough_solutions += solve.is_rough
             try:
                 return self._finish(state, dt, solve, began)
             except StepTooLong:
