@@ -19,10 +19,11 @@ from fracsim.meshes import BUILDERS
 from fracsim.meshes.write import write_mesh
 from fracsim.output.frame_files import FieldEvaluator
 from fracsim.scene import Scene
+from fracsim.study.check import check_study
 from fracsim.timestepping.state import State
 from support.laws import law_of, rotation
 from support.oscillator import slopes
-from support.scenes import Values, deform, each_step, make_scene, march, positions
+from support.scenes import Values, deform, each_step, make_scene, make_study, march, positions
 
 EPS = np.finfo(float).eps
 YOUNG, POISSON = 1.0, 0.3
@@ -165,6 +166,20 @@ def test_a_staggered_bar_pulls_too_hard_by_one_step() -> None:
         scene, state = pulled([0, 4 * TINY], steps, "corotated", update="staggered")
         march(scene, state)
         assert stress(scene) - TINY * YOUNG == pytest.approx(3 * MU * 4 * TINY / steps, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("scheme", "update", "is_noted"),
+    [("quasi-static", "staggered", True), ("quasi-static", "implicit", False), ("backward-euler", "staggered", False)],
+)
+def test_check_notes_staggered_flow_without_inertia(scheme: str, update: str, is_noted: bool) -> None:
+    study = make_study(
+        material={"energy": "corotated", "young": 1e3, "poisson": 0.3, "density": 1.0},
+        plasticity={"yield_stress": 1.0, "update": update},
+        boundary=[{"on": "left", "fix": "xy"}],
+        time={"scheme": scheme, "step": 0.1, "end": 1.0},
+    )
+    assert ("up to 3 G d above" in "\n".join(check_study(study))) == is_noted
 
 
 def test_an_extrapolated_bar_overshoots_where_flow_begins_and_then_catches_up() -> None:

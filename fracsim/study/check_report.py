@@ -63,6 +63,8 @@ def report_lines(study: Study, summary: MeshSummary, near: list[str]) -> Iterato
     yield from _mesh_lines(study, summary)
     yield from _fracture_lines(study, summary)
     yield f"plasticity  {_plasticity(study)}"
+    for line in _staggered_note(study):
+        yield f"{_INDENT}{line}"
     if study.brittle is not None:
         yield f"brittle     {_brittle(study.brittle)}"
     if study.crack:
@@ -313,6 +315,14 @@ def _plasticity(study: Study) -> str:
         f"{table.measure} stress above {table.yield_stress:g} Pa, {rate}, "
         f"hardening {table.hardening:g} Pa, {table.update}"
     )
+
+
+def _staggered_note(study: Study) -> Iterator[str]:
+    """Yield a note on flow that follows the steps of a body without inertia."""
+    table = study.plasticity
+    if table is not None and table.update == "staggered" and study.time.scheme == "quasi-static":
+        yield "note: in a step of strain d the stress is up to 3 G d above that of yield, G being the shear modulus;"
+        yield 'update = "implicit" has no such error'
 
 
 def _brittle(brittle: BrittleSettings) -> str:
