@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 from .output.result_checks import (
-    EnergyGainMonitor,
+    EnergyBalanceMonitor,
     InvertedCellMonitor,
     negligible_energy,
     unbroken_note,
@@ -60,7 +60,7 @@ class RunMonitors:
         history: rows of history.csv, with the peaks of its columns.
         meter: time and memory used.
         inverted: cells that are crushed or inverted.
-        energy_gain: energy that appears without work.
+        energy_balance: energy that appears or is lost without work.
         contact_monitor: contact of obstacles with the body; None without obstacles.
         obstacle_overlap: overlap of obstacles with one another; None without several obstacles, one of them free.
         interpenetration: of fragments; None without a surface.
@@ -75,7 +75,7 @@ class RunMonitors:
         self._is_linear = scene.balance.linear
         self.inverted = InvertedCellMonitor(stress, scene.fracture)
         floor = negligible_energy(stress)
-        self.energy_gain = EnergyGainMonitor(at_rest=study.starts_at_rest, floor=floor, thickness=study.thickness)
+        self.energy_balance = EnergyBalanceMonitor(at_rest=study.starts_at_rest, floor=floor, thickness=study.thickness)
         self.contact_monitor, self.obstacle_overlap = _obstacle_monitors(scene)
         self.interpenetration, self.load_drop = _interpenetration_monitor(study), _load_drop_monitor(study)
         self.intersections = _intersection_monitor(scene)
@@ -94,7 +94,7 @@ class RunMonitors:
             self.contact_monitor.record_step(state, report.dt, figures)
         if self.load_drop is not None:
             self.load_drop.record_step(state.t, figures, broken)
-        self.energy_gain.record_step(report, state)
+        self.energy_balance.record_step(report, state)
 
     def record_frame(self, t: float) -> None:
         """Record a frame (collective)."""
@@ -106,7 +106,7 @@ class RunMonitors:
 
     def to_checkpoint(self) -> dict[str, Any]:
         """Return what a checkpoint stores (collective)."""
-        result: dict[str, Any] = self.inverted.to_checkpoint() | self.energy_gain.to_checkpoint()
+        result: dict[str, Any] = self.inverted.to_checkpoint() | self.energy_balance.to_checkpoint()
         result |= {"peak_reactions": self.history.reaction_peaks, "worked": self.history.obstacle_work}
         for monitor in self._optional:
             result |= monitor.to_checkpoint()
@@ -114,7 +114,7 @@ class RunMonitors:
 
     def from_checkpoint(self, saved: dict[str, Any]) -> None:
         """Restore what `to_checkpoint` returned."""
-        monitors: list[Any] = [self.inverted, self.energy_gain, self.meter, *self._optional]
+        monitors: list[Any] = [self.inverted, self.energy_balance, self.meter, *self._optional]
         for monitor in monitors:
             monitor.from_checkpoint(saved)
         self.history.reaction_peaks |= saved["peak_reactions"]
@@ -137,7 +137,7 @@ class RunMonitors:
         energy, time = self._study.material.energy, self._study.time
         trouble = irregular_event_text(self.meter.read_totals()["trouble"])
         untested = untested_balance_note(self._study.solver, is_linear=self._is_linear)
-        of_all = (trouble, untested, self.inverted.note(energy), self.energy_gain.note(time.scheme))
+        of_all = (trouble, untested, self.inverted.note(energy), self.energy_balance.note(time.scheme))
         notes = [note for note in of_all if note]
         if done and self._fracture is not None and (unbroken := unbroken_note(self._fracture)):
             notes.append(unbroken)

@@ -539,7 +539,7 @@ def test_monitors_go_on_with_a_restart(tmp_path: Path) -> None:
 def test_a_gain_of_energy_is_told_after_a_restart(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Seen before the checkpoint alone."""
     first = Run(build_scene(MPI.COMM_SELF, study(BAR)), tmp_path, wall_limit=0.0)
-    first.monitors.energy_gain.rise, first.monitors.energy_gain.scale = 3.0, 4.0
+    first.monitors.energy_balance.rise, first.monitors.energy_balance.scale = 3.0, 4.0
     with pytest.raises(Stopped):
         first()
     capsys.readouterr()

@@ -36,8 +36,8 @@ class CheckTolerances:
 
     Attributes:
         negligible_strain: energies below Y V strain^2 are round-off, as in a body at rest.
-        relative_energy_gain: share of the largest energy or work that a run may gain. Time steps that are long compared
-            with elastic waves gain a little.
+        relative_energy_gain: share of the largest energy or work that a run may gain, or lose without inertia. Time
+            steps that are long compared with elastic waves gain a little.
         single_step_share: a single step is named if it gained at least this share of the total gain.
         min_jacobian: a cell with det F below this counts as inverted.
         min_tension: share of the strength below which a principal stress is round-off.
@@ -62,17 +62,19 @@ _ALTERNATIVE_SCHEMES = {
 }
 
 
-class EnergyGainMonitor:
+class EnergyBalanceMonitor:
     """Largest rise of the energy balance elastic + kinetic + dissipated - work above its least earlier value.
 
-    A scheme may lose energy. A gain drives motion that no load causes. Projected strains at large strains gain energy,
-    and so do second-order schemes if the tangent is not positive, or if many edges break at once.
+    A scheme with inertia may lose energy. A gain drives motion that no load causes. Projected strains at large strains
+    gain energy, and so do second-order schemes if the tangent is not positive, or if many edges break at once.
+    Without inertia all work is stored or dissipated: energy is lost in steps that are too long for their forces.
 
     Attributes:
         rise: largest gain, J.
+        fall: largest loss, J.
         scale: largest energy or absolute work so far, J.
         floor: gains below this are not reported, J.
-        All three are per metre of thickness in 2D.
+        All four are per metre of thickness in 2D.
     """
 
     def __init__(self, *, at_rest: bool, floor: float = 0.0, thickness: float = 1.0) -> None:
@@ -85,7 +87,8 @@ class EnergyGainMonitor:
         """
         self._thickness = thickness
         self._min_balance = 0.0 if at_rest else float("inf")
-        self.rise, self.scale, self.floor = 0.0, 0.0, floor
+        self._max_balance = -self._min_balance
+        self.rise, self.fall, self.scale, self.floor = 0.0, 0.0, 0.0, floor
         self._balance = self._min_balance
         self._max_step_gain, self._max_gain_time = 0.0, 0.0
 
@@ -96,7 +99,9 @@ class EnergyGainMonitor:
         if balance - self._balance > self._max_step_gain:
             self._max_step_gain, self._max_gain_time = balance - self._balance, state.t
         self._balance, self._min_balance = balance, min(self._min_balance, balance)
+        self._max_balance = max(self._max_balance, balance)
         self.rise = max(self.rise, balance - self._min_balance)
+        self.fall = max(self.fall, self._max_balance - balance)
         self.scale = max(self.scale, energy, abs(state.work))
 
     def to_checkpoint(self) -> dict[str, float]:
@@ -104,19 +109,32 @@ class EnergyGainMonitor:
         return {
             "energy_rise": self.rise, "energy_scale": self.scale, "energy_least": self._min_balance,
             "energy_balance": self._balance, "energy_most": self._max_step_gain, "energy_time": self._max_gain_time,
+            "energy_fall": self.fall, "energy_greatest": self._max_balance,
         }  # fmt: skip
 
     def from_checkpoint(self, monitors: dict[str, float]) -> None:
         """Restore the values of `to_checkpoint`."""
         self.rise, self.scale, self._min_balance = (monitors[f"energy_{name}"] for name in ("rise", "scale", "least"))
-        # checkpoints of earlier versions lack these three
+        # checkpoints of earlier versions lack these
+        self.fall = monitors.get("energy_fall", 0.0)
+        self._max_balance = monitors.get("energy_greatest", float("-inf"))
         self._balance = monitors.get("energy_balance", float("inf"))
         self._max_step_gain = monitors.get("energy_most", 0.0)
         self._max_gain_time = monitors.get("energy_time", 0.0)
 
     def note(self, scheme: str) -> str:
-        """Sentence about a gain above the tolerance, otherwise empty; `scheme` is the key time.scheme."""
-        if self.rise <= max(CHECK_TOLERANCES.relative_energy_gain * self.scale, self.floor):
+        """Sentence about a gain, or a loss without inertia, above the tolerance; otherwise empty.
+
+        `scheme`: key time.scheme.
+        """
+        limit = max(CHECK_TOLERANCES.relative_energy_gain * self.scale, self.floor)
+        if self.rise <= limit and self.fall > limit and scheme == "quasi-static":
+            return (
+                f"{self.fall * self._thickness:.3g} J of the work is neither stored nor dissipated, "
+                f"{self.fall / self.scale:.0%} of all that was at play: forces change too much within a step; "
+                "try a shorter time.step"
+            )
+        if self.rise <= limit:
             return ""
         one_step = ""
         if self._max_step_gain >= CHECK_TOLERANCES.single_step_share * self.rise:
