@@ -358,11 +358,9 @@ def _body_notes(points: Points, body: Indices, bodies: int, parts: int) -> Itera
                 "file are meant to be one body, give [mesh] join = true."
             )
     if parts > bodies:
-        how = "an edge or a node" if points.shape[1] == 3 else "a node"
-        yield (
-            f"{parts - bodies} parts of the mesh touch the rest in {how} only, not through a facet, and turn "
-            "there as on a hinge."
-        )
+        how, count = "an edge or a node" if points.shape[1] == 3 else "a node", parts - bodies
+        touch = f"{count} parts of the mesh touch" if count > 1 else "1 part of the mesh touches"
+        yield f"{touch} the rest in {how} only, not through a facet: motion there is free as on a hinge."
 
 
 def _region_notes(mesh: MeshData) -> Iterator[str]:

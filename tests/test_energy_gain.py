@@ -90,6 +90,7 @@ def test_what_a_run_went_on_in_spite_of_is_one_sentence() -> None:
         {"steps_failed": 7, "unbalanced_steps": 2, "linear_failures": 0, "cells_not_finite": 5}
     )
     assert words.startswith("the run went on in spite of 2 steps that ended out of balance")
+    assert "in spite of 1 step that ended" in irregular_event_text({"unbalanced_steps": 1})
     assert "; 5 cells crushed flat" in words and "linear" not in words
 
 

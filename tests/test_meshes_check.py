@@ -209,10 +209,10 @@ def test_join_without_coincident_nodes(mesh: MeshData) -> None:
 
 def test_bodies_that_touch_in_a_node_or_edge_are_noted() -> None:
     flat = MeshData(np.array([[0.0, 0], [1, 0], [0, 1], [-1, 0], [0, -1]]), np.array([[0, 1, 2], [0, 3, 4]]))
-    assert "1 parts of the mesh touch the rest in a node only" in check_mesh(flat).notes[0]
+    assert "1 part of the mesh touches the rest in a node only" in check_mesh(flat).notes[0]
     points = np.array([[0.0, 0, 0], [0, 0, 1], [1, 0, 0], [0, 1, 0], [-1, 0, 0], [0, -1, 0]])
     solid = MeshData(points, np.array([[0, 1, 2, 3], [0, 1, 4, 5]]))
-    assert "1 parts of the mesh touch the rest in an edge or a node only" in check_mesh(solid).notes[-1]
+    assert "1 part of the mesh touches the rest in an edge or a node only" in check_mesh(solid).notes[-1]
 
 
 def test_cells_in_two_regions_are_noted() -> None:

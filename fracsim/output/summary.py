@@ -65,17 +65,23 @@ class ResourceMeter:
 
 # Events despite which a run continued. A step that was halved and then succeeded is not among them.
 _EVENT_TEXTS = {
-    "unbalanced_steps": "steps that ended out of balance, for the body weakened by a break had no solution",
-    "rough_solutions": "steps with |r| above 1e-4 of the forces, whose first guess was off by far more (smaller steps "
-    "have better ones)",
-    "linear_failures": "linear solves that failed and were taken as no correction",
-    "cells_not_finite": "cells crushed flat, whose stress was no number and counted as none",
+    "unbalanced_steps": ("step", "that ended out of balance, for the body weakened by a break had no solution"),
+    "rough_solutions": (
+        "step",
+        "with |r| above 1e-4 of the forces, as the first guess was off by far more (smaller steps have better guesses)",
+    ),
+    "linear_failures": ("linear solve", "without a solution, taken as no correction"),
+    "cells_not_finite": ("cell", "crushed flat, with a stress that is no number and counts as none"),
 }
 
 
 def irregular_event_text(trouble: dict[str, int]) -> str:
     """Sentence about the counters of trouble, by name; empty if all are 0."""
-    phrases = [f"{trouble[name]} {words}" for name, words in _EVENT_TEXTS.items() if trouble.get(name)]
+    phrases = [
+        f"{count} {noun}{'s' if count > 1 else ''} {words}"
+        for name, (noun, words) in _EVENT_TEXTS.items()
+        if (count := trouble.get(name, 0))
+    ]
     return f"the run went on in spite of {'; '.join(phrases)} (counted in summary.json)" if phrases else ""
 
 
