@@ -195,11 +195,11 @@ class ConvergenceTest:
             self._first_norm = 0.0 if self._balance.contact.limits_newton_steps else norm
             self._further_iterations, self.is_rough = 0, False
             return norm <= self.norm_of_solution(0.0)
-        if norm > self.norm_of_solution(self._first_norm):
+        scale, round_off = self._set_solved_norm(self._first_norm)
+        if norm > self.solved_norm:
             return False
         if not self._is_intact:
             return True
-        scale, round_off = self._balance.energies.force_scale()
         limit = max(self._rtol * self._policy.max_first_norm_ratio * scale, round_off)
         self.is_rough = norm > limit
         if not self.is_rough or self._further_iterations == self._policy.max_further_iterations:
@@ -210,9 +210,14 @@ class ConvergenceTest:
 
     def norm_of_solution(self, first_norm: float) -> float:
         """Largest |r| of a solution, N, where the first guess has `first_norm`, N (collective)."""
+        self._set_solved_norm(first_norm)
+        return self.solved_norm
+
+    def _set_solved_norm(self, first_norm: float) -> tuple[float, float]:
+        """Set `solved_norm`; return size and round-off of the forces, N (collective)."""
         scale, round_off = self._balance.energies.force_scale()
         self.solved_norm = max(self._rtol * max(first_norm, scale), round_off)
-        return self.solved_norm
+        return scale, round_off
 
 
 class NewtonSolver:
