@@ -176,9 +176,12 @@ class NonlinearElimination:
             return False
         u = balance.u.x.array[: balance.owned_dof_count].copy()
         region.displace(np.zeros(region.shape))  # terms are told of a change alone
-        start, comm = balance.u.x.array[: balance.owned_dof_count].copy(), balance.domain.comm
-        fraction = min((surface.max_step_fraction(u - start) for surface in movable), default=1.0)
-        if comm.allreduce(fraction, op=MPI.MIN) < 1:
+        if not movable:
+            balance.set_displacement(u)
+            return True
+        start = balance.u.x.array[: balance.owned_dof_count].copy()
+        fraction = min(surface.max_step_fraction(u - start) for surface in movable)
+        if balance.domain.comm.allreduce(fraction, op=MPI.MIN) < 1:
             return None
         limit = (1 + self._policy.potential_round_off) * self._contact_potential(movable)
         balance.set_displacement(u)
