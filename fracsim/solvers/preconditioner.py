@@ -380,8 +380,9 @@ class Preconditioner:
             self._whole_iterations = self._whole_iterations or equivalent
             limit = self._policy.fragmented_ratio * self._whole_iterations + 2
             has_short_steps = mass_stiffness_ratio(self._balance) > self._policy.min_ssor_inertia_broken
-            if self._ever_broken and self._may_use_ssor and (equivalent > limit or has_short_steps):
-                self._uses_ssor, self._may_use_ssor = False, False  # from now on the step size decides
+            may_begin = self._ever_broken and self._may_use_ssor and self._uses_ssor is None
+            if may_begin and (equivalent > limit or has_short_steps):
+                self._uses_ssor = False  # from now on the step size decides
         if not self._keeps:
             self._due = max(self._due, Update.REFRESH)
 
