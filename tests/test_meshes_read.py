@@ -307,10 +307,10 @@ def test_few_nodes_without_a_cell_are_counted(tmp_path: Path) -> None:
 
 
 def test_a_file_that_ends_gmsh_is_a_message(tmp_path: Path) -> None:
-    """Of Gmsh's format 4.1, with no node by its head and twelve by its block: gmsh writes past its arrays."""
-    places = "".join(f"{k}.0 {k % 2}.0 {k % 3}.0\n" for k in range(12))
-    numbers = "".join(f"{k}\n" for k in range(1, 13))
-    nodes = f"$Nodes\n1 0 1 12\n3 0 0 12\n{numbers}{places}$EndNodes\n"
+    """Of Gmsh's format 4.1, with no node by its head and 50,000 by its block: gmsh writes far past its arrays."""
+    places = "".join(f"{k}.0 {k % 2}.0 {k % 3}.0\n" for k in range(50_000))
+    numbers = "".join(f"{k}\n" for k in range(1, 50_001))
+    nodes = f"$Nodes\n1 0 1 50000\n3 0 0 50000\n{numbers}{places}$EndNodes\n"
     (tmp_path / "part.msh").write_text(
         f"$MeshFormat\n4.1 0 8\n$EndMeshFormat\n{nodes}$Elements\n1 1 1 1\n3 0 4 1\n1 1 2 3 4\n$EndElements\n"
     )
