@@ -182,14 +182,32 @@ def test_momentum_is_kept_through_a_fracture() -> None:
     assert after.bodies.mass.sum() == pytest.approx(state.bodies.mass.sum(), rel=1e-13)
 
 
-def test_mass_and_momenta_are_kept_through_many_fractures() -> None:
-    """A bar in flight is cut across, and its fragments again and again: cells that two fragments share are cut anew."""
+def cell_sums(mesh: MeshData) -> tuple[float, Values, Values]:
+    """Mass, centre of mass and second moments of mass about the origin of the cells of a mesh."""
+    x = mesh.points[mesh.cells]
+    mass = DENSITY * np.abs(np.linalg.det(x[:, 1:] - x[:, :1])) / 6
+    total = x.sum(axis=1)
+    second = np.einsum("c,cni,cnj->ij", mass, x, x) + np.einsum("c,ci,cj->ij", mass, total, total)
+    return mass.sum(), mass @ total / 4 / mass.sum(), second / 20
+
+
+def test_mass_centre_inertia_and_momenta_are_kept_through_many_fractures() -> None:
+    """A bar is cut, and its fragments again and again, all of which fly and spin on their own.
+
+    Cells that two fragments share are cut anew. Masses, centres and inertia at rest sum to those of the cells, and
+    momentum and angular momentum stay. Fragments that keep their shape keep their motion, neighbours their velocities.
+    """
     stepper = stepper_of(bar(), 1e12, 1e-3, gravity=0 * DOWN, obstacles=[])
-    motion = {"velocity": np.array([[3.0, -2.0, 9.0]]), "spin": np.array([[4.0, 5.0, -6.0]])}
-    start = bodies = replace(stepper.start().bodies, **motion)
+    mass, centre, second = cell_sums(bar())
+    inertia = np.trace(second) * np.eye(3) - second
+    bodies = stepper.start().bodies
     body, random = stepper.instances.get(0), np.random.default_rng(5)
     edges, of_input = body.graph.edge_nodes, body.graph.domain.input_numbering.nodes
+    neighbours = 0
     for _ in range(15):
+        n = len(bodies)
+        move = {"velocity": 5 * random.normal(size=(n, 3)), "spin": 5 * random.normal(size=(n, 3))}
+        bodies = replace(bodies, position=bodies.position + random.random((n, 3)), **move)
         inside = np.ptp(body.fragments.node_fragment[edges], axis=1) == 0
         fragment = random.choice(body.fragments.node_fragment[edges[inside, 0]])
         inside &= body.fragments.node_fragment[edges[:, 0]] == fragment
@@ -200,14 +218,25 @@ def test_mass_and_momenta_are_kept_through_many_fractures() -> None:
         body.graph.break_edges(np.isin(np.arange(len(edges)), crosses))
         name = int(of_input[body.fragments.node_fragment == fragment].min())
         body.fragments.update()
-        bodies = stepper._replace_by_fragments(bodies, {name})
+        before, names = bodies, list(stepper.shapes.names)
+        bodies = stepper._replace_by_fragments(before, {name})
         assert np.array_equal(bodies.centre, stepper.shapes.moments.centre), "where bodies are drawn"
-    assert len(bodies) > 15
-    assert abs(bodies.mass / (DENSITY * stepper.shapes.moments.volume) - 1).max() > 1e-3
-    size = float(start.mass.sum()) * 10
-    assert bodies.mass.sum() == pytest.approx(start.mass.sum(), rel=1e-12)
-    assert np.allclose(bodies.momentum, start.momentum, rtol=0, atol=1e-12 * size)
-    assert np.allclose(bodies.angular_momentum, start.angular_momentum, rtol=0, atol=3e-12 * size)
+        X = bodies.centre
+        assert bodies.mass.sum() == pytest.approx(mass, rel=1e-12)
+        assert np.allclose(bodies.mass @ X / mass, centre, rtol=1e-12)
+        arms = np.einsum("n,ni,ni->", bodies.mass, X, X) * np.eye(3) - np.einsum("n,ni,nj->ij", bodies.mass, X, X)
+        assert np.allclose(bodies.inertia.sum(axis=0) + arms, inertia, rtol=0, atol=1e-12 * np.trace(inertia))
+        assert np.allclose(bodies.momentum, before.momentum, rtol=0, atol=1e-12 * mass * 10)
+        assert np.allclose(bodies.angular_momentum, before.angular_momentum, rtol=0, atol=1e-11 * mass * 10)
+        for row, own in enumerate(stepper.shapes.names):
+            if own != name and own in names:
+                parent = names.index(own)
+                position = before.to_current(X[[row]], np.array([parent]))
+                velocity = before.velocity_at(position, np.array([parent]))[0]
+                assert np.allclose(bodies.velocity[row], velocity, rtol=1e-12, atol=1e-12)
+                assert np.array_equal(bodies.spin[row], before.spin[parent])
+                neighbours += bodies.mass[row] != before.mass[parent]
+    assert len(bodies) > 15 and neighbours > 3
 
 
 def test_a_body_broken_at_rest_stays_where_it_is() -> None:

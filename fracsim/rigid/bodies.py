@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
 Ints = npt.NDArray[np.int64]
 Values = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 SOURCE = Path(__file__).with_name("rotation_integrator.c")
 
 
@@ -117,25 +118,32 @@ class Bodies:
 
     # --- other sets of bodies ---
 
-    def split_into(self, moments: PolyhedronMoments, parent: Ints) -> Bodies:
-        """Return fragments (m,) with the mass, momentum and angular momentum of their parent bodies (m,).
+    def at_new_shapes(self, density: float, moments: PolyhedronMoments, parent: Ints) -> Bodies:
+        """Return fragments (m,) that move as their parent bodies (m,) did: v_i = v + w x r_i, w_i = w (B07, section 7).
 
-        Fragments share the mass in proportion to their volumes and move as one rigid body about their joint centre of
-        mass: v_i = v + w x r_i, w_i = w. They move as the parent did if they fill its shape (B07, section 7).
+        `density`: kg/m^3; masses and inertia are those of `moments`.
         """
-        fragments = Bodies.at_rest((self.mass / _sums(moments.volume, parent, len(self)))[parent], moments)
+        fragments = Bodies.at_rest(np.full(len(parent), density), moments)
         position, rotation = self.to_current(moments.centre, parent), self.rotation[parent]
-        centre = _sums(fragments.mass[:, None] * position, parent, len(self)) / self.mass[:, None]
-        arm = position - centre[parent]
-        about_centre = rotation @ fragments.inertia @ np.swapaxes(rotation, 1, 2)
-        about_centre += fragments.mass[:, None, None] * (
-            np.einsum("ni,ni->n", arm, arm)[:, None, None] * np.eye(3) - arm[:, :, None] * arm[:, None]
-        )
-        momentum = np.einsum("nij,nj->ni", self.spatial_inertia, self.spin)
-        momentum += self.mass[:, None] * np.cross(self.position - centre, self.velocity)
-        spin = np.linalg.solve(_sums(about_centre, parent, len(self)), momentum[:, :, None])[parent, :, 0]
-        velocity = self.velocity[parent] + np.cross(spin, arm)
+        velocity, spin = self.velocity_at(position, parent), self.spin[parent]
         return replace(fragments, position=position, rotation=rotation, velocity=velocity, spin=spin)
+
+    def with_momenta_of(self, before: Bodies, chosen: Flags) -> Bodies:
+        """Return these bodies with momentum and angular momentum of those `before`.
+
+        Bodies `chosen` (n,) take one common rigid motion in addition: dv + dw x r_i about their joint centre, and dw.
+        """
+        mass, position = self.mass[chosen], self.position[chosen]
+        centre = mass @ position / mass.sum()
+        arm = position - centre
+        inertia = self.spatial_inertia[chosen].sum(axis=0)
+        inertia += np.einsum("n,ni,ni->", mass, arm, arm) * np.eye(3) - np.einsum("n,ni,nj->ij", mass, arm, arm)
+        lacking = before.angular_momentum_about(centre) - self.angular_momentum_about(centre)
+        spin_change = np.linalg.solve(inertia, lacking)
+        velocity, spin = self.velocity.copy(), self.spin.copy()
+        velocity[chosen] += (before.momentum - self.momentum) / mass.sum() + np.cross(spin_change, arm)
+        spin[chosen] += spin_change
+        return replace(self, velocity=velocity, spin=spin)
 
     def with_shapes(self, moments: PolyhedronMoments, changed: Ints) -> Bodies:
         """Return the bodies after those `changed` (k,) were given the shapes of `moments`.
@@ -151,8 +159,8 @@ class Bodies:
         spin[changed] = (self.rotation[changed] @ np.linalg.solve(inertia[changed], momentum))[:, :, 0]
         return replace(self, centre=centre, inertia=inertia, spin=spin)
 
-    def select(self, chosen: slice) -> Bodies:
-        """Return a contiguous part of the bodies."""
+    def select(self, chosen: slice | Ints) -> Bodies:
+        """Return some of the bodies."""
         return Bodies(*(values[chosen] for values in vars(self).values()))
 
     def concatenate(self, following: Bodies) -> Bodies:
@@ -182,8 +190,13 @@ class Bodies:
     @property
     def angular_momentum(self) -> Values:
         """Total angular momentum about the origin, sum m x x v + I w (3,), N m s."""
+        return self.angular_momentum_about(np.zeros(3))
+
+    def angular_momentum_about(self, point: Values) -> Values:
+        """Return the total angular momentum (3,), N m s, about a point (3,), m."""
         about_centres = np.einsum("nij,nj->i", self.spatial_inertia, self.spin)
-        return np.asarray((self.mass[:, None] * np.cross(self.position, self.velocity)).sum(axis=0) + about_centres)
+        moments = self.mass[:, None] * np.cross(self.position - point, self.velocity)
+        return np.asarray(moments.sum(axis=0) + about_centres)
 
     @property
     def kinetic_energies(self) -> Values:
@@ -196,13 +209,6 @@ class Bodies:
         """Total kinetic energy, J."""
         rotational = np.einsum("ni,nij,nj->", self.spin, self.spatial_inertia, self.spin)
         return float(self.mass @ np.einsum("ni,ni->n", self.velocity, self.velocity) + rotational) / 2
-
-
-def _sums(values: Values, group: Ints, count: int) -> Values:
-    """Return sums (count, ...) of values (m, ...) over groups (m,)."""
-    result = np.zeros((count, *values.shape[1:]))
-    np.add.at(result, group, values)
-    return result
 
 
 # --- motion between contacts: v' = v + dt (g + F / m), l' = l + dt M, x' = x + t v' ---

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ import numpy.typing as npt
 
 from ..contact.obstacle import RigidObstacle
 from ..errors import NotConverged, StepAborted
+from ..mesh.split_surface.polyhedron_moments import PolyhedronMoments
 from .bodies import Bodies
 from .contact_points import ContactImpulses
 from .engine import Engine
@@ -328,18 +329,23 @@ class RigidStepper:
         self.update_shapes()
         after = self.shapes
         parent = np.searchsorted(before.names, before.names[before.node_fragment[after.names]])
-        fragments = bodies.split_into(after.moments, parent)
+        broken = np.isin(before.names[parent], list(names)) | (np.bincount(parent)[parent] > 1)
+        # Fragments that share cells with these have other shapes too, as the cells were cut anew.
+        shapes = zip(vars(after.moments).values(), vars(before.moments).values(), strict=True)
+        equal = [(new == old[parent]).reshape(len(parent), -1).all(axis=1) for new, old in shapes]
+        changed = broken | ~np.logical_and.reduce(equal)
+        values = {name: np.array(array[parent]) for name, array in vars(bodies).items()}
+        for number in np.unique(after.names[broken] // self.instances.node_count):
+            rows = np.flatnonzero(changed & (after.names // self.instances.node_count == number))
+            moments = PolyhedronMoments(*(array[rows] for array in vars(after.moments).values()))
+            fragments = bodies.at_new_shapes(self._density, moments, parent[rows])
+            fragments = fragments.with_momenta_of(bodies.select(np.unique(parent[rows])), broken[rows])
+            for name, array in vars(fragments).items():
+                values[name][rows] = array
         self.impact_detector.forget_bodies(np.array([*names], np.int64))
         self._broken_instances = {name // self.instances.node_count for name in names}
-        # Bodies that did not break stay the same to the last digit. If cells that they share were cut anew, they take
-        # the centre and inertia of their new shape, to which collision shapes are relative, with the same momenta.
-        unbroken = ~np.isin(before.names[parent], list(names)) & (np.bincount(parent)[parent] == 1)
-        unbroken &= np.all(after.moments.centre == before.moments.centre[parent], axis=1)
-        values = {name: np.array(array) for name, array in vars(fragments).items()}
-        for name, array in values.items():
-            array[unbroken] = getattr(bodies, name)[parent[unbroken]]
         self.initial_overlaps = self.initial_overlaps.after_fracture(after.names, before.names[parent])
-        return replace(fragments, **values).concatenate(free)
+        return Bodies(**values).concatenate(free)
 
     def _apply_dented_shapes(self, bodies: Bodies, instances: list[int]) -> Bodies:
         """Return the bodies with the shapes of instances that have been dented; the step is not repeated."""

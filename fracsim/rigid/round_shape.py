@@ -8,7 +8,7 @@ the solid per volume, times the volume of the mesh, so that it rolls as the soli
     capsule   the sum over a cylinder, and half spheres whose centres of volume are 3 r/8 beyond its ends
 
 with the radius r, the length L and the axis a; S = int x x^T dV / V about the centre of the solid. The fragments of a
-body that breaks are those of its mesh, with the same momenta (Bodies.split_into).
+body that breaks are those of its mesh, with the same momenta (Bodies.with_momenta_of).
 """
 
 from __future__ import annotations
