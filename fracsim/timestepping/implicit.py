@@ -80,12 +80,12 @@ class ImplicitStepper(BalanceStepper):
                 if inelastic.fracture.softens_gradually:
                     self.balance.set_displacement(solved)
                 result = inelastic.fracture_pass(dt)
-                if result.previous_damage:
-                    inelastic.damage_changed(result)
+                inelastic.damage_changed(result)
+            # Cells may release energy in a pass that breaks no edge, too.
+            broken, released = broken + result.broken_edges, released + result.released_energy
             if not result.previous_damage:
                 self._return_to(solved, state, dt)
                 break
-            broken, released = broken + result.broken_edges, released + result.released_energy
             again = self._solve(state, dt, solved)
             solve = solve.with_iterations_of(again)
             if not again.converged:
