@@ -286,6 +286,19 @@ def test_bodies_that_cut_each_other_are_refused(tmp_path: Path) -> None:
         fill_surface(save(tmp_path / "cross.stl", cube(), cube(at=0.4)), h=0.3)
 
 
+def test_bodies_that_overlap_along_an_axis_are_refused() -> None:
+    """All corners of one lie on the other, and edges cross in common planes alone; bodies that touch are two."""
+    points, triangles = cube()
+
+    def pair(shift: list[float]) -> tuple[np.ndarray, np.ndarray, str]:
+        return np.concatenate([points, points + shift]), np.concatenate([triangles, triangles + len(points)]), "S"
+
+    with pytest.raises(MeshError, match="S has parts that cut each other, near"):
+        closed_surface(*pair([0.5, 0.0, 0.0]))
+    for shift in ([1.0, 0.5, 0.25], [1.5, 0.0, 0.0]):
+        assert len(closed_surface(*pair(shift)).bodies) == 2
+
+
 @pytest.mark.parametrize("unit", [1e-3, 1e3])
 @pytest.mark.parametrize(("name", "shell", "h"), [("cube", cube(), 0.3), ("torus", torus(around=24, across=10), 0.2)])
 def test_the_unit_of_length_does_not_matter(tmp_path: Path, name: str, shell: Shell, h: float, unit: float) -> None:
