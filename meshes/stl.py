@@ -13,6 +13,7 @@ from .mesh_conversion import Block, MeshFileContents
 
 HEAD = np.dtype([("text", "S80"), ("count", "<u4")])  # of a binary file
 TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+MAX_ROUNDING = 1e-3  # spacing of the coordinates of a binary file over the size of its body
 _WORDS = re.compile(rb"^[ \t]*(vertex|end[ \t]*facet|end[ \t]*loop)\b", re.IGNORECASE | re.MULTILINE)
 _VERTEX = rb"\s*+vertex([ \t]++\S++[ \t]++\S++[ \t]++\S++)[ \t]*+\n"
 _FACET = re.compile(
@@ -37,6 +38,7 @@ def read_stl(path: Path) -> MeshFileContents:
         if beyond and beyond % size == 0:
             refuse_file(path, f"it declares {declared} triangles, and holds {declared + beyond // size}")
         corners = np.frombuffer(data, TRIANGLE, declared, head)["corners"].astype(np.float64)
+        _check_resolution(path, corners)
     elif data[:4096].lstrip()[:5].lower() == b"solid" and b"\0" not in data[head:4096]:
         data = with_line_feeds(data)
         regular = _corners_of_regular_text(data)
@@ -52,6 +54,21 @@ def read_stl(path: Path) -> MeshFileContents:
         )
     triangles = np.arange(3 * len(corners)).reshape(-1, 3)
     return MeshFileContents(corners.reshape(-1, 3), [Block("triangle", triangles)], {})
+
+
+def _check_resolution(path: Path, corners: npt.NDArray[np.float64]) -> None:
+    """Raise MeshError if a body is so far from the origin that coordinates of 32 bits round off its shape."""
+    finite = corners[np.isfinite(corners).all(axis=(1, 2))].reshape(-1, 3)
+    if not len(finite) or np.array_equal(finite, np.rint(finite)):  # whole numbers are exact
+        return
+    rounding, size = float(np.spacing(np.float32(np.abs(finite).max()))), float(np.ptp(finite, axis=0).max())
+    if 0 < MAX_ROUNDING * size < rounding:
+        refuse_file(
+            path,
+            f"its coordinates have 32 bits, which round them by up to {rounding / 2:.2g} so far from the origin, of "
+            f"{size:.3g} that it measures",
+            "Move the body to the origin before the export, or export it as OBJ.",
+        )
 
 
 def _corners_of_regular_text(data: bytes, part: int = 1 << 22) -> npt.NDArray[np.float64] | None:

@@ -117,3 +117,14 @@ def test_binary_of_another_number_is_refused(tmp_path: Path, declared: int) -> N
         read_contents(tmp_path / "a.stl")
     (tmp_path / "a.stl").write_bytes(data + bytes(12))
     assert len(read_contents(tmp_path / "a.stl").blocks[0].nodes) == 4
+
+
+def test_coordinates_that_are_rounded_off_are_refused(tmp_path: Path) -> None:
+    """A part of 40 mm at 1e5 m measured 16 of 20 mm; whole numbers, and the same part near the origin, are read."""
+    path = tmp_path / "part.stl"
+    path.write_bytes(binary(0.04 * FACES + [1e5, 0, 0]))
+    with pytest.raises(MeshError, match=r"have 32 bits, which round them by up to 0.0039 so far.*of 0.04 that it"):
+        read_contents(path)
+    for faces in (1.0 * FACES + [1e6, 0, 0], 0.04 * FACES + [1, 0, 0]):
+        path.write_bytes(binary(faces))
+        np.testing.assert_allclose(read_surface(path).volume, np.ptp(faces, axis=(0, 1)).prod() / 6, rtol=1e-5)
