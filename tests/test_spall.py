@@ -82,6 +82,7 @@ def spalled(scheme: str, dt: float, size: tuple[float, ...], pattern: str = "str
         ("explicit", 1e-6, (0.15, 0.003)),
         ("newmark", 4e-7, (0.15, 0.003)),
         ("generalized-alpha", 1e-7, (0.15, 0.003)),
+        ("generalized-alpha", 4e-7, (0.15, 0.003)),
         ("explicit", 1e-6, (0.15, 0.002, 0.002)),
     ],
 )

@@ -121,7 +121,7 @@ def _check_finite(comm: MPI.Comm, end: State) -> None:
         raise NonFiniteState
 
 
-def softening_work(balance: Balance, start: State, u: Values, start_fields: Sequence[Values]) -> float:
+def softening_work(balance: Balance, start: State, u: Values, solved: Values, start_fields: Sequence[Values]) -> float:
     """Return the work, J, on this rank that forces did which softening took away in the course of a step (collective).
 
     The energy released at the displacement at the end is too large by it: forces decrease while cells open.
@@ -130,11 +130,15 @@ def softening_work(balance: Balance, start: State, u: Values, start_fields: Sequ
         balance: at the end of the step.
         start: state at the start of the step.
         u: displacement at its end, (owned dofs,), m.
+        solved: displacement at which the forces of the step balance, (owned dofs,), m.
         start_fields: damage fields at the start of the step.
     """
     # The share of `step_work` that the forces of this step have, which are those after softening.
     share = 0.5 + balance.scheme.alpha_f
-    return share * float(balance.stress.assemble_released_forces(start_fields) @ (u - start.u))
+    balance.set_displacement(solved)
+    released = balance.stress.assemble_released_forces(start_fields)
+    balance.set_displacement(u)
+    return share * float(released @ (u - start.u))
 
 
 def released_state(

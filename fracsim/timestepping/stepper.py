@@ -275,7 +275,7 @@ class BalanceStepper:
         if (softened := self.inelastic.fracture.softened_fields) is not None:
             # Explicit steps find forces before they soften cells.
             work, _ = step_work(balance, state, u, v, end.forces, damping, lumped=lumped)
-            lost -= softening_work(balance, state, u, softened)
+            lost -= softening_work(balance, state, u, solved, softened)
         energies = StepEnergies(work, lost, result.elastic_energy)
         return self._close_step(end, dt, solve, began, result.broken_edges + broken, energies)
 
