@@ -19,7 +19,7 @@ from fracsim.solvers.multigrid.levels import SmoothedLevel
 from fracsim.solvers.newton import UNLIMITED_COST, SolveResult
 from fracsim.solvers.policy import DEFAULT_POLICY
 from fracsim.solvers.preconditioner import Update, mass_stiffness_ratio
-from fracsim.solvers.strategies import Attempt, Task, _first_positive_tangents
+from fracsim.solvers.strategies import Attempt, Task, _exact_tangents, _first_positive_tangents
 from support.scenes import Walk
 from support.solver_policy import set_policy
 
@@ -346,6 +346,32 @@ def test_a_failure_that_an_indefinite_tangent_explains_keeps_the_levels(monkeypa
         linear.ksp.setConvergedReason(code)
         solvers.start_after_failure(failed)
         assert preconditioner._due == update
+
+
+@pytest.mark.parametrize("scheme", ["backward-euler", "quasi-static"])
+@pytest.mark.parametrize("norm, follows", [(0.5, None), (1.5, "guess")])
+def test_positive_tangents_continue_where_exact_ones_reduced_the_residual(
+    monkeypatch: pytest.MonkeyPatch, scheme: str, norm: float, follows: str | None
+) -> None:
+    """With inertia the next attempt starts at the last iterate if |r| has fallen there, otherwise at the first guess.
+
+    Without inertia it always starts at the first guess: |r| also falls toward an unstable balance.
+    """
+    time = {"end": 1.0, "scheme": scheme, "step": 5e-3}
+    scene = bar(2, {"snes_type": "newtonls"}, time=time)
+    newton, solvers = scene.solver._solvers.newton, scene.solver._solvers  # type: ignore[union-attr]
+    guess = np.zeros(scene.balance.owned_dof_count)
+
+    def attempt(given: np.ndarray | None, *_: object, **__: object) -> SolveResult:
+        newton._convergence.first_norm = 1.0
+        newton.snes.setFunctionNorm(norm)
+        solvers.linear.ksp.setConvergedReason(PETSc.KSP.ConvergedReason.DIVERGED_INDEFINITE_MAT)
+        return SolveResult(False, 1, 1, "")
+
+    monkeypatch.setattr(newton, "attempt", attempt)
+    last = _exact_tangents(solvers, Task(guess, UNLIMITED_COST, []), None)
+    assert last.linear_solves_failed
+    assert (last.start is None) == (follows is None and scheme == "backward-euler")
 
 
 def test_levels_that_are_not_positive_for_positive_tangents_are_made_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -78,6 +78,7 @@ class ConvergenceTest:
     An attempt is also ended if it costs too much, if it cycles, or if a stop was requested.
 
     Attributes:
+        first_norm: |r| of the first guess, N; 0 if contact limits Newton's steps.
         solved_norm: largest |r| of a solution, N.
         stopped_for_cost: whether the last attempt was ended because of its cost.
         aborted: whether the last solve was ended by a request to stop.
@@ -88,7 +89,7 @@ class ConvergenceTest:
     def __init__(self, balance: Balance, rtol: float, policy: SolverPolicy) -> None:
         """`rtol`: relative tolerance of the residual."""
         self._balance, self._policy, self._asked_rtol = balance, policy, rtol
-        self._rtol, self._first_norm = rtol, 0.0
+        self._rtol, self.first_norm = rtol, 0.0
         # iterations of the solve whose |r| was small beside that of the first guess, but not beside the forces
         self._further_iterations, self._is_intact = 0, True
         self.stop_requested: Callable[[], bool] = lambda: False
@@ -192,10 +193,10 @@ class ConvergenceTest:
         """Whether |r| = `norm`, N, after `its` iterations is that of a solution (collective)."""
         if its == 0:
             # a first guess that contact has cut is off by more than any force of the step, however stiff the body
-            self._first_norm = 0.0 if self._balance.contact.limits_newton_steps else norm
+            self.first_norm = 0.0 if self._balance.contact.limits_newton_steps else norm
             self._further_iterations, self.is_rough = 0, False
             return norm <= self.norm_of_solution(0.0)
-        scale, round_off = self._set_solved_norm(self._first_norm)
+        scale, round_off = self._set_solved_norm(self.first_norm)
         if norm > self.solved_norm:
             return False
         if not self._is_intact:
@@ -286,6 +287,11 @@ class NewtonSolver:
     def descended_potential(self) -> bool:
         """Whether the line search of the last attempt minimised the incremental potential."""
         return self._modified is not None
+
+    @property
+    def reduced_residual(self) -> bool:
+        """Whether |r| of the last iterate of the last attempt is below that of its first guess."""
+        return bool(self.snes.getFunctionNorm() < self._convergence.first_norm)
 
     # --- the tangent ---
 

@@ -239,9 +239,15 @@ def _factors_of_spell(solvers: Solvers, task: Task, last: Attempt | None) -> Att
 
 
 def _exact_tangents(solvers: Solvers, task: Task, last: Attempt | None) -> Attempt:
-    """Attempt with exact tangents; after a descent of the potential the next one continues from the last iterate."""
-    result = solvers.newton.attempt(task.guess, limit=task.limit)
-    continues = solvers.newton.descended_potential and not solvers.balance.contact.remaining_motion()
+    """Attempt with exact tangents; the next one continues from the last iterate if that one is nearer to a solution.
+
+    It is nearer after a descent of the potential, and with inertia also where |r| has fallen. Without inertia |r|
+    falls toward an unstable balance as well.
+    """
+    newton, balance = solvers.newton, solvers.balance
+    result = newton.attempt(task.guess, limit=task.limit)
+    is_nearer = newton.descended_potential or (balance.scheme.inertia and newton.reduced_residual)
+    continues = is_nearer and not balance.contact.remaining_motion()
     return Attempt(EXACT, result, solvers.linear_solves_failed(result), None if continues else task.guess)
 
 
