@@ -84,7 +84,8 @@ class FractureSettings(StudyTable):
     )
     passes: Annotated[int, Field(ge=1, strict=True)] | None = key(
         "Maximum number of times that a step is solved and evaluated for fracture.", default=None, example=10,
-        otherwise="1; in quasi-static studies until nothing changes",
+        otherwise="in quasi-static studies, and in implicit steps of cohesive cracks, until nothing changes; with "
+        "inertia as many as a crack with `energy` needs to run as fast as a Rayleigh wave, without `energy` 1",
     )  # fmt: skip
     cap: Annotated[Finite, Field(gt=0, le=1)] | None = key(
         "Maximum share of all edges that break in one pass, in the order of their load.", default=None, example=0.01,
