@@ -37,5 +37,12 @@ def test_a_body_that_broke_has_no_note() -> None:
     assert note_of_bar(0.31) == ""
 
 
+@pytest.mark.parametrize("strength", [1e14, float("inf")])
+def test_a_strength_far_above_all_stresses(strength: float) -> None:
+    """A strength in a wrong unit, or none: the body is in tension."""
+    note = note_of_bar(0.1, strength)
+    assert f"is {YOUNG * 0.1:.3g} Pa, {YOUNG * 0.1 / strength:.2g} of the strength, at (" in note
+
+
 def test_a_body_in_compression() -> None:
     assert note_of_bar(-0.1) == "nothing broke, and no cell is in tension at the end"
