@@ -83,7 +83,10 @@ REFUSED: list[tuple[Data, str]] = [
     (without("mesh"), "mesh is missing; every study needs it"),
     (without("material"), "material is missing; every study needs it"),
     (without("time"), "time is missing; every study needs it"),
-    (without("material", "density"), "material.density is missing; the table [material] needs it"),
+    (
+        without("material", "density"),
+        "material.density is missing; the table [material] needs it. Example: density = 300.0. Meaning: Mass density",
+    ),
     (changed(BAR, time={}) | {"time": {}}, "time.step and time.end are missing; the study needs them"),
     (without("fracture", "strength", STRIP), "fracture.strength is missing; the table [fracture] needs it"),
     (right(), "boundary.1: give exactly one of fix, displacement, velocity, traction, force, pressure; found none"),

@@ -52,7 +52,7 @@ def validation_message(errors: Sequence[Any], table: str = "") -> str:
         # a key may be missing in one type of a value alone
         missing = [_key(entry, table) for entry in errors if entry["type"] == "missing" and not _in_union(entry)]
         if _in_union(error) or len(missing) == 1:
-            return f"{where} is missing; {_owner(location)} needs it"
+            return f"{where} is missing; {_owner(location)} needs it{_meaning(location)}"
         return f"{', '.join(missing[:-1])} and {missing[-1]} are missing; the study needs them"
     if error["type"] == "value_error":
         return f"{where}: {error['ctx']['error']}" if where else str(error["ctx"]["error"])
@@ -110,8 +110,25 @@ def _show(value: Any) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
+def _meaning(location: list[Any]) -> str:
+    """Example and meaning of a required key of a table; empty for a table."""
+    from .documentation import toml
+
+    fields = [
+        model.model_fields[location[-1]] for model in _tables_at(location[:-1]) if location[-1] in model.model_fields
+    ]
+    if not fields or not fields[0].examples:
+        return ""
+    return f". Example: {location[-1]} = {toml(fields[0].examples[0])}. Meaning: {fields[0].description}".removesuffix(".")
+
+
 def _known_keys(location: list[Any]) -> list[str]:
     """Known keys of the table at a path of the study file."""
+    return [key for model in _tables_at(location) for key in model.model_fields if key != "regions"]
+
+
+def _tables_at(location: list[Any]) -> list[type[BaseModel]]:
+    """Models of the tables that may be at a path of the study file."""
     models: list[type[BaseModel]] = [Study]
     for part in location:
         fields = [model.model_fields for model in models]
@@ -119,7 +136,7 @@ def _known_keys(location: list[Any]) -> list[str]:
         inner = [model for field in selected if field is not None for model in models_in(field.annotation)]
         # an index of a list keeps the table of its entries
         models = inner or models
-    return [key for model in models for key in model.model_fields if key != "regions"]
+    return models
 
 
 def models_in(annotation: Any) -> list[type[BaseModel]]:
