@@ -119,7 +119,8 @@ def _meaning(location: list[Any]) -> str:
     ]
     if not fields or not fields[0].examples:
         return ""
-    return f". Example: {location[-1]} = {toml(fields[0].examples[0])}. Meaning: {fields[0].description}".removesuffix(".")
+    text = f". Example: {location[-1]} = {toml(fields[0].examples[0])}. Meaning: {fields[0].description}"
+    return text.removesuffix(".")
 
 
 def _known_keys(location: list[Any]) -> list[str]:
