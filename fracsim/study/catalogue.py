@@ -12,9 +12,9 @@ from .material_library import MATERIALS
 from .plugins import GROUPS, plugin_names
 
 ENERGIES = {
-    "linear": "Hooke's law; small strains and rotations; plane stress in 2D",
+    "linear": "Hooke's law; small strains and rotations; plane strain or plane stress in 2D",
     "corotated": "Hooke's law that turns with the cell: small strains, large rotations",
-    "stvk": "Saint Venant-Kirchhoff; moderate strains; plane stress in 2D",
+    "stvk": "Saint Venant-Kirchhoff; moderate strains; plane strain or plane stress in 2D",
     "neo-hookean": "stable neo-Hookean; large strains, any compression (default)",
 }
 OBSTACLES = {
