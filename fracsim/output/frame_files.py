@@ -91,8 +91,9 @@ class FieldEvaluator:
         """Values (cells, components) of an expression of the deformation; stress and energy are multiplied by chi."""
         if name not in self._compiled:
             expression = _EXPRESSIONS[name](self._stress)
+            domain, kernels = self._domain, self._stress.kernels
             self._compiled[name] = CellExpression(
-                self._domain.comm, self._domain.mesh, expression, self._domain.cell_count
+                domain.comm, domain.mesh, expression, domain.cell_count, kernels=kernels
             )
         values = self._compiled[name]()
         if (chi := self._stress.energy_multiplier) is not None and name != "strain":
