@@ -35,7 +35,7 @@ from fracsim.fracture.energy.tip_parameters import TIP
 from fracsim.mesh.domain import distribute
 from fracsim.mesh.small_matrices import barycentric_gradients
 from fracsim.scene import build_scene, build_scene_on
-from fracsim.studies.evidence.precision.torn_strip import crack_of_strip, strip_study
+from fracsim.studies.evidence.precision.torn_strip import SHEAR, crack_of_strip, strip_study
 from fracsim.study.check import check_study
 from fracsim.timestepping.state import State
 from fracsim.timestepping.stepper import StepReport
@@ -553,15 +553,19 @@ def test_a_strip_tears_where_it_stores_enough(scheme: str, n: int, order: int) -
     assert run.length > 0.7 and 0.2 < run.speed < (0.5 if order == 1 else 0.55)
 
 
-@pytest.mark.parametrize("step", (0.25, 0.5))
-def test_implicit_steps_count_what_a_running_crack_dissipates(step: float) -> None:
-    """A strip that stores 1.5 G_c a metre, by Newmark's method: work is the sum of all energies, to 6 % of the loss.
+@pytest.mark.parametrize(
+    ("scheme", "step", "tolerance"),
+    [("explicit", 0.1, 0.003), ("generalized-alpha", 0.25, 0.003), ("newmark", 0.25, 0.01), ("newmark", 0.5, 0.06)],
+)
+def test_the_energy_of_a_running_crack_is_balanced(scheme: str, step: float, tolerance: float) -> None:
+    """A strip that stores 1.5 G_c a metre: work is the sum of all energies, to a share of the loss.
 
-    Cells release their energy in many steps. In steps of half the time of a shear wave through a cell there are two
-    passes; if the first broke no edge, its release was left out: half of all.
+    Cells release their energy in many steps, and each release corrects the acceleration. Without that in steps in which
+    no edge breaks 2.1 % were missing in explicit steps and 4.5 % by Newmark's method. Steps of half the time of a shear
+    wave through a cell have two passes; if the first breaks no edge, its release counts, and the acceleration stays.
     """
-    tables = strip_study(1.5, "newmark", "structured", 8)
-    tables["time"]["step"] *= step / 0.5
+    tables = strip_study(1.5, scheme, "structured", 8)
+    tables["time"]["step"] = step / 8 / SHEAR
     scene = build_scene(MPI.COMM_SELF, make_study(**tables))
     rows, advance = [], scene.stepper.advance
 
@@ -576,7 +580,7 @@ def test_implicit_steps_count_what_a_running_crack_dissipates(step: float) -> No
     first = np.flatnonzero(broken)[0] - 1
     lost = dissipated[-1] - dissipated[first]
     missing = work[-1] - work[first] - (stored[-1] - stored[first]) - lost
-    assert lost > 2.5 and abs(missing) < 0.06 * lost
+    assert lost > 2.5 and abs(missing) < tolerance * lost
 
 
 @pytest.mark.slow

@@ -53,10 +53,15 @@ class EnergyRelease:
 
 
 class Degradation(Protocol):
-    """Interface of a degradation."""
+    """Interface of a degradation.
 
-    # An edge all of whose cells are split carries no stress, so that it may break as well.
+    Attributes:
+        breaks_idle_edges: an edge all of whose cells are split carries no stress, so that it may break as well.
+        releases_gradually: split cells release their energy in many passes, also in those in which no edge breaks.
+    """
+
     breaks_idle_edges: bool
+    releases_gradually: bool
 
     def __call__(self, broke: bool, stress: Values, psi: Values) -> EnergyRelease:
         """Degrade the cells after a pass.
@@ -80,7 +85,7 @@ class Degradation(Protocol):
 class ChiDegradation:
     """chi of damaged cells from the normal stress along their edges (M22, eq. 28); it never increases."""
 
-    breaks_idle_edges = True
+    breaks_idle_edges, releases_gradually = True, False
 
     def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
         assert stress.chi is not None
@@ -136,7 +141,7 @@ class EdgeIntegrityFields:
 class EdgeProjectionDegradation:
     """Energy of the strain projected on intact edges; split cells keep the forces of their intact edges."""
 
-    breaks_idle_edges = False
+    breaks_idle_edges, releases_gradually = False, False
 
     def __init__(self, stress: Stress, graph: EdgeGraph) -> None:
         self._edges = EdgeIntegrityFields(stress, graph)
@@ -177,6 +182,7 @@ class SplitCellDegradation:
         assert stress.chi is not None
         self._graph, self._chi, self._volumes = graph, stress.chi.x.array, stress.domain.volumes
         self._release_rate, self._step_start = release_rate, -np.inf
+        self.releases_gradually = release_rate is not None
         self._chi_at_start: Values = np.ones(0)
         self._min_chi: Values = np.zeros(0)
 
@@ -215,6 +221,7 @@ class CrackClosureDegradation:
     def __init__(self, degradation: Degradation, stress: Stress, graph: EdgeGraph) -> None:
         """Build the combination; `degradation` sets chi, and the springs carry pressure in broken edges."""
         self._degradation, self.breaks_idle_edges = degradation, degradation.breaks_idle_edges
+        self.releases_gradually = degradation.releases_gradually
         self._edges = EdgeIntegrityFields(stress, graph)
 
     def __call__(self, broke: bool, stress: Values, psi: Values) -> EnergyRelease:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ..mechanics.stress import Stress
 from ..mesh.edge_graph import EdgeGraph
+from ..mesh.parallel import sum_over_ranks
 from .criterion import FractureCriterion
 from .degradation import Degradation, make_degradation
 from .effective_stress import UndamagedStress
@@ -57,7 +58,8 @@ class FracturePassResult:
         released_energy: elastic energy released on this rank, J.
         elastic_energy: elastic energy left on this rank, J.
         cells_died: whether chi of some cell of this rank fell to 0.
-        previous_damage: copies of the damage fields before the pass, if edges broke or cohesive cracks softened.
+        previous_damage: copies of the damage fields before the pass, if it released forces on any rank: edges broke,
+            split cells released a part of their energy, or cohesive cracks softened.
     """
 
     broken_edges: int
@@ -187,8 +189,11 @@ class FracturePass:
             released = self.graph.break_edges(self._hinges(stress))
             broken, weakened = broken + released, weakened + released
             broken += self._break_idle_edges(released)
-        before = [damage.x.array.copy() for damage in self.stress.damage_fields] if broken else []
+        gradual = self.degradation.releases_gradually
+        before = [damage.x.array.copy() for damage in self.stress.damage_fields] if broken or gradual else []
         release = self.degradation(weakened > 0, stress, psi)
+        if not broken and gradual and not sum_over_ranks(self.graph.domain.comm, int(release.chi_drop > 0))[0]:
+            before = []
         if weakened or release.chi_drop or self._has_tip_states:
             self.mark_changed()
         return FracturePassResult(

@@ -148,10 +148,10 @@ def released_state(
     previous_damage: Sequence[Values],
     response: Callable[[Values], Values] | None,
 ) -> State:
-    """Return the end of a step with the forces and the acceleration after its edges broke (collective).
+    """Return the end of a step with the forces and the acceleration after its last fracture pass (collective).
 
-    The acceleration changes by c_a (c_a M + K)^-1 f, f the forces that the breaks released and K the tangent before
-    them. This is M^-1 f for motion that steps resolve, with an error of second order, and almost 0 for motion that is
+    The acceleration changes by c_a (c_a M + K)^-1 f, f the forces that the pass released and K the tangent before
+    it. This is M^-1 f for motion that steps resolve, with an error of second order, and almost 0 for motion that is
     much faster.
 
     Args:
@@ -159,7 +159,7 @@ def released_state(
         end: state before the release.
         solved: (owned dofs,) displacement at which the forces of the step balance, m. The end of a step of
             generalized-alpha is an extrapolation.
-        previous_damage: damage fields before the breaks.
+        previous_damage: damage fields before the pass.
         response: linear displacement response of a step to forces (owned dofs,), m; None for explicit steps, which
             resolve all motion.
     """

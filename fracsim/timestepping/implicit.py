@@ -83,7 +83,8 @@ class ImplicitStepper(BalanceStepper):
                 inelastic.damage_changed(result)
             # Cells may release energy in a pass that breaks no edge, too.
             broken, released = broken + result.broken_edges, released + result.released_energy
-            if not result.previous_damage:
+            # Repeated after cells released energy without a broken edge, steps gain energy.
+            if not (result.broken_edges or (result.previous_damage and inelastic.fracture.softens_gradually)):
                 self._return_to(solved, state, dt)
                 break
             again = self._solve(state, dt, solved)

@@ -42,7 +42,7 @@ class PassResultProtocol(Protocol):
 
     @property
     def previous_damage(self) -> list[Values]:
-        """Copies of the damage fields before the pass, if edges broke or cohesive cracks softened."""
+        """Copies of the damage fields before the pass, if it released forces on any rank."""
 
 
 class FractureProtocol(HistoryVariables, Protocol):
