@@ -35,8 +35,8 @@ class KernelSelection:
         plain: whether DOLFINx does everything.
         min_dofs: number of dofs on all ranks from which a form is compiled once more, in 1 to 2 s the first time. A
             tangent of 3,141 dofs takes 2 ms with it and 9 ms without.
-        min_cells: number of cells on all ranks from which an expression of every step or frame is, in 0.5 s, for a third of
-            its time.
+        min_cells: number of cells on all ranks from which an expression of every step or frame is, in 0.5 s, for a
+            third of its time.
     """
 
     plain: bool = False
