@@ -140,9 +140,9 @@ def test_peak_loads_on_coarse_meshes(
 
 
 def test_a_crack_under_a_wave_on_a_coarse_mesh(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It starts late or early by less than the wave takes through four cells of 4 mm, and gets as far to three quarters.
+    """It starts late or early by less than the wave takes through four cells, and gets as far to three quarters.
 
-    With cells of 0.5 mm it gets as far to 1 %.
+    Cells are 4 mm long; with 0.5 mm it gets as far to 1 %.
     """
     monkeypatch.setattr(wave_loaded_crack, "SEEDS", (1,))
     figures = wave_loaded_crack.measure({"h": 4e-3, "order": 1, "scheme": "explicit", "law": "griffith"}, tmp_path)
