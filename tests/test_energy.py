@@ -555,14 +555,20 @@ def test_a_strip_tears_where_it_stores_enough(scheme: str, n: int, order: int) -
 
 @pytest.mark.parametrize(
     ("scheme", "step", "tolerance"),
-    [("explicit", 0.1, 0.003), ("generalized-alpha", 0.25, 0.003), ("newmark", 0.25, 0.01), ("newmark", 0.5, 0.06)],
+    [
+        ("explicit", 0.1, 0.003),
+        *(("generalized-alpha", step, 0.005) for step in (0.25, 0.8)),
+        *(("newmark", step, 1e-6) for step in (0.25, 0.5, 0.8, 1.3)),
+    ],
 )
 def test_the_energy_of_a_running_crack_is_balanced(scheme: str, step: float, tolerance: float) -> None:
     """A strip that stores 1.5 G_c a metre: work is the sum of all energies, to a share of the loss.
 
-    Cells release their energy in many steps, and each release corrects the acceleration. Without that in steps in which
-    no edge breaks 2.1 % were missing in explicit steps and 4.5 % by Newmark's method. Steps of half the time of a shear
-    wave through a cell have two passes; if the first breaks no edge, its release counts, and the acceleration stays.
+    Cells release their energy in many steps, and each release corrects the acceleration. Without that in steps in
+    which no edge breaks 2.1 % were missing in explicit steps and 4.5 % by Newmark's method. Steps in which a Rayleigh
+    wave goes farther than 0.4 h have two or three passes. When releases before the last pass counted at the
+    displacement of their pass, and those without a broken edge left the acceleration as it was, 5.5, 2.7 and 7.4 %
+    were missing by Newmark's method, and 8 % too much was dissipated in generalized-alpha steps.
     """
     tables = strip_study(1.5, scheme, "structured", 8)
     tables["time"]["step"] = step / 8 / SHEAR

@@ -157,6 +157,11 @@ class FracturePass:
         return self.graph.pattern
 
     @property
+    def releases_gradually(self) -> bool:
+        """Whether split cells release their energy over many steps."""
+        return self.degradation.releases_gradually
+
+    @property
     def nonfinite_cells(self) -> int:
         """Number of evaluations, on this rank, of cells so crushed that their stress is not finite."""
         return self._undamaged.not_finite

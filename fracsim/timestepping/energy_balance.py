@@ -141,6 +141,26 @@ def softening_work(balance: Balance, start: State, u: Values, solved: Values, st
     return share * float(released @ (u - start.u))
 
 
+def release_during_step(
+    balance: Balance, start: State, u: Values, solved: Values, start_fields: Sequence[Values]
+) -> float:
+    """Return the energy, J, on this rank that damage released in a step that was solved with this damage (collective).
+
+    Args:
+        balance: at the end of the step.
+        start: state at the start of the step.
+        u: displacement at its end, (owned dofs,), m.
+        solved: displacement at which the forces of the step balance, (owned dofs,), m.
+        start_fields: damage fields at the start of the step.
+    """
+    stress = balance.stress
+    fields = stress.exchange_damage(start_fields)
+    stored = stress.stored_energy()
+    stress.exchange_damage(fields)
+    released = stored - stress.stored_energy()
+    return released - softening_work(balance, start, u, solved, start_fields)
+
+
 def released_state(
     balance: Balance,
     end: State,
@@ -160,8 +180,8 @@ def released_state(
         solved: (owned dofs,) displacement at which the forces of the step balance, m. The end of a step of
             generalized-alpha is an extrapolation.
         previous_damage: damage fields before the pass.
-        response: linear displacement response of a step to forces (owned dofs,), m; None for explicit steps, which
-            resolve all motion.
+        response: linear displacement response of a step to forces (owned dofs,), m; None: the acceleration changes by
+            M^-1 f, as steps resolve all motion that the forces excite.
     """
     owned, forces = balance.motion.owned_dofs, end.forces.copy()
     reactions = balance.reactions[owned]
@@ -171,7 +191,6 @@ def released_state(
         return replace(end, forces=forces)
     free = balance.motion.free_dofs
     if response is None:
-        # Forces balance at the end of the step, where the body is.
         released = balance.stress.assemble_released_forces(previous_damage)
         change = balance.mass.solve(np.where(free, released, 0.0), free)
     else:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,7 +15,7 @@ from .energy_balance import released_state
 from .inelastic_update import FractureProtocol, PassResultProtocol, PlasticFlowProtocol
 from .state import State
 from .step_sizes import StepSizes
-from .stepper import BalanceStepper
+from .stepper import BalanceStepper, EarlierPasses
 
 Values = npt.NDArray[np.float64]
 
@@ -64,36 +65,44 @@ class ImplicitStepper(BalanceStepper):
         """Return the displacement of motion at constant velocity, (owned dofs,), m."""
         return np.asarray(state.u + (1 - self.balance.scheme.alpha_f) * dt * state.v)
 
-    def _repeat_with_fracture(self, state: State, dt: float, solve: SolveResult) -> tuple[SolveResult, int, float]:
+    def _repeat_with_fracture(self, state: State, dt: float, solve: SolveResult) -> EarlierPasses:
         """Break edges and solve the step again, until no edge breaks or no passes are left.
 
         Each solve begins at the last solution. If the weakened body has no solution, the last solution stays, and the
         next step starts out of balance.
         """
-        inelastic, broken, released = self.inelastic, 0, 0.0
+        inelastic, fracture, passes = self.inelastic, self.inelastic.fracture, EarlierPasses(solve)
+        start_fields = [damage.x.array.copy() for damage in self.balance.stress.damage_fields]
         for _ in range(inelastic.max_passes - 1):
             solved = self._solution()
             _, v, a = self._complete_step(state, dt)
             self._flow()
-            with self._timer.measure(inelastic.fracture.phase):
-                inelastic.fracture.set_rates(v, a)
-                if inelastic.fracture.softens_gradually:
+            with self._timer.measure(fracture.phase):
+                fracture.set_rates(v, a)
+                if fracture.softens_gradually:
                     self.balance.set_displacement(solved)
+                before = fracture.snapshot()
                 result = inelastic.fracture_pass(dt)
-                inelastic.damage_changed(result)
-            # Cells may release energy in a pass that breaks no edge, too.
-            broken, released = broken + result.broken_edges, released + result.released_energy
-            # Repeated after cells released energy without a broken edge, steps gain energy.
-            if not (result.broken_edges or (result.previous_damage and inelastic.fracture.softens_gradually)):
+            if not (result.broken_edges or fracture.softens_gradually):
+                # The last pass of the step repeats this one.
+                fracture.restore(before)
+                self._return_to(solved, state, dt)
+                break
+            inelastic.damage_changed(result)
+            passes = passes.followed_by(result)
+            if not result.previous_damage:
                 self._return_to(solved, state, dt)
                 break
             again = self._solve(state, dt, solved)
-            solve = solve.with_iterations_of(again)
+            passes = replace(passes, solve=passes.solve.with_iterations_of(again))
             if not again.converged:
                 self.failures.unbalanced_steps += 1
                 self._return_to(solved, state, dt)
-                break
-        return solve, broken, released
+                return passes
+        # Backward Euler's method damps the motion that a break sets off: its end is not where the energy was released.
+        if passes.broken and self.balance.scheme.carries_acceleration and not fracture.softens_gradually:
+            return replace(passes, start_fields=start_fields)
+        return passes
 
     def _solution(self) -> Values:
         """Return a copy of the displacement of the balance, (owned dofs,), m."""
@@ -106,4 +115,6 @@ class ImplicitStepper(BalanceStepper):
         self.balance.update_reactions()
 
     def _release(self, end: State, solved: Values, dt: float, result: PassResultProtocol) -> State:
-        return released_state(self.balance, end, solved, result.previous_damage, self.solver.linear_response)
+        # Released over many steps, forces excite no fast motion: M^-1 f keeps the energy balance exact.
+        response = None if self.inelastic.fracture.releases_gradually else self.solver.linear_response
+        return released_state(self.balance, end, solved, result.previous_damage, response)

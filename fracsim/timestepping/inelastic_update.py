@@ -65,6 +65,10 @@ class FractureProtocol(HistoryVariables, Protocol):
     softened_fields: list[Values] | None
 
     @property
+    def releases_gradually(self) -> bool:
+        """Whether split cells release their energy over many steps."""
+
+    @property
     def nonfinite_cells(self) -> int:
         """Number of evaluations on this rank of cells whose stress was not finite."""
 
@@ -159,6 +163,7 @@ class NoFracture:
     weakens_gradually = False
     softens_gradually = False
     softened_fields: list[Values] | None = None
+    releases_gradually = False
 
     def __init__(self, balance: Balance, flow: PlasticFlowProtocol | None = None) -> None:
         self._balance, self._flow = balance, flow or NoPlasticFlow()

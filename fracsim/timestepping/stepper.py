@@ -21,7 +21,15 @@ import numpy.typing as npt
 from ..errors import StepAborted
 from ..mechanics.balance import Balance
 from ..solvers.newton import SolveResult
-from .energy_balance import NonFiniteState, StepEnergies, add_step_energies, balanced_forces, softening_work, step_work
+from .energy_balance import (
+    NonFiniteState,
+    StepEnergies,
+    add_step_energies,
+    balanced_forces,
+    release_during_step,
+    softening_work,
+    step_work,
+)
 from .inelastic_update import (
     DamageListener,
     FractureProtocol,
@@ -55,6 +63,29 @@ class StepReport:
     kinetic: float
     elastic: float
     seconds: float
+
+
+@dataclass(frozen=True)
+class EarlierPasses:
+    """Fracture passes of a step before its last one.
+
+    Attributes:
+        solve: result of the nonlinear solves, with all iterations.
+        broken: number of edges that broke.
+        released: energy released on this rank, J.
+        start_fields: damage fields at the start of the step, if it was solved with the damage of these passes. The
+            energy that they release is then that at the end of the step, and `released` does not count.
+    """
+
+    solve: SolveResult
+    broken: int = 0
+    released: float = 0.0
+    start_fields: list[Values] | None = None
+
+    def followed_by(self, result: PassResultProtocol) -> EarlierPasses:
+        """Return these passes and one more."""
+        broken, released = self.broken + result.broken_edges, self.released + result.released_energy
+        return replace(self, broken=broken, released=released)
 
 
 @dataclass
@@ -262,30 +293,30 @@ class BalanceStepper:
 
     def _finish(self, state: State, dt: float, solve: SolveResult, began: float) -> tuple[State, StepReport]:
         """Complete the step, let the body flow and break, and sum the energies (collective)."""
-        solve, broken, released = self._repeat_with_fracture(state, dt, solve)
+        passes = self._repeat_with_fracture(state, dt, solve)
         balance, lumped = self.balance, self.balance.mass.is_diagonal and self.balance.scheme.inertia
         solved, acting = balance.u.x.array[: balance.owned_dof_count].copy(), balanced_forces(balance, lumped=lumped)
         u, v, a = self._complete_step(state, dt)
         work, viscous = step_work(balance, state, u, v, *acting, lumped=lumped)
         forces, damping = acting
         end = replace(state, u=u, v=v, a=a, t=state.t + dt, step=state.step + 1, forces=forces, damping=damping)
-        flow_loss = self._flow()
+        lost = viscous + self._flow()
+        if passes.start_fields is None:
+            lost += passes.released
+        else:
+            lost += release_during_step(balance, state, u, solved, passes.start_fields)
         end, result = self._break_edges(end, solved, dt)
-        lost = viscous + (result.released_energy + released + flow_loss)
+        lost += result.released_energy
         if (softened := self.inelastic.fracture.softened_fields) is not None:
             # Explicit steps find forces before they soften cells.
             work, _ = step_work(balance, state, u, v, end.forces, damping, lumped=lumped)
             lost -= softening_work(balance, state, u, solved, softened)
         energies = StepEnergies(work, lost, result.elastic_energy)
-        return self._close_step(end, dt, solve, began, result.broken_edges + broken, energies)
+        return self._close_step(end, dt, passes.solve, began, result.broken_edges + passes.broken, energies)
 
-    def _repeat_with_fracture(self, state: State, dt: float, solve: SolveResult) -> tuple[SolveResult, int, float]:
-        """Carry out all fracture passes of the step but the last, each followed by a solve; by default none.
-
-        Returns:
-            Result with all iterations, number of broken edges, and the energy released on this rank, J.
-        """
-        return solve, 0, 0.0
+    def _repeat_with_fracture(self, state: State, dt: float, solve: SolveResult) -> EarlierPasses:
+        """Carry out all fracture passes of the step but the last, each followed by a solve; by default none."""
+        return EarlierPasses(solve)
 
     def _complete_step(self, state: State, dt: float) -> tuple[Values, Values, Values]:
         """Return u, v and a at the end of the step, where the balance is evaluated as well (collective)."""

@@ -50,7 +50,7 @@ def strip_study(ratio: float, scheme: str, pattern: str, n: int, order: int = 1,
     s = np.linspace(0, 1, 30)
     opening = np.sqrt(2 * ratio / constrained) * s**3 * (10 - 15 * s + 6 * s**2)
     moved = [[0.0, x] for x in opening.tolist()]
-    step = (0.1 if scheme == "explicit" else 0.5) / n / SHEAR
+    step = (0.1 if scheme == "explicit" else 0.4) / n / SHEAR
     return {
         "title": "A strip that tears",
         "mesh": {"builder": "box", "size": [LENGTH, 1.0], "h": 1 / n, "pattern": pattern, "order": order},
