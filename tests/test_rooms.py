@@ -35,7 +35,7 @@ WITHOUT_DOLFINX = {
     "mechanics.time_functions",
 }
 WITHOUT_DOLFINX |= {"mesh.small_matrices", "mechanics.stability_limit", "rigid.instance_placement"}
-CONTACT = "laws obstacle pose shape_base shapes triangle_mesh_shape"
+CONTACT = "closest_point laws obstacle pose shape_base shapes triangle_mesh_shape"
 WITHOUT_DOLFINX |= {f"contact.{name}" for name in CONTACT.split()}
 # a sweep asks the schema and who owns a folder; colours and pictures read files
 OF_REPORT = {

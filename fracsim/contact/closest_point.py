@@ -15,7 +15,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..array_types import Ints, Values
+from ..array_types import Flags, Ints, Values
 from .pose import PosedShape
 
 
@@ -27,7 +27,7 @@ class ClosestPointPolicy:
         max_iterations: of Newton's method.
         max_trials: of a line search.
         slope_reduction: part of the initial slope at which a line search ends.
-        flat_distance: distance, in facet sizes, from which on an obstacle counts as flat for the initial guess.
+        flat_distance: distance, in facet sizes, from which on an obstacle counts as flat for the compiled guess.
         min_change: change of barycentric coordinates that counts as none.
         tolerance: remaining derivative by barycentric coordinates, in smoothings mu.
         round_off: that of a derivative, in largest coordinates, below which the search ends.
@@ -81,6 +81,22 @@ def minimise_on_simplex(Q: Values, slope: Values, barycentric: Values) -> Values
     return np.where(np.all(interior > 0, axis=1, keepdims=True), interior, on_side)
 
 
+def closest_points_of_facets(x: Values, corners: Values) -> tuple[Values, Values]:
+    """Points of facets that are closest to points.
+
+    Args:
+        x: (k, d) points, m.
+        corners: (k, c, d) of triangles or segments, m.
+
+    Returns:
+        (k, c) barycentric coordinates, and (k, d) vectors from there to the points, m.
+    """
+    (k, c, _), arms = corners.shape, corners - x[:, None]
+    slope = np.einsum("kcd,kd->kc", arms, arms.mean(axis=1))
+    barycentric = minimise_on_simplex(arms @ arms.transpose(0, 2, 1), slope, np.full((k, c), 1 / c))
+    return barycentric, -np.einsum("kcd,kc->kd", arms, barycentric)
+
+
 @dataclass(frozen=True, eq=False)
 class FacetClosestPoints:
     """Closest points of facets to an obstacle, with derivatives of the smoothed gap G.
@@ -101,7 +117,7 @@ class FacetClosestPoints:
     smoothing: float
     barycentric: Values
 
-    def select(self, rows: Ints) -> FacetClosestPoints:
+    def select(self, rows: Ints | Flags) -> FacetClosestPoints:
         """Closest points of some of the facets."""
         return FacetClosestPoints(self.posed, self.x[rows], self.smoothing, self.barycentric[rows])
 
@@ -113,8 +129,10 @@ class FacetClosestPoints:
     @cached_property
     def gap(self) -> Values:
         """(k,) G minus its largest possible excess over the minimum distance, m."""
-        value = _smoothed_distance(self.posed, self.x, self.barycentric, self.smoothing)
-        return value - smoothing_error(self.x.shape[1], self.smoothing)
+        c, mu = self.x.shape[1], self.smoothing
+        offset = self.barycentric - 1 / c
+        value = self.posed.distance(self.position) + mu / 2 * np.einsum("kc,kc->k", offset, offset)
+        return np.asarray(value - smoothing_error(c, mu))
 
     @cached_property
     def normal(self) -> Values:
@@ -132,7 +150,8 @@ class FacetClosestPoints:
 
         It may be negative where the closest point was found with a coarse tolerance.
         """
-        slope = _barycentric_slope(self.x, self.normal, self.barycentric, self.smoothing)
+        slope = np.einsum("kcd,kd->kc", self.x - self.x[:, :1], self.normal)
+        slope = slope + self.smoothing * (self.barycentric - 1 / self.x.shape[1])
         return np.asarray(slope - np.einsum("kc,kc->k", self.barycentric, slope)[:, None])
 
     def curvature(self) -> Values:
@@ -171,112 +190,44 @@ def find_closest_points(
         posed: convex obstacle.
         x: (k, c, d) corners, m.
         smoothing: mu, m.
-        start: (k, c) barycentric coordinates to start from; None: from `initial_barycentric`.
+        start: (k, c) barycentric coordinates to start from; None: a guess of the compiled functions, else centroids.
         tolerance: remaining derivative by barycentric coordinates, in smoothings mu.
     """
-    lam = np.full(x.shape[:2], np.nan) if start is None else start.copy()
-    if (kernels := posed.shape.kernels) is not None:
-        kernels.find_closest_points(posed.packed, x, smoothing, tolerance, lam)
-        return FacetClosestPoints(posed, x, smoothing, lam)
+    kernels = posed.shape.kernels
+    guess = 1 / x.shape[1] if kernels is None else np.nan
+    barycentric = np.full(x.shape[:2], guess) if start is None else start.copy()
+    if kernels is not None:
+        kernels.find_closest_points(posed.packed, x, smoothing, tolerance, barycentric)
+        return FacetClosestPoints(posed, x, smoothing, barycentric)
     max_residual = np.maximum(tolerance * smoothing, SEARCH.round_off * abs(x).max(axis=(1, 2), initial=0.0))
-    if start is None:
-        lam = initial_barycentric(posed, x, smoothing)
-    slope, active = _SlopeFunction(posed, x, smoothing)(lam), np.arange(len(x))
+    active = np.arange(len(x))
     for _ in range(SEARCH.max_iterations):
-        rise = _rise(slope[active], lam[active])
-        active = active[np.where(lam[active] > 0, abs(rise), -rise).max(axis=1) > max_residual[active]]
-        if not len(active):
+        points = FacetClosestPoints(posed, x[active], smoothing, barycentric[active])
+        rise = points.corner_rise
+        remaining = np.where(points.barycentric > 0, abs(rise), -rise).max(axis=1) > max_residual[active]
+        if not remaining.any():
             break
-        start_lam, corners = lam[active], x[active]
-        step = minimise_on_simplex(_barycentric_hessian(posed, corners, start_lam, smoothing), slope[active], start_lam)
-        step = step - start_lam
-        fraction, slope[active] = _line_search(
-            _SlopeFunction(posed, corners, smoothing), start_lam, step, slope[active]
-        )
-        lam[active] = start_lam + fraction[:, None] * step
-        active = active[fraction * abs(step).max(axis=1) > SEARCH.min_change]
-    return FacetClosestPoints(posed, x, smoothing, lam)
+        active, points = active[remaining], points.select(remaining)
+        step = _newton_step(points)
+        barycentric[active] += step
+        active = active[abs(step).max(axis=1) > SEARCH.min_change]
+    return FacetClosestPoints(posed, x, smoothing, barycentric)
 
 
-def initial_barycentric(posed: PosedShape, x: Values, smoothing: float) -> Values:
-    """(k, c) barycentric coordinates of the points of facets closest to a point of the obstacle's core.
-
-    The core is the obstacle without its least radius; its point is the one closest to the centroid of the facet.
-    For a sphere this is the closest point itself, apart from the smoothing.
-    """
-    k, c, _ = x.shape
-    centroid = x.mean(axis=1)
-    arms = x - centroid[:, None]
-    size = np.linalg.norm(arms, axis=2).max(axis=1, initial=0.0)
-    radius = np.minimum(posed.distance(centroid) + posed.shape.min_radius, SEARCH.flat_distance * size)
-    Q = np.einsum("kci,kei->kce", arms, arms) + smoothing * (abs(radius) + smoothing)[:, None, None] * np.eye(c)
-    slope = radius[:, None] * np.einsum("kcd,kd->kc", arms, posed.normal(centroid))
-    return minimise_on_simplex(Q, slope, np.full((k, c), 1 / c))
-
-
-def _barycentric_hessian(posed: PosedShape, x: Values, barycentric: Values, smoothing: float) -> Values:
-    """(k, c, c) second derivative of L by the barycentric coordinates, up to parts common to all corners."""
-    y = np.einsum("kc,kcd->kd", barycentric, x)
-    arms = x - y[:, None]
-    return np.asarray(arms @ posed.curvature(y) @ arms.transpose(0, 2, 1) + smoothing * np.eye(x.shape[1]))
-
-
-@dataclass(frozen=True)
-class _SlopeFunction:
-    """Derivative of L by the barycentric coordinates (k, c), up to parts common to all corners."""
-
-    posed: PosedShape
-    x: Values
-    smoothing: float
-
-    def __call__(self, barycentric: Values, rows: Ints | slice = slice(None)) -> Values:
-        x = self.x[rows]
-        normal = self.posed.normal(np.einsum("kc,kcd->kd", barycentric, x))
-        return _barycentric_slope(x, normal, barycentric, self.smoothing)
-
-
-def _rise(slope: Values, barycentric: Values) -> Values:
-    """(k, c) rise of L towards each corner."""
-    return np.asarray(slope - np.einsum("kc,kc->k", slope, barycentric)[:, None])
-
-
-def _line_search(slope_at: _SlopeFunction, barycentric: Values, step: Values, slope: Values) -> tuple[Values, Values]:
-    """(k,) fractions of steps (k, c) after which the convex L is no longer steep along them, and slopes (k, c) there.
-
-    The root of the directional derivative is bracketed; regula falsi with a bisection every third trial.
-    """
-    fraction, end_slope = np.ones(len(barycentric)), slope_at(barycentric + step)
-    # by the rise towards corners: exact to the last digits near 0, as steps sum to 0 but for round-off
-    start_rate, end_rate = (np.einsum("kc,kc->k", _rise(s, barycentric), step) for s in (slope, end_slope))
-    low, high = np.zeros(len(barycentric)), np.ones(len(barycentric))
-    rate_low, rate_high = start_rate.copy(), end_rate
-    active = np.flatnonzero((end_rate > -SEARCH.slope_reduction * start_rate) & (start_rate < 0))
-    for trial in range(SEARCH.max_trials):
-        if not len(active):
+def _newton_step(points: FacetClosestPoints) -> Values:
+    """(k, c) changes of barycentric coordinates: Newton steps, halved until the convex L is not steep beyond them."""
+    posed, x, mu, barycentric = points.posed, points.x, points.smoothing, points.barycentric
+    arms = x - points.position[:, None]
+    Q = arms @ posed.curvature(points.position) @ arms.transpose(0, 2, 1) + mu * np.eye(x.shape[1])
+    step = minimise_on_simplex(Q, points.corner_rise, barycentric) - barycentric
+    max_rate = -SEARCH.slope_reduction * np.einsum("kc,kc->k", points.corner_rise, step)
+    for _ in range(SEARCH.max_trials):
+        end = FacetClosestPoints(posed, x, mu, barycentric + step)
+        rate = np.einsum("kc,kc->k", end.corner_rise, step)
+        if not (too_far := (rate > max_rate) & (max_rate > 0)).any():
             break
-        secant = low[active] - rate_low[active] * (high[active] - low[active]) / (rate_high[active] - rate_low[active])
-        # bisection from time to time, as regula falsi may stall
-        fraction[active] = (low[active] + high[active]) / 2 if trial % 3 == 2 else secant
-        end_slope[active] = slope_at(barycentric[active] + fraction[active, None] * step[active], active)
-        rate = np.einsum("kc,kc->k", _rise(end_slope[active], barycentric[active]), step[active])
-        falling, rising = active[rate < 0], active[rate >= 0]
-        low[falling], rate_low[falling] = fraction[falling], rate[rate < 0]
-        high[rising], rate_high[rising] = fraction[rising], rate[rate >= 0]
-        steep = abs(rate) > -SEARCH.slope_reduction * start_rate[active]
-        active = active[steep & (high[active] - low[active] > SEARCH.min_change)]
-    return fraction, end_slope
-
-
-def _smoothed_distance(posed: PosedShape, x: Values, barycentric: Values, smoothing: float) -> Values:
-    """(k,) L = D(y) + mu/2 |l - 1/c|^2, m."""
-    offset = barycentric - 1 / x.shape[1]
-    distance = posed.distance(np.einsum("kc,kcd->kd", barycentric, x))
-    return distance + smoothing / 2 * np.einsum("kc,kc->k", offset, offset)
-
-
-def _barycentric_slope(x: Values, normal: Values, barycentric: Values, smoothing: float) -> Values:
-    """(k, c) derivative of L by the barycentric coordinates, up to parts common to all corners."""
-    return np.asarray(np.einsum("kcd,kd->kc", x - x[:, :1], normal) + smoothing * (barycentric - 1 / x.shape[1]))
+        step[too_far], max_rate[too_far] = step[too_far] / 2, max_rate[too_far] / 2
+    return step
 
 
 @dataclass(frozen=True, eq=False)

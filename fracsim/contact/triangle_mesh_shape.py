@@ -13,6 +13,7 @@ from ..array_types import Flags, Ints, Values
 from ..errors import InputError
 from ..meshes.surfaces.triangle_geometry import BATCH_SIZE, batches, enclosed_volumes, winding_numbers
 from ..meshes.topology import distinct_rows
+from .closest_point import closest_points_of_facets
 from .shape_base import Tessellation
 
 
@@ -55,6 +56,7 @@ class TriangleMeshShape:
     convex: bool = False
     rotation_invariant: bool = False
     min_radius: float = 0.0
+    max_inset: float = 0.0
     kernels: None = None
 
     def tessellate(self) -> Tessellation:
@@ -70,13 +72,11 @@ class TriangleMeshShape:
         """Raise NotImplementedError: there is no distance function."""
         raise NotImplementedError("solids are felt by their triangles")
 
-    def normal(self, x: Values) -> Values:
-        """Raise NotImplementedError."""
-        return self.distance(x)
+    normal = curvature = distance
 
-    def curvature(self, x: Values) -> Values:
-        """Raise NotImplementedError."""
-        return self.distance(x)
+    def inset(self, by: float) -> TriangleMeshShape:
+        """The shape itself: its triangles stay."""
+        return self
 
     @property
     def centre(self) -> Values:
@@ -208,20 +208,9 @@ def is_inside(x: Values, corners: Values) -> Flags:
 
 def surface_distances(x: Values, corners: Values) -> Values:
     """(n,) distances of points x (n, 3) to the nearest of triangles (k, 3, 3), m."""
-    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
 
     def min_distances(x: Values) -> Values:
-        from_corner = x[:, None, None] - corners[None]
-        shape = from_corner.shape[:2]
-        is_above, distance = np.ones(shape, bool), np.full(shape, np.inf)
-        for k in range(3):
-            side, arm = corners[:, (k + 1) % 3] - corners[:, k], from_corner[:, :, k]
-            along = np.clip(np.einsum("nki,ki->nk", arm, side) / np.einsum("ki,ki->k", side, side), 0.0, 1.0)
-            distance = np.minimum(distance, np.linalg.norm(arm - along[:, :, None] * side, axis=2))
-            is_above &= np.einsum("nki,ki->nk", arm, np.cross(normal, side)) >= 0
-        # to the plane where the foot is inside the triangle, else to the nearest side
-        height = abs(np.einsum("nki,ki->nk", from_corner[:, :, 0], normal))
-        return np.asarray(np.where(is_above, height, distance).min(axis=1))
+        offset = closest_points_of_facets(np.repeat(x, len(corners), axis=0), np.tile(corners, (len(x), 1, 1)))[1]
+        return np.asarray(np.linalg.norm(offset, axis=1).reshape(len(x), -1).min(axis=1))
 
     return np.concatenate([min_distances(part) for part in batches(x, len(corners))])
