@@ -14,8 +14,8 @@ import numpy as np
 
 from ..array_types import Values
 from .pose import Pose, PosedShape
-from .shape_base import Shape, frame_about, unit_vector
-from .shapes import Capsule, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
+from .shape_base import Shape, frame_about, measures
+from .shapes import RevolvedBody, RoundedBox, TranslatedShape
 from .triangle_mesh_shape import TriangleMeshShape
 
 
@@ -86,33 +86,17 @@ def inset_points(shape: Shape) -> InsetPoints:
     if isinstance(shape, TranslatedShape):
         original = inset_points(shape.shape)
         return replace(original, points=original.points + shape.offset)
+    points: Values = np.empty((0, shape.dim))
+    radius, axis = 0.0, None
     if isinstance(shape, TriangleMeshShape):
-        return InsetPoints(shape.points, 0.0, surface_measure(shape) / len(shape.points))
-    points, radius = _points_and_radius(shape)
-    axis = unit_vector(shape.axis) if isinstance(shape, RoundedCylinder) and len(points) else None
-    return InsetPoints(points, radius, surface_measure(shape) / max(len(points), 1), axis)
-
-
-def _points_and_radius(shape: Shape) -> tuple[Values, float]:
-    if isinstance(shape, Sphere) and shape.convex:
-        return np.zeros((1, shape.dim)), shape.radius
-    if isinstance(shape, Capsule) and shape.convex:
-        along = np.linspace(-0.5, 0.5, SAMPLES.edge_points) * shape.length
-        return along[:, None] * unit_vector(shape.axis), shape.radius
-    if isinstance(shape, RoundedBox) and shape.convex:
-        return _edge_points(np.array(shape.size) / 2 - shape.fillet), shape.fillet
-    if isinstance(shape, RoundedCylinder) and shape.convex:
-        return _circle_points(shape), shape.fillet
-    return np.empty((0, shape.dim)), 0.0
-
-
-def surface_measure(shape: Shape) -> float:
-    """Area of the tessellation of a shape, m^2 (2D: length, m)."""
-    points, elements = shape.tessellate()
-    side = points[elements[:, 1:]] - points[elements[:, :1]]
-    if shape.dim == 2:
-        return float(np.linalg.norm(side[:, 0], axis=1).sum())
-    return float(np.linalg.norm(np.cross(side[:, 0], side[:, 1]), axis=1).sum() / 2)
+        points = shape.points
+    elif isinstance(shape, RoundedBox) and shape.convex:
+        points, radius = _edge_points(shape.core), shape.fillet
+    elif isinstance(shape, RevolvedBody) and shape.convex:
+        direction, core_radius, half = shape.core
+        points, radius = _circle_points(direction, core_radius, half), shape.fillet
+        axis = direction if core_radius else None
+    return InsetPoints(points, radius, float(measures(*shape.tessellate()).sum()) / max(len(points), 1), axis)
 
 
 def _edge_points(half: Values) -> Values:
@@ -126,11 +110,12 @@ def _edge_points(half: Values) -> Values:
     return np.unique(np.array(lines), axis=0) * half
 
 
-def _circle_points(shape: RoundedCylinder) -> Values:
-    """Points on circles over the side of a cylinder."""
+def _circle_points(axis: Values, radius: float, half: float) -> Values:
+    """Points on circles over the side of a cylinder of half length `half`, m; without a radius on its axis."""
+    heights = np.linspace(-half, half, SAMPLES.edge_points) if half else np.zeros(1)
+    if not radius:
+        return heights[:, None] * axis
     angle = np.arange(SAMPLES.circle_points) * (2 * np.pi / SAMPLES.circle_points)
-    radius, half = shape.radius - shape.fillet, shape.length / 2 - shape.fillet
     circle = radius * np.column_stack([np.cos(angle), np.sin(angle)])
-    heights = np.linspace(-half, half, SAMPLES.edge_points)
     rings = [np.column_stack([circle, np.full(SAMPLES.circle_points, height)]) for height in heights]
-    return np.concatenate(rings) @ frame_about(unit_vector(shape.axis)).T
+    return np.concatenate(rings) @ frame_about(axis).T

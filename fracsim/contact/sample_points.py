@@ -19,6 +19,7 @@ import numpy.typing as npt
 from scipy.sparse import csr_matrix, identity, kron, vstack
 
 from ..array_types import Ints, Values
+from .shape_base import measures
 
 
 @dataclass(frozen=True)
@@ -120,13 +121,6 @@ class Centroids:
             pair.weight *= measure[pair.vertex_id]
         for pair in pairs.vv_collisions:
             pair.weight *= measure[max(pair.vertex0_id, pair.vertex1_id)]
-
-
-def measures(x: Values, elements: Ints) -> Values:
-    """(m,) areas of triangles, m^2, or lengths of segments, m."""
-    side = x[elements[:, 1:]] - x[elements[:, :1]]
-    spanned = side[:, 0] if x.shape[1] == 2 else 0.5 * np.cross(side[:, 0], side[:, 1])
-    return np.asarray(np.linalg.norm(spanned, axis=1))
 
 
 def vertex_areas(x: Values, elements: Ints) -> Values:

@@ -121,6 +121,13 @@ class Shape(Protocol):
     def volume(self) -> float:
         """Volume, m^3 (2D: area, m^2); of a hollow body that of the cavity."""
 
+    @property
+    def max_inset(self) -> float:
+        """Largest inset, m; infinite for a half space and a hollow body."""
+
+    def inset(self, by: float) -> Shape:
+        """The obstacle with its surface receded by `by` <= `max_inset`, m: distances grow by at least as much."""
+
     def distance(self, x: Values) -> Values:
         """(n,) signed distances of points x (n, d), m: positive outside the obstacle."""
 
@@ -139,7 +146,11 @@ class Shape(Protocol):
 
 @dataclass(frozen=True, kw_only=True)
 class ConvexBody(ABC):
-    """Convex body, or the space outside it.
+    """Core that is grown by a radius r, the fillet; or the space outside this body.
+
+        distance = f(q(x)) - r,    f: signed distance to the quadrant q <= 0 (QuadrantDistance)
+
+    The coordinates q (n, k) of a point tell how far it is outside the core, along directions that are orthogonal.
 
     Attributes:
         kind: name in messages.
@@ -157,25 +168,63 @@ class ConvexBody(ABC):
         """Dimension, 2 or 3."""
 
     @property
+    @abstractmethod
+    def fillet(self) -> float:
+        """Radius r by which the core is grown, m."""
+
+    @property
+    @abstractmethod
+    def depth(self) -> float:
+        """Largest distance of an inner point from the surface, m."""
+
+    @abstractmethod
+    def resized(self, by: float) -> Self:
+        """The body with its surface moved outwards by `by`, m, which may be negative."""
+
+    @abstractmethod
+    def core_coordinates(self, x: Values) -> tuple[Values, Values]:
+        """(n, k) q at points x (n, d), m, and their gradients (n, k, d), of length 1."""
+
+    @abstractmethod
+    def core_curvature(self, x: Values, corner: QuadrantDistance) -> Values:
+        """(n, d, d) part of the Hessian of f(q(x)) by the second derivatives of q, 1/m; `corner`: f at q(x)."""
+
+    @abstractmethod
+    def outline(self) -> Tessellation:
+        """Closed surface or polygon of the filled body."""
+
+    @abstractmethod
+    def moments(self) -> tuple[float, Values]:
+        """Volume, m^3 (2D: m^2), and S = int x x^T dV (d, d) of the filled body."""
+
+    @property
     def convex(self) -> bool:
         """True unless the body is hollow."""
         return not self.hollow
 
+    @property
+    def _sign(self) -> float:
+        return -1.0 if self.hollow else 1.0
+
     def distance(self, x: Values) -> Values:
         """(n,) signed distances of points x (n, d), m."""
-        return _sign(self.hollow) * self._distance(x)
+        return self._sign * (QuadrantDistance(self.core_coordinates(x)[0]).value - self.fillet)
 
     def normal(self, x: Values) -> Values:
         """(n, d) gradients of the distance."""
-        return _sign(self.hollow) * self._normal(x)
+        q, directions = self.core_coordinates(x)
+        return self._sign * np.asarray(np.einsum("nk,nkd->nd", QuadrantDistance(q).gradient, directions))
 
     def curvature(self, x: Values) -> Values:
         """(n, d, d) Hessians of the distance, 1/m."""
-        return _sign(self.hollow) * self._curvature(x)
+        q, directions = self.core_coordinates(x)
+        corner = QuadrantDistance(q)
+        along = directions.transpose(0, 2, 1) @ corner.hessian @ directions
+        return self._sign * np.asarray(along + self.core_curvature(x, corner))
 
     def tessellate(self) -> Tessellation:
         """Closed surface or polygon; that of a hollow body faces inwards."""
-        points, elements = self._tessellate()
+        points, elements = self.outline()
         return points, np.ascontiguousarray(elements[:, ::-1]) if self.hollow else elements
 
     @property
@@ -186,59 +235,28 @@ class ConvexBody(ABC):
     @property
     def min_radius(self) -> float:
         """Smallest radius of curvature, m; infinite for a hollow body."""
-        return float("inf") if self.hollow else self._radius()
+        return float("inf") if self.hollow else self.fillet
 
     @property
     def volume(self) -> float:
         """Enclosed volume, m^3 (2D: area, m^2)."""
-        return self._moments()[0]
+        return self.moments()[0]
 
     def inertia(self, density: float) -> Values:
         """Moment of inertia rho (tr S 1 - S) with S = int x x^T dV; in 2D rho tr S."""
         if self.hollow:
             raise InputError(f"a hollow {self.kind} has walls without thickness, so no inertia: hold it")
-        S = self._moments()[1]
+        S = self.moments()[1]
         return density * (np.trace(S) * np.eye(3) - S if self.dim == 3 else np.asarray(np.trace(S)))
 
     def inset(self, by: float) -> Self:
         """The obstacle with its surface receded by `by` <= `max_inset`, m: distances grow by at least as much."""
-        return self._resized(-_sign(self.hollow) * by)
+        return self.resized(-self._sign * by)
 
     @property
     def max_inset(self) -> float:
         """Largest inset, m; infinite for a hollow body."""
-        return float("inf") if self.hollow else self._depth() / 2
-
-    @abstractmethod
-    def _resized(self, by: float) -> Self:
-        """The body with its surface moved outwards by `by`, m, which may be negative."""
-
-    @abstractmethod
-    def _depth(self) -> float:
-        """Largest distance of an inner point from the surface, m."""
-
-    @abstractmethod
-    def _distance(self, x: Values) -> Values: ...
-
-    @abstractmethod
-    def _normal(self, x: Values) -> Values: ...
-
-    @abstractmethod
-    def _curvature(self, x: Values) -> Values: ...
-
-    @abstractmethod
-    def _radius(self) -> float: ...
-
-    @abstractmethod
-    def _tessellate(self) -> Tessellation: ...
-
-    @abstractmethod
-    def _moments(self) -> tuple[float, Values]:
-        """Volume and second moments S (d, d) of the filled body."""
-
-
-def _sign(hollow: bool) -> float:
-    return -1.0 if hollow else 1.0
+        return float("inf") if self.hollow else self.depth / 2
 
 
 def resized_fillet(fillet: float, by: float) -> float:
@@ -328,6 +346,13 @@ class QuadrantDistance:
 
 
 # --- tessellations ---
+
+
+def measures(x: Values, elements: npt.NDArray[np.integer]) -> Values:
+    """(m,) areas of triangles (m, 3), m^2, or lengths of segments (m, 2), m, with points at x (n, d), m."""
+    side = x[elements[:, 1:]] - x[elements[:, :1]]
+    spanned = side[:, 0] if x.shape[1] == 2 else 0.5 * np.cross(side[:, 0], side[:, 1])
+    return np.asarray(np.linalg.norm(spanned, axis=1))
 
 
 def profile(core_radius: float, half: float, rounding: float) -> Values:

@@ -14,7 +14,7 @@ typedef struct {
   double centre[3], rotation[9], origin[3];  // pose, and where the shape is in its own frame
   double min_radius;
   double axis[3], across[3];  // unit vectors; that of a half space is its normal
-  double half[3], radius, fillet;  // of a box all three, of others the first
+  double half[3], radius, fillet;  // of the core: of a box all three half sizes, of others the first
 } Obstacle;
 
 static inline double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
@@ -48,7 +48,7 @@ static double swept_sphere(const Obstacle *o, const double *x, double *n, double
     for (int i = 0; i < 3; ++i)
       for (int j = 0; j < 3; ++j)
         H[3 * i + j] = on_core ? 0.0 : ((i == j) - beside * o->axis[i] * o->axis[j] - n[i] * n[j]) / length;
-  return length - o->radius;
+  return length - o->fillet;
 }
 
 static double box(const Obstacle *o, const double *x, double *n, double *H) {

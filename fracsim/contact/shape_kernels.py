@@ -7,7 +7,7 @@ They replace dozens of array operations on a few rows each. Their plain counterp
 from __future__ import annotations
 
 from collections.abc import Hashable
-from ctypes import CDLL, byref, c_double, c_int64
+from ctypes import CDLL
 from dataclasses import replace
 from enum import IntEnum
 from functools import lru_cache
@@ -18,11 +18,11 @@ import numpy as np
 from mpi4py import MPI
 
 from ..array_types import Values
-from ..mesh.c_library import FAST_FLAGS, array_pointer, compile_on_all_ranks, unchecked_function
+from ..mesh.c_library import FAST_FLAGS, compile_on_all_ranks
 from .closest_point import SEARCH
 from .laws import BARRIER, Barrier
 from .shape_base import ConvexBody, Shape, frame_about, unit_vector
-from .shapes import Capsule, HalfSpace, OffsetShape, RoundedBox, RoundedCylinder, Sphere, TranslatedShape
+from .shapes import HalfSpace, OffsetShape, RevolvedBody, RoundedBox, TranslatedShape
 
 SOURCE = Path(__file__).with_suffix(".c")
 _SEARCH = np.array([
@@ -44,8 +44,7 @@ class CompiledShapeKernels:
     """Functions of shape_kernels.c (shape_base.ShapeKernels)."""
 
     def __init__(self, code: CDLL) -> None:
-        names = "evaluate_shape", "find_closest_points", "evaluate_facets"
-        self._shape, self._closest, self._facets = (unchecked_function(code, name) for name in names)
+        self._code = code
 
     def used_for(self, shape: Shape) -> Shape:
         """The shape, evaluated by these functions."""
@@ -61,29 +60,26 @@ class CompiledShapeKernels:
     def distance(self, packed: Values, x: Values) -> Values:
         """(n,) signed distances of points x (n, d), m."""
         result = np.empty(len(x))
-        self._shape(*_sizes(x), _pointer(packed), _pointer(x), _pointer(result), None, None)
+        self._code.evaluate_shape(*x.shape, packed, _numbers(x), result, None, None)
         return result
 
     def normal(self, packed: Values, x: Values) -> Values:
         """(n, d) gradients of the distance."""
         result = np.empty(x.shape)
-        self._shape(*_sizes(x), _pointer(packed), _pointer(x), None, _pointer(result), None)
+        self._code.evaluate_shape(*x.shape, packed, _numbers(x), None, result, None)
         return result
 
     def curvature(self, packed: Values, x: Values) -> Values:
         """(n, d, d) Hessians of the distance, 1/m."""
         result = np.empty((*x.shape, x.shape[1]))
-        self._shape(*_sizes(x), _pointer(packed), _pointer(x), None, None, _pointer(result))
+        self._code.evaluate_shape(*x.shape, packed, _numbers(x), None, None, result)
         return result
 
     def find_closest_points(
         self, packed: Values, x: Values, smoothing: float, tolerance: float, barycentric: Values
     ) -> None:
         """Search for the closest points of facets (shape_base.ShapeKernels)."""
-        self._closest(
-            *_sizes(x), _pointer(packed), _pointer(x), c_double(smoothing), c_double(tolerance), _pointer(_SEARCH),
-            _pointer(barycentric),
-        )  # fmt: skip
+        self._code.find_closest_points(*x.shape, packed, _numbers(x), smoothing, tolerance, _SEARCH, barycentric)
 
     def facet_energy(
         self,
@@ -117,28 +113,18 @@ class CompiledShapeKernels:
         k, c, d = x.shape
         shapes = ((k, c * d, c * d), (k, c, d, d)) if second else ((k,), (k, c, d))
         results = np.empty(shapes[0]), np.empty(shapes[1])
-        pointers = _pointer(results[0]), _pointer(results[1])
-        self._facets(
-            *_sizes(x), _pointer(packed), _pointer(x), _pointer(barycentric), c_double(smoothing),
-            _pointer(np.array([law.stiffness, law.width, BARRIER.early_weight, BARRIER.closed_value])),
-            None if start is None else _pointer(start), _pointer(area),
-            *((None, None, *pointers) if second else (*pointers, None, None)),
+        numbers = np.array([law.stiffness, law.width, BARRIER.early_weight, BARRIER.closed_value])
+        self._code.evaluate_facets(
+            *x.shape, packed, _numbers(x), _numbers(barycentric), smoothing, numbers,
+            None if start is None else _numbers(start), _numbers(area),
+            *((None, None, *results) if second else (*results, None, None)),
         )  # fmt: skip
         return results
 
 
-def _sizes(values: Values) -> list[c_int64]:
-    return [c_int64(size) for size in values.shape]
-
-
-def _pointer(values: Values) -> Any:
-    """Pointer to the first entry of an array; an array that is not contiguous, or of other numbers, is copied."""
-    try:
-        if values.dtype.char == "d":
-            return byref(c_double.from_buffer(values))
-    except (TypeError, ValueError, BufferError):
-        pass  # empty, read-only, or not contiguous
-    return array_pointer(np.ascontiguousarray(values, np.float64))
+def _numbers(values: Values) -> Values:
+    """Contiguous array of the values."""
+    return np.ascontiguousarray(values, np.float64)
 
 
 def compile_shape_kernels(comm: MPI.Comm) -> CompiledShapeKernels | None:
@@ -169,14 +155,12 @@ def _pack_shape(original: Hashable) -> Values:
 
 
 def _parameters(shape: Shape) -> tuple[int, Values, Values, float, float]:
-    """Kind, axis (d,), half sizes (m,), radius and fillet of a shape, m."""
+    """Kind, axis (d,), half sizes (m,) and radius of the core, and fillet of a shape, m."""
     if isinstance(shape, HalfSpace):
         return ShapeKind.HALF_SPACE, unit_vector(shape.direction), np.empty(0), 0.0, 0.0
-    if isinstance(shape, Sphere | Capsule):
-        axis, half, radius = shape.core
-        return ShapeKind.SWEPT_SPHERE, axis, np.array([half]), radius, 0.0
     if isinstance(shape, RoundedBox):
-        return ShapeKind.BOX, np.empty(0), np.array(shape.size) / 2 - shape.fillet, 0.0, shape.fillet
-    assert isinstance(shape, RoundedCylinder)
-    radius, half = shape.core
-    return ShapeKind.CYLINDER, unit_vector(shape.axis), np.array([half]), radius, shape.fillet
+        return ShapeKind.BOX, np.empty(0), shape.core, 0.0, shape.fillet
+    assert isinstance(shape, RevolvedBody)
+    axis, radius, half = shape.core
+    kind = ShapeKind.CYLINDER if radius else ShapeKind.SWEPT_SPHERE
+    return kind, axis, np.array([half]), radius, shape.fillet

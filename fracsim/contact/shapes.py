@@ -13,7 +13,7 @@ from typing import ClassVar, Self
 
 import numpy as np
 
-from ..array_types import Flags, Values
+from ..array_types import Values
 from ..errors import InputError
 from .shape_base import (
     SHAPE,
@@ -37,7 +37,7 @@ from .shape_base import (
 )
 
 __all__ = [
-    "SHAPES", "Capsule", "HalfSpace", "OffsetShape", "RoundedBox", "RoundedCylinder", "Shape", "Sphere",
+    "SHAPES", "Capsule", "HalfSpace", "OffsetShape", "RevolvedBody", "RoundedBox", "RoundedCylinder", "Shape", "Sphere",
     "TranslatedShape",
 ]  # fmt: skip
 
@@ -57,6 +57,7 @@ class HalfSpace:
     rotation_invariant: ClassVar[bool] = False
     min_radius: ClassVar[float] = float("inf")
     volume: ClassVar[float] = float("inf")
+    max_inset: ClassVar[float] = float("inf")
     direction: tuple[float, ...]
     extent: float = 1.0
     kernels: ShapeKernels | None = field(default=None, compare=False, repr=False, kw_only=True)
@@ -92,75 +93,86 @@ class HalfSpace:
         square = np.array([[-h, -h, 0.0], [h, -h, 0.0], [h, h, 0.0], [-h, h, 0.0]])
         return square @ R.T, np.array([[0, 1, 2], [0, 2, 3]], np.int32)
 
+    def inset(self, by: float) -> TranslatedShape:
+        """The half space with its surface receded by `by`, m."""
+        return TranslatedShape(self, -by * unit_vector(self.direction))
+
     def inertia(self, density: float) -> Values:
         """Raise InputError: a half space has no finite mass."""
         raise InputError("a plane is a half space without end, so it cannot move freely: hold it or drive it")
 
 
 @dataclass(frozen=True)
-class _SweptSphere(ConvexBody):
-    """All points within a radius of a point or segment, the core."""
+class RevolvedBody(ConvexBody):
+    """Cylinder that is grown by a fillet; in 2D a rectangle. Without a radius its core is a segment, or a point.
+
+    In the half plane through the axis q = (rho - R, |height| - H), rho the distance from the axis.
+
+    Attributes:
+        radius: of the body, m; that of the fillet, too, where the core has none.
+    """
+
+    radius: float
 
     @property
     @abstractmethod
     def core(self) -> tuple[Values, float, float]:
-        """Unit vector along the segment, half its length and the radius, m."""
+        """Unit vector (d,) along the axis, radius R and half length H of the core, m."""
 
-    def _from_core(self, x: Values) -> tuple[Values, Values, Values]:
-        """Vectors (n, d) from the closest points of the core, their lengths (n,), and heights along it (n,), m."""
-        axis, half, _ = self.core
+    @property
+    def fillet(self) -> float:
+        """Radius by which the core is grown, m."""
+        return self.radius
+
+    @property
+    def depth(self) -> float:
+        """Largest distance of an inner point from the surface, m."""
+        return self.radius
+
+    def resized(self, by: float) -> Self:
+        """The body with its surface moved outwards by `by`, m, which may be negative."""
+        return replace(self, radius=self.radius + by)
+
+    def _polar(self, x: Values) -> tuple[Values, Values, Values]:
+        """Heights (n,) and distances from the axis (n,), m, and unit vectors away from it (n, d)."""
+        axis = self.core[0]
         height = x @ axis
-        away = x - np.minimum(np.maximum(height, -half), half)[:, None] * axis
-        return away, np.sqrt(np.einsum("nd,nd->n", away, away)), height
+        across = x - height[:, None] * axis
+        rho = lengths(across)
+        on_axis = rho < np.finfo(float).tiny
+        away = across / np.where(on_axis, 1.0, rho)[:, None]
+        if on_axis.any():
+            away[on_axis] = frame_about(axis)[:, 0]
+        return height, rho, away
 
-    def _distance(self, x: Values) -> Values:
-        return self._from_core(x)[1] - self.core[2]
+    def core_coordinates(self, x: Values) -> tuple[Values, Values]:
+        """(n, 2) q at points x (n, d), m, and their gradients (n, 2, d): away from the axis, and along it."""
+        (axis, radius, half), (height, rho, away) = self.core, self._polar(x)
+        up = np.where(height < 0, -1.0, 1.0)[:, None] * axis
+        return np.stack([rho - radius, abs(height) - half], axis=1), np.stack([away, up], axis=1)
 
-    def _normal(self, x: Values) -> Values:
-        away, length, _ = self._from_core(x)
-        return self._direction(away, length, length < np.finfo(float).tiny)
+    def core_curvature(self, x: Values, corner: QuadrantDistance) -> Values:
+        """(n, d, d) f_rho / rho around the axis, 1/m; on the axis its limit, the second derivative f_rho,rho."""
+        axis, (_, rho, away) = self.core[0], self._polar(x)
+        around = np.eye(self.dim) - away[:, :, None] * away[:, None, :] - np.outer(axis, axis)
+        on_axis = rho < np.finfo(float).tiny
+        hoop = np.where(on_axis, corner.hessian[:, 0, 0], corner.gradient[:, 0] / np.where(on_axis, 1.0, rho))
+        return np.asarray(hoop[:, None, None] * around)
 
-    def _direction(self, away: Values, length: Values, on_core: Flags) -> Values:
-        """(n, d) unit vectors along `away` (n, d) of a length (n,), m; across the axis for points on the core (n,)."""
-        if not on_core.any():
-            return np.asarray(away / length[:, None])
-        # on the core every direction across it is a closest one
-        across = frame_about(self.core[0])[:, 0]
-        return np.where(on_core[:, None], across, away / np.where(on_core, 1.0, length)[:, None])
-
-    def _curvature(self, x: Values) -> Values:
-        """(n, d, d) (P - n n^T) / |x - closest|, P across the axis beside the core, the identity beyond its ends."""
-        axis, half, _ = self.core
-        away, length, height = self._from_core(x)
-        on_core = length < np.finfo(float).tiny
-        n, P = self._direction(away, length, on_core), np.eye(self.dim)
-        if half:
-            P = P - (abs(height) < half)[:, None, None] * np.outer(axis, axis)
-        inverse = np.where(on_core, 0.0, 1 / np.where(on_core, 1.0, length))
-        return np.asarray((P - n[:, :, None] * n[:, None, :]) * inverse[:, None, None])
-
-    def _radius(self) -> float:
-        return self.core[2]
-
-    def _depth(self) -> float:
-        return self._radius()
-
-    def _resized(self, by: float) -> Self:
-        return replace(self, radius=self._radius() + by)  # type: ignore[call-arg]
-
-    def _tessellate(self) -> Tessellation:
-        axis, half, radius = self.core
-        side = profile(0.0, half, radius)
+    def outline(self) -> Tessellation:
+        """Surface of revolution, or polygon, of the filled body."""
+        axis, radius, half = self.core
+        side = profile(radius, half, self.fillet)
         points, elements = polygon(side) if self.dim == 2 else surface_of_revolution(side)
         return points @ frame_about(axis).T, elements
 
-    def _moments(self) -> tuple[float, Values]:
-        axis, half, radius = self.core
-        return revolved(axis, 0.0, half, radius)
+    def moments(self) -> tuple[float, Values]:
+        """Volume, m^3 (2D: m^2), and S = int x x^T dV (d, d) of the filled body."""
+        return revolved(*self.core, self.fillet)
 
 
 @dataclass(frozen=True)
-class Sphere(_SweptSphere):
+class Sphere(RevolvedBody):
     """Sphere about the reference point; in 2D a disk.
 
     Attributes:
@@ -169,7 +181,7 @@ class Sphere(_SweptSphere):
     """
 
     kind: ClassVar[str] = "sphere"
-    radius: float
+    rotation_invariant: ClassVar[bool] = True
     dim: int = 3
 
     def __post_init__(self) -> None:
@@ -178,19 +190,14 @@ class Sphere(_SweptSphere):
         if self.dim not in (2, 3):
             raise InputError(f"a sphere in {self.dim} dimensions is not known: dim is 2 or 3")
 
-    @property
-    def rotation_invariant(self) -> bool:
-        """True."""
-        return True
-
     @cached_property
     def core(self) -> tuple[Values, float, float]:
-        """Unit vector along the segment, half its length and the radius, m."""
-        return unit_vector((*[0.0] * (self.dim - 1), 1.0)), 0.0, self.radius
+        """The centre: a vector (d,), and twice 0 m."""
+        return unit_vector((*[0.0] * (self.dim - 1), 1.0)), 0.0, 0.0
 
 
 @dataclass(frozen=True)
-class Capsule(_SweptSphere):
+class Capsule(RevolvedBody):
     """All points within a radius of a segment; in 2D a stadium. Its overall length is length + 2 radius.
 
     Attributes:
@@ -200,7 +207,6 @@ class Capsule(_SweptSphere):
     """
 
     kind: ClassVar[str] = "capsule"
-    radius: float
     length: float
     axis: tuple[float, ...] = (0.0, 0.0, 1.0)
 
@@ -216,13 +222,63 @@ class Capsule(_SweptSphere):
 
     @cached_property
     def core(self) -> tuple[Values, float, float]:
-        """Unit vector along the segment, half its length and the radius, m."""
-        return unit_vector(self.axis), self.length / 2, self.radius
+        """The segment: unit vector (d,) along it, 0 m, and half its length, m."""
+        return unit_vector(self.axis), 0.0, self.length / 2
+
+
+@dataclass(frozen=True)
+class RoundedCylinder(RevolvedBody):
+    """Finite cylinder with rounded edges, in 3D.
+
+    Inside a container the distance is C1 within the rounding of the wall, as for a box.
+
+    Attributes:
+        radius: m.
+        length: full length, m.
+        rounding: radius of the edges, m; default: `SHAPE.fillet_ratio` of the radius.
+        axis: (3,) direction.
+    """
+
+    kind: ClassVar[str] = "cylinder"
+    dim: ClassVar[int] = 3
+    length: float
+    rounding: float | None = None
+    axis: tuple[float, ...] = (0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        """Raise InputError unless lengths, rounding and axis are valid."""
+        unit_vector(self.axis)
+        if len(self.axis) != 3:
+            raise InputError("a cylinder needs an axis of 3 numbers: in 2D take a sphere (a disk) or a box")
+        require_lengths(self.kind, radius=self.radius, length=self.length)
+        require_fillet(self.kind, self.fillet, self.depth)
+        if self.fillet == self.radius:
+            raise InputError("the rounding of a cylinder is its radius: take a capsule")
+
+    @property
+    def fillet(self) -> float:
+        """Radius of the edges, m; of a thin disk at most half its thickness."""
+        return min(SHAPE.fillet_ratio * self.radius, self.length / 2) if self.rounding is None else self.rounding
+
+    @property
+    def core(self) -> tuple[Values, float, float]:
+        """Unit vector (d,) along the axis, radius R and half length H of the core, m."""
+        return unit_vector(self.axis), self.radius - self.fillet, self.length / 2 - self.fillet
+
+    @property
+    def depth(self) -> float:
+        """Radius or half the length, m: the smaller one."""
+        return min(self.radius, self.length / 2)
+
+    def resized(self, by: float) -> RoundedCylinder:
+        """Cylinder with its surface moved outwards by `by`, m."""
+        rounding = resized_fillet(self.fillet, by)
+        return replace(self, radius=self.radius + by, length=self.length + 2 * by, rounding=rounding)
 
 
 @dataclass(frozen=True)
 class RoundedBox(ConvexBody):
-    """Box with rounded edges; in 2D a rectangle.
+    """Box with rounded edges; in 2D a rectangle. q = |x| - h, h the half sizes of its core.
 
     Inside a container the distance is C1 within the rounding of the wall. Farther in, where another wall becomes the
     nearest, its gradient jumps: a barrier must be thinner than the rounding.
@@ -242,7 +298,7 @@ class RoundedBox(ConvexBody):
             raise InputError(f"a box of {len(self.size)} sizes is not known: give 2 or 3")
         for size in self.size:
             require_lengths(self.kind, size=size)
-        require_fillet(self.kind, self.fillet, min(self.size) / 2)
+        require_fillet(self.kind, self.fillet, self.depth)
 
     @property
     def dim(self) -> int:
@@ -252,145 +308,43 @@ class RoundedBox(ConvexBody):
     @property
     def fillet(self) -> float:
         """Radius of the edges, m."""
-        return SHAPE.fillet_ratio * min(self.size) / 2 if self.rounding is None else self.rounding
+        return SHAPE.fillet_ratio * self.depth if self.rounding is None else self.rounding
 
-    def _half(self) -> Values:
-        """(d,) half sizes of the sharp core that the fillet grows, m."""
+    @property
+    def core(self) -> Values:
+        """(d,) half sizes of the core, m."""
         return np.array(self.size) / 2 - self.fillet
 
-    def _corner(self, x: Values) -> QuadrantDistance:
-        return QuadrantDistance(abs(x) - self._half())
-
-    def _distance(self, x: Values) -> Values:
-        return self._corner(x).value - self.fillet
-
-    def _normal(self, x: Values) -> Values:
-        return _signs(x) * self._corner(x).gradient
-
-    def _curvature(self, x: Values) -> Values:
-        signs = _signs(x)
-        return signs[:, :, None] * self._corner(x).hessian * signs[:, None, :]
-
-    def _radius(self) -> float:
-        return self.fillet
-
-    def _depth(self) -> float:
+    @property
+    def depth(self) -> float:
+        """Least half size, m."""
         return min(self.size) / 2
 
-    def _resized(self, by: float) -> RoundedBox:
+    def resized(self, by: float) -> RoundedBox:
+        """Box with its surface moved outwards by `by`, m."""
         size = tuple(side + 2 * by for side in self.size)
         return replace(self, size=size, rounding=resized_fillet(self.fillet, by))
 
-    def _tessellate(self) -> Tessellation:
-        half = self._half()
+    def core_coordinates(self, x: Values) -> tuple[Values, Values]:
+        """(n, d) q at points x (n, d), m, and their gradients (n, d, d)."""
+        # never 0: a point on a middle plane has a nearest face as well
+        signs = np.where(x < 0, -1.0, 1.0)
+        return abs(x) - self.core, signs[:, :, None] * np.eye(self.dim)
+
+    def core_curvature(self, x: Values, corner: QuadrantDistance) -> Values:
+        """(n, d, d) zero: faces are plane."""
+        return np.zeros((len(x), self.dim, self.dim))
+
+    def outline(self) -> Tessellation:
+        """Surface or polygon of the filled box."""
+        half = self.core
         if self.dim == 3:
             return rounded_block(half, self.fillet)
         return polygon(profile(float(half[0]), float(half[1]), self.fillet))
 
-    def _moments(self) -> tuple[float, Values]:
-        return rounded_box(self._half(), self.fillet)
-
-
-def _signs(x: Values) -> Values:
-    """Signs -1 or 1, never 0: a point on a middle plane has a nearest face as well."""
-    return np.where(x < 0, -1.0, 1.0)
-
-
-@dataclass(frozen=True)
-class RoundedCylinder(ConvexBody):
-    """Finite cylinder with rounded edges, in 3D.
-
-    In the half plane through the axis it is a quadrant, q = (rho - (R - r), |height| - (L / 2 - r)). Inside a
-    container the distance is C1 within the rounding of the wall, as for a box.
-
-    Attributes:
-        radius: R, m.
-        length: full length L, m.
-        rounding: radius r of the edges, m; default: `SHAPE.fillet_ratio` of the radius.
-        axis: (3,) direction.
-    """
-
-    kind: ClassVar[str] = "cylinder"
-    radius: float
-    length: float
-    rounding: float | None = None
-    axis: tuple[float, ...] = (0.0, 0.0, 1.0)
-
-    def __post_init__(self) -> None:
-        """Raise InputError unless lengths, rounding and axis are valid."""
-        unit_vector(self.axis)
-        if len(self.axis) != 3:
-            raise InputError("a cylinder needs an axis of 3 numbers: in 2D take a sphere (a disk) or a box")
-        require_lengths(self.kind, radius=self.radius, length=self.length)
-        require_fillet(self.kind, self.fillet, min(self.radius, self.length / 2))
-        if self.fillet == self.radius:
-            raise InputError("the rounding of a cylinder is its radius: take a capsule")
-
-    @property
-    def dim(self) -> int:
-        """Dimension, 3."""
-        return 3
-
-    @property
-    def fillet(self) -> float:
-        """Radius of the edges, m; of a thin disk at most half its thickness."""
-        return min(SHAPE.fillet_ratio * self.radius, self.length / 2) if self.rounding is None else self.rounding
-
-    @property
-    def core(self) -> tuple[float, float]:
-        """Radius and half length of the sharp core that the fillet grows, m."""
-        return self.radius - self.fillet, self.length / 2 - self.fillet
-
-    def _polar(self, x: Values) -> tuple[QuadrantDistance, Values, Values, Values]:
-        """Quadrant distance, distances from the axis (n,), m, unit vectors (n, d) away from the axis and along it."""
-        axis, (radius, half) = unit_vector(self.axis), self.core
-        height = x @ axis
-        across = x - height[:, None] * axis
-        rho = lengths(across)
-        on_axis = rho < np.finfo(float).tiny
-        away = across / np.where(on_axis, 1.0, rho)[:, None]
-        if on_axis.any():
-            away[on_axis] = frame_about(axis)[:, 0]
-        q = np.stack([rho - radius, abs(height) - half], axis=1)
-        return QuadrantDistance(q), rho, away, np.where(height < 0, -1.0, 1.0)[:, None] * axis
-
-    def _distance(self, x: Values) -> Values:
-        return self._polar(x)[0].value - self.fillet
-
-    def _normal(self, x: Values) -> Values:
-        corner, _, away, up = self._polar(x)
-        return corner.gradient[:, :1] * away + corner.gradient[:, 1:] * up
-
-    def _curvature(self, x: Values) -> Values:
-        """(n, d, d) quadrant's Hessian in the half plane, and f_rho / rho around the axis (0 on it)."""
-        corner, rho, away, up = self._polar(x)
-        plane = np.stack([away, up], axis=1)
-        # across both, for which the sign does not matter
-        around = np.eye(3) - away[:, :, None] * away[:, None, :] - up[:, :, None] * up[:, None, :]
-        on_axis = rho < np.finfo(float).tiny
-        hoop = np.where(on_axis, 0.0, corner.gradient[:, 0] / np.where(on_axis, 1.0, rho))
-        in_plane = plane.transpose(0, 2, 1) @ corner.hessian @ plane
-        return np.asarray(in_plane + hoop[:, None, None] * around)
-
-    def _radius(self) -> float:
-        return self.fillet
-
-    def _depth(self) -> float:
-        return min(self.radius, self.length / 2)
-
-    def _resized(self, by: float) -> RoundedCylinder:
-        rounding = resized_fillet(self.fillet, by)
-        return replace(self, radius=self.radius + by, length=self.length + 2 * by, rounding=rounding)
-
-    def _tessellate(self) -> Tessellation:
-        radius, half = self.core
-        side = profile(radius, half, self.fillet)
-        points, triangles = surface_of_revolution(side)
-        return points @ frame_about(unit_vector(self.axis)).T, triangles
-
-    def _moments(self) -> tuple[float, Values]:
-        radius, half = self.core
-        return revolved(unit_vector(self.axis), radius, half, self.fillet)
+    def moments(self) -> tuple[float, Values]:
+        """Volume, m^3 (2D: m^2), and S = int x x^T dV (d, d) of the filled box."""
+        return rounded_box(self.core, self.fillet)
 
 
 @dataclass(frozen=True, eq=False)
@@ -435,6 +389,15 @@ class TranslatedShape(_DerivedShape):
     def min_radius(self) -> float:
         """Smallest radius of curvature of the original shape, m."""
         return self.shape.min_radius
+
+    @property
+    def max_inset(self) -> float:
+        """Largest inset of the original shape, m."""
+        return self.shape.max_inset
+
+    def inset(self, by: float) -> TranslatedShape:
+        """The shape with its surface receded by `by`, m."""
+        return TranslatedShape(self.shape.inset(by), self.offset)
 
     @property
     def volume(self) -> float:

@@ -26,8 +26,8 @@ from .laws import ObstacleLaw
 from .obstacle import RigidObstacle, free_pairs
 from .obstacle_pairs import ObstaclePair
 from .obstacle_term import ObstacleTerm
-from .shape_base import ConvexBody, Shape
-from .shapes import HalfSpace, TranslatedShape
+from .shape_base import unit_vector
+from .shapes import HalfSpace
 from .triangle_mesh_shape import TriangleMeshShape, refine_triangles
 
 
@@ -66,14 +66,14 @@ def build_inactive_at_rest[Term: ObstacleTerm](
         build: obstacles, law -> term. It refuses obstacles that overlap the body.
         mutual: whether free obstacles are in contact with others.
     """
-    limits = np.array([_max_offset(obstacle.shape) for obstacle in obstacles])
+    limits = np.array([obstacle.shape.max_inset for obstacle in obstacles])
     gaps, pairs = _gaps_to_nodes(domain, obstacles), _pair_gaps(obstacles) if mutual else []
     for number in range(SET_DOWN.max_rounds):
         room = min([*(gaps + limits), *(gap + limits[a] + limits[b] for a, b, gap in pairs)])
         width = min(law.barrier.width, float(room) / SET_DOWN.clearance)
         offsets = np.clip(SET_DOWN.clearance * width - gaps, 0.0, limits)
         _add_offsets_of_pairs(offsets, limits, pairs, obstacles, SET_DOWN.clearance * width)
-        moved = [offset_obstacle(*item) for item in zip(obstacles, offsets, strict=True)]
+        moved = [_offset_obstacle(*item) for item in zip(obstacles, offsets, strict=True)]
         term = build(moved, _with_width(law, width))
         rest_gaps = _rest_gaps(term)
         if number == SET_DOWN.max_rounds - 1 or (rest_gaps >= width).all():
@@ -109,26 +109,20 @@ def pair_obstacles(obstacles: Sequence[RigidObstacle], width: float, edge: float
         edge: length to which triangles are refined, m.
     """
     result = {number: _with_small_triangles(obstacle, edge) for number, obstacle in enumerate(obstacles)}
-    free_meshes = [
-        obstacle for obstacle in result.values() if obstacle.free and isinstance(obstacle.shape, TriangleMeshShape)
+    free_points = [
+        obstacle.posed_at(0.0).pose.points_to_space(obstacle.shape.points)
+        for obstacle in result.values()
+        if obstacle.free and isinstance(obstacle.shape, TriangleMeshShape)
     ]
-    x = [obstacle.posed_at(0.0).pose.points_to_space(_points(obstacle.shape)) for obstacle in free_meshes]
     for number, obstacle in result.items():
-        if x and not obstacle.free and not isinstance(obstacle.shape, TriangleMeshShape):
-            gap = min(float(obstacle.posed_at(0.0).distance(points).min()) for points in x)
-            offset = min(max(SET_DOWN.clearance * width - gap, 0.0), _max_offset(obstacle.shape))
-            if gap >= 0 and offset:
-                result[number] = replace(obstacle, shape=_offset_shape(obstacle.shape, offset))
+        shape = obstacle.shape
+        if not free_points or obstacle.free or isinstance(shape, TriangleMeshShape):
+            continue
+        gap = min(float(obstacle.posed_at(0.0).distance(points).min()) for points in free_points)
+        offset = min(max(SET_DOWN.clearance * width - gap, 0.0), shape.max_inset)
+        if gap >= 0 and offset:
+            result[number] = replace(obstacle, shape=shape.inset(offset))
     return result
-
-
-def _offset_shape(shape: Shape, offset: float) -> Shape:
-    """Shape with its surface moved back by `offset`, m, about the same reference point."""
-    if isinstance(shape, HalfSpace):
-        return TranslatedShape(shape, -offset * shape.normal(np.zeros((1, shape.dim)))[0])
-    if isinstance(shape, TranslatedShape):
-        return TranslatedShape(_inset(shape.shape, offset), shape.offset)
-    return _inset(shape, offset)
 
 
 def _with_small_triangles(obstacle: RigidObstacle, edge: float) -> RigidObstacle:
@@ -138,31 +132,13 @@ def _with_small_triangles(obstacle: RigidObstacle, edge: float) -> RigidObstacle
     return replace(obstacle, shape=TriangleMeshShape(*refine_triangles(shape.points, shape.triangles, edge)))
 
 
-def _points(shape: Shape) -> Values:
-    assert isinstance(shape, TriangleMeshShape)
-    return shape.points
-
-
-def offset_obstacle(obstacle: RigidObstacle, offset: float) -> RigidObstacle:
+def _offset_obstacle(obstacle: RigidObstacle, offset: float) -> RigidObstacle:
     """Obstacle with its surface moved back by `offset`, m; its mass and inertia stay."""
-    shape = obstacle.shape
     if not offset:
         return obstacle
-    if isinstance(shape, HalfSpace):
-        normal = shape.normal(obstacle.start_point[None])[0]
-        return replace(obstacle, start_point=obstacle.start_point - offset * normal)
-    return replace(obstacle, shape=_offset_shape(shape, offset))
-
-
-def _inset(shape: Shape, offset: float) -> Shape:
-    assert isinstance(shape, ConvexBody)
-    return shape.inset(offset)
-
-
-def _max_offset(shape: Shape) -> float:
-    """Largest distance by which a shape can be moved back, m."""
-    body = shape.shape if isinstance(shape, TranslatedShape) else shape
-    return body.max_inset if isinstance(body, ConvexBody) else float("inf")
+    if isinstance(shape := obstacle.shape, HalfSpace):
+        return replace(obstacle, start_point=obstacle.start_point - offset * unit_vector(shape.direction))
+    return replace(obstacle, shape=shape.inset(offset))
 
 
 def _with_width(law: ObstacleLaw, width: float) -> ObstacleLaw:
